@@ -82,7 +82,7 @@ _ROOMS = (
     "control",
 )
 # Rooms that are not searched for names; most need an extra.
-_OTHER_ROOMS = ("ax", "records", "report", "rl", "sklearn", "systems")
+_OTHER_ROOMS = ("ax", "export", "records", "report", "rl", "sklearn", "systems")
 
 
 def __getattr__(name: str) -> Any:

@@ -4,14 +4,9 @@ Its fixtures are imported by rooms.
 """
 
 import io
-import os
 import pickle
 import random
-import subprocess
-import sys
-import textwrap
 import threading
-import time
 import zipfile
 
 import gymnasium
@@ -120,16 +115,27 @@ def scramble():
     random.seed(99)
 
 
-class Falls(gymnasium.Wrapper):
-    """A robot that has to be set up again after its eighth step."""
+FAULTS = ("nan", "inf", "1e30", "reward nan", "reward 1e30", "raises")
 
-    steps = 0
+
+class Faulty(gymnasium.Wrapper):
+    """A machine of which some steps fail, by their numbers from 1, each in its way of `FAULTS`."""
+
+    def __init__(self, env, faults):
+        super().__init__(env)
+        self.faults, self.steps = faults, 0
 
     def step(self, action):
         self.steps += 1
-        if self.steps == 8:
+        fault = self.faults.get(self.steps, "")
+        if fault == "raises":
             raise OSError("the robot fell")
-        return super().step(action)
+        observation, reward, *others = self.env.step(action)
+        if fault.startswith("reward"):
+            reward = float(fault.split()[1])
+        elif fault:
+            observation = np.full_like(observation, float(fault))
+        return observation, reward, *others
 
 
 class Shouting(gymnasium.Wrapper):
@@ -172,31 +178,8 @@ def forbid_unpickling(monkeypatch):
         raise AssertionError("unpickled")
 
     calls = [f"{room}.{call}" for room in ("pickle", "cloudpickle") for call in ("load", "loads")]
-    for name in (*calls, "gpadjust.control.agent._Unpickler"):
+    for name in (*calls, "gpadjust.control.pickled_agent._Unpickler"):
         monkeypatch.setattr(name, unpickled)
-
-
-def last_lines(script, folder):
-    """The last line that a script prints, and that of one which is killed at random moments."""
-    file = folder / "run.py"
-    file.write_text(textwrap.dedent(script))
-
-    def start(name):
-        command = [sys.executable, str(file), str(folder / name)]
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-        return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
-
-    def last(process):
-        return process.communicate()[0].splitlines()[-1]
-
-    whole, moments = last(start("whole.ckpt")), random.Random(0)
-    for _ in range(3):
-        process = start("run.ckpt")
-        assert process.stdout.readline() == "written\n"
-        time.sleep(moments.uniform(0.0, 0.4))
-        process.kill()
-        process.communicate()
-    return whole, last(start("run.ckpt"))
 
 
 def flat(name, value, found):

@@ -19,7 +19,7 @@ from gpadjust.control import CrossEntropy, Planner
 from tests.systems import line
 
 ROOT = Path(__file__).parents[1]
-WITH_DATA = {"control", "records", "saving"}  # pages that are tested below
+WITH_DATA = {"control", "export", "records", "saving"}  # pages that are tested below
 GUIDE = [p for p in sorted((ROOT / "docs" / "guide").rglob("*.md")) if p.stem not in WITH_DATA]
 FIRST = [ROOT / "docs" / f"{name}.md" for name in ("start", "install", "choose")]
 
@@ -198,3 +198,18 @@ def test_the_agent_learns_and_goes_on(tmp_path, monkeypatch, capsys):
     assert actions.shape == (2, 1)
     assert greedy.predict(seen[1])[0] == actions[1]
     assert evaluate_policy(greedy, names["env"], n_eval_episodes=1, warn=False)[0] < 0
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::UserWarning", "ignore::FutureWarning")  # of do-mpc's
+def test_do_mpc_controls_the_tanks_by_the_exported_dynamics(tmp_path, monkeypatch):
+    pytest.importorskip("do_mpc")
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    for block in blocks("docs/guide/control/export.md"):
+        exec(block, names)
+    upper, lower = names["adjusted"].unbind(-1)
+    assert (lower[-6:] - 8).abs().max() < 0.05
+    assert upper.max() < 9
+    assert (names["path"][-1, 1] - 8).abs() > 0.5  # f_p alone
+    assert "tanks_step" in names["code"]

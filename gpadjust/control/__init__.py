@@ -1,17 +1,19 @@
 """Tasks, planning and policy search in dynamics models, and agents that control by them."""
 
 from gpadjust.control.action_rate import ActionRate
-from gpadjust.control.agent import Agent, Callback, print_progress
+from gpadjust.control.agent import Agent, Callback
 from gpadjust.control.agents import MPCAgent, PolicySearchAgent
 from gpadjust.control.checkpoint import EpisodeCheckpoint, resume
 from gpadjust.control.mpc import MPC, Planned
 from gpadjust.control.planner import Plan, Planner
 from gpadjust.control.policies import BoundedPolicy, linear_policy, mlp_policy
 from gpadjust.control.policy_search import PolicySearch, SearchResult, imitate
+from gpadjust.control.progress import print_progress
 from gpadjust.control.recorded_episodes import RecordedEpisodes
 from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts
 from gpadjust.control.search import CrossEntropy, PathIntegral, Search
 from gpadjust.control.state_filter import Estimate, StateFilter
+from gpadjust.control.step_guard import FailedStepWarning, StepGuard
 from gpadjust.control.task import Constraints, InitialStates, Reward, Step, Task, Termination
 
 __all__ = [
@@ -24,6 +26,7 @@ __all__ = [
     "CrossEntropy",
     "EpisodeCheckpoint",
     "Estimate",
+    "FailedStepWarning",
     "InitialStates",
     "MPCAgent",
     "Objective",
@@ -42,6 +45,7 @@ __all__ = [
     "SearchResult",
     "StateFilter",
     "Step",
+    "StepGuard",
     "Task",
     "Termination",
     "imitate",

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import io
-import pickle
+import time
 import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import groupby
-from operator import attrgetter
 from typing import Any, ClassVar, NamedTuple, Self
 
 import cloudpickle
@@ -22,19 +20,20 @@ from torch import Tensor
 from gpadjust.checks import check_kind, checked_number, checked_whole
 from gpadjust.control.checkpoint import (
     EpisodeCheckpoint,
-    RandomState,
-    TaskAgent,
-    layer_names,
     locked,
     packed,
     pickled_environment,
     unpacked,
 )
-from gpadjust.control.recorded_episodes import RecordedEpisodes, learn_dynamics
+from gpadjust.control.pickled_agent import pickled, unpickled
+from gpadjust.control.random_state import RandomState
+from gpadjust.control.recorded_episodes import RecordedEpisodes, learn_again, learn_dynamics
 from gpadjust.control.search import random_sequences
 from gpadjust.control.smoothed_episodes import Seen, smooth_episodes
 from gpadjust.control.state_filter import StateFilter
+from gpadjust.control.step_guard import StepGuard
 from gpadjust.control.task import Task
+from gpadjust.control.task_agent import TaskAgent
 from gpadjust.dynamics.free_run import checked_horizons
 
 MAX_HOLD = 5  # steps of a random action
@@ -66,14 +65,17 @@ class Agent(TaskAgent):
     nothing: the episodes are kept, and the dynamics learn them after the next one. Mend what is
     wrong, set ``agent.task`` to a task with other functions or dynamics, for example, and call
     ``learn`` again; dynamics that know nothing learn all episodes. Transitions at which the physics
-    fails are not learnt, with a warning. A step that did not happen, which an environment tells by
-    a true ``info["step_failed"]``, is not kept and ends its episode.
+    fails are not learnt, with a warning. A step that fails, or gives what cannot be data, is not
+    kept and ends its episode, see :class:`StepGuard`; so does one that did not happen, which an
+    environment tells by a true ``info["step_failed"]``.
 
     Callbacks are called with the agent, the name of an event, and a dictionary of numbers:
 
     - ``"episode"``: an episode begins;
     - ``"plan"``: its first action is chosen, with what the agent says of it (:meth:`promise`);
     - ``"step"``: a real step was made, with its ``reward``;
+    - ``"trial"``: the episode has ended, with its ``number`` (from 1), ``steps``, ``seconds``, the
+      ``reward`` of a step, and what was promised of it (``promised_reward``);
     - ``"fit"``: the dynamics have learnt, with the scores of the new steps before that
       (``nlpd``, ``coverage``, ``rmse/x``, ``coverage_15``, ...), ``real_reward`` of a step and
       ``promised_reward``;
@@ -84,7 +86,7 @@ class Agent(TaskAgent):
 
     Args:
         env: The real environment, of Gymnasium, with a box of observations, as the spec of the
-            dynamics has them, and a box of actions.
+            dynamics has them, and a box of actions; the attribute has a :class:`StepGuard` around.
         task: What is known of the system; rewards and terminations are compared with those of
             each real episode.
         action_noise: Called at each step for what is added to the action, ``action_dim`` numbers in
@@ -129,6 +131,7 @@ class Agent(TaskAgent):
     """
 
     model: Task | None
+    _is_improved: bool  # in all that is known
     _filter: StateFilter | None
 
     def __init__(
@@ -148,7 +151,7 @@ class Agent(TaskAgent):
         self.task = task
         expected = "an environment of Gymnasium, as gymnasium.make(...) makes it, not vectorized"
         check_kind("env", env, gym.Env, expected)
-        self.env = env
+        self.env = StepGuard.around(env)
         task.check_spaces(env.observation_space, env.action_space)
         self.action_noise = action_noise
         self.random_steps = random_steps
@@ -228,11 +231,14 @@ class Agent(TaskAgent):
         with locked(given):
             self._callbacks = given
             self._begin()
-            while self.num_timesteps < end:
+            while True:
+                if not self._is_improved:
+                    self._improve()
+                if self.num_timesteps >= end:
+                    break
                 self.tell("episode")
                 self._play()
-                if self._learn_dynamics():
-                    self._improve()
+                self._learn_dynamics()
             self.tell("done")
         return self
 
@@ -240,6 +246,7 @@ class Agent(TaskAgent):
         """Play a real episode, and keep its steps."""
         observation, self._start = self._reset(), None
         episode, begins, state = len(self._promises), True, None
+        began, rewards = time.perf_counter(), list[float]()
         self._promises.append(None)
         random = self._random_actions() if self.model is None else None
         getattr(self.action_noise, "reset", lambda: None)()
@@ -260,12 +267,19 @@ class Agent(TaskAgent):
             if not failed:
                 row = (observation, action, following, float(reward), bool(terminated))
                 self._steps.append(_Step(episode, *row))
+                rewards.append(float(reward))
             self.tell("step", {"reward": float(reward)})
             if failed or terminated or truncated:
-                if failed and begins:
-                    self._promises.pop()  # there is no step of it to compare
-                return
+                break
             observation, begins = following, False
+        if not rewards:
+            self._promises.pop()  # there is no step of it to compare
+            return
+        values: dict[str, float] = {"number": len(self._promises), "steps": len(rewards)}
+        values |= {"reward": sum(rewards) / len(rewards), "seconds": time.perf_counter() - began}
+        if (promised := self._promises[episode]) is not None:
+            values["promised_reward"] = promised
+        self.tell("trial", values)
 
     def _chosen(
         self, observation: NDArray[Any], state: Any, begins: NDArray[np.bool_]
@@ -292,24 +306,30 @@ class Agent(TaskAgent):
             )
         return said
 
-    def _learn_dynamics(self) -> bool:
-        """Let the dynamics learn the episodes that they have not; return whether there were any."""
-        if self.task.sensors is not None:
+    def _learn_dynamics(self) -> None:
+        """Let the dynamics learn the episodes that they have not, if there are any."""
+        dynamics, sensors = self.task.dynamics, self.task.sensors
+        by_physics = not dynamics.is_fitted
+        if sensors is not None and len(self._promises) > self.num_episodes:
             with self.timed("fit"):
                 self._smooth()
-        recorded, dynamics = self.recorded_episodes(), self.task.dynamics
+        recorded = self.recorded_episodes()
         new = recorded.some(recorded.episode >= (self.num_episodes if dynamics.has_learnt else 0))
         if new.num_transitions < (1 if dynamics.is_fitted else 2):  # a first fit needs two
-            return False
-        if self.reward_tolerance is not None and self.task.sensors is None:
+            self._is_improved &= new.num_transitions == 0  # there is another start
+            return
+        if self.reward_tolerance is not None and sensors is None:
             new.check(self.task, self.reward_tolerance)
         with self.timed("fit"):
             task = recorded.complete(self.task, self.episode_length(), self.action_bounds())
             values = learn_dynamics(task, new, recorded, self.score_horizons)
+            if sensors is not None and by_physics:  # whose errors were noise in the states
+                self._smooth()
+                learn_again(dynamics, self.recorded_episodes())
         bounds = None if self.model is None else self.model.state_bounds
         if bounds is not None and self.task.state_bounds is None:
             new.warn_of_bounds(bounds)
-        self.model = None  # it is not the newest any more
+        self.model, self._is_improved = None, False  # it is not the newest any more
         promises, self.num_episodes = self._promises[self.num_episodes :], len(self._promises)
         kept = [each for each in promises if each is not None]
         # Of actions that were random nothing was promised.
@@ -319,7 +339,6 @@ class Agent(TaskAgent):
             values["promised_reward"] = self.promised_reward
             self._compare(values, recorded.rewards)
         self.tell("fit", values)
-        return True
 
     def _smooth(self) -> None:
         """Estimate the states behind all episodes, and the noises, in the newest model."""
@@ -333,7 +352,9 @@ class Agent(TaskAgent):
             )
             for steps in by_episode
         ]
-        task = replace(self.task, dynamics=self.newest_model.dynamics)
+        newest = self.task.dynamics.before_data()
+        assert newest is not None, "checked at the start"
+        task = replace(self.task, dynamics=newest)
         known = self.filter
         assert known is not None, "there are sensors"
         self._filter, self._states = smooth_episodes(task, known, seen, len(seen))
@@ -352,6 +373,7 @@ class Agent(TaskAgent):
                 f"{type(self).__name__}.improve must return whether the agent can act by now, True "
                 f"or False; found {can_act!r}."
             )
+        self._is_improved = True
         if can_act:
             self.model = task
 
@@ -372,7 +394,7 @@ class Agent(TaskAgent):
         told = "a Task(dynamics, reward, ...), which an agent needs to learn"
         check_kind("task", task, Task, told)
         self._task = task
-        self.model = None
+        self.model, self._is_improved = None, False
         self._filter = None
 
     @property
@@ -447,26 +469,16 @@ class Agent(TaskAgent):
         space = self.env.action_space
         return torch.from_numpy(np.stack([space.low, space.high]).astype(np.float64))
 
-    def __repr__(self) -> str:
-        """Name the agent, its environment, its dynamics and the number of its episodes."""
-        return (
-            f"{type(self).__name__}({layer_names(self.env)[-1]}, "
-            f"{type(self.task.dynamics).__name__}, {self.num_episodes} episodes learnt, "
-            f"{self.num_timesteps} steps)"
-        )
-
     # The parts of the loop
 
     def _begin(self) -> None:
-        """Find what is wrong before it costs a real step, and improve if that was not done yet."""
+        """Find what is wrong before it costs a real step."""
         if self._random_state is not None:  # a run that goes on
             self._random_state.restore()
             self._random_state = None
         if self.task.sensors is not None:
             self._check_sensors()
         self.try_task(np.atleast_2d(self._reset()), self.env.action_space)
-        if self.model is None:
-            self._improve()
 
     def _check_sensors(self) -> None:
         """Raise a ValueError if hidden states could not be estimated."""
@@ -538,6 +550,11 @@ class Agent(TaskAgent):
 
     # Checkpoints
 
+    @classmethod
+    def wrapped(cls, env: Any) -> Any:
+        """The user's environment with a guard around it."""
+        return StepGuard.around(env)
+
     def save(self, path: Any) -> None:
         """Write a checkpoint, from which :func:`resume` makes the agent."""
         EpisodeCheckpoint(path).write(self)
@@ -551,22 +568,11 @@ class Agent(TaskAgent):
         if env is None:
             state["_start"] = None  # it will be reset
         return {
-            "agent.pkl": self._pickled(state),
+            "agent.pkl": pickled(state, self),
             "steps.pt": packed({"columns": columns, "states": self._states}),
             "dynamics.pt": packed(self.task.dynamics.state_dict()),
             "environment.pkl": env or b"",
         }
-
-    def _pickled(self, state: dict[str, Any]) -> bytes:
-        """Attributes, without task, model and dynamics."""
-        try:
-            return _pickled(state, self)
-        except Exception as error:  # pickling runs the user's code
-            name = next(name for name, part in state.items() if not _can_be_pickled(part, self))
-            raise TypeError(
-                f"{type(self).__name__}.{name} cannot be pickled, as a checkpoint does "
-                f"({type(error).__name__}: {error}). Make it a property, or name it in not_saved."
-            ) from error
 
     @classmethod
     def from_parts(cls, parts: dict[str, bytes], env: Any, task: Task) -> Self:
@@ -581,62 +587,5 @@ class Agent(TaskAgent):
             for row in zip(*steps["columns"], strict=True)
         ]
         agent._states = steps["states"]
-        vars(agent).update(_Unpickler(io.BytesIO(parts["agent.pkl"]), agent).load())
+        vars(agent).update(unpickled(parts["agent.pkl"], agent))
         return agent
-
-
-class _Pickler(cloudpickle.Pickler):
-    """Pickles attributes of an agent, in which names stand for task, model and dynamics."""
-
-    def __init__(self, file: io.BytesIO, agent: Agent) -> None:
-        super().__init__(file)
-        self.agent = agent
-
-    def persistent_id(self, value: Any) -> str | None:
-        """The name of what is not pickled, wherever it is kept."""
-        task, model = self.agent.task, self.agent.model or self.agent.task
-        names = {id(model.dynamics): "model.dynamics", id(task.dynamics): "task.dynamics"}
-        names[id(task)] = "task"
-        if id(value) in names or not isinstance(value, Task):
-            return names.get(id(value))
-        if value is model:
-            return "model"
-        if value.dynamics in (task.dynamics, model.dynamics):
-            return None  # pickled, but for its dynamics
-        raise TypeError(
-            f"{type(self.agent).__name__} keeps a Task with dynamics of its own, which no "
-            "checkpoint holds; keep its reward and so on, and make it where it is needed"
-        )
-
-
-def _pickled(value: Any, agent: Agent) -> bytes:
-    file = io.BytesIO()
-    _Pickler(file, agent).dump(value)
-    return file.getvalue()
-
-
-def _can_be_pickled(value: Any, agent: Agent) -> bool:
-    try:
-        _pickled(value, agent)
-    except Exception:  # as above
-        return False
-    return True
-
-
-class _Unpickler(pickle.Unpickler):
-    def __init__(self, file: io.BytesIO, agent: Agent) -> None:
-        super().__init__(file)
-        self.agent = agent
-
-    def persistent_load(self, name: str) -> Any:
-        """The part of the agent that has this name; the model when it is first asked for."""
-        if name.startswith("model") and self.agent.model is None:
-            self.agent.model = self.agent.known_task()
-        return attrgetter(name)(self.agent)
-
-
-def print_progress(agent: Agent, event: str, values: dict[str, float]) -> None:
-    """A callback that prints a line for each plan, fit and search."""
-    if event in ("plan", "fit", "update", "search"):
-        numbers = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
-        print(f"{agent.num_timesteps} steps, {event}: {numbers}")

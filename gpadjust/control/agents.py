@@ -21,6 +21,7 @@ from gpadjust.control.policy_search import PolicySearch
 from gpadjust.control.rollouts import Rollouts
 from gpadjust.control.search import random_sequences
 from gpadjust.control.state_filter import Estimate
+from gpadjust.control.step_guard import check_observation
 from gpadjust.control.task import Task
 from gpadjust.states import StateSpec
 
@@ -52,7 +53,7 @@ class MPCAgent(Agent):
         >>> quick = Planner(search=CrossEntropy(1), horizon=3, num_random=16)  # or leave it out
         >>> agent = MPCAgent(system.make(), system.task(), quick, first=quick, seed=0)
         >>> agent.learn(total_timesteps=2 * 25)
-        MPCAgent(CartPoleSwingUpEnv, LearnedDynamics, 2 episodes learnt, 50 steps)
+        MPCAgent(CartPoleSwingUpEnv, LearnedDynamics, 2 episodes learnt, 50 steps, last reward ...)
     """
 
     def __init__(
@@ -162,7 +163,7 @@ class PolicySearchAgent(Agent):
         >>> search = PolicySearch(updates=2, num_starts=4, num_functions=2)
         >>> agent = PolicySearchAgent(system.make(), system.task(), linear_policy, search, seed=0)
         >>> agent.learn(total_timesteps=25)
-        PolicySearchAgent(CartPoleSwingUpEnv, LearnedDynamics, 1 episodes learnt, 25 steps)
+        PolicySearchAgent(CartPoleSwingUpEnv, LearnedDynamics, 1 episodes learnt, 25 steps, ...)
     """
 
     def __init__(
@@ -231,6 +232,7 @@ class PolicySearchAgent(Agent):
 
         With sensors the state is an :class:`Estimate` of each episode, at whose mean they are.
         """
+        check_observation(observation)
         seen, found = torch.as_tensor(np.asarray(observation)).double(), list[Estimate]()
         if self.filter is not None:
             rows = torch.atleast_2d(seen)

@@ -21,9 +21,11 @@ def margins(
 ) -> Tensor:
     r"""By how much constraints must hold in the mean of a plan, for them to hold in the system.
 
-    The covariance of the states is carried along the plan, whose deviations are corrected by a
-    linear feedback, as they will be by the plans to come: open loop it would grow without limit.
-    With the slope g of a constraint its margin is
+    The covariance of the states is carried along the plan: noise is another one in each step, and
+    what is not known of the mean errs in the same direction all along. Deviations are corrected by
+    a linear feedback, as far as the actions of the plan leave room for it, as they will be by the
+    plans to come: open loop they would grow without limit. With the slope g of a constraint its
+    margin is
 
     .. math:: \Phi^{-1}(1 - \epsilon)\, \sqrt{g^\top \Sigma\, g},
 
@@ -46,35 +48,46 @@ def margins(
     num_steps, num_constraints, dim = slopes.shape
     if task.probability is None:
         return slopes.new_zeros(num_steps, num_constraints)
-    feedback = _feedback(near, slopes, (action_bounds[1] - action_bounds[0]) / 2)
-    closed = near.slope + near.gain @ feedback
-    seen = slopes.new_zeros(dim, dim) if covariance is None else covariance
-    # The feedback corrects what will be seen; the error of the estimate stays.
-    spread, variances, steps = torch.zeros_like(seen), [], near.carry(seen.expand_as(near.slope))
-    for t in range(num_steps):
-        total = closed[t] @ spread @ closed[t].mT + steps[t]
-        spread = total - seen
-        variances.append(_along(slopes[t], total))
     share = (1 - task.probability) / (task.episode_length or num_steps) / num_constraints
-    quantile = torch.special.ndtri(torch.tensor(1 - share, dtype=torch.float64))
-    return quantile.clamp_min(0.0) * torch.stack(variances).clamp_min(0.0).sqrt()
+    quantile = torch.special.ndtri(slopes.new_tensor(1 - share)).clamp_min(0.0)
+    feedback = _feedback(near, slopes, (action_bounds[1] - action_bounds[0]) / 2)
+    noise = task.dynamics.noise_variance(states, actions)
+    unknown = (near.variance - noise).clamp_min(0.0).sqrt().diag_embed()
+    seen = slopes.new_zeros(dim, dim) if covariance is None else covariance
+    steps = near._replace(variance=noise).carry(seen.expand_as(near.slope))
+    # The feedback corrects what will be seen; the error of the estimate stays.
+    scattered, biased = (slopes.new_zeros(num_constraints, dim, dim) for _ in range(2))
+    found = []
+    for t in range(num_steps):
+        spread = scattered + biased @ biased.mT
+        ahead = spread @ (slopes[t] @ near.slope[t]).unsqueeze(-1)
+        sd = _along(slopes[t] @ near.slope[t], spread).clamp_min(_TINY).sqrt()
+        wanted = quantile * (feedback[t] @ ahead).squeeze(-1) / sd.unsqueeze(-1)
+        room = torch.where(wanted > 0, action_bounds[1] - actions[t], actions[t] - action_bounds[0])
+        possible = (room / wanted.abs().clamp_min(_TINY)).clamp(0.0, 1.0).amin(-1)
+        closed = near.slope[t] + possible[:, None, None] * (near.gain[t] @ feedback[t])
+        scattered = closed @ scattered @ closed.mT + steps[t] - seen
+        biased = closed @ biased + unknown[t]
+        total = scattered + seen + biased @ biased.mT
+        found.append(quantile * _along(slopes[t], total).clamp_min(0.0).sqrt())
+    return torch.stack(found)
 
 
 def _feedback(near: Linearised, slopes: Tensor, half_range: Tensor) -> Tensor:
-    """The linear-quadratic regulator of the constraints, ``T x action_dim x state_dim``.
+    """The linear-quadratic regulator of each constraint, ``T x c x action_dim x state_dim``.
 
-    Their deviations count in those that they would have without it, actions in half their range.
+    Its deviation counts in that which it would have without, actions in half their range.
     """
     open_loop, largest = torch.zeros_like(near.slope[0]), slopes.new_zeros(slopes.shape[1])
     for t in range(len(slopes)):
         open_loop = near.slope[t] @ open_loop @ near.slope[t].mT + near.variance[t].diag()
         largest = torch.maximum(largest, _along(slopes[t], open_loop))
-    weights = torch.where(largest > _TINY, 1 / largest.clamp_min(_TINY), 0.0)
+    weights = torch.where(largest > _TINY, 1 / largest.clamp_min(_TINY), 0.0)[:, None, None]
     effort = half_range.square().reciprocal().diag()
-    value, gains = torch.zeros_like(near.slope[0]), []
+    value, gains = slopes.new_zeros(len(weights), *near.slope.shape[1:]), []
     for t in reversed(range(len(slopes))):
         slope, gain = near.slope[t], near.gain[t]
-        value = value + slopes[t].mT @ (weights.unsqueeze(-1) * slopes[t])
+        value = value + weights * slopes[t].unsqueeze(-1) * slopes[t].unsqueeze(-2)
         gains.append(-torch.linalg.solve(effort + gain.mT @ value @ gain, gain.mT @ value @ slope))
         value = slope.mT @ value @ (slope + gain @ gains[-1])
         value = (value + value.mT) / 2
@@ -83,7 +96,7 @@ def _feedback(near: Linearised, slopes: Tensor, half_range: Tensor) -> Tensor:
 
 def _along(slopes: Tensor, covariance: Tensor) -> Tensor:
     """Variances ``c`` in the directions of slopes ``c x state_dim``."""
-    return (slopes @ covariance * slopes).sum(-1)
+    return ((slopes.unsqueeze(-2) @ covariance).squeeze(-2) * slopes).sum(-1)
 
 
 def _slopes(task: Task, states: Tensor, actions: Tensor) -> Tensor:

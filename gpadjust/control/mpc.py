@@ -17,6 +17,7 @@ from gpadjust.control.constraints import margins
 from gpadjust.control.planner import Plan, Planner
 from gpadjust.control.search import CrossEntropy
 from gpadjust.control.state_filter import Estimate, StateFilter
+from gpadjust.control.step_guard import check_observation
 from gpadjust.control.task import Task
 from gpadjust.models.sampled_functions import seeded
 
@@ -171,6 +172,7 @@ class MPC:
         The state is the plan. Without one all episodes begin. If ``deterministic``, the search is
         always the same.
         """
+        check_observation(observation)
         rows = torch.as_tensor(np.atleast_2d(observation), dtype=torch.float64)
         episodes = going_on(state, episode_start, len(rows))
         known: Sequence[Estimate | None] = [None] * len(rows)

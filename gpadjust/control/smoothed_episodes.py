@@ -22,7 +22,8 @@ from gpadjust.records.kalman import (
 from gpadjust.states import StateSpec
 
 _ROUNDS = 30
-_GUESS = 1  # measurements that what was known of a noise counts for
+_GUESSED = 1.0  # measurements that what was known of a noise counts for
+_TOLD = 10.0  # those that the user's guess counts for
 _LONGER = 1.6  # than a step of expectation maximisation, in logarithms
 _STEADY = 0.02  # a change of the logarithm of a variance
 _TINY = 1e-300  # of a variance that is none
@@ -63,14 +64,15 @@ def smooth_episodes(
     first, covariance, _ = known.start
     near = [path[0] + spec.change(path[0], first) for path in paths]
     starts = [(mean.numpy(), covariance.diagonal().numpy()) for mean in near]
-    before = noise = known.noise.square().numpy()
+    noise = known.noise.square().numpy()
+    prior, weight = _prior(task, noise)
     links, predicted = _links(task, paths, episodes)
     added = np.where(predicted > 0, predicted, known.process_noise.square().numpy())
     for _ in range(_ROUNDS):
         found, _ = smooth_chain(links, starts, noise, added)
         links, _ = _links(task, [torch.from_numpy(each.states.means) for each in found], episodes)
         errors, steps = expected_squares(links, found, spec.state_dim)
-        likely = (errors.sum(0) + _GUESS * before) / (len(errors) + _GUESS)
+        likely = (errors.sum(0) + weight * prior) / (len(errors) + weight)
         step = torch.from_numpy(steps.mean(0))[spec.predicted]
         new = np.concatenate([likely, spec.complete_variance(step).numpy()])
         old = np.concatenate([noise, added])
@@ -82,6 +84,15 @@ def smooth_episodes(
     sd = (torch.from_numpy(variance).sqrt() for variance in (noise, added))
     learnt = StateFilter(known.start, *sd)
     return learnt, [wrapped(task, torch.from_numpy(path)) for path in drawn]
+
+
+def _prior(task: Task, known: Array) -> tuple[Array, Array]:
+    """Variances of the noise as they are guessed, and the measurements that these count for."""
+    sensors = task.sensors
+    assert sensors is not None, "asked before"
+    told = [name in sensors.noise for name in sensors.outputs]
+    guesses = [sensors.noise.get(name, 1.0) ** 2 for name in sensors.outputs]
+    return np.where(told, guesses, known), np.where(told, _TOLD, _GUESSED)
 
 
 def _filtered(task: Task, known: StateFilter, episodes: Sequence[Seen]) -> list[Tensor]:

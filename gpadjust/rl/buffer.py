@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from gpadjust.checks import checked_number, checked_whole
 from gpadjust.control import RecordedEpisodes
+from gpadjust.control.step_guard import fault
 from gpadjust.states import StateSpec
 
 
@@ -102,7 +103,8 @@ class MixedReplayBuffer(CompactReplayBuffer):
 
     A real step whose ``info["step_failed"]`` is true did not happen, as where a simulator failed.
     It is not kept: the step before it is the last one of its episode, truncated. (Where other
-    environments made theirs, its place in the row repeats another transition.)
+    environments made theirs, its place in the row repeats another transition.) Nor is one that
+    cannot be data, of an environment without a :class:`gpadjust.control.StepGuard`.
 
     Args:
         buffer_size: Capacity of the real buffer.
@@ -161,7 +163,8 @@ class MixedReplayBuffer(CompactReplayBuffer):
         infos: list[dict[str, Any]],
     ) -> None:
         """Add a real step of each environment, see Stable-Baselines3."""
-        failed = np.array([bool(info.get("step_failed")) for info in infos])
+        steps = zip(infos, np.stack([obs, next_obs], 1), reward, strict=True)
+        failed = np.array([bool(info.get("step_failed") or fault(*step)) for info, *step in steps])
         if failed.any():
             self.end_episodes(failed)
         if failed.all():

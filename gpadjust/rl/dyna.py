@@ -32,10 +32,13 @@ from torch import Tensor
 
 from gpadjust.checks import check_kind
 from gpadjust.control import EpisodeCheckpoint, RecordedEpisodes, Task
-from gpadjust.control.checkpoint import TaskAgent, locked, packed, unpacked
+from gpadjust.control.checkpoint import locked, packed, unpacked
 from gpadjust.control.recorded_episodes import learn_dynamics
+from gpadjust.control.step_guard import check_observation
+from gpadjust.control.task_agent import TaskAgent
 from gpadjust.rl.buffer import CompactReplayBuffer, MixedReplayBuffer
-from gpadjust.rl.checkpoint import CheckpointCallback, environment_state, restore_environment
+from gpadjust.rl.callbacks import AgentCallback, DynaCallback
+from gpadjust.rl.environments import environment_state, guarded, restore_environment
 from gpadjust.rl.model_vec_env import ModelVecEnv
 from gpadjust.rl.options import DynaOptions
 
@@ -52,7 +55,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
     parameters of the dynamics, but not the task: pass it to ``load``, or get an agent that can only
     predict. (Files of ``save`` are Stable-Baselines3's, which hold pickles: open those you trust.)
 
-    An error on the way loses nothing, and steps that did not happen are no data, as of
+    An error on the way loses nothing, and steps that fail are no data, as of
     :class:`gpadjust.control.Agent`: mend what is wrong, set ``agent.task``, for example, and call
     ``learn`` again. Dynamics that know nothing learn all that is in the buffer. (Where the
     environment was wrong, ``agent.replay_buffer.reset()`` forgets what it said.)
@@ -269,7 +272,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
     # Real episodes
 
     def learn(self, total_timesteps: int, callback: Any = None, *args: Any, **kwargs: Any) -> Self:
-        """Learn; a callback may be, or a list of them hold, an ``EpisodeCheckpoint``."""
+        """Learn; callbacks may be, or hold, an ``EpisodeCheckpoint`` and ``print_progress``."""
         several = isinstance(callback, list | CallbackList)
         given = getattr(callback, "callbacks", callback) if several else [callback]
         checkpoints = [each for each in given if isinstance(each, EpisodeCheckpoint)]
@@ -278,9 +281,20 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
                 "EpisodeCheckpoint cannot resume generalised state-dependent exploration exactly; "
                 f"use {type(self).__name__} with use_sde=False."
             )
-        known = [CheckpointCallback(each) if each in checkpoints else each for each in given]
+        known = [AgentCallback.around(each) for each in given]
         with locked(checkpoints):
             return super().learn(total_timesteps, known if several else known[0], *args, **kwargs)
+
+    def predict(
+        self, observation: Any, *args: Any, **kwargs: Any
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Choose actions as the learner does; refuse an observation that cannot be data.
+
+        Raises:
+            ValueError: If a number of it is not finite, or larger than 1e25.
+        """
+        check_observation(observation)
+        return super().predict(observation, *args, **kwargs)
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
         """Collect; if it ends within an episode, the next `learn` resets the environments."""
@@ -497,7 +511,11 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
     @classmethod
     def wrapped(cls, env: GymEnv) -> VecEnv:
         """The user's environment in the wrappers of Stable-Baselines3."""
-        return cls._wrap_env(env, verbose=0)
+        return cls._wrap_env(env)
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        return guarded(OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper))
 
     @classmethod
     def described(cls, env: VecEnv) -> dict[str, Any]:
@@ -542,40 +560,6 @@ def _on_cpu(state: Any) -> Any:
     if isinstance(state, dict):
         return {name: _on_cpu(part) for name, part in state.items()}
     return state.cpu() if torch.is_tensor(state) else state
-
-
-class DynaCallback(BaseCallback):
-    """A Stable-Baselines3 callback with two more hooks, for :class:`Dyna` agents.
-
-    Subclasses that override ``_init_callback`` must call that of this class.
-    """
-
-    def _init_callback(self) -> None:
-        if not isinstance(self.model, Dyna):
-            raise TypeError(
-                f"{type(self).__name__} is for Dyna agents, such as DynaSAC; found "
-                f"{type(self.model).__name__}."
-            )
-        self.model.model_hooks.append(self)
-
-    def _on_step(self) -> bool:
-        return True
-
-    def on_model_fit(self, metrics: dict[str, float]) -> None:
-        """Called after the dynamics were fitted.
-
-        Args:
-            metrics: ``"fit_seconds"``; and of the newest real transitions, predicted before they
-                were learnt, as soon as the dynamics can predict: ``"nlpd"`` and ``"coverage"``,
-                averaged over the states, and ``"rmse/<state>"`` of each.
-        """
-
-    def on_model_episodes(self, returns: np.ndarray) -> None:
-        """Called after some model episodes that ran side by side.
-
-        Args:
-            returns: The sum of rewards of each.
-        """
 
 
 class DynaSAC(Dyna, SAC):

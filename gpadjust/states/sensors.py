@@ -23,9 +23,9 @@ class Sensors:
             those of what ``function`` returns.
         function: Outputs ``N x len(outputs)`` of states ``N x state_dim``, in PyTorch. Default: the
             states of these names.
-        noise: First guesses of the standard deviations of the noise, by the name of the output,
-            each as good as a few measurements. Default: a tenth of what an output changes by in a
-            step.
+        noise: Guesses of the standard deviations of the noise, by the name of the output, each as
+            good as ten measurements. Default: at first a tenth of what an output changes by in a
+            step, then what was learnt.
 
     Raises:
         TypeError: If names are not strings, or ``function`` is none.

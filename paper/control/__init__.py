@@ -125,6 +125,60 @@ class Hidden(Experiment):
 
 
 @dataclass(frozen=True, kw_only=True)
+class WallsSettings:
+    """Settings that decide the numbers; found with seeds of 100 and more."""
+
+    trials: int = 5
+    """real trials of a run, of which the first goes by f_p with its stated error"""
+    probability: float = 0.95
+    """of constraints holding through a trial"""
+    sequences: int = 40
+    """that are planned, in each round of the cross-entropy method"""
+    horizon: int = 8
+    """steps that are planned ahead at each step"""
+    rounds: int = 1
+    """of these after the first"""
+    first_sequences: int = 64
+    """that are planned when a trial begins, of all its steps"""
+    first_rounds: int = 2
+    """of these after the first"""
+    elites: int = 8
+    """of a round"""
+    fit: Literal["map", "bayes"] = "map"
+    """of the learnt models, as of `gpadjust.fit`"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Walls(Experiment):
+    """Systems near walls, with margins of the constraints and without."""
+
+    runs: int = 14
+    """seeds with margins; half of these of the true model, a quarter of the others"""
+    out: Path = Path("results/walls")
+    settings: WallsSettings = field(default_factory=WallsSettings)
+
+    axes: ClassVar[Axes] = {
+        "system": {"cart": "cart in gusts", "cart-pole": "cart-pole", "tanks": "two tanks"},
+        "controller": {
+            "margin": "CKA, probability 0.95",
+            "hard": "CKA, no margin",
+            "none": "CKA, no constraint",
+            "truth": "true model, no margin",
+        },
+    }
+    calls: ClassVar[tuple[str, ...]] = (
+        "gpadjust.dynamics.LearnedDynamics",
+        "gpadjust.control.Planner",
+        "gpadjust.control.CrossEntropy",
+    )
+
+    def seeds_of(self, *kind: Any) -> Sequence[int]:
+        """Fewer seeds of the rivals."""
+        share = {"margin": 1, "truth": 2}.get(kind[1], 4)
+        return self.seeds[: -(-self.runs // share)]
+
+
+@dataclass(frozen=True, kw_only=True)
 class SetpointsSettings:
     """Settings that decide the numbers; found with seeds of 100 and more."""
 

@@ -24,7 +24,8 @@ from paper.common.learners import LEARNERS
 from paper.common.tables import frame, groups, markdown, number
 from paper.common.verdicts import Curves, Difference, paired
 from paper.control import HORIZONS, Known, KnownSettings
-from paper.control.systems import SYSTEMS, Physics
+from paper.control.machine import Physics
+from paper.control.systems import SYSTEMS
 from paper.machines.networks import NetworkDynamics
 
 _SYSTEMS, _LEARNERS = Known.axes["system"], Known.axes["learner"]

@@ -40,3 +40,21 @@ def test_model_beside_updates(benchmark, agent, episode, updates):
     benchmark.extra_info[name] = round((fit + rollout) / spent["update"], 3)
     print(f"{name}: {benchmark.extra_info[name]} (fit {fit:.2f} s, rollout {rollout:.2f} s)")
     assert fit + rollout <= spent["update"]
+
+
+def test_fused_adam(record_ratio):
+    """Updates of SAC's networks, of 256 x 256 units and batches of 256, by default."""
+
+    def learner(**options):
+        policy = {"optimizer_kwargs": options}
+        system = cart_pole()
+        none = DynaOptions(last_model_episode=0)
+        known = {"policy_kwargs": policy, "seed": 0, "device": "cpu"}
+        return DynaSAC("MlpPolicy", system.make(), system.task(), none, **known).learn(50)
+
+    fused, plain = learner(fused=True), learner()
+    record_ratio(
+        "an update with fused Adam / without",
+        lambda: fused.train(50, 256),
+        lambda: plain.train(50, 256),
+    )

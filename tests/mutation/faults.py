@@ -152,6 +152,18 @@ FAULTS = (
         "The planner forgets its best sequences of earlier rounds.",
     ),
     Fault(
+        "gpadjust/control/state_filter.py",
+        "off = seen.change(values.detach(), seen.decode(observations))",
+        "off = seen.decode(observations) - values.detach()",
+        "A measured angle beyond half a turn throws the estimate a turn back.",
+    ),
+    Fault(
+        "gpadjust/control/smoothed_episodes.py",
+        "near = [path[0] + spec.change(path[0], first) for path in paths]",
+        "near = [first for path in paths]",
+        "The start of a smoothed episode is a turn away from its first measured angle.",
+    ),
+    Fault(
         "gpadjust/records/kalman.py",
         "end_spread = spread + gain @ (covariance[d:, d:] - spread[d:, d:]) @ gain.T",
         "end_spread = spread",

@@ -17,7 +17,6 @@ from tests.point import (
     Shouting,
     assert_read_without_pickle,
     forbid_unpickling,
-    last_lines,
     robot,
     scramble,
 )
@@ -121,48 +120,6 @@ def test_steps_in_the_middle_of_episodes(point_agent, point_task, point_env, ass
     assert_same(whole, agent)
 
 
-# Processes that are killed
-
-
-SCRIPT = """
-    import hashlib, sys
-    from pathlib import Path
-
-    import torch
-    from stable_baselines3.common.callbacks import BaseCallback
-
-    torch.set_num_threads(1)
-    from gpadjust.control import EpisodeCheckpoint, resume
-    from gpadjust.systems import cart_pole
-    from gpadjust.rl import DynaOptions, DynaSAC
-
-    class Tells(BaseCallback):
-        def _on_step(self):
-            return True
-
-        def _on_rollout_start(self):
-            print("written", flush=True)
-
-    path = Path(sys.argv[1])
-    env, task = cart_pole().make(), cart_pole().task()
-    if path.exists():
-        agent = resume(path, env, task)
-    else:
-        agent = DynaSAC("MlpPolicy", env, task, DynaOptions(model_episodes=2), batch_size=8,
-                        seed=0, policy_kwargs={"net_arch": [8]}, device="cpu")
-    written = [EpisodeCheckpoint(path), Tells()]
-    agent.learn(100 - agent.num_timesteps, written, reset_num_timesteps=False)
-    weights = b"".join(p.detach().numpy().tobytes() for p in agent.policy.parameters())
-    print(hashlib.sha256(weights).hexdigest())
-"""
-
-
-@pytest.mark.slow
-def test_a_process_that_is_killed_at_random_moments(tmp_path):
-    whole, killed = last_lines(SCRIPT, tmp_path)
-    assert whole == killed
-
-
 def test_an_environment_that_cannot_be_pickled_is_reset(
     point_agent, point_env, point_task, tmp_path
 ):
@@ -190,7 +147,7 @@ def test_what_does_not_fit_is_refused_before_anything_is_unpickled(
     wide = point_env()
     wide.action_space = gymnasium.spaces.Box(-3, 3, (1,))
     for env, given, algorithm, message in [
-        (Shouting(point_env()), task, DynaSAC, "DummyVecEnv of Monitor of Shout"),
+        (Shouting(point_env()), task, DynaSAC, "DummyVecEnv of StepGuard of Monitor of Shout"),
         *(
             (wrapped([layer]), task, DynaSAC, "wrappers is")
             for layer in ("normalised", "monitored")

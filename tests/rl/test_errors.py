@@ -1,15 +1,19 @@
 """Errors on the way lose nothing."""
 
+from contextlib import suppress
+
 import gymnasium
+import numpy as np
 import pytest
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from gpadjust.control import FailedStepWarning
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.physics import PhysicsError
 from gpadjust.rl import ModelVecEnv
-from tests.point import POINT_SPEC, Falls
+from tests.point import POINT_SPEC, Faulty
 from tests.rl.conftest import model_rows
 
 
@@ -74,18 +78,47 @@ def test_a_buffer_that_holds_no_episode_is_refused(point_agent):
         point_agent(buffer_size=3).learn(5)
 
 
-def test_an_environment_that_fails_within_an_episode(point_agent, point_env, learnt_dynamics):
-    dynamics = learnt_dynamics()
-    agent = point_agent(Falls(point_env()), dynamics=dynamics)
-    with pytest.raises(OSError, match="fell"):
-        agent.learn(10)
-    agent.learn(5, reset_num_timesteps=False)
+FAILS = {1: "raises", 4: "nan", 9: "1e30", 12: "reward nan", 13: "reward 1e30", 18: "inf"}
+
+
+@pytest.mark.parametrize("layers", [(), ("normalised",)])
+def test_steps_that_fail_end_their_episodes_and_lose_nothing(
+    point_agent, point_env, learnt_dynamics, layers
+):
+    """The first step of one, steps in the middle and at the end; good episodes follow."""
+    env = Faulty(point_env(), FAILS)
+    env = VecNormalize(DummyVecEnv([lambda: env])) if layers else env
+    agent = point_agent(env, dynamics=learnt_dynamics())
+    with pytest.warns(FailedStepWarning) as told:
+        agent.learn(18)
+    assert len(told) == len(FAILS)
+    agent.learn(10, reset_num_timesteps=False)
     recorded = agent.recorded_episodes()
-    assert dynamics.num_transitions == recorded.num_transitions == 5 + 2 + 5
-    follows = (recorded.states[1:] == recorded.next_states[:-1]).all(-1)
-    assert follows.logical_not().nonzero().flatten().tolist() == [4, 6]
-    starts = recorded.draw_starts(100).unique().tolist()
-    assert starts == recorded.states[[0, 5, 7], 0].sort().values.tolist()
+    assert agent.task.dynamics.num_transitions == recorded.num_transitions == 28 - len(FAILS)
+    moved = recorded.next_states - recorded.states
+    torch.testing.assert_close(moved, 0.5 * recorded.actions, atol=0.1, rtol=0)
+    assert recorded.begins.sum() == 6
+    for group in (*agent.get_parameters()["policy"].values(), recorded.rewards):
+        assert group.isfinite().all()
+    if layers:
+        assert abs(agent.env.obs_rms.mean).max() < 10
+
+
+def test_a_vectorised_environment_without_guards_gives_no_bad_data(point_agent, point_env):
+    """As where other processes run the environments: a bad observation is refused."""
+    env = DummyVecEnv([lambda: Faulty(point_env(), {8: "nan", 12: "reward inf"})])
+    agent = point_agent(env)
+    env.envs = [env.envs[0].env]
+    for _ in range(2):
+        with suppress(ValueError):
+            agent.learn(10, reset_num_timesteps=False)
+    assert agent.replay_buffer.size() == agent.num_timesteps - 2
+    assert agent.recorded_episodes().rewards.isfinite().all()
+
+
+def test_an_observation_that_cannot_be_data_is_not_acted_on(point_agent):
+    with pytest.raises(ValueError, match="No action can be chosen: entry 0 of the observation is"):
+        point_agent().predict(np.array([np.nan], dtype=np.float32))
 
 
 class BreaksAt(BaseCallback):

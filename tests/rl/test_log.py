@@ -1,6 +1,7 @@
 """What callbacks and the logger are told."""
 
 import csv
+import re
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecNormalize
 
+from gpadjust.control import print_progress
 from gpadjust.dynamics import PhysicsDynamics
 from gpadjust.rl import DynaCallback
 from tests.rl.conftest import model_rows
@@ -143,3 +145,19 @@ def test_scores_of_trajectories_are_logged_and_change_nothing(
         f"model/{name}_{k}" for name in ("nlpd", "coverage", "energy") for k in (1, 5)
     }
     assert_same(one, other)
+
+
+def test_progress_is_printed(point_agent, capsys):
+    point_agent().learn(10, [print_progress])
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.partition(" ")[0] for line in lines] == ["trial", "fit:"] * 2
+    assert re.fullmatch(r"trial 2: reward -\d\S* a step, 5 steps in \d+\.\d s", lines[2])
+
+
+def test_its_representation_says_what_it_is(point_agent):
+    last = point_agent().learn(10)
+    assert "DynaSAC(Point, PhysicsDynamics, 2 episodes learnt, 10 steps, last reward -" in repr(
+        last
+    )
+    last.task = None
+    assert repr(last) == "DynaSAC(Point, no task)"

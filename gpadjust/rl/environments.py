@@ -1,35 +1,22 @@
-"""The environments of Stable-Baselines3 in checkpoints."""
+"""The environments of Stable-Baselines3: guarded, and in checkpoints."""
 
 from __future__ import annotations
 
 import cloudpickle
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
-from gpadjust.control import EpisodeCheckpoint
+from gpadjust.control import StepGuard
 from gpadjust.control.checkpoint import pickled_environment, warn_unsaved
 
 _OF_ALL = ("venv", "envs", "class_attributes", "observation_space", "action_space", "metadata")
 
 
-class CheckpointCallback(BaseCallback):
-    """Writes an :class:`EpisodeCheckpoint` between the rollouts of Stable-Baselines3."""
-
-    def __init__(self, checkpoint: EpisodeCheckpoint) -> None:
-        super().__init__()
-        self.checkpoint = checkpoint
-
-    def _on_step(self) -> bool:
-        return True
-
-    def _on_rollout_start(self) -> None:
-        # The updates of the last episode are done, and the next has not begun.
-        self.checkpoint(self.model, "episode")  # type: ignore[arg-type]
-
-    def _on_training_end(self) -> None:
-        # Unless another callback stopped the run within an episode.
-        if self.model.num_timesteps >= self.model._total_timesteps:
-            self.checkpoint(self.model, "done")  # type: ignore[arg-type]
+def guarded(env: VecEnv) -> VecEnv:
+    """A vectorised environment in which each one that is in this process has a guard."""
+    inner = _layers(env)[-1]
+    if isinstance(inner, DummyVecEnv):
+        inner.envs = [StepGuard.around(each) for each in inner.envs]
+    return env
 
 
 def environment_state(env: VecEnv) -> bytes:

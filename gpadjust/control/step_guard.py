@@ -1,0 +1,119 @@
+"""Real steps that cannot be data, and what becomes of them."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+LARGEST = 1e25
+"""The largest number that an environment may observe or reward.
+
+No quantity of a machine is as large in a unit that is used, nor is the square of one, which a
+reward may be: pressures stay below 1e12 Pa. There is no least one, as for 1e-9 m.
+"""
+
+_IN_VAIN = 3  # episodes on end without a step, after which there is no sense in another
+
+
+class FailedStepWarning(UserWarning):
+    """A real step could not be made, or gave what cannot be data; it is not kept."""
+
+
+class StepGuard(gym.Wrapper[Any, Any, Any, Any]):
+    """Ends an episode where its step fails, as a step that did not happen.
+
+    A step fails that raises an error, or whose observation or reward is not finite or larger than
+    1e25. It is refused with a :class:`FailedStepWarning`. The episode is truncated at the last
+    good observation, with a reward of zero and a true ``info["step_failed"]``, so that no learner
+    of the library takes it as data. Agents put a guard around their environment, and Dyna around
+    each of a ``DummyVecEnv``; put one yourself around each environment that another process runs,
+    as in ``SubprocVecEnv([lambda: StepGuard(make()), ...])``.
+
+    An interruption (``KeyboardInterrupt``) and an error of ``reset`` come through.
+
+    Args:
+        env: The environment.
+
+    Raises:
+        RuntimeError: By ``step``, if the first step of three episodes on end fails.
+        ValueError: By ``reset``, if the first observation of an episode cannot be data.
+
+    Example:
+        >>> from gpadjust.control import StepGuard
+        >>> from gpadjust.systems import cart_pole
+        >>> env = StepGuard(cart_pole().make())
+        >>> _ = env.reset(seed=0)
+        >>> *_, info = env.step(env.action_space.sample())
+        >>> "step_failed" in info
+        False
+    """
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self._last: NDArray[Any] = np.empty(0)  # the last good observation
+        self._steps = 0  # good ones of the episode
+        self._in_vain = 0
+
+    @staticmethod
+    def around(env: gym.Env[Any, Any]) -> StepGuard:
+        """The environment with a guard around it, or as it is if it has one."""
+        return env if isinstance(env, StepGuard) else StepGuard(env)
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode."""
+        observation, info = self.env.reset(**options)
+        check_observation(observation, "An episode cannot begin")
+        self._last, self._steps = np.array(observation), 0
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Make a step, or end the episode where it fails."""
+        cause = None
+        try:
+            found = self.env.step(action)
+            problem = fault(found[0], found[1])
+        except Exception as error:  # whatever a machine, or its driver, does
+            cause, problem = error, f"the environment raised {type(error).__name__}: {error}"
+        if not problem:
+            self._last, self._steps, self._in_vain = np.array(found[0]), self._steps + 1, 0
+            return found
+        said = f"Step {self._steps + 1} of an episode failed, and ends it: {problem}."
+        self._in_vain += self._steps == 0
+        if self._in_vain >= _IN_VAIN:
+            self._in_vain = 0
+            raise RuntimeError(
+                f"{said} Nor was there a good step in the {_IN_VAIN - 1} episodes before. Mend the "
+                "environment and call `learn` again; all earlier steps are kept."
+            ) from cause
+        warnings.warn(
+            f"{said} It is not kept, all earlier steps are, and learning goes on with the next "
+            "episode. If it happens often, look at the sensor or the simulator.",
+            FailedStepWarning,
+            stacklevel=2,
+        )
+        return self._last.copy(), 0.0, False, True, {"step_failed": True}
+
+
+def fault(observation: ArrayLike, reward: Any = 0.0) -> str:
+    """Return what cannot be data in an observation or a reward, in words; empty if all can."""
+    for name, values in (("observation", observation), ("reward", reward)):
+        numbers = np.asarray(values, dtype=np.float64)
+        wrong = ~(np.abs(numbers) <= LARGEST)  # NaN is not, either
+        if wrong.any():
+            place = np.argwhere(wrong)[0]
+            entry = f"entry {', '.join(map(str, place))} of the " if len(place) else "the "
+            return (
+                f"{entry}{name} is {numbers[tuple(place)]:g}, where a finite number of at most "
+                f"{LARGEST:g} is expected (a larger quantity needs another unit)"
+            )
+    return ""
+
+
+def check_observation(observation: ArrayLike, what: str = "No action can be chosen") -> None:
+    """Raise a ValueError, which begins with ``what``, if an observation cannot be data."""
+    if problem := fault(observation):
+        raise ValueError(f"{what}: {problem}. Stop the machine, or wait for a good observation.")

@@ -1,0 +1,307 @@
+"""A fitted model, or the dynamics that hold one, as a file of C."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from string import Template
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gpadjust.dynamics import LearnedDynamics
+from gpadjust.export.finite_sum import Column, FiniteSum, finite_sum, model_of
+from gpadjust.export.transition import next_state, next_variance, target_columns
+from gpadjust.models import TermsModel
+
+_KERNELS = {  # of r, the squared distance in lengthscales
+    "rbf": "exp(-0.5 * r)",
+    "matern0.5": "exp(-sqrt(r))",
+    "matern1.5": "(1.0 + sqrt(3.0 * r)) * exp(-sqrt(3.0 * r))",
+    "matern2.5": "(1.0 + sqrt(5.0 * r) + 5.0 / 3.0 * r) * exp(-sqrt(5.0 * r))",
+    "constant": "0.0",
+}
+_BEGIN = Template("""\
+    double each[SAMPLES * OUTPUTS]$spread;
+    for (int g = 0; g < SAMPLES * OUTPUTS; g++) {
+        double phi[FEATURES] = {0.0}, sum = start[g]$prior;
+""")
+_TERM = Template("""\
+        const double b$t = $basis; /* $name */
+        sum += b$t * mean$t[g];
+""")
+_PRIOR = Template("        prior += b$t * b$t * (amplitude$t[g] + constant$t[g]);\n")
+_KERNEL = Template("""\
+        for (int i = 0; i < FEATURES; i++) {
+            double r = 0.0;
+            for (int k = 0; k < INPUTS; k++) {
+                const double u = (z[k] - points[g % POINT_SETS][i][k]) * rate$t[g][k];
+                r += u * u;
+            }
+            phi[i] += b$t * at_points$t[g][i] * (amplitude$t[g] * $kernel + constant$t[g]);
+        }
+""")
+_WAVES = Template("""\
+        for (int i = 0; i < $half; i++) {
+            double angle = 0.0;
+            for (int k = 0; k < INPUTS; k++) angle += z[k] * rate$t[g][k] * frequencies$t[i][k];
+            phi[$first + i] = b$t * sqrt(amplitude$t[g] / $half) * cos(angle);
+            phi[$first + $half + i] = b$t * sqrt(amplitude$t[g] / $half) * sin(angle);
+        }
+""")
+_MEAN = """\
+        for (int i = 0; i < FEATURES; i++) sum += phi[i] * weights[g][i];
+        each[g] = shift[g] + scale[g] * sum;
+"""
+_VARIANCE = """\
+        if (!variance) continue;
+        double found = 0.0;
+"""
+_LOWER = """\
+        const double *column = lower[g];
+        found = prior;
+        for (int k = 0; k < FEATURES; column += FEATURES - k, k++) {
+            const double u = phi[k] / column[0];
+            found -= u * u;
+            for (int i = 0; i < FEATURES - k; i++) phi[k + i] -= column[i] * u;
+            phi[k] = u;
+        }
+"""
+_ROOT = """\
+        const double *row = root[g];
+        double u[FEATURES] = {0.0};
+        for (int k = 0; k < FEATURES; row += FEATURES - k, k++)
+            for (int i = 0; i < FEATURES - k; i++) u[k + i] += row[i] * phi[k];
+        for (int i = 0; i < FEATURES; i++) found += u[i] * u[i];
+"""
+_SPREAD = """\
+        spread[g] = scale[g] * scale[g] * (fmax(found, $least * prior) + noise[g]);
+"""
+_MIXED = """\
+    }
+    for (int j = 0; j < OUTPUTS; j++) {
+        mean[j] = 0.0;
+        for (int g = j; g < SAMPLES * OUTPUTS; g += OUTPUTS) mean[j] += each[g] / SAMPLES;
+"""
+_WIDER = """\
+        if (!variance) continue;
+        double wider = 1.0;
+"""
+_ERRORS = """\
+        double errors = 1.0, near = 1.0;
+        for (int i = 0; i < ERRORS; i++) {
+            double r = 0.0;
+            for (int k = 0; k < INPUTS; k++) {
+                const double u = (z[k] - error_points[i][k]) * error_rate[j][k];
+                r += u * u;
+            }
+            near += exp(-0.5 * r);
+            errors += exp(-0.5 * r) * error_squares[j][i];
+        }
+        wider = fmax(1.0, errors / near) * error_factor[j];
+"""
+_MIXED_VARIANCE = """\
+        variance[j] = 0.0;
+        for (int g = j; g < SAMPLES * OUTPUTS; g += OUTPUTS) {
+            const double off = each[g] - mean[j];
+            variance[j] += (wider * spread[g] + off * off) / SAMPLES;
+        }
+"""
+
+
+def c_source(
+    fitted: TermsModel | LearnedDynamics,
+    name: str,
+    *,
+    variance: bool = True,
+    observation_noise: bool = False,
+) -> str:
+    r"""Return a fitted model as a file of C99, which needs ``math.h`` alone and allocates nothing.
+
+    Of a model it has ``void NAME_predict(const double *x, const double *f_p, double *mean, double
+    *variance)``, which is :meth:`~gpadjust.CKA.predict` at one point. Of dynamics it has ``void
+    NAME_step(const double *state, const double *action, const double *f_p, double *mean, double
+    *variance)``, which is :meth:`LearnedDynamics.predict`. The physics stays yours: ``f_p`` is what
+    it returns there, of several physics side by side; without physics it is no argument. A
+    ``variance`` that is ``NULL`` is not computed, which is faster. The same model makes the same
+    file.
+
+    Args:
+        fitted: The model, or dynamics that have learnt.
+        name: What the names of functions begin with.
+        variance: Whether there is a variance. Its tables are the most of the file: the square of
+            the number of points or features, for each output and sample.
+        observation_noise: Whether the variance has the noise that was learnt.
+
+    Raises:
+        TypeError: If it is neither.
+        ValueError: If ``name`` is none in C, or the model is no finite sum; with the way out.
+        RuntimeError: If the dynamics have learnt nothing yet.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust import CKA
+        >>> from gpadjust.export import c_source
+        >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+        >>> code = c_source(CKA(X, X.sin(), physics=lambda X: X), "pump")
+        >>> "void pump_predict(const double *x, const double *f_p, double *mean" in code
+        True
+    """
+    if not (isinstance(name, str) and name.isidentifier() and name.isascii()):
+        raise ValueError(f"Expected name as one of C, such as 'pump', got {name!r}.")
+    model = model_of(fitted)
+    found = finite_sum(model, variance, observation_noise)
+    is_step, body = isinstance(fitted, LearnedDynamics), "".join(_body(found, variance))
+    tables = {n: t for n, t in _tables(found).items() if re.search(rf"\b{n}\[", body)}
+    given = ["const double *f_p"] * bool(found.num_physics) + ["double *mean"]
+    given += ["double *variance"] * variance
+    about = [
+        f"{model!r}. Made by gpadjust; numbers are in the units of the data.",
+        f"x: {', '.join(model.input_names)}.",
+        f"f_p: {found.num_physics} values that the physics returns at x.",
+        f"mean: {', '.join(model.output_names)}.",
+        "variance: in their square, "
+        f"{'with' if observation_noise else 'without'} the noise; NULL if it is not wanted.",
+        f"Numbers in tables: {sum(table.numel() for table in tables.values())}.",
+    ]
+    lines = ["/*", *(f" * {line.replace('*/', '* /')}" for line in about), " */", ""]
+    lines += ["#include <math.h>", "", _sizes(found, model.num_outputs)]
+    lines += [*(_declared(*table) for table in tables.items()), ""]
+    lines += [f"{'static ' * is_step}void {name}_predict(const double *x, {', '.join(given)})"]
+    lines += [f"{{\n{body}    }}\n}}"]
+    if isinstance(fitted, LearnedDynamics):
+        lines += ["", *_step(fitted, name, given, found.num_physics)]
+    return "\n".join(lines) + "\n"
+
+
+def _sizes(s: FiniteSum, num_outputs: int) -> str:
+    """The sizes of the tables, as names."""
+    sizes = {
+        "INPUTS": len(s.columns),
+        "OUTPUTS": num_outputs,
+        "SAMPLES": len(s.weights) // num_outputs,
+        "FEATURES": s.weights.shape[-1],
+        "POINT_SETS": len(s.points),
+        "ERRORS": 0 if s.errors is None else len(s.errors.points),
+    }
+    return f"enum {{ {', '.join(f'{name} = {size}' for name, size in sizes.items())} }};"
+
+
+def _tables(s: FiniteSum) -> dict[str, Tensor]:
+    """All numbers, by the names that they have in C."""
+    found = s._asdict()
+    for t, term in enumerate(s.terms):
+        found |= {f"{name}{t}": value for name, value in term._asdict().items()}
+    if s.errors is not None:
+        found |= {f"error_{name}": value for name, value in s.errors._asdict().items()}
+    rows, columns = torch.triu_indices(*2 * s.weights.shape[-1:])
+    if s.lower is not None:  # by columns: loops along them have no sum to wait for
+        found["lower"] = s.lower[:, columns, rows]
+    if s.root is not None:
+        found["root"] = s.root[:, rows, columns]
+    return {name: value for name, value in found.items() if isinstance(value, Tensor)}
+
+
+def _body(s: FiniteSum, variance: bool) -> Iterator[str]:
+    """The sum at one point."""
+    yield f"    const double z[INPUTS] = {{{', '.join(map(_input, s.columns))}}};\n"
+    more = {"spread": ", spread[SAMPLES * OUTPUTS]", "prior": ", prior = 0.0"}
+    yield _BEGIN.substitute(more if variance else dict.fromkeys(more, ""))
+    first = 0
+    for t, term in enumerate(s.terms):
+        basis = f"(f_p[column{t}[g % OUTPUTS]] - origin{t}[g]) / unit{t}[g]"
+        basis = "1.0" if term.column is None else basis
+        yield _TERM.substitute(t=t, basis=basis, name=term.name.replace("*/", "* /"))
+        if s.lower is not None:
+            yield _PRIOR.substitute(t=t)
+        if term.frequencies is not None:
+            half = len(term.frequencies)
+            yield _WAVES.substitute(t=t, half=half, first=first)
+            first += 2 * half
+            if term.constant.any():
+                yield f"        phi[{first}] = b{t} * sqrt(constant{t}[g]);\n"
+                first += 1
+        elif term.kind:
+            yield _KERNEL.substitute(t=t, kernel=_KERNELS[term.kind])
+    yield _MEAN
+    if variance:
+        yield from (_VARIANCE, _LOWER * (s.lower is not None), _ROOT * (s.root is not None))
+        yield Template(_SPREAD).substitute(least=s.least)
+    yield _MIXED
+    if variance:
+        yield from (_WIDER, _ERRORS * (s.errors is not None), _MIXED_VARIANCE)
+
+
+def _input(column: Column) -> str:
+    """An input of the kernels in C."""
+    value = f"x[{column.source}]"
+    value = f"{column.function}({value})" if column.function else value
+    plain = (column.offset, column.size) == (0.0, 1.0)
+    return value if plain else f"({value} - {column.offset!r}) / {column.size!r}"
+
+
+def _declared(name: str, table: Tensor) -> str:
+    """A table in C."""
+    kind = "double" if table.is_floating_point() else "int"
+    shape = "".join(f"[{size}]" for size in table.shape)
+    return f"static const {kind} {name}{shape} = {_braces(table.tolist())};"
+
+
+def _braces(values: list[Any]) -> str:
+    """Nested numbers in C, a few in a line."""
+    if isinstance(values[0], list):
+        return "{" + ",\n".join(map(_braces, values)) + "}"
+    parts = [", ".join(map(repr, values[i : i + 6])) for i in range(0, len(values), 6)]
+    return "{" + ",\n ".join(parts) + "}"
+
+
+def _step(
+    dynamics: LearnedDynamics, name: str, given: list[str], num_physics: int
+) -> Iterator[str]:
+    """The function of dynamics, which calls that of their model."""
+    spec, m = dynamics.spec, dynamics.model.num_outputs
+    state, action = _entries("state", spec.state_dim), _entries("action", spec.action_dim)
+    yield f"/* state, mean: {', '.join(spec.states)}; action: {', '.join(spec.actions)}."
+    yield f" * f_p: the next {', '.join(spec.states[i] for i in spec.moving)} by the physics. */"
+    yield f"void {name}_step(const double *state, const double *action, {', '.join(given)})"
+    yield "{"
+    x, arguments = [(*state, *action)[i] for i in spec.model_columns], ["x"]
+    yield f"    const double x[{len(x)}] = {{{', '.join(x)}}};"
+    if num_physics:
+        f_p = _entries("f_p", num_physics // m * len(spec.moving))
+        columns = target_columns(dynamics, state, f_p, _wrapped)
+        yield f"    const double columns[{num_physics}] = {{{', '.join(columns)}}};"
+        arguments.append("columns")
+    has_variance = "double *variance" in given
+    yield f"    double learnt[{m}]{f', spread[{m}]' * has_variance};"
+    arguments += ["learnt"] + ["variance ? spread : 0"] * has_variance
+    yield f"    {name}_predict({', '.join(arguments)});"
+    for i, value in enumerate(next_state(dynamics, state, action, _entries("learnt", m))):
+        yield f"    mean[{i}] = {value};"
+    if has_variance:
+        yield "    if (!variance) return;"
+        variances = next_variance(dynamics, _entries("spread", m), _Text("0.0"))
+        yield from (f"    variance[{i}] = {value};" for i, value in enumerate(variances))
+    yield "}"
+
+
+class _Text(str):
+    """An expression in C."""
+
+    def __add__(self, other: str) -> _Text:
+        return _Text(f"({self} + {other})")
+
+    def __sub__(self, other: str) -> _Text:
+        return _Text(f"({self} - {other})")
+
+    def __rmul__(self, number: Any) -> _Text:
+        return _Text(f"{number!r} * {self}")
+
+
+def _entries(name: str, size: int) -> list[_Text]:
+    return [_Text(f"{name}[{i}]") for i in range(size)]
+
+
+def _wrapped(angle: _Text) -> _Text:
+    return _Text(f"atan2(sin{angle}, cos{angle})")

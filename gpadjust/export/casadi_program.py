@@ -1,0 +1,189 @@
+"""A fitted model, or the dynamics that hold one, as a function of CasADi."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from torch import Tensor
+
+from gpadjust.dynamics import LearnedDynamics
+from gpadjust.export.finite_sum import ErrorTables, FiniteSum, finite_sum, model_of
+from gpadjust.export.transition import next_state, next_variance, target_columns
+from gpadjust.models import TermsModel
+
+ca: Any
+try:
+    import casadi as ca
+except ImportError:  # C needs none
+    ca = None
+
+_TINY = 1e-30  # of a squared distance, at which its root has a derivative
+
+
+def casadi_function(
+    fitted: TermsModel | LearnedDynamics,
+    name: str = "predict",
+    *,
+    physics: Callable[[Any], Any] | None = None,
+    variance: bool = True,
+    observation_noise: bool = False,
+) -> Any:
+    """Return a fitted model as a ``casadi.Function``, with derivatives, for optimal control.
+
+    Of a model it maps columns ``x`` and ``f_p`` to ``mean`` and ``variance``, those of
+    :meth:`~gpadjust.CKA.predict`; of dynamics ``state``, ``action`` and ``f_p`` to those of
+    :meth:`LearnedDynamics.predict`. The physics stays yours: ``f_p`` is what it returns there, of
+    several physics below each other; without physics it is no argument.
+
+    Args:
+        fitted: The model, or dynamics that have learnt.
+        name: The name of the function.
+        physics: f_p in CasADi, to take the place of that argument: a ``casadi.Function``, or one of
+            Python, from the column of what f_p reads to the column of what it returns.
+        variance: Whether there is a variance.
+        observation_noise: Whether the variance has the noise that was learnt.
+
+    Raises:
+        ImportError: Without CasADi.
+        TypeError: If ``fitted`` is neither.
+        ValueError: If the model is no finite sum, with the way out; or if ``physics`` returns
+            another number of values than the model's physics.
+        RuntimeError: If the dynamics have learnt nothing yet.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust import CKA
+        >>> from gpadjust.export import casadi_function
+        >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+        >>> model = CKA(X, 2 * X, physics=lambda X: X)
+        >>> casadi_function(model, physics=lambda x: x)
+        Function(predict:(x)->(mean,variance) MXFunction)
+    """
+    if ca is None:
+        raise ImportError('casadi_function needs CasADi; run `pip install "gpadjust[export]"`.')
+    model = model_of(fitted)
+    found, m = finite_sum(model, variance, observation_noise), model.num_outputs
+    dynamics = fitted if isinstance(fitted, LearnedDynamics) else None
+    if dynamics is None:
+        given = {"x": ca.MX.sym("x", len(model.input_names))}
+        (x,), count = map(ca.vertsplit, given.values()), found.num_physics
+        read = x
+    else:
+        spec = dynamics.spec
+        sizes = {"state": spec.state_dim, "action": spec.action_dim}
+        given = {entry: ca.MX.sym(entry, size) for entry, size in sizes.items()}
+        state, action = map(ca.vertsplit, given.values())
+        x, read = (
+            [(*state, *action)[i] for i in columns]
+            for columns in (spec.model_columns, spec.physics_columns)
+        )
+        count = found.num_physics // m * len(spec.moving)
+    if physics is None:
+        given |= {"f_p": ca.MX.sym("f_p", count)} if count else {}
+        values = given.get("f_p", ca.MX(0, 1))
+    else:
+        values = ca.MX(physics(ca.vertcat(*read)))
+        if values.shape != (count, 1):
+            raise ValueError(
+                f"Expected physics to return a column of {count} values, as the model's physics "
+                f"does, got shape {values.shape}."
+            )
+    f_p = ca.vertsplit(values) if count else []
+    if dynamics is None:
+        mean, spread = _moments(found, m, x, f_p)
+    else:
+        columns = target_columns(
+            dynamics, state, f_p, lambda angle: ca.atan2(ca.sin(angle), ca.cos(angle))
+        )
+        mean, spread = _moments(found, m, x, columns)
+        mean = next_state(dynamics, state, action, mean)
+        spread = next_variance(dynamics, spread, ca.MX(0))
+    made = {"mean": ca.vertcat(*mean)} | ({"variance": ca.vertcat(*spread)} if variance else {})
+    return ca.Function(name, [*given.values()], [*made.values()], [*given], [*made])
+
+
+def _moments(s: FiniteSum, m: int, x: list[Any], f_p: list[Any]) -> tuple[list[Any], list[Any]]:
+    """Mean and variance of each of ``m`` outputs."""
+    inputs = []
+    for source, function, offset, size in s.columns:
+        value = getattr(ca, function)(x[source]) if function else x[source]
+        inputs.append((value - offset) / size)
+    z, means, variances = ca.horzcat(*inputs), list[Any](), list[Any]()
+    for g in range(len(s.weights)):
+        shift, scale = float(s.shift[g]), float(s.scale[g])
+        features, start, prior = _features(s, g, g % m, z, f_p)
+        means.append(shift + scale * (start + ca.dot(_matrix(s.weights[g]), features)))
+        found = 0.0
+        if s.lower is not None:
+            features = ca.solve(_triangle(s.lower[g]), features)
+            found = prior - ca.sumsqr(features)
+        if s.root is not None:
+            found = found + ca.sumsqr(_triangle(s.root[g].mT) @ features)
+        least = 0.0 if s.lower is None else s.least * prior
+        variances.append(scale**2 * (ca.fmax(found, least) + float(s.noise[g])))
+    mean = [sum(means[j::m]) * (m / len(means)) for j in range(m)]
+    spread = []
+    for j in range(m):
+        wider = 1.0 if s.errors is None else _wider(s.errors, j, z)
+        off = [(each - mean[j]) ** 2 for each in means[j::m]] if len(means) > m else []
+        spread.append((wider * sum(variances[j::m]) + sum(off)) * (m / len(means)))
+    return mean, spread
+
+
+def _features(s: FiniteSum, g: int, j: int, z: Any, f_p: list[Any]) -> tuple[Any, Any, Any]:
+    """Features of a Gaussian of output j, its prior mean, and its prior variance."""
+    kernels, waves, mean, variance = 0.0, list[Any](), float(s.start[g]), 0.0
+    for term in s.terms:
+        amplitude, constant = float(term.amplitude[g]), float(term.constant[g])
+        basis = 1.0
+        if term.column is not None:
+            column, origin = f_p[int(term.column[j])], float(term.origin[g])
+            basis = (column - origin) / float(term.unit[g])
+        mean = mean + basis * float(term.mean[g])
+        variance = variance + basis * basis * (amplitude + constant)
+        if term.frequencies is not None:
+            angle = _matrix(term.frequencies * term.rate[g]) @ z.T
+            size = basis * math.sqrt(amplitude / len(term.frequencies))
+            waves += [size * ca.cos(angle), size * ca.sin(angle)]
+            waves += [basis * math.sqrt(constant)] if term.constant.any() else []
+        elif term.kind:
+            squares = _squares(s.points[j % len(s.points)], term.rate[g], z)
+            kernel = amplitude * _kernel(term.kind, squares) + constant
+            kernels = kernels + basis * _matrix(term.at_points[g]) * kernel
+    return (ca.vertcat(*waves) if waves else kernels), mean, variance
+
+
+def _squares(points: Tensor, rate: Tensor, z: Any) -> Any:
+    """Squared distances to points ``P x d``, in lengthscales, a column."""
+    u = _matrix(points * rate) - ca.repmat(z * _matrix(rate).T, len(points), 1)
+    return ca.sum2(u**2)
+
+
+def _kernel(kind: str, squares: Any) -> Any:
+    """A kernel of squared distances."""
+    if kind == "rbf":
+        return ca.exp(-squares / 2)
+    if kind == "constant":
+        return 0.0 * squares
+    factor = 2 * float(kind.removeprefix("matern"))
+    t = ca.sqrt(factor * ca.fmax(squares, _TINY))
+    return ({1: 1.0, 3: 1.0 + t, 5: 1.0 + t + t**2 / 3}[int(factor)]) * ca.exp(-t)
+
+
+def _wider(errors: ErrorTables, j: int, z: Any) -> Any:
+    """The factor of the variance of output j."""
+    near = _kernel("rbf", _squares(errors.points, errors.rate[j], z))
+    total = 1.0 + ca.dot(_matrix(errors.squares[j]), near)
+    return ca.fmax(1.0, total / (1.0 + ca.sum1(near))) * float(errors.factor[j])
+
+
+def _matrix(values: Tensor) -> Any:
+    """Numbers in CasADi, a vector as a column."""
+    return ca.DM(values.tolist())
+
+
+def _triangle(values: Tensor) -> Any:
+    """A lower triangle in CasADi, which solves by substitution."""
+    return ca.tril(_matrix(values))

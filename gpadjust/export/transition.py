@@ -1,0 +1,51 @@
+"""A step of dynamics in scalars of any kind: texts of C, or symbols of CasADi."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from gpadjust.dynamics import LearnedDynamics
+
+Scalars = Sequence[Any]
+
+
+def target_columns(
+    dynamics: LearnedDynamics, state: Scalars, f_p: Scalars, wrapped: Callable[[Any], Any]
+) -> list[Any]:
+    """The columns of f_p in the model, made of next values, as :class:`TargetPhysics` does."""
+    spec, targets = dynamics.spec, dynamics.targets
+    found = []
+    for first in range(0, len(f_p), len(spec.moving)):
+        for i, place in zip(spec.predicted, targets.predicted, strict=True):
+            change = f_p[first + place] - state[i]
+            change = wrapped(change) if spec.states[i] in spec.angles else change
+            found.append(change if targets.target == "difference" else state[i] + change)
+    return found
+
+
+def next_state(
+    dynamics: LearnedDynamics, state: Scalars, action: Scalars, learnt: Scalars
+) -> list[Any]:
+    """The next state by what the model says, as :meth:`StateSpec.complete` makes it."""
+    spec, found = dynamics.spec, [*state]
+    for i, value in zip(spec.predicted, learnt, strict=True):
+        found[i] = state[i] + value if dynamics.targets.target == "difference" else value
+    before = dict(zip((*spec.states, *spec.actions), (*state, *action), strict=True))
+    for name, other in spec.previous.items():
+        found[spec.states.index(name)] = before[other]
+    for name, velocity in spec.integrated.items():
+        i, v = spec.states.index(name), spec.states.index(velocity)
+        found[i] = state[i] + (spec.step or 0.0) / 2 * (state[v] + found[v])
+    return found
+
+
+def next_variance(dynamics: LearnedDynamics, learnt: Scalars, zero: Any) -> list[Any]:
+    """The variance of the next state, as :meth:`StateSpec.complete_variance` makes it."""
+    spec = dynamics.spec
+    known = dict(zip(spec.predicted, learnt, strict=True))
+    found = [known.get(i, zero) for i in range(spec.state_dim)]
+    for name, velocity in spec.integrated.items():
+        variance = ((spec.step or 0.0) / 2) ** 2 * found[spec.states.index(velocity)]
+        found[spec.states.index(name)] = variance
+    return found

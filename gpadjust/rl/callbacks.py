@@ -1,0 +1,88 @@
+"""Callbacks of Dyna agents."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+
+from gpadjust.control import EpisodeCheckpoint, print_progress
+
+
+class DynaCallback(BaseCallback):
+    """A Stable-Baselines3 callback with two more hooks, for :class:`Dyna` agents.
+
+    Subclasses that override ``_init_callback`` must call that of this class.
+    """
+
+    model: Any
+
+    def _init_callback(self) -> None:
+        if not hasattr(self.model, "model_hooks"):
+            raise TypeError(
+                f"{type(self).__name__} is for Dyna agents, such as DynaSAC; found "
+                f"{type(self.model).__name__}."
+            )
+        self.model.model_hooks.append(self)
+
+    def _on_step(self) -> bool:
+        return True
+
+    def on_model_fit(self, metrics: dict[str, float]) -> None:
+        """Called after the dynamics were fitted.
+
+        Args:
+            metrics: ``"fit_seconds"``; and of the newest real transitions, predicted before they
+                were learnt, as soon as the dynamics can predict: ``"nlpd"`` and ``"coverage"``,
+                averaged over the states, and ``"rmse/<state>"`` of each.
+        """
+
+    def on_model_episodes(self, returns: np.ndarray) -> None:
+        """Called after some model episodes that ran side by side.
+
+        Args:
+            returns: The sum of rewards of each.
+        """
+
+
+class AgentCallback(DynaCallback):
+    """Tells a callback of :class:`gpadjust.control.Agent` the events that Dyna agents have, too.
+
+    A trial is a rollout of Stable-Baselines3, which is an episode by default.
+    """
+
+    def __init__(self, callback: Any) -> None:
+        super().__init__()
+        self.callback = callback
+        self._begun, self._steps_before = 0.0, 0
+
+    @staticmethod
+    def around(callback: Any) -> Any:
+        """A callback of agents as Stable-Baselines3 takes it; others as they are."""
+        told = isinstance(callback, EpisodeCheckpoint) or callback is print_progress
+        return AgentCallback(callback) if told else callback
+
+    def on_model_fit(self, metrics: dict[str, float]) -> None:
+        """Tell that the dynamics have learnt."""
+        self.callback(self.model, "fit", metrics)
+
+    def _on_rollout_start(self) -> None:
+        # The updates of the last episode are done, and the next has not begun.
+        self.callback(self.model, "episode", {})
+        self._begun, self._steps_before = time.perf_counter(), self.model.num_timesteps
+
+    def _on_rollout_end(self) -> None:
+        rows = (self.model.num_timesteps - self._steps_before) // self.model.n_envs
+        recorded = self.model.recorded_episodes(newest=rows)
+        if recorded.num_transitions:
+            values: dict[str, float] = {"number": self.model.num_episodes + 1}
+            values |= {"steps": recorded.num_transitions, "reward": float(recorded.rewards.mean())}
+            values["seconds"] = time.perf_counter() - self._begun
+            self.callback(self.model, "trial", values)
+
+    def _on_training_end(self) -> None:
+        # Unless another callback stopped the run within an episode.
+        if self.model.num_timesteps >= self.model._total_timesteps:
+            self.callback(self.model, "done", {})

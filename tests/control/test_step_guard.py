@@ -1,0 +1,139 @@
+"""Steps that fail: refused with a sentence, and learning goes on."""
+
+import numpy as np
+import pytest
+import torch
+
+from gpadjust.control import FailedStepWarning, MPCAgent, StepGuard
+from tests.control.conftest import KINDS
+from tests.point import FAULTS, Faulty, PowerCut
+
+pytestmark = pytest.mark.filterwarnings("ignore:A step of the last real episode")
+ACTION = np.ones(1, dtype=np.float32)
+SAID = {
+    "nan": "entry 0 of the observation is nan",
+    "inf": "entry 0 of the observation is inf",
+    "1e30": r"entry 0 of the observation is 1e\+30, where a finite number of at most 1e\+25",
+    "reward nan": "the reward is nan",
+    "reward 1e30": r"the reward is 1e\+30",
+    "raises": "the environment raised OSError: the robot fell",
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("place", [1, 3, 5])
+def test_a_step_that_fails_ends_its_episode_at_the_last_good_observation(point_env, fault, place):
+    env = StepGuard(Faulty(point_env(), {place: fault}))
+    last, _ = env.reset(seed=0)
+    for _ in range(place - 1):
+        last, *_ = env.step(ACTION)
+    with pytest.warns(FailedStepWarning, match=f"Step {place} of an episode failed.*{SAID[fault]}"):
+        observation, reward, terminated, truncated, info = env.step(ACTION)
+    assert np.array_equal(observation, last)
+    assert (reward, terminated, truncated, info) == (0.0, False, True, {"step_failed": True})
+    env.reset()
+    assert "step_failed" not in env.step(ACTION)[4]
+
+
+def test_good_steps_are_as_without_a_guard(point_env):
+    """In units small and large."""
+    guarded, plain = StepGuard(point_env()), point_env()
+    for env in (guarded, plain):
+        env.reset(seed=1)
+        env.unwrapped.x = np.array([1e12], dtype=np.float32)
+    for action in (1e-9, 2.0):
+        one, other = (env.step(np.array([action])) for env in (guarded, plain))
+        assert one == other
+    assert StepGuard.around(guarded) is guarded
+
+
+def test_the_last_good_observation_is_kept_though_the_environment_writes_over_it(point_env):
+    class Reuses(Faulty):
+        def step(self, action):
+            found = super().step(action)
+            self.unwrapped.x[:] = found[0]
+            return found
+
+    env = StepGuard(Reuses(point_env(), {1: "nan"}))
+    first = env.reset(seed=0)[0].copy()
+    with pytest.warns(FailedStepWarning):
+        assert np.array_equal(env.step(ACTION)[0], first)
+
+
+def test_an_environment_that_can_make_no_step_is_an_error_in_the_third_episode(point_env):
+    env = StepGuard(Faulty(point_env(), dict.fromkeys((2, 3, 4, 5, 6), "raises")))
+    env.reset()
+    env.step(ACTION)
+    with pytest.warns(FailedStepWarning):  # of an episode that had a step
+        env.step(ACTION)
+    for _ in range(2):
+        env.reset()
+        with pytest.warns(FailedStepWarning):
+            env.step(ACTION)
+    env.reset()
+    with pytest.raises(RuntimeError, match="Nor was there a good step in the 2 ep") as found:
+        env.step(ACTION)
+    assert isinstance(found.value.__cause__, OSError)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit])
+def test_an_interruption_comes_through(point_env, error):
+    class Interrupted(Faulty):
+        def step(self, action):
+            raise error
+
+    env = StepGuard(Interrupted(point_env(), {}))
+    env.reset()
+    with pytest.raises(error):
+        env.step(ACTION)
+
+
+def test_an_episode_that_cannot_begin_is_an_error(make_agent, point_env):
+    class Blind(Faulty):
+        def reset(self, **options):
+            observation, info = super().reset(**options)
+            return observation * (np.nan if self.steps == 5 else 1.0), info
+
+    agent = make_agent(MPCAgent, Blind(point_env(), {}))
+    with pytest.raises(ValueError, match="An episode cannot begin: entry 0 of the observation is"):
+        agent.learn(10)
+    agent.env.unwrapped.steps = agent.env.env.steps = 0
+    assert agent.learn(5).recorded_episodes().num_transitions == 10
+
+
+EACH = {1: "raises", 4: "nan", 9: "1e30", 12: "reward nan", 13: "reward 1e30", 18: "inf"}
+ALL = [{place: fault} for fault in FAULTS for place in (1, 6, 8, 10)]
+
+
+@pytest.mark.parametrize(
+    "faults", [EACH, *(pytest.param(each, marks=pytest.mark.slow) for each in ALL)]
+)
+def test_agents_lose_nothing(make_agent, kind, point_env, faults):
+    """Of the first, a middle and the last step; before there are data, and after."""
+    agent = make_agent(kind, Faulty(point_env(), faults))
+    with pytest.warns(FailedStepWarning) as told:
+        agent.learn(max(faults))
+    assert len([each for each in told if each.category is FailedStepWarning]) == len(faults)
+    agent.learn(5)
+    recorded = agent.recorded_episodes()
+    assert recorded.num_transitions == agent.num_timesteps - len(faults)
+    assert agent.task.dynamics.num_transitions == recorded.num_transitions
+    moved = recorded.next_states - recorded.states
+    torch.testing.assert_close(moved, 0.5 * recorded.actions, atol=0.1, rtol=0)
+    assert recorded.rewards.isfinite().all()
+    assert agent.num_episodes == int(recorded.begins.sum())
+
+
+def test_an_error_of_a_callback_comes_through(make_agent):
+    def stop(agent, event, values):
+        raise PowerCut
+
+    with pytest.raises(PowerCut):
+        make_agent(MPCAgent).learn(5, stop)
+
+
+@pytest.mark.parametrize("seen", [np.array([np.nan]), np.array([[0.5], [np.inf]])])
+def test_an_observation_that_cannot_be_data_is_not_acted_on(make_agent, seen):
+    for each in KINDS:
+        with pytest.raises(ValueError, match=r"No action can be chosen: entry .* of the observ"):
+            make_agent(each).predict(seen)

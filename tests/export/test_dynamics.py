@@ -1,0 +1,125 @@
+"""Programs of dynamics say what the dynamics predict."""
+
+import functools
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+
+from gpadjust import CKA, RRA
+from gpadjust.dynamics import LearnedDynamics
+from gpadjust.export import c_source, casadi_function
+from gpadjust.states import StateSpec
+from tests.export.conftest import called, compiled
+from tests.systems import normal, uniform
+
+pytestmark = pytest.mark.filterwarnings("ignore:L-BFGS did not converge")
+SPEC = StateSpec(
+    ["goal", "angle", "x", "rate", "speed", "last"],
+    ["force"],
+    angles=["angle"],
+    exogenous=["goal"],
+    integrated={"x": "speed"},
+    step=0.1,
+    previous={"last": "force"},
+)
+
+
+def pushed(X):
+    """The next angle, x, rate and speed."""
+    angle, x, rate, speed, force = X.unbind(-1)
+    rate_, speed_ = rate - 0.9 * angle.sin() + 0.1 * speed, speed + 0.1 * force
+    return torch.stack([angle + 0.1 * rate_, x + 0.1 * speed_, rate_, speed_], dim=-1)
+
+
+def pushed_in_casadi(read):
+    ca = pytest.importorskip("casadi")
+    angle, x, rate, speed, force = ca.vertsplit(read)
+    rate_, speed_ = rate - 0.9 * ca.sin(angle) + 0.1 * speed, speed + 0.1 * force
+    return ca.vertcat(angle + 0.1 * rate_, x + 0.1 * speed_, rate_, speed_)
+
+
+STILL = {"pushed": pushed, "still": lambda X: X[:, :4]}
+
+
+def transitions():
+    states, actions = 3 * normal(40, 6), normal(40, 1, seed=1)
+    states[:, 1] = torch.atan2(states[:, 1].sin(), states[:, 1].cos())
+    read = torch.cat([states[:, 1:5], actions], dim=-1)
+    moved = 1.1 * pushed(read) - 0.1 * read[:, :4] + 0.02 * normal(40, 4, seed=2)
+    moved[:, 1] = states[:, 2] + 0.05 * (states[:, 4] + moved[:, 3])
+    return states, actions, torch.cat([states[:, :1], moved, actions], dim=-1)
+
+
+@functools.cache
+def learnt(target="difference", model=CKA, physics=pushed, reads=()):
+    options = {"method": "map", "num_starts": 1, "num_screened": 8, "max_iterations": 5}
+    physics = STILL if physics is None else physics
+    dynamics = LearnedDynamics(
+        replace(SPEC, physics_reads=reads), physics, model=model, target=target, fit_options=options
+    )
+    dynamics.update(*transitions())
+    return dynamics
+
+
+CASES = {
+    "difference": learnt,
+    "absolute": partial(learnt, "absolute", partial(RRA, num_features=20)),
+    "two physics": partial(learnt, physics=None),
+    "late": partial(learnt, reads=("angle", "x", "rate", "speed", "last")),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_programs_say_the_next_state_and_its_variance(case, tmp_path):
+    pytest.importorskip("casadi")
+    dynamics = CASES[case]()
+    states, actions = 2 * uniform(5, 6, low=-2.0, high=2.0, seed=3), uniform(5, 1, seed=4)
+    f_p = dynamics.physics(dynamics.spec.physics_inputs(states, actions))
+    expected = dynamics.predict(states, actions, observation_noise=False)
+    program = compiled(c_source(dynamics, "cart"), tmp_path)
+    function = casadi_function(dynamics)
+    assert function.name_in() == ["state", "action", "f_p"]
+    for *given, mean, variance in zip(states, actions, f_p, *expected, strict=True):
+        for found in (
+            called(program.cart_step, (6, 6), *given),
+            [torch.tensor(each.full()[:, 0]) for each in function(*(g.numpy() for g in given))],
+        ):
+            torch.testing.assert_close(found[0], mean, rtol=1e-9, atol=1e-12)
+            torch.testing.assert_close(found[1], variance, rtol=1e-8, atol=1e-14)
+
+
+@pytest.mark.parametrize("case", ["difference", "late"])
+def test_a_physics_in_casadi_takes_the_place_of_its_values(case):
+    pytest.importorskip("casadi")
+    dynamics = CASES[case]()
+    state, action = normal(6, seed=5), normal(1, seed=6)
+    step = casadi_function(dynamics, "step", physics=pushed_in_casadi, observation_noise=True)
+    assert (step.name_in(), step.name_out()) == (["state", "action"], ["mean", "variance"])
+    found = [torch.tensor(each.full()[:, 0]) for each in step(state.numpy(), action.numpy())]
+    for value, expected in zip(found, dynamics.predict(state, action), strict=True):
+        torch.testing.assert_close(value, expected, rtol=1e-9, atol=1e-14)
+
+
+def test_casadi_has_the_slopes_of_the_mean():
+    pytest.importorskip("casadi")
+    dynamics = learnt()
+    state, action = normal(6, seed=5), normal(1, seed=6)
+    step = casadi_function(dynamics, physics=pushed_in_casadi, variance=False)
+    found = step.jacobian()(state.numpy(), action.numpy(), 0)[0].full()
+
+    def mean(state):
+        return dynamics.mean_function()(state[None, None], action[None, None])[0, 0]
+
+    expected = torch.autograd.functional.jacobian(mean, state)
+    torch.testing.assert_close(torch.tensor(found), expected, rtol=1e-8, atol=1e-10)
+
+
+def test_a_file_without_variance_says_the_next_state_alone(tmp_path):
+    dynamics = learnt()
+    state, action = normal(6, seed=5), normal(1, seed=6)
+    f_p = pushed(torch.cat([state[1:5], action])[None])[0]
+    program = compiled(c_source(dynamics, "cart", variance=False), tmp_path)
+    (found,) = called(program.cart_step, (6,), state, action, f_p)
+    torch.testing.assert_close(found, dynamics.predict(state, action).mean, rtol=1e-9, atol=1e-12)

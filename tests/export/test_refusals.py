@@ -1,0 +1,96 @@
+"""Files that are the same, and what is no finite sum."""
+
+import pytest
+from gpytorch.kernels import PeriodicKernel, RFFKernel, ScaleKernel
+
+from gpadjust import AR1, CKA, ParallelPartialGP, fit
+from gpadjust.dynamics import LearnedDynamics
+from gpadjust.export import c_source, casadi_function
+from gpadjust.states import StateSpec
+from tests.export.conftest import MODELS, X, Y, fitted
+from tests.systems import crude
+
+
+def periodic(d, batch):
+    return PeriodicKernel(batch_shape=batch)
+
+
+def features(d, batch):
+    kernel = RFFKernel(4, ard_num_dims=d, batch_shape=batch)
+    kernel._init_weights(d, 4)
+    return ScaleKernel(kernel, batch_shape=batch)
+
+
+def with_samples_of_parameters():
+    model = MODELS["CKA, unknown parameter"]()
+    fit(model, num_samples=2)
+    return model
+
+
+def with_levels():
+    return AR1(X[:10], Y[:10], low_X=X, low_Y=Y)
+
+
+REFUSED = {
+    "batch": (lambda: CKA(X.repeat(2, 1, 1), Y.repeat(2, 1, 1), physics=crude), "data sets"),
+    "link": (lambda: CKA(X, Y, physics=crude, outcome_transform="log"), "with a link"),
+    "kernel": (lambda: CKA(X, Y, physics=crude, delta_covar_module=periodic), "PeriodicKernel"),
+    "features of an exact model": (
+        lambda: CKA(X, Y, physics=crude, delta_covar_module=features),
+        "kernel of 'delta'",
+    ),
+    "categories": (
+        lambda: CKA(X.round(), Y, physics=crude, categorical=[0]),
+        "CategoricalInput|GroupedRBF",
+    ),
+    "samples": (with_samples_of_parameters, "method='map'"),
+    "levels": (with_levels, "AR1"),
+    "known noise": (lambda: CKA(X, Y, 0.1 * Y, physics=crude), "add the variance"),
+    "relative noise": (lambda: CKA(X, Y, physics=crude, likelihood="relative"), "add the variance"),
+}
+
+
+@pytest.mark.parametrize(("make", "words"), REFUSED.values(), ids=REFUSED)
+def test_what_is_no_finite_sum_is_refused_with_the_way_out(make, words):
+    model = make()
+    for export in (c_source, casadi_function):
+        with pytest.raises(ValueError, match=words):
+            export(model, "f", observation_noise=True)
+
+
+def test_what_is_no_model_of_terms_is_refused():
+    for wrong in (None, ParallelPartialGP(X, Y.repeat(1, 5), physics=lambda X: X.repeat(1, 5))):
+        with pytest.raises(TypeError, match="or LearnedDynamics of one, got"):
+            c_source(wrong, "f")
+    with pytest.raises(RuntimeError, match="has not learnt"):
+        c_source(LearnedDynamics(StateSpec(["x"], ["u"]), lambda X: X[:, :1]), "f")
+
+
+@pytest.mark.parametrize("name", ["", "a b", "2f", "pumpe_ä", None])
+def test_a_name_that_c_has_not_is_refused(name):
+    with pytest.raises(ValueError, match="one of C"):
+        c_source(fitted("CKA"), name)
+
+
+def test_the_same_model_makes_the_same_file():
+    once, again = (c_source(CKA(X, Y, physics=crude), "f") for _ in range(2))
+    assert once == again
+
+
+def test_a_file_without_variance_is_small():
+    model = fitted("CKA")
+    whole, mean = c_source(model, "f"), c_source(model, "f", variance=False)
+    assert "variance" not in mean.split("*/")[-1]
+    assert len(mean) < len(whole) / 3
+
+
+def test_a_physics_that_returns_another_number_of_values_is_refused():
+    pytest.importorskip("casadi")
+    with pytest.raises(ValueError, match="column of 2 values"):
+        casadi_function(fitted("CKA"), physics=lambda x: x[0])
+
+
+def test_without_casadi_there_is_a_way_out(monkeypatch):
+    monkeypatch.setattr("gpadjust.export.casadi_program.ca", None)
+    with pytest.raises(ImportError, match=r"gpadjust\[export\]"):
+        casadi_function(fitted("CKA"))
