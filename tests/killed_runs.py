@@ -21,7 +21,7 @@ from gpadjust.control import (
     linear_policy,
     resume,
 )
-from gpadjust.control.checkpoint import RandomState
+from gpadjust.control.random_state import RandomState
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.rl import DynaOptions, DynaSAC
 from paper.cartpole import CartPole, Settings

@@ -178,7 +178,7 @@ def forbid_unpickling(monkeypatch):
         raise AssertionError("unpickled")
 
     calls = [f"{room}.{call}" for room in ("pickle", "cloudpickle") for call in ("load", "loads")]
-    for name in (*calls, "gpadjust.control.agent._Unpickler"):
+    for name in (*calls, "gpadjust.control.pickled_agent._Unpickler"):
         monkeypatch.setattr(name, unpickled)
 
 

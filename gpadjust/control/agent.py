@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import io
-import pickle
 import time
 import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import groupby
-from operator import attrgetter
 from typing import Any, ClassVar, NamedTuple, Self
 
 import cloudpickle
@@ -23,19 +20,20 @@ from torch import Tensor
 from gpadjust.checks import check_kind, checked_number, checked_whole
 from gpadjust.control.checkpoint import (
     EpisodeCheckpoint,
-    RandomState,
-    TaskAgent,
     locked,
     packed,
     pickled_environment,
     unpacked,
 )
+from gpadjust.control.pickled_agent import pickled, unpickled
+from gpadjust.control.random_state import RandomState
 from gpadjust.control.recorded_episodes import RecordedEpisodes, learn_dynamics
 from gpadjust.control.search import random_sequences
 from gpadjust.control.smoothed_episodes import Seen, smooth_episodes
 from gpadjust.control.state_filter import StateFilter
 from gpadjust.control.step_guard import StepGuard
 from gpadjust.control.task import Task
+from gpadjust.control.task_agent import TaskAgent
 from gpadjust.dynamics.free_run import checked_horizons
 
 MAX_HOLD = 5  # steps of a random action
@@ -74,7 +72,8 @@ class Agent(TaskAgent):
     Callbacks are called with the agent, the name of an event, and a dictionary of numbers:
 
     - ``"episode"``: an episode begins;
-    - ``"plan"``: its first action is chosen, with what the agent says of it (:meth:`promise`);
+    - ``"plan"``: its first action is chosen, which took ``seconds``, with what the agent says of it
+      (:meth:`promise`);
     - ``"step"``: a real step was made, with its ``reward``;
     - ``"trial"``: the episode has ended, with its ``number`` (from 1), ``steps``, ``seconds``, the
       ``reward`` of a step, and what was promised of it (``promised_reward``);
@@ -256,13 +255,14 @@ class Agent(TaskAgent):
             if random is not None:
                 action = self._scaled(next(random))
             else:
+                asked = time.perf_counter()
                 with self.timed("plan"):
                     choice, state = self._chosen(observation, state, np.array([begins]))
                 action = self._scaled(choice, noisy=True)
                 if begins:
                     said = self._said(state)
                     self._promises[episode] = said.get("promised_reward")
-                    self.tell("plan", said)
+                    self.tell("plan", {**said, "seconds": time.perf_counter() - asked})
             following, reward, terminated, truncated, info = self.env.step(self._unscaled(action))
             self.num_timesteps += 1
             failed = bool(info.get("step_failed"))
@@ -566,22 +566,11 @@ class Agent(TaskAgent):
         if env is None:
             state["_start"] = None  # it will be reset
         return {
-            "agent.pkl": self._pickled(state),
+            "agent.pkl": pickled(state, self),
             "steps.pt": packed({"columns": columns, "states": self._states}),
             "dynamics.pt": packed(self.task.dynamics.state_dict()),
             "environment.pkl": env or b"",
         }
-
-    def _pickled(self, state: dict[str, Any]) -> bytes:
-        """Attributes, without task, model and dynamics."""
-        try:
-            return _pickled(state, self)
-        except Exception as error:  # pickling runs the user's code
-            name = next(name for name, part in state.items() if not _can_be_pickled(part, self))
-            raise TypeError(
-                f"{type(self).__name__}.{name} cannot be pickled, as a checkpoint does "
-                f"({type(error).__name__}: {error}). Make it a property, or name it in not_saved."
-            ) from error
 
     @classmethod
     def from_parts(cls, parts: dict[str, bytes], env: Any, task: Task) -> Self:
@@ -596,55 +585,5 @@ class Agent(TaskAgent):
             for row in zip(*steps["columns"], strict=True)
         ]
         agent._states = steps["states"]
-        vars(agent).update(_Unpickler(io.BytesIO(parts["agent.pkl"]), agent).load())
+        vars(agent).update(unpickled(parts["agent.pkl"], agent))
         return agent
-
-
-class _Pickler(cloudpickle.Pickler):
-    """Pickles attributes of an agent, in which names stand for task, model and dynamics."""
-
-    def __init__(self, file: io.BytesIO, agent: Agent) -> None:
-        super().__init__(file)
-        self.agent = agent
-
-    def persistent_id(self, value: Any) -> str | None:
-        """The name of what is not pickled, wherever it is kept."""
-        task, model = self.agent.task, self.agent.model or self.agent.task
-        names = {id(model.dynamics): "model.dynamics", id(task.dynamics): "task.dynamics"}
-        names[id(task)] = "task"
-        if id(value) in names or not isinstance(value, Task):
-            return names.get(id(value))
-        if value is model:
-            return "model"
-        if value.dynamics in (task.dynamics, model.dynamics):
-            return None  # pickled, but for its dynamics
-        raise TypeError(
-            f"{type(self.agent).__name__} keeps a Task with dynamics of its own, which no "
-            "checkpoint holds; keep its reward and so on, and make it where it is needed"
-        )
-
-
-def _pickled(value: Any, agent: Agent) -> bytes:
-    file = io.BytesIO()
-    _Pickler(file, agent).dump(value)
-    return file.getvalue()
-
-
-def _can_be_pickled(value: Any, agent: Agent) -> bool:
-    try:
-        _pickled(value, agent)
-    except Exception:  # as above
-        return False
-    return True
-
-
-class _Unpickler(pickle.Unpickler):
-    def __init__(self, file: io.BytesIO, agent: Agent) -> None:
-        super().__init__(file)
-        self.agent = agent
-
-    def persistent_load(self, name: str) -> Any:
-        """The part of the agent that has this name; the model when it is first asked for."""
-        if name.startswith("model") and self.agent.model is None:
-            self.agent.model = self.agent.known_task()
-        return attrgetter(name)(self.agent)

@@ -21,9 +21,11 @@ def margins(
 ) -> Tensor:
     r"""By how much constraints must hold in the mean of a plan, for them to hold in the system.
 
-    The covariance of the states is carried along the plan, whose deviations are corrected by a
-    linear feedback, as they will be by the plans to come: open loop it would grow without limit.
-    With the slope g of a constraint its margin is
+    The covariance of the states is carried along the plan: noise is another one in each step, and
+    what is not known of the mean errs in the same direction all along. Deviations are corrected by
+    a linear feedback, as far as the actions of the plan leave room for it, as they will be by the
+    plans to come: open loop they would grow without limit. With the slope g of a constraint its
+    margin is
 
     .. math:: \Phi^{-1}(1 - \epsilon)\, \sqrt{g^\top \Sigma\, g},
 
@@ -41,28 +43,32 @@ def margins(
     Returns:
         ``T x c``, of the states to which the actions lead; zero if the task has no probability.
     """
+    if task.probability is None:
+        return torch.zeros_like(task.constraint_values(states, actions))
     near = linearised(task.dynamics, states, actions)
     slopes = _slopes(task, near.mean, actions)
     num_steps, num_constraints, dim = slopes.shape
-    if task.probability is None:
-        return slopes.new_zeros(num_steps, num_constraints)
     share = (1 - task.probability) / (task.episode_length or num_steps) / num_constraints
     quantile = torch.special.ndtri(slopes.new_tensor(1 - share)).clamp_min(0.0)
     feedback = _feedback(near, slopes, (action_bounds[1] - action_bounds[0]) / 2)
+    noise = task.dynamics.noise_variance(states, actions)
+    unknown = (near.variance - noise).clamp_min(0.0).sqrt().diag_embed()
     seen = slopes.new_zeros(dim, dim) if covariance is None else covariance
-    steps = near.carry(seen.expand_as(near.slope))
+    steps = near._replace(variance=noise).carry(seen.expand_as(near.slope))
     # The feedback corrects what will be seen; the error of the estimate stays.
-    spread = slopes.new_zeros(num_constraints, dim, dim)
+    scattered, biased = (slopes.new_zeros(num_constraints, dim, dim) for _ in range(2))
     found = []
     for t in range(num_steps):
+        spread = scattered + biased @ biased.mT
         ahead = spread @ (slopes[t] @ near.slope[t]).unsqueeze(-1)
         sd = _along(slopes[t] @ near.slope[t], spread).clamp_min(_TINY).sqrt()
         wanted = quantile * (feedback[t] @ ahead).squeeze(-1) / sd.unsqueeze(-1)
         room = torch.where(wanted > 0, action_bounds[1] - actions[t], actions[t] - action_bounds[0])
         possible = (room / wanted.abs().clamp_min(_TINY)).clamp(0.0, 1.0).amin(-1)
         closed = near.slope[t] + possible[:, None, None] * (near.gain[t] @ feedback[t])
-        total = closed @ spread @ closed.mT + steps[t]
-        spread = total - seen
+        scattered = closed @ scattered @ closed.mT + steps[t] - seen
+        biased = closed @ biased + unknown[t]
+        total = scattered + seen + biased @ biased.mT
         found.append(quantile * _along(slopes[t], total).clamp_min(0.0).sqrt())
     return torch.stack(found)
 

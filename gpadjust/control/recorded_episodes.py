@@ -22,6 +22,7 @@ from gpadjust.states import StateSpec
 from gpadjust.validation.trust import trust
 
 _NEAR = 0.05  # of half the width between bounds: a state that is so near may be held by them
+_MOST = 10.0  # times as far they may be by what the physics reaches
 _REACH = 10.0  # half ranges of the recorded states, from their middle to the bounds
 _ROUNDING = 1e-5  # of set-points, in single precision
 _WINDOWS = 4  # of which trajectories are scored: some half second for a model of an episode
@@ -94,8 +95,9 @@ class RecordedEpisodes:
         They are infinite for angles, constants and previous values; None if no episode has ended.
 
         Args:
-            reached: Least and greatest states that the physics reaches, which the bounds leave by
-                half of its range or more.
+            reached: Least and greatest states that the physics reaches. The bounds leave room for
+                them and half of their range beyond, within a hundred half ranges of what was seen:
+                where the physics runs away, it says nothing of the system.
         """
         if not self.whole.any():
             return None
@@ -106,12 +108,13 @@ class RecordedEpisodes:
         for i, name in enumerate(self.spec.states):
             if name in (*self.spec.angles, *self.spec.exogenous, *self.spec.previous):
                 room[i] = torch.inf
-        bounds = torch.stack([(low + high) / 2 - room, (low + high) / 2 + room])
+        middle = (low + high) / 2
+        near = far = torch.stack([middle - room, middle + room])
         if reached is not None:
-            room = (reached[1] - reached[0]) / 2
-            bounds[0] = torch.minimum(bounds[0], reached[0] - room)
-            bounds[1] = torch.maximum(bounds[1], reached[1] + room)
-        return bounds
+            beyond = (reached[1] - reached[0]) / 2
+            far = torch.stack([reached[0] - beyond, reached[1] + beyond])
+            far = torch.clamp(far, middle - _MOST * room, middle + _MOST * room)
+        return torch.stack([torch.minimum(near[0], far[0]), torch.maximum(near[1], far[1])])
 
     def complete(self, task: Task, episode_length: int, action_bounds: Tensor) -> Task:
         """The task with length, starts and bounds of these episodes where it has none.

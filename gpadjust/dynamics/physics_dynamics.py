@@ -62,7 +62,7 @@ class PhysicsDynamics(Dynamics):
             from the columns that the spec says (``physics_reads``): by default these states and
             the actions.
         physics_error: Standard deviations of the error of a step of the physics, by the name of the
-            state; until unknown parameters are fitted they are its noise. Default: none.
+            state; its variance until unknown parameters are fitted. Default: none.
 
     Raises:
         TypeError: If ``spec`` is no :class:`StateSpec`, or the physics is not callable.
@@ -156,23 +156,25 @@ class PhysicsDynamics(Dynamics):
         self._compared = True
 
     def predict(self, states: Tensor, actions: Tensor) -> Prediction[Tensor]:
-        """The next states, and the variance of the noise (:meth:`noise_variance`)."""
+        """The next states, and the variance of the noise; before a fit, of the stated error."""
         with torch.no_grad():
             following = self._step(states, actions, self._values)
-        return Prediction(following, self.noise_variance(following, actions))
+        stated = [self.physics_error.get(name, 0.0) ** 2 for name in self.spec.states]
+        error = states.new_tensor(stated) if self._fitted is None else self._fitted.noise
+        return Prediction(following, error.expand_as(following))
 
     def noise_variance(self, states: Tensor, actions: Tensor) -> Tensor:
-        """Mean squares of the errors that the fitted parameters leave; before, as was stated."""
-        stated = [self.physics_error.get(name, 0.0) ** 2 for name in self.spec.states]
-        noise = states.new_tensor(stated) if self._fitted is None else self._fitted.noise
-        return noise.expand_as(states)
+        """Mean squares of the errors that the fitted parameters leave; else zero."""
+        if self._fitted is None:
+            return torch.zeros_like(states)
+        return self._fitted.noise.expand_as(states)
 
     def physics_alone(self) -> Dynamics:
         """These dynamics."""
         return self
 
     def sample(self, states: Tensor, actions: Tensor) -> Tensor:
-        """The next states, with the noise if there is any."""
+        """The next states, with the noise or the stated error if there is any."""
         noisy = self._fitted is not None or self.physics_error
         return super().sample(states, actions) if noisy else self.predict(states, actions)[0]
 

@@ -12,11 +12,7 @@ from torch import Tensor
 
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.export.finite_sum import Column, FiniteSum, finite_sum, model_of
-from gpadjust.export.transition import (
-    next_state,
-    next_variance,
-    target_columns,
-)
+from gpadjust.export.transition import next_state, next_variance, target_columns
 from gpadjust.models import TermsModel
 
 _KERNELS = {  # of r, the squared distance in lengthscales
@@ -43,7 +39,7 @@ _KERNEL = Template("""\
                 const double u = (z[k] - points[g % POINT_SETS][i][k]) * rate$t[g][k];
                 r += u * u;
             }
-            phi[i] += b$t * $at_point * (amplitude$t[g] * $kernel + constant$t[g]);
+            phi[i] += b$t * at_points$t[g][i] * (amplitude$t[g] * $kernel + constant$t[g]);
         }
 """)
 _WAVES = Template("""\
@@ -101,9 +97,9 @@ _ERRORS = """\
                 r += u * u;
             }
             near += exp(-0.5 * r);
-            errors += exp(-0.5 * r) * squares[j][i];
+            errors += exp(-0.5 * r) * error_squares[j][i];
         }
-        wider = fmax(1.0, errors / near) * recent[j];
+        wider = fmax(1.0, errors / near) * error_factor[j];
 """
 _MIXED_VARIANCE = """\
         variance[j] = 0.0;
@@ -194,30 +190,17 @@ def _sizes(s: FiniteSum, num_outputs: int) -> str:
 
 def _tables(s: FiniteSum) -> dict[str, Tensor]:
     """All numbers, by the names that they have in C."""
-    found = {name: getattr(s, name) for name in ("start", "shift", "scale", "noise", "weights")}
+    found = s._asdict()
     for t, term in enumerate(s.terms):
-        for name in ("mean", "amplitude", "constant"):
-            found[f"{name}{t}"] = getattr(term, name)
-        if term.column is not None:
-            found |= {f"column{t}": term.column, f"origin{t}": term.origin, f"unit{t}": term.unit}
-        if term.kind:
-            found[f"rate{t}"] = 1 / term.lengthscale
-        if term.at_points is not None:
-            found[f"at_points{t}"] = term.at_points
-        if term.frequencies is not None:
-            found[f"frequencies{t}"] = term.frequencies
-    if s.points.numel():
-        found["points"] = s.points
-    size = s.weights.shape[-1]
-    rows, columns = torch.triu_indices(size, size)  # loops along them have no sum to wait for
-    if s.lower is not None:
+        found |= {f"{name}{t}": value for name, value in term._asdict().items()}
+    if s.errors is not None:
+        found |= {f"error_{name}": value for name, value in s.errors._asdict().items()}
+    rows, columns = torch.triu_indices(*2 * s.weights.shape[-1:])
+    if s.lower is not None:  # by columns: loops along them have no sum to wait for
         found["lower"] = s.lower[:, columns, rows]
     if s.root is not None:
         found["root"] = s.root[:, rows, columns]
-    if s.errors is not None:
-        found |= {"error_points": s.errors.points, "error_rate": 1 / s.errors.lengthscale}
-        found |= {"squares": s.errors.squares, "recent": s.errors.factor}
-    return found
+    return {name: value for name, value in found.items() if isinstance(value, Tensor)}
 
 
 def _body(s: FiniteSum, variance: bool) -> Iterator[str]:
@@ -240,8 +223,7 @@ def _body(s: FiniteSum, variance: bool) -> Iterator[str]:
                 yield f"        phi[{first}] = b{t} * sqrt(constant{t}[g]);\n"
                 first += 1
         elif term.kind:
-            at = f"at_points{t}[g][i]" if term.at_points is not None else "1.0"
-            yield _KERNEL.substitute(t=t, kernel=_KERNELS[term.kind], at_point=at)
+            yield _KERNEL.substitute(t=t, kernel=_KERNELS[term.kind])
     yield _MEAN
     if variance:
         yield from (_VARIANCE, _LOWER * (s.lower is not None), _ROOT * (s.root is not None))

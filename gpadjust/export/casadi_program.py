@@ -10,11 +10,7 @@ from torch import Tensor
 
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.export.finite_sum import ErrorTables, FiniteSum, finite_sum, model_of
-from gpadjust.export.transition import (
-    next_state,
-    next_variance,
-    target_columns,
-)
+from gpadjust.export.transition import next_state, next_variance, target_columns
 from gpadjust.models import TermsModel
 
 ca: Any
@@ -148,21 +144,20 @@ def _features(s: FiniteSum, g: int, j: int, z: Any, f_p: list[Any]) -> tuple[Any
         mean = mean + basis * float(term.mean[g])
         variance = variance + basis * basis * (amplitude + constant)
         if term.frequencies is not None:
-            angle = _matrix(term.frequencies / term.lengthscale[g]) @ z.T
+            angle = _matrix(term.frequencies * term.rate[g]) @ z.T
             size = basis * math.sqrt(amplitude / len(term.frequencies))
             waves += [size * ca.cos(angle), size * ca.sin(angle)]
             waves += [basis * math.sqrt(constant)] if term.constant.any() else []
         elif term.kind:
-            squares = _squares(s.points[j % len(s.points)], term.lengthscale[g], z)
-            at = 1.0 if term.at_points is None else _matrix(term.at_points[g])
+            squares = _squares(s.points[j % len(s.points)], term.rate[g], z)
             kernel = amplitude * _kernel(term.kind, squares) + constant
-            kernels = kernels + basis * at * kernel
+            kernels = kernels + basis * _matrix(term.at_points[g]) * kernel
     return (ca.vertcat(*waves) if waves else kernels), mean, variance
 
 
-def _squares(points: Tensor, lengthscale: Tensor, z: Any) -> Any:
+def _squares(points: Tensor, rate: Tensor, z: Any) -> Any:
     """Squared distances to points ``P x d``, in lengthscales, a column."""
-    u = _matrix(points / lengthscale) - ca.repmat(z / _matrix(lengthscale).T, len(points), 1)
+    u = _matrix(points * rate) - ca.repmat(z * _matrix(rate).T, len(points), 1)
     return ca.sum2(u**2)
 
 
@@ -179,7 +174,7 @@ def _kernel(kind: str, squares: Any) -> Any:
 
 def _wider(errors: ErrorTables, j: int, z: Any) -> Any:
     """The factor of the variance of output j."""
-    near = _kernel("rbf", _squares(errors.points, errors.lengthscale[j], z))
+    near = _kernel("rbf", _squares(errors.points, errors.rate[j], z))
     total = 1.0 + ca.dot(_matrix(errors.squares[j]), near)
     return ca.fmax(1.0, total / (1.0 + ca.sum1(near))) * float(errors.factor[j])
 

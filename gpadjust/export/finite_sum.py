@@ -49,8 +49,8 @@ class TermTables(NamedTuple):
             ``"constant"`` without a kernel; empty of a term without features.
         amplitude: a, ``G``.
         constant: c, the prior variance of an unknown mean, ``G``.
-        lengthscale: ``G x d``.
-        at_points: The basis at the points, ``G x P``; None for 1.
+        rate: One over the lengthscales, ``G x d``.
+        at_points: The basis at the points, ``G x P``; none of waves.
         frequencies: Of waves, ``D/2 x d``; else None.
     """
 
@@ -62,8 +62,8 @@ class TermTables(NamedTuple):
     kind: str
     amplitude: Tensor
     constant: Tensor
-    lengthscale: Tensor
-    at_points: Tensor | None
+    rate: Tensor
+    at_points: Tensor
     frequencies: Tensor | None
 
 
@@ -72,7 +72,7 @@ class ErrorTables(NamedTuple):
 
     points: Tensor  # n x d
     squares: Tensor  # m x n
-    lengthscale: Tensor  # m x d
+    rate: Tensor  # one over the lengthscales, m x d
     factor: Tensor  # by recent errors, m
 
 
@@ -199,6 +199,8 @@ def check_finite_sum(model: TermsModel, observation_noise: bool) -> None:
         why = "several data sets: build and export a model of each"
     elif model.has_unknowns and model.num_samples is not None:
         why = "samples of a physics' parameters, each with its own f_p: fit(model, method='map')"
+    elif not model.term_names:
+        why = "known terms alone, which is its physics: take model.physics_parameters to yours"
     elif model.covar_module.sister is not None:
         why = "what sister machines taught: build it of the data of one machine"
     elif any(term.scaled_by for term in model.terms):
@@ -256,8 +258,8 @@ def _tables(
         kind,
         amplitude,
         constant,
-        each(lengthscale, 1, d).squeeze(-2),
-        None if at_points is None else each(at_points, size),
+        1 / each(lengthscale, 1, d).squeeze(-2),
+        each(zero.new_ones(size) if at_points is None else at_points, size),
         frequencies,
     )
 
@@ -272,7 +274,7 @@ def _columns(transform: Any, num_inputs: int) -> list[Column]:
             found = [
                 column._replace(function=function)
                 for i, column in enumerate(found)
-                for function in (("sin", "cos") if i in part.columns else ("",))
+                for function in (("sin", "cos") if i in part.columns else (column.function,))
             ]
         elif type(part) in (AffineInputTransform, Normalize, InputStandardize):
             offset, size = torch.zeros(len(found)).double(), torch.ones(len(found)).double()
@@ -298,6 +300,6 @@ def _errors(model: TermsModel) -> ErrorTables | None:
     return ErrorTables(
         errors.points,
         errors.squares.reshape(m, n),
-        errors.lengthscale.reshape(m, d),
+        1 / errors.lengthscale.reshape(m, d),
         (errors(anywhere) / errors(anywhere, recent=False)).reshape(m),
     )

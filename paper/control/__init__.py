@@ -140,10 +140,12 @@ class WallsSettings:
     """of these after the first"""
     first_sequences: int = 64
     """that are planned when a trial begins, of all its steps"""
-    first_rounds: int = 4
+    first_rounds: int = 2
     """of these after the first"""
     elites: int = 8
     """of a round"""
+    fit: Literal["map", "bayes"] = "map"
+    """of the learnt models, as of `gpadjust.fit`"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,7 +153,7 @@ class Walls(Experiment):
     """Systems near walls, with margins of the constraints and without."""
 
     runs: int = 14
-    """seeds of the controllers that are judged; of the others a quarter"""
+    """seeds with margins; half of these of the true model, a quarter of the others"""
     out: Path = Path("results/walls")
     settings: WallsSettings = field(default_factory=WallsSettings)
 
@@ -172,7 +174,8 @@ class Walls(Experiment):
 
     def seeds_of(self, *kind: Any) -> Sequence[int]:
         """Fewer seeds of the rivals."""
-        return self.seeds if kind[1] in ("margin", "truth") else self.seeds[: -(-self.runs // 4)]
+        share = {"margin": 1, "truth": 2}.get(kind[1], 4)
+        return self.seeds[: -(-self.runs // share)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -220,7 +223,7 @@ class DelaysSettings:
     trials: int = 3
     """real trials of a run, of which the first goes by f_p"""
     hint_trials: int = 1
-    """of the runs that only ask whether the delay is found, in which f_p alone plans"""
+    """of the runs that only ask whether the delay is found, in which f_p alone plans, lightly"""
     sequences: int = 64
     """that are planned, in each round of the cross-entropy method"""
     first_rounds: int = 8

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from gpadjust import systems
 from gpadjust.control import CrossEntropy, MPCAgent, Planner
-from gpadjust.dynamics import PhysicsDynamics
+from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
+from gpadjust.dynamics.learning import DynamicsFitOptions
 from gpadjust.physics import Physics
 from gpadjust.states import StateSpec
 from gpadjust.systems import System
@@ -25,7 +26,7 @@ from paper.common.experiment import Run, Table
 from paper.common.figures import one_legend, panels, save
 from paper.common.tables import frame, groups, of, table
 from paper.control import Walls
-from paper.control.systems import tanks
+from paper.control.systems import TANKS
 
 GUST = 0.02  # m/s, standard deviation of what a step adds to the velocity of the cart
 GOAL = 0.5  # m
@@ -115,8 +116,9 @@ def cart_pole(seed: int) -> Walled:
 def two_tanks(seed: int) -> Walled:
     """The two tanks, of which the upper one has a brim at 6 cm."""
     errors = {"upper": 0.6, "lower": 0.1}
-    system = replace(tanks(), constraints=partial(below, 0, 6.0), physics_error=errors)
-    return Walled(system, tanks("true").physics)
+    machine = replace(TANKS, substeps=4)  # they do not flow over
+    system = replace(machine.system(), constraints=partial(below, 0, 6.0), physics_error=errors)
+    return Walled(system, machine.physics("true"))
 
 
 SYSTEMS: dict[str, Callable[[int], Walled]] = {
@@ -138,14 +140,18 @@ def run(experiment: Walls, system: str, controller: str, seed: int) -> Run:
         "none": {"constraints": None},
     }
     here = replace(here, **changes.get(controller, {"probability": None}))
-    dynamics = PhysicsDynamics(here.spec, walled.truth) if controller == "truth" else None
+    dynamics: Dynamics = PhysicsDynamics(here.spec, walled.truth)
+    if controller != "truth":
+        fit: DynamicsFitOptions = {"method": settings.fit}
+        error = here.physics_error
+        dynamics = LearnedDynamics(here.spec, here.physics, fit_options=fit, physics_error=error)
     search = partial(CrossEntropy, num_elites=settings.elites, correlation=0.5)
     agent = MPCAgent(
         here.make(),
         here.task(dynamics),
         Planner(
             search=search(settings.rounds),
-            horizon=settings.horizon,
+            horizon=settings.horizon * (here.spec.step or 1.0),
             num_random=settings.sequences,
             spread=0.15,
         ),

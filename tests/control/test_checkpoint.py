@@ -19,7 +19,8 @@ import torch
 from filelock import FileLock
 
 from gpadjust.control import MPC, EpisodeCheckpoint, MPCAgent, PolicySearchAgent, resume
-from gpadjust.control.checkpoint import RandomState, unpacked
+from gpadjust.control.checkpoint import unpacked
+from gpadjust.control.random_state import RandomState
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
 from tests.control.conftest import PLAN, described
 from tests.point import (

@@ -40,8 +40,15 @@ def before_the_wall(states, actions):
     return states[:, :1] - WALL
 
 
-def task(error=0.1, **parts):
-    dynamics = PhysicsDynamics(SPEC, step, physics_error={"x": error} if error else None)
+class Noisy(PhysicsDynamics):
+    """Dynamics whose whole error is noise, another one in each step."""
+
+    def noise_variance(self, states, actions):
+        return self.predict(states, actions).variance
+
+
+def task(error=0.1, kind=Noisy, **parts):
+    dynamics = kind(SPEC, step, physics_error={"x": error} if error else None)
     known = {"episode_length": 10, "constraints": before_the_wall}
     return Task(dynamics, to_the_wall, **{**known, **parts})
 
@@ -62,15 +69,22 @@ def test_margins_of_a_step_are_quantiles_of_its_error():
     assert torch.allclose(found[0], torch.tensor([0.1, 0.2, 0.0]).double() * quantile(0.05 / 30))
 
 
-def test_margins_of_later_steps_are_those_of_a_closed_loop():
-    found = margins(task(), rows(*[0.0] * 30), rows(*[0.0] * 30), BOUNDS)
+@pytest.mark.parametrize(("kind", "power"), [(Noisy, 0.5), (PhysicsDynamics, 1.0)])
+def test_margins_of_later_steps_are_those_of_a_closed_loop(kind, power):
+    """Open loop noise grows as the root of the time, and what is not known as the time."""
+    plan = rows(*[0.0] * 30), rows(*[0.0] * 30)
+    found = margins(task(kind=kind), *plan, BOUNDS)
     assert (found[1:] > found[0]).all()
-    assert found.max() < 1.5 * found[0]  # open loop it would be 5.5 times
-    strong = margins(task(), rows(*[0.0] * 30), rows(*[0.0] * 30), 1e4 * BOUNDS)
-    assert torch.allclose(strong[:-1], found[:1], rtol=1e-3)  # what can be corrected at once is
-    weak = margins(task(), rows(*[0.0] * 30), rows(*[0.0] * 30), 1e-4 * BOUNDS)
-    roots = torch.arange(1, 31).double().sqrt().unsqueeze(-1)
-    assert torch.allclose(weak, found[0] * roots, rtol=1e-3)  # open loop
+    assert found.max() < 2 * found[0]
+    strong = margins(task(kind=kind), *plan, 1e4 * BOUNDS)
+    assert torch.allclose(strong, found[:1].expand_as(strong), rtol=1e-3)  # corrected at once
+    open_loop = found[0] * torch.arange(1, 31).double().pow(power).unsqueeze(-1)
+    weak = margins(task(kind=kind), *plan, 1e-5 * BOUNDS)
+    assert torch.allclose(weak, open_loop, rtol=1e-2)
+    braking = margins(task(kind=kind), plan[0], plan[1] - 1, BOUNDS)
+    assert torch.allclose(braking, open_loop, rtol=1e-2)  # there is no more to brake with
+    racing = margins(task(kind=kind), plan[0], plan[1] + 1, BOUNDS)
+    assert torch.allclose(racing, found, rtol=0.3)
 
 
 def test_the_error_of_an_estimate_stays():

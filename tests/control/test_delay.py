@@ -56,3 +56,18 @@ def test_there_is_no_false_alarm(spec, delay, seed, noise):
 def test_few_steps_say_nothing():
     data = episodes(PLAIN, 1, steps=6)
     assert find_delay(PhysicsDynamics(PLAIN, motion), data) is None
+
+
+@pytest.mark.parametrize("gain", [0.6, 1.5])
+def test_a_wrong_gain_under_a_feedback_is_no_delay(gain):
+    torch.manual_seed(0)
+    x = torch.linspace(-1, 1, 4).double().unsqueeze(-1)
+    parts = []
+    for _ in range(10):
+        v = -0.3 * x + 0.01 * torch.randn(4, 1).double()
+        parts.append((x, v, x + gain * v))
+        x = parts[-1][-1]
+    columns = [torch.stack(column, 1).flatten(0, 1) for column in zip(*parts, strict=True)]
+    data = Trajectories(*columns, torch.arange(4).repeat_interleave(10))
+    spec = StateSpec(["x"], ["v"])
+    assert find_delay(PhysicsDynamics(spec, lambda X: X.sum(-1, keepdim=True)), data) is None

@@ -88,6 +88,9 @@ def test_bounds_leave_room_for_what_the_physics_reaches(moved):
     middle, half = 1.1, 0.1 + 20.0
     assert low.item() == pytest.approx(middle - 2 * half, abs=0.5)
     assert high.item() == pytest.approx(middle + 2 * half, abs=0.5)
+    away = Task(PhysicsDynamics(POINT_SPEC, lambda X: 1e6 * X[:, :1]), reward)
+    close, wide = moved.bounds(), moved.complete(away, 5, FORCES).state_bounds
+    assert (wide[1] - wide[0]).item() == pytest.approx(10 * (close[1] - close[0]).item())
     still = Task(PhysicsDynamics(POINT_SPEC, lambda X: X[:, :1]), reward)
     assert torch.equal(moved.complete(still, 5, FORCES).state_bounds, moved.bounds())
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gpadjust.control.checkpoint import RandomState
+from gpadjust.control.random_state import RandomState
 from gpadjust.physics import ODEPhysics
 from gpadjust.systems.torque_arm import ARM_TIME_STEP, believed_arm
 from paper.arm import SLOW, Arm, Reaching, ReachingSettings, Settings

@@ -8,7 +8,7 @@ import pytest
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
-from gpadjust.control.checkpoint import RandomState
+from gpadjust.control.random_state import RandomState
 from gpadjust.systems.swing_up import REAL_CART_POLE, START_MEAN, equation_physics
 from paper.arm import Arm
 from paper.arm import Settings as ArmSettings

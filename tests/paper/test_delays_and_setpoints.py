@@ -19,6 +19,7 @@ def runs_of(module, experiment, kinds):
         ]
 
 
+@pytest.mark.slow
 def test_set_points_make_tables():
     light = SetpointsSettings(trials=2, sequences=8, first_rounds=0)
     experiment = Setpoints(settings=light)
@@ -28,6 +29,7 @@ def test_set_points_make_tables():
     assert "reference given" in found["within"].text
 
 
+@pytest.mark.slow
 def test_delays_make_tables(tmp_path):
     light = DelaysSettings(trials=1, sequences=8, first_rounds=0)
     experiment = Delays(settings=light, out=tmp_path)
