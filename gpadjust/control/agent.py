@@ -27,7 +27,7 @@ from gpadjust.control.checkpoint import (
 )
 from gpadjust.control.pickled_agent import pickled, unpickled
 from gpadjust.control.random_state import RandomState
-from gpadjust.control.recorded_episodes import RecordedEpisodes, learn_again, learn_dynamics
+from gpadjust.control.recorded_episodes import RecordedEpisodes, learn_dynamics
 from gpadjust.control.search import random_sequences
 from gpadjust.control.smoothed_episodes import Seen, smooth_episodes
 from gpadjust.control.state_filter import StateFilter
@@ -311,7 +311,6 @@ class Agent(TaskAgent):
     def _learn_dynamics(self) -> None:
         """Let the dynamics learn the episodes that they have not, if there are any."""
         dynamics, sensors = self.task.dynamics, self.task.sensors
-        by_physics = not dynamics.is_fitted
         if sensors is not None and len(self._promises) > self.num_episodes:
             with self.timed("fit"):
                 self._smooth()
@@ -325,9 +324,6 @@ class Agent(TaskAgent):
         with self.timed("fit"):
             task = recorded.complete(self.task, self.episode_length(), self.action_bounds())
             values = learn_dynamics(task, new, recorded, self.score_horizons)
-            if sensors is not None and by_physics:  # whose errors were noise in the states
-                self._smooth()
-                learn_again(dynamics, self.recorded_episodes())
         bounds = None if self.model is None else self.model.state_bounds
         if bounds is not None and self.task.state_bounds is None:
             new.warn_of_bounds(bounds)
