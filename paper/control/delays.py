@@ -81,7 +81,7 @@ def _agent(experiment: Delays, told: str, seed: int) -> tuple[MPCAgent, int]:
     sequences = settings.sequences // (4 if asks else 1)
     each_step = Planner(
         search=CrossEntropy(1, num_elites=12, correlation=0.5),
-        horizon=8,
+        horizon=8 * (system.spec.step or 1.0),
         num_random=sequences,
         spread=0.15,
     )
