@@ -72,7 +72,8 @@ class Agent(TaskAgent):
     Callbacks are called with the agent, the name of an event, and a dictionary of numbers:
 
     - ``"episode"``: an episode begins;
-    - ``"plan"``: its first action is chosen, with what the agent says of it (:meth:`promise`);
+    - ``"plan"``: its first action is chosen, which took ``seconds``, with what the agent says of it
+      (:meth:`promise`);
     - ``"step"``: a real step was made, with its ``reward``;
     - ``"trial"``: the episode has ended, with its ``number`` (from 1), ``steps``, ``seconds``, the
       ``reward`` of a step, and what was promised of it (``promised_reward``);
@@ -254,13 +255,14 @@ class Agent(TaskAgent):
             if random is not None:
                 action = self._scaled(next(random))
             else:
+                asked = time.perf_counter()
                 with self.timed("plan"):
                     choice, state = self._chosen(observation, state, np.array([begins]))
                 action = self._scaled(choice, noisy=True)
                 if begins:
                     said = self._said(state)
                     self._promises[episode] = said.get("promised_reward")
-                    self.tell("plan", said)
+                    self.tell("plan", {**said, "seconds": time.perf_counter() - asked})
             following, reward, terminated, truncated, info = self.env.step(self._unscaled(action))
             self.num_timesteps += 1
             failed = bool(info.get("step_failed"))

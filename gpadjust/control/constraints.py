@@ -43,11 +43,11 @@ def margins(
     Returns:
         ``T x c``, of the states to which the actions lead; zero if the task has no probability.
     """
+    if task.probability is None:
+        return torch.zeros_like(task.constraint_values(states, actions))
     near = linearised(task.dynamics, states, actions)
     slopes = _slopes(task, near.mean, actions)
     num_steps, num_constraints, dim = slopes.shape
-    if task.probability is None:
-        return slopes.new_zeros(num_steps, num_constraints)
     share = (1 - task.probability) / (task.episode_length or num_steps) / num_constraints
     quantile = torch.special.ndtri(slopes.new_tensor(1 - share)).clamp_min(0.0)
     feedback = _feedback(near, slopes, (action_bounds[1] - action_bounds[0]) / 2)

@@ -158,7 +158,7 @@ def make_agent(
         task = replace(task, sensors=None)
     each_step = Planner(
         search=CrossEntropy(settings.rounds, num_elites=settings.elites, correlation=0.5),
-        horizon=_AHEAD[system],
+        horizon=_AHEAD[system] * (known.spec.step or 1.0),
         num_random=settings.sequences,
         spread=0.15,
     )

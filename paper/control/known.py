@@ -62,7 +62,7 @@ def make_agent(
     task = known.task(dynamics(settings, known, learner))
     each_step = Planner(
         search=CrossEntropy(settings.rounds, num_elites=settings.elites, correlation=0.5),
-        horizon=HORIZONS[system],
+        horizon=HORIZONS[system] * (known.spec.step or 1.0),
         num_random=settings.sequences,
         spread=settings.spread,
     )

@@ -146,6 +146,12 @@ FAULTS = (
         "A search ends with its last policy, not with the best one.",
     ),
     Fault(
+        "gpadjust/control/constraints.py",
+        ".clamp(0.0, 1.0).amin(-1)",
+        ".clamp(1.0, 1.0).amin(-1)",
+        "Margins count on corrections that the actions leave no room for.",
+    ),
+    Fault(
         "gpadjust/control/search.py",
         "torch.cat([sequences, drawn]), torch.cat([scores, score(drawn)])",
         "drawn, score(drawn)",
@@ -222,5 +228,17 @@ FAULTS = (
         "found.noise.where(found.variance > 0, noise[..., 0])",
         "found.noise",
         "Without a rest the noise does not count what was fitted to the noise: too small.",
+    ),
+    Fault(
+        "gpadjust/export/c_program.py",
+        "variance[j] += (wider * spread[g] + off * off) / SAMPLES;",
+        "variance[j] += wider * spread[g] / SAMPLES;",
+        "The variance in C forgets that the means of the samples differ.",
+    ),
+    Fault(
+        "gpadjust/export/finite_sum.py",
+        "offset=c.offset + c.size * o, size=c.size * s",
+        "offset=c.offset + o, size=c.size * s",
+        "The second of two scalings of an input takes its offset in the units of the first.",
     ),
 )
