@@ -6,11 +6,9 @@ import math
 import time
 import warnings
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from matplotlib.axes import Axes
 
 from gpadjust.control import CrossEntropy, MPCAgent, Planner
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
@@ -19,7 +17,6 @@ from gpadjust.inference import ParameterWarning, SamplingWarning
 from gpadjust.physics import as_physics
 from gpadjust.systems import System
 from paper.common.experiment import Run, Table
-from paper.common.figures import curves as draw_curves
 from paper.common.learners import LEARNERS
 from paper.common.tables import frame, groups, markdown, number
 from paper.common.verdicts import Curves, Difference, paired
@@ -31,8 +28,6 @@ from paper.machines.networks import NetworkDynamics
 _SYSTEMS, _LEARNERS = Known.axes["system"], Known.axes["learner"]
 _PHYSICS: dict[str, Physics] = {"oracle": "true", "fitted": "unknown"}  # else the crude one
 _RATIOS = ("phymean", "fitted", "gp", "ensemble")  # to which CKA is compared
-_COLORS = {name: known.color for name, known in LEARNERS.items()}
-_COLORS |= {"ensemble": "tab:cyan", "networks": "tab:pink"}
 
 
 def run(experiment: Known, system: str, learner: str, seed: int) -> Run:
@@ -112,6 +107,7 @@ def tables(runs: Sequence[Run], experiment: Known) -> dict[str, Table]:
         label = f"CKA / {_LEARNERS[other]}, trials 2 and 3"
         rows.append([label, *cells, _ratio(later, other).ratio(".2f")])
     heads = [f"{name} ({own['seed'].nunique()} runs)" for name, own in by_system.items()]
+    rows = [row for row in rows if any(row[1:])]
     text = markdown(["mean cost of trials 1; 2; 3", *heads, "all systems"], rows)
     return {"costs": Table("Costs of trials, and their ratios", text)}
 
@@ -126,18 +122,5 @@ def _costs(curves: Curves, learner: str) -> str:
     if learner not in curves.names:
         return ""
     means = "; ".join(number(mean, ".2f") for mean in curves.mean(learner))
-    return f"{means} (± {number(curves.window(learner, 2, 3).sem(), '.2f')})"
-
-
-def draw(runs: Sequence[Run], experiment: Known) -> list[Path]:
-    """Draw the cost of the trials, rivals over each other, a panel for each system."""
-    parts = groups(frame(runs, "trials"), "system", _SYSTEMS)
-    lines = {name: (label, _COLORS[name]) for name, label in _LEARNERS.items()}
-    path = experiment.out / "known.png"
-    labels = ("trial", "cost, median and quartiles")
-    options: dict[str, Any] = {"columns": 3, "size": (3.4, 2.6), "share": False}
-    return [draw_curves(path, parts, "cost", lines, labels=labels, finish=_ticks, **options)]
-
-
-def _ticks(ax: Axes, title: str, own: pd.DataFrame) -> None:
-    ax.set_xticks(sorted({*own["episode"]}))
+    error = number(curves.window(learner, 2, 3).sem(), ".2f")
+    return f"{means} (± {error})" if error else means
