@@ -178,7 +178,7 @@ def test_the_agent_learns_and_goes_on(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     code, again, own = blocks("docs/guide/control.md")
     assert "=2 * 25" in code
-    quick = "Planner(search=CrossEntropy(1), horizon=3, num_random=16)"
+    quick = "Planner(search=CrossEntropy(1), horizon=0.3, num_random=16)"
     code = code.replace("=2 * 25", "=25").replace(
         "MPCAgent(env, system.task(),", f"MPCAgent(env, system.task(), {quick}, first={quick},"
     )

@@ -27,7 +27,7 @@ from gpadjust.control.checkpoint import (
 )
 from gpadjust.control.pickled_agent import pickled, unpickled
 from gpadjust.control.random_state import RandomState
-from gpadjust.control.recorded_episodes import RecordedEpisodes, learn_again, learn_dynamics
+from gpadjust.control.recorded_episodes import RecordedEpisodes, learn_dynamics
 from gpadjust.control.search import random_sequences
 from gpadjust.control.smoothed_episodes import Seen, smooth_episodes
 from gpadjust.control.state_filter import StateFilter
@@ -72,7 +72,8 @@ class Agent(TaskAgent):
     Callbacks are called with the agent, the name of an event, and a dictionary of numbers:
 
     - ``"episode"``: an episode begins;
-    - ``"plan"``: its first action is chosen, with what the agent says of it (:meth:`promise`);
+    - ``"plan"``: its first action is chosen, which took ``seconds``, with what the agent says of it
+      (:meth:`promise`);
     - ``"step"``: a real step was made, with its ``reward``;
     - ``"trial"``: the episode has ended, with its ``number`` (from 1), ``steps``, ``seconds``, the
       ``reward`` of a step, and what was promised of it (``promised_reward``);
@@ -254,13 +255,14 @@ class Agent(TaskAgent):
             if random is not None:
                 action = self._scaled(next(random))
             else:
+                asked = time.perf_counter()
                 with self.timed("plan"):
                     choice, state = self._chosen(observation, state, np.array([begins]))
                 action = self._scaled(choice, noisy=True)
                 if begins:
                     said = self._said(state)
                     self._promises[episode] = said.get("promised_reward")
-                    self.tell("plan", said)
+                    self.tell("plan", {**said, "seconds": time.perf_counter() - asked})
             following, reward, terminated, truncated, info = self.env.step(self._unscaled(action))
             self.num_timesteps += 1
             failed = bool(info.get("step_failed"))
@@ -309,7 +311,6 @@ class Agent(TaskAgent):
     def _learn_dynamics(self) -> None:
         """Let the dynamics learn the episodes that they have not, if there are any."""
         dynamics, sensors = self.task.dynamics, self.task.sensors
-        by_physics = not dynamics.is_fitted
         if sensors is not None and len(self._promises) > self.num_episodes:
             with self.timed("fit"):
                 self._smooth()
@@ -323,9 +324,6 @@ class Agent(TaskAgent):
         with self.timed("fit"):
             task = recorded.complete(self.task, self.episode_length(), self.action_bounds())
             values = learn_dynamics(task, new, recorded, self.score_horizons)
-            if sensors is not None and by_physics:  # whose errors were noise in the states
-                self._smooth()
-                learn_again(dynamics, self.recorded_episodes())
         bounds = None if self.model is None else self.model.state_bounds
         if bounds is not None and self.task.state_bounds is None:
             new.warn_of_bounds(bounds)

@@ -50,7 +50,7 @@ class MPCAgent(Agent):
         >>> from gpadjust.control import CrossEntropy, MPCAgent, Planner
         >>> from gpadjust.systems import cart_pole
         >>> system = cart_pole()
-        >>> quick = Planner(search=CrossEntropy(1), horizon=3, num_random=16)  # or leave it out
+        >>> quick = Planner(search=CrossEntropy(1), horizon=0.3, num_random=16)  # or leave it out
         >>> agent = MPCAgent(system.make(), system.task(), quick, first=quick, seed=0)
         >>> agent.learn(total_timesteps=2 * 25)
         MPCAgent(CartPoleSwingUpEnv, LearnedDynamics, 2 episodes learnt, 50 steps, last reward ...)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar
@@ -21,22 +22,22 @@ from gpadjust.control.step_guard import check_observation
 from gpadjust.control.task import Task
 from gpadjust.models.sampled_functions import seeded
 
-_SHORTEST = 8  # steps ahead
+_SHORTEST, _LONGEST = 8, 30  # steps ahead
+_SEGMENT = 1.5  # horizons of a step
 
 EACH_STEP = Planner(
     search=CrossEntropy(1, num_elites=12, correlation=0.5),
-    horizon=_SHORTEST,
     num_random=128,
     spread=0.15,
 )
-"""The default plan of a step: two looks at 128 sequences, of eight steps or more."""
+"""The default plan of a step: two looks at 128 sequences, of eight to 30 steps."""
 
 FIRST = Planner(
-    search=CrossEntropy(12, num_elites=12, correlation=0.5),
+    search=CrossEntropy(5, num_elites=12, correlation=0.5),
     num_random=128,
-    restarts=3,
+    spread=0.15,
 )
-"""The default plan of an episode that begins: the whole of it, in some seconds."""
+"""The default plan of an episode that begins: the whole of it, at once and in segments."""
 
 
 class Planned(NamedTuple):
@@ -84,15 +85,17 @@ class MPC:
         task: The task; its dynamics must be fitted.
         action_bounds: Lower and upper bounds of the actions, ``2 x action_dim``.
         each_step: Plans at each step but the first. Default: two looks at 128 sequences of a third
-            of the episode, of eight steps at least. A horizon must be as long as the manoeuvre
+            of the episode, of 8 to 30 steps. A horizon must be as long as the manoeuvre
             needs, as energy must be put into a pole before it can stand: try it in f_p alone
             (:class:`~gpadjust.dynamics.PhysicsDynamics`) first.
-        first: Plans when an episode begins. Default: with three searches of the whole episode, or
-            as far as ``each_step`` looks if the task does not say how long it is; objective,
-            functions and seconds are those of ``each_step``.
+        first: Plans when an episode begins, which has not to be in time. Default: two searches of
+            the whole episode, from random sequences and from a plan in segments, half as long again
+            as ``each_step`` looks; as far as that if the task does not say how long an episode is.
+            Objective and functions are those of ``each_step``.
         tolerance: Where the plan of a step is worth less than what was promised of its steps when
             the whole was planned, by more than this share of the range of the promised rewards (a
-            step, on average), the rest is planned as when it began. None for never.
+            step, on average), the rest is planned as when it began; where ``each_step`` has
+            ``seconds``, about that plan, if half of these are left. None for never.
         seed: Of the searches of deterministic actions, which are the same for the same observation
             and plan.
         state_filter: Of a task with sensors, by which observations are states. Default: that before
@@ -132,26 +135,27 @@ class MPC:
             check_kind(name, planner, Planner | None, "a Planner(...)")
         if tolerance is not None:
             checked_number("tolerance", tolerance, above=0)
-        length = task.episode_length
+        length, spec = task.episode_length, task.dynamics.spec
         if each_step is None:
-            third = 0 if length is None else length // 3
-            each_step = replace(EACH_STEP, horizon=max(third, _SHORTEST))
+            steps = min(max((length or 0) // 3, _SHORTEST), _LONGEST)
+            each_step = replace(EACH_STEP, horizon=steps * (spec.step or 1.0))
         if first is None:
             first = replace(
                 FIRST,
                 objective=each_step.objective,
                 num_functions=each_step.num_functions,
-                seconds=each_step.seconds,
                 horizon=each_step.horizon if length is None else None,
+                segment=each_step.horizon and _SEGMENT * each_step.horizon,
             )
+        for planner in (each_step, first):
+            planner.steps_ahead(spec)  # or an error
         if length is None and None in (each_step.horizon, first.horizon):
             raise ValueError(
                 "Nobody says how far to plan; give the task an episode_length, or the planners a "
                 "horizon."
             )
         self.task = task
-        dim = task.dynamics.spec.action_dim
-        self.action_bounds = checked_bounds("action_bounds", action_bounds, dim)
+        self.action_bounds = checked_bounds("action_bounds", action_bounds, spec.action_dim)
         self.each_step = each_step
         self.first = first
         self.tolerance = tolerance
@@ -209,39 +213,55 @@ class MPC:
             earlier: What was planned by then; None at the start.
             covariance: That of the state, ``state_dim x state_dim``, if it is estimated.
         """
+        begun = time.perf_counter()
         steps_done = 0 if earlier is None else earlier.steps_done
         length = self.task.episode_length
         left = None if length is None else max(length - steps_done, 1)
+        where = self.task, state, self.action_bounds, left
         before = None if earlier is None else earlier.before
+        how: dict[str, Any] = {"before": before, "steps_done": steps_done}
         if earlier is not None and len(earlier.actions):
-            horizon = self.each_step.horizon
+            horizon = self.each_step.steps_ahead(self.task.dynamics.spec)
             tight = self._margins(state, earlier.actions[:horizon], earlier, covariance)
-            plan = self.each_step.plan(
-                self.task,
-                state,
-                self.action_bounds,
-                left,
-                known=earlier.actions,
-                steps_done=steps_done,
-                before=before,
-                margins=tight,
+            how["margins"] = tight
+            known = earlier.actions
+            plan = self._in_time(self.each_step, begun).plan(*where, known=known, **how)
+            k = len(plan.actions)
+            kept = earlier._replace(
+                actions=torch.cat([plan.actions, known[k:]]),
+                next_states=torch.cat([plan.next_states, earlier.next_states[k:]]),
+                left_bounds=plan.left_bounds,
+                violation=plan.violation,
             )
             if not self._disappoints(plan, earlier):
-                k = len(plan.actions)
-                return earlier._replace(
-                    actions=torch.cat([plan.actions, earlier.actions[k:]]),
-                    next_states=torch.cat([plan.next_states, earlier.next_states[k:]]),
-                    left_bounds=plan.left_bounds,
-                    violation=plan.violation,
-                )
-        how: dict[str, Any] = {"before": before, "steps_done": steps_done}
-        plan = self.first.plan(self.task, state, self.action_bounds, left, **how)
+                return kept
+            if self.each_step.seconds is not None:
+                whole = self._in_time(self.first, begun)
+                if (whole.seconds or 0.0) < self.each_step.seconds / 2:
+                    return kept
+                plan = whole.plan(*where, known=kept.actions, **how)
+                if len(plan.actions) < len(kept.actions):
+                    return kept
+                return self._begun(plan, earlier, before)
+        how["margins"] = None
+        plan = self.first.plan(*where, **how)
         if self.task.constraints is not None:
             # The margins are those of a plan that has none yet.
             how["margins"] = self._margins(state, plan.actions, plan, covariance)
-            plan = self.first.plan(
-                self.task, state, self.action_bounds, left, known=plan.actions, **how
-            )
+            plan = self.first.plan(*where, known=plan.actions, **how)
+        return self._begun(plan, earlier, before)
+
+    def _in_time(self, planner: Planner, begun: float) -> Planner:
+        """The planner, for what is left of the time of a step that has begun."""
+        if self.each_step.seconds is None:
+            return planner
+        left = begun + self.each_step.seconds - time.perf_counter()
+        return replace(planner, seconds=max(left, 1e-9), segment=None)
+
+    @staticmethod
+    def _begun(plan: Plan, earlier: Planned | None, before: Tensor | None) -> Planned:
+        """A plan of all steps ahead, with what it promises."""
+        steps_done = 0 if earlier is None else earlier.steps_done
         made = plan.rewards[:0] if earlier is None else earlier.promised[:steps_done]
         promised = torch.cat([made, plan.rewards])
         reward = float(plan.rewards.sum() / plan.made.sum().clamp_min(1e-12))

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import KW_ONLY, dataclass, field
-from typing import NamedTuple
+from contextlib import suppress
+from dataclasses import KW_ONLY, dataclass, field, replace
+from typing import Any, NamedTuple
 
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
 from gpadjust.checks import check_kind, checked_bounds, checked_number, checked_whole
-from gpadjust.control.rollouts import Objective, Return, Rollouts
+from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts
 from gpadjust.control.search import CrossEntropy, Search, correlated_noise, random_sequences
 from gpadjust.control.task import Task
+from gpadjust.states import StateSpec
 
 
 class Plan(NamedTuple):
@@ -40,6 +42,20 @@ class Plan(NamedTuple):
     next_states: Tensor
     violation: float = 0.0
 
+    @classmethod
+    def of(cls, rollout: Rollout, n: int, value: float) -> Plan:
+        """The plan of the actions that were taken in the n-th episodes of a rollout."""
+        made = rollout.made[:, n]
+        return cls(
+            rollout.actions[0, n],
+            value,
+            rollout.rewards[:, n].masked_fill(~made, 0.0).mean(0),
+            float(rollout.left_bounds[:, n].double().mean()),
+            made.double().mean(0),
+            rollout.next_states[:, n].mean(0),
+            float(rollout.violation[:, n].mean(0).max()),
+        )
+
 
 @dataclass(frozen=True)
 class Planner:
@@ -53,7 +69,8 @@ class Planner:
     Args:
         objective: What to look for: :class:`Return`, or your own.
         search: How the sequences are improved: :class:`CrossEntropy` or :class:`PathIntegral`.
-        horizon: The most steps to look ahead. Default: to the end of the episode.
+        horizon: The most time to look ahead, in the time unit of ``spec.step``; in steps where the
+            spec has none. Default: to the end of the episode.
         num_functions: How many functions of the posterior each sequence is followed through; None
             for the mean of the model alone, which takes least time. (Of a sampled model it is the
             mean of some samples, two or more, see
@@ -64,8 +81,13 @@ class Planner:
             of the actions.
         restarts: How many searches there are, of which the best is taken; one where there is an
             earlier plan.
-        seconds: After so many seconds of a plan no further round of a search begins, and no further
-            search.
+        seconds: The most time that a plan takes. A round of the search that would take longer does
+            not begin; if even the first one would, its sequences are followed, and compared, as far
+            as there is time, one step of the model at least. Default: as long as it takes.
+        segment: Without an earlier plan, one more search begins with a plan in segments of this
+            duration (in the unit of ``horizon``): half of a segment is made in the model, where the
+            next one is planned. Of an unstable system, random sequences of a whole episode tell
+            nothing. Default: none.
 
     Raises:
         TypeError: If objective or search is none, or a number is of another kind.
@@ -86,13 +108,14 @@ class Planner:
     objective: Objective = field(default_factory=Return)
     search: Search = field(default_factory=CrossEntropy)
     _: KW_ONLY
-    horizon: int | None = None
+    horizon: float | None = None
     num_functions: int | None = None
     num_random: int = 80
     max_hold: int = 5
     spread: float = 0.1
     restarts: int = 1
     seconds: float | None = None
+    segment: float | None = None
 
     def __post_init__(self) -> None:
         """Check objective, search and numbers."""
@@ -102,13 +125,23 @@ class Planner:
         check_kind("search", self.search, Search, told)
         for name in ("num_random", "max_hold", "restarts"):
             checked_whole(name, getattr(self, name), 1)
-        for name in ("horizon", "num_functions"):
+        if self.num_functions is not None:
+            checked_whole("num_functions", self.num_functions, 1)
+        for name in ("horizon", "seconds", "segment"):
             if getattr(self, name) is not None:
-                checked_whole(name, getattr(self, name), 1)
+                checked_number(name, getattr(self, name), above=0)
         self.objective.check_functions(self.num_functions)
         checked_number("spread", self.spread, above=0, below=1)
-        if self.seconds is not None:
-            checked_number("seconds", self.seconds, above=0)
+        if None not in (self.seconds, self.segment):
+            raise ValueError("A plan in segments has no time limit; leave out seconds or segment.")
+
+    def steps_ahead(self, spec: StateSpec) -> int | None:
+        """Return the horizon in steps; None to the end of the episode.
+
+        Raises:
+            ValueError: If it is shorter than a step.
+        """
+        return in_steps("horizon", self.horizon, spec)
 
     @torch.no_grad()
     def plan(
@@ -145,41 +178,63 @@ class Planner:
             RuntimeError: If the dynamics have learnt nothing yet.
             PhysicsError: If the physics fails at ``state``, whatever the action.
         """
-        begun = time.perf_counter()
-        dim = task.dynamics.spec.action_dim
-        action_bounds = checked_bounds("action_bounds", action_bounds, dim)
+        deadline = math.inf if self.seconds is None else time.perf_counter() + self.seconds
+        spec = task.dynamics.spec
+        action_bounds = checked_bounds("action_bounds", action_bounds, spec.action_dim)
         num_steps = self._checked_steps(task, state, num_steps)
         score = self.objective.of(task)
-        rollouts = Rollouts(task, self.num_functions, margins=margins, before=before)
-        known = None if known is None or not len(known) else known
-        deadline = math.inf if self.seconds is None else begun + self.seconds
+        given: dict[str, Any] = {"margins": margins, "before": before, "deadline": deadline}
+        rollouts = Rollouts(task, self.num_functions, **given)
+        best: list[Plan] = []  # so far, the newest last
 
-        def search() -> Plan:
-            asked: list[tuple[Tensor, ...]] = []
+        def scored(sequences: Tensor) -> Tensor:
+            if best and not rollouts.has_time(num_steps):
+                raise _TimeIsUp
+            rollout = rollouts.follow(state, sequences, steps_done)
+            if best and rollout.made.shape[-1] < num_steps:
+                raise _TimeIsUp
+            scores = self._checked_scores(score(rollout), len(sequences))
+            found = int(scores.argmax())
+            if not best or scores[found] > best[-1].value:
+                best.append(Plan.of(rollout, found, float(scores[found])))
+            return scores
 
-            def scored(sequences: Tensor) -> Tensor:
-                rollout = rollouts.follow(state, sequences, steps_done)
-                rewards = rollout.rewards.masked_fill(~rollout.made, 0.0).mean(0)
-                left, made = (part.double().mean(0) for part in (rollout.left_bounds, rollout.made))
-                reached, violation = rollout.next_states.mean(0), rollout.violation.mean(0).amax(-1)
-                taken = rollout.actions[0]
-                asked.append((sequences, taken, rewards, left, made, reached, violation))
-                return self._checked_scores(score(rollout), len(sequences))
-
+        def search(known: Tensor | None) -> None:
             first = self._proposed(num_steps, action_bounds, known)
-            actions, value = self.search.best(scored, first, action_bounds, deadline)
-            columns = [torch.cat(column) for column in zip(*asked, strict=True)]
-            sequences, *columns = columns
-            found = int((sequences == actions).all(-1).all(-1).nonzero()[0])
-            taken, rewards, left, made, reached, violation = (column[found] for column in columns)
-            return Plan(taken, value, rewards, float(left), made, reached, float(violation))
+            self.search.best(scored, first, action_bounds)
 
-        plans = [search()]
-        while len(plans) < (self.restarts if known is None else 1):
-            if time.perf_counter() > deadline:
-                break
-            plans.append(search())
-        return max(plans, key=lambda plan: plan.value)
+        with suppress(_TimeIsUp):
+            if known is not None and len(known):
+                search(known)
+            else:
+                for _ in range(self.restarts):
+                    search(None)
+                segment = in_steps("segment", self.segment, spec)
+                if segment is not None and segment < num_steps:
+                    where = task, state, action_bounds, num_steps
+                    search(self._in_segments(*where, before, steps_done))
+        return best[-1]
+
+    def _in_segments(
+        self,
+        task: Task,
+        state: Tensor,
+        action_bounds: Tensor,
+        num_steps: int,
+        before: Tensor | None,
+        steps_done: int,
+    ) -> Tensor:
+        """Actions ``num_steps x action_dim`` of segments, each begun in the middle of the last."""
+        ahead = replace(self, horizon=self.segment, segment=None, restarts=1)
+        actions, known = action_bounds[:0], None
+        while (left := num_steps - len(actions)) > 0:
+            done = steps_done + len(actions)
+            how: dict[str, Any] = {"known": known, "before": before, "steps_done": done}
+            plan = ahead.plan(task, state, action_bounds, left, **how)
+            k = left if len(plan.actions) == left else -(-len(plan.actions) // 2)
+            actions, known = torch.cat([actions, plan.actions[:k]]), plan.actions[k:]
+            state, before = plan.next_states[k - 1], plan.actions[k - 1]
+        return actions
 
     def _proposed(self, num_steps: int, bounds: Tensor, known: Tensor | None) -> Tensor:
         """The sequences that a search begins with, ``n x num_steps x action_dim``."""
@@ -213,11 +268,33 @@ class Planner:
             raise ValueError(
                 f"Expected state of shape {spec.state_dim}, found {tuple(state.shape)}."
             )
+        horizon = self.steps_ahead(spec)
         num_steps = task.episode_length if num_steps is None else num_steps
-        num_steps = self.horizon if num_steps is None else num_steps
+        num_steps = horizon if num_steps is None else num_steps
         if num_steps is None or num_steps < 1:
             raise ValueError(
                 f"Expected num_steps as a number of steps >= 1, found {num_steps}; pass it, or "
                 "give the task an episode_length, or the planner a horizon."
             )
-        return num_steps if self.horizon is None else min(num_steps, self.horizon)
+        return num_steps if horizon is None else min(num_steps, horizon)
+
+
+class _TimeIsUp(Exception):  # noqa: N818 - no error
+    """Raised in a search whose next round would take too long."""
+
+
+def in_steps(name: str, duration: float | None, spec: StateSpec) -> int | None:
+    """Return the number of steps nearest to a duration in the time unit of the spec.
+
+    Raises:
+        ValueError: If it is shorter than a step.
+    """
+    if duration is None:
+        return None
+    step = spec.step or 1.0
+    if duration < step * (1 - 1e-9):
+        raise ValueError(
+            f"{name} must be one step at least, which takes {step:g} in the time unit of "
+            f"StateSpec(step=...); found {duration:g}."
+        )
+    return round(duration / step)

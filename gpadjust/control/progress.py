@@ -6,7 +6,7 @@ from typing import Any
 
 _PROMISE = {"promised_reward": "promised {:.3g} a step", "left_bounds": "{:.0%} left the bounds"}
 _SHOWN = {
-    "plan": _PROMISE,
+    "plan": {"seconds": "{:.1f} s"} | _PROMISE,
     "fit": {"fit_seconds": "{:.1f} s", "nlpd": "NLPD {:.3g}", "coverage": "coverage {:.0%}"},
     "update": {"number": "{}", "value": "value {:.4g}"},
     "search": {"seconds": "{:.1f} s", "reward": "promised {:.3g} a step"} | _PROMISE,

@@ -270,13 +270,13 @@ def learn_dynamics(
     if task.sensors is None:
         task.dynamics.update(*learnable)
     else:
-        learn_again(task.dynamics, recorded)
+        _learn_again(task.dynamics, recorded)
     _warn_of_delay(task.dynamics, new, recorded)
     found["fit_seconds"] = time.perf_counter() - start - found.get("score_seconds", 0.0)
     return {name: value for name, value in found.items() if not math.isnan(value)}
 
 
-def learn_again(dynamics: Dynamics, recorded: RecordedEpisodes) -> None:
+def _learn_again(dynamics: Dynamics, recorded: RecordedEpisodes) -> None:
     """Let dynamics forget what they have learnt, and learn all episodes; not if this fails."""
     data, before = recorded.learnable(dynamics), dynamics.state_dict()
     dynamics.load_state_dict({})

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
@@ -67,6 +69,8 @@ class Rollouts:
         margins: By how much constraints must hold in each step, ``T x c``; the last ones beyond.
             Default: not at all.
         before: The action before the first step, ``action_dim``; None where an episode begins.
+        deadline: The time of ``time.perf_counter`` by which episodes are over: there are no steps
+            beyond the first that would take longer, by the slowest so far. Default: none.
     """
 
     def __init__(
@@ -76,8 +80,10 @@ class Rollouts:
         *,
         margins: Tensor | None = None,
         before: Tensor | None = None,
+        deadline: float = math.inf,
     ) -> None:
         self.task, self.margins, self.before = task, margins, before
+        self.deadline, self._slowest = deadline, 0.0
         if num_functions is None:
             self.num_functions, self.functions = 1, task.dynamics.mean_function()
         else:
@@ -115,6 +121,10 @@ class Rollouts:
 
         return self._run(states, num_steps, choose)
 
+    def has_time(self, num_steps: int = 1) -> bool:
+        """Return whether so many steps can be made before the deadline, by the slowest so far."""
+        return time.perf_counter() + num_steps * self._slowest < self.deadline
+
     def _run(
         self,
         starts: Tensor,
@@ -130,6 +140,9 @@ class Rollouts:
         overshoot = torch.zeros(running.shape, dtype=torch.float64)
         steps: list[tuple[Tensor, ...]] = []
         for t in range(num_steps):
+            begun = time.perf_counter()
+            if t and not self.has_time():
+                break
             actions = choose(t, states)
             # Where the episodes start the physics has to work; later, all may have come to where
             # it does not.
@@ -146,6 +159,7 @@ class Rollouts:
             steps.append((states, actions, following, rewards, made, violation))
             running = made & ~ended
             states = torch.where(running.unsqueeze(-1), following, states)
+            self._slowest = max(self._slowest, time.perf_counter() - begun)
         columns = [torch.stack(parts, dim=2) for parts in zip(*steps, strict=True)]
         *columns, violation = columns
         return Rollout._make([*columns, left, overshoot, violation, self.before])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
@@ -18,22 +17,19 @@ SequenceScore = Callable[[Tensor], Tensor]
 
 
 class Search(ABC):
-    """Improves sequences of actions, round by round, until there is no time left."""
+    """Improves sequences of actions, round by round."""
 
     rounds: int
 
     @abstractmethod
-    def best(
-        self, score: SequenceScore, first: Tensor, bounds: Tensor, deadline: float = math.inf
-    ) -> tuple[Tensor, float]:
+    def best(self, score: SequenceScore, first: Tensor, bounds: Tensor) -> tuple[Tensor, float]:
         """Search, from PyTorch's generator.
 
         Args:
             score: What is sought; it is asked once a round, about as many sequences as there are
-                first ones.
+                first ones. When there is no time left, it raises an exception, which comes through.
             first: The sequences to begin with, ``n x T x action_dim``.
             bounds: Lower and upper bounds of the actions, ``2 x action_dim``.
-            deadline: The time of ``time.perf_counter`` at which no further round begins.
 
         Returns:
             The sequence, ``T x action_dim``, one of those whose score was asked, and its score.
@@ -69,14 +65,10 @@ class CrossEntropy(Search):
         checked_whole("num_elites", self.num_elites, 1)
         checked_number("correlation", self.correlation, least=0, below=1)
 
-    def best(
-        self, score: SequenceScore, first: Tensor, bounds: Tensor, deadline: float = math.inf
-    ) -> tuple[Tensor, float]:
+    def best(self, score: SequenceScore, first: Tensor, bounds: Tensor) -> tuple[Tensor, float]:
         """Search; see :class:`Search`."""
         sequences, scores = first, score(first)
         for _ in range(self.rounds):
-            if time.perf_counter() > deadline:
-                break
             elites = scores.topk(min(self.num_elites, len(scores))).indices
             sequences, scores = sequences[elites], scores[elites]
             mean, sd = sequences.mean(0), sequences.std(0, correction=0)
@@ -123,15 +115,11 @@ class PathIntegral(Search):
         checked_number("spread", self.spread, above=0, below=1)
         checked_number("correlation", self.correlation, least=0, below=1)
 
-    def best(
-        self, score: SequenceScore, first: Tensor, bounds: Tensor, deadline: float = math.inf
-    ) -> tuple[Tensor, float]:
+    def best(self, score: SequenceScore, first: Tensor, bounds: Tensor) -> tuple[Tensor, float]:
         """Search; see :class:`Search`."""
         sequences, scores = first, score(first)
         asked = [(sequences, scores)]
         for _ in range(self.rounds):
-            if time.perf_counter() > deadline:
-                break
             mean = self._mean(sequences, scores)
             noise = correlated_noise(first.shape, self.correlation)
             noise[0] = 0.0  # the mean itself is among them

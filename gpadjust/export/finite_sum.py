@@ -199,6 +199,8 @@ def check_finite_sum(model: TermsModel, observation_noise: bool) -> None:
         why = "several data sets: build and export a model of each"
     elif model.has_unknowns and model.num_samples is not None:
         why = "samples of a physics' parameters, each with its own f_p: fit(model, method='map')"
+    elif not model.term_names:
+        why = "known terms alone, which is its physics: take model.physics_parameters to yours"
     elif model.covar_module.sister is not None:
         why = "what sister machines taught: build it of the data of one machine"
     elif any(term.scaled_by for term in model.terms):
@@ -272,7 +274,7 @@ def _columns(transform: Any, num_inputs: int) -> list[Column]:
             found = [
                 column._replace(function=function)
                 for i, column in enumerate(found)
-                for function in (("sin", "cos") if i in part.columns else ("",))
+                for function in (("sin", "cos") if i in part.columns else (column.function,))
             ]
         elif type(part) in (AffineInputTransform, Normalize, InputStandardize):
             offset, size = torch.zeros(len(found)).double(), torch.ones(len(found)).double()

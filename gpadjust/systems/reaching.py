@@ -15,7 +15,13 @@ from gpadjust.checks import check_columns, check_switch, checked_whole
 from gpadjust.physics import Physics, Unknown
 from gpadjust.states import StateSpec
 from gpadjust.systems.system import System
-from gpadjust.systems.torque_arm import REAL_ARM, SUBSTEPS, believed_arm, torque_arm_physics
+from gpadjust.systems.torque_arm import (
+    ARM_TIME_STEP,
+    REAL_ARM,
+    SUBSTEPS,
+    believed_arm,
+    torque_arm_physics,
+)
 from gpadjust.systems.wrappers import RememberAction
 
 START_MEAN = (math.radians(35), math.radians(65))
@@ -26,6 +32,7 @@ ARM_SPEC = StateSpec(
     ["theta_s", "theta_e", "theta_s_dot", "theta_e_dot", "target_s", "target_e"],
     actions=["a1", "a2", "a3", "a4"],
     exogenous=["target_s", "target_e"],
+    step=ARM_TIME_STEP,
 )
 """The state of the reaching arm, in rad and s; the targets, which stay, are for the policy only.
 
@@ -36,6 +43,7 @@ ARM_MEMORY_SPEC = StateSpec(
     [*ARM_SPEC.states, "a1_last", "a2_last", "a3_last", "a4_last"],
     actions=ARM_SPEC.actions,
     exogenous=ARM_SPEC.exogenous,
+    step=ARM_SPEC.step,
     previous={f"{name}_last": name for name in ARM_SPEC.actions},
 )
 """The state of the reaching arm with the previous action, of ``RememberAction(MuscleArmEnv())``.

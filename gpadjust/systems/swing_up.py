@@ -37,12 +37,17 @@ MAX_START = 100.0  # far beyond what forces do; the equation can be integrated t
 _SOFT = 0.05  # m/s: the speed over which dry friction changes its sign
 
 CART_POLE_SPEC = StateSpec(
-    ["x", "theta", "x_dot", "theta_dot"], actions=["force"], angles=["theta"]
+    ["x", "theta", "x_dot", "theta_dot"], actions=["force"], angles=["theta"], step=TIME_STEP
 )
 """The state of the cart-pole; policy and model see sine and cosine of the angle."""
 
-CART_POLE_RAW_SPEC = StateSpec(["x", "theta", "x_dot", "theta_dot"], actions=["force"])
+CART_POLE_RAW_SPEC = replace(CART_POLE_SPEC, angles=())
 """The same state with the angle as it is, not wrapped: the observation is the state."""
+
+
+def cart_pole_spec(encode_angle: bool = True, time_step: float = TIME_STEP) -> StateSpec:
+    """Return the spec of these options of the environment."""
+    return replace(CART_POLE_SPEC if encode_angle else CART_POLE_RAW_SPEC, step=time_step)
 
 
 @dataclass(frozen=True)
@@ -304,7 +309,7 @@ class CartPoleSwingUpEnv(ViewedEnv):
         self.equation = equation
         self.physics = equation_physics(equation, time_step)
         self.metadata = {**self.metadata, "render_fps": max(round(1 / time_step), 1)}
-        self.state_spec = CART_POLE_SPEC if encode_angle else CART_POLE_RAW_SPEC
+        self.state_spec = cart_pole_spec(encode_angle, time_step)
         high = [np.inf, 1.0, 1.0, np.inf, np.inf] if encode_angle else [np.inf] * 4
         bound = np.array(high, dtype=np.float32)
         self.observation_space = gym.spaces.Box(-bound, bound, dtype=np.float32)
@@ -432,7 +437,7 @@ def cart_pole(
     real["equation"] = replace(REAL_CART_POLE, dry=dry, drag=drag)
     return System(
         partial(gym.make, "gpadjust/CartPoleSwingUp-v0", max_episode_steps=episode_length, **real),
-        CART_POLE_SPEC if encode_angle else CART_POLE_RAW_SPEC,
+        cart_pole_spec(encode_angle, time_step),
         equation_physics(believed, time_step, named),
         cart_pole_reward,
         start=cart_pole_start,

@@ -141,7 +141,7 @@ class Reaching(Experiment):
             "strength": "f_p twice as strong",
         },
         "learner": labels("cka", "phymean", "phy", "fitted", "gp")
-        | {"ensemble": "f_p and an ensemble of networks", "cka-slow": "CKA, learning rate 0.003"},
+        | {"ensemble": "f_p and an ensemble of networks", "cka-slow": "CKA, rate 0.003"},
     }
     packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "stable_baselines3", "opensim")
     calls: ClassVar[tuple[str, ...]] = (

@@ -222,7 +222,7 @@ TARGETS = (
 def draw(runs: Sequence[Run], experiment: Reaching) -> list[Path]:
     """Draw the error over the trials, a panel for each arm, and maps of CKA's on the plain one."""
     trials = frame(_trials(runs), "trials")
-    floor = {"color": "0.5", "lw": 1, "ls": "--", "label": "true arm, 1,000 trials of SAC"}
+    floor = {"color": "0.5", "lw": 1, "ls": "--", "label": "SAC, 1,000 trials"}
 
     def finish(ax: Any, title: str, own: pd.DataFrame) -> None:
         ax.axhline(BOUND, **floor)

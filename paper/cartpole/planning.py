@@ -34,6 +34,7 @@ from gpadjust.systems.swing_up import (
     REAL_CART_POLE,
     START_MEAN,
     believed_cart_pole,
+    cart_pole_spec,
     equation_physics,
 )
 from paper.cartpole import (
@@ -124,7 +125,7 @@ def planners(settings: PlanningSettings) -> tuple[Planner, Planner]:
     elites, correlation = settings.elites, settings.correlation
     each_step = Planner(
         search=CrossEntropy(settings.rounds, num_elites=elites, correlation=correlation),
-        horizon=settings.horizon,
+        horizon=settings.horizon * settings.time_step,
         num_random=settings.sequences,
         spread=settings.spread,
     )
@@ -148,7 +149,8 @@ def dynamics(settings: PlanningSettings, system: str, learner: str, seed: int) -
     if learner == "oracle":
         dry, drag = FRICTIONS.get(system, (0.0, 0.0))
         real = replace(REAL_CART_POLE, dry=dry, drag=drag)
-        return PhysicsDynamics(CART_POLE_SPEC, equation_physics(real, settings.time_step))
+        spec = cart_pole_spec(time_step=settings.time_step)
+        return PhysicsDynamics(spec, equation_physics(real, settings.time_step))
     known = system_of(system, settings, seed, unknowns=learner in ("fitted", "structured"))
     if learner == "structured":
         unknowns = {**known.unknowns, **FRICTION_UNKNOWNS}

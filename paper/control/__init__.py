@@ -223,7 +223,7 @@ class DelaysSettings:
     trials: int = 3
     """real trials of a run, of which the first goes by f_p"""
     hint_trials: int = 1
-    """of the runs that only ask whether the delay is found, in which f_p alone plans"""
+    """of the runs that only ask whether the delay is found, in which f_p alone plans, lightly"""
     sequences: int = 64
     """that are planned, in each round of the cross-entropy method"""
     first_rounds: int = 8

@@ -78,15 +78,16 @@ def _agent(experiment: Delays, told: str, seed: int) -> tuple[MPCAgent, int]:
         env = Late(env)
     if told in ("previous", "physics"):
         env, system = RememberAction(env), _remembering(system, told == "physics")
+    sequences = settings.sequences // (4 if asks else 1)
     each_step = Planner(
         search=CrossEntropy(1, num_elites=12, correlation=0.5),
-        horizon=8,
-        num_random=settings.sequences,
+        horizon=8 * (system.spec.step or 1.0),
+        num_random=sequences,
         spread=0.15,
     )
     first = Planner(
-        search=CrossEntropy(settings.first_rounds, num_elites=12, correlation=0.5),
-        num_random=settings.sequences,
+        search=CrossEntropy(2 if asks else settings.first_rounds, num_elites=12, correlation=0.5),
+        num_random=sequences,
     )
     dynamics: Dynamics = PhysicsDynamics(system.spec, system.physics)
     if not asks:

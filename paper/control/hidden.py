@@ -31,7 +31,7 @@ from paper.control.systems import furuta
 
 _SYSTEMS, _LEARNERS = Hidden.axes["system"], Hidden.axes["learner"]
 _MEASURED = {"cart_pole": ["x", "theta"], "furuta": ["arm", "theta"]}
-_STEPS = {"cart_pole": 0.1, "furuta": 0.04}  # s
+_STEP = {"cart_pole": 0.1, "furuta": 0.04}  # s
 _AHEAD = {"cart_pole": 8, "furuta": HORIZONS["furuta"]}
 _TOLD = 2  # the trial whose states are kept, for the picture
 
@@ -154,11 +154,11 @@ def make_agent(
     fit: DynamicsFitOptions = {"method": settings.fit}
     task = known.task(LearnedDynamics(known.spec, known.physics, fit_options=fit))
     if learner == "quotient":
-        env = Quotients(env, sensors.spec(known.spec), known.spec, _STEPS[system])
+        env = Quotients(env, sensors.spec(known.spec), known.spec, _STEP[system])
         task = replace(task, sensors=None)
     each_step = Planner(
         search=CrossEntropy(settings.rounds, num_elites=settings.elites, correlation=0.5),
-        horizon=_AHEAD[system],
+        horizon=_AHEAD[system] * _STEP[system],
         num_random=settings.sequences,
         spread=0.15,
     )
@@ -217,13 +217,13 @@ def draw(runs: Sequence[Run], experiment: Hidden) -> list[Path]:
         told = {r["learner"]: r["states"] for r in own if r["system"] == name}
         if "filter" in told:
             true, mean, sd = (np.array(told["filter"][k])[:, 3] for k in ("true", "mean", "sd"))
-            t = _STEPS[str(name)] * np.arange(len(true))
+            t = _STEP[str(name)] * np.arange(len(true))
             ax.fill_between(t, mean - 1.96 * sd, mean + 1.96 * sd, color="tab:blue", alpha=0.25,
                             label="95 % interval", lw=0)  # fmt: skip
             ax.plot(t, mean, color="tab:blue", label="estimate")
             steps = np.diff(np.array(told["filter"]["seen"])[:, 1])
             steps = (steps + np.pi) % (2 * np.pi) - np.pi
-            ax.plot(t[1:], steps / _STEPS[str(name)], "o", ms=3, color="tab:orange",
+            ax.plot(t[1:], steps / _STEP[str(name)], "o", ms=3, color="tab:orange",
                     label="difference quotient")  # fmt: skip
             ax.plot(t, true, "k--", lw=1, label="true")
         ax.set_title(_SYSTEMS[str(name)], loc="left", fontsize=10)

@@ -102,7 +102,7 @@ def _agent(experiment: Setpoints, moves: str, plans: str, seed: int) -> tuple[MP
         dynamics = LearnedDynamics(system.spec, system.physics, fit_options=likely)
     each_step = Planner(
         search=CrossEntropy(1, num_elites=8, correlation=0.5),
-        horizon=HORIZONS["tanks"],
+        horizon=HORIZONS["tanks"] * (system.spec.step or 1.0),
         num_random=settings.sequences,
         spread=0.15,
     )

@@ -151,7 +151,7 @@ def run(experiment: Walls, system: str, controller: str, seed: int) -> Run:
         here.task(dynamics),
         Planner(
             search=search(settings.rounds),
-            horizon=settings.horizon,
+            horizon=settings.horizon * (here.spec.step or 1.0),
             num_random=settings.sequences,
             spread=0.15,
         ),

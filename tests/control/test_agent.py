@@ -185,7 +185,7 @@ def test_progress_is_printed(make_agent, kind, capsys):
     for line in (
         rf"trial 2: reward {number} a step( \(promised {number}\))?, 5 steps in {span}",
         rf"fit: {span}, NLPD {number}, coverage \d+%",
-        r"plan: .*",
+        rf"plan: {span}.*",
     ):
         assert sum(re.fullmatch(line, said) is not None for said in lines) == 1 + ("plan" in line)
     for event in ("update", "search"):

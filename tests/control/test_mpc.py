@@ -1,5 +1,8 @@
 """A policy that plans at every step."""
 
+import time
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -90,6 +93,41 @@ def test_what_disappoints_is_planned_anew(monkeypatch):
         assert len(state[0].actions) == 4
 
 
+def test_decisions_within_an_episode_are_in_time(monkeypatch):
+    """A wind that the model lacks disappoints; the rest is planned again if there is time."""
+    clock = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: clock[0])
+
+    def slow(states, actions, next_states):
+        clock[0] += 1.0
+        return to_one(states, actions, next_states)
+
+    task = Task(PhysicsDynamics(SPEC, lambda X: X.sum(-1, True)), slow, episode_length=8)
+    for seconds, again in ((5.5, False), (40.0, True)):
+        mpc = MPC(task, BOUNDS, quick(1, horizon=2, seconds=seconds))
+        assert mpc.first.seconds is None
+        _, state = mpc.predict(np.zeros(1))
+        assert clock[0] > 40  # the first plan takes its time
+        promised = state[0].promised
+        for left, x in ((7, 1.0), (6, -4.0)):
+            clock[0] = 0.0
+            _, state = mpc.predict(np.array([x]), state)
+            assert 0 < clock[0] <= seconds
+            assert len(state[0].actions) == left - 1
+        assert (not torch.equal(state[0].promised, promised)) == again
+        assert len(state[0].promised) == 8
+
+
+def test_the_default_plans_look_a_third_of_the_episode_ahead_but_not_for_ever(task):
+    for step, length, horizon in ((None, 6, 8), (0.1, 45, 1.5), (0.02, 1000, 0.6)):
+        dynamics = PhysicsDynamics(replace(SPEC, step=step), lambda X: X.sum(-1, True))
+        mpc = MPC(replace(task, dynamics=dynamics, episode_length=length), BOUNDS)
+        assert mpc.each_step.horizon == pytest.approx(horizon)
+        assert mpc.first.segment == pytest.approx(1.5 * horizon)
+    with pytest.raises(ValueError, match="horizon must be one step at least"):
+        MPC(replace(task, dynamics=dynamics), BOUNDS, quick(horizon=0.01))
+
+
 def test_deterministic_actions_are_always_the_same(task):
     mpc = MPC(task, BOUNDS, quick(0))
     before = torch.get_rng_state()
@@ -106,7 +144,7 @@ def test_sb3_evaluates_it():
     import gymnasium
 
     env = gymnasium.wrappers.TimeLimit(CartPoleSwingUpEnv(), 4)
-    few = quick(1, horizon=3)
+    few = quick(1, horizon=0.3)
     mpc = MPC(task, torch.tensor([[-10.0], [10.0]]), few, first=few)
     mean, _ = evaluate_policy(mpc, env, n_eval_episodes=1, warn=False)
     assert -4 <= mean <= 0

@@ -1,6 +1,7 @@
 """Plans of episodes, and the search that makes them."""
 
 import pickle
+import time
 from dataclasses import replace
 
 import pytest
@@ -164,7 +165,9 @@ def test_plans_are_those_of_the_generator(known_left, origin):
         ({"num_random": 0}, ValueError, "num_random must be at least 1; found 0"),
         ({"num_functions": 0}, ValueError, "num_functions must be at least 1; found 0"),
         ({"search": "cem"}, TypeError, "object of a Search, .* found 'cem'"),
-        ({"horizon": 1.5}, TypeError, "horizon must be a whole number; found 1.5"),
+        ({"horizon": 0}, ValueError, "horizon must be finite and above 0; found 0"),
+        ({"segment": "long"}, TypeError, "segment must be a number; found 'long'"),
+        ({"segment": 2.0, "seconds": 1.0}, ValueError, "leave out seconds or segment"),
         ({"spread": 0.0}, ValueError, "spread must be above 0 and below 1; found 0.0"),
         ({"max_hold": True}, TypeError, "max_hold must be a whole number; found True"),
     ],
@@ -290,16 +293,75 @@ def test_an_objective_must_score_each_sequence(origin):
         Planner(Wrong()).plan(half_steps(), origin, BOUNDS, 2)
 
 
-def test_no_search_begins_when_time_is_up(origin):
-    counted = []
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that shows 1 s more after each step of the model of :func:`slow_steps`."""
+    shown = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: shown[0])
+    return shown
 
-    def reward(states, actions, next_states):
-        counted.append(len(states))
-        return -next_states[:, 0].abs()
 
-    planner = Planner(Return(), restarts=5, seconds=1e-6, num_random=8)
-    planner.plan(replace(half_steps(), reward=reward), origin, BOUNDS, 2)
-    assert len(counted) == 2  # two steps of the first round of one search
+def slow_steps(clock):
+    def slow(states, actions, next_states):
+        clock[0] += 1.0
+        return reward(states, actions, next_states)
+
+    return replace(half_steps(), reward=slow)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "rounds", "taken", "planned"),
+    [
+        (0.5, 3, 1, 1),  # a step of the model at least
+        (3.5, 3, 3, 3),  # no further step would end in time
+        (9.5, 3, 8, 4),  # two rounds of four steps
+        (99.0, 1, 40, 4),  # five searches of two rounds
+    ],
+)
+@pytest.mark.parametrize("search", [CrossEntropy, PathIntegral])
+def test_plans_are_made_in_time(origin, clock, search, seconds, rounds, taken, planned):
+    if search is PathIntegral and seconds == 99.0:
+        taken = 60  # which asks for the mean at the end, too
+    planner = Planner(search=search(rounds), restarts=5, seconds=seconds, num_random=8)
+    plan = planner.plan(slow_steps(clock), origin, BOUNDS, 4)
+    assert clock[0] == taken
+    assert len(plan.actions) == len(plan.rewards) == len(plan.next_states) == planned
+    assert plan.value == pytest.approx(float(plan.rewards.sum()))
+
+
+def test_a_plan_that_has_time_is_that_without_a_limit(known_left, origin):
+    plans = []
+    for seconds in (None, 1e3):
+        torch.manual_seed(0)
+        planner = Planner(restarts=2, seconds=seconds, num_random=8)
+        plans.append(planner.plan(task_of(known_left), origin, BOUNDS, 3))
+    assert torch.equal(plans[0].actions, plans[1].actions)
+    assert plans[0].value == plans[1].value
+
+
+def test_horizons_are_in_the_time_unit_of_the_step(origin):
+    spec = replace(SPEC, step=0.1)
+    task = task_of(PhysicsDynamics(spec, lambda X: X[:, :1] + 0.5 * X[:, 1:]), episode_length=9)
+    for horizon, planned in ((0.3, 3), (0.1, 1), (5, 9)):
+        assert len(Planner(horizon=horizon).plan(task, origin, BOUNDS).actions) == planned
+    with pytest.raises(ValueError, match=r"horizon must be one step at least, .* 0\.1 in the time"):
+        Planner(horizon=0.05).plan(task, origin, BOUNDS)
+
+
+def test_a_plan_in_segments_holds_what_is_unstable():
+    """Where x grows by half in each step, all random sequences of a whole episode run away."""
+    dynamics = PhysicsDynamics(SPEC, lambda X: 1.5 * X[:, :1] + X[:, 1:])
+    task = task_of(dynamics, state_bounds=torch.tensor([[-9.0], [9.0]]))
+    start, found = torch.full((1,), 0.3).double(), {}
+    for segment in (None, 6):
+        torch.manual_seed(0)
+        planner = Planner(search=CrossEntropy(2), num_random=40, segment=segment)
+        found[segment] = planner.plan(replace(task), start, BOUNDS, 25)
+    assert found[None].left_bounds == 1
+    assert found[6].left_bounds == 0
+    assert found[6].made.tolist() == [1] * 25
+    states = torch.cat([start, found[6].next_states[:-1, 0]]).unsqueeze(-1)
+    torch.testing.assert_close(found[6].next_states, 1.5 * states + found[6].actions)
 
 
 def test_impossible_bounds_and_careful_plans_of_the_mean_are_refused(origin):

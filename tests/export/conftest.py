@@ -24,6 +24,7 @@ from gpadjust import (
     ZeroMeanGP,
     fit,
 )
+from gpadjust.models import PaperRRA
 from tests.systems import crude, normal, truth, uniform
 
 X = uniform(30, 2)
@@ -92,6 +93,7 @@ MODELS = {
     "ScaleGP": lambda: ScaleGP(X, Y, physics=crude),
     "ZeroMeanGP": lambda: ZeroMeanGP(X, Y),
     "RRA": lambda: RRA(X, Y, physics=crude, num_features=20),
+    "PaperRRA": lambda: PaperRRA(X, Y, physics=crude, num_features=20),
     "RRA, one output": lambda: RRA(
         X, Y[:, :1], physics=lambda X: crude(X)[..., :1], num_features=20
     ),

@@ -3,11 +3,11 @@
 import pytest
 from gpytorch.kernels import PeriodicKernel, RFFKernel, ScaleKernel
 
-from gpadjust import AR1, CKA, ParallelPartialGP, fit
+from gpadjust import AR1, CKA, CalibratedPhysics, FunctionPhysics, ParallelPartialGP, Unknown, fit
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.export import c_source, casadi_function
 from gpadjust.states import StateSpec
-from tests.export.conftest import MODELS, X, Y, fitted
+from tests.export.conftest import MODELS, X, Y, fitted, scaled
 from tests.systems import crude
 
 
@@ -27,6 +27,11 @@ def with_samples_of_parameters():
     return model
 
 
+def calibrated():
+    physics = FunctionPhysics(scaled, unknowns={"factor": Unknown(1.0, sd=0.5)})
+    return CalibratedPhysics(X, Y, physics=physics)
+
+
 def with_levels():
     return AR1(X[:10], Y[:10], low_X=X, low_Y=Y)
 
@@ -44,6 +49,7 @@ REFUSED = {
         "CategoricalInput|GroupedRBF",
     ),
     "samples": (with_samples_of_parameters, "method='map'"),
+    "no term": (calibrated, "physics_parameters"),
     "levels": (with_levels, "AR1"),
     "known noise": (lambda: CKA(X, Y, 0.1 * Y, physics=crude), "add the variance"),
     "relative noise": (lambda: CKA(X, Y, physics=crude, likelihood="relative"), "add the variance"),

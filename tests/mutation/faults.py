@@ -229,4 +229,16 @@ FAULTS = (
         "found.noise",
         "Without a rest the noise does not count what was fitted to the noise: too small.",
     ),
+    Fault(
+        "gpadjust/export/c_program.py",
+        "variance[j] += (wider * spread[g] + off * off) / SAMPLES;",
+        "variance[j] += wider * spread[g] / SAMPLES;",
+        "The variance in C forgets that the means of the samples differ.",
+    ),
+    Fault(
+        "gpadjust/export/finite_sum.py",
+        "offset=c.offset + c.size * o, size=c.size * s",
+        "offset=c.offset + o, size=c.size * s",
+        "The second of two scalings of an input takes its offset in the units of the first.",
+    ),
 )
