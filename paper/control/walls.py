@@ -195,9 +195,11 @@ def tables(runs: Sequence[Run], experiment: Walls) -> dict[str, Table]:
     def ratio(part: pd.DataFrame) -> str:
         """Of the costs of all trials of a seed to those of the true model, and its error."""
         pairs = part.groupby(["system", "seed"])[["cost", "best"]].sum(min_count=1).dropna()
+        if pairs.empty:
+            return ""
         logs = np.log(pairs.cost / pairs.best)
-        error = logs.std() / len(logs) ** 0.5
-        return f"{np.exp(logs.mean()):.2f} ± {error * np.exp(logs.mean()):.2f}" if len(logs) else ""
+        mean = np.exp(logs.mean())
+        return f"{mean:.2f} ± {mean * logs.std() / len(logs) ** 0.5:.2f}"
 
     def later(cell: Callable[[pd.DataFrame], Any]) -> Callable[[pd.DataFrame], Any]:
         return lambda part: cell(part[part.episode > 1])
