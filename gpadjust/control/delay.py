@@ -13,9 +13,9 @@ from gpadjust.dynamics.particles import step_or_nan
 from gpadjust.physics import PhysicsError
 from gpadjust.states import StateSpec
 
-_LEAST = 12  # transitions before which the action has changed, beside as many as moving states
+_LEAST = 8  # transitions before which the action has changed, beside as many as moving states
 _CLEAR = 3.0  # standard errors, by which a longer delay explains more
-_SHARE = 0.5  # of the squared errors, at most, that are left by then
+_SHARE = 0.2  # of the squared errors, at most, that are left by then
 
 
 class Delay(NamedTuple):
@@ -55,7 +55,7 @@ def find_delay(physics: Dynamics, data: Trajectories) -> Delay | None:
     before than is told, and by those between; each are those that a scale of the change and terms
     linear in the states leave, as a wrong gain is no delay. The longer delay is found if it
     explains a state better than the best shorter one: the relative differences of the squares are
-    on average above three of their standard errors, and their mean is at most half of that.
+    on average above three of their standard errors, and their mean is at most a fifth of that.
 
     Args:
         physics: The physics alone.
