@@ -4,6 +4,7 @@ from gpadjust.control.action_rate import ActionRate
 from gpadjust.control.agent import Agent, Callback
 from gpadjust.control.agents import MPCAgent, PolicySearchAgent
 from gpadjust.control.checkpoint import EpisodeCheckpoint, resume
+from gpadjust.control.constraints import margins
 from gpadjust.control.mpc import MPC, Planned
 from gpadjust.control.planner import Plan, Planner
 from gpadjust.control.policies import BoundedPolicy, linear_policy, mlp_policy
@@ -50,6 +51,7 @@ __all__ = [
     "Termination",
     "imitate",
     "linear_policy",
+    "margins",
     "mlp_policy",
     "print_progress",
     "resume",
