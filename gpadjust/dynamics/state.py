@@ -25,7 +25,9 @@ def fingerprint(kind: type, spec: StateSpec, **settings: Any) -> dict[str, str]:
     A setting that is a mapping counts by its items. Modules and other objects that have no value to
     compare are named by their class, classes and functions by their name.
     """
-    settings = {**asdict(spec), **settings}
+    # Where nothing is integrated, the step is but the unit of horizons.
+    step = spec.step if spec.integrated else None
+    settings = {**asdict(spec), "step": step, **settings}
     return {"class": kind.__name__, **{name: _text(value) for name, value in settings.items()}}
 
 

@@ -13,12 +13,7 @@ from gpadjust.export.finite_sum import ErrorTables, FiniteSum, finite_sum, model
 from gpadjust.export.transition import next_state, next_variance, target_columns
 from gpadjust.models import TermsModel
 
-ca: Any
-try:
-    import casadi as ca
-except ImportError:  # C needs none
-    ca = None
-
+ca: Any = None  # CasADi, once it is needed: its libraries and OpenSim's cannot share a process
 _TINY = 1e-30  # of a squared distance, at which its root has a derivative
 
 
@@ -58,13 +53,18 @@ def casadi_function(
         >>> from gpadjust.export import casadi_function
         >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
         >>> model = CKA(X, 2 * X, physics=lambda X: X)
-        >>> casadi_function(model, physics=lambda x: x)
+        >>> casadi_function(model, physics=lambda x: x)  # doctest: +SKIP
         Function(predict:(x)->(mean,variance) MXFunction)
     """
-    if ca is None:
-        raise ImportError('casadi_function needs CasADi; run `pip install "gpadjust[export]"`.')
     model = model_of(fitted)
     found, m = finite_sum(model, variance, observation_noise), model.num_outputs
+    global ca
+    try:
+        import casadi as ca
+    except ImportError as error:
+        raise ImportError(
+            'casadi_function needs CasADi; run `pip install "gpadjust[export]"`.'
+        ) from error
     dynamics = fitted if isinstance(fitted, LearnedDynamics) else None
     if dynamics is None:
         given = {"x": ca.MX.sym("x", len(model.input_names))}

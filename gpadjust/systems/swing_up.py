@@ -47,7 +47,8 @@ CART_POLE_RAW_SPEC = replace(CART_POLE_SPEC, angles=())
 
 def cart_pole_spec(encode_angle: bool = True, time_step: float = TIME_STEP) -> StateSpec:
     """Return the spec of these options of the environment."""
-    return replace(CART_POLE_SPEC if encode_angle else CART_POLE_RAW_SPEC, step=time_step)
+    step = checked_number("time_step", time_step, above=0)
+    return replace(CART_POLE_SPEC if encode_angle else CART_POLE_RAW_SPEC, step=step)
 
 
 @dataclass(frozen=True)

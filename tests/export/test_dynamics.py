@@ -11,6 +11,7 @@ from gpadjust import CKA, RRA
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.export import c_source, casadi_function
 from gpadjust.states import StateSpec
+from tests.export.apart import apart
 from tests.export.conftest import called, compiled
 from tests.systems import normal, uniform
 
@@ -34,7 +35,8 @@ def pushed(X):
 
 
 def pushed_in_casadi(read):
-    ca = pytest.importorskip("casadi")
+    import casadi as ca
+
     angle, x, rate, speed, force = ca.vertsplit(read)
     rate_, speed_ = rate - 0.9 * ca.sin(angle) + 0.1 * speed, speed + 0.1 * force
     return ca.vertcat(angle + 0.1 * rate_, x + 0.1 * speed_, rate_, speed_)
@@ -72,8 +74,8 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
+@apart
 def test_programs_say_the_next_state_and_its_variance(case, tmp_path):
-    pytest.importorskip("casadi")
     dynamics = CASES[case]()
     states, actions = 2 * uniform(5, 6, low=-2.0, high=2.0, seed=3), uniform(5, 1, seed=4)
     f_p = dynamics.physics(dynamics.spec.physics_inputs(states, actions))
@@ -91,8 +93,8 @@ def test_programs_say_the_next_state_and_its_variance(case, tmp_path):
 
 
 @pytest.mark.parametrize("case", ["difference", "late"])
+@apart
 def test_a_physics_in_casadi_takes_the_place_of_its_values(case):
-    pytest.importorskip("casadi")
     dynamics = CASES[case]()
     state, action = normal(6, seed=5), normal(1, seed=6)
     step = casadi_function(dynamics, "step", physics=pushed_in_casadi, observation_noise=True)
@@ -102,8 +104,8 @@ def test_a_physics_in_casadi_takes_the_place_of_its_values(case):
         torch.testing.assert_close(value, expected, rtol=1e-9, atol=1e-14)
 
 
+@apart
 def test_casadi_has_the_slopes_of_the_mean():
-    pytest.importorskip("casadi")
     dynamics = learnt()
     state, action = normal(6, seed=5), normal(1, seed=6)
     step = casadi_function(dynamics, physics=pushed_in_casadi, variance=False)

@@ -1,9 +1,12 @@
 """Programs of models say what the models predict."""
 
+import doctest
+
 import pytest
 import torch
 
 from gpadjust.export import c_source, casadi_function
+from tests.export.apart import apart
 from tests.export.conftest import CANCELS, MODELS, called, compiled, fitted
 from tests.systems import uniform
 
@@ -34,8 +37,8 @@ def test_c_says_what_the_model_predicts(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", MODELS)
+@apart
 def test_casadi_says_what_the_model_predicts(name):
-    pytest.importorskip("casadi")
     model = fitted(name)
     function = casadi_function(model)
     for *given_, mean, variance in zip(
@@ -43,3 +46,10 @@ def test_casadi_says_what_the_model_predicts(name):
     ):
         found = function(*(each.numpy() for each in given_))
         agrees(name, [torch.tensor(each.full()[:, 0]) for each in found], (mean, variance))
+
+
+@apart
+def test_the_example_runs():
+    example = casadi_function.__doc__.replace("  # doctest: +SKIP", "")
+    found = doctest.DocTestParser().get_doctest(example, {}, "example", None, 0)
+    assert doctest.DocTestRunner().run(found).failed == 0

@@ -1,5 +1,7 @@
 """Files that are the same, and what is no finite sum."""
 
+import sys
+
 import pytest
 from gpytorch.kernels import PeriodicKernel, RFFKernel, ScaleKernel
 
@@ -7,6 +9,7 @@ from gpadjust import AR1, CKA, CalibratedPhysics, FunctionPhysics, ParallelParti
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.export import c_source, casadi_function
 from gpadjust.states import StateSpec
+from tests.export.apart import apart
 from tests.export.conftest import MODELS, X, Y, fitted, scaled
 from tests.systems import crude
 
@@ -90,13 +93,13 @@ def test_a_file_without_variance_is_small():
     assert len(mean) < len(whole) / 3
 
 
+@apart
 def test_a_physics_that_returns_another_number_of_values_is_refused():
-    pytest.importorskip("casadi")
     with pytest.raises(ValueError, match="column of 2 values"):
         casadi_function(fitted("CKA"), physics=lambda x: x[0])
 
 
 def test_without_casadi_there_is_a_way_out(monkeypatch):
-    monkeypatch.setattr("gpadjust.export.casadi_program.ca", None)
+    monkeypatch.setitem(sys.modules, "casadi", None)
     with pytest.raises(ImportError, match=r"gpadjust\[export\]"):
         casadi_function(fitted("CKA"))
