@@ -199,7 +199,8 @@ def tables(runs: Sequence[Run], experiment: Walls) -> dict[str, Table]:
             return ""
         logs = np.log(pairs.cost / pairs.best)
         mean = np.exp(logs.mean())
-        return f"{mean:.2f} ± {mean * logs.std() / len(logs) ** 0.5:.2f}"
+        error = mean * logs.std() / len(logs) ** 0.5
+        return f"{mean:.2f} ± {error:.2f}" if len(logs) > 1 else f"{mean:.2f}"
 
     def later(cell: Callable[[pd.DataFrame], Any]) -> Callable[[pd.DataFrame], Any]:
         return lambda part: cell(part[part.episode > 1])
@@ -235,7 +236,7 @@ def draw(runs: Sequence[Run], experiment: Walls) -> list[Path]:
 
 
 _DRAWN = {
-    "hard": ("tab:red", "constraints in the mean, no margin"),
     "margin": ("tab:blue", "margins, probability 0.95"),
+    "hard": ("tab:red", "constraints in the mean, no margin"),
 }
 _SEEN = {"cart": (-0.1, 0.04), "cart-pole": (-0.6, 0.15), "tanks": (-3.0, 0.6)}
