@@ -161,7 +161,12 @@ def test_a_state_is_of_the_same_dynamics():
             "target is 'difference' in the state",
         ),
         (lambda: LearnedDynamics(StateSpec(["y", "v"], ["a"]), push), r"states is \('x', 'v'\)"),
-        (lambda: LearnedDynamics(StateSpec(["x", "v"], ["a"], step=0.1), push), "step is None"),
+        (
+            lambda: LearnedDynamics(
+                StateSpec(["x", "v"], ["a"], integrated={"x": "v"}, step=0.1), push
+            ),
+            "integrated is",
+        ),
     ],
 )
 def test_a_state_of_others_is_refused(make, message):
