@@ -163,7 +163,7 @@ def test_reaching_runs_and_their_tables(tmp_path):
         "targets",
         "seconds",
     }
-    assert "too few runs of cka" in tables["targets"].text
+    assert "no results of cka-slow" in tables["targets"].text
     assert [path.name for path in experiment.draw(records)] == ["curves.png", "map.png"]
 
 

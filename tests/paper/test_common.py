@@ -220,6 +220,8 @@ def test_committed_runs_have_the_settings_of_today(name):
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_tables_are_those_of_the_committed_runs(name):
     experiment, runs = committed(name)
+    if not runs:
+        pytest.skip("it was not run yet")
     shown = results(PAPER / "results")
     # Old records have no commit, new ones have, or None outside a repository.
     records = [
