@@ -24,7 +24,7 @@ CHAPTERS = {
         *("Balldrop", "Categories", "Curves", "Drift", "Emulated", "Hints", "Links"),
         *("Noisyinputs", "Outliers", "Relative", "Repeats", "Sisters", "Vanishing"),
     ),
-    "control": ("Known", "Hidden", "Setpoints", "Delays", "Walls"),
+    "control": ("Known", "First", "Ontime", "Hidden", "Setpoints", "Delays", "Walls"),
     "machines": ("Real", "Elsewhere", "Tanks", "Foresight", "Kinks"),
 }
 """Folders, and the classes of the experiments that they declare."""

@@ -258,3 +258,51 @@ class Delays(Experiment):
         """Four times as many of the runs that only ask whether the delay is found."""
         more = 4 if str(kind[0]).startswith("hint") else 1
         return range(self.seed, self.seed + more * self.runs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FirstSettings:
+    """Settings that decide the numbers: nearly all are the library's defaults."""
+
+    trials: int = 5
+    """real trials of a run, of which the first goes by f_p"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class First(Experiment):
+    """The first trials of cart-poles, by the library's defaults; found with seeds of 100 on."""
+
+    runs: int = 20
+    out: Path = Path("results/first")
+    settings: FirstSettings = field(default_factory=FirstSettings)
+
+    axes: ClassVar[Axes] = {"model": {"cka": "CKA", "truth": "the true system"}}
+    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "gymnasium")
+    calls: ClassVar[tuple[str, ...]] = (*Setpoints.calls, "gpadjust.control.MPC")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OntimeSettings:
+    """Settings that decide the numbers."""
+
+    random_trials: int = 4
+    """real trials of random actions, of 25 steps"""
+    trials: int = 2
+    """real trials that are planned in time"""
+    horizon: float = 0.8
+    """s that a plan looks ahead"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ontime(Experiment):
+    """Decisions of the cart-pole that have a time; measured on an idle core."""
+
+    runs: int = 4
+    out: Path = Path("results/ontime")
+    settings: OntimeSettings = field(default_factory=OntimeSettings)
+
+    axes: ClassVar[Axes] = {
+        "seconds": {"none": "none", "0.1": "0.1", "0.05": "0.05", "0.02": "0.02"}
+    }
+    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "gymnasium")
+    calls: ClassVar[tuple[str, ...]] = First.calls
