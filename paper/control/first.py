@@ -24,14 +24,13 @@ def run(experiment: First, model: str, seed: int) -> Run:
         spec = cart_pole_spec()
         physics = equation_physics(REAL_CART_POLE, spec.step or 1.0)
         task = system.task(PhysicsDynamics(spec, physics))
-    agent, rows = MPCAgent(env, task, seed=seed), list[tuple[float, float]]()
-    length = agent.episode_length()
+    agent = MPCAgent(env, task, seed=seed)
+    length, costs, promises = agent.episode_length(), list[float](), list[float]()
     for _ in range(experiment.settings.trials):
         agent.learn(length)
-        cost = -agent.recorded_episodes(newest=length).rewards.mean().item()
-        rows.append((cost, -(agent.promised_reward or 0.0)))
-    cost, promised = zip(*rows, strict=True)
-    return {"trials": {"cost": [*cost], "promised": [*promised]}}
+        costs.append(-agent.recorded_episodes(newest=length).rewards.mean().item())
+        promises.append(-(agent.promised_reward or 0.0))
+    return {"trials": {"cost": costs, "promised": promises}}
 
 
 def tables(runs: Sequence[Run], experiment: First) -> dict[str, Table]:
