@@ -7,8 +7,7 @@ import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from itertools import groupby
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, Self
 
 import cloudpickle
 import gymnasium as gym
@@ -20,38 +19,26 @@ from torch import Tensor
 from gpadjust.checks import check_kind, checked_number, checked_whole
 from gpadjust.control.checkpoint import (
     EpisodeCheckpoint,
-    locked,
     packed,
     pickled_environment,
     unpacked,
 )
 from gpadjust.control.pickled_agent import pickled, unpickled
 from gpadjust.control.random_state import RandomState
+from gpadjust.control.real_steps import RealStep, RealSteps
 from gpadjust.control.recorded_episodes import RecordedEpisodes, learn_dynamics
 from gpadjust.control.search import random_sequences
-from gpadjust.control.smoothed_episodes import Seen, smooth_episodes
+from gpadjust.control.smoothed_episodes import smooth_episodes
 from gpadjust.control.state_filter import StateFilter
 from gpadjust.control.step_guard import StepGuard
 from gpadjust.control.task import Task
-from gpadjust.control.task_agent import TaskAgent
+from gpadjust.control.task_agent import TaskAgent, locked
 from gpadjust.dynamics.free_run import checked_horizons
 
 MAX_HOLD = 5  # steps of a random action
-_ENDS = slice(None, -1), slice(1, None)  # of the steps along a path
 
 Callback = Callable[["Agent", str, dict[str, float]], Any]
 """What is called with the agent, the name of an event, and its numbers; see :class:`Agent`."""
-
-
-class _Step(NamedTuple):
-    """A real step, as the environment has it; its action in the scale of [-1, 1]."""
-
-    episode: int
-    observation: NDArray[Any]
-    action: NDArray[Any]
-    following: NDArray[Any]
-    reward: float
-    terminated: bool
 
 
 class Agent(TaskAgent):
@@ -122,7 +109,6 @@ class Agent(TaskAgent):
     not_saved: ClassVar[tuple[str, ...]] = (
         "env",
         "_steps",
-        "_states",
         "_callbacks",
         "_random_state",
     )
@@ -163,8 +149,7 @@ class Agent(TaskAgent):
         self.promised_reward: float | None = None
         self.wall_time = dict.fromkeys(("plan", "fit", "update"), 0.0)
         self.notes: dict[str, Any] = {}
-        self._steps: list[_Step] = []
-        self._states: list[Tensor] = []  # of each episode that was smoothed, T + 1 x state_dim
+        self._steps = RealSteps()
         self._promises: list[float | None] = []  # one for each episode
         self._start: NDArray[Any] | None = None  # where the next episode begins, after a reset
         self._env_seed = seed  # of the first reset
@@ -268,7 +253,7 @@ class Agent(TaskAgent):
             failed = bool(info.get("step_failed"))
             if not failed:
                 row = (observation, action, following, float(reward), bool(terminated))
-                self._steps.append(_Step(episode, *row))
+                self._steps.steps.append(RealStep(episode, *row))
                 rewards.append(float(reward))
             self.tell("step", {"reward": float(reward)})
             if failed or terminated or truncated:
@@ -340,22 +325,15 @@ class Agent(TaskAgent):
 
     def _smooth(self) -> None:
         """Estimate the states behind all episodes, and the noises, in the newest model."""
-        by_episode = [[*steps] for _, steps in groupby(self._steps, key=lambda step: step.episode)]
-        if not by_episode:
+        seen = self._steps.seen(self._unscaled)
+        if not seen:
             return
-        seen = [
-            Seen(
-                torch.from_numpy(np.array([steps[0].observation, *(s.following for s in steps)])),
-                torch.from_numpy(self._unscaled(np.array([s.action for s in steps]))),
-            )
-            for steps in by_episode
-        ]
         newest = self.task.dynamics.before_data()
         assert newest is not None, "checked at the start"
         task = replace(self.task, dynamics=newest)
         known = self.filter
         assert known is not None, "there are sensors"
-        self._filter, self._states = smooth_episodes(task, known, seen, len(seen))
+        self._filter, self._steps.paths = smooth_episodes(task, known, seen, len(seen))
 
     def _improve(self) -> None:
         """Improve in what is known, if that is something and actions are not to be random."""
@@ -411,31 +389,7 @@ class Agent(TaskAgent):
 
         With sensors the states are drawn from what is known of them since they were last learnt.
         """
-        spec, steps, states = self.task.observed, self._steps, self._states
-        if self.task.sensors is not None:
-            steps = steps[: sum(len(path) - 1 for path in states)]
-        shapes = [(), (spec.observation_dim,), (spec.action_dim,), (spec.observation_dim,), (), ()]
-        columns = zip(*steps, strict=True) if steps else [()] * len(shapes)
-        episode, seen, actions, following, rewards, terminated = (
-            torch.from_numpy(np.array(column, dtype=np.float64).reshape(len(steps), *shape))
-            for column, shape in zip(columns, shapes, strict=True)
-        )
-        episode = episode.long()
-        found = RecordedEpisodes(
-            self.task.dynamics.spec,
-            spec.decode(seen),
-            torch.from_numpy(self._unscaled(actions.numpy())),
-            spec.decode(following),
-            rewards,
-            terminated.bool(),
-            episode,
-            begins=torch.cat([torch.tensor([True]), episode.diff() > 0])[: len(steps)],
-            whole=torch.ones(len(steps), dtype=torch.bool),
-        )
-        if self.task.sensors is not None and steps:
-            ends = [torch.cat([path[part] for path in states]) for part in _ENDS]
-            found = replace(found, states=ends[0], next_states=ends[1])
-        return found if newest is None else found.some(slice(max(len(steps) - newest, 0), None))
+        return self._steps.recorded(self.task, self._unscaled, newest)
 
     def env_attribute(self, name: str) -> Any:
         """An attribute of the environment or of one that it wraps."""
@@ -561,13 +515,12 @@ class Agent(TaskAgent):
         """Settings and counts, the real steps, what the dynamics learnt, and the environment."""
         left_out = {name for each in type(self).__mro__ for name in vars(each).get("not_saved", ())}
         state = {name: part for name, part in vars(self).items() if name not in left_out}
-        columns = [torch.from_numpy(np.array(part)) for part in zip(*self._steps, strict=True)]
         env = pickled_environment(self.env)
         if env is None:
             state["_start"] = None  # it will be reset
         return {
             "agent.pkl": pickled(state, self),
-            "steps.pt": packed({"columns": columns, "states": self._states}),
+            "steps.pt": packed(self._steps.state_dict()),
             "dynamics.pt": packed(self.task.dynamics.state_dict()),
             "environment.pkl": env or b"",
         }
@@ -575,15 +528,11 @@ class Agent(TaskAgent):
     @classmethod
     def from_parts(cls, parts: dict[str, bytes], env: Any, task: Task) -> Self:
         """The agent that :meth:`saved_parts` saved."""
-        steps = unpacked(parts["steps.pt"])
+        steps = RealSteps.of(unpacked(parts["steps.pt"]))
         task.dynamics.load_state_dict(unpacked(parts["dynamics.pt"]))
         agent = cls.__new__(cls)
         agent.task, agent._callbacks = task, []
         agent.env = cloudpickle.loads(parts["environment.pkl"]) if parts["environment.pkl"] else env
-        agent._steps = [
-            _Step(*(value.numpy() if value.dim() else value.item() for value in row))
-            for row in zip(*steps["columns"], strict=True)
-        ]
-        agent._states = steps["states"]
+        agent._steps = steps
         vars(agent).update(unpickled(parts["agent.pkl"], agent))
         return agent

@@ -8,8 +8,6 @@ import os
 import pickle
 import warnings
 import zipfile
-from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -125,16 +123,6 @@ class EpisodeCheckpoint:
             ) from error
         finally:
             temporary.unlink(missing_ok=True)
-
-
-@contextmanager
-def locked(callbacks: Iterable[Any]) -> Iterator[None]:
-    """Hold the locks of all checkpoints among some callbacks."""
-    with ExitStack() as held:
-        for each in callbacks:
-            if isinstance(each, EpisodeCheckpoint):
-                held.enter_context(each.locked())
-        yield
 
 
 def resume(path: str | Path, env: Any, task: Task, algorithm: type[TaskAgent] | None = None) -> Any:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any, Self
 
 import numpy as np
@@ -137,6 +137,16 @@ class TaskAgent(ABC):
     @abstractmethod
     def from_parts(cls, parts: dict[str, bytes], env: Any, task: Task) -> Self:
         """The agent of these files."""
+
+
+@contextmanager
+def locked(callbacks: Iterable[Any]) -> Iterator[None]:
+    """Hold the locks of the callbacks that have one, as checkpoints do."""
+    with ExitStack() as held:
+        for each in callbacks:
+            if (lock := getattr(each, "locked", None)) is not None:
+                held.enter_context(lock())
+        yield
 
 
 def layer_names(env: Any) -> list[str]:
