@@ -51,10 +51,13 @@ def test_a_run_that_is_killed_ends_as_one_that_is_not(start, name, tmp_path):
             if not process.is_alive():
                 assert process.exitcode == 0
                 break
-            resumed += any(folder.rglob("*.ckpt"))
             process.kill()
             process.join()
             kills += 1
+            if any(folder.rglob("*.ckpt")):
+                resumed += 1
+            else:  # the machine has become slower
+                span *= 1.5
         assert_equal(found(folder), whole)
         if kills == KILLS:
             break

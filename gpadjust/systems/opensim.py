@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -73,6 +74,7 @@ def load_opensim() -> ModuleType:
     Raises:
         ImportError: If it is missing. One that is installed but broken raises its own error.
     """
+    libraries = os.environ.get("LD_LIBRARY_PATH")
     try:
         import opensim
     except ModuleNotFoundError as error:
@@ -81,6 +83,10 @@ def load_opensim() -> ModuleType:
         raise ImportError(
             'The muscle arm needs OpenSim; run `pip install "gpadjust[arm]"`.'
         ) from error
+    finally:  # or processes that are started later load OpenSim's libraries for their own CasADi's
+        os.environ.pop("LD_LIBRARY_PATH", None)
+        if libraries is not None:
+            os.environ["LD_LIBRARY_PATH"] = libraries
     opensim.Logger.setLevelString("off")
     return opensim
 

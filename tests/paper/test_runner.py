@@ -376,10 +376,14 @@ def test_report_takes_no_options(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # of Ray
 def test_runs_on_ray(tmp_path):
-    pytest.importorskip("ray")
+    ray = pytest.importorskip("ray")
     from paper.forrester import Forrester, Settings
 
     settings = Settings(steps=1, lengthscales=(0.5,), ridges=(0.01,))
     experiment = Forrester(out=tmp_path, runs=2, jobs=2, backend="ray", settings=settings)
-    run_missing(experiment)
+    ray.init("local", num_cpus=2)  # not a cluster of another test
+    try:
+        run_missing(experiment)
+    finally:
+        ray.shutdown()
     assert len(runs_file(experiment).read()) == 12

@@ -455,6 +455,20 @@ def test_a_broken_opensim_says_so_itself(tmp_path, monkeypatch, content, message
     assert "pip install" not in str(error.value)
 
 
+@pytest.mark.slow
+def test_child_processes_load_libraries_of_their_own(tmp_path):
+    pytest.importorskip("casadi")
+    code = (
+        "import subprocess, sys\n"
+        "from gpadjust.systems.opensim import load_opensim\n"
+        "load_opensim()\n"
+        "subprocess.run([sys.executable, '-c', 'import casadi; print(casadi.SX(2))'], check=True)\n"
+    )
+    run = python(code, tmp_path)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.strip() == "2"
+
+
 def test_the_logger_is_switched_off_once():
     opensim = load_opensim()
     opensim.Logger.setLevelString("critical")
