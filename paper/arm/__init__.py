@@ -122,7 +122,7 @@ class ReachingSettings:
     """of the muscles; a healthy arm's is 1"""
 
 
-SLOW: dict[str, Any] = {"updates": 60, "starts": 24, "learning_rate": 3e-3}
+SLOW: dict[str, Any] = {"updates": 100, "starts": 96, "learning_rate": 3e-3}
 """Settings of the learner that searches at the library's learning rate."""
 
 
