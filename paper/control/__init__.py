@@ -22,23 +22,34 @@ HORIZONS = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class KnownSettings:
-    """Settings that decide the numbers; found with the true systems and seeds of 20 and more."""
+class Planned:
+    """Settings of trials that are planned by the cross-entropy method."""
 
-    trials: int = 3
+    trials: int = 5
     """real trials of a run, of which the first goes by f_p, or is random where there is none"""
-    sequences: int = 128
+    sequences: int = 64
     """that are planned, in each round of the cross-entropy method"""
-    spread: float = 0.15
-    """of these about the earlier plan, in shares of the range of the actions"""
-    rounds: int = 0
+    rounds: int = 1
     """of these after the first"""
-    first_rounds: int = 2
+    first_rounds: int = 8
     """of these when a trial begins, with all its steps"""
-    elites: int = 12
+    elites: int = 8
     """of these"""
     fit: Literal["map", "bayes"] = "map"
     """of the learnt models; "bayes", the default of the library, takes twice as long"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownSettings(Planned):
+    """Settings that decide the numbers; found with the true systems and seeds of 20 and more."""
+
+    trials: int = 3
+    sequences: int = 128
+    rounds: int = 0
+    first_rounds: int = 2
+    elites: int = 12
+    spread: float = 0.15
+    """of the sequences about the earlier plan, in shares of the range of the actions"""
     networks: int = 5
     """of an ensemble"""
     training: int = 250
@@ -81,23 +92,11 @@ class Known(Experiment):
 
 
 @dataclass(frozen=True, kw_only=True)
-class HiddenSettings:
+class HiddenSettings(Planned):
     """Settings that decide the numbers; found with seeds of 100 and more."""
 
-    trials: int = 5
-    """real trials of a run, of which the first goes by f_p"""
     noise: float = 0.01
     """standard deviation of the sensors' noise, in m and rad"""
-    sequences: int = 64
-    """that are planned, in each round of the cross-entropy method"""
-    rounds: int = 1
-    """of these after the first"""
-    first_rounds: int = 8
-    """of these when a trial begins, with all its steps"""
-    elites: int = 8
-    """of these"""
-    fit: Literal["map", "bayes"] = "map"
-    """of the learnt models, as of `gpadjust.fit`"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,27 +124,17 @@ class Hidden(Experiment):
 
 
 @dataclass(frozen=True, kw_only=True)
-class WallsSettings:
+class WallsSettings(Planned):
     """Settings that decide the numbers; found with seeds of 100 and more."""
 
-    trials: int = 5
-    """real trials of a run, of which the first goes by f_p with its stated error"""
-    probability: float = 0.95
-    """of constraints holding through a trial"""
     sequences: int = 40
-    """that are planned, in each round of the cross-entropy method"""
+    first_sequences: int = 64
+    """of these when a trial begins"""
+    first_rounds: int = 2
     horizon: int = 8
     """steps that are planned ahead at each step"""
-    rounds: int = 1
-    """of these after the first"""
-    first_sequences: int = 64
-    """that are planned when a trial begins, of all its steps"""
-    first_rounds: int = 2
-    """of these after the first"""
-    elites: int = 8
-    """of a round"""
-    fit: Literal["map", "bayes"] = "map"
-    """of the learnt models, as of `gpadjust.fit`"""
+    probability: float = 0.95
+    """of constraints holding through a trial"""
 
 
 @dataclass(frozen=True, kw_only=True)
