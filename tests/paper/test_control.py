@@ -90,6 +90,7 @@ def test_a_physics_of_another_name_is_refused():
         FURUTA.physics("fitted")
 
 
+@pytest.mark.slow
 def test_rivals_of_a_system_make_a_table():
     known = Known(settings=LIGHT)
     runs = []
@@ -103,6 +104,7 @@ def test_rivals_of_a_system_make_a_table():
     assert "| f_p and an ensemble of networks | 0.0" in text
 
 
+@pytest.mark.slow
 def test_hidden_rates_make_a_table(tmp_path):
     settings = HiddenSettings(trials=2, sequences=8, rounds=0, first_rounds=0, elites=2)
     hidden, runs = Hidden(settings=settings, out=tmp_path), []

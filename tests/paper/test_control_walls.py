@@ -32,6 +32,7 @@ def test_physics_errors_are_those_of_a_step_of_each_system(name):
         assert found[spec.states.index(state)] < 3 * sd
 
 
+@pytest.mark.slow
 def test_walls_make_a_table_and_a_figure(tmp_path):
     walls, runs = Walls(settings=TINY, out=tmp_path), []
     for controller in ("margin", "truth"):
