@@ -313,11 +313,12 @@ class Agent(TaskAgent):
         if bounds is not None and self.task.state_bounds is None:
             new.warn_of_bounds(bounds)
         self.model, self._is_improved = None, False  # it is not the newest any more
+        real = recorded.rewards[recorded.episode >= self.num_episodes].mean()
         promises, self.num_episodes = self._promises[self.num_episodes :], len(self._promises)
         kept = [each for each in promises if each is not None]
         # Of actions that were random nothing was promised.
         self.promised_reward = sum(kept) / len(kept) if kept and kept == promises else None
-        values["real_reward"] = float(new.rewards.mean())
+        values["real_reward"] = float(real)
         if self.promised_reward is not None:
             values["promised_reward"] = self.promised_reward
             self._compare(values, recorded.rewards)
@@ -430,6 +431,12 @@ class Agent(TaskAgent):
             self._random_state = None
         if self.task.sensors is not None:
             self._check_sensors()
+        rate = self.task.rate
+        if self.action_noise is not None and rate is not None and rate.most is not None:
+            raise ValueError(
+                "Noise on the actions may change them by more than action_rate allows; leave "
+                "action_noise out, or the limit."
+            )
         self.try_task(np.atleast_2d(self._reset()), self.env.action_space)
 
     def _check_sensors(self) -> None:
@@ -439,6 +446,7 @@ class Agent(TaskAgent):
                 "Hidden states are estimated in a model of the system; give the dynamics a "
                 "physics, or leave the sensors out."
             )
+        self.task.dynamics.state_dict()  # or an error: they learn all again after each episode
         if self.action_noise is not None:
             raise ValueError(
                 "The estimate of hidden states takes the actions for those that were chosen; leave "
@@ -454,11 +462,15 @@ class Agent(TaskAgent):
 
     def _random_actions(self) -> Iterator[NDArray[Any]]:
         """Random actions, held for some steps, for the episode and, if it is longer, beyond."""
-        num_steps, bounds = self.episode_length(), self.action_bounds()
+        num_steps, bounds, rate = self.episode_length(), self.action_bounds(), self.task.rate
+        before: Tensor | None = None
         while True:
-            for action in random_sequences(1, num_steps, bounds, MAX_HOLD)[0]:
+            sequences = random_sequences(1, num_steps, bounds, MAX_HOLD)
+            if rate is not None:
+                sequences = rate.limited(sequences, before)
+            for action in sequences[0]:
                 yield action.numpy().astype(self.env.action_space.dtype)
-            num_steps = 1
+            num_steps, before = 1, sequences[0, -1]
 
     def _scaled(self, action: NDArray[Any], noisy: bool = False) -> NDArray[Any]:
         """An action in the scale of [-1, 1], in which noise is added and steps are kept.

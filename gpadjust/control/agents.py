@@ -186,8 +186,7 @@ class PolicySearchAgent(Agent):
 
     def try_task(self, observations: NDArray[Any], action_space: Any) -> None:
         """Call the task's functions, and refuse what a policy cannot keep."""
-        for part in ("constraints", "action_rate"):
-            self.task.refuse(type(self).__name__, part, "MPCAgent can")
+        self.search.check_task(self.task)
         super().try_task(observations, action_space)
 
     def improve(self, task: Task) -> bool:

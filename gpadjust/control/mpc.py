@@ -186,11 +186,10 @@ class MPC:
             before = [None if each is None else each.estimate for each in episodes]
             found = known = self.filter.follow(self.task, rows, before)
             states = [each.mean for each in found]
-        with seeded(self.seed if deterministic else None):
-            plans = [
-                self.plan(at, earlier, None if seen is None else seen.covariance)
-                for at, earlier, seen in zip(states, episodes, known, strict=True)
-            ]
+        plans = []
+        for at, earlier, seen in zip(states, episodes, known, strict=True):
+            with seeded(self.seed if deterministic else None):  # whatever the other rows are
+                plans.append(self.plan(at, earlier, None if seen is None else seen.covariance))
         actions = torch.stack([plan.actions[0] for plan in plans]).numpy().astype(np.float32)
         return (actions if np.ndim(observation) > 1 else actions[0]), tuple(
             plan._replace(

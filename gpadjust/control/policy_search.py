@@ -112,6 +112,11 @@ class PolicySearch:
             checked_number(name, getattr(self, name), above=0)
         check_kind("guide", self.guide, Planner | None, "a Planner, or None")
 
+    def check_task(self, task: Task) -> None:
+        """Raise a ValueError if a task has what a policy cannot keep."""
+        for part in ("constraints", "action_rate"):
+            task.refuse(type(self).__name__, part, "MPCAgent can")
+
     def improve(
         self,
         policy: Callable[[Tensor], Tensor],
@@ -143,6 +148,7 @@ class PolicySearch:
                 f"policy must be a module with parameters, such as mlp_policy(...); found "
                 f"{policy!r}."
             )
+        self.check_task(task)
         if task.episode_length is None:
             raise ValueError("A policy search needs a task with episode_length; found None.")
         home = next(policy.parameters()).device

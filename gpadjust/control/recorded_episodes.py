@@ -216,8 +216,11 @@ class RecordedEpisodes:
         said = task.set_points(self.states[known], self.steps[known])
         if said is None:
             return
-        found = self.next_states[known][:, self.spec.exogenous_columns]
-        off = ((said - found).abs() > _ROUNDING * found.abs().clamp_min(1.0)).any(1).nonzero()
+        columns, after = self.spec.exogenous_columns, self.next_states[known]
+        found, expected = after[:, columns], after.clone()
+        expected[:, columns] = said
+        apart = self.spec.change(expected, after)[:, columns].abs()  # of angles the shortest way
+        off = (apart > _ROUNDING * found.abs().clamp_min(1.0)).any(1).nonzero()
         if len(off):
             i = int(off[0])
             raise ValueError(

@@ -63,7 +63,7 @@ def smooth_episodes(
     spec, paths = task.dynamics.spec, _filtered(task, known, episodes)
     first, covariance, _ = known.start
     near = [path[0] + spec.change(path[0], first) for path in paths]
-    starts = [(mean.numpy(), covariance.diagonal().numpy()) for mean in near]
+    starts = [(mean.numpy(), covariance.numpy()) for mean in near]
     noise = known.noise.square().numpy()
     prior, weight = _prior(task, noise)
     links, predicted = _links(task, paths, episodes)
@@ -76,7 +76,7 @@ def smooth_episodes(
         step = torch.from_numpy(steps.mean(0))[spec.predicted]
         new = np.concatenate([likely, spec.complete_variance(step).numpy()])
         old = np.concatenate([noise, added])
-        moved = np.log(new.clip(_TINY) / old.clip(_TINY))
+        moved = np.log(new.clip(_TINY) / old.clip(_TINY), where=old > 0, out=np.zeros_like(old))
         noise, added = np.split(old * np.exp(_LONGER * moved), [len(noise)])
         if (np.abs(moved) < _STEADY).all():
             break

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -147,6 +148,11 @@ class Task:
                     "Of hidden states it must be known where episodes start; pass initial_states, "
                     "or start of a System, as well as sensors."
                 )
+            if self.reference is not None:
+                raise ValueError(
+                    "The estimate of hidden states takes set-points for constant; leave reference "
+                    "out, or the sensors."
+                )
         if self.probability is not None:
             checked_number("probability", self.probability, above=0, below=1)
         if self.rate is not None:
@@ -199,6 +205,12 @@ class Task:
                     f"of which angles (seen as sine and cosine): {tuple(spec.angles)}; actions: "
                     f"{tuple(spec.actions)}."
                 )
+        if not np.isfinite([action_space.low, action_space.high]).all():
+            raise ValueError(
+                f"Actions must have bounds, between which plans and policies choose; found "
+                f"{action_space}. Wrap the environment in gymnasium.wrappers.RescaleAction, or give "
+                "its action space numbers."
+            )
 
     def refuse(self, learner: str, name: str, way_out: str) -> None:
         """Raise a ValueError if the task has a part of this name, with which a learner cannot do.

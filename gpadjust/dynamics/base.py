@@ -343,7 +343,7 @@ class Dynamics(ABC):
     def _not_saved(self) -> str:
         return (
             f"{type(self).__name__} cannot be saved or loaded. Give it state_dict() and "
-            "load_state_dict(state), or do without checkpoints."
+            "load_state_dict(state), or do without checkpoints and sensors."
         )
 
     def _checked(self, states: Tensor, actions: Tensor, next_states: Tensor) -> Trajectories:

@@ -48,18 +48,18 @@ def smooth_chain(
     """All stretches of a chain, one after the other (Rauch, Tung and Striebel 1965).
 
     The last entries of a state, beyond those that a stretch starts again with, are constants that
-    all stretches share. Starts are means and variances ``d`` of the first state of each stretch, of
-    the first one of all ``D`` entries; the noise is variances ``m``, the process noise ``d``.
+    all stretches share. Starts are means ``d`` and covariances ``d x d`` of the first state of each
+    stretch, of the first one of all ``D`` entries; the noise is variances ``m``, the process noise ``d``.
 
     Returns:
         What is known of each stretch, and the log density of what was measured.
     """
-    (mean, variance), log_density, filtered = starts[0], 0.0, []
-    covariance, d = np.diag(variance), len(process_noise)
+    (mean, covariance), log_density, filtered = starts[0], 0.0, []
+    d = len(process_noise)
     for link, (first, spread) in zip(links, starts, strict=True):
         mean = np.concatenate([first[:d], mean[d:]])
         shared, covariance = covariance[d:, d:], np.zeros_like(covariance)
-        covariance[:d, :d], covariance[d:, d:] = np.diag(spread[:d]), shared
+        covariance[:d, :d], covariance[d:, d:] = spread[:d, :d], shared
         found, gained = _filter(link, mean, covariance, noise, process_noise)
         filtered.append(found)
         log_density += gained

@@ -127,7 +127,8 @@ def _search(
     for _ in range(max_rounds):
         bar.update()
         links = chain.linearised(path)
-        found, density = smooth_chain(links, chain.starts, noise, process_noise)
+        starts = [(mean, np.diag(variance)) for mean, variance in chain.starts]
+        found, density = smooth_chain(links, starts, noise, process_noise)
         if not math.isfinite(density):
             raise np.linalg.LinAlgError
         faster, gained, value = _LONGER if density >= value else 1.0, density - value, density
@@ -199,7 +200,8 @@ def _told(chain: Chain, found: Estimate) -> tuple[Tensor, Tensor]:
     for link, (mean, variance) in zip(chain.linearised(path), chain.starts, strict=True):
         mean, variance = mean.copy(), variance.copy()
         mean[d:], variance[d:] = parameters, 1.0  # a standard normal prior there
-        (alone,), _ = smooth_chain([link], [(mean, variance)], found.noise, found.process_noise)
+        start = mean, np.diag(variance)
+        (alone,), _ = smooth_chain([link], [start], found.noise, found.process_noise)
         covariance = alone.states.covariances[0, d:, d:]
         # No stretch knows less than its prior, but by rounding.
         values, vectors = np.linalg.eigh(np.linalg.inv(covariance) - np.eye(p))

@@ -62,7 +62,14 @@ def make_agent(point_env, point_task, learnt_dynamics):
 
     def make(kind, env=None, **given):
         parts = {"dynamics": learnt_dynamics(), "initial_states": near_one}
-        names = {"dynamics", "reward", "initial_states", "state_bounds", "episode_length"}
+        names = {
+            "dynamics",
+            "reward",
+            "initial_states",
+            "state_bounds",
+            "episode_length",
+            "action_rate",
+        }
         task = point_task(**{**parts, **{name: given.pop(name) for name in names & {*given}}})
         how = KINDS[kind].options if kind in KINDS else {}
         env = point_env() if env is None else env

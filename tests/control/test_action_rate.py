@@ -4,7 +4,18 @@ import numpy as np
 import pytest
 import torch
 
-from gpadjust.control import MPC, ActionRate, CrossEntropy, Planner, Return, Rollouts, Task
+from gpadjust.control import (
+    MPC,
+    ActionRate,
+    CrossEntropy,
+    MPCAgent,
+    Planner,
+    PolicySearch,
+    Return,
+    Rollouts,
+    Task,
+    linear_policy,
+)
 from gpadjust.dynamics import PhysicsDynamics, StateSpec
 
 SPEC = StateSpec(["x"], ["v"])
@@ -84,3 +95,21 @@ def test_bad_rates_are_refused(rate, error, message):
 def test_a_price_is_not_negative():
     with pytest.raises(ValueError, match=r"price must be .* at least 0"):
         ActionRate(price=-1.0)
+
+
+def test_random_actions_keep_the_limit_and_noise_is_refused(make_agent, point_env):
+    agent = make_agent(MPCAgent, random_steps=10, action_rate=0.25).learn(10)
+    recorded = agent.recorded_episodes()
+    changes = recorded.actions.diff(dim=0).abs()[~recorded.begins[1:]]
+    assert 0.1 < changes.max() <= 0.25 + 1e-6
+    noisy = make_agent(MPCAgent, action_noise=lambda: np.ones(1), action_rate=0.25)
+    with pytest.raises(ValueError, match="more than action_rate allows; leave action_noise out"):
+        noisy.learn(5)
+    assert noisy.num_timesteps == 0
+
+
+def test_a_search_of_ones_own_refuses_what_a_policy_cannot_keep(point_task):
+    given = point_task(action_rate=0.1)
+    policy = linear_policy(given.dynamics.spec, [[-2.0], [2.0]])
+    with pytest.raises(ValueError, match="PolicySearch cannot learn a task with action_rate"):
+        PolicySearch(updates=1).improve(policy, given)

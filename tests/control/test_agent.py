@@ -238,6 +238,25 @@ def test_a_searched_policy_promises_what_its_last_search_found(make_agent):
     assert agent.promised_reward == searches[1]["reward"] != searches[2]["reward"]
 
 
+def test_the_real_reward_is_of_new_episodes_though_fresh_dynamics_learn_all(
+    make_agent, learnt_dynamics
+):
+    log, agent = Log("fit"), make_agent(MPCAgent).learn(10)
+    agent.task = replace(agent.task, dynamics=learnt_dynamics())
+    agent.learn(5, log)
+    newest = agent.recorded_episodes(newest=5).rewards.mean()
+    assert log[-1]["real_reward"] == pytest.approx(float(newest))
+
+
+def test_actions_without_bounds_are_refused(make_agent):
+    class Boundless(gymnasium.Wrapper):
+        action_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,))
+
+    env = Boundless(make_agent(MPCAgent).env)
+    with pytest.raises(ValueError, match="Actions must have bounds.*found Box.*RescaleAction"):
+        make_agent(MPCAgent, env)
+
+
 def test_promises_that_are_not_kept_are_told(make_agent, point_dynamics):
     """The physics says that any action helps, but the system goes the other way."""
     wrong = PhysicsDynamics(point_dynamics.spec, lambda X: X[:, :1] - 0.9 * X[:, 1:])

@@ -182,7 +182,7 @@ def test_who_cannot_keep_them_refuses_before_a_real_step(point_task, point_env, 
     given = point_task(**{part: before_the_wall if part == "constraints" else 0.5})
     env = point_env()
     agent = PolicySearchAgent(env, given)
-    with pytest.raises(ValueError, match=f"PolicySearchAgent .* {part}; MPCAgent can"):
+    with pytest.raises(ValueError, match=f"PolicySearch .* {part}; MPCAgent can"):
         agent.learn(5)
     assert agent.num_timesteps == 0
     with pytest.raises(ValueError, match=f"DynaSAC .* {part}; MPCAgent can"):

@@ -138,6 +138,13 @@ def test_deterministic_actions_are_always_the_same(task):
     assert first != other
 
 
+def test_the_action_of_a_row_is_that_of_the_row_alone(task):
+    mpc = MPC(task, [[-1.0], [1.0]], quick(), first=quick())
+    rows = np.array([[0.5], [-0.25], [0.5]])
+    together = mpc.predict(rows)[0]
+    assert np.array_equal(together, np.stack([mpc.predict(row)[0] for row in rows]))
+
+
 def test_sb3_evaluates_it():
     known = PhysicsDynamics(CART_POLE_SPEC, equation_physics(REAL_CART_POLE))
     task = Task(known, cart_pole_reward, episode_length=4)

@@ -76,6 +76,22 @@ def test_a_reference_that_is_not_the_environments_is_refused():
         agent.learn(8)
 
 
+def test_a_set_point_that_is_an_angle_goes_round():
+    spec = StateSpec(["x", "goal"], ["v"], angles=["goal"], exogenous=["goal"])
+
+    class Turning(Tracking):
+        observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (3,), np.float64)
+
+        def _seen(self):
+            return np.array([self.x, np.sin(self.steps), np.cos(self.steps)])
+
+    dynamics = PhysicsDynamics(spec, lambda X: X[:, :1] + 0.5 * X[:, 1:])
+    turns = lambda states, steps: steps.double().unsqueeze(-1)  # noqa: E731
+    task = Task(dynamics, near, reference=turns, episode_length=8)
+    how = {"each_step": PLAN, "first": PLAN, "reward_tolerance": 1e9, "score_horizons": ()}
+    assert MPCAgent(Turning(), task, **how).learn(8).num_episodes == 1
+
+
 @pytest.mark.parametrize(
     ("reference", "message"),
     [(lambda s, t: s, r"shape \(2, 1\).*found \(2, 2\)"), (lambda s, t: s[:, :1] / 0, "finite")],

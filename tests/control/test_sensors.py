@@ -160,7 +160,9 @@ def test_noises_and_hidden_states_are_found():
     assert rough.square().mean().sqrt() > 0.05  # as the machine's; the most likely path is smooth
 
 
-@pytest.mark.parametrize("kind", [MPCAgent, pytest.param(PolicySearchAgent, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "kind", [MPCAgent, pytest.param(PolicySearchAgent, marks=pytest.mark.slow)]
+)
 def test_agents_learn_from_positions_alone(kind, tmp_path):
     torch.manual_seed(0)
     agent = make_agent(kind, *glider())
@@ -297,3 +299,31 @@ def test_a_cart_pole_is_swung_up_by_position_and_angle_alone():
     assert costs[1:].mean() < 0.36  # 0.29 with all states
     assert (off[:, 2:] < 1.96).double().mean() > 0.85
     assert all(0.3 < found / 0.01 < 3 for found in agent.filter.noise.tolist())
+
+
+def test_what_nothing_disturbs_stays_as_it_is_and_starts_vary_together():
+    """A constant that is hidden is found from where starts vary with what is seen."""
+    spec = StateSpec(["x", "bias"], ["force"])
+
+    def stays(X):
+        return torch.stack([X[:, 0] + X[:, 2], X[:, 1]], dim=-1)
+
+    def alike(n):
+        return torch.randn(n, 1, dtype=torch.float64).expand(n, 2)
+
+    task = task_of(Sensors(["x"], noise={"x": 0.01}), stays, spec)
+    task = replace(task, initial_states=alike)
+    known = StateFilter.guessed(task, torch.tensor([[-1.0], [1.0]]).double())
+    assert known.process_noise[1] == 0
+    seen = Seen(torch.full((5, 1), 2.0).double(), torch.zeros(4, 1).double())
+    learnt, paths = smooth_episodes(task, known, [seen] * 3, 0)
+    assert learnt.process_noise[1] == 0
+    assert (torch.stack(paths)[..., 1] - 2).abs().max() < 0.2
+
+
+def test_a_reference_is_refused_beside_sensors():
+    spec = StateSpec(["x", "goal"], ["force"], exogenous=["goal"])
+    dynamics = PhysicsDynamics(spec, lambda X: X[:, :1])
+    with pytest.raises(ValueError, match="takes set-points for constant; leave reference out"):
+        Task(dynamics, near_zero, initial_states=start, sensors=Sensors(["x"]),
+             reference=lambda states, steps: states[:, 1:])  # fmt: skip

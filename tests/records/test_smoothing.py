@@ -66,7 +66,10 @@ def chain():
         outputs = rng.normal(size=(steps + 1, 2, 3))
         links.append(Link(matrices, offsets, outputs, rng.normal(size=(steps + 1, 2))))
     links[0].measured[1, 0] = links[1].measured[0] = np.nan
-    starts = [(rng.normal(size=3), rng.uniform(0.5, 2, size=3)) for _ in links]
+    sizes = [rng.uniform(0.5, 2, size=3) for _ in links]
+    starts = [(rng.normal(size=3), np.diag(size)) for size in sizes]
+    for _, covariance in starts:
+        covariance[0, 1] = covariance[1, 0] = 0.3
     return links, starts, np.array([0.3, 0.1]), np.array([0.2, 0.05])
 
 
@@ -76,12 +79,12 @@ def dense(links, starts, noise, scatter):
     mean, shape = np.zeros(rows[-1]), (rows[-1], rows[-1])
     root = np.zeros((rows[-1], 1 + 2 * rows[-1]))  # states by independent standard normal ones
     constant = np.zeros(root.shape[1])
-    constant[0] = math.sqrt(starts[0][1][2])
+    constant[0] = math.sqrt(starts[0][1][2, 2])
     free = iter(range(1, root.shape[1]))
     for row, link, (first, spread) in zip(rows, links, starts, strict=False):
         mean[row : row + 3] = [*first[:2], starts[0][0][2]]
-        for i in range(2):
-            root[row + i, next(free)] = math.sqrt(spread[i])
+        own = [next(free) for _ in range(2)]
+        root[row : row + 2, own] = np.linalg.cholesky(spread[:2, :2])
         root[row + 2] = constant
         for t, matrix in enumerate(link.matrices):
             here, there = slice(row + 3 * t, row + 3 * t + 3), row + 3 * t + 3
