@@ -207,9 +207,9 @@ class Task:
                 )
         if not np.isfinite([action_space.low, action_space.high]).all():
             raise ValueError(
-                f"Actions must have bounds, between which plans and policies choose; found "
-                f"{action_space}. Wrap the environment in gymnasium.wrappers.RescaleAction, or give "
-                "its action space numbers."
+                "Actions must have bounds, between which plans and policies choose; found "
+                f"{action_space}. Set env.action_space = gymnasium.spaces.Box(low, high) with those of the "
+                "machine."
             )
 
     def refuse(self, learner: str, name: str, way_out: str) -> None:

@@ -49,7 +49,8 @@ def smooth_chain(
 
     The last entries of a state, beyond those that a stretch starts again with, are constants that
     all stretches share. Starts are means ``d`` and covariances ``d x d`` of the first state of each
-    stretch, of the first one of all ``D`` entries; the noise is variances ``m``, the process noise ``d``.
+    stretch, of the first one of all ``D`` entries; the noise is variances ``m``, the process noise
+    ``d``.
 
     Returns:
         What is known of each stretch, and the log density of what was measured.
