@@ -208,8 +208,8 @@ class Task:
         if not np.isfinite([action_space.low, action_space.high]).all():
             raise ValueError(
                 "Actions must have bounds, between which plans and policies choose; found "
-                f"{action_space}. Set env.action_space = gymnasium.spaces.Box(low, high) with those of the "
-                "machine."
+                f"{action_space}. Set env.action_space = gymnasium.spaces.Box(low, high) with "
+                "those of the machine."
             )
 
     def refuse(self, learner: str, name: str, way_out: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -29,7 +30,8 @@ def run(experiment: First, model: str, seed: int) -> Run:
     for _ in range(experiment.settings.trials):
         agent.learn(length)
         costs.append(-agent.recorded_episodes(newest=length).rewards.mean().item())
-        promises.append(-(agent.promised_reward or 0.0))
+        promised = agent.promised_reward
+        promises.append(math.nan if promised is None else -promised)
     return {"trials": {"cost": costs, "promised": promises}}
 
 

@@ -253,7 +253,7 @@ def test_actions_without_bounds_are_refused(make_agent):
         action_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,))
 
     env = Boundless(make_agent(MPCAgent).env)
-    with pytest.raises(ValueError, match="Actions must have bounds, .*; found Box"):
+    with pytest.raises(ValueError, match=r"Actions must have bounds, .*; found Box"):
         make_agent(MPCAgent, env)
 
 
