@@ -232,7 +232,7 @@ class Agent(TaskAgent):
         """Play a real episode, and keep its steps."""
         observation, self._start = self._reset(), None
         episode, begins, state = len(self._promises), True, None
-        began, rewards = time.perf_counter(), list[float]()
+        began, before, rewards = time.perf_counter(), self.num_timesteps, list[float]()
         self._promises.append(None)
         random = self._random_actions() if self.model is None else None
         getattr(self.action_noise, "reset", lambda: None)()
@@ -256,7 +256,8 @@ class Agent(TaskAgent):
                 self._steps.steps.append(RealStep(episode, *row))
                 rewards.append(float(reward))
             self.tell("step", {"reward": float(reward)})
-            if failed or terminated or truncated:
+            whole = self.num_timesteps - before == self.task.episode_length
+            if failed or terminated or truncated or whole:
                 break
             observation, begins = following, False
         if not rewards:

@@ -228,8 +228,8 @@ class Return(Objective):
     times the largest that was at stake in the first rollouts (reward, effort or terminal value of
     an episode), so that sequences that leave come after all others, and those that leave later
     first. Beside it such an episode has the gradient of how far it left, for a policy to come back.
-    A unit of a constraint's violation costs as much as such a step, and where none can hold, the
-    least violation is the best.
+    A unit of a constraint's violation costs as much as such a step. Where none can hold, the least
+    violation is the best, and still better than to leave the bounds.
 
     Args:
         discount: Factor of the rewards from a step to the next one.
@@ -296,7 +296,8 @@ class Return(Objective):
             price = torch.where(largest > 0, largest, 1.0)
             if rollout.left_bounds.any():
                 lost = rollout.left_bounds.unsqueeze(-1) & ~rollout.made
-                missed = _NEVER * (weights[:-1] * lost).sum(-1)
+                most = (weights[:-1] * rollout.violation).sum(-1).max()  # of constraints
+                missed = _NEVER * ((weights[:-1] * lost).sum(-1) + most * rollout.left_bounds)
                 returns = returns - price * (missed + _BACK * len(weights) * rollout.overshoot)
             if rollout.violation.any():
                 returns = returns - price * _NEVER * (weights[:-1] * rollout.violation).sum(-1)

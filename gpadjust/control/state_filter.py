@@ -17,7 +17,7 @@ from gpadjust.records.kalman import Array, measure
 
 _SHARE = 0.1  # of what changes in a step: sd of noises, as long as nothing is known of them
 _EPISODES = 64  # of random actions in the physics, by which changes are known
-_HOLD = 5  # steps of a random action
+_HOLD = 5  # steps of these
 
 
 class Estimate(NamedTuple):
@@ -53,9 +53,10 @@ class StateFilter(NamedTuple):
 
     @classmethod
     def guessed(cls, task: Task, action_bounds: Tensor) -> Self:
-        """The filter before there are data, by episodes of random actions in the model of a task.
+        """The filter before there are data, by first steps of random actions in a task's model.
 
         Both noises are a tenth of what changes in a step there, unless the sensors say a guess.
+        Later steps say little: where a system is not stable, they run away.
         PyTorch's generator is left as it is.
 
         Args:
@@ -64,7 +65,7 @@ class StateFilter(NamedTuple):
         """
         spec, sensors = task.dynamics.spec, task.sensors
         assert sensors is not None, "asked before"
-        length = task.episode_length or 1
+        length = min(task.episode_length or 1, _HOLD)
         with seeded(0), torch.no_grad():
             starts = task.draw_initial_states(_EPISODES)
             steps = iter(random_sequences(_EPISODES, length, action_bounds, _HOLD).unbind(1))

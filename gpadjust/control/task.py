@@ -289,6 +289,11 @@ class Task:
         if self.constraints is None:
             return states.new_zeros(len(states), 0)
         values = torch.as_tensor(self.constraints(states, actions))
+        if values.dtype == torch.bool:
+            raise TypeError(
+                "constraints must return numbers that are at most 0 where they hold, such as "
+                "states[:, :1] - 0.4; found booleans."
+            )
         if values.dim() != 2 or len(values) != len(states):
             raise ValueError(
                 f"constraints must return a column for each constraint, shape ({len(states)}, c); "

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 from torch import Tensor
 
+from gpadjust.checks import check_kind
 from gpadjust.physics import Physics, Unknown, as_physics
 from gpadjust.states import Sensors, StateSpec
 from gpadjust.systems.wrappers import NoisySensors
@@ -85,6 +86,9 @@ class System:
             if not callable(getattr(self, name)):
                 hint = ", its class or `lambda: env`" if name == "env" else ""
                 raise TypeError(f"{name} must be a function{hint}; found {getattr(self, name)!r}.")
+        check_kind("sensors", self.sensors, Sensors | None, 'Sensors(["x", "theta"]), say')
+        told = "standard deviations by the name of the state"
+        check_kind("physics_error", self.physics_error, Mapping | None, told)
         object.__setattr__(self, "physics", as_physics(self.physics))
 
     @property
@@ -111,9 +115,27 @@ class System:
             )
         if self.episode_length not in (None, limit):
             env = gym.wrappers.TimeLimit(env, self.episode_length)
-        if not self.noise and self.sensors is None:
+        if self._shows_what_is_measured(env):
             return env
         return NoisySensors(env, self.spec, self.noise or {}, self.sensors)
+
+    def _shows_what_is_measured(self, env: gym.Env[Any, Any]) -> bool:
+        """Return whether an environment observes that itself, by the number of entries.
+
+        Raises:
+            ValueError: If it observes neither that nor the states.
+        """
+        if self.sensors is None:
+            return not self.noise
+        shape, states = env.observation_space.shape, self.spec.observation_dim
+        outputs = self.sensors.spec(self.spec).observation_dim
+        if shape != (states,) and (shape != (outputs,) or self.noise):
+            raise ValueError(
+                f"The environment must observe the states ({states} entries), of which "
+                f"`system.make()` shows what the sensors measure, or that alone ({outputs} "
+                f"entries), without `noise`; found {env.observation_space}."
+            )
+        return shape != (states,)
 
     def task(self, dynamics: Dynamics | None = None) -> Task:
         """The task that agents and planners take.
