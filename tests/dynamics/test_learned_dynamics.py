@@ -250,9 +250,7 @@ def test_it_is_described_by_what_all_fits_are_told(cart_pole_system):
 
 def test_it_is_described_by_what_is_given_beside_the_fits(cart_pole_system):
     def described(**options):
-        return LearnedDynamics(
-            cart_pole_system.spec, cart_pole_system.crude, **options
-        ).describe()
+        return LearnedDynamics(cart_pole_system.spec, cart_pole_system.crude, **options).describe()
 
     plain, moving = described(), cart_pole_system.spec.states[cart_pole_system.spec.moving[0]]
     assert plain == described(num_features=1024, physics_error={})
