@@ -158,9 +158,7 @@ def test_points_of_a_batch_are_apart_and_none_of_them_is_left_out(harmless):
     points = collection.ask(3)
     assert points.flatten().sort().values.diff().min() >= 0.01
     assert len(collection.left_out) == 0
-    with pytest.raises(
-        RuntimeError, match=r"of which \d\d are apart by 0\.01 of the bounds"
-    ):
+    with pytest.raises(RuntimeError, match=r"of which \d\d are apart by 0\.01 of the bounds"):
         collection.ask(101)
 
 

@@ -160,7 +160,9 @@ def test_noises_and_hidden_states_are_found():
     assert rough.square().mean().sqrt() > 0.05  # as the machine's; the most likely path is smooth
 
 
-@pytest.mark.parametrize("kind", [MPCAgent, pytest.param(PolicySearchAgent, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "kind", [MPCAgent, pytest.param(PolicySearchAgent, marks=pytest.mark.slow)]
+)
 def test_agents_learn_from_positions_alone(kind, tmp_path):
     torch.manual_seed(0)
     agent = make_agent(kind, *glider())

@@ -107,7 +107,10 @@ ALL = [{place: fault} for fault in FAULTS for place in (1, 6, 8, 10)]
 
 @pytest.mark.parametrize(
     "faults",
-    [{1: "raises", 4: "nan"}, *(pytest.param(each, marks=pytest.mark.slow) for each in [EACH, *ALL])],
+    [
+        {1: "raises", 4: "nan"},
+        *(pytest.param(each, marks=pytest.mark.slow) for each in [EACH, *ALL]),
+    ],
 )
 def test_agents_lose_nothing(make_agent, kind, point_env, faults):
     """Of the first, a middle and the last step; before there are data, and after."""
