@@ -88,7 +88,7 @@ class Collection(Measurements):
         num_outputs: Number ``m`` of outputs. Default: that of the first measurement.
         fit: Fits a new model, in place. Default: :func:`gpadjust.fit`. A point fit,
             ``lambda model: fit(model, "map")``, begins where the last one was.
-        optimizer_options: Arguments of ``optimize_acqf``.
+        optimizer_options: Arguments of ``optimize_acqf``, which ``keep`` does without.
         log: The file of the log.
         seed: Seed of the design and of the acquisition function's maximisation. The global random
             state is left alone.
@@ -169,6 +169,11 @@ class Collection(Measurements):
                 )
         self._fit, self._initial = fit, checked_whole("initial, a number of points,", initial, 2)
         self._options = as_options(optimizer_options)
+        if keep is not None and self._options:
+            raise ValueError(
+                f"Expected no optimizer_options with keep, got {sorted(self._options)}: the best "
+                "of random points that are safe is taken, without optimize_acqf. Leave them out."
+            )
         if num_outputs is not None:
             checked_whole("num_outputs", num_outputs, 1)
         super().__init__(self.bounds, num_outputs, data)
@@ -242,7 +247,8 @@ class Collection(Measurements):
             The points, ``q x d``, which are pending from now on.
 
         Raises:
-            RuntimeError: If no point is safe by ``keep``, or the first ones told too little.
+            RuntimeError: If with ``keep`` fewer points are safe, or the first ones are pending or
+                told too little.
             TypeError: If ``acquisition`` makes no acquisition function.
             ValueError: If it takes single points, and ``q`` is larger.
             LogError: If the points cannot be logged; then they are not pending.
@@ -388,6 +394,11 @@ class Collection(Measurements):
         if self.keep is not None:
             if len(first):
                 return first[:q]
+            if len(self.pending):
+                raise RuntimeError(
+                    f"All first points are asked for, and {len(self.pending)} of them are pending: "
+                    "tell() these first, as later points are chosen by a model of what came out."
+                )
             raise RuntimeError(
                 f"{self.num_observed} measurements came of the first points, but a model that is "
                 "to keep limits needs two of each output; tell others that are safe."

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from botorch.acquisition import AcquisitionFunction
-from botorch.exceptions.errors import UnsupportedError
 from botorch.utils.sampling import draw_sobol_samples
 from torch import Tensor
 
-from gpadjust.active.points import NEAR, distances
+from gpadjust.active.points import NEAR, distances, taken_as_pending
 
 _CANDIDATES = 1024  # in all of the bounds, and as many near the points measured
 _REACH = 0.1  # of the bounds' widths: how far from these
@@ -71,31 +69,32 @@ class Keep:
             if that is another, ``l x d``.
 
         Raises:
-            RuntimeError: If no point is safe.
+            RuntimeError: If fewer points are safe, or these are too near to each other.
         """
         points = self._candidates(bounds, torch.cat([measured, pending]))
         points = points[(distances(points, torch.cat([failed, pending]), bounds) >= NEAR).all(-1)]
         safe = self.probabilities(model, points) >= self.probability
-        if safe.sum() < q:
-            raise RuntimeError(
-                f"The model knows {int(safe.sum())} of {len(points)} points as safe with a "
-                f"probability of {self.probability:g}, but {q} are asked for. Tell measurements of "
-                "points that you know as safe, nearer to each other, or lower the probability."
-            )
+        num_points, num_safe = len(points), int(safe.sum())
         taken: list[Tensor] = []
         left_out: list[Tensor] = []
         for _ in range(q):
+            if not safe.any():
+                raise RuntimeError(
+                    f"The model knows {num_safe} of {num_points} points as safe with a probability "
+                    f"of {self.probability:g}, of which {len(taken)} are apart by {NEAR:g} of the "
+                    f"bounds' widths, but {q} are asked for. Tell measurements of points that you "
+                    "know as safe, nearer to each other, or lower the probability."
+                )
             away = torch.cat([pending, failed, *taken])
-            if len(away):
-                with suppress(UnsupportedError):  # of one point at a time, which is far from these
-                    acquisition.set_X_pending(away)
-            with torch.no_grad():
+            # One that counts on none takes one point at a time, which is far from these anyway.
+            with taken_as_pending(acquisition, away), torch.no_grad():
                 values = torch.cat([acquisition(z.unsqueeze(-2)) for z in points.split(_AT_ONCE)])
-            best = int(values.masked_fill(~safe, -torch.inf).argmax())
+            best = points[[int(values.masked_fill(~safe, -torch.inf).argmax())]]
             if not safe[values.argmax()]:
                 left_out.append(points[[int(values.argmax())]])
-            taken.append(points[[best]])
-            safe[best] = False
+            taken.append(best)
+            apart = (distances(points, best, bounds) >= NEAR).all(-1)
+            points, safe = points[apart], safe[apart]
         return torch.cat(taken), torch.cat([bounds[:0], *left_out])
 
     def _candidates(self, bounds: Tensor, known: Tensor) -> Tensor:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -70,22 +72,36 @@ def best_points(
     Returns:
         The points, ``q x d``.
     """
-    away = failed
-    taken = torch.cat([pending, failed])
-    if len(taken):
-        own = getattr(acquisition, "X_pending", None)
-        try:
-            acquisition.set_X_pending(taken if own is None else torch.cat([own, taken]))
-        except UnsupportedError:
-            away = taken  # it is to be kept from pending points by hand, too
     # A line search that rounding errors end has converged: no second try is needed.
     defaults = {"num_restarts": 8, "raw_samples": 128, "retry_on_optimization_warning": False}
-    points, _ = optimize_acqf(acquisition, bounds, q=q, **{**defaults, **options})
-    points = points.detach()
-    for i in range(q):
-        if _near(points[i : i + 1], away, bounds).any():
-            points[i] = _elsewhere(acquisition, points, i, away, bounds)
+    taken = torch.cat([pending, failed])
+    with taken_as_pending(acquisition, taken) as counts:
+        away = failed if counts else taken  # others are to be kept from by hand
+        points, _ = optimize_acqf(acquisition, bounds, q=q, **{**defaults, **options})
+        points = points.detach()
+        for i in range(q):
+            if _near(points[i : i + 1], away, bounds).any():
+                points[i] = _elsewhere(acquisition, points, i, away, bounds)
     return points
+
+
+@contextmanager
+def taken_as_pending(acquisition: AcquisitionFunction, points: Tensor) -> Iterator[bool]:
+    """Let an acquisition function count on pending points beside its own, if it does so at all.
+
+    It has its own alone again at the end. The value is whether it counts on them.
+    """
+    own, counts = getattr(acquisition, "X_pending", None), bool(len(points))
+    if counts:
+        try:
+            acquisition.set_X_pending(points if own is None else torch.cat([own, points]))
+        except UnsupportedError:
+            counts = False
+    try:
+        yield counts
+    finally:
+        if counts:
+            acquisition.set_X_pending(own)
 
 
 def _near(points: Tensor, others: Tensor, bounds: Tensor) -> Tensor:

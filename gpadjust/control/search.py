@@ -87,7 +87,8 @@ class PathIntegral(Search):
     :math:`\propto \exp((J_i - \max J) / (\lambda\, s))` is taken, where s is the standard
     deviation of the best quarter of the scores, as others may be those of sequences that leave the
     bounds; each further round draws sequences about it. The result is the last mean, or the best
-    sequence of all if that scores better.
+    sequence of all if that scores better. Sequences with a score of :math:`-\infty` do not count,
+    unless all have it.
 
     Args:
         rounds: Rounds after the first sequences.
@@ -134,8 +135,10 @@ class PathIntegral(Search):
         return sequences[best], float(scores[best])
 
     def _mean(self, sequences: Tensor, scores: Tensor) -> Tensor:
-        scale = scores.topk(-(-len(scores) // 4)).values.std(correction=0)
-        scale = scale.clamp_min(torch.finfo(scores.dtype).tiny)
+        top = scores.topk(-(-len(scores) // 4)).values
+        if top[0].isinf():
+            return sequences[scores == top[0]].mean(0)
+        scale = top[top.isfinite()].std(correction=0).clamp_min(torch.finfo(scores.dtype).tiny)
         weights = torch.softmax((scores - scores.max()) / (self.temperature * scale), dim=0)
         return torch.einsum("n,nta->ta", weights, sequences)
 

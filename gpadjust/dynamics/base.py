@@ -30,6 +30,7 @@ from gpadjust.dynamics.state import fingerprint
 from gpadjust.dynamics.targets import check_spec
 from gpadjust.dynamics.trajectories import Trajectories, check_doubles
 from gpadjust.models import Prediction
+from gpadjust.models.sampled_functions import seeded
 from gpadjust.states import StateSpec
 from gpadjust.validation import Scores
 
@@ -226,8 +227,7 @@ class Dynamics(ABC):
         root = self.noise_root() if learnt else None
         roots = [root if isinstance(each, str) else None for each in (start_noise, process_noise)]
         # Dynamics of a user's may draw from PyTorch's generator all the same.
-        with torch.no_grad(), torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
+        with torch.no_grad(), seeded(seed):
             functions = sample_functions(num_functions, seed)
             particles = initial_states.expand(num_functions, -1, -1)
             if isinstance(start_noise, str):

@@ -31,6 +31,7 @@ from gpadjust.models.sampled_functions import check_num_features
 from gpadjust.models.term_builder import PhysicsLike
 from gpadjust.states import StateSpec
 
+_NUM_FEATURES = 1024  # by default
 _MEAN_ROWS = 256  # kernel rows of a mean: transitions times samples of the hyper-parameters
 
 
@@ -97,7 +98,7 @@ class LearnedDynamics(Dynamics):
         target: Target = "difference",
         encode_angles: bool = True,
         fit_options: DynamicsFitOptions | None = None,
-        num_features: int = 1024,
+        num_features: int = _NUM_FEATURES,
         physics_error: Mapping[str, float] | None = None,
     ) -> None:
         super().__init__(spec)
@@ -291,6 +292,10 @@ class LearnedDynamics(Dynamics):
         several: dict[str, Any] = {"physics": parts} if len(parts) > 1 else {}
         if self.physics is not None and self.physics.unknowns:
             several["unknowns"] = {name: repr(u) for name, u in self.physics.unknowns.items()}
+        if self.num_features != _NUM_FEATURES:
+            several["num_features"] = self.num_features
+        if self.physics_error:
+            several["physics_error"] = self.physics_error
         later = {k: v for k, v in kept(self.fit_options).items() if v is not None}
         return fingerprint(
             type(self),

@@ -122,10 +122,10 @@ def c_source(
     Of a model it has ``void NAME_predict(const double *x, const double *f_p, double *mean, double
     *variance)``, which is :meth:`~gpadjust.CKA.predict` at one point. Of dynamics it has ``void
     NAME_step(const double *state, const double *action, const double *f_p, double *mean, double
-    *variance)``, which is :meth:`LearnedDynamics.predict`. The physics stays yours: ``f_p`` is what
-    it returns there, of several physics side by side; without physics it is no argument. A
-    ``variance`` that is ``NULL`` is not computed, which is faster. The same model makes the same
-    file.
+    *variance)``, which is :meth:`LearnedDynamics.predict`; ``mean`` may be ``state`` itself. The
+    physics stays yours: ``f_p`` is what it returns there, of several physics side by side; without
+    physics it is no argument. A ``variance`` that is ``NULL`` is not computed, which is faster. The
+    same model makes the same file.
 
     Args:
         fitted: The model, or dynamics that have learnt.
@@ -277,8 +277,10 @@ def _step(
     yield f"    double learnt[{m}]{f', spread[{m}]' * has_variance};"
     arguments += ["learnt"] + ["variance ? spread : 0"] * has_variance
     yield f"    {name}_predict({', '.join(arguments)});"
-    for i, value in enumerate(next_state(dynamics, state, action, _entries("learnt", m))):
-        yield f"    mean[{i}] = {value};"
+    values = next_state(dynamics, state, action, _entries("learnt", m))
+    # All of them are there before `mean` is written, which may be `state`.
+    yield f"    const double next[{len(values)}] = {{{', '.join(values)}}};"
+    yield f"    for (int i = 0; i < {len(values)}; i++) mean[i] = next[i];"
     if has_variance:
         yield "    if (!variance) return;"
         variances = next_variance(dynamics, _entries("spread", m), _Text("0.0"))

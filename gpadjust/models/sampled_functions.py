@@ -180,10 +180,10 @@ class FunctionPerBatch(Module):
 
 @contextmanager
 def seeded(seed: int | None) -> Iterator[None]:
-    """Draw from PyTorch's generator, from a copy of it if there is a seed."""
+    """Draw from PyTorch's generator of the CPU, from a copy of it if there is a seed."""
     with nullcontext() if seed is None else torch.random.fork_rng(devices=[]):
         if seed is not None:
-            torch.manual_seed(seed)
+            torch.default_generator.manual_seed(seed)  # those of GPUs are no copies
         yield
 
 

@@ -11,7 +11,6 @@ from typing import Any, Literal, Self
 import numpy as np
 import torch
 from botorch.posteriors.fully_bayesian import MCMC_DIM
-from botorch.utils.sampling import manual_seed
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils import check_random_state
@@ -35,6 +34,7 @@ from gpadjust.models import (
 from gpadjust.models.factory import ModelFactory, make_model, with_options
 from gpadjust.models.levels import Levels, coded, several, texts_of
 from gpadjust.models.plausibility import is_standardised
+from gpadjust.models.sampled_functions import seeded
 from gpadjust.models.training_data import check_array, column_names
 from gpadjust.physics import PhysicsWarning
 from gpadjust.physics.array_physics import array_physics
@@ -256,7 +256,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         checked_whole("n_samples", n_samples, 1)
         inputs, held = self._inputs(X), self.model_.num_samples or 1
-        with torch.no_grad(), manual_seed(_seed(random_state)):
+        with torch.no_grad(), seeded(_seed(random_state)):
             posterior = self.model_.posterior(inputs, observation_noise=observation_noise)
             draws = posterior.rsample(Size([-(-int(n_samples) // held)]))
             draws = draws.reshape(-1, *draws.shape[-2:])

@@ -98,4 +98,5 @@ class Sensors:
 
     def describe(self) -> dict[str, Any]:
         """Return the sensors in plain values: of the function, whether there is one."""
-        return {"outputs": [*self.outputs], "function": self.function is not None}
+        guesses = {"noise": self.noise} if self.noise else {}
+        return {"outputs": [*self.outputs], "function": self.function is not None, **guesses}

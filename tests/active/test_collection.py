@@ -322,13 +322,16 @@ def test_a_log_cut_at_any_byte_has_lost_nothing_before(make, tmp_path):
 
 
 def test_pending_points_of_the_acquisition_functions_own_count_too(make):
-    own, made = torch.tensor([[0.3, 0.4]], dtype=torch.float64), []
+    own, given = torch.tensor([[0.3, 0.4]], dtype=torch.float64), []
 
-    def acquisition(model):
-        made.append(qAdjustmentInformationGain(model, X_pending=own))
-        return made[-1]
+    class Told(qAdjustmentInformationGain):
+        def set_X_pending(self, X_pending=None):
+            given.append(X_pending)
+            super().set_X_pending(X_pending)
 
-    collection = filled(make(acquisition=acquisition))
+    collection = filled(make(acquisition=lambda model: Told(model, X_pending=own)))
     first = collection.ask(1)
+    assert len(given) == 1
     collection.ask(1)
-    assert torch.equal(made[-1].X_pending, torch.cat([own, first]))
+    for found, expected in zip(given[1:], (own, torch.cat([own, first]), own), strict=True):
+        assert torch.equal(found, expected)

@@ -4,7 +4,7 @@ from functools import partial
 
 import pytest
 import torch
-from botorch.acquisition import PosteriorStandardDeviation
+from botorch.acquisition import AcquisitionFunction, PosteriorStandardDeviation
 
 from gpadjust import CKA, ZeroMeanGP, fit
 from gpadjust.active import Collection, collect, qAdjustmentInformationGain
@@ -91,6 +91,11 @@ def test_an_interrupted_run_goes_on_with_what_was_left_out(tmp_path):
         ({"initial": [[0.1]]}, ValueError, "found 1 and 0"),
         ({"initial": [[0.1], [0.2]], "probability": 95}, ValueError, "probability must be"),
         ({"initial": [[0.1], [0.2]], "keep": 1.5}, TypeError, "keep to be callable"),
+        (
+            {"initial": [[0.1], [0.2]], "optimizer_options": {"raw_samples": 4}},
+            ValueError,
+            r"no optimizer_options with keep, got \['raw_samples'\]",
+        ),
     ],
 )
 def test_bad_options_are_refused(options, error, message):
@@ -108,4 +113,59 @@ def test_where_nothing_is_safe_it_says_so():
         fit=point_fit,
     )
     with pytest.raises(RuntimeError, match=r"0 of \d+ points as safe with a probability of 0\.95"):
+        collection.ask()
+
+
+class Nearest(AcquisitionFunction):
+    """Which is best at 0.5, and notes what is pending when it is asked."""
+
+    def __init__(self, own=None):
+        super().__init__(torch.nn.Module())
+        self.set_X_pending(own)
+        self.noted = []
+
+    def forward(self, X):
+        if not self.noted or self.noted[-1] is not self.X_pending:
+            self.noted.append(self.X_pending)
+        return -(X - 0.5).abs().sum((-2, -1))
+
+
+@pytest.fixture
+def harmless():
+    """A collection, by an acquisition function, of outputs far below the limit."""
+
+    def harmless(acquisition):
+        X = torch.tensor([[0.0], [0.5], [1.0]])
+        options = {"data": (X, X / 10), "keep": below, "fit": point_fit}
+        return Collection(ZeroMeanGP, BOUNDS, lambda model: acquisition, **options)
+
+    return harmless
+
+
+def test_points_pending_by_the_acquisition_function_itself_stay_so(harmless):
+    own = torch.tensor([[0.3], [0.4]], dtype=torch.float64)
+    acquisition = Nearest(own)
+    collection = harmless(acquisition)
+    points = torch.cat([collection.ask(2), collection.ask(1)])
+    for i, found in enumerate(acquisition.noted):
+        assert torch.equal(found, torch.cat([own, points[:i]]))
+    assert len(acquisition.noted) == 3
+    assert torch.equal(acquisition.X_pending, own)
+
+
+def test_points_of_a_batch_are_apart_and_none_of_them_is_left_out(harmless):
+    collection = harmless(Nearest())
+    points = collection.ask(3)
+    assert points.flatten().sort().values.diff().min() >= 0.01
+    assert len(collection.left_out) == 0
+    with pytest.raises(RuntimeError, match=r"of which \d\d are apart by 0\.01 of the bounds"):
+        collection.ask(101)
+
+
+def test_first_points_are_to_be_told_first():
+    options = {"initial": [[0.1], [0.9]], "keep": below}
+    collection = Collection(ZeroMeanGP, BOUNDS, PosteriorStandardDeviation, **options)
+    X = collection.ask(2)
+    collection.tell(X[:1], steep(X[:1]))
+    with pytest.raises(RuntimeError, match=r"1 of them are pending: tell\(\) these first"):
         collection.ask()

@@ -73,6 +73,24 @@ def test_a_single_sequence_is_taken():
     assert torch.equal(found, only[0])
 
 
+@pytest.mark.parametrize("least", [-0.8, -2.0])
+def test_path_integrals_take_sequences_of_no_score(least):
+    """Of the first sequences one in ten has a score, or none."""
+    asked = []
+
+    def score(sequences):
+        asked.append(sequences)
+        forbidden = sequences[:, 0, 0] > least
+        return -sequences.square().sum((1, 2)).masked_fill(forbidden, torch.inf)
+
+    bounds = torch.tensor([[-1.0], [1.0]], dtype=torch.float64)
+    first = torch.linspace(-1, 1, 20, dtype=torch.float64).reshape(20, 1, 1).expand(20, 4, 1)
+    found, value = PathIntegral(2).best(score, first, bounds)
+    assert all(each.isfinite().all() for each in asked)
+    assert value == score(found.unsqueeze(0)).item()
+    assert (value > -torch.inf) == (least > -1)
+
+
 # Trials in functions
 
 

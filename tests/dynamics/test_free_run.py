@@ -240,14 +240,16 @@ def test_without_the_noise_there_is_no_interval():
     assert torch.equal(run.lower.isnan(), run.upper.isnan())
 
 
-def test_runs_are_the_same_again_and_draw_from_no_generator():
+def test_runs_are_the_same_again_and_draw_from_no_generator(monkeypatch):
     class Careless(Drift):
         def sample_functions(self, num_functions, seed=None):
             return super().sample_functions(num_functions, int(torch.randint(99, ())))
 
-    before = torch.get_rng_state()
+    before, seeds_of_gpus = torch.get_rng_state(), []
+    monkeypatch.setattr(torch.cuda, "manual_seed_all", seeds_of_gpus.append)
     one, other = (Careless(0.1, 0.1).free_run(*start()) for _ in range(2))
     assert torch.equal(before, torch.get_rng_state())
+    assert seeds_of_gpus == []
     for value, again in zip(one[:5], other[:5], strict=True):
         assert torch.equal(value, again)
     assert not torch.equal(Careless(0.1, 0.1).free_run(*start(), seed=1).lower, one.lower)

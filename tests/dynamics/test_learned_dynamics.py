@@ -248,6 +248,19 @@ def test_it_is_described_by_what_all_fits_are_told(cart_pole_system):
     assert described(method="map") == {**plain, "method": "'map'"}
 
 
+def test_it_is_described_by_what_is_given_beside_the_fits(cart_pole_system):
+    def described(**options):
+        return LearnedDynamics(cart_pole_system.spec, cart_pole_system.crude, **options).describe()
+
+    plain, moving = described(), cart_pole_system.spec.states[cart_pole_system.spec.moving[0]]
+    assert plain == described(num_features=1024, physics_error={})
+    for options in ({"num_features": 256}, {"physics_error": {moving: 0.1}}):
+        found = described(**options)
+        (name,) = options
+        assert {k: v for k, v in found.items() if k != name} == plain
+        assert name in found
+
+
 def test_each_transition_costs_one_row_of_the_physics(uniform):
     rows = []
 

@@ -1,5 +1,6 @@
 """Programs of dynamics say what the dynamics predict."""
 
+import ctypes
 import functools
 from dataclasses import replace
 from functools import partial
@@ -7,7 +8,7 @@ from functools import partial
 import pytest
 import torch
 
-from gpadjust import CKA, RRA
+from gpadjust import CKA, RRA, ZeroMeanGP
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.export import c_source, casadi_function
 from gpadjust.states import StateSpec
@@ -125,3 +126,22 @@ def test_a_file_without_variance_says_the_next_state_alone(tmp_path):
     program = compiled(c_source(dynamics, "cart", variance=False), tmp_path)
     (found,) = called(program.cart_step, (6,), state, action, f_p)
     torch.testing.assert_close(found, dynamics.predict(state, action).mean, rtol=1e-9, atol=1e-12)
+
+
+def test_a_step_in_place_is_that_into_another_array(tmp_path):
+    """Each entry but the first is made of one that is written before it."""
+    spec = StateSpec(
+        ["v", "x", "last"], ["f"], integrated={"x": "v"}, step=0.1, previous={"last": "v"}
+    )
+    states, actions = normal(20, 3), normal(20, 1, seed=1)
+    v = states[:, :1] + 0.5 * actions
+    moved = torch.cat([v, states[:, 1:2] + 0.05 * (states[:, :1] + v), states[:, :1]], dim=-1)
+    options = {"method": "map", "num_starts": 1, "num_screened": 8, "max_iterations": 5}
+    dynamics = LearnedDynamics(spec, model=ZeroMeanGP, fit_options=options)
+    dynamics.update(states, actions, moved)
+    program = compiled(c_source(dynamics, "cart", variance=False), tmp_path)
+    (expected,) = called(program.cart_step, (3,), states[0], actions[0])
+    numbers = [(ctypes.c_double * len(each))(*each) for each in (states[0], actions[0])]
+    program.cart_step(*numbers, numbers[0])
+    assert [*numbers[0]] == expected.tolist()
+    torch.testing.assert_close(expected, dynamics.predict(states[0], actions[0]).mean)

@@ -98,6 +98,13 @@ def test_shapes_and_seed(data, build, kind, num_outputs, uniform):
     assert torch.equal(torch.get_rng_state(), state)
 
 
+def test_a_seed_is_none_of_the_generators_of_gpus(data, build, monkeypatch):
+    seeds, model = [], build("CKA", *data())
+    monkeypatch.setattr(torch.cuda, "manual_seed_all", seeds.append)
+    model.sample_functions(3, seed=1)
+    assert seeds == []
+
+
 def test_a_batch_of_models(data, build, kind, num_outputs, uniform):
     model = build(kind, *data((3,), num_outputs=num_outputs))
     functions = model.sample_functions(2, seed=0)

@@ -99,8 +99,8 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/active/points.py",
-        "acquisition.set_X_pending(taken if own is None else torch.cat([own, taken]))",
-        "acquisition.set_X_pending(taken)",
+        "acquisition.set_X_pending(points if own is None else torch.cat([own, points]))",
+        "acquisition.set_X_pending(points)",
         "Pending points of the acquisition function's own are lost.",
     ),
     Fault(

@@ -27,6 +27,8 @@ def test_outputs_are_any_function():
     assert sensors.measure(SPEC, STATE).item() == pytest.approx(math.cos(0.5))
     assert sensors.spec(SPEC).angles == ()
     assert sensors.describe() == {"outputs": ["height"], "function": True}
+    guessed = Sensors(["height"], sensors.function, noise={"height": 0.1})
+    assert guessed.describe() == {**sensors.describe(), "noise": {"height": 0.1}}
 
 
 @pytest.mark.parametrize(
