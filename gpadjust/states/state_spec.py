@@ -213,9 +213,14 @@ class StateSpec:
             observations: ``... x observation_dim``; sensors may be noisy.
 
         Raises:
-            ValueError: If the two entries of an angle are far from the unit circle.
+            ValueError: If there are more or less, or the two entries of an angle are far from the
+                unit circle.
         """
-        check_columns("observations", observations, self.observation_dim)
+        try:
+            check_columns("observations", observations, self.observation_dim)
+        except ValueError as error:
+            each = [f"sin {n}, cos {n}" if n in self.angles else n for n in self.states]
+            raise ValueError(f"{error} The entries are {', '.join(each)}.") from None
         first = 0
         for name in self.states:
             if name not in self.angles:

@@ -46,8 +46,9 @@ class System:
             :meth:`task` makes.
         noise: Standard deviations of the sensors' noise, by the name of the state or output, which
             :class:`NoisySensors` adds to what the environment observes.
-        sensors: What is measured of the states, as of a :class:`~gpadjust.control.Task`; the
-            environment observes nothing else. Default: all of the states.
+        sensors: What is measured of the states, as of a :class:`~gpadjust.control.Task`. ``env``
+            observes the states, and :meth:`make` shows what is measured of them; or it observes
+            that itself. Default: all of the states.
 
     Raises:
         TypeError: If ``env``, ``physics`` or ``reward`` is not callable, or ``spec`` no

@@ -248,6 +248,11 @@ def test_the_real_reward_is_of_new_episodes_though_fresh_dynamics_learn_all(
     assert log[-1]["real_reward"] == pytest.approx(float(newest))
 
 
+def test_episodes_end_at_the_tasks_length(make_agent, point_env):
+    agent = make_agent(MPCAgent, point_env().env, episode_length=4).learn(8)
+    assert agent.recorded_episodes().episode.tolist() == 4 * [0] + 4 * [1]
+
+
 def test_actions_without_bounds_are_refused(make_agent):
     class Boundless(gymnasium.Wrapper):
         action_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,))

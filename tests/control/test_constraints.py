@@ -201,6 +201,24 @@ def test_bad_constraints_are_refused(parts, error, message):
         task(**parts)
 
 
+def test_what_leaves_the_bounds_is_worse_than_any_violation():
+    """Margins of hundreds of units, as of a system that is not stable."""
+    given = replace(task(), state_bounds=torch.tensor([[-3.0], [3.0]]))
+    wide = torch.full((10, 1), 500.0).double()
+    sequences = torch.zeros(3, 10, 1).double()
+    sequences[1], sequences[2, 0] = -1.0, 1.0  # leaves the bounds after six steps; is nearer
+    rollout = Rollouts(given, None, margins=wide).follow(torch.zeros(1).double(), sequences)
+    assert rollout.left_bounds.tolist() == [[False, True, False]]
+    stays, leaves, nearer = Return().of(given)(rollout)
+    assert stays > nearer > leaves
+
+
+def test_constraints_are_numbers():
+    given = task(constraints=lambda states, actions: states < 1)
+    with pytest.raises(TypeError, match=r"numbers that are at most 0 where they hold.*booleans"):
+        given.try_functions(rows(0.0, 0.0), rows(0.0, 0.0))
+
+
 def test_constraints_return_a_column_each():
     flat = task(constraints=lambda states, actions: states[:, 0] - 1)
     with pytest.raises(ValueError, match=r"shape \(2, c\); found \(2,\)"):

@@ -327,3 +327,12 @@ def test_a_reference_is_refused_beside_sensors():
     with pytest.raises(ValueError, match="takes set-points for constant; leave reference out"):
         Task(dynamics, near_zero, initial_states=start, sensors=Sensors(["x"]),
              reference=lambda states, steps: states[:, 1:])  # fmt: skip
+
+
+def test_guesses_of_a_system_that_runs_away_are_those_of_its_first_steps():
+    """Each step multiplies the state by 20."""
+    runs = task_of(Sensors(["x"]), lambda X: 20 * X[:, :2] + X[:, 2:], SPEC)
+    bounds = torch.tensor([[-1.0], [1.0]]).double()
+    short, long = (StateFilter.guessed(replace(runs, episode_length=n), bounds) for n in (5, 200))
+    assert torch.equal(short.noise, long.noise)
+    assert long.noise.isfinite().all()

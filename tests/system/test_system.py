@@ -2,6 +2,7 @@
 
 import functools
 import pickle
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -13,6 +14,7 @@ import torch
 from gpadjust import systems
 from gpadjust.control import Task
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
+from gpadjust.states import Sensors
 from gpadjust.systems import NoisySensors, System
 from gpadjust.systems.reaching import ARM_MEMORY_SPEC
 from gpadjust.systems.swing_up import REAL_CART_POLE, believed_cart_pole, equation_physics
@@ -108,6 +110,10 @@ def test_what_is_no_part_of_a_system_is_refused():
     ):
         with pytest.raises(TypeError, match=message):
             System(*parts)
+    with pytest.raises(TypeError, match=r"sensors must be .*found .*'x'"):
+        cart(sensors=["x"])
+    with pytest.raises(TypeError, match=r"physics_error must be .*found 0.1"):
+        cart(physics_error=0.1)
 
 
 def test_the_cart_pole_is_that_of_its_id():
@@ -147,6 +153,23 @@ def test_sensors_of_any_system_can_be_noisy():
     assert 0 < abs(seen[1] - true[1]) < 0.5
     with pytest.raises(ValueError, match="no state 'y'"):
         make(noise={"y": 0.1}).make()
+
+
+def test_an_environment_shows_the_states_or_what_is_measured_of_them():
+    class Blind(Cart):
+        observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+
+        def reset(self, **options):
+            state, info = super().reset(**options)
+            return state[:1], info
+
+    only = {"start": lambda n: torch.zeros(n, 2).double(), "sensors": Sensors(["x"])}
+    blind = System(Blind, SPEC, coast, reward, **only)
+    assert isinstance(blind.make(), Blind)
+    assert cart(**only).make().reset(seed=0)[0].shape == (1,)
+    for parts in ({"noise": {"x": 0.1}}, {"sensors": Sensors(["x", "v", "sum"], lambda s: s)}):
+        with pytest.raises(ValueError, match=r"must observe the states .2 entries.*found Box"):
+            replace(blind, **parts).make()
 
 
 def test_no_system_hides_a_module():
@@ -215,7 +238,7 @@ def test_noise_of_sensors_has_its_size_and_leaves_rewards_alone():
     seen, true = systems.cart_pole(noise=noise).make(), systems.cart_pole().make()
     spec, errors = systems.cart_pole().spec, []
     push = np.zeros(1, dtype=np.float32)
-    for seed in range(40):
+    for seed in range(12):
         for env in (seen, true):
             env.reset(seed=seed)
         for _ in range(25):
@@ -225,7 +248,7 @@ def test_noise_of_sensors_has_its_size_and_leaves_rewards_alone():
             state = spec.decode(torch.from_numpy(observed).double())
             errors.append(spec.change(torch.from_numpy(true.unwrapped.state), state))
     sd = torch.stack(errors).std(0)
-    torch.testing.assert_close(sd, torch.tensor([0, 0.1, 0.5, 0]).double(), rtol=0.06, atol=1e-5)
+    torch.testing.assert_close(sd, torch.tensor([0, 0.1, 0.5, 0]).double(), rtol=0.1, atol=1e-5)
 
 
 def test_noise_of_what_is_no_state_is_refused():
