@@ -11,6 +11,7 @@ from paper.common.experiment import Axes, Experiment
 from paper.common.learners import labels
 
 HORIZONS = {
+    "cart_pole": 8,
     "pendulum": 12,
     "furuta": 10,
     "quadrotor": 12,
@@ -28,13 +29,17 @@ class Planned:
     trials: int = 5
     """real trials of a run, of which the first goes by f_p, or is random where there is none"""
     sequences: int = 64
-    """that are planned, in each round of the cross-entropy method"""
+    """that are planned at each step, in each round of the cross-entropy method"""
     rounds: int = 1
     """of these after the first"""
+    first_sequences: int = 128
+    """that are planned when a trial begins, of all its steps"""
     first_rounds: int = 8
-    """of these when a trial begins, with all its steps"""
+    """of these after the first"""
     elites: int = 8
-    """of these"""
+    """of a round"""
+    spread: float = 0.15
+    """of the sequences about the earlier plan, in shares of the range of the actions"""
     fit: Literal["map", "bayes"] = "map"
     """of the learnt models; "bayes", the default of the library, takes twice as long"""
 
@@ -48,8 +53,6 @@ class KnownSettings(Planned):
     rounds: int = 0
     first_rounds: int = 2
     elites: int = 12
-    spread: float = 0.15
-    """of the sequences about the earlier plan, in shares of the range of the actions"""
     networks: int = 5
     """of an ensemble"""
     training: int = 250
@@ -116,11 +119,11 @@ class Hidden(Experiment):
         },
     }
     packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "gymnasium")
-    calls: ClassVar[tuple[str, ...]] = (
-        "gpadjust.dynamics.LearnedDynamics",
-        "gpadjust.control.Planner",
-        "gpadjust.control.CrossEntropy",
-    )
+    calls: ClassVar[tuple[str, ...]] = Known.calls
+
+    def describe(self, *kind: Any) -> dict[str, Any]:
+        """The settings, and how far plans look."""
+        return {**asdict(self.settings), "horizon": HORIZONS[kind[0]]}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,7 +132,6 @@ class WallsSettings(Planned):
 
     sequences: int = 40
     first_sequences: int = 64
-    """of these when a trial begins"""
     first_rounds: int = 2
     horizon: int = 8
     """steps that are planned ahead at each step"""
@@ -168,15 +170,15 @@ class Walls(Experiment):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SetpointsSettings:
+class SetpointsSettings(Planned):
     """Settings that decide the numbers; found with seeds of 100 and more."""
 
     trials: int = 2
-    """real trials of a run, of which the first goes by f_p"""
     sequences: int = 48
-    """that are planned, in each round of the cross-entropy method"""
+    first_sequences: int = 48
     first_rounds: int = 4
-    """of these when a trial begins, with all its steps"""
+    horizon: int = HORIZONS["tanks"]
+    """steps that are planned ahead at each step"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,17 +208,20 @@ class Setpoints(Experiment):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DelaysSettings:
+class DelaysSettings(Planned):
     """Settings that decide the numbers; found with seeds of 100 and more."""
 
     trials: int = 3
-    """real trials of a run, of which the first goes by f_p"""
+    first_sequences: int = 64
+    elites: int = 12
+    horizon: int = HORIZONS["cart_pole"]
+    """steps that are planned ahead at each step"""
     hint_trials: int = 1
     """of the runs that only ask whether the delay is found, in which f_p alone plans, lightly"""
-    sequences: int = 64
-    """that are planned, in each round of the cross-entropy method"""
-    first_rounds: int = 8
-    """of these when a trial begins, with all its steps"""
+    hint_sequences: int = 16
+    """of these runs, at each step and when a trial begins"""
+    hint_rounds: int = 2
+    """of these when a trial begins"""
     dry: float = 0.5
     """dry friction of the cart in the runs that only ask, in N, which f_p lacks"""
 

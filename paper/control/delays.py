@@ -12,8 +12,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from gpadjust.control import CrossEntropy, MPCAgent, Planner
+from gpadjust.control import MPCAgent
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
+from gpadjust.dynamics.learning import DynamicsFitOptions
 from gpadjust.states import StateSpec
 from gpadjust.systems import RememberAction, System, cart_pole
 from gpadjust.systems.swing_up import CART_POLE_SPEC
@@ -21,6 +22,7 @@ from paper.common.experiment import Run, Table
 from paper.common.figures import panels, save
 from paper.common.tables import frame, groups, of, table
 from paper.control import Delays
+from paper.control.planners import planners
 
 _HINT = "hint_"
 _NOISE = {"x": 0.01, "theta": 0.02, "x_dot": 0.05, "theta_dot": 0.1}
@@ -78,23 +80,20 @@ def _agent(experiment: Delays, told: str, seed: int) -> tuple[MPCAgent, int]:
         env = Late(env)
     if told in ("previous", "physics"):
         env, system = RememberAction(env), _remembering(system, told == "physics")
-    sequences = settings.sequences // (4 if asks else 1)
-    each_step = Planner(
-        search=CrossEntropy(1, num_elites=12, correlation=0.5),
-        horizon=8 * (system.spec.step or 1.0),
-        num_random=sequences,
-        spread=0.15,
-    )
-    first = Planner(
-        search=CrossEntropy(2 if asks else settings.first_rounds, num_elites=12, correlation=0.5),
-        num_random=sequences,
-    )
+    if asks:
+        settings = replace(
+            settings,
+            sequences=settings.hint_sequences,
+            first_sequences=settings.hint_sequences,
+            first_rounds=settings.hint_rounds,
+        )
+    plans = planners(settings, settings.horizon * (system.spec.step or 1.0))
     dynamics: Dynamics = PhysicsDynamics(system.spec, system.physics)
     if not asks:
-        likely: Any = {"method": "map"}
+        likely: DynamicsFitOptions = {"method": settings.fit}
         dynamics = LearnedDynamics(system.spec, system.physics, fit_options=likely)
     how: dict[str, Any] = {"reward_tolerance": None, "score_horizons": (), "seed": seed}
-    agent = MPCAgent(env, system.task(dynamics), each_step, first=first, **how)
+    agent = MPCAgent(env, system.task(dynamics), **plans, **how)
     return agent, system.episode_length or 0
 
 

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gpadjust.control import CrossEntropy, Estimate, MPCAgent, Planner
+from gpadjust.control import Estimate, MPCAgent
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.dynamics.learning import DynamicsFitOptions
 from gpadjust.inference import ParameterWarning, SamplingWarning
@@ -27,12 +27,12 @@ from paper.common.figures import save
 from paper.common.tables import frame, groups, markdown, number
 from paper.common.verdicts import Curves, paired
 from paper.control import HORIZONS, Hidden, HiddenSettings
+from paper.control.planners import planners
 from paper.control.systems import furuta
 
 _SYSTEMS, _LEARNERS = Hidden.axes["system"], Hidden.axes["learner"]
 _MEASURED = {"cart_pole": ["x", "theta"], "furuta": ["arm", "theta"]}
 _STEP = {"cart_pole": 0.1, "furuta": 0.04}  # s
-_AHEAD = {"cart_pole": 8, "furuta": HORIZONS["furuta"]}
 _TOLD = 2  # the trial whose states are kept, for the picture
 
 
@@ -156,18 +156,9 @@ def make_agent(
     if learner == "quotient":
         env = Quotients(env, sensors.spec(known.spec), known.spec, _STEP[system])
         task = replace(task, sensors=None)
-    each_step = Planner(
-        search=CrossEntropy(settings.rounds, num_elites=settings.elites, correlation=0.5),
-        horizon=_AHEAD[system] * _STEP[system],
-        num_random=settings.sequences,
-        spread=0.15,
-    )
-    first = Planner(
-        search=CrossEntropy(settings.first_rounds, num_elites=settings.elites, correlation=0.5),
-        num_random=2 * settings.sequences,
-    )
+    plans = planners(settings, HORIZONS[system] * _STEP[system])
     options: dict[str, Any] = {"score_horizons": (), "reward_tolerance": None, "seed": seed}
-    return Watching(env, task, each_step, first=first, **options), known
+    return Watching(env, task, **plans, **options), known
 
 
 def tables(runs: Sequence[Run], experiment: Hidden) -> dict[str, Table]:

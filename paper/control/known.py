@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from gpadjust.control import CrossEntropy, MPCAgent, Planner
+from gpadjust.control import MPCAgent
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.dynamics.learning import DynamicsFitOptions
 from gpadjust.inference import ParameterWarning, SamplingWarning
@@ -22,6 +22,7 @@ from paper.common.tables import frame, groups, markdown, number
 from paper.common.verdicts import Curves, Difference, paired
 from paper.control import HORIZONS, Known, KnownSettings
 from paper.control.machine import Physics
+from paper.control.planners import planners
 from paper.control.systems import SYSTEMS
 from paper.machines.networks import NetworkDynamics
 
@@ -60,19 +61,10 @@ def make_agent(
     """The agent of a run, at its start, and what it controls."""
     known = SYSTEMS[system](_PHYSICS.get(learner, "crude"))
     task = known.task(dynamics(settings, known, learner))
-    each_step = Planner(
-        search=CrossEntropy(settings.rounds, num_elites=settings.elites, correlation=0.5),
-        horizon=HORIZONS[system] * (known.spec.step or 1.0),
-        num_random=settings.sequences,
-        spread=settings.spread,
-    )
-    first = Planner(
-        search=CrossEntropy(settings.first_rounds, num_elites=settings.elites, correlation=0.5),
-        num_random=settings.sequences,
-    )
+    plans = planners(settings, HORIZONS[system] * (known.spec.step or 1.0))
     # Reacher-v5's reward is of a moment before the end of the step, a millimetre off.
     options: dict[str, Any] = {"score_horizons": (), "reward_tolerance": 0.02, "seed": seed}
-    return MPCAgent(known.make(), task, each_step, first=first, **options), known
+    return MPCAgent(known.make(), task, **plans, **options), known
 
 
 def dynamics(settings: KnownSettings, known: System, learner: str) -> Dynamics:

@@ -13,12 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpadjust.control import CrossEntropy, MPCAgent, Planner
+from gpadjust.control import MPCAgent
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
+from gpadjust.dynamics.learning import DynamicsFitOptions
 from gpadjust.systems import System
 from paper.common.experiment import Run, Table
 from paper.common.tables import frame, groups, of, table
-from paper.control import HORIZONS, Setpoints
+from paper.control import Setpoints
+from paper.control.planners import planners
 from paper.control.systems import tanks
 
 _SET_POINTS = (2.0, 6.0)  # in cm, of the first trial and of later ones
@@ -98,22 +100,13 @@ def _agent(experiment: Setpoints, moves: str, plans: str, seed: int) -> tuple[MP
         system = replace(system, reference=stays if plans == "constant" else sine)
     dynamics: Dynamics = PhysicsDynamics(system.spec, system.physics)
     if plans != "oracle":
-        likely: Any = {"method": "map"}
+        likely: DynamicsFitOptions = {"method": settings.fit}
         dynamics = LearnedDynamics(system.spec, system.physics, fit_options=likely)
-    each_step = Planner(
-        search=CrossEntropy(1, num_elites=8, correlation=0.5),
-        horizon=HORIZONS["tanks"] * (system.spec.step or 1.0),
-        num_random=settings.sequences,
-        spread=0.15,
-    )
-    first = Planner(
-        search=CrossEntropy(settings.first_rounds, num_elites=8, correlation=0.5),
-        num_random=settings.sequences,
-    )
+    by = planners(settings, settings.horizon * (system.spec.step or 1.0))
     env = Moving(system.make(), moves == "within")
     # Nothing is checked, as the reference that is believed to stay is not the environment's.
     how: dict[str, Any] = {"reward_tolerance": None, "score_horizons": (), "seed": seed}
-    return MPCAgent(env, system.task(dynamics), each_step, first=first, **how), system
+    return MPCAgent(env, system.task(dynamics), **by, **how), system
 
 
 def tables(runs: Sequence[Run], experiment: Setpoints) -> dict[str, Table]:

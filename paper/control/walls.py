@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gpadjust import systems
-from gpadjust.control import CrossEntropy, MPCAgent, Planner
+from gpadjust.control import MPCAgent
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.dynamics.learning import DynamicsFitOptions
 from gpadjust.physics import Physics
@@ -26,6 +26,7 @@ from paper.common.experiment import Run, Table
 from paper.common.figures import one_legend, panels, save
 from paper.common.tables import frame, groups, of, table
 from paper.control import Walls
+from paper.control.planners import planners
 from paper.control.systems import TANKS
 
 GUST = 0.02  # m/s, standard deviation of what a step adds to the velocity of the cart
@@ -145,20 +146,9 @@ def run(experiment: Walls, system: str, controller: str, seed: int) -> Run:
         fit: DynamicsFitOptions = {"method": settings.fit}
         error = here.physics_error
         dynamics = LearnedDynamics(here.spec, here.physics, fit_options=fit, physics_error=error)
-    search = partial(CrossEntropy, num_elites=settings.elites, correlation=0.5)
-    agent = MPCAgent(
-        here.make(),
-        here.task(dynamics),
-        Planner(
-            search=search(settings.rounds),
-            horizon=settings.horizon * (here.spec.step or 1.0),
-            num_random=settings.sequences,
-            spread=0.15,
-        ),
-        first=Planner(search=search(settings.first_rounds), num_random=settings.first_sequences),
-        seed=seed,
-        score_horizons=(),
-    )
+    plans = planners(settings, settings.horizon * (here.spec.step or 1.0))
+    how: dict[str, Any] = {"score_horizons": (), "seed": seed}
+    agent = MPCAgent(here.make(), here.task(dynamics), **plans, **how)
     length = here.episode_length or 1
     agent.learn(settings.trials * length)
     made = agent.recorded_episodes()

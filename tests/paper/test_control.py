@@ -18,6 +18,7 @@ LIGHT = KnownSettings(
     trials=2,
     sequences=8,
     rounds=0,
+    first_sequences=8,
     first_rounds=0,
     elites=2,
     networks=3,
@@ -106,7 +107,9 @@ def test_rivals_of_a_system_make_a_table():
 
 @pytest.mark.slow
 def test_hidden_rates_make_a_table(tmp_path):
-    settings = HiddenSettings(trials=2, sequences=8, rounds=0, first_rounds=0, elites=2)
+    settings = HiddenSettings(
+        trials=2, sequences=8, rounds=0, first_sequences=16, first_rounds=0, elites=2
+    )
     hidden, runs = Hidden(settings=settings, out=tmp_path), []
     for learner in ("filter", "quotient"):
         found = hidden_run(hidden, "cart_pole", learner, 0)

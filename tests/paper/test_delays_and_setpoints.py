@@ -21,7 +21,7 @@ def runs_of(module, experiment, kinds):
 
 @pytest.mark.slow
 def test_set_points_make_tables():
-    light = SetpointsSettings(trials=2, sequences=8, first_rounds=0)
+    light = SetpointsSettings(trials=2, sequences=8, first_sequences=8, first_rounds=0)
     experiment = Setpoints(settings=light)
     kinds = [("between", "seen"), ("within", "constant"), ("within", "oracle")]
     found = setpoints.tables(runs_of(setpoints, experiment, kinds), experiment)
@@ -31,7 +31,7 @@ def test_set_points_make_tables():
 
 @pytest.mark.slow
 def test_delays_make_tables(tmp_path):
-    light = DelaysSettings(trials=1, sequences=8, first_rounds=0)
+    light = DelaysSettings(trials=1, sequences=8, first_sequences=8, first_rounds=0)
     experiment = Delays(settings=light, out=tmp_path)
     assert len(experiment.seeds_of("hint_late")) == 4 * len(experiment.seeds_of("not"))
     runs = runs_of(delays, experiment, [("physics",), ("hint_late",), ("hint_noisy",)])
