@@ -149,7 +149,7 @@ class Agent(TaskAgent):
         self.promised_reward: float | None = None
         self.wall_time = dict.fromkeys(("plan", "fit", "update"), 0.0)
         self.notes: dict[str, Any] = {}
-        self._steps = RealSteps()
+        self._steps = RealSteps(self.env.action_space)
         self._promises: list[float | None] = []  # one for each episode
         self._start: NDArray[Any] | None = None  # where the next episode begins, after a reset
         self._env_seed = seed  # of the first reset
@@ -238,17 +238,19 @@ class Agent(TaskAgent):
         getattr(self.action_noise, "reset", lambda: None)()
         while True:
             if random is not None:
-                action = self._scaled(next(random))
+                action = self._steps.scaled(next(random))
             else:
                 asked = time.perf_counter()
                 with self.timed("plan"):
                     choice, state = self._chosen(observation, state, np.array([begins]))
-                action = self._scaled(choice, noisy=True)
+                noise = 0.0 if self.action_noise is None else self.action_noise()
+                action = self._steps.scaled(choice, noise)
                 if begins:
                     said = self._said(state)
                     self._promises[episode] = said.get("promised_reward")
                     self.tell("plan", {**said, "seconds": time.perf_counter() - asked})
-            following, reward, terminated, truncated, info = self.env.step(self._unscaled(action))
+            taken = self._steps.unscaled(action)
+            following, reward, terminated, truncated, info = self.env.step(taken)
             self.num_timesteps += 1
             failed = bool(info.get("step_failed"))
             if not failed:
@@ -327,7 +329,7 @@ class Agent(TaskAgent):
 
     def _smooth(self) -> None:
         """Estimate the states behind all episodes, and the noises, in the newest model."""
-        seen = self._steps.seen(self._unscaled)
+        seen = self._steps.seen()
         if not seen:
             return
         newest = self.task.dynamics.before_data()
@@ -391,7 +393,7 @@ class Agent(TaskAgent):
 
         With sensors the states are drawn from what is known of them since they were last learnt.
         """
-        return self._steps.recorded(self.task, self._unscaled, newest)
+        return self._steps.recorded(self.task, newest)
 
     def env_attribute(self, name: str) -> Any:
         """An attribute of the environment or of one that it wraps."""
@@ -473,21 +475,6 @@ class Agent(TaskAgent):
                 yield action.numpy().astype(self.env.action_space.dtype)
             num_steps, before = 1, sequences[0, -1]
 
-    def _scaled(self, action: NDArray[Any], noisy: bool = False) -> NDArray[Any]:
-        """An action in the scale of [-1, 1], in which noise is added and steps are kept.
-
-        This is how Stable-Baselines3 rounds: agents of both are the same, bit for bit.
-        """
-        low, high = self.env.action_space.low, self.env.action_space.high
-        scaled = 2.0 * ((action - low) / (high - low)) - 1.0
-        if noisy and self.action_noise is not None:
-            scaled = scaled + self.action_noise()
-        return np.clip(scaled, -1.0, 1.0).astype(low.dtype)
-
-    def _unscaled(self, scaled: NDArray[Any]) -> NDArray[Any]:
-        low, high = self.env.action_space.low, self.env.action_space.high
-        return np.asarray(low + (0.5 * (scaled + 1.0) * (high - low)))
-
     def _compare(self, values: dict[str, float], recorded: Tensor) -> None:
         """Warn if a real step gave less than promised by a quarter of the range of all rewards.
 
@@ -541,11 +528,11 @@ class Agent(TaskAgent):
     @classmethod
     def from_parts(cls, parts: dict[str, bytes], env: Any, task: Task) -> Self:
         """The agent that :meth:`saved_parts` saved."""
-        steps = RealSteps.of(unpacked(parts["steps.pt"]))
+        steps = unpacked(parts["steps.pt"])
         task.dynamics.load_state_dict(unpacked(parts["dynamics.pt"]))
         agent = cls.__new__(cls)
         agent.task, agent._callbacks = task, []
         agent.env = cloudpickle.loads(parts["environment.pkl"]) if parts["environment.pkl"] else env
-        agent._steps = steps
+        agent._steps = RealSteps.of(steps, agent.env.action_space)
         vars(agent).update(unpickled(parts["agent.pkl"], agent))
         return agent

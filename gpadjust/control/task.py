@@ -67,8 +67,8 @@ class Task:
         terminated: Whether states ``N x state_dim`` end an episode, ``N`` booleans. Default: none.
         initial_states: Draws ``n`` states, ``n x state_dim``, at which episodes start. Default:
             those at which real episodes started.
-        episode_length: Steps after which an episode is truncated. Default: the time limit of the
-            environment.
+        episode_length: Steps after which an episode is truncated, in the model and by an
+            :class:`Agent`. Default: the time limit of the environment.
         state_bounds: Lower and upper bounds of the states, ``2 x state_dim``, beyond which the
             model is not followed; infinite where there is none. Default: far beyond all that was
             seen, of an agent that has seen some; else none.

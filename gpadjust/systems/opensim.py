@@ -83,7 +83,7 @@ def load_opensim() -> ModuleType:
         raise ImportError(
             'The muscle arm needs OpenSim; run `pip install "gpadjust[arm]"`.'
         ) from error
-    finally:  # or processes that are started later load OpenSim's libraries for their own CasADi's
+    finally:  # child processes would load OpenSim's CasADi in the place of their own
         os.environ.pop("LD_LIBRARY_PATH", None)
         if libraries is not None:
             os.environ["LD_LIBRARY_PATH"] = libraries

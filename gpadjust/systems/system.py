@@ -51,8 +51,8 @@ class System:
             that itself. Default: all of the states.
 
     Raises:
-        TypeError: If ``env``, ``physics`` or ``reward`` is not callable, or ``spec`` no
-            :class:`~gpadjust.states.StateSpec`.
+        TypeError: If ``env``, ``physics`` or ``reward`` is not callable, or ``spec``, ``sensors``
+            or ``physics_error`` is of another kind.
 
     Example:
         >>> from gpadjust import systems
@@ -104,7 +104,8 @@ class System:
             options: Keyword arguments of ``env``, such as ``render_mode="human"``.
 
         Raises:
-            ValueError: If the environment's own time limit is less than ``episode_length``.
+            ValueError: If the environment's own time limit is less than ``episode_length``, or it
+                observes neither the states nor what the sensors measure.
         """
         env = self.env(**options)
         limit = env.spec and env.spec.max_episode_steps
