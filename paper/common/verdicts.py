@@ -302,6 +302,12 @@ def met(held: bool) -> Verdict:
     return "met" if held else "missed"
 
 
+def below(difference: Difference, most: float) -> Verdict:
+    """The verdict on a target that a difference is at most a number, by its 95 % interval."""
+    verdict = within(difference, high=most)
+    return met(verdict == "reproduced") if verdict != "inconclusive" else verdict
+
+
 def counted(runs: int) -> str:
     """A number of runs, in words."""
     return f"{runs} run{'' if runs == 1 else 's'}"

@@ -21,7 +21,7 @@ from paper.common.experiment import Experiment, Run, Table
 from paper.common.learners import LEARNERS
 from paper.common.runs import RunsFile, timed
 from paper.common.tables import Cell, claims_table, frame, table
-from paper.common.verdicts import Difference, Judged, Verdict, met, paired, within
+from paper.common.verdicts import Difference, Judged, below, met, paired
 from paper.pairs import Multifidelity
 from paper.pairs.multifidelity import judge_intervals
 from paper.structures import CELLS, GROUPS, KINDS, MODELS, OF_NO_USE, Choice, Structures
@@ -33,7 +33,6 @@ CELLS_HELD = 0.9  # the share in which CKA is to hold both
 MOST_RRA = 1.15  # of RRA's RMSE in CKA's, in the mean
 _CONTAINED = ["phy", "gp"]
 _CELL = ["problem", "size", "noise"]
-_AHEAD: dict[Verdict, Verdict] = {"reproduced": "met", "not reproduced": "missed"}
 
 
 def run(
@@ -182,7 +181,7 @@ def verdicts(found: pd.DataFrame) -> list[Judged]:
         Judged(
             "S2",
             "CKA is ahead of the better of them in the mean (95 % interval over the cells)",
-            _AHEAD.get(within(logs, high=0), "inconclusive") if ahead[""][1] < 0 else "missed",
+            below(logs, 0.0) if ahead[""][1] < 0 else "missed",
             f"RMSE {logs.ratio()} times, median cell {np.exp(np.log(rmse).median()):.2f}; "
             + "; ".join(
                 f"{name}: " * bool(name) + f"RMSE {error:.2f} times, NLPD {density:+.2f}"
