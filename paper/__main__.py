@@ -25,7 +25,7 @@ CHAPTERS = {
         *("Noisyinputs", "Outliers", "Relative", "Repeats", "Sisters", "Vanishing"),
     ),
     "control": ("Known", "First", "Ontime", "Hidden", "Setpoints", "Delays", "Walls"),
-    "published": ("Uci",),
+    "published": ("Uci", "Formula"),
     "machines": ("Real", "Elsewhere", "Tanks", "Foresight", "Kinks"),
 }
 """Folders, and the classes of the experiments that they declare."""

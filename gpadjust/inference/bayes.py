@@ -14,12 +14,20 @@ from torch import Tensor
 
 from gpadjust.inference import annealing
 from gpadjust.inference.annealing import Particles, Proposal
-from gpadjust.inference.calibrate import calibrate_roughly, warn_of_parameters
+from gpadjust.inference.calibrate import Calibrated, calibrate_roughly, warn_of_parameters
 from gpadjust.inference.optimise import MANY, NOWHERE, Search, maximise
 from gpadjust.inference.parameter_draws import draw_parameters
 from gpadjust.inference.priors import LogPriors, register_priors
 from gpadjust.inference.proposals import Both, Normal, around_optima
-from gpadjust.inference.relevance import mixed, probability, without_physics
+from gpadjust.inference.relevance import (
+    ADJUSTED,
+    ALONE,
+    WITHOUT,
+    alone,
+    mixed,
+    probabilities,
+    without_physics,
+)
 from gpadjust.inference.representative import LeftOut, disagreement, left_out, representative
 from gpadjust.inference.targets import LogPosterior
 from gpadjust.inference.vectors import Parameters
@@ -143,18 +151,14 @@ class _Draws(NamedTuple):
         """True if the draws are of the posterior, ``B``."""
         return self.particles.power >= _LEAST_POWER
 
-    def relevance(self, rival: _Draws) -> Tensor:
-        """Posterior probability of this model beside one without the physics, ``B``."""
+    def away(self) -> Tensor:
+        """The constant between targets and their prior mean, in spreads of the targets, ``B``."""
         parameters, targets = self.target.parameters, self.target.targets
         mean, *_ = self.target.distribution(parameters.unflatten(parameters.current()))
         if self.target.repeats is not None:
             mean = self.target.repeats.of_rows(mean)
         spread = (targets - targets.nanmean(-1, keepdim=True)).square().nanmean(-1).sqrt()
-        return probability(
-            self.log_evidence(),
-            rival.log_evidence(),
-            (targets - mean.squeeze(0)).nanmean(-1).abs() / spread,
-        )
+        return (targets - mean.squeeze(0)).nanmean(-1).abs() / spread
 
     def log_evidence(self) -> Tensor:
         """The log evidence by all states, ``B``; rough if particles are of a density on the way."""
@@ -185,47 +189,106 @@ def sample(
         return _with_parameters(model, search, num_samples, num_draws, generator)
     copy = deepcopy(model)
     settled = _settle_shared(copy, search)
-    without = None if settled or not _can_be_weighed(model) else without_physics(copy)
+    can_be_weighed = not settled and _can_be_weighed(model)
+    rivals = {WITHOUT: without_physics(copy), ALONE: alone(copy)} if can_be_weighed else {}
     register_priors(copy)
     num_samples = num_samples or default_num_samples(n)
-    draws = _draw(LogPosterior(copy), search, num_draws, generator)
-    size, is_good, relevance = draws.particles.effective_size(), draws.is_good(), None
+    every = {ADJUSTED: _draw(LogPosterior(copy), search, num_draws, generator)}
+    draws = every[ADJUSTED]
+    for name, rival in rivals.items():
+        if rival is not None:
+            register_priors(rival)
+            found = (LogPosterior(rival), search, num_draws // 2, generator, draws.log_evidence())
+            every[name] = _draw(*found)
+    shares = probabilities({k: each.log_evidence() for k, each in every.items()}, draws.away())
+    best = torch.stack([*shares.values()]).argmax(0)  # what most samples are of is what counts
+    size = torch.stack([each.particles.effective_size() for each in every.values()])
+    good = torch.stack([each.is_good() for each in every.values()])
+    size, is_good = (each.gather(0, best[None])[0] for each in (size, good))
     positions = draws.particles.positions
-    predicted, (number, problems, p) = left_out(draws.target, positions), positions.shape
-    weights = torch.full_like(positions[..., 0], 1 / number)
-    if without is None:
-        held = draws.raw(representative(predicted, positions, weights, num_samples))
-    else:
-        register_priors(without)
-        evidence = draws.log_evidence()
-        plain = _draw(LogPosterior(without), search, num_draws // 2, generator, evidence)
-        share = draws.relevance(plain)
-        # What most samples are of is what counts.
-        size = size.where(share > 0.5, plain.particles.effective_size())
-        is_good = is_good.where(share > 0.5, plain.is_good())
-        others = left_out(plain.target, plain.particles.positions)
-        more = others.mean.shape[0]
-        predicted = LeftOut(*(torch.cat(each) for each in zip(predicted, others, strict=True)))
-        rest = ((1 - share) / more).expand(more, problems)
-        weights = torch.cat([share * weights, rest])
-        middle = positions.mean(0).expand(more, problems, p)
-        is_own = torch.arange(number + more, device=weights.device) < number
-        every = torch.cat([positions, middle])
-        rows = representative(predicted, every, weights, num_samples, is_own)
-        is_on = rows < number
-        held = mixed(
-            draws.raw(rows.clamp_max(number - 1)),
-            plain.raw((rows - number).clamp_min(0)),
-            copy,
-            without,
-            is_on.to(share).mean(0).reshape(model._aug_batch_shape),
-        )
-        relevance = share.reshape(model._aug_batch_shape)
+    middle = positions.mean(0)
+    counts = [len(each.particles.positions) for each in every.values()]
+    of = torch.repeat_interleave(torch.arange(len(every)), torch.tensor(counts)).to(
+        positions.device
+    )
+    predicted = [left_out(each.target, each.particles.positions) for each in every.values()]
+    predicted = LeftOut(*(torch.cat(each) for each in zip(*predicted, strict=True)))
+    weights = torch.cat([(shares[k] / m).expand(m, -1) for k, m in zip(every, counts, strict=True)])
+    own = torch.cat([positions, middle.expand(sum(counts[1:]), *middle.shape)])
+    rows = representative(predicted, own, weights, num_samples, of)
+    starts = torch.tensor([0, *counts]).cumsum(0)
+    raw = [
+        each.raw((rows - start).clamp(0, count - 1))
+        for each, start, count in zip(every.values(), starts, counts, strict=False)
+    ]
+    held = raw[0]
+    if len(every) > 1:
+        models = [each.target.model for each in every.values()]
+        which = of[rows].reshape(num_samples, *model._aug_batch_shape)
+        held = mixed([*zip(raw, models, strict=True)], which)
+    relevance = None
+    if WITHOUT in shares:
+        relevance = (1 - shares[WITHOUT]).reshape(model._aug_batch_shape)
     off = disagreement(predicted, weights, draws.target.targets)
     is_good &= off <= _OFF
     _hold(model, held, settled)
     named = _named(draws.target.parameters, draws.particles.positions)
     return _result(size, is_good, named, draws.target.parameters, relevance)
+
+
+class _ParameterDraws(NamedTuple):
+    """Draws of a model whose physics has unknown parameters.
+
+    Attributes:
+        target: Of the hyper-parameters, with the parameters integrated out.
+        vectors: Of the hyper-parameters, ``K x B x q``.
+        coordinates: Of the parameters that go with them, ``K x p``.
+        size: Effective sample size of the hyper-parameters, ``B``, and ``own`` of the parameters.
+        is_good: True if the draws are of the posterior, ``B``.
+        log_evidence: ``B``.
+        calibrated: The model near its most likely parameters.
+    """
+
+    target: LogPosterior
+    vectors: Tensor
+    coordinates: Tensor
+    size: Tensor
+    own: Tensor
+    is_good: Tensor
+    log_evidence: Tensor
+    calibrated: Calibrated
+
+    def raw(self, rows: Tensor) -> dict[str, Tensor]:
+        """Raw parameters of draws of the numbers ``k``, ``k x`` their shape, by name."""
+        parameters = self.target.parameters
+        held = parameters.to_raw(parameters.unflatten(self.vectors[rows]))
+        return held | {"input_transform.coordinates": self.coordinates[rows]}
+
+
+def _draw_with_parameters(
+    model: TermsGP, search: Search, number: int, num_draws: int, generator: torch.Generator
+) -> _ParameterDraws:
+    """Draw hyper-parameters and parameters of the physics."""
+    calibrated = calibrate_roughly(model, search)
+    register_priors(model)
+    target = LogPosterior(model, None, calibrated.marginalized)
+    parameters = target.parameters
+    vectors = parameters.current()  # if all is known but the parameters of the physics
+    log_densities = log_evidence = vectors.new_zeros(1)
+    size = vectors.new_full((parameters.num_problems,), math.inf)
+    is_good = size > 0
+    if parameters.names:
+        draws = _draw(target, search, num_draws, generator)
+        size, is_good = draws.particles.effective_size(), draws.is_good()
+        vectors, log_evidence = draws.particles.positions, draws.log_evidence()
+        # What is not done of the way to the posterior leaves a part.
+        left = (1 - draws.particles.power) * draws.particles.log_ratio
+        log_densities = (target.log_likelihood(vectors) - left).sum(-1)
+    found = draw_parameters(calibrated, parameters, vectors, log_densities, number, generator)
+    vectors, coordinates, own = found
+    return _ParameterDraws(
+        target, vectors, coordinates, size, own, is_good, log_evidence, calibrated
+    )
 
 
 def _with_parameters(
@@ -235,50 +298,55 @@ def _with_parameters(
     num_draws: int,
     generator: torch.Generator,
 ) -> SampleResult:
-    """Sample a model whose physics has unknown parameters."""
+    """Sample a model whose physics has unknown parameters.
+
+    One output is weighed against the physics alone, whose parameters are its own.
+    """
     copy, n = deepcopy(model), model.train_targets.shape[-1]
     settled = _settle_shared(copy, search)
-    calibrated = calibrate_roughly(copy, search)
-    register_priors(copy)
-    target = LogPosterior(copy, None, calibrated.marginalized)
-    parameters = target.parameters
+    can_be_weighed = not settled and _can_be_weighed(model) and model.num_outputs == 1
+    rival = alone(copy) if can_be_weighed else None
     if num_samples is None:
-        alone = all(term.is_known for term in model.terms)
-        least = min(_HELD_ALONE, _SAMPLED_ALONE // n**2) if alone else 0
+        known = all(term.is_known for term in model.terms)
+        least = min(_HELD_ALONE, _SAMPLED_ALONE // n**2) if known else 0
         num_samples = max(default_num_samples(n), _SAMPLES_OF_PARAMETERS, least)
-    vectors = parameters.current()  # if all is known but the parameters of the physics
-    log_densities = vectors.new_zeros(1)
-    size = vectors.new_full((parameters.num_problems,), math.inf)
-    is_good = size > 0
-    if parameters.names:
-        draws = _draw(target, search, num_draws, generator)
-        size, is_good = draws.particles.effective_size(), draws.is_good()
-        vectors = draws.particles.positions
-        # What is not done of the way to the posterior leaves a part.
-        left = (1 - draws.particles.power) * draws.particles.log_ratio
-        log_densities = (target.log_likelihood(vectors) - left).sum(-1)
-    vectors, coordinates, own = draw_parameters(
-        calibrated, parameters, vectors, log_densities, max(_RETURNED, num_samples), generator
-    )
-    few, many = bool(own < _LEAST_SIZE_OF_PARAMETERS), calibrated.unseen >= _UNSEEN
-    hint = _HINT
+    number = max(_RETURNED, num_samples)
+    found = _draw_with_parameters(copy, search, number, num_draws, generator)
+    parts, share = [found], found.size.new_zeros(())
+    if rival is not None:
+        parts.append(_draw_with_parameters(rival, search, number, num_draws, generator))
+        names = (ADJUSTED, ALONE)
+        evidences = {k: p.log_evidence for k, p in zip(names, parts, strict=True)}
+        share = probabilities(evidences)[ALONE].squeeze()
+    main = parts[int(share > 0.5)]  # what most samples are of is what counts
+    few, many = bool(main.own < _LEAST_SIZE_OF_PARAMETERS), main.calibrated.unseen >= _UNSEEN
+    is_good, hint = main.is_good, _HINT
+    unknowns = found.calibrated.calibration.unknowns.names
     if few or many:
         is_good = is_good & False
-        names = ", ".join(calibrated.calibration.unknowns.names)
         why = "many values of them explain the observations" if many else "few draws of them count"
-        hint = f"It is {names} of the physics: {why}. Give narrower priors, or observe what tells "
-        hint += "them apart."
-    size = size.minimum(own)
-    rows = torch.linspace(0, len(vectors) - 1, num_samples).round().long()
-    held = parameters.to_raw(parameters.unflatten(vectors[rows]))
-    held["input_transform.coordinates"] = coordinates[rows]
-    named = _named(parameters, vectors) | model.input_transform.remember(coordinates)
+        hint = f"It is {', '.join(unknowns)} of the physics: {why}. Give narrower priors, or "
+        hint += "observe what tells them apart."
+
+    def of_each(total: int) -> tuple[Tensor, Tensor]:
+        """Numbers of draws, and of the part that each is of."""
+        rows = torch.linspace(0, number - 1, total).round().long()
+        return rows, (torch.arange(total) >= total - (total * share.cpu()).round()).long()
+
+    rows, which = of_each(num_samples)
+    held = found.raw(rows)
+    every, of = found.coordinates, of_each(number)[1]
+    if rival is not None:
+        pairs = [(p.raw(rows), p.target.model) for p in parts]
+        held = mixed(pairs, which.to(share.device).reshape(-1, *[1] * len(model._aug_batch_shape)))
+        every = every.where(of.to(share.device)[:, None] == 0, parts[1].coordinates)
+    named = _named(found.target.parameters, found.vectors) | model.input_transform.remember(every)
     _hold(model, held, settled)
-    calibrated.calibration.direct(model, coordinates[rows])
-    calibration, near = calibrated.calibration, calibrated.near
-    told = calibrated.information.precision.sum(-3)
-    warn_of_parameters(calibration.unknowns.names, told, near.point)
-    return _result(size, is_good, named, parameters, hint=hint)
+    found.calibrated.calibration.direct(model, held["input_transform.coordinates"])
+    told = found.calibrated.information.precision.sum(-3)
+    warn_of_parameters(unknowns, told, found.calibrated.near.point)
+    size = main.size.minimum(main.own)
+    return _result(size, is_good, named, found.target.parameters, hint=hint)
 
 
 def _hold(model: TermsGP, samples: dict[str, Tensor], settled: dict[str, Tensor]) -> None:

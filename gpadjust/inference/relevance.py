@@ -1,8 +1,8 @@
-"""Use of a physics: the same model without it, weighed by its evidence."""
+"""Use of a physics: the same model without it, and it alone, weighed by their evidence."""
 
 from __future__ import annotations
 
-import math
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 
 import torch
@@ -10,10 +10,11 @@ from torch import Tensor
 
 from gpadjust.gp import AppendedPhysics, Term
 from gpadjust.models import TermsGP
-from gpadjust.models.parameters import Hyperparameter, hyperparameters
+from gpadjust.models.hyperparameter_samples import NONE
+from gpadjust.models.parameters import SIZES, hyperparameters
 
-_DOUBT = 0.2  # prior probability that a physics is of no use
-_NONE = 1e-20  # variance of a rho that is switched off, in its typical size
+ADJUSTED, WITHOUT, ALONE = "adjusted", "without", "alone"
+_PRIOR = {ADJUSTED: 0.32, WITHOUT: 0.08, ALONE: 0.6}
 
 
 def is_scaled(term: Term) -> bool:
@@ -37,17 +38,8 @@ def without_physics(model: TermsGP) -> TermsGP | None:
     if any(basis.learnt is None and basis.center.any() for basis in centers):
         return None
     other = deepcopy(model)
-    rows = _of_scaled(other)
-    sizes = [row for row in rows if row.kind == "scaling"]
-    learnt = [row for row in rows if row.raw.requires_grad]
-    if len(sizes) != len(scaled) or not all(row.is_free for row in sizes):
+    if not _switched_off(other, [term for term in other.terms if is_scaled(term)]):
         return None
-    if next(iter(model.named_priors()), None) is not None or len(learnt) < len(rows):
-        return None
-    for row in rows:
-        row.raw.requires_grad_(False)
-        if row.kind == "scaling":
-            row.raw.copy_(row.to_raw(row.log_of(torch.full_like(row.raw, _NONE))))
     mean = model.train_targets.nanmean(-1, keepdim=True)
     for term in other.terms:
         term.mean.copy_(mean if term.name == rest[0].name else torch.zeros_like(mean))
@@ -57,58 +49,93 @@ def without_physics(model: TermsGP) -> TermsGP | None:
     return other
 
 
-def _of_scaled(model: TermsGP) -> list[Hyperparameter]:
-    """The rows of the hyper-parameters of functions that scale a physics."""
-    own = {id(p) for t in model.terms if is_scaled(t) for p in t.parameters()}
+@torch.no_grad()
+def alone(model: TermsGP) -> TermsGP | None:
+    r"""A model with its functions switched off, :math:`\rho = 1` and :math:`\delta = 0`.
+
+    It is the physics, by its prior means, and noise; None of a model that has no physics in its
+    mean, or functions whose priors are not the default ones.
+    """
+    with_physics = [term for term in model.terms if isinstance(term.basis, AppendedPhysics)]
+    if not with_physics or any(term.learns_mean for term in model.terms):
+        return None
+    other = deepcopy(model)
+    functions = [term for term in other.terms if term.kernel is not None]
+    if any(not is_scaled(term) and term.basis is not None for term in functions):
+        return None
+    if not functions or not all((term.given_mean != 0).all() for term in with_physics):
+        return None
+    if not _switched_off(other, functions):
+        return None
+    rows = hyperparameters(other)
+    if not any(row.raw.requires_grad for row in rows):  # of known noise: one that changes nothing
+        next(row for row in rows if row.kind == "lengthscale").raw.requires_grad_(True)
+    return other
+
+
+def _switched_off(model: TermsGP, terms: Sequence[Term]) -> bool:
+    """Fix functions of a model at next to nothing, if their hyper-parameters are the default's."""
+    own = {id(p) for term in terms for p in term.parameters()}
     rows = [row for row in hyperparameters(model) if id(row.raw) in own]
-    return [row for row in rows if row.kind != "other"]
+    rows = [row for row in rows if row.kind != "other"]
+    sizes = [row for row in rows if row.kind in SIZES]
+    if len(sizes) != len(terms) or not all(row.is_free for row in sizes):
+        return False
+    if next(iter(model.named_priors()), None) is not None:
+        return False
+    if not all(row.raw.requires_grad for row in rows):
+        return False
+    for row in rows:
+        row.raw.requires_grad_(False)
+        if row in sizes:
+            row.raw.copy_(row.to_raw(row.log_of(torch.full_like(row.raw, NONE))))
+    return True
 
 
-def probability(log_evidence: Tensor, without: Tensor, away: Tensor | float = 0.0) -> Tensor:
-    """Posterior probability that the physics is of use, of log evidences with and without it.
+def probabilities(
+    log_evidences: Mapping[str, Tensor], away: Tensor | float = 0.0
+) -> dict[str, Tensor]:
+    """Posterior probabilities of models by their log evidences.
 
-    The model without has a constant for free. The other draws it from a distribution as wide as
-    the constant itself, which costs the logarithm of that over the width of what varies.
+    The model without its physics has a constant for free. The others draw it from a distribution as
+    wide as the constant itself, which costs the logarithm of that over the width of what varies.
 
     Args:
-        log_evidence: Of the model with its physics.
-        without: Of that without.
+        log_evidences: Of the model that adjusts its physics, of that without it, and of the
+            physics alone, or of some of these.
         away: The constant between targets and their prior mean, in spreads of the targets. Below
             one it cannot be separated from the variation.
     """
     constant = torch.as_tensor(away).nan_to_num(nan=1.0, posinf=1.0).clamp_min(1.0).log()
-    return (log_evidence - without + constant + math.log(1 / _DOUBT - 1)).sigmoid()
+    found = [
+        torch.as_tensor(_PRIOR[name]).log() + evidence + (0 if name == WITHOUT else constant)
+        for name, evidence in log_evidences.items()
+    ]
+    shares = torch.stack(torch.broadcast_tensors(*found)).softmax(0)
+    return dict(zip(log_evidences, shares, strict=True))
 
 
 @torch.no_grad()
-def mixed(
-    samples: dict[str, Tensor],
-    others: dict[str, Tensor],
-    model: TermsGP,
-    without: TermsGP,
-    share: Tensor,
-) -> dict[str, Tensor]:
-    """Samples of a model of which the last ones have the physics switched off.
+def mixed(parts: Sequence[tuple[dict[str, Tensor], TermsGP]], which: Tensor) -> dict[str, Tensor]:
+    """Samples of a model of which some have functions switched off.
 
     Args:
-        samples: Raw parameters of the model, ``S x`` their shape, by name.
-        others: Of the model without physics.
-        model: The model.
-        without: That without physics.
-        share: Of the samples that are the model's, ``batch_shape x (m)``.
+        parts: Raw parameters, ``S x`` their shape, by name, and the model that they are of: first
+            of the model itself, then of those that have some of its parameters switched off.
+        which: The part that each sample is of, ``S x batch_shape x (m)``.
     """
-    (number,) = {len(values) for values in samples.values()}
-    kept = (number * share).round()
-    steps = torch.arange(number, device=share.device).reshape(-1, *[1] * share.dim())
-    is_on = steps < kept
-    named = dict(model.named_parameters()), dict(without.named_parameters())
+    (samples, model), number = parts[0], len(which)
+    named = [dict(own.named_parameters()) for _, own in parts]
     means = [f"covar_module.terms.{i}.mean" for i in range(len(model.terms))]
     found = {}
     for name in (*samples, *means):
-        on, off = (
+        every = [
             given.get(name, own[name].detach().expand(number, *own[name].shape))
-            for given, own in zip((samples, others), named, strict=True)
-        )
-        which = is_on.reshape(*is_on.shape, *[1] * (on.dim() - is_on.dim()))
-        found[name] = torch.where(which, on, off)
+            for (given, _), own in zip(parts, named, strict=True)
+        ]
+        chosen = every[0]
+        for i, values in enumerate(every[1:], 1):
+            is_own = (which == i).reshape(*which.shape, *[1] * (values.dim() - which.dim()))
+            chosen = torch.where(is_own, values, chosen)
+        found[name] = chosen
     return found

@@ -88,7 +88,7 @@ def representative(
     positions: Tensor,
     weights: Tensor,
     number: int,
-    is_first: Tensor | None = None,
+    which: Tensor | None = None,
 ) -> Tensor:
     """Numbers of a few draws whose mixture predicts as that of all, ``number x B``, in order.
 
@@ -100,8 +100,8 @@ def representative(
         positions: Of the draws, ``N x B x p``.
         weights: Of the draws, ``N x B``, which sum to one.
         number: How many.
-        is_first: Which draws are of the first of two models, ``N``; as many are chosen as it has
-            weight. Default: all are of one.
+        which: Numbers of the models that draws are of, ``N``, from 0; as many are chosen of each as
+            it has weight. Default: all are of one.
     """
     share = weights.unsqueeze(-1)
     unit = (share * predictions.variance).sum(0).sqrt()
@@ -112,8 +112,9 @@ def representative(
         predictions.variance.sqrt() / unit,
         _OF_POSITIONS * away / spread,
     ]
-    if is_first is not None:
-        parts.append(_OF_MODELS * is_first.to(away)[:, None, None].expand_as(away[..., :1]))
+    for model in range(0 if which is None else int(which.max())):
+        is_own = (which == model).to(away)[:, None, None]
+        parts.append(_OF_MODELS * is_own.expand_as(away[..., :1]))
     features = torch.cat(
         [(each - (share * each).sum(0)) / math.sqrt(each.shape[-1]) for each in parts], dim=-1
     )

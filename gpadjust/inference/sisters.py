@@ -21,7 +21,7 @@ from gpadjust.inference.priors import register_priors
 from gpadjust.inference.representative import left_out, representative
 from gpadjust.inference.targets import LogPosterior
 from gpadjust.models import RRA, TermsGP
-from gpadjust.models.hyperparameter_samples import uses_physics
+from gpadjust.models.hyperparameter_samples import adjusts, uses_physics
 from gpadjust.models.parameters import Hyperparameter, hyperparameters
 
 _HELPS = 0.1  # prior probability that other machines help: they must show it
@@ -166,8 +166,8 @@ def _scale(model: TermsGP, unit: Unit = Unit.TARGET) -> Tensor:
 
 
 def _of_physics(model: TermsGP, values: Tensor) -> Tensor:
-    """Values of samples, ``S x ...``; those without the physics have the mean of the others."""
-    used = uses_physics(model)
+    """Values of samples, ``S x ...``; those without physics or functions have the others' mean."""
+    used = uses_physics(model) & adjusts(model)
     used = used.reshape(*used.shape, *[1] * (values.dim() - used.dim())).to(values)
     used = torch.where(used.sum(0) > 0, used, torch.ones_like(used))
     middle = ((values.log() * used).sum(0) / used.sum(0)).exp()

@@ -9,7 +9,7 @@ import torch
 
 from gpadjust.gp import AppendedPhysics
 from gpadjust.models import TermsGP, TermsModel, VariationalCKA
-from gpadjust.models.hyperparameter_samples import uses_physics
+from gpadjust.models.hyperparameter_samples import adjusts, uses_physics
 from gpadjust.models.parameters import hyperparameters
 
 
@@ -53,9 +53,9 @@ def warm_start(model: TermsModel, previous: TermsModel) -> None:
 def _mean_of_samples(model: TermsGP) -> TermsGP:
     """A copy with the means of the raw parameters that a model holds samples of.
 
-    Samples that do without the physics do not count; NaN where there are no others.
+    Samples without the physics, or of it alone, do not count; NaN where there are no others.
     """
-    held, counts = dict(model.named_parameters()), uses_physics(model).double()
+    held, counts = dict(model.named_parameters()), (uses_physics(model) & adjusts(model)).double()
     weights, shape = counts / counts.sum(0), counts.shape
     model = deepcopy(model)
     model.release_samples()

@@ -16,6 +16,7 @@ from gpadjust.gp import AppendedPhysics, Term
 from gpadjust.gp.kernels import CompositeKernel
 from gpadjust.gp.noise import RowNoise
 from gpadjust.gp.sister import Sister
+from gpadjust.models.parameters import SIZES, hyperparameters
 from gpadjust.models.relative_noise import RelativeNoise
 from gpadjust.models.updates import UpdatedWeights
 
@@ -23,6 +24,8 @@ HOLDS_SAMPLES = (
     "The model holds samples of its hyper-parameters; `gpadjust.fit` lets go of them, "
     "`model.release_samples()` keeps the first."
 )
+NONE = 1e-20  # variance of a function that is switched off, in its typical size
+_OFF = 1e-16  # the same, below which it is
 # Modules whose buffers have the batch.
 _BATCHED = (
     AppendedPhysics,
@@ -80,6 +83,20 @@ def uses_physics(model: Any) -> Tensor:
     known = [term for term in model.terms if not term.learns_mean]
     same = [(term.mean == term.given_mean).squeeze(-1) for term in known]
     return torch.stack(same).all(0) if same else model.terms[0].mean.squeeze(-1).isfinite()
+
+
+@torch.no_grad()
+def adjusts(model: Any) -> Tensor:
+    """Mask of the samples of a model that have functions; of the others the physics is alone.
+
+    It is ``S x batch_shape x (m)``.
+    """
+    rows = [row for row in hyperparameters(model) if row.kind in SIZES and row.size is not None]
+    mask = torch.ones_like(model.terms[0].mean.squeeze(-1), dtype=torch.bool)
+    if not rows:
+        return mask
+    off = [(row.parameter(row.raw) <= _OFF * row.size).reshape(mask.shape) for row in rows]
+    return ~torch.stack(off).all(0)
 
 
 def transform_training_inputs(model: Any) -> None:

@@ -60,6 +60,8 @@ KINDS = {
     "mean": Kind(1e2),
 }
 """The kinds of parameters that have a typical size."""
+SIZES = ("outputscale", "scaling")
+"""Those that are the variance of a function."""
 _ROUNDING = 1e-12
 
 

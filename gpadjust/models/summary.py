@@ -10,7 +10,7 @@ from botorch.models.transforms.outcome import nanstd
 from torch import Tensor
 
 from gpadjust.gp import AppendedPhysics, OffsetKernel, PhysicsInput, Unit
-from gpadjust.models.hyperparameter_samples import take_samples, uses_physics
+from gpadjust.models.hyperparameter_samples import adjusts, take_samples, uses_physics
 from gpadjust.models.parameters import Hyperparameter, hyperparameters
 
 _ROUNDING = 1e-12  # of a term's unit
@@ -43,12 +43,15 @@ def summary(model: Any) -> str:
     for i, name in enumerate(model.output_names):
         own = model.subset_output([i])
         lines.append(f"{name}:")
-        has_physics = None if own.num_samples is None else uses_physics(own).flatten()
-        if has_physics is not None and not has_physics.all():
-            out, held = int((~has_physics).sum()), len(has_physics)
-            lines.append(f"  the physics is left out in {out} of {held} samples")
-            if out < held:  # what follows is of the others
-                own = take_samples(own, has_physics.nonzero().flatten(), as_mixture=True)
+        if own.num_samples is not None:
+            has_physics, has_functions = uses_physics(own).flatten(), adjusts(own).flatten()
+            for kept, what in ((has_physics, "left out"), (has_functions, "left as it is")):
+                if not kept.all():
+                    out = f"{int((~kept).sum())} of {len(kept)} samples"
+                    lines.append(f"  the physics is {what} in {out}")
+            kept = has_physics & has_functions
+            if kept.any() and not kept.all():  # what follows is of the others
+                own = take_samples(own, kept.nonzero().flatten(), as_mixture=True)
         lines += _lines(own)
     return "\n".join(lines)
 

@@ -11,7 +11,15 @@ from gpytorch.priors import LogNormalPrior
 
 from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP, fit, load, save
 from gpadjust.inference import FitResult, register_priors
-from gpadjust.inference.relevance import mixed, probability, without_physics
+from gpadjust.inference.relevance import (
+    ADJUSTED,
+    ALONE,
+    WITHOUT,
+    alone,
+    mixed,
+    probabilities,
+    without_physics,
+)
 from gpadjust.inference.targets import LogPosterior
 from gpadjust.inference.warm_start import warm_start
 from gpadjust.validation import trust
@@ -65,7 +73,9 @@ def half_off(model, share, number=4):
     """Samples of a model, of which some have the physics switched off; with those of both."""
     other = without_physics(model)
     on, off = around(model, number), around(other, number, seed=1)
-    return mixed(on, off, model, other, torch.as_tensor(share, dtype=torch.float64)), on, off
+    kept = (number * torch.as_tensor(share)).round()
+    which = (torch.arange(number).reshape(-1, *[1] * kept.dim()) >= kept).long()
+    return mixed([(on, model), (off, other)], which), on, off
 
 
 @pytest.fixture
@@ -189,25 +199,90 @@ class TestWithoutPhysics:
         torch.testing.assert_close(other.predict(Z).mean, on_delta, rtol=1e-6, atol=1e-8)
 
 
-def test_probability():
-    # With a prior probability of 0.8.
-    with_, without = torch.tensor([0.3, -2.0, 5.0]), torch.tensor([0.1, 1.0, 5.0])
-    expected = 0.8 * with_.exp() / (0.8 * with_.exp() + 0.2 * without.exp())
-    torch.testing.assert_close(probability(with_, without), expected)
-    assert probability(with_, without)[2] == pytest.approx(0.8)
-    far = torch.tensor([1e4, -1e4])
-    assert probability(far, torch.zeros(2)).tolist() == [1.0, 0.0]
-    torch.testing.assert_close(probability(far - 1e4, far - 1e4), torch.full((2,), 0.8))
+class TestAlone:
+    @pytest.mark.parametrize("kind", [CKA, PhysicsMeanGP, ScaleGP, RRA])
+    @pytest.mark.parametrize("known", [None, 0.04])
+    def test_it_is_the_physics_and_noise(self, data, kind, known):
+        X, Y, Z = data
+        options = {"num_features": 32} if kind is RRA else {}
+        model = kind(X, Y, known, physics=double, **options)
+        before = deepcopy(model.state_dict())
+        other = alone(model).eval()
+        assert all(torch.equal(before[name], v) for name, v in model.state_dict().items())
+        found = other.predict(Z)
+        torch.testing.assert_close(found.mean, double(Z), rtol=1e-6, atol=1e-8)
+        assert (found.variance < 1e-12 * Y.var()).all()
+        register_priors(other)
+        names = LogPosterior(other).parameters.names  # what there is to learn
+        kinds = {name.rsplit(".", 1)[-1] for name in names}
+        assert kinds == ({"raw_noise"} if known is None else {"raw_lengthscale"})
+
+    @pytest.mark.parametrize(
+        "build",
+        [
+            ZeroMeanGP,
+            lambda X, Y: AR1(X, Y, physics=double, low_X=X),
+            lambda X, Y: CKA(X, Y, physics=double, rho_mean="learn"),
+            lambda X, Y: CKA(X, Y, physics=double, rho_mean=0.0),
+            lambda X, Y: CKA(X, Y, physics=double, rho_covar_module=RBFKernel()),
+        ],
+        ids=["no physics", "two levels", "unknown rho", "none without data", "a rho of one size"],
+    )
+    def test_there_is_none(self, data, build):
+        X, Y, _ = data
+        assert alone(build(X, Y)) is None
+
+    @pytest.mark.parametrize("kind", [CKA, PhysicsMeanGP])
+    def test_a_right_physics_is_followed(self, kind):
+        """With noise, functions that are free find some where there is none."""
+        Z, squares = line(40), torch.zeros(2)
+        for seed in range(4):
+            X = uniform(12, 1, seed=seed)
+            Y = truth(X) + 0.2 * normal(12, 1, seed=10 + seed)
+            model, free = (kind(X, Y, physics=truth) for _ in range(2))
+            register_priors(free)  # as if they were the user's: nothing is weighed
+            for i, each in enumerate((model, free)):
+                fit(each)
+                squares[i] += (each.predict(Z).mean - truth(Z)).square().mean()
+        assert squares[0] < 0.5 * squares[1]
+        assert "left as it is in" in model.summary()
+
+    def test_a_wrong_physics_is_not(self, data):
+        X, Y, Z = data
+        model = CKA(X, Y, physics=lambda X: truth(X) + 0.3 * X.cos())
+        fit(model)
+        assert (model.predict(Z).mean - truth(Z)).abs().max() < 1e-3
+
+
+def test_probabilities():
+    evidences = {
+        ADJUSTED: torch.tensor([0.3, -2.0, 5.0]),
+        WITHOUT: torch.tensor([0.1, 1.0, 5.0]),
+        ALONE: torch.tensor([-1.0, 0.0, 5.0]),
+    }
+    found = probabilities(evidences)
+    torch.testing.assert_close(sum(found.values()), torch.ones(3))
+    even = {name: share[2].item() for name, share in found.items()}  # the prior ones
+    for name, share in found.items():
+        expected = even[name] * evidences[name].exp()
+        total = sum(even[other] * evidences[other].exp() for other in evidences)
+        torch.testing.assert_close(share, expected / total)
+    assert even[ADJUSTED] == pytest.approx(4 * even[WITHOUT])
+    far = {ADJUSTED: torch.tensor([1e4, -1e4]), WITHOUT: torch.zeros(2)}
+    assert probabilities(far)[ADJUSTED].tolist() == [1.0, 0.0]
+    assert probabilities({ADJUSTED: far[ADJUSTED]})[ADJUSTED].tolist() == [1.0, 1.0]
 
 
 class TestConstant:
     """A constant between physics and targets, which a model without physics has for free."""
 
     def test_its_cost(self):
-        zero = torch.zeros(5)
+        even = {ADJUSTED: torch.zeros(5), WITHOUT: torch.zeros(5)}
+        prior = probabilities(even)
+        odds = (prior[ADJUSTED] / prior[WITHOUT])[0]
         away = torch.tensor([0.0, 1.0, 10.0, torch.inf, torch.nan])
-        expected = (torch.tensor([1.0, 1.0, 10.0, 1.0, 1.0]) * 4).log().sigmoid()
-        torch.testing.assert_close(probability(zero, zero, away), expected)
+        expected = (torch.tensor([1.0, 1.0, 10.0, 1.0, 1.0]) * odds).log().sigmoid()
+        torch.testing.assert_close(probabilities(even, away)[ADJUSTED], expected)
 
     @pytest.mark.parametrize("offset", [0.0, 1e5])
     def test_it_does_not_count_against_the_physics(self, data, offset):
