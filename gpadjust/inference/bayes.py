@@ -211,8 +211,8 @@ def sample(
     of = torch.repeat_interleave(torch.arange(len(every)), torch.tensor(counts)).to(
         positions.device
     )
-    predicted = [left_out(each.target, each.particles.positions) for each in every.values()]
-    predicted = LeftOut(*(torch.cat(each) for each in zip(*predicted, strict=True)))
+    apart = [left_out(each.target, each.particles.positions) for each in every.values()]
+    predicted = LeftOut(*(torch.cat(each) for each in zip(*apart, strict=True)))
     weights = torch.cat([(shares[k] / m).expand(m, -1) for k, m in zip(every, counts, strict=True)])
     own = torch.cat([positions, middle.expand(sum(counts[1:]), *middle.shape)])
     rows = representative(predicted, own, weights, num_samples, of)

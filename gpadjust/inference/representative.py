@@ -112,8 +112,9 @@ def representative(
         predictions.variance.sqrt() / unit,
         _OF_POSITIONS * away / spread,
     ]
-    for model in range(0 if which is None else int(which.max())):
-        is_own = (which == model).to(away)[:, None, None]
+    which = weights.new_zeros(len(weights)) if which is None else which
+    for model in range(int(which.max())):
+        is_own = which.eq(model).to(away)[:, None, None]
         parts.append(_OF_MODELS * is_own.expand_as(away[..., :1]))
     features = torch.cat(
         [(each - (share * each).sum(0)) / math.sqrt(each.shape[-1]) for each in parts], dim=-1

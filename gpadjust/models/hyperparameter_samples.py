@@ -91,12 +91,13 @@ def adjusts(model: Any) -> Tensor:
 
     It is ``S x batch_shape x (m)``.
     """
-    rows = [row for row in hyperparameters(model) if row.kind in SIZES and row.size is not None]
     mask = torch.ones_like(model.terms[0].mean.squeeze(-1), dtype=torch.bool)
-    if not rows:
-        return mask
-    off = [(row.parameter(row.raw) <= _OFF * row.size).reshape(mask.shape) for row in rows]
-    return ~torch.stack(off).all(0)
+    off = [
+        (row.parameter(row.raw) <= _OFF * row.size).reshape(mask.shape)
+        for row in hyperparameters(model)
+        if row.kind in SIZES and row.size is not None
+    ]
+    return ~torch.stack(off).all(0) if off else mask
 
 
 def transform_training_inputs(model: Any) -> None:

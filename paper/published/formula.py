@@ -154,7 +154,7 @@ def cells(runs: Sequence[Run], experiment: Formula) -> pd.DataFrame:
         wide = tables.pivot_table(
             index=["table", "share", "seed"], columns="method", values=["rmse", "coverage"]
         )
-        for (name, share, _), row in wide.iterrows():  # type: ignore[misc]
+        for (name, share, _), row in wide.iterrows():
             gap = math.log(row["rmse", "cka"] / row["rmse", "formula"])
             text = f"{TABLES[name]}, {100 * share:.0f} % of the rows"
             held = row["coverage", "cka"]
