@@ -79,6 +79,8 @@ class SampleResult:
             physics. Of a center that is learnt in standard deviations of f_p from its mean.
         relevance: Posterior probability that the physics is of use at all, of each output, of the
             same shape; None of a model that is not weighed without it.
+        sufficiency: Posterior probability that the physics, with noise, is all there is, which
+            needs no adjustment, of the same shape; None of a model that is not weighed beside it.
         num_samples: How many samples the model holds, and ``seconds`` what the fit took on the
             wall clock; :func:`~gpadjust.fit` says both.
         sisters: Posterior probability that the models given as ``prior=`` help, of the same shape;
@@ -96,6 +98,7 @@ class SampleResult:
     converged: Tensor
     draws: dict[str, Tensor]
     relevance: Tensor | None = None
+    sufficiency: Tensor | None = None
     num_samples: int | None = None
     seconds: float | None = None
     sisters: Tensor | None = None
@@ -123,12 +126,14 @@ class SampleResult:
         size = f"effective size {self.effective_size.min():.3g}"
         known = self.num_samples is not None
         parts.append(f"{self.num_samples} samples ({size})" if known else size)
-        if self.relevance is not None:
-            shares = ", ".join(f"{share:.2g}" for share in self.relevance.flatten().tolist())
-            parts.append(f"the physics is of use with probability {shares}")
-        if self.sisters is not None:
-            shares = ", ".join(f"{share:.2g}" for share in self.sisters.flatten().tolist())
-            parts.append(f"other machines help with probability {shares}")
+        for of, what in (
+            (self.relevance, "the physics is of use"),
+            (self.sufficiency, "it needs no adjustment"),
+            (self.sisters, "other machines help"),
+        ):
+            if of is not None:
+                shares = ", ".join(f"{share:.2g}" for share in of.flatten().tolist())
+                parts.append(f"{what} with probability {shares}")
         if self.seconds is not None:
             parts.append(f"{self.seconds:.1f} s")
         return ", ".join(parts)
@@ -226,14 +231,14 @@ def sample(
         models = [each.target.model for each in every.values()]
         which = of[rows].reshape(num_samples, *model._aug_batch_shape)
         held = mixed([*zip(raw, models, strict=True)], which)
-    relevance = None
-    if WITHOUT in shares:
-        relevance = (1 - shares[WITHOUT]).reshape(model._aug_batch_shape)
+    shape = model._aug_batch_shape
+    relevance = (1 - shares[WITHOUT]).reshape(shape) if WITHOUT in shares else None
+    sufficiency = shares[ALONE].reshape(shape) if ALONE in shares else None
     off = disagreement(predicted, weights, draws.target.targets)
     is_good &= off <= _OFF
     _hold(model, held, settled)
     named = _named(draws.target.parameters, draws.particles.positions)
-    return _result(size, is_good, named, draws.target.parameters, relevance)
+    return _result(size, is_good, named, draws.target.parameters, relevance, sufficiency)
 
 
 class _ParameterDraws(NamedTuple):
@@ -346,7 +351,8 @@ def _with_parameters(
     told = found.calibrated.information.precision.sum(-3)
     warn_of_parameters(unknowns, told, found.calibrated.near.point)
     size = main.size.minimum(main.own)
-    return _result(size, is_good, named, found.target.parameters, hint=hint)
+    enough = share.reshape(model._aug_batch_shape) if rival is not None else None
+    return _result(size, is_good, named, found.target.parameters, None, enough, hint)
 
 
 def _hold(model: TermsGP, samples: dict[str, Tensor], settled: dict[str, Tensor]) -> None:
@@ -371,6 +377,7 @@ def _result(
     draws: dict[str, Tensor],
     parameters: Parameters,
     relevance: Tensor | None = None,
+    sufficiency: Tensor | None = None,
     hint: str = _HINT,
 ) -> SampleResult:
     """The result of a fit, with a warning and a hint if draws do not show the posterior."""
@@ -382,7 +389,7 @@ def _result(
             SamplingWarning,
             stacklevel=4,
         )
-    return SampleResult(size, converged, draws, relevance)
+    return SampleResult(size, converged, draws, relevance, sufficiency)
 
 
 def _can_be_weighed(model: TermsGP) -> bool:

@@ -235,22 +235,24 @@ class TestAlone:
     @pytest.mark.parametrize("kind", [CKA, PhysicsMeanGP])
     def test_a_right_physics_is_followed(self, kind):
         """With noise, functions that are free find some where there is none."""
-        Z, squares = line(40), torch.zeros(2)
+        Z, squares, sufficiency = line(40), torch.zeros(2), []
         for seed in range(4):
             X = uniform(12, 1, seed=seed)
             Y = truth(X) + 0.2 * normal(12, 1, seed=10 + seed)
             model, free = (kind(X, Y, physics=truth) for _ in range(2))
             register_priors(free)  # as if they were the user's: nothing is weighed
             for i, each in enumerate((model, free)):
-                fit(each)
+                sufficiency.append(fit(each).sufficiency)
                 squares[i] += (each.predict(Z).mean - truth(Z)).square().mean()
         assert squares[0] < 0.5 * squares[1]
+        assert torch.stack(sufficiency[::2]).mean() > 0.4
+        assert {*sufficiency[1::2]} == {None}
         assert "left as it is in" in model.summary()
 
     def test_a_wrong_physics_is_not(self, data):
         X, Y, Z = data
         model = CKA(X, Y, physics=lambda X: truth(X) + 0.3 * X.cos())
-        fit(model)
+        assert fit(model).sufficiency < 0.01
         assert (model.predict(Z).mean - truth(Z)).abs().max() < 1e-3
 
 

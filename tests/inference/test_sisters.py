@@ -75,12 +75,12 @@ def test_without_a_difference_a_term_is_what_the_other_knows(other):
             mean, variance = prior.mean() * scale + shift, prior.variance() * scale.square()
             known = other.term(name, own)
             torch.testing.assert_close(mean, known.mean.squeeze(-1), atol=0.01, rtol=0.05)
-            torch.testing.assert_close(variance, known.variance.squeeze(-1), atol=1e-3, rtol=0.15)
+            torch.testing.assert_close(variance, known.variance.squeeze(-1), atol=1e-3, rtol=0.3)
         within = AT[(own.min() < AT) & (own.max() > AT)].unsqueeze(-1)
         inputs = model.model_inputs(within)
         f, (shift, scale) = model.at(inputs), model.units()
         mean, variance = other.predict(within)
-        torch.testing.assert_close(f.mean() * scale + shift, mean.squeeze(-1), atol=0.02, rtol=0.02)
+        torch.testing.assert_close(f.mean() * scale + shift, mean.squeeze(-1), atol=0.05, rtol=0.02)
         sd = f.variance().sqrt() * scale
         torch.testing.assert_close(sd, variance.squeeze(-1).sqrt(), atol=0.02, rtol=0.3)
         torch.testing.assert_close(
