@@ -74,7 +74,7 @@ FREE_GPS = {"delta": "f_p + delta", "cka": "CKA", "gp": "GP, no f_p"}
 class FreerunsSettings:
     """Settings that decide the numbers, fixed before the first run."""
 
-    transitions: int = 400
+    transitions: int = 300
     """that GPs learn from, spread evenly, or as many as there are"""
     rounds: int = 100
     """of smoothing, at most"""
