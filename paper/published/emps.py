@@ -260,6 +260,10 @@ def _learners(runs: Sequence[Run], experiment: Emps) -> str:
         cells = [_mean(x, form) for x, form in zip(numbers, forms, strict=True)]
         text = f"**{label}**" if learner == best else label
         rows.append([text, f"{len(own)}", cells[0], f"{max(numbers[0]):.2f}", *cells[1:]])
+        if len(own) > 1:  # the states are not known: free runs of all that they may be
+            off = np.mean([each["path"]["off"] for each in own], axis=0)
+            pooled = number(float(np.sqrt(np.mean(off**2))), ".2f")
+            rows.append([f"{label}, mean path of all runs", "", pooled, *[""] * 6])
     for name, (error, source) in PUBLISHED.items():
         shown = "not found" if error is None else number(error)
         rows.append([f"{name}, {source}", "", shown, "", "", "", "", "", ""])
