@@ -329,7 +329,8 @@ def _with_error(own: Sequence[Run], name: str) -> str:
     if not own:
         return ""
     found = Difference.of([math.inf if each[name] is None else each[name] for each in own])
-    error = "" if not math.isfinite(found.error) else f" ± {found.error:.1g}"
+    several = math.isfinite(found.error) and found.error > 1e-9  # equal where all rows are learnt
+    error = f" ± {found.error:.1g}" if several else ""
     return _number(found.mean) + error
 
 
