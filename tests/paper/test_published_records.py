@@ -31,6 +31,7 @@ def test_emps(tmp_path, monkeypatch):
     assert (tmp_path / "emps" / "emps.png").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_freeruns(tmp_path, monkeypatch):
     options = ["--only", "furnace", "--transitions", "20", "--rounds", "5", "--starts", "1"]
@@ -67,6 +68,7 @@ def test_candidates_return_next_states(record):
         assert step(states[None], actions[:3].view(1, 3, 1)).isfinite().all()
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")
 def test_a_record_fills_in_what_was_before():
     system = SYSTEMS["furnace"]
     output, actions = system.column("co2")[:10], system.column("gas_rate")[:10]
