@@ -88,7 +88,7 @@ class Part(NamedTuple):
         """A record without velocities."""
         states = torch.stack([self.q, torch.full_like(self.q, torch.nan)], dim=-1)
         times = self.step * torch.arange(len(self.q), dtype=torch.float64)
-        return Records(Record(times, states, self.force.unsqueeze(-1), name="servo"), self.spec)
+        return Records([Record(times, states, self.force.unsqueeze(-1), name="servo")], self.spec)
 
     def halves(self) -> tuple[Part, Part]:
         """The first half, and the second from the last row of the first."""

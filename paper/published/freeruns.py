@@ -424,9 +424,9 @@ def draw(runs: Sequence[Run], experiment: Freeruns) -> list[Path]:
                         label="95 %")  # fmt: skip
         ax.plot(rows, own["mean"], color="tab:blue", label="free run")
         _measured(ax, measured, system.unit)
-    for own in hidden:
+    for with_hidden in hidden:
         measured = SYSTEMS["tanks"].column("y2")[SYSTEMS["tanks"].train :]
-        path_of = own["hidden"]["path"]
+        path_of = with_hidden["hidden"]["path"]
         rows = _every(measured) * np.arange(len(path_of))
         axes[-1].plot(rows, path_of, color="tab:blue", label="free run")
         _measured(axes[-1], measured, "V")

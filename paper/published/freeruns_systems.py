@@ -116,7 +116,7 @@ def records(states: Tensor, actions: Tensor, spec: StateSpec) -> Records:
     whole = torch.full((len(states), spec.state_dim), torch.nan, dtype=torch.float64)
     whole[:, : states.shape[1]] = states
     times = torch.arange(len(states), dtype=torch.float64)
-    return Records(Record(times, whole, actions.unsqueeze(-1)), spec)
+    return Records([Record(times, whole, actions.unsqueeze(-1))], spec)
 
 
 def _ball(X: Tensor, p: ParameterValues) -> Tensor:
