@@ -69,6 +69,9 @@ RECORDS = {
 FREE_GPS = {"delta": "f_p + delta", "cka": "CKA", "gp": "GP, no f_p"}
 """Learners of the records that learn from draws of the smoothed states, or from the records."""
 
+AFTER = "after"
+"""An f_p of the tanks that was thought of after the hidden level had been seen; never chosen."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class FreerunsSettings:
@@ -97,12 +100,14 @@ class Freeruns(Experiment):
 
     axes: ClassVar[Axes] = {
         "record": RECORDS,
-        "learner": {"fitted": "f_p, smoothed", **FREE_GPS},
+        "learner": {"fitted": "f_p, smoothed", **FREE_GPS, AFTER: "f_p of equal holes, afterwards"},
     }
     calls: ClassVar[tuple[str, ...]] = _DYNAMICS
 
     def seeds_of(self, *kind: Any) -> Sequence[int]:
         """One run of f_p alone."""
+        if kind[1] == AFTER and kind[0] != "tanks":
+            return ()
         return self.seeds if kind[1] in FREE_GPS else self.seeds[:1]
 
     def describe(self, *kind: Any) -> dict[str, Any]:

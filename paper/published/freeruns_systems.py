@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import pandas as pd
@@ -66,6 +67,7 @@ class System(NamedTuple):
         earlier: Numbers of earlier actions that a GP beside f_p may read.
         narx: Numbers of outputs and actions that a GP without f_p may read.
         hidden: Column of a hidden state, which is never learnt from, with its name.
+        after: Structures that were thought of after the test part had been seen; none is chosen.
     """
 
     file: str
@@ -77,6 +79,11 @@ class System(NamedTuple):
     earlier: tuple[int, ...]
     narx: tuple[tuple[int, int], ...]
     hidden: tuple[str, str] | None = None
+    after: Mapping[str, Structure] = MappingProxyType({})
+
+    def structure(self, name: str) -> Structure:
+        """A candidate, or one that was thought of later."""
+        return {**self.structures, **self.after}[name]
 
     def column(self, name: str) -> Tensor:
         """A column of the record."""
@@ -183,6 +190,17 @@ def _tanks(X: Tensor, p: ParameterValues) -> Tensor:
     return torch.stack([lower, upper], dim=-1)
 
 
+def _equal_holes(X: Tensor, p: ParameterValues) -> Tensor:
+    """The same of tanks with equal holes, whose areas may differ."""
+    lower, upper, u = X.unbind(-1)
+    inflow = p.pump * u.clamp_min(1e-3) ** p.power
+    for _ in range(2):
+        between, out = (p.outflow * level.clamp_min(1e-3).sqrt() for level in (upper, lower))
+        upper = upper + 0.5 * (inflow - between * p.area)
+        lower = lower + 0.5 * (between - out)
+    return torch.stack([lower, upper], dim=-1)
+
+
 _STEP_NOISE = {"learnt": None, "small": (1e-4, 1e-3), "large": (1e-3, 1e-2)}
 _V = {"v": (0.0, 0.05)}
 _VESSEL = {
@@ -266,5 +284,15 @@ SYSTEMS = {
             ),
         },
         (0,), ((3, 1), (3, 3)), ("y2", "upper"),
+        {
+            "equal holes": Structure(
+                ("y", "upper"), _equal_holes,
+                {
+                    **{name: Unknown(0.2, factor=2.0) for name in ("pump", "outflow")},
+                    **{name: Unknown(1.0, factor=1.5) for name in ("power", "area")},
+                },
+                _UPPER, _TANK_NOISE,
+            ),
+        },
     ),
 }  # fmt: skip
