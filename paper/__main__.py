@@ -27,6 +27,7 @@ CHAPTERS = {
     "control": ("Known", "First", "Ontime", "Hidden", "Setpoints", "Delays", "Walls"),
     "published": ("Uci", "Formula"),
     "machines": ("Real", "Elsewhere", "Tanks", "Foresight", "Kinks"),
+    "published": ("Emps", "Freeruns"),
 }
 """Folders, and the classes of the experiments that they declare."""
 EXPERIMENTS = {
