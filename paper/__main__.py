@@ -26,6 +26,7 @@ CHAPTERS = {
     ),
     "control": ("Known", "First", "Ontime", "Hidden", "Setpoints", "Delays", "Walls"),
     "machines": ("Real", "Elsewhere", "Tanks", "Foresight", "Kinks"),
+    "published": ("Masses",),
 }
 """Folders, and the classes of the experiments that they declare."""
 EXPERIMENTS = {
