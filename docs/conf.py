@@ -41,6 +41,7 @@ include_patterns = [
     "paper/*.md",
     "paper/*/README.md",
     "paper/machines/data/README.md",
+    "paper/published/*.md",
     "paper/results/*/tables.md",
     "tutorials/*",
 ]

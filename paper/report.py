@@ -7,7 +7,8 @@ from pathlib import Path
 from paper.common.tables import filled, fragments
 
 PAPER = Path(__file__).parent
-PAGES = sorted([PAPER.parent / "README.md", *PAPER.glob("*.md"), *PAPER.glob("*/README.md")])
+_FOLDERS = ("*.md", "*/README.md", "published/[a-z]*.md")
+PAGES = sorted([PAPER.parent / "README.md", *(p for f in _FOLDERS for p in PAPER.glob(f))])
 
 
 def report() -> None:

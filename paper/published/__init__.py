@@ -17,7 +17,7 @@ class MassesSettings:
     split: int = 0
     """seed of the ten folds"""
     num_rows: int = 600
-    """random rows on which the search for hyper-parameters is made"""
+    """random rows for the search for hyper-parameters, and for f_p alone"""
     max_iterations: int = 1
     """iterations of L-BFGS with all rows, from what that search found"""
     stride: int = 1

@@ -41,6 +41,12 @@ from paper.published import Masses, MassesSettings
 
 DATA = Path(__file__).parent / "data" / "masses" / "ame2020.csv"
 MAGIC = (8, 20, 28, 50, 82, 126, 184)
+PUBLISHED = {
+    "published: drop and deep net, 26 features, ten folds of 2,149": "0.263",
+    "published: the same, Z, N and A alone": "0.332",
+}
+"""RMSE of ten folds in MeV: C.-Q. Li et al., Deep learning on nuclear mass and alpha decay
+half-lives, tenfold cross-validation."""
 _INPUTS = ["Z", "N", "odd Z", "odd N", "near N = Z"]
 
 
@@ -123,12 +129,17 @@ def fitted(
     make: Callable[..., TermsGP], data: Sequence[Tensor], settings: MassesSettings, seed: int
 ) -> TermsGP:
     """A model of all rows; the search for its hyper-parameters is made on some of them."""
-    order = np.random.default_rng(seed).permutation(len(data[0]))[: settings.num_rows]
-    rough, model = make(*(each[np.sort(order)] for each in data)), make(*data)
+    some = _some(len(data[0]), settings, seed)
+    rough, model = make(*(each[some] for each in data)), make(*data)
     fit(rough, "map", seed=seed)
     warm_start(model, rough)
     fit(model, "map", num_screened=0, max_iterations=settings.max_iterations)
     return model
+
+
+def _some(number_of_rows: int, settings: MassesSettings, seed: int) -> np.ndarray:
+    order = np.random.default_rng(seed).permutation(number_of_rows)
+    return np.sort(order[: settings.num_rows])
 
 
 def run(experiment: Masses, task: str, physics: str, model: str, seed: int) -> Run:
@@ -150,7 +161,8 @@ def run(experiment: Masses, task: str, physics: str, model: str, seed: int) -> R
         key = (task, physics, seed, settings)
         if key not in _ALONE:
             _ALONE.clear()
-            alone = CalibratedPhysics(X, Y, physics=law)
+            some = _some(len(X), settings, seed)  # five parameters need no more
+            alone = CalibratedPhysics(X[some], Y[some], physics=law)
             fit(alone, "map", seed=seed)
             _ALONE[key] = alone, time.perf_counter() - begin
         else:
@@ -221,7 +233,7 @@ def tables(runs: Sequence[Run], experiment: Masses) -> dict[str, Table]:
         f"{label}: {what}"
         for task, label in tasks.items()
         if task != "unmeasured"
-        for what in ("error", "held", "half width")
+        for what in ("RMSE, MeV", "held", "half width, MeV")
     ]
     errors, all_rows = [], []
     for (physics, model), label in kinds.items():
@@ -244,17 +256,18 @@ def tables(runs: Sequence[Run], experiment: Masses) -> dict[str, Table]:
                 ]
                 all_rows.append([title, label, *rest])
         errors.append([*cells, number(own[own.task == "fold"].seconds.median(), ".0f")])
+    errors += [[label, value, *[""] * (len(heads))] for label, value in PUBLISHED.items()]
     header = ["task", "model", "nuclides in runs", "RMSE, MeV", "held by 95 %"]
     header += ["half width of 95 %, mean, MeV", "median error, MeV"]
     header += ["half width, median, MeV", "seconds of a fit, median"]
     return {
-        "masses:targets": _targets(data),
-        "masses:errors": Table(
+        "targets": _targets(data),
+        "errors": Table(
             "RMSE in MeV, share held by intervals of 95 %, their mean half width in MeV",
             markdown(["model", *heads, "seconds of a fit"], errors),
         ),
-        "masses:all": Table("All tasks", markdown(header, all_rows)),
-        "masses:parameters": _parameters(data, kinds),
+        "all": Table("All tasks", markdown(header, all_rows)),
+        "parameters": _parameters(data, kinds),
     }
 
 
@@ -329,7 +342,7 @@ def draw(runs: Sequence[Run], experiment: Masses) -> list[Path]:
     measured = table.measured == 1
     wrong = (table.energy - np.array(found["drop", "alone"]["energy"])).where(measured)
     sd = pd.Series(found["drop", "mean"]["sd"])
-    figure = Figure(figsize=(11.0, 8.4), layout="constrained")
+    figure = Figure(figsize=(8.0, 9.6), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True, sharey=True)
     shown = [
         (wrong, "measured less liquid drop, fitted alone [MeV]", "RdBu", (-8.0, 8.0)),
@@ -346,7 +359,7 @@ def draw(runs: Sequence[Run], experiment: Masses) -> list[Path]:
         if values is not wrong:
             image.set_clim(*limits)
         figure.colorbar(image, ax=ax, label=label, extend="both" if values is wrong else "max")
-        _outline(ax, table[measured])
+        _outline(ax, table[measured], "black" if values is wrong else "white")
         for number_ in MAGIC:
             ax.axvline(number_, color="0.8", lw=0.5, zorder=0)
             if number_ < 120:
@@ -364,8 +377,8 @@ def _chart(table: pd.DataFrame, values: pd.Series[float]) -> np.ndarray:
     return chart
 
 
-def _outline(ax: Any, measured: pd.DataFrame) -> None:
+def _outline(ax: Any, measured: pd.DataFrame, color: str) -> None:
     """Draw the ends of the measured chains as a line of steps."""
     ends = measured.groupby("Z").N.agg(["min", "max"])
     for column, shift in (("min", -0.5), ("max", 0.5)):
-        ax.step(ends[column] + shift, ends.index - 0.5, where="pre", color="black", lw=0.7)
+        ax.step(ends[column] + shift, ends.index - 0.5, where="pre", color=color, lw=0.7)
