@@ -267,6 +267,7 @@ def tables(runs: Sequence[Run], experiment: Masses) -> dict[str, Table]:
             markdown(["model", *heads, "seconds of a fit"], errors),
         ),
         "all": Table("All tasks", markdown(header, all_rows)),
+        "beyond": _beyond(runs, experiment),
         "parameters": _parameters(data, kinds),
     }
 
@@ -310,6 +311,29 @@ def _targets(data: pd.DataFrame) -> Table:
             met = value >= bound if which else value <= bound
             rows.append([claim, label, text, number(value, ".3f"), "met" if met else "missed"])
     return Table("Targets", markdown(["claim", "model", "asked", "measured", "verdict"], rows))
+
+
+def _beyond(runs: Sequence[Run], experiment: Masses) -> Table:
+    """The evaluators' extrapolations, which are no data, by parts of the chart."""
+    table, rows = nuclides(experiment.settings.stride), []
+    left = table.measured == 0
+    parts = {
+        "A below 50": left & (table.Z + table.N < 50),
+        "A from 50, N to 160": left & (table.Z + table.N >= 50) & (table.N <= 160),
+        "N above 160": left & (table.N > 160),
+    }
+    for run in runs:
+        if run["task"] != "unmeasured" or "sd" not in run:
+            continue
+        error = (np.array(run["energy"]) - table.energy).abs()
+        held = error < 1.96 * np.hypot(run["sd"], table.sd)
+        label = experiment.axes["physics", "model"][run["physics"], run["model"]]
+        for part, which in parts.items():
+            rms = float((error[which] ** 2).mean() ** 0.5)
+            numbers = [rms, error[which].max(), held[which].mean()]
+            rows.append([label, part, f"{which.sum()}", *(number(n, ".3g") for n in numbers)])
+    header = ["model", "part", "nuclides", "RMSE, MeV", "largest error, MeV", "held by 95 %"]
+    return Table("Evaluators' extrapolations, no data", markdown(header, rows))
 
 
 def _parameters(data: pd.DataFrame, kinds: Any) -> Table:
