@@ -25,9 +25,8 @@ CHAPTERS = {
         *("Noisyinputs", "Outliers", "Relative", "Repeats", "Sisters", "Vanishing"),
     ),
     "control": ("Known", "First", "Ontime", "Hidden", "Setpoints", "Delays", "Walls"),
-    "published": ("Uci", "Formula"),
+    "published": ("Masses", "Uci", "Emps", "Freeruns", "Formula"),
     "machines": ("Real", "Elsewhere", "Tanks", "Foresight", "Kinks"),
-    "published": ("Emps", "Freeruns"),
 }
 """Folders, and the classes of the experiments that they declare."""
 EXPERIMENTS = {

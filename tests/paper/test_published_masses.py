@@ -1,0 +1,52 @@
+"""Smoke run of the experiment on nuclear masses, and its physics."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from paper.__main__ import main
+from paper.published.masses import drop, left_out, nuclides, shell
+
+
+class Textbook:
+    """Coefficients in MeV."""
+
+    volume, surface, coulomb, asymmetry, pairing = 15.8, 18.3, 0.714, 23.2, 12.0
+    valence, promiscuity = -0.2, 0.1
+
+
+def test_the_physics():
+    lead, tin = torch.tensor([[82.0, 126.0], [50.0, 70.0]]).double()
+    both = torch.stack([lead, tin])
+    assert torch.allclose(shell(both, Textbook)[0], drop(both, Textbook)[0])  # doubly magic
+    assert abs(drop(both, Textbook)[0] - 1636.4) < 15  # MeV, as measured
+    assert shell(both, Textbook)[1] == drop(both, Textbook)[1] - 0.2 * 12
+
+
+def test_the_data_and_what_is_left_out():
+    table = nuclides()
+    known = table[table.measured == 1].reset_index(drop=True)
+    assert len(known) == 2457
+    folds = np.stack([left_out(known, "fold", 0, seed) for seed in range(10)])
+    assert (folds.sum(0) == 1).all()
+    ends = left_out(known, "outer2", 0, 0)
+    tin = known[known.Z == 50].N
+    assert sorted(known[ends & (known.Z == 50)].N) == [
+        *sorted(tin)[:2],
+        *sorted(tin)[-2:],
+    ]
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_it_runs(tmp_path, monkeypatch):
+    out = tmp_path / "masses"
+    options = ["--runs", "2", "--stride", "15", "--num-rows", "60", "--jobs", "1"]
+    monkeypatch.setattr("sys.argv", ["paper", "masses", *options, "--out", str(out)])
+    main()
+    runs = [json.loads(line) for line in (out / "runs.jsonl").read_text().splitlines()]
+    assert len(runs) == 2 * 7 + 2 * 9 + 7
+    tables = (out / "tables.md").read_text()
+    assert all(name in tables for name in ("targets", "errors", "all", "parameters"))
+    assert (out / "masses.png").exists()
