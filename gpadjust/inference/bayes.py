@@ -351,7 +351,7 @@ def _with_parameters(
     told = found.calibrated.information.precision.sum(-3)
     warn_of_parameters(unknowns, told, found.calibrated.near.point)
     size = main.size.minimum(main.own)
-    enough = share.reshape(model._aug_batch_shape) if rival is not None else None
+    enough = share.reshape(found.target.parameters.batch_shape) if rival is not None else None
     return _result(size, is_good, named, found.target.parameters, None, enough, hint)
 
 

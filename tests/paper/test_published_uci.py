@@ -32,7 +32,7 @@ def test_formula_explains_most_of_the_output(table):
     X, Y, points, expected = split(table, 0.25, 0)
     with torch.no_grad():
         mean = fitted_formula(X, Y, physics(table)).predict(points).mean
-    assert (mean - expected).square().mean() < 0.4 * (expected - Y.mean()).square().mean()
+    assert (mean - expected).square().mean() < 0.5 * (expected - Y.mean()).square().mean()
 
 
 def test_published_rows_are_of_all_tables():
