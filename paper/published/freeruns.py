@@ -422,22 +422,25 @@ def draw(runs: Sequence[Run], experiment: Freeruns) -> list[Path]:
     names = [name for name in RECORDS if any(each["record"] == name for each in runs)]
     titles = [f"{RECORDS[n]}: {experiment.axes['learner'][best_of(runs, n)]}" for n in names]
     hidden = [own for own in _of(runs, "tanks", "fitted") if "hidden" in own]
+    after = _of(runs, "tanks", AFTER)
     titles += ["two tanks: upper level, hidden; f_p"] * bool(hidden)
     figure, axes = panels(titles, 2, (5.0, 2.3), share=False)
     for ax, name in zip(axes, names, strict=False):
         system = SYSTEMS[name]
-        own = _of(runs, name, best_of(runs, name))[0]["path"]
+        shown = _of(runs, name, best_of(runs, name))[0]["path"]
         measured = system.column(system.output)[system.train :]
-        rows = _every(measured) * np.arange(len(own["mean"]))
-        ax.fill_between(rows, own["low"], own["high"], color="tab:blue", alpha=0.25, lw=0,
+        rows = _every(measured) * np.arange(len(shown["mean"]))
+        ax.fill_between(rows, shown["low"], shown["high"], color="tab:blue", alpha=0.25, lw=0,
                         label="95 %")  # fmt: skip
-        ax.plot(rows, own["mean"], color="tab:blue", label="free run")
+        ax.plot(rows, shown["mean"], color="tab:blue", label="free run")
         _measured(ax, measured, system.unit)
     for known in hidden:
         measured = SYSTEMS["tanks"].column("y2")[SYSTEMS["tanks"].train :]
-        path_of = known["hidden"]["path"]
-        rows = _every(measured) * np.arange(len(path_of))
-        axes[-1].plot(rows, path_of, color="tab:blue", label="free run")
+        for later, color in ((known, "tab:blue"), *((r, "tab:red") for r in after)):
+            path_of = later["hidden"]["path"]
+            rows = _every(measured) * np.arange(len(path_of))
+            label = "free run" if later is known else "free run, equal holes (afterwards)"
+            axes[-1].plot(rows, path_of, color=color, label=label)
         _measured(axes[-1], measured, "V")
     one_legend(figure, axes)
     return [save(figure, experiment.out / "freeruns.png")]
