@@ -404,16 +404,18 @@ def _verdicts(runs: Sequence[Run]) -> list[Judged]:
             f"{good} of {len(BEST)}; " + "; ".join(said),
         )
     )  # fmt: skip
-    for own in _of(runs, "tanks", "fitted"):
+    for each in _of(runs, "tanks", "fitted"):
         for id, part, text in (
             ("F2", "smoothed", "the upper tank's level, hidden, along the training part"),
             ("F3", "ahead", "the same in the free run"),
         ):
-            error = own["hidden"][part]
-            said = f"{error:.1%}"
+            error = each["hidden"][part]
+            found = f"{error:.1%}"
             for later in _of(runs, "tanks", AFTER):
-                said += f"; with equal holes, thought of afterwards, {later['hidden'][part]:.1%}"
-            judged.append(Judged(id, f"{text}: at most 5 % of its range", met(error <= 0.05), said))
+                found += f"; with equal holes, thought of afterwards, {later['hidden'][part]:.1%}"
+            judged.append(
+                Judged(id, f"{text}: at most 5 % of its range", met(error <= 0.05), found)
+            )
     return judged
 
 
