@@ -7,7 +7,7 @@ The machine is that of Janot, Gautier and Brunot (2019). Its files hold the posi
 Tried before the first run, by what half of the estimation record says of the other half: steps of
 25, 50 and 100 ms, 60 to 490 transitions, learning from draws or from means, friction with a slope
 of its own in each direction (it was not better). Seen of the validation record by then: errors of
-f_p with six sets of parameters, 4.9 to 9.0 mm, and no GP's.
+f_p with some sets of parameters, 4.9 to 9.0 mm, and a regression of its force; no GP's.
 """
 
 from __future__ import annotations

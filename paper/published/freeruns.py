@@ -404,16 +404,18 @@ def _verdicts(runs: Sequence[Run]) -> list[Judged]:
             f"{good} of {len(BEST)}; " + "; ".join(said),
         )
     )  # fmt: skip
-    for own in _of(runs, "tanks", "fitted"):
+    for each in _of(runs, "tanks", "fitted"):
         for id, part, text in (
             ("F2", "smoothed", "the upper tank's level, hidden, along the training part"),
             ("F3", "ahead", "the same in the free run"),
         ):
-            error = own["hidden"][part]
-            said = f"{error:.1%}"
+            error = each["hidden"][part]
+            found = f"{error:.1%}"
             for later in _of(runs, "tanks", AFTER):
-                said += f"; with equal holes, thought of afterwards, {later['hidden'][part]:.1%}"
-            judged.append(Judged(id, f"{text}: at most 5 % of its range", met(error <= 0.05), said))
+                found += f"; with equal holes, thought of afterwards, {later['hidden'][part]:.1%}"
+            judged.append(
+                Judged(id, f"{text}: at most 5 % of its range", met(error <= 0.05), found)
+            )
     return judged
 
 
@@ -422,22 +424,25 @@ def draw(runs: Sequence[Run], experiment: Freeruns) -> list[Path]:
     names = [name for name in RECORDS if any(each["record"] == name for each in runs)]
     titles = [f"{RECORDS[n]}: {experiment.axes['learner'][best_of(runs, n)]}" for n in names]
     hidden = [own for own in _of(runs, "tanks", "fitted") if "hidden" in own]
+    after = _of(runs, "tanks", AFTER)
     titles += ["two tanks: upper level, hidden; f_p"] * bool(hidden)
     figure, axes = panels(titles, 2, (5.0, 2.3), share=False)
     for ax, name in zip(axes, names, strict=False):
         system = SYSTEMS[name]
-        own = _of(runs, name, best_of(runs, name))[0]["path"]
+        shown = _of(runs, name, best_of(runs, name))[0]["path"]
         measured = system.column(system.output)[system.train :]
-        rows = _every(measured) * np.arange(len(own["mean"]))
-        ax.fill_between(rows, own["low"], own["high"], color="tab:blue", alpha=0.25, lw=0,
+        rows = _every(measured) * np.arange(len(shown["mean"]))
+        ax.fill_between(rows, shown["low"], shown["high"], color="tab:blue", alpha=0.25, lw=0,
                         label="95 %")  # fmt: skip
-        ax.plot(rows, own["mean"], color="tab:blue", label="free run")
+        ax.plot(rows, shown["mean"], color="tab:blue", label="free run")
         _measured(ax, measured, system.unit)
     for known in hidden:
         measured = SYSTEMS["tanks"].column("y2")[SYSTEMS["tanks"].train :]
-        path_of = known["hidden"]["path"]
-        rows = _every(measured) * np.arange(len(path_of))
-        axes[-1].plot(rows, path_of, color="tab:blue", label="free run")
+        for later, color in ((known, "tab:blue"), *((r, "tab:red") for r in after)):
+            path_of = later["hidden"]["path"]
+            rows = _every(measured) * np.arange(len(path_of))
+            label = "free run" if later is known else "free run, equal holes (afterwards)"
+            axes[-1].plot(rows, path_of, color=color, label=label)
         _measured(axes[-1], measured, "V")
     one_legend(figure, axes)
     return [save(figure, experiment.out / "freeruns.png")]
