@@ -39,6 +39,7 @@ def test_the_data_and_what_is_left_out():
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_it_runs(tmp_path, monkeypatch):
     out = tmp_path / "masses"
