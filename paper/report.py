@@ -7,7 +7,7 @@ from pathlib import Path
 from paper.common.tables import filled, fragments
 
 PAPER = Path(__file__).parent
-_FOLDERS = ("*.md", "*/README.md", "published/[a-z]*.md")
+_FOLDERS = ("*.md", "*/*.md")
 PAGES = sorted([PAPER.parent / "README.md", *(p for f in _FOLDERS for p in PAPER.glob(f))])
 
 

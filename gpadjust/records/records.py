@@ -28,7 +28,7 @@ class Records:
     there. Where nothing was, steps begin later by as many as the spec looks back.
 
     Args:
-        records: The records, a :class:`Record` each.
+        records: The records, a :class:`Record` each, or one.
         spec: What the entries of their states and actions are.
 
     Raises:
@@ -50,7 +50,7 @@ class Records:
         torch.Size([2, 10, 1])
     """
 
-    def __init__(self, records: Iterable[Record], spec: StateSpec) -> None:
+    def __init__(self, records: Record | Iterable[Record], spec: StateSpec) -> None:
         check_spec(spec)
         if isinstance(records, Record):
             records = [records]
