@@ -39,9 +39,8 @@ include_patterns = [
     "CONTRIBUTING.md",
     "docs/**",
     "paper/*.md",
-    "paper/*/README.md",
-    "paper/machines/data/README.md",
-    "paper/published/*.md",
+    "paper/*/*.md",
+    "paper/*/data/README.md",
     "paper/results/*/tables.md",
     "tutorials/*",
 ]

@@ -107,6 +107,7 @@ FITTED_BEFORE = ("CKA, samples", "CKA, larger errors", "CKA, later observations"
 CANCELS = (  # sums of terms that are much larger, in torch as well
     "CKA, missing and repeated",
     "CKA, samples",
+    "CKA, Matern",
     "CKA, two physics",
     "CKA, unknown mean",
     "BiasGP",
