@@ -277,6 +277,11 @@ def draw(runs: Sequence[Run], experiment: Uci) -> list[Path]:
         best = min(row.rmse[[*TABLES].index(table)] or np.inf for row in PUBLISHED.values())
         ax.axhline(best, color="0.6", ls=":", lw=1, label="least published error")
         ax.set(xscale="log", yscale="log", xlabel="training rows")
+        rows = sorted({*found[found["table"] == table].groupby("share")["rows"].max()})
+        ax.set_xticks(rows, rows)
+        ax.set_xticks([], minor=True)
+        ax.yaxis.set_major_formatter("{x:g}")
+        ax.yaxis.set_minor_formatter("{x:g}")
     axes[0].set_ylabel("RMSE on the test rows")
     one_legend(figure, axes, ncols=4)
     return [save(figure, experiment.out / "uci.png")]
