@@ -17,7 +17,6 @@ ALLOWED = {
         "physics/base.py forward",
         "physics/error.py relocate",
         "physics/memo.py recall",
-        "inference/bayes.py _with_parameters",
         "inference/optimise.py _optima_of_some",
         "inference/optimise.py maximise",
         "inference/parameter_draws.py draw_parameters",

@@ -24,6 +24,7 @@ from gpadjust.inference.relevance import (
     ALONE,
     WITHOUT,
     alone,
+    held,
     mixed,
     probabilities,
     without_physics,
@@ -76,7 +77,8 @@ class SampleResult:
             0.3 at least.
         draws: Equally likely draws of each hyper-parameter of the model with its physics, ``k x``
             its shape, by its name: 16 to 256 by default, 1,024 beside unknown parameters of the
-            physics. Of a center that is learnt in standard deviations of f_p from its mean.
+            physics, whose own are those of all samples. Of a center that is learnt in standard
+            deviations of f_p from its mean.
         relevance: Posterior probability that the physics is of use at all, of each output, of the
             same shape; None of a model that is not weighed without it.
         sufficiency: Posterior probability that the physics, with noise, is all there is, which
@@ -128,7 +130,7 @@ class SampleResult:
         parts.append(f"{self.num_samples} samples ({size})" if known else size)
         for of, what in (
             (self.relevance, "the physics is of use"),
-            (self.sufficiency, "it needs no adjustment"),
+            (self.sufficiency, "the physics needs no adjustment"),
             (self.sisters, "other machines help"),
         ):
             if of is not None:
@@ -218,25 +220,25 @@ def sample(
     )
     apart = [left_out(each.target, each.particles.positions) for each in every.values()]
     predicted = LeftOut(*(torch.cat(each) for each in zip(*apart, strict=True)))
-    weights = torch.cat([(shares[k] / m).expand(m, -1) for k, m in zip(every, counts, strict=True)])
+    parts = held(shares)
+    weights = torch.cat([(parts[k] / m).expand(m, -1) for k, m in zip(every, counts, strict=True)])
     own = torch.cat([positions, middle.expand(sum(counts[1:]), *middle.shape)])
     rows = representative(predicted, own, weights, num_samples, of)
-    starts = torch.tensor([0, *counts]).cumsum(0)
     raw = [
-        each.raw((rows - start).clamp(0, count - 1))
-        for each, start, count in zip(every.values(), starts, counts, strict=False)
+        each.raw((rows - sum(counts[:i])).clamp(0, counts[i] - 1))
+        for i, each in enumerate(every.values())
     ]
-    held = raw[0]
+    samples = raw[0]
     if len(every) > 1:
         models = [each.target.model for each in every.values()]
         which = of[rows].reshape(num_samples, *model._aug_batch_shape)
-        held = mixed([*zip(raw, models, strict=True)], which)
+        samples = mixed([*zip(raw, models, strict=True)], which)
     shape = model._aug_batch_shape
     relevance = (1 - shares[WITHOUT]).reshape(shape) if WITHOUT in shares else None
     sufficiency = shares[ALONE].reshape(shape) if ALONE in shares else None
     off = disagreement(predicted, weights, draws.target.targets)
     is_good &= off <= _OFF
-    _hold(model, held, settled)
+    _hold(model, samples, settled)
     named = _named(draws.target.parameters, draws.particles.positions)
     return _result(size, is_good, named, draws.target.parameters, relevance, sufficiency)
 
@@ -318,11 +320,12 @@ def _with_parameters(
     number = max(_RETURNED, num_samples)
     found = _draw_with_parameters(copy, search, number, num_draws, generator)
     parts, share = [found], found.size.new_zeros(())
+    kept = share
     if rival is not None:
         parts.append(_draw_with_parameters(rival, search, number, num_draws, generator))
         names = (ADJUSTED, ALONE)
-        evidences = {k: p.log_evidence for k, p in zip(names, parts, strict=True)}
-        share = probabilities(evidences)[ALONE].squeeze()
+        shares = probabilities({k: p.log_evidence for k, p in zip(names, parts, strict=True)})
+        share, kept = shares[ALONE].squeeze(), held(shares)[ALONE].squeeze()
     main = parts[int(share > 0.5)]  # what most samples are of is what counts
     few, many = bool(main.own < _LEAST_SIZE_OF_PARAMETERS), main.calibrated.unseen >= _UNSEEN
     is_good, hint = main.is_good, _HINT
@@ -333,21 +336,25 @@ def _with_parameters(
         hint = f"It is {', '.join(unknowns)} of the physics: {why}. Give narrower priors, or "
         hint += "observe what tells them apart."
 
-    def of_each(total: int) -> tuple[Tensor, Tensor]:
-        """Numbers of draws, and of the part that each is of."""
-        rows = torch.linspace(0, number - 1, total).round().long()
-        return rows, (torch.arange(total) >= total - (total * share.cpu()).round()).long()
+    def drawn(total: int) -> tuple[Tensor, Tensor]:
+        """Numbers of draws, spread over all of each part, and the parts."""
+        last = int((total * kept).round())
+        counts = [total - last, last]
+        spread = [torch.linspace(0, number - 1, n, device=kept.device).round() for n in counts]
+        of = torch.cat([kept.new_full((n,), i) for i, n in enumerate(counts)])
+        return torch.cat(spread).long(), of.long()
 
-    rows, which = of_each(num_samples)
-    held = found.raw(rows)
-    every, of = found.coordinates, of_each(number)[1]
+    rows, of = drawn(num_samples)
+    samples, (every, origin) = found.raw(rows), drawn(number)
+    coordinates = found.coordinates[every]
     if rival is not None:
-        pairs = [(p.raw(rows), p.target.model) for p in parts]
-        held = mixed(pairs, which.to(share.device).reshape(-1, *[1] * len(model._aug_batch_shape)))
-        every = every.where(of.to(share.device)[:, None] == 0, parts[1].coordinates)
-    named = _named(found.target.parameters, found.vectors) | model.input_transform.remember(every)
-    _hold(model, held, settled)
-    found.calibrated.calibration.direct(model, held["input_transform.coordinates"])
+        pairs = [(part.raw(rows), part.target.model) for part in parts]
+        samples = mixed(pairs, of.reshape(-1, *[1] * len(model._aug_batch_shape)))
+        coordinates = coordinates.where(origin[:, None] == 0, parts[1].coordinates[every])
+    named = _named(found.target.parameters, found.vectors)
+    named |= model.input_transform.remember(coordinates)
+    _hold(model, samples, settled)
+    found.calibrated.calibration.direct(model, samples["input_transform.coordinates"])
     told = found.calibrated.information.precision.sum(-3)
     warn_of_parameters(unknowns, told, found.calibrated.near.point)
     size = main.size.minimum(main.own)

@@ -116,15 +116,18 @@ def fit(
     *A physics that misleads* is left out, *and one that is right* is left as it is, each with the
     probability that the data give it: beside the model itself (prior probability 0.32) there are
     the same without the physics, a Gaussian process around the mean of the targets (0.08), and the
-    physics alone with noise, rho = 1 and delta = 0 (0.6). The posterior probability of each, by its
-    evidence, is the share of its samples among those that the model holds; ``result.relevance`` is
-    that of the two with the physics, ``result.sufficiency`` that of the physics alone. So are
-    weighed, by 3 to 150 observations, models whose prior means are known and whose kernels have the
-    default priors and an outputscale. Without the physics: a :class:`~gpadjust.CKA` or
-    :class:`~gpadjust.RRA` of a physics without unknown or learnt parameters; of others
-    ``relevance`` is None. The physics alone: all with f_p in the mean; if it has unknown
-    parameters, of one output, with draws of these of its own. A constant between physics and
-    targets, however large, does not count against the physics.
+    physics alone with noise, its rho and delta at their prior means (0.6). The posterior
+    probability of each, by its evidence, is the share of its samples among those that the model
+    holds; ``result.relevance`` is that of the two with the physics, ``result.sufficiency`` that of
+    the physics alone, which data can refute, and hardly confirm: it stays near its prior where all
+    fits. At most three quarters of the samples are of the physics alone, which can learn nothing
+    from later observations (:meth:`~gpadjust.CKA.update` lets go of them). So are weighed, by 3 to
+    150 observations, models whose prior means are known and whose kernels have the default priors
+    and an outputscale. Without the physics: a :class:`~gpadjust.CKA` or :class:`~gpadjust.RRA` of a
+    physics without unknown or learnt parameters; of others ``relevance`` is None. The physics
+    alone: what has f_p in the mean, and no other functions than rho and one delta; if it has
+    unknown parameters, of one output, with draws of these of its own. A constant between physics
+    and targets, however large, does not count against the physics.
 
     *Where left-out observations are missed* by more than predicted, variances are larger: near a
     kink or a jump, as by dry friction or an impact, of which stationary kernels are too sure. All

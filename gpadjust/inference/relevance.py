@@ -15,6 +15,7 @@ from gpadjust.models.parameters import SIZES, hyperparameters
 
 ADJUSTED, WITHOUT, ALONE = "adjusted", "without", "alone"
 _PRIOR = {ADJUSTED: 0.32, WITHOUT: 0.08, ALONE: 0.6}
+_MOST_ALONE = 0.75  # of the samples: those of the physics alone learn from no later observation
 
 
 def is_scaled(term: Term) -> bool:
@@ -51,10 +52,10 @@ def without_physics(model: TermsGP) -> TermsGP | None:
 
 @torch.no_grad()
 def alone(model: TermsGP) -> TermsGP | None:
-    r"""A model with its functions switched off, :math:`\rho = 1` and :math:`\delta = 0`.
+    r"""A model with its functions switched off: rho and delta are their prior means.
 
-    It is the physics, by its prior means, and noise; None of a model that has no physics in its
-    mean, or functions whose priors are not the default ones.
+    It is the physics and noise; None of a model that has no physics in its mean, other functions
+    than rho and one delta, or functions whose priors are not the default ones.
     """
     with_physics = [term for term in model.terms if isinstance(term.basis, AppendedPhysics)]
     if not with_physics or any(term.learns_mean for term in model.terms):
@@ -97,8 +98,8 @@ def probabilities(
 ) -> dict[str, Tensor]:
     """Posterior probabilities of models by their log evidences.
 
-    The model without its physics has a constant for free. The others draw it from a distribution as
-    wide as the constant itself, which costs the logarithm of that over the width of what varies.
+    The model without its physics has a constant for free. The others have to explain it, which
+    costs the logarithm of its size over the width of what varies, and is given back to them.
 
     Args:
         log_evidences: Of the model that adjusts its physics, of that without it, and of the
@@ -113,6 +114,21 @@ def probabilities(
     ]
     shares = torch.stack(torch.broadcast_tensors(*found)).softmax(0)
     return dict(zip(log_evidences, shares, strict=True))
+
+
+def held(shares: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Shares of the samples that a model holds, by the probabilities of models.
+
+    At least a quarter is of those that have functions.
+    """
+    if ALONE not in shares:
+        return dict(shares)
+    most = shares[ALONE].clamp_max(_MOST_ALONE)
+    rest = (1 - most) / (1 - shares[ALONE]).clamp_min(torch.finfo(most.dtype).tiny)
+    found = {name: each * rest for name, each in shares.items()} | {ALONE: most}
+    # Where nothing is left of the others, it is the adjusted model.
+    left = (1 - torch.stack([*found.values()]).sum(0)).clamp_min(0.0)
+    return found | {ADJUSTED: found[ADJUSTED] + left}
 
 
 @torch.no_grad()

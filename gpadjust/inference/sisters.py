@@ -169,7 +169,7 @@ def _of_physics(model: TermsGP, values: Tensor) -> Tensor:
     """Values of samples, ``S x ...``; those without physics or functions have the others' mean."""
     used = uses_physics(model) & adjusts(model)
     used = used.reshape(*used.shape, *[1] * (values.dim() - used.dim())).to(values)
-    used = torch.where(used.sum(0) > 0, used, torch.ones_like(used))
+    used = torch.where(used.sum(0) > 0, used, adjusts(model).reshape(used.shape).to(used))
     middle = ((values.log() * used).sum(0) / used.sum(0)).exp()
     return torch.where(used > 0, values, middle)
 

@@ -32,7 +32,8 @@ def warm_start(model: TermsModel, previous: TermsModel) -> None:
     with torch.no_grad():
         if model.has_unknowns and previous.has_unknowns:
             model.train()  # its inputs are then transformed again
-            model.input_transform.coordinates.copy_(previous.input_transform.coordinates)
+            known, now = (each.input_transform.coordinates for each in (previous, model))
+            now.copy_(known.where(known.isfinite(), now))
         for row in hyperparameters(model):
             if not row.raw.requires_grad:
                 continue

@@ -100,6 +100,18 @@ def adjusts(model: Any) -> Tensor:
     return ~torch.stack(off).all(0) if off else mask
 
 
+@torch.no_grad()
+def let_all_learn(model: Any) -> None:
+    """Replace samples of the physics alone by copies of those with functions, in place."""
+    if model.num_samples is None:
+        return
+    learn = adjusts(model).reshape(model.num_samples, -1).all(-1)
+    rows = learn.nonzero().flatten()
+    if 0 < len(rows) < len(learn):
+        index = rows[torch.arange(len(learn), device=rows.device) % len(rows)]
+        _change(model, lambda tensor: tensor[index], len(index))
+
+
 def transform_training_inputs(model: Any) -> None:
     """Ask the physics about the training inputs again, by its parameters of each sample."""
     if model.has_unknowns:

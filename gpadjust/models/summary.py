@@ -50,7 +50,8 @@ def summary(model: Any) -> str:
                     out = f"{int((~kept).sum())} of {len(kept)} samples"
                     lines.append(f"  the physics is {what} in {out}")
             kept = has_physics & has_functions
-            if kept.any() and not kept.all():  # what follows is of the others
+            if kept.any() and not kept.all():
+                lines.append("  of the others:")
                 own = take_samples(own, kept.nonzero().flatten(), as_mixture=True)
         lines += _lines(own)
     return "\n".join(lines)

@@ -34,6 +34,7 @@ from gpadjust.models.exact_conditioning import ExactConditioning
 from gpadjust.models.hyperparameter_samples import (
     HOLDS_SAMPLES,
     hold_samples,
+    let_all_learn,
     match_parameters,
     release_samples,
     transform_training_inputs,
@@ -446,7 +447,8 @@ class TermsGP(TermsModel, SingleTaskGP):
         """Condition on new observations; see BoTorch. No posterior has to be called before.
 
         The hyper-parameters stay, and with them the factors of the training covariance, to which
-        ``k`` new points among ``n`` are appended in O(n^2 k).
+        ``k`` new points among ``n`` are appended in O(n^2 k). Samples of the physics alone stay what
+        they are, whatever is observed: fit again if it may be wrong after all.
 
         Args:
             X: Raw inputs, ``batch_shape x k x d``.
@@ -484,10 +486,11 @@ class TermsGP(TermsModel, SingleTaskGP):
 
         Any other model keeps its last ``forget`` observations, and forgets those before.
 
-        Hyper-parameters stay, also which samples of them a model holds, all of which learn from the
-        observations; so do places of larger errors. Where new observations are missed by more than
-        predicted, as while a machine drifts, variances grow by the ratio (with ``forget``). To fit
-        them again, build a model of recent observations.
+        Hyper-parameters stay, also which samples of them a model holds; so do places of larger
+        errors. Samples of the physics alone, which cannot learn, give way to copies of others.
+        Where new observations are missed by more than predicted, as while a machine drifts,
+        variances grow by the ratio (with ``forget``). To fit them again, build a model of recent
+        observations.
 
         Args:
             X: Raw inputs, ``k x d``, of ``k`` observations in their order.
@@ -524,6 +527,7 @@ class TermsGP(TermsModel, SingleTaskGP):
             self.has_repeats, self.prediction_strategy = False, None
         with torch.no_grad():
             self._check_window(forget)
+            let_all_learn(self)
             new = NewRows.of(self, X, Y, noise)
             if forget is not None:
                 judge(self, new, forget)

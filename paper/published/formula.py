@@ -1,9 +1,10 @@
-"""Is the default ever worse than the formula that it was given?
+"""The error of the default in that of the formula that it was given, over all chapters.
 
 A cell is a problem with a number of data; its error is that of new observations, over several data
 sets. f_p is the formula as it is given; if it has unknown parameters, as it is fitted to the same
-data, by its priors. Tried on seeds from 1000 on; a first run had seeds 0 to 3, and of laws fewer
-points to be scored at.
+data, by its priors. The prior probabilities of the default fit (the physics alone 0.6) were chosen
+on these problems, of the seeds 1000 to 1007; runs of the seeds 0 to 3 and 100 to 109 came before a
+quarter of the samples were left to the adjusted model.
 """
 
 from __future__ import annotations

@@ -16,12 +16,15 @@ from gpadjust.inference.relevance import (
     ALONE,
     WITHOUT,
     alone,
+    held,
     mixed,
     probabilities,
     without_physics,
 )
 from gpadjust.inference.targets import LogPosterior
 from gpadjust.inference.warm_start import warm_start
+from gpadjust.models.hyperparameter_samples import adjusts
+from gpadjust.physics import FunctionPhysics, Unknown
 from gpadjust.validation import trust
 from tests.systems import around, line, normal, same, uniform
 
@@ -248,6 +251,55 @@ class TestAlone:
         assert torch.stack(sufficiency[::2]).mean() > 0.4
         assert {*sufficiency[1::2]} == {None}
         assert "left as it is in" in model.summary()
+
+    def test_some_samples_can_learn(self):
+        """Of a physics that is right up to now."""
+        X = uniform(60, 2)
+
+        def f_p(X):
+            return torch.cat([truth(X[:, :1]), truth(X[:, 1:])], dim=-1)
+
+        Y = f_p(X) + 0.1 * normal(60, 2, seed=50)
+        model = CKA(X, Y, physics=f_p)
+        fit(model, num_samples=8)
+        learns = adjusts(model)
+        assert (learns.sum(0) >= 2).all()
+        assert not learns.all()
+        warm_start(CKA(X, Y, physics=f_p), model)
+        before = (model.predict(X).mean - Y - 1).square().mean()
+        model.update(X, Y + 1, forget=60)
+        assert adjusts(model).all()
+        assert (model.predict(X).mean - Y - 1).square().mean() < 0.1 * before
+
+    def test_parameters_of_a_right_physics(self):
+        law = FunctionPhysics(
+            lambda X, p: p.a * (3 * X[:, 0]).sin(), unknowns={"a": Unknown(2.0, sd=1.0)}
+        )
+        X = uniform(30, 1)
+        Y = 1.5 * (3 * X).sin() + 0.1 * normal(30, 1)
+        model = PhysicsMeanGP(X, Y, physics=law)
+        result = fit(model)
+        assert result.relevance is None
+        assert 0.2 < result.sufficiency < 1
+        assert 0 < (~adjusts(model)).sum() <= 0.75 * len(adjusts(model))
+        later = PhysicsMeanGP(X, Y, physics=law)
+        warm_start(later, model)
+        assert later.input_transform.coordinates.isfinite().all()
+        low, high = model.physics_parameters.interval()
+        assert low < 1.5 < high
+        fit(later, num_samples=1)
+        other = PhysicsMeanGP(X, Y, physics=law)
+        warm_start(other, later)
+        assert other.input_transform.coordinates.isfinite().all()
+
+    def test_shares_of_samples(self):
+        shares = {ADJUSTED: [0.3, 0.05, 0.0], WITHOUT: [0.1, 0.05, 0.0], ALONE: [0.6, 0.9, 1.0]}
+        shares = {name: torch.tensor(each, dtype=torch.float64) for name, each in shares.items()}
+        found = held(shares)
+        torch.testing.assert_close(sum(found.values()), torch.ones(3, dtype=torch.float64))
+        assert found[ALONE].tolist() == pytest.approx([0.6, 0.75, 0.75])
+        assert found[ADJUSTED].tolist() == pytest.approx([0.3, 0.125, 0.25])
+        assert held({ADJUSTED: shares[ADJUSTED]}) == {ADJUSTED: shares[ADJUSTED]}
 
     def test_a_wrong_physics_is_not(self, data):
         X, Y, Z = data
