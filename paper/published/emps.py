@@ -58,7 +58,7 @@ AUTHORS = {
 PUBLISHED = {
     "GRU": (220.3, "2405.10779"),
     "MLP, finite impulse response": (120.8, "2405.10779"),
-    "LSTM, output alone": (110.9, "2405.10779"),
+    "OLSTM": (110.9, "2405.10779"),
     "recurrent network": (89.2, "2405.10779"),
     "LSTM": (74.1, "2405.10779"),
     "state space, ARX, three NARX": (None, "2405.10779"),

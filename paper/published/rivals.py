@@ -25,7 +25,6 @@ from paper.pairs.multifidelity import SMTModel
 
 Predict = Callable[[Tensor], Posterior]
 _FOLDS = 5
-_LOW = 2  # times as many runs of the formula for SMT as there are observations
 _TREES = {"n_estimators": (100, 400), "max_depth": (2, 4, 6)}
 
 
@@ -127,7 +126,7 @@ def mfk(X: Tensor, Y: Tensor, physics: Physics, *, seed: int) -> Predict:
     formula = fitted_formula(X, Y, physics)
     draw = np.random.default_rng(seed)
     more = np.stack([draw.permutation(column) for column in X.numpy().T], -1)
-    low = torch.cat([X, torch.from_numpy(more)])[: _LOW * len(X)]
+    low = torch.cat([X, torch.from_numpy(more)])
     with torch.no_grad():
         model = SMTModel(low, formula.predict(low).mean, X, Y)
     return lambda test: model.posterior(test)

@@ -70,12 +70,13 @@ PUBLISHED = {
     "deep GP of two layers": Row(
         (None, None, None),
         (-1.39, -1.32, -3.13),
-        "Bui et al. 2016, as in Izmailov et al. 2019, supplement, table 2; errors not found",
+        "Bui et al. 2016, as in Izmailov et al. 2019, supplement, table 2; splits of their own",
     ),
     "subspace inference": Row(
         (0.972, 1.598, 5.194),
         (-0.225, -1.563, -3.007),
-        "Izmailov et al. 2019, supplement, tables 2 and 3; splits of their own",
+        "Izmailov et al. 2019, supplement, tables 2 and 3; splits of their own; the likelihood of "
+        "the yacht could not be reproduced (issue 5 of wjmaddox/drbayes)",
     ),
     "NGBoost": Row(
         (0.50, 0.46, 5.06),
