@@ -327,7 +327,8 @@ def _with_parameters(
         shares = probabilities({k: p.log_evidence for k, p in zip(names, parts, strict=True)})
         share, kept = shares[ALONE].squeeze(), held(shares)[ALONE].squeeze()
     main = parts[int(share > 0.5)]  # what most samples are of is what counts
-    few, many = bool(main.own < _LEAST_SIZE_OF_PARAMETERS), main.calibrated.unseen >= _UNSEEN
+    own = (1 - kept).square() / found.own + kept.square() / parts[-1].own  # of the mean of both
+    few, many = bool(own > 1 / _LEAST_SIZE_OF_PARAMETERS), main.calibrated.unseen >= _UNSEEN
     is_good, hint = main.is_good, _HINT
     unknowns = found.calibrated.calibration.unknowns.names
     if few or many:
@@ -357,7 +358,7 @@ def _with_parameters(
     found.calibrated.calibration.direct(model, samples["input_transform.coordinates"])
     told = found.calibrated.information.precision.sum(-3)
     warn_of_parameters(unknowns, told, found.calibrated.near.point)
-    size = main.size.minimum(main.own)
+    size = main.size.minimum(own.reciprocal())
     enough = share.reshape(found.target.parameters.batch_shape) if rival is not None else None
     return _result(size, is_good, named, found.target.parameters, None, enough, hint)
 
