@@ -17,7 +17,7 @@ TABLES = {"yacht": "yacht", "energy": "energy", "concrete": "concrete"}
 OURS = {"formula": "formula, parameters fitted"} | labels("phymean", "cka", "gp")
 RIVALS = {
     "single": "BoTorch's SingleTaskGP",
-    "feature": "the same, formula as an input",
+    "feature": "SingleTaskGP, formula as an input",
     "boosting": "boosted trees, formula as an input",
     "ensemble": "formula and a deep ensemble",
     "mfk": "SMT's MFK",

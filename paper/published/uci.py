@@ -243,7 +243,7 @@ def verdicts(found: pd.DataFrame) -> list[Judged]:
                 ),
                 Judged(
                     f"{table}, density",
-                    f"log likelihood above every published one ({best[table]:g})",
+                    f"log likelihood above every published one that was found ({best[table]:g})",
                     met(density > best[table]),
                     _mean(own, "density", ".2f"),
                 ),
