@@ -447,8 +447,8 @@ class TermsGP(TermsModel, SingleTaskGP):
         """Condition on new observations; see BoTorch. No posterior has to be called before.
 
         The hyper-parameters stay, and with them the factors of the training covariance, to which
-        ``k`` new points among ``n`` are appended in O(n^2 k). Samples of the physics alone stay what
-        they are, whatever is observed: fit again if it may be wrong after all.
+        ``k`` new points among ``n`` are appended in O(n^2 k). Samples of the physics alone stay
+        what they are, whatever is observed: fit again if it may be wrong after all.
 
         Args:
             X: Raw inputs, ``batch_shape x k x d``.
