@@ -207,7 +207,8 @@ def sample(
             register_priors(rival)
             found = (LogPosterior(rival), search, num_draws // 2, generator, draws.log_evidence())
             every[name] = _draw(*found)
-    shares = probabilities({k: each.log_evidence() for k, each in every.items()}, draws.away())
+    away = draws.away() if WITHOUT in every else 0.0
+    shares = probabilities({k: each.log_evidence() for k, each in every.items()}, away)
     best = torch.stack([*shares.values()]).argmax(0)  # what most samples are of is what counts
     size = torch.stack([each.particles.effective_size() for each in every.values()])
     good = torch.stack([each.is_good() for each in every.values()])
