@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     )
     from gpadjust.physics import (
         BlackBoxPhysics,
+        FormulaPhysics,
         FunctionPhysics,
         JoinedPhysics,
         ODEPhysics,
@@ -46,6 +47,7 @@ __all__ = [
     "Comparison",
     "EmulatedPhysics",
     "FitResult",
+    "FormulaPhysics",
     "FunctionPhysics",
     "JoinedPhysics",
     "ODEPhysics",

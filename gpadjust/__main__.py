@@ -1,4 +1,4 @@
-"""The command line: ``python -m gpadjust report data.csv ...``."""
+"""The command line: ``gpadjust report data.csv ...``, or ``python -m gpadjust``."""
 
 from __future__ import annotations
 
@@ -9,45 +9,64 @@ from collections.abc import Sequence
 _ABOUT = """\
 One page that shows whether a crude physics model helps to predict your measurements, where it is
 wrong, how well left-out measurements are predicted, and which model to take, which is saved beside
-it. You need a CSV file, whose first line names its columns, and a Python function: the physics.
+it. You need a table, whose first line names its columns, and the physics: a formula of these
+columns, or a Python function.
 """
 _EXAMPLE = """\
-example: pump.csv has the columns "flow [m3/h]", "speed [rpm]" and "head [m]", and pump.py
+example: beam.csv has the columns "force [N]", "length [m]", "thickness [m]" and "deflection [m]"
+
+    gpadjust report beam.csv --outputs deflection --unknown "E [GPa] = 210 +- 20 %" \\
+        --physics "4000 * force * length**3 / (E * 0.03 * thickness**3)"
+
+writes report.html and report.pt. Where an output was not measured its field is empty. A function is
+given as module:function, and its inputs are named in the order of its columns: of pump.py with
 
     def head(X):  # a row for each measurement, its columns in the order of --inputs
         flow, speed = X[:, 0], X[:, 1]
         return 30 * (speed / 1450) ** 2 - 0.02 * flow**2
 
-of NumPy arrays or torch tensors. Then, in their folder,
+of NumPy arrays or torch tensors, in its folder,
 
-    python -m gpadjust report pump.csv --inputs flow,speed --outputs head --physics pump:head
-
-writes report.html and report.pt. Where an output was not measured its field is empty.
+    gpadjust report pump.csv --inputs flow,speed --outputs head --physics pump:head
 """
 _SEEDS = 2**32
 
 
 def parser() -> ArgumentParser:
     """The options, and what they say of themselves."""
-    main_parser = ArgumentParser(prog="python -m gpadjust", description="Adjust physics to data.")
+    main_parser = ArgumentParser(prog="gpadjust", description="Adjust physics to data.")
     commands = main_parser.add_subparsers(dest="command", required=True)
     report = commands.add_parser(
         "report",
-        help="a page about a CSV file and a physics",
+        help="a page about a table and a physics",
         description=_ABOUT,
         epilog=_EXAMPLE,
         formatter_class=RawDescriptionHelpFormatter,
     )
     add = report.add_argument
-    add("data", help="the CSV file, in UTF-8")
-    add("--inputs", required=True, metavar="a,b", help="the columns that the physics reads")
+    add("data", help="the table: a CSV file in UTF-8, or *.xlsx (the extra excel)")
+    add(
+        "--inputs",
+        metavar="a,b",
+        help="the columns that the physics reads; by default those that its formula names",
+    )
     add("--outputs", required=True, metavar="y", help="the columns that it predicts")
     add(
         "--physics",
         required=True,
         action="append",
-        metavar="module:function",
-        help="the physics: head of pump.py is pump:head. Several: give it again",
+        metavar="formula",
+        help="the physics: a formula of the columns' names, with + - * / ** and functions such as "
+        "sqrt, of several outputs with commas between them; or module:function. Several: give it "
+        "again",
+    )
+    add(
+        "--unknown",
+        action="append",
+        default=[],
+        metavar="E=2+-0.4",
+        help="an unknown number of the formula, its guess and standard deviation, which may be a "
+        "percentage; or a factor, E=2*/1.5; or bounds, E=1..3. Several: give it again",
     )
     add(
         "--out",
@@ -79,6 +98,14 @@ def parser() -> ArgumentParser:
     )
     add("--seed", type=_seed, default=0, metavar="0", help="of the fits (%(default)s)")
     add(
+        "--rows",
+        type=_positive,
+        default=1000,
+        metavar="1000",
+        help="the most rows that are taken; of more, so many are drawn at random (%(default)s)",
+    )
+    add("--sheet", metavar="name", help="the sheet of a workbook that has several")
+    add(
         "--delimiter", default=",", metavar="mark", help='between two fields (","); ";" or tab, say'
     )
     add("--decimal", default=".", choices=(".", ","), metavar="mark", help='the decimal mark (".")')
@@ -100,7 +127,7 @@ def main(command: Sequence[str] | None = None) -> int:
         return _fail("interrupted; nothing was written.", 130)
     try:
         run(arguments, command)
-    except (ValueError, OSError, PhysicsError) as error:
+    except (ValueError, OSError, ImportError, PhysicsError) as error:
         return _fail(str(error))
     except SystemExit as error:  # of the user's code
         return _fail(
@@ -121,6 +148,13 @@ def _seed(text: str) -> int:
     if not 0 <= seed < _SEEDS:
         raise ArgumentTypeError(f"expected a whole number from 0 to {_SEEDS - 1}, found {text!r}")
     return seed
+
+
+def _positive(text: str) -> int:
+    """A number of rows."""
+    if not text.isdecimal() or not int(text):
+        raise ArgumentTypeError(f"expected a number of rows from 1 on, found {text!r}")
+    return int(text)
 
 
 def _fail(message: str, status: int = 1) -> int:

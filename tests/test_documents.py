@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import gpadjust
+from gpadjust.__main__ import parser
 from paper.__main__ import main
 
 ROOT = Path(__file__).parents[1]
@@ -77,6 +78,8 @@ def test_commands_exist(name, monkeypatch, capsys):
             case ["python", "-m", module, *arguments]:
                 assert find_spec(module) is not None or module == "build", command
                 assert all((ROOT / a).exists() for a in arguments if a.startswith("tests")), command
+            case ["gpadjust", *arguments]:
+                parser().parse_args(arguments)
             case ["cd", folder]:
                 assert (ROOT / folder).is_dir()
             case ["python", script, *_]:

@@ -3,6 +3,7 @@
 from gpadjust.physics.base import Physics
 from gpadjust.physics.black_box import BlackBoxPhysics
 from gpadjust.physics.error import PhysicsError
+from gpadjust.physics.formula import FormulaPhysics
 from gpadjust.physics.function import FunctionPhysics, JoinedPhysics, as_physics
 from gpadjust.physics.ode import ODEPhysics
 from gpadjust.physics.subprocess_physics import SubprocessPhysics
@@ -11,6 +12,7 @@ from gpadjust.physics.warning import PhysicsWarning
 
 __all__ = [
     "BlackBoxPhysics",
+    "FormulaPhysics",
     "FunctionPhysics",
     "JoinedPhysics",
     "ODEPhysics",

@@ -1,7 +1,8 @@
-"""A physics by the name under which Python can import it."""
+"""A physics by a text: the name under which Python can import it, or its formula."""
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable
 from importlib import import_module
@@ -11,7 +12,11 @@ from typing import Any
 from torch import Tensor
 
 from gpadjust.physics.base import Physics
+from gpadjust.physics.formula import FormulaPhysics
 from gpadjust.physics.function import FunctionPhysics, as_physics
+from gpadjust.physics.unknown import Unknown
+
+_FORMULA = "formula:"
 
 
 def import_path(physics: Physics | Callable[[Tensor], Tensor]) -> str | None:
@@ -21,13 +26,16 @@ def import_path(physics: Physics | Callable[[Tensor], Tensor]) -> str | None:
     alone. Objects have a path if they are attributes of the module of their class or callables.
 
     Returns:
-        ``"package.module:qualname"``; None for what has no name in a module, as lambdas and
-        functions inside of functions. A path in ``__main__`` holds for the same script only.
+        ``"package.module:qualname"``; of a ``FormulaPhysics`` ``"formula:"`` and what it was made
+        of; None for what has no name in a module, as lambdas and functions inside of functions. A
+        path in ``__main__`` holds for the same script only.
 
     Example:
         >>> import_path(physics_from_path), import_path(lambda X: X)
         ('gpadjust.physics.import_path:physics_from_path', None)
     """
+    if type(physics) is FormulaPhysics:
+        return f"{_FORMULA}{json.dumps(physics.made_of)}"
     path = _path_of(physics)
     if path or type(physics) is not FunctionPhysics:
         return path
@@ -38,16 +46,19 @@ def import_path(physics: Physics | Callable[[Tensor], Tensor]) -> str | None:
 def physics_from_path(path: str) -> Physics:
     """Imports the physics that a path of ``import_path`` names.
 
-    Importing a module runs its code, so take paths from files that you trust only.
+    Importing a module runs its code, so take paths from files that you trust only. A formula is
+    read and runs nothing.
 
     Args:
-        path: ``"package.module:qualname"``; a ValueError if it has another form, cannot be
+        path: As ``import_path`` returns it; a ValueError if it has another form, cannot be
             imported, or names something else.
 
     Example:
         >>> physics_from_path("torch:sin").name
         'sin'
     """
+    if path.startswith(_FORMULA):
+        return _formula(path.removeprefix(_FORMULA))
     module, colon, name = path.partition(":")
     if not (module and colon and name):
         raise ValueError(
@@ -64,6 +75,16 @@ def physics_from_path(path: str) -> Physics:
         return as_physics(physics)
     except TypeError as error:
         raise ValueError(f"The path {path!r} does not name a physics: {error}") from error
+
+
+def _formula(text: str) -> FormulaPhysics:
+    """The physics of what :attr:`FormulaPhysics.made_of` says."""
+    try:
+        given = json.loads(text)
+        unknowns = {name: Unknown(**own) for name, own in given["unknowns"].items()}
+        return FormulaPhysics(given["formula"], given["columns"], unknowns=unknowns)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"Found {text!r} as a formula, which is damaged: {error}") from error
 
 
 def _path_of(thing: Any) -> str | None:

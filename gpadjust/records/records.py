@@ -13,7 +13,7 @@ import torch
 from gpadjust.checks import checked_number
 from gpadjust.dynamics import Trajectories, Windows
 from gpadjust.dynamics.targets import check_spec
-from gpadjust.files import CsvColumns
+from gpadjust.files import TableColumns
 from gpadjust.records.record import Record, Stretch, in_control_steps, resampled
 from gpadjust.states import StateSpec
 
@@ -137,7 +137,7 @@ class Records:
         action_columns = _columns(actions, spec.actions, "actions")
 
         def read(file: str | Path) -> Record:
-            table = CsvColumns(file, delimiter, decimal=decimal)
+            table = TableColumns(file, delimiter, decimal=decimal)
             if isinstance(time, str):
                 times = table.numbers(time)
             else:

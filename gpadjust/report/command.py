@@ -1,4 +1,4 @@
-"""The command ``python -m gpadjust report``."""
+"""The command ``gpadjust report``."""
 
 from __future__ import annotations
 
@@ -14,14 +14,20 @@ from typing import Any
 from gpadjust.files import LARGEST
 from gpadjust.inference import fit
 from gpadjust.models import CKA, TermsGP
+from gpadjust.report.given_physics import (
+    GivenPhysics,
+    columns_of,
+    given_physics,
+    is_path,
+    unknowns_of,
+)
 from gpadjust.report.inputs import (
-    CsvData,
-    NamedPhysics,
-    named_physics,
+    TableData,
     names_of,
     noise_variances,
+    open_table,
     pairs,
-    read_csv,
+    read_table,
 )
 from gpadjust.report.markup import listed, name_and_unit, plural
 from gpadjust.report.page import checked_path, write
@@ -42,19 +48,24 @@ def run(arguments: Namespace, command: Sequence[str]) -> None:
         ValueError: If an option, the data or the physics are wrong.
         PhysicsError: If the physics fails where the models evaluate it.
     """
-    path = checked_path(arguments.out)
-    inputs = names_of(arguments.inputs, "--inputs")
+    path = checked_path(arguments.out, arguments.data)
     outputs = names_of(arguments.outputs, "--outputs")
     units = {} if arguments.units is None else pairs(arguments.units, "--units")
     variances = noise_variances(arguments.noise, outputs)
-    marks = (_mark(arguments.delimiter), arguments.decimal)
+    unknowns = unknowns_of(arguments.unknown)
+    marks = (_mark(arguments.delimiter), arguments.decimal, arguments.sheet)
+    table = open_table(arguments.data, *marks)
+    inputs = _inputs(arguments, table.names, outputs)
     asked = ((arguments.categories, "--categories"), (arguments.batches, "--batches"))
     categories, batches = (names_of(names, o) if names else [] for names, o in asked)
-    data = read_csv(arguments.data, inputs, outputs, units, *marks, [*categories, *batches])
+    named = [*categories, *batches]
+    data = read_table(table, inputs, outputs, units, named, arguments.rows, arguments.seed)
     options = _options(arguments, inputs, data.levels)
-    physics = named_physics(arguments.physics, data)
+    physics = given_physics(arguments.physics, data, unknowns)
     names = (listed(data.Y.columns), listed(data.X.columns))
     _say(f"{arguments.data}: {plural(len(data.lines), 'row')}, {names[0]} from {names[1]}.")
+    for remark in data.remarks:
+        _say(remark)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("default")
         model = _fitted(arguments, data, physics, variances, options)
@@ -69,14 +80,17 @@ def run(arguments: Namespace, command: Sequence[str]) -> None:
     for note in notes:
         _say(f"Warning: {note}")
     settings = {
-        "command": f"python -m gpadjust {shlex.join(command)}",
+        "command": f"gpadjust {shlex.join(command)}",
         "data file": f"{Path(arguments.data).name} (SHA-256 {data.digest}...)",
         "seed": str(arguments.seed),
     }
     how = _comparing(command)
     origin = Origin(settings, data.remarks, notes, physics.code, physics.modules, how)
     write(subject, path, arguments.title, origin, progress=True)
-    written = [str(each) for each in (path, path.with_suffix(".pt")) if each.exists()]
+    given = Path(arguments.out)
+    written = [
+        str(given.with_suffix(s)) for s in (given.suffix, ".pt") if path.with_suffix(s).exists()
+    ]
     print(f"{headline(subject, how)}\nWrote {listed(written)}.")
 
 
@@ -91,13 +105,13 @@ def _comparing(command: Sequence[str]) -> str:
                 next(words, None)
             continue
         kept.append(word)
-    return f"python -m gpadjust {shlex.join(kept)}"
+    return f"gpadjust {shlex.join(kept)}"
 
 
 def _fitted(
     arguments: Namespace,
-    data: CsvData,
-    physics: NamedPhysics,
+    data: TableData,
+    physics: GivenPhysics,
     variances: list[float] | None,
     options: dict[str, Any],
 ) -> Comparison | TermsGP:
@@ -108,6 +122,21 @@ def _fitted(
     model = CKA(X, Y, variances, physics=f_p, **options)
     fit(model, arguments.fit, seed=arguments.seed)
     return model
+
+
+def _inputs(arguments: Namespace, names: Sequence[str], outputs: Sequence[str]) -> list[str]:
+    """The names of the inputs: those given, or the columns that formulas have."""
+    if arguments.inputs is not None:
+        return names_of(arguments.inputs, "--inputs")
+    if paths := [text for text in arguments.physics if is_path(text)]:
+        raise ValueError(
+            f"Expected --inputs, the columns that {paths[0]} reads, in its order; only formulas "
+            "name their own."
+        )
+    others = [
+        name for name in names if name not in outputs and name_and_unit(name)[0] not in outputs
+    ]
+    return columns_of(arguments.physics, others)
 
 
 def _mark(text: str) -> str:

@@ -1,37 +1,26 @@
-"""Inputs of the command line of a report: the columns of a CSV file, and the physics."""
+"""Inputs and outputs of a report's command line: columns of a CSV file or a spreadsheet."""
 
 from __future__ import annotations
 
 import csv
 import hashlib
 import math
-import os
-import re
-import sys
-import traceback
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
-from importlib import import_module
-from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from gpadjust.files import LARGEST, CsvColumns
-from gpadjust.physics import BlackBoxPhysics, Physics, PhysicsError, as_physics
-from gpadjust.physics.array_physics import array_physics
+from gpadjust.files import LARGEST, TableColumns
 from gpadjust.report.markup import listed, name_and_unit, plural
 
 _HINT = (
     "Name columns as the first line does; a unit in brackets may be left out, so that 'head' is "
     "'head [m]'."
 )
-_FORM = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
-_SHOWN = 5  # rows at which a physics fails
-_SAME = 1e-6  # as a model's file asks it when it is loaded
 
 
 @dataclass(frozen=True)
@@ -51,8 +40,8 @@ class Columns:
         return self.values.numpy()
 
 
-class CsvData(NamedTuple):
-    """The inputs and outputs of a CSV file.
+class TableData(NamedTuple):
+    """The inputs and outputs of a file.
 
     Attributes:
         X: The inputs, ``n x d``.
@@ -72,53 +61,45 @@ class CsvData(NamedTuple):
     levels: dict[str, tuple[Any, ...]]
 
 
-class NamedPhysics(NamedTuple):
-    """A physics, and the Python code by which a program that loads its model gives it.
-
-    Attributes:
-        physics: The physics.
-        code: An expression by its name: ``""`` of a single physics.
-        modules: The modules that these need.
-    """
-
-    physics: Physics
-    code: dict[str, str]
-    modules: tuple[str, ...]
-
-
-def read_csv(
-    file: str,
-    inputs: Sequence[str],
-    outputs: Sequence[str],
-    units: dict[str, str],
-    delimiter: str = ",",
-    decimal: str = ".",
-    categories: Sequence[str] = (),
-) -> CsvData:
-    """Read columns of a CSV file; an output may be missing in some rows.
-
-    Args:
-        file: The file, whose first line names the columns.
-        inputs: The columns of the inputs, in the order in which the physics takes them.
-        outputs: Those of the outputs, in the order in which the physics returns them.
-        units: Units of columns whose names do not have them.
-        delimiter: The mark between two fields.
-        decimal: The decimal mark.
-        categories: The inputs that are categories, which may be texts.
-
-    Raises:
-        OSError: If the file cannot be read.
-        ValueError: If a column is missing or asked for twice, a field is no number, an input is
-            missing, or there are too few rows.
-    """
+def open_table(
+    file: str, delimiter: str = ",", decimal: str = ".", sheet: str | None = None
+) -> TableColumns:
+    """Open a CSV file or a workbook; the arguments and errors are those of ``TableColumns``."""
     path = Path(file)
     if path.exists() and not path.is_file():
         what = "a folder" if path.is_dir() else "a device or a pipe"
         raise OSError(f"{file!r} is {what}, expected a CSV file.")
     if not path.exists():
         near = (each.name for each in path.absolute().parent.glob("*") if each.is_file())
-        raise FileNotFoundError(f"There is no file {file!r}.{_meant(path.name, near)}")
-    table = CsvColumns(file, delimiter, decimal=decimal, hint=_HINT, option="--{} {!r}")
+        raise FileNotFoundError(f"There is no file {file!r}.{meant(path.name, near)}")
+    said = "--{} {!r}"
+    return TableColumns(file, delimiter, decimal=decimal, sheet=sheet, hint=_HINT, option=said)
+
+
+def read_table(
+    table: TableColumns,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    units: dict[str, str],
+    categories: Sequence[str] = (),
+    most: int | None = None,
+    seed: int = 0,
+) -> TableData:
+    """Read columns of a table; an output may be missing in some rows.
+
+    Args:
+        table: The table.
+        inputs: The columns of the inputs, in the order in which the physics takes them.
+        outputs: Those of the outputs, in the order in which the physics returns them.
+        units: Units of columns whose names do not have them.
+        categories: The inputs that are categories, which may be texts.
+        most: The most rows to take; of more, so many are drawn.
+        seed: Of the drawing.
+
+    Raises:
+        ValueError: If a column is missing or asked for twice, a field is no number, an input is
+            missing, or there are too few rows.
+    """
     asked = (*inputs, *outputs)
     bare = [name_and_unit(name)[0] for name in table.names]
     headers = [
@@ -148,11 +129,19 @@ def read_csv(
         shown = [*left[:10], f"{len(left) - 10} more"] if len(left) > 10 else left
         remarks.append(f"Left out, as they have no output: line {listed(shown)}.")
     X, Y, lines = X[seen], Y[seen], lines[seen]
+    if most is not None and (n := len(lines)) > most:
+        order = torch.randperm(n, generator=torch.Generator().manual_seed(seed))
+        drawn = order[:most].sort().values
+        X, Y, lines = X[drawn], Y[drawn], lines[drawn]
+        remarks.append(
+            f"Of {plural(n, 'row')} {most:,} were taken, drawn at random by --seed: a comparison "
+            "takes time with the cube of their number. --rows takes more or fewer."
+        )
     for name, y in zip(names[d:], Y.unbind(-1), strict=True):
         if (number := int((~y.isnan()).sum())) < 2:
             raise ValueError(
-                f"{file}: expected two rows or more with a number in {name!r}, found {number}; a "
-                "comparison wants eight or more to show anything."
+                f"{table.file}: expected two rows or more with a number in {name!r}, found "
+                f"{number}; a comparison wants eight or more to show anything."
             )
     if missing := int(Y.isnan().sum()):
         remarks.append(
@@ -163,12 +152,12 @@ def read_csv(
         if isinstance(own[0], str):
             told = listed(f"{k} is {level}" for k, level in enumerate(own))
             remarks.append(f"The physics reads {name_and_unit(name)[0]} as a number: {told}.")
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    digest = hashlib.sha256(Path(table.file).read_bytes()).hexdigest()[:12]
     columns = Columns(tuple(names[:d]), X), Columns(tuple(names[d:]), Y)
-    return CsvData(*columns, tuple(lines.tolist()), tuple(remarks), digest, levels)
+    return TableData(*columns, tuple(lines.tolist()), tuple(remarks), digest, levels)
 
 
-def _numbers(table: CsvColumns, name: str, may_miss: bool) -> Tensor:
+def _numbers(table: TableColumns, name: str, may_miss: bool) -> Tensor:
     """The numbers of a column; the error says what to do if they are names of an input."""
     try:
         return table.numbers(name, may_miss=may_miss)
@@ -182,7 +171,7 @@ def _numbers(table: CsvColumns, name: str, may_miss: bool) -> Tensor:
         ) from error
 
 
-def _are_names(table: CsvColumns, name: str) -> bool:
+def _are_names(table: TableColumns, name: str) -> bool:
     """Return whether all fields of a column begin with a letter; not if one is empty."""
     try:
         return all(text[0].isalpha() for text in table.texts(name))
@@ -243,142 +232,8 @@ def noise_variances(text: str | None, outputs: Sequence[str]) -> list[float] | N
     return variances
 
 
-def named_physics(paths: Sequence[str], data: CsvData) -> NamedPhysics:
-    """Import functions ``"module:name"``, and evaluate them at the data.
-
-    Raises:
-        ValueError: If a name has another form, its module or the function is not there or raises
-            an error, it is no physics, or is named twice; or if the physics fails in some row,
-            which the error names, or returns other values when it is called again.
-    """
-    if again := [path for path in dict.fromkeys(paths) if paths.count(path) > 1]:
-        raise ValueError(
-            f"Expected different --physics, found {again[0]} more than once; give it once."
-        )
-    parts: dict[str, Physics] = {}
-    code: dict[str, str] = {}
-    for path in paths:
-        thing = _imported(path)
-        try:
-            physics = array_physics(thing, data.X.to_numpy())
-        except (TypeError, PhysicsError) as error:
-            row = f" The first row is line {data.lines[0]} of the file."
-            where = row * isinstance(error, PhysicsError)
-            raise ValueError(f"--physics {path}: {error}{where}") from error
-        try:
-            _check(physics, data)
-        except ValueError as error:
-            raise ValueError(f"--physics {path}: {error}") from error
-        short = path.rpartition(":")[2].rpartition(".")[2]
-        key = path if short in parts else short
-        expression = path.replace(":", ".")
-        is_numpy = isinstance(physics, BlackBoxPhysics) and physics is not thing
-        parts[key] = physics
-        code[key] = f"BlackBoxPhysics({expression})" if is_numpy else expression
-    modules = tuple(dict.fromkeys(path.partition(":")[0] for path in paths))
-    if len(parts) > 1:
-        return NamedPhysics(as_physics({**parts}), code, modules)
-    ((key, physics),) = parts.items()
-    return NamedPhysics(physics, {"": code[key]}, modules)
-
-
-def _imported(path: str) -> Any:
-    """The object that a path names."""
-    module, _, name = path.partition(":")
-    if not _FORM.fullmatch(path):
-        file = module.endswith(".py") or "/" in module or "\\" in module
-        hint = " Give the module without folder and .py, and run this in its folder." * file
-        raise ValueError(
-            f"Expected --physics as module:function, such as pump:head for the function head of "
-            f"pump.py, found {path!r}.{hint}"
-        )
-    if os.getcwd() not in sys.path:
-        sys.path.insert(0, os.getcwd())
-    try:
-        found = import_module(module)
-    except ModuleNotFoundError as error:
-        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
-            raise ValueError(
-                f"{module} cannot be imported: it needs {error.name!r}, which is not installed."
-            ) from error
-        near = _meant(module, (file.stem for file in Path().glob("*.py")))
-        raise ValueError(
-            f"There is no module {error.name!r} for --physics {path} in this folder, or where "
-            f"else Python looks (PYTHONPATH).{near}"
-        ) from error
-    except (Exception, SystemExit) as error:  # importing runs the user's code
-        last = traceback.extract_tb(error.__traceback__)[-1]
-        where = f" ({Path(last.filename).name}, line {last.lineno})"
-        place = "" if isinstance(error, SyntaxError) else where
-        raise ValueError(
-            f"{module} cannot be imported: {type(error).__name__}: {error}{place}"
-        ) from error
-    try:
-        return attrgetter(name)(found)
-    except AttributeError as error:
-        own = [
-            each
-            for each, value in vars(found).items()
-            if isinstance(value, Physics) or getattr(value, "__module__", None) == module
-        ]
-        has = ", ".join(own) or "no functions"
-        raise ValueError(f"{module} has no {name!r}; it has {has}.{_meant(name, own)}") from error
-
-
-def _check(physics: Physics, data: CsvData) -> None:
-    """Raise a ValueError that names the lines of the file at which a physics fails."""
-    X, n, m = data.X.values, len(data.lines), len(data.Y.columns)
-    try:
-        with torch.no_grad():
-            Y = physics(X)
-            physics.forget()
-            again = physics(X)
-    except PhysicsError as error:
-        rows, message = error.rows, str(error.args[0])
-        if len(rows) == n > 1:  # a function of all rows does not say which
-            each = {i: found for i in range(n) if (found := _error_at(physics, X[i : i + 1]))}
-            if 0 < len(each) < n:
-                rows, message = tuple(each), next(iter(each.values()))
-        raise ValueError(message + _told(rows, data)) from error
-    if Y.shape[-1] != m:
-        raise ValueError(
-            f"expected {plural(m, 'column')}, one for each of --outputs "
-            f"{', '.join(data.Y.columns)}, found {Y.shape[-1]}."
-        )
-    same = torch.isclose(again, Y, rtol=_SAME, atol=_SAME * float(Y.abs().max()))
-    small = f"values between {-LARGEST:.0e} and {LARGEST:.0e}"
-    exclude = "Correct the physics there, or exclude such inputs:"
-    settle = "Take random numbers out of it, or let it set their seed itself:"
-    for expected, wrong, way_out in (
-        (small, Y.abs() > LARGEST, exclude),
-        ("the same values whenever it is called", ~same, settle),
-    ):
-        if lost := wrong.any(-1).nonzero().flatten().tolist():
-            found = f"found others in {len(lost)} of {plural(n, 'row')}"
-            raise ValueError(f"expected {expected}, {found}. {way_out}{_told(lost, data)}")
-
-
-def _error_at(physics: Physics, row: Tensor) -> str:
-    try:
-        with torch.no_grad():
-            physics(row)
-    except PhysicsError as error:
-        return str(error.args[0])
-    return ""
-
-
-def _told(rows: Sequence[int], data: CsvData) -> str:
-    """The first of some rows by their lines in the file and their inputs."""
-    shown = []
-    for i in rows[:_SHOWN]:
-        values = zip(data.X.columns, data.X.values[i].tolist(), strict=True)
-        at = ", ".join(f"{name} = {value:.6g}" for name, value in values)
-        shown.append(f"\n  line {data.lines[i]}: {at}")
-    more = f"\n  and {len(rows) - _SHOWN} more" if len(rows) > _SHOWN else ""
-    return f"{''.join(shown)}{more}"
-
-
-def _meant(name: str, known: Iterable[str]) -> str:
+def meant(name: str, known: Iterable[str]) -> str:
+    """Return a hint at the name that was meant, if some is near."""
     near = get_close_matches(name, [*known], n=1)
     return f" Is it {near[0]!r}?" if near else ""
 

@@ -80,11 +80,15 @@ def report(
     return write(subject_of(model, rows), path, title, Origin(settings=told), progress)
 
 
-def checked_path(file: str | Path) -> Path:
-    """The path of a page that can be written.
+def checked_path(file: str | Path, *data: str | Path) -> Path:
+    """The absolute path of a page that can be written, the model's beside it.
+
+    Args:
+        file: The page.
+        data: Files that neither may replace.
 
     Raises:
-        ValueError: If it is not ``*.html``.
+        ValueError: If it is not ``*.html``, or the page or the model would replace data.
         OSError: If the folder is not there, or cannot be written to.
     """
     path = Path(file)
@@ -95,6 +99,10 @@ def checked_path(file: str | Path) -> Path:
     if path.is_dir():
         raise IsADirectoryError(f"{str(path)!r} is a folder; give the name of a file.")
     model_path = path.with_suffix(".pt")
+    for own in map(Path, data):
+        for each in (path, model_path):
+            if own.exists() and each.exists() and own.samefile(each):
+                raise ValueError(f"{each.name} is the data; give the page another name by --out.")
     if model_path.is_dir():
         raise IsADirectoryError(
             f"{str(model_path)!r} is a folder, where the model's file would be; give the page "
@@ -102,7 +110,7 @@ def checked_path(file: str | Path) -> Path:
         )
     try:  # before the work rather than after it
         with TemporaryDirectory(prefix=".report-", dir=path.parent):
-            return path
+            return path.absolute()  # a physics may change the working folder
     except OSError as error:
         folder = str(path.parent.absolute())
         raise type(error)(f"Nothing can be written to {folder!r}: {error.strerror}.") from error

@@ -59,6 +59,7 @@ _APART = (
 )
 _WORST = 5
 _LEVELS = (0.5, 0.8, 0.95)
+_MADE = ("BlackBoxPhysics", "FormulaPhysics", "Unknown")
 _LIBRARIES = ("torch", "gpytorch", "botorch", "numpy")
 
 
@@ -101,13 +102,14 @@ def verdicts(subject: Subject, how: str = COMPARE) -> Markup:
 
 
 def headline(subject: Subject, how: str = COMPARE) -> str:
-    """The answer of all outputs in one line, for the terminal."""
-    found = [verdict(subject, j, how) for j in range(len(subject.outputs))]
-    if len(found) == 1:
-        answer, (first, *_) = found[0]
-        return f"{answer}. {first}"
-    pairs = zip(subject.outputs, found, strict=True)
-    return "; ".join(f"{name}: {answer.lower()}" for name, (answer, _) in pairs) + "."
+    """The errors and the answer of each output, a line each, for the terminal."""
+    lines = []
+    for j, name in enumerate(subject.outputs):
+        answer, (first, *_) = verdict(subject, j, how)
+        told = "; ".join(f"{what} {value}" for what, value in errors(subject, j).items())
+        lines.append(f"Left-out errors of {name}: {told}." if told else f"{name}:")
+        lines[-1] += f"\n{answer}. {first}" if len(subject.outputs) == 1 else f" {answer}."
+    return "\n".join(lines)
 
 
 def verdict(subject: Subject, output: int, how: str = COMPARE) -> tuple[str, list[str]]:
@@ -205,32 +207,38 @@ def spread_of(subject: Subject, output: int) -> float:
     return spread if spread > 0 else 1.0
 
 
-def _errors(subject: Subject, output: int) -> list[Markup]:
-    """The errors of the formula, its adjustment and the data alone, in a line."""
+def errors(subject: Subject, output: int) -> dict[str, str]:
+    """The errors of the formula, its adjustment and the data alone, with the unit."""
     name = subject.outputs[output]
     if subject.comparison is not None:
-        errors = subject.comparison.errors()[name]
+        found = subject.comparison.errors()[name]
     else:
         Y, shown = subject.judged[:, output], subject.physics_at(subject.X, output)
-        errors = {
+        found = {
             ALONE if len(shown) == 1 else f"{ALONE} of {physics}": float(
                 (Y - values).square().nanmean().sqrt()
             )
             for physics, values in shown
         }
         own = "adjusted" if subject.physics or subject.is_sampled else "data alone"
-        errors[own] = float(subject.loo.score().rmse[output])
-    if not errors:
-        return []
+        found[own] = float(subject.loo.score().rmse[output])
     fitted = ", with fitted parameters" if subject.as_it_is != "as it is" else ""
-    told = []
-    for what, rmse in errors.items():
+    told = {}
+    for what, rmse in found.items():
         short, of, physics = what.partition(" of ")
         label = _ERRORS.get(short, short) + (fitted if short == ALONE else "")
-        told.append(f"{label}{f' {physics}' * bool(of)}: {with_unit(number(rmse), name)}")
-    text = "; ".join(told)
-    note = tag("span", " (root mean square errors of left-out observations)", class_="note")
-    return [tag("p", text[0].upper() + text[1:], note, class_="errors")]
+        told[f"{label}{f' {physics}' * bool(of)}"] = with_unit(number(rmse), name)
+    return told
+
+
+def _errors(subject: Subject, output: int) -> list[Markup]:
+    """The :func:`errors`, in large numbers."""
+    shown = [
+        tag("div", tag("dt", what), tag("dd", value))
+        for what, value in errors(subject, output).items()
+    ]
+    note = "root mean square errors of left-out observations"
+    return [tag("dl", *shown, class_="errors"), tag("p", note, class_="note")] if shown else []
 
 
 def _weights(subject: Subject) -> Markup:
@@ -560,8 +568,8 @@ def loading(subject: Subject, saved: Saved | str, origin: Origin) -> Markup:
     imports, arguments = ["import torch"], []
     if origin.physics is not None:
         imports += [f"import {module}" for module in origin.modules]
-        boxes = any("BlackBoxPhysics(" in each for each in origin.physics.values())
-        imports.append(f"from gpadjust import {'BlackBoxPhysics, ' * boxes}load")
+        made = [f"{n}, " for n in _MADE if any(f"{n}(" in each for each in origin.physics.values())]
+        imports.append(f"from gpadjust import {''.join(made)}load")
         where = f"module{'s' * (len(origin.modules) > 1)} {listed(origin.modules)}"
         words.append(f"Python has to find the {where}: there, or in a folder on PYTHONPATH.")
         arguments.append(f"physics={_expression(origin.physics)}")
@@ -574,8 +582,9 @@ def loading(subject: Subject, saved: Saved | str, origin: Origin) -> Markup:
                 "by runs: give what the model was built with as f_p."
             )
         elif saved.physics:
-            by = ", ".join(saved.physics)
-            words.append(f"The physics is found by its name: Python has to find {by}.")
+            by = [name for name in saved.physics if not name.startswith("formula:")]
+            told = f"The physics is found by its name: Python has to find {', '.join(by)}."
+            words.append(told if by else "The file holds the formula.")
     arguments += [f"{name}={'f_p' if name == 'physics' else name}" for name in missing]
     call = ", ".join([repr(file), *arguments])
     point = ", ".join(f"{x:.6g}" for x in subject.base.tolist())

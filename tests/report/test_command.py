@@ -1,14 +1,17 @@
 """The command: from a CSV file and a function to a page, or an error that says what to do."""
 
+import math
 import re
 import subprocess
 import sys
 
+import openpyxl
 import pytest
 import torch
 
-from gpadjust import load
+from gpadjust import Unknown, load
 from gpadjust.__main__ import main
+from gpadjust.report.given_physics import unknown_of
 
 MODULE = """
 import sys
@@ -115,10 +118,10 @@ def test_a_table_that_is_none(folder, capsys, text):
 
 
 BAD_PHYSICS = {
-    "hill": "Expected --physics as module:function, such as pump:head .* found 'hill'",
-    "hill.py:wave": "There is no module 'hill.py'",
+    "hill": "'hill', which is none of its names: time.* is given as module:function",
+    "hill.py:wave": "there is no module 'hill.py'",
     "./hill.py:wave": "Give the module without folder and .py, and run this in its folder",
-    "hil:wave": r"There is no module 'hil' .* Is it 'hill'\?",
+    "hil:wave": r"there is no module 'hil' .* Is it 'hill'\?",
     "hill:wav": r"hill has no 'wav'; it has wave, of_arrays, two, root, strict, .*. Is it 'wave'\?",
     "hill:no_function": "physics must be a Physics or a callable.* found a float",
     "broken:f": r"broken cannot be imported: ZeroDivisionError: .* \(broken.py, line 2\)",
@@ -155,6 +158,8 @@ BAD_OPTIONS = {
     ("--noise", "much"): "standard deviation in the output's unit, such as 0.1, found 'much'",
     ("--noise", "tail=1"): "--noise names 'tail', which is none of --outputs",
     ("--delimiter", ";;"): "Expected --delimiter as one character",
+    ("--sheet", "a"): r"data.csv: expected a workbook, \*.xlsx, to have a sheet 'a'",
+    ("--unknown", "a=2 +- 1"): "--unknown names 'a', which is in no formula. A function has its",
 }
 
 
@@ -209,11 +214,11 @@ def test_an_interrupted_fit_leaves_nothing(folder, capsys, monkeypatch):
 def test_one_model_is_told_with_the_command_that_compares(folder, read, capsys, undrawn, option):
     given = ["--physics", "hill:wave", "--seed", "1"]
     assert main([*COMMAND[:-2], *option, *given]) == 0
-    how = f"python -m gpadjust {' '.join([*COMMAND[:-2], *given])}"
+    how = f"gpadjust {' '.join([*COMMAND[:-2], *given])}"
     assert f"has none: {how}\n" in capsys.readouterr().out
     page = read(folder / "report.html")
     assert f"has none: {how} Recommendation" in page.text
-    assert re.search(r"Your formula: [\d.e-]+ m; adjusted: [\d.e-]+ m \(root mean", page.text)
+    assert re.search(r"your formula [\d.e-]+ m adjusted [\d.e-]+ m root mean", page.text)
     assert "report(compare(" not in page.text
 
 
@@ -280,3 +285,129 @@ def test_names_that_have_digits_are_names(folder, capsys):
 )
 def test_kinds_that_are_none(folder, capsys, options, says):
     assert says in _fails(capsys, *options)
+
+
+UNKNOWNS = {
+    "E [Pa]=210e9 +- 20 %": Unknown(210e9, sd=42e9, bounds=(0, math.inf), unit="Pa"),
+    "c = -2 ± 50%": Unknown(-2.0, sd=1.0, bounds=(-math.inf, 0)),
+    "c=-2+-1": Unknown(-2.0, sd=1.0),
+    "c=1e-3 */ 2": Unknown(1e-3, factor=2.0),
+    "c=0.1..0.3": Unknown(0.2, bounds=(0.1, 0.3)),
+}
+
+
+@pytest.mark.parametrize("text", UNKNOWNS)
+def test_priors_of_unknown_parameters(text):
+    name, found = unknown_of(text)
+    assert name == text[0]
+    assert found == UNKNOWNS[text]
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["E", "E=", "E=2", "E=2+-", "E=x+-1", "=2+-1", "E=2+-0", "E=2*/20 %", "E=3..1", "E=-1*/2"],
+)
+def test_priors_that_are_none(text):
+    with pytest.raises(ValueError, match=r"Expected --unknown such as .* found"):
+        unknown_of(text)
+
+
+FORMULA = ["--physics", "a * sin(6 * time)", "--unknown", "a=1 +- 50 %", "--outputs", "head"]
+
+
+def test_a_formula_names_its_inputs_and_is_in_the_file(folder, read, capsys, undrawn):
+    assert main(["report", "data.csv", "--fit", "map", *FORMULA]) == 0
+    assert "head [m] from time [s]." in capsys.readouterr().err
+    page = read(folder / "report.html")
+    assert "The file holds the formula." in page.text
+    assert "your formula, with fitted parameters" in page.text
+    (code,) = [text for text in page.codes if "load(" in text]
+    assert "load('report.pt')" in code
+    names = {}
+    exec(code, names)
+    assert abs(names["mean"] - 2 * (6 * names["X"]).sin() - names["X"]) < 0.2
+    assert names["model"].input_transform.physics.unknowns == {"a": unknown_of("a=1 +- 50 %")[1]}
+
+
+def test_a_formula_beside_a_function(folder, read, undrawn):
+    given = [*FORMULA, "--physics", "hill:wave", "--inputs", "time"]
+    assert main(["report", "data.csv", "--fit", "map", *given]) == 0
+    (code,) = [text for text in read(folder / "report.html").codes if "load(" in text]
+    names = {}
+    exec(code, names)
+    assert abs(names["mean"] - 2 * (6 * names["X"]).sin() - names["X"]) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("physics", "says"),
+    {
+        "a * sin(6 * tme)": r"Expected a formula of columns of the table, time, note",
+        "a * time * tme": r"has 'tme', which is none of its names: time, a. Is it 'time'\?",
+        "a * time^2": r"\^ is no power, expected \*\*",
+        "a, time": r"expected 1 column, one for each of --outputs",
+        "log(time - 0.55 * a)": r"NaN or inf in 5 of 9 row.*\n  line 2: time \[s\] = 0",
+    }.items(),
+)
+def test_formulas_that_are_none_or_fail(folder, capsys, physics, says):
+    given = ["report", "data.csv", *FORMULA, "--physics", physics, "--fit", "map"]
+    given = [word for word in given if word != "a * sin(6 * time)"]
+    del given[given.index("--physics")]
+    assert main(given) == 1
+    _says(capsys.readouterr().err, says)
+    _nothing_was_written(folder)
+
+
+def test_a_function_needs_its_inputs(folder, capsys):
+    assert main(["report", "data.csv", "--outputs", "head", "--physics", "hill:wave"]) == 1
+    assert "Expected --inputs, the columns that hill:wave reads" in capsys.readouterr().err
+
+
+def test_a_workbook_is_as_a_csv_file(folder, read, capsys, undrawn):
+    book = openpyxl.Workbook()
+    for row in [("time [s]", "head [m]", "note"), *((x, y, None) for x, y in ROWS), (None, None)]:
+        book.active.append(row)
+    book.save(folder / "data.xlsx")
+    assert main(["report", "data.xlsx", "--fit", "map", *FORMULA]) == 0
+    model = load("report.pt")
+    assert model.data()["train_Y"].flatten().tolist() == [y for _, y in ROWS]
+    book.create_sheet("other")
+    book.save(folder / "data.xlsx")
+    capsys.readouterr()
+    assert main(["report", "data.xlsx", "--fit", "map", *FORMULA]) == 1
+    assert "expected one sheet, found 'Sheet', 'other'; say which" in capsys.readouterr().err
+    assert main(["report", "data.xlsx", "--fit", "map", *FORMULA, "--sheet", "Sheet"]) == 0
+    (folder / "data.xlsx").write_text(TABLE)
+    assert main(["report", "data.xlsx", *FORMULA]) == 1
+    assert "expected a workbook, *.xlsx, but" in capsys.readouterr().err
+
+
+def test_of_many_rows_some_are_drawn(folder, read, capsys, undrawn):
+    rows = "".join(f"{i / 1e5},{i % 7}\n" for i in range(100_000))
+    (folder / "data.csv").write_text("time,head\n" + rows)
+    assert main(["report", "data.csv", "--fit", "map", *FORMULA, "--rows", "12"]) == 0
+    told = "Of 100,000 rows 12 were taken, drawn at random by --seed"
+    assert told in capsys.readouterr().err
+    assert told in read(folder / "report.html").text
+    X = load("report.pt").data()["train_X"]
+    assert len(X) == 12
+    assert X.std() > 0.1
+    with pytest.raises(SystemExit):
+        main(["report", "data.csv", *FORMULA, "--rows", "0"])
+
+
+@pytest.mark.parametrize("data", ["report.pt", "report.html"])
+def test_data_are_not_overwritten(folder, capsys, data):
+    (folder / data).write_text(TABLE)
+    assert main(["report", data, *FORMULA]) == 1
+    assert f"{data} is the data; give the page another name by --out" in capsys.readouterr().err
+    assert (folder / data).read_text() == TABLE
+
+
+def test_a_physics_that_moves_elsewhere(folder, undrawn, tmp_path_factory):
+    there = tmp_path_factory.mktemp("there")
+    (folder / "hill.py").write_text(
+        f"import os\ndef wave(X):\n    os.chdir({str(there)!r})\n    return X[:, :1]\n"
+    )
+    assert main([*COMMAND, "--physics", "hill:wave"]) == 0
+    assert (folder / "report.html").read_text() != "earlier"
+    assert not [*there.iterdir()]

@@ -2,7 +2,7 @@
 
 import pytest
 
-from gpadjust.files import CsvColumns
+from gpadjust.files import TableColumns
 
 
 @pytest.fixture
@@ -12,7 +12,7 @@ def columns(tmp_path):
     def columns(text, *args, **options):
         path = tmp_path / "table.csv"
         path.write_bytes(text.encode())
-        return CsvColumns(path, *args, **options)
+        return TableColumns(path, *args, **options)
 
     return columns
 

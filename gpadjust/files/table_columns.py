@@ -1,4 +1,4 @@
-"""Columns of a CSV file."""
+"""Columns of a CSV file or a spreadsheet."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator
 from difflib import get_close_matches
 from pathlib import Path
-from typing import NoReturn, TextIO
+from typing import Any, NoReturn
 
 import torch
 from torch import Tensor
@@ -21,16 +21,17 @@ _OF_RECORDS = (
 )
 
 
-class CsvColumns:
-    r"""The columns of a CSV file by their names, which its first line has.
+class TableColumns:
+    r"""The columns of a table by their names, which its first line has.
 
     Lines and columns are counted from 1, as editors and spreadsheets do. Lines of nothing but
     empty fields are left out.
 
     Args:
-        file: The file, in UTF-8.
-        delimiter: What is between two fields.
+        file: The file: a CSV file in UTF-8, or a workbook, ``*.xlsx`` (the extra ``excel``).
+        delimiter: What is between two fields of a CSV file.
         decimal: The decimal mark of its numbers, a point or a comma.
+        sheet: The sheet of a workbook that has more than one.
         hint: What to do about a column that is not there.
         option: How errors write an option, such as ``"--{} {!r}"`` on a command line.
 
@@ -40,7 +41,9 @@ class CsvColumns:
 
     Raises:
         OSError: If the file cannot be read.
-        ValueError: If it is no text, has no rows, or a row has not one field for each name.
+        ImportError: If it is a workbook, and openpyxl is not installed.
+        ValueError: If it is no table, has no rows or several sheets, or a row has not one field for
+            each name.
 
     Example:
         >>> from pathlib import Path
@@ -48,7 +51,7 @@ class CsvColumns:
         >>> with TemporaryDirectory() as folder:
         ...     file = Path(folder, "pump.csv")
         ...     _ = file.write_text("speed;head\n1000;2,5\n2000;\n")
-        ...     table = CsvColumns(file, ";", decimal=",")
+        ...     table = TableColumns(file, ";", decimal=",")
         >>> table.names
         ('speed', 'head')
         >>> table.numbers("head", may_miss=True)
@@ -61,18 +64,20 @@ class CsvColumns:
         delimiter: str = ",",
         *,
         decimal: str = ".",
+        sheet: str | None = None,
         hint: str = _OF_RECORDS,
         option: str = "`{}={!r}`",
     ) -> None:
         self.file, self.decimal = str(file), decimal
         self._hint, self._option = hint, option
-        try:
-            with open(file, encoding="utf-8-sig", newline="") as text:
-                found = [(line, fields) for line, fields in _rows(text, delimiter) if any(fields)]
-        except (UnicodeDecodeError, csv.Error) as error:
-            raise ValueError(
-                f"{file}: expected a CSV file in UTF-8, but {error}; save it as such."
-            ) from error
+        if Path(file).suffix.lower() == ".xlsx":
+            self.decimal = "."  # its numbers have none
+            rows = _rows_of_sheet(file, sheet)
+        elif sheet is not None:
+            raise ValueError(f"{file}: expected a workbook, *.xlsx, to have a sheet {sheet!r}.")
+        else:
+            rows = _rows_of_text(file, delimiter)
+        found = [(line, fields) for line, fields in rows if any(fields)]
         if len(found) < 2:
             what = "only a line of names" if found else "an empty file"
             raise ValueError(f"{file}: expected a line of names and then rows, found {what}.")
@@ -217,10 +222,49 @@ class CsvColumns:
         return f" If this {name} is a decimal {name}, say so by {option}."
 
 
-def _rows(text: TextIO, delimiter: str) -> Iterator[tuple[int, list[str]]]:
-    """The rows of a file, and the line at which each begins."""
-    reader = csv.reader(text, delimiter=delimiter)
-    before = 0
-    for fields in reader:
-        yield before + 1, fields
-        before = reader.line_num
+def _rows_of_text(file: str | Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
+    """The rows of a CSV file, and the line at which each begins."""
+    try:
+        with open(file, encoding="utf-8-sig", newline="") as text:
+            reader = csv.reader(text, delimiter=delimiter)
+            before = 0
+            for fields in reader:
+                yield before + 1, fields
+                before = reader.line_num
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(
+            f"{file}: expected a CSV file in UTF-8, but {error}; save it as such."
+        ) from error
+
+
+def _rows_of_sheet(file: str | Path, sheet: str | None) -> Iterator[tuple[int, list[str]]]:
+    """The rows of a workbook's sheet as texts, and their numbers."""
+    try:
+        from openpyxl import load_workbook
+    except ImportError as error:
+        raise ImportError(
+            f'{file} is a workbook, which needs openpyxl; run `pip install "gpadjust[excel]"`, or '
+            "save it as CSV."
+        ) from error
+    with open(file, "rb") as content:
+        try:
+            book = load_workbook(content, read_only=True, data_only=True)
+        except Exception as error:  # of zip, XML and more
+            raise ValueError(f"{file}: expected a workbook, *.xlsx, but {error}.") from error
+        names = [each.title for each in book.worksheets]
+        if sheet not in names and (sheet is not None or len(names) != 1):
+            found = ", ".join(map(repr, names))
+            asked = "one sheet" if sheet is None else f"a sheet {sheet!r}"
+            raise ValueError(f"{file}: expected {asked}, found {found}; say which, by its name.")
+        width = None
+        for line, cells in enumerate(book[sheet or names[0]].iter_rows(values_only=True), start=1):
+            fields = [_text(cell) for cell in cells]
+            while fields and not fields[-1]:
+                fields.pop()
+            width = len(fields) if width is None and fields else width
+            yield line, fields + [""] * ((width or 0) - len(fields))
+
+
+def _text(cell: Any) -> str:
+    """A cell as a CSV file has it."""
+    return "" if cell is None else repr(cell) if isinstance(cell, float) else str(cell).strip()

@@ -1,0 +1,131 @@
+"""A physics that is a text."""
+
+import math
+from contextlib import suppress
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gpadjust import CKA, Unknown, fit, load, save
+from gpadjust.physics import FormulaPhysics, PhysicsError
+from gpadjust.physics.formula import symbol
+from gpadjust.physics.import_path import import_path, physics_from_path
+
+X = torch.tensor([[1.0, 2.0], [0.5, -3.0]], dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    ("formula", "value"),
+    {
+        "a + b*2 - -a/4": lambda a, b: a + 2 * b + a / 4,
+        "a**2**0.5": lambda a, b: a ** (2**0.5),
+        "sqrt(a) * sin(pi*b) + exp(-a)": lambda a, b: a**0.5 * (torch.pi * b).sin() + (-a).exp(),
+        "where(b < 0, a, max(a, abs(b)))": lambda a, b: torch.where(b < 0, a, b.abs()),
+        "(a >= 1) * atan2(a, b)": lambda a, b: (a >= 1) * torch.atan2(a, b),
+        "1e3": lambda a, b: 1000 + 0 * a,
+    }.items(),
+)
+def test_values_are_those_of_torch(formula, value):
+    found = FormulaPhysics(formula, ["a [m]", "b"])(X)
+    torch.testing.assert_close(found, value(*X.unbind(-1)).unsqueeze(-1))
+
+
+def test_several_outputs_and_what_is_used():
+    physics = FormulaPhysics("2 * b, -b", ["a", "b"])
+    assert physics.num_outputs == 2
+    assert physics.used == ("b",)
+    torch.testing.assert_close(physics(X), torch.stack([2 * X[:, 1], -X[:, 1]], -1))
+
+
+def test_it_has_gradients():
+    inputs = X.clone().requires_grad_()
+    FormulaPhysics("a**2 * b", ["a", "b"])(inputs).sum().backward()
+    torch.testing.assert_close(inputs.grad, torch.stack([2 * X[:, 0] * X[:, 1], X[:, 0] ** 2], -1))
+
+
+WRONG = {
+    "": "Expected a formula such as",
+    "a ** (": "never closed",
+    "a^2": "\\^ is no power, expected \\*\\*",
+    "sinn(a)": "sinn is no function of formulas, is it sin",
+    "max(a)": "max takes 2 values, found 1",
+    "a < b < 2": "a comparison is of two values",
+    "a == b": "a comparison is of two values",
+    "c * a": "'c', which is none of its names: a, b",
+    "aa * bb": "Is it 'a'",
+    "True": "True is no number",
+    "'a'": "no number",
+    "2j": "no number",
+    "(" * 300 + "a" + ")" * 300: "too many nested|nested too deeply",
+    "a + " * 900 + "a": "at most 2000 characters",
+}
+
+
+@pytest.mark.parametrize("formula", WRONG)
+def test_texts_that_are_no_formula(formula):
+    with pytest.raises(ValueError, match=WRONG[formula]):
+        FormulaPhysics(formula, ["a", "b"])
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        *("__import__('os')", "a.__class__", "().__class__", "[a for a in (1,)]", "lambda: a"),
+        *("a if b else a", "f'{a}'", "a[0]", "(a := 2)", "exec(a)", "sin(*a)", "sin(x=a)", "a @ b"),
+    ],
+)
+def test_code_is_no_formula(code):
+    with pytest.raises(ValueError, match="Expected a formula such as"):
+        FormulaPhysics(code, ["a", "b"])
+
+
+@given(st.text(max_size=30))
+def test_any_text_is_a_formula_or_an_error_of_ours(text):
+    with suppress(ValueError):
+        assert FormulaPhysics(text, ["a", "b"]).num_outputs
+
+
+def test_names_of_columns_and_parameters():
+    assert [*map(symbol, ["air flow [m3/h]", "E", "2nd", "dT/dt"])] == [
+        "air_flow",
+        "E",
+        "_2nd",
+        "dT_dt",
+    ]
+    with pytest.raises(ValueError, match="found 'a' more than once"):
+        FormulaPhysics("a", ["a", "a [m]"])
+    with pytest.raises(ValueError, match="found 'a' more than once"):
+        FormulaPhysics("a", ["a"], unknowns={"a": Unknown(1.0, sd=1.0)})
+    with pytest.raises(TypeError, match="as a text"):
+        FormulaPhysics(torch.sin, ["a"])
+
+
+def test_columns_are_as_many_as_said():
+    with pytest.raises(PhysicsError, match="has 2 columns, a, b, and X has 1"):
+        FormulaPhysics("a", ["a", "b"])(X[:, :1])
+
+
+def test_a_formula_is_a_text_that_it_can_be_made_of_again():
+    unknowns = {"c": Unknown(2.0, sd=0.5, bounds=(0.0, math.inf), unit="m")}
+    physics = FormulaPhysics("c * a + b", ["a", "b"], unknowns=unknowns)
+    again = physics_from_path(import_path(physics))
+    assert again.made_of == physics.made_of
+    assert again.unknowns == physics.unknowns
+    assert torch.equal(again(X), physics(X))
+    for damaged in ("formula:", "formula:{}", import_path(physics).replace("c *", "d *")):
+        with pytest.raises(ValueError, match="which is damaged"):
+            physics_from_path(damaged)
+
+
+def test_a_saved_model_holds_its_formula(tmp_path):
+    inputs = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+    physics = FormulaPhysics("c * sin(6 * x)", ["x"], unknowns={"c": Unknown(1.0, sd=1.0)})
+    model = CKA(inputs, 2 * (6 * inputs).sin() + inputs, physics=physics)
+    fit(model, "map")
+    assert save(model, tmp_path / "model.pt").missing == ()
+    again = load(tmp_path / "model.pt")
+    torch.testing.assert_close(
+        again.predict(inputs)[0], model.predict(inputs)[0], rtol=0, atol=1e-6
+    )
