@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     )
     from gpadjust.validation import Comparison, compare
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "AR1",
@@ -81,10 +81,9 @@ _ROOMS = (
     "files",
     "active",
     "dynamics",
-    "control",
 )
 # Rooms that are not searched for names; most need an extra.
-_OTHER_ROOMS = ("ax", "export", "records", "report", "rl", "sklearn", "systems")
+_OTHER_ROOMS = ("ax", "control", "export", "records", "report", "rl", "sklearn", "systems")
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""Checks of the numbers, shapes and options that a user gives, for all rooms.
+"""Checks of the numbers, shapes and options that a user gives, and progress bars, for all rooms.
 
 A function ``check_...`` raises an error or returns nothing; one called ``checked_...`` also returns
 the value in the form that is worked with. The name of the argument comes first. A wrong kind is a
@@ -8,7 +8,7 @@ TypeError, a wrong value or shape a ValueError; both say what was found and what
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from numbers import Real
 from operator import index
 from typing import Any
@@ -256,3 +256,49 @@ def _check_rows(name: str, bad: Tensor, expected: str) -> None:
 def marked_rows(marked: Tensor) -> list[int]:
     """Return the positions in the last dimension at which something is marked."""
     return sorted({int(where[-1]) for where in marked.nonzero()})
+
+
+class _Hidden:
+    """The methods of a bar of tqdm that this library calls, without a bar."""
+
+    def __init__(self, iterable: Iterable[Any]) -> None:
+        self.iterable, self.n = iterable, 0
+
+    def __enter__(self) -> _Hidden:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        pass
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter(self.iterable)
+
+    def update(self, n: int = 1) -> None:
+        self.n += n
+
+    def set_description(self, text: str) -> None:
+        pass
+
+    def set_postfix(self, **values: object) -> None:
+        pass
+
+
+def progress_bar(shown: bool, iterable: Iterable[Any] = (), **options: Any) -> Any:
+    """Return a bar of tqdm with these options, or an object that goes the same way unseen.
+
+    Raises:
+        ImportError: If it is to be shown, and tqdm is not installed.
+
+    Example:
+        >>> with progress_bar(False, total=3) as bar:
+        ...     bar.update(2)
+        >>> bar.n, [*progress_bar(False, "ab")]
+        (2, ['a', 'b'])
+    """
+    if not shown:
+        return _Hidden(iterable)
+    try:
+        from tqdm import tqdm
+    except ImportError as error:
+        raise ImportError("A progress bar needs tqdm; run `pip install tqdm`.") from error
+    return tqdm(iterable, **options)

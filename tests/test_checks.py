@@ -1,6 +1,7 @@
 """The checks that all rooms share: what they let pass, what they refuse, and in which words."""
 
 import math
+import sys
 from fractions import Fraction
 
 import numpy as np
@@ -21,6 +22,7 @@ from gpadjust.checks import (
     checked_tensor,
     checked_whole,
     finite_array,
+    progress_bar,
 )
 
 NAN = math.nan
@@ -162,3 +164,22 @@ def test_rows_that_are_not_finite_are_named():
     values[2, 1] = math.inf
     with pytest.raises(ValueError, match=r"Y to be finite, found infinity .*\(row 2\)"):
         check_observed("Y", values)
+
+
+def test_shown_and_unseen_bars_go_the_same_way(capsys):
+    for shown in (False, True):
+        with progress_bar(shown, total=3) as bar:
+            bar.set_description("start")
+            bar.set_postfix(failed=1)
+            bar.update()
+            bar.update(2)
+            assert bar.n == 3
+        assert [*progress_bar(shown, [5, 6], unit="part")] == [5, 6]
+        assert ("start" in capsys.readouterr().err) == shown
+
+
+def test_tqdm_is_needed_where_one_is_shown(monkeypatch):
+    monkeypatch.setitem(sys.modules, "tqdm", None)
+    assert [*progress_bar(False, [5, 6])] == [5, 6]
+    with pytest.raises(ImportError, match="pip install tqdm"):
+        progress_bar(True, [5, 6])

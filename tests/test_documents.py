@@ -8,6 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import yaml
 
 import gpadjust
 from gpadjust.__main__ import parser
@@ -19,12 +20,15 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 COPIED = {"changelog", "contributing"}  # into docs/ by a build
 PAGES = [p for p in sorted((ROOT / "docs").rglob("*.md")) if p.parent.name in ("docs", "guide")]
 DOCUMENTS = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "paper/README.md"]
+DOCUMENTS += ["CODE_OF_CONDUCT.md", "SECURITY.md"]
 DOCUMENTS += [str(page.relative_to(ROOT)) for page in PAGES if page.stem not in COPIED]
-TOOLS = {"ruff", "mypy", "sphinx-build", "twine"}  # of the extra `dev`
+TOOLS = {"coverage", "mypy", "ruff", "sphinx-build", "tox", "twine"}
 BUILT = {"docs/_build", "docs/_build/index.html"}
 PICTURES = "tutorials/pictures/"  # taken from the notebooks as the site is built
 REFERENCE = sorted((ROOT / "docs" / "reference").glob("*.rst"))
 EXAMPLES = [p for p in sorted((ROOT / "docs").rglob("*.rst")) if "_build" not in p.parts]
+
+WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
 
 YOURS = {"NAME.py"}
 MODULES = {
@@ -114,8 +118,10 @@ def test_the_tools_come_with_the_extra_dev_and_are_pinned():
 
 
 def test_one_version():
-    assert f"\nversion: {gpadjust.__version__}\n" in (ROOT / "CITATION.cff").read_text()
-    assert gpadjust.__version__ in (ROOT / "CHANGELOG.md").read_text()
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert cited["version"] == gpadjust.__version__
+    told = f"\n## [{cited['version']}] - {cited['date-released']}\n"
+    assert told in (ROOT / "CHANGELOG.md").read_text()
 
 
 def test_the_rooms_have_the_files_to_read_first():
@@ -156,3 +162,26 @@ def test_the_learner_of_the_architecture_runs():
     )  # test_recipes.py has the others
     assert "class DynaDDPG" in learner
     exec(learner, {})
+
+
+@pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.stem)
+def test_the_workflows_run_what_documents_tell(path):
+    """Beside them, what only a runner has to do: check a tag, push a site, take main branches."""
+    documents = [(ROOT / name).read_text() for name in ("README.md", "CONTRIBUTING.md")]
+    told = {
+        line.strip()
+        for text in documents
+        for block in re.findall(r"```bash\n(.*?)```", text, flags=re.DOTALL)
+        for line in block.splitlines()
+    }
+    told |= {part.strip() for line in told for part in line.split("&&")}
+    told |= {"tox -e ${{ matrix.env }}", ".ci/run"}
+    told |= {"pip install --constraint constraints.txt build setuptools twine"}
+    runs, jobs = [], yaml.safe_load(path.read_text())["jobs"]
+    for job in jobs.values():
+        steps = job.get("steps", [{"uses": "actions/checkout"}])  # or those of another workflow
+        assert steps[0].get("uses", "actions/checkout").startswith("actions/checkout")
+        runs += [step["run"] for step in steps if "run" in step]
+    own = [run for run in runs if run.startswith(("git fetch", "grep ", "pip install --no-deps"))]
+    assert len(own) < 2
+    assert {*runs} - {*own} <= told

@@ -2,13 +2,25 @@
 
 import os
 import pickle
+import re
 import subprocess
 import sys
+import tomllib
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 
 import pytest
+import torch
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 import gpadjust
+from gpadjust import RRA
+from tests.systems import line
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
 def python(code, **options):
@@ -41,6 +53,43 @@ def test_what_is_not_needed_is_not_imported():
         for first, absent in steps.items()
     )
     assert python(code).splitlines() == [*steps]
+
+
+def brought_by(package, known=frozenset()):
+    """The packages that come with one, as far as they are installed here."""
+    with suppress(PackageNotFoundError):
+        for each in map(Requirement, requires(package) or ()):
+            name = canonicalize_name(each.name)
+            if name not in known and (not each.marker or each.marker.evaluate({"extra": ""})):
+                known = brought_by(name, known | {name})
+    return known
+
+
+def test_the_core_brings_no_more_than_botorch():
+    """And the README's ten lines, and a comparison, need no more."""
+    core = {canonicalize_name(Requirement(each).name) for each in PROJECT["dependencies"]}
+    assert core <= {"botorch", *brought_by("botorch")}
+    absent = ["gymnasium", "matplotlib", "pandas", "pyro", "torchdiffeq", "tqdm"]
+    lines = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)[0]
+    python(
+        f"import sys\nsys.modules.update(dict.fromkeys({absent}))\n{lines}\n"
+        "from gpadjust import active, compare, dynamics, records\n"
+        "compare(train_X, train_Y, f_p, structures=['CKA'], num_starts=1)\n"
+    )
+
+
+NEEDED = {
+    "torchdiffeq": ("ode", lambda: gpadjust.ODEPhysics(lambda s, a: -s, step=0.1, state_dim=1)),
+    "pyro": ("pyro", lambda: RRA(line(5), line(5), physics=torch.sin).pyro_model()),
+}
+
+
+@pytest.mark.parametrize("missing", NEEDED)
+def test_an_error_names_the_extra(missing, monkeypatch):
+    monkeypatch.setitem(sys.modules, missing, None)
+    extra, call = NEEDED[missing]
+    with pytest.raises(ImportError, match=rf'pip install "gpadjust\[{extra}\]"'):
+        call()
 
 
 def test_every_name_is_there_and_brings_nothing_optional():

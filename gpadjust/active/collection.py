@@ -13,7 +13,6 @@ import torch
 from botorch.acquisition import AcquisitionFunction, AnalyticAcquisitionFunction
 from botorch.models.model import Model
 from torch import Tensor
-from tqdm import tqdm
 
 from gpadjust.active.keep import Keep
 from gpadjust.active.measurement_log import LogError, MeasurementLog, Record
@@ -26,7 +25,13 @@ from gpadjust.active.measurements import (
 )
 from gpadjust.active.points import among, best_points, sobol_points
 from gpadjust.active.warm_refit import load_parameter_values, parameter_values, refit
-from gpadjust.checks import checked_bounds, checked_number, checked_points, checked_whole
+from gpadjust.checks import (
+    checked_bounds,
+    checked_number,
+    checked_points,
+    checked_whole,
+    progress_bar,
+)
 from gpadjust.models.factory import ModelFactory, make_model
 from gpadjust.models.sampled_functions import seeded
 
@@ -360,7 +365,7 @@ class Collection(Measurements):
         checked_whole("budget", budget, 1)
         checked_whole("max_failures", max_failures, 1)
         done, failures = min(budget, self.num_measured), 0
-        with tqdm(total=budget, initial=done, unit="measurement", disable=not progress) as bar:
+        with progress_bar(progress, total=budget, initial=done, unit="measurement") as bar:
             while (left := budget - self.num_measured) > 0:
                 q = min(self.batch_size, left)
                 # After a resumption the points that it was killed at come first.

@@ -1,4 +1,11 @@
-"""Tasks, planning and policy search in dynamics models, and agents that control by them."""
+"""Tasks, planning, policy search, and agents that control by them (the extra ``control``)."""
+
+try:
+    import gymnasium as _  # noqa: F401
+except ImportError as error:
+    raise ImportError(
+        'gpadjust.control needs Gymnasium; run `pip install "gpadjust[control]"`.'
+    ) from error
 
 from gpadjust.control.action_rate import ActionRate
 from gpadjust.control.agent import Agent, Callback

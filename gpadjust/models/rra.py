@@ -266,11 +266,17 @@ class RRA(TermsGP):
             The values of the function, ``(m) x n``.
 
         Raises:
+            ImportError: Without Pyro, ``pip install "gpadjust[pyro]"``.
             ValueError: If the model has a batch shape besides its outputs, or ``Y`` comes without
                 ``X``.
         """
-        import pyro  # here alone, as it takes a second
-        import pyro.distributions as dist
+        try:
+            import pyro  # here alone, as it takes a second
+            import pyro.distributions as dist
+        except ImportError as error:
+            raise ImportError(
+                'pyro_model() needs Pyro; run `pip install "gpadjust[pyro]"`.'
+            ) from error
 
         if X is None and Y is not None:
             raise ValueError("Got `Y` without `X`, the inputs that it belongs to.")

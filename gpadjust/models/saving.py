@@ -13,12 +13,13 @@ from typing import Any, NamedTuple
 import torch
 from gpytorch.kernels import Kernel
 
+from gpadjust.checks import check_switch
 from gpadjust.gp import PhysicsInput
 from gpadjust.models.stacked import StackedGP
 from gpadjust.models.terms_model import TermsModel
 from gpadjust.models.training_data import with_names
 from gpadjust.physics import JoinedPhysics, Physics, PhysicsError, PhysicsWarning, as_physics
-from gpadjust.physics.import_path import import_path, physics_from_path
+from gpadjust.physics.import_path import import_path, is_formula, physics_from_path
 
 _FORMAT = 3
 
@@ -66,7 +67,7 @@ def save(model: TermsModel | StackedGP, path: str | Path) -> Saved:
         >>> model = CKA(X, 2 * silu(X) + X, physics=silu)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     saved = save(model, f"{folder}/model.pt")
-        ...     again = load(f"{folder}/model.pt")
+        ...     again = load(f"{folder}/model.pt", physics=silu)
         >>> saved.missing, torch.equal(again.posterior(X).mean, model.posterior(X).mean)
         ((), True)
     """
@@ -147,35 +148,40 @@ def content_of(model: TermsModel | StackedGP) -> dict[str, Any]:
     }
 
 
-def load(path: str | Path, **objects: Any) -> Any:
+def load(path: str | Path, *, trusted: bool = False, **objects: Any) -> Any:
     """Load a model that :func:`save` wrote.
 
-    A physics that is not given is imported by its name in the file, which runs the code of its
-    module: open files that you trust only. The class is of this library, or of a module that you
-    have imported.
+    A file of a stranger executes nothing: numbers are read without pickle, the class is of this
+    library or of a module that you have imported, and the physics is the one that you give, or a
+    formula. The physics of a trusted file is imported by its name, which runs its module.
 
     Args:
         path: The file.
+        trusted: Whether to import a physics that is not given by its name in the file.
         objects: ``physics`` and other arguments of the model that could not be saved; an error
             says which. Of a mixture each goes to the models that have it.
 
     Raises:
+        TypeError: If ``trusted`` is not True or False.
         ValueError: If it is no such file, or damaged; if objects are missing, or given though the
-            file holds them; if the module of the class was not imported; or if a physics cannot be
-            imported or is another than the model was built with.
+            file holds them; if the module of the class was not imported; or if a physics is only
+            named and the file not trusted, cannot be imported, or is another than the model was
+            built with.
     """
+    check_switch("trusted", trusted)
     try:
         content = torch.load(path, weights_only=True)
     except FileNotFoundError:
         raise
     except Exception as error:
         raise ValueError(f"{path} is not a model that gpadjust saved, or is damaged.") from error
-    if not isinstance(content, dict) or content.get("format") != _FORMAT:
+    found = content.get("format") if isinstance(content, dict) else None
+    if not isinstance(found, int) or found != _FORMAT:
         raise ValueError(
             f"{path} is not a model that this version of gpadjust saved; expected format {_FORMAT}."
         )
     try:
-        return _loaded(content, objects)
+        return _loaded(content, objects, trusted)
     except PhysicsError:
         raise
     except ValueError as error:
@@ -185,7 +191,9 @@ def load(path: str | Path, **objects: Any) -> Any:
         raise ValueError(f"{path} is damaged, or what was given is wrong {found}.") from error
 
 
-def _loaded(content: dict[str, Any], objects: dict[str, Any]) -> TermsModel | StackedGP:
+def _loaded(
+    content: dict[str, Any], objects: dict[str, Any], trusted: bool
+) -> TermsModel | StackedGP:
     """The model of a file, with the objects that are given beside it."""
     stacked = "models" in content
     models = content["models"] if stacked else {"": content}
@@ -196,13 +204,13 @@ def _loaded(content: dict[str, Any], objects: dict[str, Any]) -> TermsModel | St
             f"it does not take {', '.join(sorted(objects.keys() - known))}, but only what the file "
             f"could not hold: {', '.join(sorted(known)) or 'nothing'}."
         )
-    built = {name: _model(each, objects) for name, each in models.items()}
+    built = {name: _model(each, objects, trusted) for name, each in models.items()}
     if stacked:
         return StackedGP(built, content["weights"], content["num_components"])
     return built[""]
 
 
-def _model(content: dict[str, Any], objects: dict[str, Any]) -> TermsModel:
+def _model(content: dict[str, Any], objects: dict[str, Any], trusted: bool) -> TermsModel:
     missing = [name for name in content["missing"] if name not in objects]
     if missing:
         given = ", ".join(f"{name}=..." for name in missing)
@@ -217,7 +225,7 @@ def _model(content: dict[str, Any], objects: dict[str, Any]) -> TermsModel:
         raise ValueError(f"it is of the class {content['class']}, but the module {module!r} {way}.")
     own = {n: deepcopy(objects[n]) for n in content["missing"] if n != "physics"}
     if content["physics"] is not None:
-        own["physics"] = _physics(content, objects)
+        own["physics"] = _physics(content, objects, trusted)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PhysicsWarning)  # it was said when the model was built
         data = {name: value for name, value in content["data"].items() if value is not None}
@@ -265,26 +273,21 @@ def _kernels(model: TermsModel) -> list[str]:
     return [f"{type(k).__qualname__} {getattr(k, 'nu', '')}".strip() for k in kernels]
 
 
-def _named_physics(path: str) -> Physics:
-    """The physics of a file by its import path, not called yet; none is of Python itself."""
-    physics = None if _is_of_python(path) else physics_from_path(path)
-    owner = getattr(getattr(physics, "function", None), "__module__", None)
-    if physics is None or _is_of_python(owner or ""):
+def _named_physics(path: str, trusted: bool) -> Physics:
+    """The physics of a file by its import path, not called yet."""
+    if not trusted and not is_formula(path):
         raise ValueError(
-            f"it names {path} as its physics, a function of Python itself; give the physics, "
-            "load(path, physics=...), if you trust the file."
+            f"it names {path} as its physics, which is code. Give the physics, load(path, "
+            "physics=...), or, if you trust the file, have it imported, load(path, trusted=True)."
         )
-    return physics
+    return physics_from_path(path)
 
 
-def _is_of_python(path: str) -> bool:
-    return path.partition(":")[0].partition(".")[0] in sys.stdlib_module_names
-
-
-def _physics(content: dict[str, Any], objects: dict[str, Any]) -> Any:
+def _physics(content: dict[str, Any], objects: dict[str, Any], trusted: bool) -> Any:
     """The physics that is given, of several the model's own, or else those that the file names."""
     if "physics" not in objects:
-        parts = {name: _named_physics(path) for name, path in content["physics"].items()}
+        named = content["physics"].items()
+        parts = {name: _named_physics(path, trusted) for name, path in named}
         return parts[""] if "" in parts else as_physics(parts)
     physics, names = as_physics(objects["physics"]), content["physics_names"]
     if isinstance(physics, JoinedPhysics) and len(names) == 1 and names[0] in physics.names:

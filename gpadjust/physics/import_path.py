@@ -43,6 +43,11 @@ def import_path(physics: Physics | Callable[[Tensor], Tensor]) -> str | None:
     return _path_of(physics.function) if is_plain else None
 
 
+def is_formula(path: str) -> bool:
+    """Return whether a text of ``import_path`` is a formula, which is read and runs nothing."""
+    return path.startswith(_FORMULA)
+
+
 def physics_from_path(path: str) -> Physics:
     """Imports the physics that a path of ``import_path`` names.
 
@@ -57,7 +62,7 @@ def physics_from_path(path: str) -> Physics:
         >>> physics_from_path("torch:sin").name
         'sin'
     """
-    if path.startswith(_FORMULA):
+    if is_formula(path):
         return _formula(path.removeprefix(_FORMULA))
     module, colon, name = path.partition(":")
     if not (module and colon and name):

@@ -7,7 +7,6 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor
-from torchdiffeq import odeint
 
 from gpadjust.checks import checked_number, checked_whole
 from gpadjust.physics.base import Physics
@@ -17,6 +16,17 @@ from gpadjust.physics.unknown import ParameterValues, Unknown
 
 FIXED_STEP = ("euler", "midpoint", "heun2", "heun3", "rk4", "explicit_adams", "implicit_adams")
 ADAPTIVE_STEP = ("dopri5", "dopri8", "bosh3", "fehlberg2", "adaptive_heun")
+
+
+def _integrate() -> Any:
+    """Return ``torchdiffeq.odeint``, which an extra brings."""
+    try:
+        from torchdiffeq import odeint
+    except ImportError as error:
+        raise ImportError(
+            'ODEPhysics needs torchdiffeq; run `pip install "gpadjust[ode]"`.'
+        ) from error
+    return odeint
 
 
 class ODEPhysics(Physics):
@@ -50,6 +60,7 @@ class ODEPhysics(Physics):
         name: The name in messages. Default: that of ``rhs``.
 
     Raises:
+        ImportError: Without torchdiffeq, ``pip install "gpadjust[ode]"``.
         TypeError: If ``rhs`` is not callable, or a setting is no number, or not whole.
         ValueError: If a setting is out of range, or ``method`` or ``gradient`` is unknown.
 
@@ -77,6 +88,7 @@ class ODEPhysics(Physics):
         inputs: Sequence[int] | None = None,
         name: str | None = None,
     ) -> None:
+        _integrate()
         if not callable(rhs):
             raise TypeError(f"rhs must be callable; found {type(rhs).__name__}.")
         checked_number("step", step, above=0)
@@ -132,7 +144,7 @@ class ODEPhysics(Physics):
             # A grid of our own: torchdiffeq's step_size rounds up to one substep too many.
             options = {"grid_constructor": lambda *_: self._times(self.substeps, X)}
         try:
-            path: Tensor = odeint(
+            path: Tensor = _integrate()(
                 derivative,
                 state,
                 self._times(1, X),

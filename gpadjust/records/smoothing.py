@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
+from gpadjust.checks import progress_bar
 from gpadjust.dynamics.particles import even_normal
 from gpadjust.physics import PhysicsError
 from gpadjust.records.chain import Chain
@@ -73,7 +73,7 @@ def estimate(chain: Chain, max_rounds: int, num_starts: int, progress: bool) -> 
         SmoothingWarning: If there are no rounds left.
     """
     ends = list[_End]()
-    with tqdm(total=num_starts * max_rounds, unit="round", disable=not progress) as bar:
+    with progress_bar(progress, total=num_starts * max_rounds, unit="round") as bar:
         for i, (coordinates, known_at_once) in enumerate(_starts(chain, num_starts)):
             bar.set_description(f"start {i + 1} of {num_starts}")
             bar.update(i * max_rounds - bar.n)  # a search that has settled leaves rounds
@@ -116,7 +116,7 @@ def _starts(chain: Chain, number: int) -> Iterator[tuple[Array, bool]]:
 
 
 def _search(
-    chain: Chain, coordinates: Array, known_at_once: bool, max_rounds: int, bar: tqdm[Any]
+    chain: Chain, coordinates: Array, known_at_once: bool, max_rounds: int, bar: Any
 ) -> _End:
     """Search from these parameters."""
     path = chain.first_path(coordinates)

@@ -8,8 +8,7 @@ from importlib.resources import files
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from tqdm import tqdm
-
+from gpadjust.checks import progress_bar
 from gpadjust.models import StackedGP, TermsGP
 from gpadjust.models.saving import Saved, save
 from gpadjust.report import sections
@@ -159,7 +158,7 @@ def page(
         "Load the model, predict": lambda: sections.loading(subject, saved, origin),
         "Settings": lambda: sections.settings(subject, origin),
     }
-    bar = tqdm(made_by.items(), disable=not progress, unit="section", leave=False)
+    bar = progress_bar(progress, made_by.items(), unit="section", leave=False)
     made = {name: text for name, make in bar if (text := make())}
     links = [tag("a", name, href=f"#{_anchor(name)}") for name in made]
     body = [tag("section", tag("h2", name), text, id=_anchor(name)) for name, text in made.items()]

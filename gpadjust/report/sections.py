@@ -17,6 +17,7 @@ import gpadjust
 from gpadjust.models import PhysicsParameters, StackedGP, TermsGP
 from gpadjust.models.saving import Saved
 from gpadjust.physics import PhysicsError
+from gpadjust.physics.import_path import is_formula
 from gpadjust.report import figures
 from gpadjust.report.markup import (
     Markup,
@@ -582,9 +583,10 @@ def loading(subject: Subject, saved: Saved | str, origin: Origin) -> Markup:
                 "by runs: give what the model was built with as f_p."
             )
         elif saved.physics:
-            by = [name for name in saved.physics if not name.startswith("formula:")]
+            by = [name for name in saved.physics if not is_formula(name)]
             told = f"The physics is found by its name: Python has to find {', '.join(by)}."
             words.append(told if by else "The file holds the formula.")
+            arguments += ["trusted=True"] * bool(by)
     arguments += [f"{name}={'f_p' if name == 'physics' else name}" for name in missing]
     call = ", ".join([repr(file), *arguments])
     point = ", ".join(f"{x:.6g}" for x in subject.base.tolist())

@@ -12,7 +12,7 @@ try:
     import gymnasium as _gymnasium
 except ImportError as error:
     raise ImportError(
-        'gpadjust.systems needs Gymnasium; run `pip install "gpadjust[rl]"`.'
+        'gpadjust.systems needs Gymnasium; run `pip install "gpadjust[control]"`.'
     ) from error
 
 from gpadjust.systems.muscle_arm import MuscleArmEnv

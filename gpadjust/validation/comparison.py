@@ -11,8 +11,8 @@ from typing import Any, Unpack
 import torch
 from botorch.exceptions.warnings import OptimizationWarning
 from torch import Tensor
-from tqdm import tqdm
 
+from gpadjust.checks import progress_bar
 from gpadjust.gp.gaussian import threads_for
 from gpadjust.inference.bayes import SamplingWarning
 from gpadjust.inference.fitting import check_options, fit
@@ -290,7 +290,7 @@ def compare(
     relevance: dict[str, Tensor] = {}
     heard: dict[tuple[str, type[Warning]], list[str]] = {}
     number = max(_DRAWS[0], min(_DRAWS[1], _MEMORY // len(data.X)))
-    for structure, part in tqdm(fitted_to, disable=not progress, unit="structure"):
+    for structure, part in progress_bar(progress, fitted_to, unit="structure"):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", PhysicsWarning)
             try:

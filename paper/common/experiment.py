@@ -75,8 +75,8 @@ class Experiment:
     of their arguments are part of what identifies a run"""
     flat: ClassVar[bool] = True
     """whether options of nested settings have the names of these alone"""
-    packages: ClassVar[tuple[str, ...]] = ("gpadjust", "torch", "gpytorch", "botorch", "numpy")
-    """whose versions decide the numbers"""
+    packages: ClassVar[tuple[str, ...]] = ("torch", "gpytorch", "botorch", "numpy")
+    """whose versions decide the numbers; of the library itself the commit is said"""
 
     def __init_subclass__(cls) -> None:
         cls.name = cls.__name__.lower()

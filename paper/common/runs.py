@@ -18,7 +18,6 @@ from typing import Any, TypeVar
 from botorch.exceptions.warnings import OptimizationWarning
 from filelock import FileLock
 
-import gpadjust
 from gpadjust.inference import SamplingWarning
 from paper.common.experiment import Case, Run
 
@@ -117,7 +116,7 @@ def versions(packages: Sequence[str]) -> dict[str, str]:
     found = {"python": platform.python_version()}
     for name in packages:
         with suppress(PackageNotFoundError):
-            found[name] = gpadjust.__version__ if name == "gpadjust" else version(name)
+            found[name] = version(name)
     return found
 
 

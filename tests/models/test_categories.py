@@ -123,7 +123,7 @@ def test_a_new_rig_has_the_variance_of_offsets(model):
 
 def test_files_scores_and_stacking(model, tmp_path):
     save(model, tmp_path / "model.pt")
-    again = load(tmp_path / "model.pt")
+    again = load(tmp_path / "model.pt", trusted=True)
     torch.testing.assert_close(predicted(again, NEW).mean, predicted(model, NEW).mean)
     assert (again.levels, again.batches) == (model.levels, (2,))
     stacked = StackedGP({"CKA": model}, [[1.0]], 4)

@@ -109,7 +109,7 @@ def test_the_ways_to_say_it(given, tmp_path):
     assert (lower > 0).all()
     assert (upper < 1).all()
     save(model, tmp_path / "model.pt")
-    again = load(tmp_path / "model.pt")
+    again = load(tmp_path / "model.pt", trusted=True)
     torch.testing.assert_close(again.predict(NEW).mean, model.predict(NEW).mean)
     assert "log(y / (1 - y))" in again.summary()
     conditioned = model.condition_on_observations(NEW[2:], share(NEW[2:]))

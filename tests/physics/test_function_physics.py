@@ -58,7 +58,7 @@ def test_numpy_inside_where_a_gradient_is_needed(points):
 
 def test_other_runtime_errors_are_not_taken_for_numpy(points):
     physics = FunctionPhysics(lambda X: X @ X)
-    with pytest.raises(PhysicsError, match="RuntimeError: mat1"):
+    with pytest.raises(PhysicsError, match=r"RuntimeError: .*mat1"):
         physics(points(3, 2))
 
 

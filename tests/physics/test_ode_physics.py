@@ -6,7 +6,7 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
@@ -96,6 +96,7 @@ class TestSolutions:
         step=st.floats(1e-6, 1e3),
         dtype=st.sampled_from([torch.float32, torch.float64]),
     )
+    @settings(deadline=None)  # the first call imports torchdiffeq
     def test_substeps_count(self, substeps, step, dtype):
         calls = 0
 

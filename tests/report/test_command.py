@@ -227,7 +227,7 @@ def test_a_german_table_with_units_and_noise(folder, read, undrawn):
     (folder / "data.csv").write_text(text.replace("head [m]", "head"))
     options = ["--delimiter", ";", "--decimal", ",", "--units", "time=ms,head=Pa", "--noise", "0.5"]
     assert main([*COMMAND, "--physics", "hill:wave", *options, "--out", "new.htm"]) == 0
-    model = load("new.pt")
+    model = load("new.pt", trusted=True)
     assert (model.input_names, model.output_names) == (("time [ms]",), ("head [Pa]",))
     assert model.data()["train_Y"].flatten().tolist() == pytest.approx([y for _, y in ROWS])
     assert model.data()["train_Yvar"].flatten().tolist() == pytest.approx([0.25] * 9)

@@ -76,7 +76,7 @@ def test_the_code_in_the_page_predicts_as_the_model(
     page = read(report(comparison, tmp_path / "a b.html"))
     monkeypatch.chdir(tmp_path)
     (code,) = [text for text in page.codes if "load(" in text]
-    assert "load('a b.pt')" in code
+    assert "load('a b.pt', trusted=True)" in code
     assert "by its name" in page.text
     names = {}
     exec(code, names)

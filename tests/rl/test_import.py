@@ -1,4 +1,4 @@
-"""Without the extra ``rl``."""
+"""Without the extras ``control`` and ``rl``."""
 
 import importlib
 import sys
@@ -7,12 +7,16 @@ import pytest
 
 
 @pytest.mark.parametrize(
-    ("package", "missing"),
-    [("gpadjust.rl", "stable_baselines3"), ("gpadjust.systems", "gymnasium")],
+    ("package", "missing", "extra"),
+    [
+        ("gpadjust.rl", "stable_baselines3", "rl"),
+        ("gpadjust.systems", "gymnasium", "control"),
+        ("gpadjust.control", "gymnasium", "control"),
+    ],
 )
-def test_what_is_missing_is_named(package, missing, monkeypatch):
+def test_what_is_missing_is_named(package, missing, extra, monkeypatch):
     monkeypatch.delitem(sys.modules, package)
     monkeypatch.setitem(sys.modules, missing, None)
-    with pytest.raises(ImportError, match=r'pip install "gpadjust\[rl\]"') as error:
+    with pytest.raises(ImportError, match=rf'pip install "gpadjust\[{extra}\]"') as error:
         importlib.import_module(package)
     assert "\n" not in str(error.value)
