@@ -1,8 +1,8 @@
 """How Sphinx builds the site: from pages, docstrings and committed outputs, without the network.
 
 Its source is the repository: ``sphinx-build -W --keep-going -b html -c docs . docs/_build``. Of a
-site with several versions, each is built into a folder of its name, with ``SITE_URL``, the address of
-that folder, and ``SITE_VERSIONS``, the names of the others.
+site with several versions, each is built into a folder of its name, with ``SITE_URL``, the address
+of that folder, and ``SITE_VERSIONS``, the names of the others.
 """
 
 import os
@@ -26,10 +26,10 @@ extensions = [
     "sphinx.ext.viewcode",
     "sphinx_copybutton",
     "sphinx_design",
-    "sphinxext.opengraph",
     "formulas",
     "names",
     "pages",
+    "previews",
 ]
 myst_enable_extensions = ["attrs_block", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 4
@@ -73,9 +73,7 @@ html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_extra_path = ["index.html"]  # leads from the site's root to docs/
 html_copy_source = False
-html_baseurl = ogp_site_url = os.environ.get("SITE_URL", "")
-ogp_use_first_image = True
-ogp_social_cards = {"enable": False}  # the first picture of a page says more
+html_baseurl = os.environ.get("SITE_URL", "")
 
 templates_path = ["_templates"]
 html_context = {"versions": os.environ.get("SITE_VERSIONS", "").split()}

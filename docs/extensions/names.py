@@ -30,8 +30,9 @@ CONSTANTS = {  # the docstrings that follow assignments
 for room in ROOMS:  # autodoc looks for them in the room's __init__ alone
     docs = ModuleAnalyzer.for_module(room.__name__).find_attr_docs()
     for name in room.__all__:
-        if id(getattr(room, name)) in CONSTANTS:
-            docs["", name] = CONSTANTS[id(getattr(room, name))]
+        found = getattr(room, name)
+        if id(found) in CONSTANTS and getattr(found, "__name__", "") != name:
+            docs["", name] = CONSTANTS[id(found)]
 
 
 WORDS = re.compile(r"collect|compare|smooth|fit\(model")
