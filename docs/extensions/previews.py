@@ -3,7 +3,7 @@
 from html import escape
 from typing import Any
 
-from docutils.nodes import Node, document, emphasis, image, paragraph
+from docutils.nodes import Node, document, emphasis, image, paragraph, section
 from sphinx.application import Sphinx
 
 LONGEST = 200  # characters of a description
@@ -31,8 +31,9 @@ def describe(
 
 
 def is_text(node: Node) -> bool:
-    """Whether a paragraph has text, and is not, in italics, the caption of a picture."""
-    return bool(node.astext()) and not isinstance(node.children[0], image | emphasis)
+    """Whether a paragraph is running text, no cell of a table nor, in italics, a caption."""
+    running = isinstance(node.parent, section) and node.astext()
+    return bool(running) and not isinstance(node.children[0], image | emphasis)
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
