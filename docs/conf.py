@@ -1,8 +1,11 @@
 """How Sphinx builds the site: from pages, docstrings and committed outputs, without the network.
 
-Its source is the repository: ``sphinx-build -W --keep-going -b html -c docs . docs/_build``.
+Its source is the repository: ``sphinx-build -W --keep-going -b html -c docs . docs/_build``. Of a
+site with several versions, each is built into a folder of its name, with ``SITE_URL``, the address
+of that folder, and ``SITE_VERSIONS``, the names of the others.
 """
 
+import os
 import sys
 from pathlib import Path
 
@@ -26,6 +29,7 @@ extensions = [
     "formulas",
     "names",
     "pages",
+    "previews",
 ]
 myst_enable_extensions = ["attrs_block", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 4
@@ -69,3 +73,17 @@ html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_extra_path = ["index.html"]  # leads from the site's root to docs/
 html_copy_source = False
+html_baseurl = os.environ.get("SITE_URL", "")
+
+templates_path = ["_templates"]
+html_context = {"versions": os.environ.get("SITE_VERSIONS", "").split()}
+html_sidebars = {
+    "**": [
+        "sidebar/brand.html",
+        "versions.html",
+        "sidebar/search.html",
+        "sidebar/scroll-start.html",
+        "sidebar/navigation.html",
+        "sidebar/scroll-end.html",
+    ]
+}

@@ -18,7 +18,8 @@ ROOT = Path(__file__).parents[1]
 CI = (ROOT / ".ci" / "run").read_text()
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 COPIED = {"changelog", "contributing"}  # into docs/ by a build
-PAGES = [p for p in sorted((ROOT / "docs").rglob("*.md")) if p.parent.name in ("docs", "guide")]
+FOLDERS = ("docs", "guide", "control", "laboratory", "coming_from")
+PAGES = [p for p in sorted((ROOT / "docs").rglob("*.md")) if p.parent.name in FOLDERS]
 DOCUMENTS = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "paper/README.md"]
 DOCUMENTS += ["CODE_OF_CONDUCT.md", "SECURITY.md"]
 DOCUMENTS += [str(page.relative_to(ROOT)) for page in PAGES if page.stem not in COPIED]
@@ -26,7 +27,9 @@ TOOLS = {"coverage", "mypy", "ruff", "sphinx-build", "tox", "twine"}
 BUILT = {"docs/_build", "docs/_build/index.html"}
 PICTURES = "tutorials/pictures/"  # taken from the notebooks as the site is built
 REFERENCE = sorted((ROOT / "docs" / "reference").glob("*.rst"))
-EXAMPLES = [p for p in sorted((ROOT / "docs").rglob("*.rst")) if "_build" not in p.parts]
+GUIDE = sorted((ROOT / "docs" / "guide").rglob("*.md"))
+EXAMPLES = [f"examples/{path.name}" for path in (ROOT / "examples").glob("*.py")]
+DOCTESTS = [p for p in sorted((ROOT / "docs").rglob("*.rst")) if "_build" not in p.parts]
 
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
 
@@ -34,6 +37,8 @@ YOURS = {"NAME.py"}
 MODULES = {
     p.name for room in ("docs", "gpadjust", "paper", "tests") for p in (ROOT / room).rglob("*.py")
 }
+
+COLUMN = 88  # characters of code that fit the site's column
 
 each_document = pytest.mark.parametrize("name", DOCUMENTS)
 
@@ -94,6 +99,21 @@ def test_commands_exist(name, monkeypatch, capsys):
                 assert tool in TOOLS, command
 
 
+@pytest.mark.parametrize("name", [*DOCUMENTS, *EXAMPLES])
+def test_code_fits_its_column(name):
+    text = (ROOT / name).read_text()
+    blocks = re.findall(r"```(?:python|none)\n(.*?)```", text, flags=re.DOTALL)
+    lines = "".join([text] if name.endswith(".py") else blocks).splitlines()
+    assert [line for line in lines if len(line) > COLUMN] == []
+
+
+@pytest.mark.parametrize("page", GUIDE, ids=lambda page: page.stem)
+def test_a_guide_begins_with_a_picture_and_says_what_it_shows(page):
+    title, picture = page.read_text().split("\n\n")[:2]
+    assert title.startswith("# ")
+    assert re.fullmatch(r"!\[.{20,}\]\(\S+\)", picture)
+
+
 def test_ci_runs_the_checks_that_documents_tell():
     told = []
     for name in ("README.md", "CONTRIBUTING.md"):
@@ -135,10 +155,10 @@ def test_the_rooms_have_the_files_to_read_first():
 
 def test_the_reference_has_a_page_for_each_room_and_lists_the_top_level():
     rooms = {path.parent.name for path in (ROOT / "gpadjust").glob("*/__init__.py")}
-    assert {page.stem for page in REFERENCE} == rooms | {"index"}
+    assert {page.stem for page in REFERENCE} == rooms | {"index", "bases"}
     index = (ROOT / "docs" / "reference" / "index.rst").read_text()
     tree = index.partition(".. toctree::")[2].split()
-    assert set(tree[2:]) == rooms
+    assert set(tree[2:]) == rooms | {"bases"}
     listed = re.search(r":nosignatures:\n\n(.*?)\n\n", index, flags=re.DOTALL)[1].split()
     assert sorted(listed) == sorted(gpadjust.__all__)
 
@@ -147,7 +167,7 @@ def test_the_reference_has_a_page_for_each_room_and_lists_the_top_level():
     "page",
     [
         pytest.param(page, marks=pytest.mark.slow if page.stem in ("control", "rl") else ())
-        for page in EXAMPLES
+        for page in DOCTESTS
     ],
     ids=lambda page: page.stem,
 )

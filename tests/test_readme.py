@@ -1,6 +1,5 @@
 """What the README and the guide show runs."""
 
-import math
 import os
 import re
 import shlex
@@ -20,8 +19,9 @@ from tests.export.apart import apart
 from tests.systems import line
 
 ROOT = Path(__file__).parents[1]
-WITH_DATA = {"control", "export", "records", "saving"}  # pages that are tested below
-GUIDE = [p for p in sorted((ROOT / "docs" / "guide").rglob("*.md")) if p.stem not in WITH_DATA]
+BELOW = {"control", "do_mpc", "export", "records", "saving"}  # pages that are tested below
+FOLDERS = [ROOT / "docs" / "guide", ROOT / "docs" / "coming_from"]
+GUIDE = [p for folder in FOLDERS for p in sorted(folder.rglob("*.md")) if p.stem not in BELOW]
 FIRST = [ROOT / "docs" / f"{name}.md" for name in ("start", "install", "choose")]
 
 
@@ -145,27 +145,15 @@ def test_measuring(tmp_path, monkeypatch):
 @pytest.mark.filterwarnings("ignore:The draws of")
 def test_the_log_of_a_pendulum_tells_its_parameters(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    (law,), (log, hidden) = blocks("docs/guide/parameters.md"), blocks("docs/guide/records.md")
+    law, data, log, hidden = blocks("docs/guide/records.md")
     names = {}
-    exec(law, names)
-    truth = torch.tensor([0.19, 3.65, 0.1], dtype=torch.float64)  # inertia, moment, friction
-    row = torch.tensor([[0.5, 0.0, 0.0]], dtype=torch.float64)
-    lines = ["time,q,dq,u"]
-    for i in range(160):
-        row[0, 2] = 0.8 * math.sin(0.7 * i)
-        lines.append(",".join(map(str, [round(0.05 * i, 2), *row[0].tolist()])))
-        row[:, :2] = names["physics"](row, truth)
-    (tmp_path / "log.csv").write_text("\n".join(lines))
-    exec(log, names)
+    for block in (law, data, log):
+        exec(block, names)
     assert "inertia" in capsys.readouterr().out
     found = names["dynamics"].model.physics_parameters.mean
-    torch.testing.assert_close(found, truth, rtol=1e-3, atol=0)
+    torch.testing.assert_close(found, names["truth"], rtol=1e-3, atol=0)
     error = names["run"].mean - names["windows"].measured
     assert error.abs().max() < 1e-2
-    noise = 0.005 * torch.randn(len(lines), generator=torch.Generator().manual_seed(0))
-    rows = [line.split(",") for line in lines[1:]]
-    noisy = [f"{t},{float(q) + e},{u}" for (t, q, _, u), e in zip(rows, noise, strict=False)]
-    (tmp_path / "angle.csv").write_text("\n".join(["time,q,u", *noisy]))
     exec(hidden, names)
     assert names["scores"].rmse[-1, 0] < 0.01
     assert (names["scores"].coverage.mean(0) > 0.8).all()
@@ -198,6 +186,14 @@ def test_the_agent_learns_and_goes_on(tmp_path, monkeypatch, capsys):
     assert actions.shape == (2, 1)
     assert greedy.predict(seen[1])[0] == actions[1]
     assert evaluate_policy(greedy, names["env"], n_eval_episodes=1, warn=False)[0] < 0
+
+
+@pytest.mark.slow
+@apart
+def test_do_mpc_gets_the_adjusted_step():
+    names = {}
+    exec(blocks("docs/coming_from/do_mpc.md")[0], names)
+    assert names["step"](4.0, 1.0)[0] == pytest.approx(5 - 0.3 * 2, abs=0.01)
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import re
 import sys
 from importlib import import_module
+from inspect import isroutine
 from pathlib import Path
 from pydoc import locate
 from typing import Any
@@ -16,7 +17,7 @@ from sphinx.util import inspect
 from sphinx.util.logging import getLogger
 
 REFERENCE = Path(__file__).parents[1] / "reference"
-PAGES = {page.stem for page in REFERENCE.glob("*.rst")} - {"index"}
+PAGES = {page.stem for page in REFERENCE.glob("*.rst")} - {"index", "bases"}
 ROOMS = [import_module(f"gpadjust.{name}") for name in (*sorted(PAGES), "validation.plots")]
 ENTRIES = {id(getattr(room, n)): f"{room.__name__}.{n}" for room in ROOMS for n in room.__all__}
 SOURCES = [ModuleAnalyzer.for_module(n) for n in list(sys.modules) if n.startswith("gpadjust.")]
@@ -29,8 +30,9 @@ CONSTANTS = {  # the docstrings that follow assignments
 for room in ROOMS:  # autodoc looks for them in the room's __init__ alone
     docs = ModuleAnalyzer.for_module(room.__name__).find_attr_docs()
     for name in room.__all__:
-        if id(getattr(room, name)) in CONSTANTS:
-            docs["", name] = CONSTANTS[id(getattr(room, name))]
+        found = getattr(room, name)
+        if id(found) in CONSTANTS and getattr(found, "__name__", "") != name:
+            docs["", name] = CONSTANTS[id(found)]
 
 
 WORDS = re.compile(r"collect|compare|smooth|fit\(model")
@@ -49,6 +51,22 @@ def link_literals(app: Sphinx, document: document) -> None:
             continue
         target = {"refdomain": "py", "reftype": "obj", "reftarget": LITERALS[name]}
         node.replace_self(pending_xref("", node.deepcopy(), refdoc=app.env.docname, **target))
+
+
+def order_entries(app: Sphinx, page: str, source: list[str]) -> None:
+    """Show the entries of a room in the order of the table at the head of its page."""
+    for part in source[0].split(".. currentmodule:: ")[1:] if "/reference/" in page else ():
+        room, listed = part.split()[0], re.findall(r"^   (\w+)$", part, re.MULTILINE)
+        entries = [f".. {directive(locate(f'{room}.{name}'))}:: {name}" for name in listed]
+        text = "\n\n".join([f".. automodule:: {room}\n   :no-members:", *entries])
+        source[0] = re.sub(rf"^\.\. automodule:: {room}(?=\n\n|\n?\Z)", text, source[0], flags=re.M)
+
+
+def directive(found: Any) -> str:
+    """Name of the directive of autodoc that shows an object."""
+    if isinstance(found, type):
+        return "autoexception" if issubclass(found, Exception) else "autoclass"
+    return "autofunction" if isroutine(found) else "autodata"
 
 
 def entry_of(found: Any) -> str | None:
@@ -116,6 +134,7 @@ def mend_ways_back(
 
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register the hooks."""
+    app.connect("source-read", order_entries)
     app.connect("doctree-read", link_literals)
     app.connect("missing-reference", link_other_names)
     app.connect("autodoc-process-signature", sign)

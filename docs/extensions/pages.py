@@ -1,7 +1,8 @@
 """Pages as they lie in the repository, with what Markdown elsewhere does not show.
 
 The site's source is the whole repository, so a link of the repository is one of the site. Added as
-a page is read: anchors of the tables of ``paper/results``, and the tutorials' pictures.
+a page is read: anchors of the tables of ``paper/results``, and the tutorials' pictures. As it is
+written: a button that copies its code, if all of it is one program.
 """
 
 import base64
@@ -10,10 +11,13 @@ import re
 from pathlib import Path
 from typing import Any
 
+from docutils.nodes import document
 from sphinx.application import Sphinx
 
 TUTORIALS = Path(__file__).parents[2] / "tutorials"
 THUMBNAILS = {"1": 1, "2": 1, "4": 2, "6": 2, "7": 1, "9": 3}  # which picture; else the first
+
+PROGRAMS = re.compile(r"docs/(start|choose|guide/.*|coming_from/.*)")  # the tests run them
 
 NO_BREAK = "\N{NO-BREAK SPACE}"
 
@@ -75,8 +79,17 @@ def take_pictures(app: Sphinx) -> None:
                 target.write_bytes(picture)
 
 
+def offer_code(
+    app: Sphinx, page: str, template: str, context: dict[str, Any], doctree: document | None
+) -> None:
+    """Let a page have a button that copies all of its Python."""
+    if PROGRAMS.fullmatch(page):
+        app.add_js_file("copy_page.js")
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register the hooks."""
     app.connect("builder-inited", take_pictures)
     app.connect("source-read", prepare)
+    app.connect("html-page-context", offer_code)
     return {"parallel_read_safe": True}

@@ -104,7 +104,7 @@ def scaled_rbf(num_inputs: int, batch_shape: Size) -> ScaleKernel:
 
 
 def orthogonal_rbf(num_inputs: int, batch_shape: Size) -> OrthogonalKernel:
-    """The same, orthogonal to what unknown parameters of the physics explain: for a delta."""
+    """The default kernel, orthogonal to what unknown parameters explain: for a delta."""
     return OrthogonalKernel(scaled_rbf(num_inputs, batch_shape))
 
 
