@@ -145,7 +145,8 @@ def test_measuring(tmp_path, monkeypatch):
 @pytest.mark.filterwarnings("ignore:The draws of")
 def test_the_log_of_a_pendulum_tells_its_parameters(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    (law,), (log, hidden) = blocks("docs/guide/parameters.md"), blocks("docs/guide/records.md")
+    (law,) = blocks("docs/guide/parameters.md")
+    log, hidden, one_call = blocks("docs/guide/records.md")
     names = {}
     exec(law, names)
     truth = torch.tensor([0.19, 3.65, 0.1], dtype=torch.float64)  # inertia, moment, friction
@@ -170,6 +171,10 @@ def test_the_log_of_a_pendulum_tells_its_parameters(tmp_path, monkeypatch, capsy
     assert names["scores"].rmse[-1, 0] < 0.01
     assert (names["scores"].coverage.mean(0) > 0.8).all()
     assert names["smoothed"].noise[0] == pytest.approx(0.005, rel=0.2)
+    exec(one_call, names)
+    low, high = names["found"].parameters.interval()
+    assert ((low < truth) & (truth < high)).all()
+    assert names["found"].errors["identified"][0] < 0.01
 
 
 @pytest.mark.slow
