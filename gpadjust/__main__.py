@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from argparse import ArgumentParser, ArgumentTypeError, RawDescriptionHelpFormatter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 _ABOUT = """\
 One page that shows whether a crude physics model helps to predict your measurements, where it is
@@ -28,6 +28,22 @@ given as module:function, and its inputs are named in the order of its columns: 
 of NumPy arrays or torch tensors, in its folder,
 
     gpadjust report pump.csv --inputs flow,speed --outputs head --physics pump:head
+"""
+_ABOUT_LOGS = """\
+One page about a machine by its log: parameters of its equations with intervals, noise of the
+sensors, hidden states, and how well the equations follow the last part of the log, which is held
+out. You need a CSV file, whose first line names its columns, and equations, one for each state.
+"""
+_EXAMPLE_OF_LOGS = """\
+example: pendulum.csv has the columns "time [s]", "angle [rad]" and "torque [N m]", and no rate
+
+    gpadjust identify pendulum.csv --states angle,rate --hidden "rate [rad/s] = 0 +- 3" \\
+        --actions torque --step 0.05 --physics "angle' = rate" \\
+        --physics "rate' = -9.81/l*sin(angle) - c*rate + torque/J" \\
+        --unknown "l [m] = 0.5 */ 1.5" --unknown "c [1/s] = 0.1 */ 2" --unknown "J = 0.3 */ 1.5"
+
+writes identify.html. Of a Python module, --physics module:name is a physics of the library, or a
+function of rows of states and actions to the next states.
 """
 _SEEDS = 2**32
 
@@ -110,7 +126,80 @@ def parser() -> ArgumentParser:
     )
     add("--decimal", default=".", choices=(".", ","), metavar="mark", help='the decimal mark (".")')
     add("--title", metavar="text", help="the title of the page")
+    _add_identify(commands.add_parser)
     return main_parser
+
+
+def _add_identify(add_parser: Callable[..., ArgumentParser]) -> None:
+    """The options of ``gpadjust identify``."""
+    log = add_parser(
+        "identify",
+        help="a page about a machine by its log, and equations",
+        description=_ABOUT_LOGS,
+        epilog=_EXAMPLE_OF_LOGS,
+        formatter_class=RawDescriptionHelpFormatter,
+    )
+    add = log.add_argument
+    add("data", nargs="+", help="the log: CSV files in UTF-8, a record each")
+    add(
+        "--time",
+        default="time",
+        metavar="t",
+        help="the column of times (%(default)s), or a number: the time from row to row",
+    )
+    add(
+        "--states",
+        required=True,
+        metavar="a,b",
+        help="the states, columns of the log; or a=q, where a's column is q",
+    )
+    add(
+        "--hidden",
+        action="append",
+        default=[],
+        metavar="b=0+-2",
+        help="a state that was not measured, with mean and standard deviation at the beginning. "
+        "Several: give it again",
+    )
+    add("--actions", metavar="u", help="what acts on the machine; without it, the time")
+    add("--angles", metavar="a", help="states in rad that jump where they have gone round")
+    add(
+        "--physics",
+        required=True,
+        action="append",
+        metavar="equation",
+        help="an equation for each state: \"a'=...\", its time derivative, or 'a=...', its next "
+        "value; or module:name",
+    )
+    add(
+        "--unknown",
+        action="append",
+        default=[],
+        metavar="E=2+-0.4",
+        help="an unknown number of the equations, its guess and standard deviation, which may be a "
+        "percentage; or a factor, E=2*/1.5; or bounds, E=1..3. Several: give it again",
+    )
+    add(
+        "--step",
+        type=float,
+        metavar="0.05",
+        help="the step of the free run, a multiple of the sampling step, which it is by default; a "
+        "longer one is quicker",
+    )
+    add("--segment", metavar="run", help="a column of labels: where they change, a new run begins")
+    add(
+        "--held-out",
+        type=float,
+        default=0.25,
+        metavar="0.25",
+        help="the share of the log that is held out at its end (%(default)s)",
+    )
+    add("--starts", type=_positive, metavar="4", help="searches to take the best of")
+    add("--out", default="identify.html", metavar="page.html", help="the page (%(default)s)")
+    add("--seed", type=_seed, default=0, metavar="0", help="of the free runs (%(default)s)")
+    add("--delimiter", default=",", metavar="mark", help='between two fields (",")')
+    add("--decimal", default=".", choices=(".", ","), metavar="mark", help='the decimal mark (".")')
+    add("--title", metavar="text", help="the title of the page")
 
 
 def main(command: Sequence[str] | None = None) -> int:
@@ -120,7 +209,11 @@ def main(command: Sequence[str] | None = None) -> int:
     try:
         # Not earlier: --help and what is wrong with options need no torch.
         from gpadjust.physics import PhysicsError
-        from gpadjust.report.command import run
+
+        if arguments.command == "report":
+            from gpadjust.report.command import run
+        else:
+            from gpadjust.report.log_command import run
     except ImportError as error:
         return _fail(str(error))
     except KeyboardInterrupt:
@@ -151,9 +244,9 @@ def _seed(text: str) -> int:
 
 
 def _positive(text: str) -> int:
-    """A number of rows."""
+    """A number of 1 or more."""
     if not text.isdecimal() or not int(text):
-        raise ArgumentTypeError(f"expected a number of rows from 1 on, found {text!r}")
+        raise ArgumentTypeError(f"expected a whole number from 1 on, found {text!r}")
     return int(text)
 
 

@@ -145,7 +145,7 @@ def test_measuring(tmp_path, monkeypatch):
 @pytest.mark.filterwarnings("ignore:The draws of")
 def test_the_log_of_a_pendulum_tells_its_parameters(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    law, data, log, hidden = blocks("docs/guide/records.md")
+    law, data, log, hidden, one_call = blocks("docs/guide/records.md")
     names = {}
     for block in (law, data, log):
         exec(block, names)
@@ -158,6 +158,10 @@ def test_the_log_of_a_pendulum_tells_its_parameters(tmp_path, monkeypatch, capsy
     assert names["scores"].rmse[-1, 0] < 0.01
     assert (names["scores"].coverage.mean(0) > 0.8).all()
     assert names["smoothed"].noise[0] == pytest.approx(0.005, rel=0.2)
+    exec(one_call, names)
+    low, high = names["found"].parameters.interval()
+    assert ((low < names["truth"]) & (names["truth"] < high)).all()
+    assert names["found"].errors["identified"][0] < 0.01
 
 
 @pytest.mark.slow

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from functools import partial
+from typing import Any, Literal, Self
 
 import torch
 from torch import Tensor
@@ -11,6 +12,7 @@ from torch import Tensor
 from gpadjust.checks import checked_number, checked_whole
 from gpadjust.physics.base import Physics
 from gpadjust.physics.error import PhysicsError
+from gpadjust.physics.formula import FormulaPhysics
 from gpadjust.physics.gradient import ExternalCall
 from gpadjust.physics.unknown import ParameterValues, Unknown
 
@@ -114,6 +116,46 @@ class ODEPhysics(Physics):
         self.gradient = gradient
         self.num_outputs = state_dim
 
+    @classmethod
+    def of_formula(
+        cls,
+        formula: str,
+        states: Sequence[str],
+        actions: Sequence[str],
+        step: float,
+        *,
+        unknowns: Mapping[str, Unknown] | None = None,
+        **options: Any,
+    ) -> Self:
+        """One time step of an equation of motion that is a text, as of :class:`FormulaPhysics`.
+
+        Args:
+            formula: The time derivative of each state, with commas between them.
+            states: The names of the states.
+            actions: The names of the actions.
+            step: The duration of the step.
+            unknowns: Unknown parameters of the formula by name.
+            options: Further options of the class.
+
+        Raises:
+            ValueError: If the formula is none, or has not one derivative for each state; and as the
+                class.
+
+        Example:
+            >>> decay = ODEPhysics.of_formula("-x + u", ["x"], ["u"], step=1.0)
+            >>> decay(torch.tensor([[1.0, 0.0], [1.0, 1.0]], dtype=torch.float64))
+            tensor([[0.3679],
+                    [1.0000]], dtype=torch.float64)
+        """
+        rates = FormulaPhysics(formula, [*states, *actions], unknowns=unknowns)
+        if rates.num_outputs != len(states):
+            raise ValueError(
+                f"Expected a time derivative of each state, {', '.join(states)}, found "
+                f"{rates.num_outputs} in {formula!r}."
+            )
+        options = {"name": rates.name, **options}
+        return cls(partial(_rates, rates), step, len(states), unknowns=unknowns, **options)
+
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """The state after the step or its change, ``N x state_dim``.
 
@@ -194,3 +236,10 @@ class ODEPhysics(Physics):
 
     def _times(self, intervals: int, X: Tensor) -> Tensor:
         return torch.linspace(0.0, self.step, intervals + 1, dtype=X.dtype, device=X.device)
+
+
+def _rates(
+    formula: FormulaPhysics, state: Tensor, action: Tensor, *parameters: ParameterValues
+) -> Tensor:
+    """The time derivatives by a formula of state and action."""
+    return formula.evaluate(torch.cat([state, action], dim=-1), *parameters)

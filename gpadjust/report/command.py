@@ -23,6 +23,7 @@ from gpadjust.report.given_physics import (
 )
 from gpadjust.report.inputs import (
     TableData,
+    mark_of,
     names_of,
     noise_variances,
     open_table,
@@ -53,7 +54,7 @@ def run(arguments: Namespace, command: Sequence[str]) -> None:
     units = {} if arguments.units is None else pairs(arguments.units, "--units")
     variances = noise_variances(arguments.noise, outputs)
     unknowns = unknowns_of(arguments.unknown)
-    marks = (_mark(arguments.delimiter), arguments.decimal, arguments.sheet)
+    marks = (mark_of(arguments.delimiter), arguments.decimal, arguments.sheet)
     table = open_table(arguments.data, *marks)
     inputs = _inputs(arguments, table.names, outputs)
     asked = ((arguments.categories, "--categories"), (arguments.batches, "--batches"))
@@ -137,14 +138,6 @@ def _inputs(arguments: Namespace, names: Sequence[str], outputs: Sequence[str]) 
         name for name in names if name not in outputs and name_and_unit(name)[0] not in outputs
     ]
     return columns_of(arguments.physics, others)
-
-
-def _mark(text: str) -> str:
-    """The mark between two fields; a tab may be written as in Python."""
-    mark = {"\\t": "\t", "tab": "\t"}.get(text, text)
-    if len(mark) != 1:
-        raise ValueError(f"Expected --delimiter as one character, or tab, found {text!r}.")
-    return mark
 
 
 def _say(text: str) -> None:

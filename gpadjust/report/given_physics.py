@@ -179,7 +179,7 @@ def _formula(text: str, data: TableData, unknowns: Mapping[str, Unknown]) -> For
 
 def _function(path: str, data: TableData) -> tuple[Physics, str]:
     """The physics that a path names, and the code that makes it of what the path names."""
-    thing = _imported(path)
+    thing = imported(path)
     try:
         physics = array_physics(thing, data.X.to_numpy())
     except (TypeError, PhysicsError) as error:
@@ -202,8 +202,8 @@ def _code(physics: FormulaPhysics) -> str:
     return text.replace("inf", "torch.inf") if "bounds" in text else text
 
 
-def _imported(path: str) -> Any:
-    """The object that a path names."""
+def imported(path: str) -> Any:
+    """The object that a path ``module:name`` names."""
     module, _, name = path.partition(":")
     if not _PATH.fullmatch(path):
         file = module.endswith(".py") or "/" in module or "\\" in module

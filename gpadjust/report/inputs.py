@@ -179,6 +179,18 @@ def _are_names(table: TableColumns, name: str) -> bool:
         return False
 
 
+def mark_of(text: str) -> str:
+    """The mark between two fields; a tab may be written as in Python.
+
+    Raises:
+        ValueError: If it is not one character.
+    """
+    mark = {"\\t": "\t", "tab": "\t"}.get(text, text)
+    if len(mark) != 1:
+        raise ValueError(f"Expected --delimiter as one character, or tab, found {text!r}.")
+    return mark
+
+
 def names_of(text: str, option: str) -> list[str]:
     """Names with commas between them, quoted as in a CSV file where they have commas.
 

@@ -6,8 +6,9 @@ import math
 import re
 import warnings
 from base64 import b64encode
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
+from importlib.resources import files
 from io import BytesIO
 from typing import Any
 from urllib.parse import quote
@@ -111,6 +112,41 @@ def bullets(items: Iterable[str]) -> Markup:
     return tag("ul", *(tag("li", item) for item in items))
 
 
+def document(
+    title: str, lead: str, question: str, answer: Markup, sections: Mapping[str, Markup]
+) -> str:
+    """A page of HTML that needs nothing else.
+
+    Args:
+        title: The title.
+        lead: A sentence below it.
+        question: The heading of the first part.
+        answer: The first part, before the links to all others.
+        sections: The other parts by their headings.
+    """
+    links = [tag("a", name, href=f"#{_anchor(name)}") for name in sections]
+    body = [
+        tag("section", tag("h2", name), text, id=_anchor(name)) for name, text in sections.items()
+    ]
+    main = tag(
+        "main",
+        tag("header", tag("h1", title), tag("p", lead, class_="lead")),
+        tag("h2", question, class_="first"),
+        answer,
+        tag("nav", bullets(links), aria_label="Sections"),
+        *body,
+    )
+    style = Markup(files("gpadjust.report").joinpath("style.css").read_text(encoding="utf-8"))
+    head = tag(
+        "head",
+        tag("meta", charset="utf-8"),
+        tag("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        tag("title", title),
+        tag("style", style),
+    )
+    return join([Markup("<!DOCTYPE html>\n"), tag("html", head, tag("body", main), lang="en")])
+
+
 def code(text: str) -> Markup:
     """A block of code."""
     return tag("div", tag("pre", tag("code", text)), class_="scroll", tabindex="0")
@@ -185,6 +221,10 @@ def image(figure: Figure, alt: str, *, pixels: bool = False) -> Markup:
         source = min(source or raster, raster, key=len)
     width, height = (str(round(96 * size)) for size in figure.get_size_inches())
     return tag("img", src=Markup(source), alt=alt, width=width, height=height)
+
+
+def _anchor(name: str) -> str:
+    return "".join(c if c.isalnum() else "-" for c in name.lower()).strip("-")
 
 
 def _curves(figure: Figure) -> str:

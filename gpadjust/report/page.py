@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from gpadjust.checks import progress_bar
 from gpadjust.models import StackedGP, TermsGP
 from gpadjust.models.saving import Saved, save
-from gpadjust.report import sections
-from gpadjust.report.markup import Markup, bullets, join, listed, plural, tag
+from gpadjust.records import Identification
+from gpadjust.report import log_page, sections
+from gpadjust.report.log_page import LogOrigin
+from gpadjust.report.markup import document, listed, plural
 from gpadjust.report.sections import Origin
 from gpadjust.report.subject import Subject, subject_of
 from gpadjust.validation import Comparison
 
 
 def report(
-    model: TermsGP | StackedGP | Comparison,
+    model: TermsGP | StackedGP | Comparison | Identification,
     file: str | Path = "report.html",
     *,
     title: str | None = None,
@@ -37,13 +38,17 @@ def report(
     the model, which is saved beside it (``report.pt`` beside ``report.html``). It is one file,
     without scripts and links.
 
+    The page of a log (:func:`~gpadjust.records.identify`) has a free run along what was held out,
+    beside the physics with its guesses and a state that stays; parameters with their intervals,
+    noise and hidden states, advice and settings. No model is saved beside it.
+
     Whether the physics helps takes a comparison with a model that has none, so report on what
     :func:`~gpadjust.compare` returns. Units are read from names such as ``"head [m]"``, the columns
     of a DataFrame, say.
 
     Args:
         model: A fitted model, a :class:`~gpadjust.StackedGP`, or a :class:`~gpadjust.Comparison`,
-            of which what it recommends is saved.
+            of which what it recommends is saved; or an :class:`~gpadjust.records.Identification`.
         file: Where to write the page, ``*.html``. Files that are there, this and the model's, are
             replaced; where the model cannot be saved, the page says why, and an old file of it is
             removed.
@@ -76,6 +81,8 @@ def report(
     """
     told = {name: str(value) for name, value in (settings or {}).items()}
     path = checked_path(file)
+    if isinstance(model, Identification):
+        return log_page.write(model, path, title, LogOrigin(settings=told))
     return write(subject_of(model, rows), path, title, Origin(settings=told), progress)
 
 
@@ -160,32 +167,11 @@ def page(
     }
     bar = progress_bar(progress, made_by.items(), unit="section", leave=False)
     made = {name: text for name, make in bar if (text := make())}
-    links = [tag("a", name, href=f"#{_anchor(name)}") for name in made]
-    body = [tag("section", tag("h2", name), text, id=_anchor(name)) for name, text in made.items()]
     lead = (
         f"{listed(subject.outputs)} from {listed(subject.inputs)}: "
         f"{plural(len(subject.X), 'row')} of data, f_a(x) = rho(x) f_p(x) + delta(x)."
     )
     if not subject.physics and not subject.is_sampled:
         lead = lead.replace(", f_a(x) = rho(x) f_p(x) + delta(x)", ", without physics")
-    main = tag(
-        "main",
-        tag("header", tag("h1", title), tag("p", lead, class_="lead")),
-        tag("h2", "Does the physics help?", class_="first"),
-        sections.verdicts(subject, origin.how),
-        tag("nav", bullets(links), aria_label="Sections"),
-        *body,
-    )
-    style = Markup(files("gpadjust.report").joinpath("style.css").read_text(encoding="utf-8"))
-    head = tag(
-        "head",
-        tag("meta", charset="utf-8"),
-        tag("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        tag("title", title),
-        tag("style", style),
-    )
-    return join([Markup("<!DOCTYPE html>\n"), tag("html", head, tag("body", main), lang="en")])
-
-
-def _anchor(name: str) -> str:
-    return "".join(c if c.isalnum() else "-" for c in name.lower()).strip("-")
+    first = sections.verdicts(subject, origin.how)
+    return document(title, lead, "Does the physics help?", first, made)

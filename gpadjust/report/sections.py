@@ -234,12 +234,15 @@ def errors(subject: Subject, output: int) -> dict[str, str]:
 
 def _errors(subject: Subject, output: int) -> list[Markup]:
     """The :func:`errors`, in large numbers."""
-    shown = [
-        tag("div", tag("dt", what), tag("dd", value))
-        for what, value in errors(subject, output).items()
-    ]
+    shown = errors(subject, output)
     note = "root mean square errors of left-out observations"
-    return [tag("dl", *shown, class_="errors"), tag("p", note, class_="note")] if shown else []
+    return large_numbers(shown, note) if shown else []
+
+
+def large_numbers(shown: Mapping[str, str], note: str) -> list[Markup]:
+    """Numbers above their names, and a note below them."""
+    each = [tag("div", tag("dt", what), tag("dd", value)) for what, value in shown.items()]
+    return [tag("dl", *each, class_="errors"), tag("p", note, class_="note")]
 
 
 def _weights(subject: Subject) -> Markup:
@@ -442,15 +445,8 @@ def parameters(subject: Subject) -> Markup:
         if shown is None or not shown.model.has_unknowns or shown.structure in seen:
             continue  # outputs share them
         seen.add(shown.structure)
-        known: PhysicsParameters = shown.model.physics_parameters
-        low, high = known.interval()
-        rows = []
-        for i, (name, unknown) in enumerate(known.unknowns.items()):
-            interval = f"{number(float(low[i]), 4)} to {number(float(high[i]), 4)}"
-            mean, sd = number(float(known.mean[i]), 4), number(float(known.sd[i]))
-            rows.append([name, mean, sd, interval, unknown.prior_text, unknown.unit or "-"])
-        head = ["parameter", "mean", "sd", "95 % interval", "known before", "unit"]
-        parts.append(table(f"Parameters of the physics, by {shown.structure}", head, rows))
+        caption = f"Parameters of the physics, by {shown.structure}"
+        parts.append(parameter_table(caption, shown.model.physics_parameters))
     if not parts:
         return Markup()
     words = (
@@ -459,6 +455,18 @@ def parameters(subject: Subject) -> Markup:
         "are alike, the data say next to nothing."
     )
     return join([*parts, tag("p", words)])
+
+
+def parameter_table(caption: str, known: PhysicsParameters) -> Markup:
+    """A table of unknown parameters: the posterior, and what was known before."""
+    low, high = known.interval()
+    rows = []
+    for i, (name, unknown) in enumerate(known.unknowns.items()):
+        interval = f"{number(float(low[i]), 4)} to {number(float(high[i]), 4)}"
+        mean, sd = number(float(known.mean[i]), 4), number(float(known.sd[i]))
+        rows.append([name, mean, sd, interval, unknown.prior_text, unknown.unit or "-"])
+    head = ["parameter", "mean", "sd", "95 % interval", "known before", "unit"]
+    return table(caption, head, rows)
 
 
 def summary(subject: Subject) -> Markup:
@@ -553,9 +561,14 @@ def settings(subject: Subject, origin: Origin) -> Markup:
     rows = [[name, value] for name, value in origin.settings.items()]
     physics = physics or ("known through samples" if subject.is_sampled else "none")
     rows += [["model", repr(subject.model)], ["physics", physics]]
+    return settings_table(rows)
+
+
+def settings_table(rows: list[list[str]]) -> Markup:
+    """A table of settings, with versions and the date."""
     versions = [f"{name} {version(name)}" for name in _LIBRARIES]
     own = f"gpadjust {gpadjust.__version__}"
-    rows.append(["versions", ", ".join([own, f"Python {platform.python_version()}", *versions])])
+    rows = [*rows, ["versions", ", ".join([own, f"Python {platform.python_version()}", *versions])]]
     rows.append(["date", datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")])
     return table("How this page came about", ["setting", "value"], rows, kind="words")
 

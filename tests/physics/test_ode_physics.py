@@ -38,6 +38,27 @@ def held_input_solution(A, B, step):
     return expm(block * step)[:n]
 
 
+class TestFormulas:
+    def test_of_formula_is_the_function_of_the_same_equations(self, points):
+        formula = "rate, -k * angle + torque"
+        known = {"k": Unknown(3.0, factor=2.0)}
+        physics = ODEPhysics.of_formula(formula, ["angle", "rate"], ["torque"], 0.2, unknowns=known)
+        own = ODEPhysics(
+            lambda s, a, p: torch.stack([s[:, 1], -p.k * s[:, 0] + a[:, 0]], -1),
+            *(0.2, 2),
+            unknowns=known,
+        )
+        X = points(5, 3)
+        for values in (None, torch.tensor([2.0], dtype=torch.float64)):
+            torch.testing.assert_close(physics(X, values), own(X, values))
+        torch.testing.assert_close(pickle.loads(pickle.dumps(physics))(X), own(X))
+        assert physics.name == formula
+
+    def test_a_derivative_of_each_state(self):
+        with pytest.raises(ValueError, match="derivative of each state, x, v, found 1 in 'v'"):
+            ODEPhysics.of_formula("v", ["x", "v"], ["u"], 0.1)
+
+
 class TestSolutions:
     @pytest.mark.parametrize("method", ["rk4", "dopri5"])
     def test_linear_system_is_a_matrix_exponential(self, method, points):

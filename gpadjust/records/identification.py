@@ -1,0 +1,291 @@
+"""Identification of a machine by its log, and the free run that judges it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gpadjust.checks import checked_number, checked_whole
+from gpadjust.dynamics import Dynamics, FreeRun, PhysicsDynamics, Windows
+from gpadjust.dynamics.base import TransitionFunctions
+from gpadjust.dynamics.targets import one_physics
+from gpadjust.models import PhysicsParameters
+from gpadjust.physics import Physics
+from gpadjust.records.record import Record, Stretch, in_control_steps
+from gpadjust.records.records import Records
+from gpadjust.records.smoothed_records import SmoothedRecords, smooth
+from gpadjust.states import StateSpec
+
+GUESSES, IDENTIFIED, PERSISTENCE = "guesses", "identified", "persistence"
+_PARTICLES = 199
+_LEVEL = 0.95
+_LEAST = 8  # steps of a stretch, of which the last part is held out
+_KNOWN_BEFORE = 0.8  # of a prior's standard deviation: the log tells next to nothing
+_FAR = 3.0  # standard deviations of a prior
+_FEW = 0.9  # of measurements in intervals of 95 %
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Identification:
+    """A machine as its log shows it, as :func:`identify` finds it.
+
+    Attributes:
+        smoothed: States, parameters and noises, by all but the last part of the log.
+        dynamics: The physics, whose sampled functions have parameters drawn from their posterior.
+        windows: The last part, held out: one window from the last smoothed state of each long
+            stretch.
+        runs: Free runs along the windows: ``"identified"``, and ``"guesses"`` by the parameters
+            that were guessed, if there are any.
+        step: The control step, in the unit of the times.
+    """
+
+    smoothed: SmoothedRecords
+    dynamics: Dynamics
+    windows: Windows
+    runs: Mapping[str, FreeRun]
+    step: float
+
+    @property
+    def spec(self) -> StateSpec:
+        """The names and kinds of states and actions."""
+        return self.smoothed.records.spec
+
+    @property
+    def parameters(self) -> PhysicsParameters | None:
+        """The posterior of the physics' unknown parameters; None if it has none."""
+        return self.smoothed.physics_parameters if GUESSES in self.runs else None
+
+    @property
+    def hidden(self) -> list[str]:
+        """The states that were not measured."""
+        pairs = zip(self.spec.states, self.smoothed.noise.isnan().tolist(), strict=True)
+        return [name for name, was_not in pairs if was_not]
+
+    @property
+    def errors(self) -> dict[str, Tensor]:
+        """Root mean square errors along the windows, ``state_dim``, NaN of hidden states.
+
+        Beside those of the runs those of ``"persistence"``: the state stays where it was.
+        """
+        still = self.windows.initial_states.unsqueeze(1).expand_as(self.windows.measured)
+        paths = {name: run.mean for name, run in self.runs.items()} | {PERSISTENCE: still}
+        return {
+            name: self.spec.change(path, self.windows.measured).square().nanmean((0, 1)).sqrt()
+            for name, path in paths.items()
+        }
+
+    @property
+    def coverage(self) -> Tensor:
+        """Shares of what was measured that the identified run's intervals hold, ``state_dim``."""
+        run, measured = self.runs[IDENTIFIED], self.windows.measured
+        # Of angles, the measured one within half a turn of the mean.
+        measured = run.mean + self.spec.change(run.mean, measured)
+        holds = (run.lower <= measured) & (measured <= run.upper)
+        return holds.double().where(~measured.isnan(), torch.nan).nanmean((0, 1))
+
+    @property
+    def advice(self) -> list[str]:
+        """Sentences on what to look at."""
+        return [*_of_parameters(self.parameters), *self._of_errors()]
+
+    def _of_errors(self) -> list[str]:
+        told, errors = [], self.errors
+        for i, name in enumerate(self.spec.states):
+            share = float(self.coverage[i])
+            if share < _FEW:
+                told.append(
+                    f"Of {name} the intervals of 95 % hold {100 * share:.0f} % of what was held "
+                    "out: the physics lacks something whose errors last longer than process noise, "
+                    "such as dry friction. Rely neither on them nor on those of the parameters."
+                )
+            told += [
+                f"Along what was held out the identified physics errs no less in {name} than "
+                f"{'the guesses do' if other == GUESSES else 'a state that stays'}."
+                for other, error in errors.items()
+                if other != IDENTIFIED and error[i] <= errors[IDENTIFIED][i]
+            ]
+        return told
+
+    def __repr__(self) -> str:
+        """Parameters, noises and errors."""
+        lines = [f"Identification by {self.smoothed!r}"]
+        lines += [] if self.parameters is None else [repr(self.parameters)]
+        names = [name for name in self.spec.states if name not in self.hidden]
+        places = [self.spec.states.index(name) for name in names]
+        steps = self.windows.measured.shape[1]
+        lines.append(f"free run of {steps} steps, root mean square error ({', '.join(names)}):")
+        for name, error in self.errors.items():
+            lines.append(f"  {name}: {', '.join(f'{e:.3g}' for e in error[places].tolist())}")
+        shares = ", ".join(f"{100 * share:.0f} %" for share in self.coverage[places].tolist())
+        return "\n".join([*lines, f"  in intervals of 95 %: {shares}"])
+
+
+def identify(
+    records: Records,
+    physics: Physics | Callable[[Tensor], Tensor],
+    step: float | None = None,
+    *,
+    start: Mapping[str, tuple[float, float]] | None = None,
+    held_out: float = 0.25,
+    num_starts: int | None = None,
+    seed: int = 0,
+    progress: bool = False,
+) -> Identification:
+    """Find parameters, noise and hidden states of a machine, and judge them by a free run.
+
+    All but the last part of the records is smoothed (:func:`smooth`). A free run follows the
+    actions from there to the end, and is compared with what was measured. Its particles start
+    where the state may be, have parameters drawn from their posterior, and are moved by the process
+    noise. That is white: where the physics lacks something, whose errors last, intervals are too
+    narrow. How many of them hold is part of what is returned.
+
+    Args:
+        records: The records, of states that all move. One that is NaN throughout is hidden.
+        physics: The next states, as of :func:`smooth`.
+        step: The control step, as of :meth:`Records.trajectories`.
+        start: Of hidden states by name, mean and standard deviation at the beginning.
+        held_out: The share of the longest stretch without gaps that is held out at its end; as many
+            steps are at the end of each other stretch that has twice as many.
+        num_starts: How many starts to take the best end of, as of :func:`smooth`.
+        seed: Seed of the free runs.
+        progress: Whether to show a progress bar.
+
+    Returns:
+        What was found; :func:`gpadjust.report.report` makes a page of it.
+
+    Raises:
+        TypeError: If an argument is of the wrong type.
+        ValueError: If states are exogenous or previous values, the longest stretch has fewer than 8
+            steps, ``held_out`` is not above 0 and at most 0.5, or as :func:`smooth`.
+        PhysicsError: If the physics fails at measured states.
+        RuntimeError: If the states diverge from all starts.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust.records import Record, Records, identify
+        >>> from gpadjust.physics import ODEPhysics, Unknown
+        >>> from gpadjust.states import StateSpec
+        >>> def spring(x, u, p):
+        ...     return torch.stack([x[:, 1], u[:, 0] - p.stiffness * x[:, 0]], dim=-1)
+        >>> unknowns = {"stiffness": Unknown(1.0, factor=2.0)}
+        >>> physics = ODEPhysics(spring, step=0.1, state_dim=2, unknowns=unknowns)
+        >>> t = 0.1 * torch.arange(60, dtype=torch.float64)
+        >>> position = (1.5 * t).cos() + 0.01 * torch.randn(60, dtype=torch.float64)
+        >>> states = torch.stack([position, torch.full_like(t, torch.nan)], dim=-1)
+        >>> record = Record(t, states, torch.zeros_like(states[:, :1]))
+        >>> found = identify(
+        ...     Records(record, StateSpec(["x", "v"], ["u"])), physics, start={"v": (0.0, 1.0)}
+        ... )
+        >>> bool(found.errors["identified"][0] < 0.1 * found.errors["guesses"][0])
+        True
+    """
+    if not isinstance(records, Records):
+        raise TypeError(f"Expected records as Records([record, ...], spec), found {records!r}.")
+    spec = records.spec
+    if len(spec.moving) < spec.state_dim:
+        raise ValueError(
+            "Expected states that all move, found exogenous ones or previous values; `smooth` "
+            "takes these."
+        )
+    share = checked_number("held_out", held_out, above=0, most=0.5)
+    checked_whole("seed", seed, 0)
+    stretches = [s for s in in_control_steps(records.records, spec, step) if len(s.actions)]
+    longest = max(len(stretch.actions) for stretch in stretches)
+    if longest < _LEAST:
+        raise ValueError(
+            f"Expected a stretch of {_LEAST} control steps or more, to hold some out, found "
+            f"{longest}; take a shorter step, or a longer log."
+        )
+    steps = max(1, int(share * longest))
+    ends = [i for i, each in enumerate(stretches) if len(each.actions) >= 2 * steps]
+    kept = [len(each.actions) - steps * (i in ends) for i, each in enumerate(stretches)]
+    whole = one_physics(physics, spec, "identify one of them")
+    known = Records([_beginning(s, k) for s, k in zip(stretches, kept, strict=True)], spec)
+    smoothed = smooth(known, whole, start=start, num_starts=num_starts, progress=progress)
+    by_guesses = PhysicsDynamics(spec, whole)
+    drawn = _Drawn(spec, whole, smoothed.physics_parameters) if whole.unknowns else by_guesses
+    windows = Windows(
+        torch.stack([smoothed.records.records[i].states[-1] for i in ends]),
+        torch.stack([stretches[i].actions[kept[i] :] for i in ends]),
+        torch.stack([stretches[i].states[kept[i] + 1 :] for i in ends]),
+    )
+    noises: dict[str, Any] = {
+        "start_noise": torch.stack([smoothed.sd[i][-1] for i in ends]).square().mean(0).sqrt(),
+        "noise": smoothed.noise.nan_to_num(),
+    }
+    runs = {
+        IDENTIFIED: drawn.free_run(
+            windows.initial_states,
+            windows.actions,
+            num_functions=_PARTICLES,
+            level=_LEVEL,
+            process_noise=smoothed.process_noise,
+            seed=seed,
+            **noises,
+        )
+    }
+    if whole.unknowns:
+        runs[GUESSES] = by_guesses.free_run(
+            windows.initial_states, windows.actions, seed=seed, **noises
+        )
+    times = stretches[0].times
+    return Identification(smoothed, drawn, windows, runs, float(times[1] - times[0]))
+
+
+class _Drawn(PhysicsDynamics):
+    """A physics of which each sampled function has parameters drawn from a posterior."""
+
+    def __init__(self, spec: StateSpec, physics: Physics, parameters: PhysicsParameters) -> None:
+        super().__init__(spec, physics)
+        self._parameters = parameters
+
+    @property
+    def physics_parameters(self) -> PhysicsParameters:
+        """The posterior."""
+        return self._parameters
+
+    @property
+    def _values(self) -> Tensor:
+        """Means, for predictions that are of one function."""
+        return self._parameters.mean
+
+    def sample_functions(self, num_functions: int, seed: int | None = None) -> TransitionFunctions:
+        """The physics with draws of the parameters, the same ones for the same seed."""
+        checked_whole("num_functions", num_functions, 1)
+        generator = torch.Generator().manual_seed(0 if seed is None else seed)
+        draws = self._parameters.draws
+        order = torch.randperm(len(draws), generator=generator)
+        values = draws[order[torch.arange(num_functions) % len(draws)]]
+
+        def step(states: Tensor, actions: Tensor) -> Tensor:
+            self._check_blocks(states, actions, num_functions)
+            return self._step(states, actions, values)
+
+        return step
+
+
+def _beginning(stretch: Stretch, steps: int) -> Record:
+    """A record of the first steps of a stretch; its last action counts for nothing."""
+    actions = torch.cat([stretch.actions[:steps], stretch.actions[-1:]])
+    return Record(stretch.times[: steps + 1], stretch.states[: steps + 1], actions)
+
+
+def _of_parameters(parameters: PhysicsParameters | None) -> list[str]:
+    """Sentences on parameters of which the log says little, or which were guessed badly."""
+    if parameters is None:
+        return []
+    told = []
+    for name, unknown in parameters.unknowns.items():
+        z = unknown.coordinate(parameters[name])
+        if z.std() > _KNOWN_BEFORE:
+            told.append(f"The log says next to nothing of {name}: it stays as known before.")
+        elif z.mean().abs() > _FAR:
+            told.append(
+                f"{name} is {float(z.mean().abs()):.1f} standard deviations of its prior from its "
+                "guess: units, or a physics that lacks something?"
+            )
+    return told

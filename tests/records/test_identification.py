@@ -1,0 +1,141 @@
+"""A machine by its log: what is held out, what is compared with it, and what is said of it."""
+
+from functools import partial
+
+import pytest
+import torch
+
+from gpadjust.physics import FunctionPhysics, ODEPhysics, Unknown
+from gpadjust.records import Record, Records, identify
+from gpadjust.states import StateSpec
+
+STEP, TRUE = 0.1, 2.25
+SPEC = StateSpec(["x", "v"], ["u"], step=STEP)
+START = {"v": (0.0, 2.0)}
+quickly = partial(identify, start=START, num_starts=1)
+
+
+def spring(prior=None):
+    """A mass on a spring; with a prior its stiffness is unknown."""
+    unknowns = {} if prior is None else {"k": prior}
+    formula = "v, u - k * x" if unknowns else f"v, u - {TRUE} * x"
+    return ODEPhysics.of_formula(formula, ["x", "v"], ["u"], STEP, unknowns=unknowns)
+
+
+def oscillation(rows, noise=0.02, seed=0, known=("x",)):
+    """A record of the spring under an alternating force, in its own steps."""
+    generator = torch.Generator().manual_seed(seed)
+    force = torch.rand(rows, 1, generator=generator, dtype=torch.float64) - 0.5
+    state, states = torch.tensor([[1.0, 0.0]], dtype=torch.float64), []
+    for u in force:
+        states.append(state)
+        state = spring()(torch.cat([state, u[None]], -1))
+    states = torch.cat(states)
+    states = states + noise * torch.randn(states.shape, generator=generator, dtype=torch.float64)
+    for i, name in enumerate(("x", "v")):
+        if name not in known:
+            states[:, i] = torch.nan
+    return Record(STEP * torch.arange(rows, dtype=torch.float64), states, force)
+
+
+@pytest.fixture(scope="module")
+def found():
+    return quickly(Records(oscillation(121), SPEC), spring(Unknown(1.5, factor=1.5, unit="1/s²")))
+
+
+def test_parameters_noise_and_a_free_run_that_errs_by_the_noise(found):
+    low, high = found.parameters.interval()
+    assert low < TRUE < high
+    assert high - low < 0.2
+    assert float(found.smoothed.noise[0]) == pytest.approx(0.02, rel=0.25)
+    assert found.hidden == ["v"]
+    errors = {name: error.tolist() for name, error in found.errors.items()}
+    assert (
+        errors["identified"][0] < 0.04 < 0.2 < min(errors["guesses"][0], errors["persistence"][0])
+    )
+    assert all(error[1] != error[1] for error in errors.values())  # nobody knows
+    assert found.coverage[0] > 0.85
+    assert found.advice == []
+    assert "guesses: " in repr(found)
+
+
+def test_what_is_held_out_is_not_learnt_from(found):
+    """Another end of the log changes neither states nor parameters, and is followed as badly."""
+    (record,) = Records(oscillation(121), SPEC)
+    states = record.states.clone()
+    states[91:] += 1.0
+    other = quickly(
+        Records(Record(record.times, states, record.actions), SPEC),
+        spring(Unknown(1.5, factor=1.5)),
+    )
+    assert found.windows.measured.shape == (1, 30, 2)
+    torch.testing.assert_close(other.parameters.mean, found.parameters.mean)
+    torch.testing.assert_close(other.runs["identified"].mean, found.runs["identified"].mean)
+    assert other.errors["identified"][0] > 0.9
+    assert any("hold 0 % of what was held out" in each for each in other.advice)
+
+
+def test_functions_of_the_dynamics_have_parameters_of_their_own(found):
+    at_rest = torch.tensor([[1.0, 0.0]], dtype=torch.float64).expand(300, -1, -1)
+    functions = found.dynamics.sample_functions(300, seed=1)
+    ends = functions(at_rest, found.windows.actions[:, 0])
+    spread = ends[:, 0, 1].std() / STEP  # v changes by the stiffness times the step
+    assert float(spread) == pytest.approx(float(found.parameters.sd[0]), rel=0.1)
+
+
+def test_several_records_and_gaps_each_have_an_end():
+    long, other, short = oscillation(61), oscillation(61, seed=1), oscillation(12, seed=2)
+    times = long.times.clone()
+    times[40:] += 1.0  # stretches of 39 and 20 steps
+    records = Records([Record(times, long.states, long.actions), other, short], SPEC)
+    found = quickly(records, spring(), held_out=0.25)
+    assert found.windows.measured.shape == (2, 15, 2)  # the others have less than twice as many
+    assert [len(each.times) for each in found.smoothed.records] == [25, 21, 46, 12]
+
+
+def test_a_physics_without_unknowns_is_judged_too():
+    found = quickly(Records(oscillation(60, known=("x", "v")), SPEC), spring(), start=None)
+    assert found.parameters is None
+    assert [*found.errors] == ["identified", "persistence"]
+    assert found.hidden == []
+
+
+def test_advice_on_parameters():
+    def of_two(X, p):
+        x, v, u = X.unbind(-1)
+        return torch.stack([x + STEP * v, v + STEP * (u - p.k * x) + 0 * p.idle], -1)
+
+    unknowns = {"k": Unknown(1.0, factor=1.1), "idle": Unknown(1.0, sd=1.0)}
+    physics = FunctionPhysics(of_two, unknowns=unknowns)
+    told = " ".join(quickly(Records(oscillation(80), SPEC), physics).advice)
+    assert "next to nothing of idle" in told
+    assert "k is" in told
+    assert "standard deviations of its prior from its guess" in told
+
+
+BAD = {
+    "no records": ({"records": oscillation(20)}, TypeError, r"Records\(\[record"),
+    "share": ({"held_out": 0.7}, ValueError, "at most 0.5"),
+    "nothing": ({"held_out": 0}, ValueError, "above 0"),
+    "few": ({"records": Records(oscillation(6), SPEC)}, ValueError, "8 control steps or more"),
+    "seed": ({"seed": -1}, ValueError, "seed"),
+    "start": ({"start": None}, ValueError, "'v' was never measured"),
+    "lags": (
+        {
+            "records": Records(
+                Record(torch.arange(9).double(), *torch.zeros(2, 9, 2).double()),
+                StateSpec(["x", "x_1"], ["u", "w"], previous={"x_1": "x"}),
+            )
+        },
+        ValueError,
+        "states that all move",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_arguments(case):
+    given, error, message = BAD[case]
+    given = {"records": Records(oscillation(20), SPEC), "physics": spring(), **given}
+    with pytest.raises(error, match=message):
+        quickly(given.pop("records"), given.pop("physics"), **given)

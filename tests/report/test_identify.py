@@ -1,0 +1,200 @@
+"""The command for a log: from a CSV file and equations to a page, or an error that says why not."""
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from gpadjust.__main__ import main
+from gpadjust.records import Records, identify
+from gpadjust.report import report
+from gpadjust.report.markup import Markup
+
+LOG = Path(__file__).parents[2] / "examples" / "pendulum.csv"
+TRUE = {"l": 0.6, "c": 0.15, "J": 0.4, "F": 0.1}  # of the simulation
+NOISE = 0.5 * torch.pi / 180  # rad
+GRAVITY = "rate' = -9.81/l*sin(angle) - c*rate + "
+PRIORS = ("l [m] = 0.5 */ 1.5", "c [1/s] = 0.1 */ 2", "J [kg m2] = 0.3 */ 1.5")
+QUICKLY = ("--step", "0.1", "--starts", "1")
+STATES = ("--states", "angle,rate", "--hidden", "rate [rad/s] = 0 +- 3", "--actions", "torque")
+MODULE = """
+import torch
+from gpadjust import ODEPhysics, Unknown
+def rates(x, u, p):
+    return torch.stack([x[:, 1], -9.81 / p.l * x[:, 0].sin() + u[:, 0] / 0.4], -1)
+physics = ODEPhysics(rates, step=0.1, state_dim=2, unknowns={"l": Unknown(0.5, factor=1.5)})
+def fails(X): raise RuntimeError("no such angle")
+"""
+
+
+@pytest.fixture
+def undrawn_log(monkeypatch):
+    """Leaves the figures out."""
+    monkeypatch.setattr("gpadjust.report.log_page.drawn", lambda draw: Markup())
+
+
+def options(*equations, unknowns=PRIORS):
+    parts = [("--physics", each) for each in ("angle' = rate", *equations)]
+    parts += [("--unknown", each) for each in unknowns]
+    return [word for part in parts for word in part]
+
+
+VISCOUS = options(GRAVITY + "torque/J")
+DRY = options(GRAVITY + "(torque - F*tanh(rate/0.05))/J", unknowns=(*PRIORS, "F [N m] = 0.05 */ 3"))
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The working directory: the log, a module, and an earlier page."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "log.csv").write_text(LOG.read_text())
+    (tmp_path / "swing.py").write_text(MODULE)
+    (tmp_path / "identify.html").write_text("earlier")
+    yield tmp_path
+    sys.modules.pop("swing", None)
+
+
+def test_a_page_of_true_parameters_noise_and_a_free_run(folder, read, capsys):
+    assert main(["identify", "log.csv", *STATES, *DRY, *QUICKLY]) == 0
+    out, err = capsys.readouterr()
+    assert "Wrote identify.html." in out
+    assert "1201 rows every 0.01" in err
+    page = read(folder / "identify.html")
+    assert page.needs_nothing_else()
+    for name, _, _, interval, _, unit in page.tables["Parameters by what was learnt from"][1:]:
+        low, high = map(float, interval.split(" to "))
+        assert low < TRUE[name] < high < 3 * low
+        assert unit == {"l": "m", "c": "1/s", "J": "kg m2", "F": "N m"}[name]
+    noises = {row[0]: row[1:] for row in page.tables["Noise"][1:]}
+    assert float(noises["angle"][0]) == pytest.approx(NOISE, rel=0.2)
+    assert noises["rate"][0::2] == ["hidden", "rad/s"]
+    errors = {row[0]: row[2:] for row in page.tables["Errors of the free run"][1:]}
+    guesses, identified, still = (float(row[0]) for row in errors.values())
+    assert identified < 1.3 * NOISE < 5 * NOISE < min(guesses, still)
+    assert errors["identified"][1] == "rad"
+    assert int(errors["identified"][2].removesuffix(" %")) >= 90
+    assert "Advice" not in page.text
+    assert [each["alt"].partition(",")[0] for each in page.images] == [
+        "free run of angle with intervals",
+        "free run of rate with intervals",
+        "angle",
+        "rate",
+    ]
+    (program,) = page.codes
+    names = {}
+    exec(program, names)
+    assert f"{float(names['found'].errors['identified'][0]):.3g}" == errors["identified"][0]
+    assert names["run"].mean.shape == (1, 100, 2)
+    assert {each.name for each in folder.iterdir()} == {*("log.csv", "swing.py", "identify.html")}
+
+
+def test_what_the_equations_lack_is_said(folder, read, undrawn_log):
+    """Without dry friction the viscous one is wrong, and so are the intervals."""
+    assert main(["identify", "log.csv", *STATES, *VISCOUS, *QUICKLY, "--title", "A swing"]) == 0
+    page = read(folder / "identify.html")
+    assert page.text.startswith("A swing")
+    assert "the physics lacks something whose errors last longer" in page.text
+
+
+def test_a_physics_of_a_module_has_a_step_of_its_own(folder, read, undrawn_log):
+    given = ["--physics", "swing:physics", "--starts", "1", "--out", "module.html"]
+    assert main(["identify", "log.csv", *STATES, *given]) == 0
+    page = read(folder / "module.html")
+    assert dict(page.tables["How this page came about"])["step"] == "0.1 s"
+    assert "physics = swing.physics" in page.codes[0]
+
+
+def test_without_actions_there_is_the_time_and_next_values_are_equations_too(folder, undrawn_log):
+    rows = "".join(f"{k},{k / 2},{5 * 0.9**k}\n" for k in range(24))
+    (folder / "cooling.csv").write_text(f"n,t [s],excess [K]\n{rows}")
+    given = ["--time", "t", "--states", "T=excess", "--physics", "T = q * T + 0 * time"]
+    assert main(["identify", "cooling.csv", *given, "--unknown", "q = 0.5 .. 1"]) == 0
+    text = (folder / "identify.html").read_text()
+    assert "0.9 to 0.9" in text
+    assert "FormulaPhysics.of_formula" not in text
+
+
+def test_python_makes_the_same_page_of_an_identification(folder, read, undrawn_log):
+    from tests.records.test_identification import SPEC, START, oscillation, spring
+
+    found = identify(Records(oscillation(40), SPEC), spring(), start=START)
+    path = report(found, folder / "own.html", settings={"day": "Monday"})
+    page = read(path)
+    assert ["day", "Monday"] in page.tables["How this page came about"]
+    assert "Parameters of the physics" not in page.text
+    assert not page.codes
+    assert not (folder / "own.pt").exists()
+
+
+BAD = {
+    ("--states", "angel,rate"): "expected a column 'angel', found .* Is it 'angle.*--hidden",
+    ("--delimiter", "ab"): "--delimiter as one character",
+    ("--hidden", "speed=0+-1"): "--hidden names 'speed', which is none of --states",
+    ("--hidden", "rate"): r"such as 'rate \[rad/s\]=0 \+- 2', found 'rate'",
+    ("--hidden", "rate=0..1"): "mean and standard deviation",
+    ("--actions", "force"): "expected a column 'force'",
+    ("--time", "clock"): "expected a column 'clock'",
+    ("--angles", "torque"): "--angles names 'torque'",
+    ("--unknown", "c=1"): "Expected --unknown such as",
+    ("--unknown", "z=1+-1"): "--unknown names 'z', which is in no equation",
+    ("--physics", "rate' = rate"): "one equation for each state",
+    ("--physics", "swing:physics"): "Expected swing:physics alone",
+    ("--physics", "x' = rate"): "equation for each of angle, rate.* found those of angle, rate, x",
+    ("--held-out", "0.8"): "at most 0.5",
+    ("--step", "0.013"): "whole multiple of the sampling step",
+    ("--segment", "day"): "expected a column 'day'",
+    ("--out", "none/page.html"): "There is no folder 'none'",
+    ("--out", "page.pdf"): "Expected a page such as 'report.html'",
+}
+
+
+@pytest.mark.parametrize("option", BAD, ids=" ".join)
+def test_bad_options(folder, capsys, option):
+    _fails(folder, capsys, ["log.csv", *STATES, *VISCOUS, *option], BAD[option])
+
+
+BAD_LOGS = {
+    "time,angle,torque\n0,1,0\n0,1,0\n": "expected times that rise, found 0 after 0",
+    "time,angle,torque\n0,1,0\n1,1,\n": r"column 3 \('torque'\): expected a number",
+    "time,angle,torque\n0,1,0\n1,x,0\n": r"column 2 \('angle'\): expected a number, or nothing",
+    "time,angle,torque\n0,1,0\n1,1,0\n2,1,0\n": "8 control steps or more",
+    "time;angle;torque\n0;1;0\n": "say so by --delimiter ';'",
+}
+
+
+@pytest.mark.parametrize("text", BAD_LOGS)
+def test_a_log_that_is_none(folder, capsys, text):
+    (folder / "log.csv").write_text(text)
+    _fails(folder, capsys, ["log.csv", *STATES, *VISCOUS], BAD_LOGS[text])
+
+
+def test_a_physics_that_fails(folder, capsys):
+    given = ["log.csv", *STATES, "--physics", "swing:fails", "--step", "0.05"]
+    _fails(folder, capsys, given, "no such angle")
+
+
+def test_angles_are_in_rad(folder, capsys):
+    (folder / "log.csv").write_text(LOG.read_text().replace("[rad]", "[deg]", 1))
+    given = ["log.csv", *STATES, *VISCOUS, "--angles", "angle"]
+    _fails(folder, capsys, given, "Expected the angle 'angle' in rad, found 'deg'")
+
+
+def test_the_log_is_never_overwritten(folder, capsys):
+    (folder / "log.html").write_text(LOG.read_text())
+    given = ["log.html", *STATES, *VISCOUS, "--out", "log.html"]
+    _fails(folder, capsys, given, "log.html is the data")
+    assert (folder / "log.html").read_text() == LOG.read_text()
+
+
+def _fails(folder, capsys, given, message):
+    before = {each: each.read_bytes() for each in folder.iterdir() if each.is_file()}
+    assert main(["identify", *given]) == 1
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "Traceback" not in err
+    assert re.search(message, err, flags=re.DOTALL), err
+    after = {each: each.read_bytes() for each in folder.iterdir() if each.is_file()}
+    assert after == before
