@@ -1,14 +1,19 @@
-"""What an import brings, in a process of its own."""
+"""What an import brings, in a process of its own, and the cheat sheet."""
 
+import inspect
 import os
 import pickle
+import re
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
 import gpadjust
+from tests.systems import line
 
 
 def python(code, **options):
@@ -35,12 +40,34 @@ def test_what_is_not_needed_is_not_imported():
         "import gpadjust.states, gpadjust.files": "botorch gpytorch linear_operator gymnasium",
         "from gpadjust import ODEPhysics": "botorch gpytorch gymnasium",
         "import gpadjust.systems": "botorch gpytorch linear_operator stable_baselines3 opensim",
+        "from gpadjust import CKA, compare, fit": "scipy.stats scipy.integrate joblib",
     }
     code = "import sys\n" + "".join(
         f"{first}\nprint({first!r}, *set({absent.split()}) & {{*sys.modules}})\n"
         for first, absent in steps.items()
     )
     assert python(code).splitlines() == [*steps]
+
+
+def rate(state, action):
+    return -state
+
+
+def f_p(X):
+    return 1 + X
+
+
+def test_each_line_of_the_cheat_sheet_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    X = line(6)
+    names = {name: getattr(gpadjust, name) for name in gpadjust.__all__}
+    names |= {"X": X, "Y": 2 * f_p(X) + 0.1 * X.sin(), "f_p": f_p, "g_p": torch.exp}
+    names |= {"simulator": np.sin, "rate": rate}
+    calls = re.findall(r"^ {4}(.+)", inspect.getdoc(gpadjust), flags=re.MULTILINE)
+    assert len(calls) > 25
+    for call in calls:
+        exec(call, names)
+    assert names["mean"].shape == names["rho"].mean.shape == (6, 1)
 
 
 def test_every_name_is_there_and_brings_nothing_optional():

@@ -7,7 +7,6 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor
-from torchdiffeq import odeint
 
 from gpadjust.checks import checked_number, checked_whole
 from gpadjust.physics.base import Physics
@@ -108,6 +107,8 @@ class ODEPhysics(Physics):
         A PhysicsError says that X has fewer columns, ``rhs`` returns something else than one time
         derivative per state, or an adaptive method does not arrive.
         """
+        from torchdiffeq import odeint  # brings scipy.integrate, slow to import
+
         if X.shape[1] < self.state_dim:
             raise PhysicsError(
                 f"Physics {self.name!r} needs {self.state_dim} state column(s), then the action; "
