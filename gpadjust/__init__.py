@@ -34,6 +34,7 @@ Other data, for each of these::
 
 Other physics, with unknown parameters or without::
 
+    FormulaPhysics("1 + x", ["x"])               # a formula as text
     BlackBoxPhysics(simulator)                   # NumPy code; SubprocessPhysics: a program
     ODEPhysics(rate, step=0.1, state_dim=1)      # a differential equation
     law = FunctionPhysics(lambda X, p: p.gain * X[:, 0], unknowns={"gain": Unknown(1.0, factor=2)})
