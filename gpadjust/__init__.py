@@ -1,16 +1,67 @@
-"""Gaussian processes that adjust a physics model to data."""
+"""Gaussian processes that adjust a physics model to data: the calls, on one page.
+
+Inputs X are ``n x d``, outputs Y ``n x m``, in your units: float64 tensors, arrays or data frames.
+The physics f_p takes rows of X and returns rows of Y. ``from gpadjust import CKA, fit`` and so on.
+
+The usual way::
+
+    model = CKA(X, Y, physics=f_p)               # rho(x) f_p(x) + delta(x)
+    print(fit(model))                            # is f_p of use? A point fit: fit(model, "map")
+    print(model.summary())                       # hyper-parameters and noise, in your units
+    mean, variance = model.predict(X)            # of a measurement: observation_noise=True
+    lower, upper = model.interval(X, level=0.95)
+    rho, delta = model.rho(X), model.delta(X)    # where and how is f_p wrong?
+    model.plot()                                 # all of it, along each input
+    print(compare(X, Y, f_p))                    # does f_p help, and which model is best?
+    save(model, "model.pt")
+    model = load("model.pt")                     # physics=f_p, if it cannot be imported
+
+Other models, with the same calls::
+
+    CKA(X, Y, physics={"a": f_p, "b": g_p})      # several physics
+    PhysicsMeanGP(X, Y, physics=f_p)             # delta alone
+    ScaleGP(X, Y, physics=f_p)                   # rho alone
+    ZeroMeanGP(X, Y)                             # no physics
+    RRA(X, Y, physics=f_p)                       # functions to call anywhere
+    VariationalCKA(X, Y, physics=f_p)            # up to 100,000 rows
+    AR1(X, Y, physics=f_p, bounds=[[0], [1]])    # a constant rho; f_p known through samples
+
+Other data, for each of these::
+
+    CKA(X, Y, 0.1**2, physics=f_p)                     # noise of a known variance
+    CKA(X, Y, physics=f_p, likelihood="heavy-tailed")  # outliers; "relative": errors in per cent
+    CKA(X, Y, physics=f_p, outcome_transform="log")    # positive outputs
+
+Other physics, with unknown parameters or without::
+
+    FormulaPhysics("1 + x", ["x"])               # a formula as text
+    BlackBoxPhysics(simulator)                   # NumPy code; SubprocessPhysics: a program
+    ODEPhysics(rate, step=0.1, state_dim=1)      # a differential equation
+    law = FunctionPhysics(lambda X, p: p.gain * X[:, 0], unknowns={"gain": Unknown(1.0, factor=2)})
+    CalibratedPhysics(X, Y, physics=law)         # the law alone
+
+Beyond the models::
+
+    from gpadjust.validation import leave_one_out, trust   # do the intervals hold what they say?
+    from gpadjust.report import report                     # a page to show
+    from gpadjust.active import collect                    # the next point to measure
+    from gpadjust.records import Records, smooth           # log files of machines
+    from gpadjust.dynamics import LearnedDynamics          # the next state of a system
+    from gpadjust.control import MPCAgent                  # a controller; SAC and TD3: gpadjust.rl
+    from gpadjust.export import c_source, casadi_function  # onto the machine
+    from gpadjust.sklearn import CKARegressor              # scikit-learn; Ax: gpadjust.ax
+"""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gpadjust.emulation import EmulatedPhysics
-    from gpadjust.inference import FitResult, SampleResult, fit
+    from gpadjust.inference import fit
     from gpadjust.models import (
         AR1,
         CKA,
         RRA,
-        BiasGP,
         CalibratedPhysics,
         ParallelPartialGP,
         PhysicsMeanGP,
@@ -25,9 +76,7 @@ if TYPE_CHECKING:
         BlackBoxPhysics,
         FormulaPhysics,
         FunctionPhysics,
-        JoinedPhysics,
         ODEPhysics,
-        Physics,
         PhysicsError,
         PhysicsWarning,
         SubprocessPhysics,
@@ -41,22 +90,17 @@ __all__ = [
     "AR1",
     "CKA",
     "RRA",
-    "BiasGP",
     "BlackBoxPhysics",
     "CalibratedPhysics",
     "Comparison",
     "EmulatedPhysics",
-    "FitResult",
     "FormulaPhysics",
     "FunctionPhysics",
-    "JoinedPhysics",
     "ODEPhysics",
     "ParallelPartialGP",
-    "Physics",
     "PhysicsError",
     "PhysicsMeanGP",
     "PhysicsWarning",
-    "SampleResult",
     "ScaleGP",
     "StackedGP",
     "SubprocessPhysics",

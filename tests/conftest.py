@@ -6,8 +6,8 @@ from itertools import combinations
 import pytest
 import torch
 
-from gpadjust import AR1, CKA, RRA, BiasGP, PhysicsMeanGP, ScaleGP, ZeroMeanGP
-from gpadjust.models import PaperRRA
+from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP
+from gpadjust.models import BiasGP, PaperRRA
 from tests import systems
 from tests.systems import around, crude, truth
 

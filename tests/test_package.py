@@ -1,5 +1,6 @@
-"""What an import brings, in a process of its own."""
+"""What an import brings, in a process of its own, and the cheat sheet."""
 
+import inspect
 import os
 import pickle
 import re
@@ -10,6 +11,7 @@ from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from packaging.requirements import Requirement
@@ -47,6 +49,7 @@ def test_what_is_not_needed_is_not_imported():
         "import gpadjust.states, gpadjust.files": "botorch gpytorch linear_operator gymnasium",
         "from gpadjust import ODEPhysics": "botorch gpytorch gymnasium",
         "import gpadjust.systems": "botorch gpytorch linear_operator stable_baselines3 opensim",
+        "from gpadjust import CKA, compare, fit": "scipy.stats scipy.integrate joblib",
     }
     code = "import sys\n" + "".join(
         f"{first}\nprint({first!r}, *set({absent.split()}) & {{*sys.modules}})\n"
@@ -90,6 +93,27 @@ def test_an_error_names_the_extra(missing, monkeypatch):
     extra, call = NEEDED[missing]
     with pytest.raises(ImportError, match=rf'pip install "gpadjust\[{extra}\]"'):
         call()
+
+
+def rate(state, action):
+    return -state
+
+
+def f_p(X):
+    return 1 + X
+
+
+def test_each_line_of_the_cheat_sheet_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    X = line(6)
+    names = {name: getattr(gpadjust, name) for name in gpadjust.__all__}
+    names |= {"X": X, "Y": 2 * f_p(X) + 0.1 * X.sin(), "f_p": f_p, "g_p": torch.exp}
+    names |= {"simulator": np.sin, "rate": rate}
+    calls = re.findall(r"^ {4}(.+)", inspect.getdoc(gpadjust), flags=re.MULTILINE)
+    assert len(calls) > 25
+    for call in calls:
+        exec(call, names)
+    assert names["mean"].shape == names["rho"].mean.shape == (6, 1)
 
 
 def test_every_name_is_there_and_brings_nothing_optional():

@@ -24,8 +24,8 @@ class ParameterPhysics:
     Args:
         physics: The physics f_p. A function whose arguments have names of parameters,
             ``f_p(pressure, temperature)``, is given tensors of ``N`` values of these, whatever the
-            order of the search space. Any other function or :class:`~gpadjust.Physics` is given
-            ``N x d`` rows, a column for each parameter, in the order of the search space. It
+            order of the search space. Any other function or :class:`~gpadjust.physics.Physics` is
+            given ``N x d`` rows, a column for each parameter, in the order of the search space. It
             returns ``N`` values or ``N x 1``. Or an import path, ``"package.module:f_p"``.
 
     Raises:

@@ -52,8 +52,8 @@ class MPCAgent(Agent):
         >>> system = cart_pole()
         >>> quick = Planner(search=CrossEntropy(1), horizon=0.3, num_random=16)  # or leave it out
         >>> agent = MPCAgent(system.make(), system.task(), quick, first=quick, seed=0)
-        >>> agent.learn(total_timesteps=2 * 25)
-        MPCAgent(CartPoleSwingUpEnv, LearnedDynamics, 2 episodes learnt, 50 steps, last reward ...)
+        >>> agent.learn(total_timesteps=25)
+        MPCAgent(CartPoleSwingUpEnv, LearnedDynamics, 1 episodes learnt, 25 steps, last reward ...)
     """
 
     def __init__(

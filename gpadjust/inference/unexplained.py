@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from scipy.optimize import minimize
-from scipy.stats import chi2
+from scipy.special import chdtri
 from torch import Tensor
 
 from gpadjust.gp.gaussian import negative_log_likelihood, threads_for
@@ -107,7 +107,7 @@ def _of_one(
     best = min(runs, key=lambda run: float(run.fun))
     alone = r.square().mean().expand_as(r) if own is None else own
     without = 0.5 * (r.square() / alone + (2 * math.pi * alone).log()).mean()
-    if 2 * (float(without) - float(best.fun)) * r.numel() <= chi2.isf(_CHANCE, d + 1):
+    if 2 * (float(without) - float(best.fun)) * r.numel() <= chdtri(d + 1, _CHANCE):
         return torch.zeros_like(size), spread, whole
     p = torch.as_tensor(best.x).to(x).exp()
     noise = p[d + 1] if own is None else own.mean()

@@ -10,7 +10,7 @@ from botorch.acquisition.objective import PosteriorTransform
 from botorch.models.transforms.input import InputTransform
 from botorch.posteriors import Posterior
 from botorch.posteriors.fully_bayesian import MCMC_DIM
-from scipy.stats import invgamma
+from scipy.special import gammainccinv
 from torch import Tensor
 
 from gpadjust.checks import check_level
@@ -334,7 +334,7 @@ class ParallelPartialGP(TermsModel):
         # Quantiles of each output's variance (coupled, of one factor for all), one for each sample.
         order = torch.rand(rate.shape, generator=generator, dtype=rate.dtype).argsort(0)
         level = (order.double() + 0.5) / number
-        unit = torch.as_tensor(invgamma.ppf(level.numpy(), shape)).to(rate)
+        unit = torch.as_tensor(1 / gammainccinv(shape, level.numpy())).to(rate)
         scales = rate * (unit if number > 1 else 1 / max(shape - 1, 0.5))
         self.scales = scales.expand(number, self.num_outputs).clone()
         if self.coordinate is not None:

@@ -151,8 +151,9 @@ class ZeroMeanGP(TermsGP):
 class PhysicsMeanGP(TermsGP):
     r"""A Gaussian process with the physics as its mean, :math:`f \sim GP(f_p, k)`.
 
-    Seen as an adjustment, the paper's GP-bias (:data:`~gpadjust.BiasGP`), it is a bias alone,
-    :math:`f_a = f_p + \delta`, :math:`\delta \sim GP(0, k)`, with the posterior ``delta(X)``.
+    Seen as an adjustment, the paper's GP-bias (:data:`~gpadjust.models.BiasGP`), it is a bias
+    alone, :math:`f_a = f_p + \delta`, :math:`\delta \sim GP(0, k)`, with the posterior
+    ``delta(X)``.
 
     The arguments and errors are those of :class:`~gpadjust.CKA`, but for:
 

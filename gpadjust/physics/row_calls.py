@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from joblib import Parallel, delayed
 from numpy.typing import ArrayLike, NDArray
 
 from gpadjust.checks import real_array
@@ -27,6 +26,8 @@ def call_rows(
         >>> call_rows(lambda x: 1 / int(x[0]), np.array([[2.0], [0.0]]))
         [array([0.5]), ZeroDivisionError('division by zero')]
     """
+    from joblib import Parallel, delayed  # slow to import
+
     results: list[NDArray[np.float64] | Exception] = Parallel(n_jobs=None)(
         delayed(_call_row)(function, *row) for row in zip(X, *more, strict=True)
     )

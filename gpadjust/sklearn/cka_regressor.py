@@ -75,10 +75,10 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     Args:
         physics: The physics f_p: a function of rows ``N x d`` to ``N`` or ``N x m``, of NumPy
             arrays or of torch tensors; a torch module, of which ``fit`` trains a copy; or a
-            :class:`~gpadjust.Physics`, such as ``BlackBoxPhysics(function, batched=False)`` of
-            single rows, or one with unknown parameters. Several: a list, or a dictionary with their
-            names. None: no physics; the model is then :class:`~gpadjust.ZeroMeanGP`, which is what
-            CKA of :math:`f_p = 0` is.
+            :class:`~gpadjust.physics.Physics`, such as ``BlackBoxPhysics(function, batched=False)``
+            of single rows, or one with unknown parameters. Several: a list, or a dictionary with
+            their names. None: no physics; the model is then :class:`~gpadjust.ZeroMeanGP`, which is
+            what CKA of :math:`f_p = 0` is.
         model: ``"cka"``, ``"variational"`` (of very many rows), ``"parallel_partial"`` (of very
             many outputs), ``"rra"``, ``"physics_mean"``,
             ``"scale"``, ``"calibrated_physics"``, ``"zero_mean"`` (which leaves the physics out, to

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from scipy.stats import spearmanr
 from torch import Tensor
 
 from gpadjust.models import StackedGP, TermsGP
@@ -83,6 +82,8 @@ _GROWS = (
 
 def _grows(size: Tensor, mean: Tensor) -> bool:
     """Return whether residuals, in units of their predictions, grow with the mean."""
+    from scipy.stats import spearmanr  # slow to import
+
     order = mean.argsort()
     third = len(order) // 3
     low, high = size[order[:third]].median(), size[order[-third:]].median()

@@ -25,8 +25,9 @@ import torch
 from botorch.exceptions.warnings import OptimizationWarning
 from scipy.stats import gmean
 
-from gpadjust import CKA, EmulatedPhysics, FunctionPhysics, Physics, PhysicsWarning, fit
+from gpadjust import CKA, EmulatedPhysics, FunctionPhysics, PhysicsWarning, fit
 from gpadjust.inference import SamplingWarning
+from gpadjust.physics import Physics
 from gpadjust.validation import rmse
 from paper.common.experiment import Run, Table
 from paper.common.figures import panels, save

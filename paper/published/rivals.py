@@ -25,6 +25,7 @@ from paper.pairs.multifidelity import SMTModel
 
 Predict = Callable[[Tensor], Posterior]
 _FOLDS = 5
+_STEPS = 2000  # of the deep ensemble's optimiser
 _TREES = {"n_estimators": (100, 400), "max_depth": (2, 4, 6)}
 
 
@@ -101,7 +102,7 @@ def ensemble(X: Tensor, Y: Tensor, physics: Physics, *, seed: int) -> Predict:
         out = networks(((points - units[0]) / units[1]).expand(5, -1, -1))
         return out[..., :1], nn.functional.softplus(out[..., 1:]) + 1e-6
 
-    for _ in range(2000):
+    for _ in range(_STEPS):
         mean, variance = moments(X)
         optimizer.zero_grad()
         nn.functional.gaussian_nll_loss(mean, target.expand_as(mean), variance).backward()

@@ -10,8 +10,9 @@ from botorch.models import ModelListGP
 from botorch.models.transforms import Normalize
 from botorch.optim import optimize_acqf
 
-from gpadjust import BiasGP, BlackBoxPhysics, VariationalCKA, fit
+from gpadjust import BlackBoxPhysics, VariationalCKA, fit
 from gpadjust.active import qAdjustmentInformationGain
+from gpadjust.models import BiasGP
 from tests.systems import crude
 
 ABOUT = ["rho", "delta", "both"]

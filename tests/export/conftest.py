@@ -13,18 +13,8 @@ from botorch.exceptions.warnings import OptimizationWarning
 from botorch.models.transforms.input import ChainedInputTransform, InputStandardize, Normalize
 from gpytorch.kernels import MaternKernel, ScaleKernel
 
-from gpadjust import (
-    CKA,
-    RRA,
-    BiasGP,
-    FunctionPhysics,
-    ScaleGP,
-    Unknown,
-    VariationalCKA,
-    ZeroMeanGP,
-    fit,
-)
-from gpadjust.models import PaperRRA
+from gpadjust import CKA, RRA, FunctionPhysics, ScaleGP, Unknown, VariationalCKA, ZeroMeanGP, fit
+from gpadjust.models import BiasGP, PaperRRA
 from tests.systems import crude, normal, truth, uniform
 
 X = uniform(30, 2)

@@ -12,10 +12,10 @@ from gpytorch.mlls import ExactMarginalLogLikelihood
 from gpytorch.priors import LogNormalPrior
 from torch.distributions import MultivariateNormal
 
-from gpadjust import AR1, CKA, RRA, BiasGP, FitResult, PhysicsMeanGP, ScaleGP, ZeroMeanGP, fit
+from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP, fit
 from gpadjust.gp.gaussian import nugget
-from gpadjust.inference import optimise
-from gpadjust.models import PaperRRA
+from gpadjust.inference import FitResult, optimise
+from gpadjust.models import BiasGP, PaperRRA
 from gpadjust.models.parameters import LogInterval
 from tests.systems import Sine, line, ripple, wave
 

@@ -14,7 +14,7 @@ from gpytorch.priors import LogNormalPrior
 from pyro.infer import MCMC, NUTS
 from pyro.ops.stats import effective_sample_size
 
-from gpadjust import CKA, BiasGP, PhysicsMeanGP, ZeroMeanGP, fit
+from gpadjust import CKA, PhysicsMeanGP, ZeroMeanGP, fit
 from gpadjust.inference import (
     FitResult,
     SampleResult,
@@ -25,6 +25,7 @@ from gpadjust.inference import (
 from gpadjust.inference.optimise import Search, optima
 from gpadjust.inference.proposals import Both, Mixture, laplace_root
 from gpadjust.inference.targets import LogPosterior
+from gpadjust.models import BiasGP
 from gpadjust.physics import FunctionPhysics, Unknown
 from gpadjust.validation import leave_one_out
 from gpadjust.validation.plots import plot_adjustment, plot_adjustment_pair

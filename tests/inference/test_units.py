@@ -6,7 +6,8 @@ from functools import partial
 import pytest
 import torch
 
-from gpadjust import AR1, CKA, RRA, BiasGP, PhysicsMeanGP, ScaleGP, ZeroMeanGP, fit
+from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP, fit
+from gpadjust.models import BiasGP
 
 BOUNDS = torch.tensor([[-0.6], [1.0]], dtype=torch.float64)
 BUILD = {

@@ -5,7 +5,8 @@ import pytest
 import torch
 from botorch.models.transforms import Normalize, Standardize
 
-from gpadjust import CKA, RRA, BiasGP, PhysicsMeanGP, ScaleGP, ZeroMeanGP
+from gpadjust import CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP
+from gpadjust.models import BiasGP
 from tests.systems import crude
 
 NOTHING = 1e-14  # an outputscale that switches a kernel off

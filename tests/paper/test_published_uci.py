@@ -50,6 +50,7 @@ def test_uci(method, tmp_path, monkeypatch):
     out = tmp_path / "uci"
     options = ["--only", "yacht", "0.1", *method, "--runs", "2", "--jobs", "1", "--out", str(out)]
     monkeypatch.setattr("sys.argv", ["paper", "uci", *options])
+    monkeypatch.setattr("paper.published.rivals._STEPS", 200)
     main()
     runs = [json.loads(line) for line in (out / "runs.jsonl").read_text().splitlines()]
     assert {run["method"] for run in runs} == {*method}

@@ -4,13 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from gpadjust import (
-    BlackBoxPhysics,
-    CalibratedPhysics,
-    FunctionPhysics,
-    JoinedPhysics,
-    PhysicsError,
-)
+from gpadjust import BlackBoxPhysics, CalibratedPhysics, FunctionPhysics, PhysicsError
+from gpadjust.physics import JoinedPhysics
 from gpadjust.physics.array_physics import array_physics
 
 X = np.linspace(0.1, 1, 6).reshape(3, 2)

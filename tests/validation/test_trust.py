@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from gpadjust import AR1, CKA, BiasGP, StackedGP, VariationalCKA, ZeroMeanGP, fit
+from gpadjust import AR1, CKA, StackedGP, VariationalCKA, ZeroMeanGP, fit
 from gpadjust.dynamics import LearnedDynamics, StateSpec
+from gpadjust.models import BiasGP
 from gpadjust.validation import Trust, trust
 from gpadjust.validation.plots import plot_trust, plot_trust_pair
 from tests.systems import crude
