@@ -14,7 +14,7 @@ The usual way::
     model.plot()                                 # all of it, along each input
     print(compare(X, Y, f_p))                    # does f_p help, and which model is best?
     save(model, "model.pt")
-    model = load("model.pt")                     # physics=f_p, if it cannot be imported
+    model = load("model.pt", physics=f_p)        # code is not loaded from files
 
 Other models, with the same calls::
 

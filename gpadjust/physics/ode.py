@@ -162,8 +162,6 @@ class ODEPhysics(Physics):
         A PhysicsError says that X has fewer columns, ``rhs`` returns something else than one time
         derivative per state, or an adaptive method does not arrive.
         """
-        from torchdiffeq import odeint  # brings scipy.integrate, slow to import
-
         if X.shape[1] < self.state_dim:
             raise PhysicsError(
                 f"Physics {self.name!r} needs {self.state_dim} state column(s), then the action; "
