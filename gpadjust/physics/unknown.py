@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from keyword import iskeyword
 from numbers import Real
 from typing import Any
@@ -20,7 +20,7 @@ _STANDARD = Normal(
 _LARGEST = 8.0  # coordinate, beyond which float64 knows no mass of the normal distribution
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Unknown:
     r"""An unknown parameter of a physics, and its prior.
 
@@ -42,7 +42,7 @@ class Unknown:
 
     Example:
         >>> Unknown(9.81, sd=0.1, unit="m/s²"), Unknown(0.2, bounds=(0.0, 1.0)).prior_text
-        (Unknown(guess=9.81, sd=0.1, factor=None, bounds=(-inf, inf), unit='m/s²'), '0 to 1')
+        (Unknown(9.81, sd=0.1, unit='m/s²'), '0 to 1')
     """
 
     guess: float
@@ -81,6 +81,12 @@ class Unknown:
                 "of a log-normal one, or two finite bounds."
             )
         object.__setattr__(self, "bounds", (low, high))
+
+    def __repr__(self) -> str:
+        """The code that makes it, without what is left at its default."""
+        given = [(each, getattr(self, each.name)) for each in fields(self)[1:]]
+        told = [f"{each.name}={value!r}" for each, value in given if value != each.default]
+        return f"Unknown({', '.join([repr(self.guess), *told])})"
 
     @property
     def prior_text(self) -> str:

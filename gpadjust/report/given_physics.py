@@ -192,14 +192,8 @@ def _function(path: str, data: TableData) -> tuple[Physics, str]:
 
 def _code(physics: FormulaPhysics) -> str:
     """The code that makes the physics of a formula."""
-    priors = []
-    for name, own in physics.unknowns.items():
-        given = {"sd": own.sd, "factor": own.factor, "bounds": own.bounds}
-        told = [f"{key}={value!r}" for key, value in given.items() if value is not None]
-        priors.append(f"{name!r}: Unknown({', '.join([repr(own.guess), *told])})")
     text = f"FormulaPhysics({physics.formula!r}, {[*physics.columns]!r}"
-    text += f", unknowns={{{', '.join(priors)}}})" if priors else ")"
-    return text.replace("inf", "torch.inf") if "bounds" in text else text
+    return text + (f", unknowns={dict(physics.unknowns)!r})" if physics.unknowns else ")")
 
 
 def imported(path: str) -> Any:

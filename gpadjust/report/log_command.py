@@ -9,7 +9,6 @@ import sys
 import warnings
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import NamedTuple
 
@@ -226,16 +225,9 @@ def _physics(
         physics = FormulaPhysics(formula, [*states, *actions], unknowns=unknowns)
         name, names = "FormulaPhysics", f"{[*states, *actions]}"
     maker = f"{name}.of_formula" if is_rate else name
-    priors = "".join(f"        {name!r}: {_prior(own)},\n" for name, own in unknowns.items())
+    priors = "".join(f"        {name!r}: {own!r},\n" for name, own in unknowns.items())
     made = f"{maker}(\n    {formula!r},\n    {names},\n    unknowns={{\n{priors}    }},\n)"
     return physics, (f"from gpadjust import {name}, Unknown", made)
-
-
-def _prior(own: Unknown) -> str:
-    """The code of an unknown parameter."""
-    values = {each.name: getattr(own, each.name) for each in fields(own)}
-    told = [f"{f.name}={values[f.name]!r}" for f in fields(own) if values[f.name] != f.default]
-    return f"Unknown({', '.join(told)})"
 
 
 def _formula(texts: Sequence[str], states: Sequence[str]) -> tuple[str, bool]:

@@ -582,6 +582,8 @@ def loading(subject: Subject, saved: Saved | str, origin: Origin) -> Markup:
     imports, arguments = ["import torch"], []
     if origin.physics is not None:
         imports += [f"import {module}" for module in origin.modules]
+        if any("inf)" in each for each in origin.physics.values()):
+            imports.insert(0, "from math import inf\n")
         made = [f"{n}, " for n in _MADE if any(f"{n}(" in each for each in origin.physics.values())]
         imports.append(f"from gpadjust import {''.join(made)}load")
         where = f"module{'s' * (len(origin.modules) > 1)} {listed(origin.modules)}"
