@@ -204,6 +204,7 @@ def tables(runs: Sequence[Run], experiment: Formula) -> dict[str, Table]:
             each.low > math.log(MOST) for each in _ratios(part).values()
         ),
         "worst cell": _worst,
+        "worst data set": lambda part: f"{math.exp(part['gap'].max()):.2f}",
         "95 % hold": lambda part: f"{part.groupby('cell')['held'].mean().mean():.3f}",
     }
     each = {
@@ -212,6 +213,7 @@ def tables(runs: Sequence[Run], experiment: Formula) -> dict[str, Table]:
     }
     single: dict[str, Cell] = {
         "error, ours / the formula's": lambda part: Difference.of(part["gap"]).ratio(),
+        "worst data set": lambda part: f"{math.exp(part['gap'].max()):.2f}",
         "95 % hold": lambda part: f"{part['held'].mean():.2f}",
         "data sets": len,
     }
