@@ -40,7 +40,9 @@ copybutton_exclude = ".linenos, .gp, .go"
 root_doc = "docs/index"
 include_patterns = [
     "CHANGELOG.md",
+    "CODE_OF_CONDUCT.md",
     "CONTRIBUTING.md",
+    "SECURITY.md",
     "docs/**",
     "paper/*.md",
     "paper/*/*.md",

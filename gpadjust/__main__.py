@@ -116,8 +116,8 @@ def parser() -> ArgumentParser:
     add(
         "--rows",
         type=_positive,
-        default=1000,
-        metavar="1000",
+        default=500,
+        metavar="500",
         help="the most rows that are taken; of more, so many are drawn at random (%(default)s)",
     )
     add("--sheet", metavar="name", help="the sheet of a workbook that has several")
@@ -184,7 +184,7 @@ def _add_identify(add_parser: Callable[..., ArgumentParser]) -> None:
         type=float,
         metavar="0.05",
         help="the step of the free run, a multiple of the sampling step, which it is by default; a "
-        "longer one is quicker",
+        "longer one is quicker, and averages the actions over it",
     )
     add("--segment", metavar="run", help="a column of labels: where they change, a new run begins")
     add(

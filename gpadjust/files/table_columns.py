@@ -69,8 +69,9 @@ class TableColumns:
         option: str = "`{}={!r}`",
     ) -> None:
         self.file, self.decimal = str(file), decimal
+        self._is_text = Path(file).suffix.lower() != ".xlsx"
         self._hint, self._option = hint, option
-        if Path(file).suffix.lower() == ".xlsx":
+        if not self._is_text:
             self.decimal = "."  # its numbers have none
             rows = _rows_of_sheet(file, sheet)
         elif sheet is not None:
@@ -180,7 +181,7 @@ class TableColumns:
     def _other_delimiter(self) -> str:
         """Return a hint if a single column has the names of several."""
         marks = [mark for mark in _OTHERS if mark in self.names[0]] if len(self.names) == 1 else []
-        if not marks:
+        if not marks or not self._is_text:
             return ""
         return (
             f" There seem to be {_OTHERS[marks[0]]} between its fields: say so by "
@@ -217,6 +218,8 @@ class TableColumns:
             return ""
         if other not in text:
             return ""
+        if not self._is_text:
+            return " It is a text there, not a number."
         name = {",": "comma", ".": "point"}[other]
         option = self._option.format("decimal", other)
         return f" If this {name} is a decimal {name}, say so by {option}."
@@ -233,7 +236,8 @@ def _rows_of_text(file: str | Path, delimiter: str) -> Iterator[tuple[int, list[
                 before = reader.line_num
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(
-            f"{file}: expected a CSV file in UTF-8, but {error}; save it as such."
+            f"{file}: expected a CSV file in UTF-8, but {error}; save it as such, in a spreadsheet "
+            "as 'CSV UTF-8'."
         ) from error
 
 
@@ -248,16 +252,24 @@ def _rows_of_sheet(file: str | Path, sheet: str | None) -> Iterator[tuple[int, l
         ) from error
     with open(file, "rb") as content:
         try:
-            book = load_workbook(content, read_only=True, data_only=True)
+            book, formulas = (
+                load_workbook(content, read_only=True, data_only=only) for only in (True, False)
+            )
         except Exception as error:  # of zip, XML and more
             raise ValueError(f"{file}: expected a workbook, *.xlsx, but {error}.") from error
         names = [each.title for each in book.worksheets]
         if sheet not in names and (sheet is not None or len(names) != 1):
             found = ", ".join(map(repr, names))
             asked = "one sheet" if sheet is None else f"a sheet {sheet!r}"
-            raise ValueError(f"{file}: expected {asked}, found {found}; say which, by its name.")
-        width = None
-        for line, cells in enumerate(book[sheet or names[0]].iter_rows(values_only=True), start=1):
+            raise ValueError(f"{file}: expected {asked}, found {found}; say which, by `sheet`.")
+        width, name = None, sheet or names[0]
+        both = (each[name].iter_rows(values_only=True) for each in (book, formulas))
+        for line, (cells, codes) in enumerate(zip(*both, strict=True), start=1):
+            if any(c is None and code is not None for c, code in zip(cells, codes, strict=True)):
+                raise ValueError(
+                    f"{file}, line {line}: a formula has no value in the file; open the workbook "
+                    "in a spreadsheet, which computes it, and save it."
+                )
             fields = [_text(cell) for cell in cells]
             while fields and not fields[-1]:
                 fields.pop()

@@ -74,7 +74,7 @@ class PhysicsParameters(dict[str, Tensor]):
         low, high = self.interval()
         rows = [("", "mean", "95 % interval", "prior", "unit")]
         for i, (name, unknown) in enumerate(self.unknowns.items()):
-            interval = f"{low[i]:.4g} to {high[i]:.4g}"
+            interval = f"{low[i]:.4g} to {high[i]:.4g}" if low[i] < high[i] else "-"  # a point fit
             rows.append((name, f"{self.mean[i]:.4g}", interval, unknown.prior_text, unknown.unit))
         padded = (
             [cell.ljust(max(map(len, column))) for cell in column]

@@ -170,6 +170,7 @@ class TermBuilder:
         transform = input_transform
         if physics is not None:
             physics = as_physics(physics)
+            physics.check_names(data.input_names)
             if link is not None and physics.is_emulated:
                 raise ValueError(
                     "An emulated physics is uncertain in the units of its runs, which a link would "

@@ -179,6 +179,9 @@ class Physics(torch.nn.Module, ABC):
             )
         return X[..., list(self.inputs)]
 
+    def check_names(self, names: Sequence[str]) -> None:
+        """Raise a ValueError if the physics names its columns, and data have them otherwise."""
+
     def read_rows(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """Rows for :meth:`of_rows`, of rows ``N x d`` and parameters of several physics."""
         own = [parameters[0][name].unsqueeze(-1) for name in self.unknowns]
@@ -257,7 +260,8 @@ class Physics(torch.nn.Module, ABC):
 
     def extra_repr(self) -> str:
         """The settings that ``repr`` shows."""
-        return f"name={self.name!r}, inputs={self.inputs}, num_outputs={self.num_outputs}"
+        told = f"name={self.name!r}, inputs={self.inputs}, num_outputs={self.num_outputs}"
+        return f"{told}, unknowns={dict(self.unknowns)!r}" if self.unknowns else told
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         """The physics itself if it has no parameters and buffers, else a copy."""

@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from difflib import get_close_matches
+from keyword import iskeyword
 from typing import Any
 
 import torch
@@ -36,9 +37,11 @@ _FUNCTIONS: dict[str, tuple[Callable[..., Tensor], int]] = {
     **{name: (getattr(torch, name), 1) for name in ("sin", "cos", "tan", "asin", "acos", "atan")},
     **{name: (getattr(torch, name), 1) for name in ("sinh", "cosh", "tanh", "exp", "log")},
     **{name: (getattr(torch, name), 1) for name in ("log10", "sqrt", "abs", "sign")},
+    "ln": (torch.log, 1),
     **{"atan2": (torch.atan2, 2), "min": (torch.minimum, 2), "max": (torch.maximum, 2)},
     "where": (torch.where, 3),
 }
+_SIGNS = "It has no units, no = and no names with blanks: water flow is water_flow."
 _GRAMMAR = (
     "Formulas have numbers, names, + - * / **, brackets, comparisons such as a < b, and the "
     f"functions {', '.join(_FUNCTIONS)}; pi is known. Outputs are parted by commas."
@@ -55,9 +58,11 @@ class FormulaPhysics(Physics):
         formula: The output, or outputs with commas between them, such as ``"U * I, U / I"``. It has
             numbers, names of columns and of unknown parameters, ``pi``, ``+ - * / **``,
             comparisons, and the functions sin, cos, tan, asin, acos, atan, atan2, sinh, cosh, tanh,
-            exp, log, log10, sqrt, abs, sign, min and max of two, and ``where(a < b, x, y)``.
+            exp, log and ln (the same), log10, sqrt, abs, sign, min and max of two, and
+            ``where(a < b, x, y)``.
         columns: The names of the columns of X, ``d`` of them. Of a name as the models have it the
-            unit is left out, and what no name can have is ``_``: "air flow [m3/h]" is ``air_flow``.
+            unit is left out, and what no name can have is ``_``: "air flow [m3/h]" is ``air_flow``,
+            and "lambda" is ``lambda_``.
         unknowns: Unknown parameters by name.
         name: The name in messages. Default: the formula.
 
@@ -117,6 +122,16 @@ class FormulaPhysics(Physics):
         unknowns = {name: asdict(own) for name, own in self.unknowns.items()}
         return {"formula": self.formula, "columns": self.columns, "unknowns": unknowns}
 
+    def check_names(self, names: Sequence[str]) -> None:
+        """Raise a ValueError if these are the names of the columns in another order."""
+        found = tuple(map(symbol, names))
+        if found != self.columns and sorted(found) == sorted(self.columns):
+            raise ValueError(
+                f"The formula {self.formula!r} has the columns {', '.join(self.columns)}, and the "
+                f"data have {', '.join(found)}: expected the same order, as columns are passed by "
+                "it. Make the formula with the columns in the order of the data."
+            )
+
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """The values of the formula, ``N x m``."""
         if X.shape[-1] != len(self.columns):
@@ -135,6 +150,7 @@ class FormulaPhysics(Physics):
 def symbol(name: str) -> str:
     """The name by which a formula has a column: without its unit, and ``_`` for other marks."""
     bare = re.sub(r"\W+", "_", name.partition("[")[0].strip()).strip("_")
+    bare = f"{bare}_" if iskeyword(bare) else bare
     return f"_{bare}" if bare[:1].isdigit() else bare
 
 
@@ -162,7 +178,7 @@ def parse(formula: str) -> list[ast.expr]:
             if wrong := _wrong(node):
                 raise ValueError(f"{told}: {wrong}. {_GRAMMAR}")
     except SyntaxError as error:
-        raise ValueError(f"{told}: {error.msg}. {_GRAMMAR}") from error
+        raise ValueError(f"{told}: {error.msg}. {_SIGNS} {_GRAMMAR}") from error
     except (RecursionError, MemoryError) as error:
         raise ValueError(f"{told}: it is nested too deeply.") from error
     if not outputs:

@@ -152,6 +152,11 @@ class JoinedPhysics(Physics):
         self.num_outputs = Y.shape[1]
         return Y
 
+    def check_names(self, names: Sequence[str]) -> None:
+        """Raise a ValueError if a part names its columns, and data have them otherwise."""
+        for part in cast(Iterable[Physics], self.parts):
+            part.check_names(names)
+
     def forget(self) -> None:
         """Empty the memory of the parts."""
         for part in cast(Iterable[Physics], self.parts):

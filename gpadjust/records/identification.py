@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -26,7 +27,9 @@ _LEVEL = 0.95
 _LEAST = 8  # steps of a stretch, of which the last part is held out
 _KNOWN_BEFORE = 0.8  # of a prior's standard deviation: the log tells next to nothing
 _FAR = 3.0  # standard deviations of a prior
-_FEW = 0.9  # of measurements in intervals of 95 %
+_VARIES = 1e-3  # share of the variance of an action that is within steps
+_NEAR_A_TURN = 0.12
+FEW = 0.9  # of measurements in intervals of 95 %
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -41,6 +44,7 @@ class Identification:
         runs: Free runs along the windows: ``"identified"``, and ``"guesses"`` by the parameters
             that were guessed, if there are any.
         step: The control step, in the unit of the times.
+        remarks: Sentences on the log itself: actions that vary within a step, angles that jump.
     """
 
     smoothed: SmoothedRecords
@@ -48,6 +52,7 @@ class Identification:
     windows: Windows
     runs: Mapping[str, FreeRun]
     step: float
+    remarks: tuple[str, ...] = ()
 
     @property
     def spec(self) -> StateSpec:
@@ -90,17 +95,18 @@ class Identification:
     @property
     def advice(self) -> list[str]:
         """Sentences on what to look at."""
-        return [*_of_parameters(self.parameters), *self._of_errors()]
+        return [*self.remarks, *_of_parameters(self.parameters), *self._of_errors()]
 
     def _of_errors(self) -> list[str]:
         told, errors = [], self.errors
         for i, name in enumerate(self.spec.states):
             share = float(self.coverage[i])
-            if share < _FEW:
+            if share < FEW:
                 told.append(
                     f"Of {name} the intervals of 95 % hold {100 * share:.0f} % of what was held "
-                    "out: the physics lacks something whose errors last longer than process noise, "
-                    "such as dry friction. Rely neither on them nor on those of the parameters."
+                    "out: the physics lacks something whose errors last longer than process noise "
+                    "(dry friction, an input), or has a sign or unit wrong. Rely neither on them "
+                    "nor on those of the parameters."
                 )
             told += [
                 f"Along what was held out the identified physics errs no less in {name} than "
@@ -233,7 +239,9 @@ def identify(
             windows.initial_states, windows.actions, seed=seed, **noises
         )
     times = stretches[0].times
-    return Identification(smoothed, drawn, windows, runs, float(times[1] - times[0]))
+    length = float(times[1] - times[0])
+    remarks = (*_of_actions(records, length), *_of_jumps(records))
+    return Identification(smoothed, drawn, windows, runs, length, remarks)
 
 
 class _Drawn(PhysicsDynamics):
@@ -274,6 +282,36 @@ def _beginning(stretch: Stretch, steps: int) -> Record:
     return Record(stretch.times[: steps + 1], stretch.states[: steps + 1], actions)
 
 
+def _of_actions(records: Records, step: float) -> list[str]:
+    """A sentence if actions vary within control steps, over which they are averaged."""
+    within, total = 0.0, 0.0
+    for record in records:
+        size = round(step / record.sampling_step)
+        actions = record.actions[: len(record.actions) // size * size].unflatten(0, (-1, size))
+        spread = actions.var(1, correction=0).nanmean(0) / record.actions.var(0, correction=0)
+        within = max(within, float(spread.nan_to_num().max()) if size > 1 else 0.0)
+        total = max(total, size)
+    if within <= _VARIES:
+        return []
+    return [
+        f"The actions vary within a step of {total:.0f} samples, over which they are averaged: "
+        "parameters and their intervals may be off. Take a shorter step and compare."
+    ]
+
+
+def _of_jumps(records: Records) -> list[str]:
+    """Sentences on states that jump by a turn."""
+    told = []
+    for i, name in enumerate(records.spec.states):
+        moves = torch.cat([record.states[:, i].diff() for record in records])
+        moves = moves[~moves.isnan()].abs()
+        for turn, unit in ((2 * math.pi, "rad"), (360.0, "degrees")):
+            jumps = ((moves / turn - 1).abs() < _NEAR_A_TURN).any()
+            if name not in records.spec.angles and jumps and moves.median() < 0.1 * turn:
+                told.append(f"{name} jumps by a turn: is it an angle in {unit}? Say so (`angles`).")
+    return told
+
+
 def _of_parameters(parameters: PhysicsParameters | None) -> list[str]:
     """Sentences on parameters of which the log says little, or which were guessed badly."""
     if parameters is None:
@@ -281,11 +319,11 @@ def _of_parameters(parameters: PhysicsParameters | None) -> list[str]:
     told = []
     for name, unknown in parameters.unknowns.items():
         z = unknown.coordinate(parameters[name])
-        if z.std() > _KNOWN_BEFORE:
-            told.append(f"The log says next to nothing of {name}: it stays as known before.")
-        elif z.mean().abs() > _FAR:
+        if z.mean().abs() > _FAR:
             told.append(
                 f"{name} is {float(z.mean().abs()):.1f} standard deviations of its prior from its "
-                "guess: units, or a physics that lacks something?"
+                "guess: a sign, a unit, or a physics that lacks something?"
             )
+        elif z.std() > _KNOWN_BEFORE:
+            told.append(f"The log says next to nothing of {name}: it stays as known before.")
     return told

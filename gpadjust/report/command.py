@@ -56,10 +56,10 @@ def run(arguments: Namespace, command: Sequence[str]) -> None:
     unknowns = unknowns_of(arguments.unknown)
     marks = (mark_of(arguments.delimiter), arguments.decimal, arguments.sheet)
     table = open_table(arguments.data, *marks)
-    inputs = _inputs(arguments, table.names, outputs)
     asked = ((arguments.categories, "--categories"), (arguments.batches, "--batches"))
     categories, batches = (names_of(names, o) if names else [] for names, o in asked)
     named = [*categories, *batches]
+    inputs = _inputs(arguments, table.names, outputs, [*unknowns], named)
     data = read_table(table, inputs, outputs, units, named, arguments.rows, arguments.seed)
     options = _options(arguments, inputs, data.levels)
     physics = given_physics(arguments.physics, data, unknowns)
@@ -125,8 +125,14 @@ def _fitted(
     return model
 
 
-def _inputs(arguments: Namespace, names: Sequence[str], outputs: Sequence[str]) -> list[str]:
-    """The names of the inputs: those given, or the columns that formulas have."""
+def _inputs(
+    arguments: Namespace,
+    names: Sequence[str],
+    outputs: Sequence[str],
+    unknowns: Sequence[str],
+    groups: Sequence[str],
+) -> list[str]:
+    """The names of the inputs: those given, or the columns that formulas have, and groups."""
     if arguments.inputs is not None:
         return names_of(arguments.inputs, "--inputs")
     if paths := [text for text in arguments.physics if is_path(text)]:
@@ -137,7 +143,9 @@ def _inputs(arguments: Namespace, names: Sequence[str], outputs: Sequence[str]) 
     others = [
         name for name in names if name not in outputs and name_and_unit(name)[0] not in outputs
     ]
-    return columns_of(arguments.physics, others)
+    found = columns_of(arguments.physics, others, unknowns)
+    bare = {name_and_unit(name)[0] for name in found}
+    return found + [name for name in groups if name not in found and name not in bare]
 
 
 def _say(text: str) -> None:

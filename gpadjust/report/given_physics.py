@@ -32,8 +32,9 @@ from gpadjust.report.markup import plural
 
 _PATH = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
 _PRIOR = re.compile(
-    r"\s*([^=\[]+?)\s*(?:\[(.*)\])?\s*=\s*(.+?)\s*(\+-|±|\*/|\.\.)\s*(.+?)\s*(%?)\s*"
+    r"\s*([^=\[]+?)\s*(?:\[(.*)\])?\s*=\s*(.+?)\s*(\+/?-|±|\*/|\.\.)\s*(.+?)\s*(%?)\s*"
 )
+_HOW = "A Python function is given as module:function, such as pump:head."
 _SHOWN = 5  # rows at which a physics fails
 _SAME = 1e-6  # as a model's file asks it when it is loaded
 
@@ -66,11 +67,11 @@ def unknown_of(text: str) -> tuple[str, Unknown]:
     found = _PRIOR.fullmatch(text)
     try:
         if found is None:
-            raise ValueError("this form was not found")
+            raise ValueError("it has another form")
         name, unit, one, how, other, is_share = found.groups()
         first, second = float(one), float(other)
         given: dict[str, Any] = {"unit": unit or ""}
-        if is_share and how not in ("+-", "±"):
+        if is_share and how in ("*/", ".."):
             raise ValueError("a percentage goes with +-")
         if how == "..":
             first, given["bounds"] = 0.5 * (first + second), (first, second)
@@ -85,7 +86,7 @@ def unknown_of(text: str) -> tuple[str, Unknown]:
     except ValueError as error:
         raise ValueError(
             "Expected --unknown such as 'E [Pa]=210e9 +- 20 %', 'c=0.1 */ 2' (a factor), or "
-            f"'e=0.1 .. 0.3' (bounds), found {text!r}: {error}"
+            f"'e=0.1 .. 0.3' (bounds), with decimal points, found {text!r}: {error}"
         ) from error
 
 
@@ -103,19 +104,27 @@ def is_path(text: str) -> bool:
     return ":" in text
 
 
-def columns_of(formulas: Sequence[str], names: Sequence[str]) -> list[str]:
+def columns_of(formulas: Sequence[str], names: Sequence[str], unknowns: Sequence[str]) -> list[str]:
     """The columns among some of a table that formulas name, in the order of the table.
 
     Raises:
-        ValueError: If one is no formula, or they name no column.
+        ValueError: If one is no formula, they name no column, or what is none and no unknown
+            parameter; or if two columns have the same name but for their units.
     """
     named = {name for formula in formulas for name in names_in(formula)}
+    known = [symbol(name) for name in names]
     found = [name for name in names if symbol(name) in named]
-    if not found:
-        columns = ", ".join(symbol(name) for name in names)
+    if again := [symbol(name) for name in found if known.count(symbol(name)) > 1]:
         raise ValueError(
-            f"Expected a formula of columns of the table, {columns}; found --physics "
-            f"{formulas[0]!r}."
+            f"Several columns are {again[0]!r} in a formula, which has no units; rename one."
+        )
+    absent = sorted(named - {*known, *unknowns})
+    if absent or not found:
+        wrong = absent[0] if absent else "none of them"
+        hint = meant(wrong, [*known, *unknowns]) if absent else ""
+        raise ValueError(
+            f"Expected a formula of columns of the table, {', '.join(known)}, and of --unknown; "
+            f"found {wrong!r} in --physics {formulas[0]!r}.{hint} {_HOW}"
         )
     return found
 
@@ -153,7 +162,9 @@ def given_physics(
             _check(physics, data)
         except ValueError as error:
             raise ValueError(f"--physics {text}: {error}") from error
-        short = text.rpartition(":")[2].rpartition(".")[2] if is_path(text) else text
+        short = text.rpartition(":")[2].rpartition(".")[2]
+        if not is_path(text):  # a name that figures have room for
+            short = f"formula {formulas.index(text) + 1}" if len(formulas) > 1 else "formula"
         key = text if short in parts else short
         parts[key], code[key] = physics, expression
     used = {name for physics in parts.values() for name in physics.unknowns}
@@ -173,8 +184,7 @@ def _formula(text: str, data: TableData, unknowns: Mapping[str, Unknown]) -> For
         own = {name: each for name, each in unknowns.items() if name in names_in(text)}
         return FormulaPhysics(text, data.X.columns, unknowns=own)
     except ValueError as error:
-        hint = "A Python function is given as module:function, such as pump:head."
-        raise ValueError(f"{error} {hint}") from error
+        raise ValueError(f"{error} {_HOW}") from error
 
 
 def _function(path: str, data: TableData) -> tuple[Physics, str]:
@@ -254,9 +264,11 @@ def _check(physics: Physics, data: TableData) -> None:
                 rows, message = tuple(each), next(iter(each.values()))
         raise ValueError(message + _told(rows, data)) from error
     if Y.shape[-1] != m:
+        hint = " Commas part the outputs of a formula: is one a decimal comma?"
         raise ValueError(
             f"expected {plural(m, 'column')}, one for each of --outputs "
             f"{', '.join(data.Y.columns)}, found {Y.shape[-1]}."
+            f"{hint * isinstance(physics, FormulaPhysics)}"
         )
     same = torch.isclose(again, Y, rtol=_SAME, atol=_SAME * float(Y.abs().max()))
     small = f"values between {-LARGEST:.0e} and {LARGEST:.0e}"

@@ -112,7 +112,9 @@ def read_table(
         )
     d = len(inputs)
     if unknown := [name for name in categories if name not in inputs]:
-        raise ValueError(f"The category {unknown[0]!r} is none of --inputs.")
+        raise ValueError(
+            f"The category {unknown[0]!r} is none of --inputs {','.join(inputs)}; name it there."
+        )
     names = _with_units(headers, asked, units)
     values, levels = [], {}
     for i, name in enumerate(headers):
@@ -127,7 +129,9 @@ def read_table(
     lines = torch.tensor(table.lines)
     if left := [str(line) for line in lines[~seen].tolist()]:
         shown = [*left[:10], f"{len(left) - 10} more"] if len(left) > 10 else left
-        remarks.append(f"Left out, as they have no output: line {listed(shown)}.")
+        remarks.append(
+            f"Left out, as they have no output: line{'s' * (len(left) > 1)} {listed(shown)}."
+        )
     X, Y, lines = X[seen], Y[seen], lines[seen]
     if most is not None and (n := len(lines)) > most:
         order = torch.randperm(n, generator=torch.Generator().manual_seed(seed))

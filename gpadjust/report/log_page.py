@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from gpadjust.dynamics.plots import going_on, labels, plot_free_run
 from gpadjust.records import Identification
-from gpadjust.records.identification import GUESSES, IDENTIFIED, PERSISTENCE
+from gpadjust.records.identification import FEW, GUESSES, IDENTIFIED, PERSISTENCE
 from gpadjust.report.markup import (
     Markup,
     bullets,
@@ -111,9 +111,11 @@ def _verdict(found: Identification, origin: LogOrigin) -> Markup:
         shown = large_numbers(_errors(found, origin, name), note)
         heading = [tag("h3", name)] if len(_measured(found)) > 1 else []
         words = f"Intervals of 95 % hold {percent(float(found.coverage[i]))} of {name} there."
-        answer = tag("p", "Yes" if better else "No", class_="answer")
-        kind = f"card {'yes' if better else 'no'}"
-        cards.append(tag("div", *heading, *shown, answer, tag("p", words), class_=kind))
+        holds = float(found.coverage[i]) >= FEW
+        word, kind = ("Yes", "yes") if holds else ("In part", "open")
+        word, kind = (word, kind) if better else ("No", "no")
+        answer = tag("p", word, class_="answer")
+        cards.append(tag("div", *heading, *shown, answer, tag("p", words), class_=f"card {kind}"))
     return tag("div", *cards, class_="cards")
 
 

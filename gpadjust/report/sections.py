@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -128,8 +129,13 @@ def verdict(subject: Subject, output: int, how: str = COMPARE) -> tuple[str, lis
             "The comparison has no structure without the physics, or none with it; add 'zero mean' "
             "to its structures."
         ]
-    gain = comparison.gain[name]
-    return gain.answer, gain.sentences(name)
+    gain, found = comparison.gain[name], comparison.errors()[name]
+    sentences = gain.sentences(name)
+    if gain.shown > 0 and found.get("adjusted", 0.0) > found.get("data alone", math.inf):
+        sentences.append(
+            "Its error is not the smaller one: what the physics helps with is how sure one is."
+        )
+    return gain.answer, sentences
 
 
 def recommendation(subject: Subject) -> Markup:
@@ -189,7 +195,9 @@ def structures(subject: Subject) -> Markup:
         "elpd is the log density of left-out observations, summed, in nats: higher is better. A "
         "difference of less than two of its errors shows nothing. RMSE is of the left-out "
         "predictions, sd is that of the observations, and the last column is the share of left-out "
-        "observations within their 95 % intervals."
+        "observations within their 95 % intervals. Weights are those of the mixture that predicts "
+        "left-out observations best: of structures that predict alike one may have all of it, also "
+        "one that is not the first."
     )
     return join([*parts, tag("p", words), tag("dl", *terms)])
 
@@ -236,6 +244,10 @@ def _errors(subject: Subject, output: int) -> list[Markup]:
     """The :func:`errors`, in large numbers."""
     shown = errors(subject, output)
     note = "root mean square errors of left-out observations"
+    if subject.comparison is None and len(shown) > 1:
+        note += "; the formula's at the data, with the model's parameters if it has unknown ones"
+    elif subject.model.batches:
+        note += "; each with an offset for each batch"
     return large_numbers(shown, note) if shown else []
 
 
@@ -462,9 +474,11 @@ def parameter_table(caption: str, known: PhysicsParameters) -> Markup:
     low, high = known.interval()
     rows = []
     for i, (name, unknown) in enumerate(known.unknowns.items()):
-        interval = f"{number(float(low[i]), 4)} to {number(float(high[i]), 4)}"
-        mean, sd = number(float(known.mean[i]), 4), number(float(known.sd[i]))
-        rows.append([name, mean, sd, interval, unknown.prior_text, unknown.unit or "-"])
+        mean, spread = number(float(known.mean[i]), 4), ["-", "-"]
+        if known.sd[i] > 0:  # not of a point fit
+            interval = f"{number(float(low[i]), 4)} to {number(float(high[i]), 4)}"
+            spread = [number(float(known.sd[i])), interval]
+        rows.append([name, mean, *spread, unknown.prior_text, unknown.unit or "-"])
     head = ["parameter", "mean", "sd", "95 % interval", "known before", "unit"]
     return table(caption, head, rows)
 
@@ -488,7 +502,7 @@ def data(subject: Subject, origin: Origin) -> Markup:
         for name, column in zip(names, values.unbind(-1), strict=True):
             seen = column[~column.isnan()]
             short, unit = name_and_unit(name)
-            ends = (seen.min(), seen.median(), seen.max())
+            ends = (seen.min(), seen.quantile(0.5), seen.max())
             is_name = kind == "input" and len(rows) in subject.names  # of which none is the least
             numbers = ["-"] * 3 if is_name else [number(float(end), 4) for end in ends]
             rows.append([short, kind, unit or "-", *numbers, str(len(column) - len(seen))])

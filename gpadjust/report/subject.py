@@ -98,8 +98,10 @@ class Subject:
 
     @property
     def base(self) -> Tensor:
-        """The medians of the inputs, ``d``, through which slices are laid."""
-        return self.X.median(0).values
+        """The medians of the inputs, ``d``, for slices; of categories a level."""
+        middle, level = self.X.quantile(0.5, dim=0), self.X.median(0).values
+        which = [i in self.model.levels for i in range(len(middle))]
+        return level.where(torch.tensor(which), middle)
 
     @property
     def physics(self) -> dict[str, Physics]:

@@ -97,7 +97,8 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         random_state: The seed of the fit; a ``RandomState``, or None for NumPy's, draws it.
 
     Attributes:
-        model_: The fitted model; its own methods take and return float64 tensors.
+        model_: The fitted model; its own methods return what they are given, frames, arrays or
+            tensors.
         fit_result_: The result of :func:`gpadjust.fit`.
         physics_parameters_: The :class:`~gpadjust.models.PhysicsParameters`, draws of the unknown
             parameters of the physics by their names. Only if it has some.
@@ -296,7 +297,8 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         check_is_fitted(self)
         _check_measured(X=X)
         X = _in_numbers(X, self.model_.levels, self.model_.batches)
-        return torch.tensor(validate_data(self, X, dtype=np.float64, reset=False))
+        rows = validate_data(self, X, dtype=np.float64, reset=False)
+        return torch.tensor(np.ascontiguousarray(rows))  # others may run backwards
 
     def _covariance(self, X: Tensor, observation_noise: bool) -> Tensor:
         """The covariances of the points, ``q x q x m``."""

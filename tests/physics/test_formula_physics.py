@@ -3,6 +3,7 @@
 import math
 from contextlib import suppress
 
+import pandas as pd
 import pytest
 import torch
 from hypothesis import given
@@ -24,7 +25,7 @@ X = torch.tensor([[1.0, 2.0], [0.5, -3.0]], dtype=torch.float64)
         "sqrt(a) * sin(pi*b) + exp(-a)": lambda a, b: a**0.5 * (torch.pi * b).sin() + (-a).exp(),
         "where(b < 0, a, max(a, abs(b)))": lambda a, b: torch.where(b < 0, a, b.abs()),
         "(a >= 1) * atan2(a, b)": lambda a, b: (a >= 1) * torch.atan2(a, b),
-        "1e3": lambda a, b: 1000 + 0 * a,
+        "1e3 + ln(a) - log(a)": lambda a, b: 1000 + 0 * a,
     }.items(),
 )
 def test_values_are_those_of_torch(formula, value):
@@ -88,18 +89,23 @@ def test_any_text_is_a_formula_or_an_error_of_ours(text):
 
 
 def test_names_of_columns_and_parameters():
-    assert [*map(symbol, ["air flow [m3/h]", "E", "2nd", "dT/dt"])] == [
-        "air_flow",
-        "E",
-        "_2nd",
-        "dT_dt",
-    ]
+    names = ["air flow [m3/h]", "E", "2nd", "dT/dt", "lambda [W/mK]"]
+    assert [*map(symbol, names)] == ["air_flow", "E", "_2nd", "dT_dt", "lambda_"]
     with pytest.raises(ValueError, match="found 'a' more than once"):
         FormulaPhysics("a", ["a", "a [m]"])
     with pytest.raises(ValueError, match="found 'a' more than once"):
         FormulaPhysics("a", ["a"], unknowns={"a": Unknown(1.0, sd=1.0)})
     with pytest.raises(TypeError, match="as a text"):
         FormulaPhysics(torch.sin, ["a"])
+
+
+def test_columns_of_data_have_the_order_of_the_formula():
+    data = pd.DataFrame(X.numpy(), columns=["b [m]", "a"])
+    formula = FormulaPhysics("a * b", ["a", "b"])
+    for physics in (formula, [formula, torch.sin]):
+        with pytest.raises(ValueError, match="has the columns a, b, and the data have b, a"):
+            CKA(data, X[:, :1], physics=physics)
+    CKA(data[["a", "b [m]"]], X[:, :1], physics=formula)
 
 
 def test_columns_are_as_many_as_said():

@@ -1,5 +1,6 @@
 """A machine by its log: what is held out, what is compared with it, and what is said of it."""
 
+import math
 from functools import partial
 
 import pytest
@@ -7,6 +8,7 @@ import torch
 
 from gpadjust.physics import FunctionPhysics, ODEPhysics, Unknown
 from gpadjust.records import Record, Records, identify
+from gpadjust.records.identification import _of_jumps
 from gpadjust.states import StateSpec
 
 STEP, TRUE = 0.1, 2.25
@@ -139,3 +141,30 @@ def test_bad_arguments(case):
     given = {"records": Records(oscillation(20), SPEC), "physics": spring(), **given}
     with pytest.raises(error, match=message):
         quickly(given.pop("records"), given.pop("physics"), **given)
+
+
+def test_actions_that_vary_within_a_step_and_angles_that_jump_are_said():
+    record = oscillation(121)
+    records = Records(record, StateSpec(["x", "v"], ["u"], step=2 * STEP))
+    physics = ODEPhysics.of_formula(
+        "v, u - k * x", ["x", "v"], ["u"], 2 * STEP, unknowns={"k": Unknown(1.5, factor=1.5)}
+    )
+    (told, *_) = quickly(records, physics).advice
+    assert "The actions vary within a step of 2 samples, over which they are averaged" in told
+    held = Record(record.times, record.states, record.actions[::2].repeat_interleave(2, 0)[:121])
+    spec = StateSpec(["x", "v"], ["u"], step=2 * STEP)
+    assert not any("vary" in each for each in quickly(Records(held, spec), physics).advice)
+
+
+@pytest.mark.parametrize(("turn", "unit"), [(2 * math.pi, "rad"), (360.0, "degrees")])
+def test_an_angle_that_jumps_by_a_turn_is_said(turn, unit):
+    t = 0.1 * torch.arange(100, dtype=torch.float64)
+    angle = (0.1 * turn * t + 0.4 * turn) % turn
+    states = torch.stack([angle, torch.full_like(t, torch.nan)], -1)
+    records = Records(Record(t, states, torch.zeros_like(states[:, :1])), SPEC)
+    assert _of_jumps(records) == [
+        f"x jumps by a turn: is it an angle in {unit}? Say so (`angles`)."
+    ]
+    assert not _of_jumps(
+        Records(records.records, StateSpec(["x", "v"], ["u"], angles=["x"], step=0.1))
+    )

@@ -277,7 +277,7 @@ def test_names_that_have_digits_are_names(folder, capsys):
             "--inputs",
             "time,note",
         ): "If these are names, say so by --categories note, or by --batches note",
-        ("--categories", "note"): "The category 'note' is none of --inputs.",
+        ("--categories", "note"): "The category 'note' is none of --inputs time; name it there",
         ("--bounds", "1,0"): "Expected --bounds as two numbers, the lower first: 0,1; found '1,0'",
         ("--input-noise", "head=1"): "--input-noise names 'head', which is none of --inputs",
         ("--input-noise", "time=-1"): "standard deviations in the inputs' units, such as time=0.5",
@@ -341,8 +341,8 @@ def test_a_formula_beside_a_function(folder, read, undrawn):
 @pytest.mark.parametrize(
     ("physics", "says"),
     {
-        "a * sin(6 * tme)": r"Expected a formula of columns of the table, time, note",
-        "a * time * tme": r"has 'tme', which is none of its names: time, a. Is it 'time'\?",
+        "a * sin(6 * tme)": r"of the table, time, note, and of --unknown; found 'tme' .*'time'\?",
+        "a + 2": r"found 'none of them' in --physics",
         "a * time^2": r"\^ is no power, expected \*\*",
         "a, time": r"expected 1 column, one for each of --outputs",
         "log(time - 0.55 * a)": r"NaN or inf in 5 of 9 row.*\n  line 2: time \[s\] = 0",
@@ -355,6 +355,20 @@ def test_formulas_that_are_none_or_fail(folder, capsys, physics, says):
     assert main(given) == 1
     _says(capsys.readouterr().err, says)
     _nothing_was_written(folder)
+
+
+def test_groups_are_inputs_beside_those_of_a_formula(folder, undrawn):
+    rows = [f"{x},{'ab'[i % 2]},{y}" for i, (x, y) in enumerate(ROWS)]
+    (folder / "data.csv").write_text("\n".join(["time [s],rig,head [m]", *rows, ""]))
+    assert main(["report", "data.csv", "--fit", "map", *FORMULA, "--batches", "rig"]) == 0
+    assert load("report.pt").input_names == ("time [s]", "rig")
+
+
+def test_several_formulas_have_short_names(folder, read, undrawn):
+    given = [*FORMULA, "--physics", "cos(time)"]
+    assert main(["report", "data.csv", "--fit", "map", *given]) == 0
+    assert "formula 1" in read(folder / "report.html").text
+    assert load("report.pt").input_transform.physics.names == ("formula 1", "formula 2")
 
 
 def test_a_function_needs_its_inputs(folder, capsys):
@@ -374,8 +388,16 @@ def test_a_workbook_is_as_a_csv_file(folder, read, capsys, undrawn):
     book.save(folder / "data.xlsx")
     capsys.readouterr()
     assert main(["report", "data.xlsx", "--fit", "map", *FORMULA]) == 1
-    assert "expected one sheet, found 'Sheet', 'other'; say which" in capsys.readouterr().err
+    assert (
+        "expected one sheet, found 'Sheet', 'other'; say which, by `sheet`"
+        in capsys.readouterr().err
+    )
     assert main(["report", "data.xlsx", "--fit", "map", *FORMULA, "--sheet", "Sheet"]) == 0
+    book["Sheet"]["B3"] = "=1+1"
+    book.save(folder / "data.xlsx")
+    capsys.readouterr()
+    assert main(["report", "data.xlsx", *FORMULA, "--sheet", "Sheet"]) == 1
+    assert "line 3: a formula has no value in the file; open" in capsys.readouterr().err
     (folder / "data.xlsx").write_text(TABLE)
     assert main(["report", "data.xlsx", *FORMULA]) == 1
     assert "expected a workbook, *.xlsx, but" in capsys.readouterr().err

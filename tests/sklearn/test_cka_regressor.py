@@ -335,6 +335,12 @@ def test_kinds_of_arrays(data, kind):
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3)
 
 
+def test_rows_may_run_backwards(data):
+    X, y = data
+    regressor = fast().fit(X[::-1], y[::-1])
+    np.testing.assert_allclose(regressor.predict(Z[::-1]), regressor.predict(Z)[::-1], rtol=1e-9)
+
+
 @pytest.mark.parametrize("copied", [lambda r: pickle.loads(pickle.dumps(r)), clone])
 def test_copies_before_the_fit(data, copied):
     X, y = data
