@@ -15,7 +15,7 @@ from scipy.stats import binom
 from torch import Tensor
 
 import gpadjust
-from gpadjust.models import PhysicsParameters, StackedGP, TermsGP
+from gpadjust.models import CalibratedPhysics, PhysicsParameters, StackedGP, TermsGP
 from gpadjust.models.saving import Saved
 from gpadjust.physics import PhysicsError
 from gpadjust.physics.import_path import is_formula
@@ -459,6 +459,11 @@ def parameters(subject: Subject) -> Markup:
         seen.add(shown.structure)
         caption = f"Parameters of the physics, by {shown.structure}"
         parts.append(parameter_table(caption, shown.model.physics_parameters))
+    models = {} if subject.comparison is None else subject.comparison.models
+    for name, model in models.items():
+        if isinstance(model, CalibratedPhysics) and name not in seen:
+            caption = f"Parameters of the physics by itself, with noise ({name})"
+            parts.append(parameter_table(caption, model.physics_parameters))
     if not parts:
         return Markup()
     words = (
