@@ -160,6 +160,7 @@ def c_source(
         f"{model!r}. Made by gpadjust; numbers are in the units of the data.",
         f"x: {', '.join(model.input_names)}.",
         f"f_p: {found.num_physics} values that the physics returns at x.",
+        *_told(fitted, model),
         f"mean: {', '.join(model.output_names)}.",
         "variance: in their square, "
         f"{'with' if observation_noise else 'without'} the noise; NULL if it is not wanted.",
@@ -173,6 +174,16 @@ def c_source(
     if isinstance(fitted, LearnedDynamics):
         lines += ["", *_step(fitted, name, given, found.num_physics)]
     return "\n".join(lines) + "\n"
+
+
+def _told(fitted: TermsModel | LearnedDynamics, model: TermsModel) -> Iterator[str]:
+    """Lines on the parameters that f_p has in this model, and on the step of dynamics."""
+    if model.has_unknowns:
+        means = model.physics_parameters
+        pairs = zip(means.unknowns, means.mean.tolist(), strict=True)
+        yield f"Its parameters are {', '.join(f'{name} = {value!r}' for name, value in pairs)}."
+    if isinstance(fitted, LearnedDynamics) and fitted.spec.step is not None:
+        yield f"A step lasts {fitted.spec.step!r}."
 
 
 def _sizes(s: FiniteSum, num_outputs: int) -> str:

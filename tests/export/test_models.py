@@ -53,3 +53,10 @@ def test_the_example_runs():
     example = casadi_function.__doc__.replace("  # doctest: +SKIP", "")
     found = doctest.DocTestParser().get_doctest(example, {}, "example", None, 0)
     assert doctest.DocTestRunner().run(found).failed == 0
+
+
+def test_the_file_says_the_parameters_of_its_physics():
+    model = fitted("CKA, unknown parameter")
+    value = model.physics_parameters.mean.item()
+    assert f" * Its parameters are factor = {value!r}.\n" in c_source(model, "pump")
+    assert "parameters" not in c_source(fitted("CKA, unknown mean"), "pump")
