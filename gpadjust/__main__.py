@@ -35,9 +35,9 @@ sensors, hidden states, and how well the equations follow the last part of the l
 out. You need a CSV file, whose first line names its columns, and equations, one for each state.
 """
 _EXAMPLE_OF_LOGS = """\
-example: pendulum.csv has the columns "time [s]", "angle [rad]" and "torque [N m]", and no rate
+example: swing.csv has the columns "time [s]", "angle [rad]" and "torque [N m]", and no rate
 
-    gpadjust identify pendulum.csv --states angle,rate --hidden "rate [rad/s] = 0 +- 3" \\
+    gpadjust identify swing.csv --states angle,rate --hidden "rate [rad/s] = 0 +- 3" \\
         --actions torque --step 0.05 --physics "angle' = rate" \\
         --physics "rate' = -9.81/l*sin(angle) - c*rate + torque/J" \\
         --unknown "l [m] = 0.5 */ 1.5" --unknown "c [1/s] = 0.1 */ 2" --unknown "J = 0.3 */ 1.5"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Callable
 from functools import wraps
@@ -67,5 +68,5 @@ def deprecated(
 
 def _numbers(version: str) -> tuple[int, ...]:
     """The first two numbers of a version, to be compared: 0.10.1 comes after 0.9."""
-    major, minor, *_ = version.split(".")
+    major, minor, *_ = re.findall(r"\d+", version)
     return int(major), int(minor)

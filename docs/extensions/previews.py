@@ -16,10 +16,11 @@ def describe(
     if doctree is None:
         return
     texts = [each.astext() for each in doctree.findall(paragraph) if is_text(each)]
-    text = " ".join((texts or [context["title"]])[0].split())
+    title = app.env.titles[page].astext()
+    text = " ".join((texts or [title])[0].split())
     if len(text) > LONGEST:
         text = text[:LONGEST].rsplit(" ", 1)[0] + " ..."
-    tags = {"og:type": "website", "og:site_name": app.config.project, "og:title": context["title"]}
+    tags = {"og:type": "website", "og:site_name": app.config.project, "og:title": title}
     tags["og:description"] = text
     pictures = [each["uri"] for each in doctree.findall(image) if "://" not in each["uri"]]
     if app.config.html_baseurl and pictures:  # an address as a whole is asked for

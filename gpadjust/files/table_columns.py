@@ -78,7 +78,7 @@ class TableColumns:
             raise ValueError(f"{file}: expected a workbook, *.xlsx, to have a sheet {sheet!r}.")
         else:
             rows = _rows_of_text(file, delimiter)
-        found = [(line, fields) for line, fields in rows if any(fields)]
+        found = [(line, fields) for line, fields in rows if any(map(str.strip, fields))]
         if len(found) < 2:
             what = "only a line of names" if found else "an empty file"
             raise ValueError(f"{file}: expected a line of names and then rows, found {what}.")
@@ -263,14 +263,18 @@ def _rows_of_sheet(file: str | Path, sheet: str | None) -> Iterator[tuple[int, l
             asked = "one sheet" if sheet is None else f"a sheet {sheet!r}"
             raise ValueError(f"{file}: expected {asked}, found {found}; say which, by `sheet`.")
         width, name = None, sheet or names[0]
-        both = (each[name].iter_rows(values_only=True) for each in (book, formulas))
+        both = (each[name].iter_rows() for each in (book, formulas))
         for line, (cells, codes) in enumerate(zip(*both, strict=True), start=1):
-            if any(c is None and code is not None for c, code in zip(cells, codes, strict=True)):
+            # Of a formula whose value is an empty text the cell is one of texts.
+            if any(
+                cell.value is None and cell.data_type == "n" and code.value is not None
+                for cell, code in zip(cells, codes, strict=True)
+            ):
                 raise ValueError(
                     f"{file}, line {line}: a formula has no value in the file; open the workbook "
                     "in a spreadsheet, which computes it, and save it."
                 )
-            fields = [_text(cell) for cell in cells]
+            fields = [_text(cell.value) for cell in cells]
             while fields and not fields[-1]:
                 fields.pop()
             width = len(fields) if width is None and fields else width

@@ -11,6 +11,7 @@ from dataclasses import asdict
 from difflib import get_close_matches
 from keyword import iskeyword
 from typing import Any
+from unicodedata import normalize
 
 import torch
 from torch import Tensor
@@ -20,6 +21,7 @@ from gpadjust.physics.unknown import ParameterValues, Unknown
 
 _LONGEST = 2000  # characters
 _LARGEST = 1e300  # number
+_DEEPEST = 100
 _OPERATORS: dict[type[ast.AST], Callable[..., Any]] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
@@ -39,7 +41,7 @@ _FUNCTIONS: dict[str, tuple[Callable[..., Tensor], int]] = {
     **{name: (getattr(torch, name), 1) for name in ("log10", "sqrt", "abs", "sign")},
     "ln": (torch.log, 1),
     **{"atan2": (torch.atan2, 2), "min": (torch.minimum, 2), "max": (torch.maximum, 2)},
-    "where": (torch.where, 3),
+    "where": (lambda c, x, y: torch.where(c != 0, x, y), 3),
 }
 _SIGNS = "It has no units, no = and no names with blanks: water flow is water_flow."
 _GRAMMAR = (
@@ -69,7 +71,6 @@ class FormulaPhysics(Physics):
     Attributes:
         formula: The text.
         columns: The names that the formula may use.
-        used: Those that it does, in the order of the columns.
 
     Raises:
         TypeError: If the formula is no text.
@@ -99,6 +100,8 @@ class FormulaPhysics(Physics):
         self.formula = formula
         self.columns = tuple(map(symbol, columns))
         known = [*self.columns, *self.unknowns]
+        if "pi" in known:
+            raise ValueError("Expected other names than 'pi', which formulas have as a number.")
         if again := [name for name in known if known.count(name) > 1]:
             raise ValueError(
                 f"Expected different names of columns and unknown parameters, found {again[0]!r} "
@@ -113,19 +116,20 @@ class FormulaPhysics(Physics):
                 f"{', '.join(known)}.{''.join(f' Is it {each!r}?' for each in near)} Give its "
                 "value as a number, or name it as an unknown parameter."
             )
-        self.used = tuple(name for name in self.columns if name in named)
         self.num_outputs = len(self._outputs)
 
     @property
     def made_of(self) -> dict[str, Any]:
         """The arguments, as JSON has them."""
         unknowns = {name: asdict(own) for name, own in self.unknowns.items()}
-        return {"formula": self.formula, "columns": self.columns, "unknowns": unknowns}
+        own = {"formula": self.formula, "columns": self.columns, "name": self.name}
+        return {**own, "unknowns": unknowns}
 
     def check_names(self, names: Sequence[str]) -> None:
         """Raise a ValueError if these are the names of the columns in another order."""
         found = tuple(map(symbol, names))
-        if found != self.columns and sorted(found) == sorted(self.columns):
+        places = {name: i for i, name in enumerate(self.columns)}
+        if any(places.get(name, i) != i for i, name in enumerate(found)):
             raise ValueError(
                 f"The formula {self.formula!r} has the columns {', '.join(self.columns)}, and the "
                 f"data have {', '.join(found)}: expected the same order, as columns are passed by "
@@ -149,7 +153,8 @@ class FormulaPhysics(Physics):
 
 def symbol(name: str) -> str:
     """The name by which a formula has a column: without its unit, and ``_`` for other marks."""
-    bare = re.sub(r"\W+", "_", name.partition("[")[0].strip()).strip("_")
+    name = normalize("NFKC", name.partition("[")[0].strip())  # as Python does with names
+    bare = re.sub(r"\W+", "_", name).strip("_")
     bare = f"{bare}_" if iskeyword(bare) else bare
     return f"_{bare}" if bare[:1].isdigit() else bare
 
@@ -174,16 +179,27 @@ def parse(formula: str) -> list[ast.expr]:
     try:
         tree = ast.parse(formula.strip(), mode="eval").body
         outputs = tree.elts if isinstance(tree, ast.Tuple) else [tree]
+        if any(_depth(output) > _DEEPEST for output in outputs):
+            raise RecursionError
         for node in (node for output in outputs for node in ast.walk(output)):
             if wrong := _wrong(node):
                 raise ValueError(f"{told}: {wrong}. {_GRAMMAR}")
-    except SyntaxError as error:
-        raise ValueError(f"{told}: {error.msg}. {_SIGNS} {_GRAMMAR}") from error
+    except (SyntaxError, UnicodeError) as error:
+        what = getattr(error, "msg", "not a text")
+        raise ValueError(f"{told}: {what}. {_SIGNS} {_GRAMMAR}") from error
     except (RecursionError, MemoryError) as error:
         raise ValueError(f"{told}: it is nested too deeply.") from error
     if not outputs:
         raise ValueError(f"{told}. {_GRAMMAR}")
     return outputs
+
+
+def _depth(node: ast.AST) -> int:
+    """The depth of a tree, found without recursion."""
+    depth, level = 0, [node]
+    while level:
+        depth, level = depth + 1, [each for n in level for each in ast.iter_child_nodes(n)]
+    return depth
 
 
 def _wrong(node: ast.AST) -> str:
@@ -224,7 +240,8 @@ def _value(node: ast.expr, values: Mapping[str, Tensor], like: Tensor) -> Tensor
         case ast.BinOp(op=op, left=left, right=right):
             parts = [left, right]
         case ast.Compare(left=left, ops=[op], comparators=[right]):
-            parts = [left, right]
+            ends = (_value(part, values, like) for part in (left, right))
+            return _OPERATORS[type(op)](*ends).to(like)  # one or zero
         case ast.Call(func=ast.Name(id=name), args=parts):
             return _FUNCTIONS[name][0](*(_value(part, values, like) for part in parts))
         case _:

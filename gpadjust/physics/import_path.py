@@ -87,7 +87,8 @@ def _formula(text: str) -> FormulaPhysics:
     try:
         given = json.loads(text)
         unknowns = {name: Unknown(**own) for name, own in given["unknowns"].items()}
-        return FormulaPhysics(given["formula"], given["columns"], unknowns=unknowns)
+        own = {"unknowns": unknowns, "name": given["name"]}
+        return FormulaPhysics(given["formula"], given["columns"], **own)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"Found {text!r} as a formula, which is damaged: {error}") from error
 

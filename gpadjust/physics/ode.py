@@ -156,6 +156,11 @@ class ODEPhysics(Physics):
         options = {"name": rates.name, **options}
         return cls(partial(_rates, rates), step, len(states), unknowns=unknowns, **options)
 
+    def check_names(self, names: Sequence[str]) -> None:
+        """Raise a ValueError if the equations are a text, and data have its columns otherwise."""
+        if isinstance(self.rhs, partial) and self.rhs.func is _rates:
+            self.rhs.args[0].check_names(names)
+
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """The state after the step or its change, ``N x state_dim``.
 

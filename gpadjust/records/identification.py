@@ -305,10 +305,10 @@ def _of_jumps(records: Records) -> list[str]:
     for i, name in enumerate(records.spec.states):
         moves = torch.cat([record.states[:, i].diff() for record in records])
         moves = moves[~moves.isnan()].abs()
-        for turn, unit in ((2 * math.pi, "rad"), (360.0, "degrees")):
+        for turn, way in ((2 * math.pi, "say so"), (360.0, "convert it to rad, and say so")):
             jumps = ((moves / turn - 1).abs() < _NEAR_A_TURN).any()
             if name not in records.spec.angles and jumps and moves.median() < 0.1 * turn:
-                told.append(f"{name} jumps by a turn: is it an angle in {unit}? Say so (`angles`).")
+                told.append(f"{name} jumps by a turn: if it is an angle, {way} (`angles`).")
     return told
 
 

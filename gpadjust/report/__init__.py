@@ -1,10 +1,10 @@
-"""A page to show: what a model or a comparison says (the extra ``plot``)."""
+"""A page to show: what a model or a comparison says (the extra ``report``)."""
 
 try:
     import matplotlib as _  # noqa: F401
 except ImportError as error:
     raise ImportError(
-        'gpadjust.report needs matplotlib; run `pip install "gpadjust[plot]"`.'
+        'gpadjust.report needs matplotlib; run `pip install "gpadjust[report]"`.'
     ) from error
 
 from gpadjust.report.page import report

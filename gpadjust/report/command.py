@@ -26,6 +26,7 @@ from gpadjust.report.inputs import (
     mark_of,
     names_of,
     noise_variances,
+    notes_of,
     open_table,
     pairs,
     read_table,
@@ -71,13 +72,7 @@ def run(arguments: Namespace, command: Sequence[str]) -> None:
         warnings.simplefilter("default")
         model = _fitted(arguments, data, physics, variances, options)
         subject = subject_of(model, [f"line {line}" for line in data.lines])
-    notes = tuple(
-        dict.fromkeys(
-            str(each.message)
-            for each in caught
-            if not issubclass(each.category, DeprecationWarning | PendingDeprecationWarning)
-        )
-    )
+    notes = notes_of(caught)
     for note in notes:
         _say(f"Warning: {note}")
     settings = {

@@ -99,6 +99,11 @@ def unknowns_of(texts: Sequence[str]) -> dict[str, Unknown]:
     return dict(pairs)
 
 
+def needs_inf(code: str) -> bool:
+    """Return whether the code of a physics has bounds at infinity, and has to import it."""
+    return re.search(r"\binf\b", code) is not None
+
+
 def is_path(text: str) -> bool:
     """Return whether a physics is given as ``module:function``, and not as a formula."""
     return ":" in text

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import math
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -193,6 +194,12 @@ def mark_of(text: str) -> str:
     if len(mark) != 1:
         raise ValueError(f"Expected --delimiter as one character, or tab, found {text!r}.")
     return mark
+
+
+def notes_of(caught: Sequence[warnings.WarningMessage]) -> tuple[str, ...]:
+    """The texts of warnings that a reader may need, each once."""
+    kinds = (DeprecationWarning, PendingDeprecationWarning)
+    return tuple(dict.fromkeys(str(w.message) for w in caught if not issubclass(w.category, kinds)))
 
 
 def names_of(text: str, option: str) -> list[str]:

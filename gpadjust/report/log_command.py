@@ -8,6 +8,7 @@ import shlex
 import sys
 import warnings
 from argparse import Namespace
+from ast import unparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -16,8 +17,8 @@ from gpadjust.files import TableColumns
 from gpadjust.physics import FormulaPhysics, ODEPhysics, Physics, PhysicsError, Unknown, as_physics
 from gpadjust.physics.formula import names_in, parse
 from gpadjust.records import Records, identify
-from gpadjust.report.given_physics import imported, is_path, unknown_of, unknowns_of
-from gpadjust.report.inputs import mark_of, names_of, open_table
+from gpadjust.report.given_physics import imported, is_path, needs_inf, unknown_of, unknowns_of
+from gpadjust.report.inputs import mark_of, names_of, notes_of, open_table
 from gpadjust.report.log_page import LogOrigin, headline, write
 from gpadjust.report.markup import listed, name_and_unit
 from gpadjust.report.page import checked_path
@@ -49,7 +50,7 @@ def run(arguments: Namespace, command: Sequence[str]) -> None:
         ValueError: If an option, the log or the physics are wrong, or the states diverge.
         PhysicsError: If the physics fails at measured states.
     """
-    path = checked_path(arguments.out, *arguments.data)
+    path = checked_path(arguments.out, *arguments.data, model=False)
     hidden, starts = _hidden(arguments.hidden)
     unknowns = unknowns_of(arguments.unknown)
     marks = {"delimiter": mark_of(arguments.delimiter), "decimal": arguments.decimal}
@@ -69,6 +70,10 @@ def run(arguments: Namespace, command: Sequence[str]) -> None:
     read = Records.read_csv(arguments.data, StateSpec(*names, angles=angles), **given)
     physics, code = _physics(arguments.physics, *names, unknowns, _step(arguments, read))
     step = physics.step if isinstance(physics, ODEPhysics) else _step(arguments, read)
+    if arguments.step not in (None, step):
+        raise ValueError(
+            f"Expected no --step, as the physics has a step of {step:g}, found {arguments.step:g}."
+        )
     spec = StateSpec(*names, angles=angles, step=step)
     records = Records(read.records, spec)
     _say(f"{listed(arguments.data)}: {listed(map(repr, read))}.")
@@ -86,9 +91,7 @@ def run(arguments: Namespace, command: Sequence[str]) -> None:
             raise
         except RuntimeError as error:  # the states diverged
             raise ValueError(str(error)) from error
-    notes = tuple(
-        dict.fromkeys(str(w.message) for w in caught if issubclass(w.category, UserWarning))
-    )
+    notes = notes_of(caught)
     for note in notes:
         _say(f"Warning: {note}")
     settings = {
@@ -235,13 +238,14 @@ def _formula(texts: Sequence[str], states: Sequence[str]) -> tuple[str, bool]:
     sides, primes = dict[str, str](), set[str]()
     for text in texts:
         found = _EQUATION.fullmatch(text)
-        if found is None or len(parse(found[3])) != 1 or found[1] in sides:
+        trees = [] if found is None else parse(found[3])
+        if found is None or len(trees) != 1 or found[1] in sides:
             raise ValueError(
                 'Expected --physics as one equation for each state, such as "rate\'=-sin(angle)" '
                 "(a time derivative) or 'level=0.9*level' (its next value), or module:name, found "
                 f"{text!r}."
             )
-        sides[found[1]] = found[3].strip()
+        sides[found[1]] = unparse(trees[0])
         primes.add(found[2])
     if {*sides} != {*states} or len(primes) > 1:
         raise ValueError(
@@ -263,7 +267,7 @@ def _program(
     angles = f", angles={[*spec.angles]!r}" if spec.angles else ""
     read = "".join(f"    {name}={value!r},\n" for name, value in given.items() if value is not None)
     chosen = "".join(f", {name}={value!r}" for name, value in options.items() if value is not None)
-    imports = "from math import inf\n\n" if "inf)" in physics[1] else ""
+    imports = "from math import inf\n\n" if needs_inf(physics[1]) else ""
     return f"""\
 {imports}import torch
 

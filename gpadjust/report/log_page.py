@@ -216,8 +216,9 @@ def _states(found: Identification, origin: LogOrigin) -> list[Markup]:
 
 
 def _measured(found: Identification) -> dict[str, int]:
-    """The places of the states that were measured."""
-    return {name: i for i, name in enumerate(found.spec.states) if name not in found.hidden}
+    """The places of the states that were measured in what was held out."""
+    seen = (~found.windows.measured.isnan()).flatten(0, 1).any(0).tolist()
+    return {name: i for i, name in enumerate(found.spec.states) if seen[i]}
 
 
 def _length(found: Identification, origin: LogOrigin) -> str:
@@ -225,4 +226,4 @@ def _length(found: Identification, origin: LogOrigin) -> str:
 
 
 def _time(duration: float, origin: LogOrigin) -> str:
-    return f"{number(duration)} {origin.units.get('time', 's')}"
+    return f"{number(duration)} {origin.units.get('time', '')}".strip()

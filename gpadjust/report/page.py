@@ -86,12 +86,13 @@ def report(
     return write(subject_of(model, rows), path, title, Origin(settings=told), progress)
 
 
-def checked_path(file: str | Path, *data: str | Path) -> Path:
+def checked_path(file: str | Path, *data: str | Path, model: bool = True) -> Path:
     """The absolute path of a page that can be written, the model's beside it.
 
     Args:
         file: The page.
         data: Files that neither may replace.
+        model: Whether a model is written, too.
 
     Raises:
         ValueError: If it is not ``*.html``, or the page or the model would replace data.
@@ -106,10 +107,10 @@ def checked_path(file: str | Path, *data: str | Path) -> Path:
         raise IsADirectoryError(f"{str(path)!r} is a folder; give the name of a file.")
     model_path = path.with_suffix(".pt")
     for own in map(Path, data):
-        for each in (path, model_path):
+        for each in (path, model_path)[: 1 + model]:
             if own.exists() and each.exists() and own.samefile(each):
                 raise ValueError(f"{each.name} is the data; give the page another name by --out.")
-    if model_path.is_dir():
+    if model and model_path.is_dir():
         raise IsADirectoryError(
             f"{str(model_path)!r} is a folder, where the model's file would be; give the page "
             "another name."

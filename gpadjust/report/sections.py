@@ -20,6 +20,7 @@ from gpadjust.models.saving import Saved
 from gpadjust.physics import PhysicsError
 from gpadjust.physics.import_path import is_formula
 from gpadjust.report import figures
+from gpadjust.report.given_physics import needs_inf
 from gpadjust.report.markup import (
     Markup,
     bullets,
@@ -108,8 +109,9 @@ def headline(subject: Subject, how: str = COMPARE) -> str:
     lines = []
     for j, name in enumerate(subject.outputs):
         answer, (first, *_) = verdict(subject, j, how)
-        told = "; ".join(f"{what} {value}" for what, value in errors(subject, j).items())
-        lines.append(f"Left-out errors of {name}: {told}." if told else f"{name}:")
+        told = "; ".join(f"{what}: {value}" for what, value in errors(subject, j).items())
+        kind = "Errors" if subject.comparison is None else "Left-out errors"
+        lines.append(f"{kind} of {name}, {told}." if told else f"{name}:")
         lines[-1] += f"\n{answer}. {first}" if len(subject.outputs) == 1 else f" {answer}."
     return "\n".join(lines)
 
@@ -236,7 +238,8 @@ def errors(subject: Subject, output: int) -> dict[str, str]:
     for what, rmse in found.items():
         short, of, physics = what.partition(" of ")
         label = _ERRORS.get(short, short) + (fitted if short == ALONE else "")
-        told[f"{label}{f' {physics}' * bool(of)}"] = with_unit(number(rmse), name)
+        which = f" ({physics.removeprefix('physics ')})" * bool(of)
+        told[f"{label}{which}"] = with_unit(number(rmse), name)
     return told
 
 
@@ -601,7 +604,7 @@ def loading(subject: Subject, saved: Saved | str, origin: Origin) -> Markup:
     imports, arguments = ["import torch"], []
     if origin.physics is not None:
         imports += [f"import {module}" for module in origin.modules]
-        if any("inf)" in each for each in origin.physics.values()):
+        if any(needs_inf(each) for each in origin.physics.values()):
             imports.insert(0, "from math import inf\n")
         made = [f"{n}, " for n in _MADE if any(f"{n}(" in each for each in origin.physics.values())]
         imports.append(f"from gpadjust import {''.join(made)}load")

@@ -156,15 +156,15 @@ def test_actions_that_vary_within_a_step_and_angles_that_jump_are_said():
     assert not any("vary" in each for each in quickly(Records(held, spec), physics).advice)
 
 
-@pytest.mark.parametrize(("turn", "unit"), [(2 * math.pi, "rad"), (360.0, "degrees")])
-def test_an_angle_that_jumps_by_a_turn_is_said(turn, unit):
+@pytest.mark.parametrize(
+    ("turn", "way"), [(2 * math.pi, "say so"), (360.0, "convert it to rad, and say so")]
+)
+def test_an_angle_that_jumps_by_a_turn_is_said(turn, way):
     t = 0.1 * torch.arange(100, dtype=torch.float64)
     angle = (0.1 * turn * t + 0.4 * turn) % turn
     states = torch.stack([angle, torch.full_like(t, torch.nan)], -1)
     records = Records(Record(t, states, torch.zeros_like(states[:, :1])), SPEC)
-    assert _of_jumps(records) == [
-        f"x jumps by a turn: is it an angle in {unit}? Say so (`angles`)."
-    ]
+    assert _of_jumps(records) == [f"x jumps by a turn: if it is an angle, {way} (`angles`)."]
     assert not _of_jumps(
         Records(records.records, StateSpec(["x", "v"], ["u"], angles=["x"], step=0.1))
     )

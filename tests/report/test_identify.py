@@ -12,7 +12,7 @@ from gpadjust.records import Records, identify
 from gpadjust.report import report
 from gpadjust.report.markup import Markup
 
-LOG = Path(__file__).parents[2] / "examples" / "pendulum.csv"
+LOG = Path(__file__).parents[2] / "examples" / "swing.csv"
 TRUE = {"l": 0.6, "c": 0.15, "J": 0.4, "F": 0.1}  # of the simulation
 NOISE = 0.5 * torch.pi / 180  # rad
 GRAVITY = "rate' = -9.81/l*sin(angle) - c*rate + "

@@ -17,7 +17,7 @@ def test_what_is_missing_is_named(monkeypatch, capsys):
     assert main(["report", "data.csv", *given]) == 1
     error = capsys.readouterr().err
     assert error == (
-        'gpadjust: gpadjust.report needs matplotlib; run `pip install "gpadjust[plot]"`.\n'
+        'gpadjust: gpadjust.report needs matplotlib; run `pip install "gpadjust[report]"`.\n'
     )
 
 
