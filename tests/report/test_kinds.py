@@ -177,7 +177,8 @@ def test_the_whole_command_by_an_interpreter_of_its_own(tmp_path, read, monkeypa
     assert run.returncode == 0, run.stderr
     assert "structure" in run.stderr  # the progress
     page = read(tmp_path / "report.html")
-    assert f"{run.stdout.partition('.')[0]} " in page.text
+    answer, _, sentence = run.stdout.splitlines()[1].partition(". ")
+    assert f"{answer} {sentence.partition(':')[0]}" in page.text
     (code,) = [text for text in page.codes if "load(" in text]
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
