@@ -100,6 +100,7 @@ def csv_to_free_run(file):
     return dynamics.free_run(windows.initial_states, windows.actions).score(windows.measured)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::gpadjust.records.SmoothingWarning")
 def test_a_log_passes_few_files_on_the_way_to_a_free_run(tmp_path):
     t = 0.1 * torch.arange(31, dtype=torch.float64)
@@ -116,6 +117,7 @@ def report_of_a_file():
     assert main(["report", "pump.csv", *given, "--fit", "map"]) == 0
 
 
+@pytest.mark.slow
 def test_a_report_passes_few_files(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
@@ -141,6 +143,7 @@ def swing_up():
     return system.make(), system.task(dynamics)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:A step of the last real episode")
 def test_a_planned_trial_passes_few_files(swing_up):
     from gpadjust.control import CrossEntropy, MPCAgent, Planner
@@ -153,6 +156,7 @@ def test_a_planned_trial_passes_few_files(swing_up):
     assert len(files) <= TRIAL, sorted(files)
 
 
+@pytest.mark.slow
 def test_an_iteration_of_dyna_passes_few_files(swing_up):
     from gpadjust.rl import DynaOptions, DynaSAC
 
@@ -193,6 +197,7 @@ def test_imports_point_one_way():
             assert FLOORS.index(other) <= FLOORS.index(floor), f"{path.name} imports {module}"
 
 
+@pytest.mark.slow
 def test_no_module_knows_its_owner():
     graph = {}
     for path in ROOT.glob("*/**/*.py"):

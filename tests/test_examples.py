@@ -13,6 +13,7 @@ SLOW = {"nuclides", "pendulum", "reactor", "yacht"}
 GALLERY = (ROOT / "docs" / "gallery.md").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "example",
     [pytest.param(e, marks=pytest.mark.slow if e.stem in SLOW else ()) for e in EXAMPLES],

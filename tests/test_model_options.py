@@ -76,6 +76,7 @@ def data():
     return torch.cat([x, rig], dim=-1), Y
 
 
+@pytest.mark.slow
 def test_compare_and_its_page(kind, data, tmp_path, monkeypatch):
     monkeypatch.setattr(sys.modules["gpadjust.validation.comparison"], "_DRAWS", (32, 32))
     monkeypatch.setattr("gpadjust.report.sections.drawn", lambda draw: Markup())
@@ -95,6 +96,7 @@ def test_compare_and_its_page(kind, data, tmp_path, monkeypatch):
             assert torch.allclose(ours, theirs)
 
 
+@pytest.mark.slow
 def test_regressor(kind, data):
     options, has = kind
     X, y = data[0].numpy(), data[1].numpy()[:, 0]
@@ -108,6 +110,7 @@ def test_regressor(kind, data):
     assert np.abs(fitted.predict(X) - y).max() < 0.2
 
 
+@pytest.mark.slow
 def test_a_frame_with_texts_in_a_search(data):
     frame = pd.DataFrame(data[0].numpy(), columns=["time", "rig"])
     frame["rig"] = frame["rig"].map({0.0: "old", 1.0: "new", 2.0: "lent"})
@@ -127,6 +130,7 @@ def test_a_frame_with_texts_in_a_search(data):
         plain.predict(other)
 
 
+@pytest.mark.slow
 def test_collection(kind, tmp_path):
     options, has = kind
     if {"categorical", "batch"} & {*options}:
@@ -145,6 +149,7 @@ def test_collection(kind, tmp_path):
     assert has(call(budget=7).model)  # goes on from the log
 
 
+@pytest.mark.slow
 def test_dynamics(kind):
     options, has = kind
     spec = StateSpec(["x"], ["v"])

@@ -42,6 +42,7 @@ def test_a_script_beside_a_clone_imports_the_library(tmp_path):
     assert found.split() == ["CKA", gpadjust.__version__]
 
 
+@pytest.mark.slow
 def test_what_is_not_needed_is_not_imported():
     """One after the other, so that none may bring what a later one is to do without."""
     steps = {
@@ -68,6 +69,7 @@ def brought_by(package, known=frozenset()):
     return known
 
 
+@pytest.mark.slow
 def test_the_core_brings_no_more_than_botorch():
     """And the README's ten lines, and a comparison, need no more."""
     core = {canonicalize_name(Requirement(each).name) for each in PROJECT["dependencies"]}
@@ -103,6 +105,7 @@ def f_p(X):
     return 1 + X
 
 
+@pytest.mark.slow
 def test_each_line_of_the_cheat_sheet_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     X = line(6)
@@ -116,6 +119,7 @@ def test_each_line_of_the_cheat_sheet_runs(tmp_path, monkeypatch):
     assert names["mean"].shape == names["rho"].mean.shape == (6, 1)
 
 
+@pytest.mark.slow
 def test_every_name_is_there_and_brings_nothing_optional():
     optional = ["gymnasium", "stable_baselines3", "pygame", "opensim", "matplotlib", "pandas"]
     optional.append("sklearn")

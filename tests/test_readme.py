@@ -34,6 +34,7 @@ def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_text().splitlines()) <= 130
 
 
+@pytest.mark.slow
 def test_the_first_command_writes_the_page_that_is_told(tmp_path, monkeypatch, capsys):
     text = (ROOT / "README.md").read_text()
     first = re.search(r"```bash\n(.*?)\n```", text)[1]
@@ -52,6 +53,7 @@ def test_the_first_command_writes_the_page_that_is_told(tmp_path, monkeypatch, c
     assert [float(each) for each in shown[:3]] == pytest.approx([*map(float, told)], rel=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "page",
     [*FIRST, *(pytest.param(page, marks=pytest.mark.slow) for page in GUIDE)],
@@ -69,6 +71,7 @@ def test_each_page_runs_by_itself(page, capsys, tmp_path, monkeypatch):
         assert sorted(words.findall(printed)) == sorted(words.findall("".join(shown)))
 
 
+@pytest.mark.slow
 def test_the_examples_run(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (first,), (held,) = blocks("README.md"), blocks("docs/guide/saving.md")
@@ -121,6 +124,7 @@ def abilities(name):
             yield "no"
 
 
+@pytest.mark.slow
 def test_the_models_can_do_what_the_guide_says():
     text = (ROOT / "docs" / "guide" / "models.md").read_text()
     rows = re.findall(r"^\| `(\w+)` \| (yes .*) \|$", text, flags=re.MULTILINE)
@@ -129,6 +133,7 @@ def test_the_models_can_do_what_the_guide_says():
         assert list(abilities(name)) == marks.split(" | "), name
 
 
+@pytest.mark.slow
 def test_measuring(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     code = blocks("docs/guide/measure.md")[0]

@@ -33,6 +33,7 @@ def data(uniform):
     return X, 2 * wave(X) + X + 0.05 * uniform(14, 1, seed=1)
 
 
+@pytest.mark.slow
 def test_a_structure(data, uniform):
     X, Y = data
     model = recipe("A structure")["SeasonalCKA"](X, Y, physics=wave)

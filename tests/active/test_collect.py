@@ -117,6 +117,7 @@ class TestMeasuring:
         design = collect(**laboratory(budget=2))
         assert not (result.X[4:, None] == design.X).all(-1).any()
 
+    @pytest.mark.slow
     def test_warm_started_fits(self, laboratory, monkeypatch):
         started = []
         from gpadjust.active import warm_refit
@@ -128,6 +129,7 @@ class TestMeasuring:
         collect(**laboratory(budget=7)).model  # noqa: B018
         assert started == [(5, 4), (6, 5), (7, 6)]
 
+    @pytest.mark.slow
     def test_the_default_fit(self, laboratory):
         result = collect(**laboratory(budget=6, fit=None))
         assert result.model.num_samples == 16
@@ -147,6 +149,7 @@ class TestMeasuring:
 
 
 class TestFailures:
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("what", "message"),
         [
@@ -168,6 +171,7 @@ class TestFailures:
         distance = (result.X - result.failed_X).abs().amax(-1)
         assert distance.min() > 1e-3
 
+    @pytest.mark.slow
     @quiet
     @pytest.mark.parametrize("analytic", [False, True])
     def test_a_failing_region_does_not_hold_the_loop(self, laboratory, analytic):
@@ -198,6 +202,7 @@ class TestFailures:
         result = collect(**laboratory(oracle=oracle, batch_size=3, budget=6))
         assert (len(result.X), len(result.failed_X)) == (4, 2)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("at", [pytest.param(3, marks=pytest.mark.slow), 6])
     def test_each_output_is_learnt_from_its_own_measurements(self, laboratory, tmp_path, at):
         def oracle(killed_at=None):
@@ -285,6 +290,7 @@ class TestResultsThatCannotBeTaken:
         assert record["refused"] == logged
         assert record["of"] == error.X.tolist()
 
+    @pytest.mark.slow
     def test_it_goes_on_by_hand_or_anew(self, laboratory, tmp_path):
         path = tmp_path / "log.jsonl"
         with pytest.raises(CollectionError) as caught:
@@ -296,6 +302,7 @@ class TestResultsThatCannotBeTaken:
         assert collection.num_measured == 5
         assert same(collect(**laboratory(log=path)), whole)
 
+    @pytest.mark.slow
     def test_a_full_disk(self, laboratory, tmp_path, monkeypatch):
         def full(file):
             raise OSError(28, "No space left on device")
@@ -319,6 +326,7 @@ class TestResultsThatCannotBeTaken:
 
 
 class TestResuming:
+    @pytest.mark.slow
     def test_a_collection_runs_on(self, laboratory):
         arguments = laboratory()
         oracle, budget = arguments.pop("oracle"), arguments.pop("budget")
@@ -329,6 +337,7 @@ class TestResuming:
         assert collection.num_measured == 3
         assert same(collection.run(oracle, budget), collect(**laboratory()))
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("batch_size", "at", "fit"),
         [
@@ -379,6 +388,7 @@ class TestResuming:
             measured = 0 if not oracle.asked else len(torch.cat(oracle.asked))
             assert measured in (lost, lost + 1)
 
+    @pytest.mark.slow
     @quiet
     def test_failures_and_an_unchanged_model(self, laboratory, tmp_path):
         bad = {"n5": lambda Y: Y * float("nan"), "n6": lambda Y: Y * float("nan")}
@@ -391,6 +401,7 @@ class TestResuming:
         assert same(result, whole)
         assert torch.equal(result.failed_X, whole.failed_X)
 
+    @pytest.mark.slow
     def test_a_larger_budget_goes_on(self, laboratory, tmp_path):
         path = tmp_path / "log.jsonl"
         collect(**laboratory(log=path, budget=5))

@@ -83,6 +83,7 @@ def test_told_again_is_a_repeated_measurement(make):
     assert torch.equal(collection.X, X.repeat(2, 1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("initial", [4, torch.tensor([[0.123456, 0.5], [1.9, -0.654321]])])
 def test_what_was_set_need_not_be_what_was_asked_for(make, initial):
     collection = make(initial=initial)
@@ -156,6 +157,7 @@ def test_failing_and_withdrawing(make, tmp_path):
     assert torch.equal(collection.ask(3), X[1:])
 
 
+@pytest.mark.slow
 def test_all_of_it_comes_back_from_the_log(make, tmp_path, uniform):
     path = tmp_path / "log.jsonl"
     collection = filled(make(log=path))
@@ -173,6 +175,7 @@ def test_all_of_it_comes_back_from_the_log(make, tmp_path, uniform):
     assert torch.equal(again.ask(), collection.ask())
 
 
+@pytest.mark.slow
 def test_a_log_of_another_structure_is_no_hindrance(make, tmp_path):
     from gpadjust import PhysicsMeanGP
 

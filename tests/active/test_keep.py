@@ -26,6 +26,7 @@ def point_fit(model):
     return fit(model, "map", num_starts=2)
 
 
+@pytest.mark.slow
 def test_a_forbidden_region_is_hardly_entered():
     """Beyond 0.707 the outputs are too large; f_p says so beyond 0.79 only."""
     measured, left_out = [], 0

@@ -55,6 +55,7 @@ def specs(ours):
     return kwargs["surrogate_spec"], kwargs["transforms"]
 
 
+@pytest.mark.slow
 def test_it_goes_on_from_a_file(named, tmp_path):
     first = client({"y": named}, 3)
     first.save_to_json_file(str(tmp_path / "client.json"))
@@ -72,6 +73,7 @@ def test_it_goes_on_from_a_file(named, tmp_path):
     assert predicted[0] == pytest.approx(predicted[1], rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("trials", [0, 1, 2])
 def test_it_goes_on_with_the_first_trials_from_a_file(named, tmp_path, trials):
     first = client({"y": {"fine": named}}, trials)

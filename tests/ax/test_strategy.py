@@ -67,6 +67,7 @@ def adapter(ours):
     return ours._generation_strategy.adapter
 
 
+@pytest.mark.slow
 def test_trials_constraints_and_predictions():
     torch.manual_seed(0)
     ours = try_out(client(), 7)
@@ -82,6 +83,7 @@ def test_trials_constraints_and_predictions():
     assert metrics["output"][0] > 50
 
 
+@pytest.mark.slow
 def test_the_model_is_the_one_that_the_library_fits():
     ours = try_out(client(), 6)
     model = adapter(ours).generator.surrogate.model.models[0]
@@ -96,6 +98,7 @@ def test_the_model_is_the_one_that_the_library_fits():
     assert sd == pytest.approx(variance.sqrt().item(), rel=0.05, abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fit_options", [FAST, pytest.param(None, marks=pytest.mark.slow)])
 def test_cross_validation_leaves_each_trial_out(fit_options):
     ours = try_out(client(fit_options=fit_options), 6)

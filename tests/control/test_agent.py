@@ -48,6 +48,7 @@ class Log(list):
 # The loop
 
 
+@pytest.mark.slow
 def test_it_learns_the_system_and_brings_the_point_home(make_agent, kind, point_env):
     agent = make_agent(kind).learn(15)
     assert agent.num_episodes == 3
@@ -75,6 +76,7 @@ def test_without_a_physics_the_first_episode_is_random(make_agent, kind, point_d
     assert agent.learn(5).recorded_episodes().num_transitions == 10
 
 
+@pytest.mark.slow
 def test_the_first_episodes_can_be_random(make_agent, kind):
     """Two episodes of five steps begin before the sixth step; the third is brought home."""
     agent = make_agent(kind, random_steps=6).learn(15)
@@ -85,6 +87,7 @@ def test_the_first_episodes_can_be_random(make_agent, kind):
             make_agent(kind, random_steps=wrong)
 
 
+@pytest.mark.slow
 def test_episodes_are_played_to_their_end_and_numbered(make_agent, kind):
     agent = make_agent(kind).learn(7)
     episodes = agent.recorded_episodes()
@@ -170,6 +173,7 @@ def test_a_promise_that_is_no_dictionary_is_refused(point_env, point_task):
     assert agent.num_timesteps == 0
 
 
+@pytest.mark.slow
 def test_callbacks_are_told_what_happens(make_agent, kind):
     events = []
     make_agent(kind).learn(10, lambda agent, event, values: events.append(event))
@@ -178,6 +182,7 @@ def test_callbacks_are_told_what_happens(make_agent, kind):
     assert events == [*search, *episode, *episode, "done"]
 
 
+@pytest.mark.slow
 def test_progress_is_printed(make_agent, kind, capsys):
     make_agent(kind).learn(10, [print_progress])
     lines = capsys.readouterr().out.splitlines()
@@ -192,6 +197,7 @@ def test_progress_is_printed(make_agent, kind, capsys):
         assert any(said.startswith(event) for said in lines) == (event in KINDS[kind].events)
 
 
+@pytest.mark.slow
 def test_its_representation_says_what_it_is(make_agent, kind):
     agent = make_agent(kind)
     assert repr(agent) == f"{kind.__name__}(Point, LearnedDynamics, 0 episodes learnt, 0 steps)"
@@ -232,6 +238,7 @@ def test_the_promise_is_of_the_episode_that_was_learnt(make_agent, first):
     assert (promises == [None, None]) == (first is PLAN)
 
 
+@pytest.mark.slow
 def test_a_searched_policy_promises_what_its_last_search_found(make_agent):
     searches = Log("search")
     agent = make_agent(PolicySearchAgent).learn(10, searches)
@@ -269,6 +276,7 @@ def test_promises_that_are_not_kept_are_told(make_agent, point_dynamics):
         make_agent(PolicySearchAgent, dynamics=wrong).learn(5)
 
 
+@pytest.mark.slow
 def test_a_promise_that_data_made_against_the_physics_is_told(make_agent, crude_dynamics):
     """After an episode the model knows that the point moves some ten times as far."""
 
@@ -316,6 +324,7 @@ def test_policies_that_leave_the_bounds_are_told(make_agent):
 # Errors lose nothing
 
 
+@pytest.mark.slow
 def test_an_error_loses_no_episode(make_agent, kind, point_reward):
     agent = make_agent(kind, reward=lambda s, a, n: -3 * n[:, 0].square())
     with pytest.raises(ValueError, match="is not the environment's"):
@@ -378,6 +387,7 @@ def test_an_environment_is_needed(env, point_task):
         MPCAgent(env, point_task())
 
 
+@pytest.mark.slow
 def test_a_callback_that_raises_lets_nothing_be_learnt_twice(make_agent, kind):
     class Full:
         def __call__(self, agent, event, values):

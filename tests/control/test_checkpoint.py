@@ -65,6 +65,7 @@ def again(make_agent, point_env):
     return lambda kind=MPCAgent, **given: (point_env(), make_agent(kind, **given).task)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [(7,), pytest.param((3, 11, 12), marks=pytest.mark.slow)])
 def test_an_interrupted_run_ends_as_another(make_agent, kind, steps, again, tmp_path):
     path = tmp_path / "run.ckpt"
@@ -101,6 +102,7 @@ def test_checkpoints_come_every_so_many_episodes(make_agent, tmp_path, monkeypat
 # Files
 
 
+@pytest.mark.slow
 def test_a_full_disk_leaves_the_file_before_it_and_the_run_goes_on(
     make_agent, again, tmp_path, monkeypatch
 ):
@@ -404,6 +406,7 @@ def test_a_lock_is_released_after_an_error_and_held_by_one_run(make_agent, tmp_p
     lock.release()
 
 
+@pytest.mark.slow
 def test_a_refused_call_does_not_spend_the_generators(make_agent, again, tmp_path):
     path = tmp_path / "run.ckpt"
     whole = numbers(make_agent(MPCAgent).learn(TOTAL))

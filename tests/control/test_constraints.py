@@ -162,6 +162,7 @@ def test_a_violation_costs_more_than_any_reward_and_as_much_as_it_is():
     assert tight.violation[0, :, 1].tolist() == [0.0, 0.25, 1.25, 2.25]
 
 
+@pytest.mark.slow
 def test_an_agent_keeps_walls_from_the_first_episode_on():
     error = {"x": 0.05}
     system = System(

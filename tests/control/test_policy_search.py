@@ -93,6 +93,7 @@ def test_an_episode_that_runs_away_does_not_outweigh_the_others():
     assert slope(x).abs() < 20 * usual.abs()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind",
     [
@@ -238,6 +239,7 @@ def test_bad_options_are_refused():
         PolicySearch(guide=3)
 
 
+@pytest.mark.slow
 def test_a_policy_comes_back_from_the_bounds():
     """The reward lies beyond them; within, the nearest is best."""
     torch.manual_seed(0)

@@ -160,6 +160,7 @@ def test_noises_and_hidden_states_are_found():
     assert rough.square().mean().sqrt() > 0.05  # as the machine's; the most likely path is smooth
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind", [MPCAgent, pytest.param(PolicySearchAgent, marks=pytest.mark.slow)]
 )

@@ -105,6 +105,7 @@ EACH = {1: "raises", 4: "nan", 9: "1e30", 12: "reward nan", 13: "reward 1e30", 1
 ALL = [{place: fault} for fault in FAULTS for place in (1, 6, 8, 10)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "faults",
     [

@@ -45,6 +45,7 @@ def error(dynamics):
     return (missed.square().mean(0) / (after - states).square().mean(0)).sqrt().mean().item()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The draws of")  # few of them count where all is exact
 @pytest.mark.parametrize(
     "model",

@@ -133,6 +133,7 @@ DAMAGES = [
 ]
 
 
+@pytest.mark.slow
 def test_a_state_that_cannot_be_loaded_changes_nothing(learnt):
     dynamics = learnt()
     before = dynamics.state_dict()
@@ -144,6 +145,7 @@ def test_a_state_that_cannot_be_loaded_changes_nothing(learnt):
     unchanged(dynamics, before, learnt())
 
 
+@pytest.mark.slow
 def test_a_physics_that_learns_is_stored_and_restored(learnt):
     physics = Gain()
     dynamics = learnt(physics)
@@ -244,6 +246,7 @@ def test_damaged_probes_are_refused(probes):
 # Transitions
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", [pytest.param("physics", marks=pytest.mark.slow), "model", "fit"])
 def test_an_error_while_learning_changes_nothing(learnt, monkeypatch, where):
     broken = False
@@ -352,6 +355,7 @@ def test_bad_arguments_are_found_at_once(options, error, message):
         LearnedDynamics(**{"spec": SPEC, "physics": push, **options})
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The draws of")
 @pytest.mark.parametrize("model", [RRA, None])
 def test_bad_tensors_are_refused(learnt, model):

@@ -57,6 +57,7 @@ def test_without_noise_the_parameters_are_exact():
     assert (variance < 1e-10).all()
 
 
+@pytest.mark.slow
 def test_angles_that_come_wrapped_are_the_same():
     states, actions, following = swings()
     one, other = PhysicsDynamics(PENDULUM, swing()), PhysicsDynamics(PENDULUM, swing())
@@ -68,6 +69,7 @@ def test_angles_that_come_wrapped_are_the_same():
     assert found(other) == pytest.approx(found(one), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_standard_errors_are_those_of_repeated_data():
     estimates, errors = [], []
     for seed in range(40):

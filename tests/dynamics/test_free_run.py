@@ -115,6 +115,7 @@ def test_the_ends_of_the_interval_are_draws_at_any_level():
     torch.testing.assert_close(inner.upper, ordered[29])
 
 
+@pytest.mark.slow
 def test_one_step_is_that_of_the_predictions(cart_pole_system, make):
     system = cart_pole_system
     dynamics = make("CKA", system.spec, system.crude)

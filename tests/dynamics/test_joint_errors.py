@@ -31,6 +31,7 @@ def learnt(correlation, n=120, seed=0):
     return dynamics
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["measured", "process", "sampled"])
 def test_spread_of_a_derived_quantity(kind, monkeypatch):
     dynamics, correlation = learnt(0.8), 0.8
@@ -52,6 +53,7 @@ def test_spread_of_a_derived_quantity(kind, monkeypatch):
     assert spread() > 1.8 * expected
 
 
+@pytest.mark.slow
 def test_defaults_stay_where_no_correlation_is_clear(monkeypatch):
     dynamics = learnt(0.0, n=60)
     assert error_correlation(dynamics.model) is None

@@ -23,6 +23,7 @@ KINDS += [
 ]
 
 
+@pytest.mark.slow
 def test_physics_that_is_the_truth_is_left_alone(cart_pole_system, make):
     system = cart_pole_system
     for target in ("difference", "absolute"):
@@ -33,6 +34,7 @@ def test_physics_that_is_the_truth_is_left_alone(cart_pole_system, make):
         torch.testing.assert_close(mean, next_states, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_learning_lowers_the_error_of_the_physics(cart_pole_system, make, kind):
     system = cart_pole_system
@@ -74,6 +76,7 @@ def test_scores_are_those_of_the_predictions(cart_pole_system, make):
         torch.testing.assert_close(*pair, rtol=1e-3, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_whole_turns_of_an_angle_change_nothing(cart_pole_system, make):
     system = cart_pole_system
     turn = torch.tensor([0, 2 * math.pi, 0, 0], dtype=torch.float64)
@@ -136,6 +139,7 @@ def test_exogenous_and_integrated_states(uniform):
         torch.testing.assert_close(drawn[:, 0], new[:, 0])
 
 
+@pytest.mark.slow
 def test_a_system_that_follows_the_previous_action(uniform):
     spec = StateSpec(["last", "x"], ["a"], previous={"last": "a"})
     states, actions = uniform(30, 2, low=-1), uniform(30, 1, low=-1, seed=1)
@@ -192,6 +196,7 @@ class WavyCKA(TermsGP):
         super().__init__(make, [*make.rhos(), make.delta(), *terms])
 
 
+@pytest.mark.slow
 def test_a_model_of_the_user(cart_pole_system):
     system = cart_pole_system
 
@@ -261,6 +266,7 @@ def test_it_is_described_by_what_is_given_beside_the_fits(cart_pole_system):
         assert name in found
 
 
+@pytest.mark.slow
 def test_each_transition_costs_one_row_of_the_physics(uniform):
     rows = []
 
@@ -294,6 +300,7 @@ def test_samples_scatter_as_predicted(cart_pole_system, make):
     assert (noise_free < variance).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [pytest.param("GP", marks=pytest.mark.slow), "CKA", "RRA"])
 def test_sampled_functions_are_of_the_posterior(cart_pole_system, make, kind):
     system = cart_pole_system

@@ -29,6 +29,7 @@ def agree(first, second, states, actions):
     return all(torch.equal(a, b) for a, b in pairs)
 
 
+@pytest.mark.slow
 def test_loaded_dynamics_go_on_bit_by_bit(cart_pole_system, make, costly_kind):
     system, kind = cart_pole_system, costly_kind
     dynamics, other = (make(kind, system.spec, system.crude) for _ in range(2))
@@ -58,6 +59,7 @@ def test_state_of_dynamics_that_learnt_nothing(cart_pole_system, make):
     assert dynamics.num_transitions == 0
 
 
+@pytest.mark.slow
 def test_conditioning_is_the_exact_posterior(cart_pole_system, make):
     system = cart_pole_system
     dynamics = make("CKA", system.spec, system.crude)
@@ -76,6 +78,7 @@ def test_conditioning_is_the_exact_posterior(cart_pole_system, make):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_refits_are_quiet_and_leave_the_generator_alone(cart_pole_system, make):
     system = cart_pole_system
     dynamics = make("CKA", system.spec, system.crude)
@@ -87,6 +90,7 @@ def test_refits_are_quiet_and_leave_the_generator_alone(cart_pole_system, make):
     assert torch.equal(torch.get_rng_state(), state)
 
 
+@pytest.mark.slow
 def test_a_warm_start_is_the_same_in_the_users_units(cart_pole_system, make):
     system = cart_pole_system
     dynamics = make("CKA", system.spec, system.crude, fit_options={"method": "map"})
@@ -110,6 +114,7 @@ def test_a_warm_start_is_the_same_in_the_users_units(cart_pole_system, make):
     torch.testing.assert_close(variance, before.variance, rtol=1e-2, atol=0)
 
 
+@pytest.mark.slow
 def test_kernels_of_the_users(cart_pole_system, make):
     system = cart_pole_system
 

@@ -37,6 +37,7 @@ def dynamics():
     return dynamics
 
 
+@pytest.mark.slow
 def test_they_come_back_and_go_on(dynamics):
     before, dynamics = dynamics, make(fit_options=QUICK)
     dynamics.load_state_dict(before.state_dict())

@@ -34,6 +34,7 @@ def test_targets_of_missing_entries_are_missing(cart_pole_system, make, holed, t
     assert torch.equal(Y.isnan(), holed[2].isnan())
 
 
+@pytest.mark.slow
 def test_each_state_is_learnt_from_its_own_rows(cart_pole_system, make, costly_kind, holed):
     system, test, kind = cart_pole_system, cart_pole_system.trial(9)[:2], costly_kind
     dynamics = make(kind, system.spec, system.crude)
@@ -51,6 +52,7 @@ def test_each_state_is_learnt_from_its_own_rows(cart_pole_system, make, costly_k
         assert_same(alone.predict(*test), dynamics.predict(*test), column, rtol=1e-4, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_learning_goes_on(cart_pole_system, make, holed):
     system, test = cart_pole_system, cart_pole_system.trial(9)
     dynamics, other = (make("CKA", system.spec, system.crude) for _ in range(2))
@@ -64,6 +66,7 @@ def test_learning_goes_on(cart_pole_system, make, holed):
     assert_same(other.predict(*test[:2]), dynamics.predict(*test[:2]))
 
 
+@pytest.mark.slow
 def test_conditioning_skips_what_is_missing(cart_pole_system, make, holed):
     system, test = cart_pole_system, cart_pole_system.trial(9)[:2]
     dynamics, other = (make("CKA", system.spec, system.crude) for _ in range(2))
@@ -90,6 +93,7 @@ def test_scores_are_over_what_was_measured(cart_pole_system, make, holed):
         assert_same(*pairs, column)
 
 
+@pytest.mark.slow
 def test_a_state_that_is_seldom_measured(cart_pole_system, make):
     system = cart_pole_system
     trials = [system.trial(seed) for seed in range(8)]

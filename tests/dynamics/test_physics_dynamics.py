@@ -90,6 +90,7 @@ def test_every_update_is_checked():
         dynamics.update(states, actions, following)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The draws of")
 @pytest.mark.parametrize("learnt", [False, True])
 def test_a_physics_of_differences_is_warned_of(learnt):
@@ -139,6 +140,7 @@ def learnt(**options):
     return dynamics
 
 
+@pytest.mark.slow
 def test_a_state_is_of_the_same_dynamics():
     dynamics = PhysicsDynamics(SPEC, push)
     dynamics.load_state_dict(stored(PhysicsDynamics(SPEC, push)))
@@ -148,6 +150,7 @@ def test_a_state_is_of_the_same_dynamics():
     assert other.num_transitions == 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "message"),
     [

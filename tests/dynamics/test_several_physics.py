@@ -20,6 +20,7 @@ def still():
     return lambda X: X[:, :4] + 0.1 * torch.cat([X[:, 2:4], torch.zeros_like(X[:, 2:4])], -1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind",
     [pytest.param(k, marks=() if k in ("CKA", "RRA") else pytest.mark.slow) for k in SEVERAL],
@@ -54,6 +55,7 @@ def test_the_better_physics_gets_the_weight(cart_pole_system, make, still):
     torch.testing.assert_close(rho, torch.ones_like(rho), rtol=0, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_loading_runs_them_at_three_rows_only(cart_pole_system, make, still):
     system, calls = cart_pole_system, []
 
@@ -84,6 +86,7 @@ def test_loading_runs_them_at_three_rows_only(cart_pole_system, make, still):
         swapped.load_state_dict(dynamics.state_dict())
 
 
+@pytest.mark.slow
 def test_functions(cart_pole_system, make, still):
     system = cart_pole_system
     dynamics = make("CKA", system.spec, [system.crude, still])

@@ -39,6 +39,7 @@ def transitions(uniform):
     return transitions
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", [CalibratedPhysics, CKA])
 def test_are_learnt_kept_and_used(model, transitions, uniform):
     dynamics, (states, actions, after) = make(model), transitions(8, seed=5)

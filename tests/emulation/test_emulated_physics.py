@@ -124,6 +124,7 @@ def test_the_model_is_a_gaussian_process_with_that_covariance(crude):
             torch.testing.assert_close(-value.squeeze(), expected, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_where_the_emulator_is_certain_results_are_those_of_the_physics():
     runs, X = 1.5 * line(40), 1.2 * line(6) + 0.1
     known = EmulatedPhysics(runs, wave(runs))
@@ -135,6 +136,7 @@ def test_where_the_emulator_is_certain_results_are_those_of_the_physics():
         torch.testing.assert_close(a, b, rtol=1e-2, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_unknown_parameters_are_inputs_of_the_runs(with_parameter):
     exact = FunctionPhysics(lambda X, p: simulated(X[:, 0], p.w), unknowns=W)
     X = 0.1 + 2.8 * line(12)
@@ -166,6 +168,7 @@ def test_columns_of_a_frame_are_unknown_parameters_by_their_names():
     assert torch.equal(again(x, w), physics(x, w))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The draws of")
 def test_it_works_through_the_whole_house(crude, tmp_path):
     X, test_X = 2.4 * line(7), 2 * line(3)

@@ -74,6 +74,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 @apart
 def test_programs_say_the_next_state_and_its_variance(case, tmp_path):

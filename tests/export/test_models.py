@@ -25,6 +25,7 @@ def agrees(name, found, expected):
         torch.testing.assert_close(value, right, rtol=tolerance, atol=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 def test_c_says_what_the_model_predicts(name, tmp_path):
     model = fitted(name)
@@ -36,6 +37,7 @@ def test_c_says_what_the_model_predicts(name, tmp_path):
         agrees(name, called(program.f_predict, sizes, *given_), (mean, variance))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 @apart
 def test_casadi_says_what_the_model_predicts(name):

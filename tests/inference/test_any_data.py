@@ -116,6 +116,7 @@ def profile(max_examples):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
 @profile(8)
 @given(kind=st.sampled_from(list(BUILD)), problem=problems())

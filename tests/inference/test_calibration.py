@@ -93,6 +93,7 @@ def test_outputs_share_what_they_say():
         assert (both.physics_parameters.sd < one.physics_parameters.sd).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "model_class",
     [CalibratedPhysics, PhysicsMeanGP, pytest.param(CKA, marks=pytest.mark.slow)],
@@ -188,6 +189,7 @@ def test_parameters_that_nothing_tells_apart_are_named():
         fit(CalibratedPhysics(X, 2 * X + 1, 0.01, physics=law))
 
 
+@pytest.mark.slow
 def test_a_discrepancy_that_is_orthogonal_leaves_the_best_fit_to_the_parameters():
     X = torch.linspace(0.02, 1, 17, dtype=torch.float64).unsqueeze(-1)
     truth = 4 * X + X * (5 * X).sin()  # Plumlee (2017)

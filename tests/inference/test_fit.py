@@ -188,6 +188,7 @@ class TestManyPoints:
         expected = fit(problem(), "map").log_likelihood
         assert (found >= expected - 0.1 - 2e-3 * expected.abs()).all()
 
+    @pytest.mark.slow
     def test_it_is_never_worse_than_the_start(self, problem, request):
         model = problem()
         good = fit(model, "map", **QUICK).log_likelihood
@@ -205,10 +206,12 @@ class TestLearningPhysics:
         noise = 0.01 * torch.randn(20, 1, dtype=torch.float64)
         return CKA(X, (2.0 * X).sin() + 0.05 * X + noise, physics=Sine(1.8), center=0.0)
 
+    @pytest.mark.slow
     def test_by_botorch(self, model):
         fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
         assert model.physics.function.rate.item() == pytest.approx(2.0, abs=0.1)
 
+    @pytest.mark.slow
     def test_predictions_use_what_was_learnt(self, model):
         start = log_likelihood(model)
         fit(model, "map", **QUICK)
@@ -296,6 +299,7 @@ class TestUsersChoices:
         assert (log_likelihood(model) > before).all()
 
 
+@pytest.mark.slow
 def test_a_part_that_shows_nothing_but_noise_does_not_decide():
     # On the 96 of these rows that are searched first, the likeliest function is none at all.
     generator = torch.Generator().manual_seed(0)

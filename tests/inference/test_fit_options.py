@@ -143,6 +143,7 @@ class TestThreads:
         yield seen
         torch.set_num_threads(before)
 
+    @pytest.mark.slow
     @pytest.mark.filterwarnings("ignore::gpadjust.inference.SamplingWarning")
     def test_a_small_problem_takes_one(self, model, seen):
         X, Y = model.train_inputs[0][0, :, :2], model.train_targets.mT

@@ -41,6 +41,7 @@ def XY(uniform):
     return X, 1.5 * ripple(X) + X + 0.02 * torch.randn(8, 1, dtype=torch.float64)
 
 
+@pytest.mark.slow
 @quick
 @pytest.mark.parametrize("kind", ["ZeroMeanGP", "ScaleGP", "CKA", "AR1", "RRA"])
 def test_result_and_model(build, data, kind, num_outputs, uniform):
@@ -127,6 +128,7 @@ def test_draws_of_no_density_are_tried_around_the_optima_once(XY, monkeypatch, m
     assert [type(each) for each in begun] == [Both, Mixture][-tries:]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::gpadjust.inference.SamplingWarning")  # of one of six
 @pytest.mark.parametrize("noise", [pytest.param(0.0, marks=pytest.mark.slow), 0.1])
 def test_it_errs_less_than_a_point_estimate_and_its_intervals_hold(noise):
@@ -154,6 +156,7 @@ def test_it_errs_less_than_a_point_estimate_and_its_intervals_hold(noise):
     assert sum(covered) / 6 > 0.9
 
 
+@pytest.mark.slow
 def test_the_default_samples_where_it_can(XY, build, data):
     model = CKA(*XY, physics=ripple)
     assert isinstance(fit(model, **SHORT), SampleResult)
@@ -168,6 +171,7 @@ def test_the_default_samples_where_it_can(XY, build, data):
         fit(SingleTaskGP(*XY), num_draws=64)
 
 
+@pytest.mark.slow
 def test_a_physics_that_learns_is_at_its_most_likely_parameters(XY):
     physics, other = Sine(2.0, 2.0), Sine(2.0, 2.0)
     options = {"num_starts": 2, "num_screened": 16}
@@ -277,6 +281,7 @@ def test_nuts_agrees(XY):
         assert error.max() < 0.15
 
 
+@pytest.mark.slow
 @quick
 def test_missing_targets(uniform):
     X = uniform(10, 1)
@@ -345,6 +350,7 @@ def test_constraints_hold(XY, lengths, noises, options):
 class TestBeforeAndAfter:
     """A fit does not depend on what the model did before."""
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         "before", [pytest.param("predicted", marks=pytest.mark.slow), "fitted"]
     )
@@ -394,6 +400,7 @@ def test_narrow_constraints_are_kept(d, uniform):
     assert model.predict(X).mean.isfinite().all()
 
 
+@pytest.mark.slow
 def test_draws_for_arviz(monkeypatch):
     X = torch.linspace(0, 1, 6, dtype=torch.float64).unsqueeze(-1)
     law = FunctionPhysics(lambda X, p: p.slope * X[:, 0], unknowns={"slope": Unknown(1.0, sd=1.0)})

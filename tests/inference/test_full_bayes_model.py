@@ -157,6 +157,7 @@ def test_leave_one_out_is_the_posterior_without_the_observation(held, data):
 
 
 class TestFunctions:
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         "kind",
         [pytest.param(k, marks=() if k in ("CKA", "RRA") else pytest.mark.slow) for k in KINDS],

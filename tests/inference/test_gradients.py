@@ -94,6 +94,7 @@ MODELS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(MODELS))
 @settings(max_examples=5, deadline=None, derandomize=True)
 @given(seed=SEEDS, m=st.sampled_from([1, 3]), batch=st.sampled_from([(), (2,)]))

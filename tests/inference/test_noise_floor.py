@@ -59,6 +59,7 @@ QUICKLY = [("CKA", "the physics"), ("ZeroMeanGP", "constant"), ("ScaleGP", "a sh
 QUICKLY += [("CKA", "of outputs of many sizes"), ("learnt means", "in the class")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "targets"),
     [pytest.param(*case, marks=() if case in QUICKLY else pytest.mark.slow) for case in CASES],

@@ -235,6 +235,7 @@ class TestAlone:
         X, Y, _ = data
         assert alone(build(X, Y)) is None
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("kind", [CKA, PhysicsMeanGP])
     def test_a_right_physics_is_followed(self, kind):
         """With noise, functions that are free find some where there is none."""
@@ -252,6 +253,7 @@ class TestAlone:
         assert {*sufficiency[1::2]} == {None}
         assert "left as it is in" in model.summary()
 
+    @pytest.mark.slow
     def test_some_samples_can_learn(self):
         """Of a physics that is right up to now."""
         X = uniform(60, 2)
@@ -271,6 +273,7 @@ class TestAlone:
         assert adjusts(model).all()
         assert (model.predict(X).mean - Y - 1).square().mean() < 0.1 * before
 
+    @pytest.mark.slow
     def test_parameters_of_a_right_physics(self):
         law = FunctionPhysics(
             lambda X, p: p.a * (3 * X[:, 0]).sin(), unknowns={"a": Unknown(2.0, sd=1.0)}
@@ -338,6 +341,7 @@ class TestConstant:
         expected = (torch.tensor([1.0, 1.0, 10.0, 1.0, 1.0]) * odds).log().sigmoid()
         torch.testing.assert_close(probabilities(even, away)[ADJUSTED], expected)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("offset", [0.0, 1e5])
     def test_it_does_not_count_against_the_physics(self, data, offset):
         X, Y, _ = data
@@ -381,6 +385,7 @@ class TestMixed:
 
 
 class TestFit:
+    @pytest.mark.slow
     def test_of_physics_of_no_use_and_of_use(self, fitted, data):
         X, Y, Z = data
         model, result = fitted
@@ -447,6 +452,7 @@ class TestFit:
         found, expected = (each.log_evidence()[1] for each in (model, new))
         torch.testing.assert_close(found, expected, rtol=1e-2, atol=1e-2)
 
+    @pytest.mark.slow
     def test_again(self, data):
         X, Y, Z = data
         model = CKA(X, Y, physics=unrelated)
@@ -531,6 +537,7 @@ class TestPartlyOff:
 
 
 class TestTracesOfSamplesWithoutPhysics:
+    @pytest.mark.slow
     def test_relevance_of_many_inputs(self):
         """Draws that do not get to the posterior are no evidence against the physics."""
         g = torch.Generator().manual_seed(0)
@@ -544,6 +551,7 @@ class TestTracesOfSamplesWithoutPhysics:
         Y = 1.5 * physics(X) + 0.3 * X[:, :1] + 0.5 * noise
         assert fit(CKA(X, Y, physics=physics)).relevance > 0.95
 
+    @pytest.mark.slow
     def test_a_warm_start_after_the_physics_was_off(self, data):
         X, Y, _ = data
         again = 3 * unrelated(X) + X

@@ -50,6 +50,7 @@ def case(name, seed):
     return X, physics(X, true) + noise * torch.randn(n, 1, **options), physics, true
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::gpadjust.inference.ParameterWarning")
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_intervals_are_those_of_a_grid(name):

@@ -49,6 +49,7 @@ def error(model):
     return (model.predict(AT).mean[:, :1] - truth(AT, 1)).square().mean().sqrt().item()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["bayes", "map"])
 def test_a_machine_of_few_points_is_known_better_with_what_another_taught(other, method):
     options = {**QUICK} if method == "bayes" else {}
@@ -107,6 +108,7 @@ def test_a_posterior_is_that_of_a_prior_with_their_mean_and_covariance(other):
     np.testing.assert_allclose(found.variance.squeeze(-1).numpy(), variance, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_machine_that_has_nothing_to_do_with_it_is_left_out():
     X = torch.linspace(0, 1, 25, dtype=torch.float64).unsqueeze(-1)
     rough = CKA(X, wave(X) + 2 * torch.sin(37 * X) - 3, physics=wave)
@@ -118,6 +120,7 @@ def test_a_machine_that_has_nothing_to_do_with_it_is_left_out():
     assert error(model) < 1.3 * error(without)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_others", [1, 2])
 def test_the_whole_house(other, tmp_path, num_others):
     others = [other, machine(0.5, 25, 3)][:num_others]
@@ -145,6 +148,7 @@ def test_the_whole_house(other, tmp_path, num_others):
     assert model.covar_module.sister is None
 
 
+@pytest.mark.slow
 def test_of_several_outputs_each_has_a_probability(tmp_path):
     taught, model = machine(0, 20, 0, two=True), machine(1, 5, 1, two=True)
     fit(taught, "map")

@@ -82,6 +82,7 @@ def test_units_of_the_inputs(error, kind, stretch, shift):
     assert actual == pytest.approx(expected, rel=0.05, abs=EXACT)
 
 
+@pytest.mark.slow
 def test_cka_is_exact_on_a_pair_within_its_class(error):
     errors = [error(BUILD["CKA"], seed) for seed in range(3)]
     assert statistics.median(errors) <= 0.002

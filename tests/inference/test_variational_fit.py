@@ -141,6 +141,7 @@ def test_rounding_does_not_lift_the_bound():
     assert gradient.isfinite().all()
 
 
+@pytest.mark.slow
 def test_enough_points_leave_no_rest():
     X, f, Y = problem(400)
     model = make(X, Y)
@@ -234,6 +235,7 @@ def test_priors_count():
     assert bound.evidence < free.evidence
 
 
+@pytest.mark.slow
 def test_unknown_parameters_of_the_physics():
     X, f, Y = problem(120)
     physics = FunctionPhysics(
@@ -316,6 +318,7 @@ def test_an_error_leaves_the_model_as_it_was(monkeypatch, error):
     assert all(p.requires_grad for n, p in model.named_parameters() if "raw_noise" in n)
 
 
+@pytest.mark.slow
 def test_many_observations_in_parts(monkeypatch, close):
     X, f, Y = problem(150)
     whole = make(X, Y)

@@ -136,6 +136,7 @@ def test_files_scores_and_stacking(model, tmp_path):
     assert predicted(comparison.recommended, NEW).mean.isfinite().all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [RRA, VariationalCKA])
 def test_other_models(kind):
     model = kind(FRAME, Y, physics=head, batch="rig")

@@ -47,6 +47,7 @@ def fit_by_botorch(model, of=ExactMarginalLogLikelihood, **options):
     return mll
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:f_p is nearly zero")
 @pytest.mark.parametrize(
     ("noise", "unit", "n"),
@@ -71,6 +72,7 @@ def test_as_likely_as_the_search(data, build, kind, num_outputs, noise, unit, n)
     assert own_likelihood(model) > own_likelihood(searched) - 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("center", ["learn", "mean", 0.0])
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("normalised", [False, True])
@@ -114,6 +116,7 @@ SETTINGS = {
 
 # The search may look at hyper-parameters of which a kernel is nearly singular; where, depends on
 # the processor.
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:A not p.d., added jitter")
 @pytest.mark.parametrize("setting", SETTINGS)
 @pytest.mark.parametrize("batch_shape", [(), (2,)], ids=["single", "batch"])

@@ -173,6 +173,7 @@ class TestMixed:
         with pytest.raises(NotImplementedError, match="mixed=False"):
             posterior.entropy()
 
+    @pytest.mark.slow
     def test_density_is_the_slope_of_the_quantiles(self, held):
         posterior = held("CKA")[0].rho(held("CKA")[1])
         levels = torch.tensor([0.3, 0.3001], dtype=torch.float64)

@@ -58,6 +58,7 @@ def test_the_prior_mean_is_the_physics_wherever_the_center_is(XY):
         torch.testing.assert_close(move(model, center).posterior(far).mean, crude(far))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["map", "bayes"])
 def test_an_offset_of_targets_and_physics_changes_nothing(XY, uniform, method):
     X, Y = XY

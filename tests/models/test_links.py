@@ -144,6 +144,7 @@ def test_unknown_parameters_and_missing_observations():
     assert model.log_evidence()[1].isfinite().all()
 
 
+@pytest.mark.slow
 def test_links_are_compared_and_stacked():
     linked = partial(CKA, outcome_transform="log")
     comparison = compare(X, Y, decades, structures=[CKA, linked])

@@ -55,6 +55,7 @@ def test_the_formula():
     assert first[2] == 1
 
 
+@pytest.mark.slow
 def test_intervals_hold_at_a_kink_and_no_others_are_wider(fitted, Z):
     Y, plain = truth(Z), without(fitted)
     held, width = {}, {}

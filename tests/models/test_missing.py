@@ -58,6 +58,7 @@ def test_each_output_is_the_model_of_its_own_rows(
         same(later, more, Z, 1e-7, [j])
 
 
+@pytest.mark.slow
 def test_fits_and_samples(gaps, build, costly_kind, uniform):
     X, Y = gaps
     model, Z = build(costly_kind, X, Y), uniform(5, 2, high=2.0, seed=4)

@@ -91,6 +91,7 @@ def test_without_outliers_nothing_changes(gross: tuple[Tensor, Tensor]) -> None:
     assert torch.allclose(*means, atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("names", ["relative", "heavy-tailed", ["relative", "heavy-tailed"]])
 def test_the_whole_house(names: Any, gross: tuple[Tensor, Tensor], tmp_path: Any) -> None:
     X, Y = gross
@@ -114,6 +115,7 @@ def test_the_whole_house(names: Any, gross: tuple[Tensor, Tensor], tmp_path: Any
     assert before.converged.shape == (2,)
 
 
+@pytest.mark.slow
 def test_random_features(gross: tuple[Tensor, Tensor]) -> None:
     X, Y = gross
     model = RRA(X, Y, physics=wave, likelihood="heavy-tailed")

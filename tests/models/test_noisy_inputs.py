@@ -78,6 +78,7 @@ def test_true_inputs_have_the_moments_of_the_measured_ones_less_noise(data):
     assert not noisy.spread[10:].any()
 
 
+@pytest.mark.slow
 def test_it_is_nearer_than_what_ignores_it():
     ratios = []
     for seed in range(3):
@@ -90,6 +91,7 @@ def test_it_is_nearer_than_what_ignores_it():
     assert sum(ratios) / 3 < -0.2
 
 
+@pytest.mark.slow
 def test_it_works_through_the_house(data, tmp_path):
     X, Y = data
     model = CKA(X, Y, physics=f_p, train_Xvar=[SD**2])
@@ -122,6 +124,7 @@ def test_samples_are_saved_with_it(data, tmp_path):
     assert torch.allclose(again.predict(TEST).mean, model.predict(TEST).mean)
 
 
+@pytest.mark.slow
 def test_compare_and_scikit_learn(data):
     X, Y = data
     found = compare(X, Y, f_p, structures=["CKA"], num_starts=1, num_screened=4, train_Xvar=SD**2)
@@ -138,6 +141,7 @@ def test_no_noise_changes_nothing(data):
     assert torch.allclose(plain.predict(TEST).mean, model.predict(TEST).mean, atol=1e-2)
 
 
+@pytest.mark.slow
 def test_several_outputs_and_models_without_physics(data):
     X, Y = data
     two = CKA(X, torch.cat([Y, 2 * Y], -1), physics=lambda X: f_p(X).repeat(1, 2), train_Xvar=0.001)

@@ -123,6 +123,7 @@ def test_a_row_left_out_is_predicted_by_a_model_without_it(options):
     assert torch.allclose(variance[:, 0], own[1].squeeze(1), rtol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", KINDS)
 def test_the_whole_house(options, tmp_path):
     model = make(**options)

@@ -29,6 +29,7 @@ def counting():
 PHYSICAL = ["PhysicsMeanGP", "ScaleGP", "CKA", "RRA", "RRA-paper"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", PHYSICAL)
 def test_each_row_is_evaluated_once(data, build, uniform, counting, num_outputs, kind):
     counting.num_outputs = num_outputs

@@ -165,6 +165,7 @@ class TestPhysicsParameters:
         )
         assert parameters.sd.tolist() == [0.0, 0.0]
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         "build",
         [

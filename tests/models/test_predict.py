@@ -106,6 +106,7 @@ def change_of_data(model, build, data):
     model.set_train_data(model.train_inputs[0], 2 * targets, strict=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change", [change_by_training, change_by_fit, change_by_state, change_of_data]
 )

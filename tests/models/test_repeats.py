@@ -114,6 +114,7 @@ def test_the_likelihood_by_the_book():
     assert model.log_evidence()[1].item() == pytest.approx(expected.item(), rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["map", "bayes"])
 def test_a_fit_is_that_of_single_rows(ways, method):
     X, Y = data()

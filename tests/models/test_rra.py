@@ -51,6 +51,7 @@ def design_of(model, Z):
     return zero, (model.functions(unit)(Z) - zero).permute(2, 1, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rra", "num_outputs"),
     [

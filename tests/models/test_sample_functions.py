@@ -71,6 +71,7 @@ class TestWithoutNoise:
     def test_spread(self, model):
         assert ((self.spread(model, self.Z) - 1).abs() < 0.1).all()
 
+    @pytest.mark.slow
     def test_after_further_observations(self, model):
         more = self.Z[[1, 4]] + 0.03
         model = model.condition_on_observations(more, model.posterior(more).mean.detach())
@@ -140,6 +141,7 @@ def test_wrong_numbers(data, build, kind):
         model.sample_functions(1, num_features=7)
 
 
+@pytest.mark.slow
 def test_botorch_draws_paths(data, build, costly_kind, num_outputs, uniform):
     model = build(costly_kind, *data(num_outputs=num_outputs)).eval()
     Z = uniform(5, 2)

@@ -206,6 +206,7 @@ def test_a_stacked_model_comes_back(uniform, path):
     same(load(path, trusted=True).predict(Z), stacked.predict(Z))
 
 
+@pytest.mark.slow
 def test_a_stacked_model_of_several_physics_is_given_those_without_a_name(uniform, path):
     X, Y, Z = problem(uniform)
     parts = {"low": lambda X: X - 1, "high": relu}

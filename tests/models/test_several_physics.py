@@ -75,6 +75,7 @@ def test_names(uniform, close):
     assert CKA(X, Y, physics=[lambda X: swing(X), drift]).rho_names == ("rho_f_1", "rho_drift")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cls", CLASSES)
 def test_far_from_the_data_their_weighted_sum_remains(uniform, cls):
     X = problem(uniform, 24)[0]

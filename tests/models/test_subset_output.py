@@ -47,6 +47,7 @@ def test_the_posterior_is_that_of_the_whole(three_outputs, uniform, same, indice
 
 
 # BoTorch's fit adds no nugget but after a warning.
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:A not p.d.")
 @pytest.mark.parametrize(
     ("kind", "indices"),

@@ -12,6 +12,7 @@ MORE += [(k, m, m == 1) for k in ("ZeroMeanGP", "PhysicsMeanGP", "ScaleGP", "CKA
 MORE = [case for case in MORE if case not in CASES]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "num_outputs", "known_noise"),
     CASES + [pytest.param(*case, marks=pytest.mark.slow) for case in MORE],

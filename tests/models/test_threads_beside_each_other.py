@@ -57,6 +57,7 @@ def test_conditioning_leaves_the_model_whole(model, data, uniform):
     assert all(torch.equal(v, state[n]) for n, v in model.state_dict().items())
 
 
+@pytest.mark.slow
 def test_seeded_functions(model, uniform):
     Z = uniform(6, 2)
     expected = [model.sample_functions(2, seed=seed)(Z) for seed in range(4)]

@@ -146,6 +146,7 @@ class Column(torch.nn.Module):
 class TestForrester:
     """Reading A: f_true = 8 f_p - 20 x; reading B: f_true = 2 f_p - 5 x."""
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(("factor", "limit"), [(4.0, 0.01), (1.0, 0.003)], ids=["A", "B"])
     @pytest.mark.parametrize("seeds", [3, pytest.param(10, marks=pytest.mark.slow)])
     def test_error(self, forrester, factor, limit, seeds):

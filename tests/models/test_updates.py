@@ -148,6 +148,7 @@ def test_known_noise_follows_the_window_and_the_filter():
         torch.testing.assert_close(model.predict(AT).mean, all_of_them.predict(AT).mean)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", [rra, lambda: CKA(X, Y, physics=wave)])
 def test_the_whole_house(build, tmp_path):
     model = build()

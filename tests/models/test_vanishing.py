@@ -40,6 +40,7 @@ def at_open(uniform):
     return X
 
 
+@pytest.mark.slow
 def test_the_whole_house(valve, at_open, tmp_path, uniform):
     model = PhysicsMeanGP(*valve, physics=PIPE, covar_module=OPEN)
     fit(model, num_samples=8)
@@ -98,6 +99,7 @@ def test_rho_is_its_mean_there(structure, valve, at_open):
     assert rho.variance.max() < 1e-9
 
 
+@pytest.mark.slow
 def test_several_outputs_and_a_transform_of_inputs(valve, at_open):
     X, Y = valve
     both = np.concatenate([Y, 2 * Y], 1)

@@ -108,6 +108,7 @@ def _jacobian(model):
     return count * model.units()[1].squeeze(-1).log()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rest", [False, True], ids=["none", "rest"])
 def test_all_that_predicts_agrees(close, fitted, rest):
     before = fitted.predict(LINE).variance
@@ -175,6 +176,7 @@ def test_acquisition_functions(one):
         assert 0.2 < best.item() < 0.4  # of the maximum, 0.28
 
 
+@pytest.mark.slow
 def test_paths_of_botorch(close, fitted):
     X, m = problem(4)[0], fitted.num_outputs
     torch.manual_seed(0)

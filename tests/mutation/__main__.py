@@ -34,15 +34,15 @@ def check(faults: tuple[Fault, ...] = FAULTS) -> None:
 
 
 def found_by(copy: Path, fault: Fault, processes: int) -> str | None:
-    """The first quick test that fails in a copy with the fault, or None."""
+    """The first test that fails in a copy with the fault, or None: the room's, then quick ones."""
     path = copy / fault.file
     text = path.read_text()
     path.write_text(text.replace(fault.old, fault.new))
     folder = f"tests/{fault.room}"
     here = [folder] if (copy / folder).is_dir() else []
-    elsewhere = [f"--ignore={folder}"] if here else []
+    tried = [[*here, "-m", "not slow"], [*here, "-m", "slow"]] if here else []
     try:
-        for places in [here, elsewhere] if here else [elsewhere]:
+        for places in [*tried, [f"--ignore={folder}"] if here else []]:
             failed = first_failure(copy, places, processes)
             if failed:
                 return failed
@@ -52,7 +52,7 @@ def found_by(copy: Path, fault: Fault, processes: int) -> str | None:
 
 
 def first_failure(copy: Path, places: list[str], processes: int) -> str | None:
-    """The first quick test of some places that fails, or None."""
+    """The first test of some places that fails, or None."""
     options = ["-x", "-q", "-rfE", "--no-header", "--ignore=tests/mutation"]
     options += ["-p", "no:cacheprovider", "--numprocesses", str(processes)]
     command = [sys.executable, "-m", "pytest", *options, *places]

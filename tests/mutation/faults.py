@@ -1,4 +1,4 @@
-"""Faults made by hand, that the quick tests are to find: small, realistic, in every room."""
+"""Faults made by hand, that the tests are to find: small, realistic, in every room."""
 
 from typing import NamedTuple
 

@@ -56,6 +56,7 @@ class Still:
 
 
 class TestArm:
+    @pytest.mark.slow
     @pytest.mark.usefixtures("_few_targets")
     def test_an_evaluation_is_that_of_the_environment(self):
         settings, policy = replace(TINY_ARM, memory=True), Still()
@@ -197,6 +198,7 @@ def transitions(physics, n=40):
     return states, actions, following
 
 
+@pytest.mark.slow
 def test_the_fitted_baseline_finds_damping_and_strengths():
     data = transitions(physics((7.0, 5.0), damping=0.7))
     fitted = dynamics(FEW, "plain", "fitted")
@@ -205,6 +207,7 @@ def test_the_fitted_baseline_finds_damping_and_strengths():
     assert (fitted.score(*data).rmse < before / 50).all()
 
 
+@pytest.mark.slow
 def test_networks_learn_what_physics_lacks():
     data = transitions(physics((9.0, 5.0)), 200)
     ensemble = dynamics(FEW, "plain", "ensemble")

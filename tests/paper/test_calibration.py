@@ -125,6 +125,7 @@ def test_targets_of_seeds(tmp_path, is_good):
     assert f"| {SETS[0]} | {size / 2:.2f} |" in found["seeds"].text
 
 
+@pytest.mark.slow
 def test_a_run_of_few_fits(tmp_path, monkeypatch):
     for name in ("SETS", "SMOOTH"):
         monkeypatch.setattr(f"paper.calibration.{name}", SETS[:1])

@@ -82,6 +82,7 @@ def without_seconds(found):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("experiment", "name", "step"),
     [
@@ -128,6 +129,7 @@ def test_what_identifies_a_run_holds_what_the_settings_do_not_say():
 
 
 class TestCartPole:
+    @pytest.mark.slow
     def test_smoke(self, tmp_path, capsys):
         experiment = CartPole(out=tmp_path, runs=2, jobs=1, only=("mf", "cka"), settings=TINY)
         main(experiment)
@@ -213,6 +215,7 @@ def judged(claims, curves, num_runs=4, num_episodes=50):
     return {claim.id: claim for claim in judge(claims, curves, num_episodes)}
 
 
+@pytest.mark.slow
 def test_floors(tmp_path):
     settings = FloorSettings(sequences=8, rounds=1, elites=2, restarts=2)
     experiment = Floor(out=tmp_path, runs=2, settings=settings)
@@ -226,6 +229,7 @@ def test_floors(tmp_path):
         Floor(runs=25).check()
 
 
+@pytest.mark.slow
 def test_planned_runs_and_their_tables(tmp_path):
     experiment = Planning(out=tmp_path, runs=1, settings=FEW, only=("phy", "gp"))
     assert len(experiment.cases()) == 2 * len(Planning.axes["system"])
@@ -276,12 +280,14 @@ def test_mc_pilcos_cost_is_that_of_angle_and_place():
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_policy_is_searched_for_and_the_last_second_is_watched():
     trials = Planning(settings=FEW).run("plain", "search", 0)["trials"]
     assert len(trials["cost"]) == 2
     assert all(0 <= lean <= 180 for lean in trials["last_lean"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("system", "learner"), [("plain", "fitted"), ("friction", "structured")])
 def test_the_fitted_baselines_find_the_parameters(system, learner):
     env = environment(system, PlanningSettings())

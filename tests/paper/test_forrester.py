@@ -27,6 +27,7 @@ def test_readings_of_the_crude_function():
     assert ((X >= -0.6) & (X <= 1)).all()
 
 
+@pytest.mark.slow
 def test_smoke(tmp_path):
     """One data set for each protocol; the tables of the runs that are committed."""
     settings = Settings(steps=2, lengthscales=(0.5, 1.0), ridges=(0.01,))

@@ -2,9 +2,12 @@
 
 import json
 
+import pytest
+
 from paper.__main__ import main
 
 
+@pytest.mark.slow
 def test_curves(tmp_path, monkeypatch):
     out = tmp_path / "curves"
     only = ["diffusion", "physics", "coupled", "components"]

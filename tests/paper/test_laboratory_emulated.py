@@ -12,6 +12,7 @@ SMALL = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["emulated", pytest.param("balldrop", marks=pytest.mark.slow)])
 @pytest.mark.filterwarnings("ignore")
 def test_it_runs(name, tmp_path, monkeypatch):

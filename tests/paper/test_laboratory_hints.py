@@ -1,5 +1,6 @@
 """Hints: the data of each kind, and a run."""
 
+import pytest
 import torch
 
 from paper.laboratory import Hints
@@ -20,6 +21,7 @@ def test_data_differ_in_their_kind_alone():
     assert wide.max() / wide.min() > 20
 
 
+@pytest.mark.slow
 def test_a_run():
     experiment = Hints()
     found = {"data": "outliers", "problem": "currin", "seed": 7}

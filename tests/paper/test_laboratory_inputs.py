@@ -2,6 +2,8 @@
 
 import json
 
+import pytest
+
 from paper.__main__ import main
 
 
@@ -14,6 +16,7 @@ def run(monkeypatch, tmp_path, name, *options):
     return runs, (out / "tables.md").read_text()
 
 
+@pytest.mark.slow
 def test_noisy_inputs(tmp_path, monkeypatch):
     options = ["--only", "wave", "decay", "--observations", "12", "--observations-of-law", "12"]
     runs, tables = run(monkeypatch, tmp_path, "noisyinputs", *options)
@@ -22,6 +25,7 @@ def test_noisy_inputs(tmp_path, monkeypatch):
     assert "held by 95 %" in tables
 
 
+@pytest.mark.slow
 def test_repeats(tmp_path, monkeypatch):
     runs, tables = run(monkeypatch, tmp_path, "repeats", "--only", "400", "copies", "map")
     assert len(runs) == 4

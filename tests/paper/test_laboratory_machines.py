@@ -2,6 +2,8 @@
 
 import json
 
+import pytest
+
 from paper.__main__ import main
 
 
@@ -12,6 +14,7 @@ def ran(monkeypatch, out, name, *options):
     return [json.loads(line) for line in (out / "runs.jsonl").read_text().splitlines()]
 
 
+@pytest.mark.slow
 def test_sisters(tmp_path, monkeypatch):
     options = ["--only", "one", "--known", "8", "--tests", "20"]
     runs = ran(monkeypatch, tmp_path / "sisters", "sisters", *options)
@@ -20,6 +23,7 @@ def test_sisters(tmp_path, monkeypatch):
     assert "geometric mean" in (tmp_path / "sisters" / "tables.md").read_text()
 
 
+@pytest.mark.slow
 def test_drift(tmp_path, monkeypatch):
     options = ["--steps", "60", "--first", "24", "--num-features", "8", "--refit-every", "24"]
     runs = ran(monkeypatch, tmp_path / "drift", "drift", *options)

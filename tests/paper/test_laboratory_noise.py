@@ -7,6 +7,7 @@ import pytest
 from paper.__main__ import main
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "options", "number"),
     [

@@ -2,9 +2,12 @@
 
 import json
 
+import pytest
+
 from paper.__main__ import main
 
 
+@pytest.mark.slow
 def test_vanishing(tmp_path, monkeypatch):
     out = tmp_path / "vanishing"
     options = ["--runs", "2", "--only", "ball", "misplaced", "--jobs", "1", "--out", str(out)]

@@ -58,6 +58,7 @@ def recorded(experiment, cases):
     ]
 
 
+@pytest.mark.slow
 def test_runs_and_their_tables(tmp_path):
     learners = ("phy", "fitted", "gp", "cka-identified")
     settings = RealSettings(windows=2, drawn=25)
@@ -145,6 +146,7 @@ def energy(machine, states, p):
     return (links + rotors) / 2 - 9.81 * heights
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MACHINES)
 def test_least_squares_finds_the_parameters(name):
     machine = MACHINES[name]
@@ -309,6 +311,7 @@ def test_sensor_of_a_root_slows_where_it_is_flat():
     assert_close(change, 0.04 * (2.0 - level.sqrt()))
 
 
+@pytest.mark.slow
 def test_free_run_ends_where_inflow_is_outflow():
     lower = torch.full((800,), 5.0).double()
     actions = torch.full((800,), 2.0).double()
@@ -381,6 +384,7 @@ def test_which_systems_have_kinks(name):
     assert growth > 2 if name in KINKS else growth < 1.2
 
 
+@pytest.mark.slow
 def test_physics_is_crude_and_data_are_as_told():
     settings = KinksSettings(held_out=10, steps=5)
     for system in SYSTEMS.values():
@@ -422,6 +426,7 @@ def test_targets_of_kinks(tmp_path):
     assert row in found["intervals"].text
 
 
+@pytest.mark.slow
 def test_a_run_of_few_transitions(tmp_path, monkeypatch):
     monkeypatch.setitem(Kinks.axes, "n", {8: "8"})
     settings = KinksSettings(held_out=20, steps=4)

@@ -95,6 +95,7 @@ def test_integrated_variance_of_outputs_is_the_sum_in_their_units(kind):
     torch.testing.assert_close(found.detach(), expected.reshape(1), rtol=1e-3, atol=0)
 
 
+@pytest.mark.slow
 def test_all_learners_of_a_seed_begin_alike(tmp_path):
     system = problem("forrester", 0)
     points = {
@@ -298,6 +299,7 @@ def test_targets_of_misled(tmp_path):
     assert "| moved peak | SingleTaskGP | 3 | 0.4 | 0.4 | 0 | 3 |  |" in rows
 
 
+@pytest.mark.slow
 def test_a_run_of_few_trials(tmp_path):
     main(Misled(out=tmp_path, runs=2, jobs=1, only=("unrelated",), settings=FEW))
     text = (tmp_path / "tables.md").read_text()

@@ -238,6 +238,7 @@ def test_targets(tmp_path):
     assert "| currin, N = 10 | 0.4 (1.00) | 0.2 (1.00) |" in found["textbook"].text
 
 
+@pytest.mark.slow
 def test_a_run_of_few(tmp_path):
     settings = PolynomialsSettings(num_test=20, num_low=10)
     main(Polynomials(out=tmp_path, runs=2, seed=7, jobs=1, only=("growth",), settings=settings))

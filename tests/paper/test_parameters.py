@@ -91,6 +91,7 @@ def test_targets(tmp_path):
     assert found.count("missed") == 2
 
 
+@pytest.mark.slow
 def test_a_run_of_two_cases(tmp_path):
     settings = Settings(compared=0, long=0)
     main(Ridges(out=tmp_path, runs=2, jobs=1, only=("beam", "focus"), settings=settings))

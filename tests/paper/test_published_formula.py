@@ -12,6 +12,7 @@ from paper.published.formula import cells, judge
 RUN = {"group": "kinds", "problem": "decay", "size": 5, "noise": 0.0, "held": [0.9]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind", [("kinds", "decay"), ("right", "lens"), ("laws", "creep"), ("functions", "forrester")]
 )

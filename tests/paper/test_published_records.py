@@ -20,6 +20,7 @@ def ran(monkeypatch, out, name, *options):
     return [json.loads(line) for line in (out / "runs.jsonl").read_text().splitlines()]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_emps(tmp_path, monkeypatch):
     options = ["--rows", "600", "--every", "20", "--rounds", "5"]

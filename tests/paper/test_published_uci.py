@@ -45,6 +45,7 @@ def test_there_are_twenty_splits():
         Uci(runs=2, seed=19).check()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [("cka", "gp", "ensemble"), ("formula", "single", "feature")])
 def test_uci(method, tmp_path, monkeypatch):
     out = tmp_path / "uci"

@@ -86,6 +86,7 @@ def test_an_interrupted_call_goes_on_and_a_larger_one_adds(tmp_path):
     assert len(calls(tmp_path)) == len(set(calls(tmp_path))) == 8
 
 
+@pytest.mark.slow
 def test_runs_in_other_processes(tmp_path):
     register_pickle_by_value(sys.modules[__name__])  # which they cannot import
     try:
@@ -337,6 +338,7 @@ def test_a_full_disk_loses_only_what_is_being_written(tmp_path, monkeypatch):
     assert file.path.read_bytes() == before
 
 
+@pytest.mark.slow
 def test_a_killed_process_leaves_whole_runs(tmp_path):
     code = (
         "import os, sys\nfrom pathlib import Path\n"

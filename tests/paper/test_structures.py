@@ -74,6 +74,7 @@ def test_cells():
         Structures(only=("pendulums",)).check()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["arm", "cart-pole", "pendulum", "double-pendulum"])
 def test_transitions(name):
     """Few are part of many; all go on from where the one before ended, or are of records."""
@@ -177,6 +178,7 @@ def test_targets(tmp_path, changes, missed):
     assert {name for name, verdict in verdicts.items() if verdict == "missed"} == missed
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
 def test_a_small_run(tmp_path):
     few = {"runs": 2, "seed": 0, "only": ("decay",)}

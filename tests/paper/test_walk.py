@@ -3,6 +3,8 @@
 import sys
 from pathlib import Path
 
+import pytest
+
 import paper.calibration.calibration  # not while files are counted  # noqa: F401
 from paper.calibration import Calibration, Settings
 from paper.common.runner import main
@@ -11,6 +13,7 @@ from paper.report import PAPER
 FILES, OF_PAPER = 35, 7  # of the library and of paper/ in a run of point fits, its tables included
 
 
+@pytest.mark.slow
 def test_one_experiment_passes_few_files(tmp_path):
     only, settings = ("forrester", "5", "map"), Settings(num_test=20)
     experiment = Calibration(out=tmp_path, runs=2, jobs=1, only=only, settings=settings)

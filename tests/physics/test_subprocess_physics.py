@@ -78,6 +78,7 @@ def test_failures_say_what_the_program_wrote(law):
         SubprocessPhysics([sys.executable, "-c", "print('done')"])(line(1))
 
 
+@pytest.mark.slow
 def test_a_run_that_takes_too_long_is_ended_with_all_that_it_started(tmp_path):
     late = tmp_path / "late"
     child = f"import time; time.sleep(3); open({str(late)!r}, 'w')"

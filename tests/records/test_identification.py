@@ -45,6 +45,7 @@ def found():
     return quickly(Records(oscillation(121), SPEC), spring(Unknown(1.5, factor=1.5, unit="1/s²")))
 
 
+@pytest.mark.slow
 def test_parameters_noise_and_a_free_run_that_errs_by_the_noise(found):
     low, high = found.parameters.interval()
     assert low < TRUE < high
@@ -61,6 +62,7 @@ def test_parameters_noise_and_a_free_run_that_errs_by_the_noise(found):
     assert "guesses: " in repr(found)
 
 
+@pytest.mark.slow
 def test_what_is_held_out_is_not_learnt_from(found):
     """Another end of the log changes neither states nor parameters, and is followed as badly."""
     (record,) = Records(oscillation(121), SPEC)
@@ -85,6 +87,7 @@ def test_functions_of_the_dynamics_have_parameters_of_their_own(found):
     assert float(spread) == pytest.approx(float(found.parameters.sd[0]), rel=0.1)
 
 
+@pytest.mark.slow
 def test_several_records_and_gaps_each_have_an_end():
     long, other, short = oscillation(61), oscillation(61, seed=1), oscillation(12, seed=2)
     times = long.times.clone()
@@ -95,6 +98,7 @@ def test_several_records_and_gaps_each_have_an_end():
     assert [len(each.times) for each in found.smoothed.records] == [25, 21, 46, 12]
 
 
+@pytest.mark.slow
 def test_a_physics_without_unknowns_is_judged_too():
     found = quickly(Records(oscillation(60, known=("x", "v")), SPEC), spring(), start=None)
     assert found.parameters is None
@@ -143,6 +147,7 @@ def test_bad_arguments(case):
         quickly(given.pop("records"), given.pop("physics"), **given)
 
 
+@pytest.mark.slow
 def test_actions_that_vary_within_a_step_and_angles_that_jump_are_said():
     record = oscillation(121)
     records = Records(record, StateSpec(["x", "v"], ["u"], step=2 * STEP))

@@ -123,6 +123,7 @@ def test_the_smoother_is_the_conditional_distribution_of_all_states(chain):
             row += 3
 
 
+@pytest.mark.slow
 def test_draws_have_the_moments_and_one_constant(chain):
     mean, covariance, _ = dense(*chain)
     found, rng = smooth_chain(*chain)[0], np.random.default_rng(0)
@@ -133,6 +134,7 @@ def test_draws_have_the_moments_and_one_constant(chain):
     np.testing.assert_allclose(np.cov(paths.T), covariance, atol=0.06)
 
 
+@pytest.mark.slow
 def test_progress_is_shown_when_it_is_asked_for(capsys):
     t = 0.1 * torch.arange(12, dtype=torch.float64)
     record = Record(t, torch.stack([t.sin(), t.cos()], -1), torch.zeros(12, 1).double())
@@ -141,6 +143,7 @@ def test_progress_is_shown_when_it_is_asked_for(capsys):
         assert ("start 2 of 2" in capsys.readouterr().err) == progress
 
 
+@pytest.mark.slow
 def test_noise_process_noise_parameters_and_states_are_found():
     runs = [simulated(seed) for seed in range(2)]
     records = Records([measured(*run, seed) for seed, run in enumerate(runs)], SPEC)
@@ -177,6 +180,7 @@ def test_parameters_are_not_biased_by_noise_in_the_inputs():
     assert float(found.noise) == pytest.approx(1.5, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_hidden_state_and_rows_that_were_not_measured():
     truth, actions = simulated(0)
     states = measured(truth, actions).states
@@ -197,6 +201,7 @@ def test_a_hidden_state_and_rows_that_were_not_measured():
     assert inside(torch.tensor([STIFFNESS, DAMPING]), found.physics_parameters.interval(0.99))
 
 
+@pytest.mark.slow
 def test_what_is_known_of_the_errors_is_kept():
     truth, actions = simulated(0)
     noise = torch.tensor([0.02, math.nan])
@@ -205,6 +210,7 @@ def test_what_is_known_of_the_errors_is_kept():
     assert found.noise[1] == pytest.approx(0.1, rel=0.25)
 
 
+@pytest.mark.slow
 def test_angles_may_come_wrapped_and_the_physics_may_wrap_them():
     def turn(X):
         q = X[:, 0] + STEP * X[:, 1]
@@ -225,6 +231,7 @@ def test_angles_may_come_wrapped_and_the_physics_may_wrap_them():
     torch.testing.assert_close(*paths)
 
 
+@pytest.mark.slow
 def test_a_model_learns_from_draws_segment_by_segment():
     truth, actions = simulated(0)
     record = measured(truth, actions)
@@ -266,6 +273,7 @@ def test_a_state_that_one_record_lacks_starts_about_where_it_is_in_others():
     assert found.process_noise[1] < 0.1
 
 
+@pytest.mark.slow
 def test_a_turning_angle_goes_on_over_a_gap():
     spec = StateSpec(["q", "dq"], ["u"], angles=["q"])
     times = STEP * torch.arange(80).double()
@@ -283,6 +291,7 @@ def test_a_turning_angle_goes_on_over_a_gap():
     torch.testing.assert_close(found.records.records[0].states[:, 0], 12 * times, atol=0.1, rtol=0)
 
 
+@pytest.mark.slow
 def test_earlier_outputs_are_those_of_the_smoothed_states():
     truth, actions = simulated(0)
     spec = StateSpec(["x", "v", "x_1"], ["force"], previous={"x_1": "x"})
@@ -294,6 +303,7 @@ def test_earlier_outputs_are_those_of_the_smoothed_states():
     assert noise[2] == found.process_noise[2] == 0
 
 
+@pytest.mark.slow
 def test_a_step_that_goes_where_the_physics_fails_is_taken_in_part():
     truth, actions = simulated(0)
 

@@ -103,6 +103,7 @@ def test_the_evidence_is_that_of_a_dense_gaussian():
     assert float(found) == pytest.approx(float(density) - constant, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_what_varies_is_found_and_what_does_not_is_small(varied):
     stiffness, damping = varied[0].variation.tolist()
     assert 0.3 < stiffness < 0.8
@@ -111,6 +112,7 @@ def test_what_varies_is_found_and_what_does_not_is_small(varied):
     assert steady[0] < 0.06
 
 
+@pytest.mark.slow
 def test_intervals_hold_where_the_machine_varies(varied):
     found, dynamics = varied
     others = strokes(25, 0.5, seed=1)
@@ -120,6 +122,7 @@ def test_intervals_hold_where_the_machine_varies(varied):
     assert not run.lost.any()
 
 
+@pytest.mark.slow
 def test_another_friction_law_at_forces_that_were_not_learnt_from():
     """The equation lacks Coulomb friction; four times the forces, and so other rates."""
     found, dynamics = learnt(strokes(10, 0.0, seed=2, friction=0.3))
@@ -161,6 +164,7 @@ def test_bad_variations(varied, variation, message):
         varied[1].free_run(states, actions, variation="much")
 
 
+@pytest.mark.slow
 def test_there_have_to_be_unknown_parameters():
     physics = spring()
     states, actions = torch.zeros(1, 2).double(), torch.zeros(1, 2, 1).double()
@@ -171,6 +175,7 @@ def test_there_have_to_be_unknown_parameters():
         _ = smooth(strokes(3, 0.0, seed=0), known).variation
 
 
+@pytest.mark.slow
 def test_a_turn_in_a_gap_is_no_variation():
     def coasting(X, p):
         speed = X[:, 1] * (1 - STEP * p.drag)

@@ -242,6 +242,7 @@ def test_help_has_an_example_and_needs_no_torch():
     assert "--inputs flow,speed --outputs head --physics pump:head" in run.stdout
 
 
+@pytest.mark.slow
 def test_kinds_of_data(folder, read, undrawn):
     rigs = ["old", "new", "lent"]
     rows = [f"{x},{rigs[i % 3]},{y + 3}" for i, (x, y) in enumerate(ROWS)]
@@ -377,6 +378,7 @@ def test_a_function_needs_its_inputs(folder, capsys):
     assert "Expected --inputs, the columns that hill:wave reads" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_workbook_is_as_a_csv_file(folder, read, capsys, undrawn):
     book = openpyxl.Workbook()
     for row in [("time [s]", "head [m]", "note"), *((x, y, None) for x, y in ROWS), (None, None)]:
@@ -404,6 +406,7 @@ def test_a_workbook_is_as_a_csv_file(folder, read, capsys, undrawn):
     assert "expected a workbook, *.xlsx, but" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_of_many_rows_some_are_drawn(folder, read, capsys, undrawn):
     rows = "".join(f"{i / 1e5},{i % 7}\n" for i in range(100_000))
     (folder / "data.csv").write_text("time,head\n" + rows)

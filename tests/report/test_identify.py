@@ -57,6 +57,7 @@ def folder(tmp_path, monkeypatch):
     sys.modules.pop("swing", None)
 
 
+@pytest.mark.slow
 def test_a_page_of_true_parameters_noise_and_a_free_run(folder, read, capsys):
     assert main(["identify", "log.csv", *STATES, *DRY, *QUICKLY]) == 0
     out, err = capsys.readouterr()
@@ -91,6 +92,7 @@ def test_a_page_of_true_parameters_noise_and_a_free_run(folder, read, capsys):
     assert {each.name for each in folder.iterdir()} == {*("log.csv", "swing.py", "identify.html")}
 
 
+@pytest.mark.slow
 def test_what_the_equations_lack_is_said(folder, read, undrawn_log):
     """Without dry friction the viscous one is wrong, and so are the intervals."""
     assert main(["identify", "log.csv", *STATES, *VISCOUS, *QUICKLY, "--title", "A swing"]) == 0
@@ -99,6 +101,7 @@ def test_what_the_equations_lack_is_said(folder, read, undrawn_log):
     assert "the physics lacks something whose errors last longer" in page.text
 
 
+@pytest.mark.slow
 def test_a_physics_of_a_module_has_a_step_of_its_own(folder, read, undrawn_log):
     given = ["--physics", "swing:physics", "--starts", "1", "--out", "module.html"]
     assert main(["identify", "log.csv", *STATES, *given]) == 0
@@ -117,6 +120,7 @@ def test_without_actions_there_is_the_time_and_next_values_are_equations_too(fol
     assert "FormulaPhysics.of_formula" not in text
 
 
+@pytest.mark.slow
 def test_python_makes_the_same_page_of_an_identification(folder, read, undrawn_log):
     from tests.records.test_identification import SPEC, START, oscillation, spring
 

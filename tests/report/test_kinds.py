@@ -47,6 +47,7 @@ def named(d, m):
     return model
 
 
+@pytest.mark.slow
 def test_names_are_shown_as_they_are(tmp_path, read, monkeypatch):
     page = read(report(named(1, 1), tmp_path / "report.html", rows=[NASTY[0]] * 12))
     assert "<script>alert" in page.text
@@ -183,6 +184,7 @@ def test_the_whole_command_by_an_interpreter_of_its_own(tmp_path, read, monkeypa
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
+@pytest.mark.slow
 def test_errors_and_coverage_are_without_outliers(tmp_path, read):
     X = torch.linspace(0, 1, 20, dtype=torch.float64).unsqueeze(-1)
     noise = torch.randn(20, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -207,6 +209,7 @@ def test_errors_and_coverage_are_without_outliers(tmp_path, read):
         assert (n, row[2]) == ("19", f"{100 * int(held) / 19:.0f} %")
 
 
+@pytest.mark.slow
 def test_categories_have_their_names(tmp_path, read):
     pandas = pytest.importorskip("pandas")
     x = torch.linspace(0, 1, 12, dtype=torch.float64)

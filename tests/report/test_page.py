@@ -20,6 +20,7 @@ from gpadjust.validation import Gain
 from .conftest import Page, f_p
 
 
+@pytest.mark.slow
 def test_a_comparison(comparison, tmp_path, read):
     path = report(comparison, tmp_path / "report.html", rows=range(2, 12), settings={"seed": 7})
     assert {each.name for each in tmp_path.iterdir()} == {"report.html", "report.pt"}

@@ -62,6 +62,7 @@ def go_on(agent, *callbacks):
     return agent.learn(TOTAL - agent.num_timesteps, [*callbacks], reset_num_timesteps=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "step", "layers"),
     [

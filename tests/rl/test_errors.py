@@ -150,6 +150,7 @@ class Jams(gymnasium.Wrapper):
         return observation, reward, terminated, truncated or failed, info | {"step_failed": failed}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jams", [(0,), (3,), (5, 6), (4, 9)])
 def test_a_step_that_failed_is_no_data(point_agent, point_env, learnt_dynamics, jams):
     dynamics = learnt_dynamics()

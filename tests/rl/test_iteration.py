@@ -17,6 +17,7 @@ from gpadjust.systems.swing_up import CART_POLE_SPEC, cart_pole_reward
 from tests.rl.conftest import model_rows
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "updates"),
     [
@@ -100,6 +101,7 @@ def test_after_last_model_episode_batches_hold_no_model_rows(point_agent):
     assert model_rows(agent) == 2 * 2 * 5
 
 
+@pytest.mark.slow
 def test_a_long_run_in_pieces_goes_on(point_agent, sampled_dynamics):
     dynamics = sampled_dynamics()
     agent = point_agent(dynamics=dynamics)
@@ -113,6 +115,7 @@ def test_a_long_run_in_pieces_goes_on(point_agent, sampled_dynamics):
     assert agent.num_episodes == 5
 
 
+@pytest.mark.slow
 def test_dynamics_learn_each_real_transition_once(point_agent, learnt_dynamics):
     seen = []
     dynamics = learnt_dynamics()
@@ -203,6 +206,7 @@ def test_a_first_episode_of_a_single_step_waits_for_the_second(
     assert agent._n_updates == 3 + 3 * 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", [DynaSAC, DynaTD3])
 def test_a_trivial_task_is_improved(point_agent, algorithm):
     def cost(agent):
@@ -227,6 +231,7 @@ def test_a_trivial_task_is_improved(point_agent, algorithm):
     assert cost(agent) < 0.2 * before
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The draws of")  # there are 16
 def test_cart_pole(cart_pole):
     dynamics = LearnedDynamics(

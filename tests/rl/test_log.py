@@ -133,6 +133,7 @@ def test_a_hook_that_raises_lets_nothing_be_learnt_twice(point_agent, learnt_dyn
     assert dynamics.num_transitions == 10
 
 
+@pytest.mark.slow
 def test_scores_of_trajectories_are_logged_and_change_nothing(
     point_agent, sampled_dynamics, assert_same
 ):

@@ -289,6 +289,7 @@ def test_bounds_give_way_to_the_starts(point_particles, rise):
     assert particles.task.state_bounds.tolist() == [[0.0], [5.0]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sampling", ["step", "trajectory"])
 @pytest.mark.parametrize("rows", [0, 1, 7])
 def test_refreshed_transitions_end_as_the_model_has_it(

@@ -15,6 +15,7 @@ from gpadjust.systems.swing_up import CART_POLE_RAW_SPEC, cart_pole_reward, cart
 SMALL = {"batch_size": 8, "policy_kwargs": {"net_arch": [8]}, "seed": 0, "device": "cpu"}
 
 
+@pytest.mark.slow
 def test_actions_taken_in_the_model_are_remembered():
     raw = CART_POLE_RAW_SPEC
     spec = StateSpec([*raw.states, "last"], raw.actions, previous={"last": raw.actions[0]})

@@ -53,6 +53,7 @@ def test_with_dynamics_but_no_environment_it_says_so(saved, learnt_dynamics, poi
         loaded.learn(5)
 
 
+@pytest.mark.slow
 def test_with_dynamics_a_loaded_agent_goes_on(
     point_agent, point_env, sampled_dynamics, point_task, tmp_path
 ):

@@ -81,6 +81,7 @@ def expected_failures(regressor):
     return {"check_regressor_multioutput": "y has five columns, the physics has one"}
 
 
+@pytest.mark.slow
 @parametrize_with_checks([CKARegressor(fit_method="map", fit_options=FAST)], legacy=True)
 def test_scikit_learn_accepts_it(estimator, check):
     check(estimator)
@@ -97,6 +98,7 @@ def test_scikit_learn_accepts_it_by_full_bayes_and_with_physics(estimator, check
     check(estimator)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [None, "map"])
 @pytest.mark.parametrize("noise", [False, True])
 def test_it_says_what_the_model_says(data, method, noise):
@@ -180,6 +182,7 @@ def test_the_seed_of_draws(data):
     assert (regressor.sample_y(Z, 1, state) != regressor.sample_y(Z, 1, state)).all()
 
 
+@pytest.mark.slow
 def test_the_seed_of_the_fit(data):
     def scales(state):
         regressor = CKARegressor(wave, random_state=state, fit_options={"num_draws": 16})

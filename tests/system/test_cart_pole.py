@@ -74,6 +74,7 @@ def test_power_of_force_and_friction_changes_the_energy(states_and_forces):
     torch.testing.assert_close(power, (forces[:, 0] - REAL_CART_POLE.damping * x_dot) * x_dot)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seconds", [3, pytest.param(10, marks=pytest.mark.slow)])
 def test_energy_is_conserved_without_damping(seconds):
     equation = CartPoleEquation(0.5, 0.5, 0.6, 0.0)

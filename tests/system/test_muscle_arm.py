@@ -285,6 +285,7 @@ def test_failed_integration_truncates_and_reset_recovers(arm, speed):
     assert same(rollout(start(arm)), expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "num_trials",
     [
@@ -305,6 +306,7 @@ def test_random_trials_do_not_fail(arm, num_trials):
             assert arm.observation_space.contains(observation)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_trials", [300, pytest.param(1000, marks=pytest.mark.slow)])
 def test_resets_do_not_leak_memory(arm, num_trials):
     def resident():
@@ -415,6 +417,7 @@ def test_nothing_is_printed_and_no_log_is_written(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_without_opensim_only_the_arm_is_missing(tmp_path):
     """And an id with the package needs no import of it."""
     code = (

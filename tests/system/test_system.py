@@ -212,6 +212,7 @@ def test_each_row_has_the_parameters_that_it_is_given():
     torch.testing.assert_close(found, heavier(states, actions), rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [systems.cart_pole, systems.arm])
 def test_its_parameters_are_found_by_least_squares(make):
     system = make(unknowns=True)
@@ -233,6 +234,7 @@ def test_its_parameters_are_found_by_least_squares(make):
     assert {n: found[n].median().item() for n in found} == pytest.approx(truth, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_noise_of_sensors_has_its_size_and_leaves_rewards_alone():
     noise = {"theta": 0.1, "x_dot": 0.5}
     seen, true = systems.cart_pole(noise=noise).make(), systems.cart_pole().make()

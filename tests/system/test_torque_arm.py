@@ -75,6 +75,7 @@ def test_equation_and_energy_are_those_of_the_lagrangian(mechanics, states_and_a
     torch.testing.assert_close(equation.energy(states), energy)
 
 
+@pytest.mark.slow
 def test_energy_is_conserved_for_2_s_without_damping_and_torque(states_and_actions):
     equation = replace(OTHER_ARM, damping=0.0)
     physics = ODEPhysics(equation, step=0.2, state_dim=4, substeps=200)

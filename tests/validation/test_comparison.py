@@ -264,6 +264,7 @@ def test_rounding_errors_show_nothing(X):
     assert says(comparison, "Scaling the physics is not shown to help: elpd +0.0")
 
 
+@pytest.mark.slow
 def test_cka_stands_beside_what_few_observations_show(X, noise):
     """The physics mean is right, and better; twelve times the observations show it."""
     names, weights = ["physics mean", "CKA"], []
@@ -345,6 +346,7 @@ class TestAdvice:
         assert "elpd +8.0 +- 0.0 nats (CKA)" in finding
         assert "by the evidence of a model with and without the physics" in reason
 
+    @pytest.mark.slow
     def test_one_physics_of_no_use_does_not_hide_another(self, X, noise):
         parts = {"good": crude, "unrelated": lambda X: (23 * X + 1).cos()}
         comparison = compare(X, 2 * crude(X) + X + noise, parts, **QUICK)

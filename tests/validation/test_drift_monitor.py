@@ -33,6 +33,7 @@ def first_alarm(model, monitor, scale, n=200):
     return None
 
 
+@pytest.mark.slow
 def test_what_does_not_drift_gives_no_alarm(model):
     assert first_alarm(model, DriftMonitor(model), 1.2) is None
 

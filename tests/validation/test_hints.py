@@ -68,6 +68,7 @@ def test_categories(noise):
     assert "categorical=['x2'] (--categories x2)" in hint
 
 
+@pytest.mark.slow
 def test_of_a_comparison_each_output_has_its_own(noise):
     Y = torch.cat([truth(X) + noise, truth(X) + 100 + noise], -1)
     Y[7, 1] += 40

@@ -57,6 +57,7 @@ def check(construct, kind, model, X, Y, Yvar=None, **options):
     assert not loo.variance.requires_grad
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["plain", "known-noise", "transformed", "batch"])
 def test_it_is_rebuilding_without_the_point(data, construct, kind, num_outputs, shuffle, case):
     X, Y = data(batch_shape=(2,) if case == "batch" else (), n=7, num_outputs=num_outputs)

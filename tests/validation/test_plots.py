@@ -73,6 +73,7 @@ def test_inducing_points(data):
     assert plot_adjustment_pair(model, num_points=4).shape == (2, 2)
 
 
+@pytest.mark.slow
 def test_a_prediction_of_one_input(line, forrester):
     X = forrester.test_X.flip(0)
     ax = plot_prediction(line, X, forrester.truth(X))

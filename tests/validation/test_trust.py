@@ -40,6 +40,7 @@ def _close_figures():
     plt.close("all")
 
 
+@pytest.mark.slow
 def test_each_side_is_found_where_it_is(half):
     Z = torch.tensor([[-2.0], [0.1], [0.3], [0.8], [0.95]], dtype=torch.float64)
     found = trust(half, Z)
@@ -86,6 +87,7 @@ def test_without_data_there_is_neither():
     assert trust(model, line(3, 4, 20)).neither.item() == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shift", [0.0, 1e3])
 def test_units_make_no_difference(half, shift):
     X = line(0, 1, 20)
@@ -131,6 +133,7 @@ def test_inducing_points_fall_back_to_the_physics_too(data):
     assert trust(model, num_points=9).side.shape == (9, 2)
 
 
+@pytest.mark.slow
 def test_of_several_physics_the_weighted_sum_counts():
     X = line(0, 1, 12)
     physics = {"wave": wave, "line": lambda X: X}
@@ -156,6 +159,7 @@ def test_a_model_that_holds_samples_is_judged_as_their_mixture(data, held, num_o
     torch.testing.assert_close(model.fallback(Z), singles[0].fallback(Z))
 
 
+@pytest.mark.slow
 def test_the_model_of_learned_dynamics(uniform):
     spec = StateSpec(["x", "angle"], ["v"], angles=["angle"])
     dynamics = LearnedDynamics(spec, lambda X: X[:, :2] + 0.1 * X[:, 2:])
