@@ -44,7 +44,8 @@ class Identification:
         runs: Free runs along the windows: ``"identified"``, and ``"guesses"`` by the parameters
             that were guessed, if there are any.
         step: The control step, in the unit of the times.
-        remarks: Sentences on the log itself: actions that vary within a step, angles that jump.
+        remarks: Sentences on the log itself: gaps, actions that vary within a step, angles that
+            jump.
     """
 
     smoothed: SmoothedRecords
@@ -240,7 +241,9 @@ def identify(
         )
     times = stretches[0].times
     length = float(times[1] - times[0])
-    remarks = (*_of_actions(records, length), *_of_jumps(records))
+    told = f"Gaps part the log into {len(stretches)} stretches, each smoothed by itself."
+    gaps = [told] * (len(stretches) > len(records.records))
+    remarks = (*gaps, *_of_actions(records, length), *_of_jumps(records))
     return Identification(smoothed, drawn, windows, runs, length, remarks)
 
 

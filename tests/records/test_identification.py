@@ -161,6 +161,15 @@ def test_actions_that_vary_within_a_step_and_angles_that_jump_are_said():
     assert not any("vary" in each for each in quickly(Records(held, spec), physics).advice)
 
 
+@pytest.mark.slow
+def test_gaps_are_said():
+    record = oscillation(121)
+    kept = (record.times < 6.0) | (record.times > 6.35)
+    parted = Record(record.times[kept], record.states[kept], record.actions[kept])
+    found = quickly(Records(parted, SPEC), spring(Unknown(1.5, factor=1.5)))
+    assert "Gaps part the log into 2 stretches, each smoothed by itself." in found.advice
+
+
 @pytest.mark.parametrize(
     ("turn", "way"), [(2 * math.pi, "say so"), (360.0, "convert it to rad, and say so")]
 )
