@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from argparse import ArgumentParser, ArgumentTypeError, RawDescriptionHelpFormatter
 from collections.abc import Callable, Sequence
+from typing import Any
 
 _ABOUT = """\
 One page that shows whether a crude physics model helps to predict your measurements, where it is
@@ -76,14 +77,7 @@ def parser() -> ArgumentParser:
         "sqrt, of several outputs with commas between them; or module:function. Several: give it "
         "again",
     )
-    add(
-        "--unknown",
-        action="append",
-        default=[],
-        metavar="E=2+-0.4",
-        help="an unknown number of the formula, its guess and standard deviation, which may be a "
-        "percentage; or a factor, E=2*/1.5; or bounds, E=1..3. Several: give it again",
-    )
+    add("--unknown", **_unknown("formula"))
     add(
         "--out",
         default="report.html",
@@ -171,14 +165,7 @@ def _add_identify(add_parser: Callable[..., ArgumentParser]) -> None:
         help="an equation for each state: \"a'=...\", its time derivative, or 'a=...', its next "
         "value; or module:name",
     )
-    add(
-        "--unknown",
-        action="append",
-        default=[],
-        metavar="E=2+-0.4",
-        help="an unknown number of the equations, its guess and standard deviation, which may be a "
-        "percentage; or a factor, E=2*/1.5; or bounds, E=1..3. Several: give it again",
-    )
+    add("--unknown", **_unknown("equations"))
     add(
         "--step",
         type=float,
@@ -241,6 +228,15 @@ def _seed(text: str) -> int:
     if not 0 <= seed < _SEEDS:
         raise ArgumentTypeError(f"expected a whole number from 0 to {_SEEDS - 1}, found {text!r}")
     return seed
+
+
+def _unknown(where: str) -> dict[str, Any]:
+    """The option of unknown numbers."""
+    text = (
+        f"an unknown number of the {where}, its guess and standard deviation, which may be a "
+        "percentage; or a factor, E=2*/1.5; or bounds, E=1..3. Several: give it again"
+    )
+    return {"action": "append", "default": [], "metavar": "E=2+-0.4", "help": text}
 
 
 def _positive(text: str) -> int:

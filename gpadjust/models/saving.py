@@ -162,6 +162,8 @@ def load(path: str | Path, *, trusted: bool = False, **objects: Any) -> Any:
             says which. Of a mixture each goes to the models that have it.
 
     Raises:
+        FileNotFoundError: If there is no such file.
+        PhysicsError: If a physics fails at the training inputs.
         TypeError: If ``trusted`` is not True or False.
         ValueError: If it is no such file, or damaged; if objects are missing, or given though the
             file holds them; if the module of the class was not imported; or if a physics is only

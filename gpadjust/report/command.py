@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import shlex
-import sys
 import warnings
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
@@ -30,6 +29,7 @@ from gpadjust.report.inputs import (
     open_table,
     pairs,
     read_table,
+    say,
 )
 from gpadjust.report.markup import listed, name_and_unit, plural
 from gpadjust.report.page import checked_path, write
@@ -65,16 +65,16 @@ def run(arguments: Namespace, command: Sequence[str]) -> None:
     options = _options(arguments, inputs, data.levels)
     physics = given_physics(arguments.physics, data, unknowns)
     names = (listed(data.Y.columns), listed(data.X.columns))
-    _say(f"{arguments.data}: {plural(len(data.lines), 'row')}, {names[0]} from {names[1]}.")
+    say(f"{arguments.data}: {plural(len(data.lines), 'row')}, {names[0]} from {names[1]}.")
     for remark in data.remarks:
-        _say(remark)
+        say(remark)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("default")
         model = _fitted(arguments, data, physics, variances, options)
         subject = subject_of(model, [f"line {line}" for line in data.lines])
     notes = notes_of(caught)
     for note in notes:
-        _say(f"Warning: {note}")
+        say(f"Warning: {note}")
     settings = {
         "command": f"gpadjust {shlex.join(command)}",
         "data file": f"{Path(arguments.data).name} (SHA-256 {data.digest}...)",
@@ -114,7 +114,7 @@ def _fitted(
     X, Y, f_p = data.X, data.Y, physics.physics
     if arguments.fit == "compare":
         return compare(X, Y, f_p, variances, seed=arguments.seed, progress=True, **options)
-    _say(f"Fitting CKA by {arguments.fit!r} ...")
+    say(f"Fitting CKA by {arguments.fit!r} ...")
     model = CKA(X, Y, variances, physics=f_p, **options)
     fit(model, arguments.fit, seed=arguments.seed)
     return model
@@ -141,10 +141,6 @@ def _inputs(
     found = columns_of(arguments.physics, others, unknowns)
     bare = {name_and_unit(name)[0] for name in found}
     return found + [name for name in groups if name not in found and name not in bare]
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
 
 
 def _options(

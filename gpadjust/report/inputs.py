@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import math
+import sys
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -157,7 +158,7 @@ def read_table(
         if isinstance(own[0], str):
             told = listed(f"{k} is {level}" for k, level in enumerate(own))
             remarks.append(f"The physics reads {name_and_unit(name)[0]} as a number: {told}.")
-    digest = hashlib.sha256(Path(table.file).read_bytes()).hexdigest()[:12]
+    digest = digest_of(table.file)
     columns = Columns(tuple(names[:d]), X), Columns(tuple(names[d:]), Y)
     return TableData(*columns, tuple(lines.tolist()), tuple(remarks), digest, levels)
 
@@ -194,6 +195,16 @@ def mark_of(text: str) -> str:
     if len(mark) != 1:
         raise ValueError(f"Expected --delimiter as one character, or tab, found {text!r}.")
     return mark
+
+
+def digest_of(file: str) -> str:
+    """The beginning of a file's SHA-256."""
+    return hashlib.sha256(Path(file).read_bytes()).hexdigest()[:12]
+
+
+def say(text: str) -> None:
+    """Print a line beside the result, while a command works."""
+    print(text, file=sys.stderr, flush=True)
 
 
 def notes_of(caught: Sequence[warnings.WarningMessage]) -> tuple[str, ...]:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 import shlex
-import sys
 import warnings
 from argparse import Namespace
 from ast import unparse
@@ -18,7 +16,7 @@ from gpadjust.physics import FormulaPhysics, ODEPhysics, Physics, PhysicsError, 
 from gpadjust.physics.formula import names_in, parse
 from gpadjust.records import Records, identify
 from gpadjust.report.given_physics import imported, is_path, needs_inf, unknown_of, unknowns_of
-from gpadjust.report.inputs import mark_of, names_of, notes_of, open_table
+from gpadjust.report.inputs import digest_of, mark_of, names_of, notes_of, open_table, say
 from gpadjust.report.log_page import LogOrigin, headline, write
 from gpadjust.report.markup import listed, name_and_unit
 from gpadjust.report.page import checked_path
@@ -55,7 +53,7 @@ def run(arguments: Namespace, command: Sequence[str]) -> None:
     unknowns = unknowns_of(arguments.unknown)
     marks = {"delimiter": mark_of(arguments.delimiter), "decimal": arguments.decimal}
     tables = [open_table(file, **marks) for file in arguments.data]
-    log = listed(f"{Path(file).name} (SHA-256 {_digest(file)}...)" for file in arguments.data)
+    log = listed(f"{Path(file).name} (SHA-256 {digest_of(file)}...)" for file in arguments.data)
     columns = _columns(arguments, tables, hidden)
     angles = names_of(arguments.angles, "--angles") if arguments.angles else []
     _check_angles(angles, columns)
@@ -76,7 +74,7 @@ def run(arguments: Namespace, command: Sequence[str]) -> None:
         )
     spec = StateSpec(*names, angles=angles, step=step)
     records = Records(read.records, spec)
-    _say(f"{listed(arguments.data)}: {listed(map(repr, read))}.")
+    say(f"{listed(arguments.data)}: {listed(map(repr, read))}.")
     options = {
         "start": starts or None,
         "held_out": arguments.held_out,
@@ -93,7 +91,7 @@ def run(arguments: Namespace, command: Sequence[str]) -> None:
             raise ValueError(str(error)) from error
     notes = notes_of(caught)
     for note in notes:
-        _say(f"Warning: {note}")
+        say(f"Warning: {note}")
     settings = {
         "command": f"gpadjust {shlex.join(command)}",
         "log": log,
@@ -292,11 +290,3 @@ noises = {{"start_noise": smoothed.sd[-1][-1], "process_noise": smoothed.process
 run = found.dynamics.free_run(state, plan, noise=False, **noises)
 print(run.mean, run.lower, run.upper)
 """
-
-
-def _digest(file: str) -> str:
-    return hashlib.sha256(Path(file).read_bytes()).hexdigest()[:12]
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)

@@ -62,7 +62,7 @@ def report(
         The path of the page.
 
     Raises:
-        TypeError: If ``model`` is something else.
+        TypeError: If ``model`` is something else, or there are ``rows`` for a log.
         ValueError: If the model was not fitted, is of a batch of data sets, ``rows`` are not ``n``,
             or ``file`` is not ``*.html``. Nothing is written then.
         OSError: If the files cannot be written.
@@ -80,8 +80,10 @@ def report(
         ['report.html', 'report.pt']
     """
     told = {name: str(value) for name, value in (settings or {}).items()}
-    path = checked_path(file)
+    path = checked_path(file, model=not isinstance(model, Identification))
     if isinstance(model, Identification):
+        if rows is not None:
+            raise TypeError("The page of a log has no names of rows; leave `rows` out.")
         return log_page.write(model, path, title, LogOrigin(settings=told))
     return write(subject_of(model, rows), path, title, Origin(settings=told), progress)
 

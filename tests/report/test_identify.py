@@ -125,6 +125,8 @@ def test_python_makes_the_same_page_of_an_identification(folder, read, undrawn_l
     from tests.records.test_identification import SPEC, START, oscillation, spring
 
     found = identify(Records(oscillation(40), SPEC), spring(), start=START)
+    with pytest.raises(TypeError, match="leave `rows` out"):
+        report(found, folder / "own.html", rows=["first"])
     path = report(found, folder / "own.html", settings={"day": "Monday"})
     page = read(path)
     assert ["day", "Monday"] in page.tables["How this page came about"]
