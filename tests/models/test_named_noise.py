@@ -9,9 +9,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from gpadjust import CKA, RRA, VariationalCKA, ZeroMeanGP, fit, load, save
+from gpadjust import CKA, RRA, VariationalCKA, ZeroMeanGP, compare, fit, load, save
 from gpadjust.models import Logit
 from gpadjust.models.heavy_tails import SHARE
+from gpadjust.report import report
+from gpadjust.sklearn import CKARegressor
 from gpadjust.validation import leave_one_out
 
 OPTIONS: Any = {"num_draws": 64, "num_starts": 2, "num_screened": 16}
@@ -113,6 +115,17 @@ def test_the_whole_house(names: Any, gross: tuple[Tensor, Tensor], tmp_path: Any
     assert bool((more.predict(one).variance < model.predict(one).variance).all())
     before = fit(model, "map")
     assert before.converged.shape == (2,)
+
+
+@pytest.mark.slow
+def test_compare_report_and_regressor(gross: tuple[Tensor, Tensor], tmp_path: Any) -> None:
+    X, Y = gross
+    found = compare(X, Y, physics=wave, likelihood="heavy-tailed", structures=["CKA"])
+    page = report(found, tmp_path / "page.html")
+    assert "outlier" in page.read_text().lower()
+    fitted = CKARegressor(wave, model_options={"likelihood": "heavy-tailed"}, fit_options=OPTIONS)
+    fitted.fit(X.numpy(), Y.numpy().ravel())
+    assert abs(float(fitted.predict([[0.65]])[0]) - float(wave(X.new_tensor([[0.65]]))) - 0.2) < 0.1
 
 
 @pytest.mark.slow

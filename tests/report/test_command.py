@@ -337,7 +337,7 @@ def test_a_formula_beside_a_function(folder, read, undrawn):
     (code,) = [text for text in read(folder / "report.html").codes if "load(" in text]
     names = {}
     exec(code, names)
-    assert names["mean"].shape == (1, 1)
+    assert abs(names["mean"] - 2 * (6 * names["X"]).sin() - names["X"]) < 0.2
 
 
 @pytest.mark.parametrize(
