@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP
-from gpadjust.models import BiasGP, PaperRRA
+from gpadjust.models import BiasGP
 from tests import systems
 from tests.systems import around, crude, truth
 
@@ -133,7 +133,6 @@ _CLASSES = {
     "CKA": CKA,
     "AR1": AR1,
     "RRA": RRA,
-    "RRA-paper": PaperRRA,
     "BiasGP": BiasGP,
 }
 _KINDS = [kind for kind in _CLASSES if kind != "BiasGP"]  # a PhysicsMeanGP by another name
@@ -145,7 +144,7 @@ def kind(request):
     return request.param
 
 
-_QUICK = ["CKA", "AR1", "RRA", "RRA-paper"]
+_QUICK = ["CKA", "AR1", "RRA"]
 
 
 @pytest.fixture(
@@ -185,10 +184,8 @@ def build():
         if kind == "AR1":
             options.setdefault("num_low", 12)
             options.setdefault("bounds", torch.tensor([[0.0] * X.shape[-1], [2.0] * X.shape[-1]]))
-        if kind.startswith("RRA"):
+        if kind == "RRA":
             options.setdefault("num_features", 24)
-        if kind == "RRA-paper":
-            options.pop("outcome_transform", None)  # it is always in the user's units
         return _CLASSES[kind](X, Y, Yvar, **options)
 
     return build

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gpadjust.gp import SumOfTerms
 from gpadjust.gp.gaussian import cholesky
-from gpadjust.models import PaperRRA, TermsModel, VariationalCKA
+from gpadjust.models import TermsModel, VariationalCKA
 from gpadjust.models.exact_conditioning import Factors, conditional_covariance
 from gpadjust.models.terms_gp import TermsGP
 
@@ -154,11 +154,6 @@ def _check(model: Any, about: str) -> None:
         raise TypeError(
             f"Expected a model with rho or delta (CKA, RRA, ScaleGP, PhysicsMeanGP, BiasGP), got "
             f"{name}; for a model without them, take BoTorch's qNegIntegratedPosteriorVariance."
-        )
-    if isinstance(model, PaperRRA):
-        raise TypeError(
-            "PaperRRA has a covariance that is not a posterior's, so that there is no information "
-            "to speak of; take RRA."
         )
     if about == "both":
         return

@@ -19,7 +19,7 @@ from gpadjust.dynamics import LearnedDynamics
 from gpadjust.dynamics.angle_input import AngleInput
 from gpadjust.gp import AppendedPhysics, PhysicsInput, Term
 from gpadjust.gp.kernels import stationary_parts
-from gpadjust.models import RRA, ParallelPartialGP, TermsModel, VariationalCKA
+from gpadjust.models import RRA, TermsModel, VariationalCKA
 from gpadjust.models.sparse_conditioning import inducing_root
 
 
@@ -121,7 +121,7 @@ class FiniteSum(NamedTuple):
 def model_of(fitted: Any) -> TermsModel:
     """A model, or that of dynamics; a TypeError if it is neither."""
     model = fitted.model if isinstance(fitted, LearnedDynamics) else fitted
-    if not isinstance(model, TermsModel) or isinstance(model, ParallelPartialGP):
+    if not isinstance(model, TermsModel):
         raise TypeError(
             "Expected a CKA, RRA, VariationalCKA, PhysicsMeanGP, ScaleGP or ZeroMeanGP, or "
             f"LearnedDynamics of one, got {type(model).__name__}."
@@ -201,8 +201,6 @@ def check_finite_sum(model: TermsModel, observation_noise: bool) -> None:
         why = "samples of a physics' parameters, each with its own f_p: fit(model, method='map')"
     elif not model.term_names:
         why = "known terms alone, which is its physics: take model.physics_parameters to yours"
-    elif model.covar_module.sister is not None:
-        why = "what sister machines taught: build it of the data of one machine"
     elif any(term.scaled_by for term in model.terms):
         why = "an emulated physics, which has errors: give FunctionPhysics(physics), without them"
     elif not all(isinstance(term.basis, AppendedPhysics | None) for term in model.terms):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import deepcopy
 from typing import Any
 
 import torch
@@ -14,7 +13,6 @@ from torch import Tensor
 from torch.nn import Module, ModuleDict, ModuleList
 
 from gpadjust.gp.categories import OffsetFeatures, OffsetKernel
-from gpadjust.gp.kernels import stationary_parts
 from gpadjust.gp.orthogonal_kernel import OrthogonalKernel
 from gpadjust.gp.term import SumOfTerms, Term, side_by_side
 from gpadjust.gp.vanishing_kernel import VanishingKernel
@@ -144,37 +142,9 @@ class SumFeatures(FeatureMap):
         return self.kernel.at(x).features(self.maps)
 
 
-def sum_features(kernel: SumOfTerms, terms: Sequence[Term], num_features: int) -> Any:
-    """Those of :func:`term_features` of a model's terms, and of ``sister``, if there is one."""
-    found = term_features(terms, num_features)
-    if kernel.sister is not None:
-        found["sister"] = SisterFeatures(kernel, num_features)
-    return found
-
-
 def term_features(terms: Sequence[Term], num_features: int) -> Any:
     """Random features of terms, by their names; see :class:`TermFeatures`."""
     return ModuleDict({term.name: TermFeatures(term, num_features) for term in terms})
-
-
-class SisterFeatures(Module):
-    """Random features of what other machines taught a sum of terms."""
-
-    def __init__(self, kernel: SumOfTerms, num_features: int) -> None:
-        super().__init__()
-        terms = [term for term in kernel.terms if term.kernel is not None]
-        forms = kernel.sister.forms([term.form.profile for term in terms])
-        maps: list[Module] = []
-        for term, form in zip(terms, forms, strict=True) if num_features else ():
-            own = deepcopy(term.kernel)
-            base, outer, _ = stationary_parts(own, term.num_inputs) or (own, None, None)
-            base.lengthscale = form.lengthscale
-            if outer is not None:
-                outer.outputscale = form.scale
-            maps += _feature_maps(own, term.num_inputs, num_features)
-        self.maps = ModuleList(maps)
-        size = kernel.sister.root.shape[-1] + len(maps) * num_features
-        self.num_features = size if num_features else 0
 
 
 @GenKernelFeatures.register(SumOfTerms)  # type: ignore[untyped-decorator, unused-ignore]

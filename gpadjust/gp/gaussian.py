@@ -89,7 +89,6 @@ class LikelihoodValue(NamedTuple):
     by_covariance: Tensor | None = None  # ... x n x n
     by_least_scale: Tensor | None = None  # by the logarithm of `least_scale`, ...
     coefficients: Tensor | None = None  # of the basis, ... x q; None without one
-    by_noise: Tensor | None = None  # by variances of means, beside that by the covariance, ... x n
 
 
 class Trend(NamedTuple):
@@ -124,7 +123,6 @@ def negative_log_likelihood(
     least_scale: Tensor | None = None,
     derivatives: bool = False,
     trend: Trend | None = None,
-    more: tuple[Tensor, Tensor, Tensor] | None = None,
 ) -> LikelihoodValue:
     r"""Negative log likelihood of :math:`r \sim N(H \beta, s K)`, with one Cholesky factor.
 
@@ -147,8 +145,6 @@ def negative_log_likelihood(
         least_scale: The least s, ``...``, or None for s = 1.
         derivatives: Whether to compute the derivatives.
         trend: The trend T, or none.
-        more: The number of independent targets beside these, the sum of their squares and that of
-            the logarithms of their variances, ``...``, or none.
     """
     size = residual.shape[-1]
     observed = ~residual.isnan()
@@ -168,12 +164,9 @@ def negative_log_likelihood(
     # The basis is orthogonal to P r, so that r^T P r needs no other residual.
     square = (residual * alpha).sum(-1)
     scale = torch.ones_like(square)
-    if more is not None:
-        n, square = n + more[0], square + more[1]
     if least_scale is not None:
         scale = (square / n).maximum(least_scale)
     log_det = 2 * chol.diagonal(dim1=-1, dim2=-2).log().sum(-1)
-    log_det = log_det if more is None else log_det + more[2]
     if trend is not None:
         columns = trend.columns.expand(*chol.shape[:-1], trend.columns.shape[-1])
         # Through an orthogonal basis, as the product is ill-conditioned where K is.

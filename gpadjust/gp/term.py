@@ -139,7 +139,6 @@ class WeightedSum:
     x: Tensor  # ... x n x (d + k)
     parts: Sequence[tuple[Term, Tensor | None]]  # the terms and their weights, ... x n, None for 1
     shift: Tensor | float = 0.0  # what the prior mean has beside that, ... x 1
-    sister: Any = None  # what other machines taught of it, in the mean and covariance
     # Of a term that another one scales, the product counts, where both are in the sum. Its mean is
     # zero, so that it is correlated with neither, and its covariance is a product, too.
     _prepared: dict[tuple[str, ...], ToPoints] = field(default_factory=dict, init=False)
@@ -147,7 +146,6 @@ class WeightedSum:
     def combine(self, values: Mapping[str, Tensor]) -> Tensor:
         """Sum values of the terms by their names, ``k x ... x n``, times weights, and the shift."""
         total = torch.zeros_like(self.x[..., 0]) + self.shift
-        total = total if self.sister is None else total + self.sister.mean()
         for term, weight in self.parts:
             value = values[term.name]
             weight = values.get(term.scaled_by or "", weight)
@@ -170,7 +168,7 @@ class WeightedSum:
             if term.scaled_by and (mean := self._mean_of_scaling(term)) is not None:
                 part = part * (mean.square() + found.get(term.scaled_by or "", 0.0))
             total = total + (part if weight is None else part * weight.square())
-        return total if self.sister is None else total + self.sister.covariance(self.sister, True)
+        return total
 
     def covariance(self, known_means: bool = False) -> Tensor:
         """The prior covariance, ``... x n x n``."""
@@ -200,9 +198,6 @@ class WeightedSum:
             for weight, dim in ((theirs[term.name], -2), (left, -1)):
                 part = part if weight is None else scaled(part, weight.unsqueeze(dim))
             total = part if total is None else total + part
-        if self.sister is not None:
-            taught = self.sister.covariance(other.sister)
-            total = taught if total is None else total + taught
         return self.x.new_zeros(*self.x.shape[:-1], other.x.shape[-2]) if total is None else total
 
     def features(self, maps: Mapping[str, Module]) -> Tensor:
@@ -258,7 +253,6 @@ class SumOfTerms(CompositeKernel):
     """
 
     terms: Any  # a ModuleList, of which mypy would not know that it holds terms
-    sister: Any  # what other machines taught, a gpadjust.gp.sister.Sister, or None
 
     def __init__(self, terms: Sequence[Term], known_means: bool = False) -> None:
         super().__init__()
@@ -273,7 +267,6 @@ class SumOfTerms(CompositeKernel):
             )
         self.terms = ModuleList(terms)
         self.known_means = known_means
-        self.sister = None
 
     @property
     def batch_shape(self) -> Size:
@@ -287,15 +280,7 @@ class SumOfTerms(CompositeKernel):
         for term in terms:
             shift = shift + getattr(term.basis, "moved_mean", 0.0)
         parts = [(term, term.weights(x)) for term in terms]
-        taught = None if self.sister is None else self.sister.at(x, parts, self.terms)
-        return WeightedSum(x, parts, shift, taught)
-
-    def weighted(
-        self, x: Tensor, parts: Sequence[tuple[Term, Tensor | None]], shift: Tensor | float
-    ) -> WeightedSum:
-        """The terms with weights of their own, see :class:`WeightedSum`."""
-        taught = None if self.sister is None else self.sister.at(x, parts, self.terms)
-        return WeightedSum(x, parts, shift, taught)
+        return WeightedSum(x, parts, shift)
 
     def covariance(self, x: Tensor, known_means: bool = False) -> Tensor:
         """Return ``... x n x n``; see :class:`WeightedSum`."""
@@ -321,9 +306,7 @@ class SumOfTerms(CompositeKernel):
 
     def map_batches(self, change: Callable[[Any], Any]) -> Self:
         """A copy whose terms are changed along their batch dimensions."""
-        new = type(self)([term.map_batches(change) for term in self.terms], self.known_means)
-        new.sister = None if self.sister is None else self.sister.map_batches(change)
-        return new
+        return type(self)([term.map_batches(change) for term in self.terms], self.known_means)
 
 
 class TermsMean(Mean):

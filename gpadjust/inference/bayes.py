@@ -85,8 +85,6 @@ class SampleResult:
             needs no adjustment, of the same shape; None of a model that is not weighed beside it.
         num_samples: How many samples the model holds, and ``seconds`` what the fit took on the
             wall clock; :func:`~gpadjust.fit` says both.
-        sisters: Posterior probability that the models given as ``prior=`` help, of the same shape;
-            None without them. ``relevance`` is then what it is where they do not.
 
     Example:
         >>> import torch
@@ -103,7 +101,6 @@ class SampleResult:
     sufficiency: Tensor | None = None
     num_samples: int | None = None
     seconds: float | None = None
-    sisters: Tensor | None = None
 
     def to_arviz(self) -> Any:
         """The draws as ArviZ has them: a DataTree with the group ``posterior``, of one chain.
@@ -131,7 +128,6 @@ class SampleResult:
         for of, what in (
             (self.relevance, "the physics is of use"),
             (self.sufficiency, "the physics needs no adjustment"),
-            (self.sisters, "other machines help"),
         ):
             if of is not None:
                 shares = ", ".join(f"{share:.2g}" for share in of.flatten().tolist())
@@ -162,8 +158,6 @@ class _Draws(NamedTuple):
         """The constant between targets and their prior mean, in spreads of the targets, ``B``."""
         parameters, targets = self.target.parameters, self.target.targets
         mean, *_ = self.target.distribution(parameters.unflatten(parameters.current()))
-        if self.target.repeats is not None:
-            mean = self.target.repeats.of_rows(mean)
         spread = (targets - targets.nanmean(-1, keepdim=True)).square().nanmean(-1).sqrt()
         return (targets - mean.squeeze(0)).nanmean(-1).abs() / spread
 

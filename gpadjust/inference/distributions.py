@@ -40,14 +40,12 @@ class Moments(NamedTuple):
         covariance: With noise, ``... x n x n``; it may be overwritten.
         basis: The bases of unknown constants that are not in these, ``... x n x q``, or None.
         pull_back: Carries derivatives of a likelihood back to the hyper-parameters, if asked for.
-        noise: The noise in the covariance, ``... x n``.
     """
 
     mean: Tensor
     covariance: Tensor
     basis: Tensor | None
     pull_back: Callable[[LikelihoodValue], Values] | None
-    noise: Tensor
 
 
 class _Part(NamedTuple):
@@ -157,10 +155,7 @@ class StationaryTerms:
             by: Any = likelihood.by_covariance
             result: Values = {}
             if isinstance(self.noise, str) and self.noise in values:
-                by_noise = by.diagonal(dim1=-1, dim2=-2)
-                if likelihood.by_noise is not None:
-                    by_noise = by_noise + likelihood.by_noise
-                by_noise = by_noise.unsqueeze(-1)
+                by_noise = by.diagonal(dim1=-1, dim2=-2).unsqueeze(-1)
                 by_noise = by_noise if self.selection is None else by_noise * self.selection
                 result[self.noise] = values[self.noise].exp() * by_noise.sum(-2)
             for part, (pairs, weight) in zip(self.parts, found, strict=True):
@@ -182,7 +177,7 @@ class StationaryTerms:
             return result
 
         given = pull_back if derivatives else None
-        return Moments(self.mean, total, self.basis, given, variances)
+        return Moments(self.mean, total, self.basis, given)
 
 
 @torch.no_grad()
@@ -193,7 +188,6 @@ def stationary_terms(
     known_noise: Tensor | None,
     random_means: bool,
     kept: Any = slice(None),
-    share: Tensor | None = None,
 ) -> StationaryTerms | None:
     """The distribution of a model in closed form, or None if it has another form.
 
@@ -251,16 +245,8 @@ def stationary_terms(
         square = term.mean.square() + (term.mean_variance if random_means else 0.0)
         of_error = errors[term.name] * square.unsqueeze(-1)
         of_means = of_error if of_means is None else of_means + of_error
-    if kernel.sister is not None:  # of which nothing is learnt
-        taught = kernel.at(inputs).sister
-        of_sister = taught.covariance(taught)
-        of_means = of_sister if of_means is None else of_means + of_sister
     shares = (None, None) if known_noise is not None else likelihood.shares(inputs, kept)
-    selection, added = shares
-    if share is not None and known_noise is None:
-        each = share.unsqueeze(-1)
-        selection = each if selection is None else selection * each
-    return StationaryTerms(parts, current, mean, of_means, basis, noise, selection, added)
+    return StationaryTerms(parts, current, mean, of_means, basis, noise, *shares)
 
 
 @dataclass(eq=False)
@@ -278,8 +264,6 @@ class ByModules:
         known_noise: The noise variances of these inputs, if they are known.
         random_means: Whether the prior variances of unknown constants are in the covariance.
         kept: Which rows of the training data these are.
-        share: The share of the noise of one observation that each input has, ``... x n``, if its
-            target is a mean; None for all of it.
     """
 
     model: BatchedMultiOutputGPyTorchModel
@@ -288,21 +272,19 @@ class ByModules:
     known_noise: Tensor | None
     random_means: bool
     kept: Any = field(default_factory=lambda: slice(None))
-    share: Tensor | None = None
 
     def __call__(self, values: Values, derivatives: bool = False) -> Moments:
         """Moments at values by name; see :class:`Moments`."""
         if derivatives:
             values = {name: value.detach().requires_grad_() for name, value in values.items()}
         with torch.set_grad_enabled(derivatives), lazily_evaluate_kernels(False):
-            mean, covariance, basis, noise = self.parameters.call_at(values, self._moments)
+            mean, covariance, basis = self.parameters.call_at(values, self._moments)
 
         def pull_back(found: LikelihoodValue) -> Values:
             by: list[Any] = [(covariance, found.by_covariance), (mean, found.by_mean)]
             if found.by_mean is not None and found.coefficients is not None:
                 # The estimates minimise, so that no derivative goes through them.
                 by.append((basis, found.by_mean.unsqueeze(-1) * found.coefficients.unsqueeze(-2)))
-            by.append((noise, found.by_noise))
             by = [(m, each) for m, each in by if each is not None and m.requires_grad]
             moments, each = zip(*by, strict=True)
             slopes = torch.autograd.grad(moments, list(values.values()), each, allow_unused=True)
@@ -312,13 +294,13 @@ class ByModules:
             }
 
         if not derivatives:
-            return Moments(mean, covariance, basis, None, noise)
+            return Moments(mean, covariance, basis, None)
         fixed = None if basis is None else basis.detach()
         covariances = covariance.detach().clone()
-        return Moments(mean.detach(), covariances, fixed, pull_back, noise.detach())
+        return Moments(mean.detach(), covariances, fixed, pull_back)
 
-    def _moments(self) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
-        """Mean, covariance, basis and noise at the model's parameters."""
+    def _moments(self) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Mean, covariance and basis at the model's parameters."""
         model, inputs, noise = self.model, self.inputs, self.known_noise
         if self.parameters.learns_inputs:
             inputs = model.transform_inputs(inputs)
@@ -330,11 +312,7 @@ class ByModules:
             basis = kernel.basis_of_means(inputs)
         if noise is None:
             likelihood = Noise(model.likelihood)
-            noise = likelihood.at(inputs)
-            if self.share is None:
-                noise = likelihood.of_rows(noise, self.kept)
-            else:
-                noise = noise * self.share
+            noise = likelihood.of_rows(likelihood.at(inputs), self.kept)
         noise = noise.expand(torch.broadcast_shapes(noise.shape, covariance.shape[:-1]))
         mean = model.mean_module(inputs).expand(noise.shape)
-        return mean, covariance + torch.diag_embed(noise), basis, noise
+        return mean, covariance + torch.diag_embed(noise), basis

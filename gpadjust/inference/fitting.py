@@ -21,13 +21,12 @@ from gpadjust.inference.bayes import SampleResult, default_num_samples, sample
 from gpadjust.inference.calibrate import calibrate
 from gpadjust.inference.optimise import FitResult, Search, maximise, optima
 from gpadjust.inference.priors import register_priors
-from gpadjust.inference.shared_kernel import fit_shared
 from gpadjust.inference.targets import LogPosterior
 from gpadjust.inference.variational_fit import fit_variational
-from gpadjust.models import ParallelPartialGP, TermsGP, VariationalCKA
+from gpadjust.models import TermsGP, VariationalCKA
 from gpadjust.models.parameters import shared_parameters
 
-Fittable: TypeAlias = BatchedMultiOutputGPyTorchModel | VariationalCKA | ParallelPartialGP
+Fittable: TypeAlias = BatchedMultiOutputGPyTorchModel | VariationalCKA
 
 
 class FitOptions(TypedDict, total=False):
@@ -151,20 +150,11 @@ def fit(
     targets and physics make no difference. The result is never less likely than the parameters that
     the model came with. Priors registered on the model are honoured (maximum a posteriori,
     otherwise maximum likelihood). With few data its intervals are far too narrow. It is the default
-    for models of other libraries, for batches of data sets, and for
-    :class:`~gpadjust.models.PaperRRA`.
+    for models of other libraries, and for batches of data sets.
 
     A :class:`~gpadjust.VariationalCKA` has ``"map"`` alone: the search is that of an exact model of
     up to 1,000 of its observations, and what it finds goes on by the evidence lower bound. The
     inducing points, the distribution there, and the sizes of ``rest`` and noise are found with it.
-
-    *What others taught* (``prior=``): fitted models of other machines of the same kind, of the same
-    class, inputs and outputs. Each term is then the sum of theirs and of a difference; of several
-    the spread between them says how much machines differ, and in which directions. Lengthscales and
-    noise have priors around theirs. Whether they help has the prior probability 0.1;
-    ``result.sisters`` is the posterior one, by the evidence of the model's own data, and the share
-    of its samples that have them. The others are those of a fit without. (``"map"`` takes the
-    likelier one.) The model keeps what it needs of the others.
 
     Parameters with ``requires_grad=False`` stay. A model that holds samples lets go of them first.
     Small problems are computed with one thread; the user's setting is restored after.
@@ -212,31 +202,22 @@ def fit(
             "Expected a model of gpadjust, another BoTorch model with batched outputs, or a "
             f"ModelListGP of them, got {type(model).__name__}."
         )
-    if is_fully_bayesian(model) and not isinstance(model, TermsGP | ParallelPartialGP):
+    if is_fully_bayesian(model) and not isinstance(model, TermsGP):
         raise RuntimeError(
             f"The {type(model).__name__} holds samples of its hyper-parameters; build it again, to "
             "fit it."
         )
     method = method or ("bayes" if _can_be_sampled(model) else "map")
     own: dict[str, Any] = {**options}
-    prior = own.pop("prior", None)
     check_options(method, own)
     search = Search(**{name: own.pop(name) for name in _SEARCH if name in own})
     with threads_for(model.train_targets.shape[-1]), _without_samples(model):
-        if isinstance(model, ParallelPartialGP):
-            return fit_shared(model, search, method == "bayes", **own)
         try:
             begin = time.perf_counter()
             if isinstance(model, TermsGP) and model.noise.rows is not None:
                 _refine_noise(model, search)
             for _ in range(2):
-                if prior is None:
-                    result = METHODS[method].run(model, search, **own)
-                else:
-                    from gpadjust.inference.sisters import fit_with_prior
-
-                    run = METHODS[method].run
-                    result = fit_with_prior(model, prior, run, search, **own)
+                result = METHODS[method].run(model, search, **own)
                 if not (isinstance(model, TermsGP) and model.noise.rows and _is_unconfirmed(model)):
                     break
             if isinstance(model, TermsGP):
@@ -331,7 +312,7 @@ def _fit_list(
 def _can_be_sampled(model: Fittable) -> bool:
     """Return whether a model can hold samples, and has something to sample."""
     if not isinstance(model, TermsGP):
-        return isinstance(model, ParallelPartialGP)
+        return False
     try:
         model.check_can_be_sampled()
     except ValueError:
@@ -343,17 +324,8 @@ def _can_be_sampled(model: Fittable) -> bool:
 @contextmanager
 def _without_samples(model: Fittable) -> Iterator[None]:
     """Let a model go of the samples that it holds; it holds them again if there is an error."""
-    if not isinstance(model, TermsGP):
+    if not isinstance(model, TermsGP) or model.num_samples is None:
         yield
-        return
-    kernel, sister = model.covar_module, model.covar_module.sister
-    if model.num_samples is None:
-        kernel.sister = None
-        try:
-            yield
-        except BaseException:
-            kernel.sister = sister
-            raise
         return
     samples = {
         name: parameter.detach().clone()
@@ -362,7 +334,6 @@ def _without_samples(model: Fittable) -> Iterator[None]:
     }
     errors = deepcopy(model.local_errors)
     model.release_samples()
-    sister, kernel.sister = kernel.sister, None
     with torch.no_grad():
         for basis in model.covar_module.modules():
             if isinstance(basis, AppendedPhysics) and basis.learnt is not None:
@@ -371,7 +342,6 @@ def _without_samples(model: Fittable) -> Iterator[None]:
         yield
     except BaseException:
         model.release_samples()
-        kernel.sister = sister
         model.hold_samples(samples)
         model.local_errors = errors
         raise

@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -58,12 +58,10 @@ class FitResult:
             :class:`~gpadjust.VariationalCKA` the evidence lower bound of all observations.
         converged: Whether the optimiser converged, for each output, of the same shape; of a
             VariationalCKA, whose last search stops after 15 iterations, it seldom has.
-        sisters: Of a fit with ``prior=``: 1 where other machines help, else 0, of the same shape.
     """
 
     log_likelihood: Tensor
     converged: Tensor
-    sisters: Tensor | None = field(default=None, repr=False)
 
 
 class Differentiable(Protocol):

@@ -43,18 +43,12 @@ class LeftOut(NamedTuple):
 @torch.no_grad()
 def left_out(target: LogPosterior, vectors: Tensor) -> LeftOut:
     """Predictions at vectors ``N x B x p``."""
-    mean, covariance, *_, noise = target.distribution(target.parameters.unflatten(vectors))
-    repeats, means = target.repeats, target.means
-    targets = target.targets if means is None else means.targets
-    residual = (targets - mean).expand(covariance.shape[:-1])
+    mean, covariance, *_ = target.distribution(target.parameters.unflatten(vectors))
+    residual = (target.targets - mean).expand(covariance.shape[:-1])
     observed = ~residual.isnan()
     chol, _ = cholesky(covariance, None if observed.all() else observed)
     precision = torch.cholesky_inverse(chol).diagonal(dim1=-1, dim2=-2)
     alpha = torch.cholesky_solve(residual.nan_to_num(nan=0.0).unsqueeze(-1), chol).squeeze(-1)
-    if repeats is not None and means is not None:
-        found = (means, target.targets, noise, alpha, precision)
-        alpha, precision = repeats.of_each(*found)
-        precision = precision.where(precision > 0, 1.0)
     variance, shape = precision.reciprocal(), (*vectors.shape[:2], -1)
     return LeftOut((-alpha * variance).reshape(shape), variance.reshape(shape))
 

@@ -19,7 +19,6 @@ from gpadjust.gp.gaussian import (
     nugget,
 )
 from gpadjust.gp.noise import Noise
-from gpadjust.gp.repeats import Repeats
 from gpadjust.inference.distributions import (
     ByModules,
     MarginalizedParameters,
@@ -59,15 +58,12 @@ class Target:
     Attributes:
         parameters: The vectors and their bounds.
         targets: The observations, ``... x n``, and ``num_points`` their number ``n``.
-        repeats: Those of equal inputs, which count by their means ``means``; None where each
-            counts by itself.
         distribution: Theirs.
         concentrated: Whether the overall scale of all variances is at its optimum.
     """
 
     random_means: ClassVar[bool] = True
     of_logs: ClassVar[bool] = False
-    vague_trends: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -90,32 +86,11 @@ class Target:
         noise = Noise(model.likelihood).known
         noise = None if noise is None else Noise(model.likelihood).of_rows(noise)[..., kept]
         inputs = self._raw_inputs if self.parameters.learns_inputs else inputs
-        self.repeats: Repeats | None = None
-        self.means, self._values, share = None, self.targets, None
-        if getattr(model, "has_repeats", False):
-            self.repeats = repeats = Repeats.of(self._raw_inputs)
-            precision = torch.ones_like(self.targets) if noise is None else noise.reciprocal()
-            self.means = repeats.means(self.targets, precision)
-            self._values, share = self.means.targets, self.means.share
-            inputs, noise = inputs[..., repeats.first, :], None if noise is None else share
-        args = (model, self.parameters, inputs, noise, self.random_means, kept, share)
+        args = (model, self.parameters, inputs, noise, self.random_means, kept)
         found = stationary_terms(*args) if self.parameters.is_batched else None
         self.distribution: StationaryTerms | ByModules = found or ByModules(*args)
-        taught = getattr(model.covar_module, "sister", None) is not None
-        vague = self.of_logs and self.vague_trends and marginalized is None and not taught
+        vague = self.of_logs and marginalized is None
         self._trend = _trends(model, self._raw_inputs, self.targets) if vague else None
-        if self.repeats is not None:
-            rows = self.repeats.observed(self.targets)
-            if self._trend is not None:
-                columns = self._trend.columns
-                columns = columns.expand(*rows.shape[:-1], *columns.shape[-2:])
-                each = rows.unsqueeze(-1).expand(*rows.shape, columns.shape[-1])
-                self._trend = self._trend._replace(columns=columns.gather(-2, each))
-            if marginalized is not None:
-                each = rows.unsqueeze(-1).expand(*rows.shape, self.num_points)
-                self._added = self._added.gather(-2, each)
-                each = rows.unsqueeze(-2).expand(*rows.shape, rows.shape[-1])
-                self._added = self._added.gather(-1, each)
         self._log_priors: LogPriors | None = None
         if self.of_logs or next(iter(model.named_priors()), None) is not None:
             self._log_priors = LogPriors(model, self.parameters, self.of_logs)
@@ -140,7 +115,7 @@ class Target:
         if basis is None:
             return
         covariance = covariance + self._added
-        shift, vague = _constant_means(self._values - mean, covariance, basis)
+        shift, vague = _constant_means(self.targets - mean, covariance, basis)
         terms = [term for term in self.model.covar_module.terms if term.learns_mean]
         for i, term in enumerate(terms):
             term.mean.add_(shift[..., i : i + 1])
@@ -198,7 +173,7 @@ class Target:
 
         Where problems share parameters, as the physics learns, it is one vector after the other.
         """
-        size = self.parameters.num_problems * self._values.shape[-1] ** 2
+        size = self.parameters.num_problems * self.targets.shape[-1] ** 2
         at_once = max(1, _AT_ONCE // size) if self.parameters.is_batched else 1
         first, second = zip(*(function(part) for part in vectors.split(at_once)), strict=True)
         return torch.cat(first), torch.cat(second)
@@ -233,15 +208,12 @@ class Target:
         values = self.parameters.unflatten(vectors)
         if not self.parameters.is_batched:
             values = {name: value[0] for name, value in values.items()}
-        mean, covariance, basis, pull_back, noise = self.distribution(values, derivatives)
+        mean, covariance, basis, pull_back = self.distribution(values, derivatives)
         covariance = covariance if self._of_all is None else covariance + self._added
-        residual = (self._values - mean).expand(covariance.shape[:-1])
-        more = None if self.means is None else self.means.within.at(noise)
+        residual = (self.targets - mean).expand(covariance.shape[:-1])
         found = negative_log_likelihood(
-            residual, covariance, basis, least, derivatives, self._trend, more
+            residual, covariance, basis, least, derivatives, self._trend
         )
-        if self.means is not None:
-            found = found._replace(by_noise=self.means.within.slope(noise, found.scale))
         if pull_back is None:
             return found, torch.zeros_like(vectors)
         return found, self.parameters.flatten(pull_back(found))

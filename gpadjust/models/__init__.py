@@ -2,11 +2,10 @@
 
 from gpadjust.models.ar1 import AR1
 from gpadjust.models.links import Logit
-from gpadjust.models.parallel_partial import ParallelPartialGP
 from gpadjust.models.parameters import orthogonal_rbf
 from gpadjust.models.physics_parameters import PhysicsParameters
 from gpadjust.models.predictive_model import Prediction, PredictiveModel
-from gpadjust.models.rra import RRA, PaperRRA
+from gpadjust.models.rra import RRA
 from gpadjust.models.sampled_functions import SampledFunctions
 from gpadjust.models.saving import load, save
 from gpadjust.models.stacked import StackedGP
@@ -31,8 +30,6 @@ __all__ = [
     "BiasGP",
     "CalibratedPhysics",
     "Logit",
-    "PaperRRA",
-    "ParallelPartialGP",
     "PhysicsMeanGP",
     "PhysicsParameters",
     "Prediction",

@@ -18,7 +18,6 @@ from torch import Tensor
 from gpadjust.gp import SumOfTerms, WeightedSum
 from gpadjust.gp.gaussian import cholesky, nugget
 from gpadjust.gp.noise import Noise
-from gpadjust.gp.repeats import Means, Repeats
 
 _FEW = 256  # points up to which a product is faster than solving
 _INFINITE = 1e200  # the standard deviation of a target that is missing
@@ -182,17 +181,9 @@ class ExactConditioning(DefaultPredictionStrategy):
     GPyTorch's prediction strategy of a model, ``model.prediction_strategy``, and dies with that.
     """
 
-    def __init__(
-        self,
-        inputs: Tensor,
-        targets: Tensor,
-        noise: Noise,
-        kernel: SumOfTerms,
-        repeats: Repeats | None = None,
-    ) -> None:
+    def __init__(self, inputs: Tensor, targets: Tensor, noise: Noise, kernel: SumOfTerms) -> None:
         # GPyTorch's own makes lazy covariances that are not needed here.
-        self.repeats = repeats
-        self.train_inputs = [inputs if repeats is None else inputs[..., repeats.first, :]]
+        self.train_inputs = [inputs]
         self.targets = targets
         self.noise = noise
         self.kernel = kernel
@@ -218,16 +209,9 @@ class ExactConditioning(DefaultPredictionStrategy):
                 self._remembered = self.kernel.at(self.train_inputs[0])
         return self._remembered
 
-    def observations(self) -> tuple[Tensor, Tensor, Means | None]:
-        """Targets and their variances at the training inputs; of repeated ones their means."""
-        repeats, (inputs,) = self.repeats, self.train_inputs
-        if repeats is None:
-            return self.targets, self.noise.of_rows(self.noise.at(inputs)), None
-        known = self.noise.known
-        precision = torch.ones_like(self.targets) if known is None else known.reciprocal()
-        means = repeats.means(self.targets, precision)
-        noise = means.share if known is not None else self.noise.at(inputs) * means.share
-        return means.targets, noise, means
+    def target_noise(self) -> Tensor:
+        """The noise variances of the targets, ``... x n``."""
+        return self.noise.of_rows(self.noise.at(self.train_inputs[0]))
 
     @property
     def mean_cache(self) -> Tensor:
@@ -244,13 +228,10 @@ class ExactConditioning(DefaultPredictionStrategy):
         with torch.set_grad_enabled(torch.is_grad_enabled() and detach_test_caches.off()):
             train = self.kernel.at(self.train_inputs[0])
             covariance = train.covariance(self.kernel.known_means)
-            if self.repeats is None:
-                targets, noise = self.targets, self.noise.of_rows(self.noise.at(train.x))
-            else:
-                targets, noise, _ = self.observations()
+            noise = self.noise.of_rows(self.noise.at(train.x))
             # Not in place: kernels may share memory with what they return.
             covariance = covariance + torch.diag_embed(noise)
-            factors = Factors.of(covariance, targets - train.mean())
+            factors = Factors.of(covariance, self.targets - train.mean())
         for factor in (factors.base, factors.alpha):
             if factor.grad_fn is not None:
                 # A backward pass frees the graph that a later prediction would need.
@@ -258,13 +239,6 @@ class ExactConditioning(DefaultPredictionStrategy):
         self._factors = factors
         self._inverse = None
         return factors
-
-    def of_each(self, alpha: Tensor, precision: Tensor) -> tuple[Tensor, Tensor]:
-        """Weights and precisions of all observations, by those of the means of repeated ones."""
-        _, noise, means = self.observations()
-        if self.repeats is None or means is None:
-            return alpha, precision
-        return self.repeats.of_each(means, self.targets, noise, alpha, precision)
 
     def marginals(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Posterior means and variances at each point by itself, ``... x q``."""
@@ -297,18 +271,15 @@ class ExactConditioning(DefaultPredictionStrategy):
         (train,) = self.train_inputs
         # What the factors have beside the prior: the noise, and their nugget.
         added = self.factors().variance() - self.train.variance(self.kernel.known_means)
-        targets, variance, means = self.observations()
         draws = torch.randn(len(prior), *train.shape[:-2], self.targets.shape[-1]).to(train)
-        if self.repeats is not None and means is not None:  # as many as there are observations
-            draws = self.repeats.sum(means.weight.sqrt() * draws)
-        noise = added.maximum(variance).sqrt() * draws
-        return self.factors().solve((targets - prior - noise).nan_to_num(nan=0.0))
+        noise = added.maximum(self.target_noise()).sqrt() * draws
+        return self.factors().solve((self.targets - prior - noise).nan_to_num(nan=0.0))
 
     def exact_predictive_mean(
         self, test_mean: Tensor, test_train_covar: Tensor | LinearOperator
     ) -> Tensor:
         """GPyTorch's hook for the posterior mean."""
-        cross = self._of_distinct(test_train_covar)
+        cross = test_train_covar
         return test_mean + (cross @ self.mean_cache.unsqueeze(-1)).squeeze(-1)
 
     def exact_predictive_covar(
@@ -317,7 +288,7 @@ class ExactConditioning(DefaultPredictionStrategy):
         """GPyTorch's hook for the posterior covariance, ``... x q x q``."""
         if skip_posterior_variances.on():
             return ZeroLinearOperator(*test_test_covar.shape)
-        white = self.factors().whiten(to_dense(self._of_distinct(test_train_covar)))
+        white = self.factors().whiten(to_dense(test_train_covar))
         return to_linear_operator(conditional_covariance(to_dense(test_test_covar), white))
 
     def get_fantasy_strategy(
@@ -334,9 +305,8 @@ class ExactConditioning(DefaultPredictionStrategy):
         Targets are ``(f) x ... x k``; with a dimension of fantasies ``f`` that the inputs lack, all
         fantasies share one factor. Of known noise ``kwargs`` has the variances, ``... x k``.
         """
-        n, repeats = self.num_train, self.repeats
-        rows = slice(n) if repeats is None else repeats.first
-        train = self.kernel.at(full_inputs[0][..., rows, :])
+        n = self.num_train
+        train = self.kernel.at(full_inputs[0][..., :n, :])
         new = self.kernel.at(full_inputs[0][..., n:, :])
         noise = self.noise.after(**kwargs)
         cross = new.cross(train)
@@ -345,21 +315,13 @@ class ExactConditioning(DefaultPredictionStrategy):
         factors = self.factors().append(cross, corner, residual)
         if detach_test_caches.on():
             factors = Factors(*(factor.detach() for factor in factors))
-        if repeats is not None:
-            repeats = repeats.appended(full_inputs[0].shape[-2] - n)
-        strategy = type(self)(full_inputs[0], full_targets, noise, self.kernel, repeats)
+        strategy = type(self)(full_inputs[0], full_targets, noise, self.kernel)
         strategy._factors = factors
         return strategy
 
     def __reduce__(self) -> tuple[type[None], tuple[()]]:
         """Pickle as nothing, as it is copied: it can be made again from the model."""
         return type(None), ()
-
-    def _of_distinct(self, cross: Any) -> Any:
-        """Covariances with the training data, as GPyTorch has them, with the distinct ones."""
-        if self.repeats is None or cross.shape[-1] == len(self.repeats.first):
-            return cross
-        return to_dense(cross)[..., self.repeats.first]
 
     def _mean(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Posterior means of a sum, and its covariances with the data."""

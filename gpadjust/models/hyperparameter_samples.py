@@ -15,7 +15,6 @@ from torch.nn import Parameter
 from gpadjust.gp import AppendedPhysics, Term
 from gpadjust.gp.kernels import CompositeKernel
 from gpadjust.gp.noise import RowNoise
-from gpadjust.gp.sister import Sister
 from gpadjust.models.parameters import SIZES, hyperparameters
 from gpadjust.models.relative_noise import RelativeNoise
 from gpadjust.models.updates import UpdatedWeights
@@ -33,7 +32,6 @@ _BATCHED = (
     RFFKernel,
     RelativeNoise,
     RowNoise,
-    Sister,
     Term,
     UpdatedWeights,
 )

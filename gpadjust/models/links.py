@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -234,58 +233,6 @@ class LinkedUnits(Standardize):
         return type(self)(self.link, plain.eval().subset_output(idcs))
 
 
-class LinkOfEach:
-    """The links of the components of mixtures, tensors ``... x S x q x m``.
-
-    Args:
-        links: Of each output the link of each of its ``S`` components, or None.
-    """
-
-    def __init__(self, links: Sequence[Sequence[Logit | None]]) -> None:
-        self.links = [[*each] for each in links]
-
-    def _each(self, change: Callable[..., Any], *values: Tensor) -> list[Tensor]:
-        """Change values of each component by its link; there may be several results."""
-        outputs = []
-        for j, links in enumerate(self.links):
-            own = [value[..., j] for value in values]
-            kinds = {id(link): link for link in links}
-            found: list[Tensor] = []
-            for key, link in kinds.items():
-                index = [s for s, each in enumerate(links) if id(each) == key]
-                parts = [value[..., index, :] for value in own]
-                changed = change(link, *parts) if link else parts
-                if link is None and change is Logit.log_slope:
-                    changed = torch.zeros_like(parts[0])
-                changed = [changed] if isinstance(changed, Tensor) else [*changed]
-                found = found or [torch.empty_like(own[0]) for _ in changed]
-                for whole, part in zip(found, changed, strict=True):
-                    whole[..., index, :] = part
-            outputs.append(found)
-        return [torch.stack(each, -1) for each in zip(*outputs, strict=True)]
-
-    def value(self, y: Tensor) -> Tensor:
-        """The links of values."""
-        return self._each(Logit.value, y)[0]
-
-    def inverse(self, z: Tensor) -> Tensor:
-        """The reverse of :meth:`value`."""
-        return self._each(Logit.inverse, z)[0]
-
-    def log_slope(self, y: Tensor) -> Tensor:
-        """The logarithms of the links' derivatives."""
-        return self._each(Logit.log_slope, y)[0]
-
-    def moments(self, mean: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
-        """Means and variances in the user's units, of each component."""
-        first, second = self._each(Logit.moments, mean, variance)
-        return first, second
-
-    def posterior(self, posterior: Posterior) -> LinkedPosterior:
-        """The posterior in the user's units, of a mixture."""
-        return LinkedPosterior(posterior, self)
-
-
 class LinkedPosterior(TransformedPosterior):
     """The posterior of an output with a link, in the user's units.
 
@@ -293,7 +240,7 @@ class LinkedPosterior(TransformedPosterior):
     BoTorch has them, and ``mixture_mean``, ``mixture_variance`` and ``quantile`` those of all.
     """
 
-    def __init__(self, posterior: Posterior, link: Logit | LinkOfEach) -> None:
+    def __init__(self, posterior: Posterior, link: Logit) -> None:
         super().__init__(
             posterior,
             link.inverse,

@@ -62,11 +62,6 @@ class PredictiveModel(Model):
     input_names: tuple[str, ...]
     output_names: tuple[str, ...]
 
-    @property
-    def joint_link(self) -> Any:
-        """That of :meth:`joint_moments`."""
-        return self.link
-
     def components(self, X: ArrayLike, observation_noise: bool | Tensor) -> tuple[Tensor, Tensor]:
         """Means and variances of each of the Gaussians, ``... x S x q x m``."""
         raise NotImplementedError
@@ -106,8 +101,8 @@ class PredictiveModel(Model):
                 noise = noise[..., list(output_indices)]
             return subset.posterior(X, None, noise, posterior_transform)
         posterior = self.as_posterior(*self.joint_moments(X, observation_noise))
-        if (link := self.joint_link) is not None:
-            posterior = link.posterior(posterior)
+        if self.link is not None:
+            posterior = self.link.posterior(posterior)
         if posterior_transform is None:
             return posterior
         return ScaleFreePosterior.transformed(posterior_transform(posterior=posterior, X=X))

@@ -8,10 +8,8 @@ from functools import partial
 from typing import Any, Literal, Self, Unpack, cast
 
 import torch
-from botorch.models.transforms.input import InputTransform
 from gpytorch.distributions import MultivariateNormal
 from gpytorch.kernels import RFFKernel, ScaleKernel
-from gpytorch.likelihoods import Likelihood
 from linear_operator.operators import RootLinearOperator
 from torch import Size, Tensor
 
@@ -62,8 +60,8 @@ class WeightConditioning(ExactConditioning):
         After updates it is their weights that are known, and of observations those after them.
         """
         train = self.kernel.at(self.train_inputs[0])
-        targets, noise, _ = self.observations()
-        design, residual = train.features(self.features), targets - train.mean()
+        noise = self.target_noise()
+        design, residual = train.features(self.features), self.targets - train.mean()
         if self._known is None:
             return regression(design, residual, noise)
         mean, root, n = self._known
@@ -167,12 +165,7 @@ class RRA(TermsGP):
         self.num_features = num_features
 
     def _check_window(self, forget: int | None) -> None:
-        """Raise an error if there are no weights to update."""
-        if self.conditioning_class is not WeightConditioning:
-            raise NotImplementedError(
-                f"The covariance of {type(self).__name__} is not that of a posterior, so that "
-                "there is nothing to update; take RRA."
-            )
+        """Do nothing: weights are updated with a window and without."""
 
     def _take(self, new: NewRows, forget: int | None) -> None:
         """Take new observations by a step of a Kalman filter for each, which keeps no row."""
@@ -327,81 +320,6 @@ class RRA(TermsGP):
                 if term.learns_mean:
                     parts.append(term.mean_variance.sqrt() * scale)
         return torch.cat(parts, dim=-1)
-
-
-class PaperConditioning(WeightConditioning):
-    """Weight conditioning with the covariance of the paper."""
-
-    def regress(self) -> tuple[Tensor, Tensor]:
-        """The paper's mean and root of the covariance of weights."""
-        design = self.kernel.at(self.train_inputs[0]).features(self.features)
-        targets, _, means = self.observations()
-        ridge = torch.ones_like(design[..., 0]) if means is None else means.share
-        _, root = regression(design, targets, ridge)
-        return super().regress()[0], root
-
-
-class PaperRRA(RRA):
-    r"""The ridge regression adjustment as printed in the paper, for comparison.
-
-    It regresses y itself, so that it falls to zero far from the data; weights have the prior
-    variance 1 in the user's units, the noise variance is the ridge :math:`\lambda`:
-
-    .. math:: \hat\beta = (\Phi^T\Phi + \lambda I)^{-1}\Phi^T y, \quad
-        \mathrm{Cov}(\beta) = (\Phi^T\Phi + I)^{-1},
-
-    which is no posterior's unless :math:`\lambda = 1`: it cannot be fully Bayesian, nor give the
-    information of an observation. The arguments are those of :class:`RRA`, without prior means, and
-    always in the user's units.
-    """
-
-    conditioning_class = PaperConditioning
-    not_sampled = (
-        "PaperRRA cannot be fully Bayesian: its covariance is not that of a posterior. Take RRA, "
-        "or fit it by method 'map'."
-    )
-
-    def __init__(
-        self,
-        train_X: ArrayLike,
-        train_Y: ArrayLike,
-        train_Yvar: ArrayLike = None,
-        *,
-        physics: PhysicsLike,
-        num_features: int = 128,
-        center: Center = 0.0,
-        likelihood: Likelihood | None = None,
-        input_transform: InputTransform | None = None,
-        seed: int = 0,
-    ) -> None:
-        super().__init__(
-            train_X,
-            train_Y,
-            train_Yvar,
-            physics=physics,
-            num_features=num_features,
-            rho_mean=0.0,
-            center=center,
-            likelihood=likelihood,
-            outcome_transform=None,
-            input_transform=input_transform,
-            seed=seed,
-        )
-        for term in self.covar_module.terms:
-            term.kernel.raw_outputscale.requires_grad_(False).zero_()  # an outputscale of 1
-
-    def left_out(self) -> tuple[Tensor, Tensor]:
-        """Return left-out predictions, with the variance of the paper's covariance."""
-        mean, _ = super().left_out()
-        with torch.no_grad():
-            train = self.at(self.train_inputs[0])
-            design = train.features(self._regression().features)
-            design = design * ~self.train_targets.isnan().unsqueeze(-1)
-            precision = torch.linalg.inv(
-                design @ design.mT + torch.eye(design.shape[-2]).to(design)
-            )
-            latent = precision.diagonal(dim1=-1, dim2=-2).reciprocal() - 1
-            return mean, latent + self.noise.of_rows(self.noise.at(train.x))
 
 
 def fourier_kernel(

@@ -14,7 +14,7 @@ from torch.nn import Module, ModuleDict
 
 from gpadjust.checks import checked_whole
 from gpadjust.gp import SumOfTerms, WeightedSum
-from gpadjust.gp.features import sum_features
+from gpadjust.gp.features import term_features
 
 DRAWING = RLock()
 """Held by the thread that draws functions, as the generator is the process's."""
@@ -63,9 +63,7 @@ class SampledFunctions(Module):
         self.has_outputs = model.num_outputs > 1
         self.batch_shape: Size = model.batch_shape
         # Together, as the features read the kernels of the terms.
-        total = SumOfTerms(model.terms)
-        total.sister = model.covar_module.sister
-        self.sum, self.features = deepcopy((total, features))
+        self.sum, self.features = deepcopy((SumOfTerms(model.terms), features))
         self._reached = {term.name for term in model.covar_module.terms}
         tensors = (*model.units(), weights, update, train, alpha)
         names = ("shift", "scale", "weights", "update", "points", "alpha")
@@ -81,7 +79,7 @@ class SampledFunctions(Module):
         conditioning = model.conditioning()
         (train,) = conditioning.train_inputs
         with torch.no_grad():
-            features: Any = sum_features(model.covar_module, model.terms, num_features)
+            features: Any = term_features(model.terms, num_features)
             shape = (num_functions, *model._aug_batch_shape)
             sizes = [each.num_features for each in features.values()]
             drawn = [torch.randn(*shape, size, dtype=torch.float64) for size in sizes]
@@ -98,7 +96,7 @@ class SampledFunctions(Module):
         conditioning = model.conditioning()
         with torch.no_grad():
             alpha = conditioning.mean_cache.unsqueeze(0)
-            features = sum_features(model.covar_module, model.terms, 0)
+            features = term_features(model.terms, 0)
             return cls(model, features, alpha[..., :0], conditioning.train_inputs[0], alpha)
 
     def forward(self, X: Tensor) -> Tensor:
@@ -134,9 +132,6 @@ class SampledFunctions(Module):
             for (term, _), weights in zip(sought.parts, parts, strict=False)
         }
         total = sought.combine(values)
-        if sought.sister is not None and parts[-1].shape[-1]:
-            taught = sought.sister.features(self.features["sister"].maps)
-            total = total + _product(taught, parts[-1], extra)
         if self.points is not None:
             if self._data is None or self._data.x is not self.points:  # also after .to(device)
                 self._data = self.sum.at(self.points, self._reached)

@@ -16,7 +16,6 @@ from torch.quasirandom import SobolEngine
 
 from gpadjust.checks import checked_whole
 from gpadjust.models.hyperparameter_samples import take_samples
-from gpadjust.models.links import LinkOfEach
 from gpadjust.models.predictive_model import PredictiveModel, given_noise
 from gpadjust.models.sampled_functions import check_each
 from gpadjust.models.terms_gp import TermsGP
@@ -77,8 +76,8 @@ class StackedGP(PredictiveModel):
     Raises:
         TypeError: If models do not come by name, one is none of this library, or weights are no
             numbers.
-        ValueError: If there is no model, their data differ, or weights are of another shape,
-            negative, or not 1 in all.
+        ValueError: If there is no model, their data or links differ, or weights are of another
+            shape, negative, or not 1 in all.
 
     Example:
         >>> import torch
@@ -173,25 +172,14 @@ class StackedGP(PredictiveModel):
 
     @property
     def link(self) -> Any:
-        """The links of :meth:`components`, if there are any."""
-        return self._links([[*range(self.num_samples)]] * self.num_outputs)
-
-    @property
-    def joint_link(self) -> Any:
-        """Those of :meth:`joint_moments`."""
-        return self._links([torch.as_tensor(order).tolist() for order in self._orders])
-
-    def _links(self, orders: list[list[int]]) -> Any:
-        links = [[p.model.link for p in parts for _ in range(p.number)] for parts in self.parts]
-        if not any(link for each in links for link in each):
-            return None
-        return LinkOfEach([[own[i] for i in o] for own, o in zip(links, orders, strict=True)])
+        """The link of the models, which is the same for all, or None."""
+        return self.parts[0][0].model.link
 
     def _check_no_link(self) -> None:
         if self.link is not None:
             raise ValueError(
-                "Variances as observation_noise have a meaning for each model of a mixture with "
-                "links apart; ask one of them, `stacked.made_of`, or pass True for learnt noise."
+                "Expected observation_noise True or False for a mixture of models with a link, "
+                "got variances; pass these to one of the models, `stacked.made_of`."
             )
 
     def components(self, X: ArrayLike, observation_noise: bool | Tensor) -> tuple[Tensor, Tensor]:
@@ -285,7 +273,7 @@ class StackedGP(PredictiveModel):
             sampler: Draws the observations from the posterior at ``X``.
 
         Raises:
-            ValueError: If a part cannot hold samples, as a :class:`~gpadjust.models.PaperRRA`.
+            ValueError: If a part cannot hold samples, as one of a batch of data sets.
         """
         with fantasize_flag():
             Y = sampler(self.posterior(X, observation_noise=True))  # f x batch x S x k x m
@@ -390,11 +378,7 @@ def _checked(models: Any, weights: Any) -> tuple[TermsGP, Tensor]:
         ) from error
     first, *others = models.values()
     for other in others:
-        if not _same_data(first, other):
-            raise ValueError(
-                f"Expected models of the same points and outputs, but the data of {first!r} and "
-                f"{other!r} differ."
-            )
+        check_stackable(first, other)
     if weights.shape != (len(models), first.num_outputs):
         raise ValueError(
             f"Expected weights of shape {(len(models), first.num_outputs)}, one for each model and "
@@ -405,6 +389,20 @@ def _checked(models: Any, weights: Any) -> tuple[TermsGP, Tensor]:
             f"Expected weights that are not negative and 1 in all for each output, got {weights}."
         )
     return first, weights
+
+
+def check_stackable(first: TermsGP, other: TermsGP) -> None:
+    """Raise a ValueError if two models have other data or another link."""
+    if not _same_data(first, other):
+        raise ValueError(
+            f"Expected models of the same points and outputs, but the data of {first!r} and "
+            f"{other!r} differ."
+        )
+    if getattr(first.link, "bounds", None) != getattr(other.link, "bounds", None):
+        raise ValueError(
+            f"Expected models of one link, but the outcome_transform of {first!r} and of "
+            f"{other!r} differ: give all the same."
+        )
 
 
 @torch.no_grad()

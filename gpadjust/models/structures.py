@@ -81,7 +81,7 @@ class CKA(TermsGP):
 
     Warns:
         PhysicsWarning: If f_p is obviously off at the training inputs, and shows why.
-        UserWarning: Of rows that equal an earlier one, outputs included, where this is no rounding;
+        UserWarning: Of rows that equal an earlier one, outputs included;
             of more than 5,000 points; take :class:`~gpadjust.VariationalCKA`.
 
     Raises:

@@ -28,8 +28,6 @@ from gpadjust.gp import SumOfTerms, Term, TermsMean
 from gpadjust.gp.gaussian import negative_log_likelihood
 from gpadjust.gp.kernels import Stationary
 from gpadjust.gp.noise import RowNoise
-from gpadjust.gp.repeats import Repeats
-from gpadjust.gp.sister import Sister
 from gpadjust.models.exact_conditioning import ExactConditioning
 from gpadjust.models.hyperparameter_samples import (
     HOLDS_SAMPLES,
@@ -43,11 +41,15 @@ from gpadjust.models.local_errors import LocalErrors
 from gpadjust.models.parameters import learnt_noise, set_initial_values
 from gpadjust.models.term_builder import TermBuilder
 from gpadjust.models.terms_model import TermsModel
-from gpadjust.models.training_data import ArrayLike, check_noise, new_observations
+from gpadjust.models.training_data import (
+    ArrayLike,
+    check_noise,
+    new_observations,
+    warn_of_copies,
+)
 from gpadjust.models.updates import NewRows, judge, keep_last
 
 _ROUNDING = 1e-8  # of the targets' standard deviation: smaller errors are of rounding
-_DISTINCT = 0.75  # of the rows, at most, for equal ones to be taken together
 _MANY = 5_000  # points, above which an exact fit takes long
 # What a state has as many of as there were draws, samples or points.
 _OF_ANY_NUMBER = ("draws", "coordinates", "points", "directions", "squares")
@@ -65,7 +67,6 @@ class TermsGP(TermsModel, SingleTaskGP):
         terms: The terms of the model.
 
     Attributes:
-        has_repeats: Whether rows of equal inputs are taken together, by their means.
         was_fitted: Whether :func:`~gpadjust.fit` or ``load_state_dict`` gave it hyper-parameters;
             set it after training of your own.
 
@@ -127,14 +128,8 @@ class TermsGP(TermsModel, SingleTaskGP):
         if data.levels:
             self.remember_levels(data)
         set_initial_values(self, *made.given)
-        self.was_fitted, rows = False, data.X.unique(dim=-2).shape[-2]
-        known = self.noise.known
-        weighs = self.noise.learnt is not None if known is None else bool((known > 0).all())
-        self.has_repeats = weighs and self.noise.rows is None and rows <= _DISTINCT * n
-        if rows < n:
-            from gpadjust.models.copies import warn_of_copies
-
-            warn_of_copies(data, stacklevel=3)
+        self.was_fitted = False
+        warn_of_copies(data, stacklevel=3)
 
     @property
     def is_fitted(self) -> bool:
@@ -175,11 +170,8 @@ class TermsGP(TermsModel, SingleTaskGP):
     def conditioning(self) -> ExactConditioning:
         """Return the posterior of the terms; it is built if there is none."""
         if self.prediction_strategy is None:
-            inputs, raw = self.train_inputs[0], self._original_train_inputs
-            raw = raw if raw is not None and raw.shape[-2] == inputs.shape[-2] else inputs
-            repeats = Repeats.of(raw) if self.has_repeats else None
             self.prediction_strategy = self.conditioning_class(
-                inputs, self.train_targets, self.noise, self.covar_module, repeats
+                self.train_inputs[0], self.train_targets, self.noise, self.covar_module
             )
         strategy: ExactConditioning = self.prediction_strategy
         return strategy
@@ -188,10 +180,8 @@ class TermsGP(TermsModel, SingleTaskGP):
     def log_evidence(self) -> tuple[str, Tensor]:
         """The log marginal likelihood of the observations, in the user's units, ``... x (m)``."""
         train, (_, scale) = self.conditioning().train, self.units()
-        targets, noise, means = self.conditioning().observations()
-        covariance = train.covariance() + torch.diag_embed(noise)
-        more = None if means is None else means.within.at(noise)
-        value = -negative_log_likelihood(targets - train.mean(), covariance, more=more).value
+        covariance = train.covariance() + torch.diag_embed(self.conditioning().target_noise())
+        value = -negative_log_likelihood(self.train_targets - train.mean(), covariance).value
         count = (~self.train_targets.isnan()).sum(-1)
         if self.link is not None:
             value = value + self.outputs_first(self.link.log_slope(self.user_targets())).nansum(-1)
@@ -206,11 +196,8 @@ class TermsGP(TermsModel, SingleTaskGP):
         """
         if self.training:
             self.eval()
-        conditioning = self.conditioning()
-        factors = conditioning.factors()
+        factors = self.conditioning().factors()
         alpha, precision = factors.alpha, factors.squared_columns()
-        if conditioning.repeats is not None:
-            alpha, precision = conditioning.of_each(alpha, precision)
         variance = precision.masked_fill(precision <= 0, torch.nan).reciprocal()
         mean = self.train_targets - alpha * variance
         if self.noise.rows is not None and self.noise.rows.outlying.any():
@@ -360,8 +347,6 @@ class TermsGP(TermsModel, SingleTaskGP):
         self, state_dict: Mapping[str, Any], strict: bool = True, *args: Any, **kwargs: Any
     ) -> Any:
         """Load parameters; with those of a model that holds samples, this one holds them too."""
-        if self.covar_module.sister is None:
-            self.covar_module.sister = Sister.of_state(state_dict, len(self._aug_batch_shape))
         samples = {
             name: state_dict[name]
             for name, parameter in self.named_parameters()
@@ -523,8 +508,6 @@ class TermsGP(TermsModel, SingleTaskGP):
         self.eval()
         if forget is not None:
             forget = checked_whole("forget", forget, 1)
-        if self.has_repeats:  # rows come and go from now on
-            self.has_repeats, self.prediction_strategy = False, None
         with torch.no_grad():
             self._check_window(forget)
             let_all_learn(self)

@@ -519,7 +519,7 @@ class TermsModel(PredictiveModel):
         for other in self._centerd() if term.unit is Unit.TARGET else ():
             parts.append((other, -other.basis.origin / other.basis.scale))
             shift = shift + other.basis.moved_mean
-        return self.covar_module.weighted(inputs, parts, shift)
+        return WeightedSum(inputs, parts, shift)
 
     def _centerd(self) -> list[Term]:
         """The terms from whose physics a center is taken."""

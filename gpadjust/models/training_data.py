@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from datetime import date, time, timedelta
 from typing import Any, NamedTuple
@@ -239,6 +240,23 @@ def check_order(values: ArrayLike, names: tuple[str, ...]) -> None:
 def default_names(letter: str, number: int) -> tuple[str, ...]:
     """``x``, or ``x1`` and so on."""
     return (letter,) if number == 1 else tuple(f"{letter}{i + 1}" for i in range(number))
+
+
+def warn_of_copies(data: TrainingData, stacklevel: int) -> None:
+    """Warn of rows that equal an earlier one in all inputs and outputs; not of a batch."""
+    if data.X.dim() > 2:
+        return
+    is_missing = data.Y.isnan()
+    rows = torch.cat([data.X, data.Y.masked_fill(is_missing, 0.0), is_missing.to(data.X)], dim=-1)
+    n, distinct = len(rows), len(rows.unique(dim=0))
+    if distinct < n:
+        warnings.warn(
+            f"{n - distinct} of {n} rows equal an earlier row in all inputs and outputs. If the "
+            "same measurements stand in the data twice, as of files joined twice, the noise comes "
+            "out too small: drop them, `frame.drop_duplicates()`. Repeats that are equal by "
+            "rounding may stay.",
+            stacklevel=stacklevel + 1,
+        )
 
 
 def check_noise(noise: object, Y: Tensor) -> None:

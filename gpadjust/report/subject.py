@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.gp import PhysicsInput
-from gpadjust.models import AR1, ParallelPartialGP, StackedGP, TermsGP, VariationalCKA
+from gpadjust.models import AR1, StackedGP, TermsGP, VariationalCKA
 from gpadjust.physics import JoinedPhysics, Physics
 from gpadjust.validation import Comparison, LeaveOneOut, leave_one_out
 from gpadjust.validation.leave_one_out import observations
@@ -164,11 +164,6 @@ def subject_of(thing: object, rows: Sequence[object] | None = None) -> Subject:
         raise TypeError(
             "VariationalCKA has no leave-one-out predictions, expected a model that has: report "
             "on `gpadjust.compare` of some hundred of its rows."
-        )
-    if isinstance(model, ParallelPartialGP):
-        raise TypeError(
-            f"A page has a section for each output, expected a model of few, got {model!r}: report "
-            "on `gpadjust.compare` of some of its columns; `model.summary()` tells of all."
         )
     if not isinstance(model, TermsGP | StackedGP):
         raise TypeError(

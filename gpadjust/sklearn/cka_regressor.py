@@ -23,7 +23,6 @@ from gpadjust.models import (
     CKA,
     RRA,
     CalibratedPhysics,
-    ParallelPartialGP,
     PhysicsMeanGP,
     PhysicsParameters,
     ScaleGP,
@@ -49,7 +48,6 @@ MODELS: dict[str, type[TermsModel]] = {
     "calibrated_physics": CalibratedPhysics,
     "zero_mean": ZeroMeanGP,
     "variational": VariationalCKA,
-    "parallel_partial": ParallelPartialGP,
 }
 
 
@@ -79,8 +77,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             of single rows, or one with unknown parameters. Several: a list, or a dictionary with
             their names. None: no physics; the model is then :class:`~gpadjust.ZeroMeanGP`, which is
             what CKA of :math:`f_p = 0` is.
-        model: ``"cka"``, ``"variational"`` (of very many rows), ``"parallel_partial"`` (of very
-            many outputs), ``"rra"``, ``"physics_mean"``,
+        model: ``"cka"``, ``"variational"`` (of very many rows), ``"rra"``, ``"physics_mean"``,
             ``"scale"``, ``"calibrated_physics"``, ``"zero_mean"`` (which leaves the physics out, to
             compare with), or a callable that makes a model of X and y, with the keyword
             ``physics`` if there is one: a class of models, or ``functools.partial`` of one with

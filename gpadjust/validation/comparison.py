@@ -19,6 +19,7 @@ from gpadjust.inference.fitting import check_options, fit
 from gpadjust.models import CalibratedPhysics, StackedGP, TermsGP
 from gpadjust.models.factory import ModelFactory, make_model, with_options
 from gpadjust.models.hyperparameter_samples import take_samples
+from gpadjust.models.stacked import check_stackable
 from gpadjust.models.term_builder import ModelOptions, PhysicsLike
 from gpadjust.models.training_data import ArrayLike, training_data
 from gpadjust.physics import PhysicsWarning, as_physics
@@ -279,8 +280,7 @@ def compare(
     if (m := data.Y.shape[-1]) > _MOST_OUTPUTS:
         raise ValueError(
             f"Expected at most {_MOST_OUTPUTS} outputs, each of which is judged by itself, got "
-            f"{m}: compare some of them, or fit a ParallelPartialGP of all with the physics and "
-            "one with physics=None, and see the scores of `leave_one_out` of both."
+            f"{m}: compare some of them."
         )
     given_physics = as_physics(physics)
     fitted_to = candidates(asked, given_physics, len(data.X))
@@ -302,6 +302,8 @@ def compare(
                     train_Yvar=train_Yvar,
                     physics=deepcopy(part) if structure.uses_physics else None,
                 )
+                for first in [*models.values()][:1]:
+                    check_stackable(first, model)
                 warnings.simplefilter("ignore", OptimizationWarning)
                 warnings.simplefilter("ignore", SamplingWarning)  # the advice says so
                 with threads_for(len(data.X)):

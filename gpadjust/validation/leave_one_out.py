@@ -17,7 +17,7 @@ from linear_operator import to_dense
 from torch import Tensor
 
 from gpadjust.gp.noise import Noise
-from gpadjust.models import ParallelPartialGP, StackedGP, TermsGP, VariationalCKA
+from gpadjust.models import StackedGP, TermsGP, VariationalCKA
 from gpadjust.models.exact_conditioning import Factors
 from gpadjust.models.heavy_tails import with_tails
 from gpadjust.models.stacked import Part
@@ -98,8 +98,7 @@ def leave_one_out(
         \sigma^2_{-i} = 1 / [K^{-1}]_{ii}
 
     (Rasmussen and Williams 2006, eqs. 5.10-5.12; Sundararajan and Keerthi 2001). Of an
-    :class:`~gpadjust.AR1` only points of the high level are left out. The covariance of a
-    :class:`~gpadjust.models.PaperRRA` is that of the paper.
+    :class:`~gpadjust.AR1` only points of the high level are left out.
 
     Of a model that holds samples of its hyper-parameters, these *are* without the left-out
     observation: a sample has the weight :math:`1 / p(y_i | y_{-i}, \theta)`, at most
@@ -135,12 +134,6 @@ def leave_one_out(
             "Expected an exact model, got a VariationalCKA: of so many observations hold some out, "
             "build the model of the others, and compare model.interval(X) with what was held out."
         )
-    if isinstance(model, ParallelPartialGP):
-        found: Any = model.data()
-        mean, variance = model.left_out()
-        density = log_densities(mean, variance, found["train_Y"])
-        mixed_ones = _mixture_of(mean, variance, density, _without_each(density))
-        return LeaveOneOut(found["train_X"], found["train_Y"], *mixed_ones, model.output_names)
     if not isinstance(model, BatchedMultiOutputGPyTorchModel):
         raise TypeError(
             "Expected a model of this library, a SingleTaskGP, or a ModelListGP of such, got "
@@ -246,7 +239,7 @@ def observations(model: Any) -> tuple[Tensor, Tensor]:
         models = model.models if several else [parts[0].model for parts in model.parts]
         parts = [observations(part) for part in models]
         return parts[0][0], torch.cat([Y for _, Y in parts], dim=-1)
-    if isinstance(model, VariationalCKA | ParallelPartialGP):
+    if isinstance(model, VariationalCKA):
         data: Any = model.data()
         return data["train_X"], data["train_Y"]
     with _evaluating(model), torch.no_grad():

@@ -97,7 +97,7 @@ def scenario(
 ) -> Scenario:
     """A scenario of a learner of the registry, or of ``"rra-paper"``, RRA as printed."""
     known = LEARNERS.get(name, LEARNERS["rra"])
-    model = "PaperRRA" if name == "rra-paper" else known.model
+    model = "paper.forrester.paper_rra:PaperRRA" if name == "rra-paper" else known.model
     kind = {"phy": "physics", "oracle": "truth", "mf": "none"}.get(name, "learnt")
     options = LITERAL if name in ("cka", "rra") else {}
     return Scenario(

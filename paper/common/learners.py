@@ -16,7 +16,8 @@ class Learner:
     Args:
         label: Its name in tables and figures.
         color: Its color in figures.
-        model: A class of :mod:`gpadjust.models`; None of a learner whose model a chapter makes.
+        model: A class of :mod:`gpadjust.models`, or ``"module:class"``; None of a learner whose
+            model a chapter makes.
         options: Of that class.
         adjusts: Whether the model is given f_p.
     """
@@ -32,7 +33,7 @@ class Learner:
         """Its model factory, of inputs, targets and ``physics``; imports the library."""
         if self.model is None:
             raise ValueError(f"{self.label}: the chapter makes its model")
-        kind = resolve_name(f"gpadjust.models:{self.model}")
+        kind = resolve_name(self.model if ":" in self.model else f"gpadjust.models:{self.model}")
         if self.adjusts:
             return partial(kind, **self.options) if self.options else kind
 

@@ -33,7 +33,6 @@ from matplotlib.ticker import NullFormatter
 from torch import Tensor
 
 from gpadjust import RRA, fit
-from gpadjust.models import PaperRRA
 from gpadjust.validation import coverage, crps, nlpd, rmse
 from paper.common.experiment import Run, Table
 from paper.common.figures import save, strips
@@ -41,6 +40,7 @@ from paper.common.learners import LEARNERS, LITERAL
 from paper.common.tables import across, claims_table, frame, groups, markdown, of, table
 from paper.common.verdicts import Difference, Judged, Verdict, all_of, bootstrap, reproduced, within
 from paper.forrester import GRID, OTHER, PROTOCOLS, READINGS, Forrester, Settings
+from paper.forrester.paper_rra import PaperRRA
 from paper.forrester.problem import CRUDE, LOWER, POINTS, UPPER, observations, truth
 
 LEARNT = "CKA, learnt means"  # not in the paper

@@ -418,10 +418,6 @@ class TestErrors:
         with pytest.raises(TypeError, match="got ModelListGP"):
             qAdjustmentInformationGain(ModelListGP(build("CKA", *data())))
 
-    def test_the_papers_ridge(self, data, build):
-        with pytest.raises(TypeError, match="take RRA"):
-            qAdjustmentInformationGain(build("RRA-paper", *data()))
-
     def test_delta_of_a_centred_model(self, data, build):
         for center in ("mean", "learn"):
             with pytest.raises(ValueError, match=r"ask about 'rho' or 'both', .* center=0\.0"):

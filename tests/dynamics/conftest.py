@@ -8,7 +8,6 @@ import torch
 
 from gpadjust import CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP
 from gpadjust.dynamics import LearnedDynamics, StateSpec
-from gpadjust.models import PaperRRA
 from gpadjust.physics import ODEPhysics
 
 TRUTH = (0.5, 0.5, 0.6, 0.1)
@@ -68,7 +67,6 @@ _MODELS = {
     "Scale": ScaleGP,
     "CKA": CKA,
     "RRA": RRA,
-    "RRA-paper": PaperRRA,
 }
 
 
@@ -94,10 +92,9 @@ def make():
     """Makes dynamics by the name of their model, with a quick search and few samples."""
 
     def make(kind, spec, physics, **options):
-        sampled = FEW_SAMPLES if kind != "RRA-paper" else {"num_starts": 1, "num_screened": 8}
-        options.setdefault("fit_options", sampled)
+        options.setdefault("fit_options", FEW_SAMPLES)
         model = options.pop("model", _MODELS[kind])
-        if kind.startswith("RRA"):
+        if kind == "RRA":
             model = partial(model, num_features=32)
         return LearnedDynamics(spec, None if kind == "GP" else physics, model=model, **options)
 

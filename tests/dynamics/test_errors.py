@@ -9,7 +9,7 @@ from botorch.models import SingleTaskGP
 
 from gpadjust import CKA, RRA, PhysicsMeanGP, ZeroMeanGP
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
-from gpadjust.models import PaperRRA, TermsGP
+from gpadjust.models import TermsGP
 from gpadjust.physics import FunctionPhysics, PhysicsError
 
 SPEC = StateSpec(["x", "v"], ["a"])
@@ -334,16 +334,6 @@ def test_an_integrated_state_hides_no_failure():
             "it is one of method 'bayes'",
         ),
         ({"fit_options": {"starts": 8}}, ValueError, "no option 'starts'; expected num_starts"),
-        (
-            {"model": PaperRRA, "fit_options": {"num_samples": 8}},
-            ValueError,
-            "Method 'map' has no option 'num_samples'",
-        ),
-        (
-            {"model": PaperRRA, "fit_options": {"method": "bayes"}},
-            ValueError,
-            "PaperRRA cannot be fully Bayesian.*method 'map'",
-        ),
         ({"fit_options": [8]}, TypeError, r"dictionary of options of gpadjust.fit, found \[8\]"),
         ({"encode_angles": "no"}, TypeError, "encode_angles must be True or False; found 'no'"),
         ({"target": 3}, ValueError, "Unknown target 3"),

@@ -11,7 +11,7 @@ from gpadjust.physics import JoinedPhysics, ODEPhysics, PhysicsError
 pytestmark = pytest.mark.filterwarnings(
     "ignore:f_p is nearly zero", "ignore::gpadjust.inference.SamplingWarning"
 )
-SEVERAL = ["PhysicsMean", "Scale", "CKA", "RRA", "RRA-paper"]
+SEVERAL = ["PhysicsMean", "Scale", "CKA", "RRA"]
 
 
 @pytest.fixture

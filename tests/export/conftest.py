@@ -14,7 +14,7 @@ from botorch.models.transforms.input import ChainedInputTransform, InputStandard
 from gpytorch.kernels import MaternKernel, ScaleKernel
 
 from gpadjust import CKA, RRA, FunctionPhysics, ScaleGP, Unknown, VariationalCKA, ZeroMeanGP, fit
-from gpadjust.models import BiasGP, PaperRRA
+from gpadjust.models import BiasGP
 from tests.systems import crude, normal, truth, uniform
 
 X = uniform(30, 2)
@@ -83,7 +83,6 @@ MODELS = {
     "ScaleGP": lambda: ScaleGP(X, Y, physics=crude),
     "ZeroMeanGP": lambda: ZeroMeanGP(X, Y),
     "RRA": lambda: RRA(X, Y, physics=crude, num_features=20),
-    "PaperRRA": lambda: PaperRRA(X, Y, physics=crude, num_features=20),
     "RRA, one output": lambda: RRA(
         X, Y[:, :1], physics=lambda X: crude(X)[..., :1], num_features=20
     ),

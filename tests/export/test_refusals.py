@@ -5,7 +5,7 @@ import sys
 import pytest
 from gpytorch.kernels import PeriodicKernel, RFFKernel, ScaleKernel
 
-from gpadjust import AR1, CKA, CalibratedPhysics, FunctionPhysics, ParallelPartialGP, Unknown, fit
+from gpadjust import AR1, CKA, CalibratedPhysics, FunctionPhysics, Unknown, fit
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.export import c_source, casadi_function
 from gpadjust.states import StateSpec
@@ -69,7 +69,7 @@ def test_what_is_no_finite_sum_is_refused_with_the_way_out(make, words):
 
 
 def test_what_is_no_model_of_terms_is_refused():
-    for wrong in (None, ParallelPartialGP(X, Y.repeat(1, 5), physics=lambda X: X.repeat(1, 5))):
+    for wrong in (None, lambda X: X):
         with pytest.raises(TypeError, match="or LearnedDynamics of one, got"):
             c_source(wrong, "f")
     with pytest.raises(RuntimeError, match="has not learnt"):

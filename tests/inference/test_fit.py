@@ -15,7 +15,7 @@ from torch.distributions import MultivariateNormal
 from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP, fit
 from gpadjust.gp.gaussian import nugget
 from gpadjust.inference import FitResult, optimise
-from gpadjust.models import BiasGP, PaperRRA
+from gpadjust.models import BiasGP
 from gpadjust.models.parameters import LogInterval
 from tests.systems import Sine, line, ripple, wave
 
@@ -31,7 +31,6 @@ BUILD = {
     "CKA": lambda *data: CKA(*data, physics=ripple),
     "AR1": lambda *data: AR1(*data, physics=ripple, num_low=12, bounds=[[0.0, 0.0], [1.0, 1.0]]),
     "RRA": lambda *data: RRA(*data, physics=ripple, num_features=16),
-    "RRA-paper": lambda *data: PaperRRA(*data, physics=ripple, num_features=16),
 }
 
 
@@ -42,7 +41,7 @@ def XY(uniform):
     return X, 1.5 * ripple(X) + X.flip(-1) + 0.1 * uniform(9, 2, seed=5)
 
 
-SLOW = ("AR1", "ScaleGP", "RRA-paper")
+SLOW = ("AR1", "ScaleGP")
 
 
 @pytest.fixture(

@@ -163,7 +163,6 @@ def test_the_default_samples_where_it_can(XY, build, data):
     point = {"num_starts": 1, "num_screened": 8}
     for other in (
         SingleTaskGP(*XY),
-        build("RRA-paper", *data()),
         build("CKA", *data(batch_shape=(2,))),
     ):
         assert isinstance(fit(other, **point), FitResult)

@@ -284,10 +284,6 @@ class TestRefusals:
         with pytest.raises(RuntimeError, match="holds samples"):
             model.hold_samples({})
 
-    def test_the_papers_closed_form(self, build, data):
-        with pytest.raises(ValueError, match="Take RRA"):
-            fit(build("RRA-paper", *data()), "bayes")
-
     def test_a_batch_of_data_sets(self, build, data):
         with pytest.raises(ValueError, match="one data set"):
             fit(build("CKA", *data(batch_shape=(2,))), "bayes")

@@ -47,9 +47,7 @@ def assert_equal_to_autograd(
     assert isinstance(by_hand.distribution, StationaryTerms)
     kept = slice(None) if rows is None else rows
     noise = Noise(model.likelihood).known
-    inputs, share = model.transform_inputs(model.train_inputs[0])[..., kept, :], None
-    if reference.repeats is not None:
-        inputs, share = inputs[..., reference.repeats.first, :], reference.means.share
+    inputs = model.transform_inputs(model.train_inputs[0])[..., kept, :]
     reference.distribution = ByModules(
         model,
         reference.parameters,
@@ -57,7 +55,6 @@ def assert_equal_to_autograd(
         None if noise is None else noise[..., kept],
         kind.random_means,
         kept,
-        share,
     )
     current = by_hand.parameters.current()
     noise = normal(3, *current.shape[1:], seed=seed)

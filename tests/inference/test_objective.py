@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP
 from gpadjust.gp.gaussian import log_likelihood, negative_log_likelihood, nugget
 from gpadjust.inference.targets import LogLikelihood, LogPosterior, Target
-from gpadjust.models import PaperRRA
 from gpadjust.models.parameters import KINDS
 from tests.systems import line, ripple, uniform
 
@@ -79,7 +78,6 @@ BUILD = {
     "other priors": lambda X, Y: with_priors(X, Y, GammaPrior(3.0, 6.0), GammaPrior(2.0, 0.5)),
     "AR1": lambda X, Y: AR1(X, Y, physics=ripple, bounds=torch.tensor([[0.0, 0], [1, 1]])),
     "RRA": lambda X, Y: RRA(X, Y, physics=ripple, num_features=16),
-    "PaperRRA": lambda X, Y: PaperRRA(X, Y, physics=ripple, num_features=16),
 }
 
 

@@ -41,7 +41,7 @@ some = pytest.mark.parametrize(
     [
         pytest.param(name, kind, marks=() if kind == "CKA" or quick else pytest.mark.slow)
         for name in NAMES
-        for kind in ("ZeroMeanGP", "PhysicsMeanGP", "ScaleGP", "CKA", "AR1", "RRA", "RRA-paper")
+        for kind in ("ZeroMeanGP", "PhysicsMeanGP", "ScaleGP", "CKA", "AR1", "RRA")
         for quick in [(name, kind) in (("deviation", "AR1"), ("knowledge gradient", "RRA"))]
     ],
 )

@@ -86,7 +86,7 @@ def expired(X):
     raise RuntimeError("licence expired")
 
 
-@pytest.mark.parametrize("kind", ["PhysicsMeanGP", "ScaleGP", "CKA", "AR1", "RRA", "RRA-paper"])
+@pytest.mark.parametrize("kind", ["PhysicsMeanGP", "ScaleGP", "CKA", "AR1", "RRA"])
 def test_physics(build, kind, XY):
     wrong = "outputs as the high one has, got 2 and 2" if kind == "AR1" else "returned 2 col"
     for physics, error, says in (
@@ -171,7 +171,7 @@ BAD_OPTIONS = [
     ("AR1", {"num_low": 2.5}, TypeError, r"num_low must be a whole number; found 2\.5"),
     *(
         (kind, {"seed": seed}, TypeError, f"seed must be a whole number; found {seed!r}")
-        for kind in ("AR1", "RRA", "RRA-paper")
+        for kind in ("AR1", "RRA")
         for seed in ("a", 1.5)
     ),
     *(

@@ -24,7 +24,7 @@ from gpadjust.inference.targets import LogLikelihood
 from gpadjust.physics import FunctionPhysics, Unknown
 from tests.systems import line
 
-REST = ("AR1", "RRA", "RRA-paper")  # of models in lists
+REST = ("AR1", "RRA")  # of models in lists
 
 
 def own_likelihood(model):

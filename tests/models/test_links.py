@@ -146,13 +146,9 @@ def test_unknown_parameters_and_missing_observations():
 
 @pytest.mark.slow
 def test_links_are_compared_and_stacked():
-    linked = partial(CKA, outcome_transform="log")
-    comparison = compare(X, Y, decades, structures=[CKA, linked])
-    assert comparison.table["y"][0].structure == "CKA(outcome_transform='log')"
+    comparison = compare(X, Y, decades, structures=[CKA, PhysicsMeanGP], outcome_transform="log")
     stacked = StackedGP(comparison.models, torch.tensor([[0.25], [0.75]]).double(), 8)
-    parts = [part.model for part in stacked.parts[0]]
-    assert [part.link is None for part in parts] == [True, False]
-    moments = [part.predict(NEW).mean for part in parts]
+    moments = [part.model.predict(NEW).mean for part in stacked.parts[0]]
     torch.testing.assert_close(
         stacked.predict(NEW).mean, 0.25 * moments[0] + 0.75 * moments[1], rtol=0.05, atol=0.05
     )
@@ -167,8 +163,10 @@ def test_links_are_compared_and_stacked():
         atol=0.1,
     )
     assert leave_one_out(stacked).pit is not None
-    with pytest.raises(ValueError, match="links apart"):
+    with pytest.raises(ValueError, match="got variances"):
         stacked.predict(NEW, torch.ones_like(NEW))
+    with pytest.raises(ValueError, match="Expected models of one link"):
+        compare(X, Y, decades, structures=[CKA, partial(CKA, outcome_transform="log")])
 
 
 def test_acquisition_regression_and_many_rows(log_model):

@@ -36,8 +36,6 @@ class TestPosterior:
     @pytest.mark.parametrize("shape", [(5,), (3, 5)])
     def test_as_a_single_task_gp(self, large, build, num_outputs, kind, uniform, shape):
         X, Y = large(num_outputs)
-        if kind == "RRA-paper":
-            pytest.skip("It has no outcome transform.")
         theirs = SingleTaskGP(X, Y, outcome_transform=Standardize(num_outputs))
         ours = build(kind, X, Y, outcome_transform=Standardize(num_outputs))
         Z, noise = uniform(*shape, 2), uniform(*shape, num_outputs, low=0.1, seed=2)

@@ -26,7 +26,7 @@ def counting():
     return Counting()
 
 
-PHYSICAL = ["PhysicsMeanGP", "ScaleGP", "CKA", "RRA", "RRA-paper"]
+PHYSICAL = ["PhysicsMeanGP", "ScaleGP", "CKA", "RRA"]
 
 
 @pytest.mark.slow

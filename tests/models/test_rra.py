@@ -8,9 +8,6 @@ import torch
 from botorch.models.transforms import Normalize, Standardize
 from pyro.infer.autoguide import AutoLaplaceApproximation
 
-from gpadjust.models import PaperRRA
-from tests.systems import crude
-
 
 @pytest.fixture(autouse=True)
 def _clear_pyro():
@@ -157,54 +154,6 @@ def test_evidence_is_that_of_the_weights_marginalised(data, build, shuffle):
     assert actual == pytest.approx(expected.item(), rel=1e-8)
 
 
-@pytest.mark.parametrize("known_noise", [False, True])
-def test_the_papers_closed_form(data, build, shuffle, close, uniform, known_noise):
-    X, Y = data(num_outputs=2)
-    Yvar = torch.full_like(Y, 0.3) if known_noise else None
-    model = shuffle(build("RRA-paper", X, Y, Yvar, num_features=6))
-    Z = uniform(5, 2, high=2.0, seed=3)
-    posterior, noisy = model.posterior(Z), model.posterior(Z, observation_noise=True)
-    weights = model.weights()
-    for j in range(2):
-        kernels = [term.kernel.base_kernel for term in model.terms]
-
-        def phi(X, j=j, kernels=kernels):
-            parts = []
-            for kernel in kernels:
-                angles = (X / kernel.lengthscale[j].detach()) @ kernel.randn_weights[j]
-                parts.append(torch.cat([angles.cos(), angles.sin()], dim=-1) / 3**0.5)
-            return torch.cat([crude(X)[:, [j]] * parts[0], parts[1]], dim=-1)
-
-        ridge = 0.3 if known_noise else model.likelihood.noise[j].item()
-        eye = torch.eye(12, dtype=torch.float64)
-        gram = phi(X).mT @ phi(X)
-        beta = torch.linalg.solve(gram + ridge * eye, phi(X).mT @ Y[:, j])
-        covariance = torch.linalg.inv(gram + eye)
-        close(weights.mean[j].detach(), beta)
-        close(weights.covariance_matrix[j].detach(), covariance)
-        variance = (phi(Z) @ covariance @ phi(Z).mT).diagonal()
-        close(posterior.mean[:, j].detach(), phi(Z) @ beta)
-        close(posterior.variance[:, j].detach(), variance)
-        close(noisy.mean[:, j].detach(), phi(Z) @ beta)
-        close(noisy.variance[:, j].detach(), variance + ridge)
-
-
-def test_the_papers_prior_falls_to_zero_without_data(data, build, uniform):
-    X, Y = data()
-    model = build("RRA-paper", X, Y).eval()
-    assert (model.weights().variance <= 1).all()
-    assert not any(term.kernel.raw_outputscale.requires_grad for term in model.terms)
-    functions = model.functions(torch.zeros(1, 48, dtype=torch.float64))
-    assert (functions(uniform(4, 2)) == 0).all()
-
-
-def test_the_papers_prior_rho_times_physics_plus_delta(data, build, shuffle, close, uniform):
-    model = shuffle(build("RRA-paper", *data(), center="mean"))
-    Z = uniform(5, 2, high=2.0, seed=3)
-    parts = model.rho(Z).mean * model.physics(Z) + model.delta(Z).mean
-    close(parts.detach(), model.posterior(Z).mean.detach())
-
-
 def test_the_seed_makes_the_features(data, build, uniform):
     X, Y = data()
     Z = uniform(5, 2)
@@ -218,11 +167,3 @@ def test_rho_and_delta_have_features_of_their_own_which_the_outputs_share(data, 
     rho, delta = (term.kernel.base_kernel.randn_weights for term in model.terms)
     assert not torch.equal(rho, delta)
     assert torch.equal(rho[0], rho[1])
-
-
-def test_papers_refusals(data, build):
-    model = build("RRA-paper", *data())
-    with pytest.raises(ValueError, match="cannot be fully Bayesian"):
-        model.hold_samples({})
-    with pytest.raises(TypeError, match="outcome_transform"):
-        PaperRRA(*data(), physics=lambda X: X, outcome_transform=None)

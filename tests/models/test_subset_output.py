@@ -9,7 +9,7 @@ from gpytorch.mlls import ExactMarginalLogLikelihood
 from gpadjust import fit
 from tests.systems import crude
 
-KINDS = ["ZeroMeanGP", "PhysicsMeanGP", "ScaleGP", "CKA", "AR1", "RRA", "RRA-paper"]
+KINDS = ["ZeroMeanGP", "PhysicsMeanGP", "ScaleGP", "CKA", "AR1", "RRA"]
 CASES = [(kind, indices) for kind in KINDS for indices in ([1], [2, 0])]
 QUICK = [("CKA", [1]), ("CKA", [2, 0]), ("RRA", [2, 0])]
 

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, VariationalCKA, fit, load, save
-from gpadjust.models import PaperRRA
 from gpadjust.validation import leave_one_out
 
 
@@ -224,7 +223,5 @@ def test_what_cannot_be_updated_says_so():
         model.update(NEW_X, NEW_Y, NEW_Y.abs(), forget=5)
     with pytest.raises(NotImplementedError, match="rows of its own"):
         AR1(X, Y, physics=wave, bounds=[[0.0], [1.0]]).update(NEW_X, NEW_Y, forget=5)
-    with pytest.raises(NotImplementedError, match="take RRA"):
-        PaperRRA(X, Y, physics=wave).update(NEW_X, NEW_Y)
     with pytest.raises(NotImplementedError, match="in place"):
         VariationalCKA(X, Y, physics=wave, num_inducing=4).update(NEW_X, NEW_Y)

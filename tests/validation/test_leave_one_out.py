@@ -65,8 +65,7 @@ def test_it_is_rebuilding_without_the_point(data, construct, kind, num_outputs, 
     if case == "transformed":
         bounds = torch.tensor([[0.0, 0.0], [2.0, 2.0]], dtype=torch.float64)
         options["input_transform"] = Normalize(2, bounds=bounds)
-        if kind != "RRA-paper":
-            options["outcome_transform"] = Standardize(num_outputs)
+        options["outcome_transform"] = Standardize(num_outputs)
     Yvar = 0.01 + 0.01 * Y.abs() if case == "known-noise" else None
     model = shuffle(construct(kind, X, Y, Yvar, **options))
     check(construct, kind, model, X, Y, Yvar, **options)
