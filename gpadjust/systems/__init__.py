@@ -1,6 +1,6 @@
 """Systems to control: each an environment, and what is known of it, in one object.
 
-To import this package registers the environments with Gymnasium; ``gym.make`` imports it by itself
+To import this package registers the environment with Gymnasium; ``gym.make`` imports it by itself
 where the id names it, as in ``gym.make("gpadjust.systems:gpadjust/CartPoleSwingUp-v0")``.
 
 A step that failed, as where a simulator could not integrate, truncates the episode and says
@@ -15,11 +15,8 @@ except ImportError as error:
         'gpadjust.systems needs Gymnasium; run `pip install "gpadjust[control]"`.'
     ) from error
 
-from gpadjust.systems.muscle_arm import MuscleArmEnv
-from gpadjust.systems.reaching import arm, hand_distance_cm, hand_position
 from gpadjust.systems.swing_up import CartPoleEquation, CartPoleSwingUpEnv, cart_pole
 from gpadjust.systems.system import System
-from gpadjust.systems.torque_arm import ArmEquation
 from gpadjust.systems.wrappers import NoisySensors, RememberAction
 
 _gymnasium.register(
@@ -27,22 +24,12 @@ _gymnasium.register(
     entry_point="gpadjust.systems.swing_up:CartPoleSwingUpEnv",
     max_episode_steps=25,
 )
-_gymnasium.register(
-    id="gpadjust/MuscleArm-v0",
-    entry_point="gpadjust.systems.muscle_arm:MuscleArmEnv",
-    max_episode_steps=15,
-)
 
 __all__ = [
-    "ArmEquation",
     "CartPoleEquation",
     "CartPoleSwingUpEnv",
-    "MuscleArmEnv",
     "NoisySensors",
     "RememberAction",
     "System",
-    "arm",
     "cart_pole",
-    "hand_distance_cm",
-    "hand_position",
 ]

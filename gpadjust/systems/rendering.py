@@ -17,7 +17,6 @@ SMOOTH = 2  # drawn so many times larger, then scaled down, for smooth edges
 RENDER_MODES = ["human", "rgb_array"]
 
 Array = NDArray[np.float32]
-Color = tuple[int, int, int]
 WHITE, BLACK, GREY, LIGHT = (255, 255, 255), (0, 0, 0), (110, 110, 110), (215, 215, 215)
 BLUE, RED, GREEN = (31, 79, 130), (204, 77, 77), (44, 140, 68)
 

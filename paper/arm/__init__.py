@@ -53,7 +53,7 @@ PAPER = ("mf", "phy", "gp", "cka", "rra")  # those that the paper compares
 
 
 def _check_opensim() -> None:
-    from gpadjust.systems.opensim import load_opensim
+    from paper.arm.system.opensim import load_opensim
 
     load_opensim()
 
@@ -81,7 +81,7 @@ class Arm(Control):
 
     def setup(self, name: str, seed: int) -> Setup:
         """The arm; nothing in f_p is random."""
-        from paper.arm.system import setup
+        from paper.arm.evaluation import setup
 
         return setup(self.known[name], self.settings_of(name))
 

@@ -13,10 +13,10 @@ import pandas as pd
 from matplotlib.axes import Axes
 from torch import Tensor
 
-from gpadjust.systems.reaching import START_MEAN, arm_targets, hand_position
-from gpadjust.systems.torque_arm import REAL_ARM
 from paper.arm import PAPER, SCENARIOS
 from paper.arm.claims import LAST, MAP_AFTER, claims, targets
+from paper.arm.system.reaching import START_MEAN, arm_targets, hand_position
+from paper.arm.system.torque_arm import REAL_ARM
 from paper.cartpole import Control
 from paper.cartpole.control import (
     cost_of_a_run,

@@ -25,8 +25,8 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from gpadjust.systems.reaching import START_MEAN, arm_targets, hand_position
 from paper.arm import PAPER, SCENARIOS, Settings
+from paper.arm.system.reaching import START_MEAN, arm_targets, hand_position
 from paper.common.verdicts import (
     Claim,
     Curves,

@@ -22,11 +22,12 @@ from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.inference import ParameterWarning, SamplingWarning
 from gpadjust.physics import as_physics
 from gpadjust.states import StateSpec
-from gpadjust.systems import System, arm
+from gpadjust.systems import System
 from paper.arm import BOUNDS, SENSORS, Reaching, ReachingSettings
 from paper.arm import Settings as ArmSettings
 from paper.arm.arm import BOUND, draw_maps
-from paper.arm.system import reach, score
+from paper.arm.evaluation import reach, score
+from paper.arm.system import arm
 from paper.cartpole.planning import trials_table
 from paper.common.experiment import Run, Table
 from paper.common.figures import curves as draw_curves

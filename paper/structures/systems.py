@@ -15,9 +15,10 @@ from gpadjust.dynamics import Trajectories
 from gpadjust.physics import ODEPhysics, Physics
 from gpadjust.records import Records
 from gpadjust.states import StateSpec
-from gpadjust.systems import CartPoleSwingUpEnv, MuscleArmEnv, arm, cart_pole
-from gpadjust.systems.reaching import ARM_SPEC
+from gpadjust.systems import CartPoleSwingUpEnv, cart_pole
 from gpadjust.systems.swing_up import CART_POLE_SPEC
+from paper.arm.system import MuscleArmEnv, arm
+from paper.arm.system.reaching import ARM_SPEC
 from paper.machines.pendulums import Rates, double_pendulum, pendulum, sums_of_masses
 from paper.machines.records import DATA
 from paper.structures import ARM, SIMULATED

@@ -6,9 +6,9 @@ import numpy as np
 import opensim
 import pytest
 
-from gpadjust.systems import MuscleArmEnv
-from gpadjust.systems.opensim import build_muscle_arm, controls
-from gpadjust.systems.torque_arm import REAL_ARM
+from paper.arm.system import MuscleArmEnv
+from paper.arm.system.opensim import build_muscle_arm, controls
+from paper.arm.system.torque_arm import REAL_ARM
 
 START = np.radians([35.0, 65.0, 0.0, 0.0])
 ACCURACY = 1e-5

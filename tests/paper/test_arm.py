@@ -8,14 +8,13 @@ import torch
 
 from gpadjust.control.random_state import RandomState
 from gpadjust.physics import ODEPhysics
-from gpadjust.systems.torque_arm import ARM_TIME_STEP, believed_arm
-from paper.arm import SLOW, Arm, Reaching, ReachingSettings, Settings
-from paper.arm import system as arm_system
+from paper.arm import SLOW, Arm, Reaching, ReachingSettings, Settings, evaluation
 from paper.arm.arm import load_maps
 from paper.arm.claims import claims as arm_claims
 from paper.arm.claims import distance_from_start
+from paper.arm.evaluation import hundred, reach, score
 from paper.arm.reaching import dynamics
-from paper.arm.system import hundred, reach, score
+from paper.arm.system.torque_arm import ARM_TIME_STEP, believed_arm
 from paper.cartpole import Floor, FloorSettings
 from paper.cartpole.control import load, run
 from paper.common.runner import main, run_missing, runs_file
@@ -39,8 +38,8 @@ FEW = ReachingSettings(trials=1, long_trials=1, updates=2, starts=3)
 @pytest.fixture
 def _few_targets(monkeypatch):
     """Evaluations of 4 targets, as OpenSim takes its time."""
-    every = arm_system.arm_targets()[[0, 40, 60, 120]]
-    monkeypatch.setattr(arm_system, "arm_targets", lambda: every)
+    every = evaluation.arm_targets()[[0, 40, 60, 120]]
+    monkeypatch.setattr(evaluation, "arm_targets", lambda: every)
 
 
 class Still:
@@ -65,7 +64,7 @@ class TestArm:
         assert torch.equal(RandomState.capture().torch, before.torch)
         assert distances.shape == (4, 5)
         env = Arm(settings=settings).setup("cka-memory", 0).env
-        target = arm_system.arm_targets()[1].tolist()
+        target = evaluation.arm_targets()[1].tolist()
         start = [*np.radians([35.0, 65.0]), 0.0, 0.0]
         seen, _ = env.reset(seed=0, options={"state": start, "target": target})
         for step in range(5):

@@ -10,9 +10,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from gpadjust.control.random_state import RandomState
 from gpadjust.systems.swing_up import REAL_CART_POLE, START_MEAN, equation_physics
-from paper.arm import Arm
+from paper.arm import Arm, evaluation
 from paper.arm import Settings as ArmSettings
-from paper.arm import system as arm_system
 from paper.cartpole import (
     FRICTIONS,
     SMALL_NOISE,
@@ -94,8 +93,8 @@ def without_seconds(found):
 def test_an_interrupted_run_gives_the_numbers_of_another(
     tmp_path, monkeypatch, experiment, name, step
 ):
-    few = arm_system.arm_targets()[[0, 40, 60, 120]]
-    monkeypatch.setattr(arm_system, "arm_targets", lambda: few)
+    few = evaluation.arm_targets()[[0, 40, 60, 120]]
+    monkeypatch.setattr(evaluation, "arm_targets", lambda: few)
     experiment, cut = (replace(experiment, out=tmp_path / place) for place in ("whole", "cut"))
     for each in (experiment, cut):
         each.unfinished(name, 0).parent.mkdir(parents=True)

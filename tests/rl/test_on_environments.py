@@ -8,8 +8,7 @@ import torch
 from gpadjust.control import Task
 from gpadjust.dynamics import LearnedDynamics, StateSpec
 from gpadjust.rl import DynaOptions, DynaSAC
-from gpadjust.systems import CartPoleSwingUpEnv, RememberAction, arm, cart_pole
-from gpadjust.systems.reaching import ARM_SPEC, arm_reward
+from gpadjust.systems import CartPoleSwingUpEnv, RememberAction, cart_pole
 from gpadjust.systems.swing_up import CART_POLE_RAW_SPEC, cart_pole_reward, cart_pole_start
 
 SMALL = {"batch_size": 8, "policy_kwargs": {"net_arch": [8]}, "seed": 0, "device": "cpu"}
@@ -38,12 +37,3 @@ def test_actions_taken_in_the_model_are_remembered():
     actions = low + (model.actions[moved, 0] + 1) / 2 * (high - low)
     last = model.next_observations[moved, 0, -1:]
     np.testing.assert_allclose(last[followed], actions[followed], atol=1e-4)
-
-
-@pytest.mark.slow
-def test_the_muscle_arm():
-    env = gym.make("gpadjust/MuscleArm-v0")
-    task = Task(LearnedDynamics(ARM_SPEC, arm().physics), arm_reward)
-    agent = DynaSAC("MlpPolicy", env, task, DynaOptions(model_episodes=2), **SMALL).learn(30)
-    assert agent.num_episodes == 2
-    assert agent.replay_buffer.model_buffer.size() == 2 * 2 * 15

@@ -16,14 +16,9 @@ from gpadjust.control import Task
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.states import Sensors
 from gpadjust.systems import NoisySensors, System
-from gpadjust.systems.reaching import ARM_MEMORY_SPEC
 from gpadjust.systems.swing_up import REAL_CART_POLE, believed_cart_pole, equation_physics
-from gpadjust.systems.torque_arm import believed_arm
 
 SPEC = StateSpec(["x", "v"], ["force"])
-arm_needs_opensim = pytest.mark.skipif(
-    not __import__("importlib.util").util.find_spec("opensim"), reason="OpenSim is not installed"
-)
 
 
 class Cart(gym.Env):
@@ -57,10 +52,10 @@ def cart(**options):
     return System(Cart, SPEC, coast, reward, **options)
 
 
-def states_and_actions(num_actions, n=20):
+def states_and_actions(n=20):
     generator = torch.Generator().manual_seed(0)
     states = torch.randn(n, 4, generator=generator, dtype=torch.float64)
-    return states, torch.rand(n, num_actions, generator=generator, dtype=torch.float64)
+    return states, torch.rand(n, 1, generator=generator, dtype=torch.float64)
 
 
 def test_the_environment_ends_where_the_system_says():
@@ -179,55 +174,33 @@ def test_no_system_hides_a_module():
         assert found is None or isinstance(found, ModuleType), path.stem
 
 
-@pytest.mark.parametrize("make", [systems.cart_pole, systems.arm])
-def test_unknown_parameters_make_the_same_physics_of_their_guesses(make):
-    known, unknown = make(), make(unknowns=True)
+def test_unknown_parameters_make_the_same_physics_of_their_guesses():
+    known, unknown = systems.cart_pole(), systems.cart_pole(unknowns=True)
     assert not known.unknowns
-    X = torch.cat(states_and_actions(len(known.spec.actions)), -1)
-    values = {name: u.guess for name, u in unknown.unknowns.items()}
-    if "cart_mass" in values:
-        values["damping"] = 0.0
+    X = torch.cat(states_and_actions(), -1)
+    values = {name: u.guess for name, u in unknown.unknowns.items()} | {"damping": 0.0}
     found = unknown.physics(X, torch.tensor([*values.values()], dtype=torch.float64))
     torch.testing.assert_close(found, known.physics(X), rtol=1e-12, atol=1e-12)
 
 
 def test_each_row_has_the_parameters_that_it_is_given():
-    """Of the cart-pole against equations made with them, of the arm against scaled masses."""
-    X = torch.cat(states_and_actions(1), -1)
+    X = torch.cat(states_and_actions(), -1)
     physics = systems.cart_pole(unknowns=True).physics
     several = torch.tensor([[0.5, 0.5, 0.6, 0.1], [0.4, 0.7, 0.5, 0.3]], dtype=torch.float64)
     for values, found in zip(several, physics(X, several), strict=True):
         equation = systems.CartPoleEquation(*values.tolist())
         torch.testing.assert_close(found, equation_physics(equation)(X), rtol=1e-12, atol=1e-12)
-    states, actions = states_and_actions(4)
-    crude = believed_arm()
-    factor = {"masses": (crude.masses[0], 1.3 * crude.masses[1])}
-    factor["inertias"] = (crude.inertias[0], 1.3 * crude.inertias[1])
-    heavier = systems.ArmEquation(
-        **factor, lengths=crude.lengths, centres=crude.centres, damping=0.7, gains=(5.0, 3.0)
-    )
-    one = torch.ones(20, dtype=torch.float64)
-    values = {"forearm": 1.3, "damping": 0.7, "shoulder_gain": 5.0, "elbow_gain": 3.0}
-    found = crude(states, actions, {name: value * one for name, value in values.items()})
-    torch.testing.assert_close(found, heavier(states, actions), rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [systems.cart_pole, systems.arm])
-def test_its_parameters_are_found_by_least_squares(make):
-    system = make(unknowns=True)
+def test_its_parameters_are_found_by_least_squares():
+    system = systems.cart_pole(unknowns=True)
     generator = torch.Generator().manual_seed(1)
-    width = system.spec.state_dim
-    states = torch.randn(40, width, generator=generator, dtype=torch.float64)
-    actions = torch.rand(40, system.spec.action_dim, generator=generator, dtype=torch.float64)
-    actions = actions * (10 if width == 4 else 1)
+    states = torch.randn(40, 4, generator=generator, dtype=torch.float64)
+    actions = 10 * torch.rand(40, 1, generator=generator, dtype=torch.float64)
     truth = {name: 1.2 * u.guess for name, u in system.unknowns.items()}
-    moving = system.spec.moving
-    following = states.clone()
-    following[:, moving] = system.physics(
-        torch.cat([states[:, moving], actions], -1),
-        torch.tensor([*truth.values()], dtype=torch.float64),
-    )
+    values = torch.tensor([*truth.values()], dtype=torch.float64)
+    following = system.physics(torch.cat([states, actions], -1), values)
     dynamics = PhysicsDynamics(system.spec, system.physics)
     dynamics.update(states, actions, following)
     found = dynamics.physics_parameters
@@ -259,25 +232,6 @@ def test_noise_of_what_is_no_state_is_refused():
         NoisySensors(env, spec, {"angle": 0.1})
     with pytest.raises(ValueError, match="noise of 'x' must be finite and at least 0"):
         NoisySensors(env, spec, {"x": -0.1})
-
-
-@arm_needs_opensim
-def test_the_arm_with_memory_and_noise():
-    system = systems.arm(memory=True, noise={"theta_s": 0.01}, strength=0.3)
-    assert system.spec is ARM_MEMORY_SPEC
-    env = system.make()
-    observation, _ = env.reset(seed=0)
-    assert observation.shape == (10,)
-    assert system.start(3).shape == (3, 10)
-    assert (system.start(3)[:, 6:] == 0).all()
-    system.task().draw_initial_states(2)
-    excite = np.array([0.0, 0.0, 0.5, 0.0], dtype=np.float32)
-    assert env.step(excite)[0][6:].tolist() == [0.0, 0.0, 0.5, 0.0]
-
-
-def test_the_physics_by_opensim_has_no_unknowns():
-    with pytest.raises(ValueError, match="no unknown parameters"):
-        systems.arm(opensim=True, unknowns=True)
 
 
 def test_a_system_can_be_pickled():

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gpadjust.systems.rendering import BLUE, GREEN, GREY, LIGHT, RED, SMOOTH, WHITE, Color
-from gpadjust.systems.torque_arm import REAL_ARM
+from gpadjust.systems.rendering import BLUE, GREEN, GREY, LIGHT, RED, SMOOTH, WHITE
+from paper.arm.system.torque_arm import REAL_ARM
 
 if TYPE_CHECKING:
     import pygame
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 SIZE = WIDTH, HEIGHT = 480, 400
 METRE = 320.0  # pixels
 At = tuple[float, float]  # across and up, in m or pixels
+Color = tuple[int, int, int]
 SHOULDER = (0.5, 0.62)  # of width and height
 
 # Where the muscles are drawn: for both ends the link (0: trunk, 1: upper arm, 2: forearm), the way

@@ -1,19 +1,17 @@
-"""A planar arm of two links: its equation of motion and its physics, driven by torques."""
+"""A planar arm of two links: its equation of motion, driven by torques."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from gpadjust.checks import finite_array
-from gpadjust.physics import ODEPhysics, Unknown
 
 ARM_TIME_STEP = 0.2
-SUBSTEPS = 40  # of 5 ms: the damping of the light forearm makes the equation stiff
 
 
 @dataclass(frozen=True)
@@ -92,9 +90,6 @@ class ArmEquation:
 
         Returns:
             ``... x 4``.
-
-        Raises:
-            ValueError: If the last dimensions are not 4 and 4.
         """
         if state.shape[-1] != 4 or action.shape[-1] != 4:
             raise ValueError(
@@ -141,10 +136,7 @@ REAL_ARM = ArmEquation()
 def believed_arm(gains: tuple[float, float] = (8.0, 4.0)) -> ArmEquation:
     """The arm as someone may believe it to be, who has no model of its muscles.
 
-    :func:`~gpadjust.systems.arm` says where it errs, and what the gains are.
-
-    Raises:
-        ValueError: If the gains are not two finite numbers that are not negative.
+    :func:`~paper.arm.system.arm` says where it errs, and what the gains are.
 
     Example:
         >>> believed_arm().damping
@@ -156,32 +148,4 @@ def believed_arm(gains: tuple[float, float] = (8.0, 4.0)) -> ArmEquation:
         inertias=(1.1 * REAL_ARM.inertias[0], 1.1 * REAL_ARM.inertias[1]),
         damping=1.0,
         gains=gains,
-    )
-
-
-def torque_arm_physics(
-    equation: ArmEquation,
-    *,
-    substeps: int = SUBSTEPS,
-    gradient: Literal["autograd", "finite-difference"] = "autograd",
-    unknowns: Mapping[str, Unknown] | None = None,
-) -> ODEPhysics:
-    """The state of the arm 0.2 s later, under torques that follow the actions at once.
-
-    Unlike the environment, it does not clip actions. It integrates by Runge-Kutta of order four.
-
-    Args:
-        equation: The arm.
-        substeps: Integration steps.
-        gradient: As of :class:`~gpadjust.physics.ODEPhysics`.
-        unknowns: Parameters of the equation that are unknown.
-    """
-    return ODEPhysics(
-        equation,
-        step=ARM_TIME_STEP,
-        state_dim=4,
-        substeps=substeps,
-        name="torque_arm",
-        gradient=gradient,
-        unknowns=unknowns,
     )

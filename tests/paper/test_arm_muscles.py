@@ -1,6 +1,5 @@
 """The muscle arm as a Gymnasium environment."""
 
-import copy
 import os
 import pickle
 import subprocess
@@ -17,15 +16,24 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-import gpadjust
-from gpadjust.systems import MuscleArmEnv, hand_distance_cm
-from gpadjust.systems.opensim import MUSCLES, load_opensim
-from gpadjust.systems.reaching import arm_reward, hand_position
+from gpadjust.control import Task
+from gpadjust.dynamics import LearnedDynamics
+from gpadjust.rl import DynaOptions, DynaSAC
+from paper.arm import system
+from paper.arm.system import MuscleArmEnv, hand_distance_cm, hand_position
+from paper.arm.system.opensim import MUSCLES, load_opensim
+from paper.arm.system.reaching import ARM_MEMORY_SPEC, ARM_SPEC, arm_reward
 
-ID = "gpadjust/MuscleArm-v0"
+ROOT = Path(__file__).parents[2]
+ID = "paper.arm.system:MuscleArm-v0"
 START = np.radians([35.0, 65.0, 0.0, 0.0])
 TARGET = np.radians([70.0, 40.0])
 GENTLE = np.array([0.2, 0.1, 0.3, 0.1], dtype=np.float32)
+
+
+@pytest.fixture(autouse=True)
+def _no_screen(monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
 
 
 @pytest.fixture(scope="module")
@@ -50,10 +58,9 @@ def same(transitions, others):
 
 
 def python(code, folder):
-    """Run Python code in a folder, with this library."""
-    path = str(Path(gpadjust.__file__).parents[1])
+    """Run Python code in a folder, with this clone."""
     command = [sys.executable, "-c", code]
-    environment = {**os.environ, "PYTHONPATH": path}
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}"}
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
 
 
@@ -171,14 +178,13 @@ def test_equal_seeds_give_equal_trajectories(arm):
 @pytest.mark.parametrize(
     "render_mode", [None, "rgb_array", pytest.param("human", marks=pytest.mark.slow)]
 )
-@pytest.mark.parametrize("duplicate", [lambda env: pickle.loads(pickle.dumps(env)), copy.deepcopy])
-def test_copy_goes_on_as_the_original(render_mode, duplicate):
+def test_copy_goes_on_as_the_original(render_mode):
     env = gym.make(ID, render_mode=render_mode)
     env.reset(seed=0)
     rollout(env, 3)
     if render_mode:
         env.render()
-    twin = duplicate(env)
+    twin = pickle.loads(pickle.dumps(env))
     assert same(rollout(env, 3), rollout(twin, 3))
     assert np.array_equal(env.reset()[0], twin.reset()[0])
     if render_mode == "rgb_array":
@@ -200,47 +206,25 @@ def test_stronger_muscles_move_further(arm):
     assert strong.state[0] > arm.state[0] + 0.05
 
 
-@pytest.mark.parametrize(
-    "action", [np.full(4, np.nan), np.array([0.1, np.inf, 0.0, 0.0]), np.zeros(3), 0.5, "up"]
-)
-def test_bad_action_is_refused_and_changes_nothing(arm, action):
+def test_bad_action_is_refused_and_changes_nothing(arm):
     start(arm)
     with pytest.raises(ValueError, match="four finite excitations"):
-        arm.step(action)
+        arm.step(np.array([0.1, np.inf, 0.0, 0.0]))
     assert np.array_equal(arm.state[:4], START)
     arm.step(GENTLE)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"state": [0.0, 1.0]}, "4 numbers theta_s"),
-        ({"state": [0.0, np.nan, 0.0, 0.0]}, "4 numbers theta_s"),
-        ({"state": "bent"}, "4 numbers theta_s.*found 'bent'"),
-        ({"state": [0.0, 0.0, 1e4, 0.0]}, "at most 6.283, 6.283, 100, 100"),
+def test_bad_options_and_arguments_are_refused(arm):
+    for options, message in (
+        ({"state": [0.0, 0.0, 1e4, 0.0]}, "4 numbers theta_s.* at most 6.283, 6.283, 100, 100"),
         ({"target": [0.0, 1.0, 2.0]}, "2 numbers target_s"),
         ({"start": START}, "Unknown option 'start'"),
-    ],
-)
-def test_bad_options_are_refused(arm, options, message):
-    with pytest.raises(ValueError, match=message):
-        arm.reset(options=options)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "error"),
-    [
-        ({"strength": 0.0}, ValueError),
-        ({"strength": np.nan}, ValueError),
-        ({"strength": "strong"}, TypeError),
-        ({"accuracy": 1.0}, ValueError),
-        ({"accuracy": None}, TypeError),
-        ({"render_mode": "ascii"}, ValueError),
-    ],
-)
-def test_bad_arguments_are_refused(arguments, error):
-    with pytest.raises(error, match=next(iter(arguments))):
-        MuscleArmEnv(**arguments)
+    ):
+        with pytest.raises(ValueError, match=message):
+            arm.reset(options=options)
+    for name, value in (("strength", 2.1), ("accuracy", 1.0)):
+        with pytest.raises(ValueError, match=name):
+            MuscleArmEnv(**{name: value})
 
 
 def test_step_and_render_need_a_reset():
@@ -251,52 +235,28 @@ def test_step_and_render_need_a_reset():
         env.render()
 
 
-def test_a_failed_step_is_no_data_and_still_an_observation(arm, monkeypatch):
-    before = start(arm).state
-
-    def fail(*arguments):
-        raise RuntimeError("no convergence")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(arm.simulation, "step", fail)
-        with pytest.warns(UserWarning, match="no convergence"):
-            observation, _, terminated, truncated, info = arm.step(GENTLE)
-    assert info["step_failed"] is True
-    assert truncated
-    assert not terminated
-    assert arm.observation_space.contains(observation)
-    assert np.array_equal(observation, before.astype(np.float32))
-    assert start(arm).step(GENTLE)[4]["step_failed"] is False
-
-
 @pytest.mark.parametrize("speed", [1e3, 1e9])
 def test_failed_integration_truncates_and_reset_recovers(arm, speed):
     expected = rollout(start(arm))
     arm.state[2] = speed  # far beyond what the start may have
+    before = arm.state.astype(np.float32)
     with pytest.warns(UserWarning, match="failed to integrate the arm from .* reset starts"):
         observation, reward, terminated, truncated, info = arm.step(GENTLE)
     assert truncated
     assert not terminated
     assert info["step_failed"] is True
     assert np.isfinite(reward)
-    assert observation[2] == np.float32(speed)
+    assert np.array_equal(observation, before)
     with pytest.raises(gym.error.ResetNeeded, match="after a failed integration"):
         arm.step(GENTLE)
     assert same(rollout(start(arm)), expected)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "num_trials",
-    [
-        pytest.param(10, id="10-full-trials"),
-        pytest.param(200, id="200-full-trials", marks=pytest.mark.slow),
-    ],
-)
-def test_random_trials_do_not_fail(arm, num_trials):
+def test_random_trials_do_not_fail(arm):
     arm.reset(seed=0)
     rng = np.random.default_rng(0)
-    for trial in range(num_trials):
+    for trial in range(200):
         arm.reset()
         for _ in range(15):
             # Every second trial switches the muscles fully on and off.
@@ -307,8 +267,7 @@ def test_random_trials_do_not_fail(arm, num_trials):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("num_trials", [300, pytest.param(1000, marks=pytest.mark.slow)])
-def test_resets_do_not_leak_memory(arm, num_trials):
+def test_resets_do_not_leak_memory(arm):
     def resident():
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
@@ -319,11 +278,9 @@ def test_resets_do_not_leak_memory(arm, num_trials):
     for _ in range(50):
         trial()
     before = resident()
-    for _ in range(num_trials):
+    for _ in range(1000):
         trial()
-    growth = resident() - before
-    print(f"memory growth over {num_trials} trials: {growth / 1e6:.2f} MB")
-    assert growth < 1e4 * num_trials
+    assert resident() - before < 1e7
 
 
 BLUE, RED, GREEN, GREY, LIGHT = (
@@ -403,9 +360,9 @@ def test_frame_shows_how_active_each_muscle_is(frame, muscle):
 @pytest.mark.slow
 def test_nothing_is_printed_and_no_log_is_written(tmp_path):
     code = (
-        "import sys, gymnasium, gpadjust.systems, numpy as np\n"
+        "import sys, gymnasium, paper.arm.system, numpy as np\n"
         "assert 'opensim' not in sys.modules\n"
-        "env = gymnasium.make('gpadjust.systems:gpadjust/MuscleArm-v0')\n"
+        "env = gymnasium.make('MuscleArm-v0')\n"
         "env.reset(seed=0)\n"
         "env.step(np.full(4, 0.5, dtype=np.float32))\n"
         "import warnings; warnings.simplefilter('ignore')\n"
@@ -418,27 +375,22 @@ def test_nothing_is_printed_and_no_log_is_written(tmp_path):
 
 
 @pytest.mark.slow
-def test_without_opensim_only_the_arm_is_missing(tmp_path):
+def test_without_opensim_its_environment_and_its_black_box_are_missing(tmp_path):
     """And an id with the package needs no import of it."""
     code = (
         "import sys; sys.modules['opensim'] = None\n"
-        "import gpadjust\n"
-        "assert not {'gymnasium', 'gpadjust.systems'} & set(sys.modules)\n"
         "import gymnasium\n"
-        "print(gymnasium.make('gpadjust.systems:gpadjust/CartPoleSwingUp-v0').unwrapped)\n"
-        "gpadjust.systems.arm().physics\n"
-        "makers = [lambda: gymnasium.make('gpadjust/MuscleArm-v0'), "
-        "lambda: gpadjust.systems.arm(opensim=True)]\n"
+        f"makers = [lambda: gymnasium.make('{ID}'), "
+        "lambda: sys.modules['paper.arm.system'].arm(opensim=True)]\n"
         "for make in makers:\n"
         "    try: make()\n"
         "    except ImportError as error: print(error)\n"
+        "sys.modules['paper.arm.system'].arm().physics\n"
     )
     run = python(code, tmp_path)
     assert run.returncode == 0, run.stderr
     message = 'The muscle arm needs OpenSim; run `pip install "gpadjust[arm]"`.'
-    cart_pole, *messages = run.stdout.splitlines()
-    assert "CartPoleSwingUpEnv" in cart_pole
-    assert messages == [message, message]
+    assert run.stdout.splitlines() == [message, message]
 
 
 @pytest.mark.parametrize(
@@ -465,7 +417,7 @@ def test_child_processes_load_libraries_of_their_own(tmp_path):
         pytest.skip("there is no CasADi")
     code = (
         "import subprocess, sys\n"
-        "from gpadjust.systems.opensim import load_opensim\n"
+        "from paper.arm.system.opensim import load_opensim\n"
         "load_opensim()\n"
         "subprocess.run([sys.executable, '-c', 'import casadi; print(casadi.SX(2))'], check=True)\n"
     )
@@ -486,7 +438,7 @@ def test_the_logger_is_switched_off_once():
 
 @pytest.mark.slow
 def test_arms_in_processes_of_their_own_are_the_same():
-    make = [partial(gym.make, f"gpadjust.systems:{ID}")] * 2
+    make = [partial(gym.make, ID)] * 2
     here, there = DummyVecEnv(make), SubprocVecEnv(make)
     try:
         for envs in (here, there):
@@ -503,3 +455,26 @@ def test_arms_in_processes_of_their_own_are_the_same():
             assert np.array_equal(ends, expected[2])
     finally:
         there.close()
+
+
+def test_the_system_with_memory_and_noise():
+    reaching = system.arm(memory=True, noise={"theta_s": 0.01}, strength=0.3)
+    assert reaching.spec is ARM_MEMORY_SPEC
+    env = reaching.make()
+    observation, _ = env.reset(seed=0)
+    assert observation.shape == (10,)
+    assert reaching.start(3).shape == (3, 10)
+    assert (reaching.start(3)[:, 6:] == 0).all()
+    reaching.task().draw_initial_states(2)
+    excite = np.array([0.0, 0.0, 0.5, 0.0], dtype=np.float32)
+    assert env.step(excite)[0][6:].tolist() == [0.0, 0.0, 0.5, 0.0]
+
+
+@pytest.mark.slow
+def test_a_learner_takes_the_environment_and_the_physics():
+    task = Task(LearnedDynamics(ARM_SPEC, system.arm().physics), arm_reward)
+    small = {"batch_size": 8, "policy_kwargs": {"net_arch": [8]}, "seed": 0, "device": "cpu"}
+    options = DynaOptions(model_episodes=2)
+    agent = DynaSAC("MlpPolicy", gym.make(ID), task, options, **small).learn(30)
+    assert agent.num_episodes == 2
+    assert agent.replay_buffer.model_buffer.size() == 2 * 2 * 15

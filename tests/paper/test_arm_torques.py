@@ -12,10 +12,9 @@ import torch
 
 from gpadjust.dynamics import PhysicsDynamics
 from gpadjust.physics import ODEPhysics
-from gpadjust.systems import ArmEquation, arm, hand_distance_cm
-from gpadjust.systems.opensim import opensim_arm_physics
-from gpadjust.systems.reaching import ARM_SPEC, arm_reward, arm_start, arm_targets, hand_position
-from gpadjust.systems.torque_arm import REAL_ARM, believed_arm, torque_arm_physics
+from paper.arm.system import ArmEquation, arm, hand_distance_cm, hand_position
+from paper.arm.system.reaching import ARM_SPEC, arm_reward, arm_start, arm_targets
+from paper.arm.system.torque_arm import REAL_ARM, believed_arm
 
 OTHER_ARM = ArmEquation((1.3, 2.1), (0.4, 0.2), (0.1, 0.12), (0.03, 0.01), 0.2, (3.0, 5.0))
 
@@ -94,26 +93,24 @@ def test_equation_takes_any_batch_and_is_differentiable(states_and_actions):
     assert torch.autograd.gradcheck(OTHER_ARM, inputs)
 
 
-@pytest.mark.parametrize(("state_dim", "action_dim"), [(6, 4), (4, 2), (4, 0)])
-def test_equation_refuses_other_columns(state_dim, action_dim):
+def test_other_columns_and_impossible_parameters_are_refused():
     with pytest.raises(ValueError, match=r"states \.\.\. x 4 .* actions \.\.\. x 4"):
-        REAL_ARM(torch.zeros(2, state_dim), torch.zeros(2, action_dim))
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
+        REAL_ARM(torch.zeros(2, 4), torch.zeros(2, 2))
+    for name, value in (
         ("masses", (1.0, 0.0)),
-        ("lengths", (math.inf, 1.0)),
         ("centres", (0.1, -0.1)),
-        ("inertias", (0.1, math.nan)),
         ("damping", -0.1),
         ("gains", (1.0, 2.0, 3.0)),
-    ],
-)
-def test_impossible_parameters_are_refused(name, value):
-    with pytest.raises(ValueError, match=name):
-        ArmEquation(**{name: value})
+    ):
+        with pytest.raises(ValueError, match=name):
+            ArmEquation(**{name: value})
+    for function, columns in ((hand_distance_cm, 4), (hand_position, 3)):
+        with pytest.raises(ValueError, match=rf"of shape \.\.\. x \d.*, got \(2, {columns}\)"):
+            function(torch.zeros(2, columns))
+    with pytest.raises(ValueError, match="n must be at least 0; found -1"):
+        arm_start(-1)
+    with pytest.raises(ValueError, match="no unknown parameters"):
+        arm(opensim=True, unknowns=True)
 
 
 def test_torque_arm_is_a_tenth_too_heavy_and_takes_any_gains():
@@ -122,19 +119,13 @@ def test_torque_arm_is_a_tenth_too_heavy_and_takes_any_gains():
     assert believed_arm().lengths == REAL_ARM.lengths
     assert believed_arm().gains == (8.0, 4.0)
     assert believed_arm([5, 2.5]).gains == (5.0, 2.5)
-    for physics in (believed_arm, opensim_arm_physics):
-        with pytest.raises(ValueError, match=r"gains must be a pair.*found 0\.5"):
-            physics(0.5)
-        with pytest.raises(ValueError, match="gains must be a pair of finite numbers"):
-            physics(("strong", "weak"))
-        with pytest.raises(ValueError, match="gains must be finite and not negative"):
-            physics((8.0, -4.0))
 
 
 @pytest.mark.parametrize("gains", [(8.0, 4.0), (5.0, 2.5), (1.0, 9.0)])
 def test_ode_agrees_with_opensim(states_and_actions, gains):
     X = torch.cat(states_and_actions(100), dim=-1)
-    gap = (torque_arm_physics(believed_arm(gains))(X) - opensim_arm_physics(gains)(X)).abs()
+    ours, theirs = (arm(gains=gains, opensim=opensim).physics(X) for opensim in (False, True))
+    gap = (ours - theirs).abs()
     assert gap[:, :2].max() < 1e-5
     assert gap[:, 2:].max() < 1e-4
 
@@ -174,6 +165,46 @@ def test_torque_arm_physics_can_be_pickled(states_and_actions):
     physics = arm().physics
     X = torch.cat(states_and_actions(5), dim=-1)
     assert torch.equal(pickle.loads(pickle.dumps(physics))(X), physics(X))
+
+
+def test_unknown_parameters_make_the_same_physics_of_their_guesses(states_and_actions):
+    known, unknown = arm(), arm(unknowns=True)
+    assert not known.unknowns
+    X = torch.cat(states_and_actions(20), dim=-1)
+    guesses = torch.tensor([u.guess for u in unknown.unknowns.values()], dtype=torch.float64)
+    torch.testing.assert_close(
+        unknown.physics(X, guesses), known.physics(X), rtol=1e-12, atol=1e-12
+    )
+
+
+def test_parameters_of_rows_scale_the_forearm(states_and_actions):
+    states, actions = states_and_actions(20)
+    crude = believed_arm()
+    heavier = replace(
+        crude,
+        masses=(crude.masses[0], 1.3 * crude.masses[1]),
+        inertias=(crude.inertias[0], 1.3 * crude.inertias[1]),
+        damping=0.7,
+        gains=(5.0, 3.0),
+    )
+    one = torch.ones(20, dtype=torch.float64)
+    values = {"forearm": 1.3, "damping": 0.7, "shoulder_gain": 5.0, "elbow_gain": 3.0}
+    found = crude(states, actions, {name: value * one for name, value in values.items()})
+    torch.testing.assert_close(found, heavier(states, actions), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_its_parameters_are_found_by_least_squares(states_and_actions):
+    reaching = arm(unknowns=True)
+    states, actions = arm_start(40), states_and_actions(40)[1]
+    truth = {name: 1.2 * u.guess for name, u in reaching.unknowns.items()}
+    states[:, :4] = states_and_actions(40)[0]
+    following, values = states.clone(), torch.tensor([*truth.values()], dtype=torch.float64)
+    following[:, :4] = reaching.physics(torch.cat([states[:, :4], actions], dim=-1), values)
+    dynamics = PhysicsDynamics(reaching.spec, reaching.physics)
+    dynamics.update(states, actions, following)
+    found = dynamics.physics_parameters
+    assert {n: found[n].median().item() for n in found} == pytest.approx(truth, rel=1e-4)
 
 
 def test_spec_fits_the_physics(states_and_actions):

@@ -12,15 +12,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gpadjust.systems import arm, hand_distance_cm
-from gpadjust.systems.opensim import MUSCLES, REST_ACTIVATION, ArmSimulation, build_muscle_arm
-from gpadjust.systems.reaching import (
-    START_MEAN,
-    arm_reward,
-    arm_targets,
-)
-from gpadjust.systems.torque_arm import REAL_ARM
 from paper.arm import Settings
+from paper.arm.system import arm, hand_distance_cm
+from paper.arm.system.opensim import MUSCLES, REST_ACTIVATION, ArmSimulation, build_muscle_arm
+from paper.arm.system.reaching import START_MEAN, arm_reward, arm_targets
+from paper.arm.system.torque_arm import REAL_ARM
 from paper.cartpole import Scenario
 from paper.cartpole.control import Recorder, Setup, dynamics
 

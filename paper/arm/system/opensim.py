@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gpadjust.checks import checked_number
 from gpadjust.physics import BlackBoxPhysics
-from gpadjust.systems.torque_arm import ARM_TIME_STEP, ArmEquation, believed_arm
+from paper.arm.system.torque_arm import ARM_TIME_STEP, ArmEquation, believed_arm
 
 JOINTS = ("shoulder", "elbow")
 LIMITS = ((-20.0, 125.0), (-5.0, 145.0))  # degrees, of shoulder and elbow
@@ -30,17 +30,13 @@ class Muscle:
     r"""A muscle of the arm; its path is as long as :math:`a + s (\theta_s - \pi/2) + e_1 \theta_e
     + e_2 \theta_e^2`.
 
-    Args:
-        name: In the model.
-        force: The isometric force at full strength, in N.
-        fibre: The optimal length of its fibres, in m.
-        path: ``(a, s, e_1, e_2)``, in m, rad and rad².
+    Its force is the isometric one at full strength, in N, its fibres' length the optimal one, in m.
     """  # noqa: D205
 
     name: str
     force: float
     fibre: float
-    path: tuple[float, float, float, float]
+    path: tuple[float, float, float, float]  # a, s, e_1 and e_2
 
     def length(self, shoulder: float, elbow: float) -> float:
         """The length of the path, in m, at angles in rad."""
@@ -92,20 +88,10 @@ def load_opensim() -> ModuleType:
 
 
 def build_muscle_arm(equation: ArmEquation, strength: float) -> Any:
-    """The arm with six muscles, of which four are excited.
+    """The links of an equation with six muscles, of which four are excited.
 
-    Args:
-        equation: The links; its gains do not matter.
-        strength: The factor on the forces of the muscles.
-
-    Returns:
-        An ``opensim.Model``, whose state is angles, velocities and six activations, and whose
-        inputs are the excitations, see :func:`controls`.
-
-    Raises:
-        ImportError: If ``opensim`` is missing.
-        TypeError: If strength is no number.
-        ValueError: If strength is not in (0, 2].
+    The state of this ``opensim.Model`` is angles, velocities and six activations; its inputs are
+    the excitations, see :func:`controls`. The strength is a factor on the forces of the muscles.
     """
     checked_number("strength", strength, above=0, most=MAX_STRENGTH)
     opensim = load_opensim()
@@ -122,16 +108,9 @@ def build_muscle_arm(equation: ArmEquation, strength: float) -> Any:
 
 
 def build_torque_arm(equation: ArmEquation) -> Any:
-    """The arm whose inputs are torques at shoulder and elbow, in N m; without limits.
+    """The links of an equation, whose inputs are torques at both joints, in N m; without limits.
 
-    Args:
-        equation: The links; its gains do not matter.
-
-    Returns:
-        An ``opensim.Model``, whose state is angles and velocities.
-
-    Raises:
-        ImportError: If ``opensim`` is missing.
+    The state of this ``opensim.Model`` is angles and velocities.
     """
     opensim = load_opensim()
     model = _skeleton(opensim, equation)
@@ -237,19 +216,11 @@ class ArmSimulation:
 
     Args:
         build: Returns the ``opensim.Model`` with its inputs, as :func:`build_muscle_arm` and
-            :func:`build_torque_arm` do (:mod:`gpadjust.systems.opensim`): a
-            ``functools.partial`` of one of these can be pickled.
-        accuracy: The relative accuracy of the integrator.
-
-    Raises:
-        ImportError: If ``opensim`` is missing.
-        TypeError: If accuracy is no number.
-        ValueError: If accuracy is not in (0, 1), or ``build`` refuses its arguments.
+            :func:`build_torque_arm` do: a ``functools.partial`` of one of these can be pickled.
+        accuracy: The relative accuracy of the integrator, in (0, 1).
 
     Example:
-        >>> from functools import partial
-        >>> from gpadjust.systems.opensim import build_torque_arm
-        >>> from gpadjust.systems.torque_arm import REAL_ARM
+        >>> from paper.arm.system.torque_arm import REAL_ARM
         >>> simulation = ArmSimulation(partial(build_torque_arm, REAL_ARM), accuracy=1e-6)
         >>> simulation.step(np.array([0.6, 1.1, 0.0, 0.0]), np.zeros(2)).round(6)
         array([0.6, 1.1, 0. , 0. ])
@@ -308,21 +279,10 @@ class ArmSimulation:
 
 
 def opensim_arm_physics(gains: tuple[float, float] = (8.0, 4.0)) -> BlackBoxPhysics:
-    """The physics of :func:`torque_arm_physics`, computed by OpenSim, a row at a time.
+    """The torque arm's physics, computed by OpenSim, a row at a time.
 
-    The two agree to 1e-5 rad. In parallel it runs in processes (``joblib``'s ``loky``): threads
-    take turns.
-
-    Args:
-        gains: As of :func:`~gpadjust.systems.arm`.
-
-    Returns:
-        A physics of columns ``[theta_s, theta_e, theta_s_dot, theta_e_dot, a1, a2, a3, a4]``, in
-        rad and s, with gradients by finite differences.
-
-    Raises:
-        ImportError: If ``opensim`` is missing.
-        ValueError: If the gains are not two finite numbers that are not negative.
+    It agrees with the equation of motion to 1e-5 rad. In parallel it runs in processes
+    (``joblib``'s ``loky``): threads take turns.
 
     Example:
         >>> import torch

@@ -13,23 +13,23 @@ import torch
 from numpy.typing import NDArray
 
 from gpadjust.checks import checked_options, finite_array
-from gpadjust.systems.arm_view import SIZE, draw_arm
-from gpadjust.systems.opensim import (
+from gpadjust.systems.rendering import RENDER_MODES, ViewedEnv
+from paper.arm.system.opensim import (
     MUSCLES,
     NUM_EXCITED,
     REST_ACTIVATION,
     ArmSimulation,
     build_muscle_arm,
 )
-from gpadjust.systems.reaching import (
+from paper.arm.system.reaching import (
     MAX_TARGET,
     START_MEAN,
     START_STD,
     angle_error,
     hand_distance_cm,
 )
-from gpadjust.systems.rendering import RENDER_MODES, ViewedEnv
-from gpadjust.systems.torque_arm import ARM_TIME_STEP, REAL_ARM
+from paper.arm.system.torque_arm import ARM_TIME_STEP, REAL_ARM
+from paper.arm.system.view import SIZE, draw_arm
 
 # The arm itself stays within 3 rad and 20 rad/s.
 HIGH = np.array([2 * math.pi, 2 * math.pi, 100, 100, 2 * math.pi, 2 * math.pi], dtype=np.float32)
@@ -62,20 +62,18 @@ class MuscleArmEnv(ViewedEnv):
         for all others of that process, those of other models included.
 
     Args:
-        render_mode: ``"human"`` shows a window, ``"rgb_array"`` lets ``render`` return a frame.
-            Both need the package ``pygame-ce``.
+        render_mode: ``"human"`` or ``"rgb_array"``; both need ``pygame-ce``.
         strength: The factor on the forces of the muscles, in (0, 2]. Electrical stimulation
             recruits part of a muscle; 1 is a healthy arm's.
         accuracy: The relative accuracy of the integrator, in (0, 1).
 
     Raises:
         ImportError: If ``opensim`` is missing.
-        TypeError: If ``strength`` or ``accuracy`` is no number.
         ValueError: If an argument is out of its range.
 
     Example:
         >>> import gymnasium
-        >>> env = gymnasium.make("gpadjust.systems:gpadjust/MuscleArm-v0")
+        >>> env = gymnasium.make("paper.arm.system:MuscleArm-v0")
         >>> observation, info = env.reset(
         ...     options={"state": [0.6, 1.1, 0.0, 0.0], "target": [1.0, 1.1]}
         ... )
@@ -111,9 +109,7 @@ class MuscleArmEnv(ViewedEnv):
                 two angles to reach, in rad and s. Default of each: drawn.
 
         Raises:
-            TypeError: If ``options`` is no dictionary.
-            ValueError: If ``options`` has another key, or its numbers are too few, too many or out
-                of the bounds of the observation.
+            ValueError: If ``options`` has another key, or other numbers than these.
         """
         super().reset(seed=seed)
         options = checked_options("options", options, ("state", "target"))
@@ -136,13 +132,6 @@ class MuscleArmEnv(ViewedEnv):
         self, action: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Excite the muscles for 0.2 s.
-
-        Args:
-            action: The excitations, of shape ``(4,)``; clipped to [0, 1].
-
-        Returns:
-            Observation, reward, False, whether the integration failed, and
-            ``{"hand_distance_cm": ..., "step_failed": ...}``.
 
         Raises:
             ValueError: If the action is not four finite numbers.
@@ -173,10 +162,7 @@ class MuscleArmEnv(ViewedEnv):
         self._show()
         state = torch.from_numpy(self.state)
         reward = -angle_error(state).item()
-        info = {
-            "hand_distance_cm": hand_distance_cm(state).item(),
-            "step_failed": self._failed,
-        }
+        info = {"hand_distance_cm": hand_distance_cm(state).item(), "step_failed": self._failed}
         return self.state.astype(np.float32), reward, False, self._failed, info
 
     def _draw(self, canvas: Any, state: NDArray[np.float64]) -> None:

@@ -12,21 +12,16 @@ import torch
 from torch import Tensor
 
 from gpadjust.checks import check_columns, check_switch, checked_whole
-from gpadjust.physics import Physics, Unknown
+from gpadjust.physics import ODEPhysics, Physics, Unknown
 from gpadjust.states import StateSpec
 from gpadjust.systems.system import System
-from gpadjust.systems.torque_arm import (
-    ARM_TIME_STEP,
-    REAL_ARM,
-    SUBSTEPS,
-    believed_arm,
-    torque_arm_physics,
-)
 from gpadjust.systems.wrappers import RememberAction
+from paper.arm.system.torque_arm import ARM_TIME_STEP, REAL_ARM, believed_arm
 
 START_MEAN = (math.radians(35), math.radians(65))
 START_STD = math.radians(5)
 MAX_TARGET = math.radians(100)
+SUBSTEPS = 40  # of 5 ms: the damping of the light forearm makes the equation stiff
 
 ARM_SPEC = StateSpec(
     ["theta_s", "theta_e", "theta_s_dot", "theta_e_dot", "target_s", "target_e"],
@@ -65,12 +60,9 @@ def arm_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
     .. math:: r = -\sqrt{\big((\theta_s - \theta_s^*)^2 + (\theta_e - \theta_e^*)^2\big) / 2}
 
     Args:
-        states: ``... x 6``; not used.
-        actions: ``... x 4``; not used.
-        next_states: ``... x 6`` (or more, which is not used), the states that were reached.
-
-    Returns:
-        ``...``.
+        states: Not used.
+        actions: Not used.
+        next_states: ``... x 6`` or more, the states that were reached.
 
     Example:
         >>> reached = torch.tensor([0.3, 1.4, 0.0, 0.0, 0.0, 1.0])
@@ -108,13 +100,10 @@ def arm_targets() -> Tensor:
 
 
 def hand_position(angles: Tensor) -> Tensor:
-    """Return the position of the hand, seen from the shoulder.
+    """The position of the hand, ``... x 2`` in m, seen from the shoulder.
 
     Args:
-        angles: ``... x 2``, of shoulder and elbow, in rad.
-
-    Returns:
-        ``... x 2``, in m, the upper arm along the first axis at 0°.
+        angles: ``... x 2``, of shoulder and elbow, in rad; at 0° both are along the first axis.
 
     Example:
         >>> hand_position(torch.tensor([0.0, torch.pi / 2], dtype=torch.float64))
@@ -128,13 +117,12 @@ def hand_position(angles: Tensor) -> Tensor:
 
 
 def hand_distance_cm(states: Tensor) -> Tensor:
-    """Return the distance of the hand from its place at the target angles, in cm.
+    """The distance of the hand from its place at the target angles, ``...`` in cm.
+
+    The score of episodes is the root mean square of it over steps and targets.
 
     Args:
-        states: ``... x 6``.
-
-    Returns:
-        ``...``. The score of episodes is the root mean square of it over steps and targets.
+        states: ``... x 6`` or more.
 
     Example:
         >>> hand_distance_cm(torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, torch.pi]))
@@ -159,16 +147,17 @@ def arm(
 ) -> System:
     """Reaching with an arm of six muscles; its physics has torques in their place.
 
-    Its environment is :class:`MuscleArmEnv`. In the physics the links are a tenth too heavy, the
-    joints damped twice as much as the real ones; torques follow the actions at once, whatever the
-    angles, and nothing limits the joints.
+    Its environment is :class:`MuscleArmEnv`. In the physics, which Runge-Kutta of order four
+    integrates, the links are a tenth too heavy, the joints damped twice as much as the real ones;
+    torques follow the actions at once, whatever the angles, and nothing limits the joints. Unlike
+    the environment, it does not clip actions.
 
     Args:
         strength: The factor on the forces of the muscles, in (0, 2].
         gains: The torques of full actions at shoulder and elbow that the physics has, in N m. The
             default suits strength 0.5; (5, 2.5) suits 0.3.
-        memory: Whether the state has the previous action (:class:`RememberAction`), by which the
-            muscles' delay can be learnt.
+        memory: Whether the state has the previous action, by which the muscles' delay can be
+            learnt.
         noise: Standard deviations of the sensors' noise, by the name of the state.
         unknowns: Whether the physics has four unknown parameters: ``forearm`` (a factor on its mass
             and inertia), ``damping``, ``shoulder_gain``, ``elbow_gain``.
@@ -186,8 +175,8 @@ def arm(
 
     Example:
         >>> import torch
-        >>> from gpadjust import systems
-        >>> physics = systems.arm().physics
+        >>> from paper.arm.system import arm
+        >>> physics = arm().physics
         >>> physics(torch.tensor([[0.6, 1.1, 0.0, 0.0, 0.0, 0.0, 0.2, 0.0]], dtype=torch.float64))
         tensor([[ 0.6902,  1.0405,  0.7442, -0.2988]], dtype=torch.float64)
     """
@@ -196,7 +185,7 @@ def arm(
     spec = ARM_MEMORY_SPEC if memory else ARM_SPEC
     physics: Physics
     if opensim:
-        from gpadjust.systems.opensim import opensim_arm_physics
+        from paper.arm.system.opensim import opensim_arm_physics
 
         if unknowns:
             raise ValueError("The physics by OpenSim has no unknown parameters; use opensim=False.")
@@ -211,8 +200,14 @@ def arm(
             "shoulder_gain": Unknown(max(believed.gains[0], 0.1), factor=2.0, unit="N m"),
             "elbow_gain": Unknown(max(believed.gains[1], 0.1), factor=2.0, unit="N m"),
         }
-        physics = torque_arm_physics(
-            believed, substeps=substeps, gradient=gradient, unknowns=named if unknowns else None
+        physics = ODEPhysics(
+            believed,
+            step=ARM_TIME_STEP,
+            state_dim=4,
+            substeps=substeps,
+            name="torque_arm",
+            gradient=gradient,
+            unknowns=named if unknowns else None,
         )
     return System(
         partial(_make, memory, strength=strength, max_episode_steps=episode_length),
@@ -227,5 +222,5 @@ def arm(
 
 def _make(memory: bool, **options: Any) -> gym.Env[Any, Any]:
     """The environment."""
-    env = gym.make("gpadjust/MuscleArm-v0", **options)
+    env = gym.make("MuscleArm-v0", **options)
     return RememberAction(env) if memory else env
