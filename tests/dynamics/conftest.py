@@ -10,6 +10,7 @@ from gpadjust import CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP
 from gpadjust.dynamics import LearnedDynamics, StateSpec
 from gpadjust.models import PaperRRA
 from gpadjust.physics import ODEPhysics
+from tests.systems import uniform
 
 TRUTH = (0.5, 0.5, 0.6, 0.1)
 
@@ -59,6 +60,21 @@ class CartPole:
 @pytest.fixture
 def cart_pole_system():
     return CartPole()
+
+
+PUSHED = StateSpec(["x", "v"], ["a"])
+
+
+def push(X, strength=0.1):
+    """The next position and velocity of what is pushed."""
+    x, v, a = X.split(1, -1)
+    return torch.cat([x + 0.1 * v, v + strength * a], -1)
+
+
+def pushed(n=20, seed=0):
+    """Transitions of it."""
+    X = uniform(n, 3, seed=seed) + 1
+    return X[:, :2], X[:, 2:], push(X)
 
 
 FEW_SAMPLES = {"num_starts": 1, "num_screened": 8, "num_samples": 3, "num_draws": 16}

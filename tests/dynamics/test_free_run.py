@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics, StateSpec
+from gpadjust.dynamics.particles import step_or_nan
 from gpadjust.models import Prediction, ZeroMeanGP
 from gpadjust.physics import PhysicsError
 from gpadjust.records import Record, Records
@@ -256,60 +257,28 @@ def test_runs_are_the_same_again_and_draw_from_no_generator(monkeypatch):
     assert not torch.equal(Careless(0.1, 0.1).free_run(*start(), seed=1).lower, one.lower)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "options", "error", "says"),
-    [
-        ((STATES[0], ACTIONS[0]), {}, ValueError, r"\(1,\) and \(6, 1\); of a single run, use `in"),
-        ((STATES, ACTIONS[:1]), {}, ValueError, r"got \(2, 1\) and \(1, 6, 1\)"),
-        ((STATES, ACTIONS[:, :0]), {}, ValueError, "one or more actions for each state"),
-        ((STATES[:0], ACTIONS[:0]), {}, ValueError, r"got \(0, 1\) and \(0, 6, 1\)"),
-        ((STATES.repeat(1, 2), ACTIONS), {}, ValueError, r"initial_states of shape \.\.\. x 1"),
-        ((STATES.float(), ACTIONS), {}, TypeError, "initial_states in float64, got torch.float32"),
-        ((STATES, ACTIONS.float()), {}, TypeError, "actions in float64"),
-        ((STATES / 0, ACTIONS), {}, ValueError, "initial_states to be finite"),
-        ((STATES, ACTIONS * torch.nan), {}, ValueError, "actions to be finite"),
-        ((STATES, ACTIONS), {"level": 95}, ValueError, "level must be.* found 95"),
-        ((STATES, ACTIONS), {"level": "95 %"}, TypeError, "level must be"),
-        (
-            (STATES, ACTIONS),
-            {"start_noise": "known"},
-            ValueError,
-            "as .learnt. or a tensor",
-        ),
-        (
-            (STATES, ACTIONS),
-            {"start_noise": -torch.ones(1)},
-            ValueError,
-            "start_noise of 0 or",
-        ),
-        (
-            (STATES, ACTIONS),
-            {"process_noise": torch.tensor([torch.nan])},
-            ValueError,
-            "process_noise of 0 or more, .* `.nan_to_num",
-        ),
-        (
-            (STATES, ACTIONS),
-            {"process_noise": "learnt"},
-            ValueError,
-            "say the noise of these, such as noise=smoothed.noise",
-        ),
-        ((STATES, ACTIONS), {"noise": "learnt"}, ValueError, "noise as True or False or a tensor"),
-        ((STATES, ACTIONS), {"num_functions": 39.0}, TypeError, "num_functions must be a whole"),
-        (
-            (STATES, ACTIONS),
-            {"state_bounds": torch.ones(2)},
-            ValueError,
-            "state_bounds of shape 2 x 1",
-        ),
-    ],
-)
-def test_arguments_out_of_range(arguments, options, error, says):
-    with pytest.raises(error, match=says):
-        Drift(0.1).free_run(*arguments, **options)
+REFUSED = [
+    ((STATES[0], ACTIONS[0]), {}, ValueError, r"\(1,\) and \(6, 1\); of a single run, use `in"),
+    ((STATES, ACTIONS[:1]), {}, ValueError, r"got \(2, 1\) and \(1, 6, 1\)"),
+    ((STATES, ACTIONS[:, :0]), {}, ValueError, "one or more actions for each state"),
+    ((STATES.repeat(1, 2), ACTIONS), {}, ValueError, r"initial_states of shape \.\.\. x 1"),
+    ((STATES, ACTIONS.float()), {}, TypeError, "actions in float64"),
+    ((STATES / 0, ACTIONS), {}, ValueError, "initial_states to be finite"),
+    ((STATES, ACTIONS), {"level": 95}, ValueError, "level must be.* found 95"),
+    ((STATES, ACTIONS), {"start_noise": "known"}, ValueError, "as .learnt. or a tensor"),
+    ((STATES, ACTIONS), {"start_noise": -torch.ones(1)}, ValueError, "start_noise of 0 or"),
+    ((STATES, ACTIONS), {"process_noise": STATES[:1, 0] / 0}, ValueError, "process_noise of 0 or"),
+    ((STATES, ACTIONS), {"process_noise": "learnt"}, ValueError, "such as noise=smoothed.noise"),
+    ((STATES, ACTIONS), {"noise": "learnt"}, ValueError, "noise as True or False or a tensor"),
+    ((STATES, ACTIONS), {"num_functions": 39.0}, TypeError, "num_functions must be a whole"),
+    ((STATES, ACTIONS), {"state_bounds": torch.ones(2)}, ValueError, "state_bounds of shape 2 x 1"),
+]
 
 
-def test_it_must_have_learnt():
+def test_arguments_out_of_range():
+    for arguments, options, error, words in REFUSED:
+        with pytest.raises(error, match=words):
+            Drift(0.1).free_run(*arguments, **options)
     with pytest.raises(RuntimeError, match="call `update`"):
         LearnedDynamics(SPEC, lambda X: X[:, :1]).free_run(STATES, ACTIONS)
 
@@ -370,3 +339,22 @@ def test_lags_are_measured_with_the_noise_of_what_they_hold():
         torch.zeros(1, 3).double(), torch.zeros(1, 3, 1).double(), num_functions=2000
     )
     assert run.particles[:, 0, 2].std(0).tolist() == pytest.approx([0.3, 0.3, 0], rel=0.1)
+
+
+def test_rows_where_the_physics_fails_are_nan():
+    def move(states, actions):
+        rows = (states[:, 0] < 0).nonzero().flatten().tolist()
+        if rows:
+            raise PhysicsError("It fails.", rows=rows)
+        return states + actions[:, :1]
+
+    for num_states, bad in ((1, [2]), (3, [0, 3])):
+        states = torch.ones(4, num_states, dtype=torch.float64)
+        actions = torch.full((4, 2), 0.5, dtype=torch.float64)
+        states[bad] = -1.0
+        before = states.clone()
+        following = step_or_nan(move, states, actions)
+        works = [i for i in range(4) if i not in bad]
+        assert following[bad].isnan().all()
+        assert (following[works] == 1.5).all()
+        assert states.equal(before)

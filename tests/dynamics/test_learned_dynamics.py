@@ -6,11 +6,10 @@ from functools import partial
 import pytest
 import torch
 
-from gpadjust import CKA, ScaleGP, ZeroMeanGP
+from gpadjust import CKA, ScaleGP
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.models import TermBuilder, TermsGP
 from gpadjust.models.parameters import scaled_rbf
-from gpadjust.physics import ODEPhysics
 from gpadjust.validation import trust
 
 pytestmark = pytest.mark.filterwarnings(
@@ -241,27 +240,20 @@ def test_a_function_makes_the_model(cart_pole_system):
         LearnedDynamics(system.spec, model=lambda X, Y, **given: None).update(*system.trial(0))
 
 
-def test_it_is_described_by_what_all_fits_are_told(cart_pole_system):
-    def described(**options):
-        return LearnedDynamics(
-            cart_pole_system.spec, cart_pole_system.crude, fit_options=options
-        ).describe()
+def test_it_is_described_by_what_all_fits_are_told_and_what_is_given_beside(cart_pole_system):
+    spec = cart_pole_system.spec
 
-    plain = described()
+    def described(given=None, **options):
+        fitted = {"fit_options": options} if options else {}
+        return LearnedDynamics(spec, cart_pole_system.crude, **fitted, **(given or {})).describe()
+
+    plain, moving = described(), spec.states[spec.moving[0]]
     assert plain == described(num_starts=2, num_samples=None)
     assert described(num_samples=8, seed=3) == {**plain, "num_samples": "8", "seed": "3"}
     assert described(method="map") == {**plain, "method": "'map'"}
-
-
-def test_it_is_described_by_what_is_given_beside_the_fits(cart_pole_system):
-    def described(**options):
-        return LearnedDynamics(cart_pole_system.spec, cart_pole_system.crude, **options).describe()
-
-    plain, moving = described(), cart_pole_system.spec.states[cart_pole_system.spec.moving[0]]
-    assert plain == described(num_features=1024, physics_error={})
-    for options in ({"num_features": 256}, {"physics_error": {moving: 0.1}}):
-        found = described(**options)
-        (name,) = options
+    assert plain == described({"num_features": 1024, "physics_error": {}})
+    for name, value in (("num_features", 256), ("physics_error", {moving: 0.1})):
+        found = described({name: value})
         assert {k: v for k, v in found.items() if k != name} == plain
         assert name in found
 
@@ -334,62 +326,43 @@ def test_each_block_follows_a_function_of_its_own(cart_pole_system, make, costly
         torch.testing.assert_close(drawn[i], states[i] + change, rtol=0, atol=1e-8)
 
 
-def test_raw_angles_on_request(cart_pole_system, make):
+def test_predictions_take_leading_dimensions_and_raw_angles(cart_pole_system, make):
     system = cart_pole_system
     dynamics = make("CKA", system.spec, system.crude, encode_angles=False)
     dynamics.update(*system.trial(0))
     assert all(term.num_inputs == 5 for term in dynamics.model.terms)
-
-
-def test_predictions_take_leading_dimensions(cart_pole_system, make):
-    system = cart_pole_system
-    dynamics = make("CKA", system.spec, system.crude)
-    dynamics.update(*system.trial(0))
     states, actions, _ = system.trial(1)
     whole = dynamics.predict(states, actions)
-    for block, flat in zip(
-        dynamics.predict(states.reshape(5, 5, 4), actions.reshape(5, 5, 1)), whole, strict=True
-    ):
+    blocks = dynamics.predict(states.reshape(5, 5, 4), actions.reshape(5, 5, 1))
+    for block, flat in zip(blocks, whole, strict=True):
         torch.testing.assert_close(block, flat.reshape(5, 5, 4))
 
 
 def test_bad_data_are_refused_and_what_was_learnt_stands(cart_pole_system, make):
     system = cart_pole_system
-    states, actions, next_states = system.trial(0, 6)
+    states, actions, following = system.trial(0, 6)
     dynamics = make("CKA", system.spec, system.crude)
     with pytest.raises(ValueError, match="at least 2 transitions to learn from, got 1"):
-        dynamics.update(states[:1], actions[:1], next_states[:1])
-    for call in (dynamics.predict, dynamics.sample):
+        dynamics.update(states[:1], actions[:1], following[:1])
+    for call in (dynamics.predict, dynamics.sample, lambda *a: dynamics.condition(*a, following)):
         with pytest.raises(RuntimeError, match="call `update`"):
             call(states, actions)
-    with pytest.raises(RuntimeError, match="call `update`"):
-        dynamics.condition(states, actions, next_states)
-    dynamics.update(states, actions, next_states)
+    dynamics.update(states, actions, following)
     before = dynamics.predict(states, actions).mean
-    broken = next_states.clone()
+    broken = following.clone()
     broken[4, 2] = math.inf
-    with pytest.raises(ValueError, match=r"next_states to be finite.*row 4"):
-        dynamics.update(states, actions, broken)
-    with pytest.raises(ValueError, match=r"states to be finite.*row 4"):
-        dynamics.update(broken, actions, next_states)
-    with pytest.raises(TypeError, match=r"actions in float64, got torch\.float32"):
-        dynamics.update(states, actions.float(), next_states)
-    with pytest.raises(ValueError, match="as many rows each"):
-        dynamics.update(states, actions[:3], next_states)
+    for rows, error, words in (
+        ((states, actions, broken), ValueError, r"next_states to be finite.*row 4"),
+        ((broken, actions, following), ValueError, r"states to be finite.*row 4"),
+        ((states, actions.float(), following), TypeError, r"actions in float64, got torch\.float3"),
+        ((states, actions[:3], following), ValueError, "as many rows each"),
+    ):
+        with pytest.raises(error, match=words):
+            dynamics.update(*rows)
     with pytest.raises(ValueError, match="states of shape"):
         dynamics.predict(states[:, :3], actions)
-    with pytest.raises(ValueError, match="a block for each function"):
-        dynamics.sample_functions(2)(states, actions)
     assert dynamics.num_transitions == 6
     assert torch.equal(dynamics.predict(states, actions).mean, before)
-
-
-def test_bad_arguments(cart_pole_system):
-    system = cart_pole_system
-    with pytest.raises(ValueError, match="Unknown target 'change'"):
-        LearnedDynamics(system.spec, target="change", model=ZeroMeanGP)
-    with pytest.raises(ValueError, match="difference=False"):
-        LearnedDynamics(system.spec, ODEPhysics(lambda s, a: s, 0.1, 4, difference=True))
 
 
 @pytest.mark.filterwarnings("default")
@@ -423,9 +396,3 @@ def test_the_model_has_the_names_of_the_spec(uniform):
     assert trust(model).input_names == model.input_names
     absolute = LearnedDynamics(spec, lambda X: X[:, :2], target="absolute")
     assert absolute.targets.output_names == ("theta", "omega")
-
-
-def test_data_and_physics_are_those_of_the_dynamics():
-    for name in ("physics", "train_Yvar"):
-        with pytest.raises(TypeError, match=f"found {name} in the functools.partial"):
-            LearnedDynamics(StateSpec(["x"], ["u"]), None, model=partial(CKA, **{name: None}))

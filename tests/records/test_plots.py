@@ -55,14 +55,11 @@ def test_a_record_shows_its_gaps_and_segments():
     assert axes[2].lines[0].get_drawstyle() == "steps-post"
 
 
-@pytest.mark.parametrize(
-    ("record", "spec", "error", "says"),
-    [
+def test_what_is_no_record_of_this_machine():
+    for record, spec, error, words in (
         ([turning()], SPEC, TypeError, "record as a Record, got list; of `records` draw each"),
         (turning(), "theta", TypeError, "spec as a StateSpec, got str"),
         (turning(), StateSpec(["x"], ["u"]), ValueError, "states, x, and .* found 2 and 1 columns"),
-    ],
-)
-def test_what_is_no_record_of_this_machine(record, spec, error, says):
-    with pytest.raises(error, match=says):
-        plot_record(record, spec)
+    ):
+        with pytest.raises(error, match=words):
+            plot_record(record, spec)
