@@ -139,7 +139,7 @@ def test_other_models_are_refused(data, build):
 
 
 @pytest.mark.parametrize("num_outputs", [1, 2])
-@pytest.mark.parametrize("kind", ["ZeroMeanGP", "CKA", "AR1", "RRA", "RRA-paper"])
+@pytest.mark.parametrize("kind", ["ZeroMeanGP", "CKA", "AR1", "RRA"])
 def test_after_conditioning(data, construct, kind, num_outputs):
     X, Y = data(n=8, num_outputs=num_outputs)
     bounds = torch.tensor([[0.0, 0.0], [2.0, 2.0]], dtype=torch.float64)
