@@ -157,7 +157,7 @@ def test_full_bayes_is_the_default_and_finds_the_best():
     assert truth(**best)["output"] > 78
 
 
-@pytest.mark.parametrize("physics", [{}, None, crude, [crude]])
-def test_a_physics_is_of_a_metric(physics):
-    with pytest.raises(TypeError, match="the physics of at least one metric by its name"):
-        generator_kwargs(physics)
+def test_a_physics_is_of_a_metric():
+    for physics in ({}, None, crude, [crude]):
+        with pytest.raises(TypeError, match="the physics of at least one metric by its name"):
+            generator_kwargs(physics)
