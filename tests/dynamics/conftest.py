@@ -118,3 +118,12 @@ def make():
         return LearnedDynamics(spec, None if kind == "GP" else physics, model=model, **options)
 
     return make
+
+
+@pytest.fixture(scope="session")
+def learnt_cart_pole():
+    """CKA that has learnt from trial 1 of the cart-pole, for tests that only look at it."""
+    system = CartPole()
+    dynamics = LearnedDynamics(system.spec, system.crude, fit_options=FEW_SAMPLES)
+    dynamics.update(*system.trial(1))
+    return dynamics

@@ -36,15 +36,24 @@ class Gain(torch.nn.Module):
         return push(X, self.gain)
 
 
-@pytest.fixture
-def learnt():
-    """Makes dynamics that have learnt from 12 transitions, then were conditioned on 4."""
+def learning(physics=push):
+    """Dynamics that have learnt from 12 transitions, then were conditioned on 4."""
+    dynamics = LearnedDynamics(SPEC, physics, fit_options=FEW_SAMPLES)
+    dynamics.update(*transitions())
+    dynamics.condition(*transitions(4, seed=1))
+    return dynamics
 
-    def learnt(physics=push, **options):
-        options.setdefault("fit_options", FEW_SAMPLES)
-        dynamics = LearnedDynamics(SPEC, physics, **options)
-        dynamics.update(*transitions())
-        dynamics.condition(*transitions(4, seed=1))
+
+@pytest.fixture(scope="module")
+def learnt():
+    """Makes such dynamics; those of `push` learn once, and are loaded."""
+    state = learning().state_dict()
+
+    def learnt(physics=push):
+        if physics is not push:
+            return learning(physics)
+        dynamics = LearnedDynamics(SPEC, push, fit_options=FEW_SAMPLES)
+        dynamics.load_state_dict(state)
         return dynamics
 
     return learnt
@@ -143,7 +152,8 @@ def test_dynamics_of_another_physics_are_refused(learnt):
         ):
             other.load_state_dict(one.state_dict())
         type(one)(SPEC, push, **known).load_state_dict(one.state_dict())
-        other.load_state_dict(type(one)(SPEC, push, **known).state_dict())  # it has seen nothing
+        one.load_state_dict(type(one)(SPEC, stronger, **known).state_dict())  # it has seen nothing
+        assert getattr(one, "num_transitions", 0) == 0
 
 
 def test_loading_asks_the_physics_at_three_rows(learnt):

@@ -58,11 +58,9 @@ def test_learning_lowers_the_error_of_the_physics(cart_pole_system, make, kind):
         assert (ratio.log().mean() if kind == "RRA" else ratio.log().max()) < 0
 
 
-def test_scores_are_those_of_the_predictions(cart_pole_system, make):
-    system = cart_pole_system
-    dynamics = make("CKA", system.spec, system.crude)
-    dynamics.update(*system.trial(0))
-    states, actions, next_states = system.trial(1)
+def test_scores_are_those_of_the_predictions(cart_pole_system, learnt_cart_pole):
+    dynamics = learnt_cart_pole
+    states, actions, next_states = cart_pole_system.trial(0)
     mean, variance = dynamics.predict(states, actions)
     scores = dynamics.score(states, actions, next_states)
     density = torch.distributions.Normal(mean, variance.sqrt()).log_prob(next_states)
@@ -171,15 +169,6 @@ def test_a_system_that_follows_the_previous_action(uniform):
     again = LearnedDynamics(spec, physics)
     again.load_state_dict(dynamics.state_dict())
     assert torch.equal(again.predict(new, pushes).mean, mean)
-
-
-def test_model_sees_the_physics_of_the_user(cart_pole_system, make):
-    system = cart_pole_system
-    dynamics = make("CKA", system.spec, system.crude)
-    dynamics.update(*system.trial(0))
-    assert isinstance(dynamics.model, CKA)
-    assert dynamics.physics is system.crude
-    assert dynamics.model.physics.physics is system.crude
 
 
 class WavyCKA(TermsGP):
@@ -330,6 +319,8 @@ def test_predictions_take_leading_dimensions_and_raw_angles(cart_pole_system, ma
     system = cart_pole_system
     dynamics = make("CKA", system.spec, system.crude, encode_angles=False)
     dynamics.update(*system.trial(0))
+    assert isinstance(dynamics.model, CKA)
+    assert dynamics.physics is dynamics.model.physics.physics is system.crude
     assert all(term.num_inputs == 5 for term in dynamics.model.terms)
     states, actions, _ = system.trial(1)
     whole = dynamics.predict(states, actions)

@@ -12,13 +12,8 @@ from gpadjust.dynamics import PhysicsDynamics, StateSpec, Windows
 from gpadjust.dynamics.plots import plot_free_run
 
 mpl.use("Agg")
+pytestmark = pytest.mark.usefixtures("closed_figures")
 SPEC = StateSpec(["theta", "v"], ["u"], angles=["theta"])
-
-
-@pytest.fixture(autouse=True)
-def close():
-    yield
-    plt.close("all")
 
 
 def turns(num_windows=4, num_steps=20):

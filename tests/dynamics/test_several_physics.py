@@ -11,6 +11,7 @@ from gpadjust.physics import JoinedPhysics, PhysicsError
 pytestmark = pytest.mark.filterwarnings(
     "ignore:f_p is nearly zero", "ignore::gpadjust.inference.SamplingWarning"
 )
+POINT_FIT = {"method": "map", "num_starts": 1, "num_screened": 0}
 SEVERAL = ["PhysicsMean", "Scale", "CKA", "RRA", "RRA-paper"]
 
 
@@ -93,7 +94,7 @@ def test_each_part_is_checked(cart_pole_system, make, still):
     assert PhysicsDynamics(system.spec, JoinedPhysics([still])).is_fitted
     parts = {"rod": system.crude, "late": lambda X: system.crude(X) - X[:, :4]}
     with pytest.warns(UserWarning, match="'late' seems to return the change"):
-        make("CKA", system.spec, parts).update(*system.trial(0))
+        make("CKA", system.spec, parts, fit_options=POINT_FIT).update(*system.trial(0))
     dynamics = LearnedDynamics(system.spec, [system.crude, lambda X: X[:, :3]])
     with pytest.raises(PhysicsError, match="next values of the 4 states"):
         dynamics.update(*system.trial(0))

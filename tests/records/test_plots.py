@@ -3,7 +3,6 @@
 import math
 
 import matplotlib as mpl
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
@@ -13,13 +12,8 @@ from gpadjust.records.plots import plot_record
 from gpadjust.states import StateSpec
 
 mpl.use("Agg")
+pytestmark = pytest.mark.usefixtures("closed_figures")
 SPEC = StateSpec(["theta", "v"], ["u"], angles=["theta"])
-
-
-@pytest.fixture(autouse=True)
-def close():
-    yield
-    plt.close("all")
 
 
 def turning(num_rows=31, first=7.0, **options):

@@ -14,6 +14,7 @@ from gpadjust.validation.plots import plot_trust, plot_trust_pair
 from tests.systems import crude
 
 mpl.use("Agg")
+pytestmark = pytest.mark.usefixtures("closed_figures")
 Z95 = 1.959963984540054
 
 
@@ -32,12 +33,6 @@ def half():
     model = CKA(X, wave(X) + (X - 0.5).clamp_min(0.0).square(), physics=wave)
     fit(model)
     return model
-
-
-@pytest.fixture(autouse=True)
-def _close_figures():
-    yield
-    plt.close("all")
 
 
 @pytest.mark.slow
