@@ -111,14 +111,7 @@ class TestAgainstLinearAlgebra:
         assert_close(ask(model, X, "rho"), entropy(joint.n) - entropy(joint.size), 1e-6)
 
     @pytest.mark.parametrize("about", ABOUT)
-    def test_several_outputs_add_up(self, data, build, shuffle, X, about):
-        D, Y = data(num_outputs=2)
-        model = shuffle(build("CKA", D, Y))
-        expected = sum(Gaussian(model, D, X, output=j).information(about) for j in range(2))
-        assert_close(ask(model, X, about), expected)
-
-    @pytest.mark.parametrize("about", ABOUT)
-    def test_missing_outputs(self, data, build, shuffle, X, about):
+    def test_several_outputs_add_up_where_they_are_known(self, data, build, shuffle, X, about):
         D, Y = data(num_outputs=2)
         Y[[1, 4], 0] = Y[2, 1] = torch.nan
         model = shuffle(build("CKA", D, Y))
@@ -233,19 +226,14 @@ class TestLaws:
         assert_close(ask(model, X[[2, 0, 1]], about), ask(model, X, about))
 
     @pytest.mark.parametrize("about", ABOUT)
-    @pytest.mark.parametrize("factor", [1e-6, 1e5])
-    def test_units_do_not_matter(self, data, build, X, about, factor):
+    def test_units_do_not_matter(self, data, build, X, about):
         D, Y = data()
         values = []
-        for unit in (1.0, factor):
-            model = build(
-                "CKA",
-                D / unit,
-                Y * unit,
-                physics=lambda X, u=unit: u * crude(X * u)[..., :1],
-            )
-            values.append(ask(model, X / unit, about))
-        assert_close(values[1], values[0], 1e-6)
+        for u in (1.0, 1e-6, 1e5):
+            model = build("CKA", D / u, Y * u, physics=lambda X, u=u: u * crude(X * u)[..., :1])
+            values.append(ask(model, X / u, about))
+        for value in values[1:]:
+            assert_close(value, values[0], 1e-6)
 
     @pytest.mark.parametrize("about", ["rho", "delta"])
     def test_a_repeated_measurement_without_noise_teaches_nothing(self, data, build, about):
@@ -276,8 +264,7 @@ class TestLaws:
         assert_close(ask(model, X[2:], "delta"), ask(model, X[2:], "both"))
 
     def test_a_physics_of_zero_hides_rho(self, data, build, X):
-        D, Y = data()
-        model = build("CKA", D, Y, physics=lambda X: 0 * X[..., :1]).eval()
+        model = build("CKA", *data(), physics=lambda X: 0 * X[..., :1]).eval()
         assert_close(ask(model, X, "rho"), 0.0)
         assert_close(ask(model, X, "delta"), ask(model, X, "both"))
 
@@ -324,12 +311,10 @@ class TestShapes:
         acquisition.set_X_pending(None)
         assert_close(acquisition(X[:1]).detach(), ask(model, X[:1], "rho"))
 
-    def test_input_transform(self, data, build, X, uniform):
+    def test_input_transform(self, data, build, X):
         D, Y = data()
-        plain, normal = (
-            build("CKA", D, Y),
-            build("CKA", D, Y, input_transform=Normalize(2, bounds=BOUNDS)),
-        )
+        normal = build("CKA", D, Y, input_transform=Normalize(2, bounds=BOUNDS))
+        plain = build("CKA", D, Y)
         for model, lengthscale in ((plain, 1.0), (normal, 0.5)):
             for term in model.terms:
                 term.kernel.base_kernel.lengthscale = lengthscale
@@ -373,13 +358,13 @@ class TestGradient:
 
 
 class TestLife:
-    @pytest.mark.parametrize("copied", [copy.deepcopy, lambda a: pickle.loads(pickle.dumps(a))])
-    def test_copies(self, data, build, X, copied):
+    def test_copies(self, data, build, X):
         D, Y = data()
         model = BiasGP(D, Y, physics=torch.nn.Linear(2, 1).double())
         acquisition = qAdjustmentInformationGain(model, "delta")
         value = acquisition(X)
-        assert_close(copied(acquisition)(X), value)
+        for again in (copy.deepcopy(acquisition), pickle.loads(pickle.dumps(acquisition))):
+            assert_close(again(X), value)
 
     def test_it_follows_the_model(self, model, X):
         acquisition = qAdjustmentInformationGain(model, "rho")

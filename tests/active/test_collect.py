@@ -396,15 +396,6 @@ class TestResuming:
         assert same(result, whole)
         assert torch.equal(result.failed_X, whole.failed_X)
 
-    @pytest.mark.slow
-    def test_a_larger_budget_goes_on(self, laboratory, tmp_path):
-        path = tmp_path / "log.jsonl"
-        collect(**laboratory(log=path, budget=5))
-        oracle = Oracle()
-        result = collect(**laboratory(oracle=oracle, log=path, budget=6))
-        assert len(oracle.asked) == 1
-        assert same(result, collect(**laboratory(budget=6)))
-
     def test_a_log_that_does_not_belong(self, laboratory, tmp_path, bounds):
         path = tmp_path / "log.jsonl"
         collect(**laboratory(log=path, budget=2))

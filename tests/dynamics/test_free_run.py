@@ -8,7 +8,7 @@ import torch
 
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.dynamics.particles import step_or_nan
-from gpadjust.models import Prediction, ZeroMeanGP
+from gpadjust.models import Prediction
 from gpadjust.physics import PhysicsError
 from gpadjust.records import Record, Records
 
@@ -160,6 +160,10 @@ def test_states_that_are_integrated_share_the_noise_of_their_velocities(uniform)
     torch.testing.assert_close(variance[:, 0], variance[:, 1] / 16)
     # In units of the noise the pair is a line, whose energy score is that of v, sqrt(1 + 1) longer.
     run = dynamics.free_run(states, actions.unsqueeze(1), num_functions=199)
+    quiet = dynamics.free_run(states, actions.unsqueeze(1), num_functions=199, noise=False)
+    added = run.particles - quiet.particles
+    assert added[..., 1].std() > 0.01
+    torch.testing.assert_close(added[..., 0], 0.25 * added[..., 1])
     both, alone = (
         run.score(following.unsqueeze(1), units=torch.tensor([unit, 1.0])).energy
         for unit in (0.25, 1e9)
@@ -190,22 +194,6 @@ def test_particles_that_went_round_different_ways_have_their_mean_on_the_circle(
     assert run.lower.item() == pytest.approx(3.1 - 0.4, abs=0.1)
     assert run.upper.item() == pytest.approx(3.1 + 0.4, abs=0.1)
     assert (run.particles - run.mean).abs().max() < math.pi
-
-
-def test_an_integrated_state_has_the_noise_of_its_velocity(uniform):
-    spec = StateSpec(["x", "v"], ["u"], integrated={"x": "v"}, step=0.5)
-    dynamics = LearnedDynamics(spec, fit_options={"method": "map"}, model=ZeroMeanGP)
-    v, u = uniform(30, 1), uniform(30, 1, seed=1)
-    following = v + 0.5 * u + 0.05 * uniform(30, 1, low=-1, seed=2)
-    x = torch.zeros_like(v)
-    next_x = x + 0.25 * (v + following)
-    dynamics.update(torch.cat([x, v], -1), u, torch.cat([next_x, following], -1))
-    options = {"num_functions": 39, "seed": 2}
-    at = torch.tensor([[0.0, 0.5]]).double(), torch.full((1, 3, 1), 0.2).double()
-    with_noise = dynamics.free_run(*at, **options).particles
-    added = with_noise - dynamics.free_run(*at, noise=False, **options).particles
-    assert added[..., 1].std() > 0.01
-    torch.testing.assert_close(added[..., 0], 0.25 * added[..., 1])
 
 
 def test_lost_particles_stay_where_they_were():

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gpadjust import CKA, ScaleGP
-from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
+from gpadjust.dynamics import LearnedDynamics, StateSpec
 from gpadjust.models import TermBuilder, TermsGP
 from gpadjust.models.parameters import scaled_rbf
 from gpadjust.validation import trust
@@ -134,41 +134,6 @@ def test_exogenous_and_integrated_states(uniform):
     ):
         torch.testing.assert_close(drawn[:, 1], new[:, 1] + 0.05 * (new[:, 2] + drawn[:, 2]))
         torch.testing.assert_close(drawn[:, 0], new[:, 0])
-
-
-@pytest.mark.slow
-def test_a_system_that_follows_the_previous_action(uniform):
-    spec = StateSpec(["last", "x"], ["a"], previous={"last": "a"})
-    states, actions = uniform(30, 2, low=-1), uniform(30, 1, low=-1, seed=1)
-
-    def follow(states, actions):
-        last, x = states.split(1, -1)
-        return torch.cat([actions, x + 0.1 * actions + 0.2 * last], -1)
-
-    seen = []
-
-    def physics(X):
-        seen.append(X.shape[-1])
-        return X[:, :1] + 0.2 * X[:, 1:]
-
-    dynamics = LearnedDynamics(spec, physics)
-    dynamics.update(states, actions, follow(states, actions))
-    assert dynamics.model.num_outputs == 1
-    new, pushes = uniform(10, 2, low=-1, seed=2), uniform(10, 1, low=-1, seed=3)
-    mean, variance = dynamics.predict(new, pushes)
-    torch.testing.assert_close(mean, follow(new, pushes), rtol=0, atol=5e-3)
-    assert (variance[:, 0] == 0).all()
-    for drawn in (
-        dynamics.sample(new, pushes),
-        dynamics.sample_functions(1)(new[None], pushes[None])[0],
-        PhysicsDynamics(spec, physics).sample(new, pushes),
-    ):
-        assert torch.equal(drawn[:, :1], pushes)
-    assert set(seen) == {2}  # its own state and the action
-    assert dynamics.score(new, pushes, follow(new, pushes)).rmse.shape == (1,)
-    again = LearnedDynamics(spec, physics)
-    again.load_state_dict(dynamics.state_dict())
-    assert torch.equal(again.predict(new, pushes).mean, mean)
 
 
 class WavyCKA(TermsGP):

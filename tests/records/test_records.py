@@ -514,14 +514,10 @@ def test_what_is_no_file_of_a_record(csv):
     head, good = "time,q,dq,tau\n", csv("time,q,dq,tau\n0,1,2,3\n1,4,5,6\n", "good.csv")
     for text, words in (
         ("\n\n", ".*expected a line of names and then rows, found an empty file"),
-        (head, ".*found only a line of names"),
         ("time,q,dq\n0,1,2\n", ".*line 1: expected a column 'tau', found 'time', 'q', 'dq'"),
-        ("time,q,dq,q,tau\n0,1,2,3,4\n", ".*expected one column 'q', found columns 2 and 4"),
         (head + "0,1,2,3\n\n1,2,x,3\n", r".*line 4, column 3 \('dq'\): .*found 'x'"),
         (head + "0,1,inf,3\n1,2,3,4\n", r".*line 2, column 3 \('dq'\): .*found 'inf'"),
         (head + "0,1,2,3\n1,2,3,\n", r".*line 3, column 4 \('tau'\): .* number, found ''"),
-        (head + "0,1,2,3\n,2,3,4\n", r".*line 3, column 1 \('time'\): .*found ''"),
-        (head + "0,1,2,3\n1,2,3\n", ".*line 3: expected 4 fields, .* found 3"),
         (head + "0,1,2,3\n2,2,3,4\n1,2,3,4\n", "', row 2: .*found 1 after 2"),
         (head + "0,1,2,3\n", "': expected two rows or more"),
     ):
