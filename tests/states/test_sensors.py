@@ -35,6 +35,7 @@ def test_bad_sensors_are_told():
     pair = Sensors(["a", "b"], lambda states: states[:, 0])
     for call, error, words in (
         (lambda: Sensors([]), ValueError, "one or more"),
+        (lambda: Sensors("x"), TypeError, "sequence of names"),
         (lambda: Sensors(["x"], 3), TypeError, "function of states; found 3"),
         (lambda: Sensors(["x"], noise={"v": 1.0}), ValueError, "no output 'v'"),
         (lambda: Sensors(["x"], noise={"x": 0.0}), ValueError, "above 0"),
