@@ -88,6 +88,7 @@ def test_an_interrupted_run_goes_on_with_what_was_left_out(tmp_path):
 def test_bad_options_are_refused():
     safe = {"initial": [[0.1], [0.2]]}
     for options, error, words in (
+        ({}, ValueError, "first points must be known as safe"),
         ({"initial": [[0.1]]}, ValueError, "first points must be known as safe.*found 1 and 0"),
         ({**safe, "probability": 95}, ValueError, "probability must be"),
         ({**safe, "keep": 1.5}, TypeError, "keep to be callable"),

@@ -112,6 +112,7 @@ def test_horizons_are_rows_of_all_steps(run, measured):
 
 def test_options_out_of_range(run, measured):
     for options, error, words in (
+        ({"horizons": ()}, ValueError, "different numbers of steps"),
         ({"horizons": 5}, ValueError, r"different numbers of steps.*\(1, 5, 15\), got 5"),
         ({"horizons": (3, 3)}, ValueError, "different numbers"),
         ({"horizons": (0, 3)}, ValueError, "each horizon must be at least 1; found 0"),

@@ -78,6 +78,7 @@ def test_what_is_no_free_run_of_these_windows():
         ({"windows": turns(3)[0]}, ValueError, r"\(3, 20, 2\), got .*\(4, 20, 2\); .* by `rows`"),
         ({"others": {"old": turns(4, 9)[1]}}, ValueError, r"old of these windows, .* \(4, 9, 2\)"),
         ({"rows": [4]}, ValueError, r"windows from 0 to 3, got \[4\]"),
+        ({"rows": []}, ValueError, "windows from 0 to 3"),
         ({"states": ["omega"]}, ValueError, "states of theta, v, found 'omega'"),
         ({"states": []}, ValueError, "states of theta, v, found none"),
         ({"units": {"w": "m"}}, ValueError, "units of theta, v, u, time, found 'w'"),

@@ -411,6 +411,7 @@ REFUSED = [
     ({"states": column(0, math.inf, 0)}, ValueError, "row 1: .*inf in column 0 of states; put N"),
     ({"actions": column(0, 0, math.nan)}, ValueError, "row 2: .*nan in column 0 of actions"),
     ({"actions": column(0, 0)}, ValueError, "3 of times, 3 of states, 2 of actions"),
+    ({"actions": THREE.new_zeros(3, 0)}, ValueError, r"N x action_dim, got \(3, 0\)"),
     ({"states": column(0, 0, 0).float()}, TypeError, "states in float64, .*`states.double"),
     ({"states": [[0], [1], [2]]}, TypeError, "states to be a torch tensor"),
     ({"states": np.array([["a"], ["b"], ["c"]])}, TypeError, "hold numbers only"),
@@ -539,6 +540,8 @@ def test_what_is_asked_of_files_is_there(csv, tmp_path):
     ):
         with pytest.raises(error, match=words):
             Records.read_csv(files, POINT, **options)
+    with pytest.raises(TypeError, match="spec as a StateSpec"):
+        Records.read_csv(file, ["x"])
 
 
 def test_windows_are_drawn_evenly_and_are_records_again():

@@ -96,6 +96,7 @@ REFUSED = [
     ({"previous": {"x": "v"}, "angles": ["x"]}, ValueError, "'x' is one .* and 'v' is not"),
     ({"previous": {"x": "v"}, "angles": ["v"]}, ValueError, "'v' is one .* and 'x' is not"),
     ({"previous": {"x": "a"}, "exogenous": ["x"]}, ValueError, "'x' is said to be two things"),
+    ({"previous": {"x": "a"}, "angles": ["x"]}, ValueError, "'x' is one .* and 'a' is not"),
     ({"step": "fast"}, TypeError, "step must be a number or None; found 'fast'"),
     ({"step": 0}, ValueError, "step must be finite and above 0; found 0"),
 ]
