@@ -75,6 +75,15 @@ def _seed():
 
 
 @pytest.fixture
+def closed_figures():
+    """Leaves no figure open."""
+    yield
+    import matplotlib.pyplot as plt
+
+    plt.close("all")
+
+
+@pytest.fixture
 def uniform():
     """`systems.uniform`, which draws the same numbers for a seed."""
     return systems.uniform

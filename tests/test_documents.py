@@ -28,7 +28,6 @@ BUILT = {"docs/_build", "docs/_build/index.html"}
 PICTURES = "tutorials/pictures/"  # taken from the notebooks as the site is built
 REFERENCE = sorted((ROOT / "docs" / "reference").glob("*.rst"))
 GUIDE = sorted((ROOT / "docs" / "guide").rglob("*.md"))
-EXAMPLES = [f"examples/{path.name}" for path in (ROOT / "examples").glob("*.py")]
 DOCTESTS = [p for p in sorted((ROOT / "docs").rglob("*.rst")) if "_build" not in p.parts]
 
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
@@ -40,12 +39,9 @@ MODULES = {
 
 COLUMN = 88  # characters of code that fit the site's column
 
-each_document = pytest.mark.parametrize("name", DOCUMENTS)
 
-
-def commands(name):
+def commands(text):
     """Those of the shell blocks of a document, and what it quotes of `python -m`."""
-    text = (ROOT / name).read_text()
     blocks = re.findall(r"```bash\n(.*?)```", text, flags=re.DOTALL)
     lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
     quoted = re.findall(r"`(python -m [^`]*)`", text)
@@ -53,65 +49,68 @@ def commands(name):
     return [shlex.split(part, comments=True) for part in parts if part]
 
 
-@each_document
-def test_linked_and_quoted_files_exist(name):
+def lacking(name):
+    """Linked and quoted files and extras of a document that are not there, and long lines."""
     text = (ROOT / name).read_text()
     links = {link for link in re.findall(r"\]\(([^)#\s]+)", text) if "://" not in link}
     quoted = set(re.findall(r"`((?:gpadjust|paper|tests|docs|\.ci)/[\w./-]*)`", text))
     quoted |= set(re.findall(r"`(\w+\.(?:md|cff|toml))`", text))
     quoted = {path for path in quoted - BUILT if not re.search(r"-v\d$", path)}  # environments' ids
     links = {link for link in links if PICTURES not in link}
-    assert [link for link in links if not (ROOT / name).parent.joinpath(link).exists()] == []
-    assert [path for path in quoted if not (ROOT / path).exists()] == []
-    named = set(re.findall(r"`(?:\w+/)*(\w+\.py)`", text))
-    assert named <= MODULES | YOURS
-
-
-@each_document
-def test_extras_exist(name):
-    text = (ROOT / name).read_text()
+    yield from (link for link in links if not (ROOT / name).parent.joinpath(link).exists())
+    yield from (path for path in quoted if not (ROOT / path).exists())
+    yield from set(re.findall(r"`(?:\w+/)*(\w+\.py)`", text)) - MODULES - YOURS
     named = set(re.findall(r"extra\s+`(\w+)`", text))
     named |= {e for found in re.findall(r'\.\[([\w,]+)\]"', text) for e in found.split(",")}
-    assert named <= set(PROJECT["optional-dependencies"])
-
-
-@each_document
-def test_commands_exist(name, monkeypatch, capsys):
-    for command in commands(name):
-        match command:
-            case ["python", "-m", "paper", *arguments]:
-                monkeypatch.setattr("sys.argv", ["paper", *arguments, "--help"])
-                with pytest.raises(SystemExit) as end:
-                    main()
-                assert end.value.code == 0, command
-            case ["python", "-m", module, *arguments]:
-                assert find_spec(module) is not None or module == "build", command
-                assert all((ROOT / a).exists() for a in arguments if a.startswith("tests")), command
-            case ["gpadjust", *arguments]:
-                parser().parse_args(arguments)
-            case ["cd", folder]:
-                assert (ROOT / folder).is_dir()
-            case ["python", script, *_]:
-                assert (ROOT / script).is_file(), command
-            case ["pip", "install", "--constraint", file, *_]:
-                assert (ROOT / file).is_file()
-            case [tool, *_]:
-                assert tool in TOOLS, command
-
-
-@pytest.mark.parametrize("name", [*DOCUMENTS, *EXAMPLES])
-def test_code_fits_its_column(name):
-    text = (ROOT / name).read_text()
+    yield from named - set(PROJECT["optional-dependencies"])
     blocks = re.findall(r"```(?:python|none)\n(.*?)```", text, flags=re.DOTALL)
-    lines = "".join([text] if name.endswith(".py") else blocks).splitlines()
-    assert [line for line in lines if len(line) > COLUMN] == []
+    yield from (line for line in "".join(blocks).splitlines() if len(line) > COLUMN)
 
 
-@pytest.mark.parametrize("page", GUIDE, ids=lambda page: page.stem)
-def test_a_guide_begins_with_a_picture_and_says_what_it_shows(page):
-    title, picture = page.read_text().split("\n\n")[:2]
-    assert title.startswith("# ")
-    assert re.fullmatch(r"!\[.{20,}\]\(\S+\)", picture)
+def test_documents_name_what_there_is_and_their_code_fits_its_column():
+    missing = {name: found for name in DOCUMENTS if (found := [*lacking(name)])}
+    for path in (ROOT / "examples").glob("*.py"):
+        if found := [line for line in path.read_text().splitlines() if len(line) > COLUMN]:
+            missing[path.name] = found
+    assert not missing
+
+
+def is_known(command):
+    """Whether what a command needs is there."""
+    match command:
+        case ["python", "-m", "paper", *_]:
+            return True  # below
+        case ["python", "-m", module, *arguments]:
+            places = [ROOT / a for a in arguments if a.startswith("tests")]
+            return (find_spec(module) or module == "build") and all(p.exists() for p in places)
+        case ["gpadjust", *arguments]:
+            return parser().parse_args(arguments)
+        case ["cd", folder]:
+            return (ROOT / folder).is_dir()
+        case ["python", file, *_] | ["pip", "install", "--constraint", file, *_]:
+            return (ROOT / file).is_file()
+        case [tool, *_]:
+            return tool in TOOLS
+
+
+def test_commands_exist(monkeypatch):
+    found = [each for name in DOCUMENTS for each in commands((ROOT / name).read_text())]
+    assert not [command for command in found if not is_known(command)]
+    for command in {tuple(each) for each in found if each[:3] == ["python", "-m", "paper"]}:
+        monkeypatch.setattr("sys.argv", ["paper", *command[3:], "--help"])
+        with pytest.raises(SystemExit) as end:
+            main()
+        assert end.value.code == 0, command
+
+
+def test_a_guide_begins_with_a_picture_and_says_what_it_shows():
+    pages = {page.stem: page.read_text().split("\n\n")[:2] for page in GUIDE}
+    picture = re.compile(r"!\[.{20,}\]\(\S+\)")
+    assert not [
+        n
+        for n, (title, next_) in pages.items()
+        if not title.startswith("# ") or not picture.fullmatch(next_)
+    ]
 
 
 def test_ci_runs_the_checks_that_documents_tell():

@@ -97,8 +97,8 @@ def test_compare_and_its_page(kind, data, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_regressor(kind, data):
-    options, has = kind
+def test_regressor(data):
+    options, has = KINDS["relative noise and outliers"]
     X, y = data[0].numpy(), data[1].numpy()[:, 0]
     regressor = CKARegressor(
         lambda X: 3 + np.sin(X[:, 0]), model_options=options, fit_method="map", fit_options=QUICK
@@ -131,10 +131,8 @@ def test_a_frame_with_texts_in_a_search(data):
 
 
 @pytest.mark.slow
-def test_collection(kind, tmp_path):
-    options, has = kind
-    if {"categorical", "batch"} & {*options}:
-        pytest.skip("points are chosen among numbers")
+def test_collection(tmp_path):
+    options, has = KINDS["positive outputs"]
     call = partial(
         collect,
         with_options(partial(CKA, physics=f_p), options),

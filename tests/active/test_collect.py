@@ -95,13 +95,11 @@ class TestMeasuring:
         )
         assert result.Y.shape == (5, 2)
 
-    @pytest.mark.parametrize(
-        "squeeze", [lambda Y: Y[:, 0], lambda Y: Y.numpy(), lambda Y: Y.float(), lambda Y: Y.item()]
-    )
-    def test_forms_of_outcomes(self, laboratory, squeeze):
-        result = collect(**laboratory(oracle=lambda X: squeeze(truth(X)), budget=3))
-        torch.testing.assert_close(result.Y, truth(result.X), rtol=1e-6, atol=1e-6)
-        assert result.Y.dtype == torch.float64
+    def test_forms_of_outcomes(self, laboratory):
+        for form in (lambda Y: Y[:, 0], lambda Y: Y.numpy(), torch.Tensor.float, torch.Tensor.item):
+            result = collect(**laboratory(oracle=lambda X, f=form: f(truth(X)), budget=2))
+            torch.testing.assert_close(result.Y, truth(result.X), rtol=1e-6, atol=1e-6)
+            assert result.Y.dtype == torch.float64
 
     def test_points_to_start_with(self, laboratory, uniform):
         first = uniform(5, 2, seed=3)
@@ -155,7 +153,7 @@ class TestFailures:
         [
             (throw(OSError("no gas")), "OSError: no gas"),
             (lambda Y: Y * float("nan"), r"measured \[nan\]"),
-            pytest.param(lambda Y: Y + float("inf"), r"measured \[inf\]", marks=pytest.mark.slow),
+            (lambda Y: Y + float("inf"), r"measured \[inf\]"),
         ],
     )
     def test_they_are_skipped_and_counted(self, laboratory, tmp_path, what, message):
@@ -268,11 +266,8 @@ class TestResultsThatCannotBeTaken:
     @pytest.mark.parametrize(
         ("what", "message", "logged"),
         [
-            (lambda Y: torch.ones(2, 1), r"of shape 1 x 1, .* \(2, 1\)", [[1.0], [1.0]]),
             (lambda Y: [1.5, math.nan], r"of shape 1 x 1, .* \(2,\)", [1.5, "NaN"]),
             (lambda Y: {"Y": Y[0].numpy() * 0}, "to be real numbers", {"Y": [0.0]}),
-            (lambda Y: 2j, "to be real numbers", "2j"),
-            (lambda Y: None, "to be real numbers, got None", None),
             (lambda Y: {(1, 2): 3}, "to be real numbers", "{(1, 2): 3}"),
         ],
     )
@@ -401,15 +396,6 @@ class TestResuming:
         assert same(result, whole)
         assert torch.equal(result.failed_X, whole.failed_X)
 
-    @pytest.mark.slow
-    def test_a_larger_budget_goes_on(self, laboratory, tmp_path):
-        path = tmp_path / "log.jsonl"
-        collect(**laboratory(log=path, budget=5))
-        oracle = Oracle()
-        result = collect(**laboratory(oracle=oracle, log=path, budget=6))
-        assert len(oracle.asked) == 1
-        assert same(result, collect(**laboratory(budget=6)))
-
     def test_a_log_that_does_not_belong(self, laboratory, tmp_path, bounds):
         path = tmp_path / "log.jsonl"
         collect(**laboratory(log=path, budget=2))
@@ -482,95 +468,50 @@ def _parameters(model):
     return torch.cat([parameter.detach().reshape(-1) for parameter in model.parameters()])
 
 
-class TestProgress:
-    def test_bar(self, laboratory, capsys):
-        collect(**laboratory(budget=2, progress=True))
-        assert "2/2" in capsys.readouterr().err
-        collect(**laboratory(budget=2))
-        assert capsys.readouterr().err == ""
+def test_a_bar_of_progress(laboratory, capsys):
+    collect(**laboratory(budget=2, progress=True))
+    assert "2/2" in capsys.readouterr().err
+    collect(**laboratory(budget=2))
+    assert capsys.readouterr().err == ""
 
 
-class TestErrors:
-    @pytest.mark.parametrize("name", ["budget", "batch_size", "max_failures", "num_outputs"])
-    @pytest.mark.parametrize("value", [0, -1, 2.5, "3"])
-    def test_numbers(self, laboratory, name, value):
-        with pytest.raises((TypeError, ValueError), match=f"{name} must be (at|a whole)"):
-            collect(**laboratory(**{name: value}))
+GIVEN = torch.ones(4, 2, dtype=torch.float64)
+REFUSED = [
+    ({"budget": 0}, "budget must be at", ValueError),
+    ({"batch_size": "3"}, "batch_size must be a whole", TypeError),
+    ({"max_failures": 2.5}, "max_failures must be a whole", TypeError),
+    ({"num_outputs": -1}, "num_outputs must be at", ValueError),
+    ({"bounds": [0.0, 1.0]}, r"shape 2 x d.* got \(2,\)", ValueError),
+    ({"model_factory": 3}, "Expected (the )?model_factory to be callable, got 3", TypeError),
+    ({"acquisition": 3}, "Expected (the )?acquisition to be callable, got 3", TypeError),
+    ({"oracle": 3}, "Expected (the )?oracle to be callable, got 3", TypeError),
+    ({"fit": 3}, "Expected (the )?fit to be callable, got 3", TypeError),
+    ({"acquisition": lambda model: model}, "BoTorch AcquisitionFunction, got CKA", TypeError),
+    ({"initial": 1}, "initial, a number of points, must", ValueError),
+    ({"initial": "three"}, "initial, a number of points, must", TypeError),
+    ({"initial": [[5.0, 0.0], [1.0, 0.0]]}, r"initial within the bounds .*5.0, 0.0", ValueError),
+    ({"initial": torch.ones(3, 1)}, r"Expected initial of shape n x 2", ValueError),
+    ({"initial": [[1.0, 0.0], [0.0, 0.0], [1.0, 0.0]]}, "points of initial to differ", ValueError),
+    ({"data": torch.ones(3, 2)}, r"data to be a pair \(X, Y\), got tensor", TypeError),
+    ({"data": (GIVEN, GIVEN[:3, :1])}, r"shape 4 x m, .* got \(3, 1\)", ValueError),
+    ({"data": (GIVEN, GIVEN[:, :1] / 0)}, "Expected the Y of data to be finite", ValueError),
+    ({"data": (GIVEN, GIVEN[:, :1] * math.nan)}, "the Y of data to hold an obs", ValueError),
+    ({"seed": -1}, "seed to be a whole number >= 0", ValueError),
+    ({"optimizer_options": [1]}, r"to be a dictionary, got \[1\]", TypeError),
+    ({"optimizer_options": {"q": 2}}, r"without \['q'\]", ValueError),
+    ({"model_factory": lambda X, Y: 3}, "factory to make a botorch Model, got int", TypeError),
+    ({"log": 3}, "log to be the path of a file, got 3", TypeError),
+]
 
-    @pytest.mark.parametrize(
-        ("bounds", "message"),
-        [
-            ([0.0, 1.0], r"shape 2 x d.* got \(2,\)"),
-            ([[0.0, 0.0]], r"got \(1, 2\)"),
-            ([[0.0, 1.0], [1.0, 0.0]], "each lower one below its upper one"),
-            ([[0.0, float("nan")], [1.0, 1.0]], "Expected finite bounds"),
-            ([[0.0, 1.0], [1.0]], "Expected bounds to be real numbers"),
-            (None, "Expected bounds to be real numbers, got None"),
-        ],
-    )
-    def test_bounds(self, laboratory, bounds, message):
-        with pytest.raises((TypeError, ValueError), match=message):
-            collect(**laboratory(bounds=bounds))
 
-    @pytest.mark.parametrize("name", ["model_factory", "acquisition", "oracle", "fit"])
-    def test_callables(self, laboratory, name):
-        with pytest.raises(TypeError, match=f"Expected (the )?{name} to be callable, got 3"):
-            collect(**laboratory(**{name: 3}))
-
-    def test_no_acquisition_function(self, laboratory):
-        with pytest.raises(TypeError, match="to be a BoTorch AcquisitionFunction, got CKA"):
-            collect(**laboratory(acquisition=lambda model: model))
-
-    def test_an_acquisition_function_of_one_model(self, laboratory, uniform):
-        X = uniform(4, 2)
-        model = SingleTaskGP(X, truth(X))
-        with pytest.raises(TypeError, match="pass `lambda model: LogExpectedImprovement"):
-            collect(**laboratory(acquisition=LogExpectedImprovement(model, best_f=1.0)))
-
-    def test_an_acquisition_function_of_single_points(self, laboratory):
-        analytic = lambda model: LogExpectedImprovement(model, best_f=1.0)  # noqa: E731
-        with pytest.raises(ValueError, match=r"LogExpectedImprovement takes one .* got q = 2"):
-            collect(**laboratory(acquisition=analytic, batch_size=2))
-
-    @pytest.mark.parametrize("initial", [1, 0, 3.0, "three"])
-    def test_initial(self, laboratory, initial):
-        with pytest.raises((TypeError, ValueError), match="initial, a number of points, must"):
-            collect(**laboratory(initial=initial))
-
-    def test_initial_points(self, laboratory):
-        with pytest.raises(ValueError, match=r"Expected initial of shape n x 2"):
-            collect(**laboratory(initial=torch.ones(3, 1)))
-        with pytest.raises(ValueError, match="points of initial to differ"):
-            collect(**laboratory(initial=[[1.0, 0.0], [0.0, 0.0], [1.0, 0.0]]))
-
-    def test_data(self, laboratory, uniform):
-        X = uniform(4, 2)
-        with pytest.raises(ValueError, match="the Y of data to hold an observation in each row"):
-            collect(**laboratory(data=(X, X[:, :1].log() * float("nan"))))
-        with pytest.raises(ValueError, match="Expected the Y of data to be finite"):
-            collect(**laboratory(data=(X, X[:, :1] / 0)))
-        with pytest.raises(ValueError, match=r"shape 4 x m, .* got \(3, 1\)"):
-            collect(**laboratory(data=(X, X[:3, :1])))
-
-    def test_a_pair(self, laboratory, uniform):
-        with pytest.raises(TypeError, match=r"data to be a pair \(X, Y\), got tensor"):
-            collect(**laboratory(data=uniform(3, 2)))
-
-    @pytest.mark.parametrize("seed", [-1, 2**63, 1.0])
-    def test_seed(self, laboratory, seed):
-        with pytest.raises(ValueError, match="seed to be a whole number >= 0"):
-            collect(**laboratory(seed=seed))
-
-    def test_optimizer_options(self, laboratory):
-        with pytest.raises(TypeError, match=r"to be a dictionary, got \[1\]"):
-            collect(**laboratory(optimizer_options=[1]))
-        with pytest.raises(ValueError, match=r"without \['q'\]"):
-            collect(**laboratory(optimizer_options={"q": 2}))
-
-    def test_no_model(self, laboratory):
-        with pytest.raises(TypeError, match=r"model factory to make a botorch Model, got int"):
-            collect(**laboratory(model_factory=lambda X, Y: 3))
-
-    def test_log(self, laboratory):
-        with pytest.raises(TypeError, match="log to be the path of a file, got 3"):
-            collect(**laboratory(log=3))
+def test_what_cannot_be_collected_by_is_refused(laboratory, uniform):
+    for changes, words, error in REFUSED:
+        with pytest.raises(error, match=words):
+            collect(**laboratory(**changes))
+    X = uniform(4, 2)
+    of_one = LogExpectedImprovement(SingleTaskGP(X, truth(X)), best_f=1.0)
+    with pytest.raises(TypeError, match="pass `lambda model: LogExpectedImprovement"):
+        collect(**laboratory(acquisition=of_one))
+    analytic = lambda model: LogExpectedImprovement(model, best_f=1.0)  # noqa: E731
+    with pytest.raises(ValueError, match=r"LogExpectedImprovement takes one .* got q = 2"):
+        collect(**laboratory(acquisition=analytic, batch_size=2))

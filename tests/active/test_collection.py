@@ -1,6 +1,5 @@
 """Asking and telling in any order."""
 
-import copy
 import json
 import os
 import shutil
@@ -138,11 +137,6 @@ def test_a_failure_of_an_earlier_version_stays_one(make, tmp_path):
     assert len(collection.failed_X) == 1
 
 
-def test_first_points_out_of_bounds(make):
-    with pytest.raises(ValueError, match=r"initial within the bounds .* got \[5.0, 0.0\]"):
-        make(initial=torch.tensor([[1.0, 0.0], [5.0, 0.0]]))
-
-
 def test_failing_and_withdrawing(make, tmp_path):
     collection = make(log=tmp_path / "log.jsonl")
     X = collection.ask(4)
@@ -192,26 +186,23 @@ def test_a_model_needs_data(make):
         make().model  # noqa: B018
 
 
-@pytest.mark.parametrize(
-    ("X", "Y", "message"),
-    [
-        (torch.ones(2), torch.ones(1), r"Expected X of shape n x 2, .* got \(2,\)"),
-        (torch.ones(1, 3), torch.ones(1), r"got \(1, 3\)"),
-        (torch.ones(2, 2), torch.ones(3, 1), r"shape 2 x 1, .* got \(3, 1\)"),
-        (torch.ones(2, 2), torch.ones(2, 2), r"shape 2 x 1, .* got \(2, 2\)"),
-        (torch.ones(2, 2), torch.ones(1), r"shape 2 x 1, .* got \(1,\)"),
-        (torch.full((1, 2), float("nan")), torch.ones(1), "Expected X to be finite"),
-        ("here", 1.0, "Expected X to be real numbers, got 'here'"),
-        (torch.ones(1, 2), torch.ones(1) * 1j, "measured values to be real numbers, .*complex"),
-        (torch.ones(2, 2), [[1.0], [1.0, 2.0]], "measured values to be real numbers, got"),
-    ],
-)
-def test_bad_tellings_change_nothing(make, tmp_path, X, Y, message):
+REFUSED = [
+    (torch.ones(2), torch.ones(1), ValueError, r"Expected X of shape n x 2, .* got \(2,\)"),
+    (torch.ones(2, 2), torch.ones(3, 1), ValueError, r"shape 2 x 1, .* got \(3, 1\)"),
+    (torch.ones(2, 2), torch.ones(1), ValueError, r"shape 2 x 1, .* got \(1,\)"),
+    (torch.ones(1, 2) * torch.nan, torch.ones(1), ValueError, "Expected X to be finite"),
+    ("here", 1.0, TypeError, "Expected X to be real numbers, got 'here'"),
+    (torch.ones(1, 2), torch.ones(1) * 1j, TypeError, "measured values to be real.*complex"),
+]
+
+
+def test_bad_tellings_change_nothing(make, tmp_path):
     path = tmp_path / "log.jsonl"
     collection = filled(make(log=path), 1)
     before = path.read_bytes()
-    with pytest.raises((TypeError, ValueError), match=message):
-        collection.tell(X, Y)
+    for X, Y, error, words in REFUSED:
+        with pytest.raises(error, match=words):
+            collection.tell(X, Y)
     assert path.read_bytes() == before
     assert len(collection.X) == 1
 
@@ -242,15 +233,6 @@ class TestOneCollectionOfALog:
         assert kept.value.__traceback__
         assert len(make(log=path).X) == 1
 
-    @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy])
-    def test_a_copy_has_to_wait(self, make, tmp_path, copied):
-        first = filled(make(log=tmp_path / "log.jsonl"), 1)
-        second = copied(first)
-        with pytest.raises(LogError, match="is held by process"):
-            second.ask()
-        first.close()
-        assert second.ask().shape == (1, 2)
-
 
 def test_what_cannot_be_logged_is_not_taken(make, tmp_path, monkeypatch):
     path = tmp_path / "log.jsonl"
@@ -279,49 +261,30 @@ def test_what_cannot_be_logged_is_not_taken(make, tmp_path, monkeypatch):
     assert torch.equal(make(log=path).X, collection.X)
 
 
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
+def test_a_record_that_does_not_belong(make, tmp_path):
+    path = tmp_path / "log.jsonl"
+    filled(make(log=path), 1)
+    before = path.read_text()
+    for line, words in (
         ('{"x": [0.5], "y": [1.0]}', r"Expected X of shape n x 2"),
         ('{"x": [0.5, 0.0], "y": [null]}', "nothing but NaN"),
         ('{"x": [0.5, 0.0], "y": ["a"]}', "to be real numbers"),
         ('{"x": [0.5, 0.0]}', "KeyError: 'y'"),
-        ('{"z": 1}', "KeyError: 'x'"),
         ('{"asked": "abc"}', "Expected X to be real numbers"),
-    ],
-)
-def test_a_record_that_does_not_belong(make, tmp_path, line, message):
-    path = tmp_path / "log.jsonl"
-    filled(make(log=path), 1)
-    with path.open("a") as file:
-        file.write(line + "\n")
-    with pytest.raises(
-        ValueError, match=rf"Line 4 of the log .*log\.jsonl, .* 2 inputs.*{message}"
     ):
-        make(log=path)
+        path.write_text(before + line + "\n")
+        with pytest.raises(ValueError, match=rf"Line 4 of the .*jsonl, .* 2 inputs.*{words}"):
+            make(log=path)
 
 
-@pytest.mark.parametrize("parameters", ["abc", {"a": "b"}, {"a": [[1.0], [1.0, 2.0]]}])
-def test_parameters_that_are_none_are_no_hindrance(make, tmp_path, parameters):
+def test_parameters_that_are_none_are_no_hindrance(make, tmp_path):
     path = tmp_path / "log.jsonl"
     filled(make(log=path), 4)
-    with path.open("a") as file:
-        file.write(json.dumps({"asked": [[0.5, 0.5]], "parameters": parameters}) + "\n")
-    assert make(log=path).ask().shape == (1, 2)
-
-
-@pytest.mark.slow
-def test_a_log_cut_at_any_byte_has_lost_nothing_before(make, tmp_path):
-    path, cut = tmp_path / "log.jsonl", tmp_path / "cut.jsonl"
-    with filled(make(log=path), 6) as whole:
-        whole.ask(2)
-    content = path.read_bytes()
-    for size in range(len(content) + 1):
-        cut.write_bytes(content[:size])
-        n = content[: size + 1].count(b'"y"', 0, content.rfind(b"\n", 0, size + 1) + 1)
-        with make(log=cut) as collection:
-            assert torch.equal(collection.X, whole.X[:n])
-            assert torch.equal(collection.Y, whole.Y[:n]) or not n
+    before = path.read_text()
+    for parameters in ("abc", {"a": [[1.0], [1.0, 2.0]]}):
+        asked = {"asked": [[0.5, 0.5]], "parameters": parameters}
+        path.write_text(before + json.dumps(asked) + "\n")
+        assert make(log=path).ask().shape == (1, 2)
 
 
 def test_pending_points_of_the_acquisition_functions_own_count_too(make):

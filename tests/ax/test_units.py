@@ -157,18 +157,19 @@ def test_gradients_pass_the_transforms():
         assert slope.abs().min() > 1e-3
 
 
+WIDTHS = {"name": "width", "parameter_type": "int"}
+
+
 @pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
 @pytest.mark.parametrize(
     "config",
     [
-        ChoiceParameterConfig(
-            name="width", parameter_type="int", values=[1, 2, 4, 8], is_ordered=True
-        ),
+        ChoiceParameterConfig(**WIDTHS, values=[1, 2, 4, 8], is_ordered=True),
         ChoiceParameterConfig(
             name="width", parameter_type="float", values=[1.0, 2.0, 4.0, 8.0], is_ordered=True
         ),
-        RangeParameterConfig(name="width", parameter_type="int", bounds=(1, 8)),
-        RangeParameterConfig(name="width", parameter_type="int", bounds=(1, 8), scaling="log"),
+        RangeParameterConfig(**WIDTHS, bounds=(1, 8)),
+        RangeParameterConfig(**WIDTHS, bounds=(1, 8), scaling="log"),
     ],
     ids=["choice", "choice of floats", "range", "log"],
 )
@@ -206,35 +207,19 @@ def test_between_choices_the_nearest_is_asked():
 
 
 @pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
-def test_a_tensor_has_the_columns_of_the_search_space():
-    parameters = [PARAMETERS[2], PARAMETERS[0]]
-    arms = [{"x": arm["x"], "rate": arm["rate"]} for arm in ARMS]
+def test_a_tensor_has_the_columns_of_the_search_space_fixed_ones_too():
+    fixed = ChoiceParameterConfig(**WIDTHS, values=[4])
     asked = []
 
     def f_p(X):
         asked.append(X.copy())
-        return X[:, 0] + X[:, 1]
-
-    adapter(experiment(parameters, arms), BlackBoxPhysics(f_p), metrics=["cost"])
-    expected = torch.tensor([[arm["x"], arm["rate"]] for arm in arms], dtype=torch.float64)
-    torch.testing.assert_close(torch.from_numpy(asked[0]), expected, rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
-def test_a_fixed_parameter_is_a_column_too():
-    parameters = [
-        PARAMETERS[2],
-        ChoiceParameterConfig(name="width", parameter_type="int", values=[4]),
-    ]
-    asked = []
-
-    def f_p(X):
-        asked.append(X)
         return X.sum(-1)
 
-    arms = [{"x": arm["x"], "width": 4} for arm in ARMS]
-    adapter(experiment(parameters, arms), f_p, metrics=["cost"])
-    assert asked[0].tolist() == [[arm["x"], 4.0] for arm in arms]
+    arms = [{"x": arm["x"], "rate": arm["rate"], "width": 4} for arm in ARMS]
+    parameters = [PARAMETERS[2], PARAMETERS[0], fixed]
+    adapter(experiment(parameters, arms), BlackBoxPhysics(f_p), metrics=["cost"])
+    expected = torch.tensor([[*arm.values()] for arm in arms], dtype=torch.float64)
+    torch.testing.assert_close(torch.from_numpy(asked[0]), expected, rtol=1e-9, atol=1e-12)
 
 
 def test_a_metric_without_physics_has_ax_s_own_model():
@@ -272,27 +257,23 @@ def test_without_this_room_it_is_an_error_too(monkeypatch):
         adapter(experiment(), Recorded(), [*MBM_X_trans, *Y_trans], config)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"transforms": [*TRANSFORMS, UnitX]}, "TellPhysics as the last.*found UnitX after it"),
-        ({"transforms": [*MBM_X_trans, LogY, TellPhysics]}, r"behind the transform\(s\) LogY"),
-        ({"transforms": [*Mixed_transforms, TellPhysics]}, "no kernel for categorical parameters"),
-        (
-            {"config": {"input_transform_classes": [Normalize]}},
-            "makes its own parts; found input_transform_classes",
-        ),
-        ({"metrics": ["costs"]}, "for costs, which is no metric.*some of cost, load"),
-        ({"physics": lambda X: X[:, 0]}, r"reads the parameter\(s\) glue, which are text"),
-        ({"physics": lambda rate, speed: rate}, "but speed is no parameter"),
-        ({"physics": lambda rate: torch.stack([rate, rate], -1)}, "2 columns for the metric"),
-    ],
-    ids=["not last", "log y", "categorical", "parts", "metric", "text", "name", "columns"],
-)
-def test_what_cannot_be_right_is_an_error(change, message):
-    options = {"physics": Recorded(), **change}
-    with pytest.raises((ValueError, UserInputError, RuntimeError), match=message):
-        adapter(experiment(), **options)
+LATE, LOGGED = [*TRANSFORMS, UnitX], [*MBM_X_trans, LogY, TellPhysics]
+REFUSED = [
+    ({"transforms": LATE}, "TellPhysics as the last.*found UnitX after it"),
+    ({"transforms": LOGGED}, r"behind the transform\(s\) LogY"),
+    ({"transforms": [*Mixed_transforms, TellPhysics]}, "no kernel for categorical"),
+    ({"config": {"input_transform_classes": [Normalize]}}, "makes its own parts"),
+    ({"metrics": ["costs"]}, "for costs, which is no metric.*some of cost, load"),
+    ({"physics": lambda X: X[:, 0]}, r"reads the parameter\(s\) glue, which are text"),
+    ({"physics": lambda rate, speed: rate}, "but speed is no parameter"),
+    ({"physics": lambda rate: torch.stack([rate, rate], -1)}, "2 columns for the me"),
+]
+
+
+def test_what_cannot_be_right_is_an_error():
+    for change, words in REFUSED:
+        with pytest.raises((ValueError, UserInputError, RuntimeError), match=words):
+            adapter(experiment(), **{"physics": Recorded(), **change})
 
 
 def test_a_physics_of_all_metrics_is_of_none():

@@ -6,6 +6,8 @@ import warnings
 
 import pytest
 import torch
+from botorch.fit import fit_gpytorch_mll
+from botorch.models import SingleTaskGP
 from botorch.optim.closures import get_loss_closure_with_grads
 from gpytorch.mlls import ExactMarginalLogLikelihood
 
@@ -96,32 +98,24 @@ def test_full_bayes(benchmark, record_ratio, uniform, n):
     )
 
 
-@pytest.mark.parametrize("points", [0, 100, 10_000], ids=["fit", "predict-100", "predict-10000"])
-@pytest.mark.parametrize("row", [("currin", 5), ("hartmann6", 5), ("branin", 100)])
-def test_default_beside_map(benchmark, record_ratio, row, points):
-    """On data sets of paper/calibration: fitting, or predicting at so many points."""
-    from paper.calibration.calibration import fitted, of_pair
+def several(X, m):
+    columns = [low(X)[:, 0], X.prod(-1), X.sum(-1), (4 * X[:, 1]).cos()]
+    return torch.stack(columns[:m], dim=-1)
 
-    sets = [of_pair(*row, 0.0, 10, seed) for seed in range(3 if row[0] == "branin" else 5)]
 
-    def models(method):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return [fitted(data, method) for data in sets]
+@pytest.mark.parametrize(("n", "m"), [(50, 1), (200, 1), (500, 1), (1000, 1), (2000, 1), (500, 4)])
+def test_fit(benchmark, record_ratio, uniform, n, m):
+    """At most 2.0 for n from 200 on, without loss: see tests/inference."""
+    X = uniform(n, 2)
+    noise = 0.01 * torch.randn(n, m, dtype=torch.float64)
+    Y = (1 + 0.3 * X[:, :1]) * several(X, m) + X[:, 1:].square() + noise
 
-    benchmark.group = f"default beside map, {row[0]}, n = {len(sets[0].X)}"
-    if not points:
-        record_ratio("fits", lambda: models("default"), lambda: models("map"), rounds=3)
-        return
-    Z = torch.cat([data.points for data in sets])
-    low, high = Z.amin(0), Z.amax(0)
-    Z = low + (high - low) * torch.rand(points, Z.shape[-1], dtype=torch.float64)
-    default, most_likely = models("default"), models("map")
+    def ours():
+        fit(CKA(X, Y, physics=lambda X: several(X, m)), "map")
 
-    def predict(found):
-        with torch.no_grad():
-            for model in found:
-                model.predict(Z)
+    def theirs():
+        model = SingleTaskGP(X, Y)
+        fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
 
-    name = f"predict at {points:,} points"
-    record_ratio(name, lambda: predict(default), lambda: predict(most_likely), rounds=7)
+    benchmark.group = f"fit beside fit_gpytorch_mll, n = {n}, {m} output(s)"
+    record_ratio("fit of CKA / BoTorch's of a SingleTaskGP", ours, theirs, 3 if n < 1000 else 1)

@@ -9,6 +9,7 @@ import torch
 from gpadjust import CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP
 from gpadjust.dynamics import LearnedDynamics, StateSpec
 from gpadjust.physics import ODEPhysics
+from tests.systems import uniform
 
 TRUTH = (0.5, 0.5, 0.6, 0.1)
 
@@ -60,6 +61,21 @@ def cart_pole_system():
     return CartPole()
 
 
+PUSHED = StateSpec(["x", "v"], ["a"])
+
+
+def push(X, strength=0.1):
+    """The next position and velocity of what is pushed."""
+    x, v, a = X.split(1, -1)
+    return torch.cat([x + 0.1 * v, v + strength * a], -1)
+
+
+def pushed(n=20, seed=0):
+    """Transitions of it."""
+    X = uniform(n, 3, seed=seed) + 1
+    return X[:, :2], X[:, 2:], push(X)
+
+
 FEW_SAMPLES = {"num_starts": 1, "num_screened": 8, "num_samples": 3, "num_draws": 16}
 _MODELS = {
     "GP": ZeroMeanGP,
@@ -99,3 +115,12 @@ def make():
         return LearnedDynamics(spec, None if kind == "GP" else physics, model=model, **options)
 
     return make
+
+
+@pytest.fixture(scope="session")
+def learnt_cart_pole():
+    """CKA that has learnt from trial 1 of the cart-pole, for tests that only look at it."""
+    system = CartPole()
+    dynamics = LearnedDynamics(system.spec, system.crude, fit_options=FEW_SAMPLES)
+    dynamics.update(*system.trial(1))
+    return dynamics

@@ -41,6 +41,12 @@ def swings(n=60, noise=0.0, seed=0):
     return states, actions, following
 
 
+def fitted(*data):
+    dynamics = PhysicsDynamics(PENDULUM, swing())
+    dynamics.update(*data)
+    return dynamics
+
+
 def found(dynamics):
     parameters = dynamics.physics_parameters
     return {name: parameters[name].median().item() for name in parameters}
@@ -60,12 +66,10 @@ def test_without_noise_the_parameters_are_exact():
 @pytest.mark.slow
 def test_angles_that_come_wrapped_are_the_same():
     states, actions, following = swings()
-    one, other = PhysicsDynamics(PENDULUM, swing()), PhysicsDynamics(PENDULUM, swing())
-    one.update(states, actions, following)
     wrapped = following.clone()
     wrapped[:, 0] = torch.atan2(following[:, 0].sin(), following[:, 0].cos())
     assert (wrapped - following).abs().max() > 6
-    other.update(states, actions, wrapped)
+    one, other = (fitted(states, actions, after) for after in (following, wrapped))
     assert found(other) == pytest.approx(found(one), rel=1e-6)
 
 
@@ -73,8 +77,7 @@ def test_angles_that_come_wrapped_are_the_same():
 def test_standard_errors_are_those_of_repeated_data():
     estimates, errors = [], []
     for seed in range(40):
-        dynamics = PhysicsDynamics(PENDULUM, swing())
-        dynamics.update(*swings(40, noise=0.1, seed=seed))
+        dynamics = fitted(*swings(40, noise=0.1, seed=seed))
         estimates.append(dynamics.physics_parameters.mean)
         errors.append(dynamics.physics_parameters.sd)
     spread, said = torch.stack(estimates).std(0), torch.stack(errors).mean(0)
@@ -107,8 +110,7 @@ def test_linear_parameters_of_one_output_are_those_of_lstsq():
 def test_each_state_counts_in_units_of_its_own_error():
     states, actions, following = swings(60, noise=0.1)
     following[:, 0] += 0.8 * torch.randn(60, generator=torch.Generator().manual_seed(3)).double()
-    dynamics = PhysicsDynamics(PENDULUM, swing())
-    dynamics.update(states, actions, following)
+    dynamics = fitted(states, actions, following)
     assert found(dynamics)["gravity"] == pytest.approx(9.0, rel=0.03)
     noise = dynamics.noise_variance(states[:1], actions[:1]).sqrt()[0]
     assert noise.tolist() == pytest.approx([0.8, 0.1], rel=0.2)
@@ -131,17 +133,15 @@ def test_entries_that_were_not_measured_are_left_out():
     gaps = following.clone()
     gaps[40:, 0] = torch.nan
     gaps[:40, 1] = torch.nan
-    dynamics = PhysicsDynamics(PENDULUM, swing())
-    dynamics.update(states, actions, gaps)
+    dynamics = fitted(states, actions, gaps)
     assert found(dynamics)["gravity"] == pytest.approx(9.0, rel=0.03)
     assert dynamics.noise_variance(states, actions).isfinite().all()
 
 
 def test_an_update_goes_by_all_transitions_so_far():
     states, actions, following = swings(60, noise=0.1)
-    at_once, later = PhysicsDynamics(PENDULUM, swing()), PhysicsDynamics(PENDULUM, swing())
-    at_once.update(states, actions, following)
-    later.update(states[:20], actions[:20], following[:20])
+    at_once = fitted(states, actions, following)
+    later = fitted(states[:20], actions[:20], following[:20])
     before = later.mean_function()
     first = before(states, actions)
     later.update(states[20:], actions[20:], following[20:])
@@ -152,8 +152,10 @@ def test_an_update_goes_by_all_transitions_so_far():
 
 def test_a_dynamics_that_was_saved_goes_on_bit_for_bit():
     states, actions, following = swings(60, noise=0.1)
-    one, other = PhysicsDynamics(PENDULUM, swing()), PhysicsDynamics(PENDULUM, swing())
-    one.update(states[:30], actions[:30], following[:30])
+    one, other = (
+        fitted(states[:30], actions[:30], following[:30]),
+        PhysicsDynamics(PENDULUM, swing()),
+    )
     other.load_state_dict(one.state_dict())
     assert torch.equal(one.predict(states, actions).mean, other.predict(states, actions).mean)
     for dynamics in (one, other):
@@ -165,8 +167,7 @@ def test_a_dynamics_that_was_saved_goes_on_bit_for_bit():
 
 
 def test_a_state_of_others_is_refused():
-    dynamics = PhysicsDynamics(PENDULUM, swing())
-    dynamics.update(*swings(20))
+    dynamics = fitted(*swings(20))
     state = dynamics.state_dict()
     with pytest.raises(RuntimeError, match=r"unknowns is .* in the state"):
         PhysicsDynamics(PENDULUM, swing(gravity=7.0)).load_state_dict(state)
@@ -205,8 +206,7 @@ def test_several_optima_are_told_apart():
 
 def test_samples_have_the_noise_and_functions_have_none():
     states, actions, following = swings(60, noise=0.3)
-    dynamics = PhysicsDynamics(PENDULUM, swing())
-    dynamics.update(states, actions, following)
+    dynamics = fitted(states, actions, following)
     state, action = states[:1].expand(4000, -1), actions[:1].expand(4000, -1)
     drawn = dynamics.sample(state, action)
     mean, variance = dynamics.predict(states[:1], actions[:1])
@@ -218,10 +218,9 @@ def test_samples_have_the_noise_and_functions_have_none():
 
 
 def test_more_transitions_than_are_searched_by():
-    dynamics = PhysicsDynamics(PENDULUM, swing())
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        dynamics.update(*swings(2000, noise=0.1))
+        dynamics = fitted(*swings(2000, noise=0.1))
     assert found(dynamics) == pytest.approx(TRUTH, rel=0.05)
 
 

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics, StateSpec
-from gpadjust.models import Prediction, ZeroMeanGP
+from gpadjust.dynamics.particles import step_or_nan
+from gpadjust.models import Prediction
 from gpadjust.physics import PhysicsError
 from gpadjust.records import Record, Records
 
@@ -159,6 +160,10 @@ def test_states_that_are_integrated_share_the_noise_of_their_velocities(uniform)
     torch.testing.assert_close(variance[:, 0], variance[:, 1] / 16)
     # In units of the noise the pair is a line, whose energy score is that of v, sqrt(1 + 1) longer.
     run = dynamics.free_run(states, actions.unsqueeze(1), num_functions=199)
+    quiet = dynamics.free_run(states, actions.unsqueeze(1), num_functions=199, noise=False)
+    added = run.particles - quiet.particles
+    assert added[..., 1].std() > 0.01
+    torch.testing.assert_close(added[..., 0], 0.25 * added[..., 1])
     both, alone = (
         run.score(following.unsqueeze(1), units=torch.tensor([unit, 1.0])).energy
         for unit in (0.25, 1e9)
@@ -189,22 +194,6 @@ def test_particles_that_went_round_different_ways_have_their_mean_on_the_circle(
     assert run.lower.item() == pytest.approx(3.1 - 0.4, abs=0.1)
     assert run.upper.item() == pytest.approx(3.1 + 0.4, abs=0.1)
     assert (run.particles - run.mean).abs().max() < math.pi
-
-
-def test_an_integrated_state_has_the_noise_of_its_velocity(uniform):
-    spec = StateSpec(["x", "v"], ["u"], integrated={"x": "v"}, step=0.5)
-    dynamics = LearnedDynamics(spec, fit_options={"method": "map"}, model=ZeroMeanGP)
-    v, u = uniform(30, 1), uniform(30, 1, seed=1)
-    following = v + 0.5 * u + 0.05 * uniform(30, 1, low=-1, seed=2)
-    x = torch.zeros_like(v)
-    next_x = x + 0.25 * (v + following)
-    dynamics.update(torch.cat([x, v], -1), u, torch.cat([next_x, following], -1))
-    options = {"num_functions": 39, "seed": 2}
-    at = torch.tensor([[0.0, 0.5]]).double(), torch.full((1, 3, 1), 0.2).double()
-    with_noise = dynamics.free_run(*at, **options).particles
-    added = with_noise - dynamics.free_run(*at, noise=False, **options).particles
-    assert added[..., 1].std() > 0.01
-    torch.testing.assert_close(added[..., 0], 0.25 * added[..., 1])
 
 
 def test_lost_particles_stay_where_they_were():
@@ -256,60 +245,28 @@ def test_runs_are_the_same_again_and_draw_from_no_generator(monkeypatch):
     assert not torch.equal(Careless(0.1, 0.1).free_run(*start(), seed=1).lower, one.lower)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "options", "error", "says"),
-    [
-        ((STATES[0], ACTIONS[0]), {}, ValueError, r"\(1,\) and \(6, 1\); of a single run, use `in"),
-        ((STATES, ACTIONS[:1]), {}, ValueError, r"got \(2, 1\) and \(1, 6, 1\)"),
-        ((STATES, ACTIONS[:, :0]), {}, ValueError, "one or more actions for each state"),
-        ((STATES[:0], ACTIONS[:0]), {}, ValueError, r"got \(0, 1\) and \(0, 6, 1\)"),
-        ((STATES.repeat(1, 2), ACTIONS), {}, ValueError, r"initial_states of shape \.\.\. x 1"),
-        ((STATES.float(), ACTIONS), {}, TypeError, "initial_states in float64, got torch.float32"),
-        ((STATES, ACTIONS.float()), {}, TypeError, "actions in float64"),
-        ((STATES / 0, ACTIONS), {}, ValueError, "initial_states to be finite"),
-        ((STATES, ACTIONS * torch.nan), {}, ValueError, "actions to be finite"),
-        ((STATES, ACTIONS), {"level": 95}, ValueError, "level must be.* found 95"),
-        ((STATES, ACTIONS), {"level": "95 %"}, TypeError, "level must be"),
-        (
-            (STATES, ACTIONS),
-            {"start_noise": "known"},
-            ValueError,
-            "as .learnt. or a tensor",
-        ),
-        (
-            (STATES, ACTIONS),
-            {"start_noise": -torch.ones(1)},
-            ValueError,
-            "start_noise of 0 or",
-        ),
-        (
-            (STATES, ACTIONS),
-            {"process_noise": torch.tensor([torch.nan])},
-            ValueError,
-            "process_noise of 0 or more, .* `.nan_to_num",
-        ),
-        (
-            (STATES, ACTIONS),
-            {"process_noise": "learnt"},
-            ValueError,
-            "say the noise of these, such as noise=smoothed.noise",
-        ),
-        ((STATES, ACTIONS), {"noise": "learnt"}, ValueError, "noise as True or False or a tensor"),
-        ((STATES, ACTIONS), {"num_functions": 39.0}, TypeError, "num_functions must be a whole"),
-        (
-            (STATES, ACTIONS),
-            {"state_bounds": torch.ones(2)},
-            ValueError,
-            "state_bounds of shape 2 x 1",
-        ),
-    ],
-)
-def test_arguments_out_of_range(arguments, options, error, says):
-    with pytest.raises(error, match=says):
-        Drift(0.1).free_run(*arguments, **options)
+REFUSED = [
+    ((STATES[0], ACTIONS[0]), {}, ValueError, r"\(1,\) and \(6, 1\); of a single run, use `in"),
+    ((STATES, ACTIONS[:1]), {}, ValueError, r"got \(2, 1\) and \(1, 6, 1\)"),
+    ((STATES, ACTIONS[:, :0]), {}, ValueError, "one or more actions for each state"),
+    ((STATES.repeat(1, 2), ACTIONS), {}, ValueError, r"initial_states of shape \.\.\. x 1"),
+    ((STATES, ACTIONS.float()), {}, TypeError, "actions in float64"),
+    ((STATES / 0, ACTIONS), {}, ValueError, "initial_states to be finite"),
+    ((STATES, ACTIONS), {"level": 95}, ValueError, "level must be.* found 95"),
+    ((STATES, ACTIONS), {"start_noise": "known"}, ValueError, "as .learnt. or a tensor"),
+    ((STATES, ACTIONS), {"start_noise": -torch.ones(1)}, ValueError, "start_noise of 0 or"),
+    ((STATES, ACTIONS), {"process_noise": STATES[:1, 0] / 0}, ValueError, "process_.*nan_to_num"),
+    ((STATES, ACTIONS), {"process_noise": "learnt"}, ValueError, "such as noise=smoothed.noise"),
+    ((STATES, ACTIONS), {"noise": "learnt"}, ValueError, "noise as True or False or a tensor"),
+    ((STATES, ACTIONS), {"num_functions": 39.0}, TypeError, "num_functions must be a whole"),
+    ((STATES, ACTIONS), {"state_bounds": torch.ones(2)}, ValueError, "state_bounds of shape 2 x 1"),
+]
 
 
-def test_it_must_have_learnt():
+def test_arguments_out_of_range():
+    for arguments, options, error, words in REFUSED:
+        with pytest.raises(error, match=words):
+            Drift(0.1).free_run(*arguments, **options)
     with pytest.raises(RuntimeError, match="call `update`"):
         LearnedDynamics(SPEC, lambda X: X[:, :1]).free_run(STATES, ACTIONS)
 
@@ -370,3 +327,22 @@ def test_lags_are_measured_with_the_noise_of_what_they_hold():
         torch.zeros(1, 3).double(), torch.zeros(1, 3, 1).double(), num_functions=2000
     )
     assert run.particles[:, 0, 2].std(0).tolist() == pytest.approx([0.3, 0.3, 0], rel=0.1)
+
+
+def test_rows_where_the_physics_fails_are_nan():
+    def move(states, actions):
+        rows = (states[:, 0] < 0).nonzero().flatten().tolist()
+        if rows:
+            raise PhysicsError("It fails.", rows=rows)
+        return states + actions[:, :1]
+
+    for num_states, bad in ((1, [2]), (3, [0, 3])):
+        states = torch.ones(4, num_states, dtype=torch.float64)
+        actions = torch.full((4, 2), 0.5, dtype=torch.float64)
+        states[bad] = -1.0
+        before = states.clone()
+        following = step_or_nan(move, states, actions)
+        works = [i for i in range(4) if i not in bad]
+        assert following[bad].isnan().all()
+        assert (following[works] == 1.5).all()
+        assert states.equal(before)

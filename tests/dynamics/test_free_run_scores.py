@@ -110,23 +110,19 @@ def test_horizons_are_rows_of_all_steps(run, measured):
         torch.testing.assert_close(getattr(whole[2], name), chosen[1], equal_nan=True)
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "says"),
-    [
+def test_options_out_of_range(run, measured):
+    for options, error, words in (
         ({"horizons": ()}, ValueError, "different numbers of steps"),
-        ({"horizons": 5}, ValueError, r"such as \(1, 5, 15\), got 5"),
+        ({"horizons": 5}, ValueError, r"different numbers of steps.*\(1, 5, 15\), got 5"),
         ({"horizons": (3, 3)}, ValueError, "different numbers"),
         ({"horizons": (0, 3)}, ValueError, "each horizon must be at least 1; found 0"),
-        ({"horizons": (1.5,)}, TypeError, r"whole number; found 1\.5"),
         ({"horizons": (1, 4)}, ValueError, "at most the 3 steps of the runs, got 4"),
         ({"units": torch.zeros(2)}, ValueError, "finite and positive"),
         ({"units": torch.ones(3)}, ValueError, "Expected units of shape 2, an entry for each"),
         ({"units": "metres"}, TypeError, "Expected units to be real numbers"),
-    ],
-)
-def test_options_out_of_range(run, measured, options, error, says):
-    with pytest.raises(error, match=says):
-        run.score(measured, **options)
+    ):
+        with pytest.raises(error, match=words):
+            run.score(measured, **options)
 
 
 def test_particles_without_spread_say_nothing_of_errors(run, measured):
@@ -168,16 +164,12 @@ def test_windows_of_records_are_chosen_and_scored():
     assert scores.nlpd.isnan().all()
 
 
-@pytest.mark.parametrize(
-    ("spoil", "error", "says"),
-    [
-        (lambda m: m[:, :1], ValueError, r"\(4, 3, 2\), .* got \(4, 1, 2\); of `windows`"),
-        (lambda m: m[..., :1], ValueError, r"measured of shape \.\.\. x 2"),
-        (lambda m: m.float(), TypeError, r"float64, got torch\.float32; use `measured\.double"),
-        (lambda m: m.numpy(), TypeError, "measured as a floating-point tensor"),
-        (lambda m: m / 0, ValueError, "infinity; put NaN where"),
-    ],
-)
-def test_what_was_measured_is_checked(run, measured, spoil, error, says):
-    with pytest.raises(error, match=says):
-        run.score(spoil(measured))
+def test_what_was_measured_is_checked(run, measured):
+    for given, error, words in (
+        (measured[:, :1], ValueError, r"\(4, 3, 2\), .* got \(4, 1, 2\); of `windows`"),
+        (measured[..., :1], ValueError, r"measured of shape \.\.\. x 2"),
+        (measured.float(), TypeError, r"float64, got torch\.float32; use `measured\.double"),
+        (measured / 0, ValueError, "infinity; put NaN where"),
+    ):
+        with pytest.raises(error, match=words):
+            run.score(given)

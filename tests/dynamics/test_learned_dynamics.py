@@ -6,11 +6,10 @@ from functools import partial
 import pytest
 import torch
 
-from gpadjust import CKA, ScaleGP, ZeroMeanGP
-from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
+from gpadjust import CKA, ScaleGP
+from gpadjust.dynamics import LearnedDynamics, StateSpec
 from gpadjust.models import TermBuilder, TermsGP
 from gpadjust.models.parameters import scaled_rbf
-from gpadjust.physics import ODEPhysics
 from gpadjust.validation import trust
 
 pytestmark = pytest.mark.filterwarnings(
@@ -57,11 +56,9 @@ def test_learning_lowers_the_error_of_the_physics(cart_pole_system, make, kind):
         assert (ratio.log().mean() if kind == "RRA" else ratio.log().max()) < 0
 
 
-def test_scores_are_those_of_the_predictions(cart_pole_system, make):
-    system = cart_pole_system
-    dynamics = make("CKA", system.spec, system.crude)
-    dynamics.update(*system.trial(0))
-    states, actions, next_states = system.trial(1)
+def test_scores_are_those_of_the_predictions(cart_pole_system, learnt_cart_pole):
+    dynamics = learnt_cart_pole
+    states, actions, next_states = cart_pole_system.trial(0)
     mean, variance = dynamics.predict(states, actions)
     scores = dynamics.score(states, actions, next_states)
     density = torch.distributions.Normal(mean, variance.sqrt()).log_prob(next_states)
@@ -137,50 +134,6 @@ def test_exogenous_and_integrated_states(uniform):
         torch.testing.assert_close(drawn[:, 0], new[:, 0])
 
 
-@pytest.mark.slow
-def test_a_system_that_follows_the_previous_action(uniform):
-    spec = StateSpec(["last", "x"], ["a"], previous={"last": "a"})
-    states, actions = uniform(30, 2, low=-1), uniform(30, 1, low=-1, seed=1)
-
-    def follow(states, actions):
-        last, x = states.split(1, -1)
-        return torch.cat([actions, x + 0.1 * actions + 0.2 * last], -1)
-
-    seen = []
-
-    def physics(X):
-        seen.append(X.shape[-1])
-        return X[:, :1] + 0.2 * X[:, 1:]
-
-    dynamics = LearnedDynamics(spec, physics)
-    dynamics.update(states, actions, follow(states, actions))
-    assert dynamics.model.num_outputs == 1
-    new, pushes = uniform(10, 2, low=-1, seed=2), uniform(10, 1, low=-1, seed=3)
-    mean, variance = dynamics.predict(new, pushes)
-    torch.testing.assert_close(mean, follow(new, pushes), rtol=0, atol=5e-3)
-    assert (variance[:, 0] == 0).all()
-    for drawn in (
-        dynamics.sample(new, pushes),
-        dynamics.sample_functions(1)(new[None], pushes[None])[0],
-        PhysicsDynamics(spec, physics).sample(new, pushes),
-    ):
-        assert torch.equal(drawn[:, :1], pushes)
-    assert set(seen) == {2}  # its own state and the action
-    assert dynamics.score(new, pushes, follow(new, pushes)).rmse.shape == (1,)
-    again = LearnedDynamics(spec, physics)
-    again.load_state_dict(dynamics.state_dict())
-    assert torch.equal(again.predict(new, pushes).mean, mean)
-
-
-def test_model_sees_the_physics_of_the_user(cart_pole_system, make):
-    system = cart_pole_system
-    dynamics = make("CKA", system.spec, system.crude)
-    dynamics.update(*system.trial(0))
-    assert isinstance(dynamics.model, CKA)
-    assert dynamics.physics is system.crude
-    assert dynamics.model.physics.physics is system.crude
-
-
 class WavyCKA(TermsGP):
     """A structure of a user's: CKA with a term more."""
 
@@ -239,27 +192,20 @@ def test_a_function_makes_the_model(cart_pole_system):
         LearnedDynamics(system.spec, model=lambda X, Y, **given: None).update(*system.trial(0))
 
 
-def test_it_is_described_by_what_all_fits_are_told(cart_pole_system):
-    def described(**options):
-        return LearnedDynamics(
-            cart_pole_system.spec, cart_pole_system.crude, fit_options=options
-        ).describe()
+def test_it_is_described_by_what_all_fits_are_told_and_what_is_given_beside(cart_pole_system):
+    spec = cart_pole_system.spec
 
-    plain = described()
+    def described(given=None, **options):
+        fitted = {"fit_options": options} if options else {}
+        return LearnedDynamics(spec, cart_pole_system.crude, **fitted, **(given or {})).describe()
+
+    plain, moving = described(), spec.states[spec.moving[0]]
     assert plain == described(num_starts=2, num_samples=None)
     assert described(num_samples=8, seed=3) == {**plain, "num_samples": "8", "seed": "3"}
     assert described(method="map") == {**plain, "method": "'map'"}
-
-
-def test_it_is_described_by_what_is_given_beside_the_fits(cart_pole_system):
-    def described(**options):
-        return LearnedDynamics(cart_pole_system.spec, cart_pole_system.crude, **options).describe()
-
-    plain, moving = described(), cart_pole_system.spec.states[cart_pole_system.spec.moving[0]]
-    assert plain == described(num_features=1024, physics_error={})
-    for options in ({"num_features": 256}, {"physics_error": {moving: 0.1}}):
-        found = described(**options)
-        (name,) = options
+    assert plain == described({"num_features": 1024, "physics_error": {}})
+    for name, value in (("num_features", 256), ("physics_error", {moving: 0.1})):
+        found = described({name: value})
         assert {k: v for k, v in found.items() if k != name} == plain
         assert name in found
 
@@ -332,62 +278,45 @@ def test_each_block_follows_a_function_of_its_own(cart_pole_system, make, costly
         torch.testing.assert_close(drawn[i], states[i] + change, rtol=0, atol=1e-8)
 
 
-def test_raw_angles_on_request(cart_pole_system, make):
+def test_predictions_take_leading_dimensions_and_raw_angles(cart_pole_system, make):
     system = cart_pole_system
     dynamics = make("CKA", system.spec, system.crude, encode_angles=False)
     dynamics.update(*system.trial(0))
+    assert isinstance(dynamics.model, CKA)
+    assert dynamics.physics is dynamics.model.physics.physics is system.crude
     assert all(term.num_inputs == 5 for term in dynamics.model.terms)
-
-
-def test_predictions_take_leading_dimensions(cart_pole_system, make):
-    system = cart_pole_system
-    dynamics = make("CKA", system.spec, system.crude)
-    dynamics.update(*system.trial(0))
     states, actions, _ = system.trial(1)
     whole = dynamics.predict(states, actions)
-    for block, flat in zip(
-        dynamics.predict(states.reshape(5, 5, 4), actions.reshape(5, 5, 1)), whole, strict=True
-    ):
+    blocks = dynamics.predict(states.reshape(5, 5, 4), actions.reshape(5, 5, 1))
+    for block, flat in zip(blocks, whole, strict=True):
         torch.testing.assert_close(block, flat.reshape(5, 5, 4))
 
 
 def test_bad_data_are_refused_and_what_was_learnt_stands(cart_pole_system, make):
     system = cart_pole_system
-    states, actions, next_states = system.trial(0, 6)
+    states, actions, following = system.trial(0, 6)
     dynamics = make("CKA", system.spec, system.crude)
     with pytest.raises(ValueError, match="at least 2 transitions to learn from, got 1"):
-        dynamics.update(states[:1], actions[:1], next_states[:1])
-    for call in (dynamics.predict, dynamics.sample):
+        dynamics.update(states[:1], actions[:1], following[:1])
+    for call in (dynamics.predict, dynamics.sample, lambda *a: dynamics.condition(*a, following)):
         with pytest.raises(RuntimeError, match="call `update`"):
             call(states, actions)
-    with pytest.raises(RuntimeError, match="call `update`"):
-        dynamics.condition(states, actions, next_states)
-    dynamics.update(states, actions, next_states)
+    dynamics.update(states, actions, following)
     before = dynamics.predict(states, actions).mean
-    broken = next_states.clone()
+    broken = following.clone()
     broken[4, 2] = math.inf
-    with pytest.raises(ValueError, match=r"next_states to be finite.*row 4"):
-        dynamics.update(states, actions, broken)
-    with pytest.raises(ValueError, match=r"states to be finite.*row 4"):
-        dynamics.update(broken, actions, next_states)
-    with pytest.raises(TypeError, match=r"actions in float64, got torch\.float32"):
-        dynamics.update(states, actions.float(), next_states)
-    with pytest.raises(ValueError, match="as many rows each"):
-        dynamics.update(states, actions[:3], next_states)
+    for rows, error, words in (
+        ((states, actions, broken), ValueError, r"next_states to be finite.*row 4"),
+        ((broken, actions, following), ValueError, r"states to be finite.*row 4"),
+        ((states, actions.float(), following), TypeError, r"actions in float64, got torch\.float3"),
+        ((states, actions[:3], following), ValueError, "as many rows each"),
+    ):
+        with pytest.raises(error, match=words):
+            dynamics.update(*rows)
     with pytest.raises(ValueError, match="states of shape"):
         dynamics.predict(states[:, :3], actions)
-    with pytest.raises(ValueError, match="a block for each function"):
-        dynamics.sample_functions(2)(states, actions)
     assert dynamics.num_transitions == 6
     assert torch.equal(dynamics.predict(states, actions).mean, before)
-
-
-def test_bad_arguments(cart_pole_system):
-    system = cart_pole_system
-    with pytest.raises(ValueError, match="Unknown target 'change'"):
-        LearnedDynamics(system.spec, target="change", model=ZeroMeanGP)
-    with pytest.raises(ValueError, match="difference=False"):
-        LearnedDynamics(system.spec, ODEPhysics(lambda s, a: s, 0.1, 4, difference=True))
 
 
 @pytest.mark.filterwarnings("default")
@@ -421,9 +350,3 @@ def test_the_model_has_the_names_of_the_spec(uniform):
     assert trust(model).input_names == model.input_names
     absolute = LearnedDynamics(spec, lambda X: X[:, :2], target="absolute")
     assert absolute.targets.output_names == ("theta", "omega")
-
-
-def test_data_and_physics_are_those_of_the_dynamics():
-    for name in ("physics", "train_Yvar"):
-        with pytest.raises(TypeError, match=f"found {name} in the functools.partial"):
-            LearnedDynamics(StateSpec(["x"], ["u"]), None, model=partial(CKA, **{name: None}))

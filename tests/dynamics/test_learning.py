@@ -50,15 +50,6 @@ def test_loaded_dynamics_go_on_bit_by_bit(cart_pole_system, make, costly_kind):
     assert other.num_transitions == 37
 
 
-def test_state_of_dynamics_that_learnt_nothing(cart_pole_system, make):
-    system = cart_pole_system
-    dynamics = make("CKA", system.spec, system.crude)
-    dynamics.update(*system.trial(0))
-    dynamics.load_state_dict(stored(make("CKA", system.spec, system.crude)))
-    assert not dynamics.is_fitted
-    assert dynamics.num_transitions == 0
-
-
 @pytest.mark.slow
 def test_conditioning_is_the_exact_posterior(cart_pole_system, make):
     system = cart_pole_system

@@ -12,13 +12,8 @@ from gpadjust.dynamics import PhysicsDynamics, StateSpec, Windows
 from gpadjust.dynamics.plots import plot_free_run
 
 mpl.use("Agg")
+pytestmark = pytest.mark.usefixtures("closed_figures")
 SPEC = StateSpec(["theta", "v"], ["u"], angles=["theta"])
-
-
-@pytest.fixture(autouse=True)
-def close():
-    yield
-    plt.close("all")
 
 
 def turns(num_windows=4, num_steps=20):
@@ -75,9 +70,9 @@ def test_windows_states_and_axes_are_chosen():
     np.testing.assert_allclose(shown, run.mean[[2, 0], -1, 1])
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "says"),
-    [
+def test_what_is_no_free_run_of_these_windows():
+    windows, run = turns()
+    for options, error, words in (
         ({"run": None}, TypeError, "run as a FreeRun, got NoneType; pass `dynamics"),
         ({"windows": ()}, TypeError, "windows as Windows, got tuple; pass `records"),
         ({"windows": turns(3)[0]}, ValueError, r"\(3, 20, 2\), got .*\(4, 20, 2\); .* by `rows`"),
@@ -88,9 +83,6 @@ def test_windows_states_and_axes_are_chosen():
         ({"states": []}, ValueError, "states of theta, v, found none"),
         ({"units": {"w": "m"}}, ValueError, "units of theta, v, u, time, found 'w'"),
         ({"axes": []}, ValueError, "Expected 2 x 3 axes, got 0"),
-    ],
-)
-def test_what_is_no_free_run_of_these_windows(options, error, says):
-    windows, run = turns()
-    with pytest.raises(error, match=says):
-        plot_free_run(**{"run": run, "windows": windows, **options})
+    ):
+        with pytest.raises(error, match=words):
+            plot_free_run(**{"run": run, "windows": windows, **options})

@@ -6,11 +6,12 @@ import pytest
 import torch
 
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
-from gpadjust.physics import JoinedPhysics, ODEPhysics, PhysicsError
+from gpadjust.physics import JoinedPhysics, PhysicsError
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:f_p is nearly zero", "ignore::gpadjust.inference.SamplingWarning"
 )
+POINT_FIT = {"method": "map", "num_starts": 1, "num_screened": 0}
 SEVERAL = ["PhysicsMean", "Scale", "CKA", "RRA"]
 
 
@@ -21,16 +22,16 @@ def still():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "kind",
-    [pytest.param(k, marks=() if k in ("CKA", "RRA") else pytest.mark.slow) for k in SEVERAL],
-)
+@pytest.mark.parametrize("kind", SEVERAL)
 def test_every_structure_takes_several(cart_pole_system, make, still, kind):
     system = cart_pole_system
     dynamics = make(kind, system.spec, {"rod": system.crude, "still": still})
     dynamics.update(*system.trial(0))
-    assert dynamics.score(*system.trial(1)).rmse.isfinite().all()
+    states, actions, following = system.trial(1)
+    assert dynamics.score(states, actions, following).rmse.isfinite().all()
     assert "rho_rod" in [term.name for term in dynamics.model.terms]
+    blocks = states[:3].expand(2, -1, -1), actions[:3].expand(2, -1, -1)
+    assert dynamics.sample_functions(2, seed=0)(*blocks).shape == (2, 3, 4)
 
 
 def test_targets_are_those_of_each_part(cart_pole_system, make, still):
@@ -86,31 +87,14 @@ def test_loading_runs_them_at_three_rows_only(cart_pole_system, make, still):
         swapped.load_state_dict(dynamics.state_dict())
 
 
-@pytest.mark.slow
-def test_functions(cart_pole_system, make, still):
-    system = cart_pole_system
-    dynamics = make("CKA", system.spec, [system.crude, still])
-    dynamics.update(*system.trial(0))
-    states, actions, _ = (t[:3] for t in system.trial(1))
-    drawn = dynamics.sample_functions(2, seed=0)(
-        states.expand(2, -1, -1), actions.expand(2, -1, -1)
-    )
-    assert drawn.shape == (2, 3, 4)
-
-
 def test_each_part_is_checked(cart_pole_system, make, still):
     system = cart_pole_system
-    change = ODEPhysics(lambda s, a: s, 0.1, 4, difference=True)
-    with pytest.raises(ValueError, match="difference=False"):
-        LearnedDynamics(system.spec, [system.crude, change])
     with pytest.raises(ValueError, match="Expected one physics to follow"):
         PhysicsDynamics(system.spec, [system.crude, still])
     assert PhysicsDynamics(system.spec, JoinedPhysics([still])).is_fitted
-    dynamics = make(
-        "CKA", system.spec, {"rod": system.crude, "late": lambda X: system.crude(X) - X[:, :4]}
-    )
+    parts = {"rod": system.crude, "late": lambda X: system.crude(X) - X[:, :4]}
     with pytest.warns(UserWarning, match="'late' seems to return the change"):
-        dynamics.update(*system.trial(0))
+        make("CKA", system.spec, parts, fit_options=POINT_FIT).update(*system.trial(0))
     dynamics = LearnedDynamics(system.spec, [system.crude, lambda X: X[:, :3]])
     with pytest.raises(PhysicsError, match="next values of the 4 states"):
         dynamics.update(*system.trial(0))

@@ -74,27 +74,16 @@ def test_windows_start_at_states_that_were_measured_in_full():
     assert data.windows(2).measured[0, 1].isnan().all()
 
 
-@pytest.mark.parametrize(
-    ("episode", "says"),
-    [
+def test_episodes_and_lengths_that_are_none():
+    x = torch.zeros(3, 1, dtype=torch.float64)
+    for episode, words in (
         ([0, 1, 0], "rows of another episode between"),
         ([0, 0], "3 of next_states, 2 of episode"),
         ([[0, 0, 0]] * 3, "as many rows each"),
-    ],
-)
-def test_episodes_that_are_none(episode, says):
-    x = torch.zeros(3, 1, dtype=torch.float64)
-    with pytest.raises(ValueError, match=says):
-        Trajectories(x, x, x, episode)
-
-
-@pytest.mark.parametrize(("length", "stride"), [(0, None), (1.5, None), (2, 0)])
-def test_lengths_are_whole_numbers(length, stride):
-    with pytest.raises((TypeError, ValueError), match=r"(length|stride) must be"):
-        count(5).windows(length, stride=stride)
-
-
-def test_episodes_are_whole_numbers():
-    rows = torch.zeros(2, 1).double()
-    with pytest.raises(ValueError, match=r"whole numbers, found \[0.5, 0.75\]"):
-        Trajectories(rows, rows, rows, episode=[0.5, 0.75])
+        ([0.5, 0.75, 0.75], r"whole numbers, found \[0.5, 0.75"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            Trajectories(x, x, x, episode)
+    for length, stride, words in ((0, None, "length must be"), (2, 0, "stride must be")):
+        with pytest.raises(ValueError, match=words):
+            count(5).windows(length, stride=stride)

@@ -28,30 +28,21 @@ def test_lines_are_those_of_an_editor(columns):
         table.numbers("z")
 
 
-@pytest.mark.parametrize(
-    ("decimal", "text", "value"),
-    [(".", "1.5", 1.5), (",", "1,5", 1.5), (",", "-1,5e3", -1500.0), (",", "2", 2.0)],
-)
-def test_decimal_marks(columns, decimal, text, value):
-    table = columns(f"x;y\n{text};0\n", ";", decimal=decimal)
-    assert table.numbers("x").tolist() == [value]
-
-
-@pytest.mark.parametrize(
-    ("decimal", "text", "hint"),
-    [
+def test_decimal_marks_and_what_is_no_number(columns):
+    for decimal, text, value in ((".", "1.5", 1.5), (",", "1,5", 1.5), (",", "-1,5e3", -1500.0)):
+        table = columns(f"x;y\n{text};0\n", ";", decimal=decimal)
+        assert table.numbers("x").tolist() == [value]
+    for decimal, text, hint in (
         (".", "1,5", "If this comma is a decimal comma, say so by `decimal=','`."),
         (",", "1.5", "If this point is a decimal point, say so by `decimal='.'`."),
         (",", "1.234,5", "leave the line out."),
         (".", "1_000", "leave the line out."),
         (".", "1,5 m", "leave the line out."),
-    ],
-)
-def test_what_is_no_number(columns, decimal, text, hint):
-    table = columns(f"x;y\n{text};0\n", ";", decimal=decimal)
-    with pytest.raises(ValueError, match="line 2, column 1") as error:
-        table.numbers("x")
-    assert str(error.value).endswith(hint)
+    ):
+        table = columns(f"x;y\n{text};0\n", ";", decimal=decimal)
+        with pytest.raises(ValueError, match="line 2, column 1") as error:
+            table.numbers("x")
+        assert str(error.value).endswith(hint)
 
 
 def test_a_column_that_is_not_there_has_the_likest_name(columns):
@@ -63,9 +54,9 @@ def test_a_column_that_is_not_there_has_the_likest_name(columns):
         table.numbers("pressure")
 
 
-@pytest.mark.parametrize(("mark", "name"), [(";", "semicolons"), ("\t", "tabs"), ("|", "bars")])
-def test_another_delimiter_is_told(columns, mark, name):
-    with pytest.raises(ValueError, match=rf"{name} .*--delimiter"):
-        columns(f"x{mark}y\n1{mark}2\n", option="--{} {!r}").numbers("x")
-    with pytest.raises(ValueError, match=rf"1 field,.* {name}"):
-        columns(f"x{mark}y\n1{mark}2,5\n")
+def test_another_delimiter_is_told(columns):
+    for mark, name in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
+        with pytest.raises(ValueError, match=rf"{name} .*--delimiter"):
+            columns(f"x{mark}y\n1{mark}2\n", option="--{} {!r}").numbers("x")
+        with pytest.raises(ValueError, match=rf"1 field,.* {name}"):
+            columns(f"x{mark}y\n1{mark}2,5\n")

@@ -3,7 +3,6 @@
 import math
 
 import matplotlib as mpl
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
@@ -13,13 +12,8 @@ from gpadjust.records.plots import plot_record
 from gpadjust.states import StateSpec
 
 mpl.use("Agg")
+pytestmark = pytest.mark.usefixtures("closed_figures")
 SPEC = StateSpec(["theta", "v"], ["u"], angles=["theta"])
-
-
-@pytest.fixture(autouse=True)
-def close():
-    yield
-    plt.close("all")
 
 
 def turning(num_rows=31, first=7.0, **options):
@@ -55,14 +49,11 @@ def test_a_record_shows_its_gaps_and_segments():
     assert axes[2].lines[0].get_drawstyle() == "steps-post"
 
 
-@pytest.mark.parametrize(
-    ("record", "spec", "error", "says"),
-    [
+def test_what_is_no_record_of_this_machine():
+    for record, spec, error, words in (
         ([turning()], SPEC, TypeError, "record as a Record, got list; of `records` draw each"),
         (turning(), "theta", TypeError, "spec as a StateSpec, got str"),
         (turning(), StateSpec(["x"], ["u"]), ValueError, "states, x, and .* found 2 and 1 columns"),
-    ],
-)
-def test_what_is_no_record_of_this_machine(record, spec, error, says):
-    with pytest.raises(error, match=says):
-        plot_record(record, spec)
+    ):
+        with pytest.raises(error, match=words):
+            plot_record(record, spec)

@@ -1,6 +1,7 @@
 """Records of machines: transitions, windows and even steps, and what is no record."""
 
 import math
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -74,9 +75,7 @@ def test_the_steps_of_a_system_are_those_of_its_physics():
     assert run.score(windows.measured).rmse.max() < 1e-6
 
 
-@pytest.mark.parametrize("step", [0.01, 0.02, 0.05])
-def test_no_step_crosses_segments_gaps_or_records(step):
-    k = round(100 * step)
+def test_no_step_crosses_segments_gaps_or_records():
     segments = ["a"] * 12 + ["b"] * 13 + ["a"] * 6
     rows = torch.cat([torch.arange(11), torch.arange(13, 30)]).double()  # 11 and 12 are missing
     records = [
@@ -84,10 +83,11 @@ def test_no_step_crosses_segments_gaps_or_records(step):
         Record(0.01 * rows, rows.unsqueeze(-1), rows.unsqueeze(-1)),
         counted(14, first=70.0, name="late"),
     ]
-    data = Records(records, SPEC).trajectories(step)
-    lengths = [(n - 1) // k for n in (12, 13, 6, 11, 17, 14)]
-    assert (data.next_states - data.states).unique().tolist() == [k]
-    assert steps_of_episodes(data) == lengths
+    for k in (1, 2, 5):
+        data = Records(records, SPEC).trajectories(0.01 * k)
+        lengths = [(n - 1) // k for n in (12, 13, 6, 11, 17, 14)]
+        assert (data.next_states - data.states).unique().tolist() == [k]
+        assert steps_of_episodes(data) == lengths
 
 
 def test_windows_do_not_cross_records_that_join():
@@ -236,34 +236,23 @@ def jittery(seed=0, num_rows=200, by=0.3):
     return 0.01 * (torch.arange(num_rows) + by * share)
 
 
-@pytest.mark.parametrize(
-    ("records", "step", "says"),
-    [
+def test_steps_that_records_do_not_have():
+    uneven = counted(6, at=torch.tensor([0, 1, 3, 4, 7, 8.0]).double())
+    slow = [counted(9), counted(9, step=0.02, name="slow")]
+    for records, step, words in (
         ([counted(9)], 0.025, r"multiple of .* 0\.01, got 0\.025; take 0\.02, or first `rec"),
         ([counted(9)], 0.004, r"got 0\.004; take 0\.01\."),
-        ([counted(9), counted(9, step=0.02, name="slow")], 0.04, r"0\.02 of 'slow'; .*d\(0\.02"),
+        (slow, 0.04, r"0\.02 of 'slow'; .*d\(0\.02"),
         ([counted(200, at=jittery(), name="rough")], 0.01, r"'rough': .* a tenth of its step 0\.0"),
-        (
-            [counted(6, at=torch.tensor([0, 1, 3, 4, 7, 8.0]).double())],
-            1,
-            "2 of 5 times .* max_gap",
-        ),
+        ([uneven], 1, "2 of 5 times .* max_gap"),
         ([counted(9)], -0.1, "step must be finite and above 0; found -0.1"),
-        ([counted(9)], math.nan, "step must be finite and above 0; found nan"),
-    ],
-)
-def test_steps_that_records_do_not_have(records, step, says):
-    for take in (
-        Records(records, SPEC).trajectories,
-        lambda s: Records(records, SPEC).windows(1, s),
     ):
-        with pytest.raises(ValueError, match=says):
-            take(step)
-
-
-def test_a_step_is_a_number():
-    with pytest.raises(TypeError, match="step must be a number; found '50 ms'"):
-        Records([counted(9)], SPEC).trajectories("50 ms")
+        for take in (
+            Records(records, SPEC).trajectories,
+            partial(Records(records, SPEC).windows, 1),
+        ):
+            with pytest.raises(ValueError, match=words):
+                take(step)
 
 
 def test_even_records_stay_as_they_are_when_resampled():
@@ -391,64 +380,52 @@ def test_a_few_transitions_spread_over_all():
         data.spread(102)
 
 
-@pytest.mark.parametrize("kind", ["tensor", "array", "frame"])
-def test_a_record_takes_tensors_arrays_and_frames(kind):
+def test_a_record_takes_tensors_arrays_and_frames():
     frame = pd.DataFrame(
         {"t": [0.0, 1, 2], "x": [1, 2, 3], "u": [4, 5, 6], "part": ["a", "a", "b"]}
     )
-    parts = frame["t"], frame[["x"]], frame[["u"]]
-    if kind != "frame":
-        parts = [part.to_numpy(copy=True) for part in parts]
-    if kind == "tensor":
-        parts = [torch.tensor(part).double() for part in parts]
-    record = Record(*parts, segments=frame["part"])
-    assert record.times.tolist() == [0, 1, 2]
-    assert record.states.tolist() == [[1], [2], [3]]
-    assert record.actions.dtype == torch.float64
-    assert record.segments == ("a", "a", "b")
-    assert [(rows.start, rows.stop) for rows in record.stretches()] == [(0, 2), (2, 3)]
-    if kind != "frame":
-        parts[1][0] = 9
-        assert record.states[0] == 1, "it has data of its own"
+    frames = frame["t"], frame[["x"]], frame[["u"]]
+    arrays = [part.to_numpy(copy=True) for part in frames]
+    tensors = [torch.tensor(part).double() for part in arrays]
+    for parts in (frames, arrays, tensors):
+        record = Record(*parts, segments=frame["part"])
+        assert record.times.tolist() == [0, 1, 2]
+        assert record.states.tolist() == [[1], [2], [3]]
+        assert record.actions.dtype == torch.float64
+        assert record.segments == ("a", "a", "b")
+        assert [(rows.start, rows.stop) for rows in record.stretches()] == [(0, 2), (2, 3)]
+        if parts is not frames:
+            parts[1][0] = 9
+            assert record.states[0] == 1, "it has data of its own"
 
 
 THREE = torch.arange(3).double()
 
 
-@pytest.mark.parametrize(
-    ("changed", "error", "says"),
-    [
-        ({"times": torch.tensor([0, 2, 1.0]).double()}, ValueError, "row 2: .*found 1 after 2"),
-        ({"times": torch.tensor([0, 1, 1.0]).double()}, ValueError, "row 2: .*found 1 after 1"),
-        ({"times": torch.tensor([0, math.nan, 1]).double()}, ValueError, "row 1: .*nan .* times"),
-        ({"times": torch.tensor([0, 1, math.inf]).double()}, ValueError, "row 2: .*inf .* times"),
-        ({"times": THREE.unsqueeze(-1)}, ValueError, r"times of shape N, got \(3, 1\)"),
-        ({"states": THREE}, ValueError, r"N x state_dim, got \(3,\); .*reshape\(-1, 1\)"),
-        (
-            {"states": column(0, math.inf, 0)},
-            ValueError,
-            "row 1: .*inf in column 0 of states; put N",
-        ),
-        ({"actions": column(0, 0, math.nan)}, ValueError, "row 2: .*nan in column 0 of actions"),
-        ({"actions": column(0, 0)}, ValueError, "3 of times, 3 of states, 2 of actions"),
-        ({"actions": THREE.new_zeros(3, 0)}, ValueError, r"N x action_dim, got \(3, 0\)"),
-        ({"states": column(0, 0, 0).float()}, TypeError, "states in float64, .*`states.double"),
-        ({"states": [[0], [1], [2]]}, TypeError, "states to be a torch tensor"),
-        ({"states": np.array([["a"], ["b"], ["c"]])}, TypeError, "hold numbers only"),
-        ({"segments": [1, 1]}, ValueError, "3 of actions, 2 of segments"),
-        ({"segments": [1, math.nan, 1]}, ValueError, "row 1: expected a label .*found nan"),
-        ({"segments": [1, 2, 1]}, ValueError, "two rows or more of a segment, .* found 3 in all"),
-    ],
-)
-def test_what_is_no_record(changed, error, says):
-    parts = {"times": THREE, "states": column(0, 1, 2), "actions": column(0, 0, 0), **changed}
-    with pytest.raises(error, match=says):
-        Record(**parts, name="r")
+REFUSED = [
+    ({"times": torch.tensor([0, 2, 1.0]).double()}, ValueError, "row 2: .*found 1 after 2"),
+    ({"times": torch.tensor([0, 1, 1.0]).double()}, ValueError, "row 2: .*found 1 after 1"),
+    ({"times": torch.tensor([0, math.nan, 1]).double()}, ValueError, "row 1: .*nan .* times"),
+    ({"times": THREE.unsqueeze(-1)}, ValueError, r"times of shape N, got \(3, 1\)"),
+    ({"states": THREE}, ValueError, r"N x state_dim, got \(3,\); .*reshape\(-1, 1\)"),
+    ({"states": column(0, math.inf, 0)}, ValueError, "row 1: .*inf in column 0 of states; put N"),
+    ({"actions": column(0, 0, math.nan)}, ValueError, "row 2: .*nan in column 0 of actions"),
+    ({"actions": column(0, 0)}, ValueError, "3 of times, 3 of states, 2 of actions"),
+    ({"actions": THREE.new_zeros(3, 0)}, ValueError, r"N x action_dim, got \(3, 0\)"),
+    ({"states": column(0, 0, 0).float()}, TypeError, "states in float64, .*`states.double"),
+    ({"states": [[0], [1], [2]]}, TypeError, "states to be a torch tensor"),
+    ({"states": np.array([["a"], ["b"], ["c"]])}, TypeError, "hold numbers only"),
+    ({"segments": [1, 1]}, ValueError, "3 of actions, 2 of segments"),
+    ({"segments": [1, math.nan, 1]}, ValueError, "row 1: expected a label .*found nan"),
+    ({"segments": [1, 2, 1]}, ValueError, "two rows or more of a segment, .* found 3 in all"),
+]
 
 
-def test_one_row_is_no_record():
-    with pytest.raises(ValueError, match=r"two rows or more of a segment, .* found 1 in all"):
-        counted(1)
+def test_what_is_no_record():
+    good = {"times": THREE, "states": column(0, 1, 2), "actions": column(0, 0, 0)}
+    for changed, error, words in REFUSED:
+        with pytest.raises(error, match=words):
+            Record(**{**good, **changed}, name="r")
 
 
 def test_what_are_no_records():
@@ -502,87 +479,69 @@ def test_csv_files_are_read_as_pandas_reads_them(csv, uniform):
         assert record.segments == expected.segments
 
 
-@pytest.mark.parametrize(
-    ("text", "encoding", "options"),
-    [
-        ("time,q,dq,tau\n0,1,2,3\n1,4,5,6\n", "utf-8", {}),
-        ("time,q,dq,tau\r\n0,1,2,3\r\n1,4,5,6", "utf-8", {}),
-        ("time,q,dq,tau\n0,1,2,3\n1,4,5,6\n", "utf-8-sig", {}),
+def test_csv_files_as_they_come(csv):
+    plain = "time,q,dq,tau\n0,1,2,3\n1,4,5,6\n"
+    for text, encoding, options in (
+        (plain, "utf-8", {}),
+        (plain.replace("\n", "\r\n").removesuffix("\r\n"), "utf-8", {}),
+        (plain, "utf-8-sig", {}),
         ('"time", q ,"dq","tau",\n 0,1, 2,3,\n\n1,4,5,6,\n,,,,\n', "utf-8", {}),
-        ("time;q;dq;tau\n0;1;2;3\n1;4;5;6\n", "utf-8", {"delimiter": ";"}),
+        (plain.replace(",", ";"), "utf-8", {"delimiter": ";"}),
         ("q,dq,tau\n1,2,3\n4,5,6\n", "utf-8", {"time": 1.0}),
         ("x,q,x,dq,tau,time\na,1,a,2,3,0\na,4,a,5,6,1\n", "utf-8", {}),
-    ],
-)
-def test_csv_files_as_they_come(csv, text, encoding, options):
-    (record,) = Records.read_csv(csv(text, encoding=encoding), POINT, **NAMES, **options)
-    assert record.times.tolist() == [0, 1]
-    assert record.states.tolist() == [[1, 2], [4, 5]]
-    assert record.actions.tolist() == [[3], [6]]
+    ):
+        (record,) = Records.read_csv(csv(text, encoding=encoding), POINT, **NAMES, **options)
+        assert record.times.tolist() == [0, 1]
+        assert record.states.tolist() == [[1, 2], [4, 5]]
+        assert record.actions.tolist() == [[3], [6]]
 
 
-def test_columns_of_the_same_names_need_no_words(csv):
+def test_columns_of_the_same_names_need_no_words_and_hidden_states_no_column(csv):
     (record,) = Records.read_csv(str(csv("time,v,u,x\n0,1,2,\n1,4,5,nan\n")), POINT)
     assert record.states.tolist() == [[pytest.approx(math.nan, nan_ok=True), v] for v in (1, 4)]
-
-
-def test_a_hidden_state_has_no_column(csv):
-    (record,) = Records.read_csv(csv("time,x,u\n0,1,2\n1,4,5\n"), POINT, states={"v": None})
+    file = csv("time,x,u\n0,1,2\n1,4,5\n")
+    (record,) = Records.read_csv(file, POINT, states={"v": None})
     assert record.states[:, 0].tolist() == [1, 4]
     assert record.states[:, 1].isnan().all()
+    for held in ("u", "x"):
+        spec = StateSpec(["x", "last"], ["u"], previous={"last": held})
+        (record,) = Records.read_csv(file, spec)
+        assert record.states[:, 1].isnan().all()
+        with pytest.raises(ValueError, match="expected a column 'before'"):
+            Records.read_csv(file, spec, states={"last": "before"})
 
 
-@pytest.mark.parametrize("held", ["u", "x"])
-def test_previous_values_need_no_column(csv, held):
-    spec = StateSpec(["x", "last"], ["u"], previous={"last": held})
-    (record,) = Records.read_csv(csv("time,x,u\n0,1,2\n1,4,5\n"), spec)
-    assert record.states[:, 1].isnan().all()
-    with pytest.raises(ValueError, match="expected a column 'before'"):
-        Records.read_csv(csv("time,x,u\n0,1,2\n1,4,5\n"), spec, states={"last": "before"})
-
-
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ("", "expected a line of names and then rows, found an empty file"),
-        ("\n\n", "found an empty file"),
-        ("time,q,dq,tau\n", "found only a line of names"),
-        ("time,q,dq\n0,1,2\n1,2,3\n", "line 1: expected a column 'tau', found 'time', 'q', 'dq'"),
-        ("time,q,dq,q,tau\n0,1,2,3,4\n", "line 1: expected one column 'q', found columns 2 and 4"),
-        ("time,q,dq,tau\n0,1,2,3\n\n1,2,x,3\n", r"line 4, column 3 \('dq'\): .*found 'x'"),
-        ("time,q,dq,tau\n0,1,inf,3\n1,2,3,4\n", r"line 2, column 3 \('dq'\): .*found 'inf'"),
-        ("time,q,dq,tau\n0,1,2,3\n1,2,3,\n", r"line 3, column 4 \('tau'\): .* number, found ''"),
-        ("time,q,dq,tau\n0,1,2,3\n1,2,3,nan\n", r"line 3, column 4 \('tau'\): .*found 'nan'"),
-        ("time,q,dq,tau\n0,1,2,3\n,2,3,4\n", r"line 3, column 1 \('time'\): .*found ''"),
-        ("time,q,dq,tau\n0,1,2,3\n1,2,3\n", "line 3: expected 4 fields, .* found 3"),
-        ("time,q,dq,tau\n0,1,2,3\n2,2,3,4\n1,2,3,4\n", "log.csv', row 2: .*found 1 after 2"),
-        ("time,q,dq,tau\n0,1,2,3\n", "log.csv': expected two rows or more"),
-    ],
-)
-def test_what_is_no_file_of_a_record(csv, text, says):
-    good = csv("time,q,dq,tau\n0,1,2,3\n1,4,5,6\n", "good.csv")
-    with pytest.raises(ValueError, match=f"log.csv.*{says.removeprefix('log.csv')}"):
-        Records.read_csv([good, csv(text)], POINT, **NAMES)
+def test_what_is_no_file_of_a_record(csv):
+    head, good = "time,q,dq,tau\n", csv("time,q,dq,tau\n0,1,2,3\n1,4,5,6\n", "good.csv")
+    for text, words in (
+        ("\n\n", ".*expected a line of names and then rows, found an empty file"),
+        ("time,q,dq\n0,1,2\n", ".*line 1: expected a column 'tau', found 'time', 'q', 'dq'"),
+        (head + "0,1,2,3\n\n1,2,x,3\n", r".*line 4, column 3 \('dq'\): .*found 'x'"),
+        (head + "0,1,inf,3\n1,2,3,4\n", r".*line 2, column 3 \('dq'\): .*found 'inf'"),
+        (head + "0,1,2,3\n1,2,3,\n", r".*line 3, column 4 \('tau'\): .* number, found ''"),
+        (head + "0,1,2,3\n2,2,3,4\n1,2,3,4\n", "', row 2: .*found 1 after 2"),
+        (head + "0,1,2,3\n", "': expected two rows or more"),
+    ):
+        with pytest.raises(ValueError, match=f"log.csv{words}"):
+            Records.read_csv([good, csv(text)], POINT, **NAMES)
 
 
 def test_what_is_asked_of_files_is_there(csv, tmp_path):
     file = csv("time,x,v,u,part\n0,1,2,3,a\n1,4,5,6,\n")
-    with pytest.raises(ValueError, match=r"line 3, column 5 \('part'\): expected a text, found ''"):
-        Records.read_csv(file, POINT, segment="part")
-    with pytest.raises(ValueError, match=r"no 'y' among the states of the spec, \('x', 'v'\)"):
-        Records.read_csv(file, POINT, states={"y": "q"})
-    with pytest.raises(TypeError, match=r"actions as a dictionary .*\{'u': 'q'\}, found \['u'\]"):
-        Records.read_csv(file, POINT, actions=["u"])
+    latin, none = csv("time,é\n", "latin.csv", encoding="latin-1"), tmp_path / "none.csv"
+    for files, options, error, words in (
+        (file, {"segment": "part"}, ValueError, r"line 3, column 5 \('part'\): .* text, found ''"),
+        (file, {"states": {"y": "q"}}, ValueError, r"no 'y' among the states of the spec, \('x', "),
+        (file, {"actions": ["u"]}, TypeError, r"actions as a dictionary .*, found \['u'\]"),
+        (file, {"time": 0}, ValueError, "time must be finite and above 0"),
+        ([], {}, ValueError, "one record or more, found none"),
+        (none, {}, FileNotFoundError, "none"),
+        (latin, {}, ValueError, "expected a CSV file in UTF-8, but"),
+    ):
+        with pytest.raises(error, match=words):
+            Records.read_csv(files, POINT, **options)
     with pytest.raises(TypeError, match="spec as a StateSpec"):
         Records.read_csv(file, ["x"])
-    with pytest.raises(ValueError, match="time must be finite and above 0"):
-        Records.read_csv(file, POINT, time=0)
-    with pytest.raises(ValueError, match="one record or more, found none"):
-        Records.read_csv([], POINT)
-    with pytest.raises(FileNotFoundError):
-        Records.read_csv(tmp_path / "none.csv", POINT)
-    with pytest.raises(ValueError, match="expected a CSV file in UTF-8, but"):
-        Records.read_csv(csv("time,é\n", encoding="latin-1"), POINT)
 
 
 def test_windows_are_drawn_evenly_and_are_records_again():

@@ -9,6 +9,7 @@ import openpyxl
 import pytest
 import torch
 
+import gpadjust.report
 from gpadjust import Unknown, load
 from gpadjust.__main__ import main
 from gpadjust.report.given_physics import unknown_of
@@ -110,10 +111,10 @@ BAD_TABLES = {
 }
 
 
-@pytest.mark.parametrize("text", BAD_TABLES)
-def test_a_table_that_is_none(folder, capsys, text):
-    (folder / "data.csv").write_text(text)
-    _says(_fails(capsys), BAD_TABLES[text])
+def test_a_table_that_is_none(folder, capsys):
+    for text, words in BAD_TABLES.items():
+        (folder / "data.csv").write_text(text)
+        _says(_fails(capsys), words)
     _nothing_was_written(folder)
 
 
@@ -136,9 +137,9 @@ BAD_PHYSICS = {
 }
 
 
-@pytest.mark.parametrize("physics", BAD_PHYSICS)
-def test_a_physics_that_is_none_or_fails(folder, capsys, physics):
-    _says(_fails(capsys, physics=physics), BAD_PHYSICS[physics])
+def test_a_physics_that_is_none_or_fails(folder, capsys):
+    for physics, words in BAD_PHYSICS.items():
+        _says(_fails(capsys, physics=physics), words)
     _nothing_was_written(folder)
 
 
@@ -147,48 +148,50 @@ BAD_OPTIONS = {
     ("--out", "none/report.html"): "There is no folder 'none'",
     ("--out", "taken.html"): "'taken.pt' is a folder, where the model's file would be",
     ("--physics", "hill:wave"): "Expected different --physics, found hill:wave more than once",
-    ("--inputs", ""): "names with commas between them, such as a,b, found --inputs ''",
     ("--outputs", "head,"): "names with commas between them, such as a,b, found --outputs 'head,'",
     ("--inputs", "time\nx"): "Expected names in one line",
-    ("--noise", "1e300"): "standard deviation in the output's unit, such as 0.1, found '1e300'",
     ("--inputs", "time,head"): "as inputs and outputs, got 'head \\[m\\]' more than once",
     ("--inputs", "tome"): r"Is it 'time \[s\]'\?",
+    ("--inputs", "time,note"): "names, say so by --categories note, or by --batches note",
     ("--units", "head"): "Expected --units such as a=1,b=2, found 'head'",
     ("--units", "tail=m"): "--units names 'tail', which is none of 'time', 'head'",
     ("--noise", "much"): "standard deviation in the output's unit, such as 0.1, found 'much'",
+    ("--noise", "1e300"): "standard deviation in the output's unit, such as 0.1, found '1e300'",
     ("--noise", "tail=1"): "--noise names 'tail', which is none of --outputs",
     ("--delimiter", ";;"): "Expected --delimiter as one character",
     ("--sheet", "a"): r"data.csv: expected a workbook, \*.xlsx, to have a sheet 'a'",
     ("--unknown", "a=2 +- 1"): "--unknown names 'a', which is in no formula. A function has its",
+    ("--categories", "note"): "The category 'note' is none of --inputs time; name it there",
+    ("--bounds", "1,0"): "Expected --bounds as two numbers, the lower first: 0,1; found '1,0'",
+    ("--input-noise", "head=1"): "--input-noise names 'head', which is none of --inputs",
+    ("--input-noise", "time=-1"): "standard deviations in the inputs' units, such as time=0.5",
 }
 
 
-@pytest.mark.parametrize("options", BAD_OPTIONS)
-def test_options_that_are_wrong(folder, capsys, options):
+def test_options_that_are_wrong(folder, capsys):
     (folder / "taken.pt").mkdir()
-    _says(_fails(capsys, *options), BAD_OPTIONS[options])
+    for options, words in BAD_OPTIONS.items():
+        _says(_fails(capsys, *options), words)
     _nothing_was_written(folder)
 
 
-def test_a_file_that_is_not_there(folder, capsys):
+def test_a_file_that_is_not_there_or_no_file(folder, capsys):
     (folder / "data.csv").rename(folder / "date.csv")
     (folder / "data.csv2").mkdir()
     _says(_fails(capsys), r"There is no file 'data.csv'. Is it 'date.csv'\?")
+    (folder / "data.csv").symlink_to("/dev/null")
+    _says(_fails(capsys), "'data.csv' is a device or a pipe, expected a CSV file")
+    (folder / "data.csv").unlink()
     (folder / "data.csv").mkdir()
     _says(_fails(capsys), "'data.csv' is a folder, expected a CSV file")
 
 
-def test_a_file_that_is_no_file(folder, capsys):
-    (folder / "data.csv").unlink()
-    (folder / "data.csv").symlink_to("/dev/null")
-    _says(_fails(capsys), "'data.csv' is a device or a pipe, expected a CSV file")
-
-
-@pytest.mark.parametrize("seed", ["-1", str(2**32), "1" * 400, "one"])
-def test_a_seed_that_is_none_is_refused_at_once(capsys, seed):
-    with pytest.raises(SystemExit):
-        main([*COMMAND, "--physics", "hill:wave", "--seed", seed])
-    assert "expected a whole number from 0 to 4294967295, found" in capsys.readouterr().err
+def test_a_seed_that_is_none_is_refused_at_once(capsys):
+    for seed in ("-1", str(2**32), "1" * 400, "one"):
+        with pytest.raises(SystemExit):
+            main([*COMMAND, "--physics", "hill:wave", "--seed", seed])
+        error = capsys.readouterr().err
+        assert "expected a whole number from 0 to 4294967295, found" in error
 
 
 def _says(error, expected):
@@ -210,7 +213,7 @@ def test_an_interrupted_fit_leaves_nothing(folder, capsys, monkeypatch):
     _nothing_was_written(folder)
 
 
-@pytest.mark.parametrize("option", [["--fit", "map"], ["--fit=map"], ["--fi", "map"]])
+@pytest.mark.parametrize("option", [["--fit=map"], ["--fi", "map"]])
 def test_one_model_is_told_with_the_command_that_compares(folder, read, capsys, undrawn, option):
     given = ["--physics", "hill:wave", "--seed", "1"]
     assert main([*COMMAND[:-2], *option, *given]) == 0
@@ -265,29 +268,6 @@ def test_kinds_of_data(folder, read, undrawn):
     assert "categories in rig" in text
 
 
-def test_names_that_have_digits_are_names(folder, capsys):
-    rows = [f"{x},R{i % 3},{y}" for i, (x, y) in enumerate(ROWS)]
-    (folder / "data.csv").write_text("\n".join(["time [s],rig,head [m]", *rows, ""]))
-    assert "by --batches rig" in _fails(capsys, "--inputs", "time,rig")
-
-
-@pytest.mark.parametrize(
-    ("options", "says"),
-    {
-        (
-            "--inputs",
-            "time,note",
-        ): "If these are names, say so by --categories note, or by --batches note",
-        ("--categories", "note"): "The category 'note' is none of --inputs time; name it there",
-        ("--bounds", "1,0"): "Expected --bounds as two numbers, the lower first: 0,1; found '1,0'",
-        ("--input-noise", "head=1"): "--input-noise names 'head', which is none of --inputs",
-        ("--input-noise", "time=-1"): "standard deviations in the inputs' units, such as time=0.5",
-    }.items(),
-)
-def test_kinds_that_are_none(folder, capsys, options, says):
-    assert says in _fails(capsys, *options)
-
-
 UNKNOWNS = {
     "E [Pa]=210e9 +- 20 %": Unknown(210e9, sd=42e9, bounds=(0, math.inf), unit="Pa"),
     "c = -2 ± 50%": Unknown(-2.0, sd=1.0, bounds=(-math.inf, 0)),
@@ -297,20 +277,12 @@ UNKNOWNS = {
 }
 
 
-@pytest.mark.parametrize("text", UNKNOWNS)
-def test_priors_of_unknown_parameters(text):
-    name, found = unknown_of(text)
-    assert name == text[0]
-    assert found == UNKNOWNS[text]
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["E", "E=", "E=2", "E=2+-", "E=x+-1", "=2+-1", "E=2+-0", "E=2*/20 %", "E=3..1", "E=-1*/2"],
-)
-def test_priors_that_are_none(text):
-    with pytest.raises(ValueError, match=r"Expected --unknown such as .* found"):
-        unknown_of(text)
+def test_priors_of_unknown_parameters():
+    for text, expected in UNKNOWNS.items():
+        assert unknown_of(text) == (text[0], expected)
+    for text in ("E", "E=", "E=2", "E=2+-", "E=x+-1", "=2+-1", "E=2+-0", "E=2*/20 %", "E=3..1"):
+        with pytest.raises(ValueError, match=r"Expected --unknown such as .* found"):
+            unknown_of(text)
 
 
 FORMULA = ["--physics", "a * sin(6 * time)", "--unknown", "a=1 +- 50 %", "--outputs", "head"]
@@ -340,28 +312,28 @@ def test_a_formula_beside_a_function(folder, read, undrawn):
     assert abs(names["mean"] - 2 * (6 * names["X"]).sin() - names["X"]) < 0.2
 
 
-@pytest.mark.parametrize(
-    ("physics", "says"),
-    {
-        "a * sin(6 * tme)": r"of the table, time, note, and of --unknown; found 'tme' .*'time'\?",
-        "a + 2": r"found 'none of them' in --physics",
-        "a * time^2": r"\^ is no power, expected \*\*",
-        "a, time": r"expected 1 column, one for each of --outputs",
-        "log(time - 0.55 * a)": r"NaN or inf in 5 of 9 row.*\n  line 2: time \[s\] = 0",
-    }.items(),
-)
-def test_formulas_that_are_none_or_fail(folder, capsys, physics, says):
-    given = ["report", "data.csv", *FORMULA, "--physics", physics, "--fit", "map"]
-    given = [word for word in given if word != "a * sin(6 * time)"]
-    del given[given.index("--physics")]
-    assert main(given) == 1
-    _says(capsys.readouterr().err, says)
+BAD_FORMULAS = {
+    "a * sin(6 * tme)": r"of the table, time, note, and of --unknown; found 'tme' .*'time'\?",
+    "a + 2": r"found 'none of them' in --physics",
+    "a * time^2": r"\^ is no power, expected \*\*",
+    "a, time": r"expected 1 column, one for each of --outputs",
+    "log(time - 0.55 * a)": r"NaN or inf in 5 of 9 row.*\n  line 2: time \[s\] = 0",
+}
+
+
+def test_formulas_that_are_none_or_fail(folder, capsys):
+    for physics, words in BAD_FORMULAS.items():
+        assert main(["report", "data.csv", "--physics", physics, *FORMULA[2:], "--fit", "map"]) == 1
+        _says(capsys.readouterr().err, words)
+    assert main(["report", "data.csv", "--outputs", "head", "--physics", "hill:wave"]) == 1
+    _says(capsys.readouterr().err, "Expected --inputs, the columns that hill:wave reads")
     _nothing_was_written(folder)
 
 
-def test_groups_are_inputs_beside_those_of_a_formula(folder, undrawn):
-    rows = [f"{x},{'ab'[i % 2]},{y}" for i, (x, y) in enumerate(ROWS)]
+def test_groups_are_inputs_beside_those_of_a_formula(folder, capsys, undrawn):
+    rows = [f"{x},R{i % 2},{y}" for i, (x, y) in enumerate(ROWS)]
     (folder / "data.csv").write_text("\n".join(["time [s],rig,head [m]", *rows, ""]))
+    assert "by --batches rig" in _fails(capsys, "--inputs", "time,rig")
     assert main(["report", "data.csv", "--fit", "map", *FORMULA, "--batches", "rig"]) == 0
     assert load("report.pt").input_names == ("time [s]", "rig")
 
@@ -371,11 +343,6 @@ def test_several_formulas_have_short_names(folder, read, undrawn):
     assert main(["report", "data.csv", "--fit", "map", *given]) == 0
     assert "formula 1" in read(folder / "report.html").text
     assert load("report.pt").input_transform.physics.names == ("formula 1", "formula 2")
-
-
-def test_a_function_needs_its_inputs(folder, capsys):
-    assert main(["report", "data.csv", "--outputs", "head", "--physics", "hill:wave"]) == 1
-    assert "Expected --inputs, the columns that hill:wave reads" in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -421,12 +388,12 @@ def test_of_many_rows_some_are_drawn(folder, read, capsys, undrawn):
         main(["report", "data.csv", *FORMULA, "--rows", "0"])
 
 
-@pytest.mark.parametrize("data", ["report.pt", "report.html"])
-def test_data_are_not_overwritten(folder, capsys, data):
-    (folder / data).write_text(TABLE)
-    assert main(["report", data, *FORMULA]) == 1
-    assert f"{data} is the data; give the page another name by --out" in capsys.readouterr().err
-    assert (folder / data).read_text() == TABLE
+def test_data_are_not_overwritten(folder, capsys):
+    for data in ("report.pt", "report.html"):
+        (folder / data).write_text(TABLE)
+        assert main(["report", data, *FORMULA]) == 1
+        _says(capsys.readouterr().err, f"{data} is the data; give the page another name by --out")
+        assert (folder / data).read_text() == TABLE
 
 
 def test_a_physics_that_moves_elsewhere(folder, undrawn, tmp_path_factory):
@@ -437,3 +404,18 @@ def test_a_physics_that_moves_elsewhere(folder, undrawn, tmp_path_factory):
     assert main([*COMMAND, "--physics", "hill:wave"]) == 0
     assert (folder / "report.html").read_text() != "earlier"
     assert not [*there.iterdir()]
+
+
+def test_what_is_missing_is_named(monkeypatch, capsys):
+    for name in [name for name in sys.modules if name.startswith("gpadjust.report")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    monkeypatch.delattr(gpadjust, "report")
+    assert main([*COMMAND, "--physics", "c:d"]) == 1
+    way = 'gpadjust: gpadjust.report needs matplotlib; run `pip install "gpadjust[report]"`.\n'
+    assert capsys.readouterr().err == way
+    for arguments in ([], ["report"], ["report", "data.csv", "--inputs", "a"]):
+        with pytest.raises(SystemExit) as end:
+            main(arguments)
+        assert end.value.code == 2
+        assert "the following arguments are required" in capsys.readouterr().err

@@ -16,7 +16,6 @@ FOLDERS = [re.escape(f"{folder}") for folder in (FOLDER, sys.prefix, tempfile.ge
 PATHS = re.compile(
     "|".join([*FOLDERS, r"[A-Z]:\\", "ipykernel", "site-packages", "0x[0-9a-f]{6,}"])
 )
-by_name = pytest.mark.parametrize("path", notebooks(), ids=lambda path: path.stem)
 
 
 def code_cells(path):
@@ -31,7 +30,7 @@ def texts(cell):
 
 
 @pytest.mark.slow
-@by_name
+@pytest.mark.parametrize("path", notebooks(), ids=lambda path: path.stem)
 def test_a_tutorial_runs_without_a_warning(path):
     notebook = nbformat.read(path, as_version=4)
     shrink(notebook, quick_settings().get(path.name, {}))
@@ -49,9 +48,20 @@ def test_there_are_tutorials_and_their_settings():
     assert set(quick_settings()) <= set(names)
 
 
-@by_name
-def test_quick_settings_are_in_the_notebook(path):
-    shrink(nbformat.read(path, as_version=4), quick_settings().get(path.name, {}))
+def test_what_is_committed_is_small_and_of_one_clean_run_on_no_named_machine():
+    for path in notebooks():
+        notebook, cells = nbformat.read(path, as_version=4), code_cells(path)
+        assert path.stat().st_size < LARGEST, path
+        assert notebook.metadata == KEPT, path
+        assert not [cell.metadata for cell in notebook.cells if cell.metadata], path
+        assert [cell.execution_count for cell in cells] == [*range(1, len(cells) + 1)], path
+        outputs = [output for cell in cells for output in cell.outputs]
+        assert any("image/png" in output.get("data", {}) for output in outputs), path
+        wrong = [o for o in outputs if o.output_type == "error" or o.get("name") == "stderr"]
+        assert not wrong, path
+        found = [PATHS.search(text) for cell in cells for text in texts(cell)]
+        assert not [match.group() for match in found if match], path
+        shrink(notebook, quick_settings().get(path.name, {}))  # whose texts are there
 
 
 def test_a_setting_that_is_gone_is_an_error():
@@ -60,30 +70,6 @@ def test_a_setting_that_is_gone_is_an_error():
     assert notebook.cells[0].source == "steps = 1"
     with pytest.raises(ValueError, match="which no code cell has"):
         shrink(notebook, {"steps = 100": "steps = 1"})
-
-
-@by_name
-def test_committed_outputs_are_those_of_one_clean_run(path):
-    cells = code_cells(path)
-    assert [cell.execution_count for cell in cells] == [*range(1, len(cells) + 1)]
-    kinds = [(o.output_type, o.get("name")) for cell in cells for o in cell.outputs]
-    assert kinds
-    assert not [kind for kind in kinds if kind[0] == "error" or kind[1] == "stderr"]
-    assert any("image/png" in o.get("data", {}) for cell in cells for o in cell.outputs)
-
-
-@by_name
-def test_committed_outputs_name_no_machine(path):
-    found = [PATHS.search(text) for cell in code_cells(path) for text in texts(cell)]
-    assert not [match.group() for match in found if match]
-
-
-@by_name
-def test_committed_notebooks_are_small_and_without_volatile_metadata(path):
-    notebook = nbformat.read(path, as_version=4)
-    assert path.stat().st_size < LARGEST
-    assert notebook.metadata == KEPT
-    assert not [cell.metadata for cell in notebook.cells if cell.metadata]
 
 
 def test_the_readme_lists_every_tutorial():

@@ -274,44 +274,31 @@ def test_names_of_columns_are_on_the_axes(line, plane, data, forrester):
     assert plot_adjustment(line, num_points=4)[0, 0].get_ylabel() == r"$\rho$"
 
 
-RANGES = ("wide", [[0.0], [1.0, 2.0]], object())
-BAD_OPTIONS = [
-    ("num_points", ValueError, "must be at least 2; found 1", (1,)),
-    ("num_points", TypeError, "num_points must be a whole number", (2.5, "9", None)),
-    ("output", ValueError, "output must be at least 0|no output 2; there are 2", (-1, 2)),
-    ("output", TypeError, "output must be a whole number", (0.0, None)),
-    (
-        "bounds",
-        ValueError,
-        "Expected bounds of shape 2 x 2|Expected finite bounds, each lower one below",
-        ([0.0, 1.0], [[0.0, 0.0]], [[0.0, 0.0], [1.0, float("inf")]], torch.zeros(2, 2)),
-    ),
-    (
-        "base",
-        ValueError,
-        "Expected a base point of 2 inputs, finite, got",
-        ([[0.5, 0.5]], 0.5, [0.5, float("nan")], torch.zeros(3)),
-    ),
-    ("axes", ValueError, "Expected 2 x 2 axes, got 0", (np.zeros((2, 2)), [1, 2])),
-    ("bounds", TypeError, "Expected bounds to be real numbers", RANGES),
-    ("base", TypeError, "Expected base to be real numbers", RANGES),
+REFUSED = [
+    ({"num_points": 1}, ValueError, "must be at least 2; found 1"),
+    ({"num_points": 2.5}, TypeError, "num_points must be a whole number"),
+    ({"output": 2}, ValueError, "no output 2; there are 2"),
+    ({"output": 0.0}, TypeError, "output must be a whole number"),
+    ({"bounds": [0.0, 1.0]}, ValueError, "Expected bounds of shape 2 x 2"),
+    ({"bounds": torch.zeros(2, 2)}, ValueError, "Expected finite bounds, each lower one below"),
+    ({"bounds": "wide"}, TypeError, "Expected bounds to be real numbers"),
+    ({"base": [[0.5, 0.5]]}, ValueError, "Expected a base point of 2 inputs, finite, got"),
+    ({"base": [0.5, float("nan")]}, ValueError, "Expected a base point of 2 inputs, finite, got"),
+    ({"base": "wide"}, TypeError, "Expected base to be real numbers"),
+    ({"axes": [1, 2]}, ValueError, "Expected 2 x 2 axes, got 0"),
 ]
 
 
-@pytest.mark.parametrize("draw", [plot_adjustment, plot_adjustment_pair])
-@pytest.mark.parametrize(("name", "error", "says", "values"), BAD_OPTIONS)
-def test_bad_options_of_adjustments(plane, draw, name, error, says, values):
+def test_bad_options_of_adjustments(plane):
     before = plt.get_fignums()
-    for value in values:
-        with pytest.raises(error, match=says):
-            draw(plane, **{name: value})
+    for draw in (plot_adjustment, plot_adjustment_pair):
+        for options, error, words in REFUSED:
+            with pytest.raises(error, match=words):
+                draw(plane, **options)
+    for inputs in (0, (0,), (0.0, 1.0), "01", (0, 0), (-1, 0), (0, 2), None):
+        with pytest.raises(ValueError, match="Expected two different inputs from 0 to 1, got"):
+            plot_adjustment_pair(plane, inputs)
     assert plt.get_fignums() == before
-
-
-@pytest.mark.parametrize("inputs", [0, (0,), (0.0, 1.0), "01", (0, 0), (-1, 0), (0, 2), None])
-def test_inputs_that_are_no_pair(plane, inputs):
-    with pytest.raises(ValueError, match="Expected two different inputs from 0 to 1, got"):
-        plot_adjustment_pair(plane, inputs)
 
 
 def test_models_that_have_nothing_to_draw(line, data):
@@ -327,9 +314,8 @@ def test_models_that_have_nothing_to_draw(line, data):
 def test_bad_input(line, plane, data, forrester):
     X, Y = data(num_outputs=2)
     loo, one = leave_one_out(plane), forrester.test_X
-    for call, error, says in (
+    for call, error, words in (
         (lambda: plot_prediction(plane, X), ValueError, "pass `Y`"),
-        (lambda: plot_prediction(plane, X, Y, output=2), ValueError, "There is no output 2; "),
         (lambda: plot_prediction(plane, X, Y[1:]), ValueError, "Expected Y of shape 9 x m"),
         (lambda: plot_prediction(plane, X, Y[:, :1]), ValueError, "Y with the 2 outputs of the m"),
         (lambda: plot_prediction(plane, X[None], Y), ValueError, "Expected X of shape n x d"),
@@ -339,17 +325,12 @@ def test_bad_input(line, plane, data, forrester):
         (lambda: plot_prediction(line, one, level=95), ValueError, "level must be between 0 and 1"),
         (lambda: plot_prediction(line, one, ax=Figure().subplots(2)), ValueError, "1 x 1 axes"),
         (lambda: plot_leave_one_out(loo, level="95 %"), TypeError, "level must be a number"),
-        (lambda: plot_leave_one_out(loo, output="y1"), TypeError, "whole number; found 'y1'"),
         (lambda: plot_pit(torch.tensor([0.5, 1.5])), ValueError, "PIT values between 0 and 1"),
         (lambda: plot_pit(loo, bins=1.5), TypeError, r"bins must be a whole number; found 1\.5"),
-        (
-            lambda: plot_pit(loo.score().pit.numpy()),
-            TypeError,
-            "the values themselves as a torch tensor",
-        ),
+        (lambda: plot_pit(loo.score().pit.numpy()), TypeError, "values themselves as a torch tens"),
         (lambda: plot_coverage(loo, output=2), ValueError, "no output 2; there are 2, from 0"),
     ):
-        with pytest.raises(error, match=says):
+        with pytest.raises(error, match=words):
             call()
 
 

@@ -14,6 +14,7 @@ from gpadjust.validation.plots import plot_trust, plot_trust_pair
 from tests.systems import crude
 
 mpl.use("Agg")
+pytestmark = pytest.mark.usefixtures("closed_figures")
 Z95 = 1.959963984540054
 
 
@@ -32,12 +33,6 @@ def half():
     model = CKA(X, wave(X) + (X - 0.5).clamp_min(0.0).square(), physics=wave)
     fit(model)
     return model
-
-
-@pytest.fixture(autouse=True)
-def _close_figures():
-    yield
-    plt.close("all")
 
 
 @pytest.mark.slow
@@ -114,22 +109,14 @@ def test_outputs_are_judged_one_by_one(data, build):
     torch.testing.assert_close(second.doubt, found.doubt[:, 1:])
 
 
-@pytest.mark.parametrize("kind", ["CKA", "PhysicsMeanGP", "ScaleGP", "RRA", "BiasGP"])
-def test_all_models_with_a_physics_fall_back_to_it(kind, data, build):
+def test_all_models_with_a_physics_fall_back_to_it(data, build):
     X, Y = data(num_outputs=2)
-    model = build(kind, X, Y)
     Z = 3 * torch.rand(7, 2, dtype=torch.float64)
-    torch.testing.assert_close(model.fallback(Z), crude(Z))
-    assert trust(model, Z).side.shape == (7, 2)
-
-
-def test_inducing_points_fall_back_to_the_physics_too(data):
-    X, Y = data(num_outputs=2)
+    models = [build(kind, X, Y) for kind in ("CKA", "PhysicsMeanGP", "ScaleGP", "RRA")]
     Y[:3, 0] = torch.nan
-    model = VariationalCKA(X, Y, physics=crude)
-    Z = 3 * torch.rand(7, 2, dtype=torch.float64)
-    torch.testing.assert_close(model.fallback(Z), crude(Z))
-    assert trust(model, Z).side.shape == (7, 2)
+    for model in (*models, VariationalCKA(X, Y, physics=crude)):
+        torch.testing.assert_close(model.fallback(Z), crude(Z))
+        assert trust(model, Z).side.shape == (7, 2)
     assert trust(model, num_points=9).side.shape == (9, 2)
 
 
@@ -173,27 +160,22 @@ def test_the_model_of_learned_dynamics(uniform):
 
 def test_bad_input(half, data):
     X, Y = data()
-    for call, error, says in (
+    batch = CKA(X.expand(2, -1, -1), Y.expand(2, -1, -1), physics=lambda X: X[..., :1])
+    stacked = StackedGP({"CKA": half}, [[1.0] * half.num_outputs])
+    for call, error, words in (
         (lambda: trust(ZeroMeanGP(X, Y)), TypeError, "could trust, such as CKA, got ZeroMeanGP"),
         (lambda: trust(AR1(X, Y, low_X=X, low_Y=Y)), TypeError, "got AR1"),
-        (
-            lambda: trust(StackedGP({"CKA": half}, [[1.0] * half.num_outputs])),
-            TypeError,
-            r"got a StackedGP.*comparison\.models\['CKA'\]",
-        ),
+        (lambda: trust(stacked), TypeError, r"got a StackedGP.*comparison\.models\['CKA'\]"),
         (lambda: trust("CKA"), TypeError, "of LearnedDynamics pass its `model`"),
         (lambda: trust(half, X), ValueError, "columns"),
         (lambda: trust(half, X[:0, :1]), ValueError, "one point or more"),
         (lambda: trust(half, X[None, :, :1]), ValueError, "Expected X of shape n x d"),
         (lambda: trust(half, level=95), ValueError, "level must be between 0 and 1"),
         (lambda: trust(half, num_points=0), ValueError, "num_points must be at least 1"),
-        (lambda: trust(half, num_points=2.5), TypeError, "num_points must be a whole number"),
+        (lambda: trust(batch), ValueError, r"of one data set, got one with batch_shape \(2,\)"),
     ):
-        with pytest.raises(error, match=says):
+        with pytest.raises(error, match=words):
             call()
-    batch = CKA(X.expand(2, -1, -1), Y.expand(2, -1, -1), physics=lambda X: X[..., :1])
-    with pytest.raises(ValueError, match=r"of one data set, got one with batch_shape \(2,\)"):
-        trust(batch)
 
 
 @pytest.fixture
