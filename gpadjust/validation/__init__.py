@@ -2,7 +2,6 @@
 
 from gpadjust.validation.advice import Gain
 from gpadjust.validation.comparison import Comparison, compare
-from gpadjust.validation.drift_monitor import Alarm, DriftMonitor
 from gpadjust.validation.leave_one_out import LeaveOneOut, leave_one_out
 from gpadjust.validation.ranking import Candidate, stacking_weights
 from gpadjust.validation.scores import Scores, coverage, crps, energy_score, nlpd, pit, rmse, score
@@ -11,10 +10,8 @@ from gpadjust.validation.trust import Trust, trust
 
 __all__ = [
     "STRUCTURES",
-    "Alarm",
     "Candidate",
     "Comparison",
-    "DriftMonitor",
     "Gain",
     "LeaveOneOut",
     "Scores",
