@@ -283,7 +283,6 @@ def where_wrong(subject: Subject) -> Markup:
         shown = subject.adjusted[j]
         parts.append(tag("p", " ".join(_words(subject, shown, j))))
         parts.append(drawn(partial(figures.slices, subject, j, inputs)))
-        parts.append(drawn(partial(figures.pairs, subject, j)))
     held = figures.held(subject, inputs)
     return join([tag("p", held, class_="note") if held else Markup(), *parts])
 
@@ -319,8 +318,8 @@ def trusted(subject: Subject) -> Markup:
     inputs = figures.inputs_drawn(subject)
     for name, shown, found in shares:
         parts.append(drawn(partial(figures.trusts, found, shown.output, inputs, name)))
-    over = {1: "Along the input", 2: "Over both inputs"}.get(len(subject.inputs))
-    over = over or "Along each input, for all values of the others"
+    several = len(subject.inputs) > 1
+    over = "Along each input, for all values of the others" if several else "Along the input"
     colors = "blue where it rests on the physics, orange on the data, grey on neither"
     parts.append(tag("p", f"{over}: {colors}.", class_="note"))
     return join(parts)

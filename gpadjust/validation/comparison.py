@@ -197,7 +197,7 @@ def compare(
     less than two standard errors shows nothing.
 
     What is recommended is the mixture of all, a :class:`~gpadjust.StackedGP` with the weights of
-    :func:`stacking_weights`, or the structure that has nearly all weight
+    Yao et al. (2018), or the structure that has nearly all weight
     (:attr:`Comparison.chosen`). ``"CKA"``, whose fit leaves a physics of no use out by itself, has
     the weight of four observations beforehand: the others have to earn theirs by predictions, and
     few observations change little.
