@@ -120,12 +120,11 @@ _ROOMS = (
     "emulation",
     "gp",
     "states",
-    "files",
     "active",
     "dynamics",
 )
 # Rooms that are not searched for names; most need an extra.
-_OTHER_ROOMS = ("ax", "control", "export", "records", "report", "rl", "sklearn", "systems")
+_OTHER_ROOMS = ("ax", "control", "export", "files", "records", "report", "rl", "sklearn", "systems")
 
 
 def __getattr__(name: str) -> Any:

@@ -18,7 +18,6 @@ from tests.systems import line, wave
 
 ROOT = Path(gpadjust.__file__).parent
 FLOORS = [
-    "deprecation",
     *("checks", "physics", "states", "files", "gp", "models", "inference"),
     *("validation", "emulation"),
     *(
@@ -186,7 +185,7 @@ def imports(path):
 
 def test_the_plan_has_each_room():
     rooms = [path.parent.name for path in ROOT.glob("*/__init__.py")]
-    assert sorted(FLOORS) == sorted(["checks", "deprecation", *rooms])
+    assert sorted(FLOORS) == sorted(["checks", *rooms])
 
 
 def test_imports_point_one_way():

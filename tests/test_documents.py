@@ -153,7 +153,8 @@ def test_the_rooms_have_the_files_to_read_first():
 
 
 def test_the_reference_has_a_page_for_each_room_and_lists_the_top_level():
-    rooms = {path.parent.name for path in (ROOT / "gpadjust").glob("*/__init__.py")}
+    paths = (ROOT / "gpadjust").glob("*/__init__.py")
+    rooms = {path.parent.name for path in paths if "__all__" in path.read_text()}
     assert {page.stem for page in REFERENCE} == rooms | {"index", "bases"}
     index = (ROOT / "docs" / "reference" / "index.rst").read_text()
     tree = index.partition(".. toctree::")[2].split()

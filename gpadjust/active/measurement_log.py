@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 
 from filelock import BaseFileLock, FileLock, SoftFileLock, Timeout
 
-from gpadjust.files import sync_folder
+from gpadjust.files.sync_folder import sync_folder
 
 Record = dict[str, Any]
 

@@ -7,14 +7,12 @@ except ImportError as error:
 
 from gpadjust.ax import surrogate
 from gpadjust.ax.parameter_physics import ParameterPhysics
-from gpadjust.ax.physics_optimum import PhysicsOptimumNode
 from gpadjust.ax.strategy import TRANSFORMS, generation_strategy, generator_kwargs
 from gpadjust.ax.tell_physics import TellPhysics
 
 __all__ = [
     "TRANSFORMS",
     "ParameterPhysics",
-    "PhysicsOptimumNode",
     "TellPhysics",
     "generation_strategy",
     "generator_kwargs",

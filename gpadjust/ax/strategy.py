@@ -12,13 +12,11 @@ from ax.adapter.transforms.derelativize import Derelativize
 from ax.adapter.transforms.standardize_y import StandardizeY
 from ax.api.utils.generation_strategy_dispatch import choose_generation_strategy
 from ax.api.utils.structs import GenerationStrategyDispatchStruct
-from ax.generation_strategy.center_generation_node import CenterGenerationNode
 from ax.generation_strategy.generation_strategy import GenerationStrategy
 from ax.generators.torch.botorch_modular.surrogate import SurrogateSpec
 from ax.generators.torch.botorch_modular.utils import ModelConfig
 
 from gpadjust.ax.parameter_physics import ParameterPhysics, of_each
-from gpadjust.ax.physics_optimum import PhysicsOptimumNode
 from gpadjust.ax.tell_physics import TellPhysics
 from gpadjust.models import CKA, TermsGP, ZeroMeanGP
 
@@ -80,24 +78,17 @@ def generation_strategy(
     *,
     model: type[TermsGP] | partial[TermsGP] = CKA,
     fit_options: Mapping[str, Any] | None = None,
-    initialize_with_center: bool | None = None,
     **options: Any,
 ) -> GenerationStrategy:
     """Ax's default strategy, with models that adjust a physics in place of its own.
 
-    Its first trial is where the physics says that the objective is best, by a search that asks f_p
-    1,024 points at once and four times 64 (:class:`PhysicsOptimumNode`). If a metric of the
-    objective has no physics, or f_p fails, it is at the center of the search space, as Ax's. Sobol
-    points follow, and then what the models choose.
+    Its first trials are Ax's, the center of the search space and Sobol points.
 
     Args:
         physics: As in :func:`generator_kwargs`, like the next two.
         model: As there.
         fit_options: As there.
-        initialize_with_center: True: the first trial is at the center whatever the physics says.
-            False: at none of both, the Sobol points come first. Default: at the optimum of the
-            physics.
-        options: The others of ``Client.configure_generation_strategy`` but ``method``, such as
+        options: Those of ``Client.configure_generation_strategy`` but ``method``, such as
             ``initialization_budget`` and ``initialization_random_seed``.
 
     Returns:
@@ -105,7 +96,7 @@ def generation_strategy(
 
     Raises:
         TypeError: As there.
-        ValueError: At the first trial, if a physics reads what is no parameter, or text.
+        ValueError: At the first trial of a model, if a physics reads what is no parameter, or text.
 
     Example:
         >>> from ax.api.client import Client
@@ -118,29 +109,17 @@ def generation_strategy(
         >>> strategy = generation_strategy({"conversion": lambda time: 1 - (-time).exp()})
         >>> client.set_generation_strategy(strategy)
         >>> strategy.name
-        'PhysicsOptimum+Sobol+MBM:CKA'
+        'Center+Sobol+MBM:CKA'
     """
     own = generator_kwargs(physics, model=model, fit_options=fit_options)
-    struct = GenerationStrategyDispatchStruct(
-        method="custom", initialize_with_center=initialize_with_center is not False, **options
-    )
+    struct = GenerationStrategyDispatchStruct(method="custom", **options)
     strategy = choose_generation_strategy(
         struct, model_config=ModelConfig(name=_class_of(model)[0].__name__)
     )
     for node in strategy._nodes:
         if node.name == "MBM":
             node.generator_specs[0].generator_kwargs.update(own)
-    first, *others = strategy._nodes
-    if initialize_with_center is not None or not isinstance(first, CenterGenerationNode):
-        return strategy
-    configs = own["surrogate_spec"].metric_to_model_configs
-    at_optimum = PhysicsOptimumNode(
-        {metric: each[0].model_options["physics"] for metric, each in configs.items()},
-        next_node_name=first.next_node_name,
-        use_existing_trials_for_initialization=first.use_existing_trials_for_initialization,
-    )
-    name = strategy.name.replace("Center", at_optimum.name, 1)
-    return GenerationStrategy(name=name, nodes=[at_optimum, *others])
+    return strategy
 
 
 def _class_of(model: Any) -> tuple[type[TermsGP], dict[str, Any]]:

@@ -18,7 +18,6 @@ from botorch.utils.datasets import SupervisedDataset
 from botorch.utils.types import DEFAULT
 
 from gpadjust.ax.parameter_physics import ParameterPhysics, parts_of
-from gpadjust.ax.physics_optimum import PhysicsOptimumNode
 from gpadjust.ax.tell_physics import TellPhysics
 from gpadjust.ax.units import PhysicsInUnits
 from gpadjust.inference import fit
@@ -49,7 +48,6 @@ def register() -> None:
     register_transform(TellPhysics)
     CORE_ENCODER_REGISTRY[ParameterPhysics] = as_dict
     CORE_DECODER_REGISTRY[ParameterPhysics.__name__] = ParameterPhysics
-    CORE_DECODER_REGISTRY[PhysicsOptimumNode.__name__] = PhysicsOptimumNode
 
 
 def model_inputs(

@@ -102,7 +102,11 @@ class Units:
             step(columns)
         lost = [name for name in names if name not in columns]
         if lost:
-            raise no_numbers(lost)
+            raise ValueError(
+                f"The physics reads the parameter(s) {', '.join(lost)}, which are text, derived, "
+                "or no part of the model. Make choices numbers, or let the physics name the "
+                "parameters that it reads as its arguments: def f_p(x1, x2)."
+            )
         return torch.stack([self._within(name, columns[name].expand(len(X))) for name in names], -1)
 
     def _within(self, name: str, values: Tensor) -> Tensor:
@@ -167,20 +171,15 @@ class PhysicsInUnits(Physics):
         raw = self.units.raw(X, self.reads)
         Y = self.inner.of_rows(self.inner.read_rows(raw, *parameters))
         if Y.shape[-1] != 1:
-            raise several_outputs(self.name, self.metric, Y.shape[-1])
+            raise PhysicsError(
+                f"The physics {self.name!r} returned {Y.shape[-1]} columns for the metric "
+                f"{self.metric!r}, expected one; give each metric a physics of its own."
+            )
         return self.units.metric(Y, self.metric)
 
     def in_user_units(self, values: Tensor) -> Tensor:
         """Return values in the units of the metric."""
         return self.units.of_metric(values, self.metric)
-
-
-def several_outputs(name: str, metric: str, count: int) -> PhysicsError:
-    """The error of a physics with several outputs."""
-    return PhysicsError(
-        f"The physics {name!r} returned {count} columns for the metric {metric!r}, expected one; "
-        "give each metric a physics of its own."
-    )
 
 
 def _change(function: Change, name: str, columns: Columns) -> None:
@@ -199,20 +198,11 @@ def _value_of(name: str, values: Sequence[Any], one_hot: Sequence[str], columns:
         index = torch.stack([columns.pop(each) for each in one_hot], dim=-1).argmax(-1)
     else:
         index = columns.pop(name).round().long().clamp(0, len(values) - 1)
-    if are_numbers(values):
+    if _are_numbers(values):
         columns[name] = torch.tensor(values, dtype=torch.float64)[index]
 
 
-def no_numbers(names: Sequence[str]) -> ValueError:
-    """The error of a physics that reads parameters whose values are no numbers."""
-    return ValueError(
-        f"The physics reads the parameter(s) {', '.join(names)}, which are text, derived, or no "
-        "part of the model. Make choices numbers, or let the physics name the parameters that it "
-        "reads as its arguments: def f_p(x1, x2)."
-    )
-
-
-def are_numbers(values: Sequence[Any]) -> bool:
+def _are_numbers(values: Sequence[Any]) -> bool:
     """True if values of a parameter are numbers, as a physics reads them."""
     return all(isinstance(value, bool | int | float) for value in values)
 
@@ -237,7 +227,7 @@ def _fixed(t: RemoveFixed) -> list[Step]:
     values: dict[str, Any] = {
         n: getattr(p, "value", None) for n, p in t.nontunable_parameters.items()
     }
-    return [partial(_constant, n, float(v)) for n, v in values.items() if are_numbers([v])]
+    return [partial(_constant, n, float(v)) for n, v in values.items() if _are_numbers([v])]
 
 
 def _number(t: ChoiceToNumericChoice) -> list[Step]:

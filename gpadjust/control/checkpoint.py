@@ -19,7 +19,7 @@ from gpadjust.checks import check_kind, checked_whole
 from gpadjust.control.random_state import RandomState
 from gpadjust.control.task import Task
 from gpadjust.control.task_agent import TaskAgent
-from gpadjust.files import sync_folder
+from gpadjust.files.sync_folder import sync_folder
 
 _FORMAT = "gpadjust episode checkpoint, version 5"
 

@@ -12,7 +12,8 @@ from gpadjust.checks import check_finite, checked_whole
 from gpadjust.dynamics.particles import of_states
 from gpadjust.dynamics.trajectories import check_doubles
 from gpadjust.states import StateSpec
-from gpadjust.validation import Scores, energy_score
+from gpadjust.validation import Scores
+from gpadjust.validation.scores import energy_score
 
 _CERTAIN = 1e-9  # of how far the means range: a spread that is one of rounding errors
 

@@ -13,6 +13,8 @@ from gpadjust.gp import WeightedSum
 from gpadjust.models.terms_model import TermsModel
 from gpadjust.models.training_data import ArrayLike, to_tensor
 
+_CANDIDATES = 512
+
 
 @torch.no_grad()
 def next_runs(
@@ -21,7 +23,6 @@ def next_runs(
     number: int = 1,
     *,
     bounds: Tensor | None = None,
-    candidates: int = 512,
     seed: int = 0,
 ) -> Tensor:
     r"""Return the runs of an emulated simulator that would tell most of what a model predicts.
@@ -41,8 +42,7 @@ def next_runs(
         number: How many runs.
         bounds: Of the inputs of the runs, unknown parameters included, ``2 x D``. Default: those of
             the runs so far.
-        candidates: How many to choose from.
-        seed: Of the candidates.
+        seed: Of the candidates, of which there are 512.
 
     Returns:
         Inputs of the runs, ``number x D``, in the order of ``runs_X``.
@@ -68,13 +68,12 @@ def next_runs(
             f"{type(physics).__name__}."
         )
     checked_whole("number", number, 1)
-    checked_whole("candidates", candidates, 2)
     X = to_tensor(X, "X")
     runs = physics.emulator.data()["train_X"]
     bounds = torch.stack([runs.amin(0), runs.amax(0)]) if bounds is None else bounds.to(runs)
     d, unknowns = physics.num_inputs, physics.unknowns
-    u = draw_sobol_samples(bounds, candidates, 1, seed=seed).squeeze(1)
-    at_points = u[: candidates // 2]  # where predictions are asked for, with likely parameters
+    u = draw_sobol_samples(bounds, _CANDIDATES, 1, seed=seed).squeeze(1)
+    at_points = u[: _CANDIDATES // 2]  # where predictions are asked for, with likely parameters
     pick = torch.arange(len(at_points)).to(u.device)
     at_points[:, :d] = physics.read(X)[pick % len(X)]
     if unknowns:

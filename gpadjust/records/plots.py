@@ -28,7 +28,6 @@ def plot_record(
     record: Record,
     spec: StateSpec,
     *,
-    max_gap: float | None = None,
     units: Mapping[str, str] | None = None,
     axes: Any = None,
 ) -> Any:
@@ -41,8 +40,6 @@ def plot_record(
     Args:
         record: The record.
         spec: What the entries of its states and actions are.
-        max_gap: The longest time between two rows that follow each other, as of
-            :meth:`Record.stretches`.
         units: Units for the labels, by the names of states and actions and ``"time"``, such as
             ``{"omega": "rad/s"}``. Default: rad of angles, and s.
         axes: As many axes as states and actions. Default: a new figure.
@@ -53,7 +50,8 @@ def plot_record(
     Raises:
         TypeError: If ``record`` is no :class:`Record`, or ``spec`` no :class:`StateSpec`.
         ValueError: If the record has not the columns of the spec, a unit is of an unknown name,
-            the number of ``axes`` is another one, or it takes ``max_gap`` to say what a gap is.
+            the number of ``axes`` is another one, or times are so uneven that what a gap is cannot
+            be told.
 
     Example:
         >>> import torch
@@ -77,7 +75,7 @@ def plot_record(
             f"{', '.join(spec.actions)}, found {found[0]} and {found[1]} columns; pass the spec of "
             "this machine."
         )
-    names, stretches = [*spec.states, *spec.actions], record.stretches(max_gap)
+    names, stretches = [*spec.states, *spec.actions], record.stretches()
     called = labels(spec, units)
     if axes is None:
         figure = plt.figure(figsize=(7, 1.4 * len(names)), layout="constrained")

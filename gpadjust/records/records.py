@@ -13,7 +13,7 @@ import torch
 from gpadjust.checks import checked_number
 from gpadjust.dynamics import Trajectories, Windows
 from gpadjust.dynamics.targets import check_spec
-from gpadjust.files import TableColumns
+from gpadjust.files.table_columns import TableColumns
 from gpadjust.records.record import Record, Stretch, in_control_steps, resampled
 from gpadjust.states import StateSpec
 

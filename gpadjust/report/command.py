@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gpadjust.files import LARGEST
+from gpadjust.files.table_columns import LARGEST
 from gpadjust.inference import fit
 from gpadjust.models import CKA, TermsGP
 from gpadjust.report.given_physics import (

@@ -15,12 +15,9 @@ from gpadjust.report.markup import Markup, image, name_and_unit, number, with_un
 from gpadjust.report.subject import Subject
 from gpadjust.validation.plots import (
     plot_adjustment,
-    plot_adjustment_pair,
     plot_coverage,
     plot_leave_one_out,
-    plot_pit,
     plot_trust,
-    plot_trust_pair,
 )
 from gpadjust.validation.plots.drawing import (
     DOTS,
@@ -32,10 +29,10 @@ from gpadjust.validation.plots.drawing import (
     mean_and_half_width,
     tidy,
 )
+from gpadjust.validation.plots.predictions import plot_pit
 from gpadjust.validation.trust import Trust
 
 _MOST = 12  # inputs along which slices are drawn, in all outputs together
-_FEW = 2  # outputs, above which slices have to do, or the page grows large
 _WIDTH = 3.6  # inches: as wide as a column of the page, so that text has its size
 _POINTS = 120  # of a curve
 _STYLES = ("--", "-.", ":")
@@ -91,28 +88,9 @@ def slices(subject: Subject, output: int, inputs: list[int]) -> list[Markup]:
     ]
 
 
-def pairs(subject: Subject, output: int) -> list[Markup]:
-    """The mean and sd of rho and delta over both of two inputs."""
-    shown = subject.adjusted[output]
-    if shown is None or len(subject.inputs) != 2 or len(subject.outputs) > _FEW:
-        return []
-    terms = shown.terms
-    figures = _figures(2 * len(terms))
-    axes = np.array([figure.subplots() for figure in figures]).reshape(-1, 2)
-    if terms:
-        plot_adjustment_pair(shown.model, output=shown.output, axes=axes, num_points=20)
-    of = f"over {' and '.join(subject.inputs)}"
-    alts = [f"{what} of {name} {of}" for name in terms for what in ("mean", "standard deviation")]
-    return [image(figure, alt, pixels=True) for figure, alt in zip(figures, alts, strict=True)]
-
-
 def trusts(trusted: Trust, output: int, inputs: list[int], page_output: str) -> list[Markup]:
-    """The basis of predictions, over both of two inputs or along each."""
+    """The basis of predictions along each input."""
     alt = f"whether the prediction of {page_output} rests on physics, data or neither"
-    if len(trusted.input_names) == 2:
-        (figure,) = _figures(1, 2.8)
-        _without_legend(plot_trust_pair(trusted, output=output, ax=figure.subplots()))
-        return [image(figure, alt)]
     figures = _figures(len(trusted.input_names), 2.0)
     axes = [figure.subplots() for figure in figures]
     plot_trust(trusted, output=output, axes=axes)

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gpadjust.files import LARGEST
+from gpadjust.files.table_columns import LARGEST
 from gpadjust.physics import (
     BlackBoxPhysics,
     FormulaPhysics,

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gpadjust.files import LARGEST, TableColumns
+from gpadjust.files.table_columns import LARGEST, TableColumns
 from gpadjust.report.markup import listed, name_and_unit, plural
 
 _HINT = (

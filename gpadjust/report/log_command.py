@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from gpadjust.files import TableColumns
+from gpadjust.files.table_columns import TableColumns
 from gpadjust.physics import FormulaPhysics, ODEPhysics, Physics, PhysicsError, Unknown, as_physics
 from gpadjust.physics.formula import names_in, parse
 from gpadjust.records import Records, identify

@@ -211,14 +211,14 @@ def drawn(draw: Callable[[], list[Markup]]) -> Markup:
     return tag("div", *(tag("figure", image) for image in images), class_="figures")
 
 
-def image(figure: Figure, alt: str, *, pixels: bool = False) -> Markup:
-    """A figure as an image in the page: as curves, or many points or areas as pixels."""
-    source = "" if pixels else _curves(figure)
-    if pixels or len(source) > _LARGE:
+def image(figure: Figure, alt: str) -> Markup:
+    """A figure as an image in the page: as curves, or many points as pixels."""
+    source = _curves(figure)
+    if len(source) > _LARGE:
         buffer = BytesIO()
         figure.savefig(buffer, format="png", dpi=180)
         raster = f"data:image/png;base64,{b64encode(buffer.getvalue()).decode()}"
-        source = min(source or raster, raster, key=len)
+        source = min(source, raster, key=len)
     width, height = (str(round(96 * size)) for size in figure.get_size_inches())
     return tag("img", src=Markup(source), alt=alt, width=width, height=height)
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
 from importlib.metadata import version
+from typing import Any
 
 from botorch.models.transforms.outcome import nanstd
 from scipy.stats import binom
@@ -39,7 +40,6 @@ from gpadjust.report.markup import (
 )
 from gpadjust.report.subject import Adjusted, Subject
 from gpadjust.validation import Trust, trust
-from gpadjust.validation.hints import hints, told_of
 from gpadjust.validation.plots.drawing import quantile
 from gpadjust.validation.structures import ALONE, STACKED
 
@@ -207,8 +207,7 @@ def structures(subject: Subject) -> Markup:
 def advice(subject: Subject, notes: list[str]) -> Markup:
     """Further sentences of the comparison, and warnings of the fit."""
     told = [] if subject.comparison is None else subject.comparison.advice
-    looks = hints(subject.model, subject.loo)
-    sentences = [text.replace("+-", "±") for text in (*told, *looks, *notes)]
+    sentences = [text.replace("+-", "±") for text in (*told, *notes)]
     return bullets(sentences) if sentences else Markup()
 
 
@@ -284,7 +283,6 @@ def where_wrong(subject: Subject) -> Markup:
         shown = subject.adjusted[j]
         parts.append(tag("p", " ".join(_words(subject, shown, j))))
         parts.append(drawn(partial(figures.slices, subject, j, inputs)))
-        parts.append(drawn(partial(figures.pairs, subject, j)))
     held = figures.held(subject, inputs)
     return join([tag("p", held, class_="note") if held else Markup(), *parts])
 
@@ -320,8 +318,8 @@ def trusted(subject: Subject) -> Markup:
     inputs = figures.inputs_drawn(subject)
     for name, shown, found in shares:
         parts.append(drawn(partial(figures.trusts, found, shown.output, inputs, name)))
-    over = {1: "Along the input", 2: "Over both inputs"}.get(len(subject.inputs))
-    over = over or "Along each input, for all values of the others"
+    several = len(subject.inputs) > 1
+    over = "Along each input, for all values of the others" if several else "Along the input"
     colors = "blue where it rests on the physics, orange on the data, grey on neither"
     parts.append(tag("p", f"{over}: {colors}.", class_="note"))
     return join(parts)
@@ -522,7 +520,7 @@ def data(subject: Subject, origin: Origin) -> Markup:
 
 def _assumed(model: TermsGP | StackedGP) -> list[str]:
     """What a model takes its data for, in sentences."""
-    told = told_of(model)
+    told = _told(model)
     outputs, found = listed(name_and_unit(name)[0] for name in model.output_names), []
     if "relative" in told:
         found.append("noise that grows with the physics, beside a constant one (relative)")
@@ -545,6 +543,21 @@ def _assumed(model: TermsGP | StackedGP) -> list[str]:
     if not found:
         return ["Assumed: noise of one size, exact inputs, numbers that may be of any size."]
     return [f"Assumed: {'; '.join(found)}."]
+
+
+def _told(model: TermsGP | StackedGP) -> dict[str, Any]:
+    """Return the kinds of data that a model was told of, and the values that it was told."""
+    one: Any = model.parts[0][0].model if isinstance(model, StackedGP) else model
+    likelihood = one.options.get("likelihood") or ()
+    found: dict[str, Any] = dict.fromkeys(
+        [likelihood] if isinstance(likelihood, str) else likelihood
+    )
+    found |= {name: v for name, v in one.data().items() if name.endswith("var") and v is not None}
+    if getattr(one, "link", None) is not None:
+        found["link"] = one.link
+    if one.levels:
+        found["categorical"] = [one.input_names[i] for i in one.levels]
+    return found
 
 
 def _repeats(subject: Subject) -> list[str]:

@@ -2,19 +2,16 @@
 
 from gpadjust.validation.advice import Gain
 from gpadjust.validation.comparison import Comparison, compare
-from gpadjust.validation.drift_monitor import Alarm, DriftMonitor
 from gpadjust.validation.leave_one_out import LeaveOneOut, leave_one_out
-from gpadjust.validation.ranking import Candidate, stacking_weights
-from gpadjust.validation.scores import Scores, coverage, crps, energy_score, nlpd, pit, rmse, score
+from gpadjust.validation.ranking import Candidate
+from gpadjust.validation.scores import Scores, coverage, crps, nlpd, pit, rmse, score
 from gpadjust.validation.structures import STRUCTURES, Structure
 from gpadjust.validation.trust import Trust, trust
 
 __all__ = [
     "STRUCTURES",
-    "Alarm",
     "Candidate",
     "Comparison",
-    "DriftMonitor",
     "Gain",
     "LeaveOneOut",
     "Scores",
@@ -23,12 +20,10 @@ __all__ = [
     "compare",
     "coverage",
     "crps",
-    "energy_score",
     "leave_one_out",
     "nlpd",
     "pit",
     "rmse",
     "score",
-    "stacking_weights",
     "trust",
 ]

@@ -24,7 +24,6 @@ from gpadjust.models.term_builder import ModelOptions, PhysicsLike
 from gpadjust.models.training_data import ArrayLike, training_data
 from gpadjust.physics import PhysicsWarning, as_physics
 from gpadjust.validation.advice import Gain, advice
-from gpadjust.validation.hints import hints
 from gpadjust.validation.leave_one_out import LeaveOneOut, leave_one_out, mixed
 from gpadjust.validation.ranking import Candidate, beside, ranking
 from gpadjust.validation.structures import (
@@ -59,8 +58,6 @@ class Comparison:
             without it.
         left_out: The predictions of left-out observations by each structure, which the tables tell
             of.
-        hints: What the data look like that the models were not told, each with the option to give:
-            outliers, relative noise, outputs that cannot be negative, categories.
         alone: Those by the physics as it is, ``"physics alone"``, of several each: beside the
             candidates (:meth:`rows`), and no part of what is recommended.
     """
@@ -72,7 +69,6 @@ class Comparison:
     gain: dict[str, Gain] = field(default_factory=dict)
     left_out: dict[str, LeaveOneOut] = field(default_factory=dict)
     alone: dict[str, LeaveOneOut] = field(default_factory=dict)
-    hints: list[str] = field(default_factory=list)
 
     @property
     def chosen(self) -> str:
@@ -170,7 +166,7 @@ class Comparison:
                 )
             lines.append("")
         verdict = [text for name, gain in self.gain.items() for text in gain.sentences(name)]
-        return "\n".join([*lines, *verdict, *self.advice, *self.hints])
+        return "\n".join([*lines, *verdict, *self.advice])
 
 
 def compare(
@@ -201,7 +197,7 @@ def compare(
     less than two standard errors shows nothing.
 
     What is recommended is the mixture of all, a :class:`~gpadjust.StackedGP` with the weights of
-    :func:`stacking_weights`, or the structure that has nearly all weight
+    Yao et al. (2018), or the structure that has nearly all weight
     (:attr:`Comparison.chosen`). ``"CKA"``, whose fit leaves a physics of no use out by itself, has
     the weight of four observations beforehand: the others have to earn theirs by predictions, and
     few observations change little.
@@ -334,8 +330,7 @@ def compare(
     loo = found.leave_one_out()
     # An error with outliers would not be comparable with the others, which leave them out.
     alone = {name: replace(own, is_outlier=loo.is_outlier) for name, own in alone.items()}
-    with threads_for(len(data.X)):
-        return replace(found, alone=alone, hints=hints(found.recommended, loo))
+    return replace(found, alone=alone)
 
 
 def _thinned(model: TermsGP) -> TermsGP:

@@ -45,7 +45,7 @@ class Candidate(NamedTuple):
 def ranking(
     left_out: dict[str, LeaveOneOut], output: int, prior: Sequence[float] | None = None
 ) -> list[Candidate]:
-    """The structures for one output, best first; ``prior`` as in :func:`stacking_weights`."""
+    """The structures for one output, best first; ``prior`` as in ``stacking_weights``."""
     density = densities(left_out, output)
     weights = stacking_weights(density, prior).tolist()
     order = density.sum(0).argsort(descending=True, stable=True).tolist()

@@ -195,7 +195,7 @@ class Scores:
             interval: Lower and upper ends of the interval of that level, ``... x n x m`` each.
                 Default: those of the prediction's own distribution.
             mixture_dim: As in :func:`rmse`.
-            energy: The energy score of draws, ``...``; see :func:`energy_score`.
+            energy: The energy score of draws, ``...``.
             output_names: The names of the ``m`` outputs.
 
         Raises:

@@ -34,8 +34,8 @@ class Structure(NamedTuple):
         adjusts: Whether it does more than to take the physics as a mean.
         joins: Whether it takes several physics at once.
         calibrates: Whether it is of a physics with unknown parameters only.
-        prior: Observations that its weight counts for beforehand, see
-            :func:`~gpadjust.validation.stacking_weights`; of several physics, that of all at once.
+        prior: Observations that its weight counts for beforehand, ``stacking_weights``; of several
+            physics, that of all at once.
     """
 
     name: str

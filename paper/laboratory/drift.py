@@ -19,12 +19,12 @@ import numpy as np
 import torch
 
 from gpadjust import CKA, RRA, fit
-from gpadjust.validation import DriftMonitor
 from paper.common.experiment import Run, Table
 from paper.common.figures import panels, save
 from paper.common.tables import claims_table, markdown, number
 from paper.common.verdicts import Judged, met
 from paper.laboratory import Drift
+from paper.laboratory.drift_monitor import DriftMonitor
 from paper.laboratory.pumps import Wear, catalogue
 
 _COLORS = {"never": "0.6", "rra": "tab:green", "cka": "navy", "refit": "tab:orange"}
@@ -65,9 +65,9 @@ def run(experiment: Drift, model: str, seed: int) -> Run:
         held.append(bool(low <= y <= high))
         adjusted.update(x, y, forget=forget)
         if monitor is not None and i % settings.check_every == 0:
-            alarm = monitor.check(i)
+            alarm = monitor.check()
             if alarm is not None:
-                alarms.append((i, repr(alarm)))
+                alarms.append((i, alarm))
                 monitor.reset()
     errors = torch.tensor(means, dtype=torch.float64) - pump.truth[first:].flatten()
     week = errors.square().split(84)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from gpadjust.files import TableColumns
+from gpadjust.files.table_columns import TableColumns
 
 
 @pytest.fixture

@@ -28,7 +28,7 @@ from gpadjust.inference.targets import LogPosterior
 from gpadjust.models import BiasGP
 from gpadjust.physics import FunctionPhysics, Unknown
 from gpadjust.validation import leave_one_out
-from gpadjust.validation.plots import plot_adjustment, plot_adjustment_pair
+from gpadjust.validation.plots import plot_adjustment
 from tests.systems import Sine, line, ripple
 
 quick = pytest.mark.filterwarnings("ignore::gpadjust.inference.SamplingWarning")  # few draws
@@ -98,7 +98,6 @@ def test_figures(build, data):
     model = build("CKA", *data(num_outputs=2))
     fit(model, "bayes", **SHORT)
     assert plot_adjustment(model, num_points=5).shape == (2, 2)
-    assert plot_adjustment_pair(model, output=1, num_points=4).shape == (2, 2)
 
 
 def test_a_warning_when_the_draws_are_not_of_the_posterior(XY, monkeypatch):

@@ -23,9 +23,9 @@ from gpadjust import (
 from gpadjust.inference import bayes
 from gpadjust.models.training_data import training_data
 from gpadjust.physics import as_physics
-from gpadjust.validation import STRUCTURES, Gain, Structure, leave_one_out, stacking_weights
+from gpadjust.validation import STRUCTURES, Gain, Structure, leave_one_out
 from gpadjust.validation.advice import _scaling, physics_gain
-from gpadjust.validation.ranking import ranking
+from gpadjust.validation.ranking import ranking, stacking_weights
 from gpadjust.validation.structures import candidates, known_structures, physics_alone
 
 comparison_of = sys.modules["gpadjust.validation.comparison"]

@@ -16,12 +16,11 @@ from gpadjust import CKA, VariationalCKA, ZeroMeanGP
 from gpadjust.validation import LeaveOneOut, leave_one_out, score
 from gpadjust.validation.plots import (
     plot_adjustment,
-    plot_adjustment_pair,
     plot_coverage,
     plot_leave_one_out,
-    plot_pit,
     plot_prediction,
 )
+from gpadjust.validation.plots.predictions import plot_pit
 from tests.systems import crude
 
 mpl.use("Agg")
@@ -70,7 +69,6 @@ def test_inducing_points(data):
     axes = plot_adjustment(model, output=1)
     assert axes.shape == (2, 2)  # the rest is drawn with delta
     assert len(axes[0, 0].lines[-1].get_xdata()) == 6
-    assert plot_adjustment_pair(model, num_points=4).shape == (2, 2)
 
 
 @pytest.mark.slow
@@ -138,20 +136,12 @@ def test_lists_will_do_for_numbers(plane):
     bounds, base = [[0.1, 0.2], [1.0, 1.5]], [0.5, 0.7]
     axes = plot_adjustment(plane, bounds=bounds, base=base, num_points=3)
     np.testing.assert_allclose(curve(axes[0, 1], "mean").get_xdata(), [0.2, 0.85, 1.5])
-    assert plot_adjustment_pair(plane, bounds=bounds, base=base, num_points=3).shape == (2, 2)
 
 
 def test_an_input_that_never_changed():
     X = torch.rand(8, 2, dtype=torch.float64)
     X[:, 1] = 0.5
     assert plot_adjustment(CKA(X, X[:, :1].exp(), physics=lambda X: X[:, :1])).shape == (2, 2)
-
-
-def test_pairs_have_names_and_colour_bars(plane):
-    axes = plot_adjustment_pair(plane, (1, 0), num_points=6)
-    assert axes[0, 0].get_title() == "mean of $\\rho$\nfor $y_{1}$"
-    assert axes[1, 0].get_xlabel() == "$x_{2}$"
-    assert len(axes[0, 0].figure.axes) == 8
 
 
 def test_a_row_for_each_physics(uniform):
@@ -164,9 +154,6 @@ def test_a_row_for_each_physics(uniform):
     assert [ax.get_ylabel() for ax in axes[:, 0]] == [f"{name}\nfor $y_{{2}}$" for name in names]
     drawn = [row[0].lines[0].get_ydata()[0] for row in axes]
     np.testing.assert_allclose(drawn, [0.5, 0.25, -1.0])
-    axes = plot_adjustment_pair(several, num_points=4)
-    assert axes.shape == (3, 2)
-    assert axes[0, 1].get_title() == "sd of $\\rho$ of coarse\nfor $y_{1}$"
 
 
 def test_coverage_and_pit(plane, data):
@@ -259,9 +246,6 @@ def test_names_of_columns_are_on_the_axes(line, plane, data, forrester):
     axes = plot_adjustment(plane, output=1, num_points=4)
     assert [ax.get_xlabel() for ax in axes[1]] == ["pressure [Pa]", "$x_{2}$"]
     assert [ax.get_ylabel() for ax in axes[:, 0]] == ["$\\rho$\nfor flow", "$\\delta$\nfor flow"]
-    axes = plot_adjustment_pair(plane, (1, 0), num_points=4)
-    assert (axes[1, 0].get_xlabel(), axes[1, 0].get_ylabel()) == ("$x_{2}$", "pressure [Pa]")
-    assert axes[1, 1].get_title() == "sd of $\\delta$\nfor force [N]"
     ax = plot_prediction(plane, X, Y, output=1)
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("true flow", "predicted flow")
     named = replace(loo, output_names=plane.output_names)
@@ -291,21 +275,15 @@ REFUSED = [
 
 def test_bad_options_of_adjustments(plane):
     before = plt.get_fignums()
-    for draw in (plot_adjustment, plot_adjustment_pair):
-        for options, error, words in REFUSED:
-            with pytest.raises(error, match=words):
-                draw(plane, **options)
-    for inputs in (0, (0,), (0.0, 1.0), "01", (0, 0), (-1, 0), (0, 2), None):
-        with pytest.raises(ValueError, match="Expected two different inputs from 0 to 1, got"):
-            plot_adjustment_pair(plane, inputs)
+    for options, error, words in REFUSED:
+        with pytest.raises(error, match=words):
+            plot_adjustment(plane, **options)
     assert plt.get_fignums() == before
 
 
 def test_models_that_have_nothing_to_draw(line, data):
     with pytest.raises(TypeError, match="ZeroMeanGP has neither rho nor delta to draw"):
         plot_adjustment(ZeroMeanGP(*data()))
-    with pytest.raises(ValueError, match="of one input with `plot_adjustment`"):
-        plot_adjustment_pair(line)
     for draw in (plot_coverage, plot_pit, plot_leave_one_out):
         with pytest.raises(TypeError, match=r"got CKA; pass `leave_one_out\(model\)`"):
             draw(line)

@@ -8,7 +8,8 @@ from botorch.posteriors import GPyTorchPosterior
 from botorch.posteriors.fully_bayesian import GaussianMixturePosterior
 from gpytorch.distributions import MultitaskMultivariateNormal, MultivariateNormal
 
-from gpadjust.validation import Scores, coverage, crps, energy_score, nlpd, pit, rmse, score
+from gpadjust.validation import Scores, coverage, crps, nlpd, pit, rmse, score
+from gpadjust.validation.scores import energy_score
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from gpadjust import AR1, CKA, StackedGP, VariationalCKA, ZeroMeanGP, fit
 from gpadjust.dynamics import LearnedDynamics, StateSpec
 from gpadjust.models import BiasGP
 from gpadjust.validation import Trust, trust
-from gpadjust.validation.plots import plot_trust, plot_trust_pair
+from gpadjust.validation.plots import plot_trust
 from tests.systems import crude
 
 mpl.use("Agg")
@@ -202,13 +202,6 @@ def test_shares_along_each_input(known):
     assert second.containers[0].get_label() == "physics: 100 %"
 
 
-def test_points_over_two_inputs(known):
-    ax = plot_trust_pair(known, (1, 0))
-    for k, drawn in enumerate(ax.lines):
-        np.testing.assert_allclose(drawn.get_xydata(), known.X[k::3].flip(-1))
-    assert ax.get_ylabel() == "speed [m/s]"
-
-
 def test_an_input_that_never_changed(known):
     known.X[:, 1] = 2.0
     axes = plot_trust(known)
@@ -222,8 +215,6 @@ def test_figures_refuse_what_they_cannot_draw(half, known):
         (lambda: plot_trust(known, output=2), ValueError, "There is no output 2"),
         (lambda: plot_trust(known, bins=0), ValueError, "bins must be at least 1"),
         (lambda: plot_trust(known, axes=[1]), ValueError, "1 x 2 axes"),
-        (lambda: plot_trust_pair(known, (0, 2)), ValueError, "two different inputs from 0 to 1"),
-        (lambda: plot_trust_pair(trust(half)), ValueError, "of one input with `plot_trust`"),
     ):
         with pytest.raises(error, match=says):
             call()

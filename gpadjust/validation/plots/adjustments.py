@@ -23,11 +23,8 @@ from gpadjust.validation.plots.drawing import (
     mean_and_half_width,
     quantile,
     tidy,
-    two_inputs,
 )
 from gpadjust.validation.trust import SIDES, Trust
-
-_CONSTANT = 1e-9  # relative variation of what is constant
 
 
 def plot_adjustment(
@@ -102,69 +99,6 @@ def plot_adjustment(
             ax.set_ylim(min(low), max(high))
         row[0].set_ylabel(_symbol(name) + suffix)
     axes[0, 0].legend(frameon=False)
-    return axes
-
-
-def plot_adjustment_pair(
-    model: Any,
-    inputs: tuple[int, int] = (0, 1),
-    *,
-    bounds: Tensor | None = None,
-    base: Tensor | None = None,
-    output: int = 0,
-    num_points: int = 40,
-    axes: Any = None,
-) -> Any:
-    r"""Draw the mean and the sd of :math:`\rho` and :math:`\delta` over two inputs, as contours.
-
-    Other arguments and errors are those of :func:`plot_adjustment`, with ``num_points`` along each
-    of the two ``inputs``, which are counted from 0.
-
-    Returns:
-        An array of axes, ``rows x 2``: mean and sd.
-
-    Raises:
-        ValueError: If ``inputs`` are not two of the model's.
-
-    Example:
-        >>> import torch
-        >>> from gpadjust import CKA
-        >>> X = torch.rand(9, 2, dtype=torch.float64)
-        >>> model = CKA(X, X.prod(-1, keepdim=True), physics=lambda X: X[..., :1])
-        >>> plot_adjustment_pair(model, num_points=5).shape
-        (2, 2)
-    """
-    names = _adjustments(model)
-    num_points = checked_whole("num_points", num_points, 2)
-    train_X, bounds, base, suffix = domain(model, bounds, base, output)
-    i, j = two_inputs(inputs, train_X.shape[-1], "`plot_adjustment`")
-    axes = axes_of(axes, len(names), 2)
-    lines = [
-        torch.linspace(bounds[0, k], bounds[1, k], num_points, dtype=base.dtype) for k in (i, j)
-    ]
-    grid = torch.meshgrid(*lines, indexing="xy")
-    X = base.repeat(num_points**2, 1)
-    X[:, i], X[:, j] = grid[0].flatten(), grid[1].flatten()
-    X = on_levels(X, getattr(model, "levels", {}))
-    label = labels(model, "input", train_X.shape[-1])
-    for row, name in zip(axes, names, strict=True):
-        with torch.no_grad():
-            one_sd = 0.6826894921370859
-            mean, sd = mean_and_half_width(model.term(name, X), output, one_sd)
-        for ax, values, title, colors in zip(
-            row, (mean, sd), ("mean", "sd"), ("viridis", "cividis"), strict=True
-        ):
-            values = values.reshape(grid[0].shape)
-            middle, ticks = float(values.mean()), None
-            levels: int | list[float] = 12
-            if (values - middle).abs().max() <= _CONSTANT * abs(middle):  # rounding errors
-                around = 0.1 * abs(middle) or 1.0
-                levels, ticks = [middle - around, middle + around], [middle]
-            contour = ax.contourf(*grid, values, levels=levels, cmap=colors)
-            ax.figure.colorbar(contour, ax=ax, ticks=ticks)
-            ax.plot(train_X[:, i], train_X[:, j], "o", color=RED, ms=4, mec="white", mew=0.6)
-            ax.set(title=f"{title} of {_symbol(name)}{suffix}", xlabel=label[i], ylabel=label[j])
-            ax.set(xlim=bounds[:, i].tolist(), ylim=bounds[:, j].tolist())
     return axes
 
 
@@ -266,40 +200,6 @@ def plot_trust(trust: Trust, *, output: int = 0, bins: int = 10, axes: Any = Non
     axes[0].set_ylabel("share of predictions")
     _legend(axes[-1], trust, output)
     return axes
-
-
-def plot_trust_pair(
-    trust: Trust, inputs: tuple[int, int] = (0, 1), *, output: int = 0, ax: Axes | None = None
-) -> Axes:
-    """Draw over two inputs which predictions rest on physics, data, or neither, as points.
-
-    Other arguments and errors are those of :func:`plot_trust`.
-
-    Raises:
-        ValueError: If ``inputs`` are not two of the model's, counted from 0.
-
-    Example:
-        >>> import torch
-        >>> from gpadjust import CKA
-        >>> from gpadjust.validation import trust
-        >>> X = torch.rand(9, 2, dtype=torch.float64)
-        >>> model = CKA(X, X.prod(-1, keepdim=True), physics=lambda X: X[..., :1])
-        >>> plot_trust_pair(trust(model)).get_xlabel()
-        '$x_{1}$'
-    """
-    side, named = _side_and_names(trust, output)
-    d = trust.X.shape[-1]
-    i, j = two_inputs(inputs, d, "`plot_trust`")
-    ax = axes_of(ax, 1, 1, 4)[0, 0]
-    for k, kind in enumerate(SIDES):
-        points = trust.X[side == k]
-        style: dict[str, Any] = {"ls": "", "marker": "o", "ms": 4, "mew": 0}
-        ax.plot(points[:, i], points[:, j], color=_COLORS[kind], **style, label=named[kind])
-    names = labels(trust, "input", d)
-    ax.set(xlabel=names[i], ylabel=names[j])
-    _legend(ax, trust, output)
-    tidy(ax)
-    return ax
 
 
 def _side_and_names(trust: Trust, output: int) -> tuple[Tensor, dict[str, str]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from operator import index
 from statistics import NormalDist
 from typing import Any
 
@@ -45,18 +44,6 @@ def column(values: Tensor, output: int) -> Tensor:
     if checked_whole("output", output, 0) >= values.shape[-1]:
         raise ValueError(f"There is no output {output}; there are {values.shape[-1]}, from 0.")
     return values[:, output].detach()
-
-
-def two_inputs(inputs: Any, d: int, otherwise: str) -> tuple[int, int]:
-    """Two different ones of ``d`` inputs, or a ValueError; ``otherwise`` draws a single one."""
-    try:
-        i, j = (index(k) for k in inputs)
-    except (TypeError, ValueError):
-        i = j = 0  # not two whole numbers: refused below
-    if i == j or not (0 <= i < d and 0 <= j < d):
-        hint = f"; draw a model of one input with {otherwise}" if d == 1 else ""
-        raise ValueError(f"Expected two different inputs from 0 to {d - 1}, got {inputs!r}{hint}.")
-    return i, j
 
 
 def observed(values: Tensor, output: int) -> Tensor:
