@@ -200,11 +200,10 @@ class UnknownCovariance:
         if names is None and not self.constants:
             self.factors = conditioning.factors()
             return
-        targets, noise, _ = conditioning.observations()
-        covariance = torch.diag_embed(noise)
+        covariance = torch.diag_embed(conditioning.target_noise())
         if self.has_kernel:
             covariance = covariance + self.kernel.forward(self.train, self.train)
-        self.factors = Factors.of(covariance, targets)
+        self.factors = Factors.of(covariance, conditioning.targets)
 
     def __call__(self, inputs: Tensor) -> Tensor:
         """Return ``... x q x q`` without noise, at transformed inputs ``... x q x d``."""
