@@ -34,7 +34,7 @@ from paper.common.figures import panels, save
 from paper.common.tables import claims_table, markdown, number
 from paper.common.verdicts import Judged, met
 from paper.laboratory import Emulated
-from paper.pairs.functions import low_inputs, observations, pair
+from paper.structures.functions import low_inputs, observations, pair
 
 _MOST, _HELD = 1.2, 0.93
 _COLORS = {"exact": "0.45", "emulated": "#D55E00", "certain": "#0072B2"}

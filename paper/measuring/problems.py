@@ -17,7 +17,7 @@ from gpadjust.systems import CartPoleEquation, cart_pole
 from gpadjust.systems.swing_up import REAL_CART_POLE, SUBSTEP, TIME_STEP
 from paper.common.learners import LEARNERS
 from paper.forrester.problem import LOWER, UPPER, crude_b, truth
-from paper.pairs.functions import pair
+from paper.structures.functions import pair
 
 CART_POLE_LIMITS = (1.0, math.pi, 3.0, 8.0, 10.0)  # m, rad, m/s, rad/s, N, to either side
 _TEST_SEED = 20_000  # beyond those of runs, so that their points are others

@@ -15,7 +15,6 @@ Sources, which the pairs name:
   Illinois.
 - Park, Haftka and Kim (2017): Remarks on multi-fidelity surrogates. Structural and
   Multidisciplinary Optimization 55, 1029-1050.
-- Surjanovic and Bingham (2013): Virtual Library of Simulation Experiments.
 - Xiong, Qian and Wu (2013): Sequential design and analysis of high-accuracy and low-accuracy
   computer codes. Technometrics 55, 37-46.
 """
@@ -162,16 +161,6 @@ def _park91a(x1: Array, x2: Array, x3: Array, x4: Array) -> Array:
     return x1 / 2 * (root - 1) + (x1 + 3 * x4) * np.exp(1 + np.sin(x3))
 
 
-def _camelback(x1: Array, x2: Array) -> Array:
-    one, two = x1**2, x2**2
-    return (4 - 2.1 * one + one * one / 3) * one + x1 * x2 + (4 * two - 4) * two
-
-
-def _beale(x1: Array, x2: Array) -> Array:
-    parts = [(c - x1 + x1 * x2**k) ** 2 for k, c in ((1, 1.5), (2, 2.25), (3, 2.625))]
-    return parts[0] + parts[1] + parts[2]
-
-
 PAIRS: dict[str, Pair] = {}
 
 
@@ -238,59 +227,9 @@ _add(  # Park et al. (2017)
     _stacked(lambda X: _hartmann(X, low=False)),
     lambda high, X, *x: _hartmann(X, low=True),
 )
-_add(  # Dong et al. (2015)
-    *("himmelblau", (-4, -4), (4, 4)),
-    lambda x1, x2: (x1**2 + x2 - 11) ** 2 + (x2**2 + x1 - 7) ** 2,
-    lambda high, X, x1, x2: high(X * [0.5, 0.8]) + (x2**3 - (x1 + 1) ** 2),
-)
 _add(  # Park (1991), and Xiong et al. (2013); the root divides by x1
     *("park91a", (1e-8, 0, 0, 0), (1, 1, 1, 1), _park91a),
     lambda high, X, x1, x2, x3, x4: (
         (1 + np.sin(x1) / 10) * high(X) + (-2 * x1 + x2**2 + x3**2) + 0.5
     ),
-)
-_add(  # Park (1991), and Xiong et al. (2013)
-    *("park91b", (0,) * 4, (1,) * 4),
-    lambda x1, x2, x3, x4: 2 / 3 * np.exp(x1 + x2) - x4 * np.sin(x3) + x3,
-    lambda high, X, *x: 1.2 * high(X) - 1,
-)
-_add(  # Dong et al. (2015)
-    *("six_hump_camelback", (-2, -2), (2, 2), _camelback),
-    lambda high, X, x1, x2: high(0.7 * X) + (x1 * x2 - 15),
-)
-# The rest is nearly a polynomial; of low fidelity they are our own, the textbook's functions are
-# those of Surjanovic and Bingham (2013).
-_add(
-    *("chebyshev", (-1,), (1,)),
-    lambda x: 16 * x**5 - 20 * x**3 + 5 * x,
-    lambda high, X, x: 0.6 * high(0.9 * X) + 0.3 * x**2,
-)
-_add(
-    *("growth", (-2,), (2,)),
-    lambda x: np.exp(x) + x**3,
-    lambda high, X, x: 0.7 * high(0.8 * X) - x**2,
-)
-_add(
-    *("three_hump_camel", (-2, -2), (2, 2)),
-    lambda x1, x2: 2 * x1**2 - 1.05 * x1**4 + x1**6 / 6 + x1 * x2 + x2**2,
-    lambda high, X, x1, x2: high(0.8 * X) + x1 * x2 - 2,
-)
-_add(
-    *("rosenbrock", (-2, -1), (2, 3)),
-    lambda x1, x2: 100 * (x2 - x1**2) ** 2 + (1 - x1) ** 2,
-    lambda high, X, x1, x2: high(0.85 * X) + 50 * x1**2 - 10,
-)
-_add(
-    *("beale", (-1.5, -1.5), (1.5, 1.5), _beale),
-    lambda high, X, x1, x2: high(0.8 * X) + 2 * x1 * x2 - 3,
-)
-_add(
-    *("mccormick", (-1.5, -3), (4, 4)),
-    lambda x1, x2: np.sin(x1 + x2) + (x1 - x2) ** 2 - 1.5 * x1 + 2.5 * x2 + 1,
-    lambda high, X, x1, x2: 0.6 * high(X) + x1 * x2 - 2,
-)
-_add(
-    *("dixon_price", (-1,) * 3, (1,) * 3),
-    lambda x1, x2, x3: (x1 - 1) ** 2 + 2 * (2 * x2**2 - x1) ** 2 + 3 * (2 * x3**2 - x2) ** 2,
-    lambda high, X, x1, x2, x3: high(0.8 * X) + 3 * x1 * x3 - 4 * x2**2,
 )
