@@ -22,8 +22,7 @@ from gpadjust import CKA, RRA, fit
 from gpadjust.validation import DriftMonitor
 from paper.common.experiment import Run, Table
 from paper.common.figures import panels, save
-from paper.common.tables import claims_table, markdown, number
-from paper.common.verdicts import Judged, met
+from paper.common.tables import markdown, number
 from paper.laboratory import Drift
 from paper.laboratory.pumps import Wear, catalogue
 
@@ -100,23 +99,7 @@ def tables(runs: Sequence[Run], experiment: Drift) -> dict[str, Table]:
     shown = {"errors": Table("Errors", markdown([*header, "seconds"], rows))}
     if of["rra"] and of["steady"]:
         shown["alarms"] = _alarms(of["rra"], of["steady"])
-    if all(of[name] for name in ("rra", "cka", "refit")):
-        claims = []
-        for i, name in enumerate(("rra", "cka"), 1):
-            pairs = {r["seed"]: r["rmse"] for r in of["refit"]}
-            ratios = [r["rmse"] / pairs[r["seed"]] for r in of[name] if r["seed"] in pairs]
-            share = float(np.mean([r["coverage"] for r in of[name]]))
-            label = experiment.axes["model"][name]
-            text = f"{label}: at most 1.2 times the error of fitting again each day"
-            claims.append(Judged(f"D{2 * i - 1}", text, met(np.mean(ratios) <= 1.2), _of(ratios)))
-            text = f"{label}: 95 % hold 0.93"
-            claims.append(Judged(f"D{2 * i}", text, met(share >= 0.93), f"{share:.3f}"))
-        shown["targets"] = Table("Targets", claims_table("target", {"drift": claims}))
     return shown
-
-
-def _of(values: Sequence[float]) -> str:
-    return f"{np.mean(values):.2f} ({min(values):.2f} to {max(values):.2f})"
 
 
 def _alarms(drifting: Sequence[Run], steady: Sequence[Run]) -> Table:

@@ -17,9 +17,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Sequence
-from pathlib import Path
 
-import numpy as np
 import pandas as pd
 import torch
 from botorch.exceptions.warnings import OptimizationWarning
@@ -30,14 +28,9 @@ from gpadjust.inference import SamplingWarning
 from gpadjust.physics import Physics
 from gpadjust.validation import rmse
 from paper.common.experiment import Run, Table
-from paper.common.figures import panels, save
-from paper.common.tables import claims_table, markdown, number
-from paper.common.verdicts import Judged, met
+from paper.common.tables import markdown, number
 from paper.laboratory import Emulated
 from paper.structures.functions import low_inputs, observations, pair
-
-_MOST, _HELD = 1.2, 0.93
-_COLORS = {"exact": "0.45", "emulated": "#D55E00", "certain": "#0072B2"}
 
 
 def run(experiment: Emulated, name: str, model: str, seed: int) -> Run:
@@ -108,71 +101,8 @@ def tables(runs: Sequence[Run], experiment: Emulated) -> dict[str, Table]:
         "errors": Table(
             "Errors (geometric means over data sets) and coverage", markdown(header, rows)
         ),
-        "targets": Table("Targets", claims_table("target", {"emulated": judge(found)})),
     }
 
 
 def _ratios(own: pd.DataFrame, model: str) -> pd.Series:
     return own.loc[model, "error"] / own.loc["exact", "error"]
-
-
-def judge(found: pd.DataFrame) -> list[Judged]:
-    """The verdicts on the targets."""
-    every = found.set_index(["model", "pair", "seed"]).sort_index()
-    ratios = _ratios(every, "emulated")
-    each = ratios.groupby("pair").agg(gmean)
-    worst = each.idxmax()
-    coverage = every.loc["emulated", "coverage"].groupby("pair").mean()
-    return [
-        Judged(
-            "E1",
-            "RMSE with 20 d runs within 1.2 times that with the exact f_p (geometric mean of all)",
-            met(gmean(ratios) <= _MOST),
-            f"{gmean(ratios):.2f}",
-        ),
-        Judged(
-            "E2",
-            "the same of each pair",
-            met((each <= _MOST).all()),
-            f"{int((each <= _MOST).sum())} of {len(each)}; worst {worst}, {each[worst]:.2f}",
-        ),
-        Judged(
-            "E3",
-            "95 % intervals hold 0.93",
-            met(coverage.mean() >= _HELD),
-            f"{coverage.mean():.2f} (exact f_p {every.loc['exact', 'coverage'].mean():.2f})",
-        ),
-    ]
-
-
-def draw(runs: Sequence[Run], experiment: Emulated) -> list[Path]:
-    """Draw errors and coverage of all data sets."""
-    found, labels = pd.DataFrame(runs), experiment.axes["model"]
-    names = [*experiment.axes["pair"]]
-    figure, axes = panels(
-        ["RMSE over that with the exact f_p", "share held by 95 %"], 2, (5.0, 3.2), share=False
-    )
-    for offset, (model, label) in enumerate(labels.items()):
-        for ax, key in zip(axes, ("error", "coverage"), strict=True):
-            for i, name in enumerate(names):
-                own = found[found["pair"] == name].set_index(["model", "seed"]).sort_index()
-                if model not in own.index.get_level_values(0):
-                    continue
-                values = own.loc[model, key] / (own.loc["exact", key] if key == "error" else 1)
-                x = np.full(len(values), i + 0.22 * (offset - 1))
-                ax.plot(
-                    x,
-                    values,
-                    "o",
-                    ms=4,
-                    color=_COLORS[model],
-                    alpha=0.6,
-                    label=label if not i else None,
-                )
-    axes[0].set_yscale("log")
-    axes[0].axhline(_MOST, color="0.2", lw=1, ls="--")
-    axes[1].axhline(0.95, color="0.2", lw=1, ls="--")
-    for ax in axes:
-        ax.set_xticks(range(len(names)), names, rotation=25)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
-    return [save(figure, experiment.out / "emulated.png")]

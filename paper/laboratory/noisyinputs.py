@@ -38,12 +38,10 @@ from gpadjust.physics import FunctionPhysics, Unknown
 from gpadjust.validation import rmse
 from paper.common.experiment import Run, Table
 from paper.common.figures import panels, save
-from paper.common.tables import claims_table, markdown, number
-from paper.common.verdicts import Judged, met
+from paper.common.tables import markdown, number
 from paper.laboratory import Noisyinputs
 
 _COLORS = {"ignoring": "0.45", "noisy": "#D55E00"}
-_RATIO, _HELD, _BIAS = 0.85, 0.93, 0.02
 
 
 class Problem(NamedTuple):
@@ -185,8 +183,6 @@ def tables(runs: Sequence[Run], experiment: Noisyinputs) -> dict[str, Table]:
         header = ["law: parameter", "true", "mean estimate, ignoring it", "mean estimate"]
         header += ["held by 95 %, ignoring it", "held by 95 %"]
         shown["laws"] = Table("Parameters of laws", markdown(header, laws))
-    if rows and laws:
-        shown["targets"] = Table("Targets", claims_table("target", {"inputs": judge(pairs)}))
     return shown
 
 
@@ -207,26 +203,6 @@ def _ratio(pairs: pd.DataFrame) -> float:
 
 def _held(pairs: pd.DataFrame, model: str, true: float) -> float:
     return float(np.mean([low <= true <= high for low, high in pairs[f"interval_{model}"]]))
-
-
-def judge(pairs: pd.DataFrame) -> list[Judged]:
-    """The verdicts on the targets."""
-    functions = pairs[[PROBLEMS[p].parameter is None for p in pairs["problem"]]]
-    each = functions.groupby("problem")
-    ratio = float(np.exp(np.mean([np.log(_ratio(own)) for _, own in each])))
-    held = float(each["coverage_noisy"].mean().mean())
-    bias = {}
-    for problem, own in pairs.drop(functions.index).groupby("problem"):
-        true = PROBLEMS[str(problem)].parameter or 1.0
-        bias[problem] = [own[f"parameter_{m}"].mean() / true - 1 for m in ("ignoring", "noisy")]
-    text = ", ".join(f"{p} {b:+.1%} (ignoring it {a:+.1%})" for p, (a, b) in bias.items())
-    return [
-        Judged("X1", "RMSE at most 0.85 of ignoring it, geometric mean", met(ratio <= _RATIO),
-               f"{ratio:.2f}"),
-        Judged("X2", "95 % intervals hold 0.93", met(held >= _HELD), f"{held:.3f}"),
-        Judged("X3", "parameters are within 2 % in the mean",
-               met(all(abs(b) <= _BIAS for _, b in bias.values())), text),
-    ]  # fmt: skip
 
 
 def draw(runs: Sequence[Run], experiment: Noisyinputs) -> list[Path]:

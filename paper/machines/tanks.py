@@ -25,8 +25,8 @@ from gpadjust.records import SmoothingWarning, smooth
 from paper.common.experiment import Run, Table
 from paper.common.figures import one_legend, panels, save
 from paper.common.learners import LEARNERS
-from paper.common.tables import Cell, claims_table, markdown, number, of, table
-from paper.common.verdicts import Difference, Judged, counted, met
+from paper.common.tables import Cell, markdown, number, of, table
+from paper.common.verdicts import Difference
 from paper.machines import (
     CANDIDATES,
     CHOSEN,
@@ -338,9 +338,7 @@ def tables(runs: Sequence[Run], experiment: Tanks) -> dict[str, Table]:
     values = {**record["values"], "upper level at first": record["start"][0]}
     priors = {name: known.prior_text for name, known in UNKNOWNS.items()}
     rows = [[f"`{name}`", f"{v:.3g}", priors.get(name, "5 ± 2")] for name, v in values.items()]
-    judged = {"one first sample of the record is used": verdicts(scored, best)}
     return {
-        "targets": Table("Targets", claims_table("target", judged)),
         "candidates": Table("Structures and process noise", _candidates(scored, best)),
         "learners": Table("Free runs of the validation record", _learners(scored, best, labels)),
         "parameters": Table("Parameters of the chosen f_p", markdown(["", "value", "prior"], rows)),
@@ -399,34 +397,6 @@ def _with_error(column: str, form: str) -> Cell:
         return f"{found.mean:{form}} ± {found.error:{'.1g' if form.endswith('g') else form}}"
 
     return cell
-
-
-def verdicts(runs: pd.DataFrame, best: str) -> list[Judged]:
-    """The verdict on each target, of the candidate that cross-validation chose."""
-    claim = (
-        "free run of the validation record, by the fit that the estimation record chooses, of "
-        "structures from a search that had looked at both"
-    )
-    judged = []
-    for id, text, learner, most in (
-        ("T1", f"{claim}: at most 0.28 V", best, 0.28),
-        ("T2", "the same: at most 0.19 V", best, 0.19),
-        ("T3", "parameters from 100 samples: at most 0.25 V", TENTH, 0.25),
-    ):
-        own = runs[runs["learner"] == learner]
-        if own.empty:
-            judged.append(Judged(id, text, "not run", f"no results of {learner}"))
-            continue
-        mean = sum(own["rmse"]) / len(own)
-        said = f"{learner} {mean:.3f}"
-        said += ", a fit that had not settled" * (not own["settled"].fillna(True).all())
-        if learner == TENTH:
-            held = (own["rmse"] <= most).sum()
-            said += f" in the mean of {counted(len(own))}, {held} of which are at most that"
-            other = {*own["by"]} - {best}
-            said += f"; f_p chosen before: {', '.join(other)}" * bool(other)
-        judged.append(Judged(id, text, met(mean <= most), said))
-    return judged
 
 
 def draw(runs: Sequence[Run], experiment: Tanks) -> list[Path]:

@@ -19,7 +19,6 @@ import torch
 from botorch.acquisition import AcquisitionFunction, qNegIntegratedPosteriorVariance
 from botorch.acquisition.objective import ScalarizedPosteriorTransform
 from botorch.exceptions.warnings import BadInitialCandidatesWarning, OptimizationWarning
-from matplotlib.axes import Axes
 from torch import Tensor
 
 from gpadjust import fit
@@ -28,24 +27,13 @@ from gpadjust.active.information_gain import About
 from gpadjust.active.warm_refit import refit
 from gpadjust.validation import coverage, rmse
 from paper.common.experiment import Run, Table
-from paper.common.figures import curves
-from paper.common.tables import claims_table, markdown, settings_table
-from paper.common.verdicts import FEWEST, Judged, counted, met
+from paper.common.tables import markdown, settings_table
 from paper.measuring import Active, Settings
 from paper.measuring.problems import Problem, problem
 
 PROBLEMS, LABELS = Active.axes["problem"], Active.axes["learner"]
 REFERENCE = "gp"  # whose final error the others are to reach
 ALONE = "f_p"  # what needs no measurement
-_COLORS = {
-    "phy": "tab:purple",
-    "random": "0.6",
-    "sobol": "black",
-    "gp": "tab:red",
-    "cka": "navy",
-    "both": "tab:green",
-    "rho": "tab:cyan",
-}
 _SECONDS = ["choice_seconds", "score_seconds"]
 
 
@@ -245,7 +233,6 @@ def tables(runs: Sequence[Run], experiment: Active) -> dict[str, Table]:
         problem: asdict(experiment.settings_of(problem)) for problem in PROBLEMS
     }
     found = {"settings": Table("Settings", settings_table(columns))}
-    found["claims"] = Table("Targets", claims_table("target", {"": verdicts(scored)}))
     for name, title, cells in (
         ("errors", "Median final error", table["nrmse"].map("{:.2g}".format)),
         ("needed", "Measurements that reach the final error of `gp`", table.apply(_count, axis=1)),
@@ -296,27 +283,6 @@ def tabulate(runs: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def verdicts(runs: pd.DataFrame, learner: str = "cka") -> list[Judged]:
-    """Whether a learner reaches the reference's final error with half the measurements."""
-    judged = []
-    for name, part in runs.groupby("problem", sort=False):
-        id, count = f"M{[*PROBLEMS].index(str(name)) + 1}", needed(part, learner)
-        text = f"{name}: {LABELS[learner]} reaches the final error of {LABELS[REFERENCE]} with "
-        text += "at most half the measurements"
-        if len(count) < FEWEST:
-            judged.append(Judged(id, text, "not run", "too few runs of both"))
-            continue
-        budget, middle = part["measurements"].max(), float(np.median(count))
-        reached = f"with {middle:g}" if np.isfinite(middle) else "never"
-        measured = f"{counted(len(count))}: {reached} of {budget} (median), "
-        measured += f"in {np.isfinite(count).sum()} of them at all"
-        alone = int((needed(part, ALONE) == 0).sum())
-        if alone:
-            measured += f"; f_p alone does it without any in {alone}"
-        judged.append(Judged(id, text, met(middle <= budget / 2), measured))
-    return judged
-
-
 def _final(runs: pd.DataFrame, learner: str) -> pd.DataFrame:
     """The last row of each run of a learner, by seed."""
     return runs[runs["learner"] == learner].groupby("seed").last()
@@ -340,44 +306,3 @@ def _count(row: pd.Series[float]) -> str:
     if row["reached"] in (row["compared"], 0):
         return text
     return f"{text} ({row['reached']} of {row['compared']})"
-
-
-def draw(runs: Sequence[Run], experiment: Active) -> list[Path]:
-    """Draw the median and the quartiles of the error over the number of measurements."""
-    scored = load(runs)
-    parts = {
-        f"{PROBLEMS[name]} ({counted(part['seed'].nunique())})": part
-        for name, part in scored.groupby("problem", sort=False)
-    }
-
-    def finish(ax: Axes, title: str, part: pd.DataFrame) -> None:
-        """Add f_p's error, the reference's final one, and half the measurements."""
-        for name, style, label in ((ALONE, "--", LABELS[ALONE]), (REFERENCE, ":", "GP's final")):
-            if name in {*part["learner"]}:
-                errors = part[part["learner"] == name].groupby("measurements")["nrmse"].median()
-                color = _COLORS.get(name, "tab:orange")
-                ax.axhline(errors.iloc[-1], color=color, lw=1.2, ls=style, label=label)
-        ax.axvline(
-            part["measurements"].max() / 2,
-            color="0.7",
-            lw=1,
-            ls="--",
-            label="half the measurements",
-        )
-
-    lines = {name: (LABELS[name], color) for name, color in _COLORS.items()}
-    axis_labels = ("measurements, those of the initial design included", "RMSE / sd of the truth")
-    path = experiment.out / "errors.png"
-    found = curves(
-        path,
-        parts,
-        "nrmse",
-        lines,
-        x="measurements",
-        labels=axis_labels,
-        size=(5, 3.3),
-        share=False,
-        logarithmic=True,
-        finish=finish,
-    )
-    return [found]
