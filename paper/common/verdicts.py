@@ -1,4 +1,4 @@
-"""Verdicts on claims and targets, and the numbers behind them."""
+"""Verdicts on claims, and the numbers behind them."""
 
 from __future__ import annotations
 
@@ -17,8 +17,6 @@ Verdict = Literal[
     "beaten",
     "inconclusive",
     "undetermined",
-    "met",
-    "missed",
     "not run",
 ]
 Finding = tuple[Verdict, str]
@@ -224,10 +222,10 @@ class Judged:
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim of the paper, or a target of our own, about curves.
+    """A claim of the paper about curves.
 
     Args:
-        id: The paper's, or ours.
+        id: Ours, in the order of the paper.
         text: What it says.
         needed: The learners that it is about.
         decide: Gives verdict and numbers, from curves of the seeds with which all of ``needed``
@@ -295,17 +293,6 @@ def all_of(*verdicts: Verdict) -> Verdict:
         "beaten",
     )
     return min(verdicts, key=order.index)
-
-
-def met(held: bool) -> Verdict:
-    """The verdict on a target of our own."""
-    return "met" if held else "missed"
-
-
-def below(difference: Difference, most: float) -> Verdict:
-    """The verdict on a target that a difference is at most a number, by its 95 % interval."""
-    verdict = within(difference, high=most)
-    return met(verdict == "reproduced") if verdict != "inconclusive" else verdict
 
 
 def counted(runs: int) -> str:
