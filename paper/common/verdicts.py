@@ -20,7 +20,6 @@ Verdict = Literal[
     "not run",
 ]
 Finding = tuple[Verdict, str]
-FEWEST = 2  # runs that a verdict is given of
 _FEWEST_RESAMPLED = 4  # runs that a bootstrap interval is given of
 _RESAMPLES = 5000
 
@@ -230,14 +229,12 @@ class Claim:
         needed: The learners that it is about.
         decide: Gives verdict and numbers, from curves of the seeds with which all of ``needed``
             were run to their end; other learners may lack some of these.
-        fewest: Runs without which there is no verdict.
     """
 
     id: str
     text: str
     needed: tuple[str, ...]
     decide: Callable[[Curves], Finding]
-    fewest: int = FEWEST
 
 
 def judge(claims: Sequence[Claim], curves: Curves, last: int) -> list[Judged]:
@@ -252,7 +249,7 @@ def judge(claims: Sequence[Claim], curves: Curves, last: int) -> list[Judged]:
     for claim in claims:
         runs = {name: curves.seeds(name, last) for name in claim.needed}
         shared = set.intersection(*runs.values())
-        if len(shared) < claim.fewest:
+        if len(shared) < 2:
             least = min(runs, key=lambda name: len(runs[name]))
             lacking = f"no results of {least}" if not runs[least] else f"too few runs of {least}"
             found.append(Judged(claim.id, claim.text, "not run", lacking))
