@@ -27,7 +27,7 @@ from paper.arm.system import reach, score
 from paper.cartpole.planning import trials_table
 from paper.common.experiment import Run, Table
 from paper.common.learners import LEARNERS
-from paper.common.tables import frame, groups, of, table
+from paper.common.tables import frame
 from paper.machines.networks import NetworkDynamics
 
 MAPPED = (1, 3, 9)
@@ -173,15 +173,6 @@ def tables(runs: Sequence[Run], experiment: Reaching) -> dict[str, Table]:
                 title = f"The hand's error in cm, {steps}, arm {label}"
                 text = trials_table(own, measure, _LABELS, shown, (3, last), (1, last), ".1f")
                 found[f"{system}_{measure}"] = Table(title, text)
-    seconds = {
-        "update_seconds": "policy search, s",
-        "fit_seconds": "fit, s",
-        "cpu_seconds": "CPU, s",
-    }
-    columns = {what: of(column, "median", ".1f") for column, what in seconds.items()}
-    later = groups(trials[trials["episode"] > 1], "learner", _LABELS)
-    text = table(later, columns, "median of the trials after the first, all arms")
-    found["seconds"] = Table("Seconds of a trial", text)
     return found
 
 

@@ -55,13 +55,11 @@ class Experiment:
     """parallel processes"""
     out: Path = Path("results")
     """folder of the results"""
-    backend: Literal["loky", "ray"] = "loky"
-    """processes on this machine, or on a Ray cluster"""
     only_tables: bool = False
     """run nothing; make tables and figures of the runs that are there"""
-    other_versions: Literal["refuse", "keep", "replace"] = "refuse"
+    other_versions: Literal["refuse", "keep"] = "refuse"
     """what becomes of runs of other versions of the packages, or of other defaults of the library,
-    if more are to be run: nothing is run, they are kept with the new ones, or they are run again"""
+    if more are to be run: nothing is run, or they are kept with the new ones"""
 
     name: ClassVar[str]
     """on the command line, and in the markers of the pages: that of the class in lower case"""

@@ -93,26 +93,22 @@ def run_missing(experiment: Experiment) -> None:
         if (differ := _by_others(run, experiment, case[:-1] in kinds))
     }
     missing = [case for case in cases if case not in done]
-    if others and experiment.other_versions == "replace":
-        missing = [case for case in cases if case not in done or case in others]
-    elif others and missing and experiment.other_versions == "refuse":
+    if others and missing and experiment.other_versions == "refuse":
         raise Refused(
             f"{file.path} has runs that differ from those to come: {next(iter(others.values()))}. "
-            "Pass --other-versions keep to add to them, --other-versions replace to run them "
-            "again, or another --out."
+            "Pass --other-versions keep to add to them, or another --out."
         )
-    elif others:
+    if others:
         print(
             f"{len(others)} of the runs were made by other versions, defaults or settings, or do "
             "not say by which."
         )
     shown = _first_look(experiment, done.values()) if missing else True
     bar = tqdm(total=len(cases), initial=len(cases) - len(missing), unit="run", disable=not missing)
-    with bar, _backend(experiment.backend) as options:
-        away = replace(experiment, out=experiment.out.absolute())
-        calls = [joblib.delayed(run_one)(away, case) for case in missing]
-        parallel = joblib.Parallel(n_jobs=experiment.jobs, batch_size=1, **options)
-        for case in parallel(calls):
+    with bar:
+        calls = [joblib.delayed(run_one)(experiment, case) for case in missing]
+        options: dict[str, Any] = {"batch_size": 1, "return_as": "generator_unordered"}
+        for case in joblib.Parallel(n_jobs=experiment.jobs, **options)(calls):
             bar.update()
             bar.set_postfix_str(title(case))
             shown = shown or _first_look(experiment, file.read().values())
@@ -126,8 +122,7 @@ def run_one(experiment: Experiment, case: Case) -> Case:
     unfinished.parent.mkdir(parents=True, exist_ok=True)
     lock = FileLock(f"{unfinished}.lock")
     with lock:  # a worker may outlive a call that was killed
-        before = file.read().get(case)
-        if before is None or _by_others(before, experiment):
+        if case not in file.read():
             named = dict(zip(experiment.key, case, strict=True))
             made_by = {
                 "settings": _described(experiment, case[:-1]),
@@ -214,19 +209,3 @@ def _alone(out: Path) -> Iterator[None]:
                 "--out; --only-tables shows what there is."
             ) from None
         yield
-
-
-@contextmanager
-def _backend(name: str) -> Iterator[dict[str, Any]]:
-    """Choose joblib's backend; Ray's uses the cluster that is running, or starts a local one."""
-    if name == "ray":
-        try:
-            from ray.util.joblib import register_ray
-        except ImportError as error:
-            raise Refused(
-                "--backend ray needs Ray; install it with `pip install gpadjust[ray]`"
-            ) from error
-        register_ray()
-    with joblib.parallel_config(backend=name):
-        # Ray cannot return results one by one.
-        yield {"verbose": 10} if name == "ray" else {"return_as": "generator_unordered"}

@@ -20,7 +20,6 @@ Verdict = Literal[
     "not run",
 ]
 Finding = tuple[Verdict, str]
-_FEWEST_RESAMPLED = 4  # runs that a bootstrap interval is given of
 _RESAMPLES = 5000
 
 
@@ -107,21 +106,6 @@ def paired(
         return Difference.of([])
     wide = np.log(wide) if ratio else wide
     return Difference.of(wide[name] - wide[reference])
-
-
-def interquartile_mean(values: ArrayLike) -> tuple[float, float, float]:
-    """The mean of the middle half of some runs, and its 95 % bootstrap interval.
-
-    Of fewer than four runs an interval says nothing, and is nan.
-    """
-    scores = np.asarray(values, dtype=float)
-    if not len(scores):
-        return np.nan, np.nan, np.nan
-    middle = float(stats.trim_mean(scores, 0.25))
-    if len(scores) < _FEWEST_RESAMPLED:
-        return middle, np.nan, np.nan
-    low, high = bootstrap([scores], lambda x, axis: stats.trim_mean(x, 0.25, axis=axis))
-    return middle, low, high
 
 
 def bootstrap(

@@ -19,7 +19,7 @@ from gpadjust.inference import SamplingWarning
 from gpadjust.models import TermsGP
 from paper.common.experiment import Run, Table
 from paper.common.figures import panels, save
-from paper.common.tables import groups, markdown, number
+from paper.common.tables import markdown, number
 from paper.laboratory import Relative
 
 _DECADES = ("lowest", "middle", "highest")
@@ -117,26 +117,7 @@ def tables(runs: Sequence[Run], experiment: Relative) -> dict[str, Table]:
     header += [f"observations held, {decade} decade" for decade in _DECADES]
     header += [f"function held, {decade}" for decade in _DECADES]
     header += [f"relative error in %, {decade}" for decade in _DECADES] + ["seconds"]
-    shown = {"decades": Table("Coverage of 95 % and errors by decade", markdown(header, rows))}
-    each = [
-        [
-            title,
-            *(
-                number(part[part["decade"] == d][what].mean(), ".2f")
-                for what in ("observations", "function")
-                for d in _DECADES
-            ),
-        ]
-        for title, part in groups(
-            found[(found["noise"] == "relative") & (found["structure"] == "CKA")],
-            "problem",
-            experiment.axes["problem"],
-        ).items()
-    ]
-    shown["problems"] = Table(
-        "CKA with relative noise, of each problem", markdown(["problem", *header[2:8]], each)
-    )
-    return shown
+    return {"decades": Table("Coverage of 95 % and errors by decade", markdown(header, rows))}
 
 
 def load(runs: Sequence[Run]) -> pd.DataFrame:

@@ -285,7 +285,6 @@ def tables(runs: Sequence[Run], experiment: Freeruns) -> dict[str, Table]:
         "errors": Table("RMSE of free runs along the test part", _errors(runs, experiment)),
         "details": Table("Learners of each record", _details(runs, experiment)),
         "candidates": Table("Candidates for f_p, errors of the folds", _candidates(runs)),
-        "parameters": Table("Parameters of the chosen f_p", _parameters(runs)),
     }
 
 
@@ -373,17 +372,6 @@ def _candidates(runs: Sequence[Run]) -> str:
                 bold = f"**{name}**" if name == own["chosen"] else name
                 rows.append([label, bold, *shown])
     return markdown(["record", "f_p; process noise", "third quarter", "last quarter"], rows)
-
-
-def _parameters(runs: Sequence[Run]) -> str:
-    rows = []
-    for record, label in RECORDS.items():
-        for own in _of(runs, record, "fitted"):
-            structure = SYSTEMS[record].structure(own["chosen"].partition("; ")[0])
-            for name, (mean, low, high) in own["parameters"].items():
-                found = f"{mean:.3g} ({low:.3g} to {high:.3g})"
-                rows.append([label, f"`{name}`", structure.unknowns[name].prior_text, found])
-    return markdown(["record", "", "prior", "mean (95 %)"], rows)
 
 
 def draw(runs: Sequence[Run], experiment: Freeruns) -> list[Path]:
