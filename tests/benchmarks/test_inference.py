@@ -99,8 +99,17 @@ def test_full_bayes(benchmark, record_ratio, uniform, n):
 @pytest.mark.parametrize("points", [0, 100, 10_000], ids=["fit", "predict-100", "predict-10000"])
 @pytest.mark.parametrize("row", [("currin", 5), ("hartmann6", 5), ("branin", 100)])
 def test_default_beside_map(benchmark, record_ratio, row, points):
-    """On data sets of paper/calibration: fitting, or predicting at so many points."""
-    from paper.calibration.calibration import fitted, of_pair
+    """On data sets of paper/structures: fitting, or predicting at so many points."""
+    from paper.structures.data import of_pair
+
+    def fitted(data, method):
+        if method == "default":
+            model = CKA(data.X, data.Y, physics=data.physics)
+            fit(model)
+        else:
+            model = CKA(data.X, data.Y, physics=data.physics, center=0.0)
+            fit(model, "map")
+        return model
 
     sets = [of_pair(*row, 0.0, 10, seed) for seed in range(3 if row[0] == "branin" else 5)]
 

@@ -16,9 +16,8 @@ from paper.arm.claims import claims as arm_claims
 from paper.arm.claims import distance_from_start
 from paper.arm.reaching import dynamics
 from paper.arm.system import hundred, reach, score
-from paper.cartpole import Floor, FloorSettings
 from paper.cartpole.control import load, run
-from paper.common.runner import main, run_missing, runs_file
+from paper.common.runner import main, runs_file
 from paper.common.runs import rounded
 from paper.common.verdicts import Curves, judge
 
@@ -140,15 +139,6 @@ def arm_verdicts(**curves):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("_few_targets")
-def test_the_floor_of_the_arm(tmp_path):
-    settings = FloorSettings(sequences=8, rounds=1, elites=2, arm_episodes=2, arm_updates=1)
-    experiment = Floor(out=tmp_path, runs=2, jobs=1, settings=settings, only=("arm",))
-    run_missing(experiment)
-    assert runs_file(experiment).read()["arm", 0]["found"] > 1
-
-
-@pytest.mark.slow
 def test_reaching_runs_and_their_tables(tmp_path):
     experiment = Reaching(out=tmp_path, runs=1, settings=FEW)
     experiment.check()
@@ -160,12 +150,8 @@ def test_reaching_runs_and_their_tables(tmp_path):
         records.append({"system": system, "learner": learner, "seed": 0, **found})
     tables = experiment.tables(records)
     assert {*tables} == {
-        *(f"{system}_{m}" for system in ("sensors", "plain") for m in ("all_steps", "last_five")),
-        "targets",
-        "seconds",
+        f"{system}_{m}" for system in ("sensors", "plain") for m in ("all_steps", "last_five")
     }
-    assert "no results of cka-slow" in tables["targets"].text
-    assert [path.name for path in experiment.draw(records)] == ["curves.png", "map.png"]
 
 
 def test_the_slow_learner_is_told_apart_by_its_settings():

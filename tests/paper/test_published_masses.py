@@ -49,5 +49,5 @@ def test_it_runs(tmp_path, monkeypatch):
     runs = [json.loads(line) for line in (out / "runs.jsonl").read_text().splitlines()]
     assert len(runs) == 2 * 9 + 3 * 9
     tables = (out / "tables.md").read_text()
-    assert all(name in tables for name in ("targets", "errors", "all", "parameters"))
+    assert all(name in tables for name in ("errors", "all", "parameters"))
     assert (out / "masses.png").exists()
