@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 from matplotlib.axes import Axes
@@ -13,7 +11,8 @@ from matplotlib.axes import Axes
 from paper.arm import PAPER, SCENARIOS
 from paper.arm.claims import LAST, claims
 from paper.cartpole import Control
-from paper.cartpole.control import foresight, load, summary
+from paper.cartpole.control import foresight, load
+from paper.cartpole.planning import trials_table
 from paper.common.experiment import Run, Table
 from paper.common.figures import curves as draw_curves
 from paper.common.tables import claims_table, markdown
@@ -25,11 +24,11 @@ _SHOWN = (3, 6, 9, 12, 18, 24, 30)  # episodes
 
 
 def load_maps(runs: Sequence[Run], experiment: Control) -> pd.DataFrame:
-    """The errors in cm: a row for each scenario, seed, mapped episode and target."""
+    """The errors in cm: a row for each learner, seed, mapped episode and target."""
     frames = [
         pd.DataFrame(
             {
-                **{"scenario": each["scenario"], "seed": each["seed"], "episode": int(episode)},
+                **{"learner": each["scenario"], "seed": each["seed"], "episode": int(episode)},
                 **{"target": range(len(errors["all_steps"])), **errors},
             }
         )
@@ -38,7 +37,7 @@ def load_maps(runs: Sequence[Run], experiment: Control) -> pd.DataFrame:
         if each["scenario"] == name
         for episode, errors in each["maps"].items()
     ]
-    columns = ["scenario", "seed", "episode", "target", *MEASURES]
+    columns = ["learner", "seed", "episode", "target", *MEASURES]
     return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=columns)
 
 
@@ -46,24 +45,13 @@ def tables(runs: Sequence[Run], experiment: Control) -> dict[str, Table]:
     """All tables, by name."""
     episodes, maps = load(runs, "episodes", experiment), load_maps(runs, experiment)
     evaluations = load(runs, "evaluations", experiment)
-    of = {measure: Curves(evaluations, measure, by="scenario") for measure in MEASURES}
+    of = {measure: Curves(evaluations, measure) for measure in MEASURES}
     about = claims(episodes, maps)
     judged = {MEASURES[m]: judge(about, of[m], LAST) for m in MEASURES}
     found = {"claims": Table("Claims", claims_table("claim", judged))}
     for name, measure in (("all", "all_steps"), ("last", "last_five")):
-        hundred = Curves(evaluations, f"{measure}_100", by="scenario")
-        columns: dict[str, Callable[[str], Any]] = {
-            **{f"at {e}": partial(_at, of[measure], e) for e in _SHOWN},
-            "sd of runs": partial(_spread, of[measure]),
-            f"100 targets, at {LAST}": partial(_at, hundred, LAST),
-        }
-        text = summary(
-            of[measure],
-            experiment.labels,
-            columns,
-            windows=WINDOWS,
-            thresholds=(10, 8),
-            digits=1,
+        text = trials_table(
+            evaluations, measure, experiment.labels, _SHOWN, (24, LAST), (24, LAST), ".1f"
         )
         found[name] = Table(f"Hand's error in cm, {MEASURES[measure]}", text)
     found["memory"] = Table(
@@ -71,15 +59,6 @@ def tables(runs: Sequence[Run], experiment: Control) -> dict[str, Table]:
     )
     found["model"] = Table("How well models foresaw trials", foresight(episodes, experiment))
     return found
-
-
-def _at(curves: Curves, episode: int, name: str) -> float:
-    return curves.mean_at(name, episode)
-
-
-def _spread(curves: Curves, name: str) -> float:
-    """The standard deviation over runs, averaged over the evaluations from episode 3."""
-    return float(curves.spread(name).loc[3:].mean())
 
 
 def _memory(every: Curves, experiment: Control) -> str:
@@ -111,7 +90,7 @@ _LINES = {name: (SCENARIOS[name].label, SCENARIOS[name].color) for name in PAPER
 def draw(runs: Sequence[Run], experiment: Control) -> list[Path]:
     """Draw the error over the trials."""
     errors = load(runs, "evaluations", experiment)
-    counts = errors.groupby("scenario")["seed"].nunique()
+    counts = errors.groupby("learner")["seed"].nunique()
     lines = {n: (f"{label} ({counts.get(n, 0)})", color) for n, (label, color) in _LINES.items()}
 
     def finish(ax: Axes, title: str, own: pd.DataFrame) -> None:
@@ -125,7 +104,6 @@ def draw(runs: Sequence[Run], experiment: Control) -> list[Path]:
             {what: errors.assign(error=errors[measure]) for measure, what in MEASURES.items()},
             "error",
             lines,
-            by="scenario",
             labels=("trial", "hand's RMSE over targets, cm: median, quartiles"),
             size=(5.5, 4),
             finish=finish,

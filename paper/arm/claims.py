@@ -137,7 +137,7 @@ def _by_target(maps: pd.DataFrame, curves: Curves, names: Sequence[str]) -> dict
     """The errors of some learners after trial 9: a row for each seed, a column for each target."""
     maps = maps[(maps["episode"] == MAP_AFTER) & maps["seed"].isin(curves.seeds("cka"))]
     return {
-        name: maps[maps["scenario"] == name].pivot(
+        name: maps[maps["learner"] == name].pivot(
             index="seed", columns="target", values=curves.measure
         )
         for name in names
@@ -198,7 +198,7 @@ def _sooner(curves: Curves) -> Finding:
 
 def _intervals(episodes: pd.DataFrame, curves: Curves) -> Finding:
     scored = episodes[(episodes["episode"] > 1) & episodes["seed"].isin(curves.seeds("cka"))]
-    coverage = scored.groupby(["scenario", "seed"])["coverage"].mean().unstack(0)
+    coverage = scored.groupby(["learner", "seed"])["coverage"].mean().unstack(0)
     away = (coverage - 0.95).abs()
     found = [within(Difference.of(away[name] - away["gp"]), high=0) for name in ("cka", "rra")]
     said = ", ".join(f"{SCENARIOS[n].label} {coverage[n].mean():.2f}" for n in ("cka", "rra", "gp"))

@@ -311,11 +311,6 @@ class Planning(Experiment):
         "gpadjust.control.PolicySearch",
     )
 
-    def check(self) -> None:
-        """Refuse runs without a trial."""
-        if self.settings.trials < 1:
-            raise ValueError(f"--trials: expected at least 1, got {self.settings.trials}")
-
     def settings_of(self, system: str) -> PlanningSettings:
         """The settings for a system."""
         return replace(self.settings, **MC_PILCO) if system == "mc-pilco" else self.settings

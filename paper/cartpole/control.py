@@ -1,31 +1,25 @@
-"""Learners of a control task: one resumable run, its records, and the tables of all."""
+"""Learners of a control task: a run, its records, and the tables of all."""
 
 from __future__ import annotations
 
-import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 import pandas as pd
-from stable_baselines3.common.callbacks import BaseCallback
 from torch import Tensor
 
-from gpadjust.control import EpisodeCheckpoint, Task, resume
+from gpadjust.control import Task
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.physics import Physics
 from gpadjust.rl import DynaCallback, DynaOptions, DynaSAC
 from gpadjust.states import StateSpec
 from paper.cartpole import Control, ControlSettings, Scenario
 from paper.common.experiment import Run
-from paper.common.runner import Refused
-from paper.common.runs import differences, versions
-from paper.common.tables import markdown, number, numbers
-from paper.common.verdicts import Curves
+from paper.common.tables import numbers
 
 
 class Setup(NamedTuple):
@@ -59,47 +53,17 @@ def dynamics(
     )
 
 
-def make_agent(experiment: Control, name: str, seed: int) -> DynaSAC:
-    """A learner, at its start."""
-    setup = experiment.setup(name, seed)
-    options, arguments = _options(experiment, name), _arguments(experiment, name)
-    return DynaSAC("MlpPolicy", setup.env, setup.task, options, **arguments, seed=seed)
-
-
-def run(experiment: Control, name: str, seed: int, callbacks: Sequence[BaseCallback] = ()) -> Run:
-    """Learn, or go on with it.
-
-    Raises:
-        Refused: If an unfinished run is of other settings or versions.
-    """
-    checkpoint = Path(f"{experiment.unfinished(name, seed)}.ckpt")
+def run(experiment: Control, name: str, seed: int) -> Run:
+    """Learn."""
     settings, setup = experiment.settings_of(name), experiment.setup(name, seed)
-    now = {
-        "settings": json.loads(json.dumps(experiment.describe(name))),
-        "defaults": experiment.defaults(),
-        "versions": versions(experiment.packages),
-    }
-    if checkpoint.exists():
-        agent: Any = resume(checkpoint, setup.env, setup.task)
-        differ = differences(agent.notes["made"], now)
-        if differ:
-            raise Refused(
-                f"{checkpoint} is of an unfinished run of others: {differ}. Remove it to begin "
-                "that run again, choose another --out, or go on as it was begun."
-            )
-    else:
-        agent = make_agent(experiment, name, seed)
-        agent.notes["made"] = now
+    options, arguments = _options(experiment, name), _arguments(experiment, name)
+    agent = DynaSAC("MlpPolicy", setup.env, setup.task, options, **arguments, seed=seed)
     agent.learn(
-        settings.episodes * settings.episode_length - agent.num_timesteps,
-        callback=[setup.recorder, *callbacks, EpisodeCheckpoint(checkpoint)],
+        settings.episodes * settings.episode_length,
+        callback=setup.recorder,
         log_interval=settings.episodes + 1,  # nothing is shown
-        reset_num_timesteps=False,
     )
-    found = setup.recorder.found()
-    for path in (checkpoint, Path(f"{checkpoint}.lock")):
-        path.unlink(missing_ok=True)
-    return found
+    return setup.recorder.found()
 
 
 def _options(experiment: Control, name: str) -> DynaOptions:
@@ -211,7 +175,7 @@ class Recorder(DynaCallback):
 
 
 def load(runs: Sequence[Run], entry: str, experiment: Control) -> pd.DataFrame:
-    """A row for each scenario, seed and element of an entry that has lists by name.
+    """A row for each learner, seed and element of an entry that has lists by name.
 
     Of ``"episodes"`` there is a column for the error of each state; episodes count from 1.
     """
@@ -228,48 +192,16 @@ def load(runs: Sequence[Run], entry: str, experiment: Control) -> pd.DataFrame:
                 own = own.astype({"nlpd": float, "coverage": float})
             if "episode" not in own:
                 own.insert(0, "episode", np.arange(len(own)) + 1)
-            own.insert(0, "scenario", name)
+            own.insert(0, "learner", name)
             own.insert(1, "seed", each["seed"])
             frames.append(own)
     return pd.concat(frames, ignore_index=True)
 
 
-def summary(
-    curves: Curves,
-    labels: Mapping[str, str],
-    columns: Mapping[str, Callable[[str], Any]],
-    *,
-    windows: Sequence[tuple[int, int]],
-    thresholds: Sequence[float],
-    digits: int,
-) -> str:
-    """A row for each learner.
-
-    Args:
-        curves: Of the measure.
-        labels: Of the learners.
-        columns: By their heading, what gives a number of a learner.
-        windows: Episodes over which the learners are compared with the reference.
-        thresholds: Whose first episodes are shown.
-        digits: After the point.
-    """
-    form, other = f".{digits}f", labels[curves.reference]
-    rows = []
-    for name in curves.names:
-        row = [labels[name], f"{len(curves.seeds(name))}"]
-        row += [number(value(name), form) for value in columns.values()]
-        row += [curves.paired_difference(name, *window).text(form) for window in windows]
-        firsts = [curves.first_below(name, threshold) for threshold in thresholds]
-        rows.append([*row, *("never" if first is None else f"{first}" for first in firsts)])
-    header = ["", "runs", *columns]
-    header += [f"{first}-{last}, less {other}'s" for first, last in windows]
-    return markdown([*header, *(f"first at {threshold:g}" for threshold in thresholds)], rows)
-
-
 def foresight(episodes: pd.DataFrame, experiment: Control) -> str:
     """Scores of the models on episodes before they had them, from the second on."""
     errors = [f"rmse_{state}" for state in experiment.rmses]
-    scored = episodes[episodes["episode"] > 1].groupby("scenario", sort=False)
+    scored = episodes[episodes["episode"] > 1].groupby("learner", sort=False)
     table = scored[["nlpd", *errors]].median()
     table.insert(1, "coverage", scored["coverage"].mean())
     table = table[table[errors[0]].notna()].rename(index=experiment.labels)

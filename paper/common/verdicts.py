@@ -131,22 +131,20 @@ class Curves:
         runs: A row for each learner, ``seed`` and ``episode``, as ``tables.frame`` makes.
         measure: The column that is looked at.
         reference: The learner that others are compared with, seed by seed.
-        by: The column of the learners.
     """
 
     runs: pd.DataFrame
     measure: str
     reference: str = "cka"
-    by: str = "learner"
 
     @property
     def names(self) -> list[str]:
         """The learners that there are, in order."""
-        return list(self.runs[self.by].unique())
+        return list(self.runs["learner"].unique())
 
     def of(self, name: str) -> pd.DataFrame:
         """The rows of a learner."""
-        return self.runs[self.runs[self.by] == name]
+        return self.runs[self.runs["learner"] == name]
 
     def seeds(self, name: str, last: int = 0) -> set[int]:
         """The seeds of a learner; with a last episode, of the runs that reached it."""

@@ -410,8 +410,8 @@ def draw(runs: Sequence[Run], experiment: Forrester) -> list[Path]:
         axes[letter].set_title(f"({letter}) {name}", loc="left")
         axes[letter].set(xlabel="x" * (letter in "def"), ylabel="y" * (letter in "ad"))
     figure.legend(*axes["a"].get_legend_handles_labels(), loc="outside lower center", ncols=5)
-    rows = {name: [part["rmse"]] for name, part in groups(own, "model").items()}
-    strips(axes["g"], rows, ["tab:blue"])
+    rows = {name: part["rmse"] for name, part in groups(own, "model").items()}
+    strips(axes["g"], rows, "tab:blue")
     axes["g"].set_xscale("log")
     axes["g"].xaxis.set_minor_formatter(NullFormatter())
     axes["g"].set_xlabel("RMSE; each run, median and quartiles")

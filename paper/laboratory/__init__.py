@@ -90,8 +90,6 @@ class DriftSettings:
     """of all fits"""
     num_features: int = 64
     """features of each term of an RRA"""
-    check_every: int = 6
-    """observations between checks of the monitor"""
 
 
 @dataclass(frozen=True, kw_only=True)

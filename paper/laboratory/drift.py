@@ -16,7 +16,6 @@ import numpy as np
 import torch
 
 from gpadjust import CKA, RRA, fit
-from gpadjust.validation import DriftMonitor
 from paper.common.experiment import Run, Table
 from paper.common.figures import panels, save
 from paper.common.tables import markdown, number
@@ -24,7 +23,6 @@ from paper.laboratory import Drift
 from paper.laboratory.pumps import Wear, catalogue
 
 _COLORS = {"never": "0.6", "rra": "tab:green", "cka": "navy", "refit": "tab:orange"}
-_RRA = ("rra", "steady")
 
 
 def run(experiment: Drift, model: str, seed: int) -> Run:
@@ -36,16 +34,15 @@ def run(experiment: Drift, model: str, seed: int) -> Run:
     def built(end: int) -> Any:
         start = max(0, end - (settings.refit_window if model == "refit" else end))
         rows = slice(start, end)
-        if model in _RRA:
+        if model in ("rra", "steady"):
             return RRA(X[rows], Y[rows], physics=catalogue, num_features=settings.num_features)
         return CKA(X[rows], Y[rows], physics=catalogue)
 
     begin = time.perf_counter()
     adjusted = built(first)
     fit(adjusted, settings.method)
-    monitor = DriftMonitor(adjusted) if model in _RRA else None
     forget = {"cka": settings.window, "refit": settings.refit_window}.get(model, settings.forget)
-    means, held, alarms = [], [], []
+    means, held = [], []
     if model == "never":
         mean, _ = adjusted.predict(X[first:])
         low, high = adjusted.interval(X[first:], observation_noise=True)
@@ -60,18 +57,12 @@ def run(experiment: Drift, model: str, seed: int) -> Run:
         low, high = adjusted.interval(x, observation_noise=True)
         held.append(bool(low <= y <= high))
         adjusted.update(x, y, forget=forget)
-        if monitor is not None and i % settings.check_every == 0:
-            alarm = monitor.check(i)
-            if alarm is not None:
-                alarms.append((i, repr(alarm)))
-                monitor.reset()
     errors = torch.tensor(means, dtype=torch.float64) - pump.truth[first:].flatten()
     week = errors.square().split(84)
     return {
         "rmse": errors.square().mean().sqrt().item(),
         "coverage": float(np.mean(held)),
         "rmse_of_weeks": [each.mean().sqrt().item() for each in week],
-        "alarms": alarms,
         "breaks": pump.breaks,
         "seconds": time.perf_counter() - begin,
     }
@@ -93,29 +84,7 @@ def tables(runs: Sequence[Run], experiment: Drift) -> dict[str, Table]:
                 ]
             )
     header = ["model", "pumps", "RMSE of the head a step ahead [m]", "coverage of observations"]
-    shown = {"errors": Table("Errors", markdown([*header, "seconds"], rows))}
-    if of["rra"] and of["steady"]:
-        shown["alarms"] = _alarms(of["rra"], of["steady"])
-    return shown
-
-
-def _alarms(drifting: Sequence[Run], steady: Sequence[Run]) -> Table:
-    first = [r["alarms"][0][0] if r["alarms"] else None for r in drifting]
-    delays = [
-        next((i - r["breaks"] for i, _ in r["alarms"] if i >= r["breaks"]), None) for r in drifting
-    ]
-    counts = [len(r["alarms"]) for r in drifting]
-    false = [len(r["alarms"]) for r in steady]
-    rows = [
-        ["first alarm of a pump that wears [step of 2 hours]", ", ".join(map(str, first))],
-        ["alarms of it in half a year", ", ".join(map(str, counts))],
-        [
-            "from the sudden change to the next alarm [steps of 2 hours]",
-            ", ".join(map(str, delays)),
-        ],
-        ["alarms of a pump that does not wear, in half a year", ", ".join(map(str, false))],
-    ]
-    return Table("Alarms", markdown(["quantity", "pumps"], rows))
+    return {"errors": Table("Errors", markdown([*header, "seconds"], rows))}
 
 
 def draw(runs: Sequence[Run], experiment: Drift) -> list[Path]:
@@ -131,8 +100,6 @@ def draw(runs: Sequence[Run], experiment: Drift) -> list[Path]:
             )
     if "rra" in own:
         ax.axvline(own["rra"]["breaks"] / 84, color="tab:red", lw=1, ls="--")
-        for i, _ in own["rra"]["alarms"]:
-            ax.plot(i / 84, 0.035, "^", color="tab:red", ms=6)
     ax.set(xlabel="week", ylabel="RMSE a step ahead [m]")
     ax.legend(fontsize=8)
     return [save(figure, experiment.out / "drift.png")]

@@ -22,14 +22,14 @@ from gpadjust.validation import rmse
 from paper.common.experiment import Run, Table
 from paper.common.tables import markdown, number
 from paper.laboratory import Emulated
-from paper.structures.functions import low_inputs, observations, pair
+from paper.structures.functions import PAIRS, low_inputs, observations
 
 
 def run(experiment: Emulated, name: str, model: str, seed: int) -> Run:
     """Adjust the low level to data of the high one; score it against the truth."""
     for category in (OptimizationWarning, SamplingWarning, PhysicsWarning):
         warnings.simplefilter("ignore", category)
-    settings, found = experiment.settings, pair(name)
+    settings, found = experiment.settings, PAIRS[name]
     X, Y = observations(found, settings.per_input * found.d, seed)
     test_X = found.sobol(settings.num_test, 10_000 + seed)
     truth, low, begin, own = found.truth(test_X), found.physics(), time.perf_counter(), {}
@@ -68,7 +68,7 @@ def tables(runs: Sequence[Run], experiment: Emulated) -> dict[str, Table]:
         own = found[found["pair"] == name].set_index(["model", "seed"]).sort_index()
         if not len(own):
             continue
-        row = [f"{name}, d = {pair(name).d}"]
+        row = [f"{name}, d = {PAIRS[name].d}"]
         row += [number(gmean(own.loc[model, "error"])) for model in labels]
         row += [number(gmean(_ratios(own, model)), ".2f") for model in ("emulated", "certain")]
         row += [number(own.loc[model, "coverage"].mean(), ".2f") for model in labels]

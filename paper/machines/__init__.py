@@ -195,15 +195,6 @@ class Tanks(Experiment):
     }
     calls: ClassVar[tuple[str, ...]] = (*_DYNAMICS, "gpadjust.records.smooth")
 
-    def check(self) -> None:
-        """Refuse a number of samples that leaves a block without two."""
-        own = self.settings
-        if not own.head + 2 * own.blocks <= own.samples <= 1024:
-            raise ValueError(
-                f"--samples: expected at most 1024, and two for each of {own.blocks} blocks after "
-                f"the first {own.head}, got {own.samples}"
-            )
-
     def seeds_of(self, *kind: Any) -> Sequence[int]:
         """A candidate has all samples and one run, every tenth sample 100; GPs have three draws."""
         n, learner = kind

@@ -152,11 +152,6 @@ def tables(runs: Sequence[Run], experiment: Real) -> dict[str, Table]:
                 found[f"{name}-{test}-{column}"] = Table(
                     f"{title}, {_SYSTEMS[name]}, test {test}", by_size(own, column, SCORES[score])
                 )
-    for name, own in scored.groupby("system", sort=False):
-        once = own[own["test"] == own["test"].iloc[0]]
-        for column, what in _SECONDS.items():
-            title = f"Seconds of {what}, {_SYSTEMS[name]}"
-            found[f"{name}-{column}"] = Table(title, by_size(once, column, ".2g"))
     return found
 
 

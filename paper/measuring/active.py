@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import time
 import warnings
-import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -86,8 +83,6 @@ CHOOSERS = {
 def run(experiment: Active, name: str, learner: str, seed: int) -> Run:
     """Measure with a learner, and score what it learns.
 
-    The log of the measurements lies beside ``experiment.unfinished(...)`` until the run is done.
-
     Args:
         experiment: The experiment.
         name: The problem.
@@ -95,14 +90,9 @@ def run(experiment: Active, name: str, learner: str, seed: int) -> Run:
         seed: Of the initial design, the physics where it is random, and the learner.
 
     Returns:
-        The scores, and the seconds that choices and scores took; those of choices are None if the
-        run was interrupted.
+        The scores, and the seconds that choices and scores took.
     """
-    settings, unfinished = experiment.settings_of(name), experiment.unfinished(name, learner, seed)
-    # Other settings have another log.
-    mark = zlib.crc32(json.dumps(asdict(settings)).encode())
-    log = unfinished.with_name(f"{unfinished.name}-{mark:08x}.jsonl")
-    resumed, chosen_by = log.exists(), CHOOSERS[learner]
+    settings, chosen_by = experiment.settings_of(name), CHOOSERS[learner]
     system = problem(name, seed)
     if chosen_by.model is None:
         test_X, test_Y = system.test_points(settings.num_test)
@@ -111,20 +101,17 @@ def run(experiment: Active, name: str, learner: str, seed: int) -> Run:
         return {"choice_seconds": 0.0, "score_seconds": 0.0, "scores": scores}
     with _quiet():
         start = time.process_time()
-        X = measured(system, chosen_by, chosen_by.model, settings, seed, log)
+        X = measured(system, chosen_by, chosen_by.model, settings, seed)
         between = time.process_time()
         scores = scored(system, chosen_by.model, settings, X)
-    log.unlink(missing_ok=True)
     return {
-        "choice_seconds": None if resumed else between - start,
+        "choice_seconds": between - start,
         "score_seconds": time.process_time() - between,
         "scores": scores,
     }
 
 
-def measured(
-    system: Problem, chooser: Chooser, kind: str, settings: Settings, seed: int, log: Path
-) -> Tensor:
+def measured(system: Problem, chooser: Chooser, kind: str, settings: Settings, seed: int) -> Tensor:
     """The points that are measured, ``budget x d``, the initial design first."""
     initial, budget = settings.initial, settings.budget
     if chooser.design == "sobol":
@@ -149,7 +136,6 @@ def measured(
             "num_restarts": settings.num_restarts,
             "options": {"maxiter": settings.maxiter},
         },
-        log=log,
         seed=seed,
     )
     return collection.X

@@ -11,7 +11,7 @@ from torch import Tensor
 from gpadjust.models import TermsGP
 from gpadjust.physics import Physics
 from gpadjust.validation import score
-from paper.structures.functions import observations, pair
+from paper.structures.functions import PAIRS, observations
 
 _CHUNK = 50  # points predicted jointly, for the sake of memory
 
@@ -64,7 +64,7 @@ def scored(model: TermsGP, data: Data, seed: int) -> dict[str, Tensor]:
 
 def of_pair(name: str, per_input: int, noise: float, num_test: int, seed: int) -> Data:
     """Observations of a pair of functions, with noise in standard deviations of the truth."""
-    problem = pair(name)
+    problem = PAIRS[name]
     X, Y = observations(problem, per_input * problem.d, seed)
     test_X = problem.sobol(num_test, seed=0)
     test_Y = problem.truth(test_X)

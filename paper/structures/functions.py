@@ -84,17 +84,6 @@ class Pair:
         return self.scaled(SobolEngine(self.d, scramble=True, seed=seed).draw(n).double())
 
 
-def pair(name: str) -> Pair:
-    """The pair of a given name.
-
-    Raises:
-        ValueError: If there is none.
-    """
-    if name not in PAIRS:
-        raise ValueError(f"There is no pair {name!r}; there are {', '.join(PAIRS)}.")
-    return PAIRS[name]
-
-
 def observations(pair: Pair, n: int, seed: int) -> tuple[Tensor, Tensor]:
     """Observe the truth without noise on a random Latin hypercube: ``n x d`` and ``n x 1``."""
     generator = torch.Generator().manual_seed(seed)

@@ -9,7 +9,7 @@ from gymnasium.utils.env_checker import check_env
 
 from paper.control import First, FirstSettings, Known, KnownSettings, first
 from paper.control.known import run, tables
-from paper.control.systems import FURUTA, SYSTEMS
+from paper.control.systems import SYSTEMS
 
 LIGHT = KnownSettings(
     trials=2,
@@ -81,11 +81,6 @@ def test_environments_are_gymnasiums(name):
     assert (observation == again).all()
     system.spec.check_observations(torch.as_tensor(observation))
     assert pickle.loads(pickle.dumps(system)).spec == system.spec
-
-
-def test_a_physics_of_another_name_is_refused():
-    with pytest.raises(ValueError, match="'crude', 'unknown' or 'true'; found 'fitted'"):
-        FURUTA.physics("fitted")
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from paper.forrester.problem import forrester
 from paper.published.rivals import SMTModel
 from paper.structures import ROWS
 from paper.structures.data import of_pair, pump
-from paper.structures.functions import PAIRS, branin, low_inputs, observations, pair
+from paper.structures.functions import PAIRS, branin, low_inputs, observations
 
 
 @pytest.mark.parametrize(
@@ -23,13 +23,13 @@ from paper.structures.functions import PAIRS, branin, low_inputs, observations, 
     ],
 )
 def test_pairs_have_known_values(name, x, high, low):
-    given, X = pair(name), torch.tensor([x], dtype=torch.float64)
+    given, X = PAIRS[name], torch.tensor([x], dtype=torch.float64)
     assert given.truth(X).item() == pytest.approx(high, abs=1e-4)
     assert given.physics()(X).item() == pytest.approx(low, abs=1e-4)
 
 
 def test_data():
-    given = pair("branin")
+    given = PAIRS["branin"]
     X, Y = observations(given, 10, 3)
     cells = (10 * (X - given.bounds[0]) / (given.bounds[1] - given.bounds[0])).floor()
     for column in cells.sort(0).values.T:
@@ -42,17 +42,12 @@ def test_data():
 
 @pytest.mark.slow
 def test_mfk_predicts_in_the_units_of_the_data():
-    given = pair("booth")
+    given = PAIRS["booth"]
     X, Y = observations(given, 10, 0)
     low_X = low_inputs(given, X, 40, 0)
     posterior = SMTModel(low_X, given.physics()(low_X), X, Y).posterior(X)
     torch.testing.assert_close(posterior.mean, Y, rtol=1e-2, atol=1e-2)
     assert (posterior.variance > 0).all()
-
-
-def test_unknown_pair():
-    with pytest.raises(ValueError, match="There is no pair 'curin'; there are bohachevsky, "):
-        pair("curin")
 
 
 # By the package mf2, version 2022.6.0: name, inputs, high, low.

@@ -1,10 +1,6 @@
 """Smoke runs of the experiments on data as laboratories have them."""
 
-import json
-
 import pytest
-
-from paper.__main__ import main
 
 # Options, number of runs, what the tables say, and entries that are above zero.
 SMALL = {
@@ -26,14 +22,11 @@ SMALL = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SMALL)
 @pytest.mark.filterwarnings("ignore")
-def test_it_runs(name, tmp_path, monkeypatch):
+def test_it_runs(name, ran, tmp_path):
     given, number, said, entry = SMALL[name]
-    options = [*given, "--runs", "2", "--jobs", "1", "--out", str(tmp_path)]
-    monkeypatch.setattr("sys.argv", ["paper", name, *options])
-    main()
-    runs = [json.loads(line) for line in (tmp_path / "runs.jsonl").read_text().splitlines()]
+    runs, tables = ran(name, *given)
     assert len(runs) == number
     values = [run[entry]["rmse"] if entry == "gaussian_clean" else run[entry] for run in runs]
     assert all(value > 0 for value in values)
-    assert said in (tmp_path / "tables.md").read_text()
+    assert said in tables
     assert (tmp_path / f"{name}.png").exists() == (name != "emulated")

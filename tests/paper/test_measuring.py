@@ -1,4 +1,4 @@
-"""Where to measure: problems, learners and interruptions."""
+"""Where to measure: problems and learners."""
 
 import math
 from dataclasses import replace
@@ -9,7 +9,7 @@ import torch
 
 from gpadjust import CKA, PhysicsMeanGP, ZeroMeanGP
 from gpadjust.systems import cart_pole
-from paper.common.runner import main, run_missing, runs_file
+from paper.common.runner import main
 from paper.measuring import (
     HELPS,
     MISLEADS,
@@ -17,7 +17,6 @@ from paper.measuring import (
     Misled,
     MisledSettings,
     Settings,
-    active,
     misled,
 )
 from paper.measuring.active import CHOOSERS, integrated_variance, measured, needed, scored
@@ -90,10 +89,10 @@ def test_integrated_variance_of_outputs_is_the_sum_in_their_units(kind):
 
 
 @pytest.mark.slow
-def test_all_learners_of_a_seed_begin_alike(tmp_path):
+def test_all_learners_of_a_seed_begin_alike():
     system = problem("forrester", 0)
     points = {
-        name: measured(system, learner, learner.model, TINY, 2, tmp_path / f"{name}.jsonl")
+        name: measured(system, learner, learner.model, TINY, 2)
         for name, learner in CHOOSERS.items()
         if learner.model is not None
     }
@@ -121,40 +120,6 @@ def test_smoke(tmp_path, capsys):
     )
     main(experiment)
     assert "Measurements that reach the final error" in capsys.readouterr().out
-    assert not list((tmp_path / "unfinished").glob("*.jsonl"))
-
-
-def test_an_interrupted_run_goes_on(tmp_path, monkeypatch):
-    whole, cut = (
-        Active(out=tmp_path / name, runs=1, jobs=1, only=("forrester", "both"),
-               forrester=TINY) for name in ("whole", "cut")
-    )  # fmt: skip
-    run_missing(whole)
-    asked = []
-
-    def interrupted(name, seed):
-        system = problem(name, seed)
-
-        def measure(X):
-            if len(X) == 1:
-                asked.append(X)
-                if len(asked) == 5:
-                    raise KeyboardInterrupt
-            return system.truth(X)
-
-        return replace(system, truth=measure)
-
-    monkeypatch.setattr(active, "problem", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        run_missing(cut)
-    run_missing(cut)
-    expected, found = (
-        next(iter(runs_file(experiment).read().values())) for experiment in (whole, cut)
-    )
-    assert found["scores"] == expected["scores"]
-    assert found["choice_seconds"] is None
-    assert len(asked) == 7  # the one it was interrupted at twice
-    assert torch.equal(asked[4], asked[5])
 
 
 def test_measurements_that_are_needed():

@@ -1,11 +1,9 @@
 """The experiment on formulas and what is made of them: its cells, and a smoke run."""
 
-import json
 import math
 
 import pytest
 
-from paper.__main__ import main
 from paper.published import FORMULA_CELLS, Formula
 from paper.published.formula import cells
 
@@ -16,16 +14,12 @@ RUN = {"group": "kinds", "problem": "decay", "size": 5, "noise": 0.0, "held": [0
 @pytest.mark.parametrize(
     "kind", [("kinds", "decay"), ("right", "lens"), ("laws", "creep"), ("functions", "forrester")]
 )
-def test_formula(kind, tmp_path, monkeypatch):
-    out = tmp_path / "formula"
-    options = ["--only", *kind, "--runs", "2", "--jobs", "1", "--out", str(out)]
-    monkeypatch.setattr("sys.argv", ["paper", "formula", *options])
-    main()
-    runs = [json.loads(line) for line in (out / "runs.jsonl").read_text().splitlines()]
+def test_formula(kind, ran, tmp_path):
+    runs, tables = ran("formula", "--only", *kind)
     assert {(run["group"], run["problem"]) for run in runs} == {kind}
     assert all(0 < run["ours"][0] < 10 * run["formula"][0] for run in runs)
-    assert (out / "formula.png").exists()
-    assert "worst cell" in (out / "tables.md").read_text()
+    assert (tmp_path / "formula.png").exists()
+    assert "worst cell" in tables
 
 
 def test_ratios(tmp_path):
