@@ -58,13 +58,11 @@ def draw_quartiles(
     by: str = "episode",
     color: str,
     label: str,
-    band: bool = True,
 ) -> None:
     """Draw the median over runs, and the quartiles as a band; they hold where one run fails."""
     values = records.groupby(by)[measure]
     low, middle, high = (values.quantile(q) for q in (0.25, 0.5, 0.75))
-    if band:
-        ax.fill_between(middle.index, low, high, color=color, alpha=0.15, lw=0)
+    ax.fill_between(middle.index, low, high, color=color, alpha=0.15, lw=0)
     ax.plot(middle.index, middle, color=color, lw=1.5, label=label)
 
 

@@ -30,7 +30,6 @@ from paper.measuring.problems import Problem, problem
 
 PROBLEMS, LABELS = Active.axes["problem"], Active.axes["learner"]
 REFERENCE = "gp"  # whose final error the others are to reach
-ALONE = "f_p"  # what needs no measurement
 _SECONDS = ["choice_seconds", "score_seconds"]
 
 

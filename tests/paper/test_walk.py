@@ -3,7 +3,6 @@
 import sys
 from pathlib import Path
 
-import paper.calibration.calibration  # not while files are counted
 import pytest
 
 import paper.laboratory.drift  # not while files are counted  # noqa: F401
