@@ -13,20 +13,18 @@ from pkgutil import resolve_name
 
 CHAPTERS = {
     "forrester": ("Forrester",),
-    "pairs": ("Multifidelity", "Polynomials", "Large"),
-    "calibration": ("Calibration", "Seeds"),
-    "structures": ("Structures", "Choice"),
-    "parameters": ("Parameters", "Ridges"),
-    "measuring": ("Active", "Optimisation", "Misled"),
-    "cartpole": ("CartPole", "Planning", "Floor"),
+    "structures": ("Structures",),
+    "parameters": ("Parameters",),
+    "measuring": ("Active", "Misled"),
+    "cartpole": ("CartPole", "Planning"),
     "arm": ("Arm", "Reaching"),
     "laboratory": (
-        *("Balldrop", "Categories", "Curves", "Drift", "Emulated", "Hints", "Links"),
-        *("Noisyinputs", "Outliers", "Relative", "Repeats", "Sisters", "Vanishing"),
+        *("Balldrop", "Categories", "Drift", "Emulated", "Links"),
+        *("Noisyinputs", "Outliers", "Relative", "Vanishing"),
     ),
-    "control": ("Known", "First", "Ontime", "Hidden", "Setpoints", "Delays", "Walls"),
+    "control": ("Known", "First"),
     "published": ("Masses", "Uci", "Emps", "Freeruns", "Formula"),
-    "machines": ("Real", "Elsewhere", "Tanks", "Foresight", "Kinks"),
+    "machines": ("Real", "Tanks"),
 }
 """Folders, and the classes of the experiments that they declare."""
 EXPERIMENTS = {

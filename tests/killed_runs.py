@@ -4,8 +4,6 @@ Each is a function of a folder; `RUNS` has them by name. A process is forked for
 has imported all this.
 """
 
-import json
-
 import gymnasium
 import torch
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -24,23 +22,11 @@ from gpadjust.control import (
 from gpadjust.control.random_state import RandomState
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.rl import DynaOptions, DynaSAC
-from paper.cartpole import CartPole, Settings
-from paper.common.runner import run_missing, runs_file
 from tests.point import POINT_SPEC, QUICK, Faulty, Point, near_one
 
 TOTAL = 40  # steps, of episodes of five where none fails
 FAILS = {8: "raises", 16: "nan", 23: "reward 1e30"}
 PLAN = Planner(search=CrossEntropy(1), horizon=3, num_random=32, max_hold=1)
-TINY = Settings(
-    episodes=3,
-    episode_length=10,
-    model_episodes=2,
-    batch_size=16,
-    net_arch=(16,),
-    last_model_episode=2,
-    later_updates=5,
-    updates_per_model_step=0.2,
-)
 
 
 def reward(states, actions, next_states):
@@ -108,22 +94,7 @@ def trained(folder):
     write(agent, folder, [agent.get_parameters(), agent.env.obs_rms.mean])
 
 
-def experiment(folder):
-    """The runs of an experiment, each of which goes on from its own checkpoint."""
-    known = CartPole(settings=TINY, out=folder, runs=1, jobs=1, only=("cka", "mf"))
-    run_missing(known)
-    lines = [without_seconds(run) for run in runs_file(known).read().values()]
-    torch.save({"runs": json.dumps(lines)}, folder / "found.pt")
-
-
-def without_seconds(found):
-    """What a run found, but how long it took."""
-    if isinstance(found, dict):
-        return {n: without_seconds(v) for n, v in found.items() if not n.endswith("_seconds")}
-    return found
-
-
-RUNS = {each.__name__: each for each in (planned, searched, trained, experiment)}
+RUNS = {each.__name__: each for each in (planned, searched, trained)}
 
 
 def go(name, folder):

@@ -9,7 +9,7 @@ import torch
 
 from tests.point import assert_equal
 
-NAMES = ("planned", "searched", "trained", "experiment")
+NAMES = ("planned", "searched", "trained")
 KILLS = 12  # of each
 
 

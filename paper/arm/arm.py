@@ -1,35 +1,21 @@
-"""Tables, curves and maps of learners that reach with an arm."""
+"""Tables and curves of learners that reach with an arm."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from torch import Tensor
 
 from paper.arm import PAPER, SCENARIOS
-from paper.arm.claims import LAST, MAP_AFTER, claims, targets
-from paper.arm.system.reaching import START_MEAN, arm_targets, hand_position
-from paper.arm.system.torque_arm import REAL_ARM
+from paper.arm.claims import LAST, claims
 from paper.cartpole import Control
-from paper.cartpole.control import (
-    cost_of_a_run,
-    foresight,
-    load,
-    seconds_of_a_run,
-    summary,
-    updates_table,
-)
+from paper.cartpole.control import foresight, load
+from paper.cartpole.planning import trials_table
 from paper.common.experiment import Run, Table
 from paper.common.figures import curves as draw_curves
-from paper.common.figures import panels, save
-from paper.common.tables import claims_table, groups, markdown, numbers
+from paper.common.tables import claims_table, markdown
 from paper.common.verdicts import Curves, judge
 
 MEASURES = {"all_steps": "all steps", "last_five": "last five steps"}
@@ -38,11 +24,11 @@ _SHOWN = (3, 6, 9, 12, 18, 24, 30)  # episodes
 
 
 def load_maps(runs: Sequence[Run], experiment: Control) -> pd.DataFrame:
-    """The errors in cm: a row for each scenario, seed, mapped episode and target."""
+    """The errors in cm: a row for each learner, seed, mapped episode and target."""
     frames = [
         pd.DataFrame(
             {
-                **{"scenario": each["scenario"], "seed": each["seed"], "episode": int(episode)},
+                **{"learner": each["scenario"], "seed": each["seed"], "episode": int(episode)},
                 **{"target": range(len(errors["all_steps"])), **errors},
             }
         )
@@ -51,71 +37,28 @@ def load_maps(runs: Sequence[Run], experiment: Control) -> pd.DataFrame:
         if each["scenario"] == name
         for episode, errors in each["maps"].items()
     ]
-    columns = ["scenario", "seed", "episode", "target", *MEASURES]
+    columns = ["learner", "seed", "episode", "target", *MEASURES]
     return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=columns)
-
-
-def times(episodes: pd.DataFrame, evaluations: pd.DataFrame) -> pd.DataFrame:
-    """The seconds of a run, evaluations included, and its updates."""
-    table = cost_of_a_run(episodes)
-    seconds = seconds_of_a_run(evaluations, ["evaluation"])["evaluation_seconds"]
-    table.insert(3, "evaluation_seconds", seconds)
-    table["total_seconds"] += seconds
-    return table
 
 
 def tables(runs: Sequence[Run], experiment: Control) -> dict[str, Table]:
     """All tables, by name."""
     episodes, maps = load(runs, "episodes", experiment), load_maps(runs, experiment)
     evaluations = load(runs, "evaluations", experiment)
-    of = {measure: Curves(evaluations, measure, by="scenario") for measure in MEASURES}
-    every, seconds = of["all_steps"], times(episodes, evaluations)
-    found = {"updates": Table("Updates", updates_table(experiment))}
+    of = {measure: Curves(evaluations, measure) for measure in MEASURES}
     about = claims(episodes, maps)
     judged = {MEASURES[m]: judge(about, of[m], LAST) for m in MEASURES}
-    found["claims"] = Table("Claims", claims_table("claim", judged))
-    judged = {"": judge(targets(seconds), every, LAST)}
-    found["targets"] = Table("Targets, all steps", claims_table("target", judged))
+    found = {"claims": Table("Claims", claims_table("claim", judged))}
     for name, measure in (("all", "all_steps"), ("last", "last_five")):
-        hundred = Curves(evaluations, f"{measure}_100", by="scenario")
-        columns: dict[str, Callable[[str], Any]] = {
-            **{f"at {e}": partial(_at, of[measure], e) for e in _SHOWN},
-            "sd of runs": partial(_spread, of[measure]),
-            f"100 targets, at {LAST}": partial(_at, hundred, LAST),
-        }
-        text = summary(
-            of[measure],
-            experiment.labels,
-            columns,
-            end=(LAST, LAST),
-            windows=WINDOWS,
-            thresholds=(10, 8),
-            digits=1,
+        text = trials_table(
+            evaluations, measure, experiment.labels, _SHOWN, (24, LAST), (24, LAST), ".1f"
         )
         found[name] = Table(f"Hand's error in cm, {MEASURES[measure]}", text)
-    found["memory"] = Table("With and without the previous action, cm", _memory(every, experiment))
+    found["memory"] = Table(
+        "With and without the previous action, cm", _memory(of["all_steps"], experiment)
+    )
     found["model"] = Table("How well models foresaw trials", foresight(episodes, experiment))
-    parts = {
-        "fit_seconds": "fits, s",
-        "rollout_seconds": "model steps, s",
-        "update_seconds": "updates, s",
-        "evaluation_seconds": "evaluations, s",
-        "total_seconds": "sum, s",
-        "cpu_seconds": "core's time, s",
-        "updates": "updates",
-    }
-    rows = seconds.rename(index=experiment.labels)[list(parts)]
-    found["time"] = Table("Seconds", numbers(rows, ["of a run", *parts.values()], ".0f"))
     return found
-
-
-def _at(curves: Curves, episode: int, name: str) -> float:
-    return curves.mean_at(name, episode)
-
-
-def _spread(curves: Curves, name: str) -> float:
-    """The standard deviation over runs, averaged over the evaluations from episode 3."""
-    return float(curves.spread(name).loc[3:].mean())
 
 
 def _memory(every: Curves, experiment: Control) -> str:
@@ -137,7 +80,7 @@ def _memory(every: Curves, experiment: Control) -> str:
     return markdown(header, rows)
 
 
-BOUND = 4.1  # cm, all steps: python -m paper floor
+BOUND = 4.1  # cm, all steps, of SAC after 1,000 trials
 _LINES = {name: (SCENARIOS[name].label, SCENARIOS[name].color) for name in PAPER} | {
     "mf-best": (SCENARIOS["mf-best"].label, "black"),
     "cka-memory": (SCENARIOS["cka-memory"].label, "tab:cyan"),
@@ -145,9 +88,9 @@ _LINES = {name: (SCENARIOS[name].label, SCENARIOS[name].color) for name in PAPER
 
 
 def draw(runs: Sequence[Run], experiment: Control) -> list[Path]:
-    """Draw the error over the trials, and the errors at each target after some of them."""
-    errors, maps = load(runs, "evaluations", experiment), load_maps(runs, experiment)
-    counts = errors.groupby("scenario")["seed"].nunique()
+    """Draw the error over the trials."""
+    errors = load(runs, "evaluations", experiment)
+    counts = errors.groupby("learner")["seed"].nunique()
     lines = {n: (f"{label} ({counts.get(n, 0)})", color) for n, (label, color) in _LINES.items()}
 
     def finish(ax: Axes, title: str, own: pd.DataFrame) -> None:
@@ -155,64 +98,14 @@ def draw(runs: Sequence[Run], experiment: Control) -> list[Path]:
         ax.axhline(BOUND, color="tab:green", lw=1, ls="--", label="1,000 trials of SAC, all steps")
         ax.set_ylim(0, 70)
 
-    found = [
+    return [
         draw_curves(
             experiment.out / "curves.png",
             {what: errors.assign(error=errors[measure]) for measure, what in MEASURES.items()},
             "error",
             lines,
-            by="scenario",
             labels=("trial", "hand's RMSE over targets, cm: median, quartiles"),
             size=(5.5, 4),
             finish=finish,
         )
     ]
-    maps = maps[maps["episode"] == MAP_AFTER]
-    if maps.empty:
-        return found
-    by_title = {
-        f"{label} ({part['seed'].nunique()})": part.pivot(
-            index="seed", columns="target", values="all_steps"
-        )
-        for label, part in groups(maps, "scenario", experiment.labels).items()
-    }
-    label = f"RMSE after trial {MAP_AFTER}, cm"
-    return [*found, draw_maps(experiment.out / "map.png", by_title, label, 60, 4)]
-
-
-def draw_maps(
-    path: Path, parts: Mapping[str, pd.DataFrame], label: str, worst: float, columns: int = 3
-) -> Path:
-    """Draw errors at each target: color for the mean over runs, size for their spread.
-
-    Args:
-        path: The file.
-        parts: By the title of the panel, a row for each run, a column for each target.
-        label: Of the colors.
-        worst: The end of the colors, in cm.
-        columns: Panels in a row.
-    """
-    figure, axes = panels([*parts], columns, (2.9, 2.1))
-    targets, start = (100 * hand_position(at).numpy() for at in (arm_targets(), _start()))
-    elbow = 100 * REAL_ARM.lengths[0] * np.array([math.cos(START_MEAN[0]), math.sin(START_MEAN[0])])
-    for ax, errors in zip(axes, parts.values(), strict=True):
-        ax.plot(*np.stack([[0, 0], elbow, start]).T, color="0.7", lw=4, marker="o", ms=5, zorder=1)
-        dots = ax.scatter(
-            targets[:, 0],
-            targets[:, 1],
-            c=errors.mean(),
-            s=6 + 6 * errors.std().fillna(0).clip(upper=10),
-            cmap="viridis_r",
-            vmin=0,
-            vmax=worst,
-            zorder=2,
-        )
-        ax.set_aspect("equal")
-    figure.supxlabel("along the upper arm at 0°, cm; size: sd of runs, 0 to 10 cm or more")
-    figure.supylabel("across, cm")
-    figure.colorbar(dots, ax=axes, label=label, shrink=0.9, extend="max")
-    return save(figure, path)
-
-
-def _start() -> Tensor:
-    return arm_targets().new_tensor(START_MEAN)

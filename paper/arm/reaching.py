@@ -7,11 +7,9 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.noise import NormalActionNoise
@@ -25,15 +23,12 @@ from gpadjust.states import StateSpec
 from gpadjust.systems import System
 from paper.arm import BOUNDS, SENSORS, Reaching, ReachingSettings
 from paper.arm import Settings as ArmSettings
-from paper.arm.arm import BOUND, draw_maps
 from paper.arm.evaluation import reach, score
 from paper.arm.system import arm
 from paper.cartpole.planning import trials_table
 from paper.common.experiment import Run, Table
-from paper.common.figures import curves as draw_curves
 from paper.common.learners import LEARNERS
-from paper.common.tables import claims_table, frame, groups, of, table
-from paper.common.verdicts import Claim, Curves, Finding, judge, met
+from paper.common.tables import frame
 from paper.machines.networks import NetworkDynamics
 
 MAPPED = (1, 3, 9)
@@ -179,75 +174,8 @@ def tables(runs: Sequence[Run], experiment: Reaching) -> dict[str, Table]:
                 title = f"The hand's error in cm, {steps}, arm {label}"
                 text = trials_table(own, measure, _LABELS, shown, (3, last), (1, last), ".1f")
                 found[f"{system}_{measure}"] = Table(title, text)
-    plain = Curves(trials[trials["system"] == "plain"], "all_steps")
-    judged = {"all steps": judge(TARGETS, plain, last)}
-    found["targets"] = Table("Targets", claims_table("target", judged))
-    seconds = {
-        "update_seconds": "policy search, s",
-        "fit_seconds": "fit, s",
-        "cpu_seconds": "CPU, s",
-    }
-    columns = {what: of(column, "median", ".1f") for column, what in seconds.items()}
-    later = groups(trials[trials["episode"] > 1], "learner", _LABELS)
-    text = table(later, columns, "median of the trials after the first, all arms")
-    found["seconds"] = Table("Seconds of a trial", text)
     return found
 
 
 def _trials(runs: Sequence[Run]) -> list[Run]:
     return [{name: value for name, value in each.items() if name != "maps"} for each in runs]
-
-
-def _after(most: float, trial: int, curves: Curves) -> Finding:
-    errors = curves.window("cka-slow", trial, trial)
-    measured = f"{errors.mean():.1f} cm of {len(errors)} runs, the worst {errors.max():.1f}"
-    return met(errors.mean() <= most), measured
-
-
-def _never_above(curves: Curves) -> Finding:
-    own = curves.of("cka-slow")
-    late = own[own["episode"] >= 3]["all_steps"]
-    return met(late.max() <= 8), f"{late.max():.1f} cm"
-
-
-_LEARNER = ("cka-slow",)
-TARGETS = (
-    Claim("T1", "mean at most 10 cm after trial 1", _LEARNER, partial(_after, 10, 1)),
-    Claim("T2", "mean at most 7 cm after trial 2", _LEARNER, partial(_after, 7, 2)),
-    Claim("T3", "mean at most 5.5 cm after trial 4", _LEARNER, partial(_after, 5.5, 4)),
-    Claim("T4", "mean at most 4.5 cm after trial 10", _LEARNER, partial(_after, 4.5, 10)),
-    Claim("T5", "no run above 8 cm after trial 3 or a later one", _LEARNER, _never_above),
-)
-
-
-def draw(runs: Sequence[Run], experiment: Reaching) -> list[Path]:
-    """Draw the error over the trials, a panel for each arm, and maps of CKA's on the plain one."""
-    trials = frame(_trials(runs), "trials")
-    floor = {"color": "0.5", "lw": 1, "ls": "--", "label": "SAC, 1,000 trials"}
-
-    def finish(ax: Any, title: str, own: pd.DataFrame) -> None:
-        ax.axhline(BOUND, **floor)
-        ax.set_ylim(0, 40)
-
-    colors = {name: known.color for name, known in LEARNERS.items()}
-    colors |= {"ensemble": "tab:green", "cka-slow": "tab:cyan"}
-    found = [
-        draw_curves(
-            experiment.out / "curves.png",
-            groups(trials, "system", _SYSTEMS),
-            "all_steps",
-            {name: (label, colors[name]) for name, label in _LABELS.items()},
-            labels=("trial", "hand's error, cm, median and quartiles"),
-            finish=finish,
-        )
-    ]
-    own = [each for each in runs if (each["system"], each["learner"]) == ("plain", "cka")]
-    maps = {
-        f"CKA, after trial {trial}": pd.DataFrame(
-            [each["maps"][f"{trial}"] for each in own if f"{trial}" in each["maps"]]
-        )
-        for trial in MAPPED
-    }
-    maps = {title: errors for title, errors in maps.items() if len(errors)}
-    path = experiment.out / "map.png"
-    return [*found, draw_maps(path, maps, "RMSE, cm", 30)] if maps else found

@@ -1,4 +1,4 @@
-"""The cart-pole: learners with and without physics (the paper's sec. 3.2), planning, and floors."""
+"""The cart-pole: learners with and without physics (the paper's sec. 3.2), and planning."""
 
 from __future__ import annotations
 
@@ -311,11 +311,6 @@ class Planning(Experiment):
         "gpadjust.control.PolicySearch",
     )
 
-    def check(self) -> None:
-        """Refuse runs without a trial."""
-        if self.settings.trials < 1:
-            raise ValueError(f"--trials: expected at least 1, got {self.settings.trials}")
-
     def settings_of(self, system: str) -> PlanningSettings:
         """The settings for a system."""
         return replace(self.settings, **MC_PILCO) if system == "mc-pilco" else self.settings
@@ -331,61 +326,3 @@ class Planning(Experiment):
         more |= {"small_noise": SMALL_NOISE} if system == "mc-pilco" else {}
         more |= {"fitted_by": "PhysicsDynamics"} if learner in ("fitted", "structured") else {}
         return {**settings, **more}
-
-
-@dataclass(frozen=True, kw_only=True)
-class FloorSettings:
-    """Settings that decide the numbers."""
-
-    sequences: int = 1000
-    """of actions, that each round of the cross-entropy method looks at"""
-    rounds: int = 40
-    """of the cross-entropy method"""
-    elites: int = 200
-    """of the cross-entropy method"""
-    restarts: int = 3
-    """of the cross-entropy method, which ends in local optima"""
-    arm_runs: int = 1
-    """of SAC on the true arm"""
-    arm_episodes: int = 1000
-    """of these, far more than the experiment's"""
-    arm_updates: int = 60
-    """gradient steps after each of these episodes"""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Floor(Experiment):
-    """The best open loops found for the known cart-pole, and SAC for long on the true arm."""
-
-    runs: int = NUM_STARTS
-    """fixed starts of the cart-pole, each with an open loop of its own"""
-    out: Path = Path("results/floor")
-    settings: FloorSettings = field(default_factory=FloorSettings)
-
-    axes: ClassVar[Axes] = {
-        "system": {
-            "mean-start": "cart-pole, mean start: cost of the best open loop found",
-            "fixed-starts": "cart-pole, fixed starts: cost of the best open loop found for each",
-            "arm": "arm: hand's error in cm, all steps, of SAC for long on the true arm, its best",
-        }
-    }
-    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "stable_baselines3", "opensim")
-    calls: ClassVar[tuple[str, ...]] = ("gpadjust.control.Planner", "gpadjust.control.CrossEntropy")
-
-    def check(self) -> None:
-        """Refuse more fixed starts than there are."""
-        if self.seeds.start < 0 or self.seeds.stop > NUM_STARTS:
-            raise ValueError(
-                f"There are {NUM_STARTS} fixed starts, of the seeds 0 to {NUM_STARTS - 1}; found "
-                f"the seeds {self.seeds.start} to {self.seeds.stop - 1}."
-            )
-
-    def seeds_of(self, *kind: Any) -> Sequence[int]:
-        """Few searches from the mean start, and few runs of the arm."""
-        few = {"mean-start": 3, "arm": self.settings.arm_runs}
-        return self.seeds[: few.get(kind[0], self.runs)]
-
-    def describe(self, *kind: Any) -> dict[str, Any]:
-        """The settings of the system."""
-        arm = kind[0] == "arm"
-        return {k: v for k, v in asdict(self.settings).items() if k.startswith("arm_") == arm}

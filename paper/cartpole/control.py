@@ -1,33 +1,25 @@
-"""Learners of a control task: one resumable run, its records, and the tables of all."""
+"""Learners of a control task: a run, its records, and the tables of all."""
 
 from __future__ import annotations
 
-import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 import pandas as pd
-from stable_baselines3.common.callbacks import BaseCallback
 from torch import Tensor
 
-from gpadjust.control import EpisodeCheckpoint, Task, resume
+from gpadjust.control import Task
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.physics import Physics
 from gpadjust.rl import DynaCallback, DynaOptions, DynaSAC
 from gpadjust.states import StateSpec
 from paper.cartpole import Control, ControlSettings, Scenario
 from paper.common.experiment import Run
-from paper.common.runner import Refused
-from paper.common.runs import differences, versions
-from paper.common.tables import markdown, number, numbers
-from paper.common.verdicts import Curves, interquartile_mean
-
-PARTS = ("fit", "rollout", "update")
+from paper.common.tables import numbers
 
 
 class Setup(NamedTuple):
@@ -61,47 +53,17 @@ def dynamics(
     )
 
 
-def make_agent(experiment: Control, name: str, seed: int) -> DynaSAC:
-    """A learner, at its start."""
-    setup = experiment.setup(name, seed)
-    options, arguments = _options(experiment, name), _arguments(experiment, name)
-    return DynaSAC("MlpPolicy", setup.env, setup.task, options, **arguments, seed=seed)
-
-
-def run(experiment: Control, name: str, seed: int, callbacks: Sequence[BaseCallback] = ()) -> Run:
-    """Learn, or go on with it.
-
-    Raises:
-        Refused: If an unfinished run is of other settings or versions.
-    """
-    checkpoint = Path(f"{experiment.unfinished(name, seed)}.ckpt")
+def run(experiment: Control, name: str, seed: int) -> Run:
+    """Learn."""
     settings, setup = experiment.settings_of(name), experiment.setup(name, seed)
-    now = {
-        "settings": json.loads(json.dumps(experiment.describe(name))),
-        "defaults": experiment.defaults(),
-        "versions": versions(experiment.packages),
-    }
-    if checkpoint.exists():
-        agent: Any = resume(checkpoint, setup.env, setup.task)
-        differ = differences(agent.notes["made"], now)
-        if differ:
-            raise Refused(
-                f"{checkpoint} is of an unfinished run of others: {differ}. Remove it to begin "
-                "that run again, choose another --out, or go on as it was begun."
-            )
-    else:
-        agent = make_agent(experiment, name, seed)
-        agent.notes["made"] = now
+    options, arguments = _options(experiment, name), _arguments(experiment, name)
+    agent = DynaSAC("MlpPolicy", setup.env, setup.task, options, **arguments, seed=seed)
     agent.learn(
-        settings.episodes * settings.episode_length - agent.num_timesteps,
-        callback=[setup.recorder, *callbacks, EpisodeCheckpoint(checkpoint)],
+        settings.episodes * settings.episode_length,
+        callback=setup.recorder,
         log_interval=settings.episodes + 1,  # nothing is shown
-        reset_num_timesteps=False,
     )
-    found = setup.recorder.found()
-    for path in (checkpoint, Path(f"{checkpoint}.lock")):
-        path.unlink(missing_ok=True)
-    return found
+    return setup.recorder.found()
 
 
 def _options(experiment: Control, name: str) -> DynaOptions:
@@ -213,7 +175,7 @@ class Recorder(DynaCallback):
 
 
 def load(runs: Sequence[Run], entry: str, experiment: Control) -> pd.DataFrame:
-    """A row for each scenario, seed and element of an entry that has lists by name.
+    """A row for each learner, seed and element of an entry that has lists by name.
 
     Of ``"episodes"`` there is a column for the error of each state; episodes count from 1.
     """
@@ -230,100 +192,18 @@ def load(runs: Sequence[Run], entry: str, experiment: Control) -> pd.DataFrame:
                 own = own.astype({"nlpd": float, "coverage": float})
             if "episode" not in own:
                 own.insert(0, "episode", np.arange(len(own)) + 1)
-            own.insert(0, "scenario", name)
+            own.insert(0, "learner", name)
             own.insert(1, "seed", each["seed"])
             frames.append(own)
     return pd.concat(frames, ignore_index=True)
 
 
-def updates_table(experiment: Control) -> str:
-    """Gradient steps of each scenario after an episode."""
-    until = experiment.settings.last_model_episode
-    starts = [1, until + 1] if until < experiment.settings.episodes else [1]
-    rows = []
-    for name, scenario in experiment.known.items():
-        settings, cells = experiment.settings_of(name), []
-        for episode in starts:
-            model_free = scenario.kind == "none"
-            real = settings.updates_after(episode, model_free)
-            in_model = not model_free and episode <= until
-            cells.append(f"{real} + {settings.updates_in_model()}" if in_model else f"{real}")
-        rows.append([f"`{name}`", scenario.label, *cells, f"{scenario.max_runs or 'all'}"])
-    headings = [f"updates, trials 1-{until}", f"{until + 1}-"][: len(starts)]
-    return markdown(["`--only`", "", *headings, "seeds"], rows)
-
-
-def summary(
-    curves: Curves,
-    labels: Mapping[str, str],
-    columns: Mapping[str, Callable[[str], Any]],
-    *,
-    end: tuple[int, int],
-    windows: Sequence[tuple[int, int]],
-    thresholds: Sequence[float],
-    digits: int,
-    texts: Mapping[str, Callable[[str], str]] | None = None,
-) -> str:
-    """A row for each learner.
-
-    Args:
-        curves: Of the measure.
-        labels: Of the learners.
-        columns: By their heading, what gives a number of a learner.
-        end: The episodes that the interquartile mean is of.
-        windows: Episodes over which the learners are compared with the reference.
-        thresholds: Whose first episodes are shown.
-        digits: After the point.
-        texts: Further columns, as they are shown.
-    """
-    texts = texts or {}
-    form, other = f".{digits}f", labels[curves.reference]
-    rows = []
-    for name in curves.names:
-        row = [labels[name], f"{len(curves.seeds(name))}"]
-        row += [number(value(name), form) for value in columns.values()]
-        middle, low, high = interquartile_mean(curves.window(name, *end))
-        row.append(number(middle, form))
-        if not np.isnan(low):
-            row[-1] += f" ({low:{form}}, {high:{form}})"
-        row += [curves.paired_difference(name, *window).text(form) for window in windows]
-        firsts = [curves.first_below(name, threshold) for threshold in thresholds]
-        row += ["never" if first is None else f"{first}" for first in firsts]
-        rows.append([*row, *(text(name) for text in texts.values())])
-    said = f"{end[0]}-{end[1]}" if end[0] < end[1] else f"{end[0]}"
-    header = ["", "runs", *columns, f"IQM of {said} (95 %)"]
-    header += [f"{first}-{last}, less {other}'s" for first, last in windows]
-    header += [f"first at {threshold:g}" for threshold in thresholds]
-    return markdown([*header, *texts], rows)
-
-
-def seconds_of_a_run(rows: pd.DataFrame, parts: Sequence[str]) -> pd.DataFrame:
-    """Medians over the runs of the seconds in each part that there is: a row for each scenario."""
-    columns = [f"{part}_seconds" for part in parts if f"{part}_seconds" in rows]
-    by_run = rows.groupby(["scenario", "seed"], sort=False)[columns].sum()
-    return by_run.groupby("scenario", sort=False).median()
-
-
-def cost_of_a_run(episodes: pd.DataFrame) -> pd.DataFrame:
-    """Seconds of a run in each part, its updates, and the particles that it lost.
-
-    ``cpu_seconds`` are of the whole run on its core, the others of wall time: medians over the
-    runs, as a run may have been suspended. Updates and particles are means.
-    """
-    total = sum(episodes[f"{part}_seconds"] for part in PARTS)
-    table = seconds_of_a_run(episodes.assign(total_seconds=total), (*PARTS, "total", "cpu"))
-    by_run = episodes.groupby(["scenario", "seed"], sort=False)[["updates", "left_bounds"]].sum()
-    table[["updates", "left_bounds"]] = by_run.groupby("scenario", sort=False).mean()
-    return table
-
-
 def foresight(episodes: pd.DataFrame, experiment: Control) -> str:
     """Scores of the models on episodes before they had them, from the second on."""
     errors = [f"rmse_{state}" for state in experiment.rmses]
-    scored = episodes[episodes["episode"] > 1].groupby("scenario", sort=False)
+    scored = episodes[episodes["episode"] > 1].groupby("learner", sort=False)
     table = scored[["nlpd", *errors]].median()
     table.insert(1, "coverage", scored["coverage"].mean())
-    table["lost"] = cost_of_a_run(episodes)["left_bounds"]
     table = table[table[errors[0]].notna()].rename(index=experiment.labels)
     headings = [f"RMSE of {what}" for what in experiment.rmses.values()]
-    return numbers(table, ["", "NLPD", "coverage of 95 %", *headings, "particles lost"], ".2g")
+    return numbers(table, ["", "NLPD", "coverage of 95 %", *headings], ".2g")

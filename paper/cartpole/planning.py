@@ -49,8 +49,8 @@ from paper.common.experiment import Run, Table
 from paper.common.figures import curves as draw_curves
 from paper.common.learners import LEARNERS
 from paper.common.runner import runs_file
-from paper.common.tables import claims_table, frame, groups, markdown, number, of, table
-from paper.common.verdicts import Claim, Curves, Finding, judge, met
+from paper.common.tables import frame, groups, markdown, number, of, table
+from paper.common.verdicts import Curves
 
 FRICTION_UNKNOWNS = {
     "dry": Unknown(0.2, bounds=(0.0, 2.0), unit="N"),
@@ -228,16 +228,14 @@ def tables(runs: Sequence[Run], experiment: Planning) -> dict[str, Table]:
     """All tables, by name."""
     trials, last = frame(runs, "trials"), experiment.settings.trials
     by_system = {system: trials[trials["system"] == system] for system in _SYSTEMS}
-    found, judged = {}, []
+    found = {}
     for system, own in by_system.items():
-        judged += judge(TARGETS.get(str(system), ()), Curves(own, "cost"), last)
         if len(own):
             text = _successes(own) if system == "mc-pilco" else _costs(own, last)
             if system == "plain":
                 text = f"{text}\n{_of_dyna(experiment, last)}".rstrip()
             found[str(system)] = Table(f"Cart-pole {_SYSTEMS[system]}", text)
     found["short"] = Table("Mean cost of planned trials", _short(trials, last))
-    found["targets"] = Table("Targets", claims_table("target", {"planned": judged}))
     seconds = {"plan_seconds": "plans, s", "fit_seconds": "fit, s", "cpu_seconds": "CPU, s"}
     columns = {what: of(column, "median", ".1f") for column, what in seconds.items()}
     text = table(groups(trials, "learner", _LEARNERS), columns, "median of a trial")
@@ -322,44 +320,6 @@ def trials_table(
         part.loc[part["episode"].between(*late), measure].max(), form
     )
     return table(groups(own, "learner", labels), {**columns, "less CKA's": gap})
-
-
-def _first(most: float, trial: int, curves: Curves) -> Finding:
-    costs = curves.window("cka", trial, trial)
-    return met(costs.mean() <= most), f"{costs.mean():.3f}, the worst run {costs.max():.3f}"
-
-
-def _never_above(curves: Curves) -> Finding:
-    own = curves.of("cka")
-    late = own[own["episode"].between(3, 5)]["cost"]
-    return met(late.max() <= 0.35), f"{late.max():.3f}, mean {late.mean():.3f}"
-
-
-def _all_stand(trial: int, curves: Curves) -> Finding:
-    """Verdict: all runs succeed in a trial after the random one."""
-    own = curves.of("cka")
-    good = succeeded(own[own["episode"] == trial + 1])
-    later = succeeded(own[own["episode"] > 1])
-    text = f"{good.sum()} of {len(good)}; in all five trials {later.sum()} of {len(later)}"
-    return met(bool(good.all())), text
-
-
-TARGETS = {
-    "plain": (
-        Claim("T1", "mean cost at most 0.40 in trial 1, in f_p", ("cka",), partial(_first, 0.4, 1)),
-        Claim("T2", "mean cost at most 0.36 in trial 2", ("cka",), partial(_first, 0.36, 2)),
-        Claim("T3", "mean cost at most 0.29 in trial 3", ("cka",), partial(_first, 0.29, 3)),
-        Claim("T4", "no run above 0.35 in trials 3 to 5", ("cka",), _never_above),
-    ),
-    "mc-pilco": (
-        Claim(
-            "T5",
-            "in MC-PILCO's protocol all runs succeed in trial 2 (theirs by trial 4 or 5)",
-            ("cka",),
-            partial(_all_stand, 2),
-        ),
-    ),
-}
 
 
 def _ticks(ax: Axes, title: str, own: pd.DataFrame) -> None:

@@ -11,7 +11,7 @@ from importlib import import_module
 from itertools import product
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 Case = tuple[Any, ...]
 """What is run once: a value of each axis, and a seed."""
@@ -36,8 +36,6 @@ class Experiment:
     is made of it. Beside it lies a module with the ``name`` of each experiment, which has
 
     - ``run(experiment, *case)``: runs a case with one thread; returns what it found, for JSON.
-      A run that can go on after an interruption keeps its state at ``experiment.unfinished(*case)``
-      (a path, to which it adds a suffix) and removes it when it ends.
     - ``tables(runs, experiment)``: tables of all runs, by name.
     - ``first_look(runs)``, if wanted: a short table of the first runs, None if they are too few.
     - ``draw(runs, experiment)``, if there are figures: draws them into ``experiment.out`` and
@@ -55,13 +53,8 @@ class Experiment:
     """parallel processes"""
     out: Path = Path("results")
     """folder of the results"""
-    backend: Literal["loky", "ray"] = "loky"
-    """processes on this machine, or on a Ray cluster"""
     only_tables: bool = False
     """run nothing; make tables and figures of the runs that are there"""
-    other_versions: Literal["refuse", "keep", "replace"] = "refuse"
-    """what becomes of runs of other versions of the packages, or of other defaults of the library,
-    if more are to be run: nothing is run, they are kept with the new ones, or they are run again"""
 
     name: ClassVar[str]
     """on the command line, and in the markers of the pages: that of the class in lower case"""
@@ -130,10 +123,6 @@ class Experiment:
             found += [(*k, seed) for seed in every for k, own in seeds.items() if seed in own]
         return found
 
-    def unfinished(self, *case: Any) -> Path:
-        """Where a run keeps what it needs to go on after an interruption: a path of its own."""
-        return self.out / "unfinished" / title(case)
-
     def describe(self, *kind: Any) -> dict[str, Any]:
         """The settings that decide the numbers of a kind of cases; all of them, by default."""
         settings = getattr(self, "settings", None)
@@ -167,11 +156,6 @@ class Experiment:
     def _module(self) -> Any:
         """The experiment's module, imported when it is needed."""
         return import_module(f"{type(self).__module__}.{self.name}")
-
-
-def title(case: Case) -> str:
-    """A case as the name of a file."""
-    return "-".join(map(str, case)).replace(" ", "_")
 
 
 def defaults_of(call: Any) -> dict[str, Any]:

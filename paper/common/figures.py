@@ -58,13 +58,11 @@ def draw_quartiles(
     by: str = "episode",
     color: str,
     label: str,
-    band: bool = True,
 ) -> None:
     """Draw the median over runs, and the quartiles as a band; they hold where one run fails."""
     values = records.groupby(by)[measure]
     low, middle, high = (values.quantile(q) for q in (0.25, 0.5, 0.75))
-    if band:
-        ax.fill_between(middle.index, low, high, color=color, alpha=0.15, lw=0)
+    ax.fill_between(middle.index, low, high, color=color, alpha=0.15, lw=0)
     ax.plot(middle.index, middle, color=color, lw=1.5, label=label)
 
 
@@ -85,7 +83,6 @@ def curves(
     lines: Mapping[str, tuple[str, str]],
     *,
     x: str = "episode",
-    by: str = "learner",
     labels: tuple[str, str],
     columns: int = 2,
     size: tuple[float, float] = (4.2, 3.0),
@@ -99,9 +96,8 @@ def curves(
         path: The file.
         parts: Runs by the title of their panel, a row for each run and trial.
         value: The column that is drawn.
-        lines: Label and color by the entries of ``by`` that are drawn.
+        lines: Label and color of the learners that are drawn.
         x: The column of the trials.
-        by: The column that tells the lines apart.
         labels: What stands below and beside all panels.
         columns: Panels in a row.
         size: Of a panel, in inches.
@@ -115,7 +111,7 @@ def curves(
     figure, axes = panels([*parts], columns, size, share=share, width=8.0)
     for ax, (title, runs) in zip(axes, parts.items(), strict=True):
         for name, (label, color) in lines.items():
-            own = runs[runs[by] == name]
+            own = runs[runs["learner"] == name]
             if len(own):
                 draw_quartiles(ax, own, value, by=x, color=color, label=label)
         if logarithmic:
@@ -130,23 +126,21 @@ def curves(
     return save(figure, path)
 
 
-def strips(ax: Axes, rows: Mapping[str, Sequence[pd.Series[float]]], colors: Sequence[str]) -> None:
+def strips(ax: Axes, rows: Mapping[str, pd.Series[float]], color: str) -> None:
     """Draw each run of each row as a dot, with its median and quartiles.
 
     Args:
         ax: Where.
-        rows: Values of the runs, by the label of the row: one series, or several beside each other.
-        colors: Of the series.
+        rows: Values of the runs, by the label of the row.
+        color: Of them.
     """
-    for row, (_, series) in enumerate(rows.items()):
-        if row % 2 == 0:
-            ax.axhspan(row - 0.5, row + 0.5, color="0.95", lw=0, zorder=-1)
-        for i, (values, color) in enumerate(zip(series, colors, strict=False)):
-            y = row + 0.4 * (i - (len(series) - 1) / 2)
-            low, middle, high = values.quantile([0.25, 0.5, 0.75])
-            ax.plot([low, high], [y, y], color=color, lw=7, alpha=0.3, solid_capstyle="butt")
-            ax.plot(values, [y] * len(values), "o", color=color, ms=3.5, mew=0, alpha=0.35)
-            ax.plot(middle, y, "|", color="black", ms=11, mew=1.5)
+    for y, values in enumerate(rows.values()):
+        if y % 2 == 0:
+            ax.axhspan(y - 0.5, y + 0.5, color="0.95", lw=0, zorder=-1)
+        low, middle, high = values.quantile([0.25, 0.5, 0.75])
+        ax.plot([low, high], [y, y], color=color, lw=7, alpha=0.3, solid_capstyle="butt")
+        ax.plot(values, [y] * len(values), "o", color=color, ms=3.5, mew=0, alpha=0.35)
+        ax.plot(middle, y, "|", color="black", ms=11, mew=1.5)
     ax.set_yticks(range(len(rows)), rows)
     ax.set_ylim(len(rows) - 0.5, -0.5)
     ax.tick_params(axis="y", length=0)

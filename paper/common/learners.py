@@ -58,7 +58,6 @@ LEARNERS = {
     "ar1": Learner("AR1", "tab:brown", "AR1"),
     "fitted": Learner("f_p, parameters fitted", "tab:brown"),
     "calibrated": Learner("calibrated f_p", "tab:brown", "CalibratedPhysics"),
-    "compare": Learner("recommended by compare", "tab:cyan"),
     # Without data, or without f_p.
     "phy": Learner("f_p alone", "tab:orange"),
     "gp": Learner("GP", "tab:red", "ZeroMeanGP", adjusts=False),

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import cache
 from pathlib import Path
@@ -12,10 +12,9 @@ from typing import Any
 
 import joblib
 import torch
-from filelock import FileLock, Timeout
 from tqdm import tqdm
 
-from paper.common.experiment import Case, Experiment, Run, Table, title
+from paper.common.experiment import Case, Experiment, Run, Table
 from paper.common.runs import RunsFile, commit_of, differences, rounded, versions
 from paper.common.tables import aligned, as_document, settings_table
 
@@ -51,15 +50,14 @@ def main(experiment: Experiment) -> None:
             experiment.cases()
         except (ImportError, ValueError) as error:
             raise Refused(str(error)) from error
-        with _alone(experiment.out):
-            run_missing(experiment)
+        run_missing(experiment)
     done = file.read()
     runs = list(done.values())
     if not runs:
         raise Refused(f"There are no results in {experiment.out}.")
     if experiment.only_tables:
         with suppress(ImportError):  # of a simulator that tables do not need
-            check_all(file.path, done, experiment)
+            check_settings(file.path, done, experiment)
     tables = tables_of(experiment, runs)
     for table in tables.values():
         print(f"\n{table.title}\n\n{aligned(table.text)}")
@@ -80,105 +78,51 @@ def run_missing(experiment: Experiment) -> None:
     """Run the cases that there is no run of, and add them to the file.
 
     Raises:
-        Refused: If the runs that are there were made with other settings; or by other versions or
-            defaults, unless ``other_versions`` says what is to become of them.
+        Refused: If the runs that are there were made with other settings.
     """
     file = runs_file(experiment)
     done, cases = file.read(), experiment.cases()
-    kinds = {case[:-1] for case in cases}
-    check_all(file.path, done, experiment)
-    others = {
-        case: differ
-        for case, run in done.items()
-        if (differ := _by_others(run, experiment, case[:-1] in kinds))
-    }
+    check_settings(file.path, done, experiment)
     missing = [case for case in cases if case not in done]
-    if others and experiment.other_versions == "replace":
-        missing = [case for case in cases if case not in done or case in others]
-    elif others and missing and experiment.other_versions == "refuse":
-        raise Refused(
-            f"{file.path} has runs that differ from those to come: {next(iter(others.values()))}. "
-            "Pass --other-versions keep to add to them, --other-versions replace to run them "
-            "again, or another --out."
-        )
-    elif others:
-        print(
-            f"{len(others)} of the runs were made by other versions, defaults or settings, or do "
-            "not say by which."
-        )
     shown = _first_look(experiment, done.values()) if missing else True
     bar = tqdm(total=len(cases), initial=len(cases) - len(missing), unit="run", disable=not missing)
-    with bar, _backend(experiment.backend) as options:
-        away = replace(experiment, out=experiment.out.absolute())
-        calls = [joblib.delayed(run_one)(away, case) for case in missing]
-        parallel = joblib.Parallel(n_jobs=experiment.jobs, batch_size=1, **options)
-        for case in parallel(calls):
+    with bar:
+        calls = [joblib.delayed(run_one)(experiment, case) for case in missing]
+        options: dict[str, Any] = {"batch_size": 1, "return_as": "generator_unordered"}
+        for case in joblib.Parallel(n_jobs=experiment.jobs, **options)(calls):
             bar.update()
-            bar.set_postfix_str(title(case))
+            bar.set_postfix_str("-".join(map(str, case)))
             shown = shown or _first_look(experiment, file.read().values())
 
 
 def run_one(experiment: Experiment, case: Case) -> Case:
     """Run a case and add it to the file; return it."""
     torch.set_num_threads(1)
-    file = runs_file(experiment)
-    unfinished = experiment.unfinished(*case)
-    unfinished.parent.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(f"{unfinished}.lock")
-    with lock:  # a worker may outlive a call that was killed
-        before = file.read().get(case)
-        if before is None or _by_others(before, experiment):
-            named = dict(zip(experiment.key, case, strict=True))
-            made_by = {
-                "settings": _described(experiment, case[:-1]),
-                "defaults": experiment.defaults(),
-                "versions": versions(experiment.packages),
-                "commit": commit_of(_ROOT),  # it does not decide whether a case is run again
-            }
-            file.append({**named, **made_by, **rounded(experiment.run(*case))})
-        Path(lock.lock_file).unlink(missing_ok=True)
+    made_by = {
+        "settings": _described(experiment, case[:-1]),
+        "defaults": experiment.defaults(),
+        "versions": versions(experiment.packages),
+        "commit": commit_of(_ROOT),
+    }
+    found = rounded(experiment.run(*case))
+    runs_file(experiment).append(dict(zip(experiment.key, case, strict=True)) | made_by | found)
     return case
 
 
-def check_all(path: Path, done: Mapping[Case, Run], experiment: Experiment) -> None:
-    """Refuse runs of other settings, of whatever kind: their tables are one file, with one list."""
-    cases = [*replace(experiment, only=()).cases(), *experiment.cases()]
-    kinds = {case[:-1] for case in cases}
-    for case, run in done.items():
-        if case[:-1] in kinds:
-            check_settings(path, case, run, experiment)
-
-
-def check_settings(path: Path, case: Case, run: Run, experiment: Experiment) -> None:
-    """Refuse a run that was made with other settings, and say which.
+def check_settings(path: Path, done: Mapping[Case, Run], experiment: Experiment) -> None:
+    """Refuse runs of other settings, of whatever kind: their tables are one file, with one list.
 
     Settings that only one of them has are not meant: such a run is one of another version.
     """
-    differ = differences(run["settings"], _described(experiment, case[:-1]), of_both=True)
-    if differ:
-        raise Refused(
-            f"{path}: {title(case)} was made with other settings: {differ}. Choose another --out, "
-            "or the settings of the runs that are there."
-        )
-
-
-def _by_others(run: Run, experiment: Experiment, asked: bool = True) -> str:
-    """The first version, default or setting in which a run differs; empty if there is none.
-
-    Of the packages, those count that are still used; of the settings, those of kinds of cases that
-    are asked for.
-    """
-    now = versions(experiment.packages)
-    found = {name: was for name, was in run["versions"].items() if name in experiment.packages}
-    differ = differences(found, {name: now.get(name, "not there") for name in found})
-    if not differ and experiment.calls:
-        if not run.get("defaults"):
-            return "the defaults of the library are not said of them"
-        differ = differences(run["defaults"], experiment.defaults())
-    if differ or not asked:
-        return differ
-    kind = tuple(run[name] for name in experiment.key[:-1])
-    return differences(run["settings"], _described(experiment, kind))
+    cases = [*replace(experiment, only=()).cases(), *experiment.cases()]
+    kinds = {case[:-1] for case in cases}
+    for case in (case for case in done if case[:-1] in kinds):
+        differ = differences(done[case]["settings"], _described(experiment, case[:-1]))
+        if differ:
+            raise Refused(
+                f"{path}: {'-'.join(map(str, case))} was made with other settings: {differ}. "
+                "Choose another --out, or the settings of the runs that are there."
+            )
 
 
 @cache
@@ -199,34 +143,3 @@ def _first_look(experiment: Experiment, runs: Any) -> bool:
     if text:
         tqdm.write(f"\n{aligned(text)}\n")
     return bool(text)
-
-
-@contextmanager
-def _alone(out: Path) -> Iterator[None]:
-    """Be the only process that adds to a folder."""
-    (out / "unfinished").mkdir(parents=True, exist_ok=True)
-    with ExitStack() as stack:
-        try:
-            stack.enter_context(FileLock(out / "unfinished" / "process.lock", timeout=0))
-        except Timeout:
-            raise Refused(
-                f"Another process adds runs to {out}. Wait until it has ended, or choose another "
-                "--out; --only-tables shows what there is."
-            ) from None
-        yield
-
-
-@contextmanager
-def _backend(name: str) -> Iterator[dict[str, Any]]:
-    """Choose joblib's backend; Ray's uses the cluster that is running, or starts a local one."""
-    if name == "ray":
-        try:
-            from ray.util.joblib import register_ray
-        except ImportError as error:
-            raise Refused(
-                "--backend ray needs Ray; install it with `pip install gpadjust[ray]`"
-            ) from error
-        register_ray()
-    with joblib.parallel_config(backend=name):
-        # Ray cannot return results one by one.
-        yield {"verbose": 10} if name == "ray" else {"return_as": "generator_unordered"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
@@ -22,10 +23,15 @@ from gpadjust.inference import SamplingWarning
 from paper.common.experiment import Case, Run
 
 _Fitted = TypeVar("_Fitted")
+IDENTIFYING = ("settings", "defaults", "versions", "commit")
+"""Entries of a run that say how it was made."""
 
 
 class RunsFile:
     """A file to which runs are added, by any number of processes, and from which none is lost.
+
+    What identifies runs, as their settings and versions, is much the same in all: it has a line of
+    its own, before the first run that was made so, and a name by which runs refer to it.
 
     A line counts once its end is written. A process that dies while it writes leaves a torn line,
     which no one reads and the next to write removes; one that cannot write (a full disk) takes
@@ -46,12 +52,17 @@ class RunsFile:
         Raises:
             OSError: If it cannot be written.
         """
-        line = json.dumps(run, separators=(",", ":")).encode() + b"\n"
-        locks = self.path.parent / "unfinished"
-        locks.mkdir(parents=True, exist_ok=True)
-        with FileLock(locks / "append.lock"), open(self.path, "ab", buffering=0) as file:
+        made = {name: run[name] for name in IDENTIFYING if name in run}
+        rest = {name: value for name, value in run.items() if name not in made}
+        name = hashlib.sha256(_line(made)).hexdigest()[:12]
+        line = _line({"made_by": name, **rest} if made else rest)
+        identifying = _line({"made_by": name, "identifying": made})
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(f"{self.path}.lock"), open(self.path, "ab", buffering=0) as file:
             end = self._whole()
             file.truncate(end)
+            if made and identifying not in self.path.read_bytes().splitlines(keepends=True):
+                line = identifying + line
             try:
                 while line:  # a full disk takes some of it
                     line = line[file.write(line) :]
@@ -70,11 +81,17 @@ class RunsFile:
         """
         if not self.path.exists():
             return {}
-        found = {}
+        found: dict[Case, Run] = {}
+        made: dict[str, Run] = {}
         lines = self.path.read_bytes()[: self._whole()].splitlines()
         for number, line in enumerate(lines, start=1):
             try:
                 run = json.loads(line)
+                if "identifying" in run:
+                    made[run["made_by"]] = run["identifying"]
+                    continue
+                if "made_by" in run:
+                    run |= made[run.pop("made_by")]
                 case = tuple(run[name] for name in self.key)
             except (ValueError, KeyError, TypeError) as error:
                 raise ValueError(
@@ -89,23 +106,24 @@ class RunsFile:
         return self.path.read_bytes().rfind(b"\n") + 1
 
 
-def differences(
-    found: Mapping[str, Any], expected: Mapping[str, Any], *, of_both: bool = False
-) -> str:
-    """The first entry that differs, in words; empty if there is none. Python's version may.
+def _line(entries: Run) -> bytes:
+    return json.dumps(entries, separators=(",", ":")).encode() + b"\n"
+
+
+def differences(found: Mapping[str, Any], expected: Mapping[str, Any]) -> str:
+    """The first entry that both have and that differs, in words; empty if there is none.
 
     Args:
         found: Of a run.
         expected: As it would be now.
-        of_both: Whether only entries that both have count.
     """
-    for name in [n for n in found if n in expected] if of_both else {**found, **expected}:
-        was, now = found.get(name, "not there"), expected.get(name, "not there")
+    for name in (name for name in found if name in expected):
+        was, now = found[name], expected[name]
         if isinstance(was, dict) and isinstance(now, dict):
-            inner = differences(was, now, of_both=of_both)
+            inner = differences(was, now)
             if inner:
                 return f"{name}.{inner}"
-        elif was != now and name != "python":
+        elif was != now:
             return f"{name} was {was} and is now {now}"
     return ""
 
@@ -163,16 +181,13 @@ def commit_of(root: Path) -> str | None:
     Returns:
         None if it is none (as in an unpacked archive), has no commit yet, or git does not answer.
     """
-    found = _git(root, "rev-parse", "HEAD", "--show-prefix")
-    if found is None:
-        return None
-    head, _, prefix = found.partition("\n")
-    if prefix.strip():  # of a repository in which ours is but a folder
+    found = _git(root, "rev-parse", "HEAD")
+    if found is None or not (root / ".git").exists():  # ours is but a folder of another's
         return None
     changed = _git(
         root, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!paper/results"
     )
-    return head + "+" if changed else head
+    return found.strip() + "+" * bool(changed)
 
 
 def _git(root: Path, *command: str) -> str | None:

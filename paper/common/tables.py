@@ -10,11 +10,11 @@ from typing import Any
 import pandas as pd
 
 from paper.common.experiment import Run, Table
+from paper.common.runs import IDENTIFYING
 from paper.common.verdicts import Judged
 
 Cell = Callable[[pd.DataFrame], Any]
 """What a cell shows of the runs of its row."""
-_IDENTIFYING = ("settings", "defaults", "versions", "commit")
 
 _START, _END = r"<!-- (?!end)(\S+) -->\n", "<!-- end -->"
 _FRAGMENT = re.compile(_START + r"((?:(?!<!-- ).*\n)*?)" + _END)
@@ -32,11 +32,11 @@ def frame(
         index: The column that counts the elements of a run, from 1.
     """
     if not lists:
-        return pd.DataFrame([{k: v for k, v in r.items() if k not in _IDENTIFYING} for r in runs])
+        return pd.DataFrame([{k: v for k, v in r.items() if k not in IDENTIFYING} for r in runs])
     rows = []
     for run in runs:
         columns = run[lists] if isinstance(lists, str) else {name: run[name] for name in lists}
-        left = {*_IDENTIFYING, *([lists] if isinstance(lists, str) else lists)}
+        left = {*IDENTIFYING, *([lists] if isinstance(lists, str) else lists)}
         own = {name: value for name, value in run.items() if name not in left}
         each = zip(*columns.values(), strict=True)
         rows += [

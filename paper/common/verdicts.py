@@ -1,4 +1,4 @@
-"""Verdicts on claims and targets, and the numbers behind them."""
+"""Verdicts on claims, and the numbers behind them."""
 
 from __future__ import annotations
 
@@ -17,13 +17,9 @@ Verdict = Literal[
     "beaten",
     "inconclusive",
     "undetermined",
-    "met",
-    "missed",
     "not run",
 ]
 Finding = tuple[Verdict, str]
-FEWEST = 2  # runs that a verdict is given of
-_FEWEST_RESAMPLED = 4  # runs that a bootstrap interval is given of
 _RESAMPLES = 5000
 
 
@@ -112,21 +108,6 @@ def paired(
     return Difference.of(wide[name] - wide[reference])
 
 
-def interquartile_mean(values: ArrayLike) -> tuple[float, float, float]:
-    """The mean of the middle half of some runs, and its 95 % bootstrap interval.
-
-    Of fewer than four runs an interval says nothing, and is nan.
-    """
-    scores = np.asarray(values, dtype=float)
-    if not len(scores):
-        return np.nan, np.nan, np.nan
-    middle = float(stats.trim_mean(scores, 0.25))
-    if len(scores) < _FEWEST_RESAMPLED:
-        return middle, np.nan, np.nan
-    low, high = bootstrap([scores], lambda x, axis: stats.trim_mean(x, 0.25, axis=axis))
-    return middle, low, high
-
-
 def bootstrap(
     samples: Sequence[ArrayLike], statistic: Callable[..., Any], paired: bool = False
 ) -> tuple[float, float]:
@@ -150,22 +131,20 @@ class Curves:
         runs: A row for each learner, ``seed`` and ``episode``, as ``tables.frame`` makes.
         measure: The column that is looked at.
         reference: The learner that others are compared with, seed by seed.
-        by: The column of the learners.
     """
 
     runs: pd.DataFrame
     measure: str
     reference: str = "cka"
-    by: str = "learner"
 
     @property
     def names(self) -> list[str]:
         """The learners that there are, in order."""
-        return list(self.runs[self.by].unique())
+        return list(self.runs["learner"].unique())
 
     def of(self, name: str) -> pd.DataFrame:
         """The rows of a learner."""
-        return self.runs[self.runs[self.by] == name]
+        return self.runs[self.runs["learner"] == name]
 
     def seeds(self, name: str, last: int = 0) -> set[int]:
         """The seeds of a learner; with a last episode, of the runs that reached it."""
@@ -224,22 +203,20 @@ class Judged:
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim of the paper, or a target of our own, about curves.
+    """A claim of the paper about curves.
 
     Args:
-        id: The paper's, or ours.
+        id: Ours, in the order of the paper.
         text: What it says.
         needed: The learners that it is about.
         decide: Gives verdict and numbers, from curves of the seeds with which all of ``needed``
             were run to their end; other learners may lack some of these.
-        fewest: Runs without which there is no verdict.
     """
 
     id: str
     text: str
     needed: tuple[str, ...]
     decide: Callable[[Curves], Finding]
-    fewest: int = FEWEST
 
 
 def judge(claims: Sequence[Claim], curves: Curves, last: int) -> list[Judged]:
@@ -254,7 +231,7 @@ def judge(claims: Sequence[Claim], curves: Curves, last: int) -> list[Judged]:
     for claim in claims:
         runs = {name: curves.seeds(name, last) for name in claim.needed}
         shared = set.intersection(*runs.values())
-        if len(shared) < claim.fewest:
+        if len(shared) < 2:
             least = min(runs, key=lambda name: len(runs[name]))
             lacking = f"no results of {least}" if not runs[least] else f"too few runs of {least}"
             found.append(Judged(claim.id, claim.text, "not run", lacking))
@@ -295,17 +272,6 @@ def all_of(*verdicts: Verdict) -> Verdict:
         "beaten",
     )
     return min(verdicts, key=order.index)
-
-
-def met(held: bool) -> Verdict:
-    """The verdict on a target of our own."""
-    return "met" if held else "missed"
-
-
-def below(difference: Difference, most: float) -> Verdict:
-    """The verdict on a target that a difference is at most a number, by its 95 % interval."""
-    verdict = within(difference, high=most)
-    return met(verdict == "reproduced") if verdict != "inconclusive" else verdict
 
 
 def counted(runs: int) -> str:

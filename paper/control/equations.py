@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 GRAVITY = 9.81
-LINK = 0.3  # m, the first link of the double pendulum
 BRIM = 10.0  # cm
 _SLIDES = 0.05  # rad/s, at which dry friction is three quarters of its value
 

@@ -6,11 +6,12 @@ import math
 import time
 import warnings
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import pandas as pd
 
-from gpadjust.control import MPCAgent
+from gpadjust.control import CrossEntropy, MPCAgent, Planner
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.dynamics.learning import DynamicsFitOptions
 from gpadjust.inference import ParameterWarning, SamplingWarning
@@ -22,7 +23,6 @@ from paper.common.tables import frame, groups, markdown, number
 from paper.common.verdicts import Curves, Difference, paired
 from paper.control import HORIZONS, Known, KnownSettings
 from paper.control.machine import Physics
-from paper.control.planners import planners
 from paper.control.systems import SYSTEMS
 from paper.machines.networks import NetworkDynamics
 
@@ -61,10 +61,17 @@ def make_agent(
     """The agent of a run, at its start, and what it controls."""
     known = SYSTEMS[system](_PHYSICS.get(learner, "crude"))
     task = known.task(dynamics(settings, known, learner))
-    plans = planners(settings, HORIZONS[system] * (known.spec.step or 1.0))
+    search = partial(CrossEntropy, num_elites=settings.elites, correlation=0.5)
+    each_step = Planner(
+        search=search(settings.rounds),
+        horizon=HORIZONS[system] * (known.spec.step or 1.0),
+        num_random=settings.sequences,
+        spread=settings.spread,
+    )
+    first = Planner(search=search(settings.first_rounds), num_random=settings.first_sequences)
     # Reacher-v5's reward is of a moment before the end of the step, a millimetre off.
     options: dict[str, Any] = {"score_horizons": (), "reward_tolerance": 0.02, "seed": seed}
-    return MPCAgent(known.make(), task, **plans, **options), known
+    return MPCAgent(known.make(), task, each_step, first=first, **options), known
 
 
 def dynamics(settings: KnownSettings, known: System, learner: str) -> Dynamics:

@@ -53,13 +53,7 @@ class Machine:
     bounds: tuple[list[float], list[float]] | None = None
 
     def physics(self, kind: Physics = "crude") -> ODEPhysics:
-        """The next values of the states that move.
-
-        Raises:
-            ValueError: If there is no such kind.
-        """
-        if kind not in ("crude", "unknown", "true"):
-            raise ValueError(f"physics must be 'crude', 'unknown' or 'true'; found {kind!r}.")
+        """The next values of the states that move."""
         lacking = dict.fromkeys(self.true, 0.0)
         guesses = {name: known.guess for name, known in self.believed.items()}
         step, dim = self.spec.step or 1.0, len(self.spec.moving)

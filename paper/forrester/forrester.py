@@ -395,28 +395,28 @@ def _grid(found: dict[str, Difference], row: str = "lengthscale", column: str = 
 
 
 def draw(runs: Sequence[Run], experiment: Forrester) -> list[Path]:
-    """Draw the paper's figure for each protocol, of reading B: six fits, and all errors."""
-    scored, found = load(runs), []
-    for protocol in _there(scored[scored["reading"] == "B"]):
-        figure = Figure(figsize=(13, 6), layout="constrained")
-        axes: dict[str, Axes] = figure.subplot_mosaic(
-            [["a", "b", "c", "g"], ["d", "e", "f", "g"]], width_ratios=[1, 1, 1, 1.2]
-        )
-        names = [name for name in NAMES if name != "GP-bias"]
-        for letter, name in zip("abcdef", names, strict=True):
-            _fit_panel(axes[letter], name, protocol, experiment.settings)
-            axes[letter].set_title(f"({letter}) {name}", loc="left")
-            axes[letter].set(xlabel="x" * (letter in "def"), ylabel="y" * (letter in "ad"))
-        figure.legend(*axes["a"].get_legend_handles_labels(), loc="outside lower center", ncols=5)
-        own = scored[(scored["protocol"] == protocol) & (scored["reading"] == "B")]
-        rows = {name: [part["rmse"]] for name, part in groups(own, "model").items()}
-        strips(axes["g"], rows, ["tab:blue"])
-        axes["g"].set_xscale("log")
-        axes["g"].xaxis.set_minor_formatter(NullFormatter())
-        axes["g"].set_xlabel("RMSE; each run, median and quartiles")
-        axes["g"].set_title(f"(g) {own['seed'].nunique()} runs", loc="left")
-        found.append(save(figure, experiment.out / f"forrester_{protocol}.png"))
-    return found
+    """Draw the paper's figure, of its protocol and reading B: six fits, and all errors."""
+    scored = load(runs)
+    own = scored[(scored["protocol"] == "paper") & (scored["reading"] == "B")]
+    if own.empty:
+        return []
+    figure = Figure(figsize=(13, 6), layout="constrained")
+    axes: dict[str, Axes] = figure.subplot_mosaic(
+        [["a", "b", "c", "g"], ["d", "e", "f", "g"]], width_ratios=[1, 1, 1, 1.2]
+    )
+    names = [name for name in NAMES if name != "GP-bias"]
+    for letter, name in zip("abcdef", names, strict=True):
+        _fit_panel(axes[letter], name, "paper", experiment.settings)
+        axes[letter].set_title(f"({letter}) {name}", loc="left")
+        axes[letter].set(xlabel="x" * (letter in "def"), ylabel="y" * (letter in "ad"))
+    figure.legend(*axes["a"].get_legend_handles_labels(), loc="outside lower center", ncols=5)
+    rows = {name: part["rmse"] for name, part in groups(own, "model").items()}
+    strips(axes["g"], rows, "tab:blue")
+    axes["g"].set_xscale("log")
+    axes["g"].xaxis.set_minor_formatter(NullFormatter())
+    axes["g"].set_xlabel("RMSE; each run, median and quartiles")
+    axes["g"].set_title(f"(g) {own['seed'].nunique()} runs", loc="left")
+    return [save(figure, experiment.out / "forrester_paper.png")]
 
 
 def _fit_panel(ax: Axes, name: str, protocol: str, settings: Settings, seed: int = 3) -> None:

@@ -71,42 +71,6 @@ class Categories(Experiment):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Curves(Experiment):
-    """Outputs that are a curve: errors, intervals of single points and of whole curves, time."""
-
-    runs: int = 8
-    """cases of each problem; of CKA and times a quarter"""
-    out: Path = Path("results/curves")
-
-    axes: ClassVar[Axes] = {
-        "problem": {
-            "oscillator": "oscillator: the cubic spring is missing, 30 rows of 200 outputs",
-            "diffusion": "diffusion: the decay is missing, 20 rows of 100 outputs",
-            "spectrum": "spectrum: saturation and background are missing, 40 rows of 300 outputs",
-            "large": "100 rows of 1,000 outputs",
-        },
-        "model": {
-            "physics": "physics alone",
-            "parallel": "ParallelPartialGP",
-            "coupled": "ParallelPartialGP, coupled",
-            "alone": "ParallelPartialGP, no physics",
-            "components": "GPs of principal components",
-            "cka": "CKA of each of 8 outputs",
-            "times": "seconds of a fit",
-        },
-    }
-    calls: ClassVar[tuple[str, ...]] = (
-        *("gpadjust.fit", "gpadjust.ParallelPartialGP", "gpadjust.CKA", "gpadjust.ZeroMeanGP"),
-    )
-
-    def seeds_of(self, *kind: Any) -> Sequence[int]:
-        """CKA is slow; times are of the largest problem alone."""
-        if (kind[0] == "large") != (kind[1] == "times"):
-            return ()
-        return self.seeds[: max(1, self.runs // 4)] if kind[1] in ("cka", "times") else self.seeds
-
-
-@dataclass(frozen=True, kw_only=True)
 class DriftSettings:
     """Settings that decide the numbers, fixed before the first run."""
 
@@ -126,8 +90,6 @@ class DriftSettings:
     """of all fits"""
     num_features: int = 64
     """features of each term of an RRA"""
-    check_every: int = 6
-    """observations between checks of the monitor"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,32 +148,6 @@ class Emulated(Experiment):
     calls: ClassVar[tuple[str, ...]] = (
         *("gpadjust.fit", "gpadjust.CKA", "gpadjust.EmulatedPhysics"),
     )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Hints(Experiment):
-    """Hints of `compare`: given where the data are of a kind, and not where they are clean?"""
-
-    runs: int = 5
-    """data sets of each problem and kind"""
-    out: Path = Path("results/hints")
-
-    axes: ClassVar[Axes] = {
-        "data": {
-            "exact": "exact",
-            "noisy": "noise of 5 % of the sd",
-            "outliers": "noise, one in twenty off by 10 to 100 sd of it",
-            "decades": "output over decades, noise of one size",
-            "relative": "output over decades, noise of 15 % of it",
-            "copies": "noise, three rows copied",
-            "rigs": "noise, and the number of a rig",
-        },
-        "problem": {
-            name: name
-            for name in ("currin", "branin", "bohachevsky", "booth", "park91a", "hartmann6")
-        },
-    }
-    calls: ClassVar[tuple[str, ...]] = ("gpadjust.compare",)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -319,68 +255,6 @@ class Relative(Experiment):
         "noise": {"default": "one size", "relative": "relative"},
     }
     calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA", "gpadjust.ZeroMeanGP")
-
-
-@dataclass(frozen=True, kw_only=True)
-class RepeatsSettings:
-    """Settings that decide the numbers, fixed before the first run."""
-
-    distinct: int = 40
-    """inputs that differ"""
-    noise: float = 0.1
-    """standard deviation of the noise"""
-    copied: float = 0.3
-    """share of the rows that a careless join has twice"""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Repeats(Experiment):
-    """Repeated rows: the same answers at the cost of distinct ones; and rows that stand twice."""
-
-    runs: int = 3
-    """cases of each size"""
-    seed: int = 5000
-    """the first seed; 1000 to 1099 were for trying"""
-    out: Path = Path("results/repeats")
-    settings: RepeatsSettings = field(default_factory=RepeatsSettings)
-
-    axes: ClassVar[Axes] = {
-        "rows": {"400": "400", "1000": "1000", "copies": "80, of which 0.3 stand twice"},
-        "method": {"map": "map", "bayes": "bayes"},
-    }
-    calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA")
-
-
-@dataclass(frozen=True, kw_only=True)
-class SistersSettings:
-    """Settings that decide the numbers, fixed before the first run."""
-
-    points: int = 5
-    """measured points of pump B"""
-    known: int = 40
-    """measured points of each other machine"""
-    tests: int = 300
-    """points at which pump B is predicted"""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sisters(Experiment):
-    """A pump of which five points are measured, with what other machines taught."""
-
-    runs: int = 30
-    """three times ten pumps, each once pump B"""
-    out: Path = Path("results/sisters")
-    settings: SistersSettings = field(default_factory=SistersSettings)
-
-    axes: ClassVar[Axes] = {
-        "prior": {
-            "one": "one other pump",
-            "three": "three other pumps",
-            "rough": "a machine that has nothing to do with it, rough",
-            "smooth": "a machine that has nothing to do with it, smooth",
-        }
-    }
-    calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA")
 
 
 @dataclass(frozen=True, kw_only=True)

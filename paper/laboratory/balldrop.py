@@ -16,6 +16,7 @@ import time
 import warnings
 from collections.abc import Sequence
 from functools import cache
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -110,49 +111,29 @@ def run(experiment: Balldrop, physics: str, left: str, model: str, seed: int) ->
 
 def tables(runs: Sequence[Run], experiment: Balldrop) -> dict[str, Table]:
     """All tables, by name."""
-    parameters, predictions = [], []
-    for physics, title in experiment.axes["physics"].items():
-        for left in experiment.axes["left"]:
-            for model, label in experiment.axes["model"].items():
-                own = [
-                    r
-                    for r in runs
-                    if (r["physics"], r["left"], r["model"]) == (physics, left, model)
-                ]
-                if not own:
-                    continue
-                first = own[0]
-                row = [title, label, left]
-                parameters.append(
-                    [
-                        *row,
-                        *(
-                            f"{m:.{d}f} ± {sd:.{d}f} ({low:.{d}f} to {high:.{d}f})"
-                            for m, sd, low, high, d in zip(
-                                *(first[k] for k in ("mean", "sd", "low", "high")),
-                                (3, 2),
-                                strict=True,
-                            )
-                        ),
-                        number(first["seconds"], ".1f"),
-                    ]
-                )
-                if left == "none":
-                    continue
-                off = np.array(first["predicted"]) - first["time"]
-                held = (np.array(first["lower"]) <= first["time"]) & (
-                    first["time"] <= np.array(first["upper"])
-                )
-                half = (np.array(first["upper"]) - first["lower"]) / 2
-                predictions.append(
-                    [
-                        *row,
-                        ", ".join(f"{o:+.2f}" for o in off),
-                        number(float(np.sqrt(np.mean(off**2)))),
-                        f"{held.sum()} of {len(held)}",
-                        number(float(half.mean()), ".2f"),
-                    ]
-                )
+    parameters, predictions, axes = [], [], experiment.axes
+    for physics, left, model in product(axes["physics"], axes["left"], axes["model"]):
+        own = [r for r in runs if (r["physics"], r["left"], r["model"]) == (physics, left, model)]
+        if not own:
+            continue
+        row = [axes["physics"][physics], axes["model"][model], left]
+        mean, sd, low, high, lower, upper, time_, predicted = (
+            np.array(own[0][name])
+            for name in ("mean", "sd", "low", "high", "lower", "upper", "time", "predicted")
+        )
+        cells = [
+            f"{mean[i]:.{d}f} ± {sd[i]:.{d}f} ({low[i]:.{d}f} to {high[i]:.{d}f})"
+            for i, d in enumerate((3, 2))
+        ]
+        parameters.append([*row, *cells, number(own[0]["seconds"], ".1f")])
+        if left != "none":
+            off, held = predicted - time_, (lower <= time_) & (time_ <= upper)
+            rmse = number(float(np.sqrt(np.mean(off**2))))
+            count, half = (
+                f"{held.sum()} of {len(held)}",
+                number(((upper - lower) / 2).mean(), ".2f"),
+            )
+            predictions.append([*row, ", ".join(f"{o:+.2f}" for o in off), rmse, count, half])
     sepia = [f"{m:.{d}f} ± {sd:.{d}f}" for (m, sd), d in zip(_SEPIA.values(), (3, 2), strict=True)]
     parameters.append(["80 runs", "SEPIA's documentation", "none", *sepia, ""])
     header = [

@@ -25,11 +25,9 @@ from gpadjust.inference import SamplingWarning
 from gpadjust.models import TermsGP
 from paper.common.experiment import Run, Table
 from paper.common.figures import panels, save
-from paper.common.tables import claims_table, markdown, number
-from paper.common.verdicts import Judged, met
+from paper.common.tables import markdown, number
 from paper.laboratory import Categories
 
-_HELD = 0.93
 _ROWS, _TEST, _MATERIALS, _RIGS = 60, 200, 3, 5
 _CONSTANTS = torch.tensor([0.9, 1.3, 1.1], dtype=torch.float64)  # of the materials, in the formula
 _OFFSET = 1.0  # m, sd of rigs
@@ -170,28 +168,7 @@ def tables(runs: Sequence[Run], experiment: Categories) -> dict[str, Table]:
             )
     header = ["model", "sets", "median RMSE on the rigs [m]", "coverage of 95 %"]
     header += ["median RMSE on a new rig [m]", "coverage there", "seconds"]
-    shown = {"categories": Table("Pumps of three materials on five rigs", markdown(header, rows))}
-    if found["model"].eq("ours").any():
-        shown["targets"] = Table("Targets", claims_table("target", {"categories": judge(found)}))
-    return shown
-
-
-def judge(found: pd.DataFrame) -> list[Judged]:
-    """The verdicts on the targets."""
-    ours = found[found["model"] == "ours"]
-    shares = ours["coverage"].mean(), ours["new_coverage"].mean()
-    medians = found.groupby("model")["rmse"].median()
-    others = medians.drop("ours")
-    texts = (
-        "95 % intervals hold 0.93 of the test values on the rigs",
-        "and on a rig that was left out",
-        "the error on the rigs is below that of each other way",
-    )
-    best = f"{others.idxmin()} {others.min():.3g}" if len(others) else "none"
-    measured = f"{shares[0]:.3f}", f"{shares[1]:.3f}", f"{medians['ours']:.3g} m; {best} m"
-    verdicts = (*(s >= _HELD for s in shares), bool(len(others)) and medians["ours"] < others.min())
-    each = enumerate(zip(texts, verdicts, measured, strict=True))
-    return [Judged(f"C{i + 1}", text, met(bool(v)), m) for i, (text, v, m) in each]
+    return {"categories": Table("Pumps of three materials on five rigs", markdown(header, rows))}
 
 
 def draw(runs: Sequence[Run], experiment: Categories) -> list[Path]:

@@ -1,11 +1,8 @@
 """Half a year of a pump that wears, predicted a step of two hours ahead.
 
 What is fitted again: a CKA of the last week, to its most likely hyper-parameters, each day; between
-it is updated at each step. Of two weeks it erred by 0.39 m on the first two pumps of the table.
-
-Tried on other seeds (900 and 901): an RRA whose weights wander and return to their prior forgets
-too much (0.30 m, where fading observations err by 0.14 m, of a faster drift), for a vague prior.
-Intervals with the noise of the first fit hold 0.89, so that variances follow recent errors.
+it is updated at each step. Intervals with the noise of the first fit hold 0.89 on seeds 900 and
+901, so that variances follow recent errors.
 """
 
 from __future__ import annotations
@@ -21,14 +18,11 @@ import torch
 from gpadjust import CKA, RRA, fit
 from paper.common.experiment import Run, Table
 from paper.common.figures import panels, save
-from paper.common.tables import claims_table, markdown, number
-from paper.common.verdicts import Judged, met
+from paper.common.tables import markdown, number
 from paper.laboratory import Drift
-from paper.laboratory.drift_monitor import DriftMonitor
 from paper.laboratory.pumps import Wear, catalogue
 
 _COLORS = {"never": "0.6", "rra": "tab:green", "cka": "navy", "refit": "tab:orange"}
-_RRA = ("rra", "steady")
 
 
 def run(experiment: Drift, model: str, seed: int) -> Run:
@@ -40,16 +34,15 @@ def run(experiment: Drift, model: str, seed: int) -> Run:
     def built(end: int) -> Any:
         start = max(0, end - (settings.refit_window if model == "refit" else end))
         rows = slice(start, end)
-        if model in _RRA:
+        if model in ("rra", "steady"):
             return RRA(X[rows], Y[rows], physics=catalogue, num_features=settings.num_features)
         return CKA(X[rows], Y[rows], physics=catalogue)
 
     begin = time.perf_counter()
     adjusted = built(first)
     fit(adjusted, settings.method)
-    monitor = DriftMonitor(adjusted) if model in _RRA else None
     forget = {"cka": settings.window, "refit": settings.refit_window}.get(model, settings.forget)
-    means, held, alarms = [], [], []
+    means, held = [], []
     if model == "never":
         mean, _ = adjusted.predict(X[first:])
         low, high = adjusted.interval(X[first:], observation_noise=True)
@@ -64,18 +57,12 @@ def run(experiment: Drift, model: str, seed: int) -> Run:
         low, high = adjusted.interval(x, observation_noise=True)
         held.append(bool(low <= y <= high))
         adjusted.update(x, y, forget=forget)
-        if monitor is not None and i % settings.check_every == 0:
-            alarm = monitor.check()
-            if alarm is not None:
-                alarms.append((i, alarm))
-                monitor.reset()
     errors = torch.tensor(means, dtype=torch.float64) - pump.truth[first:].flatten()
     week = errors.square().split(84)
     return {
         "rmse": errors.square().mean().sqrt().item(),
         "coverage": float(np.mean(held)),
         "rmse_of_weeks": [each.mean().sqrt().item() for each in week],
-        "alarms": alarms,
         "breaks": pump.breaks,
         "seconds": time.perf_counter() - begin,
     }
@@ -97,45 +84,7 @@ def tables(runs: Sequence[Run], experiment: Drift) -> dict[str, Table]:
                 ]
             )
     header = ["model", "pumps", "RMSE of the head a step ahead [m]", "coverage of observations"]
-    shown = {"errors": Table("Errors", markdown([*header, "seconds"], rows))}
-    if of["rra"] and of["steady"]:
-        shown["alarms"] = _alarms(of["rra"], of["steady"])
-    if all(of[name] for name in ("rra", "cka", "refit")):
-        claims = []
-        for i, name in enumerate(("rra", "cka"), 1):
-            pairs = {r["seed"]: r["rmse"] for r in of["refit"]}
-            ratios = [r["rmse"] / pairs[r["seed"]] for r in of[name] if r["seed"] in pairs]
-            share = float(np.mean([r["coverage"] for r in of[name]]))
-            label = experiment.axes["model"][name]
-            text = f"{label}: at most 1.2 times the error of fitting again each day"
-            claims.append(Judged(f"D{2 * i - 1}", text, met(np.mean(ratios) <= 1.2), _of(ratios)))
-            text = f"{label}: 95 % hold 0.93"
-            claims.append(Judged(f"D{2 * i}", text, met(share >= 0.93), f"{share:.3f}"))
-        shown["targets"] = Table("Targets", claims_table("target", {"drift": claims}))
-    return shown
-
-
-def _of(values: Sequence[float]) -> str:
-    return f"{np.mean(values):.2f} ({min(values):.2f} to {max(values):.2f})"
-
-
-def _alarms(drifting: Sequence[Run], steady: Sequence[Run]) -> Table:
-    first = [r["alarms"][0][0] if r["alarms"] else None for r in drifting]
-    delays = [
-        next((i - r["breaks"] for i, _ in r["alarms"] if i >= r["breaks"]), None) for r in drifting
-    ]
-    counts = [len(r["alarms"]) for r in drifting]
-    false = [len(r["alarms"]) for r in steady]
-    rows = [
-        ["first alarm of a pump that wears [step of 2 hours]", ", ".join(map(str, first))],
-        ["alarms of it in half a year", ", ".join(map(str, counts))],
-        [
-            "from the sudden change to the next alarm [steps of 2 hours]",
-            ", ".join(map(str, delays)),
-        ],
-        ["alarms of a pump that does not wear, in half a year", ", ".join(map(str, false))],
-    ]
-    return Table("Alarms", markdown(["quantity", "pumps"], rows))
+    return {"errors": Table("Errors", markdown([*header, "seconds"], rows))}
 
 
 def draw(runs: Sequence[Run], experiment: Drift) -> list[Path]:
@@ -151,8 +100,6 @@ def draw(runs: Sequence[Run], experiment: Drift) -> list[Path]:
             )
     if "rra" in own:
         ax.axvline(own["rra"]["breaks"] / 84, color="tab:red", lw=1, ls="--")
-        for i, _ in own["rra"]["alarms"]:
-            ax.plot(i / 84, 0.035, "^", color="tab:red", ms=6)
     ax.set(xlabel="week", ylabel="RMSE a step ahead [m]")
     ax.legend(fontsize=8)
     return [save(figure, experiment.out / "drift.png")]

@@ -61,35 +61,6 @@ class Pump:
         return cls(*(value * factor for value, factor in zip(values, factors, strict=True)))
 
 
-class OtherMachine:
-    """A machine whose head differs from the catalogue's by a function that has no cause here.
-
-    Args:
-        generator: Draws it.
-        lengths: Its lengthscales in flow and speed.
-    """
-
-    def __init__(self, generator: torch.Generator, lengths: tuple[float, float]) -> None:
-        shape = (64, 2)
-        self.frequencies = torch.randn(shape, generator=generator, dtype=torch.float64)
-        self.frequencies = self.frequencies / torch.tensor(lengths, dtype=torch.float64)
-        self.phases = 2 * math.pi * torch.rand(64, generator=generator, dtype=torch.float64)
-        self.weights = torch.randn(64, generator=generator, dtype=torch.float64)
-        self.constant = 3 * torch.randn(1, generator=generator, dtype=torch.float64)
-
-    def head(self, X: Tensor) -> Tensor:
-        """The head in m, ``... x n x 1``."""
-        waves = (X @ self.frequencies.mT + self.phases).cos() @ self.weights
-        away = self.constant + 2 * math.sqrt(2 / 64) * waves.unsqueeze(-1)
-        return catalogue(X) + away
-
-
-def inputs(number: int, generator: torch.Generator) -> Tensor:
-    """Inputs all over the range, ``number x 2``."""
-    low, high = (torch.tensor(end, dtype=torch.float64) for end in (LOWER, UPPER))
-    return low + (high - low) * torch.rand(number, 2, generator=generator, dtype=torch.float64)
-
-
 def measured(head: Tensor, generator: torch.Generator) -> Tensor:
     """Heads with noise."""
     return head + NOISE * torch.randn(head.shape, generator=generator, dtype=torch.float64)

@@ -19,11 +19,9 @@ from gpadjust.inference import SamplingWarning
 from gpadjust.models import TermsGP
 from paper.common.experiment import Run, Table
 from paper.common.figures import panels, save
-from paper.common.tables import claims_table, groups, markdown, number
-from paper.common.verdicts import Judged, met
+from paper.common.tables import markdown, number
 from paper.laboratory import Relative
 
-_HOLDS = 0.93
 _DECADES = ("lowest", "middle", "highest")
 _NOISE = 0.05  # of the output, and a fiftieth of the least output beside it
 _COLORS = {"default": "0.45", "relative": "#D55E00"}
@@ -119,29 +117,7 @@ def tables(runs: Sequence[Run], experiment: Relative) -> dict[str, Table]:
     header += [f"observations held, {decade} decade" for decade in _DECADES]
     header += [f"function held, {decade}" for decade in _DECADES]
     header += [f"relative error in %, {decade}" for decade in _DECADES] + ["seconds"]
-    shown = {"decades": Table("Coverage of 95 % and errors by decade", markdown(header, rows))}
-    each = [
-        [
-            title,
-            *(
-                number(part[part["decade"] == d][what].mean(), ".2f")
-                for what in ("observations", "function")
-                for d in _DECADES
-            ),
-        ]
-        for title, part in groups(
-            found[(found["noise"] == "relative") & (found["structure"] == "CKA")],
-            "problem",
-            experiment.axes["problem"],
-        ).items()
-    ]
-    shown["problems"] = Table(
-        "CKA with relative noise, of each problem", markdown(["problem", *header[2:8]], each)
-    )
-    if len(found):
-        claims = claims_table("target", {"relative": judge(found)})
-        shown["targets"] = Table("Targets", claims)
-    return shown
+    return {"decades": Table("Coverage of 95 % and errors by decade", markdown(header, rows))}
 
 
 def load(runs: Sequence[Run]) -> pd.DataFrame:
@@ -155,20 +131,6 @@ def load(runs: Sequence[Run]) -> pd.DataFrame:
 
 def _geometric(values: pd.Series[float]) -> float:
     return float(np.exp(np.log(values).mean()))
-
-
-def judge(found: pd.DataFrame) -> list[Judged]:
-    """The verdicts on the targets."""
-    ours = found[(found["noise"] == "relative") & (found["structure"] == "CKA")]
-    judged = []
-    for number_of, what in (("R1", "observations"), ("R2", "function")):
-        shares: dict[Any, float] = ours.groupby("decade")[what].mean().to_dict()
-        is_met = len(shares) == 3 and all(share >= _HOLDS for share in shares.values())
-        measured = ", ".join(f"{d} {shares[d]:.3f}" for d in _DECADES if d in shares)
-        of = "new observations" if what == "observations" else "the function"
-        text = f"95 % intervals hold {of} in 0.93 of the test points of each decade"
-        judged.append(Judged(number_of, text, met(is_met), measured))
-    return judged
 
 
 def draw(runs: Sequence[Run], experiment: Relative) -> list[Path]:

@@ -1,14 +1,12 @@
-"""Dynamics learnt from records: of real machines, beyond the training, at kinks."""
+"""Dynamics learnt from records of real machines."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
-from paper.arm import Arm
-from paper.cartpole import CartPole, Control
 from paper.common.experiment import Axes, Experiment
 from paper.common.learners import LEARNERS, Learner
 
@@ -121,70 +119,6 @@ class Real(Experiment):
         return {**asdict(self.settings), **scored, **REAL[kind[0]].describe()}
 
 
-TRAININGS = {
-    "pendulum": "pendulum, 0.68 kg, up to 1.3 N m",
-    "design-a": "double pendulum A.0",
-    "design-c0": "double pendulum C.0",
-    "design-c1": "double pendulum C.1, small motions",
-}
-ANOTHER = 0.2
-"""Standard deviations of priors, by which parameters of another machine are taken to differ."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ElsewhereSettings:
-    """Settings that decide the numbers."""
-
-    n: int = 100
-    """transitions that are learnt from, in stretches of ten"""
-    windows: int = 40
-    """free runs of a test, from evenly spread states, the same for all learners"""
-    num_functions: int = 39
-    """particles of a free run"""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Elsewhere(Experiment):
-    """Coverage and widths of free runs where the training records have not been."""
-
-    runs: int = 2
-    """draws of the stretches that are learnt from"""
-    seed: int = 10
-    """the first seed; 0 to 9 were for trying"""
-    out: Path = Path("results/elsewhere")
-    settings: ElsewhereSettings = field(default_factory=ElsewhereSettings)
-
-    axes: ClassVar[Axes] = {
-        "training": TRAININGS,
-        "learner": {
-            "fitted": "f_p, least squares, constant sd",
-            "gp": "GP",
-            "smoothed": "calibrated CKA, smoothed",
-        },
-    }
-    calls: ClassVar[tuple[str, ...]] = (*_DYNAMICS, "gpadjust.records.smooth")
-    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "scipy")
-
-    def check(self) -> None:
-        """Refuse a number of transitions that is not one of stretches."""
-        if self.settings.n < 20 or self.settings.n % 10:
-            raise ValueError(f"--n: expected 20, 30, ..., got {self.settings.n}")
-
-    def describe(self, *kind: Any) -> dict[str, Any]:
-        """The settings, and the files."""
-        from paper.machines.records import ELSEWHERE
-
-        known = ELSEWHERE[kind[0]]
-        tests = {
-            name: [*(f"{known.folder}/{file}" for file in test.files), test.load]
-            for name, test in known.tests.items()
-        }
-        train = [f"{known.folder}/{file}" for file in known.train]
-        found = {"step": known.describe()["step"], "train": train, "tests": tests}
-        found |= {"fitted_by": "PhysicsDynamics"} if kind[1] == "fitted" else {}
-        return {**asdict(self.settings), "another": ANOTHER, **found}
-
-
 STRUCTURES = {
     "overflow": "overflow, linear sensor",
     "sensor": "overflow, root sensor",
@@ -261,15 +195,6 @@ class Tanks(Experiment):
     }
     calls: ClassVar[tuple[str, ...]] = (*_DYNAMICS, "gpadjust.records.smooth")
 
-    def check(self) -> None:
-        """Refuse a number of samples that leaves a block without two."""
-        own = self.settings
-        if not own.head + 2 * own.blocks <= own.samples <= 1024:
-            raise ValueError(
-                f"--samples: expected at most 1024, and two for each of {own.blocks} blocks after "
-                f"the first {own.head}, got {own.samples}"
-            )
-
     def seeds_of(self, *kind: Any) -> Sequence[int]:
         """A candidate has all samples and one run, every tenth sample 100; GPs have three draws."""
         n, learner = kind
@@ -284,113 +209,3 @@ class Tanks(Experiment):
         from paper.machines.tanks_systems import describe
 
         return {**asdict(self.settings), **describe(), "process_noise": dict(PROCESS_NOISE)}
-
-
-NOISES = {"none": "none", "sensors": "sensors'"}
-METHODS = {"default": "default", "map": "most likely, center 0"}
-SENSORS = {
-    **dict.fromkeys(("x", "theta", "theta_s", "theta_e"), 0.01),
-    **dict.fromkeys(("x_dot", "theta_dot", "theta_s_dot", "theta_e_dot"), 0.05),
-}
-"""Standard deviations of the sensors of the states that models predict."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ForesightSettings:
-    """Settings that decide the numbers."""
-
-    trials: int = 7
-    """real trials of an agent; dynamics learn from all but the last"""
-    model_episodes: int = 10
-    """episodes in the model after each of them, half as many as in the control experiments"""
-    updates_per_model_step: float = 1.0
-    """gradient steps for each step in the model, half as many as there"""
-    horizons: tuple[int, ...] = (5, 15)
-    """steps of the trajectories"""
-    max_windows: int = 6
-    """the most of these of a trial, evenly spread"""
-    num_functions: int = 39
-    """that follow them"""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Foresight(Experiment):
-    """Dynamics of the cart-pole and the arm, learnt trial by trial, predict the next trial."""
-
-    runs: int = 5
-    """agents of each system, each with a seed of its own"""
-    out: Path = Path("results/foresight")
-    settings: ForesightSettings = field(default_factory=ForesightSettings)
-
-    axes: ClassVar[Axes] = {"system": {"cartpole": "cart-pole", "arm": "arm"}}
-    calls: ClassVar[tuple[str, ...]] = _DYNAMICS
-    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "stable_baselines3", "opensim")
-
-    def check(self) -> None:
-        """Refuse too few trials, and a machine without OpenSim."""
-        if self.settings.trials < 3:
-            raise ValueError(f"--trials: expected at least 3, got {self.settings.trials}")
-        self.control("arm").check()
-
-    def describe(self, *kind: Any) -> dict[str, Any]:
-        """The settings, and those of the control experiment that the agent is of."""
-        agent = asdict(self.control(kind[0]).settings)
-        own = asdict(self.settings)
-        return {**own, "sensors": SENSORS, "agent": {k: agent[k] for k in agent if k not in own}}
-
-    def control(self, system: str) -> Control:
-        """The experiment whose system, physics and agent these are."""
-        control: Control = {"cartpole": CartPole, "arm": Arm}[system]()
-        own = self.settings
-        settings = replace(
-            control.settings,
-            episodes=own.trials,
-            model_episodes=own.model_episodes,
-            updates_per_model_step=own.updates_per_model_step,
-            last_model_episode=own.trials - 1,
-        )
-        return replace(control, settings=settings)
-
-
-KINKS = {
-    "stick-slip": "mass on a moving belt",
-    "cart-pole": "cart-pole, dry friction",
-    "bouncing": "bouncing ball",
-    "backlash": "gear with backlash",
-    "thermostat": "switched heater",
-}
-SMOOTH = {
-    "smooth cart-pole": "cart-pole, viscous friction",
-    "reactor": "stirred tank reactor",
-    "oscillator": "van der Pol's oscillator",
-    "two links": "two driven links",
-}
-
-
-@dataclass(frozen=True, kw_only=True)
-class KinksSettings:
-    """Settings that decide the numbers."""
-
-    held_out: int = 400
-    """transitions that are predicted"""
-    steps: int = 20
-    """of an episode; its actions change every fourth step"""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Kinks(Experiment):
-    """Intervals of next states, as they are and as the kernels alone have them."""
-
-    runs: int = 5
-    """data sets of each kind"""
-    seed: int = 700
-    """the first seed; 0 to 99 were for trying, of other systems"""
-    out: Path = Path("results/kinks")
-    settings: KinksSettings = field(default_factory=KinksSettings)
-
-    axes: ClassVar[Axes] = {
-        "data": {"scattered": "random states and actions", "episodes": "steps of episodes"},
-        "n": {100: "100", 300: "300"},
-        "system": {**KINKS, **SMOOTH},
-    }
-    calls: ClassVar[tuple[str, ...]] = _DYNAMICS

@@ -23,13 +23,11 @@ class Trained(NamedTuple):
         noise: Standard deviations of what is measured, ``state_dim``, if they learnt from states
             that were estimated: the noise that they learnt is then process noise.
         parameters: The posterior of f_p's parameters, if they were learnt.
-        variation: How parameters vary in a run, if states were estimated.
     """
 
     dynamics: Dynamics
     noise: Tensor | None = None
     parameters: PhysicsParameters | None = None
-    variation: Tensor | None = None
 
 
 def train(name: str, machine: Machine, data: Any, seed: int) -> Trained:
@@ -51,7 +49,7 @@ def train(name: str, machine: Machine, data: Any, seed: int) -> Trained:
     if name not in UNTRAINED:
         dynamics.update(*data)
     if found is not None:
-        return Trained(dynamics, found.noise, found.physics_parameters, found.variation)
+        return Trained(dynamics, found.noise, found.physics_parameters)
     if isinstance(dynamics, LearnedDynamics) and dynamics.model.has_unknowns:
         return Trained(dynamics, parameters=dynamics.model.physics_parameters)
     return Trained(dynamics)

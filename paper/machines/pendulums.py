@@ -18,8 +18,6 @@ SUBSTEPS = 10  # at 4 its RK4 comes near its limit: friction that sets in is sti
 _GRAVITY = 9.81
 _GEAR = 6.0
 _SLIDES = 0.05  # rad/s, at which Coulomb friction is three quarters of its value
-_MASS = 0.68  # kg, of the pendulum that is learnt from
-
 FRICTION = {
     "viscous": Unknown(0.01, factor=5.0, unit="N m s"),
     "coulomb": Unknown(0.1, factor=3.0, unit="N m"),
@@ -107,25 +105,12 @@ def double_pendulum(
     return torch.stack([dq1, dq2, ddq1, ddq2], dim=-1)
 
 
-def design_c(state: Tensor, action: Tensor, p: Mapping[str, Any]) -> Tensor:
-    """The double pendulum of designs C.0 and C.1, with links of 0.2 and 0.3 m."""
-    return double_pendulum(state, action, p, 0.2)
-
-
 def pendulum(state: Tensor, action: Tensor, p: Mapping[str, Any]) -> Tensor:
     """A rigid body on a drive: its inertia about the joint, ``moment`` :math:`m l`, friction."""
     q, dq = state.unbind(-1)
     torque = action[:, 0] - _GRAVITY * p["moment"] * q.sin()
     torque = torque - _friction(dq, p["viscous"], p["coulomb"])
     return torch.stack([dq, torque / p["inertia"]], dim=-1)
-
-
-def loaded_pendulum(state: Tensor, action: Tensor, p: Mapping[str, Any]) -> Tensor:
-    """The pendulum with its mass as a second action; inertia and moment are proportional to it."""
-    share = action[:, 1] / _MASS
-    return pendulum(
-        state, action, {**p, "inertia": p["inertia"] * share, "moment": p["moment"] * share}
-    )
 
 
 def sums_of_masses(
@@ -176,20 +161,6 @@ DOUBLE_PENDULUM = Machine(
     },
 )
 
-# The makers' model 1.0 of design C.1, links 15 % off, and no friction.
-DESIGN_C = Machine(
-    DOUBLE_PENDULUM.spec,
-    design_c,
-    {
-        "crude": sums_of_masses(
-            (0.85 * 0.5235, 0.85 * 0.03189, 0.2),
-            (1.15 * 0.6256, 1.15 * 0.05087, 0.2557),
-            0.2,
-            6.29e-5,
-        )
-    },
-)
-
 PENDULUM = Machine(
     StateSpec(["q", "dq"], ["u"], angles=["q"]),
     pendulum,
@@ -204,8 +175,4 @@ PENDULUM = Machine(
         # By free runs of these records, as the makers' identified values are off by a factor of 3.
         "identified": {"inertia": 0.19, "moment": 0.372, "viscous": 0.01, "coulomb": 0.15},
     },
-)
-
-LOADED = Machine(
-    StateSpec(["q", "dq"], ["u", "load"], angles=["q"]), loaded_pendulum, PENDULUM.known
 )

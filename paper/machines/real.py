@@ -12,24 +12,21 @@ import numpy as np
 import pandas as pd
 import torch
 from matplotlib.axes import Axes
-from matplotlib.ticker import LogLocator, NullFormatter
 
 from gpadjust.dynamics import Dynamics, FreeRun, Windows
 from gpadjust.inference import ParameterWarning, SamplingWarning
 from paper.common.experiment import Run, Table
-from paper.common.figures import curves, one_legend, panels, save
-from paper.common.tables import Cell, across, claims_table, groups, number, table
+from paper.common.figures import one_legend, panels, save
+from paper.common.tables import Cell, across, groups, number, table
 from paper.common.verdicts import Difference, paired
 from paper.machines import HORIZONS, REAL_LEARNERS, UNTRAINED, Real, RealSettings
 from paper.machines.learners import Trained, train
 from paper.machines.pendulums import STEP
 from paper.machines.records import REAL, System
-from paper.machines.targets import verdicts
 
 SCORES = {"rmse": ".3g", "coverage": ".2f", "nlpd": ".3g"}
 _TITLES = {"rmse": "RMSE of {angle} in rad", "coverage": "Coverage of 95 %", "nlpd": "NLPD in nats"}
 _SECONDS = {"fit_seconds": "a fit", "score_seconds": "the scores"}
-_CELL = ["system", "test", "learner", "n"]
 _KEPT = 2  # free runs that are kept for a figure
 _FEWEST = 3  # draws that a spread is given of
 _LABELS = Real.axes["learner"]
@@ -138,10 +135,8 @@ def load(runs: Sequence[Run]) -> pd.DataFrame:
 def tables(runs: Sequence[Run], experiment: Real) -> dict[str, Table]:
     """All tables, by name."""
     scored = load(runs)
-    means = scored.groupby(_CELL, sort=False).mean(numeric_only=True).drop(columns="seed")
-    judged = {"means of the draws that there are": verdicts(means)}
-    found = {"targets": Table("Targets", claims_table("target", judged))}
-    found["paired"] = Table("n = 100, beside least squares by the same draws", _paired(scored))
+    title = "n = 100, beside least squares by the same draws"
+    found = {"paired": Table(title, _paired(scored))}
     sizes = {n: f"n = {n}" for n in sorted({*scored["n"]})}
 
     def by_size(own: pd.DataFrame, column: str, form: str) -> str:
@@ -157,11 +152,6 @@ def tables(runs: Sequence[Run], experiment: Real) -> dict[str, Table]:
                 found[f"{name}-{test}-{column}"] = Table(
                     f"{title}, {_SYSTEMS[name]}, test {test}", by_size(own, column, SCORES[score])
                 )
-    for name, own in scored.groupby("system", sort=False):
-        once = own[own["test"] == own["test"].iloc[0]]
-        for column, what in _SECONDS.items():
-            title = f"Seconds of {what}, {_SYSTEMS[name]}"
-            found[f"{name}-{column}"] = Table(title, by_size(once, column, ".2g"))
     return found
 
 
@@ -227,43 +217,13 @@ def _held(own: pd.DataFrame, learner: str, column: str) -> str:
 
 
 _SHOWN = ("phy", "fitted", "gp", "calibrated-delta", "smoothed-cka")
-_DRAWN = ("fitted", "gp", "phymean", "cka", "calibrated", "calibrated-cka", "smoothed-cka")
 
 
 def draw(runs: Sequence[Run], experiment: Real) -> list[Path]:
-    """Draw the errors, free runs of each system, and intervals of parameters."""
-    scored = load(runs)
-    steps = scored["system"].map(lambda name: "10" if name.startswith("pendulum") else "20")
-    scored["error"] = scored["rmse-20"].where(steps == "20", scored["rmse-10"])
-    parts = groups(scored, ["system", "test"], lambda name, test: f"{_SYSTEMS[name]}, {test}")
-    found = [
-        curves(
-            experiment.out / "errors.png",
-            {k: part for k, part in parts.items() if part["n"].nunique() > 1} or parts,
-            "error",
-            {n: (REAL_LEARNERS[n].label, REAL_LEARNERS[n].color) for n in ("phy", *_DRAWN)},
-            x="n",
-            labels=("transitions", "RMSE of the last angle, rad (1 s; pendulum 0.5 s)"),
-            columns=3,
-            size=(3.6, 3.0),
-            share=False,
-            logarithmic=True,
-            finish=lambda ax, *_: ax.yaxis.set(
-                major_locator=LogLocator(subs=(1, 2, 5)),
-                major_formatter="{x:g}",
-                minor_formatter=NullFormatter(),
-            ),
-        )
-    ]
-    for name in _SYSTEMS:
-        own = [each for each in runs if each["system"] == name]
-        kept = {each["learner"]: each["paths"] for each in own if "paths" in each}
-        if {*kept} & {*_SHOWN}:
-            found.append(_free_runs(str(name), kept, experiment))
-        learnt_of = [r for r in own if "parameters" in r and r["n"] == experiment.settings.drawn]
-        if learnt_of:
-            found.append(_parameters(str(name), learnt_of, experiment))
-    return found
+    """Draw free runs of the double pendulum."""
+    name = "double-pendulum"
+    kept = {r["learner"]: r["paths"] for r in runs if r["system"] == name and "paths" in r}
+    return [_free_runs(name, kept, experiment)] if {*kept} & {*_SHOWN} else []
 
 
 def _free_runs(name: str, kept: dict[str, Any], experiment: Real) -> Path:
@@ -297,28 +257,3 @@ def _free_run(ax: Axes, measured: list[float], path: list[list[float]]) -> None:
     ax.plot(times, measured, color="black", lw=1.2, ls="--", label="measured")
     room = 0.5 * (max(measured) - min(measured))
     ax.set_ylim(min(measured) - room, max(measured) + room)
-
-
-def _parameters(name: str, runs: Sequence[Run], experiment: Real) -> Path:
-    """Intervals of each parameter, of each learner by its first draw, and the prior's."""
-    first: dict[str, Run] = {}
-    for each in sorted(runs, key=lambda r: int(r["seed"])):
-        if each["learner"] not in ("smoothed-delta", "smoothed-cka"):  # which have the first's
-            first.setdefault(each["learner"], each)
-    machine = REAL[name].machine
-    unknowns, identified = machine.unknowns, machine.known["identified"]
-    figure, axes = panels([*unknowns], 3, (4.0, 2.0), share=False, width=11)
-    for ax, (parameter, unknown) in zip(axes, unknowns.items(), strict=True):
-        ends = [float(unknown.value(torch.tensor(z).double())) for z in (-1.96, 1.96)]
-        bars = {"prior": (ends, "0.7")}
-        for learner, each in first.items():
-            bars[_LABELS[learner]] = (each["parameters"][parameter], REAL_LEARNERS[learner].color)
-        for place, (label, (bar, color)) in enumerate(bars.items()):
-            ax.plot(bar, [-place, -place], color=color, lw=4, label=label, solid_capstyle="butt")
-        ax.axvline(identified[parameter], color="black", lw=0.8, ls="--", label="identified")
-        found = [end for label, (bar, _) in bars.items() if label != "prior" for end in bar]
-        room = 0.4 * (max(found) - min(found))
-        ax.locator_params(axis="x", nbins=5)
-        ax.set(yticks=[], xlim=(min(found) - room, max(found) + room))
-    one_legend(figure, axes, ncols=4)
-    return save(figure, experiment.out / f"{name}-parameters.png")

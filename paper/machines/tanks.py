@@ -8,14 +8,11 @@ import warnings
 from collections.abc import Iterable, Sequence
 from functools import cache
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 import torch
-from matplotlib.axes import Axes
-from matplotlib.ticker import LogLocator, NullFormatter
 from torch import Tensor
 
 from gpadjust.dynamics import Dynamics, FreeRun, LearnedDynamics, PhysicsDynamics, StateSpec
@@ -23,17 +20,15 @@ from gpadjust.inference import SamplingWarning
 from gpadjust.physics import Physics
 from gpadjust.records import SmoothingWarning, smooth
 from paper.common.experiment import Run, Table
-from paper.common.figures import one_legend, panels, save
 from paper.common.learners import LEARNERS
-from paper.common.tables import Cell, claims_table, markdown, number, of, table
-from paper.common.verdicts import Difference, Judged, counted, met
+from paper.common.tables import Cell, markdown, number, of, table
+from paper.common.verdicts import Difference
 from paper.machines import (
     CANDIDATES,
     CHOSEN,
     GPS,
     NARX,
     PROCESS_NOISE,
-    STRUCTURES,
     TENTH,
     Tanks,
     TanksSettings,
@@ -43,7 +38,6 @@ from paper.machines.tanks_systems import (
     FULL,
     SPEC,
     START,
-    STEP,
     UNKNOWNS,
     levels,
     measured,
@@ -61,7 +55,6 @@ PUBLISHED = {
 """Errors in V of free runs along the validation record."""
 
 _KEPT = 4  # of so many samples a free run keeps one, for the figure
-_COLORS = {"overflow": "tab:orange", "sensor": "tab:green", "kink": "tab:blue", "narx": "tab:red"}
 
 
 class Start(NamedTuple):
@@ -334,16 +327,9 @@ def tables(runs: Sequence[Run], experiment: Tanks) -> dict[str, Table]:
     scored = load(runs)
     best = chosen(scored, CANDIDATES)
     labels: dict[str, str] = {**experiment.axes["learner"], best: f"{CANDIDATES[best]}, chosen"}
-    (record,) = [each for each in runs if each["learner"] == best]
-    values = {**record["values"], "upper level at first": record["start"][0]}
-    priors = {name: known.prior_text for name, known in UNKNOWNS.items()}
-    rows = [[f"`{name}`", f"{v:.3g}", priors.get(name, "5 ± 2")] for name, v in values.items()]
-    judged = {"one first sample of the record is used": verdicts(scored, best)}
     return {
-        "targets": Table("Targets", claims_table("target", judged)),
         "candidates": Table("Structures and process noise", _candidates(scored, best)),
         "learners": Table("Free runs of the validation record", _learners(scored, best, labels)),
-        "parameters": Table("Parameters of the chosen f_p", markdown(["", "value", "prior"], rows)),
     }
 
 
@@ -399,71 +385,3 @@ def _with_error(column: str, form: str) -> Cell:
         return f"{found.mean:{form}} ± {found.error:{'.1g' if form.endswith('g') else form}}"
 
     return cell
-
-
-def verdicts(runs: pd.DataFrame, best: str) -> list[Judged]:
-    """The verdict on each target, of the candidate that cross-validation chose."""
-    claim = (
-        "free run of the validation record, by the fit that the estimation record chooses, of "
-        "structures from a search that had looked at both"
-    )
-    judged = []
-    for id, text, learner, most in (
-        ("T1", f"{claim}: at most 0.28 V", best, 0.28),
-        ("T2", "the same: at most 0.19 V", best, 0.19),
-        ("T3", "parameters from 100 samples: at most 0.25 V", TENTH, 0.25),
-    ):
-        own = runs[runs["learner"] == learner]
-        if own.empty:
-            judged.append(Judged(id, text, "not run", f"no results of {learner}"))
-            continue
-        mean = sum(own["rmse"]) / len(own)
-        said = f"{learner} {mean:.3f}"
-        said += ", a fit that had not settled" * (not own["settled"].fillna(True).all())
-        if learner == TENTH:
-            held = (own["rmse"] <= most).sum()
-            said += f" in the mean of {counted(len(own))}, {held} of which are at most that"
-            other = {*own["by"]} - {best}
-            said += f"; f_p chosen before: {', '.join(other)}" * bool(other)
-        judged.append(Judged(id, text, met(mean <= most), said))
-    return judged
-
-
-def draw(runs: Sequence[Run], experiment: Tanks) -> list[Path]:
-    """Draw the chosen f_p's free run, that without the sensor's bend, and all candidates."""
-    scored = load(runs)
-    best = chosen(scored, CANDIDATES)
-    bent = chosen(scored, [name for name in CANDIDATES if name.startswith("overflow")])
-    first = {each["learner"]: each for each in runs if each["seed"] == 0}
-    shown = [name for name in dict.fromkeys((best, bent)) if name in first]
-    titles = [CANDIDATES[name] + ", chosen" * (name == best) for name in shown]
-    figure, axes = panels([*titles, "Errors of all candidates"], 1, (8.4, 2.7), share=False)
-    for ax, name in zip(axes, shown, strict=False):
-        _free_run(ax, first[name], experiment)
-    ax = axes[-1]
-    for name in (*CANDIDATES, *NARX):
-        if "cv" in first.get(name, {}):
-            kind, _, which = name.partition("-")
-            place = (first[name]["cv"], first[name]["rmse"])
-            label = {**STRUCTURES, "narx": "GP, no f_p"}[kind]
-            ax.plot(*place, "o", color=_COLORS[kind], label=label)
-            ax.annotate(which, place, (4, 2), textcoords="offset points", fontsize=7)
-    ax.set(xscale="log", yscale="log", ylabel="validation, V")
-    ax.set_xlabel("cross-validated on the estimation record, V")
-    for axis in (ax.xaxis, ax.yaxis):
-        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axis.set_major_formatter("{x:g}")
-        axis.set_minor_formatter(NullFormatter())
-    one_legend(figure, axes, ncols=4)
-    return [save(figure, experiment.out / "tanks.png")]
-
-
-def _free_run(ax: Axes, record: Run, experiment: Tanks) -> None:
-    _, lower = measured("Val", experiment.settings.samples)
-    minutes = STEP / 60 * torch.arange(len(lower)).double()
-    rows, path = minutes[::_KEPT].tolist(), record["path"]
-    band: dict[str, Any] = {"color": "tab:blue", "alpha": 0.25, "lw": 0, "label": "95 %"}
-    ax.fill_between(rows, path["lower"], path["upper"], **band)
-    ax.plot(rows, path["mean"], color="tab:blue", lw=1.2, label="free run")
-    ax.plot(minutes, lower, color="black", lw=1.0, ls="--", label="measured")
-    ax.set(xlabel="min", ylabel="lower level, V")

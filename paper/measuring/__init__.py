@@ -1,8 +1,7 @@
-"""Where to measure, and what to try next: how many measurements and trials a physics saves."""
+"""Where to measure, and what to try next: what a physics saves, or costs if it misleads."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -97,59 +96,6 @@ class Active(Experiment):
     def describe(self, *kind: Any) -> dict[str, Any]:
         """The settings of the problem."""
         return asdict(self.settings_of(kind[0]))
-
-
-@dataclass(frozen=True, kw_only=True)
-class OptimisationSettings:
-    """What decides the numbers."""
-
-    trials: int = 30
-    """at most, those of the initial design included"""
-    initial: int = 5
-    """trials of the initial design, Ax's default: the center and Sobol points"""
-    few: int = 2
-    """trials of the initial design of `cka-few`"""
-    regret: float = 0.01
-    """a run ends with the trial that is so near to the best value there is, in units of what the
-    median of random points is away from it"""
-    num_random: int = 4096
-    """Sobol points that tell this median, and from which the best value is searched"""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Optimisation(Experiment):
-    """How many trials a physics saves in Ax, on five problems."""
-
-    runs: int = 20
-    """number of runs, each with an initial design of its own"""
-    out: Path = Path("results/optimisation")
-    settings: OptimisationSettings = field(default_factory=OptimisationSettings)
-
-    axes: ClassVar[Axes] = {
-        "problem": {
-            "forrester": "forrester",
-            "branin": "branin",
-            "six_hump_camelback": "six-hump camelback",
-            "hartmann6": "hartmann6",
-            "reactor": "reactor, by-product limited",
-        },
-        "learner": {
-            "ax": "Ax's default",
-            "cka": "CKA",
-            "cka-few": "CKA, two initial trials",
-            "map": 'CKA, `"map"`',
-        },
-    }
-    calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.ax.generation_strategy")
-    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "ax-platform")
-
-    def check(self) -> None:
-        """Raise an ImportError if Ax is not there."""
-        import gpadjust.ax as _  # noqa: F401
-
-    def seeds_of(self, *kind: Any) -> Sequence[int]:
-        """The most likely fit only where it is named."""
-        return self.seeds if kind[1] != "map" or "map" in self.only else ()
 
 
 MISLEADS = ("moved peak", "moved ridge", "unrelated")

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import time
 import warnings
-import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -19,7 +16,6 @@ import torch
 from botorch.acquisition import AcquisitionFunction, qNegIntegratedPosteriorVariance
 from botorch.acquisition.objective import ScalarizedPosteriorTransform
 from botorch.exceptions.warnings import BadInitialCandidatesWarning, OptimizationWarning
-from matplotlib.axes import Axes
 from torch import Tensor
 
 from gpadjust import fit
@@ -28,24 +24,12 @@ from gpadjust.active.information_gain import About
 from gpadjust.active.warm_refit import refit
 from gpadjust.validation import coverage, rmse
 from paper.common.experiment import Run, Table
-from paper.common.figures import curves
-from paper.common.tables import claims_table, markdown, settings_table
-from paper.common.verdicts import FEWEST, Judged, counted, met
+from paper.common.tables import markdown, settings_table
 from paper.measuring import Active, Settings
 from paper.measuring.problems import Problem, problem
 
 PROBLEMS, LABELS = Active.axes["problem"], Active.axes["learner"]
 REFERENCE = "gp"  # whose final error the others are to reach
-ALONE = "f_p"  # what needs no measurement
-_COLORS = {
-    "phy": "tab:purple",
-    "random": "0.6",
-    "sobol": "black",
-    "gp": "tab:red",
-    "cka": "navy",
-    "both": "tab:green",
-    "rho": "tab:cyan",
-}
 _SECONDS = ["choice_seconds", "score_seconds"]
 
 
@@ -98,8 +82,6 @@ CHOOSERS = {
 def run(experiment: Active, name: str, learner: str, seed: int) -> Run:
     """Measure with a learner, and score what it learns.
 
-    The log of the measurements lies beside ``experiment.unfinished(...)`` until the run is done.
-
     Args:
         experiment: The experiment.
         name: The problem.
@@ -107,14 +89,9 @@ def run(experiment: Active, name: str, learner: str, seed: int) -> Run:
         seed: Of the initial design, the physics where it is random, and the learner.
 
     Returns:
-        The scores, and the seconds that choices and scores took; those of choices are None if the
-        run was interrupted.
+        The scores, and the seconds that choices and scores took.
     """
-    settings, unfinished = experiment.settings_of(name), experiment.unfinished(name, learner, seed)
-    # Other settings have another log.
-    mark = zlib.crc32(json.dumps(asdict(settings)).encode())
-    log = unfinished.with_name(f"{unfinished.name}-{mark:08x}.jsonl")
-    resumed, chosen_by = log.exists(), CHOOSERS[learner]
+    settings, chosen_by = experiment.settings_of(name), CHOOSERS[learner]
     system = problem(name, seed)
     if chosen_by.model is None:
         test_X, test_Y = system.test_points(settings.num_test)
@@ -123,20 +100,17 @@ def run(experiment: Active, name: str, learner: str, seed: int) -> Run:
         return {"choice_seconds": 0.0, "score_seconds": 0.0, "scores": scores}
     with _quiet():
         start = time.process_time()
-        X = measured(system, chosen_by, chosen_by.model, settings, seed, log)
+        X = measured(system, chosen_by, chosen_by.model, settings, seed)
         between = time.process_time()
         scores = scored(system, chosen_by.model, settings, X)
-    log.unlink(missing_ok=True)
     return {
-        "choice_seconds": None if resumed else between - start,
+        "choice_seconds": between - start,
         "score_seconds": time.process_time() - between,
         "scores": scores,
     }
 
 
-def measured(
-    system: Problem, chooser: Chooser, kind: str, settings: Settings, seed: int, log: Path
-) -> Tensor:
+def measured(system: Problem, chooser: Chooser, kind: str, settings: Settings, seed: int) -> Tensor:
     """The points that are measured, ``budget x d``, the initial design first."""
     initial, budget = settings.initial, settings.budget
     if chooser.design == "sobol":
@@ -161,7 +135,6 @@ def measured(
             "num_restarts": settings.num_restarts,
             "options": {"maxiter": settings.maxiter},
         },
-        log=log,
         seed=seed,
     )
     return collection.X
@@ -245,7 +218,6 @@ def tables(runs: Sequence[Run], experiment: Active) -> dict[str, Table]:
         problem: asdict(experiment.settings_of(problem)) for problem in PROBLEMS
     }
     found = {"settings": Table("Settings", settings_table(columns))}
-    found["claims"] = Table("Targets", claims_table("target", {"": verdicts(scored)}))
     for name, title, cells in (
         ("errors", "Median final error", table["nrmse"].map("{:.2g}".format)),
         ("needed", "Measurements that reach the final error of `gp`", table.apply(_count, axis=1)),
@@ -296,27 +268,6 @@ def tabulate(runs: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def verdicts(runs: pd.DataFrame, learner: str = "cka") -> list[Judged]:
-    """Whether a learner reaches the reference's final error with half the measurements."""
-    judged = []
-    for name, part in runs.groupby("problem", sort=False):
-        id, count = f"M{[*PROBLEMS].index(str(name)) + 1}", needed(part, learner)
-        text = f"{name}: {LABELS[learner]} reaches the final error of {LABELS[REFERENCE]} with "
-        text += "at most half the measurements"
-        if len(count) < FEWEST:
-            judged.append(Judged(id, text, "not run", "too few runs of both"))
-            continue
-        budget, middle = part["measurements"].max(), float(np.median(count))
-        reached = f"with {middle:g}" if np.isfinite(middle) else "never"
-        measured = f"{counted(len(count))}: {reached} of {budget} (median), "
-        measured += f"in {np.isfinite(count).sum()} of them at all"
-        alone = int((needed(part, ALONE) == 0).sum())
-        if alone:
-            measured += f"; f_p alone does it without any in {alone}"
-        judged.append(Judged(id, text, met(middle <= budget / 2), measured))
-    return judged
-
-
 def _final(runs: pd.DataFrame, learner: str) -> pd.DataFrame:
     """The last row of each run of a learner, by seed."""
     return runs[runs["learner"] == learner].groupby("seed").last()
@@ -340,44 +291,3 @@ def _count(row: pd.Series[float]) -> str:
     if row["reached"] in (row["compared"], 0):
         return text
     return f"{text} ({row['reached']} of {row['compared']})"
-
-
-def draw(runs: Sequence[Run], experiment: Active) -> list[Path]:
-    """Draw the median and the quartiles of the error over the number of measurements."""
-    scored = load(runs)
-    parts = {
-        f"{PROBLEMS[name]} ({counted(part['seed'].nunique())})": part
-        for name, part in scored.groupby("problem", sort=False)
-    }
-
-    def finish(ax: Axes, title: str, part: pd.DataFrame) -> None:
-        """Add f_p's error, the reference's final one, and half the measurements."""
-        for name, style, label in ((ALONE, "--", LABELS[ALONE]), (REFERENCE, ":", "GP's final")):
-            if name in {*part["learner"]}:
-                errors = part[part["learner"] == name].groupby("measurements")["nrmse"].median()
-                color = _COLORS.get(name, "tab:orange")
-                ax.axhline(errors.iloc[-1], color=color, lw=1.2, ls=style, label=label)
-        ax.axvline(
-            part["measurements"].max() / 2,
-            color="0.7",
-            lw=1,
-            ls="--",
-            label="half the measurements",
-        )
-
-    lines = {name: (LABELS[name], color) for name, color in _COLORS.items()}
-    axis_labels = ("measurements, those of the initial design included", "RMSE / sd of the truth")
-    path = experiment.out / "errors.png"
-    found = curves(
-        path,
-        parts,
-        "nrmse",
-        lines,
-        x="measurements",
-        labels=axis_labels,
-        size=(5, 3.3),
-        share=False,
-        logarithmic=True,
-        finish=finish,
-    )
-    return [found]

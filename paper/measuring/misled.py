@@ -1,4 +1,4 @@
-"""Six problems in the unit cube, the search for their optima, regrets, and targets."""
+"""Six problems in the unit cube, the search for their optima, and regrets."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import pandas as pd
 import torch
 from botorch.acquisition import qLogExpectedImprovement
 from botorch.fit import fit_gpytorch_mll
@@ -23,12 +22,10 @@ from gpadjust import fit
 from gpadjust.models.sampled_functions import seeded
 from paper.common.experiment import Run, Table
 from paper.common.learners import LEARNERS
-from paper.common.tables import Cell, frame, groups, markdown, number, of, table
-from paper.common.verdicts import Verdict, met
+from paper.common.tables import Cell, frame, groups, number, of, table
 from paper.measuring import HELPS, MISLEADS, Misled
 
 METHODS = Misled.axes["method"]
-_LEAST = 0.1  # per cent: regrets below it are alike
 _FOUND = 1.0  # per cent: where the optimum counts as found
 _LOST = 5.0  # per cent
 
@@ -193,10 +190,7 @@ def tables(runs: Sequence[Run], experiment: Misled) -> dict[str, Table]:
         header, rule, *rows = table(groups(part, "method", METHODS), columns).splitlines()
         rows = [f"| {'' if i else name} {row}" for i, row in enumerate(rows)]
         lines += rows if lines else [f"|  {header}", f"| --- {rule}", *rows]
-    return {
-        "targets": Table("Targets", markdown(["", "target", ""], _targets(found))),
-        "regrets": Table("Regret after all trials", "\n".join(lines)),
-    }
+    return {"regrets": Table("Regret after all trials", "\n".join(lines))}
 
 
 def _found(regrets: Sequence[float]) -> float:
@@ -206,42 +200,3 @@ def _found(regrets: Sequence[float]) -> float:
 
 def _trials(number: float) -> str:
     return "never" if number == float("inf") else f"{number:g}"
-
-
-def _targets(runs: pd.DataFrame) -> list[list[str]]:
-    median = runs.groupby(["method", "problem"])["last"].median().clip(lower=_LEAST)
-    lost = (runs["last"] > _LOST).groupby([runs["method"], runs["problem"]]).sum()
-    found = runs.groupby(["method", "problem"])["found"].median()
-    rows = []
-
-    def enter(name: str, text: str, verdict: Verdict, numbers: list[str]) -> None:
-        rows.append([name, text, f"**{verdict}**: {', '.join(numbers)}"])
-
-    ours = [method for method in ("zero", "cka") if method in {*runs["method"]}]
-    if "stgp" not in {*runs["method"]}:
-        return []
-    for i, method in enumerate(ours, start=1):
-        ratios = {p: median[method, p] / median["stgp", p] for p in MISLEADS if p in median["stgp"]}
-        enter(
-            f"B{i}",
-            f"{METHODS[method]}: median regret at most 1.1 times SingleTaskGP's, f_p misleads",
-            met(all(ratio <= 1.1 for ratio in ratios.values())),
-            [f"{p} {ratio:.2g}" for p, ratio in ratios.items()],
-        )
-    for i, method in enumerate(ours, start=3):
-        pairs = {p: (lost[method, p], lost["stgp", p]) for p in MISLEADS if p in median["stgp"]}
-        enter(
-            f"B{i}",
-            f"{METHODS[method]}: no run above 5 % where SingleTaskGP has none",
-            met(all(own == 0 or other > 0 for own, other in pairs.values())),
-            [f"{p} {own} ({other})" for p, (own, other) in pairs.items()],
-        )
-    if "cka" in ours:
-        both = {p: (found["cka", p], found["stgp", p]) for p in HELPS if p in median["stgp"]}
-        enter(
-            "B5",
-            "CKA: at most half of SingleTaskGP's trials to 1 %, f_p helps",
-            met(all(own <= 0.5 * other for own, other in both.values())),
-            [f"{p} {_trials(own)} ({_trials(other)})" for p, (own, other) in both.items()],
-        )
-    return rows

@@ -17,7 +17,7 @@ from gpadjust.systems import CartPoleEquation, cart_pole
 from gpadjust.systems.swing_up import REAL_CART_POLE, SUBSTEP, TIME_STEP
 from paper.common.learners import LEARNERS
 from paper.forrester.problem import LOWER, UPPER, crude_b, truth
-from paper.pairs.functions import pair
+from paper.structures.functions import PAIRS
 
 CART_POLE_LIMITS = (1.0, math.pi, 3.0, 8.0, 10.0)  # m, rad, m/s, rad/s, N, to either side
 _TEST_SEED = 20_000  # beyond those of runs, so that their points are others
@@ -61,17 +61,7 @@ class Problem:
 
 
 def problem(name: str, seed: int) -> Problem:
-    """The problem of a given name.
-
-    Args:
-        name: One of the experiment's.
-        seed: Of the physics, where it is random.
-
-    Raises:
-        ValueError: If there is no such problem.
-    """
-    if name not in _MAKE:
-        raise ValueError(f"There is no problem {name!r}; there are {', '.join(_MAKE)}.")
+    """The problem of a given name; the seed is that of the physics, where it is random."""
     return _MAKE[name](seed)
 
 
@@ -84,7 +74,7 @@ def _pair(name: str) -> Callable[[int], Problem]:
     """A pair of low and high fidelity."""
 
     def make(seed: int) -> Problem:
-        functions = pair(name)
+        functions = PAIRS[name]
         return Problem(functions.bounds, functions.truth, functions.smooth_physics())
 
     return make

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 from paper.common.experiment import Axes, Experiment
-
-_CALLS = ("gpadjust.fit", "gpadjust.CalibratedPhysics", "gpadjust.PhysicsMeanGP", "gpadjust.CKA")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +33,10 @@ class Parameters(Experiment):
             "vanishing": "delta that grows as the time cubed",
         },
     }
-    calls: ClassVar[tuple[str, ...]] = _CALLS
+    calls: ClassVar[tuple[str, ...]] = (
+        *("gpadjust.fit", "gpadjust.CalibratedPhysics", "gpadjust.PhysicsMeanGP"),
+        "gpadjust.CKA",
+    )
 
     def seeds_of(self, *kind: Any) -> Sequence[int]:
         """The last model is of the ball only, whose drag vanishes at the start."""
@@ -49,45 +50,8 @@ class Parameters(Experiment):
         return {"observations": len(known.X), "noise": known.noise}
 
 
-RIDGES = ("beam", "reaction", "creep", "inhibitor")
-FOLDS = ("pendulum", "focus", "alias", "radar")
-NINE = "spectrum"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Settings:
-    """What decides the numbers."""
-
-    compared: int = 2
-    """first cases of a ridge that are set beside a reference with each model"""
-    long: int = 3
-    """cases of nine parameters"""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Ridges(Experiment):
-    """Intervals of the parameters of a right law: do they hold the true ones, how wide are they?"""
-
-    runs: int = 50
-    """cases of each problem"""
-    seed: int = 3400
-    """the first seed; 1000 to 1999 were for trying, and runs of 3000 to 3313 were broken off"""
-    out: Path = Path("results/ridges")
-    settings: Settings = field(default_factory=Settings)
-
-    axes: ClassVar[Axes] = {
-        "problem": {name: name for name in (*RIDGES, NINE, *FOLDS)},
-        "model": {
-            "physics": "calibrated physics",
-            "free": "free delta",
-            "orthogonal": "orthogonal delta",
-            "cka": "CKA",
-        },
-    }
-    calls: ClassVar[tuple[str, ...]] = _CALLS
-
-    def seeds_of(self, *kind: Any) -> Sequence[int]:
-        """Laws that fold are fitted by calibrated physics alone, nine parameters less often."""
-        if kind[0] in FOLDS and kind[1] != "physics":
-            return ()
-        return self.seeds[: self.settings.long] if kind[0] == NINE else self.seeds
+LAWS = (
+    *("beam", "reaction", "creep", "inhibitor", "spectrum"),
+    *("pendulum", "focus", "alias", "radar"),
+)
+"""Right laws with unknown parameters, which observations tell apart badly, or which fold."""

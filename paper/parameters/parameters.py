@@ -20,13 +20,9 @@ from gpadjust.models import TermsGP, orthogonal_rbf
 from gpadjust.models.parameters import scaled_rbf
 from gpadjust.validation import rmse
 from paper.common.experiment import Run, Table
-from paper.common.tables import claims_table, markdown, number
-from paper.common.verdicts import Judged, met
+from paper.common.tables import markdown, number
 from paper.parameters import Parameters
 from paper.parameters.laws import textbook_case
-
-_BETWEEN = (0.90, 0.98)
-_NARROW = 0.5  # of the width of Kennedy and O'Hagan's
 
 
 def growing(num_inputs: int, batch_shape: Size) -> Kernel:
@@ -76,7 +72,7 @@ def tables(runs: Sequence[Run], experiment: Parameters) -> dict[str, Table]:
     found = load(runs)
     header = ["", "parameter", "cases", "holds the best", "holds the true", "median width"]
     header += ["RMSE", "coverage", "seconds"]
-    shown = {"targets": Table("Targets", claims_table("target", {"parameters": judge(found)}))}
+    shown = {}
     for problem, title in experiment.axes["problem"].items():
         if (found["problem"] == problem).any():
             rows = _rows(found[found["problem"] == problem], experiment)
@@ -94,31 +90,6 @@ def load(runs: Sequence[Run]) -> pd.DataFrame:
             row |= {"parameter": name, "width": high - low, "best": float(low <= best <= high)}
             rows.append({**row, "true": None if true is None else float(low <= true <= high)})
     return pd.DataFrame(rows)
-
-
-def judge(found: pd.DataFrame) -> list[Judged]:
-    """The verdicts on the targets."""
-    low, high = _BETWEEN
-    ours = found[found["model"] == "orthogonal"]
-    shares = {
-        f"{problem}, {parameter}": part["best"].mean()
-        for (problem, parameter), part in ours.groupby(["problem", "parameter"], sort=False)
-    }
-    held = ", ".join(f"{name} {share:.2f}" for name, share in shares.items())
-    text = "intervals of 95 % by the orthogonal delta hold the best parameters in "
-    text += f"{low:.2f} to {high:.2f} of the cases"
-    is_met = bool(shares) and all(low <= share <= high for share in shares.values())
-    judged = [Judged("I1", text, met(is_met), held or "not run")]
-    gravity = found[(found["problem"] == "ball") & (found["parameter"] == "gravity")]
-    vanishing, free = (gravity[gravity["model"] == name] for name in ("vanishing", "free"))
-    if len(vanishing) and len(free):
-        ratio = vanishing["width"].median() / free["width"].median()
-        share = vanishing["true"].mean()
-        text = "the ball's true g is held, by an interval at most half as wide as by a free delta"
-        measured = f"by a delta that grows as the time cubed: held in {share:.2f}, by a free one "
-        measured += f"in {free['true'].mean():.2f}; {ratio:.2f} times as wide"
-        judged.append(Judged("I2", text, met(bool(share >= low and ratio <= _NARROW)), measured))
-    return judged
 
 
 def _rows(found: pd.DataFrame, experiment: Parameters) -> list[list[str]]:

@@ -7,11 +7,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
-from paper.calibration import PUMP, ROWS
 from paper.common.experiment import Axes, Experiment
 from paper.common.learners import labels
-from paper.parameters import FOLDS, NINE, RIDGES, Parameters
-from paper.structures import KINDS, MEASURED, SIMULATED
+from paper.parameters import LAWS, Parameters
+from paper.structures import KINDS, MEASURED, PUMP, ROWS, SIMULATED
 
 TABLES = {"yacht": "yacht", "energy": "energy", "concrete": "concrete"}
 OURS = {"formula": "formula, parameters fitted"} | labels("phymean", "cka", "gp")
@@ -68,8 +67,8 @@ GROUPS = {
 }
 FORMULA_CELLS: tuple[tuple[str, str, int, float], ...] = (
     *(("right", name, n, 0.1) for name in RIGHT for n in (5, 10)),
-    *(("laws", name, 0, 0.0) for name in (*_TEXTBOOK, *RIDGES, NINE, *FOLDS)),
-    *(("kinds", name, 5, 0.0) for name in KINDS[:-2]),
+    *(("laws", name, 0, 0.0) for name in (*_TEXTBOOK, *LAWS)),
+    *(("kinds", name, 5, 0.0) for name in KINDS),
     *(("functions", *row) for row in (*ROWS, PUMP)),
     *(("simulated", name, n, 0.0) for name in SIMULATED for n in (30, 75, 150)),
     *(("measured", name, n, 0.0) for name in MEASURED for n in (50, 100, 200)),

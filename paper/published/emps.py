@@ -31,8 +31,8 @@ from gpadjust.physics import ParameterValues
 from gpadjust.records import Record, Records, SmoothedRecords, SmoothingWarning, smooth
 from paper.common.experiment import Run, Table
 from paper.common.figures import panels, save
-from paper.common.tables import claims_table, markdown, number
-from paper.common.verdicts import Difference, Judged, met
+from paper.common.tables import markdown, number
+from paper.common.verdicts import Difference
 from paper.published import EMPS_GPS, Emps, EmpsSettings
 
 DATA = Path(__file__).parent / "data" / "emps"
@@ -226,7 +226,6 @@ def _lacking(settings: EmpsSettings) -> Run:
 def tables(runs: Sequence[Run], experiment: Emps) -> dict[str, Table]:
     """All tables, by name."""
     return {
-        "targets": Table("Targets", claims_table("target", {"": _verdicts(runs)})),
         "learners": Table("Simulation of the validation record", _learners(runs, experiment)),
         "parameters": Table("The four unknowns", _parameters(runs)),
     }
@@ -297,36 +296,6 @@ def _parameters(runs: Sequence[Run]) -> str:
 def _interval(mean: float, low: float, high: float) -> str:
     form = ".2f" if abs(mean) < 50 else ".1f"
     return f"{mean:{form}} ({low:{form}} to {high:{form}})"
-
-
-def _verdicts(runs: Sequence[Run]) -> list[Judged]:
-    best = chosen(runs)
-    errors = [each["rmse"] for each in _of(runs, best)]
-    held = [each["coverage"] for each in _of(runs, best)]
-    mean, holds = float(np.mean(errors)), float(np.mean(held))
-    said = f"{best}, {_mean(errors, '.2f')} mm, worst run {max(errors):.2f} mm"
-    judged = [
-        Judged(
-            "E1", "least error beside the networks of 2405.10779: at most 74.1 mm",
-            met(mean <= 74.1), f"{said}; of its ten methods five were found",
-        ),
-        Judged("E2", "least error found anywhere: at most 2.64 mm", met(mean <= 2.64), said),
-        Judged("E3", "intervals of 95 % hold at least 0.93", met(holds >= 0.93), f"{holds:.2f}"),
-    ]  # fmt: skip
-    if own := _of(runs, "fitted"):
-        inside = [
-            low <= m <= high
-            for (m, _), (_, low, high) in zip(AUTHORS.values(), own[0]["estimation"], strict=True)
-        ]
-        judged.append(
-            Judged(
-                "E4",
-                "intervals of the four unknowns hold the authors' values",
-                met(all(inside)),
-                f"{sum(inside)} of 4",
-            )
-        )
-    return judged
 
 
 def draw(runs: Sequence[Run], experiment: Emps) -> list[Path]:

@@ -35,8 +35,8 @@ from gpadjust.inference import ParameterWarning, SamplingWarning
 from gpadjust.records import SmoothedRecords, SmoothingWarning, smooth
 from paper.common.experiment import Run, Table
 from paper.common.figures import one_legend, panels, save
-from paper.common.tables import claims_table, markdown, number
-from paper.common.verdicts import Difference, Judged, met
+from paper.common.tables import markdown, number
+from paper.common.verdicts import Difference
 from paper.published import AFTER, FREE_GPS, RECORDS, Freeruns, FreerunsSettings
 from paper.published.freeruns_systems import SYSTEMS, narx_spec, records
 
@@ -51,8 +51,6 @@ PUBLISHED = {
     "EnVI": (0.055, 1.388, 0.703),
 }
 """Errors of ball and beam, furnace and drive in table II of Lin et al. 2024 (arXiv 2312.05910)."""
-BEST = dict(zip(RECORDS, map(min, zip(*PUBLISHED.values(), strict=True)), strict=False))
-_WITHIN = 1.1
 _ROWS = 250  # of a path that is kept
 Candidate = tuple[str, str]
 
@@ -284,11 +282,9 @@ def _hidden(record: str, candidate: Candidate, mean: Tensor, settings: FreerunsS
 def tables(runs: Sequence[Run], experiment: Freeruns) -> dict[str, Table]:
     """All tables, by name."""
     return {
-        "targets": Table("Targets", claims_table("target", {"": _verdicts(runs)})),
         "errors": Table("RMSE of free runs along the test part", _errors(runs, experiment)),
         "details": Table("Learners of each record", _details(runs, experiment)),
         "candidates": Table("Candidates for f_p, errors of the folds", _candidates(runs)),
-        "parameters": Table("Parameters of the chosen f_p", _parameters(runs)),
     }
 
 
@@ -376,48 +372,6 @@ def _candidates(runs: Sequence[Run]) -> str:
                 bold = f"**{name}**" if name == own["chosen"] else name
                 rows.append([label, bold, *shown])
     return markdown(["record", "f_p; process noise", "third quarter", "last quarter"], rows)
-
-
-def _parameters(runs: Sequence[Run]) -> str:
-    rows = []
-    for record, label in RECORDS.items():
-        for own in _of(runs, record, "fitted"):
-            structure = SYSTEMS[record].structure(own["chosen"].partition("; ")[0])
-            for name, (mean, low, high) in own["parameters"].items():
-                found = f"{mean:.3g} ({low:.3g} to {high:.3g})"
-                rows.append([label, f"`{name}`", structure.unknowns[name].prior_text, found])
-    return markdown(["record", "", "prior", "mean (95 %)"], rows)
-
-
-def _verdicts(runs: Sequence[Run]) -> list[Judged]:
-    judged, said, good = [], [], 0
-    for name, bar in BEST.items():
-        if not any(each["record"] == name for each in runs):
-            continue
-        learner = best_of(runs, name)
-        own = _of(runs, name, learner)
-        good += _mean(own, "rmse") <= _WITHIN * bar
-        said.append(f"{RECORDS[name]}: {learner} {_with_error(own, 'rmse')}, published {bar:.3f}")
-    judged.append(
-        Judged(
-            "R1", "three records: best or within a tenth of the best published that was found, by "
-            "the learner that the training part chooses", met(good == len(BEST)),
-            f"{good} of {len(BEST)}; " + "; ".join(said),
-        )
-    )  # fmt: skip
-    for each in _of(runs, "tanks", "fitted"):
-        for id, part, text in (
-            ("R2", "smoothed", "the upper tank's level, hidden, along the training part"),
-            ("R3", "ahead", "the same in the free run"),
-        ):
-            error = each["hidden"][part]
-            found = f"{error:.1%}"
-            for later in _of(runs, "tanks", AFTER):
-                found += f"; with equal holes, thought of afterwards, {later['hidden'][part]:.1%}"
-            judged.append(
-                Judged(id, f"{text}: at most 5 % of its range", met(error <= 0.05), found)
-            )
-    return judged
 
 
 def draw(runs: Sequence[Run], experiment: Freeruns) -> list[Path]:

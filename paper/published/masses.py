@@ -261,7 +261,6 @@ def tables(runs: Sequence[Run], experiment: Masses) -> dict[str, Table]:
     header += ["half width of 95 %, mean, MeV", "median error, MeV"]
     header += ["half width, median, MeV", "seconds of a fit, median"]
     return {
-        "targets": _targets(data),
         "errors": Table(
             "RMSE in MeV, share held by intervals of 95 %, their mean half width in MeV",
             markdown(["model", *heads, "seconds of a fit"], errors),
@@ -282,35 +281,6 @@ def _scores(part: pd.DataFrame) -> tuple[float, float, float]:
         for name in ("mean_square", "held", "half_width")
     )
     return square**0.5, held, half
-
-
-def _targets(data: pd.DataFrame) -> Table:
-    asked = [
-        ("ten folds, liquid drop: RMSE", "fold", "drop", 0, "at most 0.25 MeV", 0.25),
-        ("ten folds, one shell term: RMSE", "fold", "shell", 0, "at most 0.18 MeV", 0.18),
-        *(
-            (
-                f"outermost {k}, {label}: held by 95 %",
-                f"outer{k}",
-                physics,
-                1,
-                "at least 0.93",
-                0.93,
-            )
-            for k in (2, 4)
-            for physics, label in (("drop", "liquid drop"), ("shell", "one shell term"))
-        ),
-    ]
-    rows = []
-    for claim, task, physics, which, text, bound in asked:
-        for model, label in (("mean", "physics mean"), ("cka", "CKA")):
-            of = (data.task == task) & (data.physics == physics) & (data.model == model)
-            if not of.any():
-                continue
-            value = _scores(data[of])[which]
-            met = value >= bound if which else value <= bound
-            rows.append([claim, label, text, number(value, ".3f"), "met" if met else "missed"])
-    return Table("Targets", markdown(["claim", "model", "asked", "measured", "verdict"], rows))
 
 
 def _beyond(runs: Sequence[Run], experiment: Masses) -> Table:

@@ -7,7 +7,6 @@ splits of our own.
 
 from __future__ import annotations
 
-import math
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -27,14 +26,12 @@ from gpadjust.physics import Physics, PhysicsWarning
 from gpadjust.validation import score
 from paper.common.experiment import Run, Table
 from paper.common.figures import one_legend, panels, save
-from paper.common.tables import claims_table, frame, groups, markdown, number
-from paper.common.verdicts import Difference, Judged, below, met, paired
+from paper.common.tables import frame, groups, markdown, number
+from paper.common.verdicts import Difference, paired
 from paper.published import TABLES, Uci
 from paper.published.rivals import RIVALS, Predict
 from paper.published.uci_tables import physics, split
 
-MOST = {"yacht": 0.30, "energy": 0.40, "concrete": 4.3}
-"""Targets of the RMSE."""
 _COLORS = {
     "formula": "tab:orange",
     "phymean": "tab:purple",
@@ -43,8 +40,6 @@ _COLORS = {
     "boosting": "tab:green",
     "ensemble": "tab:pink",
 }
-MOST_OF_GP = {"yacht": 0.7, "energy": 0.85, "concrete": 0.85}
-"""Targets of the RMSE with few rows, in that of the GP."""
 
 
 class Row(NamedTuple):
@@ -129,7 +124,7 @@ def run(experiment: Uci, table: str, share: float, method: str, seed: int) -> Ru
 def tables(runs: Sequence[Run], experiment: Uci) -> dict[str, Table]:
     """All tables, by name."""
     found = frame(runs)
-    shown = {
+    return {
         "published": Table(
             "RMSE and log likelihood by nine tenths of the rows, beside published ones",
             _beside_published(found, experiment),
@@ -146,10 +141,6 @@ def tables(runs: Sequence[Run], experiment: Uci) -> dict[str, Table]:
             _intervals(found, experiment),
         ),
     }
-    judged = verdicts(found)
-    if judged:
-        shown["targets"] = Table("Targets", claims_table("target", {"uci": judged}))
-    return shown
 
 
 def _methods(found: pd.DataFrame, experiment: Uci) -> dict[str, pd.DataFrame]:
@@ -220,48 +211,6 @@ def _intervals(found: pd.DataFrame, experiment: Uci) -> str:
         rows.append([label, *held, *times])
     seconds = [f"seconds, {table}" for table in TABLES]
     return markdown(["method", *(f"hold, {cell}" for cell in cells), *seconds], rows)
-
-
-def verdicts(found: pd.DataFrame) -> list[Judged]:
-    """The verdicts on the targets, of the default CKA."""
-    judged = []
-    best = {
-        table: max(row.density[i] or -np.inf for row in PUBLISHED.values())
-        for i, table in enumerate(TABLES)
-    }
-    for table in TABLES:
-        full = found[(found["table"] == table) & (found["share"] == 0.9)]
-        own = full[full["method"] == "cka"]
-        if len(own):
-            error, density = own["rmse"].mean(), own["density"].mean()
-            judged += [
-                Judged(
-                    f"{table}, error",
-                    f"RMSE by nine tenths of the rows at most {MOST[table]:g}",
-                    met(error <= MOST[table]),
-                    _mean(own, "rmse", ".3f"),
-                ),
-                Judged(
-                    f"{table}, density",
-                    f"log likelihood above every published one that was found ({best[table]:g})",
-                    met(density > best[table]),
-                    _mean(own, "density", ".2f"),
-                ),
-            ]
-        for share in (0.1, 0.25):
-            part = found[(found["table"] == table) & (found["share"] == share)]
-            ratio = _ratio(part, "cka") if {"cka", "gp"} <= {*part["method"]} else None
-            if ratio is not None:
-                most = MOST_OF_GP[table]
-                judged.append(
-                    Judged(
-                        f"{table}, {100 * share:.0f} %",
-                        f"RMSE at most {most:g} times that of a GP",
-                        below(ratio, math.log(most)),
-                        ratio.ratio(),
-                    )
-                )
-    return judged
 
 
 def draw(runs: Sequence[Run], experiment: Uci) -> list[Path]:

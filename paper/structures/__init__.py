@@ -1,17 +1,25 @@
-"""Does the richer model pay? CKA beside what it contains; f_p of no use, and what compare says."""
+"""Does the richer model pay? CKA and RRA beside what they contain."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar
 
-from paper.calibration import PUMP, ROWS
 from paper.common.experiment import Axes, Experiment
 from paper.common.learners import LEARNERS, labels
 
+_PAIRS = ("currin", "branin", "bohachevsky", "booth", "park91a", "hartmann6")
+# Name of the pair, observations per input, noise in standard deviations of the truth.
+ROWS: tuple[tuple[str, int, float], ...] = (
+    *((pair, per_input, 0.0) for pair in _PAIRS for per_input in (5, 10)),
+    ("forrester", 5, 0.0),
+    ("forrester", 8, 0.0),
+    ("branin", 10, 0.05),
+    ("park91a", 5, 0.05),
+)
+PUMP = ("pump", 6, 1.0)  # two noisy outputs of very different units
 MODELS = labels("cka") | {"phy": LEARNERS["phymean"].label} | labels("gp", "rra")
 ARM = "arm"
 SIMULATED = (ARM, "cart-pole")
@@ -72,44 +80,13 @@ class Structures(Experiment):
         return {k: v for k, v in asdict(self.settings).items() if k == name}
 
 
-_ONE = ("wave", "bell, noise", "saddle", "front, noise", "bowl, noise")
-_MORE = ("rate, noise", "blend", "friedman, noise", "lift", "eight, noise")
-OF_NO_USE = _ONE + _MORE
-"""Problems whose f_p has nothing to do with the data, of five and ten points each input."""
 KINDS = (
     *("addend", "gain, noise", "decay", "phase", "sign", "offset", "moved peak", "beam"),
     *("throttle, noise", "uptake, noise", "lens", "pipe, noise", "exchanger, noise", "kink"),
-    *("unrelated, noise", "unrelated"),
 )
-"""Kinds of data sets of which structures are compared, of five points each input."""
+"""Functions of the unit cube whose physics is right in part."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ChoiceSettings:
-    """What decides the numbers."""
-
-    num_test: int = 500
-    """points of a Sobol sequence that all runs are scored at"""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Choice(Experiment):
-    """The default CKA, a plain Gaussian process, and `compare`, on small data sets."""
-
-    runs: int = 4
-    """data sets of each problem and number of points"""
-    seed: int = 800
-    """the first seed; 0 to 99 were for trying, 700 and 701 for a first run"""
-    out: Path = Path("results/choice")
-    settings: ChoiceSettings = field(default_factory=ChoiceSettings)
-
-    axes: ClassVar[Axes] = {
-        "problem": {name: name for name in OF_NO_USE + KINDS},
-        "per_input": {5: "N = 5 d", 10: "N = 10 d"},
-        "method": {"zero": "ZeroMeanGP"} | labels("cka", "compare"),
-    }
-    calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA", "gpadjust.compare")
-
-    def seeds_of(self, *kind: Any) -> Sequence[int]:
-        """Ten points each input where f_p is of no use alone."""
-        return self.seeds if kind[1] == 5 or kind[0] in OF_NO_USE else ()
+def label(problem: str, n: int, noise: float) -> str:
+    """What a row is called."""
+    return f"{problem}, N = {n}" + (", noisy" if noise else "")

@@ -1,8 +1,7 @@
-"""Functions of the unit cube, and physics that are right in part, or unrelated to them."""
+"""Functions of the unit cube, and physics that are right in part."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -24,10 +23,6 @@ class Problem(NamedTuple):
     noise: float
     truth: Callable[[Tensor], Tensor]
     physics: Callable[[Tensor], Tensor]
-
-
-def _rough(X: Tensor) -> Tensor:
-    return (17 * X.sum(-1) + 1).cos()
 
 
 def _peak(X: Tensor, middle: float, width: float) -> Tensor:
@@ -71,61 +66,6 @@ def _exchanger(X: Tensor, loss: float) -> Tensor:
 
 
 PROBLEMS = {
-    # f_p of no use: other functions, some of which are rough.
-    "wave": Problem(
-        1, 0.0, lambda X: (5 * X[:, 0]).sin() + X[:, 0].square(), lambda X: (11 * X[:, 0]).cos()
-    ),
-    "bell, noise": Problem(
-        1, 0.1, lambda X: _peak(X, 0.6, 0.2), lambda X: (40 * X[:, 0].square()).sin()
-    ),
-    "saddle": Problem(
-        2,
-        0.0,
-        lambda X: X[:, 0].square() - X[:, 1] + (4 * X[:, 0] * X[:, 1]).sin(),
-        lambda X: _peak(X, 0.3, 0.2),
-    ),
-    "front, noise": Problem(
-        2, 0.1, lambda X: (4 * (X.sum(-1) - 1)).tanh(), lambda X: (5 * X[:, 0]).floor() % 2
-    ),
-    "bowl, noise": Problem(
-        2,
-        0.3,
-        lambda X: (X - 0.4).square().sum(-1),
-        lambda X: (17 * X[:, 0] + 34 * X[:, 1]).sin(),
-    ),
-    "rate, noise": Problem(
-        3,
-        0.05,
-        lambda X: (-2 * X[:, 0]).exp() * (1 + X[:, 1]) + X[:, 2].square(),
-        _rough,
-    ),
-    "blend": Problem(
-        4,
-        0.0,
-        lambda X: X[:, 0] * X[:, 1] + (2 * X[:, 2]).sin() - 0.5 * X[:, 3],
-        lambda X: (4 * X[:, 0]).cos() * (3 * X[:, 3]).sin() + X[:, 1],
-    ),
-    "friedman, noise": Problem(
-        5,
-        0.1,
-        lambda X: (
-            10 * (math.pi * X[:, 0] * X[:, 1]).sin()
-            + 20 * (X[:, 2] - 0.5).square()
-            + 10 * X[:, 3]
-            + 5 * X[:, 4]
-        ),
-        _rough,
-    ),
-    "lift": Problem(
-        6,
-        0.0,
-        lambda X: (0.5 + X[:, 0]) * (1 + X[:, 1]).sqrt() * (1 + 0.5 * X[:, 2]) + 0.3 * X[:, 4],
-        lambda X: (X - 0.5).square().sum(-1),
-    ),
-    "eight, noise": Problem(
-        8, 1.0, lambda X: X[:, 0] + (2 * X[:, 1]).sin() + X[:, 2] * X[:, 3], _rough
-    ),
-    # Kinds of data sets that structures are compared on.
     "addend": Problem(
         1, 0.0, lambda X: (8 * X[:, 0]).sin() + 2 * X[:, 0].square(), lambda X: (8 * X[:, 0]).sin()
     ),
@@ -168,14 +108,5 @@ PROBLEMS = {
         0.0,
         lambda X: (4 * X[:, 0]).sin() + (X[:, 1] - 0.5).abs(),
         lambda X: (4 * X[:, 0]).sin(),
-    ),
-    "unrelated, noise": Problem(
-        2, 0.1, lambda X: (3 * X[:, 0] + X[:, 1]).sin() + X[:, 1].square(), _rough
-    ),
-    "unrelated": Problem(
-        3,
-        0.0,
-        lambda X: (2 * X[:, 0] * X[:, 1]).exp() - X[:, 2].square(),
-        lambda X: (5 * X[:, 2]).cos() + X[:, 0],
     ),
 }

@@ -1,18 +1,15 @@
-"""The chapter of control: systems that people know."""
+"""The chapter of control: systems that people know, and first trials."""
 
 import pickle
+import warnings
 
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 
-from gpadjust.systems.swing_up import CART_POLE_SPEC as SWING_UP
-from paper.control import Hidden, HiddenSettings, Known, KnownSettings
-from paper.control.hidden import draw as hidden_draw
-from paper.control.hidden import run as hidden_run
-from paper.control.hidden import tables as hidden_tables
+from paper.control import First, FirstSettings, Known, KnownSettings, first
 from paper.control.known import run, tables
-from paper.control.systems import FURUTA, SYSTEMS
+from paper.control.systems import SYSTEMS
 
 LIGHT = KnownSettings(
     trials=2,
@@ -86,11 +83,6 @@ def test_environments_are_gymnasiums(name):
     assert pickle.loads(pickle.dumps(system)).spec == system.spec
 
 
-def test_a_physics_of_another_name_is_refused():
-    with pytest.raises(ValueError, match="'crude', 'unknown' or 'true'; found 'fitted'"):
-        FURUTA.physics("fitted")
-
-
 @pytest.mark.slow
 def test_rivals_of_a_system_make_a_table():
     known = Known(settings=LIGHT)
@@ -106,20 +98,11 @@ def test_rivals_of_a_system_make_a_table():
 
 
 @pytest.mark.slow
-def test_hidden_rates_make_a_table(tmp_path):
-    settings = HiddenSettings(
-        trials=2, sequences=8, rounds=0, first_sequences=16, first_rounds=0, elites=2
-    )
-    hidden, runs = Hidden(settings=settings, out=tmp_path), []
-    for learner in ("filter", "quotient"):
-        found = hidden_run(hidden, "cart_pole", learner, 0)
-        assert {len(values) for values in found["trials"].values()} == {2}
-        runs.append({"system": "cart_pole", "learner": learner, "seed": 0, **found})
-    starts = torch.tensor([each["states"]["true"][0] for each in runs])
-    assert (starts == starts[0]).all()  # of the second trial, whatever was measured
-    seen = torch.tensor(runs[1]["states"]["seen"])
-    quotients = SWING_UP.change(seen[:-1], seen[1:])[:, :2] / 0.1
-    torch.testing.assert_close(seen[1:, 2:], quotients, atol=1e-4, rtol=0)
-    text = hidden_tables(runs, hidden)["costs"].text
-    assert "cart-pole: positions and angles, by the filter (1 runs)" in text
-    assert hidden_draw(runs, hidden)[0].exists()
+def test_first_trials_make_a_table():
+    experiment = First(settings=FirstSettings(trials=1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = first.run(experiment, "truth", 0)
+    assert 0.1 < found["trials"]["cost"][0] < 0.42
+    text = first.tables([{"model": "truth", "seed": 0, **found}], experiment)["trials"].text
+    assert "the true system, trial 1" in text

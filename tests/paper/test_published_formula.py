@@ -1,13 +1,11 @@
 """The experiment on formulas and what is made of them: its cells, and a smoke run."""
 
-import json
 import math
 
 import pytest
 
-from paper.__main__ import main
 from paper.published import FORMULA_CELLS, Formula
-from paper.published.formula import cells, judge
+from paper.published.formula import cells
 
 RUN = {"group": "kinds", "problem": "decay", "size": 5, "noise": 0.0, "held": [0.9]}
 
@@ -16,28 +14,21 @@ RUN = {"group": "kinds", "problem": "decay", "size": 5, "noise": 0.0, "held": [0
 @pytest.mark.parametrize(
     "kind", [("kinds", "decay"), ("right", "lens"), ("laws", "creep"), ("functions", "forrester")]
 )
-def test_formula(kind, tmp_path, monkeypatch):
-    out = tmp_path / "formula"
-    options = ["--only", *kind, "--runs", "2", "--jobs", "1", "--out", str(out)]
-    monkeypatch.setattr("sys.argv", ["paper", "formula", *options])
-    main()
-    runs = [json.loads(line) for line in (out / "runs.jsonl").read_text().splitlines()]
+def test_formula(kind, ran, tmp_path):
+    runs, tables = ran("formula", "--only", *kind)
     assert {(run["group"], run["problem"]) for run in runs} == {kind}
     assert all(0 < run["ours"][0] < 10 * run["formula"][0] for run in runs)
-    assert (out / "formula.png").exists()
-    assert "nowhere above" in (out / "tables.md").read_text()
+    assert (tmp_path / "formula.png").exists()
+    assert "worst cell" in tables
 
 
-def test_ratios_and_verdicts(tmp_path):
+def test_ratios(tmp_path):
     experiment = Formula(out=tmp_path / "formula")
     runs = [{**RUN, "ours": [a], "formula": [1.0]} for a in (0.5, 2.0)]
     runs += [{**RUN, "size": 10, "ours": [1.05, 1.05], "formula": [1.0, 1.0]}] * 2
     found = cells(runs, experiment)
     assert found.groupby("cell")["gap"].mean().tolist() == pytest.approx([math.log(1.05), 0.0])
-    first, second = judge(found)
-    assert first.verdict == "missed"
-    assert "1 of 2" in first.measured
-    assert second.verdict == "met"
+    assert "| all | 2 | 1.02 " in experiment.tables(runs)["groups"].text
 
 
 def test_cells_are_apart():

@@ -1,12 +1,9 @@
 """Smoke run of the experiment on nuclear masses, and its physics."""
 
-import json
-
 import numpy as np
 import pytest
 import torch
 
-from paper.__main__ import main
 from paper.published.masses import drop, left_out, nuclides, shell
 
 
@@ -41,13 +38,8 @@ def test_the_data_and_what_is_left_out():
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_it_runs(tmp_path, monkeypatch):
-    out = tmp_path / "masses"
-    options = ["--runs", "2", "--stride", "15", "--num-rows", "60", "--jobs", "1"]
-    monkeypatch.setattr("sys.argv", ["paper", "masses", *options, "--out", str(out)])
-    main()
-    runs = [json.loads(line) for line in (out / "runs.jsonl").read_text().splitlines()]
+def test_it_runs(ran, tmp_path):
+    runs, tables = ran("masses", "--stride", "15", "--num-rows", "60")
     assert len(runs) == 2 * 9 + 3 * 9
-    tables = (out / "tables.md").read_text()
-    assert all(name in tables for name in ("targets", "errors", "all", "parameters"))
-    assert (out / "masses.png").exists()
+    assert all(name in tables for name in ("errors", "all", "parameters"))
+    assert (tmp_path / "masses.png").exists()

@@ -1,12 +1,9 @@
 """The experiment on published regression tables: its splits, its formulas, and a smoke run."""
 
-import json
-
 import pandas as pd
 import pytest
 import torch
 
-from paper.__main__ import main
 from paper.published import TABLES, Uci
 from paper.published.rivals import fitted_formula
 from paper.published.uci import PUBLISHED
@@ -47,14 +44,10 @@ def test_there_are_twenty_splits():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", [("cka", "gp", "ensemble"), ("formula", "single", "feature")])
-def test_uci(method, tmp_path, monkeypatch):
-    out = tmp_path / "uci"
-    options = ["--only", "yacht", "0.1", *method, "--runs", "2", "--jobs", "1", "--out", str(out)]
-    monkeypatch.setattr("sys.argv", ["paper", "uci", *options])
+def test_uci(method, ran, tmp_path, monkeypatch):
     monkeypatch.setattr("paper.published.rivals._STEPS", 200)
-    main()
-    runs = [json.loads(line) for line in (out / "runs.jsonl").read_text().splitlines()]
+    runs, tables = ran("uci", "--only", "yacht", "0.1", *method)
     assert {run["method"] for run in runs} == {*method}
     assert all(0 < run["rmse"] < 5 for run in runs)
-    assert "WGBoost" in (out / "tables.md").read_text()
-    assert (out / "uci.png").exists()
+    assert "WGBoost" in tables
+    assert (tmp_path / "uci.png").exists()

@@ -11,12 +11,11 @@ from typing import ClassVar
 
 import pytest
 from cloudpickle import register_pickle_by_value, unregister_pickle_by_value
-from filelock import FileLock
 
 from paper.__main__ import main as paper_main
 from paper.common import runner
 from paper.common.experiment import Axes, Experiment, Table
-from paper.common.runner import Refused, check_settings, main, run_missing, runs_file
+from paper.common.runner import Refused, main, run_missing, runs_file
 from paper.common.runs import RunsFile, commit_of, versions
 
 ROOT = Path(__file__).parents[2]
@@ -29,9 +28,14 @@ class Toy(Experiment):
     runs: int = 3
     jobs: int = 1
     scale: float = 1.0
+    missing: bool = False
 
     axes: ClassVar[Axes] = {"kind": {"a": "the first", "b": "the second"}}
     packages: ClassVar[tuple[str, ...]] = ("gpadjust", "numpy")
+
+    def check(self):
+        if self.missing:
+            raise ImportError("It needs a simulator; install it.")
 
     def describe(self, *kind):
         return {"scale": self.scale, "inner": {"kind": kind[0]}}
@@ -40,7 +44,7 @@ class Toy(Experiment):
         if (self.out / "stop").exists() and case == ("a", 1):
             raise KeyboardInterrupt
         with open(self.out / "log", "a") as log:
-            log.write(f"{case} {self.unfinished(*case).name}\n")
+            log.write(f"{case}\n")
         return {"value": self.scale * case[1] ** 2, "nothing": float("nan")}
 
     def first_look(self, runs):
@@ -64,7 +68,7 @@ def test_all_tasks_are_run_once_and_shown(tmp_path, capsys):
     assert "a first look" in first.out
     assert "Runs\n\n6\n" in first.out
     assert "<!-- toy:runs -->\n6\n<!-- end -->" in (tmp_path / "tables.md").read_text()
-    assert calls(tmp_path)[0] == "('a', 0) a-0"
+    assert calls(tmp_path)[0] == "('a', 0)"
     record = runs_file(toy).read()["b", 2]
     assert (record["value"], record["nothing"]) == (4, None)
     assert record["settings"] == {"scale": 1.0, "inner": {"kind": "b"}}
@@ -97,79 +101,45 @@ def test_runs_in_other_processes(tmp_path):
 
 
 def test_only_tables_runs_nothing(tmp_path):
-    with pytest.raises(Refused, match="There are no results"):
-        main(Toy(out=tmp_path, only_tables=True))
     main(Toy(out=tmp_path, runs=2))
     main(Toy(out=tmp_path, only_tables=True))
     assert len(calls(tmp_path)) == 4
 
 
-def test_tables_do_not_claim_settings_that_the_runs_do_not_have(tmp_path):
-    main(Toy(out=tmp_path, runs=2, only=("a",)))
-    with pytest.raises(Refused, match=r"a-0 was made with other settings: scale was 1\.0 and is "):
-        main(Toy(out=tmp_path, only_tables=True, scale=7.0))
-    with pytest.raises(Refused, match=r"a-0 was made with other settings"):
-        main(Toy(out=tmp_path, runs=2, only=("b",), scale=7.0))
-    assert len(calls(tmp_path)) == 2
-
-
-@pytest.mark.parametrize("option", ["runs", "jobs"])
-def test_options_out_of_range(tmp_path, option):
-    with pytest.raises(Refused, match=f"--{option}: expected at least"):
-        main(replace(Toy(out=tmp_path), **{option: 0}))
-
-
-def test_runs_of_other_settings_are_refused(tmp_path):
-    main(Toy(out=tmp_path))
-    with pytest.raises(Refused, match=r"a-0 was made with other settings: scale was 1\.0 and is "):
-        main(Toy(out=tmp_path, scale=2.0))
-    other = {"settings": {"inner": {"kind": "b", "more": 1}}}
-    with pytest.raises(Refused, match=r"inner\.kind was b and is now a"):
-        check_settings(tmp_path, ("a", 0), other, Toy(out=tmp_path))
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"runs": 0}, "--runs: expected at least"),
+        ({"jobs": 0}, "--jobs: expected at least"),
+        ({"only": ("c",)}, "--only: there is no 'c'"),
+        ({"only_tables": True}, "There are no results"),
+        ({"missing": True}, "It needs a simulator"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_before_anything_is_run(tmp_path, options, said):
+    with pytest.raises(Refused, match=said):
+        main(replace(Toy(out=tmp_path), **options))
+    assert not list(tmp_path.iterdir())
 
 
 @dataclass(frozen=True, kw_only=True)
 class More(Toy):
-    """With a setting that it did not have."""
+    """With another inner setting, and one that it did not have."""
 
     def describe(self, *kind):
-        return super().describe(*kind) | {"sort": "new"}
+        return {"inner": {"kind": "c", "more": 1}, "sort": "new"}
 
 
-@dataclass(frozen=True, kw_only=True)
-class Calling(Toy):
-    """With a call of a library."""
-
-    calls: ClassVar[tuple[str, ...]] = ("json.dumps",)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Less(Toy):
-    """Without a setting that it had."""
-
-    def describe(self, *kind):
-        return {"scale": self.scale}
-
-
-def test_runs_that_lack_a_setting_or_the_defaults_are_of_another_version(tmp_path):
-    """Also if a default of the library changes; nothing is said as long as nothing is to be run."""
-    main(Toy(out=tmp_path, runs=2))
-    for kind, said in (
-        (Less, r"inner was .* and is now not there\. Pass --other-versions"),
-        (More, r"sort was not there and is now new\. Pass --other-versions"),
-        (Calling, "the defaults of the library are not said"),
-    ):
-        main(kind(out=tmp_path, runs=2))
-        with pytest.raises(Refused, match=said):
-            main(kind(out=tmp_path, runs=3))
-    calling = Calling(out=tmp_path, runs=3, other_versions="replace")
-    main(calling)
-    assert len(calls(tmp_path)) == 4 + 6
-    file = runs_file(calling)
-    assert file.read()["a", 0]["defaults"]["json.dumps"]["skipkeys"] is False
-    file.path.write_text(file.path.read_text().replace('"skipkeys":false', '"skipkeys":true'))
-    with pytest.raises(Refused, match=r"json\.dumps\.skipkeys was True and is now False"):
-        main(Calling(out=tmp_path, runs=4))
+def test_runs_of_other_settings_are_refused(tmp_path):
+    """Settings that only one of them has are those of another version, and do not count."""
+    main(Toy(out=tmp_path))
+    with pytest.raises(Refused, match=r"a-0 was made with other settings: scale was 1\.0 and is "):
+        main(Toy(out=tmp_path, scale=2.0))
+    with pytest.raises(Refused, match=r"inner\.kind was a and is now c"):
+        main(More(out=tmp_path))
+    with pytest.raises(Refused, match="a-0 was made with other settings"):
+        main(Toy(out=tmp_path, only_tables=True, only=("b",), scale=7.0))
+    assert len(calls(tmp_path)) == 6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,53 +169,6 @@ def test_cases_follow_from_the_axes():
     assert Pairs(runs=1, only=("1", "gp")).cases() == [("x", 1, "gp", 0), ("y", 1, "gp", 0)]
     with pytest.raises(ValueError, match=r"there is no 'z', but .* name: x, y; n: 1, 2; learner"):
         Pairs(only=("z",)).cases()
-
-
-def test_unknown_values_are_refused_before_anything_is_run(tmp_path):
-    with pytest.raises(Refused, match="--only: there is no 'c'"):
-        main(Toy(out=tmp_path, only=("c",)))
-    assert not list(tmp_path.iterdir())
-
-
-def test_runs_of_other_versions_are_refused_kept_or_run_again(tmp_path, monkeypatch, capsys):
-    main(Toy(out=tmp_path))
-    later = {**versions(Toy.packages), "numpy": "99"}
-    monkeypatch.setattr(runner, "versions", lambda packages: later)
-    main(Toy(out=tmp_path))  # nothing is missing
-    assert "6 of the runs were made by other versions" in capsys.readouterr().out
-    more = Toy(out=tmp_path, runs=4)
-    with pytest.raises(Refused, match=r"that differ .*: numpy was .* and is now 99\. Pass --other"):
-        main(more)
-    main(replace(more, other_versions="keep"))
-    assert len(calls(tmp_path)) == 8
-    main(replace(more, other_versions="replace"))
-    assert len(calls(tmp_path)) == 14
-    assert {r["versions"]["numpy"] for r in runs_file(more).read().values()} == {"99"}
-
-
-def test_runs_of_a_package_that_is_no_longer_used_are_not_made_again(tmp_path, capsys):
-    main(Toy(out=tmp_path))
-    path = runs_file(Toy(out=tmp_path)).path
-    path.write_text(path.read_text().replace('"versions":{', '"versions":{"abandoned":"1",'))
-    main(Toy(out=tmp_path, runs=4))
-    assert len(calls(tmp_path)) == 8
-    assert "other versions" not in capsys.readouterr().out
-
-
-def test_runs_of_another_commit_or_without_one_are_not_made_again(tmp_path, monkeypatch, capsys):
-    toy = Toy(out=tmp_path, runs=2)
-    main(toy)
-    path = runs_file(toy).path
-    records = [json.loads(line) for line in path.read_text().splitlines()]
-    for record in records[:2]:
-        del record["commit"]
-    path.write_text("".join(json.dumps(record) + "\n" for record in records))
-    monkeypatch.setattr(runner, "commit_of", lambda root: "f" * 40)
-    main(replace(toy, runs=3))
-    assert len(calls(tmp_path)) == 6
-    assert "other versions" not in capsys.readouterr().out
-    found = [record.get("commit") for record in runs_file(toy).read().values()]
-    assert found == [None, None, *[commit_of(ROOT)] * 2, *["f" * 40] * 2]
 
 
 def test_a_commit_is_that_of_the_repository_and_says_if_files_are_changed(tmp_path):
@@ -283,25 +206,6 @@ def test_without_git_there_is_no_commit(monkeypatch):
         assert commit_of(ROOT) is None
     finally:
         commit_of.cache_clear()
-
-
-def test_a_second_process_is_refused(tmp_path):
-    (tmp_path / "unfinished").mkdir()
-    with (
-        FileLock(tmp_path / "unfinished" / "process.lock"),
-        pytest.raises(Refused, match="Another process adds runs to"),
-    ):
-        main(Toy(out=tmp_path))
-
-
-def test_what_is_missing_is_said(tmp_path, monkeypatch):
-    def check(self):
-        raise ImportError("It needs a simulator; install it.")
-
-    monkeypatch.setattr(Toy, "check", check)
-    with pytest.raises(Refused, match="It needs a simulator"):
-        main(Toy(out=tmp_path))
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_torn_line_is_not_read_and_not_glued_to_the_next(tmp_path):
@@ -355,6 +259,16 @@ def test_a_killed_process_leaves_whole_runs(tmp_path):
     assert [json.loads(line)["seed"] for line in path.read_text().splitlines()] == [*range(22)]
 
 
+def test_how_runs_were_made_is_written_once(tmp_path):
+    file = RunsFile(tmp_path / "runs.jsonl", ("seed",))
+    runs = [{"seed": i, "settings": {"scale": i // 2}, "commit": None, "x": 0.5} for i in range(4)]
+    for run in runs:
+        file.append(run)
+    assert list(file.read().values()) == runs
+    assert file.path.read_text().count("scale") == 2
+    assert len(file.path.read_text().splitlines()) == 6
+
+
 def test_help_is_quick_and_imports_nothing_slow():
     code = (
         "import sys\nsys.argv = ['paper', 'arm', '--help']\nfrom paper.__main__ import main\n"
@@ -373,19 +287,3 @@ def test_report_takes_no_options(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["paper", "report", "--force"])
     with pytest.raises(SystemExit, match="report takes no options; found --force"):
         paper_main()
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")  # of Ray
-def test_runs_on_ray(tmp_path):
-    ray = pytest.importorskip("ray")
-    from paper.forrester import Forrester, Settings
-
-    settings = Settings(steps=1, lengthscales=(0.5,), ridges=(0.01,))
-    experiment = Forrester(out=tmp_path, runs=2, jobs=2, backend="ray", settings=settings)
-    ray.init("local", num_cpus=2)  # not a cluster of another test
-    try:
-        run_missing(experiment)
-    finally:
-        ray.shutdown()
-    assert len(runs_file(experiment).read()) == 12

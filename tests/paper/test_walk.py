@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-import paper.calibration.calibration  # not while files are counted  # noqa: F401
-from paper.calibration import Calibration, Settings
+import paper.laboratory.drift  # not while files are counted  # noqa: F401
 from paper.common.runner import main
+from paper.laboratory import Drift, DriftSettings
 from paper.report import PAPER
 
 FILES, OF_PAPER = 35, 7  # of the library and of paper/ in a run of point fits, its tables included
@@ -15,8 +15,8 @@ FILES, OF_PAPER = 35, 7  # of the library and of paper/ in a run of point fits, 
 
 @pytest.mark.slow
 def test_one_experiment_passes_few_files(tmp_path):
-    only, settings = ("forrester", "5", "map"), Settings(num_test=20)
-    experiment = Calibration(out=tmp_path, runs=2, jobs=1, only=only, settings=settings)
+    settings = DriftSettings(steps=60, first=24)
+    experiment = Drift(out=tmp_path, runs=2, jobs=1, only=("never",), settings=settings)
     files = set()
 
     def record(frame, event, argument):
