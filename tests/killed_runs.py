@@ -18,7 +18,6 @@ from gpadjust.control import (
     PolicySearch,
     PolicySearchAgent,
     Task,
-    linear_policy,
     resume,
 )
 from gpadjust.control.random_state import RandomState
@@ -26,7 +25,7 @@ from gpadjust.dynamics import LearnedDynamics
 from gpadjust.rl import DynaOptions, DynaSAC
 from paper.cartpole import CartPole, Settings
 from paper.common.runner import run_missing, runs_file
-from tests.point import POINT_SPEC, QUICK, Faulty, Point, near_one
+from tests.point import POINT_SPEC, QUICK, Faulty, Point, linear_policy, near_one
 
 TOTAL = 40  # steps, of episodes of five where none fails
 FAILS = {8: "raises", 16: "nan", 23: "reward 1e30"}

@@ -6,7 +6,6 @@ import re
 import numpy as np
 import pytest
 import torch
-from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import (
     CheckpointCallback,
     EvalCallback,
@@ -106,12 +105,6 @@ def test_hooks_of_the_model(point_agent, learnt_dynamics):
     assert np.concatenate(watch.returns).sum() == pytest.approx(rewards.sum(), rel=1e-5)
     agent.learn(5, reset_num_timesteps=False)
     assert len(watch.fits) == 2
-
-
-def test_hooks_are_for_dyna_only(point_env):
-    agent = SAC("MlpPolicy", point_env(), policy_kwargs={"net_arch": [8]})
-    with pytest.raises(TypeError, match=r"Watch is for Dyna agents.*found SAC"):
-        agent.learn(5, Watch())
 
 
 def test_hooks_inside_another_callback(point_agent):
