@@ -15,7 +15,7 @@ from gpadjust.control.constraints import margins
 from gpadjust.control.mpc import MPC, Planned
 from gpadjust.control.planner import Plan, Planner
 from gpadjust.control.policies import BoundedPolicy, mlp_policy
-from gpadjust.control.policy_search import PolicySearch, SearchResult, imitate
+from gpadjust.control.policy_search import PolicySearch, SearchResult
 from gpadjust.control.progress import print_progress
 from gpadjust.control.recorded_episodes import RecordedEpisodes
 from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts
@@ -55,7 +55,6 @@ __all__ = [
     "StepGuard",
     "Task",
     "Termination",
-    "imitate",
     "margins",
     "mlp_policy",
     "print_progress",

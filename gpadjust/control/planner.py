@@ -79,8 +79,6 @@ class Planner:
         max_hold: The most steps that a random sequence holds an action.
         spread: Standard deviation of what is drawn about an earlier plan, as a share of the range
             of the actions.
-        restarts: How many searches there are, of which the best is taken; one where there is an
-            earlier plan.
         seconds: The most time that a plan takes. A round of the search that would take longer does
             not begin; if even the first one would, its sequences are followed, and compared, as far
             as there is time, one step of the model at least. Default: as long as it takes.
@@ -109,7 +107,6 @@ class Planner:
     num_random: int = 80
     max_hold: int = 5
     spread: float = 0.1
-    restarts: int = 1
     seconds: float | None = None
 
     def __post_init__(self) -> None:
@@ -118,7 +115,7 @@ class Planner:
         check_kind("objective", self.objective, Objective, told)
         told = "an object of a Search, such as CrossEntropy()"
         check_kind("search", self.search, Search, told)
-        for name in ("num_random", "max_hold", "restarts"):
+        for name in ("num_random", "max_hold"):
             checked_whole(name, getattr(self, name), 1)
         if self.num_functions is not None:
             checked_whole("num_functions", self.num_functions, 1)
@@ -200,21 +197,14 @@ class Planner:
                 best.append(Plan.of(rollout, found, float(scores[found])))
             return scores
 
-        def search(known: Tensor | None) -> None:
+        with suppress(_TimeIsUp):
             first = self._proposed(num_steps, action_bounds, known)
             self.search.best(scored, first, action_bounds)
-
-        with suppress(_TimeIsUp):
-            if known is not None and len(known):
-                search(known)
-            else:
-                for _ in range(self.restarts):
-                    search(None)
         return best[-1]
 
     def _proposed(self, num_steps: int, bounds: Tensor, known: Tensor | None) -> Tensor:
         """The sequences that a search begins with, ``n x num_steps x action_dim``."""
-        if known is None:
+        if known is None or not len(known):
             return random_sequences(self.num_random, num_steps, bounds, self.max_hold)
         if known.dim() != 2 or known.shape[-1] != bounds.shape[-1]:
             raise ValueError(

@@ -159,7 +159,7 @@ class PolicySearch:
                         "BoundedPolicy says, such as mlp_policy(...); found "
                         f"{type(policy).__name__}."
                     )
-                imitate(policy, *self.plans(task, policy.action_bounds))
+                _imitate(policy, *self.plans(task, policy.action_bounds))
             return self._improve(policy, task, task.episode_length, progress)
         except BaseException:
             policy.load_state_dict(before)
@@ -258,26 +258,12 @@ class _Best:
             self.worth, self.rollout, self.kept = worth, rollout, deepcopy(policy.state_dict())
 
 
-def imitate(
-    policy: nn.Module, states: Tensor, actions: Tensor, *, epochs: int = 400, rate: float = 5e-3
-) -> float:
-    """Let a policy do what was done, by least squares.
-
-    Args:
-        policy: A module from states to actions.
-        states: ``N x state_dim``.
-        actions: ``N x action_dim``.
-        epochs: Steps of Adam, all rows at once.
-        rate: Its learning rate.
-
-    Returns:
-        The root mean square error in the end, in shares of each action's standard deviation.
-    """
+def _imitate(policy: nn.Module, states: Tensor, actions: Tensor) -> None:
+    """Fit a policy to actions ``N x action_dim`` at states ``N x state_dim``, by least squares."""
     scale = actions.std(0, correction=0).clamp_min(1e-12)
-    optimizer = torch.optim.Adam(policy.parameters(), lr=rate)
-    for _ in range(epochs):
+    optimizer = torch.optim.Adam(policy.parameters(), lr=5e-3)
+    for _ in range(400):
         loss = ((policy(states) - actions) / scale).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    return float(loss.detach().sqrt())

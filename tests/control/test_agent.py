@@ -266,36 +266,32 @@ def test_an_error_loses_no_episode(make_agent, kind, point_reward):
     assert agent.num_episodes == 2
 
 
+class Jams(gymnasium.Wrapper):
+    """Some steps do not happen, by their numbers from 1."""
+
+    def __init__(self, env, *jams):
+        super().__init__(env)
+        self.jams, self.steps = jams, 0
+
+    def step(self, action):
+        self.steps += 1
+        return *super().step(action)[:4], {"step_failed": self.steps in self.jams}
+
+
 def test_a_step_that_failed_is_no_data_and_ends_its_episode(make_agent, point_env):
-    class Jams(gymnasium.Wrapper):
-        steps = 0
-
-        def step(self, action):
-            self.steps += 1
-            failed = self.steps in (1, 8)
-            return *super().step(action)[:4], {"step_failed": failed}
-
-    recorded = make_agent(MPCAgent, Jams(point_env())).learn(13).recorded_episodes()
+    recorded = make_agent(MPCAgent, Jams(point_env(), 1, 8)).learn(13).recorded_episodes()
     assert recorded.episode.tolist() == 5 * [0] + [1] + 5 * [2]
     moved = recorded.next_states - recorded.states
     torch.testing.assert_close(moved, 0.5 * recorded.actions, atol=0.1, rtol=0)
 
 
 @pytest.mark.filterwarnings("ignore:.*promised")
-def test_an_episode_without_a_step_counts_for_nothing(point_env, point_task):
+def test_an_episode_without_a_step_counts_for_nothing(make_agent, point_env):
     class Boasts(Farthest):
         def promise(self, state):
             return {"promised_reward": 100.0 if self.num_timesteps == 5 else -1.0}
 
-    class Jams(gymnasium.Wrapper):
-        steps = 0
-
-        def step(self, action):
-            self.steps += 1
-            return *super().step(action)[:4], {"step_failed": self.steps == 6}
-
-    agent = Boasts(Jams(point_env()), point_task(), score_horizons=(), reward_tolerance=None)
-    agent.learn(11)
+    agent = make_agent(Boasts, Jams(point_env(), 6), reward_tolerance=None).learn(11)
     assert agent.num_episodes == 2
     assert agent.promised_reward == -1.0
 

@@ -4,7 +4,6 @@ import errno
 import io
 import os
 import pickle
-import random
 import subprocess
 import sys
 import textwrap
@@ -13,7 +12,6 @@ import zipfile
 from dataclasses import replace
 
 import gymnasium
-import numpy as np
 import pytest
 import torch
 from filelock import FileLock
@@ -93,8 +91,8 @@ def test_checkpoints_come_every_so_many_episodes(make_agent, tmp_path, monkeypat
     monkeypatch.setattr(
         EpisodeCheckpoint, "_write", lambda self, agent: saved.append(agent.num_timesteps)
     )
-    make_agent(MPCAgent).learn(25, EpisodeCheckpoint(tmp_path / "run.ckpt", every=2))
-    assert saved == [0, 10, 20, 25]
+    make_agent(MPCAgent).learn(15, EpisodeCheckpoint(tmp_path / "run.ckpt", every=2))
+    assert saved == [0, 10, 15]
 
 
 # Files
@@ -419,15 +417,3 @@ def test_what_was_resumed_is_saved_again_as_it_was(make_agent, again, tmp_path):
     given = again()
     assert_equal(numbers(resume(second, *given).learn(5)), expected)
     assert expected["counts"][-1] == {"costs": [1.0]}
-
-
-def draw():
-    return random.random(), np.random.random(), torch.rand(1).item()  # noqa: NPY002
-
-
-def test_draws_are_repeated_after_restoring():
-    state = pickle.loads(pickle.dumps(RandomState.capture()))
-    first, second = draw(), draw()
-    assert first != second
-    state.restore()
-    assert (draw(), draw()) == (first, second)

@@ -279,11 +279,11 @@ def slow_steps(clock):
         (0.5, 3, 1, 1),  # a step of the model at least
         (3.5, 3, 3, 3),  # no further step would end in time
         (9.5, 3, 8, 4),  # two rounds of four steps
-        (99.0, 1, 40, 4),  # five searches of two rounds
+        (99.0, 1, 8, 4),  # all there is to do
     ],
 )
 def test_plans_are_made_in_time(origin, clock, seconds, rounds, taken, planned):
-    planner = Planner(search=CrossEntropy(rounds), restarts=5, seconds=seconds, num_random=8)
+    planner = Planner(search=CrossEntropy(rounds), seconds=seconds, num_random=8)
     plan = planner.plan(slow_steps(clock), origin, BOUNDS, 4)
     assert clock[0] == taken
     assert len(plan.actions) == len(plan.rewards) == len(plan.next_states) == planned
@@ -294,7 +294,7 @@ def test_a_plan_that_has_time_is_that_without_a_limit(known_left, origin):
     plans = []
     for seconds in (None, 1e3):
         torch.manual_seed(0)
-        planner = Planner(restarts=2, seconds=seconds, num_random=8)
+        planner = Planner(seconds=seconds, num_random=8)
         plans.append(planner.plan(task_of(known_left), origin, BOUNDS, 3))
     assert torch.equal(plans[0].actions, plans[1].actions)
     assert plans[0].value == plans[1].value

@@ -12,7 +12,6 @@ from gpadjust.control import (
     Return,
     Rollouts,
     Task,
-    imitate,
     mlp_policy,
 )
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
@@ -169,13 +168,6 @@ def test_a_guide_shows_what_gradients_do_not_find():
         values[name] = search.improve(policy, task).values[-5:].mean()
     assert values["alone"] < 0.1
     assert values["guided"] > 0.3
-
-
-def test_imitation_does_what_was_done():
-    torch.manual_seed(0)
-    states = starts(40)
-    policy = mlp_policy(SPEC, BOUNDS, (16,))
-    assert imitate(policy, states, 0.5 + states.tanh()) < 0.1
 
 
 def test_an_error_leaves_the_policy_as_it_was():

@@ -96,7 +96,7 @@ def test_hooks_of_the_model(point_agent, learnt_dynamics):
     agent = point_agent(
         dynamics=learnt_dynamics(), model_episodes=3, num_particles=2, refresh_model_data=False
     )
-    agent.learn(10, [watch])
+    agent.learn(10, EveryNTimesteps(5, watch))
     assert [*watch.fits[0]] == ["fit_seconds"]
     assert watch.fits[1].keys() >= {"fit_seconds", "nlpd", "coverage"}
     assert all(np.isfinite([*metrics.values()]).all() for metrics in watch.fits)
@@ -104,12 +104,6 @@ def test_hooks_of_the_model(point_agent, learnt_dynamics):
     rewards = agent.replay_buffer.model_buffer.rewards[: 5 * 6, 0]
     assert np.concatenate(watch.returns).sum() == pytest.approx(rewards.sum(), rel=1e-5)
     agent.learn(5, reset_num_timesteps=False)
-    assert len(watch.fits) == 2
-
-
-def test_hooks_inside_another_callback(point_agent):
-    watch = Watch()
-    point_agent().learn(10, EveryNTimesteps(5, watch))
     assert len(watch.fits) == 2
 
 

@@ -16,6 +16,8 @@ from gpadjust.rl import ModelVecEnv
 from gpadjust.rl.buffer import CompactReplayBuffer
 from gpadjust.systems.swing_up import cart_pole_reward, cart_pole_start
 
+WEIGHT = torch.ones(1, requires_grad=True)
+
 
 def test_perfect_physics_are_the_real_environment(cart_pole, cart_pole_dynamics):
     env = cart_pole()
@@ -288,17 +290,13 @@ def test_refreshed_transitions_end_as_the_model_has_it(
     torch.testing.assert_close(rewards, -following[:, 0].square())
 
 
-def test_whole_numbers_are_rewards(point_particles, rise):
-    particles = point_particles(reward=lambda s, a, n: (n[:, 0] > 0).long())
+@pytest.mark.parametrize(
+    "reward", [lambda s, a, n: (n[:, 0] > 0).long(), lambda s, a, n: WEIGHT * n[:, 0] / 1.5]
+)
+def test_rewards_may_be_whole_numbers_or_carry_gradients(point_particles, rise, reward):
+    particles = point_particles(reward=reward)
     particles.reset()
     assert particles.step(rise(3))[1].tolist() == [1, 1, 1]
-
-
-def test_rewards_may_carry_gradients(point_particles, rise):
-    weight = torch.ones(1, requires_grad=True)
-    particles = point_particles(reward=lambda s, a, n: weight * n[:, 0])
-    particles.reset()
-    assert particles.step(rise(3))[1].tolist() == [1.5, 1.5, 1.5]
 
 
 def test_attributes_are_those_of_all_particles(point_particles):
