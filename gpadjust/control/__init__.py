@@ -19,7 +19,7 @@ from gpadjust.control.policy_search import PolicySearch, SearchResult
 from gpadjust.control.progress import print_progress
 from gpadjust.control.recorded_episodes import RecordedEpisodes
 from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts
-from gpadjust.control.search import CrossEntropy, Search
+from gpadjust.control.search import CrossEntropy
 from gpadjust.control.state_filter import Estimate, StateFilter
 from gpadjust.control.step_guard import FailedStepWarning, StepGuard
 from gpadjust.control.task import Constraints, InitialStates, Reward, Step, Task, Termination
@@ -48,7 +48,6 @@ __all__ = [
     "Reward",
     "Rollout",
     "Rollouts",
-    "Search",
     "SearchResult",
     "StateFilter",
     "Step",

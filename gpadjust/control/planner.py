@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gpadjust.checks import check_kind, checked_bounds, checked_number, checked_whole
 from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts
-from gpadjust.control.search import CrossEntropy, Search, correlated_noise, random_sequences
+from gpadjust.control.search import CrossEntropy, correlated_noise, random_sequences
 from gpadjust.control.task import Task
 from gpadjust.states import StateSpec
 
@@ -68,7 +68,7 @@ class Planner:
 
     Args:
         objective: What to look for: :class:`Return`, or your own.
-        search: How the sequences are improved: :class:`CrossEntropy`, or your own.
+        search: How the sequences are improved.
         horizon: The most time to look ahead, in the time unit of ``spec.step``; in steps where the
             spec has none. Default: to the end of the episode.
         num_functions: How many functions of the posterior each sequence is followed through; None
@@ -100,7 +100,7 @@ class Planner:
     """
 
     objective: Objective = field(default_factory=Return)
-    search: Search = field(default_factory=CrossEntropy)
+    search: CrossEntropy = field(default_factory=CrossEntropy)
     _: KW_ONLY
     horizon: float | None = None
     num_functions: int | None = None
@@ -113,8 +113,7 @@ class Planner:
         """Check objective, search and numbers."""
         told = "an object of an Objective, such as Return()"
         check_kind("objective", self.objective, Objective, told)
-        told = "an object of a Search, such as CrossEntropy()"
-        check_kind("search", self.search, Search, told)
+        check_kind("search", self.search, CrossEntropy, "a CrossEntropy(...)")
         for name in ("num_random", "max_hold"):
             checked_whole(name, getattr(self, name), 1)
         if self.num_functions is not None:

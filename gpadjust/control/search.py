@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
 
@@ -16,28 +15,8 @@ SequenceScore = Callable[[Tensor], Tensor]
 """Scores ``n`` of sequences ``n x T x action_dim``, higher is better."""
 
 
-class Search(ABC):
-    """Improves sequences of actions, round by round."""
-
-    rounds: int
-
-    @abstractmethod
-    def best(self, score: SequenceScore, first: Tensor, bounds: Tensor) -> tuple[Tensor, float]:
-        """Search, from PyTorch's generator.
-
-        Args:
-            score: What is sought; it is asked once a round, about as many sequences as there are
-                first ones. When there is no time left, it raises an exception, which comes through.
-            first: The sequences to begin with, ``n x T x action_dim``.
-            bounds: Lower and upper bounds of the actions, ``2 x action_dim``.
-
-        Returns:
-            The sequence, ``T x action_dim``, one of those whose score was asked, and its score.
-        """
-
-
 @dataclass(frozen=True)
-class CrossEntropy(Search):
+class CrossEntropy:
     """The cross-entropy method (Rubinstein 1999).
 
     Each round draws as many sequences as the first ones from a normal distribution with mean and
@@ -66,7 +45,17 @@ class CrossEntropy(Search):
         checked_number("correlation", self.correlation, least=0, below=1)
 
     def best(self, score: SequenceScore, first: Tensor, bounds: Tensor) -> tuple[Tensor, float]:
-        """Search; see :class:`Search`."""
+        """Search, from PyTorch's generator.
+
+        Args:
+            score: What is sought; it is asked once a round, about as many sequences as there are
+                first ones. When there is no time left, it raises an exception, which comes through.
+            first: The sequences to begin with, ``n x T x action_dim``.
+            bounds: Lower and upper bounds of the actions, ``2 x action_dim``.
+
+        Returns:
+            The sequence, ``T x action_dim``, one of those whose score was asked, and its score.
+        """
         sequences, scores = first, score(first)
         for _ in range(self.rounds):
             elites = scores.topk(min(self.num_elites, len(scores))).indices

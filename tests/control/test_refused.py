@@ -48,7 +48,7 @@ VALUES = [
     (lambda at: Planner("return"), r"such as Return\(\); found 'return'"),
     (lambda at: Planner(num_random=0), "num_random must be at least 1; found 0"),
     (lambda at: Planner(num_functions=0), "num_functions must be at least 1; found 0"),
-    (lambda at: Planner(search="cem"), "object of a Search, .* found 'cem'"),
+    (lambda at: Planner(search="cem"), r"a CrossEntropy\(...\); found 'cem'"),
     (lambda at: Planner(horizon=0), "horizon must be finite and above 0; found 0"),
     (lambda at: Planner(spread=0.0), "spread must be above 0 and below 1; found 0.0"),
     (lambda at: Planner(max_hold=True), "max_hold must be a whole number; found True"),
