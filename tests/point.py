@@ -18,7 +18,7 @@ import torch
 from gpadjust.control import Task, mlp_policy
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 
-linear_policy = partial(mlp_policy, net_arch=())
+linear = partial(mlp_policy, net_arch=())
 POINT_SPEC = StateSpec(["x"], ["v"])
 QUICK = {"num_starts": 1, "num_screened": 0}
 FEW_SAMPLES = {**QUICK, "num_samples": 3, "num_draws": 16}

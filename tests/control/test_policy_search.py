@@ -16,7 +16,7 @@ from gpadjust.control import (
 )
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.physics import BlackBoxPhysics, PhysicsError
-from tests.point import linear_policy
+from tests.point import linear
 
 SPEC = StateSpec(["x"], ["v"])
 BOUNDS = torch.tensor([[-1.0], [2.0]], dtype=torch.float64)
@@ -49,7 +49,7 @@ def learnt():
     return dynamics
 
 
-@pytest.mark.parametrize("make", [mlp_policy, linear_policy])
+@pytest.mark.parametrize("make", [mlp_policy, linear])
 def test_policies_keep_to_the_bounds_and_begin_where_they_are_told_to(make):
     policy = make(SPEC, BOUNDS, first_actions=[-0.8])
     policy.look_at(10 + starts(50))
@@ -67,7 +67,7 @@ def test_an_episode_that_runs_away_does_not_outweigh_the_others():
     def steep(X):
         return torch.where(X[:, :1] > 5, 1e3 * (X[:, :1] - 5) + 5, X[:, :1]) + 0.5 * X[:, 1:]
 
-    policy = linear_policy(SPEC, BOUNDS)
+    policy = linear(SPEC, BOUNDS)
     x = torch.linspace(-1, 1, 21, dtype=torch.float64).unsqueeze(-1)
 
     def slope(starts):
@@ -98,7 +98,7 @@ def test_the_optimum_is_found(learnt, kind):
         "physics": PhysicsDynamics(SPEC, step),
         "black box": PhysicsDynamics(SPEC, black_box),
     }.get(kind, learnt)
-    policy = linear_policy(SPEC, BOUNDS)
+    policy = linear(SPEC, BOUNDS)
     functions = None if kind.startswith("mean") else 3
     search = PolicySearch(updates=120, num_functions=functions, learning_rate=0.05)
     result = search.improve(policy, task_of(dynamics))
@@ -110,7 +110,7 @@ def test_the_optimum_is_found(learnt, kind):
 
 
 def test_gradients_are_those_of_finite_differences(learnt):
-    policy = linear_policy(SPEC, BOUNDS)
+    policy = linear(SPEC, BOUNDS)
     torch.manual_seed(0)
     rollouts, at = Rollouts(task_of(learnt), 2), starts(3)
     score = Return().of(task_of(learnt))
@@ -137,7 +137,7 @@ def test_runaways_and_failures_cost_those_particles_only():
         return (X[:, :1].abs() + 1e-300).sqrt().log() * 0 + step(X)
 
     torch.manual_seed(0)
-    policy = linear_policy(SPEC, BOUNDS)
+    policy = linear(SPEC, BOUNDS)
     result = PolicySearch(updates=30, learning_rate=0.05).improve(
         policy, task_of(PhysicsDynamics(SPEC, physics))
     )
@@ -171,7 +171,7 @@ def test_a_guide_shows_what_gradients_do_not_find():
 
 
 def test_an_error_leaves_the_policy_as_it_was():
-    policy = linear_policy(SPEC, BOUNDS)
+    policy = linear(SPEC, BOUNDS)
     before = policy.body[0].weight.clone()
 
     def stop(update, value):
@@ -191,7 +191,7 @@ def test_rewards_without_gradient_are_told():
         episode_length=3,
     )
     with pytest.raises(RuntimeError, match="Write the reward in torch"):
-        PolicySearch(updates=1).improve(linear_policy(SPEC, BOUNDS), task)
+        PolicySearch(updates=1).improve(linear(SPEC, BOUNDS), task)
 
 
 def test_a_guide_needs_bounds():
@@ -222,7 +222,7 @@ def test_a_policy_comes_back_from_the_bounds():
 
 def test_a_search_that_does_harm_keeps_the_policy_that_it_began_with():
     """In one step -2 x is the optimum; updates of this size throw it far away."""
-    policy = linear_policy(SPEC, torch.tensor([[-1e3], [1e3]], dtype=torch.float64))
+    policy = linear(SPEC, torch.tensor([[-1e3], [1e3]], dtype=torch.float64))
     with torch.no_grad():
         policy.body[0].weight.fill_(-2e-3)
         policy.body[0].bias.zero_()
@@ -237,7 +237,7 @@ def test_a_search_that_does_harm_keeps_the_policy_that_it_began_with():
 def test_the_result_is_that_of_the_policy_that_is_kept():
     fixed = torch.linspace(-1, 1, 24, dtype=torch.float64).unsqueeze(-1)
     task = replace(task_of(PhysicsDynamics(SPEC, step)), initial_states=lambda n: fixed[:n])
-    policy = linear_policy(SPEC, BOUNDS)
+    policy = linear(SPEC, BOUNDS)
     result = PolicySearch(updates=7, learning_rate=0.1).improve(policy, task)
     with torch.no_grad():
         rewards = Rollouts(task, None).act(fixed, policy, 4).rewards

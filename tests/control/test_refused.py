@@ -21,7 +21,7 @@ from gpadjust.control import (
 )
 from gpadjust.dynamics import PhysicsDynamics, StateSpec
 from gpadjust.states import Sensors
-from tests.point import POINT_SPEC, linear_policy, near_one
+from tests.point import POINT_SPEC, linear, near_one
 
 BOUNDS = [[-1.0], [2.0]]
 GOAL = StateSpec(["x", "goal"], ["force"], exogenous=["goal"])
@@ -164,7 +164,7 @@ def test_it_is_refused(call, words, make_agent, point_env, point_task):
         task=point_task,
         tried=tried,
         step=lambda X: X[:, :1] + 0.5 * X[:, 1:],
-        policy=linear_policy(POINT_SPEC, BOUNDS),
+        policy=linear(POINT_SPEC, BOUNDS),
         planner=lambda **given: make_agent(MPCAgent, **given),
         searcher=lambda **given: make_agent(PolicySearchAgent, **given),
     )

@@ -26,7 +26,7 @@ from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
 from gpadjust.models import ZeroMeanGP
 from gpadjust.states import Sensors, StateSpec
 from gpadjust.systems import NoisySensors, System, cart_pole
-from tests.point import linear_policy
+from tests.point import linear
 
 SPEC = StateSpec(["x", "v"], ["force"])
 STEP, LENGTH, NOISE = 0.2, 8, 0.02
@@ -84,7 +84,7 @@ def glider(**given):
 
 def make_agent(kind, env, task, **given):
     how = {MPCAgent: {"each_step": PLAN, "first": PLAN},
-           PolicySearchAgent: {"policy": linear_policy, "search": SEARCH}}  # fmt: skip
+           PolicySearchAgent: {"policy": linear, "search": SEARCH}}  # fmt: skip
     return kind(env, task, **how[kind], score_horizons=(), seed=0, **given)
 
 
