@@ -16,13 +16,12 @@ from gpadjust.control import (
     PolicySearch,
     PolicySearchAgent,
     Task,
-    linear_policy,
     resume,
 )
 from gpadjust.control.random_state import RandomState
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.rl import DynaOptions, DynaSAC
-from tests.point import POINT_SPEC, QUICK, Faulty, Point, near_one
+from tests.point import POINT_SPEC, QUICK, Faulty, Point, linear, near_one
 
 TOTAL = 40  # steps, of episodes of five where none fails
 FAILS = {8: "raises", 16: "nan", 23: "reward 1e30"}
@@ -72,7 +71,7 @@ def searched(folder):
         agent = resume(path, env, task)
     else:
         search = PolicySearch(updates=12, num_starts=6, num_functions=2, learning_rate=0.05)
-        agent = PolicySearchAgent(env, task, linear_policy, search, random_steps=7, seed=0)
+        agent = PolicySearchAgent(env, task, linear, search, random_steps=7, seed=0)
     agent.learn(TOTAL - agent.num_timesteps, EpisodeCheckpoint(path))
     write(agent, folder, agent.policy.state_dict())
 

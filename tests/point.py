@@ -8,15 +8,17 @@ import pickle
 import random
 import threading
 import zipfile
+from functools import partial
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
 
-from gpadjust.control import Task
+from gpadjust.control import Task, mlp_policy
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 
+linear = partial(mlp_policy, net_arch=())
 POINT_SPEC = StateSpec(["x"], ["v"])
 QUICK = {"num_starts": 1, "num_screened": 0}
 FEW_SAMPLES = {**QUICK, "num_samples": 3, "num_draws": 16}

@@ -14,12 +14,12 @@ from gpadjust.control.checkpoint import EpisodeCheckpoint, resume
 from gpadjust.control.constraints import margins
 from gpadjust.control.mpc import MPC, Planned
 from gpadjust.control.planner import Plan, Planner
-from gpadjust.control.policies import BoundedPolicy, linear_policy, mlp_policy
-from gpadjust.control.policy_search import PolicySearch, SearchResult, imitate
+from gpadjust.control.policies import BoundedPolicy, mlp_policy
+from gpadjust.control.policy_search import PolicySearch, SearchResult
 from gpadjust.control.progress import print_progress
 from gpadjust.control.recorded_episodes import RecordedEpisodes
 from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts
-from gpadjust.control.search import CrossEntropy, PathIntegral, Search
+from gpadjust.control.search import CrossEntropy
 from gpadjust.control.state_filter import Estimate, StateFilter
 from gpadjust.control.step_guard import FailedStepWarning, StepGuard
 from gpadjust.control.task import Constraints, InitialStates, Reward, Step, Task, Termination
@@ -38,7 +38,6 @@ __all__ = [
     "InitialStates",
     "MPCAgent",
     "Objective",
-    "PathIntegral",
     "Plan",
     "Planned",
     "Planner",
@@ -49,15 +48,12 @@ __all__ = [
     "Reward",
     "Rollout",
     "Rollouts",
-    "Search",
     "SearchResult",
     "StateFilter",
     "Step",
     "StepGuard",
     "Task",
     "Termination",
-    "imitate",
-    "linear_policy",
     "margins",
     "mlp_policy",
     "print_progress",

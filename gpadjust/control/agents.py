@@ -141,8 +141,7 @@ class PolicySearchAgent(Agent):
         env: As of :class:`Agent`.
         task: What is known of the system, in PyTorch's functions, as gradients flow through them.
         policy: Makes the policy of a spec and the bounds of the actions: :func:`mlp_policy`,
-            :func:`linear_policy`, or a function of yours, such as
-            ``functools.partial(mlp_policy, net_arch=(32,))``.
+            or a function of yours, such as ``functools.partial(mlp_policy, net_arch=(32,))``.
         search: How the policy is improved.
         options: Further arguments of :class:`Agent`.
 
@@ -156,12 +155,12 @@ class PolicySearchAgent(Agent):
     Example:
         >>> from dataclasses import replace
         >>> import torch
-        >>> from gpadjust.control import PolicySearch, PolicySearchAgent, linear_policy
+        >>> from gpadjust.control import PolicySearch, PolicySearchAgent
         >>> from gpadjust.systems import cart_pole
         >>> wide = torch.tensor([[-50.0] * 4, [50.0] * 4])  # far beyond what is ever seen
         >>> system = replace(cart_pole(), state_bounds=wide)
         >>> search = PolicySearch(updates=2, num_starts=4, num_functions=2)
-        >>> agent = PolicySearchAgent(system.make(), system.task(), linear_policy, search, seed=0)
+        >>> agent = PolicySearchAgent(system.make(), system.task(), search=search, seed=0)
         >>> agent.learn(total_timesteps=25)
         PolicySearchAgent(CartPoleSwingUpEnv, LearnedDynamics, 1 episodes learnt, 25 steps, ...)
     """

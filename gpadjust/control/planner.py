@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from contextlib import suppress
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, NamedTuple
 
 import torch
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gpadjust.checks import check_kind, checked_bounds, checked_number, checked_whole
 from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts
-from gpadjust.control.search import CrossEntropy, Search, correlated_noise, random_sequences
+from gpadjust.control.search import CrossEntropy, correlated_noise, random_sequences
 from gpadjust.control.task import Task
 from gpadjust.states import StateSpec
 
@@ -68,7 +68,7 @@ class Planner:
 
     Args:
         objective: What to look for: :class:`Return`, or your own.
-        search: How the sequences are improved: :class:`CrossEntropy` or :class:`PathIntegral`.
+        search: How the sequences are improved.
         horizon: The most time to look ahead, in the time unit of ``spec.step``; in steps where the
             spec has none. Default: to the end of the episode.
         num_functions: How many functions of the posterior each sequence is followed through; None
@@ -79,15 +79,9 @@ class Planner:
         max_hold: The most steps that a random sequence holds an action.
         spread: Standard deviation of what is drawn about an earlier plan, as a share of the range
             of the actions.
-        restarts: How many searches there are, of which the best is taken; one where there is an
-            earlier plan.
         seconds: The most time that a plan takes. A round of the search that would take longer does
             not begin; if even the first one would, its sequences are followed, and compared, as far
             as there is time, one step of the model at least. Default: as long as it takes.
-        segment: Without an earlier plan, one more search begins with a plan in segments of this
-            duration (in the unit of ``horizon``): half of a segment is made in the model, where the
-            next one is planned. Of an unstable system, random sequences of a whole episode tell
-            nothing. Default: none.
 
     Raises:
         TypeError: If objective or search is none, or a number is of another kind.
@@ -106,34 +100,29 @@ class Planner:
     """
 
     objective: Objective = field(default_factory=Return)
-    search: Search = field(default_factory=CrossEntropy)
+    search: CrossEntropy = field(default_factory=CrossEntropy)
     _: KW_ONLY
     horizon: float | None = None
     num_functions: int | None = None
     num_random: int = 80
     max_hold: int = 5
     spread: float = 0.1
-    restarts: int = 1
     seconds: float | None = None
-    segment: float | None = None
 
     def __post_init__(self) -> None:
         """Check objective, search and numbers."""
         told = "an object of an Objective, such as Return()"
         check_kind("objective", self.objective, Objective, told)
-        told = "an object of a Search, such as CrossEntropy() or PathIntegral()"
-        check_kind("search", self.search, Search, told)
-        for name in ("num_random", "max_hold", "restarts"):
+        check_kind("search", self.search, CrossEntropy, "a CrossEntropy(...)")
+        for name in ("num_random", "max_hold"):
             checked_whole(name, getattr(self, name), 1)
         if self.num_functions is not None:
             checked_whole("num_functions", self.num_functions, 1)
-        for name in ("horizon", "seconds", "segment"):
+        for name in ("horizon", "seconds"):
             if getattr(self, name) is not None:
                 checked_number(name, getattr(self, name), above=0)
         self.objective.check_functions(self.num_functions)
         checked_number("spread", self.spread, above=0, below=1)
-        if None not in (self.seconds, self.segment):
-            raise ValueError("A plan in segments has no time limit; leave out seconds or segment.")
 
     def steps_ahead(self, spec: StateSpec) -> int | None:
         """Return the horizon in steps; None to the end of the episode.
@@ -141,7 +130,15 @@ class Planner:
         Raises:
             ValueError: If it is shorter than a step.
         """
-        return in_steps("horizon", self.horizon, spec)
+        if self.horizon is None:
+            return None
+        step = spec.step or 1.0
+        if self.horizon < step * (1 - 1e-9):
+            raise ValueError(
+                f"horizon must be one step at least, which takes {step:g} in the time unit of "
+                f"StateSpec(step=...); found {self.horizon:g}."
+            )
+        return round(self.horizon / step)
 
     @torch.no_grad()
     def plan(
@@ -199,46 +196,14 @@ class Planner:
                 best.append(Plan.of(rollout, found, float(scores[found])))
             return scores
 
-        def search(known: Tensor | None) -> None:
+        with suppress(_TimeIsUp):
             first = self._proposed(num_steps, action_bounds, known)
             self.search.best(scored, first, action_bounds)
-
-        with suppress(_TimeIsUp):
-            if known is not None and len(known):
-                search(known)
-            else:
-                for _ in range(self.restarts):
-                    search(None)
-                segment = in_steps("segment", self.segment, spec)
-                if segment is not None and segment < num_steps:
-                    where = task, state, action_bounds, num_steps
-                    search(self._in_segments(*where, before, steps_done))
         return best[-1]
-
-    def _in_segments(
-        self,
-        task: Task,
-        state: Tensor,
-        action_bounds: Tensor,
-        num_steps: int,
-        before: Tensor | None,
-        steps_done: int,
-    ) -> Tensor:
-        """Actions ``num_steps x action_dim`` of segments, each begun in the middle of the last."""
-        ahead = replace(self, horizon=self.segment, segment=None, restarts=1)
-        actions, known = action_bounds[:0], None
-        while (left := num_steps - len(actions)) > 0:
-            done = steps_done + len(actions)
-            how: dict[str, Any] = {"known": known, "before": before, "steps_done": done}
-            plan = ahead.plan(task, state, action_bounds, left, **how)
-            k = left if len(plan.actions) == left else -(-len(plan.actions) // 2)
-            actions, known = torch.cat([actions, plan.actions[:k]]), plan.actions[k:]
-            state, before = plan.next_states[k - 1], plan.actions[k - 1]
-        return actions
 
     def _proposed(self, num_steps: int, bounds: Tensor, known: Tensor | None) -> Tensor:
         """The sequences that a search begins with, ``n x num_steps x action_dim``."""
-        if known is None:
+        if known is None or not len(known):
             return random_sequences(self.num_random, num_steps, bounds, self.max_hold)
         if known.dim() != 2 or known.shape[-1] != bounds.shape[-1]:
             raise ValueError(
@@ -281,20 +246,3 @@ class Planner:
 
 class _TimeIsUp(Exception):  # noqa: N818 - no error
     """Raised in a search whose next round would take too long."""
-
-
-def in_steps(name: str, duration: float | None, spec: StateSpec) -> int | None:
-    """Return the number of steps nearest to a duration in the time unit of the spec.
-
-    Raises:
-        ValueError: If it is shorter than a step.
-    """
-    if duration is None:
-        return None
-    step = spec.step or 1.0
-    if duration < step * (1 - 1e-9):
-        raise ValueError(
-            f"{name} must be one step at least, which takes {step:g} in the time unit of "
-            f"StateSpec(step=...); found {duration:g}."
-        )
-    return round(duration / step)

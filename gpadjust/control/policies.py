@@ -30,9 +30,9 @@ class BoundedPolicy(nn.Module):
 
     Example:
         >>> import torch
-        >>> from gpadjust.control import linear_policy
+        >>> from gpadjust.control import mlp_policy
         >>> from gpadjust.states import StateSpec
-        >>> policy = linear_policy(StateSpec(["x"], ["force"]), torch.tensor([[-2.0], [2.0]]))
+        >>> policy = mlp_policy(StateSpec(["x"], ["force"]), torch.tensor([[-2.0], [2.0]]))
         >>> policy(torch.zeros(3, 1, dtype=torch.float64)).shape
         torch.Size([3, 1])
     """
@@ -78,7 +78,6 @@ def mlp_policy(
     spec: StateSpec,
     action_bounds: ArrayLike,
     net_arch: Sequence[int] = (64, 64),
-    activation: type[nn.Module] = nn.Tanh,
     first_actions: Sequence[float] | None = None,
 ) -> BoundedPolicy:
     """A network of layers.
@@ -86,8 +85,7 @@ def mlp_policy(
     Args:
         spec: What the entries of states and actions are.
         action_bounds: ``2 x action_dim``.
-        net_arch: The widths of the hidden layers.
-        activation: What follows each of these.
+        net_arch: The widths of the hidden layers; () for a linear function.
         first_actions: About what it does before it has learnt, ``action_dim`` numbers within the
             bounds. Default: their middle, which for muscles, say, is to tense them all.
 
@@ -97,22 +95,12 @@ def mlp_policy(
     widths = [spec.observation_dim, *net_arch]
     layers: list[nn.Module] = []
     for width, following in pairwise(widths):
-        layers += [nn.Linear(width, following, dtype=torch.float64), activation()]
+        layers += [nn.Linear(width, following, dtype=torch.float64), nn.Tanh()]
     last = nn.Linear(widths[-1], spec.action_dim, dtype=torch.float64)
     with torch.no_grad():
         last.weight.mul_(0.1)  # gentle actions at first
         last.bias.copy_(_before_tanh(first_actions, action_bounds, spec.action_dim))
     return BoundedPolicy(nn.Sequential(*layers, last), spec, action_bounds)
-
-
-def linear_policy(
-    spec: StateSpec, action_bounds: ArrayLike, first_actions: Sequence[float] | None = None
-) -> BoundedPolicy:
-    """A linear function of what is seen.
-
-    Arguments and errors are those of :func:`mlp_policy`.
-    """
-    return mlp_policy(spec, action_bounds, (), first_actions=first_actions)
 
 
 def _before_tanh(actions: Sequence[float] | None, action_bounds: ArrayLike, dim: int) -> Tensor:

@@ -17,6 +17,9 @@ from gpadjust.control.policies import BoundedPolicy
 from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts, Score
 from gpadjust.control.task import Task
 
+_REDRAW_EVERY = 5  # updates after which the policy is judged, and other functions are drawn
+_MAX_GRAD_NORM = 1.0
+
 
 class SearchResult(NamedTuple):
     """Result of a search.
@@ -59,10 +62,7 @@ class PolicySearch:
         num_starts: Number of starts of each update, in each function.
         num_functions: Number of functions that each is followed through, such as 6; None for the
             mean.
-        redraw_every: Number of updates after which the policy is judged, and other functions are
-            drawn.
         learning_rate: At the start; it decays to a tenth along a cosine.
-        max_grad_norm: The norm at which gradients are clipped.
         guide: Plans the episodes that the policy imitates before it is improved.
         num_guides: How many.
 
@@ -72,7 +72,7 @@ class PolicySearch:
 
     Example:
         >>> import torch
-        >>> from gpadjust.control import PolicySearch, Task, linear_policy
+        >>> from gpadjust.control import PolicySearch, Task, mlp_policy
         >>> from gpadjust.dynamics import PhysicsDynamics, StateSpec
         >>> spec = StateSpec(["x"], ["v"])
         >>> task = Task(
@@ -82,7 +82,7 @@ class PolicySearch:
         ...     episode_length=5,
         ... )
         >>> _ = torch.manual_seed(0)
-        >>> policy = linear_policy(spec, torch.tensor([[-1.0], [1.0]]))
+        >>> policy = mlp_policy(spec, torch.tensor([[-1.0], [1.0]]), net_arch=())
         >>> result = PolicySearch(updates=30, learning_rate=0.1).improve(policy, task)
         >>> bool(result.values[-5:].mean() > result.values[:5].mean())
         True
@@ -93,9 +93,7 @@ class PolicySearch:
     updates: int = 100
     num_starts: int = 24
     num_functions: int | None = None
-    redraw_every: int = 5
     learning_rate: float = 3e-3
-    max_grad_norm: float = 1.0
     guide: Planner | None = None
     num_guides: int = 16
 
@@ -103,13 +101,12 @@ class PolicySearch:
         """Check the options."""
         told = "an object of an Objective, such as Return()"
         check_kind("objective", self.objective, Objective, told)
-        for name in ("updates", "num_starts", "redraw_every", "num_guides"):
+        for name in ("updates", "num_starts", "num_guides"):
             checked_whole(name, getattr(self, name), 1)
         if self.num_functions is not None:
             checked_whole("num_functions", self.num_functions, 1)
         self.objective.check_functions(self.num_functions)
-        for name in ("learning_rate", "max_grad_norm"):
-            checked_number(name, getattr(self, name), above=0)
+        checked_number("learning_rate", self.learning_rate, above=0)
         check_kind("guide", self.guide, Planner | None, "a Planner, or None")
 
     def check_task(self, task: Task) -> None:
@@ -162,7 +159,7 @@ class PolicySearch:
                         "BoundedPolicy says, such as mlp_policy(...); found "
                         f"{type(policy).__name__}."
                     )
-                imitate(policy, *self.plans(task, policy.action_bounds))
+                _imitate(policy, *self.plans(task, policy.action_bounds))
             return self._improve(policy, task, task.episode_length, progress)
         except BaseException:
             policy.load_state_dict(before)
@@ -200,7 +197,7 @@ class PolicySearch:
         best = _Best(held_out, self._starts(task, held_out.num_functions), score, length)
         values = []
         for i in range(self.updates):
-            if i % self.redraw_every == 0:
+            if i % _REDRAW_EVERY == 0:
                 best.judge(policy)
                 rollouts = Rollouts(task, self.num_functions)
             rollout = rollouts.act(self._starts(task, rollouts.num_functions), policy, length)
@@ -213,7 +210,7 @@ class PolicySearch:
                 )
             optimizer.zero_grad()
             (-value).backward()
-            norm = nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
+            norm = nn.utils.clip_grad_norm_(parameters, _MAX_GRAD_NORM)
             if norm.isfinite():
                 optimizer.step()
             rate.step()
@@ -261,26 +258,12 @@ class _Best:
             self.worth, self.rollout, self.kept = worth, rollout, deepcopy(policy.state_dict())
 
 
-def imitate(
-    policy: nn.Module, states: Tensor, actions: Tensor, *, epochs: int = 400, rate: float = 5e-3
-) -> float:
-    """Let a policy do what was done, by least squares.
-
-    Args:
-        policy: A module from states to actions.
-        states: ``N x state_dim``.
-        actions: ``N x action_dim``.
-        epochs: Steps of Adam, all rows at once.
-        rate: Its learning rate.
-
-    Returns:
-        The root mean square error in the end, in shares of each action's standard deviation.
-    """
+def _imitate(policy: nn.Module, states: Tensor, actions: Tensor) -> None:
+    """Fit a policy to actions ``N x action_dim`` at states ``N x state_dim``, by least squares."""
     scale = actions.std(0, correction=0).clamp_min(1e-12)
-    optimizer = torch.optim.Adam(policy.parameters(), lr=rate)
-    for _ in range(epochs):
+    optimizer = torch.optim.Adam(policy.parameters(), lr=5e-3)
+    for _ in range(400):
         loss = ((policy(states) - actions) / scale).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    return float(loss.detach().sqrt())

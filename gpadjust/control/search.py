@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
 
@@ -16,28 +15,8 @@ SequenceScore = Callable[[Tensor], Tensor]
 """Scores ``n`` of sequences ``n x T x action_dim``, higher is better."""
 
 
-class Search(ABC):
-    """Improves sequences of actions, round by round."""
-
-    rounds: int
-
-    @abstractmethod
-    def best(self, score: SequenceScore, first: Tensor, bounds: Tensor) -> tuple[Tensor, float]:
-        """Search, from PyTorch's generator.
-
-        Args:
-            score: What is sought; it is asked once a round, about as many sequences as there are
-                first ones. When there is no time left, it raises an exception, which comes through.
-            first: The sequences to begin with, ``n x T x action_dim``.
-            bounds: Lower and upper bounds of the actions, ``2 x action_dim``.
-
-        Returns:
-            The sequence, ``T x action_dim``, one of those whose score was asked, and its score.
-        """
-
-
 @dataclass(frozen=True)
-class CrossEntropy(Search):
+class CrossEntropy:
     """The cross-entropy method (Rubinstein 1999).
 
     Each round draws as many sequences as the first ones from a normal distribution with mean and
@@ -66,7 +45,17 @@ class CrossEntropy(Search):
         checked_number("correlation", self.correlation, least=0, below=1)
 
     def best(self, score: SequenceScore, first: Tensor, bounds: Tensor) -> tuple[Tensor, float]:
-        """Search; see :class:`Search`."""
+        """Search, from PyTorch's generator.
+
+        Args:
+            score: What is sought; it is asked once a round, about as many sequences as there are
+                first ones. When there is no time left, it raises an exception, which comes through.
+            first: The sequences to begin with, ``n x T x action_dim``.
+            bounds: Lower and upper bounds of the actions, ``2 x action_dim``.
+
+        Returns:
+            The sequence, ``T x action_dim``, one of those whose score was asked, and its score.
+        """
         sequences, scores = first, score(first)
         for _ in range(self.rounds):
             elites = scores.topk(min(self.num_elites, len(scores))).indices
@@ -77,70 +66,6 @@ class CrossEntropy(Search):
             sequences, scores = torch.cat([sequences, drawn]), torch.cat([scores, score(drawn)])
         found = int(scores.argmax())
         return sequences[found], float(scores[found])
-
-
-@dataclass(frozen=True)
-class PathIntegral(Search):
-    r"""Model predictive path integral control (Williams et al. 2017): MPPI.
-
-    Of sequences with scores :math:`J_i` the mean with weights
-    :math:`\propto \exp((J_i - \max J) / (\lambda\, s))` is taken, where s is the standard
-    deviation of the best quarter of the scores, as others may be those of sequences that leave the
-    bounds; each further round draws sequences about it. The result is the last mean, or the best
-    sequence of all if that scores better. Sequences with a score of :math:`-\infty` do not count,
-    unless all have it.
-
-    Args:
-        rounds: Rounds after the first sequences.
-        temperature: The temperature :math:`\lambda`, in those standard deviations: small for the
-            best sequence, large for the mean of all.
-        spread: Standard deviation of what is drawn about the mean, as a share of the range of the
-            actions.
-        correlation: As of :class:`CrossEntropy`.
-
-    Raises:
-        TypeError: If a number is of another kind.
-        ValueError: If it is out of range.
-    """
-
-    rounds: int = 1
-    _: KW_ONLY
-    temperature: float = 0.2
-    spread: float = 0.15
-    correlation: float = 0.5
-
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        checked_whole("rounds", self.rounds, 0)
-        checked_number("temperature", self.temperature, above=0)
-        checked_number("spread", self.spread, above=0, below=1)
-        checked_number("correlation", self.correlation, least=0, below=1)
-
-    def best(self, score: SequenceScore, first: Tensor, bounds: Tensor) -> tuple[Tensor, float]:
-        """Search; see :class:`Search`."""
-        sequences, scores = first, score(first)
-        asked = [(sequences, scores)]
-        for _ in range(self.rounds):
-            mean = self._mean(sequences, scores)
-            noise = correlated_noise(first.shape, self.correlation)
-            noise[0] = 0.0  # the mean itself is among them
-            sequences = mean + self.spread * (bounds[1] - bounds[0]) * noise
-            sequences = torch.clamp(sequences, bounds[0], bounds[1])
-            scores = score(sequences)
-            asked.append((sequences, scores))
-        found = self._mean(sequences, scores).unsqueeze(0)
-        asked.append((found, score(found)))
-        sequences, scores = (torch.cat(column) for column in zip(*asked, strict=True))
-        best = int(scores.argmax())
-        return sequences[best], float(scores[best])
-
-    def _mean(self, sequences: Tensor, scores: Tensor) -> Tensor:
-        top = scores.topk(-(-len(scores) // 4)).values
-        if top[0].isinf():
-            return sequences[scores == top[0]].mean(0)
-        scale = top[top.isfinite()].std(correction=0).clamp_min(torch.finfo(scores.dtype).tiny)
-        weights = torch.softmax((scores - scores.max()) / (self.temperature * scale), dim=0)
-        return torch.einsum("n,nta->ta", weights, sequences)
 
 
 def random_sequences(n: int, num_steps: int, bounds: Tensor, max_hold: int) -> Tensor:

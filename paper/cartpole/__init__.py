@@ -265,8 +265,6 @@ class PlanningSettings:
     """of the plan when a trial begins, of all its steps"""
     first_rounds: int = 12
     """of these"""
-    restarts: int = 3
-    """of these"""
     correlation: float = 0.5
     """of deviations of a step and the next"""
     updates: int = 150

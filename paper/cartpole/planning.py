@@ -134,7 +134,6 @@ def planners(settings: PlanningSettings) -> tuple[Planner, Planner]:
     first = Planner(
         search=CrossEntropy(settings.first_rounds, num_elites=elites, correlation=correlation),
         num_random=settings.first_sequences,
-        restarts=settings.restarts,
     )
     return each_step, first
 

@@ -11,10 +11,9 @@ from gpadjust.control import (
     Planner,
     PolicySearch,
     PolicySearchAgent,
-    linear_policy,
 )
 from tests.point import *  # noqa: F403
-from tests.point import near_one
+from tests.point import linear, near_one
 
 PLAN = Planner(search=CrossEntropy(1), horizon=3, num_random=32, max_hold=1)
 SEARCH = PolicySearch(updates=12, num_starts=6, num_functions=2, learning_rate=0.05)
@@ -39,7 +38,7 @@ class Kind(NamedTuple):
 KINDS = {
     MPCAgent: Kind({"each_step": PLAN, "first": PLAN}, untrained="knows nothing"),
     PolicySearchAgent: Kind(
-        {"policy": linear_policy, "search": SEARCH},
+        {"policy": linear, "search": SEARCH},
         events=(*["update"] * 12, "search"),
         learnt=lambda agent: agent.policy.state_dict(),
     ),

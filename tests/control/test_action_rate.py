@@ -10,11 +10,9 @@ from gpadjust.control import (
     CrossEntropy,
     MPCAgent,
     Planner,
-    PolicySearch,
     Return,
     Rollouts,
     Task,
-    linear_policy,
 )
 from gpadjust.dynamics import PhysicsDynamics, StateSpec
 
@@ -79,24 +77,6 @@ def test_the_price_is_of_squared_changes_from_the_action_before():
         assert loss.item() == pytest.approx(expected)
 
 
-@pytest.mark.parametrize(
-    ("rate", "error", "message"),
-    [
-        (0.0, ValueError, "most of an action rate must be .* above 0"),
-        ("fast", TypeError, "most of an action rate must be a number"),
-        ([0.1, 0.2], ValueError, "one for each of 1 actions; found 2"),
-    ],
-)
-def test_bad_rates_are_refused(rate, error, message):
-    with pytest.raises(error, match=message):
-        task(action_rate=rate)
-
-
-def test_a_price_is_not_negative():
-    with pytest.raises(ValueError, match=r"price must be .* at least 0"):
-        ActionRate(price=-1.0)
-
-
 def test_random_actions_keep_the_limit_and_noise_is_refused(make_agent, point_env):
     agent = make_agent(MPCAgent, random_steps=10, action_rate=0.25).learn(10)
     recorded = agent.recorded_episodes()
@@ -106,10 +86,3 @@ def test_random_actions_keep_the_limit_and_noise_is_refused(make_agent, point_en
     with pytest.raises(ValueError, match="more than action_rate allows; leave action_noise out"):
         noisy.learn(5)
     assert noisy.num_timesteps == 0
-
-
-def test_a_search_of_ones_own_refuses_what_a_policy_cannot_keep(point_task):
-    given = point_task(action_rate=0.1)
-    policy = linear_policy(given.dynamics.spec, [[-2.0], [2.0]])
-    with pytest.raises(ValueError, match="PolicySearch cannot learn a task with action_rate"):
-        PolicySearch(updates=1).improve(policy, given)

@@ -4,7 +4,6 @@ import errno
 import io
 import os
 import pickle
-import random
 import subprocess
 import sys
 import textwrap
@@ -13,7 +12,6 @@ import zipfile
 from dataclasses import replace
 
 import gymnasium
-import numpy as np
 import pytest
 import torch
 from filelock import FileLock
@@ -93,10 +91,8 @@ def test_checkpoints_come_every_so_many_episodes(make_agent, tmp_path, monkeypat
     monkeypatch.setattr(
         EpisodeCheckpoint, "_write", lambda self, agent: saved.append(agent.num_timesteps)
     )
-    make_agent(MPCAgent).learn(25, EpisodeCheckpoint(tmp_path / "run.ckpt", every=2))
-    assert saved == [0, 10, 20, 25]
-    with pytest.raises(ValueError, match="every must be at least 1; found 0"):
-        EpisodeCheckpoint(tmp_path / "run.ckpt", every=0)
+    make_agent(MPCAgent).learn(15, EpisodeCheckpoint(tmp_path / "run.ckpt", every=2))
+    assert saved == [0, 10, 15]
 
 
 # Files
@@ -154,16 +150,6 @@ def test_the_name_of_a_checkpoint_is_on_the_disk(make_agent, tmp_path, monkeypat
     monkeypatch.setattr(os, "fsync", lambda file: synced.append(os.fstat(file).st_ino))
     agent.save(tmp_path / "run.ckpt")
     assert synced == [(tmp_path / "run.ckpt").stat().st_ino, tmp_path.stat().st_ino]
-
-
-class OwnAgent(MPCAgent):
-    """An agent that the library does not know."""
-
-
-def test_an_agent_of_ones_own_is_resumed_by_its_name(make_agent, again, tmp_path):
-    path = tmp_path / "new" / "run.ckpt"  # the folder is made
-    make_agent(OwnAgent, each_step=None, first=None).save(path)
-    assert type(resume(path, *again())) is OwnAgent
 
 
 class KeepingAgent(MPCAgent):
@@ -271,8 +257,8 @@ def test_of_a_class_that_is_defined_twice_the_newest_is_resumed(make_agent, agai
     def define(module):
         return type("CellAgent", (MPCAgent,), {"__module__": module})
 
-    path, first = tmp_path / "run.ckpt", define("notebook")
-    make_agent(first).save(path)
+    path, first = tmp_path / "new" / "run.ckpt", define("notebook")  # the folder is made
+    make_agent(first, each_step=None, first=None).save(path)
     assert type(resume(path, *again())) is first
     second = define("notebook")
     assert type(resume(path, *again())) is second
@@ -431,20 +417,3 @@ def test_what_was_resumed_is_saved_again_as_it_was(make_agent, again, tmp_path):
     given = again()
     assert_equal(numbers(resume(second, *given).learn(5)), expected)
     assert expected["counts"][-1] == {"costs": [1.0]}
-
-
-def test_it_is_for_agents_with_a_model():
-    with pytest.raises(TypeError, match="for learners with a model"):
-        EpisodeCheckpoint("run.ckpt")({}, {})
-
-
-def draw():
-    return random.random(), np.random.random(), torch.rand(1).item()  # noqa: NPY002
-
-
-def test_draws_are_repeated_after_restoring():
-    state = pickle.loads(pickle.dumps(RandomState.capture()))
-    first, second = draw(), draw()
-    assert first != second
-    state.restore()
-    assert (draw(), draw()) == (first, second)

@@ -190,18 +190,6 @@ def test_who_cannot_keep_them_refuses_before_a_real_step(point_task, point_env, 
         DynaSAC("MlpPolicy", env, given)
 
 
-@pytest.mark.parametrize(
-    ("parts", "error", "message"),
-    [
-        ({"probability": 95}, ValueError, "probability must be above 0 and below 1; found 95"),
-        ({"constraints": lambda states: states}, TypeError, "constraints is called with 2"),
-    ],
-)
-def test_bad_constraints_are_refused(parts, error, message):
-    with pytest.raises(error, match=message):
-        task(**parts)
-
-
 def test_what_leaves_the_bounds_is_worse_than_any_violation():
     """Margins of hundreds of units, as of a system that is not stable."""
     given = replace(task(), state_bounds=torch.tensor([[-3.0], [3.0]]))
@@ -212,22 +200,3 @@ def test_what_leaves_the_bounds_is_worse_than_any_violation():
     assert rollout.left_bounds.tolist() == [[False, True, False]]
     stays, leaves, nearer = Return().of(given)(rollout)
     assert stays > nearer > leaves
-
-
-def test_constraints_are_numbers():
-    given = task(constraints=lambda states, actions: states < 1)
-    with pytest.raises(TypeError, match=r"numbers that are at most 0 where they hold.*booleans"):
-        given.try_functions(rows(0.0, 0.0), rows(0.0, 0.0))
-
-
-def test_constraints_return_a_column_each():
-    flat = task(constraints=lambda states, actions: states[:, 0] - 1)
-    with pytest.raises(ValueError, match=r"shape \(2, c\); found \(2,\)"):
-        flat.try_functions(rows(0.0, 0.0), rows(0.0, 0.0))
-
-
-def test_errors_are_of_states_that_move():
-    with pytest.raises(ValueError, match=r"physics_error is of states among .'x'.; found 'y'"):
-        PhysicsDynamics(SPEC, step, physics_error={"y": 0.1})
-    with pytest.raises(ValueError, match="at least 0; found -1"):
-        PhysicsDynamics(SPEC, step, physics_error={"x": -1})

@@ -99,9 +99,3 @@ def test_a_set_point_that_is_an_angle_goes_round():
 def test_what_a_reference_returns_is_checked_before_the_first_step(reference, message):
     with pytest.raises(ValueError, match=message):
         MPCAgent(Tracking(), point(reference), PLAN, first=PLAN).learn(8)
-
-
-def test_a_reference_needs_an_exogenous_state():
-    dynamics = PhysicsDynamics(StateSpec(["x"], ["v"]), lambda X: X[:, :1] + 0.5 * X[:, 1:])
-    with pytest.raises(ValueError, match="exogenous states, but the spec has none"):
-        Task(dynamics, near, reference=wave)

@@ -6,7 +6,7 @@ import torch
 
 from gpadjust.control import FailedStepWarning, MPCAgent, StepGuard
 from tests.control.conftest import KINDS
-from tests.point import FAULTS, Faulty, PowerCut
+from tests.point import FAULTS, Faulty
 
 pytestmark = pytest.mark.filterwarnings("ignore:A step of the last real episode")
 ACTION = np.ones(1, dtype=np.float32)
@@ -127,14 +127,6 @@ def test_agents_lose_nothing(make_agent, kind, point_env, faults):
     torch.testing.assert_close(moved, 0.5 * recorded.actions, atol=0.1, rtol=0)
     assert recorded.rewards.isfinite().all()
     assert agent.num_episodes == int(recorded.begins.sum())
-
-
-def test_an_error_of_a_callback_comes_through(make_agent):
-    def stop(agent, event, values):
-        raise PowerCut
-
-    with pytest.raises(PowerCut):
-        make_agent(MPCAgent).learn(5, stop)
 
 
 @pytest.mark.parametrize("seen", [np.array([np.nan]), np.array([[0.5], [np.inf]])])

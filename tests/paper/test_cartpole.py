@@ -41,7 +41,6 @@ FEW = PlanningSettings(
     elites=3,
     first_sequences=12,
     first_rounds=0,
-    restarts=1,
     updates=2,
     starts=4,
     guides=1,

@@ -3,12 +3,14 @@
 from dataclasses import fields
 
 import gymnasium
+import numpy as np
 import pytest
+import torch
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from gpadjust.control import Task
 from gpadjust.dynamics import PhysicsDynamics
-from gpadjust.rl import DynaOptions, DynaSAC
+from gpadjust.rl import DynaOptions, DynaSAC, ModelVecEnv
 from gpadjust.systems.swing_up import CART_POLE_SPEC, REAL_CART_POLE, equation_physics
 from tests.point import *  # noqa: F403
 from tests.point import assert_equal
@@ -83,6 +85,28 @@ def assert_same(tensors_of):
 def normalised(point_env):
     """Makes normalised environments of the point."""
     return lambda n=1: VecNormalize(DummyVecEnv([point_env] * n))
+
+
+@pytest.fixture
+def point_particles(point_env, point_task):
+    """Makes particles that are points, from x = 1; every argument can be given."""
+
+    def make(num_envs=3, start=1.0, **given):
+        env = point_env()
+        parts = {entry.name for entry in fields(Task)} & {*given}
+        starts = {"initial_states": lambda n: torch.full((n, 1), start)}
+        task = point_task(**{**starts, **{name: given.pop(name) for name in parts}})
+        names = ("observation_space", "action_space")
+        spaces = (given.pop(name, getattr(env, name)) for name in names)
+        return ModelVecEnv(task, num_envs, *spaces, **given)
+
+    return make
+
+
+@pytest.fixture
+def rise():
+    """An action of 1 for each particle."""
+    return lambda n: np.ones((n, 1), dtype=np.float32)
 
 
 def model_rows(agent):

@@ -104,11 +104,6 @@ def test_add_rows_keeps_the_newest_rows_in_order(buffer, chunks):
     assert in_order(many) == in_order(one)
 
 
-def test_add_rows_is_for_one_environment(buffer):
-    with pytest.raises(ValueError, match="one environment; found 2"):
-        buffer(n_envs=2).add_rows(*rows(np.arange(3)))
-
-
 def test_extend_is_that_of_stable_baselines(buffer):
     made = buffer()
     steps = [real_row(i) for i in range(1, 4)]
@@ -168,18 +163,3 @@ def test_reset_empties_both(buffer):
     made = buffer(5, 5)
     made.reset()
     assert made.size() == made.model_buffer.size() == 0
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"real_fraction": 1.5}, "real_fraction must be .*; found 1.5"),
-        ({"real_fraction": -0.1}, "real_fraction"),
-        ({"optimize_memory_usage": True}, "optimize_memory_usage"),
-        ({"model_buffer_size": 0}, "model_buffer_size must be at least 1; found 0"),
-        ({"model_buffer_size": -3}, "model_buffer_size must be at least 1; found -3"),
-    ],
-)
-def test_bad_arguments_are_refused(buffer, options, message):
-    with pytest.raises(ValueError, match=message):
-        buffer(**options)

@@ -3,17 +3,15 @@
 from contextlib import suppress
 
 import gymnasium
-import numpy as np
 import pytest
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from gpadjust.control import FailedStepWarning
-from gpadjust.dynamics import LearnedDynamics
 from gpadjust.physics import PhysicsError
 from gpadjust.rl import ModelVecEnv
-from tests.point import POINT_SPEC, Faulty
+from tests.point import Faulty
 from tests.rl.conftest import model_rows
 
 
@@ -73,11 +71,6 @@ def test_other_dynamics_learn_all_that_there_is(point_agent, point_task, learnt_
     assert other.num_transitions == 15
 
 
-def test_a_buffer_that_holds_no_episode_is_refused(point_agent):
-    with pytest.raises(ValueError, match="buffer_size must hold an episode of 5 steps"):
-        point_agent(buffer_size=3).learn(5)
-
-
 FAILS = {1: "raises", 4: "nan", 9: "1e30", 12: "reward nan", 13: "reward 1e30", 18: "inf"}
 
 
@@ -114,11 +107,6 @@ def test_a_vectorised_environment_without_guards_gives_no_bad_data(point_agent, 
             agent.learn(10, reset_num_timesteps=False)
     assert agent.replay_buffer.size() == agent.num_timesteps - 2
     assert agent.recorded_episodes().rewards.isfinite().all()
-
-
-def test_an_observation_that_cannot_be_data_is_not_acted_on(point_agent):
-    with pytest.raises(ValueError, match="No action can be chosen: entry 0 of the observation is"):
-        point_agent().predict(np.array([np.nan], dtype=np.float32))
 
 
 class BreaksAt(BaseCallback):
@@ -177,31 +165,3 @@ def test_of_several_environments_one_may_fail(point_agent, point_env):
     batch = agent.replay_buffer.sample(200)
     moved = batch.next_observations - batch.observations
     torch.testing.assert_close(moved, batch.actions, atol=0.1, rtol=0)
-
-
-class Counts(gymnasium.Wrapper):
-    num_steps = 0
-
-    def step(self, action):
-        Counts.num_steps += 1
-        return super().step(action)
-
-
-@pytest.mark.parametrize(
-    ("parts", "message"),
-    [
-        ({"initial_states": lambda n: torch.ones(n)}, r"initial_states\(2\) must return .* 2 x 1"),
-        ({"initial_states": lambda n: torch.full((n, 1), torch.nan)}, "finite states; found"),
-        ({"reward": lambda s, a, n: n}, r"reward must return one value per row, shape \(2,\)"),
-        ({"terminated": lambda s: s}, r"terminated must return one value per row"),
-        ({"dynamics": LearnedDynamics(POINT_SPEC, lambda X: X)}, "1 states .* got 2 columns"),
-    ],
-)
-def test_wrong_functions_are_found_before_the_first_real_step(
-    point_agent, point_env, parts, message
-):
-    Counts.num_steps = 0
-    agent = point_agent(Counts(point_env()), **parts)
-    with pytest.raises((ValueError, PhysicsError), match=message):
-        agent.learn(5)
-    assert Counts.num_steps == 0

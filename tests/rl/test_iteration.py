@@ -41,17 +41,12 @@ def test_updates_are_as_many_as_promised(point_agent, options, updates):
     assert agent._n_updates == updates
 
 
-def test_model_steps_are_no_time_steps(point_agent):
-    agent = point_agent().learn(15)
-    assert agent.num_timesteps == 15
-    assert agent.replay_buffer.size() == 15
-    assert model_rows(agent) == 3 * 2 * 5
-    assert agent.num_episodes == 3
-
-
 def test_model_rows_are_transitions_of_the_model(point_agent):
     agent = point_agent(terminated=lambda states: states[:, 0] > 9).learn(10)
     rows = agent.replay_buffer.model_buffer
+    assert agent.num_timesteps == agent.replay_buffer.size() == 10
+    assert agent.num_episodes == 2
+    assert model_rows(agent) == 2 * 2 * 5
     n = rows.size()
     obs, following, actions, rewards, dones, timeouts = (
         getattr(rows, name)[:n, 0]
@@ -66,9 +61,16 @@ def test_model_rows_are_transitions_of_the_model(point_agent):
     np.testing.assert_array_equal(dones, timeouts)
 
 
-def test_initial_states_may_be_given(point_agent):
-    agent = point_agent(initial_states=lambda n: torch.full((n, 1), 0.25)).learn(5)
-    assert (agent.replay_buffer.model_buffer.observations[:2] == 0.25).all()
+def test_options_of_the_model_are_taken(point_agent):
+    starts = {"initial_states": lambda n: torch.full((n, 1), 0.25)}
+    one = point_agent(**starts, train_freq=(15, "step"), model_episodes=4).learn(15)
+    assert one.num_episodes == 3  # each is followed by its episodes in the model
+    assert model_rows(one) == 3 * 4 * 5
+    assert (one.replay_buffer.model_buffer.observations[:12] == 0.25).all()
+    other = point_agent(model_buffer_size=15, seed=1).learn(10)
+    assert other.replay_buffer.buffer_size == 500
+    assert model_rows(other) == 15
+    assert (one.replay_buffer.rewards[:5] != other.replay_buffer.rewards[:5]).any()
 
 
 def test_episodes_that_terminate_in_the_model_end_there(point_agent, point_env):
@@ -154,12 +156,6 @@ def test_a_run_that_was_stopped_within_a_episode_starts_another(point_agent, lea
     assert dynamics.num_transitions == 17
 
 
-def test_each_episode_that_ended_is_followed_by_model_episodes(point_agent):
-    agent = point_agent(train_freq=(15, "step"), model_episodes=4).learn(15)
-    assert agent.num_episodes == 3
-    assert model_rows(agent) == 3 * 4 * 5
-
-
 def test_states_beyond_the_bounds_are_not_followed(point_agent):
     bounds = torch.tensor([[0.9], [1.1]])
     agent = point_agent(state_bounds=bounds, initial_states=lambda n: torch.ones(n, 1)).learn(10)
@@ -182,12 +178,6 @@ def test_model_episodes_that_teach_nothing_are_warned_of(point_agent):
     )
     with pytest.warns(UserWarning, match="has learnt nothing of use from the model"):
         agent.learn(5)
-
-
-def test_the_model_buffer_keeps_the_newest(point_agent):
-    agent = point_agent(model_buffer_size=15).learn(10)
-    assert agent.replay_buffer.buffer_size == 500
-    assert model_rows(agent) == 15
 
 
 def test_a_first_episode_of_a_single_step_waits_for_the_second(
@@ -317,8 +307,3 @@ def test_normalised_observations_are_what_the_policy_sees_in_the_model(
     assert len(in_model) == 5
     start = agent.replay_buffer.model_buffer.observations[:2, 0]
     np.testing.assert_allclose(in_model[0], env.normalize_obs(start), rtol=1e-6)
-
-
-def test_another_seed_is_another_run(point_agent):
-    one, other = (point_agent(seed=seed).learn(5) for seed in (0, 1))
-    assert (one.replay_buffer.rewards[:5] != other.replay_buffer.rewards[:5]).any()

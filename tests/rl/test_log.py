@@ -6,7 +6,6 @@ import re
 import numpy as np
 import pytest
 import torch
-from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import (
     CheckpointCallback,
     EvalCallback,
@@ -97,7 +96,7 @@ def test_hooks_of_the_model(point_agent, learnt_dynamics):
     agent = point_agent(
         dynamics=learnt_dynamics(), model_episodes=3, num_particles=2, refresh_model_data=False
     )
-    agent.learn(10, [watch])
+    agent.learn(10, EveryNTimesteps(5, watch))
     assert [*watch.fits[0]] == ["fit_seconds"]
     assert watch.fits[1].keys() >= {"fit_seconds", "nlpd", "coverage"}
     assert all(np.isfinite([*metrics.values()]).all() for metrics in watch.fits)
@@ -105,18 +104,6 @@ def test_hooks_of_the_model(point_agent, learnt_dynamics):
     rewards = agent.replay_buffer.model_buffer.rewards[: 5 * 6, 0]
     assert np.concatenate(watch.returns).sum() == pytest.approx(rewards.sum(), rel=1e-5)
     agent.learn(5, reset_num_timesteps=False)
-    assert len(watch.fits) == 2
-
-
-def test_hooks_are_for_dyna_only(point_env):
-    agent = SAC("MlpPolicy", point_env(), policy_kwargs={"net_arch": [8]})
-    with pytest.raises(TypeError, match=r"Watch is for Dyna agents.*found SAC"):
-        agent.learn(5, Watch())
-
-
-def test_hooks_inside_another_callback(point_agent):
-    watch = Watch()
-    point_agent().learn(10, EveryNTimesteps(5, watch))
     assert len(watch.fits) == 2
 
 

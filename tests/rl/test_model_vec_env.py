@@ -1,6 +1,5 @@
 """The model as a vectorised environment."""
 
-from dataclasses import fields
 from functools import partial
 
 import numpy as np
@@ -17,27 +16,7 @@ from gpadjust.rl import ModelVecEnv
 from gpadjust.rl.buffer import CompactReplayBuffer
 from gpadjust.systems.swing_up import cart_pole_reward, cart_pole_start
 
-
-@pytest.fixture
-def point_particles(point_env, point_task):
-    """Makes particles that are points, from x = 1; every argument can be given."""
-
-    def make(num_envs=3, start=1.0, **given):
-        env = point_env()
-        parts = {entry.name for entry in fields(Task)} & {*given}
-        starts = {"initial_states": lambda n: torch.full((n, 1), start)}
-        task = point_task(**{**starts, **{name: given.pop(name) for name in parts}})
-        names = ("observation_space", "action_space")
-        spaces = (given.pop(name, getattr(env, name)) for name in names)
-        return ModelVecEnv(task, num_envs, *spaces, **given)
-
-    return make
-
-
-@pytest.fixture
-def rise():
-    """An action of 1 for each particle."""
-    return lambda n: np.ones((n, 1), dtype=np.float32)
+WEIGHT = torch.ones(1, requires_grad=True)
 
 
 def test_perfect_physics_are_the_real_environment(cart_pole, cart_pole_dynamics):
@@ -311,17 +290,13 @@ def test_refreshed_transitions_end_as_the_model_has_it(
     torch.testing.assert_close(rewards, -following[:, 0].square())
 
 
-def test_whole_numbers_are_rewards(point_particles, rise):
-    particles = point_particles(reward=lambda s, a, n: (n[:, 0] > 0).long())
+@pytest.mark.parametrize(
+    "reward", [lambda s, a, n: (n[:, 0] > 0).long(), lambda s, a, n: WEIGHT * n[:, 0] / 1.5]
+)
+def test_rewards_may_be_whole_numbers_or_carry_gradients(point_particles, rise, reward):
+    particles = point_particles(reward=reward)
     particles.reset()
     assert particles.step(rise(3))[1].tolist() == [1, 1, 1]
-
-
-def test_rewards_may_carry_gradients(point_particles, rise):
-    weight = torch.ones(1, requires_grad=True)
-    particles = point_particles(reward=lambda s, a, n: weight * n[:, 0])
-    particles.reset()
-    assert particles.step(rise(3))[1].tolist() == [1.5, 1.5, 1.5]
 
 
 def test_attributes_are_those_of_all_particles(point_particles):
@@ -334,43 +309,6 @@ def test_attributes_are_those_of_all_particles(point_particles):
         particles.set_attr("worst_reward", 0.5, indices=0)
     with pytest.raises(NotImplementedError, match="fly"):
         particles.env_method("fly")
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"reward": lambda s, a, n: n}, r"reward must return one value per row, shape \(3,\)"),
-        ({"reward": lambda s, a, n: n[:, 0] / 0}, "reward.*inf"),
-        ({"terminated": lambda s: s > 0}, "terminated must return one value per row"),
-    ],
-)
-def test_bad_functions_are_refused(point_particles, wrong, message, rise):
-    particles = point_particles(**wrong)
-    particles.reset()
-    with pytest.raises(ValueError, match=message):
-        particles.step(rise(3))
-
-
-def test_bad_starts_are_refused(point_particles):
-    with pytest.raises(ValueError, match=r"initial_states\(3\) must return .* 3 x 1; found \(3,\)"):
-        point_particles(initial_states=torch.zeros).reset()
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"observation_space": spaces.Box(-1, 1, (2,))}, "observation has 1 entries"),
-        ({"observation_space": spaces.Discrete(2)}, "observation has 1 entries"),
-        ({"action_space": spaces.Box(-1, 1, (3,))}, "action has 1 entries"),
-        ({"num_envs": 0}, "num_envs must be at least 1; found 0"),
-        ({"episode_length": 0}, "episode_length must be at least 1; found 0"),
-        ({"sampling": "swarm"}, "Unknown sampling 'swarm'"),
-        ({"initial_states": None}, "needs a task with initial_states"),
-    ],
-)
-def test_bad_arguments_are_refused(point_particles, options, message):
-    with pytest.raises(ValueError, match=message):
-        point_particles(**options)
 
 
 def test_functions_are_drawn_once_for_what_is_refreshed_and_the_episodes_after(

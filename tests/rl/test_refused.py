@@ -1,0 +1,156 @@
+"""What is refused before a real step is made."""
+
+from types import SimpleNamespace
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from stable_baselines3 import PPO, SAC, TD3
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from gpadjust.control import EpisodeCheckpoint
+from gpadjust.dynamics import LearnedDynamics
+from gpadjust.physics import PhysicsError
+from gpadjust.rl import Dyna, DynaCallback, DynaSAC
+from tests.point import POINT_SPEC
+from tests.rl.conftest import model_rows
+
+LINE, PLANE = spaces.Box(-1, 1, (1,)), spaces.Box(-1, 1, (2,))
+
+
+class Shaped(gymnasium.Env):
+    def __init__(self, observation_space, action_space):
+        self.observation_space, self.action_space = observation_space, action_space
+
+
+OPTIONS = [
+    ({"n_steps": 3}, "no n-step returns; found n_steps=3"),
+    ({"replay_buffer_class": dict}, "must be MixedReplayBuffer .*found dict"),
+    ({"optimize_memory_usage": True}, "optimize_memory_usage"),
+    ({"real_fraction": 2}, "real_fraction must be .*; found 2"),
+    ({"updates_per_model_step": float("inf")}, "updates_per_model_step must be .*; found inf"),
+    ({"model_buffer_size": 0}, "model_buffer_size must be at least 1; found 0"),
+    ({"model_episodes": 2.5}, "model_episodes must be a whole number; found 2.5"),
+    ({"last_model_episode": -1}, "last_model_episode must be at least 0; found -1"),
+    ({"num_particles": 0}, "num_particles must be at least 1; found 0"),
+    ({"sampling": "swarm"}, "Unknown sampling 'swarm'"),
+    ({"refresh_model_data": 1}, "refresh_model_data must be True or False; found 1"),
+    ({"reward_tolerance": "no"}, "reward_tolerance must be a number; found 'no'"),
+    ({"gradient_steps": 0}, "gradient_steps"),
+    ({"policy": "MultiInputPolicy", "env": Shaped(spaces.Dict({"x": LINE}), LINE)}, "has 1 entri"),
+    ({"env": Shaped(PLANE, LINE)}, "observation has 1 entries"),
+    ({"env": Shaped(LINE, PLANE)}, "action has 1 entries"),
+]
+CALLS = [
+    (lambda at: DynaSAC("MlpPolicy", at.env(), at.task().dynamics), r"must be a Task\(dynamics,"),
+    (
+        lambda at: DynaSAC("MlpPolicy", at.env(), at.task(), model_episodes=2),
+        r"pass DynaOptions\(model_episodes=2\) as options",
+    ),
+    (lambda at: type("Other", (TD3, Dyna), {}), r"found TD3 before it. Write class Other\(Dyna, T"),
+    (lambda at: type("Other", (Dyna, PPO), {}), r"Other needs an off-policy learner, .* found PPO"),
+    (lambda at: at.agent(DummyVecEnv([at.env] * 2)).learn(10), r"With 2 env.* as \(5, 'step'\)"),
+    (lambda at: at.agent(at.env().unwrapped, episode_length=None).learn(5), "no time limit"),
+    (lambda at: at.agent(buffer_size=3).learn(5), "buffer_size must hold an episode of 5 steps"),
+    (lambda at: at.agent(use_sde=True).learn(5, at.checkpoint), "use_sde=False"),
+    (lambda at: at.sac().learn(5, at.checkpoint), "is for learners with a model"),
+    (lambda at: at.sac().learn(5, DynaCallback()), "DynaCallback is for Dyna agents.*found SAC"),
+    (lambda at: at.agent().model_env(3), "initial_states"),
+    (
+        lambda at: at.agent().predict(np.array([np.nan], dtype=np.float32)),
+        "No action can be chosen: entry 0 of the observation is",
+    ),
+    (
+        lambda at: at.agent(DummyVecEnv([at.env] * 2), train_freq=1).replay_buffer.add_rows(
+            *[np.zeros((3, 1))] * 2, *[np.zeros(3)] * 4
+        ),
+        "one environment; found 2",
+    ),
+]
+FUNCTIONS = [
+    ({"initial_states": lambda n: torch.ones(n)}, r"initial_states\(2\) must return .* 2 x 1"),
+    ({"initial_states": lambda n: torch.full((n, 1), torch.nan)}, "finite states; found"),
+    ({"reward": lambda s, a, n: n}, r"reward must return one value per row, shape \(2,\)"),
+    ({"terminated": lambda s: s}, r"terminated must return one value per row"),
+    ({"dynamics": LearnedDynamics(POINT_SPEC, lambda X: X)}, "1 states .* got 2 columns"),
+]
+
+
+@pytest.mark.parametrize(("options", "words"), OPTIONS)
+def test_an_option_is_refused(point_agent, options, words):
+    with pytest.raises((TypeError, ValueError), match=words):
+        point_agent(**options)
+
+
+@pytest.mark.parametrize(("call", "words"), CALLS)
+def test_a_call_is_refused(point_agent, point_env, point_task, tmp_path, call, words):
+    path = tmp_path / "run.ckpt"
+    at = SimpleNamespace(
+        agent=point_agent,
+        env=point_env,
+        task=point_task,
+        checkpoint=EpisodeCheckpoint(path),
+        sac=lambda: SAC("MlpPolicy", point_env(), policy_kwargs={"net_arch": [8]}),
+    )
+    with pytest.raises((TypeError, ValueError), match=words):
+        call(at)
+    assert not path.exists()
+
+
+@pytest.mark.parametrize(("parts", "words"), FUNCTIONS)
+def test_wrong_functions_are_found_before_the_first_real_step(point_agent, parts, words):
+    agent = point_agent(**parts)
+    with pytest.raises((ValueError, PhysicsError), match=words):
+        agent.learn(5)
+    assert agent.num_timesteps == 0
+
+
+def test_discrete_actions_are_refused_by_stable_baselines(point_agent):
+    with pytest.raises(AssertionError, match=r"only supports.*Box.*Discrete"):
+        point_agent(Shaped(LINE, spaces.Discrete(2)))
+
+
+def test_terminations_that_come_late_are_refused(point_agent, point_env):
+    env = point_env()
+    agent = point_agent(env).learn(5)
+    env.unwrapped.end = -9
+    with pytest.raises(ValueError, match="terminated=True, but none was given"):
+        agent.learn(5, reset_num_timesteps=False)
+
+
+def test_noisy_rewards_may_be_tolerated(point_agent, point_reward):
+    def noisy(*transition):
+        return 1.05 * point_reward(*transition)
+
+    with pytest.raises(ValueError, match="raise reward_tolerance; None checks nothing"):
+        point_agent(reward=noisy).learn(5)
+    for tolerance in (0.1, None):
+        assert point_agent(reward=noisy, reward_tolerance=tolerance).learn(5).num_episodes == 1
+
+
+def test_a_time_limit_put_around_by_hand_is_read(point_agent):
+    assert model_rows(point_agent(episode_length=None).learn(5)) == 2 * 5
+
+
+PARTICLES = [
+    ({"observation_space": PLANE}, "observation has 1 entries"),
+    ({"observation_space": spaces.Discrete(2)}, "observation has 1 entries"),
+    ({"num_envs": 0}, "num_envs must be at least 1; found 0"),
+    ({"sampling": "swarm"}, "Unknown sampling 'swarm'"),
+    ({"initial_states": None}, "needs a task with initial_states"),
+    ({"initial_states": torch.zeros}, r"initial_states\(3\) must return .* 3 x 1; found \(3,\)"),
+    ({"reward": lambda s, a, n: n[:, 0] / 0}, "reward.*inf"),
+]
+
+
+@pytest.mark.parametrize(("options", "words"), PARTICLES)
+def test_particles_are_refused(point_particles, options, words, rise):
+    def step():
+        particles = point_particles(**options)
+        particles.reset()
+        particles.step(rise(3))
+
+    with pytest.raises(ValueError, match=words):
+        step()
