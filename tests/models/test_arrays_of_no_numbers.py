@@ -14,6 +14,7 @@ from gpadjust.models.training_data import to_tensor
 from gpadjust.physics import BlackBoxPhysics, PhysicsError
 from gpadjust.records import Record
 from gpadjust.sklearn import CKARegressor
+from tests.systems import refused
 
 N = 6
 ONE_TO_SIX = np.arange(1.0, N + 1)
@@ -77,8 +78,7 @@ class TestRefused:
 
     def test_questions_and_observations(self, values, message):
         model = CKA(column(ONE_TO_SIX), column(ONE_TO_SIX), physics=physics)
-        with pytest.raises(TypeError, match=rf"X to hold numbers.*{message}"):
-            model.predict(column(values))
+        refused(TypeError, rf"X to hold numbers.*{message}", model.predict, column(values))
         with pytest.raises(TypeError, match=rf"Y to hold numbers.*{message}"):
             model.condition_on_observations(column(ONE_TO_SIX), column(values))
 
@@ -117,8 +117,7 @@ def test_scikit_learn_is_asked_before_it_makes_numbers_of_them():
         (masked, ONE_TO_SIX, "X without masked"),
         (numbers, masked[:, 0], "y without masked"),
     ]:
-        with pytest.raises((TypeError, ValueError), match=message):
-            regressor.fit(X, y)
+        refused((TypeError, ValueError), message, regressor.fit, X, y)
     with pytest.raises(ValueError, match="train_Yvar without masked"):
         regressor.fit(numbers, ONE_TO_SIX, train_Yvar=masked[:, 0])
     with pytest.raises(TypeError, match=r"X to hold numbers.*dates or times"):
@@ -133,8 +132,7 @@ def test_a_physics_that_returns_masked_values():
 
 def test_a_frame_with_a_column_of_times():
     frame = pd.DataFrame({"t": DATES, "x": ONE_TO_SIX})
-    with pytest.raises(TypeError, match=r"train_X.*dates or times"):
-        CKA(frame, column(ONE_TO_SIX), physics=physics)
+    refused(TypeError, r"train_X.*dates or times", CKA, frame, column(ONE_TO_SIX), physics=physics)
 
 
 class TestMasked:
@@ -183,8 +181,7 @@ def test_inputs_of_one_dimension(make, build, kind):
     options = {"low_X": Y, "low_Y": Y, "physics": None} if kind == "AR1" else {}
     if kind not in ("ZeroMeanGP", "AR1"):
         options["physics"] = physics
-    with pytest.raises(ValueError, match=r"train_X.reshape\(-1, 1\)"):
-        build(kind, X, Y, **options)
+    refused(ValueError, r"train_X.reshape\(-1, 1\)", build, kind, X, Y, **options)
 
 
 def test_inputs_of_one_dimension_of_a_sparse_model():

@@ -26,6 +26,7 @@ from gpadjust.inference.vectors import Parameters
 from gpadjust.models import Prediction
 from gpadjust.sklearn import CKARegressor
 from gpadjust.validation import leave_one_out, trust
+from tests.systems import refused
 
 GENERATOR = torch.Generator().manual_seed(0)
 N = 30
@@ -178,8 +179,7 @@ def test_arrays_outputs_and_declared_levels():
     ],
 )
 def test_bad_options(options, message):
-    with pytest.raises(ValueError, match=message):
-        PhysicsMeanGP(FRAME, Y, physics=head, **options)
+    refused(ValueError, message, PhysicsMeanGP, FRAME, Y, physics=head, **options)
 
 
 def test_bad_levels(model):
@@ -187,5 +187,4 @@ def test_bad_levels(model):
         predicted(model, FRAME[:2].assign(material="wood"))
     with pytest.raises(ValueError, match=r"material to be one of \[0.0, 1.0, 2.0\].*got 1.5"):
         model.transform_inputs(torch.tensor([[1.0, 1.5, 0.0]]).double())
-    with pytest.raises(ValueError, match="an input beside batches"):
-        ZeroMeanGP(X[:, 2:], Y, batch=0)
+    refused(ValueError, "an input beside batches", ZeroMeanGP, X[:, 2:], Y, batch=0)

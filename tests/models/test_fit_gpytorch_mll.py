@@ -22,7 +22,7 @@ from gpytorch.priors import LogNormalPrior
 from gpadjust import CKA, CalibratedPhysics, fit
 from gpadjust.inference.targets import LogLikelihood
 from gpadjust.physics import FunctionPhysics, Unknown
-from tests.systems import line
+from tests.systems import line, refused
 
 REST = ("AR1", "RRA", "RRA-paper")  # of models in lists
 
@@ -172,8 +172,7 @@ def test_what_needs_no_gradient_stays(data, build):
 def test_a_model_that_holds_samples_is_refused(data, build):
     model = build("CKA", *data(n=12))
     fit(model, num_samples=2, num_draws=64)
-    with pytest.raises(RuntimeError, match="holds samples"):
-        fit_by_botorch(model)
+    refused(RuntimeError, "holds samples", fit_by_botorch, model)
     assert model.num_samples == 2
 
 

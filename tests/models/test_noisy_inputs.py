@@ -14,6 +14,7 @@ from gpadjust.physics import BlackBoxPhysics, FunctionPhysics, PhysicsError, Unk
 from gpadjust.report import report
 from gpadjust.sklearn import CKARegressor
 from gpadjust.validation import leave_one_out
+from tests.systems import refused
 
 SD = 0.05
 QUICK = partial(fit, method="map", num_starts=2, num_screened=8)
@@ -195,14 +196,12 @@ def test_a_black_box_that_cannot_be_asked_everywhere():
     ],
 )
 def test_bad_variances_get_a_sentence(data, given, words):
-    with pytest.raises(ValueError, match=words):
-        CKA(*data, physics=f_p, train_Xvar=given)
+    refused(ValueError, words, CKA, *data, physics=f_p, train_Xvar=given)
 
 
 def test_a_batch_is_refused(data):
     X, Y = (each.expand(2, -1, -1) for each in data)
-    with pytest.raises(ValueError, match="one data set"):
-        CKA(X, Y, physics=f_p, train_Xvar=1e-3)
+    refused(ValueError, "one data set", CKA, X, Y, physics=f_p, train_Xvar=1e-3)
 
 
 def test_a_frame(data):

@@ -22,7 +22,7 @@ from gpadjust import (
 )
 from gpadjust.gp import OrthogonalKernel
 from gpadjust.models import PhysicsParameters, orthogonal_rbf
-from tests.systems import line, normal, same
+from tests.systems import line, normal, refused, same
 
 UNKNOWNS = {"a": Unknown(1.0, sd=0.5, unit="m"), "b": Unknown(2.0, factor=1.3)}
 FEW = {"num_samples": 3, "num_draws": 32, "num_starts": 1, "num_screened": 8}
@@ -142,8 +142,7 @@ class TestPhysicsParameters:
 
     @pytest.mark.parametrize("level", [0.0, 1.0, 95, float("nan")])
     def test_of_no_level(self, parameters, level):
-        with pytest.raises(ValueError, match=f"between 0 and 1; found {level}"):
-            parameters.interval(level)
+        refused(ValueError, f"between 0 and 1; found {level}", parameters.interval, level)
 
     def test_are_shown_as_a_table(self, parameters):
         head, a, b = repr(parameters).splitlines()
@@ -354,8 +353,7 @@ def test_a_file_of_another_prior_is_refused(waves, tmp_path):
     with pytest.warns(UserWarning, match="cannot import it"):
         save(model, tmp_path / "model.pt")
     other = physics_of(1, a=Unknown(1.0, sd=0.6))  # the same guess
-    with pytest.raises(ValueError, match=r"another physics.*priors"):
-        load(tmp_path / "model.pt", physics=other)
+    refused(ValueError, r"another physics.*priors", load, tmp_path / "model.pt", physics=other)
 
 
 def test_of_several_physics(waves):

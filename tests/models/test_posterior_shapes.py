@@ -5,6 +5,8 @@ import torch
 from botorch.models import SingleTaskGP
 from botorch.models.transforms import Normalize, Standardize
 
+from tests.systems import refused
+
 
 @pytest.mark.parametrize("known_noise", [False, True], ids=["learnt", "known"])
 @pytest.mark.parametrize("batch_shape", [(), (3,)], ids=["single", "batch"])
@@ -75,8 +77,7 @@ def test_terms(data, build, kind, num_outputs, batch_shape, uniform):
             posterior = model.term(name, uniform(*leading, 4, 2))
             expected = (*(leading or batch_shape), 4, num_outputs)
             assert posterior.mean.shape == posterior.variance.shape == expected
-    with pytest.raises(ValueError, match="'gamma'; it has '"):
-        model.term("gamma", X)
+    refused(ValueError, "'gamma'; it has '", model.term, "gamma", X)
 
 
 def test_the_data_are_met_where_the_noise_is_small(data, build, kind, num_outputs):

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gpadjust import CKA, RRA, FunctionPhysics, PhysicsError, PhysicsMeanGP, ScaleGP, fit
-from tests.systems import holding
+from tests.systems import holding, refused
 
 CLASSES = [CKA, RRA, PhysicsMeanGP, ScaleGP]
 
@@ -69,8 +69,7 @@ def test_names(uniform, close):
     for named in (1, -1, "drift", "rho_drift"):
         close(model.rho(Z, physics=named).mean, model.term("rho_drift", Z).mean)
     for wrong in (None, 2, "weight"):
-        with pytest.raises(ValueError, match=r"swing, drift, or a number"):
-            model.rho(Z, physics=wrong)
+        refused(ValueError, r"swing, drift, or a number", model.rho, Z, physics=wrong)
     assert CKA(X, Y, physics=[swing]).term_names == ("rho", "delta")
     assert CKA(X, Y, physics=[lambda X: swing(X), drift]).rho_names == ("rho_f_1", "rho_drift")
 
@@ -128,8 +127,7 @@ def test_errors_name_the_one_that_failed(uniform):
         CKA(X, Y, physics=[swing, drift], rho_mean=[1.0])
     with pytest.raises(ValueError, match=r"2 kernels of rho.*got 1"):
         CKA(X, Y, physics=[swing, drift], rho_covar_module=[None])
-    with pytest.raises(PhysicsError, match="number of outputs"):
-        CKA(X, Y, physics=[swing, lambda X: X[:, 0]])
+    refused(PhysicsError, "number of outputs", CKA, X, Y, physics=[swing, lambda X: X[:, 0]])
 
 
 @pytest.mark.parametrize("cls", CLASSES)

@@ -13,6 +13,7 @@ from gpadjust.models import vanishing_rbf
 from gpadjust.physics import FunctionPhysics, Unknown
 from gpadjust.sklearn import CKARegressor
 from gpadjust.validation import leave_one_out
+from tests.systems import refused
 
 OPEN = vanishing_rbf({"valve": 1.0})
 
@@ -119,8 +120,7 @@ def test_beside_and_for_categories(valve):
         table = model.adjustments(X.assign(**there))
         assert table["delta upper"].abs().max() < 1e-6
         assert model.adjustments(X)["delta upper"].max() > 0.01
-    with pytest.raises(ValueError, match=r"category.*level"):
-        vanishing_rbf({"metal": "steel"})
+    refused(ValueError, r"category.*level", vanishing_rbf, {"metal": "steel"})
 
 
 def test_places_as_frames_arrays_and_numbers():
@@ -146,8 +146,7 @@ def test_bad_places(valve):
         ({"valve": float("nan")}, "finite"),
         (np.zeros(3), r"points p x d.*\(3,\)"),
     ]:
-        with pytest.raises(ValueError, match=message):
-            vanishing_rbf(where)
+        refused(ValueError, message, vanishing_rbf, where)
     for where, message in [
         ({"vane": 1.0}, "columns of valve, flow.*'vane'"),
         ({2: 1.0}, "numbers from 0 to 1, got 2"),
@@ -156,7 +155,6 @@ def test_bad_places(valve):
         with pytest.raises(ValueError, match=message):
             CKA(X, Y, physics=lambda X: X[:, 0], delta_covar_module=vanishing_rbf(where))
     one = {"physics": lambda X: X[:, 1], "delta_covar_module": OPEN}
-    with pytest.raises(ValueError, match=r"center=0.0.*rho_covar_module"):
-        CKA(X, Y, **one)
+    refused(ValueError, r"center=0.0.*rho_covar_module", CKA, X, Y, **one)
     with pytest.raises(ValueError, match=r"vanish nowhere.*CKA takes it"):
         VariationalCKA(X, Y, rho_covar_module=OPEN, **one)

@@ -7,6 +7,7 @@ import torch
 from gpadjust import BlackBoxPhysics, CalibratedPhysics, FunctionPhysics, PhysicsError
 from gpadjust.physics import JoinedPhysics
 from gpadjust.physics.array_physics import array_physics
+from tests.systems import refused
 
 X = np.linspace(0.1, 1, 6).reshape(3, 2)
 TENSOR = torch.tensor(X)
@@ -85,5 +86,4 @@ def test_both_errors_are_told():
 
 @pytest.mark.parametrize("thing", [3, "cka", CalibratedPhysics])
 def test_what_is_no_physics(thing):
-    with pytest.raises(TypeError, match="Physics or a callable"):
-        array_physics(thing, X)
+    refused(TypeError, "Physics or a callable", array_physics, thing, X)

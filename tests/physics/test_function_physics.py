@@ -15,6 +15,7 @@ from gpadjust.physics import (
     Unknown,
     as_physics,
 )
+from tests.systems import refused
 
 
 def test_is_named_after_its_function():
@@ -58,8 +59,7 @@ def test_numpy_inside_where_a_gradient_is_needed(points):
 
 def test_other_runtime_errors_are_not_taken_for_numpy(points):
     physics = FunctionPhysics(lambda X: X @ X)
-    with pytest.raises(PhysicsError, match=r"RuntimeError: .*mat1"):
-        physics(points(3, 2))
+    refused(PhysicsError, r"RuntimeError: .*mat1", physics, points(3, 2))
 
 
 def test_missing_gradient_warns_once(points):
@@ -115,8 +115,7 @@ def test_pickle_of_a_method_that_holds_its_physics(dumps, points):
 def test_as_physics_wraps_callables(points):
     X, physics = points(3, 2), BlackBoxPhysics(np.sin)
     assert as_physics(physics) is physics
-    with pytest.raises(TypeError, match="callable; found float"):
-        FunctionPhysics(1.0)
+    refused(TypeError, "callable; found float", FunctionPhysics, 1.0)
     assert isinstance(as_physics(torch.sin), FunctionPhysics)
     assert torch.equal(as_physics(torch.sin)(X), X.sin())
     assert list(as_physics(torch.nn.Linear(2, 1)).parameters())
@@ -128,8 +127,7 @@ def test_as_physics_joins_several(points):
         assert torch.equal(as_physics(several)(X), torch.cat([X.sin(), 2 * X], -1))
     physics = FunctionPhysics(double)
     assert as_physics([physics]) is physics
-    with pytest.raises(ValueError, match="no physics to join"):
-        as_physics([])
+    refused(ValueError, "no physics to join", as_physics, [])
 
 
 @pytest.mark.parametrize(
@@ -137,8 +135,7 @@ def test_as_physics_joins_several(points):
 )
 def test_as_physics_rejects_the_rest(thing, found):
     message = f"found {found}.*torch function.*ODEPhysics.*BlackBoxPhysics"
-    with pytest.raises(TypeError, match=message):
-        as_physics(thing)
+    refused(TypeError, message, as_physics, thing)
 
 
 PRIOR = Unknown(1.0, factor=2.0)

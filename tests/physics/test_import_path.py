@@ -9,6 +9,7 @@ import torch
 
 from gpadjust.physics import BlackBoxPhysics, FunctionPhysics, JoinedPhysics, Physics, as_physics
 from gpadjust.physics.import_path import import_path, physics_from_path
+from tests.systems import refused
 
 SOURCE = """
 import torch
@@ -109,5 +110,4 @@ def test_function_that_another_has_replaced(plant):
     ],
 )
 def test_wrong_path(plant, path, message):
-    with pytest.raises(ValueError, match=message):
-        physics_from_path(path)
+    refused(ValueError, message, physics_from_path, path)

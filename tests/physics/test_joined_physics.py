@@ -14,6 +14,7 @@ from gpadjust.physics import (
     PhysicsError,
     Unknown,
 )
+from tests.systems import refused
 
 
 def total(X):
@@ -87,8 +88,7 @@ class TestErrors:
     def test_names(self):
         joined = JoinedPhysics({"low": total, "high": FunctionPhysics(first_log)})
         assert [part.name for part in joined.parts] == ["low", "first_log"]
-        with pytest.raises(PhysicsError, match="'low' was given no rows"):
-            joined(torch.zeros(0, 2))
+        refused(PhysicsError, "'low' was given no rows", joined, torch.zeros(0, 2))
         with pytest.raises(PhysicsError, match="'first_log'") as caught:
             joined(torch.zeros(1, 1))
         assert caught.value.__notes__ == ["This physics is 'high' of ('low', 'high')."]
@@ -97,8 +97,7 @@ class TestErrors:
 
     def test_differ_in_their_number_of_outputs(self, points):
         joined = JoinedPhysics([torch.sin, total], name="pair")
-        with pytest.raises(PhysicsError, match=r"'pair'.*2 of 'sin', 1 of 'total'"):
-            joined(points(3, 2))
+        refused(PhysicsError, r"'pair'.*2 of 'sin', 1 of 'total'", joined, points(3, 2))
 
     @pytest.mark.parametrize("grad", [False, True])
     def test_of_a_part_names_it_and_the_rows_of_X(self, grad):
@@ -133,8 +132,7 @@ class TestErrors:
         ],
     )
     def test_no_list_of_physics(self, parts, message):
-        with pytest.raises(TypeError if parts else ValueError, match=message):
-            JoinedPhysics(parts)
+        refused(TypeError if parts else ValueError, message, JoinedPhysics, parts)
 
 
 class TestCopies:
@@ -182,8 +180,7 @@ class TestUnknownParameters:
         parts = self.parts()
         parts[2] = FunctionPhysics(push, unknowns={"mass": Unknown(1.0, sd=0.1)})
         message = "parameter 'mass', which is then one.*factor=1.5.*sd=0.1.*or different names"
-        with pytest.raises(ValueError, match=message):
-            JoinedPhysics(parts)
+        refused(ValueError, message, JoinedPhysics, parts)
 
     def test_at_which_a_part_fails(self):
         X = torch.tensor([[1.0, 3.0], [2.0, 4.0]], dtype=torch.float64)

@@ -12,6 +12,7 @@ from scipy.linalg import expm
 
 from gpadjust.physics import ODEPhysics, PhysicsError, Unknown
 from gpadjust.physics.ode import ADAPTIVE_STEP, FIXED_STEP
+from tests.systems import refused
 
 
 class Spring(torch.nn.Module):
@@ -182,8 +183,7 @@ class TestErrors:
 
     def test_adaptive_method_gives_up_on_a_blow_up(self):
         physics = ODEPhysics(lambda s, a: s**2, 2.0, 1, method="dopri5")
-        with pytest.raises(PhysicsError, match="not reach the end"):
-            physics(torch.ones(1, 1, dtype=torch.float64))
+        refused(PhysicsError, "not reach the end", physics, torch.ones(1, 1, dtype=torch.float64))
 
     def test_other_assertions_are_the_user_s(self):
         def rhs(state, action):
@@ -205,12 +205,10 @@ class TestErrors:
     def test_rhs_of_another_shape(self, rate, found, points):
         physics = ODEPhysics(lambda s, a: rate, 0.1, 2, name="tank")
         message = rf"rhs of physics 'tank' returned {found}, expected.*\(3, 2\)"
-        with pytest.raises(PhysicsError, match=message):
-            physics(points(3, 2))
+        refused(PhysicsError, message, physics, points(3, 2))
 
     def test_too_few_columns_for_the_state(self, points):
-        with pytest.raises(PhysicsError, match=r"3 state column.*2 column"):
-            ODEPhysics(decay, 0.1, 3)(points(4, 2))
+        refused(PhysicsError, r"3 state column.*2 column", ODEPhysics(decay, 0.1, 3), points(4, 2))
 
     def test_blow_up_names_the_row(self):
         physics = ODEPhysics(lambda s, a: s**3, 1.0, 1)

@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gpadjust.physics import BlackBoxPhysics, FunctionPhysics, Physics, PhysicsError
+from tests.systems import refused
 
 integers_as_rows = st.lists(st.lists(st.integers(-2, 2), min_size=2, max_size=2), min_size=1)
 
@@ -54,8 +55,7 @@ class TestShapes:
 
     def test_no_rows_after_a_first_call(self, counter, points):
         physics = FunctionPhysics(counter)
-        with pytest.raises(PhysicsError, match=r"'RowCounter'.*no rows"):
-            physics(points(0, 3))
+        refused(PhysicsError, r"'RowCounter'.*no rows", physics, points(0, 3))
         physics(points(2, 3))
         assert physics(points(4, 0, 3)).shape == (4, 0, 2)
         assert len(counter.rows) == 2
@@ -81,8 +81,7 @@ class TestColumns:
     @pytest.mark.parametrize("column", [2, -3])
     def test_too_few_columns(self, column, points):
         message = rf"inputs=\(0, {column}\).*\(5, 2\).*2 column.*no column \[{column}\]"
-        with pytest.raises(ValueError, match=message):
-            FunctionPhysics(square, inputs=[0, column])(points(5, 2))
+        refused(ValueError, message, FunctionPhysics(square, inputs=[0, column]), points(5, 2))
 
 
 def test_bad_settings_and_inputs(points):
@@ -95,11 +94,9 @@ def test_bad_settings_and_inputs(points):
         ({"memo": -1}, ValueError, "memo must be at least 0; found -1"),
         ({"memo": 1.5}, TypeError, r"memo must be a whole number; found 1\.5"),
     ):
-        with pytest.raises(error, match=says):
-            BlackBoxPhysics(square, **options)
+        refused(error, says, BlackBoxPhysics, square, **options)
     for X in ([[1.0]], torch.tensor([[1]])):
-        with pytest.raises(TypeError, match=r"floating-point.*found (list|torch.int64)"):
-            FunctionPhysics(square)(X)
+        refused(TypeError, r"floating-point.*found (list|torch.int64)", FunctionPhysics(square), X)
     for shape in ((3,), (3, 0)):
         with pytest.raises(ValueError, match=re.escape(f"batch_shape x n x d; found {shape}")):
             FunctionPhysics(square)(points(*shape))
@@ -167,16 +164,14 @@ class TestMemo:
             return np.where(X > 0, np.abs(X) ** 0.5, np.nan)
 
         physics = BlackBoxPhysics(root)
-        with pytest.raises(PhysicsError, match="NaN"):
-            physics(torch.tensor([[4.0], [-1.0], [9.0]]))
+        refused(PhysicsError, "NaN", physics, torch.tensor([[4.0], [-1.0], [9.0]]))
         assert physics(torch.tensor([[4.0], [9.0]])).flatten().tolist() == [2.0, 3.0]
         assert asked == [4.0, -1.0, 9.0]
 
     def test_a_new_number_of_outputs_is_seen_behind_known_rows(self, points):
         physics = BlackBoxPhysics(lambda X: np.repeat(X, len(X), 1))
         physics(points(2, 1))
-        with pytest.raises(PhysicsError, match=r"1 output\(s\), expected 2"):
-            physics(points(3, 1))
+        refused(PhysicsError, r"1 output\(s\), expected 2", physics, points(3, 1))
 
 
 class TestGradients:
@@ -387,5 +382,4 @@ class TestSubclass:
         assert torch.equal(drag(X), -X[:, 1:] * X[:, 1:].abs())
 
     def test_without_evaluate_cannot_be_made(self):
-        with pytest.raises(TypeError, match="abstract"):
-            Physics()
+        refused(TypeError, "abstract", Physics)

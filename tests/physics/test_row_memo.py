@@ -3,12 +3,12 @@
 import copy
 import pickle
 
-import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gpadjust.physics.memo import RowMemo, row_keys
+from tests.systems import refused
 
 finite = st.floats(allow_nan=False, allow_infinity=False, width=64)
 
@@ -65,8 +65,7 @@ def test_it_starts_again_when_full_and_never_holds_more():
     memo.recall(new, double)
     assert len(memo) == 2
     memo.recall(new, refuse)
-    with pytest.raises(AssertionError, match="asked for"):
-        memo.recall(old, refuse)
+    refused(AssertionError, "asked for", memo.recall, old, refuse)
     memo.recall(torch.arange(9.0).unsqueeze(-1), double)
     assert len(memo) == 3
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gpadjust import FunctionPhysics, PhysicsError, SubprocessPhysics, Unknown
-from tests.systems import line
+from tests.systems import line, refused
 
 LAW = """
 import sys, pathlib
@@ -85,8 +85,7 @@ def test_a_run_that_takes_too_long_is_ended_with_all_that_it_started(tmp_path):
     program = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])"
     physics = SubprocessPhysics([sys.executable, "-c", program], timeout=1.0)
     begin = time.perf_counter()
-    with pytest.raises(PhysicsError, match=r"timed out after 1\.0 seconds"):
-        physics(line(1))
+    refused(PhysicsError, r"timed out after 1\.0 seconds", physics, line(1))
     assert time.perf_counter() - begin < 2.5
     time.sleep(2.5)
     assert not late.exists()
@@ -123,15 +122,11 @@ def test_processes_share_a_cache(law, tmp_path):
 
 
 def test_bad_input():
-    with pytest.raises(TypeError, match=r"shlex\.split"):
-        SubprocessPhysics("prog {T}")
-    with pytest.raises(ValueError, match="no name of an input"):
-        SubprocessPhysics(["prog", "{T}"])
-    with pytest.raises(ValueError, match="is no template"):
-        SubprocessPhysics(["prog", "{"])
+    refused(TypeError, r"shlex\.split", SubprocessPhysics, "prog {T}")
+    refused(ValueError, "no name of an input", SubprocessPhysics, ["prog", "{T}"])
+    refused(ValueError, "is no template", SubprocessPhysics, ["prog", "{"])
     with pytest.raises(ValueError, match="no placeholder of the unknown parameter k"):
         SubprocessPhysics(["prog"], unknowns={"k": Unknown(4.0, sd=1.0)})
-    with pytest.raises(ValueError, match="positive number of seconds"):
-        SubprocessPhysics(["prog"], timeout=0)
+    refused(ValueError, "positive number of seconds", SubprocessPhysics, ["prog"], timeout=0)
     with pytest.raises(PhysicsError, match="names has 1 entries"):
         SubprocessPhysics(["prog", "{T}"], names=["T"])(torch.zeros(1, 2).double())

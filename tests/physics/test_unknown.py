@@ -19,6 +19,7 @@ from gpadjust.physics import (
     PhysicsError,
     Unknown,
 )
+from tests.systems import refused
 
 A, B = Unknown(1.0, sd=0.5), Unknown(2.0, factor=1.5)
 
@@ -142,8 +143,7 @@ BAD = {
 @pytest.mark.parametrize("name", BAD)
 def test_what_is_no_prior(name):
     given, options, error, message = BAD[name]
-    with pytest.raises(error, match=message):
-        Unknown(*given, **options)
+    refused(error, message, Unknown, *given, **options)
 
 
 @pytest.mark.parametrize(
@@ -165,13 +165,11 @@ class TestNames:
         "name", ["two words", "1st", "_hidden", "lambda", "rows", "numpy", "keys", 3]
     )
     def test_that_can_be_no_attribute(self, name):
-        with pytest.raises(ValueError, match=rf"names.*found {name!r}"):
-            FunctionPhysics(wave, unknowns={name: A})
+        refused(ValueError, rf"names.*found {name!r}", FunctionPhysics, wave, unknowns={name: A})
 
     @pytest.mark.parametrize("given", [{"mass": 1.0}, ["mass"], A])
     def test_without_priors(self, given):
-        with pytest.raises(TypeError, match=r"Unknown\(guess, sd="):
-            FunctionPhysics(wave, unknowns=given)
+        refused(TypeError, r"Unknown\(guess, sd=", FunctionPhysics, wave, unknowns=given)
 
 
 class TestParameterValues:
@@ -244,8 +242,7 @@ class TestCalls:
     @pytest.mark.parametrize("values", [torch.ones(3), torch.ones(()), 1.0])
     def test_of_another_shape(self, values, points):
         message = r"has 2 unknown parameter\(s\): a, b; expected parameters of shape ... x 2, found"
-        with pytest.raises(ValueError, match=message):
-            MAKE["function"]()(points(3, 2), values)
+        refused(ValueError, message, MAKE["function"](), points(3, 2), values)
 
     def test_of_a_physics_that_has_none(self, points):
         with pytest.raises(ValueError, match=r"'sin' has 0 unknown"):
@@ -323,8 +320,7 @@ class TestFailures:
         if name == "NaN":  # whose shape says what it returns
             assert physics.or_nan(X, numbers(2.0)).isnan().all()
         else:
-            with pytest.raises(PhysicsError, match="below zero"):
-                physics.or_nan(X, numbers(2.0, 3.0).unsqueeze(-1))
+            refused(PhysicsError, "below zero", physics.or_nan, X, numbers(2.0, 3.0).unsqueeze(-1))
 
     def test_or_nan_of_an_error_without_rows(self):
         physics = FunctionPhysics(lambda X, p: [1.0], unknowns=LOW)
@@ -356,10 +352,7 @@ def test_pickles_and_copies(name, points):
 def test_a_function_that_takes_other_arguments_is_told_what_it_is_called_with():
     X = torch.ones(2, 1, dtype=torch.float64)
     without = FunctionPhysics(lambda X: X[:, 0], unknowns={"a": Unknown(1.0, sd=1.0)})
-    with pytest.raises(PhysicsError, match=r"unknown parameters, p, .*p\.a"):
-        without(X)
-    with pytest.raises(PhysicsError, match="are named as unknowns="):
-        FunctionPhysics(lambda X, p: p.a * X[:, 0])(X)
+    refused(PhysicsError, r"unknown parameters, p, .*p\.a", without, X)
+    refused(PhysicsError, "are named as unknowns=", FunctionPhysics(lambda X, p: p.a * X[:, 0]), X)
     misspelt = FunctionPhysics(lambda X, p: p.b * X[:, 0], unknowns={"a": Unknown(1.0, sd=1.0)})
-    with pytest.raises(PhysicsError, match=r"no parameter 'b'.*a\."):
-        misspelt(X)
+    refused(PhysicsError, r"no parameter 'b'.*a\.", misspelt, X)
