@@ -136,23 +136,14 @@ _CLASSES = {
     "RRA-paper": PaperRRA,
     "BiasGP": BiasGP,
 }
-_KINDS = [kind for kind in _CLASSES if kind != "BiasGP"]  # a PhysicsMeanGP by another name
+# One of each class; where there is no physics, or no delta, in the slow run.
+_KINDS = ["CKA", "AR1", "RRA", "RRA-paper"]
+_SLOW = ["ZeroMeanGP", "ScaleGP"]
 
 
-@pytest.fixture(params=_KINDS)
+@pytest.fixture(params=[*_KINDS, *(pytest.param(kind, marks=pytest.mark.slow) for kind in _SLOW)])
 def kind(request):
     """The name of each model, for `build`."""
-    return request.param
-
-
-_QUICK = ["CKA", "AR1", "RRA", "RRA-paper"]
-
-
-@pytest.fixture(
-    params=[pytest.param(k, marks=() if k in _QUICK else pytest.mark.slow) for k in _KINDS]
-)
-def costly_kind(request):
-    """As `kind`, for what takes long: the baselines are left to the slow run."""
     return request.param
 
 

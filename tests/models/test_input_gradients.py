@@ -10,14 +10,14 @@ from tests.systems import crude
 
 @pytest.mark.parametrize("black_box", [False, True], ids=["torch", "numpy"])
 @pytest.mark.parametrize("normalize", [False, True], ids=["raw", "normalize"])
-def test_posterior(data, build, costly_kind, num_outputs, uniform, black_box, normalize):
+def test_posterior(data, build, kind, num_outputs, uniform, black_box, normalize):
     X, Y = data(num_outputs=num_outputs)
     options = {"input_transform": Normalize(2)} if normalize else {}
-    if black_box and costly_kind != "ZeroMeanGP":
+    if black_box and kind != "ZeroMeanGP":
         options["physics"] = BlackBoxPhysics(
             lambda X: crude(torch.from_numpy(X))[:, :num_outputs].numpy()
         )
-    model = build(costly_kind, X, Y, **options).eval().requires_grad_(False)
+    model = build(kind, X, Y, **options).eval().requires_grad_(False)
     Z = uniform(3, 2, high=2.0, seed=3).requires_grad_()
 
     def moments(Z):

@@ -31,11 +31,11 @@ def single_of(build, kind, model, X, Y, Yvar, physics, j):
 
 @pytest.mark.parametrize("known_noise", [False, True], ids=["learnt", "known"])
 def test_each_output_is_the_model_of_its_own_rows(
-    gaps, build, costly_kind, shuffle, uniform, same, close, known_noise
+    gaps, build, kind, shuffle, uniform, same, close, known_noise
 ):
     X, Y = gaps
     Yvar = uniform(*Y.shape, low=0.01, high=0.1, seed=2) if known_noise else None
-    model, Z = shuffle(build(costly_kind, X, Y, Yvar)), uniform(5, 2, high=2.0, seed=4)
+    model, Z = shuffle(build(kind, X, Y, Yvar)), uniform(5, 2, high=2.0, seed=4)
     new_X, new_Y = uniform(3, 2, high=2.0, seed=5), 5 + uniform(3, 2, seed=6)
     new_Y[0, 0] = new_Y[2, 1] = torch.nan
     noise = uniform(3, 2, low=0.01, high=0.1, seed=7)
@@ -44,7 +44,7 @@ def test_each_output_is_the_model_of_its_own_rows(
     loo = leave_one_out(model)
     assert torch.equal(loo.Y.isnan(), Y.isnan())
     for j in range(2):
-        single, rows = single_of(build, costly_kind, model, X, Y, Yvar, crude, j)
+        single, rows = single_of(build, kind, model, X, Y, Yvar, crude, j)
         same(single, model, Z, 1e-8, [j])
         same(model.subset_output([j]), single, Z, 1e-8)
         own = leave_one_out(single)
@@ -59,13 +59,13 @@ def test_each_output_is_the_model_of_its_own_rows(
 
 
 @pytest.mark.slow
-def test_fits_and_samples(gaps, build, costly_kind, uniform):
+def test_fits_and_samples(gaps, build, kind, uniform):
     X, Y = gaps
-    model, Z = build(costly_kind, X, Y), uniform(5, 2, high=2.0, seed=4)
+    model, Z = build(kind, X, Y), uniform(5, 2, high=2.0, seed=4)
     result = fit(model, "map", num_screened=8, num_starts=2)
     assert result.log_likelihood.isfinite().all()
     functions, posterior = model.sample_functions(400, seed=0), model.posterior(Z)
-    if costly_kind != "RRA-paper":
+    if kind != "RRA-paper":
         error = functions(Z).mean(0) - posterior.mean
         assert (error.abs() < 0.3 * posterior.variance.sqrt() + 1e-3 * Y.nanmean()).all()
     assert posterior.rsample(torch.Size([3])).isfinite().all()

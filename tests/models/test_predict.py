@@ -55,8 +55,8 @@ def test_given_noise(data, build, kind, num_outputs, uniform):
     torch.testing.assert_close(actual, noise.expand_as(actual))
 
 
-def test_gradients_to_the_hyperparameters(data, build, costly_kind, num_outputs, uniform):
-    model, Z = build(costly_kind, *data(num_outputs=num_outputs)).eval(), uniform(3, 2)
+def test_gradients_to_the_hyperparameters(data, build, kind, num_outputs, uniform):
+    model, Z = build(kind, *data(num_outputs=num_outputs)).eval(), uniform(3, 2)
     learnt = [p for p in model.parameters() if p.requires_grad]
 
     def predict(*values):
@@ -110,12 +110,12 @@ def change_of_data(model, build, data):
 @pytest.mark.parametrize(
     "change", [change_by_training, change_by_fit, change_by_state, change_of_data]
 )
-def test_nothing_stale_is_kept(data, build, costly_kind, uniform, close, change):
+def test_nothing_stale_is_kept(data, build, kind, uniform, close, change):
     X, Y = data()
-    model = build(costly_kind, X, Y + 0.1 * uniform(*Y.shape, seed=5))
+    model = build(kind, X, Y + 0.1 * uniform(*Y.shape, seed=5))
     Z = uniform(5, 2, high=2.0)
     before = model.predict(Z)
-    change(model, lambda X, Y: build(costly_kind, X, Y), data)
+    change(model, lambda X, Y: build(kind, X, Y), data)
     after = model.predict(Z)
     assert (after.mean - before.mean).abs().max() > 1e-6
     fresh = copy.deepcopy(model)

@@ -15,9 +15,9 @@ from gpadjust.gp.features import TermFeatures
 from tests.systems import line, refused
 
 
-def test_moments(data, build, costly_kind, num_outputs, uniform):
+def test_moments(data, build, kind, num_outputs, uniform):
     X, Y = data(num_outputs=num_outputs, n=12)
-    model = build(costly_kind, X, Y, input_transform=Normalize(2)).eval()
+    model = build(kind, X, Y, input_transform=Normalize(2)).eval()
     Z = uniform(4, 2, high=2.0, seed=4)
     with torch.no_grad():
         values, posterior = model.sample_functions(1500, seed=0)(Z), model.posterior(Z)
@@ -139,15 +139,15 @@ def test_wrong_numbers(data, build, kind):
 
 
 @pytest.mark.slow
-def test_botorch_draws_paths(data, build, costly_kind, num_outputs, uniform):
-    model = build(costly_kind, *data(num_outputs=num_outputs)).eval()
+def test_botorch_draws_paths(data, build, kind, num_outputs, uniform):
+    model = build(kind, *data(num_outputs=num_outputs)).eval()
     Z = uniform(5, 2)
     shape = (4, 5) if num_outputs == 1 else (4, num_outputs, 5)
     for draw in (draw_matheron_paths, draw_kernel_feature_paths):
         assert draw(model, torch.Size([4]))(Z).shape == shape
     values = draw_matheron_paths(model, torch.Size([512]))(Z).detach()
     posterior = model.posterior(Z)
-    if costly_kind != "RRA-paper":
+    if kind != "RRA-paper":
         error = values.mean(0).reshape(num_outputs, 5).mT - posterior.mean
         assert (error.abs() < 0.25 * posterior.variance.sqrt()).all()
     assert MatheronPathModel(model, seed=0).posterior(Z).mean.shape == (5, num_outputs)

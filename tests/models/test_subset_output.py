@@ -15,13 +15,13 @@ QUICK = [("CKA", [1]), ("CKA", [2, 0]), ("RRA", [2, 0])]
 
 
 @pytest.fixture(params=["plain", "transformed", "known-noise", "batch"])
-def three_outputs(request, data, build, costly_kind, shuffle):
+def three_outputs(request, data, build, kind, shuffle):
     """A model of three different outputs."""
     batch = (2,) if request.param == "batch" else ()
     X, Y = data(batch_shape=batch, num_outputs=2)
     Y = torch.cat([Y, Y[..., :1].sin() + 3], dim=-1)
     options = {}
-    if costly_kind != "ZeroMeanGP":
+    if kind != "ZeroMeanGP":
 
         def physics(X):
             f_p = crude(X)
@@ -32,7 +32,7 @@ def three_outputs(request, data, build, costly_kind, shuffle):
         options["input_transform"] = Normalize(2)
         options["outcome_transform"] = Standardize(3)
     Yvar = 0.01 * torch.ones_like(Y) if request.param == "known-noise" else None
-    return shuffle(build(costly_kind, X, Y, Yvar, **options))
+    return shuffle(build(kind, X, Y, Yvar, **options))
 
 
 @pytest.mark.parametrize("indices", [[1], [2, 0], [-1]])
