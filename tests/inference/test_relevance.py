@@ -147,53 +147,28 @@ class TestWithoutPhysics:
             kernels[1][0].outputscale = kernels[1][0].outputscale * ours / theirs
         same(other.predict(Z), one.predict(Z), rtol=1e-6, atol=1e-8)
 
-    @pytest.mark.parametrize(
-        "build",
-        [
-            ZeroMeanGP,
-            lambda X, Y: PhysicsMeanGP(X, Y, physics=double),
-            lambda X, Y: PhysicsMeanGP(X, Y, physics=double, rho_mean="learn"),
-            lambda X, Y: ScaleGP(X, Y, physics=lambda X: 3 + X),
-            lambda X, Y: AR1(X, Y, physics=double, low_X=X),
-            lambda X, Y: CKA(X, Y, physics=double, rho_mean="learn"),
-            lambda X, Y: CKA(X, Y, physics=double, delta_mean="learn"),
-            lambda X, Y: CKA(X, Y, physics=[double, unrelated]),
-            lambda X, Y: CKA(X, Y, physics=double, rho_covar_module=RBFKernel()),
-            lambda X, Y: CKA(
-                X,
-                Y,
-                physics=double,
-                rho_covar_module=ScaleKernel(
-                    RBFKernel(), outputscale_constraint=Interval(0.1, 1.0)
-                ),
-            ),
-        ],
-        ids=[
-            "no physics",
-            "as a mean",
-            "by an unknown factor",
-            "no delta",
-            "two levels",
-            "unknown rho",
-            "unknown delta",
-            "unknown weights",
-            "a rho of one size",
-            "a size that is bounded",
-        ],
-    )
-    def test_there_is_none(self, data, build):
+    def test_there_is_none(self, data):
+        """Of other structures, of unknown means, and with priors or values of the user."""
         X, Y, _ = data
-        assert without_physics(build(X, Y)) is None
-
-    def test_there_is_none_with_priors_or_values_of_the_user(self, data):
-        X, Y, _ = data
-        models = [CKA(X, Y, physics=double) for _ in range(3)]
-        assert without_physics(models[0]) is not None
-        models[0].terms[1].kernel.register_prior("p", LogNormalPrior(0.0, 1.0), "outputscale")
-        models[1].terms[0].kernel.base_kernel.raw_lengthscale.requires_grad_(False)
-        models[2].terms[0].kernel.raw_outputscale.requires_grad_(False)
-        for model in models:
-            assert without_physics(model) is None
+        bounded = ScaleKernel(RBFKernel(), outputscale_constraint=Interval(0.1, 1.0))
+        models = [ZeroMeanGP(X, Y), ScaleGP(X, Y, physics=lambda X: 3 + X)]
+        models += [AR1(X, Y, physics=double, low_X=X), PhysicsMeanGP(X, Y, physics=double)]
+        models += [PhysicsMeanGP(X, Y, physics=double, rho_mean="learn")]
+        for options in (
+            {"rho_mean": "learn"},
+            {"delta_mean": "learn"},
+            {"physics": [double, unrelated]},
+            {"rho_covar_module": RBFKernel()},
+            {"rho_covar_module": bounded},
+        ):
+            models.append(CKA(X, Y, **{"physics": double, **options}))
+        users = [CKA(X, Y, physics=double) for _ in range(3)]
+        assert without_physics(users[0]) is not None
+        users[0].terms[1].kernel.register_prior("p", LogNormalPrior(0.0, 1.0), "outputscale")
+        users[1].terms[0].kernel.base_kernel.raw_lengthscale.requires_grad_(False)
+        users[2].terms[0].kernel.raw_outputscale.requires_grad_(False)
+        for i, model in enumerate(models + users):
+            assert without_physics(model) is None, i
 
     def test_there_is_one_of_a_ridge_regression(self, data):
         X, Y, Z = data
@@ -220,20 +195,13 @@ class TestAlone:
         kinds = {name.rsplit(".", 1)[-1] for name in names}
         assert kinds == ({"raw_noise"} if known is None else {"raw_lengthscale"})
 
-    @pytest.mark.parametrize(
-        "build",
-        [
-            ZeroMeanGP,
-            lambda X, Y: AR1(X, Y, physics=double, low_X=X),
-            lambda X, Y: CKA(X, Y, physics=double, rho_mean="learn"),
-            lambda X, Y: CKA(X, Y, physics=double, rho_mean=0.0),
-            lambda X, Y: CKA(X, Y, physics=double, rho_covar_module=RBFKernel()),
-        ],
-        ids=["no physics", "two levels", "unknown rho", "none without data", "a rho of one size"],
-    )
-    def test_there_is_none(self, data, build):
+    def test_there_is_none(self, data):
         X, Y, _ = data
-        assert alone(build(X, Y)) is None
+        unknown, nothing = ({"rho_mean": mean} for mean in ("learn", 0.0))
+        of_one_size = {"rho_covar_module": RBFKernel()}
+        models = [CKA(X, Y, physics=double, **o) for o in (unknown, nothing, of_one_size)]
+        for model in (*models, ZeroMeanGP(X, Y), AR1(X, Y, physics=double, low_X=X)):
+            assert alone(model) is None
 
     @pytest.mark.slow
     @pytest.mark.parametrize("kind", [CKA, PhysicsMeanGP])
@@ -420,26 +388,14 @@ class TestFit:
         torch.testing.assert_close(rho.mean[:, 1], torch.full_like(Z[:, 0], 0.5), rtol=0, atol=0.2)
 
     @quick
-    @pytest.mark.parametrize(
-        "build",
-        [
-            ZeroMeanGP,
-            lambda X, Y: PhysicsMeanGP(X, Y, physics=double),
-            lambda X, Y: AR1(X, Y, physics=double, low_X=X),
-        ],
-        ids=["no physics", "as a mean", "two levels"],
-    )
-    def test_nothing_is_said_of_what_cannot_do_without(self, data, build):
+    def test_nothing_is_said_of_what_cannot_do_without_nor_with_priors_of_the_user(self, data):
         X, Y, _ = data
-        assert fit(build(X, Y), "bayes", **SHORT).relevance is None
-
-    @quick
-    def test_nothing_is_said_with_priors_of_the_user(self, data):
-        X, Y, _ = data
-        model = CKA(X, Y, physics=unrelated)
-        register_priors(model)
-        assert fit(model, "bayes", **SHORT).relevance is None
-        assert (model.terms[0].mean == 1.0).all()
+        users = CKA(X, Y, physics=unrelated)
+        register_priors(users)
+        others = PhysicsMeanGP(X, Y, physics=double), AR1(X, Y, physics=double, low_X=X)
+        for model in (users, ZeroMeanGP(X, Y), *others):
+            assert fit(model, "bayes", **SHORT).relevance is None
+        assert (users.terms[0].mean == 1.0).all()
 
     def test_the_most_likely_values_know_nothing_of_it(self, fitted, data):
         X, Y, Z = data

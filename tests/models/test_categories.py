@@ -169,22 +169,16 @@ def test_arrays_outputs_and_declared_levels():
     assert math.isclose(float(inputs(X)[0, 1:4].norm()), 0.5**0.5)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_bad_options_and_levels(model):
+    for options, says in (
         ({"categorical": "colour"}, "columns of flow, material, rig, got 'colour'"),
         ({"batch": 7}, "got 7"),
         ({"categorical": {"material": ["iron", "iron"]}}, "different levels"),
         ({"categorical": {"material": ["iron", "steel"]}}, "one of iron, steel, got 'brass'"),
-    ],
-)
-def test_bad_options(options, message):
-    refused(ValueError, message, PhysicsMeanGP, FRAME, Y, physics=head, **options)
-
-
-def test_bad_levels(model):
-    with pytest.raises(ValueError, match="brass, iron, steel, got 'wood'"):
-        predicted(model, FRAME[:2].assign(material="wood"))
-    with pytest.raises(ValueError, match=r"material to be one of \[0.0, 1.0, 2.0\].*got 1.5"):
-        model.transform_inputs(torch.tensor([[1.0, 1.5, 0.0]]).double())
+    ):
+        refused(ValueError, says, PhysicsMeanGP, FRAME, Y, physics=head, **options)
+    wood = FRAME[:2].assign(material="wood")
+    refused(ValueError, "brass, iron, steel, got 'wood'", predicted, model, wood)
+    between, says = torch.tensor([[1.0, 1.5, 0.0]]).double(), r"\[0.0, 1.0, 2.0\].*got 1.5"
+    refused(ValueError, f"material to be one of {says}", model.transform_inputs, between)
     refused(ValueError, "an input beside batches", ZeroMeanGP, X[:, 2:], Y, batch=0)

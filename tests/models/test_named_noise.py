@@ -13,7 +13,6 @@ from gpadjust import CKA, RRA, VariationalCKA, ZeroMeanGP, compare, fit, load, s
 from gpadjust.models import Logit
 from gpadjust.models.heavy_tails import SHARE
 from gpadjust.report import report
-from gpadjust.sklearn import CKARegressor
 from gpadjust.validation import leave_one_out
 from tests.systems import refused
 
@@ -119,41 +118,28 @@ def test_the_whole_house(names: Any, gross: tuple[Tensor, Tensor], tmp_path: Any
 
 
 @pytest.mark.slow
-def test_compare_report_and_regressor(gross: tuple[Tensor, Tensor], tmp_path: Any) -> None:
+def test_a_page_tells_outliers(gross: tuple[Tensor, Tensor], tmp_path: Any) -> None:
+    found = compare(*gross, physics=wave, likelihood="heavy-tailed", structures=["CKA"])
+    assert "outlier" in report(found, tmp_path / "page.html").read_text().lower()
+
+
+@pytest.mark.parametrize(
+    ("kind", "known"), [(CKA, 0.03**2), pytest.param(RRA, None, marks=pytest.mark.slow)]
+)
+def test_random_features_and_known_noise_have_outliers_too(gross, kind, known) -> None:
     X, Y = gross
-    found = compare(X, Y, physics=wave, likelihood="heavy-tailed", structures=["CKA"])
-    page = report(found, tmp_path / "page.html")
-    assert "outlier" in page.read_text().lower()
-    fitted = CKARegressor(wave, model_options={"likelihood": "heavy-tailed"}, fit_options=OPTIONS)
-    fitted.fit(X.numpy(), Y.numpy().ravel())
-    assert abs(float(fitted.predict([[0.65]])[0]) - float(wave(X.new_tensor([[0.65]]))) - 0.2) < 0.1
-
-
-@pytest.mark.slow
-def test_random_features(gross: tuple[Tensor, Tensor]) -> None:
-    X, Y = gross
-    model = RRA(X, Y, physics=wave, likelihood="heavy-tailed")
-    fit(model, **OPTIONS)
-    assert bool((model.outliers()[OUTLIERS] > 0.5).all())
-
-
-def test_known_noise_has_outliers_too(gross: tuple[Tensor, Tensor]) -> None:
-    X, Y = gross
-    model = CKA(X, Y, 0.03**2, physics=wave, likelihood="heavy-tailed")
+    model = kind(X, Y, known, physics=wave, likelihood="heavy-tailed")
     fit(model, **OPTIONS)
     assert bool((model.outliers()[OUTLIERS] > 0.5).all())
 
 
 def test_bad_input(gross: tuple[Tensor, Tensor]) -> None:
     X, Y = gross
-    with pytest.raises(ValueError, match="a sequence of both, or a Gaussian"):
-        CKA(X, Y, physics=wave, likelihood="Student")
-    with pytest.raises(ValueError, match="relative already"):
-        CKA(
-            X, Y + 9, physics=lambda X: X + 9, outcome_transform=Logit(0, 99), likelihood="relative"
-        )
-    with pytest.raises(ValueError, match="train_Yvar or a likelihood"):
-        CKA(X, Y, 0.1, physics=wave, likelihood="relative")
-    with pytest.raises(ValueError, match="one variance for all"):
-        VariationalCKA(X, Y, physics=wave, likelihood="heavy-tailed", num_inducing=5)
+    f_p, logit = {"physics": wave}, Logit(0, 99)
+    refused(ValueError, "a sequence of both, or a Ga", CKA, X, Y, **f_p, likelihood="Student")
+    options = {"physics": lambda X: X + 9, "outcome_transform": logit, "likelihood": "relative"}
+    refused(ValueError, "relative already", CKA, X, Y + 9, **options)
+    refused(ValueError, "train_Yvar or a like", CKA, X, Y, 0.1, **f_p, likelihood="relative")
+    sparse = {"likelihood": "heavy-tailed", "num_inducing": 5}
+    refused(ValueError, "one variance for all", VariationalCKA, X, Y, **f_p, **sparse)
     refused(ValueError, "heavy-tailed", CKA(X, Y, physics=wave).outliers)

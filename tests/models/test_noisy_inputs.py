@@ -7,12 +7,11 @@ import pandas as pd
 import pytest
 import torch
 
-from gpadjust import CKA, CalibratedPhysics, ZeroMeanGP, compare, fit, load, save
+from gpadjust import CKA, CalibratedPhysics, ZeroMeanGP, fit, load, save
 from gpadjust.models.noisy_inputs import NoisyInputs
 from gpadjust.models.training_data import training_data
 from gpadjust.physics import BlackBoxPhysics, FunctionPhysics, PhysicsError, Unknown
 from gpadjust.report import report
-from gpadjust.sklearn import CKARegressor
 from gpadjust.validation import leave_one_out
 from tests.systems import refused
 
@@ -125,16 +124,6 @@ def test_samples_are_saved_with_it(data, tmp_path):
     assert torch.allclose(again.predict(TEST).mean, model.predict(TEST).mean)
 
 
-@pytest.mark.slow
-def test_compare_and_scikit_learn(data):
-    X, Y = data
-    found = compare(X, Y, f_p, structures=["CKA"], num_starts=1, num_screened=4, train_Xvar=SD**2)
-    assert all(model.noisy_inputs is not None for model in found.models.values())
-    regressor = CKARegressor(f_p, fit_method="map", fit_options={"num_starts": 1})
-    regressor.fit(X.numpy(), Y.numpy()[:, 0], train_Xvar=np.full((30, 1), SD**2))
-    assert regressor.model_.noisy_inputs is not None
-
-
 def test_no_noise_changes_nothing(data):
     plain, model = CKA(*data, physics=f_p), CKA(*data, physics=f_p, train_Xvar=0.0)
     for each in (plain, model):
@@ -186,26 +175,17 @@ def test_a_black_box_that_cannot_be_asked_everywhere():
         QUICK(CKA(X, X, physics=never, train_Xvar=1e-3))
 
 
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
+def test_a_frame_and_bad_variances(data):
+    X, Y = data
+    for given, says in (
         (-1.0, "not to be negative"),
         ([1e-3, 1e-3], "one number"),
         (1.0, "not standard deviations"),
         (float("nan"), "finite"),
-    ],
-)
-def test_bad_variances_get_a_sentence(data, given, words):
-    refused(ValueError, words, CKA, *data, physics=f_p, train_Xvar=given)
-
-
-def test_a_batch_is_refused(data):
-    X, Y = (each.expand(2, -1, -1) for each in data)
-    refused(ValueError, "one data set", CKA, X, Y, physics=f_p, train_Xvar=1e-3)
-
-
-def test_a_frame(data):
-    X, Y = data
+    ):
+        refused(ValueError, says, CKA, X, Y, physics=f_p, train_Xvar=given)
+    batch = [each.expand(2, -1, -1) for each in data]
+    refused(ValueError, "one data set", CKA, *batch, physics=f_p, train_Xvar=1e-3)
     frame = pd.DataFrame(X.numpy(), columns=["length"])
     model = CKA(frame, Y, physics=f_p, train_Xvar=pd.DataFrame({"length": np.full(30, SD**2)}))
     assert model.input_names == ("length",)
