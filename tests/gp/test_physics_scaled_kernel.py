@@ -6,9 +6,10 @@ import pytest
 import torch
 from gpytorch.kernels import MaternKernel, RBFKernel, ScaleKernel
 from gpytorch.test.base_kernel_test_case import BaseKernelTestCase
+from gpytorch.test.base_mean_test_case import BaseMeanTestCase
 from torch import Size
 
-from gpadjust.gp import PhysicsScaledKernel
+from gpadjust.gp import PhysicsMean, PhysicsScaledKernel
 from tests.systems import refused
 
 
@@ -83,3 +84,34 @@ def test_gradients_reach_hyper_parameters_and_inputs(uniform):
     kernel(X).to_dense().sum().backward()
     assert kernel.base_kernel.raw_lengthscale.grad.abs() > 0
     assert X.grad.abs().max() > 0
+
+
+# The physics as a mean function
+
+
+class TestAsGPyTorchsMeans(BaseMeanTestCase, TestCase):
+    def create_mean(self):
+        return PhysicsMean(lambda X: X.sum(-1))
+
+    test_forward_vec = None  # f_p takes rows; a GPyTorch model passes n x d
+
+
+def test_values(uniform):
+    X = uniform(3, 4, 2)
+    mean = PhysicsMean(lambda X: X.square(), output=1)
+    torch.testing.assert_close(mean(X), X[..., 1].square())
+
+
+def test_parameters_of_the_physics_are_those_of_the_mean():
+    class Gain(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.gain = torch.nn.Parameter(torch.tensor(2.0))
+
+        def forward(self, X):
+            return self.gain * X[:, 0]
+
+    mean = PhysicsMean(Gain())
+    assert [p.item() for p in mean.parameters()] == [2.0]
+    mean(torch.ones(3, 1)).sum().backward()
+    assert next(mean.parameters()).grad.item() == 3.0

@@ -107,35 +107,14 @@ def check(kind, problem):
         assert (mean.abs() <= 1e3 * size + 10 * variance.sqrt()).all()
 
 
-def profile(max_examples):
-    return settings(
-        max_examples=max_examples,
-        deadline=None,
-        derandomize=True,
-        suppress_health_check=list(HealthCheck),
-    )
-
-
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
-@profile(8)
+@settings(
+    max_examples=150, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck)
+)
 @given(kind=st.sampled_from(list(BUILD)), problem=problems())
 def test_any_data(kind, problem):
     check(kind, problem)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
-@profile(150)
-@given(kind=st.sampled_from(list(BUILD)), problem=problems())
-def test_any_data_at_length(kind, problem):
-    check(kind, problem)
-
-
-@pytest.mark.parametrize("kind", list(BUILD))
-def test_one_point_is_too_few(kind):
-    X = torch.ones(1, 2, dtype=torch.float64)
-    refused(ValueError, "at least 2 points", BUILD[kind], X, wave(X), physics=wave)
 
 
 @pytest.mark.parametrize("kind", list(BUILD))

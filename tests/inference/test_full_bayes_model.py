@@ -4,7 +4,17 @@ from copy import deepcopy
 
 import pytest
 import torch
+from botorch.acquisition import (
+    LogExpectedImprovement,
+    qLogExpectedImprovement,
+    qLogNoisyExpectedImprovement,
+    qNegIntegratedPosteriorVariance,
+)
+from botorch.acquisition.bayesian_active_learning import qBayesianActiveLearningByDisagreement
+from botorch.acquisition.monte_carlo import qPosteriorStandardDeviation
+from botorch.acquisition.objective import LinearMCObjective
 from botorch.models.transforms import Normalize
+from botorch.optim import optimize_acqf
 from botorch.posteriors.fully_bayesian import GaussianMixturePosterior
 from botorch.sampling import SobolQMCNormalSampler
 from gpytorch.kernels import MaternKernel, RBFKernel, ScaleKernel
@@ -14,7 +24,7 @@ from gpadjust import fit
 from gpadjust.validation import leave_one_out
 from tests.systems import refused
 
-KINDS = ["ZeroMeanGP", "PhysicsMeanGP", "ScaleGP", "CKA", "AR1", "RRA"]
+KINDS = ["ZeroMeanGP", "ScaleGP", "CKA", "AR1", "RRA"]
 
 
 def matern(m):
@@ -86,6 +96,16 @@ def test_posteriors(case, uniform, close, shape):
         close(variance, expected.mixture_variance.squeeze(-2))
     given = uniform(*shape, m)
     close(model.predict(Z, given).variance, model.predict(Z).variance + given)
+
+
+def test_what_is_refused(held, build, data, uniform):
+    model, _ = held("CKA", *data())
+    refused(RuntimeError, "holds samples", model.train)
+    refused(RuntimeError, "holds samples", model.hold_samples, {})
+    fantasies = model.fantasize(uniform(1, 2), SobolQMCNormalSampler(Size([5]), seed=0))
+    refused(RuntimeError, "fantasies", fantasies.release_samples)
+    refused(ValueError, "Take RRA", fit, build("RRA-paper", *data()), "bayes")
+    refused(ValueError, "one data set", fit, build("CKA", *data(batch_shape=(2,))), "bayes")
 
 
 class TestObservations:
@@ -257,11 +277,6 @@ class TestLettingGo:
         expected = fit(fresh, "map", **options).log_likelihood
         assert (found > expected - 1.0).all()
 
-    def test_a_model_of_fantasies(self, held, data, uniform):
-        model, _ = held("CKA", *data())
-        fantasies = model.fantasize(uniform(1, 2), SobolQMCNormalSampler(Size([5]), seed=0))
-        refused(RuntimeError, "fantasies", fantasies.release_samples)
-
     def test_it_keeps_them_if_a_fit_fails(self, held, data, uniform):
         model, _ = held("CKA", *data())
         Z = uniform(4, 2)
@@ -274,14 +289,62 @@ class TestLettingGo:
         torch.testing.assert_close(model.posterior(Z).mean, before)
 
 
-class TestRefusals:
-    def test_training(self, held, data):
-        model, _ = held("CKA", *data())
-        refused(RuntimeError, "holds samples", model.train)
-        refused(RuntimeError, "holds samples", model.hold_samples, {})
+# BoTorch's acquisition functions on a fully Bayesian model
 
-    def test_the_papers_closed_form(self, build, data):
-        refused(ValueError, "Take RRA", fit, build("RRA-paper", *data()), "bayes")
 
-    def test_a_batch_of_data_sets(self, build, data):
-        refused(ValueError, "one data set", fit, build("CKA", *data(batch_shape=(2,))), "bayes")
+SAMPLER = {"sampler": SobolQMCNormalSampler(torch.Size([8]), seed=0)}
+ACQUISITIONS = {
+    "qLogNEI": lambda model, X: qLogNoisyExpectedImprovement(model, X, **SAMPLER),
+    "qLogEI": lambda model, X: qLogExpectedImprovement(model, 1.0, **SAMPLER),
+    "LogEI": lambda model, X: LogExpectedImprovement(model, best_f=1.0),
+    "NIPV": lambda model, X: qNegIntegratedPosteriorVariance(model, mc_points=X),
+    "PSTD": lambda model, X: qPosteriorStandardDeviation(model, **SAMPLER),
+    "BALD": lambda model, X: qBayesianActiveLearningByDisagreement(model, **SAMPLER),
+}
+BOUNDS = torch.tensor([[0.0, 0.0], [2.0, 2.0]], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("name", ACQUISITIONS)
+@pytest.mark.parametrize("kind", ["CKA", "AR1"])
+def test_optimize(held, data, name, kind):
+    X, Y = data()
+    model, _ = held(kind, X, Y)
+    acquisition = ACQUISITIONS[name](model, X)
+    q = 2 if name.startswith("q") or name == "PSTD" else 1
+    point, value = optimize_acqf(
+        acquisition, BOUNDS, q=q, num_restarts=2, raw_samples=4, options={"maxiter": 3}
+    )
+    assert point.shape == (q, 2)
+    assert value.isfinite().all()
+    assert acquisition(torch.rand(5, q, 2, dtype=torch.float64)).shape == (5,)
+
+
+@pytest.mark.parametrize("name", ["qLogNEI", "LogEI", "NIPV", "PSTD"])
+def test_gradients_through_the_physics(held, data, uniform, gradient_is_right, name):
+    X, Y = data()
+    model, _ = held("CKA", X, Y)
+    gradient_is_right(ACQUISITIONS[name](model, X), uniform(1, 1, 2, high=2.0, seed=5))
+
+
+def test_values_are_averages_over_the_samples(held, data, uniform):
+    X, Y = data()
+    model, singles = held("CKA", X, Y)
+    Z, best = uniform(6, 1, 2, high=2.0), Y.mean()
+    each = torch.stack([LogExpectedImprovement(single, best_f=best)(Z) for single in singles])
+    actual = LogExpectedImprovement(model, best_f=best)(Z)
+    torch.testing.assert_close(actual, each.exp().mean(0).log())
+    each = [qNegIntegratedPosteriorVariance(single, mc_points=X)(Z) for single in singles]
+    actual = qNegIntegratedPosteriorVariance(model, mc_points=X)(Z)
+    torch.testing.assert_close(actual, torch.stack(each).mean(0))
+
+
+@pytest.mark.filterwarnings("ignore:Sparse invariant checks:UserWarning")
+@pytest.mark.filterwarnings("ignore:A not p.d.")
+def test_two_outputs(held, data, uniform):
+    X, Y = data(num_outputs=2)
+    model, _ = held("CKA", X, Y)
+    Z = uniform(6, 1, 2, high=2.0)
+    weights = torch.tensor([1.0, -0.5], dtype=torch.float64)
+    objective = LinearMCObjective(weights)
+    values = qLogNoisyExpectedImprovement(model, X, objective=objective, **SAMPLER)(Z)
+    assert values.shape == (6,)

@@ -408,16 +408,6 @@ class TestFit:
         found, expected = (each.log_evidence()[1] for each in (model, new))
         torch.testing.assert_close(found, expected, rtol=1e-2, atol=1e-2)
 
-    @pytest.mark.slow
-    def test_again(self, data):
-        X, Y, Z = data
-        model = CKA(X, Y, physics=unrelated)
-        first, mean = fit(model).relevance, model.predict(Z).mean
-        second = fit(model).relevance
-        assert first < 0.5
-        assert second < 0.5
-        assert (model.predict(Z).mean - mean).abs().max() < 0.01
-
 
 class TestPartlyOff:
     """What samples with the physics on, and others with it off, are to a model."""
@@ -518,14 +508,6 @@ class TestTracesOfSamplesWithoutPhysics:
         for each in (new, cold):
             fit(each, "map", num_screened=0, num_starts=1)
         assert new.log_evidence()[1] > cold.log_evidence()[1] - 1
-
-    def test_released_samples_leave_none(self, data):
-        X, Y, Z = data
-        model = CKA(X, Y, physics=unrelated)
-        fit(model)
-        model.release_samples()
-        fit(model, "map")
-        torch.testing.assert_close(model.fallback(Z), unrelated(Z))
 
     def test_a_center_that_moved(self, data):
         X, Y, _ = data

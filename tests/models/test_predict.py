@@ -10,7 +10,8 @@ from gpytorch.kernels import InducingPointKernel, RBFKernel, ScaleKernel
 from gpytorch.likelihoods import GaussianLikelihood
 from gpytorch.settings import detach_test_caches
 
-from gpadjust import ZeroMeanGP, fit
+from gpadjust import BlackBoxPhysics, ZeroMeanGP, fit
+from tests.systems import crude
 
 
 def reference(model, Z, **options):
@@ -142,3 +143,38 @@ def test_a_kernel_with_its_own_way(data, uniform, close):
     kernel = InducingPointKernel(ScaleKernel(RBFKernel()).double(), X[:8].clone(), likelihood)
     model = ZeroMeanGP(X, Y, covar_module=kernel, likelihood=likelihood).eval()
     same(model, uniform(5, 2), close)
+
+
+# Gradients of predictions in X
+
+
+@pytest.mark.parametrize("black_box", [False, True], ids=["torch", "numpy"])
+@pytest.mark.parametrize("normalize", [False, True], ids=["raw", "normalize"])
+def test_posterior(data, build, kind, num_outputs, uniform, black_box, normalize):
+    X, Y = data(num_outputs=num_outputs)
+    options = {"input_transform": Normalize(2)} if normalize else {}
+    if black_box and kind != "ZeroMeanGP":
+        options["physics"] = BlackBoxPhysics(
+            lambda X: crude(torch.from_numpy(X))[:, :num_outputs].numpy()
+        )
+    model = build(kind, X, Y, **options).eval().requires_grad_(False)
+    Z = uniform(3, 2, high=2.0, seed=3).requires_grad_()
+
+    def moments(Z):
+        posterior = model.posterior(Z)
+        return posterior.mean, posterior.variance
+
+    assert torch.autograd.gradcheck(moments, Z, rtol=1e-4)
+    assert torch.autograd.gradcheck(model.predict, Z, rtol=1e-4)
+
+
+def test_terms(data, build, kind, uniform):
+    model = build(kind, *data(num_outputs=2)).eval().requires_grad_(False)
+    Z = uniform(3, 2, high=2.0, seed=3).requires_grad_()
+    for name in model.term_names:
+
+        def moments(Z, name=name):
+            posterior = model.term(name, Z)
+            return posterior.mean, posterior.variance
+
+        assert torch.autograd.gradcheck(moments, Z)
