@@ -163,67 +163,58 @@ class TestGradients:
         assert caught.value.rows == (1,)
         assert "fd_step smaller" in caught.value.__notes__[0]
 
-    @pytest.mark.parametrize(
-        ("jacobian", "message"),
-        [
+    def test_wrong_jacobian(self, points):
+        for jacobian, says in (
             (lambda X: np.zeros((3, 2)), r"shape \(3, 2\), expected shape.*\(3, 2, 2\)"),
             (lambda X: np.full((3, 2, 2), np.nan), "finite numbers"),
             (lambda X: 1 / 0, "raised ZeroDivisionError"),
             (lambda X: np.full((3, 2, 2), 1j), "expected real numbers, found complex128"),
-        ],
-    )
-    def test_wrong_jacobian(self, jacobian, message, points):
-        Y = BlackBoxPhysics(waves, gradient=jacobian, name="mill")(points(3, 2).requires_grad_())
-        refused(PhysicsError, r"gradient of physics 'mill'.*" + message, Y.sum().backward)
+        ):
+            physics = BlackBoxPhysics(waves, gradient=jacobian, name="mill")
+            Y = physics(points(3, 2).requires_grad_()).sum()
+            refused(PhysicsError, rf"gradient of physics 'mill'.*{says}", Y.backward)
 
 
-class TestSettings:
-    def test_bad_ones(self):
-        for gradient in ("autograd", 1, True):
-            with pytest.raises(ValueError, match=rf"gradient.*found {gradient!r}"):
-                BlackBoxPhysics(waves, gradient=gradient)
-        for fd_step in (0.0, -1.0, float("nan"), [0.1, 0.0], []):
-            refused(ValueError, "fd_step must be positive", BlackBoxPhysics, waves, fd_step=fd_step)
-        refused(TypeError, "callable; found list", BlackBoxPhysics, [])
-
-    def test_steps_for_other_columns(self, points):
-        physics = BlackBoxPhysics(waves, fd_step=[0.1, 0.1, 0.1])
-        with pytest.raises(ValueError, match=r"'waves' has 3 entries.*1 or 2"):
-            physics(points(4, 2).requires_grad_())
+def test_bad_settings(points):
+    for gradient in ("autograd", 1, True):
+        says = rf"gradient.*found {gradient!r}"
+        refused(ValueError, says, BlackBoxPhysics, waves, gradient=gradient)
+    for fd_step in (0.0, -1.0, float("nan"), [0.1, 0.0], []):
+        refused(ValueError, "fd_step must be positive", BlackBoxPhysics, waves, fd_step=fd_step)
+    refused(TypeError, "callable; found list", BlackBoxPhysics, [])
+    X, physics = points(4, 2).requires_grad_(), BlackBoxPhysics(waves, fd_step=[0.1, 0.1, 0.1])
+    refused(ValueError, r"'waves' has 3 entries.*1 or 2", physics, X)
 
 
-class TestFailures:
-    @pytest.mark.parametrize(
-        ("function", "batched", "says"),
-        [
-            (lambda x: x[0] + x[1], True, r"single row take .*batched=False"),
-            (lambda x: np.zeros((2, 2)), False, r"a scalar or outputs.*found \(2, 2\)"),
-            *(
-                (lambda x, result=result: result, batched, f"expected real numbers, found {found}")
-                for result, found in ((1j, "complex"), (None, "None"), ("1", "<U1"), ([None], "No"))
-                for batched in (True, False)
-            ),
-        ],
-    )
-    def test_wrong_results(self, function, batched, says, points):
+def test_wrong_results(points):
+    for function, batched, says in (
+        (lambda x: x[0] + x[1], True, r"single row take .*batched=False"),
+        (lambda x: np.zeros((2, 2)), False, r"a scalar or outputs.*found \(2, 2\)"),
+        *(
+            (lambda x, result=result: result, batched, f"expected real numbers, found {found}")
+            for result, found in ((1j, "complex"), (None, "None"), ("1", "<U1"), ([None], "No"))
+            for batched in (True, False)
+        ),
+    ):
         physics = BlackBoxPhysics(function, batched=batched, name="mill")
         refused(PhysicsError, rf"Physics 'mill' .*{says}", physics, points(3, 2))
 
+
+class TestFailures:
     def test_rows_of_different_length(self):
         exact = BlackBoxPhysics(lambda x: Fraction(1, 4), batched=False)
         assert exact(torch.ones(1, 1)).item() == 0.25
-        tape = BlackBoxPhysics(lambda x: np.zeros(int(x[0])), batched=False, name="tape")
-        with pytest.raises(PhysicsError, match=r"'tape' returned 2 output\(s\)") as caught:
-            tape(torch.tensor([[2.0], [3.0], [2.0]]))
-        assert caught.value.rows == (1,)
 
-    def test_failed_rows_do_not_hide_a_new_number_of_outputs(self):
         def fragile(x):
             return np.zeros(int(x[0])) if x[0] else np.array([1 // 0])
 
-        physics = BlackBoxPhysics(fragile, batched=False)
-        physics(torch.tensor([[2.0]]))
-        refused(PhysicsError, r"3 output\(s\), expected 2", physics, torch.tensor([[3.0], [0.0]]))
+        tape = BlackBoxPhysics(fragile, batched=False, name="tape")
+        with pytest.raises(PhysicsError, match=r"'tape' returned 2 output\(s\)") as caught:
+            tape(torch.tensor([[2.0], [3.0], [2.0]]))
+        assert caught.value.rows == (1,)
+        tape(torch.tensor([[2.0]]))  # nor is it hidden by rows that fail
+        rows = torch.tensor([[3.0], [0.0]])
+        refused(PhysicsError, r"3 output\(s\), expected 2", tape, rows)
 
     @pytest.mark.parametrize("grad", [False, True])
     def test_good_rows_survive_failed_ones(self, grad):
@@ -342,10 +333,3 @@ class TestUnknownParameters:
             Y.sum().backward()
         assert caught.value.rows == (3,)
         assert caught.value.inputs.tolist() == [[1.0, 1.0, 2.0]]
-
-    def test_in_threads(self, points):
-        X, values = points(3, 2), points(2, 2, seed=1)
-        physics = BlackBoxPhysics(self.decay, unknowns=UNKNOWNS, batched=False, memo=0)
-        expected = physics(X, values)
-        with joblib.parallel_config(backend="threading", n_jobs=2):
-            torch.testing.assert_close(physics(X, values), expected)

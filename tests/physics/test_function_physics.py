@@ -14,7 +14,6 @@ from gpadjust.physics import (
     FunctionPhysics,
     JoinedPhysics,
     PhysicsError,
-    Unknown,
     as_physics,
 )
 from gpadjust.physics.array_physics import array_physics
@@ -45,42 +44,30 @@ def test_parameters_of_a_module_are_learnt(points):
 
 
 @pytest.mark.parametrize("grad", [False, True])
-@pytest.mark.parametrize(
-    "function", [lambda X: X.detach().numpy() ** 2, lambda X: X.detach().numpy().sum()]
-)
-def test_numpy_result(function, grad, points):
-    with pytest.raises(PhysicsError, match=r"'noodle'.*NumPy.*BlackBoxPhysics\("):
-        FunctionPhysics(function, name="noodle")(points(3, 2).requires_grad_(grad))
-
-
-def test_numpy_inside_where_a_gradient_is_needed(points):
-    physics = FunctionPhysics(lambda X: torch.from_numpy(np.sin(X.numpy())))
-    with pytest.raises(PhysicsError, match=r"NumPy.*BlackBoxPhysics\(") as caught:
-        physics(points(3, 2).requires_grad_())
-    assert "Can't call numpy()" in str(caught.value.__cause__)
-
-
-def test_other_runtime_errors_are_not_taken_for_numpy(points):
+def test_numpy_results_and_other_errors(grad, points):
+    X = points(3, 2).requires_grad_(grad)
+    for function in (lambda X: X.detach().numpy() ** 2, lambda X: X.detach().numpy().sum()):
+        physics = FunctionPhysics(function, name="noodle")
+        refused(PhysicsError, r"'noodle'.*NumPy.*BlackBoxPhysics\(", physics, X)
     physics = FunctionPhysics(lambda X: X @ X)
-    refused(PhysicsError, r"RuntimeError: .*mat1", physics, points(3, 2))
+    refused(PhysicsError, r"RuntimeError: .*mat1", physics, X)
+    if grad:
+        physics = FunctionPhysics(lambda X: torch.from_numpy(np.sin(X.numpy())))
+        with pytest.raises(PhysicsError, match=r"NumPy.*BlackBoxPhysics\(") as caught:
+            physics(X)
+        assert "Can't call numpy()" in str(caught.value.__cause__)
 
 
 def test_missing_gradient_warns_once(points):
-    physics = FunctionPhysics(lambda X: X.detach() ** 2, name="stone")
+    physics, smooth = FunctionPhysics(lambda X: X.detach() ** 2, name="stone"), torch.sin
     X = points(3, 2).requires_grad_()
     with pytest.warns(UserWarning, match=r"No gradient.*'stone'.*BlackBox"):
         assert torch.equal(physics(X), X.detach() ** 2)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         physics(X)
-
-
-def test_no_warning_where_a_gradient_flows(points):
-    physics = FunctionPhysics(torch.sin)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        physics(points(3, 2).requires_grad_())
-        physics(points(3, 2))
+        FunctionPhysics(smooth)(X)
+        FunctionPhysics(smooth)(points(3, 2))
 
 
 def double(X):
@@ -115,33 +102,20 @@ def test_pickle_of_a_method_that_holds_its_physics(dumps, points):
     assert torch.equal(loaded(points(3, 2)), points(3, 2) + 1)
 
 
-def test_as_physics_wraps_callables(points):
+def test_as_physics(points):
     X, physics = points(3, 2), BlackBoxPhysics(np.sin)
     assert as_physics(physics) is physics
-    refused(TypeError, "callable; found float", FunctionPhysics, 1.0)
+    assert as_physics([physics]) is physics
     assert isinstance(as_physics(torch.sin), FunctionPhysics)
     assert torch.equal(as_physics(torch.sin)(X), X.sin())
     assert list(as_physics(torch.nn.Linear(2, 1)).parameters())
-
-
-def test_as_physics_joins_several(points):
-    X = points(3, 2)
     for several in ([torch.sin, double], (torch.sin, double), {"a": torch.sin, "b": double}):
         assert torch.equal(as_physics(several)(X), torch.cat([X.sin(), 2 * X], -1))
-    physics = FunctionPhysics(double)
-    assert as_physics([physics]) is physics
+    refused(TypeError, "callable; found float", FunctionPhysics, 1.0)
     refused(ValueError, "no physics to join", as_physics, [])
-
-
-@pytest.mark.parametrize(
-    ("thing", "found"), [(3.0, "a float"), (None, "a NoneType"), (torch.nn.Tanh, "the class Tanh")]
-)
-def test_as_physics_rejects_the_rest(thing, found):
-    message = f"found {found}.*torch function.*ODEPhysics.*BlackBoxPhysics"
-    refused(TypeError, message, as_physics, thing)
-
-
-PRIOR = Unknown(1.0, factor=2.0)
+    for thing, found in ((3.0, "a float"), (None, "a NoneType"), (torch.nn.Tanh, "the class Tanh")):
+        says = f"found {found}.*torch function.*ODEPhysics.*BlackBoxPhysics"
+        refused(TypeError, says, as_physics, thing)
 
 
 # NumPy functions, torch functions and modules, and Physics are told apart
@@ -151,43 +125,28 @@ X = np.linspace(0.1, 1, 6).reshape(3, 2)
 TENSOR = torch.tensor(X)
 
 
-@pytest.mark.parametrize(
-    "function",
-    [
+def test_functions_are_told_apart():
+    for function in (
         lambda X: np.sin(X[:, 0]),
         lambda X: X[:, 0] ** 2,  # of both
         lambda X: [row.sum() for row in X],
         np.squeeze,  # a single number of a single row would be no array
-    ],
-)
-def test_a_numpy_function(function):
-    assert type(array_physics(function, X[:, :1])) is BlackBoxPhysics
-
-
-@pytest.mark.parametrize(
-    "function",
-    [
+    ):
+        assert type(array_physics(function, X[:, :1])) is BlackBoxPhysics
+    linear = torch.nn.Linear(2, 1).double()
+    for function in (
         torch.sin,
         lambda X: X.sin(),
         lambda X: torch.cat([X[:, :1].exp(), X[:, 1:]], dim=1),
         lambda X: torch.as_tensor(X) * 2,
-        torch.nn.Linear(2, 1).double(),
-    ],
-)
-def test_a_torch_function(function):
-    physics = array_physics(function, X)
-    assert type(physics) is FunctionPhysics
-    torch.testing.assert_close(physics(TENSOR), function(TENSOR))
-
-
-def test_a_physics_is_taken_as_it_is():
+        linear,
+    ):
+        physics = array_physics(function, X)
+        assert type(physics) is FunctionPhysics
+        torch.testing.assert_close(physics(TENSOR), function(TENSOR))
+    assert physics.function is not linear  # a module is copied
     physics = BlackBoxPhysics(lambda x: x[0], batched=False)
     assert array_physics(physics, X) is physics
-
-
-def test_a_module_is_copied():
-    linear = torch.nn.Linear(2, 1).double()
-    assert array_physics(linear, X).function is not linear
 
 
 def test_several():
@@ -212,16 +171,13 @@ def test_one_row_is_asked_and_left_as_it_is():
     assert (before == X).all()
 
 
-def test_both_errors_are_told():
+def test_errors_of_both_and_what_is_no_physics():
     def both(X):
         if isinstance(X, np.ndarray):
             raise KeyError("no array")
         raise IndexError("no tensor")
 
-    with pytest.raises(PhysicsError, match=r"(?s)'both'.*KeyError: 'no array'.*IndexError: no ten"):
-        array_physics(both, X)
-
-
-@pytest.mark.parametrize("thing", [3, "cka", CalibratedPhysics])
-def test_what_is_no_physics(thing):
-    refused(TypeError, "Physics or a callable", array_physics, thing, X)
+    says = r"(?s)'both'.*KeyError: 'no array'.*IndexError: no ten"
+    refused(PhysicsError, says, array_physics, both, X)
+    for thing in (3, "cka", CalibratedPhysics):
+        refused(TypeError, "Physics or a callable", array_physics, thing, X)

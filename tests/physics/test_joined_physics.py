@@ -25,19 +25,25 @@ def first_log(X):
     return X[:, 0].log()
 
 
-class TestNames:
-    @pytest.mark.parametrize(
-        ("parts", "names"),
-        [
-            ([torch.sin, torch.cos], ("sin", "cos")),
-            ([torch.sin, lambda X: X, lambda X: X], ("sin", "f_2", "f_3")),
-            ([torch.sin, torch.cos, torch.sin], ("f_1", "cos", "f_3")),
-            ([FunctionPhysics(torch.sin, name="f_2"), lambda X: X], ("f_1", "f_2")),
-            ({"low": torch.sin, "high": torch.sin}, ("low", "high")),
-        ],
-    )
-    def test_are_unique(self, parts, names):
+def test_names_are_unique_and_what_is_refused(points):
+    for parts, names in (
+        ([torch.sin, torch.cos], ("sin", "cos")),
+        ([torch.sin, lambda X: X, lambda X: X], ("sin", "f_2", "f_3")),
+        ([torch.sin, torch.cos, torch.sin], ("f_1", "cos", "f_3")),
+        ([FunctionPhysics(torch.sin, name="f_2"), lambda X: X], ("f_1", "f_2")),
+        ({"low": torch.sin, "high": torch.sin}, ("low", "high")),
+    ):
         assert JoinedPhysics(parts).names == names
+    for parts, says in (
+        (torch.sin, "takes a list of physics.*found a builtin_function"),
+        ([torch.sin, 3.0], "found a float"),
+        ({1: torch.sin}, r"must be text; found \[1\]"),
+        ([], "no physics to join"),
+        ({}, "no physics to join"),
+    ):
+        refused(TypeError if parts else ValueError, says, JoinedPhysics, parts)
+    pair = JoinedPhysics([torch.sin, total], name="pair")
+    refused(PhysicsError, r"'pair'.*2 of 'sin', 1 of 'total'", pair, points(3, 2))
 
 
 class TestValues:
@@ -78,11 +84,6 @@ class TestValues:
         )
         assert torch.autograd.gradcheck(joined, points(2, 3, 2).requires_grad_())
 
-    def test_joined_physics_can_be_joined(self, points):
-        X = points(3, 2)
-        inner = JoinedPhysics([total, lambda X: X[:, 0]])
-        assert torch.equal(JoinedPhysics([inner, torch.sin])(X)[:, :2], inner(X))
-
 
 class TestErrors:
     def test_names(self):
@@ -94,10 +95,6 @@ class TestErrors:
         assert caught.value.__notes__ == ["This physics is 'high' of ('low', 'high')."]
         joined(torch.ones(1, 2))
         assert joined(torch.zeros(0, 2)).shape == (0, 2)
-
-    def test_differ_in_their_number_of_outputs(self, points):
-        joined = JoinedPhysics([torch.sin, total], name="pair")
-        refused(PhysicsError, r"'pair'.*2 of 'sin', 1 of 'total'", joined, points(3, 2))
 
     @pytest.mark.parametrize("grad", [False, True])
     def test_of_a_part_names_it_and_the_rows_of_X(self, grad):
@@ -121,28 +118,14 @@ class TestErrors:
             assert caught.value.rows == (1,)
             assert joined(torch.tensor([[4.0]])).tolist() == [[4.0, 2.0]]
 
-    @pytest.mark.parametrize(
-        ("parts", "message"),
-        [
-            (torch.sin, "takes a list of physics.*found a builtin_function"),
-            ([torch.sin, 3.0], "found a float"),
-            ({1: torch.sin}, r"must be text; found \[1\]"),
-            ([], "no physics to join"),
-            ({}, "no physics to join"),
-        ],
-    )
-    def test_no_list_of_physics(self, parts, message):
-        refused(TypeError if parts else ValueError, message, JoinedPhysics, parts)
 
-
-class TestCopies:
-    def test_deep_copy(self):
-        joined = JoinedPhysics([torch.sin, torch.cos])
-        assert copy.deepcopy(joined) is joined
-        learnt = JoinedPhysics([torch.sin, torch.nn.Linear(1, 1)])
-        duplicate = copy.deepcopy(learnt)
-        assert duplicate.parts[0] is learnt.parts[0]
-        assert duplicate.parts[1].function is not learnt.parts[1].function
+def test_deep_copy():
+    joined = JoinedPhysics([torch.sin, torch.cos])
+    assert copy.deepcopy(joined) is joined
+    learnt = JoinedPhysics([torch.sin, torch.nn.Linear(1, 1)])
+    duplicate = copy.deepcopy(learnt)
+    assert duplicate.parts[0] is learnt.parts[0]
+    assert duplicate.parts[1].function is not learnt.parts[1].function
 
 
 MASS, DRAG = Unknown(1.0, factor=1.5), Unknown(0.1, bounds=(0.0, 1.0))
