@@ -314,7 +314,7 @@ class TestPower:
         torch.testing.assert_close(weights, ratio / ratio.sum(0))
         torch.testing.assert_close(log_mean, ratio.mean(0).log())
         one = torch.ones(1, dtype=torch.float64)  # once it is one, all is done
-        reached, weights, log_mean = raised(1e3 * log_ratio[:8, :1], one, 4.0)
+        reached, weights, log_mean = raised(1e3 * log_ratio[:8, 1:2], one, 4.0)
         assert reached == 1.0
         assert (weights == 1 / 8).all()
         assert log_mean == pytest.approx(0.0, abs=1e-12)

@@ -23,38 +23,25 @@ def low_level(kind, uniform, num_outputs):
     return {"low_X": low_X, "low_Y": crude(low_X)[:, :num_outputs]}
 
 
-@pytest.mark.parametrize("sizes", [(3,), (1, 1, 1), (2, 1)], ids=str)
-@pytest.mark.parametrize("setting", ["learnt noise", "known noise"])
+@pytest.mark.parametrize("sizes", [(3,), (2, 1)], ids=str)
+@pytest.mark.parametrize("known", [False, True], ids=["learnt noise", "known noise"])
 def test_conditioning_is_rebuilding(
-    data,
-    build,
-    rebuild,
-    kind,
-    num_outputs,
-    shuffle,
-    uniform,
-    same,
-    close,
-    low_level,
-    setting,
-    sizes,
+    data, build, rebuild, kind, num_outputs, shuffle, uniform, same, low_level, known, sizes
 ):
     X, Y = data(num_outputs=num_outputs, n=12)
-    options, Yvar = {**low_level}, None
-    if setting == "known noise":
+    options, Yvar = {**low_level}, uniform(*Y.shape, low=0.01, high=0.1, seed=2) if known else None
+    if known:
         bounds = torch.tensor([[0.0, 0.0], [2.0, 2.0]], dtype=torch.float64)
-        options["input_transform"] = Normalize(2, bounds=bounds)
-        options["outcome_transform"] = None
-        Yvar = uniform(*Y.shape, low=0.01, high=0.1, seed=2)
-    model = shuffle(build(kind, X[:9], Y[:9], Yvar if Yvar is None else Yvar[:9], **options))
+        options |= {"input_transform": Normalize(2, bounds=bounds), "outcome_transform": None}
+    model = shuffle(build(kind, X[:9], Y[:9], Yvar[:9] if known else None, **options))
     conditioned, n, Z = model, 9, uniform(5, 2, high=2.0, seed=4)
     before = model.posterior(Z).mean
     for size in sizes:
         new = slice(n, n := n + size)
-        noise = {} if Yvar is None else {"noise": Yvar[new]}
+        noise = {"noise": Yvar[new]} if known else {}
         conditioned = conditioned.condition_on_observations(X[new], Y[new], **noise)
     same(conditioned, rebuild(kind, model, X, Y, Yvar, **options), Z, 1e-7)
-    close(copy.deepcopy(conditioned).predict(Z).mean, conditioned.predict(Z).mean, 1e-7)
+    same(copy.deepcopy(conditioned), conditioned, Z, 1e-7)
     assert torch.equal(model.posterior(Z).mean, before)
 
 
@@ -156,24 +143,17 @@ def test_a_batched_product(uniform, lead, batch):
     torch.testing.assert_close(batched_product(left, right), left @ right)
 
 
+@pytest.mark.parametrize("kind", ["CKA", "AR1"])
 def test_bad_observations(data, build, kind):
     X, Y = data()
-    model = build(kind, X, Y)
+    condition = build(kind, X, Y).condition_on_observations
     for bad, found in ((float("inf"), "to be finite"), (float("nan"), "to hold an observation")):
         wrong = torch.tensor([[0.0], [bad]], dtype=torch.float64)
-        with pytest.raises(ValueError, match=rf"Expected Y {found}.*row 1"):
-            model.condition_on_observations(X[:2], wrong)
-        with pytest.raises(ValueError, match=r"Expected X to be finite.*row 1"):
-            model.condition_on_observations(wrong.expand(2, 2), Y[:2])
-    refused(ValueError, "with a row for each", model.condition_on_observations, X[:2], Y[:3])
-    with pytest.raises(ValueError, match=r"Y of shape \.\.\. x k x 1"):
-        model.condition_on_observations(X[:2], Y[:2].expand(2, 2))
-    known = build(kind, X, Y, 0.1)
-    refused(ValueError, "pass `noise`", known.condition_on_observations, X[:1], Y[:1])
-
-
-def test_noise_that_is_learnt_is_not_given(data, build, kind):
-    X, Y = data()
-    model = build(kind, X, Y)
-    with pytest.raises(ValueError, match="The model learns its noise"):
-        model.condition_on_observations(X[:1], Y[:1], noise=torch.full_like(Y[:1], 0.1))
+        refused(ValueError, rf"Expected Y {found}.*row 1", condition, X[:2], wrong)
+        refused(ValueError, r"X to be finite.*row 1", condition, wrong.expand(2, 2), Y[:2])
+    refused(ValueError, "with a row for each", condition, X[:2], Y[:3])
+    refused(ValueError, r"Y of shape \.\.\. x k x 1", condition, X[:2], Y[:2].expand(2, 2))
+    noise = torch.full_like(Y[:1], 0.1)
+    refused(ValueError, "The model learns its noise", condition, X[:1], Y[:1], noise=noise)
+    known = build(kind, X, Y, 0.1).condition_on_observations
+    refused(ValueError, "pass `noise`", known, X[:1], Y[:1])

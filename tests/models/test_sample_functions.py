@@ -78,8 +78,12 @@ class TestWithoutNoise:
         assert ((self.spread(model, self.Z) - 1).abs() < 0.2).all()
 
 
-def test_points_for_other_functions(data, build, kind, uniform):
-    model = build(kind, *data())
+def test_wrong_numbers_and_points_for_other_functions(data, build, uniform):
+    model = build("CKA", *data())
+    for number, error in ((0, ValueError), (-1, ValueError), (2.5, TypeError)):
+        refused(error, "num_functions must be", model.sample_functions, number)
+        refused(error, "num_features must be", model.sample_functions, 1, num_features=number)
+    refused(ValueError, "num_features to be even", model.sample_functions, 1, num_features=7)
     functions = model.sample_functions(3, seed=0)
     assert functions.each(uniform(3, 4, 2)).shape == (3, 4, 1)
     for shape in ((2, 4, 2), (4, 2), (1, 3, 4, 2)):
@@ -129,15 +133,6 @@ def test_a_later_fit_leaves_them(data, build, kind, shuffle, uniform):
     torch.testing.assert_close(copy.deepcopy(functions)(Z), before)
 
 
-def test_wrong_numbers(data, build, kind):
-    model = build(kind, *data())
-    for number in (0, -1, 2.5):
-        refused((TypeError, ValueError), "num_functions must be", model.sample_functions, number)
-        with pytest.raises((TypeError, ValueError), match="num_features must be"):
-            model.sample_functions(1, num_features=number)
-    refused(ValueError, "num_features to be even", model.sample_functions, 1, num_features=7)
-
-
 @pytest.mark.slow
 def test_botorch_draws_paths(data, build, kind, num_outputs, uniform):
     model = build(kind, *data(num_outputs=num_outputs)).eval()
@@ -179,11 +174,8 @@ def test_means_are_those_of_the_predictions(data, build, kind, num_outputs, unif
     torch.testing.assert_close(slope, expected)
 
 
-def test_a_mean_for_each_sample_of_the_hyperparameters(data, build, uniform):
-    from gpadjust import fit
-
-    model = build("CKA", *data(n=9))
-    fit(model, num_samples=4, num_draws=32, num_starts=1, num_screened=8)
-    values, Z = model.mean_functions()(uniform(5, 2, seed=3)), uniform(5, 2, seed=3)
-    assert len(values) == model.num_samples
-    torch.testing.assert_close(values.mean(0), model.predict(Z).mean)
+def test_a_mean_for_each_sample_of_the_hyperparameters(data, held, uniform):
+    model, singles = held("CKA", *data(n=9))
+    Z = uniform(5, 2, seed=3)
+    each = [single.predict(Z).mean for single in singles]
+    torch.testing.assert_close(model.mean_functions()(Z), torch.stack(each))

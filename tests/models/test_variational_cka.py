@@ -164,16 +164,18 @@ def test_shapes_of_posteriors(close, num_outputs, fitted):
 
 def test_acquisition_functions(one):
     X, Y = problem(120)
+    options = {"num_restarts": 1, "raw_samples": 4, "options": {"maxiter": 3}}
     for acquisition in (
         UpperConfidenceBound(one, 0.2),
         qLogExpectedImprovement(one, Y.max()),
         qLogNoisyExpectedImprovement(one, X[:10]),
     ):
-        options = {"maxiter": 3}
-        best, _ = optimize_acqf(
-            acquisition, LINE, q=1, num_restarts=1, raw_samples=4, options=options
-        )
+        best, _ = optimize_acqf(acquisition, LINE, q=1, **options)
         assert 0.2 < best.item() < 0.4  # of the maximum, 0.28
+    torch.manual_seed(0)
+    Z = torch.tensor([0.28, 0.75], dtype=torch.float64).reshape(2, 1, 1)
+    value = PathwiseThompsonSampling(one)(Z)
+    assert value[0] > value[1]
 
 
 @pytest.mark.slow
@@ -190,14 +192,6 @@ def test_paths_of_botorch(close, fitted):
     own = paths(X.repeat(50, 1)[:, None, None].expand(-1, 2, 1, 1))  # a point for each of 200
     assert own.shape == ((200, 2, 2, 1) if m > 1 else (200, 2, 1))
     close(own[7, ..., 0], values[7, ..., 3])
-
-
-def test_thompson_sampling(one):
-    torch.manual_seed(0)
-    acquisition = PathwiseThompsonSampling(one)
-    X = torch.tensor([0.28, 0.75], dtype=torch.float64).reshape(2, 1, 1)
-    value = acquisition(X)
-    assert value[0] > value[1]
 
 
 def test_lists_of_models(close, one):
@@ -316,24 +310,31 @@ def test_transforms(close, transform):
     assert (model.predict(X).mean - Y).std() < 0.15
 
 
-def test_it_is_not_conditioned(one):
-    X, Y = problem(3)
-    refused(NotImplementedError, "build it of all data", one.condition_on_observations, X, Y)
-    with pytest.raises(NotImplementedError, match="build it of all data"):
-        one.fantasize(X, SobolQMCNormalSampler(torch.Size([2])))
-    with pytest.raises(NotImplementedError, match="build it of all data"):
-        qKnowledgeGradient(one, num_fantasies=2)(X.unsqueeze(0))
+def test_what_is_refused(one):
+    class Halves(ComponentNoise):
+        def selection(self, inputs):
+            left = (inputs[..., 0] < 0.5).to(inputs)
+            return torch.stack([left, 1 - left], dim=-1)
 
-
-def test_bad_input(one):
     X, Y = problem(10)
     refused(TypeError, "float64", make, X.float(), Y.float())
     refused(ValueError, "agree", make, X, Y[:4])
     refused(ValueError, "one data set", make, X.expand(2, -1, -1), Y.expand(2, -1, -1))
-    for number in (0, 2.5):
-        refused((TypeError, ValueError), "num_inducing", make, X, Y, num_inducing=number)
+    refused(ValueError, "num_inducing", make, X, Y, num_inducing=0)
+    refused(TypeError, "num_inducing", make, X, Y, num_inducing=2.5)
+    says = "one variance for all observations, got Halves"
+    refused(ValueError, says, make, X, Y, likelihood=Halves(2, Size()))
     refused(ValueError, "columns", one.predict, torch.zeros(2, 3, dtype=torch.float64))
     refused(ValueError, "no unknown term 'season'", one.term, "season", X)
+    says, sampler = "build it of all data", SobolQMCNormalSampler(torch.Size([2]))
+    refused(NotImplementedError, says, one.condition_on_observations, X, Y)
+    refused(NotImplementedError, says, one.fantasize, X, sampler)
+    refused(NotImplementedError, says, qKnowledgeGradient(one, num_fantasies=2), X.unsqueeze(0))
+    refused(TypeError, r"exact models.*VariationalCKA", StackedGP, {"many": one}, [[1.0]])
+    options = {"structures": [Structure("many", VariationalCKA)]}
+    refused(TypeError, "TermsGP, got VariationalCKA", compare, X, Y, wave, **options)
+    with pytest.warns(UserWarning, match="VariationalCKA"):
+        CKA(*problem(5001), physics=wave)  # an exact model of many points
 
 
 def test_texts(one):
@@ -347,25 +348,3 @@ def test_texts(one):
     assert "  not fitted" in make(*problem(10)).summary().splitlines()
     assert one.term_names == ("rho", "delta")
     assert one.term("rest", LINE).mean.abs().max() == 0
-
-
-def test_an_exact_model_of_many_points_warns():
-    X, Y = problem(5001)
-    with pytest.warns(UserWarning, match="VariationalCKA"):
-        CKA(X, Y, physics=wave)
-
-
-def test_stacking_and_comparison_want_exact_models(one):
-    refused(TypeError, r"exact models.*VariationalCKA", StackedGP, {"many": one}, [[1.0]])
-    with pytest.raises(TypeError, match="TermsGP, got VariationalCKA"):
-        compare(*problem(8), wave, structures=[Structure("many", VariationalCKA)])
-
-
-def test_several_variances_are_refused():
-    class Halves(ComponentNoise):
-        def selection(self, inputs):
-            left = (inputs[..., 0] < 0.5).to(inputs)
-            return torch.stack([left, 1 - left], dim=-1)
-
-    with pytest.raises(ValueError, match="one variance for all observations, got Halves"):
-        VariationalCKA(*problem(30), physics=wave, num_inducing=5, likelihood=Halves(2, Size()))
