@@ -68,7 +68,7 @@ def test_far_from_runs_the_emulators_variance_is_in_predictions_and_near_them_is
         assert model.predict(far).variance.min() > 0.1 * away
 
 
-def test_its_values_are_the_emulators_mean_with_a_gradient(crude):
+def test_values_and_their_errors_are_the_emulators(crude):
     X = (2 * line(5)).requires_grad_()
     torch.testing.assert_close(crude(X), crude.emulator.predict(X.detach()).mean)
     (slope,) = torch.autograd.grad(crude(X).sum(), X)
@@ -76,10 +76,6 @@ def test_its_values_are_the_emulators_mean_with_a_gradient(crude):
     with torch.no_grad():
         numeric = (crude(X + step) - crude(X - step)) / (2 * step)
     torch.testing.assert_close(slope, numeric, rtol=1e-5, atol=1e-5)
-
-
-def test_the_covariance_of_its_error_is_that_of_the_mixture(crude):
-    """By the emulator's own moments, sample by sample."""
     rows = 2 * line(6)
     mean, covariance = crude.emulator.joint_moments(rows, False)
     away = mean - mean.mean(0)

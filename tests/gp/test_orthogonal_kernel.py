@@ -59,25 +59,19 @@ def test_the_formula(kernel, uniform, base_class):
     torch.testing.assert_close(plain(X, diag=True), square.diagonal())
     assert torch.linalg.eigvalsh(square).min() > -1e-9
     assert (square.diagonal() < plain.base_kernel(X, diag=True)).all()
-
-
-def test_nothing_is_left_along_the_directions(kernel, uniform):
     plain, Z, G, X = kernel(), uniform(9, 2), uniform(9, 3, seed=1), uniform(6, 2, seed=2)
     plain.set_directions(Z, G)
     assert (G.mT @ plain(Z, X).to_dense()).abs().max() < 1e-8
     assert torch.linalg.eigvalsh(plain(Z).to_dense()).min() > -1e-9
 
 
-def test_the_size_of_directions_and_those_that_are_not_apart_do_not_matter(kernel, uniform):
+def test_directions_that_do_not_matter(kernel, uniform):
     plain, Z, G, X = kernel(), uniform(9, 2), uniform(9, 2, seed=1), uniform(6, 2, seed=2)
     plain.set_directions(Z, G)
     expected = plain(X).to_dense()
     for others in (G * 1e6, G * torch.tensor([1e-9, 1.0]), G[:, [0, 1, 0]]):
         plain.set_directions(Z, others)
         torch.testing.assert_close(plain(X).to_dense(), expected, rtol=0, atol=1e-6)
-
-
-def test_a_direction_that_is_nothing_takes_nothing(kernel, uniform):
     plain, Z, G, X = kernel(), uniform(9, 2), uniform(9, 1, seed=1), uniform(6, 2, seed=2)
     plain.set_directions(Z, G)
     expected = plain(X).to_dense()
@@ -116,16 +110,13 @@ def test_a_batch(kernel, uniform):
     assert several.batch_shape == (2,)
 
 
-def test_gradients_reach_hyper_parameters_and_inputs(kernel, uniform):
+def test_gradients_and_states(kernel, uniform):
     plain, X = kernel(), uniform(4, 2).requires_grad_()
     plain.set_directions(uniform(9, 2, seed=1), uniform(9, 2, seed=2))
     assert torch.autograd.gradcheck(lambda X: plain(X).to_dense(), X)
     plain(X).to_dense().square().sum().backward()
     assert plain.base_kernel.raw_outputscale.grad.abs() > 0
     assert plain.base_kernel.base_kernel.raw_lengthscale.grad.abs().min() > 0
-
-
-def test_a_state_has_the_directions(kernel, uniform):
     plain, other, X = kernel(), kernel(), uniform(6, 2)
     plain.set_directions(uniform(9, 2, seed=1), uniform(9, 3, seed=2))
     other.set_directions(uniform(5, 2), uniform(5, 1))

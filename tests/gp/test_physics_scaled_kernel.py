@@ -47,24 +47,15 @@ def test_one_output_of_several(uniform):
     pair = PhysicsScaledKernel(RBFKernel().double(), lambda X: X + 1, output=1)
     single = PhysicsScaledKernel(RBFKernel().double(), lambda X: X[..., 1] + 1)
     torch.testing.assert_close(pair(X).to_dense(), single(X).to_dense())
-
-
-def test_several_outputs_without_saying_which(uniform):
     kernel = PhysicsScaledKernel(RBFKernel().double(), lambda X: X)
     refused(ValueError, r"2 outputs.*`output=`", kernel(uniform(5, 2)).to_dense)
-
-
-def test_last_dim_is_batch(uniform):
     kernel = PhysicsScaledKernel(RBFKernel().double(), physics)
     with pytest.raises(ValueError, match="last_dim_is_batch"):
         kernel.forward(uniform(5, 2), uniform(5, 2), last_dim_is_batch=True)
-
-
-def test_it_is_not_stationary():
     assert not PhysicsScaledKernel(RBFKernel(), physics).is_stationary
 
 
-def test_a_batch(uniform):
+def test_a_batch_and_gradients(uniform):
     base, X = RBFKernel(batch_shape=Size([2])).double(), uniform(6, 2)
     base.lengthscale = torch.tensor([0.4, 0.9]).reshape(2, 1, 1)
     kernel = PhysicsScaledKernel(base, physics)
@@ -76,9 +67,6 @@ def test_a_batch(uniform):
     assert wide.batch_shape == (3, 2)
     torch.testing.assert_close(wide(X).to_dense(), values.expand(3, 2, 6, 6))
     assert kernel.batch_shape == (2,)
-
-
-def test_gradients_reach_hyper_parameters_and_inputs(uniform):
     kernel = PhysicsScaledKernel(RBFKernel().double(), physics)
     X = uniform(5, 2).requires_grad_()
     kernel(X).to_dense().sum().backward()

@@ -33,33 +33,24 @@ def _two():
     torch.set_num_threads(before)
 
 
-def test_one_within():
+def test_one_within_none_of_large_problems_and_after_an_error():
     with threads_for(12):
         assert (torch.get_num_threads(), of_blas()) == (1, {1})
-
-
-def test_large_problems_are_left_alone():
     before = of_blas()
     with threads_for(1000):
         assert (torch.get_num_threads(), of_blas()) == (2, before)
+    with pytest.raises(KeyboardInterrupt), threads_for(12):
+        raise KeyboardInterrupt
+    with threads_for(12):
+        with threads_for(20):
+            assert (torch.get_num_threads(), of_blas()) == (1, {1})
+        assert (torch.get_num_threads(), of_blas()) == (1, {1})
 
 
 def test_threads_that_begin_meanwhile_have_the_users():
     with threads_for(12), ThreadPoolExecutor(1) as pool:
         assert pool.submit(torch.get_num_threads).result() == 2
         pool.submit(lambda: torch.rand(9, 9) @ torch.rand(9, 9)).result()
-
-
-def test_after_an_error():
-    with pytest.raises(KeyboardInterrupt), threads_for(12):
-        raise KeyboardInterrupt
-
-
-def test_within_each_other():
-    with threads_for(12):
-        with threads_for(20):
-            assert (torch.get_num_threads(), of_blas()) == (1, {1})
-        assert (torch.get_num_threads(), of_blas()) == (1, {1})
 
 
 @pytest.mark.parametrize("first_out", [0, 1])

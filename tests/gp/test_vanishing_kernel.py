@@ -51,10 +51,17 @@ def test_it_is_the_base_kernel_conditioned_on_zeros(places, uniform):
     assert kernel(zeros, diag=True).max() < 1e-8
 
 
-def test_far_from_there_it_is_the_base_kernel(uniform):
+def test_far_from_there_and_in_a_batch(uniform):
     base, X = base_of(), uniform(5, 3)
     kernel = VanishingKernel(base, torch.tensor([[nan, 50.0, nan]]).double())
     torch.testing.assert_close(kernel(X).to_dense(), base(X).to_dense())
+    several = VanishingKernel(base_of((2,)), torch.tensor([[nan, 0.3, nan]]).double())
+    X = uniform(6, 3, seed=2)
+    values = several(X).to_dense()
+    for j in range(2):
+        torch.testing.assert_close(several[j](X).to_dense(), values[j])
+    wide = several.expand_batch(Size([3, 2]))
+    torch.testing.assert_close(wide(X).to_dense(), values.expand(3, 2, 6, 6))
 
 
 def test_any_kernel_of_points_and_rbf_kernels_else(uniform):
@@ -68,24 +75,11 @@ def test_any_kernel_of_points_and_rbf_kernels_else(uniform):
             VanishingKernel(base_of(), torch.tensor(places))
 
 
-def test_a_batch(uniform):
-    several = VanishingKernel(base_of((2,)), torch.tensor([[nan, 0.3, nan]]).double())
-    X = uniform(6, 3, seed=2)
-    values = several(X).to_dense()
-    for j in range(2):
-        torch.testing.assert_close(several[j](X).to_dense(), values[j])
-    wide = several.expand_batch(Size([3, 2]))
-    torch.testing.assert_close(wide(X).to_dense(), values.expand(3, 2, 6, 6))
-
-
-def test_gradients_reach_hyper_parameters_and_inputs(uniform):
+def test_gradients_and_states(uniform):
     kernel = VanishingKernel(base_of(), torch.tensor([[nan, 0.3, nan]]).double())
     X = uniform(4, 3).requires_grad_()
     assert torch.autograd.gradcheck(lambda X: kernel(X).to_dense(), X)
     kernel(X).to_dense().square().sum().backward()
     assert kernel.base_kernel.base_kernel.raw_lengthscale.grad.abs().min() > 0
-
-
-def test_a_state_of_another_place_is_refused():
     one, other = (VanishingKernel(base_of(), torch.tensor([[nan, v, nan]])) for v in (0.0, 1.0))
     refused(ValueError, r"zero elsewhere", one.load_state_dict, other.state_dict())

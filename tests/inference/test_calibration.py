@@ -238,7 +238,7 @@ def test_what_other_outputs_say_is_a_prior_to_each():
         torch.testing.assert_close(found.covariance[i], own @ prior @ own.T, rtol=1e-5, atol=1e-8)
 
 
-def test_what_cannot_be_calibrated_is_told():
+def test_what_cannot_be_calibrated_is_told_and_a_failed_fit_leaves_the_model(monkeypatch):
     X, Y = data()
     law = FunctionPhysics(lines, unknowns=PRIORS)
     silent = CKA(X, Y, physics=law, rho_mean=0.0)
@@ -246,6 +246,17 @@ def test_what_cannot_be_calibrated_is_told():
     batch = CKA(X.expand(2, -1, -1), Y.expand(2, -1, -1), physics=law)
     refused(ValueError, r"one data set.*unknown", fit, batch, "map")
     refused(ValueError, r"AR1.*a, b\. CKA", AR1, X, Y, physics=law, bounds=[[0.0, 0.0], [1.0, 1.0]])
+    model = PhysicsMeanGP(X, Y, physics=FunctionPhysics(lines, unknowns=PRIORS))
+    before = {name: value.clone() for name, value in model.named_parameters()}
+
+    def stopped(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Calibration, "newton", stopped)  # when hyper-parameters have been found
+    with pytest.raises(KeyboardInterrupt):
+        fit(model, "map")
+    for name, value in model.named_parameters():
+        assert torch.equal(value, before[name]), name
 
 
 def test_the_figure_shows_the_physics_with_what_was_learnt():
@@ -281,18 +292,3 @@ def test_a_curved_ridge_is_followed():
     low, high = (grid[(below < q).sum()] for q in (0.025, 0.975))
     found = model.physics_parameters.interval()
     assert (found[1][0] - found[0][0]).item() == pytest.approx((high - low).item(), rel=0.1)
-
-
-def test_a_fit_that_fails_leaves_the_model_as_it_was(monkeypatch):
-    X, Y = data()
-    model = PhysicsMeanGP(X, Y, physics=FunctionPhysics(lines, unknowns=PRIORS))
-    before = {name: value.clone() for name, value in model.named_parameters()}
-
-    def stopped(*arguments):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Calibration, "newton", stopped)  # when hyper-parameters have been found
-    with pytest.raises(KeyboardInterrupt):
-        fit(model, "map")
-    for name, value in model.named_parameters():
-        assert torch.equal(value, before[name]), name

@@ -109,17 +109,6 @@ def test_what_is_refused(held, build, data, uniform):
 
 
 class TestObservations:
-    def test_conditioning(self, case, data, uniform, close):
-        name, model, singles = case
-        Z, m = uniform(4, 2, high=2.0), model.num_outputs
-        for seed in (1, 2):
-            X, Y = data(n=2, num_outputs=m, seed=seed)
-            noise = {"noise": torch.full_like(Y, 1e-3)} if "known" in name else {}
-            model = model.condition_on_observations(X, Y, **noise)
-            singles = [single.condition_on_observations(X, Y, **noise) for single in singles]
-            check(model.posterior(Z), [single.posterior(Z) for single in singles], close)
-            close(model.predict(Z).mean, model.posterior(Z).mixture_mean)
-
     def test_conditioning_of_each_sample(self, held, data, uniform, close):
         model, singles = held("CKA", *data(num_outputs=2))
         X, Y = data(batch_shape=(3,), n=2, num_outputs=2, seed=1)
@@ -142,7 +131,7 @@ class TestObservations:
         assert posterior.mixture_mean.shape == (5, *batch, 4, m)
         assert (posterior.variance <= model.posterior(Z).variance + 1e-9).all()
 
-    def test_leave_one_out(self, case, close):
+    def test_leave_one_out_and_conditioning(self, case, close, data, uniform):
         _, model, singles = case
         loo = leave_one_out(model)
         parts = [leave_one_out(single) for single in singles]
@@ -156,6 +145,15 @@ class TestObservations:
         close(loo.mean, (weight * mean).sum(0))
         second = (weight * (variance + (mean - loo.mean).square())).sum(0)
         close(loo.variance, second)
+        name, model, singles = case
+        Z, m = uniform(4, 2, high=2.0), model.num_outputs
+        for seed in (1, 2):
+            X, Y = data(n=2, num_outputs=m, seed=seed)
+            noise = {"noise": torch.full_like(Y, 1e-3)} if "known" in name else {}
+            model = model.condition_on_observations(X, Y, **noise)
+            singles = [single.condition_on_observations(X, Y, **noise) for single in singles]
+            check(model.posterior(Z), [single.posterior(Z) for single in singles], close)
+            close(model.predict(Z).mean, model.posterior(Z).mixture_mean)
 
 
 def test_leave_one_out_is_the_posterior_without_the_observation(held, data):
@@ -194,15 +192,13 @@ class TestFunctions:
         assert ((values.mean(0) - mean).abs() <= 0.15 * sd + 1e-6 * mean.abs()).all()
         assert (values.std(0) / sd - 1).abs().max() < 0.15
 
-    def test_shapes_and_seed(self, held, data, uniform):
+    def test_shapes_seed_and_functions_after_conditioning(self, held, data, uniform):
         model, _ = held("CKA", *data(num_outputs=2))
         functions = model.sample_functions(4, seed=1)
         Z = uniform(5, 6, 2)
         assert functions(Z).shape == (4, 5, 6, 2)
         torch.testing.assert_close(functions(Z)[:, 2], functions(Z[2]))
         torch.testing.assert_close(functions(Z), model.sample_functions(4, seed=1)(Z))
-
-    def test_after_conditioning(self, held, data):
         X, Y = data(num_outputs=2)
         model, _ = held("CKA", X, Y, torch.full_like(Y, 1e-4))
         new_X, new_Y = data(n=2, num_outputs=2, seed=1)
@@ -223,7 +219,7 @@ class TestCopies:
             close(part.mixture_variance, whole.mixture_variance[..., indices])
         close(subset.predict(Z).mean, whole.mixture_mean[..., indices])
 
-    def test_deepcopy_and_state_dict(self, case, uniform, close, build, data):
+    def test_copies_and_the_first_sample_after_release(self, case, uniform, close, build, data):
         name, model, _ = case
         Z = uniform(4, 2, high=2.0)
         expected = model.posterior(Z)
@@ -235,21 +231,6 @@ class TestCopies:
             other.load_state_dict(model.state_dict())
             assert other.num_samples == 3
             close(other.posterior(Z).mean, expected.mean)
-
-    def test_a_state_with_another_number_of_samples(self, held, data, build):
-        model, _ = held("CKA", *data())
-        fresh = build("CKA", *data())
-        expected = model.train_targets
-        with pytest.raises(RuntimeError, match=r"number.*release_samples\(\)"):
-            model.load_state_dict(fresh.state_dict())
-        assert model.num_samples == 3
-        assert torch.equal(model.train_targets, expected)
-        model.release_samples()
-        model.load_state_dict(fresh.state_dict())
-
-
-class TestLettingGo:
-    def test_the_first_sample_is_kept(self, case, uniform, close):
         name, model, singles = case
         Z, m = uniform(4, 2, high=2.0), model.num_outputs
         more = [uniform(2, 2, seed=3), uniform(2, m, seed=4)]
@@ -265,6 +246,19 @@ class TestLettingGo:
         close(model.posterior(Z).variance, singles[0].posterior(Z).variance)
         model.release_samples()
 
+    def test_a_state_with_another_number_of_samples(self, held, data, build):
+        model, _ = held("CKA", *data())
+        fresh = build("CKA", *data())
+        expected = model.train_targets
+        with pytest.raises(RuntimeError, match=r"number.*release_samples\(\)"):
+            model.load_state_dict(fresh.state_dict())
+        assert model.num_samples == 3
+        assert torch.equal(model.train_targets, expected)
+        model.release_samples()
+        model.load_state_dict(fresh.state_dict())
+
+
+class TestLettingGo:
     @pytest.mark.filterwarnings("ignore::gpadjust.inference.SamplingWarning")
     def test_it_can_be_fitted_again(self, data, build):
         model, fresh = (build("CKA", *data(num_outputs=2)) for _ in range(2))

@@ -378,7 +378,9 @@ class TestFit:
         found, expected = model.predict(Z), plain.predict(Z)
         assert ((found.mean - expected.mean).abs() < expected.variance.sqrt()).all()
 
-    def test_the_rho_of_a_physics_of_no_use_is_none(self, fitted, data):
+    def test_the_rho_of_a_physics_of_no_use_is_none_and_the_most_likely_values_are_as_ever(
+        self, fitted, data
+    ):
         *_, Z = data
         model, _ = fitted
         rho, delta, total = model.rho(Z), model.delta(Z), model.predict(Z)
@@ -386,6 +388,14 @@ class TestFit:
         assert rho.variance[:, 0].max() < 1e-6
         torch.testing.assert_close(delta.mean[:, 0], total.mean[:, 0], rtol=1e-5, atol=1e-6)
         torch.testing.assert_close(rho.mean[:, 1], torch.full_like(Z[:, 0], 0.5), rtol=0, atol=0.2)
+        X, Y, Z = data
+        new = CKA(X, torch.cat([Y, Y], dim=-1), physics=unrelated_and_double)
+        for each in (new, model):
+            assert isinstance(fit(each, "map"), FitResult)
+            torch.testing.assert_close(each.fallback(Z), unrelated_and_double(Z))
+            assert (each.terms[0].mean == 1.0).all()
+        found, expected = (each.log_evidence()[1] for each in (model, new))
+        torch.testing.assert_close(found, expected, rtol=1e-2, atol=1e-2)
 
     @quick
     def test_nothing_is_said_of_what_cannot_do_without_nor_with_priors_of_the_user(self, data):
@@ -397,22 +407,11 @@ class TestFit:
             assert fit(model, "bayes", **SHORT).relevance is None
         assert (users.terms[0].mean == 1.0).all()
 
-    def test_the_most_likely_values_know_nothing_of_it(self, fitted, data):
-        X, Y, Z = data
-        model, _ = fitted
-        new = CKA(X, torch.cat([Y, Y], dim=-1), physics=unrelated_and_double)
-        for each in (new, model):
-            assert isinstance(fit(each, "map"), FitResult)
-            torch.testing.assert_close(each.fallback(Z), unrelated_and_double(Z))
-            assert (each.terms[0].mean == 1.0).all()
-        found, expected = (each.log_evidence()[1] for each in (model, new))
-        torch.testing.assert_close(found, expected, rtol=1e-2, atol=1e-2)
-
 
 class TestPartlyOff:
     """What samples with the physics on, and others with it off, are to a model."""
 
-    def test_terms_make_up_the_function(self, partly, data):
+    def test_terms_functions_and_outputs(self, partly, data):
         *_, Z = data
         model, *_ = partly
         rho, delta = (f(Z, mixed=False).mean for f in (model.rho, model.delta))  # S x q x m
@@ -429,6 +428,24 @@ class TestPartlyOff:
         parts = model.rho(Z), model.delta(Z)
         assert all(each.variance.isfinite().all() for each in parts)
         torch.testing.assert_close(parts[0].mean, rho.mean(0))
+        *_, Z = data
+        model, *_ = partly
+        mean, _ = model.components(Z, False)
+        torch.testing.assert_close(model.mean_functions()(Z), mean)
+        torch.manual_seed(0)
+        values = model.sample_functions(200, num_features=256)(Z)
+        assert values.isfinite().all()
+        found = model.predict(Z)
+        sd = found.variance.sqrt()
+        assert ((values.mean(0) - found.mean).abs() < 4 * sd / math.sqrt(200)).all()
+        assert (values.var(0) / found.variance - 1).abs().median() < 0.2
+        *_, Z = data
+        model, *_ = partly
+        both = model.predict(Z)
+        for i in range(2):
+            one = model.subset_output([i]).predict(Z)
+            torch.testing.assert_close(one.mean, both.mean[:, i : i + 1])
+            torch.testing.assert_close(one.variance, both.variance[:, i : i + 1])
 
     def test_conditioning(self, partly, data):
         X, Y, Z = data
@@ -445,19 +462,6 @@ class TestPartlyOff:
             a, b = (m.term(name, Z) for m in (found, expected))
             torch.testing.assert_close(a.mean, b.mean, rtol=1e-5, atol=1e-6)
 
-    def test_sampled_functions(self, partly, data):
-        *_, Z = data
-        model, *_ = partly
-        mean, _ = model.components(Z, False)
-        torch.testing.assert_close(model.mean_functions()(Z), mean)
-        torch.manual_seed(0)
-        values = model.sample_functions(200, num_features=256)(Z)
-        assert values.isfinite().all()
-        found = model.predict(Z)
-        sd = found.variance.sqrt()
-        assert ((values.mean(0) - found.mean).abs() < 4 * sd / math.sqrt(200)).all()
-        assert (values.var(0) / found.variance - 1).abs().median() < 0.2
-
     @pytest.mark.parametrize("which", ["fitted", "partly"])
     def test_saved_and_loaded_it_predicts_the_same(self, request, which, data, tmp_path):
         *_, Z = data
@@ -471,15 +475,6 @@ class TestPartlyOff:
             (again.fallback(Z), model.fallback(Z)),
         ):
             assert torch.equal(a, b)
-
-    def test_of_one_output(self, partly, data):
-        *_, Z = data
-        model, *_ = partly
-        both = model.predict(Z)
-        for i in range(2):
-            one = model.subset_output([i]).predict(Z)
-            torch.testing.assert_close(one.mean, both.mean[:, i : i + 1])
-            torch.testing.assert_close(one.variance, both.variance[:, i : i + 1])
 
 
 class TestTracesOfSamplesWithoutPhysics:

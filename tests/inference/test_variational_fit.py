@@ -184,7 +184,7 @@ def test_what_few_points_cannot_show_is_in_the_intervals(n):
     assert coverage() < 0.5
 
 
-def test_noise_is_no_function(uniform):
+def test_noise_is_no_function_and_a_function_is_found(uniform):
     for d, n in ((1, 300), (3, 120)):
         for seed in range(2):
             X = uniform(n, d, seed=seed)
@@ -192,9 +192,6 @@ def test_noise_is_no_function(uniform):
             found = unexplained(X, residuals, None, 0)
             assert found.variance == 0
             assert found.noise.item() == pytest.approx(1.0, rel=0.3)
-
-
-def test_a_function_in_residuals_is_found():
     X = line(400)
     noise = 0.1 * torch.randn(2, 400, generator=torch.Generator().manual_seed(0)).double()
     residuals = torch.stack([(40 * X).sin().squeeze(-1), 0 * X.squeeze(-1)]) + noise

@@ -103,7 +103,7 @@ def test_each_level_has_a_noise_of_its_own(ar1, levels):
     torch.testing.assert_close(noise.detach(), expected)
 
 
-def test_the_samples_lie_within_the_bounds(data):
+def test_the_samples_lie_within_the_bounds_and_the_seed_makes_them(data, build):
     X, Y = data()
     seen = []
 
@@ -118,9 +118,6 @@ def test_the_samples_lie_within_the_bounds(data):
     assert (rows >= bounds[0]).all()
     assert (rows <= bounds[1]).all()
     assert (rows.amax(0) - rows.amin(0) > 0.8 * (bounds[1] - bounds[0])).all()
-
-
-def test_the_seed_makes_the_samples(data, build):
     X, Y = data()
     first, same, other = (build("AR1", X, Y, seed=s).train_inputs[0] for s in (1, 1, 2))
     assert torch.equal(first, same)
@@ -180,9 +177,6 @@ def test_the_prior_of_rho_is_each_outputs_own(levels):
     own = AR1(X, 9 * Y, low_X=low_X, low_Y=low_Y)
     part = both.subset_output([1])
     torch.testing.assert_close(part.terms[0].basis.ratio, own.terms[0].basis.ratio)
-
-
-def test_a_low_level_that_does_not_vary_says_nothing_of_rho():
     X = torch.tensor([[0.0], [1.0], [2.0]], dtype=torch.float64)
     model = AR1(X, X, low_X=X, low_Y=torch.full_like(X, 3.0))
     assert model.terms[0].basis.prior_of_learnt[1].item() == 1.0

@@ -64,7 +64,9 @@ def test_variances_that_are_small(dense, close, scale, options):
     agree(model, dense(model, X, Y, physics), X, close, 1e-6)
 
 
-def test_noise_of_observations_and_the_marginal_likelihood(uniform, shuffle, dense, close):
+def test_noise_known_and_of_observations_and_the_marginal_likelihood(
+    uniform, shuffle, dense, close
+):
     X, Y, Z, physics = problem(uniform, 2, 10.0, 0)
     model = shuffle(CKA(X, Y, physics=physics, center=0.0))
     formula = dense(model, X, Y, physics)
@@ -77,9 +79,6 @@ def test_noise_of_observations_and_the_marginal_likelihood(uniform, shuffle, den
     log_density = model.likelihood(model(*model.train_inputs)).log_prob(model.train_targets)
     jacobian = len(Y) * model.outcome_transform.stdvs.log().item()
     assert -log_density.item() + jacobian == pytest.approx(formula.nlml().item(), rel=1e-9)
-
-
-def test_known_noise(uniform, shuffle, dense, close):
     X, Y, Z, physics = problem(uniform, 2, 3.0, 1)
     Yvar = uniform(*Y.shape, low=0.01, high=0.3, seed=9)
     model = shuffle(CKA(X, Y, Yvar, physics=physics, center=0.0))

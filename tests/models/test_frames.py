@@ -47,16 +47,12 @@ def test_arrays_and_frames(data, build, kind, uniform, same):
     assert isinstance(frames.posterior(asked).mean, torch.Tensor)
 
 
-def test_columns_in_another_order(data, build):
+def test_orders_integers_series_and_gaps(data, build, uniform, same):
     X, Y = data()
     frame = pd.DataFrame(X.numpy(), columns=["speed", "load"])
     model, other = build("CKA", frame, Y), frame[["load", "speed"]]
     refused(ValueError, r"\('speed', 'load'\).*order", model.predict, other)
     refused(ValueError, r"\('speed', 'load'\).*order", model.condition_on_observations, other, Y)
-
-
-def test_integers_and_series(data, build, uniform):
-    X, Y = data()
     whole = (10 * X).round()
     series = pd.Series(Y.squeeze(-1).numpy(), name="u")
     with pytest.raises(ValueError, match=r"train_Y.*reshape\(-1, 1\)"):
@@ -66,6 +62,10 @@ def test_integers_and_series(data, build, uniform):
     expected = CKA(whole, Y, physics=lambda X: 2 + X.sum(-1) / 10)
     Z = uniform(5, 2)
     torch.testing.assert_close(model.posterior(Z).mean, expected.posterior(Z).mean)
+    X, Y = data(num_outputs=2)
+    Y[3, 1] = torch.nan
+    frame = pd.DataFrame(Y.numpy().astype(object)).where(~Y.isnan().numpy(), None)
+    same(build("CKA", X, frame), build("CKA", X, Y), uniform(5, 2), 1e-12)
 
 
 @pytest.mark.parametrize("noise", [0.04, 4, [0.04, 0.3], np.array([0.04, 0.3])], ids=str)
@@ -73,13 +73,6 @@ def test_known_noise(data, build, kind, uniform, same, noise):
     X, Y = data(num_outputs=2)
     every = torch.as_tensor(noise, dtype=torch.float64).expand(Y.shape).clone()
     same(build(kind, X, Y, noise), build(kind, X, Y, every), uniform(5, 2, high=2.0), 1e-12)
-
-
-def test_missing_values_of_a_frame(data, build, uniform, same):
-    X, Y = data(num_outputs=2)
-    Y[3, 1] = torch.nan
-    frame = pd.DataFrame(Y.numpy().astype(object)).where(~Y.isnan().numpy(), None)
-    same(build("CKA", X, frame), build("CKA", X, Y), uniform(5, 2), 1e-12)
 
 
 # Models from BoTorch's datasets

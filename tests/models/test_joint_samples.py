@@ -306,15 +306,12 @@ def test_quantiles_are_those_of_the_interval(sized, uniform, size):
         assert ((draws.quantile(float(level), dim=0) - found).abs() < 0.05 * sd).all()
 
 
-def test_one_quantile_has_no_dimension_of_its_own(sized, uniform):
+@pytest.mark.parametrize("level", [0.0, 1.0, -0.5, float("nan")])
+def test_quantiles_of_one_level_and_of_none(sized, uniform, level):
     posterior = sized(CKA, 1.0, 2, True, 3).posterior(uniform(5, 4, 2))
     single = posterior.quantile(LEVELS[1])
     assert single.shape == (5, 4, 2)
     assert torch.equal(posterior.quantile(LEVELS)[1], single)
-
-
-@pytest.mark.parametrize("level", [0.0, 1.0, -0.5, float("nan")])
-def test_levels_out_of_range(sized, uniform, level):
     posterior = sized(CKA, 1.0, 1, True, 3).posterior(uniform(4, 2))
     refused(ValueError, "between 0 and 1", posterior.quantile, torch.tensor(level))
 

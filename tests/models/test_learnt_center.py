@@ -56,6 +56,8 @@ def test_the_prior_mean_is_the_physics_wherever_the_center_is(XY):
     far = 1e3 + X
     for center in (0.0, 7.0):
         torch.testing.assert_close(move(model, center).posterior(far).mean, crude(far))
+    model = move(CKA(*XY, physics=crude, center="learn"), 4.25)
+    assert "center 4.25" in model.summary()
 
 
 @pytest.mark.slow
@@ -84,21 +86,30 @@ def test_a_center_that_is_right_is_found(uniform):
     assert (model.terms[0].basis.origin - 8).abs().max() < 0.3
 
 
-def test_a_later_model_starts_with_the_same_center(XY, uniform):
+def test_later_models(XY, uniform):
     X, Y = XY
     model = move(CKA(X, Y, physics=crude, center="learn"), 4.2)
     more = uniform(12, 2, seed=3)
     later = CKA(more, 2 * crude(more), physics=crude, center="learn")
     warm_start(later, model)
     torch.testing.assert_close(later.terms[0].basis.origin, model.terms[0].basis.origin)
-
-
-def test_a_physics_that_is_constant(XY):
-    X, Y = XY
     model = CKA(X, Y, physics=lambda X: 2.0 + 0 * X[..., :1], center="learn")
     fit(model, num_screened=8, num_draws=64)
     assert model.predict(X).mean.isfinite().all()
     warm_start(CKA(X, Y, physics=lambda X: 2.0 + 0 * X[..., :1], center="learn"), model)
+
+    class Physics(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.center = torch.nn.Parameter(torch.tensor(1.0, dtype=torch.float64))
+
+        def forward(self, X):
+            return crude(X) + self.center
+
+    physics = Physics()
+    models = [CKA(*XY, physics=physics) for _ in range(2)]
+    warm_start(*models)
+    assert models[0].predict(XY[0]).mean.isfinite().all()
 
 
 @pytest.mark.parametrize("method", ["map", "bayes"])
@@ -127,26 +138,6 @@ def test_predictions_leave_no_trace_at_it(XY, uniform):
     Z = Z.detach()
     for found in (model.predict(Z).mean, model.posterior(Z).mean, model.delta(Z).mean):
         assert not found.requires_grad
-
-
-def test_a_parameter_of_the_physics_with_its_name(XY):
-    class Physics(torch.nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.center = torch.nn.Parameter(torch.tensor(1.0, dtype=torch.float64))
-
-        def forward(self, X):
-            return crude(X) + self.center
-
-    physics = Physics()
-    models = [CKA(*XY, physics=physics) for _ in range(2)]
-    warm_start(*models)
-    assert models[0].predict(XY[0]).mean.isfinite().all()
-
-
-def test_the_summary_tells_it(XY):
-    model = move(CKA(*XY, physics=crude, center="learn"), 4.25)
-    assert "center 4.25" in model.summary()
 
 
 @pytest.mark.parametrize("cls", [CKA, RRA])

@@ -47,21 +47,13 @@ def Z(uniform):
     return uniform(6, 2, low=-1.0, high=3.0, seed=7)
 
 
-def test_without_physics_it_is_a_gp_with_deltas_kernel(data, shuffle, close, Z):
+def test_without_physics_rho_or_delta(data, shuffle, close, Z, build, kernel_of):
     X, Y = data(num_outputs=2)
     model = shuffle(CKA(X, Y, physics=lambda X: X.new_zeros(len(X), 2)))
     agree(close, model, give(ZeroMeanGP(X, Y), model, f="delta"), Z)
-
-
-def test_without_rho_it_is_the_physics_mean_gp(data, build, shuffle, close, kernel_of, Z):
-    X, Y = data(num_outputs=2)
     model = shuffle(build("CKA", X, Y))
     switch_off(kernel_of(model, "rho"))
     agree(close, model, give(build("PhysicsMeanGP", X, Y), model, delta="delta"), Z)
-
-
-def test_without_delta_it_is_the_scale_gp(data, build, shuffle, close, kernel_of, Z):
-    X, Y = data(num_outputs=2)
     model = shuffle(build("CKA", X, Y))
     switch_off(kernel_of(model, "delta"))
     scale_gp = give(build("ScaleGP", X, Y), model, rho="rho")
@@ -217,15 +209,12 @@ def test_fits_and_samples(gaps, build, kind, uniform):
     assert posterior.rsample(torch.Size([3])).isfinite().all()
 
 
-def test_samples_of_hyper_parameters(gaps, held, uniform, same):
+def test_missing_observations_of_samples_and_units(gaps, held, uniform, same, build):
     model, singles = held("CKA", *gaps)
     Z = uniform(5, 2, high=2.0, seed=4)
     for i, single in enumerate(singles):
         torch.testing.assert_close(model.posterior(Z).mean[i], single.posterior(Z).mean)
         torch.testing.assert_close(model.rho(Z, mixed=False).variance[i], single.rho(Z).variance)
-
-
-def test_units_are_of_what_was_observed(gaps, build):
     X, Y = gaps
     scale = build("CKA", X, Y).outcome_transform.stdvs
     for j in range(2):

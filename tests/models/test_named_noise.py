@@ -44,7 +44,7 @@ def gross_data() -> tuple[Tensor, Tensor]:
     return X, Y
 
 
-def test_relative_noise_is_that_of_the_formula(growing: tuple[Tensor, Tensor]) -> None:
+def test_relative_noise_is_that_of_the_formula(growing):
     X, Y = growing
     model = CKA(X, Y, physics=decades, likelihood="relative")
     fit(model, **OPTIONS)
@@ -55,10 +55,6 @@ def test_relative_noise_is_that_of_the_formula(growing: tuple[Tensor, Tensor]) -
     more = [model.components(new, noisy)[1].mean(0).squeeze(-1) for noisy in (True, False)]
     assert torch.allclose(more[0] - more[1], expected)
     assert 0.06 < float(relative.median()) < 0.16
-
-
-def test_noise_relative_to_the_mean_without_physics(growing: tuple[Tensor, Tensor]) -> None:
-    X, Y = growing
     model = ZeroMeanGP(X, Y, likelihood="relative")
     fit(model, **OPTIONS)
     sd = (model.predict(X, True).variance - model.predict(X).variance).sqrt().flatten()

@@ -51,7 +51,7 @@ def data():
     return case(3)
 
 
-def test_the_slope_of_the_physics_carries_noise_to_the_targets(data):
+def test_moments_of_physics_and_true_inputs(data):
     X, Y = data
     model = CKA(X, Y, physics=f_p, train_Xvar=SD**2, outcome_transform=None)
     model.eval()
@@ -64,10 +64,6 @@ def test_the_slope_of_the_physics_carries_noise_to_the_targets(data):
     slope = 6 * torch.cos(6 * noisy.points)[:, 0]
     steep = slope.abs() > 4
     assert torch.allclose(variance[steep], (slope * noisy.spread[:, 0])[steep].square(), rtol=0.2)
-
-
-def test_true_inputs_have_the_moments_of_the_measured_ones_less_noise(data):
-    X, Y = data
     noisy = NoisyInputs.of(SD**2, training_data(X, Y))
     total = noisy.points.var(0) + noisy.spread.square().mean(0)
     assert total.item() == pytest.approx((X.var(0) - SD**2).item(), rel=1e-9)

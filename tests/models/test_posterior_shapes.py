@@ -106,7 +106,9 @@ def three_outputs(request, data, build, kind, shuffle):
 
 
 @pytest.mark.parametrize("indices", [[1], [2, 0], [-1]])
-def test_the_posterior_is_that_of_the_whole(three_outputs, uniform, same, indices):
+def test_a_subset_is_the_whole_posterior_and_leaves_the_whole(
+    three_outputs, uniform, same, indices
+):
     Z = uniform(4, 2, high=2.0, seed=5)
     same(three_outputs.subset_output(indices), three_outputs, Z, 1e-9, indices)
     posterior = three_outputs.posterior(Z, output_indices=indices)
@@ -114,6 +116,14 @@ def test_the_posterior_is_that_of_the_whole(three_outputs, uniform, same, indice
     torch.testing.assert_close(posterior.mean, expected.mean[..., indices])
     torch.testing.assert_close(posterior.variance, expected.variance[..., indices])
     refused(ValueError, "numbers of outputs from 0 to 2", three_outputs.subset_output, [3])
+    Z = uniform(4, 2)
+    before = three_outputs.posterior(Z).mean.detach()
+    part = three_outputs.subset_output([1])
+    with torch.no_grad():
+        for parameter in part.parameters():
+            parameter += 0.5
+    three_outputs.train()
+    torch.testing.assert_close(three_outputs.posterior(Z).mean.detach(), before)
 
 
 # BoTorch's fit adds no nugget but after a warning.
@@ -134,14 +144,3 @@ def test_it_can_be_fitted_again(data, build, kind, uniform, indices):
     torch.testing.assert_close(reached.log_likelihood, part_of_whole, rtol=1e-3, atol=1e-3)
     fit_gpytorch_mll(ExactMarginalLogLikelihood(part.likelihood, part))
     assert (part.posterior(X).mean - Y[:, indices]).abs().mean() < Y.std()
-
-
-def test_the_whole_stays_as_it_is(three_outputs, uniform):
-    Z = uniform(4, 2)
-    before = three_outputs.posterior(Z).mean.detach()
-    part = three_outputs.subset_output([1])
-    with torch.no_grad():
-        for parameter in part.parameters():
-            parameter += 0.5
-    three_outputs.train()
-    torch.testing.assert_close(three_outputs.posterior(Z).mean.detach(), before)

@@ -102,7 +102,7 @@ def test_nothing_stale_is_kept(data, build, kind, uniform, close, shuffle, chang
         close(actual, expected, tolerance)
 
 
-def test_factors_are_left_out_of_a_pickle(data, uniform):
+def test_pickles_and_kernels_with_their_own_way(data, uniform, close):
     model, Z = ZeroMeanGP(*data(n=148)), uniform(5, 2)
     model = model.condition_on_observations(Z[:2] + 1, torch.ones(2, 1).double())
     size = len(pickle.dumps(ZeroMeanGP(*data(n=150))))
@@ -110,9 +110,6 @@ def test_factors_are_left_out_of_a_pickle(data, uniform):
     assert len(pickle.dumps(model)) < size + 10_000
     for again in (pickle.loads(pickle.dumps(model)), copy.deepcopy(model)):
         torch.testing.assert_close(again.predict(Z).mean, before)
-
-
-def test_a_kernel_with_its_own_way(data, uniform, close):
     X, Y = data(n=20)
     likelihood = GaussianLikelihood().double()
     kernel = InducingPointKernel(ScaleKernel(RBFKernel()).double(), X[:8].clone(), likelihood)

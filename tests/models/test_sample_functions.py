@@ -90,7 +90,7 @@ def test_wrong_numbers_and_points_for_other_functions(data, build, uniform):
         refused(ValueError, r"3 functions, 3 x q x d", functions.each, uniform(*shape))
 
 
-def test_shapes_and_seed(data, build, kind, num_outputs, uniform):
+def test_shapes_seed_gradients_and_means(data, build, kind, num_outputs, uniform):
     model = build(kind, *data(num_outputs=num_outputs))
     functions, Z = model.sample_functions(3, seed=1), uniform(2, 6, 5, 2)
     values = functions(Z)
@@ -100,13 +100,29 @@ def test_shapes_and_seed(data, build, kind, num_outputs, uniform):
     state = torch.get_rng_state()
     torch.testing.assert_close(model.sample_functions(3, seed=1)(Z), values)
     assert torch.equal(torch.get_rng_state(), state)
+    functions = build(kind, *data(num_outputs=num_outputs)).sample_functions(2, seed=0)
+    Z = uniform(3, 2, seed=3)
+    assert torch.autograd.gradcheck(functions, Z.requires_grad_())
+    model = build(kind, *data(num_outputs=num_outputs, n=9))
+    functions, Z = model.mean_functions(), uniform(2, 5, 2)
+    torch.testing.assert_close(functions(Z), model.predict(Z).mean.unsqueeze(0))
+    Z.requires_grad_(True)
+    (slope,) = torch.autograd.grad(functions(Z).sum(), Z)
+    (expected,) = torch.autograd.grad(model.predict(Z).mean.sum(), Z)
+    torch.testing.assert_close(slope, expected)
 
 
-def test_a_seed_is_none_of_the_generators_of_gpus(data, build, monkeypatch):
+def test_seeds_and_later_fits(data, build, monkeypatch, kind, shuffle, uniform):
     seeds, model = [], build("CKA", *data())
     monkeypatch.setattr(torch.cuda, "manual_seed_all", seeds.append)
     model.sample_functions(3, seed=1)
     assert seeds == []
+    model, Z = build(kind, *data()), uniform(3, 2)
+    functions = model.sample_functions(2, seed=0)
+    before = functions(Z)
+    shuffle(model.train())
+    assert torch.equal(functions(Z), before)
+    torch.testing.assert_close(copy.deepcopy(functions)(Z), before)
 
 
 def test_a_batch_of_models(data, build, kind, num_outputs, uniform):
@@ -116,21 +132,6 @@ def test_a_batch_of_models(data, build, kind, num_outputs, uniform):
     values = functions(Z)
     assert values.shape == (2, 4, 3, 5, num_outputs)
     torch.testing.assert_close(functions(Z[1]), values[:, 1])
-
-
-def test_gradients(data, build, kind, num_outputs, uniform):
-    functions = build(kind, *data(num_outputs=num_outputs)).sample_functions(2, seed=0)
-    Z = uniform(3, 2, seed=3)
-    assert torch.autograd.gradcheck(functions, Z.requires_grad_())
-
-
-def test_a_later_fit_leaves_them(data, build, kind, shuffle, uniform):
-    model, Z = build(kind, *data()), uniform(3, 2)
-    functions = model.sample_functions(2, seed=0)
-    before = functions(Z)
-    shuffle(model.train())
-    assert torch.equal(functions(Z), before)
-    torch.testing.assert_close(copy.deepcopy(functions)(Z), before)
 
 
 @pytest.mark.slow
@@ -162,16 +163,6 @@ def test_features_make_the_kernel(uniform, outputs):
         expected = term.covariance(x, x).detach()
         close = {"rtol": 0, "atol": tolerance * expected.max().item()}
         torch.testing.assert_close((features @ features.mT).detach(), expected, **close)
-
-
-def test_means_are_those_of_the_predictions(data, build, kind, num_outputs, uniform):
-    model = build(kind, *data(num_outputs=num_outputs, n=9))
-    functions, Z = model.mean_functions(), uniform(2, 5, 2)
-    torch.testing.assert_close(functions(Z), model.predict(Z).mean.unsqueeze(0))
-    Z.requires_grad_(True)
-    (slope,) = torch.autograd.grad(functions(Z).sum(), Z)
-    (expected,) = torch.autograd.grad(model.predict(Z).mean.sum(), Z)
-    torch.testing.assert_close(slope, expected)
 
 
 def test_a_mean_for_each_sample_of_the_hyperparameters(data, held, uniform):

@@ -98,13 +98,22 @@ def test_one_that_was_conditioned_and_holds_samples(uniform, path, Yvar):
     same(model.predict(Z), again.predict(Z))
 
 
-def test_what_has_no_name_is_given_again(uniform, path):
+def test_what_has_no_name_is_given_again_and_compared(uniform, path):
     X, Y, Z = problem(uniform)
     options = {"physics": lambda X: relu(X), "input_transform": Normalize(2)}
     model = CKA(X, Y, **options)
     saved(model, path)
     refused(ValueError, "input_transform and physics", load, path)
     same(model.predict(Z), load(path, **options).predict(Z))
+    model = Gained(X, Y, physics=relu, physics_gain=3.0, low=1.0)
+    saved(model, path)
+    assert torch.load(path, weights_only=True)["options"] == {"physics_gain": 3.0, "low": 1.0}
+    same(model.predict(Z), load(path, physics=relu).predict(Z))
+    X, Y, _ = problem(uniform)
+    model = CKA(X, 1e-10 * Y, physics=lambda X: 1e-10 * relu(X))
+    saved(model, path)
+    refused(ValueError, "saved with another physics", load, path, physics=lambda X: 3e-10 * relu(X))
+    load(path, physics=lambda X: 1e-10 * relu(X))
 
 
 def test_what_could_not_come_back_is_refused(uniform, path):
@@ -123,17 +132,6 @@ def test_what_could_not_come_back_is_refused(uniform, path):
     save(CKA(X, Y, physics={"a": relu, "b": silu}), path)
     other = {"a": silu, "b": relu}
     refused(ValueError, r"another physics.*same order", load, path, physics=other)
-
-
-def test_a_state_of_another_model_changes_nothing(uniform):
-    X, Y, Z = problem(uniform)
-    model = CKA(X, Y, physics=relu)
-    before = model.predict(Z)
-    state = {name: value + 1 for name, value in model.state_dict().items()}
-    state["covar_module.terms.0.kernel.base_kernel.raw_lengthscale"] = torch.ones(2, 1, 3)
-    for wrong in (state, ZeroMeanGP(X, Y).state_dict()):
-        refused(RuntimeError, r"as it was.*terms\.0", model.load_state_dict, wrong)
-    torch.testing.assert_close(model.predict(Z), before)
 
 
 def test_whether_it_is_fitted_is_known_of_a_loaded_model(uniform, path):
@@ -169,14 +167,6 @@ def test_a_kernel_is_given_again(uniform, path, name):
         load(path, trusted=True, **{name: scaled_rbf})
     save(AR1(X, Y, physics=relu, low_X=X + 0.1), path)
     refused(ValueError, rf"model\.pt: .*{name}.*: nothing", load, path, **{name: kernel})
-
-
-def test_options_of_a_structure_of_your_own(uniform, path):
-    X, Y, Z = problem(uniform)
-    model = Gained(X, Y, physics=relu, physics_gain=3.0, low=1.0)
-    saved(model, path)
-    assert torch.load(path, weights_only=True)["options"] == {"physics_gain": 3.0, "low": 1.0}
-    same(model.predict(Z), load(path, physics=relu).predict(Z))
 
 
 def test_a_stacked_model_comes_back(uniform, path):
@@ -284,17 +274,18 @@ class TestFilesOfStrangers:
         yield trace
         sys.modules.pop("planted_module", None)
 
-    def test_a_class_of_no_module_that_was_imported(self, content, planted):
+    def test_what_is_imported_and_given(self, content, planted, uniform):
         with pytest.raises(ValueError, match="'planted_module' was not imported"):
             load(content(**{"class": "planted_module:X"}))
         assert not planted.exists()
         for name in ("gpadjust.models.structures:None", "builtins:dict", "torch.nn:Linear"):
             refused(ValueError, r"model\.pt: .*has no such model", load, content(**{"class": name}))
-
-    def test_a_physics_that_is_given_is_not_imported(self, content, planted):
         path = content(physics={"": "planted_module:X"})
         assert load(path, physics=relu).num_outputs == 2
         assert not planted.exists()
+        for given in ({"foo": 1}, {"train_Y": uniform(8, 2)}, {"center": 0.0}):
+            refused(ValueError, rf"{next(iter(given))}.*physics", load, content(), **given)
+        refused(ValueError, r"model\.pt is damaged", load, content(), physics=3.0)
 
     NAMES = ("planted_module:X", "planted_module:_exit", "os:_exit", "torch:os._exit")
 
@@ -335,13 +326,8 @@ class TestFilesOfStrangers:
                 torch.save({**held, name: wrong}, path)
                 refused(ValueError, r"model\.pt", load, path)
 
-    def test_what_is_given_beside_the_file(self, content, uniform):
-        for given in ({"foo": 1}, {"train_Y": uniform(8, 2)}, {"center": 0.0}):
-            refused(ValueError, rf"{next(iter(given))}.*physics", load, content(), **given)
-        refused(ValueError, r"model\.pt is damaged", load, content(), physics=3.0)
 
-
-def test_what_a_fit_may_move_comes_back(uniform, path):
+def test_what_a_fit_may_move_comes_back_and_another_state_changes_nothing(uniform, path):
     X, Y, Z = problem(uniform)
     model = CKA(X, Y, physics=relu)
     model.likelihood.noise = 0.5
@@ -352,11 +338,10 @@ def test_what_a_fit_may_move_comes_back(uniform, path):
     same(model.predict(Z), again.predict(Z))
     learnt = [{n for n, p in m.named_parameters() if p.requires_grad} for m in (model, again)]
     assert learnt[0] == learnt[1]
-
-
-def test_a_physics_of_small_units_is_compared(uniform, path):
-    X, Y, _ = problem(uniform)
-    model = CKA(X, 1e-10 * Y, physics=lambda X: 1e-10 * relu(X))
-    saved(model, path)
-    refused(ValueError, "saved with another physics", load, path, physics=lambda X: 3e-10 * relu(X))
-    load(path, physics=lambda X: 1e-10 * relu(X))
+    model = CKA(X, Y, physics=relu)
+    before = model.predict(Z)
+    state = {name: value + 1 for name, value in model.state_dict().items()}
+    state["covar_module.terms.0.kernel.base_kernel.raw_lengthscale"] = torch.ones(2, 1, 3)
+    for wrong in (state, ZeroMeanGP(X, Y).state_dict()):
+        refused(RuntimeError, r"as it was.*terms\.0", model.load_state_dict, wrong)
+    torch.testing.assert_close(model.predict(Z), before)

@@ -73,7 +73,7 @@ def test_the_parts_make_the_whole(uniform, shuffle, close, cls, center):
     close(model.predict(Z).mean, model.posterior(Z).mean)
 
 
-def test_names(uniform, close):
+def test_names_and_errors(uniform, close):
     X, Y, Z = problem(uniform)
     model = CKA(X, Y, physics=[swing, drift]).eval()
     for named in (1, -1, "drift", "rho_drift"):
@@ -82,6 +82,19 @@ def test_names(uniform, close):
         refused(ValueError, r"swing, drift, or a number", model.rho, Z, physics=wrong)
     assert CKA(X, Y, physics=[swing]).term_names == ("rho", "delta")
     assert CKA(X, Y, physics=[lambda X: swing(X), drift]).rho_names == ("rho_f_1", "rho_drift")
+    X, Y, _ = problem(uniform)
+
+    def broken(X):
+        return swing(X) / (X[:, :1] < 5)
+
+    model = CKA(X, Y, physics={"good": swing, "bad": broken}).eval()
+    with pytest.raises(PhysicsError, match=r"'bad'.*NaN or inf in 1 of 2"):
+        model.posterior(torch.tensor([[0.0, 0.5], [9.0, 0.5]], dtype=torch.float64))
+    with pytest.raises(ValueError, match=r"rho_mean.*'learn'.*2 numbers"):
+        CKA(X, Y, physics=[swing, drift], rho_mean=[1.0])
+    with pytest.raises(ValueError, match=r"2 kernels of rho.*got 1"):
+        CKA(X, Y, physics=[swing, drift], rho_covar_module=[None])
+    refused(PhysicsError, "number of outputs", CKA, X, Y, physics=[swing, lambda X: X[:, 0]])
 
 
 @pytest.mark.slow
@@ -122,22 +135,6 @@ def test_each_is_evaluated_once_a_call(uniform, cls):
     counts.clear()
     model.rho(Z, physics=0)
     assert not counts
-
-
-def test_errors_name_the_one_that_failed(uniform):
-    X, Y, _ = problem(uniform)
-
-    def broken(X):
-        return swing(X) / (X[:, :1] < 5)
-
-    model = CKA(X, Y, physics={"good": swing, "bad": broken}).eval()
-    with pytest.raises(PhysicsError, match=r"'bad'.*NaN or inf in 1 of 2"):
-        model.posterior(torch.tensor([[0.0, 0.5], [9.0, 0.5]], dtype=torch.float64))
-    with pytest.raises(ValueError, match=r"rho_mean.*'learn'.*2 numbers"):
-        CKA(X, Y, physics=[swing, drift], rho_mean=[1.0])
-    with pytest.raises(ValueError, match=r"2 kernels of rho.*got 1"):
-        CKA(X, Y, physics=[swing, drift], rho_covar_module=[None])
-    refused(PhysicsError, "number of outputs", CKA, X, Y, physics=[swing, lambda X: X[:, 0]])
 
 
 @pytest.mark.parametrize("cls", CLASSES)

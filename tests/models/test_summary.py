@@ -64,20 +64,16 @@ def test_numbers_are_in_the_users_units(uniform):
     assert numbers(text, "log likelihood") == pytest.approx([expected], rel=1e-3)
 
 
-def test_a_mean_that_is_rounding_is_zero(uniform, monkeypatch):
-    X = uniform(8, 1)
-    model = ZeroMeanGP(X, X)
-    monkeypatch.setattr(ZeroMeanGP, "term_mean", lambda *args: 7e-19)
-    assert "f: mean 0\n" in model.summary()
-
-
-def test_bounds_and_learnt_means_are_told(uniform):
+def test_bounds_learnt_means_and_rounding_are_told(uniform, monkeypatch):
     X = uniform(8, 1)
     model = CKA(X, crude(X) + X.square(), physics=crude, rho_mean="learn")
     assert "rho: learnt mean 1" in model.summary()
     assert "at its" not in model.summary()
     model.terms[0].kernel.base_kernel.lengthscale = 1e3 * (X.max() - X.min()).item()
     assert model.summary().count("(at its upper bound)") == 1
+    model = ZeroMeanGP(X, X)
+    monkeypatch.setattr(ZeroMeanGP, "term_mean", lambda *args: 7e-19)
+    assert "f: mean 0\n" in model.summary()
 
 
 @pytest.mark.parametrize("kind", [AR1, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP])
@@ -92,7 +88,7 @@ def test_every_model_has_one(kind, uniform):
     assert text.count("noise: sd") == 2
 
 
-def test_intervals(uniform):
+def test_intervals_also_of_a_mixture(uniform):
     X, Z = uniform(8, 1), uniform(5, 1, seed=1)
     model = CKA(X, crude(X) + X.sin(), physics=crude)
     mean, variance = model.predict(Z, observation_noise=True)
@@ -101,10 +97,6 @@ def test_intervals(uniform):
     torch.testing.assert_close(high, mean + 1.6448536269514722 * variance.sqrt())
     for level in (0.0, 1.0, 95, "95 %"):
         refused((TypeError, ValueError), "level must be", model.interval, Z, level)
-
-
-def test_intervals_of_a_mixture(uniform):
-    X, Z = uniform(8, 1), uniform(5, 1, seed=1)
     model = CKA(X, crude(X) + X.sin(), physics=crude)
     holding(model, 0.0, 1.0)
     assert "2 samples" in repr(model)
@@ -200,16 +192,13 @@ def test_as_the_inputs_came(data, build, uniform):
     assert [*alone.columns] == ["delta mean", "delta lower", "delta upper"]
 
 
-def test_many_points_and_other_models(uniform):
+def test_adjustments_of_many_points_and_their_gradients(uniform):
     X = uniform(30, 1)
     Y = X.sin() + X
     for make in (CKA, PhysicsMeanGP, VariationalCKA):
         many = make(X, Y, physics=torch.sin).adjustments(uniform(20_000, 1))
         assert many["delta"].mean.shape == (20_000, 1)
     refused(ValueError, "level", CKA(X, Y, physics=torch.sin).adjustments, X, level=95)
-
-
-def test_gradients_reach_the_inputs(uniform):
     X = uniform(6, 1)
     model = CKA(X, X.sin() + X, physics=torch.sin)
     asked = nn.Parameter(uniform(3, 1, seed=1))

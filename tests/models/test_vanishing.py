@@ -122,7 +122,7 @@ def test_beside_and_for_categories(valve):
         assert model.adjustments(X)["delta upper"].max() > 0.01
 
 
-def test_places_as_frames_arrays_and_numbers():
+def test_places(valve):
     names = ("valve", "flow")
     for where, expected in [
         ({"flow": [0.0, 1.0]}, [[None, 0.0], [None, 1.0]]),
@@ -135,9 +135,6 @@ def test_places_as_frames_arrays_and_numbers():
         found = vanishing_rbf(where)._raw(names)
         numbers = [[None if v != v else v for v in row] for row in found.tolist()]
         assert numbers == expected
-
-
-def test_bad_places(valve):
     X, Y = valve
     for where, says in (
         ({}, "each column a number"),

@@ -194,7 +194,7 @@ def test_paths_of_botorch(close, fitted):
     close(own[7, ..., 0], values[7, ..., 3])
 
 
-def test_lists_of_models(close, one):
+def test_lists_of_models_and_gradients_to_inputs(close, one, gradient_is_right):
     X, Y = problem(120)
     exact = CKA(X[:20], Y[:20], physics=wave)
     both = ModelListGP(one, exact)
@@ -202,9 +202,6 @@ def test_lists_of_models(close, one):
     results = fit(both, "map", num_starts=1, num_screened=0)
     assert len(results) == 2
     assert both.subset_output([0]).posterior(LINE).mean.shape == (2, 1)
-
-
-def test_gradients_to_inputs(one, gradient_is_right):
     X = torch.tensor([[0.3], [0.7]], dtype=torch.float64)
     gradient_is_right(lambda X: one.predict(X).mean.sum(), X)
     gradient_is_right(lambda X: one.posterior(X).variance.sum(), X)
@@ -239,15 +236,7 @@ def test_all_of_a_model_moves(noise):
     assert {t.device.type for t in tensors if t is not None} == {"meta"}
 
 
-def test_its_arguments_are_those_of_an_exact_model():
-    ours, theirs = (signature(each).parameters for each in (VariationalCKA, CKA))
-    assert ours.keys() - theirs.keys() == {"num_inducing", "seed"}
-    assert {name: ours[name].default for name in theirs} == {
-        name: each.default for name, each in theirs.items()
-    }
-
-
-def test_all_rows_are_asked_about_once():
+def test_rows_arguments_and_states(close):
     X, Y = problem(1500)
     asked = []
 
@@ -258,6 +247,18 @@ def test_all_rows_are_asked_about_once():
     model = VariationalCKA(X, Y, physics=physics, num_inducing=5)
     fit(model, num_screened=0, max_iterations=1)
     assert sorted(asked)[-2:] == [1000, 1500]
+    ours, theirs = (signature(each).parameters for each in (VariationalCKA, CKA))
+    assert ours.keys() - theirs.keys() == {"num_inducing", "seed"}
+    assert {name: ours[name].default for name in theirs} == {
+        name: each.default for name, each in theirs.items()
+    }
+    X, Y = problem(40)
+    model = make(5 * X, 3 * Y, input_transform=Normalize(1))
+    other = make(X, Y, input_transform=Normalize(1))
+    other.load_state_dict(model.state_dict())
+    close(other.data()["train_Y"], Y)
+    close(other.train_inputs[0], other.input_transform(X))
+    close(other.train_targets * model.outcome_transform.stdvs.squeeze(), Y.squeeze(-1))
 
 
 @pytest.mark.parametrize("noise", [None, 0.01])
@@ -270,16 +271,6 @@ def test_files(tmp_path, noise):
     same(again.predict(LINE, True), model.predict(LINE, True), rtol=1e-10, atol=0)
     assert again.summary() == model.summary()
     refused(ValueError, "subset", save, model.subset_output([0]), tmp_path / "subset.pt")
-
-
-def test_a_state_brings_its_units_and_transforms_along(close):
-    X, Y = problem(40)
-    model = make(5 * X, 3 * Y, input_transform=Normalize(1))
-    other = make(X, Y, input_transform=Normalize(1))
-    other.load_state_dict(model.state_dict())
-    close(other.data()["train_Y"], Y)
-    close(other.train_inputs[0], other.input_transform(X))
-    close(other.train_targets * model.outcome_transform.stdvs.squeeze(), Y.squeeze(-1))
 
 
 def test_outputs_of_a_model(close):

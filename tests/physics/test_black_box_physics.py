@@ -72,7 +72,7 @@ class TestValues:
         assert (seen[0].dtype, seen[0].tolist()) == (np.float64, [[2.0]])
 
     @pytest.mark.parametrize("batched", [True, False])
-    def test_function_may_write_to_its_input_and_reuse_its_output(self, batched):
+    def test_rows_are_the_functions_and_evaluated_once(self, batched, numpy_counter, points):
         buffer = np.zeros(1)
 
         def vandal(x):
@@ -85,9 +85,6 @@ class TestValues:
         first = physics(X)
         physics(X + 1)
         assert X.item() == first.item() == 1.0
-
-    @pytest.mark.parametrize("batched", [True, False])
-    def test_each_row_is_evaluated_once(self, batched, numpy_counter, points):
         physics = BlackBoxPhysics(numpy_counter, batched=batched)
         X = points(4, 2)
         physics(X.expand(3, 4, 2))
@@ -107,7 +104,7 @@ class TestGradients:
         assert torch.allclose(found, expected, rtol=1e-7, atol=1e-8)
         assert torch.autograd.gradcheck(physics, X)
 
-    def test_expanded_and_repeated_rows(self, numpy_counter, points):
+    def test_repeated_rows_and_the_memo(self, numpy_counter, points):
         physics = BlackBoxPhysics(numpy_counter)
         x = points(1, 2).requires_grad_()
         physics(x.expand(3, 1, 2)).sum().backward()
@@ -118,8 +115,6 @@ class TestGradients:
         assert torch.allclose(x.grad, once)
         expected = 3 * (2 * x.detach() + torch.tensor([[1.0, 0.0]]) * x.detach().cos())
         assert torch.allclose(once, expected)
-
-    def test_finite_differences_stay_out_of_the_memo(self, numpy_counter, points):
         physics = BlackBoxPhysics(numpy_counter)
         for number in (1, 2):
             Y = physics(points(3, 2).requires_grad_())
@@ -276,12 +271,10 @@ class TestParallel:
 
 
 class TestCopies:
-    def test_deep_copy_keeps_a_handle(self, points):
+    def test_handles_lambdas_and_modules_are_copied(self, points):
         physics = BlackBoxPhysics(Handle())
         assert copy.deepcopy(torch.nn.ModuleList([physics]))[0] is physics
         assert torch.allclose(copy.copy(physics)(points(3, 2)), torch_waves(points(3, 2)))
-
-    def test_cloudpickle_keeps_lambdas(self, points):
         scale = 3.0
         physics = BlackBoxPhysics(
             lambda X: scale * waves(X), gradient=lambda X: scale * waves_jacobian(X)
@@ -293,8 +286,6 @@ class TestCopies:
         (found,) = torch.autograd.grad(Y.sum(), X)
         (expected,) = torch.autograd.grad(3.0 * torch_waves(X).sum(), X)
         assert torch.allclose(found, expected)
-
-    def test_a_pickled_module_is_no_attribute(self, points):
         physics = BlackBoxPhysics(NumpyModule())
         X = points(3, 2)
         assert torch.equal(pickle.loads(pickle.dumps(physics))(X), physics(X))

@@ -88,7 +88,7 @@ def test_any_text_is_a_formula_or_an_error_of_ours(text):
     assert found
 
 
-def test_names_of_columns_and_parameters():
+def test_names_and_columns():
     names = ["air flow [m3/h]", "E", "2nd", "dT/dt", "lambda [W/mK]", "\u00b5"]
     assert [*map(symbol, names)] == ["air_flow", "E", "_2nd", "dT_dt", "lambda_", "\u03bc"]
     assert FormulaPhysics("\u00b5", ["\u00b5 [m]"])(X[:, :1])[0] == 1
@@ -97,9 +97,6 @@ def test_names_of_columns_and_parameters():
     with pytest.raises(ValueError, match="found 'a' more than once"):
         FormulaPhysics("a", ["a"], unknowns={"a": Unknown(1.0, sd=1.0)})
     refused(TypeError, "as a text", FormulaPhysics, torch.sin, ["a"])
-
-
-def test_columns_of_data_have_the_order_of_the_formula():
     data = pd.DataFrame(X.numpy(), columns=["b [m]", "a"])
     formula = FormulaPhysics("a * b", ["a", "b"])
     for physics in (formula, [formula, torch.sin]):

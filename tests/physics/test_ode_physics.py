@@ -65,7 +65,7 @@ class TestSolutions:
         matrix = torch.from_numpy(held_input_solution(A.numpy(), B.numpy(), 0.3))
         assert torch.allclose(physics(X), X @ matrix.T, atol=1e-6, rtol=1e-6)
 
-    def test_spring_keeps_its_energy(self, points):
+    def test_spring_keeps_its_energy_and_difference_is_from_the_start(self, points):
         physics = ODEPhysics(Spring(4.0), step=2.0, state_dim=2, substeps=400)
         X = torch.cat([points(6, 2), torch.zeros(6, 1, dtype=torch.float64)], -1)
 
@@ -75,8 +75,6 @@ class TestSolutions:
         moved = physics(X)
         assert torch.allclose(energy(moved), energy(X[:, :2]), rtol=1e-8)
         assert not torch.allclose(moved, X[:, :2], atol=0.1)
-
-    def test_difference_is_from_the_start(self, points):
         X = points(2, 5, 3)
         state = ODEPhysics(Spring(), 0.2, 2)(X)
         change = ODEPhysics(Spring(), 0.2, 2, difference=True)(X)
@@ -129,11 +127,9 @@ class TestSolutions:
 
 
 class TestGradients:
-    def test_in_X(self, points):
+    def test_gradients_in_X_and_in_a_parameter(self, points):
         physics = ODEPhysics(Spring(), 0.2, 2, substeps=3)
         assert torch.autograd.gradcheck(physics, points(2, 2, 3).requires_grad_())
-
-    def test_in_a_parameter(self):
         spring = Spring(4.0)
         physics = ODEPhysics(spring, step=0.5, state_dim=2, substeps=200)
         X = torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)

@@ -161,8 +161,6 @@ class TestGradients:
         X = points(2, 3, 2).requires_grad_()
         assert torch.autograd.gradcheck(physics, X)
         assert torch.autograd.gradgradcheck(physics, X)
-
-    def test_known_rows_still_have_a_gradient(self, points):
         physics = FunctionPhysics(square)
         X = points(3, 2)
         physics(X)
@@ -180,7 +178,7 @@ class TestGradients:
         scale.requires_grad_(False)
         assert not physics(X.detach()).requires_grad
 
-    def test_expanded_X_is_evaluated_once(self, counter, points):
+    def test_expanded_X(self, counter, points):
         X = points(2, 5, 3).requires_grad_()
         Y = FunctionPhysics(counter)(X.unsqueeze(-3).expand(2, 4, 5, 3))
         assert len(counter.rows) == 10
@@ -189,8 +187,6 @@ class TestGradients:
         (gradient,) = torch.autograd.grad((weights * Y).sum(), X)
         (expected,) = torch.autograd.grad((weights.sum(1) * counter.formula(X)).sum(), X)
         assert torch.allclose(gradient, expected)
-
-    def test_expanded_leaf_has_a_gradient_for_every_copy(self, points):
         X = points(1, 2).expand(3, 2).requires_grad_()
         weights = torch.tensor([[1.0], [2.0], [3.0]], dtype=torch.float64)
         (gradient,) = torch.autograd.grad((weights * FunctionPhysics(square)(X)).sum(), X)
@@ -232,7 +228,7 @@ class TestChecks:
         assert caught.value.inputs.tolist() == [[7.0], [8.0]]
         assert str(caught.value).endswith("  row 7: [7.0]\n  row 8: [8.0]")
 
-    def test_rows_are_told_for_every_copy(self):
+    def test_rows_are_told_for_every_copy_and_of_an_inner_physics(self):
         physics = FunctionPhysics(lambda X: X.log(), inputs=[0])
         X = torch.tensor([[1.0, 5.0], [0.0, 5.0], [0.0, 6.0]])
         physics(X[:1])
@@ -240,6 +236,12 @@ class TestChecks:
             physics(X.expand(2, 3, 2))
         assert caught.value.rows == (1, 2, 4, 5)
         assert caught.value.inputs.tolist() == [[0.0]] * 4
+        inner = FunctionPhysics(lambda X: X.log(), name="inner")
+        outer = FunctionPhysics(lambda X: inner(X.flip(0)), name="outer")
+        with pytest.raises(PhysicsError, match="'inner'") as caught:
+            outer(torch.tensor([[0.0], [1.0]]))
+        assert caught.value.rows == (1,)
+        assert caught.value.inputs.tolist() == [[0.0]]
 
     @pytest.mark.parametrize("grad", [False, True])
     def test_exception_is_chained(self, grad, points):
@@ -262,22 +264,12 @@ class TestChecks:
             FunctionPhysics(broken)(points(3, 2))
         assert caught.value is raised
 
-    def test_error_of_an_inner_physics_keeps_its_rows(self):
-        inner = FunctionPhysics(lambda X: X.log(), name="inner")
-        outer = FunctionPhysics(lambda X: inner(X.flip(0)), name="outer")
-        with pytest.raises(PhysicsError, match="'inner'") as caught:
-            outer(torch.tensor([[0.0], [1.0]]))
-        assert caught.value.rows == (1,)
-        assert caught.value.inputs.tolist() == [[0.0]]
-
 
 class TestCopies:
-    def test_copies_without_state(self, points):
+    def test_copies_without_and_with_state(self, points):
         physics, X = FunctionPhysics(square), points(3, 2)
         assert copy.deepcopy({"model": [physics]})["model"][0] is physics
         assert torch.equal(copy.copy(physics)(X), physics(X))
-
-    def test_deep_copy_with_state_is_apart(self, points):
         physics = FunctionPhysics(Scale(), name="spring")
         X = points(3, 1)
         with torch.no_grad():
@@ -287,12 +279,13 @@ class TestCopies:
             assert torch.equal(duplicate(X), 7.0 * X)
             assert torch.equal(physics(X), expected)
         assert (duplicate.name, duplicate.num_outputs) == ("spring", 1)
-
-    def test_deep_copy_of_a_cycle(self):
         physics = FunctionPhysics(Scale())
         physics.owners = [physics]
         duplicate = copy.deepcopy(physics)
         assert duplicate.owners[0] is duplicate
+        physics = FunctionPhysics(Scale())
+        physics(points(3, 1))
+        assert set(physics.state_dict()) == {"function.gain", "function.offset"}
 
     def test_pickle_brings_the_memo(self, points):
         physics = BlackBoxPhysics(Scale())
@@ -304,11 +297,6 @@ class TestCopies:
             assert loaded.function.calls == 1
             loaded.function.gain.fill_(5.0)
             assert torch.equal(loaded(X), 5.0 * X)
-
-    def test_state_dict_holds_parameters_and_buffers_only(self, points):
-        physics = FunctionPhysics(Scale())
-        physics(points(3, 1))
-        assert set(physics.state_dict()) == {"function.gain", "function.offset"}
 
 
 class TestThreads:

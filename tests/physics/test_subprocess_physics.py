@@ -39,9 +39,6 @@ def test_placeholders_are_inputs_and_unknown_parameters(law):
     rows = torch.cat([X, 0 * X + 5.04], dim=-1)
     torch.testing.assert_close(by_number(rows), expected)
     assert by_name.name == "python" or by_name.name.startswith("python")
-
-
-def test_all_digits_arrive(law):
     X = torch.rand(4, 1, dtype=torch.float64)
     assert torch.equal(SubprocessPhysics([*law, "{0}", "1"])(X)[:, 1:], X)
 
@@ -66,7 +63,7 @@ def test_its_parameters_are_learnt(law):
     torch.testing.assert_close(physics.or_nan(t, parameters), exact(t, parameters))
 
 
-def test_failures_say_what_the_program_wrote(law):
+def test_failures_and_bad_input(law):
     physics = SubprocessPhysics([*law, "{0}", "1"])
     with pytest.raises(PhysicsError, match="no solution at this t") as caught:
         physics(torch.tensor([[1.0], [3.0]]).double())
@@ -76,6 +73,14 @@ def test_failures_say_what_the_program_wrote(law):
         SubprocessPhysics(["no_such_program", "{0}"])(line(1))
     with pytest.raises(PhysicsError, match="printed 'done', expected numbers alone; give parse"):
         SubprocessPhysics([sys.executable, "-c", "print('done')"])(line(1))
+    refused(TypeError, r"shlex\.split", SubprocessPhysics, "prog {T}")
+    refused(ValueError, "no name of an input", SubprocessPhysics, ["prog", "{T}"])
+    refused(ValueError, "is no template", SubprocessPhysics, ["prog", "{"])
+    with pytest.raises(ValueError, match="no placeholder of the unknown parameter k"):
+        SubprocessPhysics(["prog"], unknowns={"k": Unknown(4.0, sd=1.0)})
+    refused(ValueError, "positive number of seconds", SubprocessPhysics, ["prog"], timeout=0)
+    with pytest.raises(PhysicsError, match="names has 1 entries"):
+        SubprocessPhysics(["prog", "{T}"], names=["T"])(torch.zeros(1, 2).double())
 
 
 @pytest.mark.slow
@@ -119,14 +124,3 @@ def test_processes_share_a_cache(law, tmp_path):
         values = physics(X.repeat(5, 1))
     torch.testing.assert_close(values[:, 1:], X.repeat(5, 1))
     assert len([*(tmp_path / "cache").iterdir()]) == 4
-
-
-def test_bad_input():
-    refused(TypeError, r"shlex\.split", SubprocessPhysics, "prog {T}")
-    refused(ValueError, "no name of an input", SubprocessPhysics, ["prog", "{T}"])
-    refused(ValueError, "is no template", SubprocessPhysics, ["prog", "{"])
-    with pytest.raises(ValueError, match="no placeholder of the unknown parameter k"):
-        SubprocessPhysics(["prog"], unknowns={"k": Unknown(4.0, sd=1.0)})
-    refused(ValueError, "positive number of seconds", SubprocessPhysics, ["prog"], timeout=0)
-    with pytest.raises(PhysicsError, match="names has 1 entries"):
-        SubprocessPhysics(["prog", "{T}"], names=["T"])(torch.zeros(1, 2).double())

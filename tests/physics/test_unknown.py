@@ -182,9 +182,16 @@ def test_values_are_a_mapping_with_attributes():
 
 
 class TestCalls:
-    def test_without_parameters_at_the_guesses(self, make, points):
+    def test_values_columns_and_precision(self, make, points):
         X = points(3, 2)
         torch.testing.assert_close(make()(X), wave_at(X, numbers(1.0, 2.0)))
+        X, values = points(4, 3), points(2, 2, seed=1)
+        found = make(inputs=[2, 0])(X, values)
+        torch.testing.assert_close(found, wave_at(X[:, [2, 0]], values))
+        X, values = points(4, 2).float(), points(2, 2, seed=1)
+        found = make()(X, values)
+        assert found.dtype == torch.float32
+        torch.testing.assert_close(found, wave_at(X, values.float()))
 
     @pytest.mark.parametrize("lead", [(), (3,), (1,)], ids=str)
     @pytest.mark.parametrize("batch", [(), (3,), (3, 1), (4, 3)], ids=str)
@@ -210,17 +217,6 @@ class TestCalls:
         found = physics(X.expand(4, 3, 5, 2), values)
         torch.testing.assert_close(found, wave_at(X, values).expand(4, 3, 5, 2))
         assert asked == [15]
-
-    def test_inputs_of_some_columns(self, make, points):
-        X, values = points(4, 3), points(2, 2, seed=1)
-        found = make(inputs=[2, 0])(X, values)
-        torch.testing.assert_close(found, wave_at(X[:, [2, 0]], values))
-
-    def test_single_precision(self, make, points):
-        X, values = points(4, 2).float(), points(2, 2, seed=1)
-        found = make()(X, values)
-        assert found.dtype == torch.float32
-        torch.testing.assert_close(found, wave_at(X, values.float()))
 
     def test_of_another_shape(self, points):
         says = r"has 2 unknown parameter\(s\): a, b; expected parameters of shape ... x 2, found"
