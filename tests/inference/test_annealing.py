@@ -171,7 +171,7 @@ class TestEvidence:
 
 
 class TestZeroDensity:
-    def test_no_particle_is_there(self):
+    def test_no_particle_is_there_and_everywhere_is_an_error(self):
         def half_line(x):
             return standard(x).where(x[..., 0] > 0, math.inf)
 
@@ -184,6 +184,12 @@ class TestZeroDensity:
             # Without moves a fourth of them counts, at least.
             assert abs(error) < 4 * sd / math.sqrt(PARTICLES / (1 if num_gradients else 4))
 
+        def of_the_second(x):
+            return standard(x).where(torch.arange(x.shape[1]) == 0, math.inf)
+
+        with pytest.raises(FloatingPointError, match="zero at all draws"):
+            draw(of_the_second, around(0.0, problems=2))
+
     def test_but_for_a_slab_that_few_draws_meet(self):
         def slab(x):
             return standard(x).where(x[..., 0].abs() < 0.05, math.inf)
@@ -195,13 +201,6 @@ class TestZeroDensity:
         assert sd == pytest.approx(0.05 / math.sqrt(3), rel=0.05)
         expected = math.log(2 * math.pi * math.erf(0.05 / math.sqrt(2)))
         assert is_one_on_average((found.log_evidence - expected).exp())
-
-    def test_everywhere(self):
-        def of_the_second(x):
-            return standard(x).where(torch.arange(x.shape[1]) == 0, math.inf)
-
-        with pytest.raises(FloatingPointError, match="zero at all draws"):
-            draw(of_the_second, around(0.0, problems=2))
 
 
 class TestFewGradients:
@@ -246,7 +245,7 @@ class TestMixture:
         root = torch.randn(3, 2, 4, 4, generator=generator(1), dtype=torch.float64).tril()
         return Mixture(centers, weights, root)
 
-    def test_density_and_gradient(self, mixture):
+    def test_density_gradient_and_moments(self, mixture):
         sign = mixture.root.diagonal(dim1=-2, dim2=-1).sign()
         root = mixture.root * sign.unsqueeze(-2)
         parts = dist.MultivariateStudentT(root.new_tensor(5.0), mixture.centers, root)
@@ -255,8 +254,6 @@ class TestMixture:
         value, gradient = mixture.value_and_gradient(x.detach())
         torch.testing.assert_close(value, expected.detach())
         torch.testing.assert_close(gradient, torch.autograd.grad(expected.sum(), x)[0])
-
-    def test_moments_of_its_sample(self, mixture):
         number = 20_000
         x = mixture.sample(number, generator())
         assert x.shape == (number, 2, 4)
@@ -330,8 +327,6 @@ class TestHalves:
         assert same.any(1).all()
         assert not same[0::2, 1::2].any()
         assert not same[1::2, 0::2].any()
-
-    def test_they_tell_nothing_of_each_other(self):
         found = draw(lambda x: standard(x - 1), around(0.0, 0.7, problems=100))
         means = torch.stack([found.positions[i::2].mean(0).flatten() for i in range(2)])
         assert means.corrcoef()[0, 1].abs() < 4 / math.sqrt(200)
@@ -367,7 +362,7 @@ class TestProposals:
         normal = Normal(torch.randn(2, 3, **options), 0.5 + torch.rand(2, 3, **options))
         return normal, around(1.0, 0.7, p=3, problems=2)
 
-    def test_density_and_gradient(self, parts):
+    def test_density_gradient_and_draws(self, parts):
         x = torch.randn(7, 2, 3, generator=generator(1), dtype=torch.float64).requires_grad_()
         normal = dist.Normal(parts[0].mean, parts[0].sd).log_prob(x).sum(-1)
         torch.testing.assert_close(parts[0].value_and_gradient(x.detach())[0], -normal.detach())
@@ -376,8 +371,6 @@ class TestProposals:
         value, gradient = Both(*parts).value_and_gradient(x.detach())
         torch.testing.assert_close(value, -expected.detach())
         torch.testing.assert_close(gradient, -torch.autograd.grad(expected.sum(), x)[0])
-
-    def test_half_of_the_draws_are_of_each(self, parts):
         far = Normal(parts[0].mean + 100, parts[0].sd)
         x = Both(far, parts[1]).sample(200, generator())
         assert x.shape == (200, 2, 3)

@@ -99,7 +99,7 @@ class TestResult:
         assert (log_likelihood(model) >= before).all()
         assert (lengthscales[0] == 30.0).all()
 
-    def test_model_list(self, XY):
+    def test_model_lists_and_botorchs_own_model(self, XY):
         X, Y = XY
         models = [CKA(X, Y, physics=ripple), BiasGP(X[:6], Y[:6], physics=ripple)]
         before = [log_likelihood(model) for model in models]
@@ -111,9 +111,6 @@ class TestResult:
         again = fit(ModelListGP(*models), "map", num_screened=0, num_starts=1)
         for first, second in zip(results, again, strict=True):
             assert (second.log_likelihood >= first.log_likelihood - 1e-6).all()
-
-    def test_botorchs_own_model(self, XY):
-        X, Y = XY
         model = SingleTaskGP(X, Y)
         before = log_likelihood(model)
         assert (fit(model, "map", **QUICK).log_likelihood > before).all()
@@ -130,10 +127,7 @@ def test_no_convergence_is_said(model):
 class TestOutputs:
     @pytest.mark.parametrize(
         ("kind", "num_screened"),
-        [
-            *[(kind, 0) for kind in ("CKA", "PhysicsMeanGP", "RRA")],
-            pytest.param("CKA", None, marks=pytest.mark.slow),
-        ],
+        [("CKA", 0), ("RRA", 0), pytest.param("CKA", None, marks=pytest.mark.slow)],
     )
     def test_outputs_are_fitted_as_if_alone(self, XY, kind, num_screened):
         X, Y = XY
@@ -162,13 +156,7 @@ class TestOutputs:
 class TestManyPoints:
     """The search is made on some rows, and its best optima are refined on all."""
 
-    @pytest.fixture(
-        params=[
-            pytest.param("one input", marks=pytest.mark.slow),
-            "two outputs",
-            "little noise",
-        ]
-    )
+    @pytest.fixture(params=["one input", "two outputs", "little noise"])
     def problem(self, request, uniform):
         d = 1 if request.param == "one input" else 2
         X = uniform(200, d, seed=3)

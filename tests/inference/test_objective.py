@@ -58,6 +58,11 @@ def learnt_basis(X, Y):
     return model
 
 
+def cka(**options):
+    return lambda X, Y: CKA(X, Y, **{"physics": ripple, **options})
+
+
+MEANS = {"rho_mean": "learn", "delta_mean": "learn"}
 BUILD = {
     "prior of what is fixed": prior_of_what_is_fixed,
     "fixed noise": fixed_noise,
@@ -65,18 +70,14 @@ BUILD = {
     "ZeroMeanGP": ZeroMeanGP,
     "PhysicsMeanGP": lambda X, Y: PhysicsMeanGP(X, Y, physics=ripple),
     "ScaleGP": lambda X, Y: ScaleGP(X, Y, physics=ripple),
-    "CKA": lambda X, Y: CKA(X, Y, physics=ripple),
-    "known noise": lambda X, Y: CKA(X, Y, torch.full_like(Y, 0.01), physics=ripple),
-    "learnt means": lambda X, Y: CKA(X, Y, physics=ripple, rho_mean="learn", delta_mean="learn"),
-    "learnt center": lambda X, Y: CKA(X, Y, physics=ripple, center="learn"),
-    "learnt center and means": lambda X, Y: CKA(
-        X, Y, physics=ripple, center="learn", rho_mean="learn", delta_mean="learn"
-    ),
-    "two physics": lambda X, Y: CKA(X, Y, physics=[ripple, lambda X: X], rho_mean=[1.0, 0.5]),
+    "CKA": cka(),
+    "known noise": cka(train_Yvar=0.01),
+    "learnt means": cka(**MEANS),
+    "learnt center": cka(center="learn"),
+    "learnt center and means": cka(center="learn", **MEANS),
+    "two physics": cka(physics=[ripple, lambda X: X], rho_mean=[1.0, 0.5]),
     "learnt physics": lambda X, Y: CKA(X, Y, physics=Gain()),
-    "learnt physics and means": lambda X, Y: CKA(
-        X, Y, physics=Gain(), rho_mean="learn", delta_mean="learn"
-    ),
+    "learnt physics and means": lambda X, Y: CKA(X, Y, physics=Gain(), **MEANS),
     "prior": lambda X, Y: with_priors(X, Y, LogNormalPrior(0.0, 1.0)),
     "other priors": lambda X, Y: with_priors(X, Y, GammaPrior(3.0, 6.0), GammaPrior(2.0, 0.5)),
     "AR1": lambda X, Y: AR1(X, Y, physics=ripple, bounds=torch.tensor([[0.0, 0], [1, 1]])),
@@ -131,7 +132,10 @@ def assert_gradient(objective, vectors, tolerance=1e-4):
         torch.testing.assert_close(gradient[..., i], difference, rtol=tolerance, atol=tolerance)
 
 
-def test_it_is_gpytorchs_likelihood(model):
+def test_it_is_gpytorchs_likelihood_and_its_gradient_that_of_finite_differences(model):
+    for kind in (LogLikelihood, Target, LogPosterior):
+        objective = kind(model)
+        assert_gradient(objective, neighbours(objective, 2))
     objective = Target(model)
     vectors = neighbours(objective)
     values = objective(vectors)
@@ -142,12 +146,6 @@ def test_it_is_gpytorchs_likelihood(model):
         if objective.parameters.num_problems == 1:
             expected = expected.sum().reshape(1)
         torch.testing.assert_close(value, expected, rtol=1e-8, atol=1e-8)
-
-
-@pytest.mark.parametrize("kind", [LogLikelihood, Target, LogPosterior])
-def test_its_gradient_is_that_of_finite_differences(model, kind):
-    objective = kind(model)
-    assert_gradient(objective, neighbours(objective, 2))
 
 
 def test_rows_are_those_of_a_model_of_them(XY):
@@ -265,7 +263,7 @@ class TestVagueTrend:
         objective = LogPosterior(model)
         assert_gradient(objective, objective.parameters.current() + 0.2, 1e-5)
 
-    def test_functions_that_a_wider_prior_allows_beside_cost_nothing(self):
+    def test_what_the_prior_of_a_trend_costs(self):
         # delta is nearly linear at this lengthscale, so that its variance is that of a line.
         X = line(9)
         model = CKA(X, ripple(X) + 3 + 2 * X, physics=ripple)
@@ -286,9 +284,6 @@ class TestVagueTrend:
         # Level and slope cost half a logarithm of the variance each.
         assert slope(Target) == pytest.approx(1.0, abs=0.05)
         assert slope(LogPosterior) == pytest.approx(0.0, abs=0.05)
-
-    def test_a_variance_that_cannot_make_the_trend_is_ruled_out(self):
-        X = line(9)
         model = ZeroMeanGP(X, 1 + X)
         model.terms[0].kernel.base_kernel.lengthscale = 10.0
         model.likelihood.noise = 1e-6
@@ -297,6 +292,16 @@ class TestVagueTrend:
             model.terms[0].kernel.outputscale = variance
             values.append(objective(objective.parameters.current()).item())
         assert values[0] > values[1] + 100
+        X = torch.rand(9, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        Y, values = X[:, :1].sin() + X[:, 1:], []
+        for unit in (1.0, 1e7):
+            units = torch.tensor([unit, 1.0])
+            objective = LogPosterior(ZeroMeanGP(X * units, Y))
+            vector = objective.parameters.current()
+            # The density of a logarithm has no units.
+            logs = vector.sum(-1)
+            values.append(objective(vector) + logs)
+        torch.testing.assert_close(values[0], values[1], rtol=1e-6, atol=1e-6)
 
     @pytest.mark.parametrize(
         "inputs", ["constant", "collinear", "few points", "all equal", "constant where observed"]
@@ -312,18 +317,6 @@ class TestVagueTrend:
             Y = torch.cat([Y, Y.masked_fill((torch.arange(12) >= 7).unsqueeze(-1), math.nan)], -1)
         objective = LogPosterior(ZeroMeanGP(X, Y))
         assert_gradient(objective, neighbours(objective, 1))
-
-    def test_units_of_the_inputs_make_no_difference(self):
-        X = torch.rand(9, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        Y, values = X[:, :1].sin() + X[:, 1:], []
-        for unit in (1.0, 1e7):
-            units = torch.tensor([unit, 1.0])
-            objective = LogPosterior(ZeroMeanGP(X * units, Y))
-            vector = objective.parameters.current()
-            # The density of a logarithm has no units.
-            logs = vector.sum(-1)
-            values.append(objective(vector) + logs)
-        torch.testing.assert_close(values[0], values[1], rtol=1e-6, atol=1e-6)
 
 
 def test_it_is_the_textbooks(XY):
@@ -388,7 +381,7 @@ def test_of_ar1(build, data, num_outputs, unit):
     assert (noise.scale == 4).all()
 
 
-def test_a_users_priors_and_fixed_parameters_are_left_alone(data):
+def test_priors_and_fixed_parameters_of_the_user(data):
     X, Y = data()
     own = GammaPrior(3.0, 6.0)
     kernel = ScaleKernel(RBFKernel(ard_num_dims=2, lengthscale_prior=own))
@@ -400,6 +393,15 @@ def test_a_users_priors_and_fixed_parameters_are_left_alone(data):
     before = priors(model)
     register_priors(model)
     assert priors(model) == before
+    model = CKA(X, Y, physics=lambda X: crude(X)[..., :1])
+    kernel = model.terms[0].kernel
+    values = []
+    for i, prior in enumerate([LogNormalPrior(0.1, 0.7), LogNormalPrior(-2.0, 0.3)]):
+        kernel.register_prior(f"prior_{i}", prior, "outputscale")
+        target = Target(model)
+        values.append(target(target.parameters.current()))
+    added = LogNormalPrior(-2.0, 0.3).log_prob(kernel.outputscale.detach())
+    torch.testing.assert_close(values[1] - values[0], -added.reshape(1, 1))
 
 
 @pytest.mark.parametrize("kind", ["CKA", "AR1", "RRA", "ScaleGP"])
@@ -435,16 +437,3 @@ def test_potential_has_the_jacobian_of_the_logarithm(data, prior):
     step = 1e-5 * torch.eye(settings.shape[-1], dtype=torch.float64).unsqueeze(-2)
     numeric = (potential(settings + step)[0] - potential(settings - step)[0]) / 2e-5
     torch.testing.assert_close(gradient[0, 0], numeric[:, 0], rtol=1e-5, atol=1e-5)
-
-
-def test_two_priors_of_one_parameter_both_count(data):
-    X, Y = data()
-    model = CKA(X, Y, physics=lambda X: crude(X)[..., :1])
-    kernel = model.terms[0].kernel
-    values = []
-    for i, prior in enumerate([LogNormalPrior(0.1, 0.7), LogNormalPrior(-2.0, 0.3)]):
-        kernel.register_prior(f"prior_{i}", prior, "outputscale")
-        target = Target(model)
-        values.append(target(target.parameters.current()))
-    added = LogNormalPrior(-2.0, 0.3).log_prob(kernel.outputscale.detach())
-    torch.testing.assert_close(values[1] - values[0], -added.reshape(1, 1))

@@ -160,7 +160,7 @@ def test_low_values_that_are_missing(uniform, close, Yvar):
     torch.testing.assert_close(two.predict(Z).mean[:, 1:], fewer.predict(Z).mean, rtol=1e-4, atol=0)
 
 
-def test_what_a_transform_learnt_stays(uniform):
+def test_what_was_learnt_stays_and_priors_are_each_outputs_own(uniform, levels):
     X, low_X, Z = uniform(7, 1), uniform(11, 1, seed=1), 3 + uniform(2, 1, seed=2)
     low_Y, Y = low_X.sin(), X.sin() + X
     model = AR1(X, Y, low_X=low_X, low_Y=low_Y, input_transform=Normalize(1))
@@ -169,9 +169,6 @@ def test_what_a_transform_learnt_stays(uniform):
     model.train()
     model.eval()
     torch.testing.assert_close(model.predict(Z).mean, before.mean)
-
-
-def test_the_prior_of_rho_is_each_outputs_own(levels):
     X, Y, low_X, low_Y = levels
     both = AR1(X, torch.cat([Y, 9 * Y], -1), low_X=low_X, low_Y=low_Y.expand(-1, 2))
     own = AR1(X, 9 * Y, low_X=low_X, low_Y=low_Y)

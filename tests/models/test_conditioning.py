@@ -106,15 +106,11 @@ def test_fantasies_share_the_base(data, build, num_outputs, uniform):
     assert fantasy.alpha.shape == (3, 4, *outputs, 10)
 
 
-# BoTorch warns about the shapes that it makes itself.
 @pytest.mark.filterwarnings("ignore:Non-strict enforcement")
-def test_no_new_points(data, build, kind, num_outputs, uniform, close):
+def test_no_new_points_and_batches_of_them(data, build, kind, num_outputs, uniform, close):
     model, Z = build(kind, *data(num_outputs=num_outputs)), uniform(5, 2)
     fantasy = model.fantasize(torch.empty(4, 0, 2, dtype=torch.float64), sampler(3))
     close(fantasy.predict(Z).mean, model.predict(Z).mean.expand(3, 4, 5, num_outputs))
-
-
-def test_a_batch_of_observations(data, build, kind, num_outputs, uniform, close):
     model = build(kind, *data(num_outputs=num_outputs)).eval()
     new_X, Z = uniform(3, 2, 2, high=2.0, seed=3), uniform(5, 2, high=2.0, seed=4)
     new_Y = 4 + uniform(3, 2, num_outputs, seed=5)

@@ -96,13 +96,28 @@ def test_parameters_of_the_physics():
     assert model.physics_parameters.mean.item() == pytest.approx(9.81, abs=1e-3)
 
 
-def test_missing_targets(data, build):
+def test_missing_targets_priors_and_what_is_fixed(data, build):
     X, Y = data(n=12, num_outputs=2)
     Y[3, 0] = torch.nan
     model = build("CKA", X, Y)
     before = own_likelihood(model)
     fit_by_botorch(model)
     assert own_likelihood(model) > before + 1
+    X, Y = data(n=12)
+    free, held = build("CKA", X, Y), build("CKA", X, Y)
+    for model in (free, held):
+        kernel = model.terms[1].kernel.base_kernel
+        if model is held:
+            kernel.register_prior("lengthscale_prior", LogNormalPrior(0.0, 1e-3), "lengthscale")
+        fit_by_botorch(model)
+    assert (kernel.lengthscale.log().abs() < 0.1).all()
+    assert (free.terms[1].kernel.base_kernel.lengthscale.log().abs() > 0.2).any()
+    model = build("CKA", X, Y)
+    rest = model.terms[0].kernel.raw_outputscale.requires_grad_(False)
+    before, other = rest.clone(), model.terms[1].kernel.raw_outputscale.clone()
+    fit_by_botorch(model)
+    assert torch.equal(rest, before)
+    assert not torch.equal(model.terms[1].kernel.raw_outputscale, other)
 
 
 SETTINGS = {
@@ -145,28 +160,6 @@ def test_each_model_of_a_list(data, build, kind, uniform):
     assert posterior.mean.shape == (5, 4, 2)
     torch.testing.assert_close(posterior.mean[..., :1], models[0].posterior(Z).mean)
     torch.testing.assert_close(posterior.variance[..., 1:], models[1].posterior(Z).variance)
-
-
-def test_priors_are_honoured(data, build):
-    X, Y = data(n=12)
-    free, held = build("CKA", X, Y), build("CKA", X, Y)
-    for model in (free, held):
-        kernel = model.terms[1].kernel.base_kernel
-        if model is held:
-            kernel.register_prior("lengthscale_prior", LogNormalPrior(0.0, 1e-3), "lengthscale")
-        fit_by_botorch(model)
-    assert (kernel.lengthscale.log().abs() < 0.1).all()
-    assert (free.terms[1].kernel.base_kernel.lengthscale.log().abs() > 0.2).any()
-
-
-def test_what_needs_no_gradient_stays(data, build):
-    X, Y = data(n=12)
-    model = build("CKA", X, Y)
-    rest = model.terms[0].kernel.raw_outputscale.requires_grad_(False)
-    before, other = rest.clone(), model.terms[1].kernel.raw_outputscale.clone()
-    fit_by_botorch(model)
-    assert torch.equal(rest, before)
-    assert not torch.equal(model.terms[1].kernel.raw_outputscale, other)
 
 
 def test_a_model_that_holds_samples_is_refused(data, build):

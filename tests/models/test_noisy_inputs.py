@@ -112,19 +112,16 @@ def test_it_works_through_the_house(data, tmp_path):
     assert report(model, tmp_path / "page.html").stat().st_size > 10_000
 
 
-def test_samples_are_saved_with_it(data, tmp_path):
+def test_no_noise_changes_nothing_and_samples_are_saved(data, tmp_path):
+    plain, model = CKA(*data, physics=f_p), CKA(*data, physics=f_p, train_Xvar=0.0)
+    for each in (plain, model):
+        QUICK(each)
+    assert torch.allclose(plain.predict(TEST).mean, model.predict(TEST).mean, atol=1e-2)
     model = CKA(*data, physics=f_p, train_Xvar=SD**2)
     fit(model, num_starts=2, num_screened=8, num_draws=32)
     save(model, tmp_path / "model.pt")
     again = load(tmp_path / "model.pt", physics=f_p)
     assert torch.allclose(again.predict(TEST).mean, model.predict(TEST).mean)
-
-
-def test_no_noise_changes_nothing(data):
-    plain, model = CKA(*data, physics=f_p), CKA(*data, physics=f_p, train_Xvar=0.0)
-    for each in (plain, model):
-        QUICK(each)
-    assert torch.allclose(plain.predict(TEST).mean, model.predict(TEST).mean, atol=1e-2)
 
 
 @pytest.mark.slow

@@ -247,15 +247,12 @@ class TestWaysOfHeldModels:
         torch.testing.assert_close(model.predict(Z).mean, first)
         assert model.input_transform.coordinates.shape == (2,)
 
-    def test_fantasies(self, held):
+    def test_fantasies_and_functions(self, held):
         model, Z, _ = held
         for X in (Z[:2], Z.reshape(2, 2, 2)):
             fantasies = model.fantasize(X, SobolQMCNormalSampler(Size([4])))
             mean = fantasies.posterior(Z).mean
             assert mean.shape == (4, *X.shape[:-2], 3, 4, model.num_outputs)
-
-    def test_functions(self, held):
-        model, Z, _ = held
         functions = model.sample_functions(5, seed=0)
         values, away = functions(Z), Z.expand(5, 4, 2) + torch.arange(5.0)[:, None, None]
         torch.testing.assert_close(functions.each(Z.expand(5, 4, 2)), values)

@@ -143,7 +143,7 @@ def test_scaled_inputs_and_targets_are_asked_about(X, Y, correction):
     assert "f_p is about 283 above the targets. The targets were standardised" in text
 
 
-def test_unknown_and_trainable_parameters_are_guesses(X, Y):
+def test_guesses_and_warnings_that_were_given(X, Y, tmp_path):
     class Net(torch.nn.Module):
         def __init__(self):
             super().__init__()
@@ -157,9 +157,6 @@ def test_unknown_and_trainable_parameters_are_guesses(X, Y):
     unknowns = {"size": Unknown(1000.0, factor=10.0)}
     guess = FunctionPhysics(lambda X, p: p.size * law(X)[:, 0], unknowns=unknowns)
     assert said(CalibratedPhysics, X, Y, physics=guess) == []
-
-
-def test_the_warning_is_of_the_users_line_and_given_once(X, Y, tmp_path):
     with pytest.warns(PhysicsWarning) as caught:
         model = CKA(X, Y, physics=OFF["too large"][0])
     assert [each.filename for each in caught] == [__file__]

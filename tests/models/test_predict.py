@@ -40,13 +40,16 @@ def test_as_the_posterior(data, build, kind, num_outputs, shuffle, uniform, clos
     same(model, uniform(3, 7, 2, high=2.0, seed=1), close, observation_noise=noise)
 
 
-def test_a_batch_of_models(data, build, kind, num_outputs, uniform, close):
+def test_a_batch_of_models_and_no_points(data, build, kind, num_outputs, uniform, close):
     model = build(kind, *data((3,), num_outputs=num_outputs)).eval()
     for shape in [(7, 2), (3, 7, 2), (4, 3, 7, 2)]:
         Z = uniform(*shape, high=2.0, seed=1)
         prediction, posterior = model.predict(Z), model.posterior(Z)
         close(prediction.mean, posterior.mean)
         close(prediction.variance, posterior.variance)
+    model = build(kind, *data(num_outputs=num_outputs))
+    mean, variance = model.predict(torch.empty(0, 2, dtype=torch.float64))
+    assert mean.shape == variance.shape == (0, num_outputs)
 
 
 def test_gradients_to_the_hyperparameters(data, build, kind, num_outputs, uniform):
@@ -68,12 +71,6 @@ def test_gradients_to_the_hyperparameters(data, build, kind, num_outputs, unifor
     # What is remembered has no graph that one backward pass would free.
     for _ in range(2):
         model.predict(Z.requires_grad_()).mean.sum().backward()
-
-
-def test_no_points(data, build, kind, num_outputs):
-    model = build(kind, *data(num_outputs=num_outputs))
-    mean, variance = model.predict(torch.empty(0, 2, dtype=torch.float64))
-    assert mean.shape == variance.shape == (0, num_outputs)
 
 
 @pytest.mark.slow

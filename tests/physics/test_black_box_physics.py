@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gpadjust.physics import BlackBoxPhysics, PhysicsError, Unknown
+from gpadjust.physics.gradient import central_difference
 from tests.systems import refused
 
 
@@ -130,13 +131,11 @@ class TestGradients:
         h, k = np.broadcast_to(fd_step, 2)
         assert set(numpy_counter.rows[1:]) == {(h, 0), (-h, 0), (0, k), (0, -k)}
 
-    def test_second_derivative_is_refused(self, points):
+    def test_second_derivatives_and_none(self, points):
         X = points(3, 2).requires_grad_()
         Y = BlackBoxPhysics(waves)(X).sum() + (X**3).sum()
         (first,) = torch.autograd.grad(Y, X, create_graph=True)
         refused(NotImplementedError, "first derivatives only", torch.autograd.grad, first.sum(), X)
-
-    def test_none_warns_once_and_is_a_constant(self, points):
         physics = BlackBoxPhysics(waves, gradient=None, name="mill")
         X = points(3, 2).requires_grad_()
         with pytest.warns(UserWarning, match=r"No gradient.*'mill'.*'with_grad': False"):
@@ -236,7 +235,7 @@ class TestFailures:
 
 
 class TestParallel:
-    def test_threads_share_the_rows(self, points):
+    def test_threads_and_processes_share_the_rows(self, points):
         barrier = threading.Barrier(2, timeout=10)
 
         def simulate(x):
@@ -248,7 +247,6 @@ class TestParallel:
         with joblib.parallel_config(backend="threading", n_jobs=2):
             assert torch.equal(physics(X), X[:, :1])
 
-    def test_processes_share_the_rows(self, points):
         class UnpicklableError(Exception):
             def __init__(self, code, reason):
                 super().__init__(f"{reason} ({code})")
@@ -324,3 +322,28 @@ class TestUnknownParameters:
             Y.sum().backward()
         assert caught.value.rows == (3,)
         assert caught.value.inputs.tolist() == [[1.0, 1.0, 2.0]]
+
+
+class TestCentralDifference:
+    def test_it_agrees_with_autograd_and_is_exact_for_quadratics(self, points):
+        X = points(6, 2)
+        jacobian = torch.autograd.functional.jacobian
+        exact = torch.stack([jacobian(torch_waves, x[None])[0, :, 0] for x in X])
+        assert torch.allclose(central_difference(torch_waves, X), exact, rtol=1e-8, atol=1e-8)
+        J = central_difference(torch.square, X, torch.tensor([0.5, 0.25]).double())
+        assert torch.allclose(J, torch.diag_embed(2 * X), rtol=1e-12, atol=1e-12)
+
+    def test_large_inputs_get_a_step_that_floats_can_tell_apart_counted_as_rounded(self):
+        X = torch.tensor([[1e9]], dtype=torch.float64)
+        assert torch.allclose(central_difference(lambda X: 3 * X, X), torch.tensor(3.0).double())
+        slope = central_difference(lambda X: X, X, torch.tensor(1.7e-7).double())
+        assert slope.item() == 1.0
+
+    def test_each_point_is_the_row_that_the_documentation_says(self, points):
+        X, asked = points(4, 3), []
+        central_difference(lambda X: asked.append(X) or X, X, torch.tensor(0.1).double())
+        (rows,) = asked
+        i = torch.arange(len(rows))
+        moved = (rows - X[i // 3 % 4]).abs()
+        assert len(rows) == 24
+        assert torch.allclose(moved, 0.1 * torch.eye(3).double()[i % 3])

@@ -20,13 +20,10 @@ from gpadjust.physics.array_physics import array_physics
 from tests.systems import refused
 
 
-def test_is_named_after_its_function():
+def test_names_and_parameters_of_modules(points):
     assert FunctionPhysics(torch.sin).name == "sin"
     assert FunctionPhysics(torch.nn.Tanh()).name == "Tanh"
     assert FunctionPhysics(torch.sin, name="wave").name == "wave"
-
-
-def test_parameters_of_a_module_are_learnt(points):
     physics = FunctionPhysics(torch.nn.Linear(3, 2, dtype=torch.float64))
     X = points(20, 3)
     target = X @ points(3, 2, seed=1) + 1.0
@@ -149,15 +146,12 @@ def test_functions_are_told_apart():
     assert array_physics(physics, X) is physics
 
 
-def test_several():
+def test_several_and_one_row():
     joined = array_physics({"coarse": np.sin, "fine": torch.cos}, X)
     assert isinstance(joined, JoinedPhysics)
     assert joined.names == ("coarse", "fine")
     torch.testing.assert_close(joined(TENSOR), torch.cat([TENSOR.sin(), TENSOR.cos()], dim=1))
     assert array_physics([np.sin, torch.cos], X).names == ("sin", "cos")
-
-
-def test_one_row_is_asked_and_left_as_it_is():
     asked = []
 
     def writes(X):

@@ -47,11 +47,19 @@ def test_names_are_unique_and_what_is_refused(points):
 
 
 class TestValues:
-    def test_columns_of_the_parts_in_order(self, points):
+    def test_columns_and_gradients(self, points):
         X = points(2, 4, 3)
         joined = JoinedPhysics([torch.sin, FunctionPhysics(lambda X: X, inputs=[2, 1, 0])])
         assert torch.equal(joined(X), torch.cat([X.sin(), X.flip(-1)], -1))
         assert joined.num_outputs == 6
+        joined = JoinedPhysics(
+            [
+                torch.sin,
+                BlackBoxPhysics(lambda X: np.cos(X[:, ::-1])),
+                ODEPhysics(lambda s, a: -s, 0.5, 2),
+            ]
+        )
+        assert torch.autograd.gradcheck(joined, points(2, 3, 2).requires_grad_())
 
     def test_each_part_has_its_own_memo(self, counter, numpy_counter, points):
         joined = JoinedPhysics(
@@ -65,24 +73,12 @@ class TestValues:
         joined.forget()
         joined(X)
         assert len(numpy_counter.rows) == 10
-
-    def test_a_parameter_of_one_part_leaves_the_memo_of_another(self, numpy_counter, points):
         linear = torch.nn.Linear(2, 2, dtype=torch.float64)
         joined = JoinedPhysics([linear, BlackBoxPhysics(numpy_counter)])
         for _ in range(2):
             joined(points(3, 2)).sum().backward()
         assert len(numpy_counter.rows) == 3
         assert linear.weight.grad is not None
-
-    def test_gradients_through_every_kind(self, points):
-        joined = JoinedPhysics(
-            [
-                torch.sin,
-                BlackBoxPhysics(lambda X: np.cos(X[:, ::-1])),
-                ODEPhysics(lambda s, a: -s, 0.5, 2),
-            ]
-        )
-        assert torch.autograd.gradcheck(joined, points(2, 3, 2).requires_grad_())
 
 
 class TestErrors:
@@ -159,13 +155,11 @@ class TestUnknownParameters:
         for found in (joined(X, values), joined.or_nan(X, values), nested(X, values)[..., :3]):
             torch.testing.assert_close(found, expected)
 
-    def test_that_contradict_each_other(self):
+    def test_that_contradict_each_other_or_at_which_a_part_fails(self):
         parts = self.parts()
         parts[2] = FunctionPhysics(push, unknowns={"mass": Unknown(1.0, sd=0.1)})
         message = "parameter 'mass', which is then one.*factor=1.5.*sd=0.1.*or different names"
         refused(ValueError, message, JoinedPhysics, parts)
-
-    def test_at_which_a_part_fails(self):
         X = torch.tensor([[1.0, 3.0], [2.0, 4.0]], dtype=torch.float64)
         values = torch.tensor([[1.0, 0.5], [1.0, 1.5], [1.0, 9.0]], dtype=torch.float64)
         joined = JoinedPhysics(self.parts())

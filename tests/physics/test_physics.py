@@ -45,15 +45,13 @@ class TestShapes:
         assert torch.equal(physics(X), expected)
         assert torch.equal(physics(X), expected)
 
-    def test_one_output_keeps_its_dimension(self, points):
+    def test_one_output_and_no_rows(self, points, counter):
         X = points(4, 3, 2)
         flat = FunctionPhysics(lambda X: X.sum(-1))
         column = FunctionPhysics(lambda X: X.sum(-1, keepdim=True))
         assert flat(X).shape == column(X).shape == (4, 3, 1)
         assert torch.equal(flat(X), column(X))
         assert flat.num_outputs == 1
-
-    def test_no_rows_after_a_first_call(self, counter, points):
         physics = FunctionPhysics(counter)
         refused(PhysicsError, r"'RowCounter'.*no rows", physics, points(0, 3))
         physics(points(2, 3))
@@ -107,12 +105,25 @@ class TestMemo:
             assert torch.equal(physics(X), X.sum(-1, keepdim=True))
         assert len(asked) == len(set(asked)) == len({tuple(row) for rows in calls for row in rows})
 
-    def test_result_can_be_changed_in_place(self, points):
+    def test_results_changed_in_place_bad_rows_and_new_outputs(self, points):
         X = points(3, 2)
         physics = BlackBoxPhysics(square)
         for _ in range(2):
             physics(X).zero_()
         assert torch.equal(physics(X), X**2)
+        asked = []
+
+        def root(X):
+            asked.extend(X.flatten().tolist())
+            return np.where(X > 0, np.abs(X) ** 0.5, np.nan)
+
+        physics = BlackBoxPhysics(root)
+        refused(PhysicsError, "NaN", physics, torch.tensor([[4.0], [-1.0], [9.0]]))
+        assert physics(torch.tensor([[4.0], [9.0]])).flatten().tolist() == [2.0, 3.0]
+        assert asked == [4.0, -1.0, 9.0]
+        physics = BlackBoxPhysics(lambda X: np.repeat(X, len(X), 1))
+        physics(points(2, 1))
+        refused(PhysicsError, r"1 output\(s\), expected 2", physics, points(3, 1))
 
     def test_dropped_when_state_or_dtype_changes(self, points):
         three = torch.tensor(3.0).double()
@@ -137,23 +148,6 @@ class TestMemo:
         physics(X)
         assert torch.equal(physics(X.double()), X.double() / 3)
 
-    def test_good_rows_survive_bad_ones(self):
-        asked = []
-
-        def root(X):
-            asked.extend(X.flatten().tolist())
-            return np.where(X > 0, np.abs(X) ** 0.5, np.nan)
-
-        physics = BlackBoxPhysics(root)
-        refused(PhysicsError, "NaN", physics, torch.tensor([[4.0], [-1.0], [9.0]]))
-        assert physics(torch.tensor([[4.0], [9.0]])).flatten().tolist() == [2.0, 3.0]
-        assert asked == [4.0, -1.0, 9.0]
-
-    def test_a_new_number_of_outputs_is_seen_behind_known_rows(self, points):
-        physics = BlackBoxPhysics(lambda X: np.repeat(X, len(X), 1))
-        physics(points(2, 1))
-        refused(PhysicsError, r"1 output\(s\), expected 2", physics, points(3, 1))
-
 
 class TestGradients:
     def test_gradient_in_X(self, points):
@@ -177,6 +171,11 @@ class TestGradients:
             physics(X)
         scale.requires_grad_(False)
         assert not physics(X.detach()).requires_grad
+        gain = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
+        physics = FunctionPhysics(lambda X: gain * X)
+        with pytest.warns(UserWarning, match=r"parameters.*requires_grad_"):
+            Y = physics(points(3, 1))
+        assert not Y.requires_grad
 
     def test_expanded_X(self, counter, points):
         X = points(2, 5, 3).requires_grad_()
@@ -191,13 +190,6 @@ class TestGradients:
         weights = torch.tensor([[1.0], [2.0], [3.0]], dtype=torch.float64)
         (gradient,) = torch.autograd.grad((weights * FunctionPhysics(square)(X)).sum(), X)
         assert torch.equal(gradient, 2 * weights * X)
-
-    def test_hidden_parameter_is_taken_as_a_constant(self, points):
-        gain = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
-        physics = FunctionPhysics(lambda X: gain * X)
-        with pytest.warns(UserWarning, match=r"parameters.*requires_grad_"):
-            Y = physics(points(3, 1))
-        assert not Y.requires_grad
 
 
 class TestChecks:

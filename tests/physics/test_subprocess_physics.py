@@ -43,7 +43,7 @@ def test_placeholders_are_inputs_and_unknown_parameters(law):
     assert torch.equal(SubprocessPhysics([*law, "{0}", "1"])(X)[:, 1:], X)
 
 
-def test_it_reads_standard_input_and_its_output_is_parsed():
+def test_standard_input_and_parameters(law):
     program = "import sys; print('result:', 2 * float(sys.stdin.read().split('=')[1]))"
     physics = SubprocessPhysics(
         [sys.executable, "-c", program],
@@ -52,9 +52,6 @@ def test_it_reads_standard_input_and_its_output_is_parsed():
         parse=lambda text: float(text.removeprefix("result:")),
     )
     assert physics(torch.tensor([[1.5]]).double()).item() == 3.0
-
-
-def test_its_parameters_are_learnt(law):
     one = {"names": ["t"], "parse": lambda text: float(text.split()[0])}
     physics = SubprocessPhysics([*law, "{t}", "{k}"], unknowns={"k": Unknown(4.0, sd=1.0)}, **one)
     t = 0.5 + line(3)

@@ -291,7 +291,7 @@ class TestFailures:
         assert physics.or_nan(X, numbers(5.0)).isnan().all()
         assert not physics.or_nan(X, numbers(0.5).expand(2, 1)).isnan().any()
 
-    def test_or_nan_of_nothing_else(self):
+    def test_or_nan_of_nothing_else_runs_a_simulation_once(self):
         X = numbers(1.0).unsqueeze(-1)
         assert ROOTS["NaN"]().or_nan(X, numbers(2.0)).isnan().all()  # its shape is known
         for name in ("error", "rows"):
@@ -300,8 +300,6 @@ class TestFailures:
         no_tensor = FunctionPhysics(lambda X, p: [1.0], unknowns=LOW)
         args = torch.ones(2, 1), torch.zeros(1)
         refused(PhysicsError, "list, expected a real tensor", no_tensor.or_nan, *args)
-
-    def test_or_nan_runs_a_simulation_once(self):
         asked = []
 
         def simulate(x, p):
