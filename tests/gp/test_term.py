@@ -98,17 +98,14 @@ def test_known_means_and_terms_without_kernels(terms, uniform):
     torch.testing.assert_close(kernel(X, uniform(3, 2)).to_dense(), zero[:, :3])
 
 
-def test_what_is_refused(terms, uniform):
+def test_gradients_and_what_is_refused(terms, uniform):
+    X = uniform(4, 5).requires_grad_()
+    SumOfTerms(terms)(X).to_dense().square().sum().backward()
+    assert X.grad.abs().amax(0).min() > 0
+    assert terms[0].kernel.raw_lengthscale.grad.abs().min() > 0
     one, kernel = constant(1.0), RBFKernel()
     with pytest.raises(ValueError, match="different names"):
         SumOfTerms([Term("f", kernel, 2, None, one), Term("f", RBFKernel(), 2, None, one)])
     with pytest.raises(ValueError, match="share parameters"):
         SumOfTerms([Term("f", kernel, 2, None, one), Term("g", kernel, 2, None, one)])
     refused(ValueError, r"3 input columns and 2 .*f_p", SumOfTerms(terms)(uniform(6, 3)).to_dense)
-
-
-def test_gradients(terms, uniform):
-    X = uniform(4, 5).requires_grad_()
-    SumOfTerms(terms)(X).to_dense().square().sum().backward()
-    assert X.grad.abs().amax(0).min() > 0
-    assert terms[0].kernel.raw_lengthscale.grad.abs().min() > 0

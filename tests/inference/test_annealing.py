@@ -223,8 +223,6 @@ class TestFewGradients:
         for values, expected in ((scaled, mean), (scaled.square(), square)):
             error = values.mean(0) - expected
             assert error.mean().abs() < 4 * error.std() / math.sqrt(20)
-
-    def test_of_a_density_that_is_wide_they_are_of_it(self):
         found = draw(lambda x: standard(x / 1.5), around(0.0, 2.0), num_gradients=0)
         assert found.power == 1
 

@@ -81,11 +81,15 @@ def test_recursive_co_kriging_on_nested_designs(rbf, close, uniform, kernel_of):
     close(posterior.variance.squeeze(-1).detach(), variance.diagonal(), 1e-6)
 
 
-def test_rho_is_one_number_for_each_output(levels):
+def test_rho_and_low_values(levels, uniform):
     X, Y, low_X, low_Y = levels
     assert AR1(X, Y, low_X=low_X, low_Y=low_Y).rho_constant.shape == ()
     two = AR1(X, torch.cat([Y, 2 * Y], -1), low_X=low_X, low_Y=torch.cat([low_Y, low_Y], -1))
     assert two.rho_constant.shape == (2,)
+    given = AR1(X, Y, low_X=low_X, low_Y=low_Y)
+    computed = AR1(X, Y, low_X=low_X, physics=lambda X: crude(X)[:, :1])
+    Z = uniform(5, 2)
+    torch.testing.assert_close(given.posterior(Z).mean, computed.posterior(Z).mean)
 
 
 def test_each_level_has_a_noise_of_its_own(ar1, levels):
@@ -122,14 +126,6 @@ def test_the_samples_lie_within_the_bounds_and_the_seed_makes_them(data, build):
     first, same, other = (build("AR1", X, Y, seed=s).train_inputs[0] for s in (1, 1, 2))
     assert torch.equal(first, same)
     assert not torch.equal(first, other)
-
-
-def test_low_values_are_computed_where_only_inputs_are_given(levels, uniform):
-    X, Y, low_X, low_Y = levels
-    given = AR1(X, Y, low_X=low_X, low_Y=low_Y)
-    computed = AR1(X, Y, low_X=low_X, physics=lambda X: crude(X)[:, :1])
-    Z = uniform(5, 2)
-    torch.testing.assert_close(given.posterior(Z).mean, computed.posterior(Z).mean)
 
 
 @pytest.mark.parametrize("transform", [{}, {"outcome_transform": None}])

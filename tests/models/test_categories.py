@@ -98,7 +98,7 @@ def test_closed_form_and_autograd_agree():
         torch.testing.assert_close(ours[name].flatten(), theirs[name].flatten())
 
 
-def test_a_frame_is_taken_as_it_is(model):
+def test_frames_and_new_rigs(model):
     assert model.levels == {1: ("brass", "iron", "steel"), 2: ("R0", "R1", "R2", "R3")}
     torch.testing.assert_close(model.data()["train_X"], X)
     torch.testing.assert_close(predicted(model, FRAME).mean, model.predict(X).mean)
@@ -108,9 +108,6 @@ def test_a_frame_is_taken_as_it_is(model):
     torch.testing.assert_close(found - found.mean(), OFFSETS - OFFSETS.mean(), rtol=0, atol=0.1)
     assert "lengthscale of material" in model.summary()
     assert "rig: mean 0" in model.summary()
-
-
-def test_a_new_rig_has_the_variance_of_offsets(model):
     known, new = predicted(model, FRAME[:4]).variance, predicted(model, NEW).variance
     rig = model.terms[-1].kernel.outputscale.mean() * model.units()[1].square().mean()
     assert (new > 20 * known).all()

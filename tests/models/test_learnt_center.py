@@ -121,15 +121,12 @@ def test_one_that_is_held_fixed_stays(XY, method):
     torch.testing.assert_close(model.terms[0].basis.origin, expected)
 
 
-def test_a_point_fit_leaves_it_at_the_mean_of_the_physics(XY):
+def test_a_point_fit_and_predictions_leave_it(XY, uniform):
     models = [CKA(*XY, physics=crude, center=center) for center in ("learn", "mean")]
     found = [fit(model, "map", num_screened=16).log_likelihood for model in models]
     torch.testing.assert_close(*found)
     assert models[0].terms[0].basis.center.item() == 0.0
     assert models[0].terms[0].basis.center.requires_grad
-
-
-def test_predictions_leave_no_trace_at_it(XY, uniform):
     model = CKA(*XY, physics=crude, center="learn").eval()
     Z = uniform(4, 2).requires_grad_()
     model.posterior(Z).mean.sum().backward()

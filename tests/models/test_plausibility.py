@@ -105,7 +105,7 @@ def test_a_crude_physics_is_not_warned_of(X, Y):
             assert said(model, X, targets, physics=physics) == [], (name, model)
 
 
-def test_few_observations_and_constant_targets_show_nothing(X, Y):
+def test_batches_several_physics_and_few_observations(X, Y):
     large = OFF["too large"][0]
     assert said(CKA, X[:4], Y[:4], physics=large) == []
     few = Y.clone()
@@ -119,9 +119,6 @@ def test_few_observations_and_constant_targets_show_nothing(X, Y):
     (text,) = said(CKA, X, both, physics=lambda X: large(X).expand(-1, 2))
     assert "y1: at the training" in text
     assert said(CKA, X, torch.ones_like(Y), physics=large) == []
-
-
-def test_batches_and_several_physics(X, Y):
     large, both = OFF["too large"][0], torch.stack([Y, 1000 * Y, Y])
     (text,) = said(CKA, X.expand(3, -1, -1), both, physics=large)
     assert "So in 2 of 3 data sets." in text

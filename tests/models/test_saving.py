@@ -196,7 +196,9 @@ def test_a_stacked_model_of_several_physics_is_given_those_without_a_name(unifor
     same(load(path, physics=parts).predict(Z), stacked.predict(Z))
 
 
-def test_what_is_no_model_and_no_file(uniform, path, tmp_path, monkeypatch):
+def test_what_is_no_model_and_no_file_and_what_a_failed_write_leaves(
+    uniform, path, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     model = ZeroMeanGP(*problem(uniform)[:2])
     for wrong, error, says in (
@@ -215,9 +217,6 @@ def test_what_is_no_model_and_no_file(uniform, path, tmp_path, monkeypatch):
     for format in (99, [3], torch.ones(2)):
         torch.save({"format": format}, path)
         refused(ValueError, r"model\.pt .*expected format 3", load, path)
-
-
-def test_nothing_is_left_of_a_file_that_could_not_be_written(uniform, path, monkeypatch):
     model = ZeroMeanGP(*problem(uniform)[:2])
     save(model, path)
     before = path.read_bytes()

@@ -22,7 +22,7 @@ def model(request, data, build):
     return build(request.param, X, Y).eval()
 
 
-def test_predictions_while_the_model_is_conditioned(model, data, uniform):
+def test_conditioning_leaves_the_model_whole_also_in_another_thread(model, data, uniform):
     Z, (X, Y) = uniform(6, 2), data(n=2, seed=5)
     with torch.no_grad():
         expected = model.predict(Z)
@@ -44,10 +44,6 @@ def test_predictions_while_the_model_is_conditioned(model, data, uniform):
         for right, many in ((expected, found), (conditioned, others.result())):
             for one in many:
                 torch.testing.assert_close(one, right)
-
-
-def test_conditioning_leaves_the_model_whole(model, data, uniform):
-    Z, (X, Y) = uniform(6, 2), data(n=2, seed=5)
     before, state = model.predict(Z), {n: v.clone() for n, v in model.state_dict().items()}
     new = model.condition_on_observations(X, Y)
     with torch.no_grad():

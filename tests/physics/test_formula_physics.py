@@ -35,13 +35,10 @@ def test_values_are_those_of_torch(formula, value):
     torch.testing.assert_close(found, value(*X.unbind(-1)).unsqueeze(-1))
 
 
-def test_several_outputs():
+def test_several_outputs_and_gradients():
     physics = FormulaPhysics("2 * b, -b", ["a", "b"])
     assert physics.num_outputs == 2
     torch.testing.assert_close(physics(X), torch.stack([2 * X[:, 1], -X[:, 1]], -1))
-
-
-def test_it_has_gradients():
     inputs = X.clone().requires_grad_()
     FormulaPhysics("a**2 * b", ["a", "b"])(inputs).sum().backward()
     torch.testing.assert_close(inputs.grad, torch.stack([2 * X[:, 0] * X[:, 1], X[:, 0] ** 2], -1))
