@@ -84,13 +84,11 @@ class TestAsGPyTorchsMeans(BaseMeanTestCase, TestCase):
     test_forward_vec = None  # f_p takes rows; a GPyTorch model passes n x d
 
 
-def test_values(uniform):
+def test_values_and_parameters_of_the_mean(uniform):
     X = uniform(3, 4, 2)
     mean = PhysicsMean(lambda X: X.square(), output=1)
     torch.testing.assert_close(mean(X), X[..., 1].square())
 
-
-def test_parameters_of_the_physics_are_those_of_the_mean():
     class Gain(torch.nn.Module):
         def __init__(self):
             super().__init__()

@@ -266,6 +266,13 @@ class TestMixture:
             error = (x[:, i].mT.cov() - covariance[i]) / (sd[i, :, None] * sd[i])
             assert error.abs().max() < 4 * math.sqrt(8 / number)  # of a t of five degrees
 
+    def test_one_component_is_a_t(self):
+        x = around(0.0, p=1).sample(4000, generator()).flatten().sort().values
+        inside = dist.StudentT(5.0).log_prob(x).exp()
+        below = torch.cat([torch.zeros(1), torch.cumulative_trapezoid(inside, x)])
+        off = below - below[-1] * torch.linspace(0, 1, 4000)
+        assert off.abs().max() < 1.95 / math.sqrt(4000)  # Kolmogorov and Smirnov, one in thousand
+
     def test_its_first_center_is_among_the_draws(self):
         # The only place where there is any density.
         def point(x):
@@ -290,6 +297,9 @@ class TestResampling:
             count = torch.stack([(rows == i).sum(0) for i in range(10)]).unflatten(0, (5, 2))
             assert ((count >= expected.floor()) & (count <= expected.ceil())).all()
             assert (count[halves == 0] == 0).all()
+        weights = torch.tensor([[0.25], [0.3], [0.125], [0.0], [0.125], [0.2]]).double()
+        count = resampled(weights, 20, generator()).flatten().bincount(minlength=6).tolist()
+        assert count in ([5, 6, 2, 0, 3, 4], [5, 6, 3, 0, 2, 4])  # whole numbers are met
 
 
 class TestPower:
@@ -351,6 +361,15 @@ def test_the_generator_decides():
     for ours, theirs in zip(first, second, strict=True):
         assert torch.equal(ours, theirs)
     assert not torch.equal(first.positions, third.positions)
+
+
+def test_densities_that_few_draws_meet_and_that_are_far_narrower():
+    def narrow(x):
+        return standard(x).where(x[..., 0].abs() < 1e-3, math.inf)
+
+    for seed in range(5):
+        assert (draw(narrow, around(0.0), seed=seed).positions[..., 0].abs() < 1e-3).all()
+    assert draw(lambda x: standard(x / 1e-4), around(1.0), 1000 * PARTICLES).power == 1
 
 
 class TestProposals:

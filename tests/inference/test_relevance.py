@@ -120,7 +120,7 @@ class TestWithoutPhysics:
         vectors = vectors + 0.5 * torch.randn(5, *vectors.shape[1:], dtype=torch.float64)
         torch.testing.assert_close(ours(vectors), theirs(vectors), rtol=1e-6, atol=1e-6)
 
-    def test_its_predictions_in_plain_linear_algebra(self, data):
+    def test_its_predictions_in_plain_linear_algebra_and_of_a_ridge_regression(self, data):
         X, Y, Z = data
         other = without_physics(CKA(X, Y, physics=unrelated)).eval()
         kernel, noise = other.terms[1].kernel, other.likelihood.noise
@@ -133,6 +133,9 @@ class TestWithoutPhysics:
         found = other.predict(Z)
         torch.testing.assert_close(found.mean, mean, rtol=1e-6, atol=1e-8)
         torch.testing.assert_close(found.variance, variance * scale.square(), rtol=1e-5, atol=1e-9)
+        other = without_physics(RRA(X, Y, physics=unrelated, num_features=32))
+        on_delta = other.eval().delta(Z).mean
+        torch.testing.assert_close(other.predict(Z).mean, on_delta, rtol=1e-6, atol=1e-8)
 
     def test_of_several_physics_all_are_off(self, data):
         X, Y, Z = data
@@ -169,12 +172,6 @@ class TestWithoutPhysics:
         users[2].terms[0].kernel.raw_outputscale.requires_grad_(False)
         for i, model in enumerate(models + users):
             assert without_physics(model) is None, i
-
-    def test_there_is_one_of_a_ridge_regression(self, data):
-        X, Y, Z = data
-        other = without_physics(RRA(X, Y, physics=unrelated, num_features=32))
-        on_delta = other.eval().delta(Z).mean
-        torch.testing.assert_close(other.predict(Z).mean, on_delta, rtol=1e-6, atol=1e-8)
 
 
 class TestAlone:

@@ -138,7 +138,7 @@ def test_all_that_predicts_agrees(close, fitted, rest):
     torch.testing.assert_close(draws.std(0), sd.detach(), rtol=0.15, atol=0)
 
 
-def test_before_a_fit_it_is_the_prior(close, num_outputs):
+def test_the_prior_before_a_fit_and_shapes_after_it(close, num_outputs, fitted):
     X, Y = problem(30, num_outputs)
     model, Z = make(X, Y), problem(7)[0]
     mean, variance = model.predict(Z)
@@ -146,9 +146,6 @@ def test_before_a_fit_it_is_the_prior(close, num_outputs):
     prior = model.covar_module.at(model.model_inputs(Z)).variance() * model.units()[1].square()
     close(variance, model.outputs_last(prior), 1e-6)
     assert model.evidence.isnan().all()
-
-
-def test_shapes_of_posteriors(close, num_outputs, fitted):
     X = problem(24)[0].reshape(2, 3, 4, 1)
     posterior = fitted.posterior(X)
     assert posterior.mean.shape == (2, 3, 4, num_outputs)

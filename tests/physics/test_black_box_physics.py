@@ -323,6 +323,13 @@ class TestUnknownParameters:
         assert caught.value.rows == (3,)
         assert caught.value.inputs.tolist() == [[1.0, 1.0, 2.0]]
 
+    def test_in_threads(self, points):
+        X, values = points(3, 2), points(2, 2, seed=1)
+        physics = BlackBoxPhysics(self.decay, unknowns=UNKNOWNS, batched=False, memo=0)
+        expected = physics(X, values)
+        with joblib.parallel_config(backend="threading", n_jobs=2):
+            torch.testing.assert_close(physics(X, values), expected)
+
 
 class TestCentralDifference:
     def test_it_agrees_with_autograd_and_is_exact_for_quadratics(self, points):

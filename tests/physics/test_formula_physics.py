@@ -103,7 +103,7 @@ def test_names_and_columns():
     refused(PhysicsError, "has 2 columns, a, b, and X has 1", formula, X[:, :1])
 
 
-def test_a_formula_is_a_text_that_it_can_be_made_of_again():
+def test_a_formula_can_be_made_of_its_text_and_is_saved(tmp_path):
     unknowns = {"c": Unknown(2.0, sd=0.5, bounds=(0.0, math.inf), unit="m")}
     physics = FormulaPhysics("c * a + b", ["a", "b"], unknowns=unknowns, name="my law")
     again = physics_from_path(import_path(physics))
@@ -112,9 +112,6 @@ def test_a_formula_is_a_text_that_it_can_be_made_of_again():
     assert torch.equal(again(X), physics(X))
     for damaged in ("formula:", "formula:{}", import_path(physics).replace("c *", "d *")):
         refused(ValueError, "which is damaged", physics_from_path, damaged)
-
-
-def test_a_saved_model_holds_its_formula(tmp_path):
     inputs = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
     physics = FormulaPhysics("c * sin(6 * x)", ["x"], unknowns={"c": Unknown(1.0, sd=1.0)})
     model = CKA(inputs, 2 * (6 * inputs).sin() + inputs, physics=physics)

@@ -82,7 +82,7 @@ class TestValues:
 
 
 class TestErrors:
-    def test_names(self):
+    def test_names_and_partial_results(self):
         joined = JoinedPhysics({"low": total, "high": FunctionPhysics(first_log)})
         assert [part.name for part in joined.parts] == ["low", "first_log"]
         refused(PhysicsError, "'low' was given no rows", joined, torch.zeros(0, 2))
@@ -92,16 +92,6 @@ class TestErrors:
         joined(torch.ones(1, 2))
         assert joined(torch.zeros(0, 2)).shape == (0, 2)
 
-    @pytest.mark.parametrize("grad", [False, True])
-    def test_of_a_part_names_it_and_the_rows_of_X(self, grad):
-        joined = JoinedPhysics([total, FunctionPhysics(first_log, inputs=[1])])
-        X = torch.tensor([[1.0, 1.0], [5.0, -1.0]], requires_grad=grad)
-        with pytest.raises(PhysicsError, match=r"'first_log'.*NaN") as caught:
-            joined(X.unsqueeze(0).expand(2, 2, 2))
-        assert caught.value.rows == (1, 3)
-        assert caught.value.inputs.tolist() == [[5.0, -1.0]] * 2
-
-    def test_of_a_part_with_partial_results(self):
         def root(x):
             if x[0] < 0:
                 raise ArithmeticError("below zero")
@@ -113,6 +103,15 @@ class TestErrors:
                 joined(torch.tensor([[1.0], [-1.0]]))
             assert caught.value.rows == (1,)
             assert joined(torch.tensor([[4.0]])).tolist() == [[4.0, 2.0]]
+
+    @pytest.mark.parametrize("grad", [False, True])
+    def test_of_a_part_names_it_and_the_rows_of_X(self, grad):
+        joined = JoinedPhysics([total, FunctionPhysics(first_log, inputs=[1])])
+        X = torch.tensor([[1.0, 1.0], [5.0, -1.0]], requires_grad=grad)
+        with pytest.raises(PhysicsError, match=r"'first_log'.*NaN") as caught:
+            joined(X.unsqueeze(0).expand(2, 2, 2))
+        assert caught.value.rows == (1, 3)
+        assert caught.value.inputs.tolist() == [[5.0, -1.0]] * 2
 
 
 def test_deep_copy():

@@ -258,7 +258,7 @@ class TestChecks:
 
 
 class TestCopies:
-    def test_copies_without_and_with_state(self, points):
+    def test_copies_and_pickles(self, points):
         physics, X = FunctionPhysics(square), points(3, 2)
         assert copy.deepcopy({"model": [physics]})["model"][0] is physics
         assert torch.equal(copy.copy(physics)(X), physics(X))
@@ -278,8 +278,6 @@ class TestCopies:
         physics = FunctionPhysics(Scale())
         physics(points(3, 1))
         assert set(physics.state_dict()) == {"function.gain", "function.offset"}
-
-    def test_pickle_brings_the_memo(self, points):
         physics = BlackBoxPhysics(Scale())
         X = points(3, 1)
         with torch.no_grad():

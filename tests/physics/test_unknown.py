@@ -205,7 +205,7 @@ class TestCalls:
             torch.testing.assert_close(found, expected)
         torch.testing.assert_close(physics.or_nan(X, values), expected)
 
-    def test_expanded_inputs_and_equal_parameters_are_evaluated_once(self, points):
+    def test_equal_parameters_are_evaluated_once_and_other_shapes_refused(self, points):
         asked = []
 
         def record(X, p):
@@ -217,8 +217,6 @@ class TestCalls:
         found = physics(X.expand(4, 3, 5, 2), values)
         torch.testing.assert_close(found, wave_at(X, values).expand(4, 3, 5, 2))
         assert asked == [15]
-
-    def test_of_another_shape(self, points):
         says = r"has 2 unknown parameter\(s\): a, b; expected parameters of shape ... x 2, found"
         for values in (torch.ones(3), torch.ones(()), 1.0):
             refused(ValueError, says, MAKE["function"](), points(3, 2), values)
