@@ -101,12 +101,6 @@ def forrester():
         def test_X(self):
             return systems.line(40, -0.6)
 
-        def rmse(self, model):
-            """Root mean square error of the posterior mean at 40 points."""
-            with torch.no_grad():
-                mean = model.posterior(self.test_X).mean
-            return (mean - self.truth(self.test_X)).square().mean().sqrt().item()
-
     return Forrester()
 
 

@@ -34,7 +34,7 @@ def test_moments(data, build, kind, num_outputs, uniform):
 
 
 # The weights of RRA-paper do not meet the data.
-@pytest.mark.parametrize("kind", ["ZeroMeanGP", "PhysicsMeanGP", "ScaleGP", "CKA", "AR1", "RRA"])
+@pytest.mark.parametrize("kind", ["CKA", "AR1", "RRA"])
 def test_paths_meet_exact_data(data, build, kind, num_outputs):
     X, Y = data(num_outputs=num_outputs)
     options = {"low_X": X[:4] + 0.1, "low_Y": Y[:4]} if kind == "AR1" else {}
