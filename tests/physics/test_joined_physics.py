@@ -73,6 +73,7 @@ class TestValues:
         joined.forget()
         joined(X)
         assert len(numpy_counter.rows) == 10
+        numpy_counter.rows.clear()
         linear = torch.nn.Linear(2, 2, dtype=torch.float64)
         joined = JoinedPhysics([linear, BlackBoxPhysics(numpy_counter)])
         for _ in range(2):
