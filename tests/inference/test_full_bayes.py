@@ -149,7 +149,6 @@ def test_the_default_samples_where_it_can(XY, build, data):
     ):
         assert isinstance(fit(other, **point), FitResult)
     refused(ValueError, "no option 'num_draws'", fit, SingleTaskGP(*XY), num_draws=64)
-    refused(TypeError, "ZeroMeanGP", fit, SingleTaskGP(*XY), "bayes")
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from botorch.acquisition import (
 from botorch.acquisition.bayesian_active_learning import qBayesianActiveLearningByDisagreement
 from botorch.acquisition.monte_carlo import qPosteriorStandardDeviation
 from botorch.acquisition.objective import LinearMCObjective
+from botorch.models import SingleTaskGP
 from botorch.models.transforms import Normalize
 from botorch.optim import optimize_acqf
 from botorch.posteriors.fully_bayesian import GaussianMixturePosterior
@@ -99,13 +100,14 @@ def test_posteriors(case, uniform, close, shape):
 
 
 def test_what_is_refused(held, build, data, uniform):
-    model, _ = held("CKA", *data())
+    (X, Y), (model, _) = data(), held("CKA", *data())
     refused(RuntimeError, "holds samples", model.train)
     refused(RuntimeError, "holds samples", model.hold_samples, {})
     fantasies = model.fantasize(uniform(1, 2), SobolQMCNormalSampler(Size([5]), seed=0))
     refused(RuntimeError, "fantasies", fantasies.release_samples)
     refused(ValueError, "Take RRA", fit, build("RRA-paper", *data()), "bayes")
     refused(ValueError, "one data set", fit, build("CKA", *data(batch_shape=(2,))), "bayes")
+    refused(TypeError, "ZeroMeanGP", fit, SingleTaskGP(X / 2, Y), "bayes")
 
 
 class TestObservations:
