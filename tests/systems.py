@@ -1,5 +1,6 @@
 """Functions, data and models that the tests of several rooms take."""
 
+import pytest
 import torch
 
 
@@ -86,3 +87,9 @@ def same(ours, theirs, **tolerance):
     """Asserts that tensors are close, one by one: moments of two predictions, say."""
     for one, other in zip(ours, theirs, strict=True):
         torch.testing.assert_close(one, other, **tolerance)
+
+
+def refused(error, words, call, *args, **options):
+    """Asserts that a call is refused by an error with these words."""
+    with pytest.raises(error, match=words):
+        call(*args, **options)

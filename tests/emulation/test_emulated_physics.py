@@ -23,7 +23,7 @@ from gpadjust.emulation.error_kernel import error_covariance, unresolved
 from gpadjust.report import report
 from gpadjust.sklearn import CKARegressor
 from gpadjust.validation import leave_one_out
-from tests.systems import line
+from tests.systems import line, refused
 
 MAP = {"method": "map"}
 W = {"w": Unknown(2.0, bounds=(1.0, 3.0))}
@@ -68,7 +68,7 @@ def test_far_from_runs_the_emulators_variance_is_in_predictions_and_near_them_is
         assert model.predict(far).variance.min() > 0.1 * away
 
 
-def test_its_values_are_the_emulators_mean_with_a_gradient(crude):
+def test_values_and_their_errors_are_the_emulators(crude):
     X = (2 * line(5)).requires_grad_()
     torch.testing.assert_close(crude(X), crude.emulator.predict(X.detach()).mean)
     (slope,) = torch.autograd.grad(crude(X).sum(), X)
@@ -76,10 +76,6 @@ def test_its_values_are_the_emulators_mean_with_a_gradient(crude):
     with torch.no_grad():
         numeric = (crude(X + step) - crude(X - step)) / (2 * step)
     torch.testing.assert_close(slope, numeric, rtol=1e-5, atol=1e-5)
-
-
-def test_the_covariance_of_its_error_is_that_of_the_mixture(crude):
-    """By the emulator's own moments, sample by sample."""
     rows = 2 * line(6)
     mean, covariance = crude.emulator.joint_moments(rows, False)
     away = mean - mean.mean(0)
@@ -232,16 +228,11 @@ def test_new_runs_are_proposed_where_they_tell_most(with_parameter):
 
 def test_bad_input():
     X = line(5)
-    with pytest.raises(ValueError, match=r"inputs=.* names 2 columns"):
-        EmulatedPhysics(X, X, inputs=[0, 1])
+    refused(ValueError, r"inputs=.* names 2 columns", EmulatedPhysics, X, X, inputs=[0, 1])
     with pytest.raises(ValueError, match="none named w"):
         EmulatedPhysics(pd.DataFrame({"x": [0.0, 1.0]}), np.zeros(2), unknowns=W)
-    with pytest.raises(ValueError, match="and then 1 unknown parameter"):
-        EmulatedPhysics(X, X, unknowns=W)
+    refused(ValueError, "and then 1 unknown parameter", EmulatedPhysics, X, X, unknowns=W)
     crude = EmulatedPhysics(X, X.sin(), fit_options=MAP)
-    with pytest.raises(ValueError, match=r"inputs=\[...\]"):
-        crude(torch.zeros(3, 2).double())
-    with pytest.raises(TypeError, match="single EmulatedPhysics"):
-        next_runs(CKA(X, X, physics=torch.sin), X)
-    with pytest.raises(ValueError, match="FunctionPhysics"):
-        RRA(X, X, physics=crude)
+    refused(ValueError, r"inputs=\[...\]", crude, torch.zeros(3, 2).double())
+    refused(TypeError, "single EmulatedPhysics", next_runs, CKA(X, X, physics=torch.sin), X)
+    refused(ValueError, "FunctionPhysics", RRA, X, X, physics=crude)

@@ -136,15 +136,12 @@ def test_missing_targets_do_not_count(problem, with_least):
         torch.testing.assert_close(found.by_covariance[i], by_covariance, rtol=1e-8, atol=1e-10)
 
 
-def test_a_residual_that_the_basis_explains(problem):
+def test_residuals_explained_and_covariances_without_a_factor(problem):
     _, covariance, basis = problem
     residual = basis @ torch.tensor([2.0, -3.0], dtype=torch.float64)
     found = negative_log_likelihood(residual, covariance, basis, 1e-30 * least(), derivatives=True)
     assert found.value.isfinite().all()
     assert (found.scale > 0).all()
-
-
-def test_a_covariance_without_a_factor_is_infinitely_bad(problem):
     residual, covariance, _ = problem
     covariance[1] = -covariance[1]
     found = negative_log_likelihood(residual, covariance, derivatives=True)
@@ -176,7 +173,7 @@ def test_the_nugget_is_raised_where_it_must_be():
 
 
 class TestLeastSquares:
-    def test_is_the_textbooks(self, problem):
+    def test_least_squares(self, problem):
         residual, covariance, basis = problem
         coefficients, uncertainty = least_squares(
             torch.linalg.cholesky(covariance), residual, basis
@@ -186,9 +183,6 @@ class TestLeastSquares:
         torch.testing.assert_close(uncertainty, expected, rtol=1e-10, atol=1e-12)
         beta = expected @ basis.mT @ weight @ residual.unsqueeze(-1)
         torch.testing.assert_close(coefficients, beta.squeeze(-1), rtol=1e-10, atol=1e-12)
-
-    def test_collinear_columns_and_zeros(self, problem):
-        residual, covariance, basis = problem
         chol = torch.linalg.cholesky(covariance)
         first = basis[..., 0]
         columns = torch.stack([first, 3 * first, torch.zeros_like(first)], dim=-1)

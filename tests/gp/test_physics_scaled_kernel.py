@@ -6,9 +6,11 @@ import pytest
 import torch
 from gpytorch.kernels import MaternKernel, RBFKernel, ScaleKernel
 from gpytorch.test.base_kernel_test_case import BaseKernelTestCase
+from gpytorch.test.base_mean_test_case import BaseMeanTestCase
 from torch import Size
 
-from gpadjust.gp import PhysicsScaledKernel
+from gpadjust.gp import PhysicsMean, PhysicsScaledKernel
+from tests.systems import refused
 
 
 def physics(X):
@@ -45,25 +47,15 @@ def test_one_output_of_several(uniform):
     pair = PhysicsScaledKernel(RBFKernel().double(), lambda X: X + 1, output=1)
     single = PhysicsScaledKernel(RBFKernel().double(), lambda X: X[..., 1] + 1)
     torch.testing.assert_close(pair(X).to_dense(), single(X).to_dense())
-
-
-def test_several_outputs_without_saying_which(uniform):
     kernel = PhysicsScaledKernel(RBFKernel().double(), lambda X: X)
-    with pytest.raises(ValueError, match=r"2 outputs.*`output=`"):
-        kernel(uniform(5, 2)).to_dense()
-
-
-def test_last_dim_is_batch(uniform):
+    refused(ValueError, r"2 outputs.*`output=`", kernel(uniform(5, 2)).to_dense)
     kernel = PhysicsScaledKernel(RBFKernel().double(), physics)
     with pytest.raises(ValueError, match="last_dim_is_batch"):
         kernel.forward(uniform(5, 2), uniform(5, 2), last_dim_is_batch=True)
-
-
-def test_it_is_not_stationary():
     assert not PhysicsScaledKernel(RBFKernel(), physics).is_stationary
 
 
-def test_a_batch(uniform):
+def test_a_batch_and_gradients(uniform):
     base, X = RBFKernel(batch_shape=Size([2])).double(), uniform(6, 2)
     base.lengthscale = torch.tensor([0.4, 0.9]).reshape(2, 1, 1)
     kernel = PhysicsScaledKernel(base, physics)
@@ -75,11 +67,37 @@ def test_a_batch(uniform):
     assert wide.batch_shape == (3, 2)
     torch.testing.assert_close(wide(X).to_dense(), values.expand(3, 2, 6, 6))
     assert kernel.batch_shape == (2,)
-
-
-def test_gradients_reach_hyper_parameters_and_inputs(uniform):
     kernel = PhysicsScaledKernel(RBFKernel().double(), physics)
     X = uniform(5, 2).requires_grad_()
     kernel(X).to_dense().sum().backward()
     assert kernel.base_kernel.raw_lengthscale.grad.abs() > 0
     assert X.grad.abs().max() > 0
+
+
+# The physics as a mean function
+
+
+class TestAsGPyTorchsMeans(BaseMeanTestCase, TestCase):
+    def create_mean(self):
+        return PhysicsMean(lambda X: X.sum(-1))
+
+    test_forward_vec = None  # f_p takes rows; a GPyTorch model passes n x d
+
+
+def test_values_and_parameters_of_the_mean(uniform):
+    X = uniform(3, 4, 2)
+    mean = PhysicsMean(lambda X: X.square(), output=1)
+    torch.testing.assert_close(mean(X), X[..., 1].square())
+
+    class Gain(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.gain = torch.nn.Parameter(torch.tensor(2.0))
+
+        def forward(self, X):
+            return self.gain * X[:, 0]
+
+    mean = PhysicsMean(Gain())
+    assert [p.item() for p in mean.parameters()] == [2.0]
+    mean(torch.ones(3, 1)).sum().backward()
+    assert next(mean.parameters()).grad.item() == 3.0

@@ -9,6 +9,7 @@ from gpytorch.test.base_kernel_test_case import BaseKernelTestCase
 from torch import Size
 
 from gpadjust.gp import AppendedPhysics, SumOfTerms, Term, TermsMean
+from tests.systems import refused
 
 
 def constant(*values):
@@ -77,7 +78,7 @@ def test_the_formula(terms, uniform, j):
     assert kernel.batch_shape == (2,)
 
 
-def test_known_means(terms, uniform):
+def test_known_means_and_terms_without_kernels(terms, uniform):
     X, rho = uniform(6, 5), terms[0]
     assert rho.learns_mean
     assert not terms[1].learns_mean
@@ -85,9 +86,6 @@ def test_known_means(terms, uniform):
     f_p = rho.weights(X)
     added = constant(*VARIANCE)[:, None, None] * f_p.unsqueeze(-1) * f_p.unsqueeze(-2)
     torch.testing.assert_close(unknown - known, added)
-
-
-def test_terms_without_kernels(uniform):
     one, X = constant(1.0), uniform(5, 2)
     known, unknown = Term("known", None, 2, None, one), Term("f", None, 2, None, one, 2 * one)
     assert known.is_known
@@ -100,21 +98,14 @@ def test_terms_without_kernels(uniform):
     torch.testing.assert_close(kernel(X, uniform(3, 2)).to_dense(), zero[:, :3])
 
 
-def test_terms_that_are_not_their_own():
+def test_gradients_and_what_is_refused(terms, uniform):
+    X = uniform(4, 5).requires_grad_()
+    SumOfTerms(terms)(X).to_dense().square().sum().backward()
+    assert X.grad.abs().amax(0).min() > 0
+    assert terms[0].kernel.raw_lengthscale.grad.abs().min() > 0
     one, kernel = constant(1.0), RBFKernel()
     with pytest.raises(ValueError, match="different names"):
         SumOfTerms([Term("f", kernel, 2, None, one), Term("f", RBFKernel(), 2, None, one)])
     with pytest.raises(ValueError, match="share parameters"):
         SumOfTerms([Term("f", kernel, 2, None, one), Term("g", kernel, 2, None, one)])
-
-
-def test_inputs_without_the_physics(terms, uniform):
-    with pytest.raises(ValueError, match=r"3 input columns and 2 .*f_p"):
-        SumOfTerms(terms)(uniform(6, 3)).to_dense()
-
-
-def test_gradients(terms, uniform):
-    X = uniform(4, 5).requires_grad_()
-    SumOfTerms(terms)(X).to_dense().square().sum().backward()
-    assert X.grad.abs().amax(0).min() > 0
-    assert terms[0].kernel.raw_lengthscale.grad.abs().min() > 0
+    refused(ValueError, r"3 input columns and 2 .*f_p", SumOfTerms(terms)(uniform(6, 3)).to_dense)

@@ -33,33 +33,35 @@ def _two():
     torch.set_num_threads(before)
 
 
-def test_one_within():
+def test_one_within_none_of_large_problems_and_after_an_error():
     with threads_for(12):
         assert (torch.get_num_threads(), of_blas()) == (1, {1})
-
-
-def test_large_problems_are_left_alone():
     before = of_blas()
     with threads_for(1000):
         assert (torch.get_num_threads(), of_blas()) == (2, before)
-
-
-def test_threads_that_begin_meanwhile_have_the_users():
-    with threads_for(12), ThreadPoolExecutor(1) as pool:
-        assert pool.submit(torch.get_num_threads).result() == 2
-        pool.submit(lambda: torch.rand(9, 9) @ torch.rand(9, 9)).result()
-
-
-def test_after_an_error():
     with pytest.raises(KeyboardInterrupt), threads_for(12):
         raise KeyboardInterrupt
-
-
-def test_within_each_other():
     with threads_for(12):
         with threads_for(20):
             assert (torch.get_num_threads(), of_blas()) == (1, {1})
         assert (torch.get_num_threads(), of_blas()) == (1, {1})
+
+
+def test_threads_that_begin_meanwhile_and_those_with_a_setting_of_their_own():
+    with threads_for(12), ThreadPoolExecutor(1) as pool:
+        assert pool.submit(torch.get_num_threads).result() == 2
+        pool.submit(lambda: torch.rand(9, 9) @ torch.rand(9, 9)).result()
+
+    def work():
+        torch.set_num_threads(3)
+        with threads_for(12):
+            inside = torch.get_num_threads()
+        return inside, torch.get_num_threads()
+
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(work).result() == (1, 3)
+    assert (torch.get_num_threads(), of_a_new_thread()) == (2, 3)
+    torch.set_num_threads(2)
 
 
 @pytest.mark.parametrize("first_out", [0, 1])
@@ -84,19 +86,6 @@ def test_sections_that_overlap_in_two_threads(first_out):
         assert threads[last].submit(torch.get_num_threads).result() == 1
         seen[last] = threads[last].submit(leave, last).result()
     assert seen == {0: 2, 1: 2}
-
-
-def test_a_thread_with_a_setting_of_its_own_keeps_it():
-    def work():
-        torch.set_num_threads(3)
-        with threads_for(12):
-            inside = torch.get_num_threads()
-        return inside, torch.get_num_threads()
-
-    with ThreadPoolExecutor(1) as pool:
-        assert pool.submit(work).result() == (1, 3)
-    assert (torch.get_num_threads(), of_a_new_thread()) == (2, 3)
-    torch.set_num_threads(2)
 
 
 def test_many_at_once():

@@ -8,6 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gpadjust import CKA, PhysicsMeanGP, fit
+from tests.systems import refused
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::botorch.exceptions.warnings.OptimizationWarning"),
@@ -86,8 +87,7 @@ def problems(draw):
 def check(kind, problem):
     X, Y, physics, Z = problem
     if len(X) < FEWEST[kind]:
-        with pytest.raises(ValueError, match="constant means"):
-            BUILD[kind](X, Y, physics=physics)
+        refused(ValueError, "constant means", BUILD[kind], X, Y, physics=physics)
         return
     model = BUILD[kind](X, Y, physics=physics)
     fit(model, "map", **FIT)
@@ -107,36 +107,14 @@ def check(kind, problem):
         assert (mean.abs() <= 1e3 * size + 10 * variance.sqrt()).all()
 
 
-def profile(max_examples):
-    return settings(
-        max_examples=max_examples,
-        deadline=None,
-        derandomize=True,
-        suppress_health_check=list(HealthCheck),
-    )
-
-
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
-@profile(8)
+@settings(
+    max_examples=150, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck)
+)
 @given(kind=st.sampled_from(list(BUILD)), problem=problems())
 def test_any_data(kind, problem):
     check(kind, problem)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
-@profile(150)
-@given(kind=st.sampled_from(list(BUILD)), problem=problems())
-def test_any_data_at_length(kind, problem):
-    check(kind, problem)
-
-
-@pytest.mark.parametrize("kind", list(BUILD))
-def test_one_point_is_too_few(kind):
-    X = torch.ones(1, 2, dtype=torch.float64)
-    with pytest.raises(ValueError, match="at least 2 points"):
-        BUILD[kind](X, wave(X), physics=wave)
 
 
 @pytest.mark.parametrize("kind", list(BUILD))

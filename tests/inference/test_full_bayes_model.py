@@ -4,7 +4,18 @@ from copy import deepcopy
 
 import pytest
 import torch
+from botorch.acquisition import (
+    LogExpectedImprovement,
+    qLogExpectedImprovement,
+    qLogNoisyExpectedImprovement,
+    qNegIntegratedPosteriorVariance,
+)
+from botorch.acquisition.bayesian_active_learning import qBayesianActiveLearningByDisagreement
+from botorch.acquisition.monte_carlo import qPosteriorStandardDeviation
+from botorch.acquisition.objective import LinearMCObjective
+from botorch.models import SingleTaskGP
 from botorch.models.transforms import Normalize
+from botorch.optim import optimize_acqf
 from botorch.posteriors.fully_bayesian import GaussianMixturePosterior
 from botorch.sampling import SobolQMCNormalSampler
 from gpytorch.kernels import MaternKernel, RBFKernel, ScaleKernel
@@ -12,8 +23,9 @@ from torch import Size
 
 from gpadjust import fit
 from gpadjust.validation import leave_one_out
+from tests.systems import refused
 
-KINDS = ["ZeroMeanGP", "PhysicsMeanGP", "ScaleGP", "CKA", "AR1", "RRA"]
+KINDS = ["ZeroMeanGP", "ScaleGP", "CKA", "AR1", "RRA"]
 
 
 def matern(m):
@@ -87,18 +99,17 @@ def test_posteriors(case, uniform, close, shape):
     close(model.predict(Z, given).variance, model.predict(Z).variance + given)
 
 
-class TestObservations:
-    def test_conditioning(self, case, data, uniform, close):
-        name, model, singles = case
-        Z, m = uniform(4, 2, high=2.0), model.num_outputs
-        for seed in (1, 2):
-            X, Y = data(n=2, num_outputs=m, seed=seed)
-            noise = {"noise": torch.full_like(Y, 1e-3)} if "known" in name else {}
-            model = model.condition_on_observations(X, Y, **noise)
-            singles = [single.condition_on_observations(X, Y, **noise) for single in singles]
-            check(model.posterior(Z), [single.posterior(Z) for single in singles], close)
-            close(model.predict(Z).mean, model.posterior(Z).mixture_mean)
+def test_what_is_refused(held, build, data, uniform):
+    (X, Y), (model, _) = data(), held("CKA", *data())
+    refused(RuntimeError, "holds samples", model.train)
+    refused(RuntimeError, "holds samples", model.hold_samples, {})
+    fantasies = model.fantasize(uniform(1, 2), SobolQMCNormalSampler(Size([5]), seed=0))
+    refused(RuntimeError, "fantasies", fantasies.release_samples)
+    refused(ValueError, "one data set", fit, build("CKA", *data(batch_shape=(2,))), "bayes")
+    refused(TypeError, "ZeroMeanGP", fit, SingleTaskGP(X / 2, Y), "bayes")
 
+
+class TestObservations:
     def test_conditioning_of_each_sample(self, held, data, uniform, close):
         model, singles = held("CKA", *data(num_outputs=2))
         X, Y = data(batch_shape=(3,), n=2, num_outputs=2, seed=1)
@@ -121,7 +132,7 @@ class TestObservations:
         assert posterior.mixture_mean.shape == (5, *batch, 4, m)
         assert (posterior.variance <= model.posterior(Z).variance + 1e-9).all()
 
-    def test_leave_one_out(self, case, close):
+    def test_leave_one_out_and_conditioning(self, case, close, data, uniform):
         _, model, singles = case
         loo = leave_one_out(model)
         parts = [leave_one_out(single) for single in singles]
@@ -135,6 +146,15 @@ class TestObservations:
         close(loo.mean, (weight * mean).sum(0))
         second = (weight * (variance + (mean - loo.mean).square())).sum(0)
         close(loo.variance, second)
+        name, model, singles = case
+        Z, m = uniform(4, 2, high=2.0), model.num_outputs
+        for seed in (1, 2):
+            X, Y = data(n=2, num_outputs=m, seed=seed)
+            noise = {"noise": torch.full_like(Y, 1e-3)} if "known" in name else {}
+            model = model.condition_on_observations(X, Y, **noise)
+            singles = [single.condition_on_observations(X, Y, **noise) for single in singles]
+            check(model.posterior(Z), [single.posterior(Z) for single in singles], close)
+            close(model.predict(Z).mean, model.posterior(Z).mixture_mean)
 
 
 def test_leave_one_out_is_the_posterior_without_the_observation(held, data):
@@ -173,15 +193,13 @@ class TestFunctions:
         assert ((values.mean(0) - mean).abs() <= 0.15 * sd + 1e-6 * mean.abs()).all()
         assert (values.std(0) / sd - 1).abs().max() < 0.15
 
-    def test_shapes_and_seed(self, held, data, uniform):
+    def test_shapes_seed_and_functions_after_conditioning(self, held, data, uniform):
         model, _ = held("CKA", *data(num_outputs=2))
         functions = model.sample_functions(4, seed=1)
         Z = uniform(5, 6, 2)
         assert functions(Z).shape == (4, 5, 6, 2)
         torch.testing.assert_close(functions(Z)[:, 2], functions(Z[2]))
         torch.testing.assert_close(functions(Z), model.sample_functions(4, seed=1)(Z))
-
-    def test_after_conditioning(self, held, data):
         X, Y = data(num_outputs=2)
         model, _ = held("CKA", X, Y, torch.full_like(Y, 1e-4))
         new_X, new_Y = data(n=2, num_outputs=2, seed=1)
@@ -202,7 +220,7 @@ class TestCopies:
             close(part.mixture_variance, whole.mixture_variance[..., indices])
         close(subset.predict(Z).mean, whole.mixture_mean[..., indices])
 
-    def test_deepcopy_and_state_dict(self, case, uniform, close, build, data):
+    def test_copies_and_the_first_sample_after_release(self, case, uniform, close, build, data):
         name, model, _ = case
         Z = uniform(4, 2, high=2.0)
         expected = model.posterior(Z)
@@ -214,21 +232,6 @@ class TestCopies:
             other.load_state_dict(model.state_dict())
             assert other.num_samples == 3
             close(other.posterior(Z).mean, expected.mean)
-
-    def test_a_state_with_another_number_of_samples(self, held, data, build):
-        model, _ = held("CKA", *data())
-        fresh = build("CKA", *data())
-        expected = model.train_targets
-        with pytest.raises(RuntimeError, match=r"number.*release_samples\(\)"):
-            model.load_state_dict(fresh.state_dict())
-        assert model.num_samples == 3
-        assert torch.equal(model.train_targets, expected)
-        model.release_samples()
-        model.load_state_dict(fresh.state_dict())
-
-
-class TestLettingGo:
-    def test_the_first_sample_is_kept(self, case, uniform, close):
         name, model, singles = case
         Z, m = uniform(4, 2, high=2.0), model.num_outputs
         more = [uniform(2, 2, seed=3), uniform(2, m, seed=4)]
@@ -244,6 +247,19 @@ class TestLettingGo:
         close(model.posterior(Z).variance, singles[0].posterior(Z).variance)
         model.release_samples()
 
+    def test_a_state_with_another_number_of_samples(self, held, data, build):
+        model, _ = held("CKA", *data())
+        fresh = build("CKA", *data())
+        expected = model.train_targets
+        with pytest.raises(RuntimeError, match=r"number.*release_samples\(\)"):
+            model.load_state_dict(fresh.state_dict())
+        assert model.num_samples == 3
+        assert torch.equal(model.train_targets, expected)
+        model.release_samples()
+        model.load_state_dict(fresh.state_dict())
+
+
+class TestLettingGo:
     @pytest.mark.filterwarnings("ignore::gpadjust.inference.SamplingWarning")
     def test_it_can_be_fitted_again(self, data, build):
         model, fresh = (build("CKA", *data(num_outputs=2)) for _ in range(2))
@@ -256,34 +272,75 @@ class TestLettingGo:
         expected = fit(fresh, "map", **options).log_likelihood
         assert (found > expected - 1.0).all()
 
-    def test_a_model_of_fantasies(self, held, data, uniform):
-        model, _ = held("CKA", *data())
-        fantasies = model.fantasize(uniform(1, 2), SobolQMCNormalSampler(Size([5]), seed=0))
-        with pytest.raises(RuntimeError, match="fantasies"):
-            fantasies.release_samples()
-
     def test_it_keeps_them_if_a_fit_fails(self, held, data, uniform):
         model, _ = held("CKA", *data())
         Z = uniform(4, 2)
         before = model.posterior(Z).mean
-        with pytest.raises(ValueError, match="no option"):
-            fit(model, "map", num_samples=3)
+        refused(ValueError, "no option", fit, model, "map", num_samples=3)
         model.likelihood.noise_covar.raw_noise.requires_grad_(False)
         model.covar_module.requires_grad_(False)
-        with pytest.raises(ValueError, match="no learnable parameter"):
-            fit(model, "map")
+        refused(ValueError, "no learnable parameter", fit, model, "map")
         assert model.num_samples == 3
         torch.testing.assert_close(model.posterior(Z).mean, before)
 
 
-class TestRefusals:
-    def test_training(self, held, data):
-        model, _ = held("CKA", *data())
-        with pytest.raises(RuntimeError, match="holds samples"):
-            model.train()
-        with pytest.raises(RuntimeError, match="holds samples"):
-            model.hold_samples({})
+# BoTorch's acquisition functions on a fully Bayesian model
 
-    def test_a_batch_of_data_sets(self, build, data):
-        with pytest.raises(ValueError, match="one data set"):
-            fit(build("CKA", *data(batch_shape=(2,))), "bayes")
+
+SAMPLER = {"sampler": SobolQMCNormalSampler(torch.Size([8]), seed=0)}
+ACQUISITIONS = {
+    "qLogNEI": lambda model, X: qLogNoisyExpectedImprovement(model, X, **SAMPLER),
+    "qLogEI": lambda model, X: qLogExpectedImprovement(model, 1.0, **SAMPLER),
+    "LogEI": lambda model, X: LogExpectedImprovement(model, best_f=1.0),
+    "NIPV": lambda model, X: qNegIntegratedPosteriorVariance(model, mc_points=X),
+    "PSTD": lambda model, X: qPosteriorStandardDeviation(model, **SAMPLER),
+    "BALD": lambda model, X: qBayesianActiveLearningByDisagreement(model, **SAMPLER),
+}
+BOUNDS = torch.tensor([[0.0, 0.0], [2.0, 2.0]], dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"), [*(("CKA", n) for n in ACQUISITIONS), ("AR1", "qLogNEI")]
+)
+def test_optimize(held, data, name, kind):
+    X, Y = data()
+    model, _ = held(kind, X, Y)
+    acquisition = ACQUISITIONS[name](model, X)
+    q = 2 if name.startswith("q") or name == "PSTD" else 1
+    point, value = optimize_acqf(
+        acquisition, BOUNDS, q=q, num_restarts=2, raw_samples=4, options={"maxiter": 3}
+    )
+    assert point.shape == (q, 2)
+    assert value.isfinite().all()
+    assert acquisition(torch.rand(5, q, 2, dtype=torch.float64)).shape == (5,)
+
+
+@pytest.mark.parametrize("name", ["qLogNEI", "LogEI", "NIPV", "PSTD"])
+def test_gradients_through_the_physics(held, data, uniform, gradient_is_right, name):
+    X, Y = data()
+    model, _ = held("CKA", X, Y)
+    gradient_is_right(ACQUISITIONS[name](model, X), uniform(1, 1, 2, high=2.0, seed=5))
+
+
+def test_values_are_averages_over_the_samples(held, data, uniform):
+    X, Y = data()
+    model, singles = held("CKA", X, Y)
+    Z, best = uniform(6, 1, 2, high=2.0), Y.mean()
+    each = torch.stack([LogExpectedImprovement(single, best_f=best)(Z) for single in singles])
+    actual = LogExpectedImprovement(model, best_f=best)(Z)
+    torch.testing.assert_close(actual, each.exp().mean(0).log())
+    each = [qNegIntegratedPosteriorVariance(single, mc_points=X)(Z) for single in singles]
+    actual = qNegIntegratedPosteriorVariance(model, mc_points=X)(Z)
+    torch.testing.assert_close(actual, torch.stack(each).mean(0))
+
+
+@pytest.mark.filterwarnings("ignore:Sparse invariant checks:UserWarning")
+@pytest.mark.filterwarnings("ignore:A not p.d.")
+def test_two_outputs(held, data, uniform):
+    X, Y = data(num_outputs=2)
+    model, _ = held("CKA", X, Y)
+    Z = uniform(6, 1, 2, high=2.0)
+    weights = torch.tensor([1.0, -0.5], dtype=torch.float64)
+    objective = LinearMCObjective(weights)
+    values = qLogNoisyExpectedImprovement(model, X, objective=objective, **SAMPLER)(Z)
+    assert values.shape == (6,)

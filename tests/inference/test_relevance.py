@@ -120,7 +120,7 @@ class TestWithoutPhysics:
         vectors = vectors + 0.5 * torch.randn(5, *vectors.shape[1:], dtype=torch.float64)
         torch.testing.assert_close(ours(vectors), theirs(vectors), rtol=1e-6, atol=1e-6)
 
-    def test_its_predictions_in_plain_linear_algebra(self, data):
+    def test_its_predictions_in_plain_linear_algebra_and_of_a_ridge_regression(self, data):
         X, Y, Z = data
         other = without_physics(CKA(X, Y, physics=unrelated)).eval()
         kernel, noise = other.terms[1].kernel, other.likelihood.noise
@@ -133,6 +133,9 @@ class TestWithoutPhysics:
         found = other.predict(Z)
         torch.testing.assert_close(found.mean, mean, rtol=1e-6, atol=1e-8)
         torch.testing.assert_close(found.variance, variance * scale.square(), rtol=1e-5, atol=1e-9)
+        other = without_physics(RRA(X, Y, physics=unrelated, num_features=32))
+        on_delta = other.eval().delta(Z).mean
+        torch.testing.assert_close(other.predict(Z).mean, on_delta, rtol=1e-6, atol=1e-8)
 
     def test_of_several_physics_all_are_off(self, data):
         X, Y, Z = data
@@ -147,59 +150,28 @@ class TestWithoutPhysics:
             kernels[1][0].outputscale = kernels[1][0].outputscale * ours / theirs
         same(other.predict(Z), one.predict(Z), rtol=1e-6, atol=1e-8)
 
-    @pytest.mark.parametrize(
-        "build",
-        [
-            ZeroMeanGP,
-            lambda X, Y: PhysicsMeanGP(X, Y, physics=double),
-            lambda X, Y: PhysicsMeanGP(X, Y, physics=double, rho_mean="learn"),
-            lambda X, Y: ScaleGP(X, Y, physics=lambda X: 3 + X),
-            lambda X, Y: AR1(X, Y, physics=double, low_X=X),
-            lambda X, Y: CKA(X, Y, physics=double, rho_mean="learn"),
-            lambda X, Y: CKA(X, Y, physics=double, delta_mean="learn"),
-            lambda X, Y: CKA(X, Y, physics=[double, unrelated]),
-            lambda X, Y: CKA(X, Y, physics=double, rho_covar_module=RBFKernel()),
-            lambda X, Y: CKA(
-                X,
-                Y,
-                physics=double,
-                rho_covar_module=ScaleKernel(
-                    RBFKernel(), outputscale_constraint=Interval(0.1, 1.0)
-                ),
-            ),
-        ],
-        ids=[
-            "no physics",
-            "as a mean",
-            "by an unknown factor",
-            "no delta",
-            "two levels",
-            "unknown rho",
-            "unknown delta",
-            "unknown weights",
-            "a rho of one size",
-            "a size that is bounded",
-        ],
-    )
-    def test_there_is_none(self, data, build):
+    def test_there_is_none(self, data):
+        """Of other structures, of unknown means, and with priors or values of the user."""
         X, Y, _ = data
-        assert without_physics(build(X, Y)) is None
-
-    def test_there_is_none_with_priors_or_values_of_the_user(self, data):
-        X, Y, _ = data
-        models = [CKA(X, Y, physics=double) for _ in range(3)]
-        assert without_physics(models[0]) is not None
-        models[0].terms[1].kernel.register_prior("p", LogNormalPrior(0.0, 1.0), "outputscale")
-        models[1].terms[0].kernel.base_kernel.raw_lengthscale.requires_grad_(False)
-        models[2].terms[0].kernel.raw_outputscale.requires_grad_(False)
-        for model in models:
-            assert without_physics(model) is None
-
-    def test_there_is_one_of_a_ridge_regression(self, data):
-        X, Y, Z = data
-        other = without_physics(RRA(X, Y, physics=unrelated, num_features=32))
-        on_delta = other.eval().delta(Z).mean
-        torch.testing.assert_close(other.predict(Z).mean, on_delta, rtol=1e-6, atol=1e-8)
+        bounded = ScaleKernel(RBFKernel(), outputscale_constraint=Interval(0.1, 1.0))
+        models = [ZeroMeanGP(X, Y), ScaleGP(X, Y, physics=lambda X: 3 + X)]
+        models += [AR1(X, Y, physics=double, low_X=X), PhysicsMeanGP(X, Y, physics=double)]
+        models += [PhysicsMeanGP(X, Y, physics=double, rho_mean="learn")]
+        for options in (
+            {"rho_mean": "learn"},
+            {"delta_mean": "learn"},
+            {"physics": [double, unrelated]},
+            {"rho_covar_module": RBFKernel()},
+            {"rho_covar_module": bounded},
+        ):
+            models.append(CKA(X, Y, **{"physics": double, **options}))
+        users = [CKA(X, Y, physics=double) for _ in range(3)]
+        assert without_physics(users[0]) is not None
+        users[0].terms[1].kernel.register_prior("p", LogNormalPrior(0.0, 1.0), "outputscale")
+        users[1].terms[0].kernel.base_kernel.raw_lengthscale.requires_grad_(False)
+        users[2].terms[0].kernel.raw_outputscale.requires_grad_(False)
+        for i, model in enumerate(models + users):
+            assert without_physics(model) is None, i
 
 
 class TestAlone:
@@ -220,20 +192,13 @@ class TestAlone:
         kinds = {name.rsplit(".", 1)[-1] for name in names}
         assert kinds == ({"raw_noise"} if known is None else {"raw_lengthscale"})
 
-    @pytest.mark.parametrize(
-        "build",
-        [
-            ZeroMeanGP,
-            lambda X, Y: AR1(X, Y, physics=double, low_X=X),
-            lambda X, Y: CKA(X, Y, physics=double, rho_mean="learn"),
-            lambda X, Y: CKA(X, Y, physics=double, rho_mean=0.0),
-            lambda X, Y: CKA(X, Y, physics=double, rho_covar_module=RBFKernel()),
-        ],
-        ids=["no physics", "two levels", "unknown rho", "none without data", "a rho of one size"],
-    )
-    def test_there_is_none(self, data, build):
+    def test_there_is_none(self, data):
         X, Y, _ = data
-        assert alone(build(X, Y)) is None
+        unknown, nothing = ({"rho_mean": mean} for mean in ("learn", 0.0))
+        of_one_size = {"rho_covar_module": RBFKernel()}
+        models = [CKA(X, Y, physics=double, **o) for o in (unknown, nothing, of_one_size)]
+        for model in (*models, ZeroMeanGP(X, Y), AR1(X, Y, physics=double, low_X=X)):
+            assert alone(model) is None
 
     @pytest.mark.slow
     @pytest.mark.parametrize("kind", [CKA, PhysicsMeanGP])
@@ -410,7 +375,9 @@ class TestFit:
         found, expected = model.predict(Z), plain.predict(Z)
         assert ((found.mean - expected.mean).abs() < expected.variance.sqrt()).all()
 
-    def test_the_rho_of_a_physics_of_no_use_is_none(self, fitted, data):
+    def test_the_rho_of_a_physics_of_no_use_is_none_and_the_most_likely_values_are_as_ever(
+        self, fitted, data
+    ):
         *_, Z = data
         model, _ = fitted
         rho, delta, total = model.rho(Z), model.delta(Z), model.predict(Z)
@@ -418,32 +385,7 @@ class TestFit:
         assert rho.variance[:, 0].max() < 1e-6
         torch.testing.assert_close(delta.mean[:, 0], total.mean[:, 0], rtol=1e-5, atol=1e-6)
         torch.testing.assert_close(rho.mean[:, 1], torch.full_like(Z[:, 0], 0.5), rtol=0, atol=0.2)
-
-    @quick
-    @pytest.mark.parametrize(
-        "build",
-        [
-            ZeroMeanGP,
-            lambda X, Y: PhysicsMeanGP(X, Y, physics=double),
-            lambda X, Y: AR1(X, Y, physics=double, low_X=X),
-        ],
-        ids=["no physics", "as a mean", "two levels"],
-    )
-    def test_nothing_is_said_of_what_cannot_do_without(self, data, build):
-        X, Y, _ = data
-        assert fit(build(X, Y), "bayes", **SHORT).relevance is None
-
-    @quick
-    def test_nothing_is_said_with_priors_of_the_user(self, data):
-        X, Y, _ = data
-        model = CKA(X, Y, physics=unrelated)
-        register_priors(model)
-        assert fit(model, "bayes", **SHORT).relevance is None
-        assert (model.terms[0].mean == 1.0).all()
-
-    def test_the_most_likely_values_know_nothing_of_it(self, fitted, data):
         X, Y, Z = data
-        model, _ = fitted
         new = CKA(X, torch.cat([Y, Y], dim=-1), physics=unrelated_and_double)
         for each in (new, model):
             assert isinstance(fit(each, "map"), FitResult)
@@ -452,21 +394,21 @@ class TestFit:
         found, expected = (each.log_evidence()[1] for each in (model, new))
         torch.testing.assert_close(found, expected, rtol=1e-2, atol=1e-2)
 
-    @pytest.mark.slow
-    def test_again(self, data):
-        X, Y, Z = data
-        model = CKA(X, Y, physics=unrelated)
-        first, mean = fit(model).relevance, model.predict(Z).mean
-        second = fit(model).relevance
-        assert first < 0.5
-        assert second < 0.5
-        assert (model.predict(Z).mean - mean).abs().max() < 0.01
+    @quick
+    def test_nothing_is_said_of_what_cannot_do_without_nor_with_priors_of_the_user(self, data):
+        X, Y, _ = data
+        users = CKA(X, Y, physics=unrelated)
+        register_priors(users)
+        others = PhysicsMeanGP(X, Y, physics=double), AR1(X, Y, physics=double, low_X=X)
+        for model in (users, ZeroMeanGP(X, Y), *others):
+            assert fit(model, "bayes", **SHORT).relevance is None
+        assert (users.terms[0].mean == 1.0).all()
 
 
 class TestPartlyOff:
     """What samples with the physics on, and others with it off, are to a model."""
 
-    def test_terms_make_up_the_function(self, partly, data):
+    def test_terms_functions_and_outputs(self, partly, data):
         *_, Z = data
         model, *_ = partly
         rho, delta = (f(Z, mixed=False).mean for f in (model.rho, model.delta))  # S x q x m
@@ -483,6 +425,24 @@ class TestPartlyOff:
         parts = model.rho(Z), model.delta(Z)
         assert all(each.variance.isfinite().all() for each in parts)
         torch.testing.assert_close(parts[0].mean, rho.mean(0))
+        *_, Z = data
+        model, *_ = partly
+        mean, _ = model.components(Z, False)
+        torch.testing.assert_close(model.mean_functions()(Z), mean)
+        torch.manual_seed(0)
+        values = model.sample_functions(200, num_features=256)(Z)
+        assert values.isfinite().all()
+        found = model.predict(Z)
+        sd = found.variance.sqrt()
+        assert ((values.mean(0) - found.mean).abs() < 4 * sd / math.sqrt(200)).all()
+        assert (values.var(0) / found.variance - 1).abs().median() < 0.2
+        *_, Z = data
+        model, *_ = partly
+        both = model.predict(Z)
+        for i in range(2):
+            one = model.subset_output([i]).predict(Z)
+            torch.testing.assert_close(one.mean, both.mean[:, i : i + 1])
+            torch.testing.assert_close(one.variance, both.variance[:, i : i + 1])
 
     def test_conditioning(self, partly, data):
         X, Y, Z = data
@@ -499,19 +459,6 @@ class TestPartlyOff:
             a, b = (m.term(name, Z) for m in (found, expected))
             torch.testing.assert_close(a.mean, b.mean, rtol=1e-5, atol=1e-6)
 
-    def test_sampled_functions(self, partly, data):
-        *_, Z = data
-        model, *_ = partly
-        mean, _ = model.components(Z, False)
-        torch.testing.assert_close(model.mean_functions()(Z), mean)
-        torch.manual_seed(0)
-        values = model.sample_functions(200, num_features=256)(Z)
-        assert values.isfinite().all()
-        found = model.predict(Z)
-        sd = found.variance.sqrt()
-        assert ((values.mean(0) - found.mean).abs() < 4 * sd / math.sqrt(200)).all()
-        assert (values.var(0) / found.variance - 1).abs().median() < 0.2
-
     @pytest.mark.parametrize("which", ["fitted", "partly"])
     def test_saved_and_loaded_it_predicts_the_same(self, request, which, data, tmp_path):
         *_, Z = data
@@ -525,15 +472,6 @@ class TestPartlyOff:
             (again.fallback(Z), model.fallback(Z)),
         ):
             assert torch.equal(a, b)
-
-    def test_of_one_output(self, partly, data):
-        *_, Z = data
-        model, *_ = partly
-        both = model.predict(Z)
-        for i in range(2):
-            one = model.subset_output([i]).predict(Z)
-            torch.testing.assert_close(one.mean, both.mean[:, i : i + 1])
-            torch.testing.assert_close(one.variance, both.variance[:, i : i + 1])
 
 
 class TestTracesOfSamplesWithoutPhysics:
@@ -562,14 +500,6 @@ class TestTracesOfSamplesWithoutPhysics:
         for each in (new, cold):
             fit(each, "map", num_screened=0, num_starts=1)
         assert new.log_evidence()[1] > cold.log_evidence()[1] - 1
-
-    def test_released_samples_leave_none(self, data):
-        X, Y, Z = data
-        model = CKA(X, Y, physics=unrelated)
-        fit(model)
-        model.release_samples()
-        fit(model, "map")
-        torch.testing.assert_close(model.fallback(Z), unrelated(Z))
 
     def test_a_center_that_moved(self, data):
         X, Y, _ = data

@@ -45,7 +45,7 @@ def test_a_mixture_of_few_is_that_of_all(number):
     assert error < (0.5 if number == 1 else 0.1) * at_random
 
 
-def test_weights_are_shares():
+def test_weights_are_shares_and_few_draws_are_taken_twice():
     # Two kinds of draws, far apart, a fourth of all of the second kind.
     first, second = (drawn(50, seed=seed) for seed in (0, 1))
     mean = torch.cat([first[0].mean, second[0].mean + 100])
@@ -54,9 +54,6 @@ def test_weights_are_shares():
     rows = representative(predicted, mean[..., :2], weights, 8)
     assert (rows >= 50).sum() == 2
     assert (rows.diff(dim=0) >= 0).all()
-
-
-def test_none_without_weight_and_some_twice_if_they_are_few():
     predicted, positions = drawn(20)
     weights = torch.zeros(20, 1, dtype=torch.float64)
     weights[[3, 8, 11]] = 1 / 3
@@ -75,9 +72,6 @@ def test_halves_that_disagree():
     expected = (1 / variance).mean().sqrt().item()
     assert disagreement(predicted, weights, targets).item() == pytest.approx(expected, rel=0.05)
     assert disagreement(predicted, weights, 1e9 * targets) < 0.01
-
-
-def test_what_was_not_observed_does_not_hide_disagreement():
     predicted, _ = drawn(4000)
     weights = torch.full((4000, 1), 1 / 4000, dtype=torch.float64)
     predicted.mean[0::2] += 2.0

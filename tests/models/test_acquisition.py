@@ -36,15 +36,8 @@ def acquisition_function(name, model, baseline, points):
 
 
 NAMES = ["variance", "deviation", "noisy improvement", "one deviation", "knowledge gradient"]
-some = pytest.mark.parametrize(
-    ("name", "kind"),
-    [
-        pytest.param(name, kind, marks=() if kind == "CKA" or quick else pytest.mark.slow)
-        for name in NAMES
-        for kind in ("ZeroMeanGP", "PhysicsMeanGP", "ScaleGP", "CKA", "AR1", "RRA")
-        for quick in [(name, kind) in (("deviation", "AR1"), ("knowledge gradient", "RRA"))]
-    ],
-)
+CASES = [*((name, "CKA") for name in NAMES), ("deviation", "AR1"), ("knowledge gradient", "RRA")]
+some = pytest.mark.parametrize(("name", "kind"), CASES)
 
 
 @some
@@ -82,9 +75,8 @@ def test_optimize(data, build, uniform, name, kind):
     optimize(acquisition, uniform, 1 if q == 5 else q)
 
 
-@pytest.mark.parametrize("kind", ["CKA", pytest.param("AR1", marks=pytest.mark.slow)])
-def test_several_outputs(data, build, uniform, kind):
-    model = build(kind, *data(num_outputs=2)).eval()
+def test_several_outputs(data, build, uniform):
+    model = build("CKA", *data(num_outputs=2)).eval()
     weigh = ScalarizedPosteriorTransform(torch.tensor([0.5, 0.5], dtype=torch.float64))
     options = {"mc_points": uniform(30, 2, high=2.0), "posterior_transform": weigh}
     optimize(qNegIntegratedPosteriorVariance(model, **options), uniform, 1)

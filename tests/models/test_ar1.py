@@ -81,11 +81,15 @@ def test_recursive_co_kriging_on_nested_designs(rbf, close, uniform, kernel_of):
     close(posterior.variance.squeeze(-1).detach(), variance.diagonal(), 1e-6)
 
 
-def test_rho_is_one_number_for_each_output(levels):
+def test_rho_and_low_values(levels, uniform):
     X, Y, low_X, low_Y = levels
     assert AR1(X, Y, low_X=low_X, low_Y=low_Y).rho_constant.shape == ()
     two = AR1(X, torch.cat([Y, 2 * Y], -1), low_X=low_X, low_Y=torch.cat([low_Y, low_Y], -1))
     assert two.rho_constant.shape == (2,)
+    given = AR1(X, Y, low_X=low_X, low_Y=low_Y)
+    computed = AR1(X, Y, low_X=low_X, physics=lambda X: crude(X)[:, :1])
+    Z = uniform(5, 2)
+    torch.testing.assert_close(given.posterior(Z).mean, computed.posterior(Z).mean)
 
 
 def test_each_level_has_a_noise_of_its_own(ar1, levels):
@@ -103,7 +107,7 @@ def test_each_level_has_a_noise_of_its_own(ar1, levels):
     torch.testing.assert_close(noise.detach(), expected)
 
 
-def test_the_samples_lie_within_the_bounds(data):
+def test_the_samples_lie_within_the_bounds_and_the_seed_makes_them(data, build):
     X, Y = data()
     seen = []
 
@@ -118,21 +122,10 @@ def test_the_samples_lie_within_the_bounds(data):
     assert (rows >= bounds[0]).all()
     assert (rows <= bounds[1]).all()
     assert (rows.amax(0) - rows.amin(0) > 0.8 * (bounds[1] - bounds[0])).all()
-
-
-def test_the_seed_makes_the_samples(data, build):
     X, Y = data()
     first, same, other = (build("AR1", X, Y, seed=s).train_inputs[0] for s in (1, 1, 2))
     assert torch.equal(first, same)
     assert not torch.equal(first, other)
-
-
-def test_low_values_are_computed_where_only_inputs_are_given(levels, uniform):
-    X, Y, low_X, low_Y = levels
-    given = AR1(X, Y, low_X=low_X, low_Y=low_Y)
-    computed = AR1(X, Y, low_X=low_X, physics=lambda X: crude(X)[:, :1])
-    Z = uniform(5, 2)
-    torch.testing.assert_close(given.posterior(Z).mean, computed.posterior(Z).mean)
 
 
 @pytest.mark.parametrize("transform", [{}, {"outcome_transform": None}])
@@ -163,7 +156,7 @@ def test_low_values_that_are_missing(uniform, close, Yvar):
     torch.testing.assert_close(two.predict(Z).mean[:, 1:], fewer.predict(Z).mean, rtol=1e-4, atol=0)
 
 
-def test_what_a_transform_learnt_stays(uniform):
+def test_what_was_learnt_stays_and_priors_are_each_outputs_own(uniform, levels):
     X, low_X, Z = uniform(7, 1), uniform(11, 1, seed=1), 3 + uniform(2, 1, seed=2)
     low_Y, Y = low_X.sin(), X.sin() + X
     model = AR1(X, Y, low_X=low_X, low_Y=low_Y, input_transform=Normalize(1))
@@ -172,17 +165,11 @@ def test_what_a_transform_learnt_stays(uniform):
     model.train()
     model.eval()
     torch.testing.assert_close(model.predict(Z).mean, before.mean)
-
-
-def test_the_prior_of_rho_is_each_outputs_own(levels):
     X, Y, low_X, low_Y = levels
     both = AR1(X, torch.cat([Y, 9 * Y], -1), low_X=low_X, low_Y=low_Y.expand(-1, 2))
     own = AR1(X, 9 * Y, low_X=low_X, low_Y=low_Y)
     part = both.subset_output([1])
     torch.testing.assert_close(part.terms[0].basis.ratio, own.terms[0].basis.ratio)
-
-
-def test_a_low_level_that_does_not_vary_says_nothing_of_rho():
     X = torch.tensor([[0.0], [1.0], [2.0]], dtype=torch.float64)
     model = AR1(X, X, low_X=X, low_Y=torch.full_like(X, 3.0))
     assert model.terms[0].basis.prior_of_learnt[1].item() == 1.0

@@ -9,91 +9,93 @@ import pandas as pd
 import pytest
 import torch
 
-from gpadjust import CKA, VariationalCKA
+from gpadjust import AR1, CKA, VariationalCKA
 from gpadjust.models.training_data import to_tensor
 from gpadjust.physics import BlackBoxPhysics, PhysicsError
 from gpadjust.records import Record
 from gpadjust.sklearn import CKARegressor
+from tests.systems import refused
 
 N = 6
 ONE_TO_SIX = np.arange(1.0, N + 1)
-SECOND = np.timedelta64(1, "s")
-DATES = np.datetime64("2020-01-01") + np.arange(N) * SECOND
+NUMBERS = ONE_TO_SIX.reshape(-1, 1)
+DATES = np.datetime64("2020-01-01") + np.arange(N) * np.timedelta64(1, "s")
+MASKED = np.ma.masked_array(NUMBERS, mask=NUMBERS == 3)
 
-TEXT = {
-    "text": ONE_TO_SIX.astype(str),
-    "bytes": ONE_TO_SIX.astype("S"),
-    "text as objects": ONE_TO_SIX.astype(str).astype(object),
-    "one text among numbers": np.array([*ONE_TO_SIX[1:], "1.5"], dtype=object),
-    "a column of text": pd.Series(ONE_TO_SIX.astype(str)),
-    "text of each row": pd.Series(["a", "b", "c", "d", "e", "f"]),
-}
-COMPLEX = {
-    "complex": ONE_TO_SIX + 1j,
-    "complex without imaginary part": ONE_TO_SIX.astype(complex),
-    "one complex among numbers": np.array([*ONE_TO_SIX[1:], 1j], dtype=object),
-    "a column": pd.Series(ONE_TO_SIX + 1j),
-    "tensor": torch.tensor(ONE_TO_SIX + 1j),
-}
-TIMES = {
-    "dates": DATES,
-    "durations": DATES - DATES[0],
-    "index": pd.date_range("2020", periods=N, freq="s"),
-    "column": pd.Series(DATES),
-    "time zone": pd.Series(pd.date_range("2020", periods=N, freq="s", tz="Europe/London")),
-    "column of durations": pd.Series(pd.to_timedelta(range(N), unit="s")),
-    "datetime": np.array([datetime(2020, 1, 1, 0, 0, i) for i in range(N)], dtype=object),
-    "date": np.array([date(2020, 1, i + 1) for i in range(N)], dtype=object),
-    "time": np.array([time(0, 0, i) for i in range(N)], dtype=object),
-    "timedelta": np.array([timedelta(seconds=i) for i in range(N)], dtype=object),
-}
-REFUSED = [
-    *[pytest.param(values, "text.*astype", id=f"text: {name}") for name, values in TEXT.items()],
-    *[pytest.param(v, "complex numbers.*parts", id=f"complex: {n}") for n, v in COMPLEX.items()],
-    *[pytest.param(v, "dates or times.*to seconds", id=f"times: {n}") for n, v in TIMES.items()],
+TEXT = [
+    ONE_TO_SIX.astype(str),
+    ONE_TO_SIX.astype("S"),
+    ONE_TO_SIX.astype(str).astype(object),
+    np.array([*ONE_TO_SIX[1:], "1.5"], dtype=object),
+    pd.Series(ONE_TO_SIX.astype(str)),
+    pd.Series(["a", "b", "c", "d", "e", "f"]),
 ]
+COMPLEX = [
+    ONE_TO_SIX + 1j,
+    ONE_TO_SIX.astype(complex),
+    np.array([*ONE_TO_SIX[1:], 1j], dtype=object),
+    pd.Series(ONE_TO_SIX + 1j),
+    torch.tensor(ONE_TO_SIX + 1j),
+]
+TIMES = [
+    DATES,
+    DATES - DATES[0],
+    pd.date_range("2020", periods=N, freq="s"),
+    pd.Series(DATES),
+    pd.Series(pd.date_range("2020", periods=N, freq="s", tz="Europe/London")),
+    pd.Series(pd.to_timedelta(range(N), unit="s")),
+    np.array([datetime(2020, 1, 1, 0, 0, i) for i in range(N)], dtype=object),
+    np.array([timedelta(seconds=i) for i in range(N)], dtype=object),
+]
+DAYS = np.array([date(2020, 1, i + 1) for i in range(N)], dtype=object)
+CLOCK = np.array([time(0, 0, i) for i in range(N)], dtype=object)
+TEXTS, COMPLEXES = "text.*astype", "complex numbers.*parts"
+DATED = "dates or times.*to seconds"
 
 
 def column(values):
     """Values, an array or a series, as a single column."""
-    if isinstance(values, pd.Series | pd.Index):
-        return values.to_frame()
-    return values.reshape(-1, 1)
+    is_pandas = isinstance(values, pd.Series | pd.Index)
+    return values.to_frame() if is_pandas else values.reshape(-1, 1)
 
 
 def physics(X):
     return 2 + X.sum(-1)
 
 
-@pytest.mark.parametrize(("values", "message"), REFUSED)
-class TestRefused:
-    def test_inputs(self, values, message):
-        with pytest.raises(TypeError, match=rf"train_X to hold numbers.*{message}"):
-            CKA(column(values), column(ONE_TO_SIX), physics=physics)
-
-    def test_targets(self, values, message):
-        with pytest.raises(TypeError, match=rf"train_Y to hold numbers.*{message}"):
-            CKA(column(ONE_TO_SIX), column(values), physics=physics)
-
-    def test_questions_and_observations(self, values, message):
-        model = CKA(column(ONE_TO_SIX), column(ONE_TO_SIX), physics=physics)
-        with pytest.raises(TypeError, match=rf"X to hold numbers.*{message}"):
-            model.predict(column(values))
-        with pytest.raises(TypeError, match=rf"Y to hold numbers.*{message}"):
-            model.condition_on_observations(column(ONE_TO_SIX), column(values))
-
-    def test_records(self, values, message):
-        numbers = column(ONE_TO_SIX)
-        if "times" not in message or type(np.asarray(values).flat[0]) in (date, time):
-            with pytest.raises(TypeError, match=rf"times to hold numbers.*{message}"):
-                Record(values, numbers, numbers)
-        with pytest.raises(TypeError, match=rf"states to hold numbers.*{message}"):
-            Record(ONE_TO_SIX, column(values), numbers)
+def cka(X=NUMBERS, Y=NUMBERS):
+    return CKA(X, Y, physics=physics)
 
 
-@pytest.mark.parametrize("name", [n for n in TIMES if n not in ("date", "time")])
-def test_times_of_a_record_are_seconds_since_the_first(name):
-    record = Record(TIMES[name], column(ONE_TO_SIX), column(ONE_TO_SIX))
+@pytest.mark.parametrize(
+    ("arrays", "says"), [(TEXT, TEXTS), (COMPLEX, COMPLEXES), ([*TIMES, DAYS, CLOCK], DATED)]
+)
+def test_what_is_refused(arrays, says):
+    for values in arrays:
+        refused(TypeError, rf"Expected X to hold numbers.*{says}", to_tensor, column(values), "X")
+
+
+@pytest.mark.parametrize(
+    ("call", "name", "says"),
+    [
+        (lambda: cka(column(TEXT[0])), "train_X", TEXTS),
+        (lambda: cka(pd.DataFrame({"t": DATES, "x": ONE_TO_SIX})), "train_X", DATED),
+        (lambda: cka(NUMBERS, column(COMPLEX[0])), "train_Y", COMPLEXES),
+        (lambda: cka().predict(column(DATES)), "X", DATED),
+        (lambda: cka().condition_on_observations(NUMBERS, column(TEXT[4])), "Y", TEXTS),
+        (lambda: Record(COMPLEX[3], NUMBERS, NUMBERS), "times", COMPLEXES),
+        (lambda: Record(DAYS, NUMBERS, NUMBERS), "times", DATED),
+        (lambda: Record(CLOCK, NUMBERS, NUMBERS), "times", DATED),
+        (lambda: Record(ONE_TO_SIX, column(DATES), NUMBERS), "states", DATED),
+    ],
+)
+def test_where_it_is_refused(call, name, says):
+    refused(TypeError, rf"{name} to hold numbers.*{says}", call)
+
+
+@pytest.mark.parametrize("times", TIMES, ids=range(len(TIMES)))
+def test_times_of_a_record_are_seconds_since_the_first(times):
+    record = Record(times, NUMBERS, NUMBERS)
     assert record.times.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
 
 
@@ -109,85 +111,52 @@ def test_velocities_are_in_seconds():
 
 def test_scikit_learn_is_asked_before_it_makes_numbers_of_them():
     regressor = CKARegressor(lambda X: X[:, 0], fit_method="map")
-    numbers, dates = column(ONE_TO_SIX), DATES.reshape(-1, 1)
-    masked = np.ma.masked_array(numbers, mask=numbers == 3)
-    for X, y, message in [
-        (dates, ONE_TO_SIX, "X to hold numbers.*dates or times"),
-        (numbers, DATES - DATES[0], "y to hold numbers.*dates or times"),
-        (masked, ONE_TO_SIX, "X without masked"),
-        (numbers, masked[:, 0], "y without masked"),
-    ]:
-        with pytest.raises((TypeError, ValueError), match=message):
-            regressor.fit(X, y)
-    with pytest.raises(ValueError, match="train_Yvar without masked"):
-        regressor.fit(numbers, ONE_TO_SIX, train_Yvar=masked[:, 0])
-    with pytest.raises(TypeError, match=r"X to hold numbers.*dates or times"):
-        regressor.fit(numbers, ONE_TO_SIX).predict(dates)
+    dates, y = DATES.reshape(-1, 1), ONE_TO_SIX
+    refused(TypeError, "X to hold numbers.*dates or times", regressor.fit, dates, y)
+    refused(
+        TypeError, "y to hold numbers.*dates or times", regressor.fit, NUMBERS, DATES - DATES[0]
+    )
+    refused(ValueError, "X without masked", regressor.fit, MASKED, y)
+    refused(ValueError, "y without masked", regressor.fit, NUMBERS, MASKED[:, 0])
+    known = {"train_Yvar": MASKED[:, 0]}
+    refused(ValueError, "train_Yvar without masked", regressor.fit, NUMBERS, y, **known)
+    predict = regressor.fit(NUMBERS, y).predict
+    refused(TypeError, r"X to hold numbers.*dates or times", predict, dates)
 
 
-def test_a_physics_that_returns_masked_values():
-    masked = np.ma.masked_array(ONE_TO_SIX, mask=ONE_TO_SIX == 3)
-    with pytest.raises(PhysicsError, match="masked values"):
-        CKA(column(ONE_TO_SIX), column(ONE_TO_SIX), physics=BlackBoxPhysics(lambda X: masked))
+def test_masked_values():
+    refused(ValueError, "train_X without masked", cka, MASKED)
+    refused(ValueError, r"train_Y.filled\(np.nan\)", cka, NUMBERS, MASKED)
+    times = MASKED[:, 0]
+    refused(ValueError, "times without masked values", Record, times, NUMBERS, NUMBERS)
+    masked = BlackBoxPhysics(lambda X: times)
+    refused(PhysicsError, "masked values", CKA, NUMBERS, NUMBERS, physics=masked)
+    Y = np.ma.hstack([MASKED, NUMBERS]).filled(np.nan)  # the way out
+    model = CKA(NUMBERS, Y, physics=lambda X: X + torch.ones(2))
+    assert model.train_targets.isnan().tolist()[0] == [False, False, True, False, False, False]
+    nothing = np.ma.masked_array(ONE_TO_SIX, mask=False)
+    assert to_tensor(nothing, "X").tolist() == ONE_TO_SIX.tolist()
 
 
-def test_a_frame_with_a_column_of_times():
-    frame = pd.DataFrame({"t": DATES, "x": ONE_TO_SIX})
-    with pytest.raises(TypeError, match=r"train_X.*dates or times"):
-        CKA(frame, column(ONE_TO_SIX), physics=physics)
-
-
-class TestMasked:
-    values = np.ma.masked_array(column(ONE_TO_SIX), mask=column(ONE_TO_SIX) == 3)
-
-    def test_inputs_and_targets(self):
-        with pytest.raises(ValueError, match="train_X without masked"):
-            CKA(self.values, column(ONE_TO_SIX), physics=physics)
-        with pytest.raises(ValueError, match=r"train_Y.filled\(np.nan\)"):
-            CKA(column(ONE_TO_SIX), self.values, physics=physics)
-        with pytest.raises(ValueError, match="times without masked values"):
-            Record(self.values[:, 0], column(ONE_TO_SIX), column(ONE_TO_SIX))
-
-    def test_the_way_out(self):
-        Y = np.ma.hstack([self.values, column(ONE_TO_SIX)])
-        model = CKA(column(ONE_TO_SIX), Y.filled(np.nan), physics=lambda X: X + torch.ones(2))
-        assert model.train_targets.isnan().tolist()[0] == [False, False, True, False, False, False]
-
-    def test_a_mask_of_nothing(self):
-        array = np.ma.masked_array(ONE_TO_SIX, mask=False)
-        assert to_tensor(array, "X").tolist() == ONE_TO_SIX.tolist()
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
+def test_real_numbers_are_taken():
+    whole = range(1, N + 1)
+    for values in (
         np.arange(1, N + 1),
         np.arange(1, N + 1, dtype=np.uint8),
         ONE_TO_SIX.astype(np.float32),
         ONE_TO_SIX.astype(object),
-        np.array([Fraction(i, 1) for i in range(1, N + 1)], dtype=object),
-        np.array([Decimal(i) for i in range(1, N + 1)], dtype=object),
+        np.array([Fraction(i, 1) for i in whole], dtype=object),
+        np.array([Decimal(i) for i in whole], dtype=object),
         pd.Series(ONE_TO_SIX, dtype="Float64"),
-        pd.Series(range(1, N + 1)),
+        pd.Series(whole),
         pd.RangeIndex(1, N + 1),
-    ],
-    ids=lambda values: f"{type(values).__name__}-{values.dtype}",
-)
-def test_real_numbers_are_taken(values):
-    assert to_tensor(values, "X").tolist() == ONE_TO_SIX.tolist()
+    ):
+        assert to_tensor(values, "X").tolist() == ONE_TO_SIX.tolist()
 
 
-@pytest.mark.parametrize("make", [torch.as_tensor, np.asarray, pd.Series])
-def test_inputs_of_one_dimension(make, build, kind):
-    X, Y = make(ONE_TO_SIX), torch.as_tensor(column(ONE_TO_SIX))
-    options = {"low_X": Y, "low_Y": Y, "physics": None} if kind == "AR1" else {}
-    if kind not in ("ZeroMeanGP", "AR1"):
-        options["physics"] = physics
-    with pytest.raises(ValueError, match=r"train_X.reshape\(-1, 1\)"):
-        build(kind, X, Y, **options)
-
-
-def test_inputs_of_one_dimension_of_a_sparse_model():
-    X = torch.as_tensor(ONE_TO_SIX)
-    with pytest.raises(ValueError, match=r"train_X.*2 dimensions"):
-        VariationalCKA(X, X.unsqueeze(-1), physics=physics)
+def test_inputs_of_one_dimension():
+    X, Y = torch.as_tensor(ONE_TO_SIX), torch.as_tensor(NUMBERS)
+    for values in (X, ONE_TO_SIX, pd.Series(ONE_TO_SIX)):
+        refused(ValueError, r"train_X.reshape\(-1, 1\)", cka, values)
+    refused(ValueError, r"train_X.reshape\(-1, 1\)", AR1, X, Y, low_X=Y, low_Y=Y)
+    refused(ValueError, r"train_X.*2 dimensions", VariationalCKA, X, Y, physics=physics)

@@ -26,6 +26,7 @@ from gpadjust.inference.vectors import Parameters
 from gpadjust.models import Prediction
 from gpadjust.sklearn import CKARegressor
 from gpadjust.validation import leave_one_out, trust
+from tests.systems import refused
 
 GENERATOR = torch.Generator().manual_seed(0)
 N = 30
@@ -97,7 +98,7 @@ def test_closed_form_and_autograd_agree():
         torch.testing.assert_close(ours[name].flatten(), theirs[name].flatten())
 
 
-def test_a_frame_is_taken_as_it_is(model):
+def test_frames_and_new_rigs(model):
     assert model.levels == {1: ("brass", "iron", "steel"), 2: ("R0", "R1", "R2", "R3")}
     torch.testing.assert_close(model.data()["train_X"], X)
     torch.testing.assert_close(predicted(model, FRAME).mean, model.predict(X).mean)
@@ -107,9 +108,6 @@ def test_a_frame_is_taken_as_it_is(model):
     torch.testing.assert_close(found - found.mean(), OFFSETS - OFFSETS.mean(), rtol=0, atol=0.1)
     assert "lengthscale of material" in model.summary()
     assert "rig: mean 0" in model.summary()
-
-
-def test_a_new_rig_has_the_variance_of_offsets(model):
     known, new = predicted(model, FRAME[:4]).variance, predicted(model, NEW).variance
     rig = model.terms[-1].kernel.outputscale.mean() * model.units()[1].square().mean()
     assert (new > 20 * known).all()
@@ -168,24 +166,16 @@ def test_arrays_outputs_and_declared_levels():
     assert math.isclose(float(inputs(X)[0, 1:4].norm()), 0.5**0.5)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_bad_options_and_levels(model):
+    for options, says in (
         ({"categorical": "colour"}, "columns of flow, material, rig, got 'colour'"),
         ({"batch": 7}, "got 7"),
         ({"categorical": {"material": ["iron", "iron"]}}, "different levels"),
         ({"categorical": {"material": ["iron", "steel"]}}, "one of iron, steel, got 'brass'"),
-    ],
-)
-def test_bad_options(options, message):
-    with pytest.raises(ValueError, match=message):
-        PhysicsMeanGP(FRAME, Y, physics=head, **options)
-
-
-def test_bad_levels(model):
-    with pytest.raises(ValueError, match="brass, iron, steel, got 'wood'"):
-        predicted(model, FRAME[:2].assign(material="wood"))
-    with pytest.raises(ValueError, match=r"material to be one of \[0.0, 1.0, 2.0\].*got 1.5"):
-        model.transform_inputs(torch.tensor([[1.0, 1.5, 0.0]]).double())
-    with pytest.raises(ValueError, match="an input beside batches"):
-        ZeroMeanGP(X[:, 2:], Y, batch=0)
+    ):
+        refused(ValueError, says, PhysicsMeanGP, FRAME, Y, physics=head, **options)
+    wood = FRAME[:2].assign(material="wood")
+    refused(ValueError, "brass, iron, steel, got 'wood'", predicted, model, wood)
+    between, says = torch.tensor([[1.0, 1.5, 0.0]]).double(), r"\[0.0, 1.0, 2.0\].*got 1.5"
+    refused(ValueError, f"material to be one of {says}", model.transform_inputs, between)
+    refused(ValueError, "an input beside batches", ZeroMeanGP, X[:, 2:], Y, batch=0)

@@ -56,6 +56,8 @@ def test_the_prior_mean_is_the_physics_wherever_the_center_is(XY):
     far = 1e3 + X
     for center in (0.0, 7.0):
         torch.testing.assert_close(move(model, center).posterior(far).mean, crude(far))
+    model = move(CKA(*XY, physics=crude, center="learn"), 4.25)
+    assert "center 4.25" in model.summary()
 
 
 @pytest.mark.slow
@@ -84,52 +86,18 @@ def test_a_center_that_is_right_is_found(uniform):
     assert (model.terms[0].basis.origin - 8).abs().max() < 0.3
 
 
-def test_a_later_model_starts_with_the_same_center(XY, uniform):
+def test_later_models(XY, uniform):
     X, Y = XY
     model = move(CKA(X, Y, physics=crude, center="learn"), 4.2)
     more = uniform(12, 2, seed=3)
     later = CKA(more, 2 * crude(more), physics=crude, center="learn")
     warm_start(later, model)
     torch.testing.assert_close(later.terms[0].basis.origin, model.terms[0].basis.origin)
-
-
-def test_a_physics_that_is_constant(XY):
-    X, Y = XY
     model = CKA(X, Y, physics=lambda X: 2.0 + 0 * X[..., :1], center="learn")
     fit(model, num_screened=8, num_draws=64)
     assert model.predict(X).mean.isfinite().all()
     warm_start(CKA(X, Y, physics=lambda X: 2.0 + 0 * X[..., :1], center="learn"), model)
 
-
-@pytest.mark.parametrize("method", ["map", "bayes"])
-def test_one_that_is_held_fixed_stays(XY, method):
-    model = move(CKA(*XY, physics=crude, center="learn"), 4.0)
-    model.terms[0].basis.center.requires_grad_(False)
-    fit(model, method, num_screened=16)
-    expected = torch.full_like(model.terms[0].basis.origin, 4.0)
-    torch.testing.assert_close(model.terms[0].basis.origin, expected)
-
-
-def test_a_point_fit_leaves_it_at_the_mean_of_the_physics(XY):
-    models = [CKA(*XY, physics=crude, center=center) for center in ("learn", "mean")]
-    found = [fit(model, "map", num_screened=16).log_likelihood for model in models]
-    torch.testing.assert_close(*found)
-    assert models[0].terms[0].basis.center.item() == 0.0
-    assert models[0].terms[0].basis.center.requires_grad
-
-
-def test_predictions_leave_no_trace_at_it(XY, uniform):
-    model = CKA(*XY, physics=crude, center="learn").eval()
-    Z = uniform(4, 2).requires_grad_()
-    model.posterior(Z).mean.sum().backward()
-    assert Z.grad is not None
-    assert model.terms[0].basis.center.grad is None
-    Z = Z.detach()
-    for found in (model.predict(Z).mean, model.posterior(Z).mean, model.delta(Z).mean):
-        assert not found.requires_grad
-
-
-def test_a_parameter_of_the_physics_with_its_name(XY):
     class Physics(torch.nn.Module):
         def __init__(self):
             super().__init__()
@@ -144,9 +112,29 @@ def test_a_parameter_of_the_physics_with_its_name(XY):
     assert models[0].predict(XY[0]).mean.isfinite().all()
 
 
-def test_the_summary_tells_it(XY):
-    model = move(CKA(*XY, physics=crude, center="learn"), 4.25)
-    assert "center 4.25" in model.summary()
+@pytest.mark.parametrize("method", ["map", "bayes"])
+def test_one_that_is_held_fixed_stays(XY, method):
+    model = move(CKA(*XY, physics=crude, center="learn"), 4.0)
+    model.terms[0].basis.center.requires_grad_(False)
+    fit(model, method, num_screened=16)
+    expected = torch.full_like(model.terms[0].basis.origin, 4.0)
+    torch.testing.assert_close(model.terms[0].basis.origin, expected)
+
+
+def test_a_point_fit_and_predictions_leave_it(XY, uniform):
+    models = [CKA(*XY, physics=crude, center=center) for center in ("learn", "mean")]
+    found = [fit(model, "map", num_screened=16).log_likelihood for model in models]
+    torch.testing.assert_close(*found)
+    assert models[0].terms[0].basis.center.item() == 0.0
+    assert models[0].terms[0].basis.center.requires_grad
+    model = CKA(*XY, physics=crude, center="learn").eval()
+    Z = uniform(4, 2).requires_grad_()
+    model.posterior(Z).mean.sum().backward()
+    assert Z.grad is not None
+    assert model.terms[0].basis.center.grad is None
+    Z = Z.detach()
+    for found in (model.predict(Z).mean, model.posterior(Z).mean, model.delta(Z).mean):
+        assert not found.requires_grad
 
 
 @pytest.mark.parametrize("cls", [CKA, RRA])

@@ -70,7 +70,7 @@ def test_intervals_hold_at_a_kink_and_no_others_are_wider(fitted, Z):
     assert wider[:, 1].mean() < 1.05
 
 
-def test_predictions_and_joint_posteriors_agree(fitted, Z):
+def test_predictions_posteriors_gradients_and_given_noise_agree(fitted, Z):
     X = Z[:40]
     mean, variance = fitted.predict(X)
     assert (variance / without(fitted).predict(X).variance).max() > 1.5
@@ -80,6 +80,11 @@ def test_predictions_and_joint_posteriors_agree(fitted, Z):
     noisy = fitted.posterior(X, observation_noise=True).mixture_variance
     torch.testing.assert_close(noisy, fitted.predict(X, observation_noise=True).variance)
     torch.testing.assert_close(posterior.covariance_matrix, covariance(fitted, X))
+    X = Z[:3].clone().requires_grad_()
+    assert torch.autograd.gradcheck(lambda X: fitted.predict(X).variance, X, rtol=1e-3)
+    given = torch.full((3, 2), 0.5, dtype=torch.float64)
+    more = fitted.predict(Z[:3], given).variance - fitted.predict(Z[:3]).variance
+    torch.testing.assert_close(more, given)
 
 
 def test_functions_are_as_much_farther_from_their_mean(fitted, Z):
@@ -103,15 +108,7 @@ def covariance(model, X):
     return plain * root.unsqueeze(-1) * root.unsqueeze(-2)
 
 
-def test_gradients_and_given_noise(fitted, Z):
-    X = Z[:3].clone().requires_grad_()
-    assert torch.autograd.gradcheck(lambda X: fitted.predict(X).variance, X, rtol=1e-3)
-    given = torch.full((3, 2), 0.5, dtype=torch.float64)
-    more = fitted.predict(Z[:3], given).variance - fitted.predict(Z[:3]).variance
-    torch.testing.assert_close(more, given)
-
-
-def test_what_models_do_with_them(fitted, Z, tmp_path):
+def test_what_models_do_with_them(fitted, Z, tmp_path, monkeypatch):
     one = fitted.subset_output([1])
     torch.testing.assert_close(one.predict(Z).variance, fitted.predict(Z).variance[:, 1:])
     model = CKA(*[fitted.data()[name] for name in ("train_X", "train_Y")], physics=physics)
@@ -124,9 +121,6 @@ def test_what_models_do_with_them(fitted, Z, tmp_path):
     torch.testing.assert_close(wider, fitted.widening(fitted.model_inputs(Z)))
     again.release_samples()
     assert again.larger_errors is None
-
-
-def test_a_refit_that_fails_leaves_them(fitted, Z, monkeypatch):
     model = fitted.subset_output([0, 1])
     monkeypatch.setattr("gpadjust.inference.bayes.default_num_samples", lambda n: 1 / 0)
     with pytest.raises(ZeroDivisionError):

@@ -1,42 +1,38 @@
 """Noise by name through the whole house: relative to the physics, and with heavy tails."""
 
-from __future__ import annotations
-
 import math
-from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
 from gpadjust import CKA, RRA, VariationalCKA, ZeroMeanGP, compare, fit, load, save
 from gpadjust.models import Logit
 from gpadjust.models.heavy_tails import SHARE
 from gpadjust.report import report
-from gpadjust.sklearn import CKARegressor
 from gpadjust.validation import leave_one_out
+from tests.systems import refused
 
-OPTIONS: Any = {"num_draws": 64, "num_starts": 2, "num_screened": 16}
+OPTIONS = {"num_draws": 64, "num_starts": 2, "num_screened": 16}
 OUTLIERS = [4, 13]
 
 
-def decades(X: Tensor) -> Tensor:
+def decades(X):
     return torch.exp(6 * X[:, :1] - 4)
 
 
-def wave(X: Tensor) -> Tensor:
+def wave(X):
     return torch.sin(5 * X[:, :1])
 
 
-@pytest.fixture(name="growing")
-def growing_data() -> tuple[Tensor, Tensor]:
+@pytest.fixture
+def growing():
     torch.manual_seed(0)
     X = torch.linspace(0.02, 1, 24, dtype=torch.float64).unsqueeze(-1)
     return X, decades(X) * (1 + 0.2 * X) * (1 + 0.1 * torch.randn_like(X))
 
 
-@pytest.fixture(name="gross")
-def gross_data() -> tuple[Tensor, Tensor]:
+@pytest.fixture
+def gross():
     torch.manual_seed(1)
     X = torch.linspace(0, 1, 20, dtype=torch.float64).unsqueeze(-1)
     Y = wave(X) + 0.3 * X + 0.03 * torch.randn_like(X)
@@ -44,7 +40,7 @@ def gross_data() -> tuple[Tensor, Tensor]:
     return X, Y
 
 
-def test_relative_noise_is_that_of_the_formula(growing: tuple[Tensor, Tensor]) -> None:
+def test_relative_noise_is_that_of_the_formula(growing):
     X, Y = growing
     model = CKA(X, Y, physics=decades, likelihood="relative")
     fit(model, **OPTIONS)
@@ -55,17 +51,13 @@ def test_relative_noise_is_that_of_the_formula(growing: tuple[Tensor, Tensor]) -
     more = [model.components(new, noisy)[1].mean(0).squeeze(-1) for noisy in (True, False)]
     assert torch.allclose(more[0] - more[1], expected)
     assert 0.06 < float(relative.median()) < 0.16
-
-
-def test_noise_relative_to_the_mean_without_physics(growing: tuple[Tensor, Tensor]) -> None:
-    X, Y = growing
     model = ZeroMeanGP(X, Y, likelihood="relative")
     fit(model, **OPTIONS)
     sd = (model.predict(X, True).variance - model.predict(X).variance).sqrt().flatten()
     assert float(sd[-1] / sd[0]) > 8  # of equal noise it would be 1
 
 
-def test_outliers_are_found_and_hardly_count(gross: tuple[Tensor, Tensor]) -> None:
+def test_outliers_are_found_and_hardly_count(gross):
     X, Y = gross
     model = CKA(X, Y, physics=wave, likelihood="heavy-tailed")
     fit(model, **OPTIONS)
@@ -81,7 +73,7 @@ def test_outliers_are_found_and_hardly_count(gross: tuple[Tensor, Tensor]) -> No
     assert float(loo.score().rmse) < 0.1
 
 
-def test_without_outliers_nothing_changes(gross: tuple[Tensor, Tensor]) -> None:
+def test_without_outliers_nothing_changes(gross):
     X, Y = gross
     keep = [i for i in range(len(X)) if i not in OUTLIERS]
     models = [
@@ -95,7 +87,7 @@ def test_without_outliers_nothing_changes(gross: tuple[Tensor, Tensor]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("names", ["relative", "heavy-tailed", ["relative", "heavy-tailed"]])
-def test_the_whole_house(names: Any, gross: tuple[Tensor, Tensor], tmp_path: Any) -> None:
+def test_the_whole_house(names, gross, tmp_path):
     X, Y = gross
     two = torch.cat([Y, Y.flip(0)], dim=-1)
     f_p = lambda X: torch.cat([wave(X), wave(1 - X)], dim=-1)  # noqa: E731
@@ -118,42 +110,28 @@ def test_the_whole_house(names: Any, gross: tuple[Tensor, Tensor], tmp_path: Any
 
 
 @pytest.mark.slow
-def test_compare_report_and_regressor(gross: tuple[Tensor, Tensor], tmp_path: Any) -> None:
-    X, Y = gross
-    found = compare(X, Y, physics=wave, likelihood="heavy-tailed", structures=["CKA"])
-    page = report(found, tmp_path / "page.html")
-    assert "outlier" in page.read_text().lower()
-    fitted = CKARegressor(wave, model_options={"likelihood": "heavy-tailed"}, fit_options=OPTIONS)
-    fitted.fit(X.numpy(), Y.numpy().ravel())
-    assert abs(float(fitted.predict([[0.65]])[0]) - float(wave(X.new_tensor([[0.65]]))) - 0.2) < 0.1
+def test_a_page_tells_outliers(gross, tmp_path):
+    found = compare(*gross, physics=wave, likelihood="heavy-tailed", structures=["CKA"])
+    assert "outlier" in report(found, tmp_path / "page.html").read_text().lower()
 
 
-@pytest.mark.slow
-def test_random_features(gross: tuple[Tensor, Tensor]) -> None:
+@pytest.mark.parametrize(
+    ("kind", "known"), [(CKA, 0.03**2), pytest.param(RRA, None, marks=pytest.mark.slow)]
+)
+def test_random_features_and_known_noise_have_outliers_too(gross, kind, known):
     X, Y = gross
-    model = RRA(X, Y, physics=wave, likelihood="heavy-tailed")
+    model = kind(X, Y, known, physics=wave, likelihood="heavy-tailed")
     fit(model, **OPTIONS)
     assert bool((model.outliers()[OUTLIERS] > 0.5).all())
 
 
-def test_known_noise_has_outliers_too(gross: tuple[Tensor, Tensor]) -> None:
+def test_bad_input(gross):
     X, Y = gross
-    model = CKA(X, Y, 0.03**2, physics=wave, likelihood="heavy-tailed")
-    fit(model, **OPTIONS)
-    assert bool((model.outliers()[OUTLIERS] > 0.5).all())
-
-
-def test_bad_input(gross: tuple[Tensor, Tensor]) -> None:
-    X, Y = gross
-    with pytest.raises(ValueError, match="a sequence of both, or a Gaussian"):
-        CKA(X, Y, physics=wave, likelihood="Student")
-    with pytest.raises(ValueError, match="relative already"):
-        CKA(
-            X, Y + 9, physics=lambda X: X + 9, outcome_transform=Logit(0, 99), likelihood="relative"
-        )
-    with pytest.raises(ValueError, match="train_Yvar or a likelihood"):
-        CKA(X, Y, 0.1, physics=wave, likelihood="relative")
-    with pytest.raises(ValueError, match="one variance for all"):
-        VariationalCKA(X, Y, physics=wave, likelihood="heavy-tailed", num_inducing=5)
-    with pytest.raises(ValueError, match="heavy-tailed"):
-        CKA(X, Y, physics=wave).outliers()
+    f_p, logit = {"physics": wave}, Logit(0, 99)
+    refused(ValueError, "a sequence of both, or a Ga", CKA, X, Y, **f_p, likelihood="Student")
+    options = {"physics": lambda X: X + 9, "outcome_transform": logit, "likelihood": "relative"}
+    refused(ValueError, "relative already", CKA, X, Y + 9, **options)
+    refused(ValueError, "train_Yvar or a like", CKA, X, Y, 0.1, **f_p, likelihood="relative")
+    sparse = {"likelihood": "heavy-tailed", "num_inducing": 5}
+    refused(ValueError, "one variance for all", VariationalCKA, X, Y, **f_p, **sparse)
+    refused(ValueError, "heavy-tailed", CKA(X, Y, physics=wave).outliers)

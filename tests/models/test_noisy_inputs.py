@@ -7,13 +7,13 @@ import pandas as pd
 import pytest
 import torch
 
-from gpadjust import CKA, CalibratedPhysics, ZeroMeanGP, compare, fit, load, save
+from gpadjust import CKA, CalibratedPhysics, ZeroMeanGP, fit, load, save
 from gpadjust.models.noisy_inputs import NoisyInputs
 from gpadjust.models.training_data import training_data
 from gpadjust.physics import BlackBoxPhysics, FunctionPhysics, PhysicsError, Unknown
 from gpadjust.report import report
-from gpadjust.sklearn import CKARegressor
 from gpadjust.validation import leave_one_out
+from tests.systems import refused
 
 SD = 0.05
 QUICK = partial(fit, method="map", num_starts=2, num_screened=8)
@@ -51,7 +51,7 @@ def data():
     return case(3)
 
 
-def test_the_slope_of_the_physics_carries_noise_to_the_targets(data):
+def test_moments_of_physics_and_true_inputs(data):
     X, Y = data
     model = CKA(X, Y, physics=f_p, train_Xvar=SD**2, outcome_transform=None)
     model.eval()
@@ -64,10 +64,6 @@ def test_the_slope_of_the_physics_carries_noise_to_the_targets(data):
     slope = 6 * torch.cos(6 * noisy.points)[:, 0]
     steep = slope.abs() > 4
     assert torch.allclose(variance[steep], (slope * noisy.spread[:, 0])[steep].square(), rtol=0.2)
-
-
-def test_true_inputs_have_the_moments_of_the_measured_ones_less_noise(data):
-    X, Y = data
     noisy = NoisyInputs.of(SD**2, training_data(X, Y))
     total = noisy.points.var(0) + noisy.spread.square().mean(0)
     assert total.item() == pytest.approx((X.var(0) - SD**2).item(), rel=1e-9)
@@ -116,29 +112,16 @@ def test_it_works_through_the_house(data, tmp_path):
     assert report(model, tmp_path / "page.html").stat().st_size > 10_000
 
 
-def test_samples_are_saved_with_it(data, tmp_path):
+def test_no_noise_changes_nothing_and_samples_are_saved(data, tmp_path):
+    plain, model = CKA(*data, physics=f_p), CKA(*data, physics=f_p, train_Xvar=0.0)
+    for each in (plain, model):
+        QUICK(each)
+    assert torch.allclose(plain.predict(TEST).mean, model.predict(TEST).mean, atol=1e-2)
     model = CKA(*data, physics=f_p, train_Xvar=SD**2)
     fit(model, num_starts=2, num_screened=8, num_draws=32)
     save(model, tmp_path / "model.pt")
     again = load(tmp_path / "model.pt", physics=f_p)
     assert torch.allclose(again.predict(TEST).mean, model.predict(TEST).mean)
-
-
-@pytest.mark.slow
-def test_compare_and_scikit_learn(data):
-    X, Y = data
-    found = compare(X, Y, f_p, structures=["CKA"], num_starts=1, num_screened=4, train_Xvar=SD**2)
-    assert all(model.noisy_inputs is not None for model in found.models.values())
-    regressor = CKARegressor(f_p, fit_method="map", fit_options={"num_starts": 1})
-    regressor.fit(X.numpy(), Y.numpy()[:, 0], train_Xvar=np.full((30, 1), SD**2))
-    assert regressor.model_.noisy_inputs is not None
-
-
-def test_no_noise_changes_nothing(data):
-    plain, model = CKA(*data, physics=f_p), CKA(*data, physics=f_p, train_Xvar=0.0)
-    for each in (plain, model):
-        QUICK(each)
-    assert torch.allclose(plain.predict(TEST).mean, model.predict(TEST).mean, atol=1e-2)
 
 
 @pytest.mark.slow
@@ -185,28 +168,17 @@ def test_a_black_box_that_cannot_be_asked_everywhere():
         QUICK(CKA(X, X, physics=never, train_Xvar=1e-3))
 
 
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
+def test_a_frame_and_bad_variances(data):
+    X, Y = data
+    for given, says in (
         (-1.0, "not to be negative"),
         ([1e-3, 1e-3], "one number"),
         (1.0, "not standard deviations"),
         (float("nan"), "finite"),
-    ],
-)
-def test_bad_variances_get_a_sentence(data, given, words):
-    with pytest.raises(ValueError, match=words):
-        CKA(*data, physics=f_p, train_Xvar=given)
-
-
-def test_a_batch_is_refused(data):
-    X, Y = (each.expand(2, -1, -1) for each in data)
-    with pytest.raises(ValueError, match="one data set"):
-        CKA(X, Y, physics=f_p, train_Xvar=1e-3)
-
-
-def test_a_frame(data):
-    X, Y = data
+    ):
+        refused(ValueError, says, CKA, X, Y, physics=f_p, train_Xvar=given)
+    batch = [each.expand(2, -1, -1) for each in data]
+    refused(ValueError, "one data set", CKA, *batch, physics=f_p, train_Xvar=1e-3)
     frame = pd.DataFrame(X.numpy(), columns=["length"])
     model = CKA(frame, Y, physics=f_p, train_Xvar=pd.DataFrame({"length": np.full(30, SD**2)}))
     assert model.input_names == ("length",)

@@ -1,5 +1,7 @@
 """Noise that is given: in BoTorch's units to `posterior`, in the user's to all else."""
 
+from functools import partial
+
 import pytest
 import torch
 from botorch.models import SingleTaskGP
@@ -7,7 +9,7 @@ from botorch.models.transforms import Standardize
 from botorch.sampling import SobolQMCNormalSampler
 
 from gpadjust import CKA, PhysicsMeanGP, StackedGP
-from tests.systems import holding
+from tests.systems import holding, refused
 
 # The targets are 60 times those of the physics, so that their units matter.
 pytestmark = pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
@@ -43,36 +45,20 @@ class TestPosterior:
         torch.testing.assert_close(added(ours, Z, noise), noise * scale.square())
         if kind != "AR1":  # whose transform is that of two levels
             torch.testing.assert_close(added(ours, Z, noise), added(theirs, Z, noise))
-
-    def test_without_outcome_transform_in_the_users_units(self, large, num_outputs, uniform):
-        X, Y = large(num_outputs)
-        model = CKA(X, Y, physics=lambda X: 0 * X[:, :num_outputs], outcome_transform=None)
-        Z, noise = uniform(5, 2), uniform(5, num_outputs, low=0.1, seed=2)
-        torch.testing.assert_close(added(model, Z, noise), noise)
-
-    def test_some_outputs(self, large, build, uniform):
-        X, Y = large(2)
-        theirs = SingleTaskGP(X, Y, outcome_transform=Standardize(2))
-        ours = build("CKA", X, Y, outcome_transform=Standardize(2))
-        Z, noise = uniform(5, 2), uniform(5, 2, low=0.1, seed=2)
-        expected = added(ours, Z, noise)
-        for outputs in ([1], [0], [1, 0]):
+        for outputs in ([1], [0], [1, 0]) if num_outputs == 2 else ():
             found = added(ours, Z, noise, output_indices=outputs)
-            torch.testing.assert_close(found, expected[:, outputs])
-        torch.testing.assert_close(expected, added(theirs, Z, noise))
+            torch.testing.assert_close(found, added(ours, Z, noise)[..., outputs])
 
-    def test_one_number_for_all_points(self, large, build, num_outputs, uniform):
+    def test_units_samples_and_one_number_for_all_points(self, large, build, num_outputs, uniform):
         X, Y = large(num_outputs)
+        Z, noise = uniform(5, 2), uniform(5, num_outputs, low=0.1, seed=2)
+        plain = build("CKA", X, Y, outcome_transform=None)
+        torch.testing.assert_close(added(plain, Z, noise), noise)
         model = build("CKA", X, Y, outcome_transform=Standardize(num_outputs))
-        found = added(model, uniform(5, 2), torch.full((1, 1), 0.5, dtype=torch.float64))
+        found = added(model, Z, torch.full((1, 1), 0.5, dtype=torch.float64))
         torch.testing.assert_close(found, (0.5 * Y.var(0)).expand(5, num_outputs))
-
-    def test_of_samples(self, large, build, num_outputs, uniform):
-        X, Y = large(num_outputs)
-        model = holding(build("CKA", X, Y, outcome_transform=Standardize(num_outputs)), *STEPS)
-        noise = uniform(5, num_outputs, low=0.1, seed=2)
         expected = (noise * Y.var(0)).expand(3, 5, num_outputs)
-        torch.testing.assert_close(added(model, uniform(5, 2), noise), expected)
+        torch.testing.assert_close(added(holding(model, *STEPS), Z, noise), expected)
 
     def test_of_a_mixture_of_structures(self, large, num_outputs, uniform):
         X, Y = large(num_outputs)
@@ -143,18 +129,15 @@ class TestRefused:
             return holding(build("CKA", X, Y), *STEPS)
         return build(request.param, X, Y)
 
-    @pytest.mark.parametrize("wrong", [-1.0, -1e-300, float("nan"), float("inf")])
-    @pytest.mark.parametrize("asked", ["posterior", "predict", "interval", "one output"])
-    def test_what_is_no_variance(self, model, uniform, wrong, asked):
+    def test_what_is_no_variance(self, model, uniform):
         Z, noise = uniform(5, 2), torch.ones(5, 2, dtype=torch.float64)
-        noise[2, 1] = wrong
-        options = {"output_indices": [1]} if asked == "one output" else {}
-        method = getattr(model, "posterior" if options else asked)
-        with pytest.raises(ValueError, match="finite and not negative"):
-            method(Z, observation_noise=noise, **options)
-
-    @pytest.mark.parametrize("shape", [(), (2,), (4, 2), (5, 3), (2, 5)])
-    def test_shapes(self, model, uniform, shape):
-        for method in (model.posterior, model.predict, model.interval):
-            with pytest.raises(ValueError, match="Expected observation_noise"):
-                method(uniform(5, 2), observation_noise=torch.ones(shape, dtype=torch.float64))
+        methods = model.posterior, model.predict, model.interval
+        for wrong in (-1.0, -1e-300, float("nan"), float("inf")):
+            noise[2, 1] = wrong
+            for method in (*methods, partial(model.posterior, output_indices=[1])):
+                refused(ValueError, "finite and not negative", method, Z, observation_noise=noise)
+        for shape in ((), (2,), (4, 2), (5, 3), (2, 5)):
+            wrong = torch.ones(shape, dtype=torch.float64)
+            for method in methods:
+                says = "Expected observation_noise"
+                refused(ValueError, says, method, Z, observation_noise=wrong)

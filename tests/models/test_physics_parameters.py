@@ -22,7 +22,7 @@ from gpadjust import (
 )
 from gpadjust.gp import OrthogonalKernel
 from gpadjust.models import PhysicsParameters, orthogonal_rbf
-from tests.systems import line, normal, same
+from tests.systems import line, normal, refused, same
 
 UNKNOWNS = {"a": Unknown(1.0, sd=0.5, unit="m"), "b": Unknown(2.0, factor=1.3)}
 FEW = {"num_samples": 3, "num_draws": 32, "num_starts": 1, "num_screened": 8}
@@ -124,38 +124,33 @@ class TestPhysicsParameters:
         draws = line(101, 0.0, 1.0)
         return PhysicsParameters(UNKNOWNS, torch.cat([draws, 2 + draws.square()], -1))
 
-    def test_are_a_mapping(self, parameters):
+    def test_are_a_mapping_with_moments_intervals_and_a_table(self, parameters):
         assert [*parameters] == ["a", "b"]
         assert len(parameters) == 2
         assert "mass" not in parameters
         assert torch.equal(parameters["b"], parameters.draws[:, 1])
-        with pytest.raises(KeyError, match=r"'mass'.*a, b"):
-            parameters["mass"]
-
-    def test_moments_and_intervals(self, parameters):
+        refused(KeyError, r"'mass'.*a, b", parameters.__getitem__, "mass")
         torch.testing.assert_close(parameters.mean[0].item(), 0.5)
         torch.testing.assert_close(parameters.sd[0].item(), (102 / 1200) ** 0.5)
         low, high = parameters.interval(0.9)
         torch.testing.assert_close(low, torch.tensor([0.05, 2.0025], dtype=torch.float64))
         torch.testing.assert_close(high, torch.tensor([0.95, 2.9025], dtype=torch.float64))
         assert PhysicsParameters(UNKNOWNS, parameters.draws[:1]).sd.tolist() == [0.0, 0.0]
-
-    @pytest.mark.parametrize("level", [0.0, 1.0, 95, float("nan")])
-    def test_of_no_level(self, parameters, level):
-        with pytest.raises(ValueError, match=f"between 0 and 1; found {level}"):
-            parameters.interval(level)
-
-    def test_are_shown_as_a_table(self, parameters):
         head, a, b = repr(parameters).splitlines()
         assert head.split("  ")[-1] == "unit"
         assert a.split() == ["a", "0.5", "0.025", "to", "0.975", "1", "±", "0.5", "m"]
         assert b.split() == ["b", "2.335", "2.001", "to", "2.951", "2,", "factor", "1.3"]
 
-    def test_of_a_model_that_has_none(self, waves):
+    def test_what_is_refused(self, parameters, waves):
+        for level in (0.0, 1.0, 95, float("nan")):
+            says = f"between 0 and 1; found {level}"
+            refused(ValueError, says, parameters.interval, level)
         X, Y, _ = waves(1)
         for model in (CKA(X, Y, physics=lambda X: X[:, 0]), ZeroMeanGP(X, Y)):
-            with pytest.raises(ValueError, match="no unknown parameters"):
-                _ = model.physics_parameters
+            refused(ValueError, "no unknown parameters", getattr, model, "physics_parameters")
+        for known in (torch.sin, [torch.sin, torch.cos]):
+            says = r"no unknown parameter.*unknowns="
+            refused(ValueError, says, CalibratedPhysics, X, Y, physics=known)
 
     def test_of_a_model_that_was_not_fitted(self, make, waves):
         X, Y, _ = waves(2)
@@ -166,14 +161,6 @@ class TestPhysicsParameters:
         assert parameters.sd.tolist() == [0.0, 0.0]
 
     @pytest.mark.slow
-    @pytest.mark.parametrize(
-        "build",
-        [
-            pytest.param(b, marks=pytest.mark.slow if b in ("orthogonal", "RRA") else ())
-            for b in BUILDS
-        ],
-        indirect=True,
-    )
     def test_after_a_fit(self, make, waves):
         X, Y, Z = waves(1)
         model, truth = make(X, Y), torch.tensor([1.3, 1.7], dtype=torch.float64)
@@ -189,13 +176,6 @@ class TestPhysicsParameters:
         fit(model, "map")  # it lets go of samples
         assert model.physics_parameters.draws.shape == (1, 2)
         assert model.predict(Z).mean.shape == (4, 1)
-
-
-@pytest.mark.parametrize("physics", [torch.sin, [torch.sin, torch.cos]])
-def test_calibrated_physics_of_a_physics_that_is_known(waves, physics):
-    X, Y, _ = waves(2)
-    with pytest.raises(ValueError, match=r"no unknown parameter.*unknowns="):
-        CalibratedPhysics(X, Y, physics=physics)
 
 
 def test_calibrated_physics_says_what_its_physics_does(waves, num_outputs):
@@ -250,48 +230,35 @@ class TestWaysOfHeldModels:
         hold(model)
         return model, Z, model.predict(Z)
 
-    def test_batches_of_points(self, held):
+    def test_batches_subsets_copies_and_what_is_released(self, held):
         model, Z, expected = held
         wide = model.predict(Z.expand(2, 5, 4, 2))
         same((wide.mean[1, 3], wide.variance[1, 3]), expected)
         posterior = model.posterior(Z.expand(2, 4, 2))
         same((posterior.mixture_mean[1], posterior.mixture_variance[1]), expected)
+        same(deepcopy(model).predict(Z), expected)
+        for numbers in ([0], [1], [1, 0]):
+            if max(numbers) < model.num_outputs:
+                subset = model.subset_output(numbers)
+                same(subset.predict(Z), [moment[:, numbers] for moment in expected])
+                assert subset.output_names == tuple(model.output_names[i] for i in numbers)
+        first = model.posterior(Z).mean[0]
+        model.release_samples()
+        torch.testing.assert_close(model.predict(Z).mean, first)
+        assert model.input_transform.coordinates.shape == (2,)
 
-    def test_fantasies(self, held):
+    def test_fantasies_and_functions(self, held):
         model, Z, _ = held
         for X in (Z[:2], Z.reshape(2, 2, 2)):
             fantasies = model.fantasize(X, SobolQMCNormalSampler(Size([4])))
             mean = fantasies.posterior(Z).mean
             assert mean.shape == (4, *X.shape[:-2], 3, 4, model.num_outputs)
-
-    def test_copies(self, held):
-        model, Z, expected = held
-        same(deepcopy(model).predict(Z), expected)
-
-    def test_subsets_of_outputs(self, held):
-        model, Z, expected = held
-        for numbers in ([0], [1], [1, 0]):
-            if max(numbers) < model.num_outputs:
-                subset = model.subset_output(numbers)
-                same(subset.predict(Z), [moment[:, numbers] for moment in expected])
-                names = [subset.output_names, [model.output_names[i] for i in numbers]]
-                assert names[0] == tuple(names[1])
-
-    def test_functions(self, held):
-        model, Z, _ = held
         functions = model.sample_functions(5, seed=0)
         values, away = functions(Z), Z.expand(5, 4, 2) + torch.arange(5.0)[:, None, None]
         torch.testing.assert_close(functions.each(Z.expand(5, 4, 2)), values)
         each = torch.stack([functions(away[i])[i] for i in range(5)])
         torch.testing.assert_close(functions.each(away), each)
         torch.testing.assert_close(functions(Z.expand(2, 4, 2))[:, 1], values)
-
-    def test_released(self, held):
-        model, Z, _ = held
-        first = model.posterior(Z).mean[0]
-        model.release_samples()
-        torch.testing.assert_close(model.predict(Z).mean, first)
-        assert model.input_transform.coordinates.shape == (2,)
 
 
 class TestStates:
@@ -345,17 +312,8 @@ class TestStates:
         again = load(path, **given)
         same(again.predict(Z), model.predict(Z))
         assert torch.equal(again.physics_parameters.draws, model.physics_parameters.draws)
-
-
-def test_a_file_of_another_prior_is_refused(waves, tmp_path):
-    X, Y, _ = waves(1)
-    model = CalibratedPhysics(X, Y, physics=physics_of(1))
-    hold(model)
-    with pytest.warns(UserWarning, match="cannot import it"):
-        save(model, tmp_path / "model.pt")
-    other = physics_of(1, a=Unknown(1.0, sd=0.6))  # the same guess
-    with pytest.raises(ValueError, match=r"another physics.*priors"):
-        load(tmp_path / "model.pt", physics=other)
+        given["physics"] = physics_of(num_outputs, a=Unknown(1.0, sd=0.6))  # the same guess
+        refused(ValueError, r"another physics.*priors", load, path, **given)
 
 
 def test_of_several_physics(waves):

@@ -2,8 +2,13 @@
 
 import pytest
 import torch
+from botorch.fit import fit_gpytorch_mll
 from botorch.models import SingleTaskGP
 from botorch.models.transforms import Normalize, Standardize
+from gpytorch.mlls import ExactMarginalLogLikelihood
+
+from gpadjust import fit
+from tests.systems import crude, refused
 
 
 @pytest.mark.parametrize("known_noise", [False, True], ids=["learnt", "known"])
@@ -49,21 +54,18 @@ def test_a_batched_input_transform(data, build, uniform, kind):
     torch.testing.assert_close(model.posterior(Z).mean, one_by_one)
 
 
-def test_output_indices(data, build, kind, uniform):
-    model = build(kind, *data(num_outputs=2))
-    Z = uniform(4, 2)
-    full, swapped = model.posterior(Z), model.posterior(Z, output_indices=[1, 0])
-    torch.testing.assert_close(swapped.mean, full.mean.flip(-1))
-    torch.testing.assert_close(swapped.variance, full.variance.flip(-1))
-
-
-def test_outputs_are_independent(data, build, kind, uniform):
+def test_outputs_are_independent_and_data_are_met(data, build, kind, uniform, num_outputs):
     X, Y = data(num_outputs=2)
     pair = build(kind, X, Y)
     changed = build(kind, X, torch.cat([Y[:, :1], Y[:, 1:].flip(0)], dim=-1))
     Z = uniform(4, 2)
     torch.testing.assert_close(pair.posterior(Z).mean[:, 0], changed.posterior(Z).mean[:, 0])
     assert not torch.allclose(pair.posterior(Z).mean[:, 1], changed.posterior(Z).mean[:, 1])
+    X, Y = data(num_outputs=num_outputs)
+    options = {"num_features": 200} if kind.startswith("RRA") else {}
+    model = build(kind, X, Y, 1e-4 * torch.ones_like(Y), **options)
+    error = (model.posterior(X).mean - Y).abs().max()
+    assert error < 0.1 * Y.std(0).max()
 
 
 @pytest.mark.parametrize("batch_shape", [(), (3,)], ids=["single", "batch"])
@@ -75,13 +77,67 @@ def test_terms(data, build, kind, num_outputs, batch_shape, uniform):
             posterior = model.term(name, uniform(*leading, 4, 2))
             expected = (*(leading or batch_shape), 4, num_outputs)
             assert posterior.mean.shape == posterior.variance.shape == expected
-    with pytest.raises(ValueError, match="'gamma'; it has '"):
-        model.term("gamma", X)
+    refused(ValueError, "'gamma'; it has '", model.term, "gamma", X)
 
 
-def test_the_data_are_met_where_the_noise_is_small(data, build, kind, num_outputs):
-    X, Y = data(num_outputs=num_outputs)
-    options = {"num_features": 200} if kind.startswith("RRA") else {}
-    model = build(kind, X, Y, 1e-4 * torch.ones_like(Y), **options)
-    error = (model.posterior(X).mean - Y).abs().max()
-    assert error < 0.1 * Y.std(0).max()
+# Subsets of a model's outputs
+
+
+def three(X):
+    """Three outputs of the crude physics."""
+    return torch.cat([crude(X), crude(X)[..., :1].cos() + 3], dim=-1)
+
+
+@pytest.fixture(params=["plain", "transformed", "known-noise", "batch"])
+def three_outputs(request, data, build, kind, shuffle):
+    """A model of three different outputs."""
+    batch = (2,) if request.param == "batch" else ()
+    X, Y = data(batch_shape=batch, num_outputs=2)
+    Y = torch.cat([Y, Y[..., :1].sin() + 3], dim=-1)
+    options = {} if kind == "ZeroMeanGP" else {"physics": three}
+    if request.param == "transformed":
+        options["input_transform"] = Normalize(2)
+        options["outcome_transform"] = Standardize(3)
+    Yvar = 0.01 * torch.ones_like(Y) if request.param == "known-noise" else None
+    return shuffle(build(kind, X, Y, Yvar, **options))
+
+
+@pytest.mark.parametrize("indices", [[1], [2, 0], [-1]])
+def test_a_subset_is_the_whole_posterior_and_leaves_the_whole(
+    three_outputs, uniform, same, indices
+):
+    Z = uniform(4, 2, high=2.0, seed=5)
+    same(three_outputs.subset_output(indices), three_outputs, Z, 1e-9, indices)
+    posterior = three_outputs.posterior(Z, output_indices=indices)
+    expected = three_outputs.posterior(Z)
+    torch.testing.assert_close(posterior.mean, expected.mean[..., indices])
+    torch.testing.assert_close(posterior.variance, expected.variance[..., indices])
+    refused(ValueError, "numbers of outputs from 0 to 2", three_outputs.subset_output, [3])
+    Z = uniform(4, 2)
+    before = three_outputs.posterior(Z).mean.detach()
+    part = three_outputs.subset_output([1])
+    with torch.no_grad():
+        for parameter in part.parameters():
+            parameter += 0.5
+    three_outputs.train()
+    torch.testing.assert_close(three_outputs.posterior(Z).mean.detach(), before)
+
+
+# BoTorch's fit adds no nugget but after a warning.
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:A not p.d.")
+@pytest.mark.parametrize(("kind", "indices"), [("CKA", [1]), ("AR1", [2, 0]), ("RRA", [2, 0])])
+def test_it_can_be_fitted_again(data, build, kind, uniform, indices):
+    X, Y = data(num_outputs=2)
+    # With noise, so that rounding errors do not decide which optimum is reached.
+    Y = torch.cat([Y, Y[:, :1].sin() + 3], dim=-1) + 0.1 * uniform(len(X), 3, seed=5)
+    whole = build(kind, X, Y, physics=three)
+    part, refitted = whole.subset_output(indices), whole.subset_output(indices)
+    # A subset still reads all columns of f_p.
+    assert part.posterior(X).mean.shape == (len(X), len(indices))
+    from_there = {"num_screened": 0, "num_starts": 1}
+    reached, expected = fit(refitted, "map", **from_there), fit(whole, "map", **from_there)
+    part_of_whole = expected.log_likelihood[indices].reshape(reached.log_likelihood.shape)
+    torch.testing.assert_close(reached.log_likelihood, part_of_whole, rtol=1e-3, atol=1e-3)
+    fit_gpytorch_mll(ExactMarginalLogLikelihood(part.likelihood, part))
+    assert (part.posterior(X).mean - Y[:, indices]).abs().mean() < Y.std()

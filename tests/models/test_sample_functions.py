@@ -12,12 +12,12 @@ from gpytorch.kernels import ConstantKernel, RBFKernel, RFFKernel, ScaleKernel
 from gpadjust import CKA
 from gpadjust.gp import Term
 from gpadjust.gp.features import TermFeatures
-from tests.systems import line
+from tests.systems import line, refused
 
 
-def test_moments(data, build, costly_kind, num_outputs, uniform):
+def test_moments(data, build, kind, num_outputs, uniform):
     X, Y = data(num_outputs=num_outputs, n=12)
-    model = build(costly_kind, X, Y, input_transform=Normalize(2)).eval()
+    model = build(kind, X, Y, input_transform=Normalize(2)).eval()
     Z = uniform(4, 2, high=2.0, seed=4)
     with torch.no_grad():
         values, posterior = model.sample_functions(1500, seed=0)(Z), model.posterior(Z)
@@ -76,16 +76,19 @@ class TestWithoutNoise:
         assert ((self.spread(model, self.Z) - 1).abs() < 0.2).all()
 
 
-def test_points_for_other_functions(data, build, kind, uniform):
-    model = build(kind, *data())
+def test_wrong_numbers_and_points_for_other_functions(data, build, uniform):
+    model = build("CKA", *data())
+    for number, error in ((0, ValueError), (-1, ValueError), (2.5, TypeError)):
+        refused(error, "num_functions must be", model.sample_functions, number)
+        refused(error, "num_features must be", model.sample_functions, 1, num_features=number)
+    refused(ValueError, "num_features to be even", model.sample_functions, 1, num_features=7)
     functions = model.sample_functions(3, seed=0)
     assert functions.each(uniform(3, 4, 2)).shape == (3, 4, 1)
     for shape in ((2, 4, 2), (4, 2), (1, 3, 4, 2)):
-        with pytest.raises(ValueError, match=r"3 functions, 3 x q x d"):
-            functions.each(uniform(*shape))
+        refused(ValueError, r"3 functions, 3 x q x d", functions.each, uniform(*shape))
 
 
-def test_shapes_and_seed(data, build, kind, num_outputs, uniform):
+def test_shapes_seed_gradients_and_means(data, build, kind, num_outputs, uniform):
     model = build(kind, *data(num_outputs=num_outputs))
     functions, Z = model.sample_functions(3, seed=1), uniform(2, 6, 5, 2)
     values = functions(Z)
@@ -95,13 +98,29 @@ def test_shapes_and_seed(data, build, kind, num_outputs, uniform):
     state = torch.get_rng_state()
     torch.testing.assert_close(model.sample_functions(3, seed=1)(Z), values)
     assert torch.equal(torch.get_rng_state(), state)
+    functions = build(kind, *data(num_outputs=num_outputs)).sample_functions(2, seed=0)
+    Z = uniform(3, 2, seed=3)
+    assert torch.autograd.gradcheck(functions, Z.requires_grad_())
+    model = build(kind, *data(num_outputs=num_outputs, n=9))
+    functions, Z = model.mean_functions(), uniform(2, 5, 2)
+    torch.testing.assert_close(functions(Z), model.predict(Z).mean.unsqueeze(0))
+    Z.requires_grad_(True)
+    (slope,) = torch.autograd.grad(functions(Z).sum(), Z)
+    (expected,) = torch.autograd.grad(model.predict(Z).mean.sum(), Z)
+    torch.testing.assert_close(slope, expected)
 
 
-def test_a_seed_is_none_of_the_generators_of_gpus(data, build, monkeypatch):
+def test_seeds_and_later_fits(data, build, monkeypatch, kind, shuffle, uniform):
     seeds, model = [], build("CKA", *data())
     monkeypatch.setattr(torch.cuda, "manual_seed_all", seeds.append)
     model.sample_functions(3, seed=1)
     assert seeds == []
+    model, Z = build(kind, *data()), uniform(3, 2)
+    functions = model.sample_functions(2, seed=0)
+    before = functions(Z)
+    shuffle(model.train())
+    assert torch.equal(functions(Z), before)
+    torch.testing.assert_close(copy.deepcopy(functions)(Z), before)
 
 
 def test_a_batch_of_models(data, build, kind, num_outputs, uniform):
@@ -113,35 +132,9 @@ def test_a_batch_of_models(data, build, kind, num_outputs, uniform):
     torch.testing.assert_close(functions(Z[1]), values[:, 1])
 
 
-def test_gradients(data, build, kind, num_outputs, uniform):
-    functions = build(kind, *data(num_outputs=num_outputs)).sample_functions(2, seed=0)
-    Z = uniform(3, 2, seed=3)
-    assert torch.autograd.gradcheck(functions, Z.requires_grad_())
-
-
-def test_a_later_fit_leaves_them(data, build, kind, shuffle, uniform):
-    model, Z = build(kind, *data()), uniform(3, 2)
-    functions = model.sample_functions(2, seed=0)
-    before = functions(Z)
-    shuffle(model.train())
-    assert torch.equal(functions(Z), before)
-    torch.testing.assert_close(copy.deepcopy(functions)(Z), before)
-
-
-def test_wrong_numbers(data, build, kind):
-    model = build(kind, *data())
-    for number in (0, -1, 2.5):
-        with pytest.raises((TypeError, ValueError), match="num_functions must be"):
-            model.sample_functions(number)
-        with pytest.raises((TypeError, ValueError), match="num_features must be"):
-            model.sample_functions(1, num_features=number)
-    with pytest.raises(ValueError, match="num_features to be even"):
-        model.sample_functions(1, num_features=7)
-
-
 @pytest.mark.slow
-def test_botorch_draws_paths(data, build, costly_kind, num_outputs, uniform):
-    model = build(costly_kind, *data(num_outputs=num_outputs)).eval()
+def test_botorch_draws_paths(data, build, kind, num_outputs, uniform):
+    model = build(kind, *data(num_outputs=num_outputs)).eval()
     Z = uniform(5, 2)
     shape = (4, 5) if num_outputs == 1 else (4, num_outputs, 5)
     for draw in (draw_matheron_paths, draw_kernel_feature_paths):
@@ -169,21 +162,8 @@ def test_features_make_the_kernel(uniform, outputs):
         torch.testing.assert_close((features @ features.mT).detach(), expected, **close)
 
 
-def test_means_are_those_of_the_predictions(data, build, kind, num_outputs, uniform):
-    model = build(kind, *data(num_outputs=num_outputs, n=9))
-    functions, Z = model.mean_functions(), uniform(2, 5, 2)
-    torch.testing.assert_close(functions(Z), model.predict(Z).mean.unsqueeze(0))
-    Z.requires_grad_(True)
-    (slope,) = torch.autograd.grad(functions(Z).sum(), Z)
-    (expected,) = torch.autograd.grad(model.predict(Z).mean.sum(), Z)
-    torch.testing.assert_close(slope, expected)
-
-
-def test_a_mean_for_each_sample_of_the_hyperparameters(data, build, uniform):
-    from gpadjust import fit
-
-    model = build("CKA", *data(n=9))
-    fit(model, num_samples=4, num_draws=32, num_starts=1, num_screened=8)
-    values, Z = model.mean_functions()(uniform(5, 2, seed=3)), uniform(5, 2, seed=3)
-    assert len(values) == model.num_samples
-    torch.testing.assert_close(values.mean(0), model.predict(Z).mean)
+def test_a_mean_for_each_sample_of_the_hyperparameters(data, held, uniform):
+    model, singles = held("CKA", *data(n=9))
+    Z = uniform(5, 2, seed=3)
+    each = [single.predict(Z).mean for single in singles]
+    torch.testing.assert_close(model.mean_functions()(Z), torch.stack(each))

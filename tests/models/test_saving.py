@@ -12,8 +12,8 @@ from torch.nn.functional import relu, silu
 from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, StackedGP, ZeroMeanGP, load, save
 from gpadjust.inference import register_priors
 from gpadjust.models.parameters import scaled_rbf
-from gpadjust.physics import FormulaPhysics, as_physics
-from tests.systems import holding, same
+from gpadjust.physics import as_physics
+from tests.systems import holding, refused, same
 
 
 @pytest.fixture
@@ -86,56 +86,52 @@ def test_a_model_comes_back(name, uniform, path):
     same(model.predict(Z), again.predict(Z))
 
 
-def test_one_that_was_conditioned_and_holds_samples(uniform, path):
+@pytest.mark.parametrize("Yvar", [None, 0.01])
+def test_one_that_was_conditioned_and_holds_samples(uniform, path, Yvar):
     X, Y, Z = problem(uniform)
-    model = CKA(X, Y, physics=relu)
-    model = holding(model, 0.0, 0.5).condition_on_observations(Z, relu(Z))
+    model = holding(CKA(X, Y, Yvar, physics=relu), 0.0, 0.5)
+    noise = None if Yvar is None else torch.full_like(Z, 0.3)
+    model = model.condition_on_observations(Z, relu(Z), noise=noise)
     save(model, path)
     again = load(path, trusted=True)
     assert again.num_samples == 2
     same(model.predict(Z), again.predict(Z))
 
 
-def test_what_has_no_name_is_given_again(uniform, path):
+def test_what_has_no_name_is_given_again_and_compared(uniform, path):
     X, Y, Z = problem(uniform)
     options = {"physics": lambda X: relu(X), "input_transform": Normalize(2)}
     model = CKA(X, Y, **options)
     saved(model, path)
-    with pytest.raises(ValueError, match="input_transform and physics"):
-        load(path)
+    refused(ValueError, "input_transform and physics", load, path)
     same(model.predict(Z), load(path, **options).predict(Z))
-
-
-def test_another_physics_is_refused(uniform, path):
+    model = Gained(X, Y, physics=relu, physics_gain=3.0, low=1.0)
+    saved(model, path)
+    assert torch.load(path, weights_only=True)["options"] == {"physics_gain": 3.0, "low": 1.0}
+    same(model.predict(Z), load(path, physics=relu).predict(Z))
     X, Y, _ = problem(uniform)
-    save(CKA(X, Y, physics={"a": relu, "b": silu}), path)
-    with pytest.raises(ValueError, match=r"another physics.*same order"):
-        load(path, physics={"a": silu, "b": relu})
-    subset = CKA(X, Y, physics=relu).subset_output([1])
-    with pytest.raises(ValueError, match="got a subset"):
-        save(subset, path)
+    model = CKA(X, 1e-10 * Y, physics=lambda X: 1e-10 * relu(X))
+    saved(model, path)
+    refused(ValueError, "saved with another physics", load, path, physics=lambda X: 3e-10 * relu(X))
+    load(path, physics=lambda X: 1e-10 * relu(X))
 
 
-def test_a_class_that_cannot_be_imported_is_refused(uniform, path):
+def test_what_could_not_come_back_is_refused(uniform, path):
     class Local(CKA):
         pass
 
-    X, Y, _ = problem(uniform)
-    with pytest.raises(ValueError, match=r"Local cannot be imported again"):
-        save(Local(X, Y, physics=relu), path)
-    assert not path.exists()
-
-
-def test_a_state_of_another_model_changes_nothing(uniform):
     X, Y, Z = problem(uniform)
     model = CKA(X, Y, physics=relu)
-    before = model.predict(Z)
-    state = {name: value + 1 for name, value in model.state_dict().items()}
-    state["covar_module.terms.0.kernel.base_kernel.raw_lengthscale"] = torch.ones(2, 1, 3)
-    for wrong in (state, ZeroMeanGP(X, Y).state_dict()):
-        with pytest.raises(RuntimeError, match=r"as it was.*terms\.0"):
-            model.load_state_dict(wrong)
-    torch.testing.assert_close(model.predict(Z), before)
+    refused(ValueError, r"Local cannot be imported again", save, Local(X, Y, physics=relu), path)
+    refused(ValueError, r"Renamed.*train_X.*train_Y", save, Renamed(X, Y, physics=relu), path)
+    refused(ValueError, "got a subset", save, model.subset_output([1]), path)
+    assert not path.exists()
+    model = Passing(X, Y, physics=relu)
+    save(model, path)
+    same(model.predict(Z), load(path, trusted=True).predict(Z))
+    save(CKA(X, Y, physics={"a": relu, "b": silu}), path)
+    other = {"a": silu, "b": relu}
+    refused(ValueError, r"another physics.*same order", load, path, physics=other)
 
 
 def test_whether_it_is_fitted_is_known_of_a_loaded_model(uniform, path):
@@ -165,32 +161,12 @@ def test_a_kernel_is_given_again(uniform, path, name):
 
     model = AR1(X, Y, physics=relu, low_X=X + 0.1, **{name: kernel})
     save(model, path)
-    with pytest.raises(ValueError, match=f"could not hold {name}"):
-        load(path, trusted=True)
+    refused(ValueError, f"could not hold {name}", load, path, trusted=True)
     same(model.predict(Z), load(path, trusted=True, **{name: kernel}).predict(Z))
     with pytest.raises(ValueError, match=r"MaternKernel 0\.5.*RBFKernel"):
         load(path, trusted=True, **{name: scaled_rbf})
     save(AR1(X, Y, physics=relu, low_X=X + 0.1), path)
-    with pytest.raises(ValueError, match=rf"model\.pt: .*{name}.*: nothing"):
-        load(path, **{name: kernel})
-
-
-def test_options_of_a_structure_of_your_own(uniform, path):
-    X, Y, Z = problem(uniform)
-    model = Gained(X, Y, physics=relu, physics_gain=3.0, low=1.0)
-    saved(model, path)
-    assert torch.load(path, weights_only=True)["options"] == {"physics_gain": 3.0, "low": 1.0}
-    same(model.predict(Z), load(path, physics=relu).predict(Z))
-
-
-def test_known_noise_of_later_observations(uniform, path):
-    X, Y, Z = problem(uniform)
-    model = CKA(X, Y, 0.01, physics=relu)
-    model = holding(model, 0.0, 0.5).condition_on_observations(
-        Z, relu(Z), noise=torch.full_like(Z, 0.3)
-    )
-    save(model, path)
-    same(model.predict(Z), load(path, trusted=True).predict(Z))
+    refused(ValueError, rf"model\.pt: .*{name}.*: nothing", load, path, **{name: kernel})
 
 
 def test_a_stacked_model_comes_back(uniform, path):
@@ -201,8 +177,7 @@ def test_a_stacked_model_comes_back(uniform, path):
     again = load(path, trusted=True)
     assert again.weights == stacked.weights
     same(again.predict(Z), stacked.predict(Z))
-    with pytest.raises(ValueError, match="take the StackedGP"):
-        save(stacked.subset_output([0]), path)
+    refused(ValueError, "take the StackedGP", save, stacked.subset_output([0]), path)
     same(load(path, trusted=True).predict(Z), stacked.predict(Z))
 
 
@@ -217,41 +192,31 @@ def test_a_stacked_model_of_several_physics_is_given_those_without_a_name(unifor
     models |= {"of all": CKA(X, Y, physics=parts), "none": ZeroMeanGP(X, Y)}
     stacked = StackedGP(models, torch.full((4, 2), 0.25).double())
     saved(stacked, path)
-    with pytest.raises(ValueError, match="could not hold physics"):
-        load(path)
+    refused(ValueError, "could not hold physics", load, path)
     same(load(path, physics=parts).predict(Z), stacked.predict(Z))
 
 
-def test_files_that_are_no_models(path):
-    with pytest.raises(FileNotFoundError):
-        load(path)
-    path.write_bytes(b"no model")
-    with pytest.raises(ValueError, match="not a model"):
-        load(path)
-    for format in (99, [3], torch.ones(2)):
-        torch.save({"format": format}, path)
-        with pytest.raises(ValueError, match=r"model\.pt .*expected format 3"):
-            load(path)
-    with pytest.raises(TypeError, match=r"model of gpadjust.*Linear"):
-        save(torch.nn.Linear(1, 1), path)
-
-
-def test_paths_that_are_no_files(uniform, tmp_path, monkeypatch):
+def test_what_is_no_model_and_no_file_and_what_a_failed_write_leaves(
+    uniform, path, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     model = ZeroMeanGP(*problem(uniform)[:2])
-    for path, error, says in (
+    for wrong, error, says in (
         (None, TypeError, "Expected path as the name of a file, got None"),
         (3, TypeError, "name of a file, got 3"),
         (tmp_path, ValueError, "is a folder; name a file in it"),
         ("", ValueError, "is a folder"),
         (tmp_path / "none" / "model.pt", ValueError, "in a folder that does not exist"),
     ):
-        with pytest.raises(error, match=says):
-            save(model, path)
+        refused(error, says, save, model, wrong)
     assert not [*tmp_path.iterdir()]
-
-
-def test_nothing_is_left_of_a_file_that_could_not_be_written(uniform, path, monkeypatch):
+    refused(TypeError, r"model of gpadjust.*Linear", save, torch.nn.Linear(1, 1), path)
+    refused(FileNotFoundError, "model.pt", load, path)
+    path.write_bytes(b"no model")
+    refused(ValueError, "not a model", load, path)
+    for format in (99, [3], torch.ones(2)):
+        torch.save({"format": format}, path)
+        refused(ValueError, r"model\.pt .*expected format 3", load, path)
     model = ZeroMeanGP(*problem(uniform)[:2])
     save(model, path)
     before = path.read_bytes()
@@ -261,8 +226,7 @@ def test_nothing_is_left_of_a_file_that_could_not_be_written(uniform, path, monk
         raise OSError("No space left on device")
 
     monkeypatch.setattr(torch, "save", full)
-    with pytest.raises(OSError, match="No space"):
-        save(model, path)
+    refused(OSError, "No space", save, model, path)
     assert [*path.parent.iterdir()] == [path]
     assert path.read_bytes() == before
 
@@ -309,18 +273,18 @@ class TestFilesOfStrangers:
         yield trace
         sys.modules.pop("planted_module", None)
 
-    def test_a_class_of_no_module_that_was_imported(self, content, planted):
+    def test_what_is_imported_and_given(self, content, planted, uniform):
         with pytest.raises(ValueError, match="'planted_module' was not imported"):
             load(content(**{"class": "planted_module:X"}))
         assert not planted.exists()
         for name in ("gpadjust.models.structures:None", "builtins:dict", "torch.nn:Linear"):
-            with pytest.raises(ValueError, match=r"model\.pt: .*has no such model"):
-                load(content(**{"class": name}))
-
-    def test_a_physics_that_is_given_is_not_imported(self, content, planted):
+            refused(ValueError, r"model\.pt: .*has no such model", load, content(**{"class": name}))
         path = content(physics={"": "planted_module:X"})
         assert load(path, physics=relu).num_outputs == 2
         assert not planted.exists()
+        for given in ({"foo": 1}, {"train_Y": uniform(8, 2)}, {"center": 0.0}):
+            refused(ValueError, rf"{next(iter(given))}.*physics", load, content(), **given)
+        refused(ValueError, r"model\.pt is damaged", load, content(), physics=3.0)
 
     NAMES = ("planted_module:X", "planted_module:_exit", "os:_exit", "torch:os._exit")
 
@@ -328,22 +292,13 @@ class TestFilesOfStrangers:
     def test_a_physics_is_imported_of_a_trusted_file_alone(self, content, planted, name):
         """One of a module that is there already is not called either."""
         path = content(physics={"": name})
-        with pytest.raises(ValueError, match=rf"model\.pt: .*{name}.*physics=.*trusted=True"):
-            load(path)
+        refused(ValueError, rf"model\.pt: .*{name}.*physics=.*trusted=True", load, path)
         assert not planted.exists()
-        with pytest.raises(TypeError, match="trusted must be True or False"):
-            load(path, trusted=name)
+        refused(TypeError, "trusted must be True or False", load, path, trusted=name)
         if name == "planted_module:X":
-            with pytest.raises(ValueError, match=r"model\.pt: .*not name a physics"):
-                load(path, trusted=True)
+            refused(ValueError, r"model\.pt: .*not name a physics", load, path, trusted=True)
             assert planted.exists()
             assert not planted.read_text()
-
-    def test_a_formula_needs_no_trust(self, uniform, path):
-        X = uniform(8, 1)
-        model = CKA(X, X.sin(), physics=FormulaPhysics("2 * x", ["x"]))
-        save(model, path)
-        same(load(path).predict(X), model.predict(X))
 
     PARTS = ("class", "options", "missing", "physics", "physics_values", "data", "names", "state")
 
@@ -352,15 +307,14 @@ class TestFilesOfStrangers:
         """One that is left out or wrong is an error with the file's name, or does no harm."""
         path = content()
         torch.save({name: each for name, each in content.held.items() if name != part}, path)
-        with pytest.raises(ValueError, match=r"model\.pt is damaged.*KeyError"):
-            load(path, trusted=True)
-        refused = 0
+        refused(ValueError, r"model\.pt is damaged.*KeyError", load, path, trusted=True)
+        errors = 0
         for wrong in (None, 3, "x", [3], {"x": 3}, {"train_X": 1}, torch.ones(2)):
             try:
                 load(content(**{part: wrong}), trusted=True)
             except ValueError as error:
-                refused += "model.pt" in str(error)
-        assert refused > 3
+                errors += "model.pt" in str(error)
+        assert errors > 3
 
     def test_a_stacked_model(self, uniform, path):
         X, Y, _ = problem(uniform)
@@ -369,18 +323,10 @@ class TestFilesOfStrangers:
         for name in ("models", "weights", "num_components"):
             for wrong in (None, 3.5, "x", [3], {}, {"x": 3}):
                 torch.save({**held, name: wrong}, path)
-                with pytest.raises(ValueError, match=r"model\.pt"):
-                    load(path)
-
-    def test_what_is_given_beside_the_file(self, content, uniform):
-        for given in ({"foo": 1}, {"train_Y": uniform(8, 2)}, {"center": 0.0}):
-            with pytest.raises(ValueError, match=rf"{next(iter(given))}.*physics"):
-                load(content(), **given)
-        with pytest.raises(ValueError, match=r"model\.pt is damaged"):
-            load(content(), physics=3.0)
+                refused(ValueError, r"model\.pt", load, path)
 
 
-def test_what_a_fit_may_move_comes_back(uniform, path):
+def test_what_a_fit_may_move_comes_back_and_another_state_changes_nothing(uniform, path):
     X, Y, Z = problem(uniform)
     model = CKA(X, Y, physics=relu)
     model.likelihood.noise = 0.5
@@ -391,23 +337,10 @@ def test_what_a_fit_may_move_comes_back(uniform, path):
     same(model.predict(Z), again.predict(Z))
     learnt = [{n for n, p in m.named_parameters() if p.requires_grad} for m in (model, again)]
     assert learnt[0] == learnt[1]
-
-
-def test_a_physics_of_small_units_is_compared(uniform, path):
-    X, Y, _ = problem(uniform)
-    model = CKA(X, 1e-10 * Y, physics=lambda X: 1e-10 * relu(X))
-    saved(model, path)
-    with pytest.raises(ValueError, match="saved with another physics"):
-        load(path, physics=lambda X: 3e-10 * relu(X))
-    load(path, physics=lambda X: 1e-10 * relu(X))
-
-
-def test_data_under_other_names(uniform, path):
-    """No file is written that cannot be read."""
-    X, Y, Z = problem(uniform)
-    with pytest.raises(ValueError, match=r"Renamed.*train_X.*train_Y"):
-        save(Renamed(X, Y, physics=relu), path)
-    assert not path.exists()
-    model = Passing(X, Y, physics=relu)
-    save(model, path)
-    same(model.predict(Z), load(path, trusted=True).predict(Z))
+    model = CKA(X, Y, physics=relu)
+    before = model.predict(Z)
+    state = {name: value + 1 for name, value in model.state_dict().items()}
+    state["covar_module.terms.0.kernel.base_kernel.raw_lengthscale"] = torch.ones(2, 1, 3)
+    for wrong in (state, ZeroMeanGP(X, Y).state_dict()):
+        refused(RuntimeError, r"as it was.*terms\.0", model.load_state_dict, wrong)
+    torch.testing.assert_close(model.predict(Z), before)

@@ -2,12 +2,23 @@
 
 import pickle
 from collections import Counter
+from functools import partial
 
 import pytest
 import torch
+from botorch.sampling import SobolQMCNormalSampler
 
-from gpadjust import CKA, RRA, FunctionPhysics, PhysicsError, PhysicsMeanGP, ScaleGP, fit
-from tests.systems import holding
+from gpadjust import (
+    CKA,
+    RRA,
+    BlackBoxPhysics,
+    FunctionPhysics,
+    PhysicsError,
+    PhysicsMeanGP,
+    ScaleGP,
+    fit,
+)
+from tests.systems import crude, holding, refused
 
 CLASSES = [CKA, RRA, PhysicsMeanGP, ScaleGP]
 
@@ -63,16 +74,28 @@ def test_the_parts_make_the_whole(uniform, shuffle, close, cls, center):
     close(model.predict(Z).mean, model.posterior(Z).mean)
 
 
-def test_names(uniform, close):
+def test_names_and_errors(uniform, close):
     X, Y, Z = problem(uniform)
     model = CKA(X, Y, physics=[swing, drift]).eval()
     for named in (1, -1, "drift", "rho_drift"):
         close(model.rho(Z, physics=named).mean, model.term("rho_drift", Z).mean)
     for wrong in (None, 2, "weight"):
-        with pytest.raises(ValueError, match=r"swing, drift, or a number"):
-            model.rho(Z, physics=wrong)
+        refused(ValueError, r"swing, drift, or a number", model.rho, Z, physics=wrong)
     assert CKA(X, Y, physics=[swing]).term_names == ("rho", "delta")
     assert CKA(X, Y, physics=[lambda X: swing(X), drift]).rho_names == ("rho_f_1", "rho_drift")
+    X, Y, _ = problem(uniform)
+
+    def broken(X):
+        return swing(X) / (X[:, :1] < 5)
+
+    model = CKA(X, Y, physics={"good": swing, "bad": broken}).eval()
+    with pytest.raises(PhysicsError, match=r"'bad'.*NaN or inf in 1 of 2"):
+        model.posterior(torch.tensor([[0.0, 0.5], [9.0, 0.5]], dtype=torch.float64))
+    with pytest.raises(ValueError, match=r"rho_mean.*'learn'.*2 numbers"):
+        CKA(X, Y, physics=[swing, drift], rho_mean=[1.0])
+    with pytest.raises(ValueError, match=r"2 kernels of rho.*got 1"):
+        CKA(X, Y, physics=[swing, drift], rho_covar_module=[None])
+    refused(PhysicsError, "number of outputs", CKA, X, Y, physics=[swing, lambda X: X[:, 0]])
 
 
 @pytest.mark.slow
@@ -95,41 +118,19 @@ def test_each_is_evaluated_once_a_call(uniform, cls):
     counts = Counter()
 
     def counted(f):
-        def physics(X):
-            counts[f.__name__] += len(X)
-            return f(X)
-
-        return FunctionPhysics(physics, name=f.__name__)
+        return FunctionPhysics(lambda X: counts.update({f: len(X)}) or f(X), name=f.__name__)
 
     model = cls(X, Y, physics=[counted(swing), counted(drift)]).eval()
     functions = model.sample_functions(2)
     model.posterior(Z)
-    calls = [model.posterior, model.predict, functions]
-    calls.append(lambda Z: model.condition_on_observations(Z, truth(Z)))
-    for call in calls:
+    condition = partial(model.condition_on_observations, Y=truth(Z))
+    for call in (model.posterior, model.predict, functions, condition):
         counts.clear()
         call(Z)
-        assert counts == {"swing": 5, "drift": 5}
+        assert counts == {swing: 5, drift: 5}
     counts.clear()
     model.rho(Z, physics=0)
     assert not counts
-
-
-def test_errors_name_the_one_that_failed(uniform):
-    X, Y, _ = problem(uniform)
-
-    def broken(X):
-        return swing(X) / (X[:, :1] < 5)
-
-    model = CKA(X, Y, physics={"good": swing, "bad": broken}).eval()
-    with pytest.raises(PhysicsError, match=r"'bad'.*NaN or inf in 1 of 2"):
-        model.posterior(torch.tensor([[0.0, 0.5], [9.0, 0.5]], dtype=torch.float64))
-    with pytest.raises(ValueError, match=r"rho_mean.*'learn'.*2 numbers"):
-        CKA(X, Y, physics=[swing, drift], rho_mean=[1.0])
-    with pytest.raises(ValueError, match=r"2 kernels of rho.*got 1"):
-        CKA(X, Y, physics=[swing, drift], rho_covar_module=[None])
-    with pytest.raises(PhysicsError, match="number of outputs"):
-        CKA(X, Y, physics=[swing, lambda X: X[:, 0]])
 
 
 @pytest.mark.parametrize("cls", CLASSES)
@@ -155,29 +156,6 @@ def wave(*weights):
     return lambda X: torch.sin(X @ torch.tensor(weights, dtype=X.dtype)).unsqueeze(-1)
 
 
-# The number of inputs, and three physics of which the first is right but for a factor and a bias.
-ONE_IS_RIGHT = {
-    "chirp": (
-        1,
-        lambda X: torch.sin(14 * X**1.5) + X,
-        lambda X: torch.cos(11 * X) * X,
-        lambda X: (6 * X).exp() / 100 - 1,
-    ),
-    "product": (
-        2,
-        lambda X: wave(9.0, 0.0)(X) * wave(0.0, 7.0)(X),
-        wave(6.0, 8.0),
-        lambda X: wave(-7.0, 10.0)(X) + X[:, :1] ** 2,
-    ),
-    "sum": (
-        3,
-        lambda X: wave(7.0, 5.0, 0.0)(X) + wave(0.0, 4.0, 8.0)(X),
-        wave(3.0, -6.0, 5.0),
-        lambda X: X.prod(-1, keepdim=True) * 8 - 1,
-    ),
-}
-
-
 def latin_hypercube(n, d, seed):
     generator = torch.Generator().manual_seed(seed)
     cells = torch.stack([torch.randperm(n, generator=generator) for _ in range(d)], dim=-1)
@@ -190,16 +168,17 @@ def error(model, Z, truth):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", list(ONE_IS_RIGHT))
-def test_the_right_one_of_three_has_the_weight(name):
-    d, right, *wrong = ONE_IS_RIGHT[name]
+def test_the_right_one_of_three_has_the_weight():
+    """It is right but for a factor and a bias."""
+    right = lambda X: wave(9.0, 0.0)(X) * wave(0.0, 7.0)(X)  # noqa: E731
+    wrong = wave(6.0, 8.0), lambda X: wave(-7.0, 10.0)(X) + X[:, :1] ** 2
 
     def truth(X):
         return (1 + 0.3 * torch.sin(3 * X[:, -1:])) * right(X) + 0.5 * X[:, :1] ** 2
 
     shares, ratios = [], []
     for seed in range(5):
-        X, Z = latin_hypercube(10 * d, d, seed)
+        X, Z = latin_hypercube(20, 2, seed)
         model = CKA(X, truth(X), physics={"right": right, "one": wrong[0], "two": wrong[1]})
         alone = CKA(X, truth(X), physics=right)
         fit(model, "map"), fit(alone, "map")
@@ -233,3 +212,67 @@ def test_two_physics_each_right_in_half_of_the_box():
             errors.append(error(model, Z, truth))
         ratios.append(errors[0] / min(errors[1:]))
     assert sum(ratio <= 0.5 for ratio in ratios) >= 4
+
+
+# How often the physics is evaluated: a simulator once a row, a formula once a call
+
+
+@pytest.fixture
+def counting():
+    """The crude physics, with a record of the rows it was asked for."""
+
+    def counting(X):
+        counting.rows.update(tuple(row) for row in X.detach().tolist())
+        return crude(X)[..., : counting.num_outputs]
+
+    counting.rows, counting.num_outputs = Counter(), 1
+    return counting
+
+
+PHYSICAL = ["ScaleGP", "CKA", "RRA"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", PHYSICAL)
+def test_each_row_is_evaluated_once(data, build, uniform, counting, num_outputs, kind):
+    counting.num_outputs = num_outputs
+    X, Y = data(num_outputs=num_outputs)
+    Z, new_X = uniform(4, 2, seed=1), uniform(2, 2, seed=2)
+    simulator = BlackBoxPhysics(lambda x: counting(torch.from_numpy(x)).numpy())
+    model = build(kind, X, Y, physics=simulator)
+    fit(model, "map", num_screened=8, num_starts=1)
+    with torch.no_grad():
+        model.posterior(Z)
+        model.posterior(Z.unsqueeze(-2), observation_noise=True)
+        model.predict(Z)
+        model.sample_functions(3)(Z)
+        conditioned = model.condition_on_observations(new_X, 3 + new_X[:, :num_outputs])
+        conditioned.posterior(Z)
+        fantasies = model.fantasize(new_X, SobolQMCNormalSampler(torch.Size([3])))
+        fantasies.posterior(Z)
+        for name in model.term_names:
+            model.term(name, uniform(4, 2, low=-3.0, seed=3))
+    expected = {tuple(row) for row in torch.cat([X, Z, new_X]).tolist()}
+    assert set(counting.rows) == expected
+    assert set(counting.rows.values()) == {1}
+
+
+@pytest.mark.parametrize("kind", PHYSICAL)
+def test_each_call_evaluates_it_once(data, build, uniform, counting, kind):
+    X, Y = data()
+    model = build(kind, X, Y, physics=FunctionPhysics(counting)).eval()
+    functions = model.sample_functions(3)
+    model.posterior(X)
+    counting.rows.clear()
+    for number, call in enumerate((model.posterior, model.predict, functions), start=1):
+        call(X)
+        assert set(counting.rows.values()) == {number}
+
+
+def test_ar1_evaluates_the_samples_only(data, build, uniform, counting):
+    X, Y = data()
+    model = build("AR1", X, Y, physics=counting, num_low=10)
+    fit(model, "map", num_screened=8, num_starts=1)
+    model.posterior(uniform(4, 2))
+    assert len(counting.rows) == 10
+    assert set(counting.rows.values()) == {1}

@@ -2,10 +2,13 @@
 
 import re
 
+import numpy as np
+import pandas as pd
 import pytest
 import torch
 from botorch.models.transforms import Normalize
 from gpytorch.kernels import RBFKernel, ScaleKernel
+from torch import nn
 from torch.distributions import MultivariateNormal, Normal
 
 from gpadjust import (
@@ -17,11 +20,12 @@ from gpadjust import (
     PhysicsMeanGP,
     ScaleGP,
     Unknown,
+    VariationalCKA,
     ZeroMeanGP,
     fit,
 )
 from gpadjust.models.parameters import hyperparameters
-from tests.systems import holding, line, normal, uniform
+from tests.systems import holding, line, normal, refused, uniform
 
 
 def crude(X):
@@ -60,35 +64,31 @@ def test_numbers_are_in_the_users_units(uniform):
     assert numbers(text, "log likelihood") == pytest.approx([expected], rel=1e-3)
 
 
-def test_a_mean_that_is_rounding_is_zero(uniform, monkeypatch):
-    X = uniform(8, 1)
-    model = ZeroMeanGP(X, X)
-    monkeypatch.setattr(ZeroMeanGP, "term_mean", lambda *args: 7e-19)
-    assert "f: mean 0\n" in model.summary()
-
-
-def test_bounds_and_learnt_means_are_told(uniform):
+def test_bounds_learnt_means_and_rounding_are_told(uniform, monkeypatch):
     X = uniform(8, 1)
     model = CKA(X, crude(X) + X.square(), physics=crude, rho_mean="learn")
     assert "rho: learnt mean 1" in model.summary()
     assert "at its" not in model.summary()
     model.terms[0].kernel.base_kernel.lengthscale = 1e3 * (X.max() - X.min()).item()
     assert model.summary().count("(at its upper bound)") == 1
+    model = ZeroMeanGP(X, X)
+    monkeypatch.setattr(ZeroMeanGP, "term_mean", lambda *args: 7e-19)
+    assert "f: mean 0\n" in model.summary()
 
 
-@pytest.mark.parametrize("kind", [AR1, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP])
-def test_every_model_has_one(kind, uniform):
+def test_every_model_has_one(uniform):
     X = uniform(8, 2)
     Y = torch.cat([crude(X), 2 * crude(X)], dim=-1) + X
-    options = {} if kind is ZeroMeanGP else {"physics": lambda X: crude(X).expand(-1, 2)}
-    options |= {"low_X": uniform(9, 2, seed=1)} if kind is AR1 else {}
-    text = kind(X, Y, **options).summary()
-    assert "y1:" in text
-    assert "y2:" in text
-    assert text.count("noise: sd") == 2
+    f_p = {"physics": lambda X: crude(X).expand(-1, 2)}
+    others = [kind(X, Y, **f_p) for kind in (RRA, PhysicsMeanGP, ScaleGP)]
+    for model in (*others, AR1(X, Y, low_X=uniform(9, 2, seed=1), **f_p), ZeroMeanGP(X, Y)):
+        text = model.summary()
+        assert "y1:" in text
+        assert "y2:" in text
+        assert text.count("noise: sd") == 2
 
 
-def test_intervals(uniform):
+def test_intervals_also_of_a_mixture(uniform):
     X, Z = uniform(8, 1), uniform(5, 1, seed=1)
     model = CKA(X, crude(X) + X.sin(), physics=crude)
     mean, variance = model.predict(Z, observation_noise=True)
@@ -96,12 +96,7 @@ def test_intervals(uniform):
     torch.testing.assert_close(low, mean - 1.6448536269514722 * variance.sqrt())
     torch.testing.assert_close(high, mean + 1.6448536269514722 * variance.sqrt())
     for level in (0.0, 1.0, 95, "95 %"):
-        with pytest.raises((TypeError, ValueError), match="level must be"):
-            model.interval(Z, level)
-
-
-def test_intervals_of_a_mixture(uniform):
-    X, Z = uniform(8, 1), uniform(5, 1, seed=1)
+        refused((TypeError, ValueError), "level must be", model.interval, Z, level)
     model = CKA(X, crude(X) + X.sin(), physics=crude)
     holding(model, 0.0, 1.0)
     assert "2 samples" in repr(model)
@@ -158,3 +153,55 @@ def test_samples_without_the_physics_are_said():
     assert "rho: none" in first
     assert "left out" not in second
     assert "rho: mean 1" in second
+
+
+# Rho and delta with their intervals in one call
+
+
+@pytest.mark.parametrize("num_outputs", [1, 2])
+@pytest.mark.parametrize("sampled", [False, True])
+def test_they_are_the_moments_of_the_terms(sampled, num_outputs, data, build, uniform):
+    X, Y = data(num_outputs=num_outputs)
+    model, Z = build("CKA", X, Y), uniform(7, 2)
+    if sampled:
+        fit(model, num_samples=4)
+    found = model.adjustments(Z, level=0.9)
+    assert [*found] == ["rho", "delta"]
+    for name, each in found.items():
+        term = model.term(name, Z)
+        torch.testing.assert_close(each.mean, term.mean, rtol=1e-9, atol=1e-9)
+        assert each.lower.shape == each.upper.shape == (7, num_outputs)
+        if not sampled:
+            half = 1.6448536269514722 * term.variance.sqrt()
+            torch.testing.assert_close(each.upper, term.mean + half, rtol=0, atol=1e-6)
+            torch.testing.assert_close(each.lower, term.mean - half, rtol=0, atol=1e-6)
+
+
+def test_as_the_inputs_came(data, build, uniform):
+    X, Y = data(num_outputs=2)
+    Z = uniform(5, 2).numpy()
+    frame = pd.DataFrame(Z, columns=["speed", "load"], index=[*"abcde"])
+    named = pd.DataFrame(X.numpy(), columns=frame.columns)
+    model = build("CKA", named, pd.DataFrame(Y.numpy(), columns=["u", "v"]))
+    table, arrays = model.adjustments(frame), model.adjustments(Z)
+    assert [*table.index] == [*"abcde"]
+    assert len(table.columns) == 12
+    assert isinstance(arrays["rho"].lower, np.ndarray)
+    np.testing.assert_array_equal(table["rho of v lower"], arrays["rho"].lower[:, 1])
+    alone = build("PhysicsMeanGP", named, Y[:, :1]).adjustments(frame)
+    assert [*alone.columns] == ["delta mean", "delta lower", "delta upper"]
+
+
+def test_adjustments_of_many_points_and_their_gradients(uniform):
+    X = uniform(30, 1)
+    Y = X.sin() + X
+    for make in (CKA, PhysicsMeanGP, VariationalCKA):
+        many = make(X, Y, physics=torch.sin).adjustments(uniform(20_000, 1))
+        assert many["delta"].mean.shape == (20_000, 1)
+    refused(ValueError, "level", CKA(X, Y, physics=torch.sin).adjustments, X, level=95)
+    X = uniform(6, 1)
+    model = CKA(X, X.sin() + X, physics=torch.sin)
+    asked = nn.Parameter(uniform(3, 1, seed=1))
+    model.adjustments(asked)["delta"].upper.sum().backward()
+    assert asked.grad.abs().min() > 0
+    assert not model.adjustments(X)["delta"].upper.requires_grad

@@ -2,7 +2,9 @@
 
 import math
 import pickle
+import time
 from copy import deepcopy
+from resource import RUSAGE_SELF, getrusage
 
 import numpy as np
 import pytest
@@ -10,10 +12,7 @@ import torch
 
 from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, VariationalCKA, fit, load, save
 from gpadjust.validation import leave_one_out
-
-
-def wave(X):
-    return torch.sin(6 * X[:, :1])
+from tests.systems import holding, refused, wave
 
 
 def rows(n, seed, two=False):
@@ -23,15 +22,9 @@ def rows(n, seed, two=False):
     return X, torch.cat([Y, wave(X) - X], dim=-1) if two else Y
 
 
-def two_waves(X):
-    return wave(X).repeat(1, 2)
-
-
 def held(model):
     """Make a model hold three samples of its hyper-parameters."""
-    named = [(n, p) for n, p in model.named_parameters() if p.requires_grad]
-    model.hold_samples({n: torch.stack([p.detach() + 0.2 * i for i in range(3)]) for n, p in named})
-    return model
+    return holding(model, 0.0, 0.2, 0.4)
 
 
 X, Y = rows(12, 0)
@@ -70,7 +63,13 @@ def test_without_forgetting_the_answer_is_that_of_all_observations_together(samp
     y[3, 0] = y[3, 0] if not two else math.nan
     if two:
         new_y[2, 1] = math.nan
-    model = RRA(x, y, physics=two_waves if two else wave, num_features=20, rho_mean="learn")
+    model = RRA(
+        x,
+        y,
+        physics=(lambda X: wave(X).repeat(1, 2)) if two else wave,
+        num_features=20,
+        rho_mean="learn",
+    )
     model = held(model) if samples else model.eval()
     all_at_once = model.condition_on_observations(new_x, new_y)
     model.update(new_x[:4], new_y[:4])
@@ -98,18 +97,6 @@ def test_with_forgetting_it_is_a_regression_whose_noise_grows_with_age():
     np.testing.assert_allclose(found.mean.numpy(), sd * mean, atol=1e-9)
     want = sd[:, None] * covariance * sd
     np.testing.assert_allclose(found.covariance_matrix.numpy(), want, atol=1e-9)
-
-
-def test_where_nothing_is_observed_it_returns_to_the_prior():
-    model, point = rra().eval(), torch.full((1, 1), 0.5, dtype=torch.float64)
-    prior = model.terms[0].kernel.outputscale.item()
-    assert model.rho(AT[:1]).variance.item() < 0.9 * prior
-    model.update(point.expand(2000, 1), wave(point).expand(2000, 1), forget=10)
-    np.testing.assert_allclose(model.rho(AT[:1]).variance.item(), prior, rtol=0.1)
-    assert model.rho(AT[:1]).variance.item() <= prior * (1 + 1e-9)
-    np.testing.assert_allclose(model.rho(AT[:1]).mean.item(), 1, atol=0.1)
-    # What is observed is known to within the noise.
-    assert (model.predict(point).mean - wave(point)).abs().item() < 0.1
 
 
 @pytest.mark.parametrize("model_class", [CKA, PhysicsMeanGP])
@@ -176,17 +163,15 @@ def test_the_whole_house(build, tmp_path):
     assert "noise" in model.summary()
     if isinstance(model, RRA):
         kept = model.predict(AT).mean
-        with pytest.raises(RuntimeError, match="does not keep"):
-            leave_one_out(model)
-        with pytest.raises(RuntimeError, match="build a model of the observations"):
-            fit(model)
+        refused(RuntimeError, "does not keep", leave_one_out, model)
+        refused(RuntimeError, "build a model of the observations", fit, model)
         assert torch.equal(model.predict(AT).mean, kept)
     else:
         leave_one_out(model)
         fit(model, "map")
 
 
-def test_variances_follow_the_errors_of_what_was_predicted():
+def test_variances_follow_errors_and_return_to_the_prior():
     model = rra().eval()
     predicted = model.predict(NEW_X, observation_noise=True)
     squares = ((NEW_Y - predicted.mean).square() / predicted.variance).squeeze(-1)
@@ -194,12 +179,21 @@ def test_variances_follow_the_errors_of_what_was_predicted():
     weights = torch.exp(torch.arange(8, -1, -1) / -5.0).double()
     want = torch.stack([(weights * squares).sum(), weights.sum()])
     torch.testing.assert_close(model.local_errors.recent, want)
+    model, point = rra().eval(), torch.full((1, 1), 0.5, dtype=torch.float64)
+    prior = model.terms[0].kernel.outputscale.item()
+    assert model.rho(AT[:1]).variance.item() < 0.9 * prior
+    model.update(point.expand(2000, 1), wave(point).expand(2000, 1), forget=10)
+    np.testing.assert_allclose(model.rho(AT[:1]).variance.item(), prior, rtol=0.1)
+    assert model.rho(AT[:1]).variance.item() <= prior * (1 + 1e-9)
+    np.testing.assert_allclose(model.rho(AT[:1]).mean.item(), 1, atol=0.1)
+    # What is observed is known to within the noise.
+    assert (model.predict(point).mean - wave(point)).abs().item() < 0.1
 
 
 @pytest.mark.parametrize("more", [False, True])
 def test_a_subset_of_outputs_is_updated_alike(more):
     x, y = rows(12, 0, two=True)
-    model = RRA(x, y, physics=two_waves, num_features=10).eval()
+    model = RRA(x, y, physics=lambda X: wave(X).repeat(1, 2), num_features=10).eval()
     new_x, new_y = rows(5, 1, two=True)
     model.update(new_x, new_y, forget=50)
     subset = model.subset_output([1])
@@ -211,17 +205,39 @@ def test_a_subset_of_outputs_is_updated_alike(more):
 
 def test_what_cannot_be_updated_says_so():
     model = CKA(X, Y, physics=wave)
-    with pytest.raises(ValueError, match="pass forget=200"):
-        model.update(NEW_X, NEW_Y)
-    with pytest.raises(TypeError, match="forget"):
-        model.update(NEW_X, NEW_Y, forget=0.5)
-    with pytest.raises(ValueError, match="at least 1"):
-        model.update(NEW_X, NEW_Y, forget=0)
-    with pytest.raises(ValueError, match="k x d"):
-        model.update(NEW_X.expand(2, 9, 1), NEW_Y, forget=5)
-    with pytest.raises(ValueError, match="learns its noise"):
-        model.update(NEW_X, NEW_Y, NEW_Y.abs(), forget=5)
-    with pytest.raises(NotImplementedError, match="rows of its own"):
-        AR1(X, Y, physics=wave, bounds=[[0.0], [1.0]]).update(NEW_X, NEW_Y, forget=5)
-    with pytest.raises(NotImplementedError, match="in place"):
-        VariationalCKA(X, Y, physics=wave, num_inducing=4).update(NEW_X, NEW_Y)
+    refused(ValueError, "pass forget=200", model.update, NEW_X, NEW_Y)
+    refused(TypeError, "forget", model.update, NEW_X, NEW_Y, forget=0.5)
+    refused(ValueError, "at least 1", model.update, NEW_X, NEW_Y, forget=0)
+    refused(ValueError, "k x d", model.update, NEW_X.expand(2, 9, 1), NEW_Y, forget=5)
+    refused(ValueError, "learns its noise", model.update, NEW_X, NEW_Y, NEW_Y.abs(), forget=5)
+    ar1 = AR1(X, Y, physics=wave, bounds=[[0.0], [1.0]])
+    refused(NotImplementedError, "rows of its own", ar1.update, NEW_X, NEW_Y, forget=5)
+    sparse = VariationalCKA(X, Y, physics=wave, num_inducing=4)
+    refused(NotImplementedError, "in place", sparse.update, NEW_X, NEW_Y)
+
+
+# Time and memory of many updates do not grow
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_updates_take_no_more_time_or_memory_at_the_end():
+    X = torch.linspace(0, 1, 20, dtype=torch.float64).unsqueeze(-1)
+    model = RRA(X, 2 * wave(X) + X, physics=wave, num_features=20).eval()
+
+    def thousand(start):
+        begin = time.process_time()
+        for i in range(start, start + 1000):
+            x = X[i % 20 : i % 20 + 1]
+            model.update(x, (2 + i / 1e5) * wave(x) + x, forget=500)
+        model.predict(X)
+        return time.process_time() - begin
+
+    thousand(0)
+    first = min(thousand(1000 * k) for k in range(1, 4))
+    before = getrusage(RUSAGE_SELF).ru_maxrss
+    for k in range(4, 97):
+        thousand(1000 * k)
+    assert getrusage(RUSAGE_SELF).ru_maxrss - before < 20_000  # KiB: 0.2 KiB an update
+    assert min(thousand(1000 * k) for k in range(97, 100)) < 1.3 * first
+    assert model.train_targets.shape[-1] == 20
+    assert (model.predict(X).mean - 3 * wave(X) - X).abs().max() < 0.1

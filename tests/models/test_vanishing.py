@@ -13,6 +13,7 @@ from gpadjust.models import vanishing_rbf
 from gpadjust.physics import FunctionPhysics, Unknown
 from gpadjust.sklearn import CKARegressor
 from gpadjust.validation import leave_one_out
+from tests.systems import refused
 
 OPEN = vanishing_rbf({"valve": 1.0})
 
@@ -119,11 +120,9 @@ def test_beside_and_for_categories(valve):
         table = model.adjustments(X.assign(**there))
         assert table["delta upper"].abs().max() < 1e-6
         assert model.adjustments(X)["delta upper"].max() > 0.01
-    with pytest.raises(ValueError, match=r"category.*level"):
-        vanishing_rbf({"metal": "steel"})
 
 
-def test_places_as_frames_arrays_and_numbers():
+def test_places(valve):
     names = ("valve", "flow")
     for where, expected in [
         ({"flow": [0.0, 1.0]}, [[None, 0.0], [None, 1.0]]),
@@ -136,27 +135,22 @@ def test_places_as_frames_arrays_and_numbers():
         found = vanishing_rbf(where)._raw(names)
         numbers = [[None if v != v else v for v in row] for row in found.tolist()]
         assert numbers == expected
-
-
-def test_bad_places(valve):
     X, Y = valve
-    for where, message in [
+    for where, says in (
         ({}, "each column a number"),
         ({"valve": [0.0, 1.0], "flow": [1.0, 2.0, 3.0]}, "each column a number"),
         ({"valve": float("nan")}, "finite"),
         (np.zeros(3), r"points p x d.*\(3,\)"),
-    ]:
-        with pytest.raises(ValueError, match=message):
-            vanishing_rbf(where)
-    for where, message in [
+        ({"metal": "steel"}, r"category.*level"),
+    ):
+        refused(ValueError, says, vanishing_rbf, where)
+    f_p = {"physics": lambda X: X[:, 1]}
+    for where, says in (
         ({"vane": 1.0}, "columns of valve, flow.*'vane'"),
         ({2: 1.0}, "numbers from 0 to 1, got 2"),
         (np.zeros((1, 3)), "points with 2 columns"),
-    ]:
-        with pytest.raises(ValueError, match=message):
-            CKA(X, Y, physics=lambda X: X[:, 0], delta_covar_module=vanishing_rbf(where))
-    one = {"physics": lambda X: X[:, 1], "delta_covar_module": OPEN}
-    with pytest.raises(ValueError, match=r"center=0.0.*rho_covar_module"):
-        CKA(X, Y, **one)
-    with pytest.raises(ValueError, match=r"vanish nowhere.*CKA takes it"):
-        VariationalCKA(X, Y, rho_covar_module=OPEN, **one)
+        ({"valve": 1.0}, r"center=0.0.*rho_covar_module"),
+    ):
+        refused(ValueError, says, CKA, X, Y, **f_p, delta_covar_module=vanishing_rbf(where))
+    kernels = {"rho_covar_module": OPEN, "delta_covar_module": OPEN}
+    refused(ValueError, r"vanish nowhere.*CKA takes it", VariationalCKA, X, Y, **f_p, **kernels)

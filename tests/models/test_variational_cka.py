@@ -23,7 +23,7 @@ from gpadjust import CKA, StackedGP, VariationalCKA, compare, fit, load, save
 from gpadjust.inference.collapsed_bound import CollapsedBound, Observations
 from gpadjust.models.component_noise import ComponentNoise
 from gpadjust.validation import Structure
-from tests.systems import line, same, wave, waves
+from tests.systems import line, refused, same, wave, waves
 
 LINE = line(2)
 
@@ -138,7 +138,7 @@ def test_all_that_predicts_agrees(close, fitted, rest):
     torch.testing.assert_close(draws.std(0), sd.detach(), rtol=0.15, atol=0)
 
 
-def test_before_a_fit_it_is_the_prior(close, num_outputs):
+def test_the_prior_before_a_fit_and_shapes_after_it(close, num_outputs, fitted):
     X, Y = problem(30, num_outputs)
     model, Z = make(X, Y), problem(7)[0]
     mean, variance = model.predict(Z)
@@ -146,9 +146,6 @@ def test_before_a_fit_it_is_the_prior(close, num_outputs):
     prior = model.covar_module.at(model.model_inputs(Z)).variance() * model.units()[1].square()
     close(variance, model.outputs_last(prior), 1e-6)
     assert model.evidence.isnan().all()
-
-
-def test_shapes_of_posteriors(close, num_outputs, fitted):
     X = problem(24)[0].reshape(2, 3, 4, 1)
     posterior = fitted.posterior(X)
     assert posterior.mean.shape == (2, 3, 4, num_outputs)
@@ -164,16 +161,18 @@ def test_shapes_of_posteriors(close, num_outputs, fitted):
 
 def test_acquisition_functions(one):
     X, Y = problem(120)
+    options = {"num_restarts": 1, "raw_samples": 4, "options": {"maxiter": 3}}
     for acquisition in (
         UpperConfidenceBound(one, 0.2),
         qLogExpectedImprovement(one, Y.max()),
         qLogNoisyExpectedImprovement(one, X[:10]),
     ):
-        options = {"maxiter": 3}
-        best, _ = optimize_acqf(
-            acquisition, LINE, q=1, num_restarts=1, raw_samples=4, options=options
-        )
+        best, _ = optimize_acqf(acquisition, LINE, q=1, **options)
         assert 0.2 < best.item() < 0.4  # of the maximum, 0.28
+    torch.manual_seed(0)
+    Z = torch.tensor([0.28, 0.75], dtype=torch.float64).reshape(2, 1, 1)
+    value = PathwiseThompsonSampling(one)(Z)
+    assert value[0] > value[1]
 
 
 @pytest.mark.slow
@@ -192,15 +191,7 @@ def test_paths_of_botorch(close, fitted):
     close(own[7, ..., 0], values[7, ..., 3])
 
 
-def test_thompson_sampling(one):
-    torch.manual_seed(0)
-    acquisition = PathwiseThompsonSampling(one)
-    X = torch.tensor([0.28, 0.75], dtype=torch.float64).reshape(2, 1, 1)
-    value = acquisition(X)
-    assert value[0] > value[1]
-
-
-def test_lists_of_models(close, one):
+def test_lists_of_models_and_gradients_to_inputs(close, one, gradient_is_right):
     X, Y = problem(120)
     exact = CKA(X[:20], Y[:20], physics=wave)
     both = ModelListGP(one, exact)
@@ -208,9 +199,6 @@ def test_lists_of_models(close, one):
     results = fit(both, "map", num_starts=1, num_screened=0)
     assert len(results) == 2
     assert both.subset_output([0]).posterior(LINE).mean.shape == (2, 1)
-
-
-def test_gradients_to_inputs(one, gradient_is_right):
     X = torch.tensor([[0.3], [0.7]], dtype=torch.float64)
     gradient_is_right(lambda X: one.predict(X).mean.sum(), X)
     gradient_is_right(lambda X: one.posterior(X).variance.sum(), X)
@@ -245,15 +233,7 @@ def test_all_of_a_model_moves(noise):
     assert {t.device.type for t in tensors if t is not None} == {"meta"}
 
 
-def test_its_arguments_are_those_of_an_exact_model():
-    ours, theirs = (signature(each).parameters for each in (VariationalCKA, CKA))
-    assert ours.keys() - theirs.keys() == {"num_inducing", "seed"}
-    assert {name: ours[name].default for name in theirs} == {
-        name: each.default for name, each in theirs.items()
-    }
-
-
-def test_all_rows_are_asked_about_once():
+def test_rows_arguments_and_states(close):
     X, Y = problem(1500)
     asked = []
 
@@ -264,6 +244,18 @@ def test_all_rows_are_asked_about_once():
     model = VariationalCKA(X, Y, physics=physics, num_inducing=5)
     fit(model, num_screened=0, max_iterations=1)
     assert sorted(asked)[-2:] == [1000, 1500]
+    ours, theirs = (signature(each).parameters for each in (VariationalCKA, CKA))
+    assert ours.keys() - theirs.keys() == {"num_inducing", "seed"}
+    assert {name: ours[name].default for name in theirs} == {
+        name: each.default for name, each in theirs.items()
+    }
+    X, Y = problem(40)
+    model = make(5 * X, 3 * Y, input_transform=Normalize(1))
+    other = make(X, Y, input_transform=Normalize(1))
+    other.load_state_dict(model.state_dict())
+    close(other.data()["train_Y"], Y)
+    close(other.train_inputs[0], other.input_transform(X))
+    close(other.train_targets * model.outcome_transform.stdvs.squeeze(), Y.squeeze(-1))
 
 
 @pytest.mark.parametrize("noise", [None, 0.01])
@@ -275,18 +267,7 @@ def test_files(tmp_path, noise):
     again = load(tmp_path / "model.pt", physics=waves)
     same(again.predict(LINE, True), model.predict(LINE, True), rtol=1e-10, atol=0)
     assert again.summary() == model.summary()
-    with pytest.raises(ValueError, match="subset"):
-        save(model.subset_output([0]), tmp_path / "subset.pt")
-
-
-def test_a_state_brings_its_units_and_transforms_along(close):
-    X, Y = problem(40)
-    model = make(5 * X, 3 * Y, input_transform=Normalize(1))
-    other = make(X, Y, input_transform=Normalize(1))
-    other.load_state_dict(model.state_dict())
-    close(other.data()["train_Y"], Y)
-    close(other.train_inputs[0], other.input_transform(X))
-    close(other.train_targets * model.outcome_transform.stdvs.squeeze(), Y.squeeze(-1))
+    refused(ValueError, "subset", save, model.subset_output([0]), tmp_path / "subset.pt")
 
 
 def test_outputs_of_a_model(close):
@@ -301,10 +282,8 @@ def test_outputs_of_a_model(close):
         close(part.evidence.reshape(-1), model.evidence[kept])
         part.load_state_dict(part.state_dict())
         close(part.predict(Z).mean, model.predict(Z).mean[:, kept])
-        with pytest.raises(ValueError, match="Expected a whole model"):
-            fit(part)
-    with pytest.raises(ValueError, match="numbers of outputs from 0 to 1"):
-        model.subset_output([2])
+        refused(ValueError, "Expected a whole model", fit, part)
+    refused(ValueError, "numbers of outputs from 0 to 1", model.subset_output, [2])
 
 
 @pytest.mark.parametrize("transform", [None, Normalize(2)], ids=["raw", "Normalize"])
@@ -319,31 +298,31 @@ def test_transforms(close, transform):
     assert (model.predict(X).mean - Y).std() < 0.15
 
 
-def test_it_is_not_conditioned(one):
-    X, Y = problem(3)
-    with pytest.raises(NotImplementedError, match="build it of all data"):
-        one.condition_on_observations(X, Y)
-    with pytest.raises(NotImplementedError, match="build it of all data"):
-        one.fantasize(X, SobolQMCNormalSampler(torch.Size([2])))
-    with pytest.raises(NotImplementedError, match="build it of all data"):
-        qKnowledgeGradient(one, num_fantasies=2)(X.unsqueeze(0))
+def test_what_is_refused(one):
+    class Halves(ComponentNoise):
+        def selection(self, inputs):
+            left = (inputs[..., 0] < 0.5).to(inputs)
+            return torch.stack([left, 1 - left], dim=-1)
 
-
-def test_bad_input(one):
     X, Y = problem(10)
-    with pytest.raises(TypeError, match="float64"):
-        make(X.float(), Y.float())
-    with pytest.raises(ValueError, match="agree"):
-        make(X, Y[:4])
-    with pytest.raises(ValueError, match="one data set"):
-        make(X.expand(2, -1, -1), Y.expand(2, -1, -1))
-    for number in (0, 2.5):
-        with pytest.raises((TypeError, ValueError), match="num_inducing"):
-            make(X, Y, num_inducing=number)
-    with pytest.raises(ValueError, match="columns"):
-        one.predict(torch.zeros(2, 3, dtype=torch.float64))
-    with pytest.raises(ValueError, match="no unknown term 'season'"):
-        one.term("season", X)
+    refused(TypeError, "float64", make, X.float(), Y.float())
+    refused(ValueError, "agree", make, X, Y[:4])
+    refused(ValueError, "one data set", make, X.expand(2, -1, -1), Y.expand(2, -1, -1))
+    refused(ValueError, "num_inducing", make, X, Y, num_inducing=0)
+    refused(TypeError, "num_inducing", make, X, Y, num_inducing=2.5)
+    says = "one variance for all observations, got Halves"
+    refused(ValueError, says, make, X, Y, likelihood=Halves(2, Size()))
+    refused(ValueError, "columns", one.predict, torch.zeros(2, 3, dtype=torch.float64))
+    refused(ValueError, "no unknown term 'season'", one.term, "season", X)
+    says, sampler = "build it of all data", SobolQMCNormalSampler(torch.Size([2]))
+    refused(NotImplementedError, says, one.condition_on_observations, X, Y)
+    refused(NotImplementedError, says, one.fantasize, X, sampler)
+    refused(NotImplementedError, says, qKnowledgeGradient(one, num_fantasies=2), X.unsqueeze(0))
+    refused(TypeError, r"exact models.*VariationalCKA", StackedGP, {"many": one}, [[1.0]])
+    options = {"structures": [Structure("many", VariationalCKA)]}
+    refused(TypeError, "TermsGP, got VariationalCKA", compare, X, Y, wave, **options)
+    with pytest.warns(UserWarning, match="VariationalCKA"):
+        CKA(*problem(5001), physics=wave)  # an exact model of many points
 
 
 def test_texts(one):
@@ -357,26 +336,3 @@ def test_texts(one):
     assert "  not fitted" in make(*problem(10)).summary().splitlines()
     assert one.term_names == ("rho", "delta")
     assert one.term("rest", LINE).mean.abs().max() == 0
-
-
-def test_an_exact_model_of_many_points_warns():
-    X, Y = problem(5001)
-    with pytest.warns(UserWarning, match="VariationalCKA"):
-        CKA(X, Y, physics=wave)
-
-
-def test_stacking_and_comparison_want_exact_models(one):
-    with pytest.raises(TypeError, match=r"exact models.*VariationalCKA"):
-        StackedGP({"many": one}, [[1.0]])
-    with pytest.raises(TypeError, match="TermsGP, got VariationalCKA"):
-        compare(*problem(8), wave, structures=[Structure("many", VariationalCKA)])
-
-
-def test_several_variances_are_refused():
-    class Halves(ComponentNoise):
-        def selection(self, inputs):
-            left = (inputs[..., 0] < 0.5).to(inputs)
-            return torch.stack([left, 1 - left], dim=-1)
-
-    with pytest.raises(ValueError, match="one variance for all observations, got Halves"):
-        VariationalCKA(*problem(30), physics=wave, num_inducing=5, likelihood=Halves(2, Size()))

@@ -16,6 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gpadjust.physics import BlackBoxPhysics, PhysicsError, Unknown
+from gpadjust.physics.gradient import central_difference
+from tests.systems import refused
 
 
 def waves(X):
@@ -71,7 +73,7 @@ class TestValues:
         assert (seen[0].dtype, seen[0].tolist()) == (np.float64, [[2.0]])
 
     @pytest.mark.parametrize("batched", [True, False])
-    def test_function_may_write_to_its_input_and_reuse_its_output(self, batched):
+    def test_rows_are_the_functions_and_evaluated_once(self, batched, numpy_counter, points):
         buffer = np.zeros(1)
 
         def vandal(x):
@@ -84,9 +86,6 @@ class TestValues:
         first = physics(X)
         physics(X + 1)
         assert X.item() == first.item() == 1.0
-
-    @pytest.mark.parametrize("batched", [True, False])
-    def test_each_row_is_evaluated_once(self, batched, numpy_counter, points):
         physics = BlackBoxPhysics(numpy_counter, batched=batched)
         X = points(4, 2)
         physics(X.expand(3, 4, 2))
@@ -106,7 +105,7 @@ class TestGradients:
         assert torch.allclose(found, expected, rtol=1e-7, atol=1e-8)
         assert torch.autograd.gradcheck(physics, X)
 
-    def test_expanded_and_repeated_rows(self, numpy_counter, points):
+    def test_repeated_rows_and_the_memo(self, numpy_counter, points):
         physics = BlackBoxPhysics(numpy_counter)
         x = points(1, 2).requires_grad_()
         physics(x.expand(3, 1, 2)).sum().backward()
@@ -117,8 +116,7 @@ class TestGradients:
         assert torch.allclose(x.grad, once)
         expected = 3 * (2 * x.detach() + torch.tensor([[1.0, 0.0]]) * x.detach().cos())
         assert torch.allclose(once, expected)
-
-    def test_finite_differences_stay_out_of_the_memo(self, numpy_counter, points):
+        numpy_counter.rows.clear()
         physics = BlackBoxPhysics(numpy_counter)
         for number in (1, 2):
             Y = physics(points(3, 2).requires_grad_())
@@ -134,14 +132,11 @@ class TestGradients:
         h, k = np.broadcast_to(fd_step, 2)
         assert set(numpy_counter.rows[1:]) == {(h, 0), (-h, 0), (0, k), (0, -k)}
 
-    def test_second_derivative_is_refused(self, points):
+    def test_second_derivatives_and_none(self, points):
         X = points(3, 2).requires_grad_()
         Y = BlackBoxPhysics(waves)(X).sum() + (X**3).sum()
         (first,) = torch.autograd.grad(Y, X, create_graph=True)
-        with pytest.raises(NotImplementedError, match="first derivatives only"):
-            torch.autograd.grad(first.sum(), X)
-
-    def test_none_warns_once_and_is_a_constant(self, points):
+        refused(NotImplementedError, "first derivatives only", torch.autograd.grad, first.sum(), X)
         physics = BlackBoxPhysics(waves, gradient=None, name="mill")
         X = points(3, 2).requires_grad_()
         with pytest.warns(UserWarning, match=r"No gradient.*'mill'.*'with_grad': False"):
@@ -163,72 +158,58 @@ class TestGradients:
         assert caught.value.rows == (1,)
         assert "fd_step smaller" in caught.value.__notes__[0]
 
-    @pytest.mark.parametrize(
-        ("jacobian", "message"),
-        [
+    def test_wrong_jacobian(self, points):
+        for jacobian, says in (
             (lambda X: np.zeros((3, 2)), r"shape \(3, 2\), expected shape.*\(3, 2, 2\)"),
             (lambda X: np.full((3, 2, 2), np.nan), "finite numbers"),
             (lambda X: 1 / 0, "raised ZeroDivisionError"),
             (lambda X: np.full((3, 2, 2), 1j), "expected real numbers, found complex128"),
-        ],
-    )
-    def test_wrong_jacobian(self, jacobian, message, points):
-        Y = BlackBoxPhysics(waves, gradient=jacobian, name="mill")(points(3, 2).requires_grad_())
-        with pytest.raises(PhysicsError, match=r"gradient of physics 'mill'.*" + message):
-            Y.sum().backward()
+        ):
+            physics = BlackBoxPhysics(waves, gradient=jacobian, name="mill")
+            Y = physics(points(3, 2).requires_grad_()).sum()
+            refused(PhysicsError, rf"gradient of physics 'mill'.*{says}", Y.backward)
 
 
-class TestSettings:
-    def test_bad_ones(self):
-        for gradient in ("autograd", 1, True):
-            with pytest.raises(ValueError, match=rf"gradient.*found {gradient!r}"):
-                BlackBoxPhysics(waves, gradient=gradient)
-        for fd_step in (0.0, -1.0, float("nan"), [0.1, 0.0], []):
-            with pytest.raises(ValueError, match="fd_step must be positive"):
-                BlackBoxPhysics(waves, fd_step=fd_step)
-        with pytest.raises(TypeError, match="callable; found list"):
-            BlackBoxPhysics([])
+def test_bad_settings(points):
+    for gradient in ("autograd", 1, True):
+        says = rf"gradient.*found {gradient!r}"
+        refused(ValueError, says, BlackBoxPhysics, waves, gradient=gradient)
+    for fd_step in (0.0, -1.0, float("nan"), [0.1, 0.0], []):
+        refused(ValueError, "fd_step must be positive", BlackBoxPhysics, waves, fd_step=fd_step)
+    refused(TypeError, "callable; found list", BlackBoxPhysics, [])
+    X, physics = points(4, 2).requires_grad_(), BlackBoxPhysics(waves, fd_step=[0.1, 0.1, 0.1])
+    refused(ValueError, r"'waves' has 3 entries.*1 or 2", physics, X)
 
-    def test_steps_for_other_columns(self, points):
-        physics = BlackBoxPhysics(waves, fd_step=[0.1, 0.1, 0.1])
-        with pytest.raises(ValueError, match=r"'waves' has 3 entries.*1 or 2"):
-            physics(points(4, 2).requires_grad_())
+
+def test_wrong_results(points):
+    for function, batched, says in (
+        (lambda x: x[0] + x[1], True, r"single row take .*batched=False"),
+        (lambda x: np.zeros((2, 2)), False, r"a scalar or outputs.*found \(2, 2\)"),
+        *(
+            (lambda x, result=result: result, batched, f"expected real numbers, found {found}")
+            for result, found in ((1j, "complex"), (None, "None"), ("1", "<U1"), ([None], "No"))
+            for batched in (True, False)
+        ),
+    ):
+        physics = BlackBoxPhysics(function, batched=batched, name="mill")
+        refused(PhysicsError, rf"Physics 'mill' .*{says}", physics, points(3, 2))
 
 
 class TestFailures:
-    @pytest.mark.parametrize(
-        ("function", "batched", "says"),
-        [
-            (lambda x: x[0] + x[1], True, r"single row take .*batched=False"),
-            (lambda x: np.zeros((2, 2)), False, r"a scalar or outputs.*found \(2, 2\)"),
-            *(
-                (lambda x, result=result: result, batched, f"expected real numbers, found {found}")
-                for result, found in ((1j, "complex"), (None, "None"), ("1", "<U1"), ([None], "No"))
-                for batched in (True, False)
-            ),
-        ],
-    )
-    def test_wrong_results(self, function, batched, says, points):
-        physics = BlackBoxPhysics(function, batched=batched, name="mill")
-        with pytest.raises(PhysicsError, match=rf"Physics 'mill' .*{says}"):
-            physics(points(3, 2))
-
     def test_rows_of_different_length(self):
         exact = BlackBoxPhysics(lambda x: Fraction(1, 4), batched=False)
         assert exact(torch.ones(1, 1)).item() == 0.25
-        tape = BlackBoxPhysics(lambda x: np.zeros(int(x[0])), batched=False, name="tape")
-        with pytest.raises(PhysicsError, match=r"'tape' returned 2 output\(s\)") as caught:
-            tape(torch.tensor([[2.0], [3.0], [2.0]]))
-        assert caught.value.rows == (1,)
 
-    def test_failed_rows_do_not_hide_a_new_number_of_outputs(self):
         def fragile(x):
             return np.zeros(int(x[0])) if x[0] else np.array([1 // 0])
 
-        physics = BlackBoxPhysics(fragile, batched=False)
-        physics(torch.tensor([[2.0]]))
-        with pytest.raises(PhysicsError, match=r"3 output\(s\), expected 2"):
-            physics(torch.tensor([[3.0], [0.0]]))
+        tape = BlackBoxPhysics(fragile, batched=False, name="tape")
+        with pytest.raises(PhysicsError, match=r"'tape' returned 2 output\(s\)") as caught:
+            tape(torch.tensor([[2.0], [3.0], [2.0]]))
+        assert caught.value.rows == (1,)
+        tape(torch.tensor([[2.0]]))  # nor is it hidden by rows that fail
+        rows = torch.tensor([[3.0], [0.0]])
+        refused(PhysicsError, r"3 output\(s\), expected 2", tape, rows)
 
     @pytest.mark.parametrize("grad", [False, True])
     def test_good_rows_survive_failed_ones(self, grad):
@@ -255,7 +236,7 @@ class TestFailures:
 
 
 class TestParallel:
-    def test_threads_share_the_rows(self, points):
+    def test_threads_and_processes_share_the_rows(self, points):
         barrier = threading.Barrier(2, timeout=10)
 
         def simulate(x):
@@ -267,7 +248,6 @@ class TestParallel:
         with joblib.parallel_config(backend="threading", n_jobs=2):
             assert torch.equal(physics(X), X[:, :1])
 
-    def test_processes_share_the_rows(self, points):
         class UnpicklableError(Exception):
             def __init__(self, code, reason):
                 super().__init__(f"{reason} ({code})")
@@ -290,12 +270,10 @@ class TestParallel:
 
 
 class TestCopies:
-    def test_deep_copy_keeps_a_handle(self, points):
+    def test_handles_lambdas_and_modules_are_copied(self, points):
         physics = BlackBoxPhysics(Handle())
         assert copy.deepcopy(torch.nn.ModuleList([physics]))[0] is physics
         assert torch.allclose(copy.copy(physics)(points(3, 2)), torch_waves(points(3, 2)))
-
-    def test_cloudpickle_keeps_lambdas(self, points):
         scale = 3.0
         physics = BlackBoxPhysics(
             lambda X: scale * waves(X), gradient=lambda X: scale * waves_jacobian(X)
@@ -307,8 +285,6 @@ class TestCopies:
         (found,) = torch.autograd.grad(Y.sum(), X)
         (expected,) = torch.autograd.grad(3.0 * torch_waves(X).sum(), X)
         assert torch.allclose(found, expected)
-
-    def test_a_pickled_module_is_no_attribute(self, points):
         physics = BlackBoxPhysics(NumpyModule())
         X = points(3, 2)
         assert torch.equal(pickle.loads(pickle.dumps(physics))(X), physics(X))
@@ -354,3 +330,28 @@ class TestUnknownParameters:
         expected = physics(X, values)
         with joblib.parallel_config(backend="threading", n_jobs=2):
             torch.testing.assert_close(physics(X, values), expected)
+
+
+class TestCentralDifference:
+    def test_it_agrees_with_autograd_and_is_exact_for_quadratics(self, points):
+        X = points(6, 2)
+        jacobian = torch.autograd.functional.jacobian
+        exact = torch.stack([jacobian(torch_waves, x[None])[0, :, 0] for x in X])
+        assert torch.allclose(central_difference(torch_waves, X), exact, rtol=1e-8, atol=1e-8)
+        J = central_difference(torch.square, X, torch.tensor([0.5, 0.25]).double())
+        assert torch.allclose(J, torch.diag_embed(2 * X), rtol=1e-12, atol=1e-12)
+
+    def test_large_inputs_get_a_step_that_floats_can_tell_apart_counted_as_rounded(self):
+        X = torch.tensor([[1e9]], dtype=torch.float64)
+        assert torch.allclose(central_difference(lambda X: 3 * X, X), torch.tensor(3.0).double())
+        slope = central_difference(lambda X: X, X, torch.tensor(1.7e-7).double())
+        assert slope.item() == 1.0
+
+    def test_each_point_is_the_row_that_the_documentation_says(self, points):
+        X, asked = points(4, 3), []
+        central_difference(lambda X: asked.append(X) or X, X, torch.tensor(0.1).double())
+        (rows,) = asked
+        i = torch.arange(len(rows))
+        moved = (rows - X[i // 3 % 4]).abs()
+        assert len(rows) == 24
+        assert torch.allclose(moved, 0.1 * torch.eye(3).double()[i % 3])

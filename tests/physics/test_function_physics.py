@@ -8,22 +8,22 @@ import numpy as np
 import pytest
 import torch
 
+from gpadjust import CalibratedPhysics
 from gpadjust.physics import (
     BlackBoxPhysics,
     FunctionPhysics,
+    JoinedPhysics,
     PhysicsError,
-    Unknown,
     as_physics,
 )
+from gpadjust.physics.array_physics import array_physics
+from tests.systems import refused
 
 
-def test_is_named_after_its_function():
+def test_names_and_parameters_of_modules(points):
     assert FunctionPhysics(torch.sin).name == "sin"
     assert FunctionPhysics(torch.nn.Tanh()).name == "Tanh"
     assert FunctionPhysics(torch.sin, name="wave").name == "wave"
-
-
-def test_parameters_of_a_module_are_learnt(points):
     physics = FunctionPhysics(torch.nn.Linear(3, 2, dtype=torch.float64))
     X = points(20, 3)
     target = X @ points(3, 2, seed=1) + 1.0
@@ -41,43 +41,30 @@ def test_parameters_of_a_module_are_learnt(points):
 
 
 @pytest.mark.parametrize("grad", [False, True])
-@pytest.mark.parametrize(
-    "function", [lambda X: X.detach().numpy() ** 2, lambda X: X.detach().numpy().sum()]
-)
-def test_numpy_result(function, grad, points):
-    with pytest.raises(PhysicsError, match=r"'noodle'.*NumPy.*BlackBoxPhysics\("):
-        FunctionPhysics(function, name="noodle")(points(3, 2).requires_grad_(grad))
-
-
-def test_numpy_inside_where_a_gradient_is_needed(points):
-    physics = FunctionPhysics(lambda X: torch.from_numpy(np.sin(X.numpy())))
-    with pytest.raises(PhysicsError, match=r"NumPy.*BlackBoxPhysics\(") as caught:
-        physics(points(3, 2).requires_grad_())
-    assert "Can't call numpy()" in str(caught.value.__cause__)
-
-
-def test_other_runtime_errors_are_not_taken_for_numpy(points):
+def test_numpy_results_and_other_errors(grad, points):
+    X = points(3, 2).requires_grad_(grad)
+    for function in (lambda X: X.detach().numpy() ** 2, lambda X: X.detach().numpy().sum()):
+        physics = FunctionPhysics(function, name="noodle")
+        refused(PhysicsError, r"'noodle'.*NumPy.*BlackBoxPhysics\(", physics, X)
     physics = FunctionPhysics(lambda X: X @ X)
-    with pytest.raises(PhysicsError, match=r"RuntimeError: .*mat1"):
-        physics(points(3, 2))
+    refused(PhysicsError, r"RuntimeError: .*mat1", physics, X)
+    if grad:
+        physics = FunctionPhysics(lambda X: torch.from_numpy(np.sin(X.numpy())))
+        with pytest.raises(PhysicsError, match=r"NumPy.*BlackBoxPhysics\(") as caught:
+            physics(X)
+        assert "Can't call numpy()" in str(caught.value.__cause__)
 
 
 def test_missing_gradient_warns_once(points):
-    physics = FunctionPhysics(lambda X: X.detach() ** 2, name="stone")
+    physics, smooth = FunctionPhysics(lambda X: X.detach() ** 2, name="stone"), torch.sin
     X = points(3, 2).requires_grad_()
     with pytest.warns(UserWarning, match=r"No gradient.*'stone'.*BlackBox"):
         assert torch.equal(physics(X), X.detach() ** 2)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         physics(X)
-
-
-def test_no_warning_where_a_gradient_flows(points):
-    physics = FunctionPhysics(torch.sin)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        physics(points(3, 2).requires_grad_())
-        physics(points(3, 2))
+        FunctionPhysics(smooth)(X)
+        FunctionPhysics(smooth)(points(3, 2))
 
 
 def double(X):
@@ -112,33 +99,79 @@ def test_pickle_of_a_method_that_holds_its_physics(dumps, points):
     assert torch.equal(loaded(points(3, 2)), points(3, 2) + 1)
 
 
-def test_as_physics_wraps_callables(points):
+def test_as_physics(points):
     X, physics = points(3, 2), BlackBoxPhysics(np.sin)
     assert as_physics(physics) is physics
-    with pytest.raises(TypeError, match="callable; found float"):
-        FunctionPhysics(1.0)
+    assert as_physics([physics]) is physics
     assert isinstance(as_physics(torch.sin), FunctionPhysics)
     assert torch.equal(as_physics(torch.sin)(X), X.sin())
     assert list(as_physics(torch.nn.Linear(2, 1)).parameters())
-
-
-def test_as_physics_joins_several(points):
-    X = points(3, 2)
     for several in ([torch.sin, double], (torch.sin, double), {"a": torch.sin, "b": double}):
         assert torch.equal(as_physics(several)(X), torch.cat([X.sin(), 2 * X], -1))
-    physics = FunctionPhysics(double)
-    assert as_physics([physics]) is physics
-    with pytest.raises(ValueError, match="no physics to join"):
-        as_physics([])
+    refused(TypeError, "callable; found float", FunctionPhysics, 1.0)
+    refused(ValueError, "no physics to join", as_physics, [])
+    for thing, found in ((3.0, "a float"), (None, "a NoneType"), (torch.nn.Tanh, "the class Tanh")):
+        says = f"found {found}.*torch function.*ODEPhysics.*BlackBoxPhysics"
+        refused(TypeError, says, as_physics, thing)
 
 
-@pytest.mark.parametrize(
-    ("thing", "found"), [(3.0, "a float"), (None, "a NoneType"), (torch.nn.Tanh, "the class Tanh")]
-)
-def test_as_physics_rejects_the_rest(thing, found):
-    message = f"found {found}.*torch function.*ODEPhysics.*BlackBoxPhysics"
-    with pytest.raises(TypeError, match=message):
-        as_physics(thing)
+# NumPy functions, torch functions and modules, and Physics are told apart
 
 
-PRIOR = Unknown(1.0, factor=2.0)
+X = np.linspace(0.1, 1, 6).reshape(3, 2)
+TENSOR = torch.tensor(X)
+
+
+def test_functions_are_told_apart():
+    for function in (
+        lambda X: np.sin(X[:, 0]),
+        lambda X: X[:, 0] ** 2,  # of both
+        lambda X: [row.sum() for row in X],
+        np.squeeze,  # a single number of a single row would be no array
+    ):
+        assert type(array_physics(function, X[:, :1])) is BlackBoxPhysics
+    linear = torch.nn.Linear(2, 1).double()
+    for function in (
+        torch.sin,
+        lambda X: X.sin(),
+        lambda X: torch.cat([X[:, :1].exp(), X[:, 1:]], dim=1),
+        lambda X: torch.as_tensor(X) * 2,
+        linear,
+    ):
+        physics = array_physics(function, X)
+        assert type(physics) is FunctionPhysics
+        torch.testing.assert_close(physics(TENSOR), function(TENSOR))
+    assert physics.function is not linear  # a module is copied
+    physics = BlackBoxPhysics(lambda x: x[0], batched=False)
+    assert array_physics(physics, X) is physics
+
+
+def test_several_and_one_row():
+    joined = array_physics({"coarse": np.sin, "fine": torch.cos}, X)
+    assert isinstance(joined, JoinedPhysics)
+    assert joined.names == ("coarse", "fine")
+    torch.testing.assert_close(joined(TENSOR), torch.cat([TENSOR.sin(), TENSOR.cos()], dim=1))
+    assert array_physics([np.sin, torch.cos], X).names == ("sin", "cos")
+    asked = []
+
+    def writes(X):
+        asked.append(len(X))
+        X[:] = 0
+        return X[:, 0]
+
+    before = X.copy()
+    array_physics(writes, X)
+    assert asked == [1]
+    assert (before == X).all()
+
+
+def test_errors_of_both_and_what_is_no_physics():
+    def both(X):
+        if isinstance(X, np.ndarray):
+            raise KeyError("no array")
+        raise IndexError("no tensor")
+
+    says = r"(?s)'both'.*KeyError: 'no array'.*IndexError: no ten"
+    refused(PhysicsError, says, array_physics, both, X)
+    for thing in (3, "cka", CalibratedPhysics):
+        refused(TypeError, "Physics or a callable", array_physics, thing, X)

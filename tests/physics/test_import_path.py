@@ -1,6 +1,7 @@
 """Physics by name."""
 
 import sys
+from operator import attrgetter
 from types import ModuleType
 
 import numpy as np
@@ -9,6 +10,7 @@ import torch
 
 from gpadjust.physics import BlackBoxPhysics, FunctionPhysics, JoinedPhysics, Physics, as_physics
 from gpadjust.physics.import_path import import_path, physics_from_path
+from tests.systems import refused
 
 SOURCE = """
 import torch
@@ -52,53 +54,36 @@ def plant():
     del sys.modules["plant"]
 
 
-@pytest.mark.parametrize(
-    "name", ["double", "Formula.triple", "drag", "net", "mill", "ghost", "pair"]
-)
-def test_what_a_module_names_comes_back(plant, name):
-    thing = plant
-    for part in name.split("."):
-        thing = getattr(thing, part)
-    assert import_path(thing) == f"plant:{name}"
-    loaded = physics_from_path(f"plant:{name}")
-    X = torch.ones(2, 2)
-    assert torch.equal(loaded(X), as_physics(thing)(X))
-    if isinstance(thing, Physics):
-        assert loaded is thing
-
-
-def test_wrapped_function_has_the_path_of_the_function(plant):
+def test_what_a_module_names_comes_back(plant):
+    for name in ("double", "Formula.triple", "drag", "net", "mill", "ghost", "pair"):
+        thing = attrgetter(name)(plant)
+        assert import_path(thing) == f"plant:{name}"
+        loaded, X = physics_from_path(f"plant:{name}"), torch.ones(2, 2)
+        assert torch.equal(loaded(X), as_physics(thing)(X))
+        assert loaded is thing or not isinstance(thing, Physics)
     assert import_path(FunctionPhysics(plant.double)) == "plant:double"
     assert import_path(FunctionPhysics(plant.net)) == "plant:net"
 
 
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda plant: lambda X: X,
-        lambda plant: plant.local(),
-        lambda plant: FunctionPhysics(plant.double, inputs=[0]),
-        lambda plant: BlackBoxPhysics(plant.double),
-        lambda plant: JoinedPhysics([plant.double, plant.drag]),
-        lambda plant: plant.Drag(),
-        lambda plant: plant.Drag().evaluate,
-        lambda plant: np.vectorize(abs),
-        lambda plant: torch.sin,
-    ],
-)
-def test_what_has_no_name(plant, make):
-    assert import_path(make(plant)) is None
+def test_what_has_no_name(plant):
+    for thing in (
+        lambda X: X,
+        plant.local(),
+        FunctionPhysics(plant.double, inputs=[0]),
+        BlackBoxPhysics(plant.double),
+        JoinedPhysics([plant.double, plant.drag]),
+        plant.Drag(),
+        plant.Drag().evaluate,
+        np.vectorize(abs),
+        torch.sin,
+    ):
+        assert import_path(thing) is None
+    old, plant.double = plant.double, lambda X: X
+    assert import_path(old) is None  # another has replaced it
 
 
-def test_function_that_another_has_replaced(plant):
-    old = plant.double
-    plant.double = lambda X: X
-    assert import_path(old) is None
-
-
-@pytest.mark.parametrize(
-    ("path", "message"),
-    [
+def test_wrong_path(plant):
+    for path, says in (
         ("plant", "expected 'package.module:qualname'"),
         (":double", "expected 'package.module:qualname'"),
         ("nowhere.at.all:f", r"cannot be imported \(ModuleNotFoundError: No module"),
@@ -106,8 +91,5 @@ def test_function_that_another_has_replaced(plant):
         ("plant:absent", r"cannot be imported \(AttributeError: .*absent"),
         ("plant:number", "does not name a physics: .*found a int"),
         ("plant:Drag", "does not name a physics: .*the class Drag"),
-    ],
-)
-def test_wrong_path(plant, path, message):
-    with pytest.raises(ValueError, match=message):
-        physics_from_path(path)
+    ):
+        refused(ValueError, says, physics_from_path, path)

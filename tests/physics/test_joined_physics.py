@@ -14,6 +14,7 @@ from gpadjust.physics import (
     PhysicsError,
     Unknown,
 )
+from tests.systems import refused
 
 
 def total(X):
@@ -24,27 +25,41 @@ def first_log(X):
     return X[:, 0].log()
 
 
-class TestNames:
-    @pytest.mark.parametrize(
-        ("parts", "names"),
-        [
-            ([torch.sin, torch.cos], ("sin", "cos")),
-            ([torch.sin, lambda X: X, lambda X: X], ("sin", "f_2", "f_3")),
-            ([torch.sin, torch.cos, torch.sin], ("f_1", "cos", "f_3")),
-            ([FunctionPhysics(torch.sin, name="f_2"), lambda X: X], ("f_1", "f_2")),
-            ({"low": torch.sin, "high": torch.sin}, ("low", "high")),
-        ],
-    )
-    def test_are_unique(self, parts, names):
+def test_names_are_unique_and_what_is_refused(points):
+    for parts, names in (
+        ([torch.sin, torch.cos], ("sin", "cos")),
+        ([torch.sin, lambda X: X, lambda X: X], ("sin", "f_2", "f_3")),
+        ([torch.sin, torch.cos, torch.sin], ("f_1", "cos", "f_3")),
+        ([FunctionPhysics(torch.sin, name="f_2"), lambda X: X], ("f_1", "f_2")),
+        ({"low": torch.sin, "high": torch.sin}, ("low", "high")),
+    ):
         assert JoinedPhysics(parts).names == names
+    for parts, says in (
+        (torch.sin, "takes a list of physics.*found a builtin_function"),
+        ([torch.sin, 3.0], "found a float"),
+        ({1: torch.sin}, r"must be text; found \[1\]"),
+        ([], "no physics to join"),
+        ({}, "no physics to join"),
+    ):
+        refused(TypeError if parts else ValueError, says, JoinedPhysics, parts)
+    pair = JoinedPhysics([torch.sin, total], name="pair")
+    refused(PhysicsError, r"'pair'.*2 of 'sin', 1 of 'total'", pair, points(3, 2))
 
 
 class TestValues:
-    def test_columns_of_the_parts_in_order(self, points):
+    def test_columns_and_gradients(self, points):
         X = points(2, 4, 3)
         joined = JoinedPhysics([torch.sin, FunctionPhysics(lambda X: X, inputs=[2, 1, 0])])
         assert torch.equal(joined(X), torch.cat([X.sin(), X.flip(-1)], -1))
         assert joined.num_outputs == 6
+        joined = JoinedPhysics(
+            [
+                torch.sin,
+                BlackBoxPhysics(lambda X: np.cos(X[:, ::-1])),
+                ODEPhysics(lambda s, a: -s, 0.5, 2),
+            ]
+        )
+        assert torch.autograd.gradcheck(joined, points(2, 3, 2).requires_grad_())
 
     def test_each_part_has_its_own_memo(self, counter, numpy_counter, points):
         joined = JoinedPhysics(
@@ -58,8 +73,7 @@ class TestValues:
         joined.forget()
         joined(X)
         assert len(numpy_counter.rows) == 10
-
-    def test_a_parameter_of_one_part_leaves_the_memo_of_another(self, numpy_counter, points):
+        numpy_counter.rows.clear()
         linear = torch.nn.Linear(2, 2, dtype=torch.float64)
         joined = JoinedPhysics([linear, BlackBoxPhysics(numpy_counter)])
         for _ in range(2):
@@ -67,49 +81,18 @@ class TestValues:
         assert len(numpy_counter.rows) == 3
         assert linear.weight.grad is not None
 
-    def test_gradients_through_every_kind(self, points):
-        joined = JoinedPhysics(
-            [
-                torch.sin,
-                BlackBoxPhysics(lambda X: np.cos(X[:, ::-1])),
-                ODEPhysics(lambda s, a: -s, 0.5, 2),
-            ]
-        )
-        assert torch.autograd.gradcheck(joined, points(2, 3, 2).requires_grad_())
-
-    def test_joined_physics_can_be_joined(self, points):
-        X = points(3, 2)
-        inner = JoinedPhysics([total, lambda X: X[:, 0]])
-        assert torch.equal(JoinedPhysics([inner, torch.sin])(X)[:, :2], inner(X))
-
 
 class TestErrors:
-    def test_names(self):
+    def test_names_and_partial_results(self):
         joined = JoinedPhysics({"low": total, "high": FunctionPhysics(first_log)})
         assert [part.name for part in joined.parts] == ["low", "first_log"]
-        with pytest.raises(PhysicsError, match="'low' was given no rows"):
-            joined(torch.zeros(0, 2))
+        refused(PhysicsError, "'low' was given no rows", joined, torch.zeros(0, 2))
         with pytest.raises(PhysicsError, match="'first_log'") as caught:
             joined(torch.zeros(1, 1))
         assert caught.value.__notes__ == ["This physics is 'high' of ('low', 'high')."]
         joined(torch.ones(1, 2))
         assert joined(torch.zeros(0, 2)).shape == (0, 2)
 
-    def test_differ_in_their_number_of_outputs(self, points):
-        joined = JoinedPhysics([torch.sin, total], name="pair")
-        with pytest.raises(PhysicsError, match=r"'pair'.*2 of 'sin', 1 of 'total'"):
-            joined(points(3, 2))
-
-    @pytest.mark.parametrize("grad", [False, True])
-    def test_of_a_part_names_it_and_the_rows_of_X(self, grad):
-        joined = JoinedPhysics([total, FunctionPhysics(first_log, inputs=[1])])
-        X = torch.tensor([[1.0, 1.0], [5.0, -1.0]], requires_grad=grad)
-        with pytest.raises(PhysicsError, match=r"'first_log'.*NaN") as caught:
-            joined(X.unsqueeze(0).expand(2, 2, 2))
-        assert caught.value.rows == (1, 3)
-        assert caught.value.inputs.tolist() == [[5.0, -1.0]] * 2
-
-    def test_of_a_part_with_partial_results(self):
         def root(x):
             if x[0] < 0:
                 raise ArithmeticError("below zero")
@@ -122,29 +105,23 @@ class TestErrors:
             assert caught.value.rows == (1,)
             assert joined(torch.tensor([[4.0]])).tolist() == [[4.0, 2.0]]
 
-    @pytest.mark.parametrize(
-        ("parts", "message"),
-        [
-            (torch.sin, "takes a list of physics.*found a builtin_function"),
-            ([torch.sin, 3.0], "found a float"),
-            ({1: torch.sin}, r"must be text; found \[1\]"),
-            ([], "no physics to join"),
-            ({}, "no physics to join"),
-        ],
-    )
-    def test_no_list_of_physics(self, parts, message):
-        with pytest.raises(TypeError if parts else ValueError, match=message):
-            JoinedPhysics(parts)
+    @pytest.mark.parametrize("grad", [False, True])
+    def test_of_a_part_names_it_and_the_rows_of_X(self, grad):
+        joined = JoinedPhysics([total, FunctionPhysics(first_log, inputs=[1])])
+        X = torch.tensor([[1.0, 1.0], [5.0, -1.0]], requires_grad=grad)
+        with pytest.raises(PhysicsError, match=r"'first_log'.*NaN") as caught:
+            joined(X.unsqueeze(0).expand(2, 2, 2))
+        assert caught.value.rows == (1, 3)
+        assert caught.value.inputs.tolist() == [[5.0, -1.0]] * 2
 
 
-class TestCopies:
-    def test_deep_copy(self):
-        joined = JoinedPhysics([torch.sin, torch.cos])
-        assert copy.deepcopy(joined) is joined
-        learnt = JoinedPhysics([torch.sin, torch.nn.Linear(1, 1)])
-        duplicate = copy.deepcopy(learnt)
-        assert duplicate.parts[0] is learnt.parts[0]
-        assert duplicate.parts[1].function is not learnt.parts[1].function
+def test_deep_copy():
+    joined = JoinedPhysics([torch.sin, torch.cos])
+    assert copy.deepcopy(joined) is joined
+    learnt = JoinedPhysics([torch.sin, torch.nn.Linear(1, 1)])
+    duplicate = copy.deepcopy(learnt)
+    assert duplicate.parts[0] is learnt.parts[0]
+    assert duplicate.parts[1].function is not learnt.parts[1].function
 
 
 MASS, DRAG = Unknown(1.0, factor=1.5), Unknown(0.1, bounds=(0.0, 1.0))
@@ -178,14 +155,11 @@ class TestUnknownParameters:
         for found in (joined(X, values), joined.or_nan(X, values), nested(X, values)[..., :3]):
             torch.testing.assert_close(found, expected)
 
-    def test_that_contradict_each_other(self):
+    def test_that_contradict_each_other_or_at_which_a_part_fails(self):
         parts = self.parts()
         parts[2] = FunctionPhysics(push, unknowns={"mass": Unknown(1.0, sd=0.1)})
         message = "parameter 'mass', which is then one.*factor=1.5.*sd=0.1.*or different names"
-        with pytest.raises(ValueError, match=message):
-            JoinedPhysics(parts)
-
-    def test_at_which_a_part_fails(self):
+        refused(ValueError, message, JoinedPhysics, parts)
         X = torch.tensor([[1.0, 3.0], [2.0, 4.0]], dtype=torch.float64)
         values = torch.tensor([[1.0, 0.5], [1.0, 1.5], [1.0, 9.0]], dtype=torch.float64)
         joined = JoinedPhysics(self.parts())

@@ -12,6 +12,7 @@ from scipy.linalg import expm
 
 from gpadjust.physics import ODEPhysics, PhysicsError, Unknown
 from gpadjust.physics.ode import ADAPTIVE_STEP, FIXED_STEP
+from tests.systems import refused
 
 
 class Spring(torch.nn.Module):
@@ -54,10 +55,6 @@ class TestFormulas:
         torch.testing.assert_close(pickle.loads(pickle.dumps(physics))(X), own(X))
         assert physics.name == formula
 
-    def test_a_derivative_of_each_state(self):
-        with pytest.raises(ValueError, match="derivative of each state, x, v, found 1 in 'v'"):
-            ODEPhysics.of_formula("v", ["x", "v"], ["u"], 0.1)
-
 
 class TestSolutions:
     @pytest.mark.parametrize("method", ["rk4", "dopri5"])
@@ -68,7 +65,7 @@ class TestSolutions:
         matrix = torch.from_numpy(held_input_solution(A.numpy(), B.numpy(), 0.3))
         assert torch.allclose(physics(X), X @ matrix.T, atol=1e-6, rtol=1e-6)
 
-    def test_spring_keeps_its_energy(self, points):
+    def test_spring_keeps_its_energy_and_difference_is_from_the_start(self, points):
         physics = ODEPhysics(Spring(4.0), step=2.0, state_dim=2, substeps=400)
         X = torch.cat([points(6, 2), torch.zeros(6, 1, dtype=torch.float64)], -1)
 
@@ -78,8 +75,6 @@ class TestSolutions:
         moved = physics(X)
         assert torch.allclose(energy(moved), energy(X[:, :2]), rtol=1e-8)
         assert not torch.allclose(moved, X[:, :2], atol=0.1)
-
-    def test_difference_is_from_the_start(self, points):
         X = points(2, 5, 3)
         state = ODEPhysics(Spring(), 0.2, 2)(X)
         change = ODEPhysics(Spring(), 0.2, 2, difference=True)(X)
@@ -132,11 +127,9 @@ class TestSolutions:
 
 
 class TestGradients:
-    def test_in_X(self, points):
+    def test_gradients_in_X_and_in_a_parameter(self, points):
         physics = ODEPhysics(Spring(), 0.2, 2, substeps=3)
         assert torch.autograd.gradcheck(physics, points(2, 2, 3).requires_grad_())
-
-    def test_in_a_parameter(self):
         spring = Spring(4.0)
         physics = ODEPhysics(spring, step=0.5, state_dim=2, substeps=200)
         X = torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)
@@ -146,9 +139,8 @@ class TestGradients:
 
 
 class TestErrors:
-    @pytest.mark.parametrize(
-        ("settings", "message"),
-        [
+    def test_settings(self):
+        for changes, says in (
             ({"step": 0.0}, "step must be finite and above 0; found 0.0"),
             ({"step": float("inf")}, "step must be finite and above 0; found inf"),
             ({"step": float("nan")}, "step must be finite and above 0; found nan"),
@@ -158,17 +150,18 @@ class TestErrors:
             ({"rtol": -1e-3}, "rtol must be finite and at least 0; found -0.001"),
             ({"atol": float("nan")}, "atol must be finite and at least 0; found nan"),
             ({"method": "magic"}, "Unknown method 'magic'.*euler.*rk4.*dopri5"),
+            ({"gradient": "none"}, r"'none'.*'autograd' or 'finite"),
             ({"step": "x"}, "step must be a number; found 'x'"),
             ({"rtol": None}, "rtol must be a number; found None"),
             ({"state_dim": 1.5}, "state_dim must be a whole number; found 1.5"),
             ({"substeps": 1.5}, "substeps must be a whole number; found 1.5"),
             ({"rhs": "decay"}, "rhs must be callable; found str"),
-        ],
-    )
-    def test_settings(self, settings, message):
-        error = TypeError if "number; found" in message or "callable" in message else ValueError
-        with pytest.raises(error, match=message):
-            ODEPhysics(**{"rhs": decay, "step": 0.1, "state_dim": 1, **settings})
+        ):
+            is_type = "number; found" in says or "callable" in says
+            given = {"rhs": decay, "step": 0.1, "state_dim": 1, **changes}
+            refused(TypeError if is_type else ValueError, says, ODEPhysics, **given)
+        of, says = ODEPhysics.of_formula, "derivative of each state, x, v, found 1 in 'v'"
+        refused(ValueError, says, of, "v", ["x", "v"], ["u"], 0.1)
 
     @pytest.mark.parametrize("method", ADAPTIVE_STEP)
     def test_adaptive_method_gives_up_on_a_stiff_rhs(self, method):
@@ -180,37 +173,27 @@ class TestErrors:
             physics(torch.ones(2, 1, dtype=torch.float64))
         assert caught.value.rows == (0, 1)
 
-    def test_adaptive_method_gives_up_on_a_blow_up(self):
-        physics = ODEPhysics(lambda s, a: s**2, 2.0, 1, method="dopri5")
-        with pytest.raises(PhysicsError, match="not reach the end"):
-            physics(torch.ones(1, 1, dtype=torch.float64))
-
-    def test_other_assertions_are_the_user_s(self):
-        def rhs(state, action):
-            raise AssertionError("negative mass")
-
-        with pytest.raises(PhysicsError, match="AssertionError: negative mass"):
-            ODEPhysics(rhs, 0.1, 1, method="dopri5")(torch.ones(1, 1))
-
-    @pytest.mark.parametrize(
-        ("rate", "found"),
-        [
+    def test_rhs_that_is_wrong(self, points):
+        for rate, found in (
             (torch.zeros(3), r"\(3,\)"),
             (torch.zeros(3, 1), r"\(3, 1\)"),
             (torch.zeros(3, 2) * 1j, "torch.complex64"),
             (0, "int"),
             (None, "NoneType"),
-        ],
-    )
-    def test_rhs_of_another_shape(self, rate, found, points):
-        physics = ODEPhysics(lambda s, a: rate, 0.1, 2, name="tank")
-        message = rf"rhs of physics 'tank' returned {found}, expected.*\(3, 2\)"
-        with pytest.raises(PhysicsError, match=message):
-            physics(points(3, 2))
+        ):
+            physics = ODEPhysics(lambda s, a, rate=rate: rate, 0.1, 2, name="tank")
+            says = rf"rhs of physics 'tank' returned {found}, expected.*\(3, 2\)"
+            refused(PhysicsError, says, physics, points(3, 2))
+        refused(PhysicsError, r"3 state column.*2 column", ODEPhysics(decay, 0.1, 3), points(4, 2))
 
-    def test_too_few_columns_for_the_state(self, points):
-        with pytest.raises(PhysicsError, match=r"3 state column.*2 column"):
-            ODEPhysics(decay, 0.1, 3)(points(4, 2))
+        def users(state, action):
+            raise AssertionError("negative mass")
+
+        x = torch.ones(1, 1, dtype=torch.float64)
+        physics = ODEPhysics(users, 0.1, 1, method="dopri5")
+        refused(PhysicsError, "AssertionError: negative mass", physics, x)
+        blows_up = ODEPhysics(lambda s, a: s**2, 2.0, 1, method="dopri5")
+        refused(PhysicsError, "not reach the end", blows_up, x)
 
     def test_blow_up_names_the_row(self):
         physics = ODEPhysics(lambda s, a: s**3, 1.0, 1)
@@ -219,16 +202,12 @@ class TestErrors:
         assert caught.value.rows == (1,)
 
 
-class TestCopies:
-    def test_number_of_outputs_is_known_at_once(self):
-        physics = ODEPhysics(decay, 0.1, 2)
-        assert physics.num_outputs == 2
-        assert physics(torch.ones(0, 2)).shape == (0, 2)
-
-    def test_pickle(self, points):
-        physics = ODEPhysics(Spring(), 0.1, 2, difference=True)
-        X = points(3, 3)
-        assert torch.equal(pickle.loads(pickle.dumps(physics))(X), physics(X))
+def test_copies_and_the_number_of_outputs(points):
+    physics = ODEPhysics(Spring(), 0.1, 2, difference=True)
+    assert physics.num_outputs == 2  # known at once
+    assert physics(torch.ones(0, 3)).shape == (0, 2)
+    X = points(3, 3)
+    assert torch.equal(pickle.loads(pickle.dumps(physics))(X), physics(X))
 
 
 def test_gradients_by_finite_differences_are_those_of_autograd():
@@ -243,8 +222,6 @@ def test_gradients_by_finite_differences_are_those_of_autograd():
     learnt = ODEPhysics(Spring(), **options, gradient="finite-difference")
     learnt(X).sum().backward()  # parameters are learnt by autograd all the same
     assert learnt.rhs.stiffness.grad.abs() > 0
-    with pytest.raises(ValueError, match=r"'none'.*'autograd' or 'finite"):
-        ODEPhysics(decay, **options, gradient="none")
 
 
 class TestUnknownParameters:

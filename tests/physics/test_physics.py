@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gpadjust.physics import BlackBoxPhysics, FunctionPhysics, Physics, PhysicsError
+from tests.systems import refused
 
 integers_as_rows = st.lists(st.lists(st.integers(-2, 2), min_size=2, max_size=2), min_size=1)
 
@@ -44,18 +45,15 @@ class TestShapes:
         assert torch.equal(physics(X), expected)
         assert torch.equal(physics(X), expected)
 
-    def test_one_output_keeps_its_dimension(self, points):
+    def test_one_output_and_no_rows(self, points, counter):
         X = points(4, 3, 2)
         flat = FunctionPhysics(lambda X: X.sum(-1))
         column = FunctionPhysics(lambda X: X.sum(-1, keepdim=True))
         assert flat(X).shape == column(X).shape == (4, 3, 1)
         assert torch.equal(flat(X), column(X))
         assert flat.num_outputs == 1
-
-    def test_no_rows_after_a_first_call(self, counter, points):
         physics = FunctionPhysics(counter)
-        with pytest.raises(PhysicsError, match=r"'RowCounter'.*no rows"):
-            physics(points(0, 3))
+        refused(PhysicsError, r"'RowCounter'.*no rows", physics, points(0, 3))
         physics(points(2, 3))
         assert physics(points(4, 0, 3)).shape == (4, 0, 2)
         assert len(counter.rows) == 2
@@ -67,42 +65,29 @@ class TestShapes:
         assert Y.dtype == torch.float64
         assert Y.requires_grad == grad
 
-    def test_overflow_of_the_dtype_is_not_finite(self):
-        with pytest.raises(PhysicsError, match="NaN or inf in 1 of 1"):
-            FunctionPhysics(lambda X: X.double() * 1e300)(torch.ones(1, 1, dtype=torch.float32))
 
-
-class TestColumns:
-    def test_reads_the_named_columns_in_order(self, points):
-        X = points(2, 5, 4)
-        physics = FunctionPhysics(lambda X: X, inputs=[-1, 0, -4, 3])
-        assert torch.equal(physics(X), X[..., [3, 0, 0, 3]])
-
-    @pytest.mark.parametrize("column", [2, -3])
-    def test_too_few_columns(self, column, points):
-        message = rf"inputs=\(0, {column}\).*\(5, 2\).*2 column.*no column \[{column}\]"
-        with pytest.raises(ValueError, match=message):
-            FunctionPhysics(square, inputs=[0, column])(points(5, 2))
+def test_it_reads_the_named_columns_in_order(points):
+    X = points(2, 5, 4)
+    assert torch.equal(FunctionPhysics(lambda X: X, inputs=[-1, 0, -4, 3])(X), X[..., [3, 0, 0, 3]])
 
 
 def test_bad_settings_and_inputs(points):
-    for options, error, says in (
-        ({"inputs": []}, ValueError, "inputs is empty"),
-        *(
-            ({"inputs": i}, TypeError, re.escape(f"such as [0, 2]; found {i!r}"))
-            for i in ([0.5], 1, 0.5, "a")
-        ),
-        ({"memo": -1}, ValueError, "memo must be at least 0; found -1"),
-        ({"memo": 1.5}, TypeError, r"memo must be a whole number; found 1\.5"),
-    ):
-        with pytest.raises(error, match=says):
-            BlackBoxPhysics(square, **options)
+    for inputs in ([0.5], 1, 0.5, "a"):
+        says = re.escape(f"such as [0, 2]; found {inputs!r}")
+        refused(TypeError, says, BlackBoxPhysics, square, inputs=inputs)
+    refused(ValueError, "inputs is empty", BlackBoxPhysics, square, inputs=[])
+    refused(ValueError, "memo must be at least 0; found -1", BlackBoxPhysics, square, memo=-1)
+    whole = r"memo must be a whole number; found 1\.5"
+    refused(TypeError, whole, BlackBoxPhysics, square, memo=1.5)
     for X in ([[1.0]], torch.tensor([[1]])):
-        with pytest.raises(TypeError, match=r"floating-point.*found (list|torch.int64)"):
-            FunctionPhysics(square)(X)
+        refused(TypeError, r"floating-point.*found (list|torch.int64)", FunctionPhysics(square), X)
     for shape in ((3,), (3, 0)):
-        with pytest.raises(ValueError, match=re.escape(f"batch_shape x n x d; found {shape}")):
-            FunctionPhysics(square)(points(*shape))
+        says = re.escape(f"batch_shape x n x d; found {shape}")
+        refused(ValueError, says, FunctionPhysics(square), points(*shape))
+    for column in (2, -3):
+        says = rf"inputs=\(0, {column}\).*\(5, 2\).*2 column.*no column \[{column}\]"
+        refused(ValueError, says, FunctionPhysics(square, inputs=[0, column]), points(5, 2))
+    refused(TypeError, "abstract", Physics)
 
 
 class TestMemo:
@@ -120,46 +105,12 @@ class TestMemo:
             assert torch.equal(physics(X), X.sum(-1, keepdim=True))
         assert len(asked) == len(set(asked)) == len({tuple(row) for rows in calls for row in rows})
 
-    def test_result_can_be_changed_in_place(self, points):
+    def test_results_changed_in_place_bad_rows_and_new_outputs(self, points):
         X = points(3, 2)
         physics = BlackBoxPhysics(square)
         for _ in range(2):
             physics(X).zero_()
         assert torch.equal(physics(X), X**2)
-
-    @pytest.mark.parametrize(
-        "change",
-        [
-            lambda scale: scale.gain.data.fill_(3.0),
-            lambda scale: scale.load_state_dict(
-                {"gain": torch.tensor(3.0), "offset": torch.tensor(0.0)}
-            ),
-            lambda scale: setattr(scale, "gain", torch.nn.Parameter(torch.tensor(3.0).double())),
-            lambda scale: scale.offset.add_(1.0),
-        ],
-        ids=["data", "load_state_dict", "replaced", "buffer"],
-    )
-    def test_dropped_when_state_changes(self, change, points):
-        scale = Scale()
-        physics = BlackBoxPhysics(scale)
-        X = points(3, 1)
-        with torch.no_grad():
-            before = physics(X)
-            physics(X)
-            assert scale.calls == 1
-            change(scale)
-            after = physics(X)
-        assert scale.calls == 2
-        assert torch.equal(after, scale.gain.detach() * X + scale.offset)
-        assert not torch.equal(after, before)
-
-    def test_dropped_when_the_dtype_changes(self):
-        physics = BlackBoxPhysics(lambda X: X / 3)
-        physics(torch.tensor([[1.0]], dtype=torch.float32))
-        X = torch.tensor([[1.0]], dtype=torch.float64)
-        assert torch.equal(physics(X), X / 3)
-
-    def test_good_rows_survive_bad_ones(self):
         asked = []
 
         def root(X):
@@ -167,16 +118,35 @@ class TestMemo:
             return np.where(X > 0, np.abs(X) ** 0.5, np.nan)
 
         physics = BlackBoxPhysics(root)
-        with pytest.raises(PhysicsError, match="NaN"):
-            physics(torch.tensor([[4.0], [-1.0], [9.0]]))
+        refused(PhysicsError, "NaN", physics, torch.tensor([[4.0], [-1.0], [9.0]]))
         assert physics(torch.tensor([[4.0], [9.0]])).flatten().tolist() == [2.0, 3.0]
         assert asked == [4.0, -1.0, 9.0]
-
-    def test_a_new_number_of_outputs_is_seen_behind_known_rows(self, points):
         physics = BlackBoxPhysics(lambda X: np.repeat(X, len(X), 1))
         physics(points(2, 1))
-        with pytest.raises(PhysicsError, match=r"1 output\(s\), expected 2"):
-            physics(points(3, 1))
+        refused(PhysicsError, r"1 output\(s\), expected 2", physics, points(3, 1))
+
+    def test_dropped_when_state_or_dtype_changes(self, points):
+        three = torch.tensor(3.0).double()
+        for change in (
+            lambda scale: scale.gain.data.fill_(3.0),
+            lambda scale: scale.load_state_dict({"gain": three, "offset": 0 * three}),
+            lambda scale: setattr(scale, "gain", torch.nn.Parameter(three.clone())),
+            lambda scale: scale.offset.add_(1.0),
+        ):
+            scale, X = Scale(), points(3, 1)
+            physics = BlackBoxPhysics(scale)
+            with torch.no_grad():
+                before = physics(X)
+                physics(X)
+                assert scale.calls == 1
+                change(scale)
+                after = physics(X)
+            assert scale.calls == 2
+            assert torch.equal(after, scale.gain.detach() * X + scale.offset)
+            assert not torch.equal(after, before)
+        physics, X = BlackBoxPhysics(lambda X: X / 3), torch.ones(1, 1)
+        physics(X)
+        assert torch.equal(physics(X.double()), X.double() / 3)
 
 
 class TestGradients:
@@ -185,8 +155,6 @@ class TestGradients:
         X = points(2, 3, 2).requires_grad_()
         assert torch.autograd.gradcheck(physics, X)
         assert torch.autograd.gradgradcheck(physics, X)
-
-    def test_known_rows_still_have_a_gradient(self, points):
         physics = FunctionPhysics(square)
         X = points(3, 2)
         physics(X)
@@ -203,8 +171,13 @@ class TestGradients:
             physics(X)
         scale.requires_grad_(False)
         assert not physics(X.detach()).requires_grad
+        gain = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
+        physics = FunctionPhysics(lambda X: gain * X)
+        with pytest.warns(UserWarning, match=r"parameters.*requires_grad_"):
+            Y = physics(points(3, 1))
+        assert not Y.requires_grad
 
-    def test_expanded_X_is_evaluated_once(self, counter, points):
+    def test_expanded_X(self, counter, points):
         X = points(2, 5, 3).requires_grad_()
         Y = FunctionPhysics(counter)(X.unsqueeze(-3).expand(2, 4, 5, 3))
         assert len(counter.rows) == 10
@@ -213,38 +186,28 @@ class TestGradients:
         (gradient,) = torch.autograd.grad((weights * Y).sum(), X)
         (expected,) = torch.autograd.grad((weights.sum(1) * counter.formula(X)).sum(), X)
         assert torch.allclose(gradient, expected)
-
-    def test_expanded_leaf_has_a_gradient_for_every_copy(self, points):
         X = points(1, 2).expand(3, 2).requires_grad_()
         weights = torch.tensor([[1.0], [2.0], [3.0]], dtype=torch.float64)
         (gradient,) = torch.autograd.grad((weights * FunctionPhysics(square)(X)).sum(), X)
         assert torch.equal(gradient, 2 * weights * X)
 
-    def test_hidden_parameter_is_taken_as_a_constant(self, points):
-        gain = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
-        physics = FunctionPhysics(lambda X: gain * X)
-        with pytest.warns(UserWarning, match=r"parameters.*requires_grad_"):
-            Y = physics(points(3, 1))
-        assert not Y.requires_grad
-
 
 class TestChecks:
-    @pytest.mark.parametrize(
-        ("result", "message"),
-        [
+    @pytest.mark.parametrize("grad", [False, True])
+    def test_wrong_result(self, grad, points):
+        for result, says in (
             (None, r"returned NoneType, expected a real tensor of shape \(4, m\)"),
             (torch.zeros(4, dtype=torch.complex128), "returned torch.complex128"),
             (torch.zeros(3, 1), r"returned shape \(3, 1\), expected.*\(4, m\) or \(4,\)"),
             (torch.tensor(1.0), r"returned shape \(\).*X.new_full"),
             (torch.zeros(4, 1, 1), r"returned shape \(4, 1, 1\)"),
             (torch.zeros(4, 0), r"returned shape \(4, 0\)"),
-        ],
-    )
-    @pytest.mark.parametrize("grad", [False, True])
-    def test_wrong_result(self, result, message, grad, points):
-        physics = FunctionPhysics(lambda X: result, name="wrong")
-        with pytest.raises(PhysicsError, match="Physics 'wrong' " + message):
-            physics(points(4, 2).requires_grad_(grad))
+        ):
+            physics = FunctionPhysics(lambda X, result=result: result, name="wrong")
+            X = points(4, 2).requires_grad_(grad)
+            refused(PhysicsError, "Physics 'wrong' " + says, physics, X)
+        overflow = FunctionPhysics(lambda X: X.double() * 1e300)
+        refused(PhysicsError, "NaN or inf in 1 of 1", overflow, torch.ones(1, 1))
 
     @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
     @pytest.mark.parametrize("grad", [False, True])
@@ -257,7 +220,7 @@ class TestChecks:
         assert caught.value.inputs.tolist() == [[7.0], [8.0]]
         assert str(caught.value).endswith("  row 7: [7.0]\n  row 8: [8.0]")
 
-    def test_rows_are_told_for_every_copy(self):
+    def test_rows_are_told_for_every_copy_and_of_an_inner_physics(self):
         physics = FunctionPhysics(lambda X: X.log(), inputs=[0])
         X = torch.tensor([[1.0, 5.0], [0.0, 5.0], [0.0, 6.0]])
         physics(X[:1])
@@ -265,6 +228,12 @@ class TestChecks:
             physics(X.expand(2, 3, 2))
         assert caught.value.rows == (1, 2, 4, 5)
         assert caught.value.inputs.tolist() == [[0.0]] * 4
+        inner = FunctionPhysics(lambda X: X.log(), name="inner")
+        outer = FunctionPhysics(lambda X: inner(X.flip(0)), name="outer")
+        with pytest.raises(PhysicsError, match="'inner'") as caught:
+            outer(torch.tensor([[0.0], [1.0]]))
+        assert caught.value.rows == (1,)
+        assert caught.value.inputs.tolist() == [[0.0]]
 
     @pytest.mark.parametrize("grad", [False, True])
     def test_exception_is_chained(self, grad, points):
@@ -287,22 +256,12 @@ class TestChecks:
             FunctionPhysics(broken)(points(3, 2))
         assert caught.value is raised
 
-    def test_error_of_an_inner_physics_keeps_its_rows(self):
-        inner = FunctionPhysics(lambda X: X.log(), name="inner")
-        outer = FunctionPhysics(lambda X: inner(X.flip(0)), name="outer")
-        with pytest.raises(PhysicsError, match="'inner'") as caught:
-            outer(torch.tensor([[0.0], [1.0]]))
-        assert caught.value.rows == (1,)
-        assert caught.value.inputs.tolist() == [[0.0]]
-
 
 class TestCopies:
-    def test_copies_without_state(self, points):
+    def test_copies_and_pickles(self, points):
         physics, X = FunctionPhysics(square), points(3, 2)
         assert copy.deepcopy({"model": [physics]})["model"][0] is physics
         assert torch.equal(copy.copy(physics)(X), physics(X))
-
-    def test_deep_copy_with_state_is_apart(self, points):
         physics = FunctionPhysics(Scale(), name="spring")
         X = points(3, 1)
         with torch.no_grad():
@@ -312,14 +271,13 @@ class TestCopies:
             assert torch.equal(duplicate(X), 7.0 * X)
             assert torch.equal(physics(X), expected)
         assert (duplicate.name, duplicate.num_outputs) == ("spring", 1)
-
-    def test_deep_copy_of_a_cycle(self):
         physics = FunctionPhysics(Scale())
         physics.owners = [physics]
         duplicate = copy.deepcopy(physics)
         assert duplicate.owners[0] is duplicate
-
-    def test_pickle_brings_the_memo(self, points):
+        physics = FunctionPhysics(Scale())
+        physics(points(3, 1))
+        assert set(physics.state_dict()) == {"function.gain", "function.offset"}
         physics = BlackBoxPhysics(Scale())
         X = points(3, 1)
         with torch.no_grad():
@@ -329,11 +287,6 @@ class TestCopies:
             assert loaded.function.calls == 1
             loaded.function.gain.fill_(5.0)
             assert torch.equal(loaded(X), 5.0 * X)
-
-    def test_state_dict_holds_parameters_and_buffers_only(self, points):
-        physics = FunctionPhysics(Scale())
-        physics(points(3, 1))
-        assert set(physics.state_dict()) == {"function.gain", "function.offset"}
 
 
 class TestThreads:
@@ -375,17 +328,30 @@ class TestThreads:
         assert inside.is_set()
 
 
-class TestSubclass:
-    def test_needs_only_evaluate(self, points):
-        class Drag(Physics):
-            def evaluate(self, X):
-                return -X * X.abs()
+def test_a_subclass_needs_only_evaluate(points):
+    class Drag(Physics):
+        def evaluate(self, X):
+            return -X * X.abs()
 
-        X = points(3, 2)
-        drag = Drag(inputs=[1])
-        assert drag.name == "Drag"
-        assert torch.equal(drag(X), -X[:, 1:] * X[:, 1:].abs())
+    X = points(3, 2)
+    drag = Drag(inputs=[1])
+    assert drag.name == "Drag"
+    assert torch.equal(drag(X), -X[:, 1:] * X[:, 1:].abs())
 
-    def test_without_evaluate_cannot_be_made(self):
-        with pytest.raises(TypeError, match="abstract"):
-            Physics()
+
+# What a PhysicsError says and carries
+
+
+def test_errors_and_their_rows():
+    error = PhysicsError("It broke:", rows=range(10, 17))
+    error.inputs = torch.arange(7.0).unsqueeze(-1)
+    for one in (error, pickle.loads(pickle.dumps(error))):
+        lines = str(one).splitlines()
+        assert lines[:2] == ["It broke:", "  row 10: [0.0]"]
+        assert lines[5:] == ["  row 14: [4.0]", "  and 2 more"]
+        assert one.rows == tuple(range(10, 17))
+    assert "more" not in str(PhysicsError("It broke:", rows=range(5)))
+    assert str(PhysicsError("It broke.")) == "It broke."
+    error = PhysicsError("It broke:", rows=[1])
+    error.relocate(torch.tensor([0, 1, -1, 1, 2]))  # to every copy of a row
+    assert error.rows == (1, 3)

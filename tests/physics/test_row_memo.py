@@ -3,12 +3,12 @@
 import copy
 import pickle
 
-import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gpadjust.physics.memo import RowMemo, row_keys
+from tests.systems import refused
 
 finite = st.floats(allow_nan=False, allow_infinity=False, width=64)
 
@@ -58,17 +58,21 @@ def test_all_batches_within_capacity_are_known(sizes):
     assert torch.equal(memo.recall(X.flip(0), refuse), 2 * X.flip(0))
 
 
-def test_it_starts_again_when_full_and_never_holds_more():
+def test_copies_pickles_and_capacity():
     memo = RowMemo(capacity=3)
     old, new = torch.tensor([[0.0], [1.0]]), torch.tensor([[2.0], [3.0]])
     memo.recall(old, double)
     memo.recall(new, double)
     assert len(memo) == 2
     memo.recall(new, refuse)
-    with pytest.raises(AssertionError, match="asked for"):
-        memo.recall(old, refuse)
+    refused(AssertionError, "asked for", memo.recall, old, refuse)
     memo.recall(torch.arange(9.0).unsqueeze(-1), double)
     assert len(memo) == 3
+    memo, X = RowMemo(capacity=3), torch.tensor([[1.0]])
+    memo.recall(X, double)
+    assert pickle.loads(pickle.dumps(memo)).recall(X, refuse).item() == 2.0
+    empty = copy.deepcopy(memo)
+    assert (len(empty), empty.capacity) == (0, 3)
 
 
 def test_what_it_returns_is_a_copy():
@@ -76,26 +80,12 @@ def test_what_it_returns_is_a_copy():
     memo.recall(X, double).fill_(99.0)
     memo.recall(X, refuse).fill_(99.0)
     assert memo.recall(X, refuse).item() == 2.0
-
-
-def test_values_that_are_not_to_be_learnt():
     memo, X = RowMemo(capacity=3), torch.tensor([[1.0], [2.0]])
     memo.store(row_keys(X[:1]), X[:1])
     found = memo.recall(X, double, learn=False)
     assert found.flatten().tolist() == [1.0, 4.0]
     assert len(memo) == 1
-
-
-def test_values_of_inference_mode_outlive_it():
     memo, X = RowMemo(capacity=3), torch.tensor([[1.0]])
     with torch.inference_mode():
         memo.recall(X, double)
     assert memo.recall(X, refuse).add_(1.0).item() == 3.0
-
-
-def test_a_pickle_brings_the_rows_and_a_deep_copy_none():
-    memo, X = RowMemo(capacity=3), torch.tensor([[1.0]])
-    memo.recall(X, double)
-    assert pickle.loads(pickle.dumps(memo)).recall(X, refuse).item() == 2.0
-    empty = copy.deepcopy(memo)
-    assert (len(empty), empty.capacity) == (0, 3)

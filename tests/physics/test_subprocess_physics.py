@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gpadjust import FunctionPhysics, PhysicsError, SubprocessPhysics, Unknown
-from tests.systems import line
+from tests.systems import line, refused
 
 LAW = """
 import sys, pathlib
@@ -39,14 +39,11 @@ def test_placeholders_are_inputs_and_unknown_parameters(law):
     rows = torch.cat([X, 0 * X + 5.04], dim=-1)
     torch.testing.assert_close(by_number(rows), expected)
     assert by_name.name == "python" or by_name.name.startswith("python")
-
-
-def test_all_digits_arrive(law):
     X = torch.rand(4, 1, dtype=torch.float64)
     assert torch.equal(SubprocessPhysics([*law, "{0}", "1"])(X)[:, 1:], X)
 
 
-def test_it_reads_standard_input_and_its_output_is_parsed():
+def test_standard_input_and_parameters(law):
     program = "import sys; print('result:', 2 * float(sys.stdin.read().split('=')[1]))"
     physics = SubprocessPhysics(
         [sys.executable, "-c", program],
@@ -55,9 +52,6 @@ def test_it_reads_standard_input_and_its_output_is_parsed():
         parse=lambda text: float(text.removeprefix("result:")),
     )
     assert physics(torch.tensor([[1.5]]).double()).item() == 3.0
-
-
-def test_its_parameters_are_learnt(law):
     one = {"names": ["t"], "parse": lambda text: float(text.split()[0])}
     physics = SubprocessPhysics([*law, "{t}", "{k}"], unknowns={"k": Unknown(4.0, sd=1.0)}, **one)
     t = 0.5 + line(3)
@@ -66,7 +60,7 @@ def test_its_parameters_are_learnt(law):
     torch.testing.assert_close(physics.or_nan(t, parameters), exact(t, parameters))
 
 
-def test_failures_say_what_the_program_wrote(law):
+def test_failures_and_bad_input(law):
     physics = SubprocessPhysics([*law, "{0}", "1"])
     with pytest.raises(PhysicsError, match="no solution at this t") as caught:
         physics(torch.tensor([[1.0], [3.0]]).double())
@@ -76,6 +70,14 @@ def test_failures_say_what_the_program_wrote(law):
         SubprocessPhysics(["no_such_program", "{0}"])(line(1))
     with pytest.raises(PhysicsError, match="printed 'done', expected numbers alone; give parse"):
         SubprocessPhysics([sys.executable, "-c", "print('done')"])(line(1))
+    refused(TypeError, r"shlex\.split", SubprocessPhysics, "prog {T}")
+    refused(ValueError, "no name of an input", SubprocessPhysics, ["prog", "{T}"])
+    refused(ValueError, "is no template", SubprocessPhysics, ["prog", "{"])
+    with pytest.raises(ValueError, match="no placeholder of the unknown parameter k"):
+        SubprocessPhysics(["prog"], unknowns={"k": Unknown(4.0, sd=1.0)})
+    refused(ValueError, "positive number of seconds", SubprocessPhysics, ["prog"], timeout=0)
+    with pytest.raises(PhysicsError, match="names has 1 entries"):
+        SubprocessPhysics(["prog", "{T}"], names=["T"])(torch.zeros(1, 2).double())
 
 
 @pytest.mark.slow
@@ -85,8 +87,7 @@ def test_a_run_that_takes_too_long_is_ended_with_all_that_it_started(tmp_path):
     program = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])"
     physics = SubprocessPhysics([sys.executable, "-c", program], timeout=1.0)
     begin = time.perf_counter()
-    with pytest.raises(PhysicsError, match=r"timed out after 1\.0 seconds"):
-        physics(line(1))
+    refused(PhysicsError, r"timed out after 1\.0 seconds", physics, line(1))
     assert time.perf_counter() - begin < 2.5
     time.sleep(2.5)
     assert not late.exists()
@@ -120,18 +121,3 @@ def test_processes_share_a_cache(law, tmp_path):
         values = physics(X.repeat(5, 1))
     torch.testing.assert_close(values[:, 1:], X.repeat(5, 1))
     assert len([*(tmp_path / "cache").iterdir()]) == 4
-
-
-def test_bad_input():
-    with pytest.raises(TypeError, match=r"shlex\.split"):
-        SubprocessPhysics("prog {T}")
-    with pytest.raises(ValueError, match="no name of an input"):
-        SubprocessPhysics(["prog", "{T}"])
-    with pytest.raises(ValueError, match="is no template"):
-        SubprocessPhysics(["prog", "{"])
-    with pytest.raises(ValueError, match="no placeholder of the unknown parameter k"):
-        SubprocessPhysics(["prog"], unknowns={"k": Unknown(4.0, sd=1.0)})
-    with pytest.raises(ValueError, match="positive number of seconds"):
-        SubprocessPhysics(["prog"], timeout=0)
-    with pytest.raises(PhysicsError, match="names has 1 entries"):
-        SubprocessPhysics(["prog", "{T}"], names=["T"])(torch.zeros(1, 2).double())

@@ -19,6 +19,7 @@ from gpadjust.physics import (
     PhysicsError,
     Unknown,
 )
+from tests.systems import refused
 
 A, B = Unknown(1.0, sd=0.5), Unknown(2.0, factor=1.5)
 
@@ -122,88 +123,75 @@ def test_coordinates_reverse_values_which_are_within_bounds(unknown, z, far):
     assert guess.item() == pytest.approx(unknown.guess, abs=1e-6)
 
 
-BAD = {
-    "text": (("one",), {"sd": 1.0}, TypeError, "guess must be a number; found 'one'"),
-    "no number": ((1.0,), {"sd": True}, TypeError, "sd must be a number; found True"),
-    "tensor": ((1.0,), {"factor": torch.ones(())}, TypeError, "factor must be a number"),
-    "one bound": ((1.0,), {"bounds": 3.0}, TypeError, "bounds must be two numbers; found 3.0"),
-    "three": ((1.0,), {"bounds": (0, 1, 2)}, TypeError, "bounds must be two numbers"),
-    "outside": ((3.0,), {"bounds": (0, 2)}, ValueError, r"inside of the bounds; found 3.0 and \(0"),
-    "at a bound": ((0.0,), {"sd": 1, "bounds": (0, 2)}, ValueError, "inside of the bounds"),
-    "not finite": ((math.nan,), {"sd": 1.0}, ValueError, "guess must be finite"),
-    "sd": ((1.0,), {"sd": 0.0}, ValueError, "sd must be positive and finite; found 0.0"),
-    "factor": ((1.0,), {"factor": 1.0}, ValueError, "factor must be above 1 and finite; found 1.0"),
-    "negative": ((-1.0,), {"factor": 1.5}, ValueError, "positive guess; found -1.0. Give sd"),
-    "both": ((1.0,), {"factor": 1.5, "sd": 1.0}, ValueError, "sd and factor; give one of them"),
-    "neither": ((1.0,), {"bounds": (0.0, INF)}, ValueError, "no prior; give sd.*two finite bounds"),
-}
+BAD = [
+    (("one",), {"sd": 1.0}, TypeError, "guess must be a number; found 'one'"),
+    ((1.0,), {"sd": True}, TypeError, "sd must be a number; found True"),
+    ((1.0,), {"factor": torch.ones(())}, TypeError, "factor must be a number"),
+    ((1.0,), {"bounds": 3.0}, TypeError, "bounds must be two numbers; found 3.0"),
+    ((1.0,), {"bounds": (0, 1, 2)}, TypeError, "bounds must be two numbers"),
+    ((3.0,), {"bounds": (0, 2)}, ValueError, r"inside of the bounds; found 3.0 and \(0"),
+    ((0.0,), {"sd": 1, "bounds": (0, 2)}, ValueError, "inside of the bounds"),
+    ((math.nan,), {"sd": 1.0}, ValueError, "guess must be finite"),
+    ((1.0,), {"sd": 0.0}, ValueError, "sd must be positive and finite; found 0.0"),
+    ((1.0,), {"factor": 1.0}, ValueError, "factor must be above 1 and finite; found 1.0"),
+    ((-1.0,), {"factor": 1.5}, ValueError, "positive guess; found -1.0. Give sd"),
+    ((1.0,), {"factor": 1.5, "sd": 1.0}, ValueError, "sd and factor; give one of them"),
+    ((1.0,), {"bounds": (0.0, INF)}, ValueError, "no prior; give sd.*two finite bounds"),
+]
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_what_is_no_prior(name):
-    given, options, error, message = BAD[name]
-    with pytest.raises(error, match=message):
-        Unknown(*given, **options)
+def test_what_is_no_prior():
+    for guess, options, error, message in BAD:
+        refused(error, message, Unknown, *guess, **options)
 
 
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
+def test_a_prior_as_text():
+    for options, text in (
         ({"sd": 0.5}, "2 ± 0.5"),
         ({"factor": 1.5}, "2, factor 1.5"),
         ({"bounds": (0, 3)}, "0 to 3"),
         ({"sd": 0.5, "bounds": (0, INF)}, "2 ± 0.5, above 0"),
         ({"factor": 1.5, "bounds": (-INF, 3)}, "2, factor 1.5, below 3"),
-    ],
-)
-def test_a_prior_as_text(options, text):
-    assert Unknown(2.0, **options).prior_text == text
+    ):
+        assert Unknown(2.0, **options).prior_text == text
 
 
-class TestNames:
-    @pytest.mark.parametrize(
-        "name", ["two words", "1st", "_hidden", "lambda", "rows", "numpy", "keys", 3]
-    )
-    def test_that_can_be_no_attribute(self, name):
-        with pytest.raises(ValueError, match=rf"names.*found {name!r}"):
-            FunctionPhysics(wave, unknowns={name: A})
-
-    @pytest.mark.parametrize("given", [{"mass": 1.0}, ["mass"], A])
-    def test_without_priors(self, given):
-        with pytest.raises(TypeError, match=r"Unknown\(guess, sd="):
-            FunctionPhysics(wave, unknowns=given)
+def test_names_and_priors_that_are_none():
+    for name in ("two words", "1st", "_hidden", "lambda", "rows", "numpy", "keys", 3):
+        says = rf"names.*found {name!r}"
+        refused(ValueError, says, FunctionPhysics, wave, unknowns={name: A})
+    for none in ({"mass": 1.0}, ["mass"], A):
+        refused(TypeError, r"Unknown\(guess, sd=", FunctionPhysics, wave, unknowns=none)
 
 
-class TestParameterValues:
-    def test_are_a_mapping_with_attributes(self):
-        rows = numbers(1.0, 2.0, 3.0, 4.0).reshape(2, 2)
-        values = ParameterValues(("mass", "length"), rows)
-        assert [*values] == ["mass", "length"]
-        assert len(values) == 2
-        assert torch.equal(values.mass, rows[:, 0])
-        assert torch.equal(values["length"], rows[:, 1])
-        assert "drag" not in values
-        assert values.numpy().length.tolist() == [2.0, 4.0]
-        assert values.numpy().row(1).mass == 3.0
-        assert values.numpy().row(1)["length"].shape == ()
-
-    def test_of_another_name(self):
-        values = ParameterValues(("mass", "length"), torch.ones(3, 2))
-        with pytest.raises(KeyError, match=r"'drag'.*mass, length"):
-            values["drag"]
-        with pytest.raises(AttributeError, match="no parameter 'drag'"):
-            _ = values.drag
-
-    def test_copies(self):
-        values = ParameterValues(("mass",), torch.ones(3, 1)).numpy()
-        for again in (copy.deepcopy(values), pickle.loads(pickle.dumps(values))):
-            assert again.mass.tolist() == [1.0, 1.0, 1.0]
+def test_values_are_a_mapping_with_attributes():
+    rows = numbers(1.0, 2.0, 3.0, 4.0).reshape(2, 2)
+    values = ParameterValues(("mass", "length"), rows)
+    assert [*values] == ["mass", "length"]
+    assert len(values) == 2
+    assert torch.equal(values.mass, rows[:, 0])
+    assert torch.equal(values["length"], rows[:, 1])
+    assert "drag" not in values
+    arrays = values.numpy()
+    for again in (arrays, copy.deepcopy(arrays), pickle.loads(pickle.dumps(arrays))):
+        assert again.length.tolist() == [2.0, 4.0]
+        assert again.row(1).mass == 3.0
+        assert again.row(1)["length"].shape == ()
+    refused(KeyError, r"'drag'.*mass, length", values.__getitem__, "drag")
+    refused(AttributeError, "no parameter 'drag'", getattr, values, "drag")
 
 
 class TestCalls:
-    def test_without_parameters_at_the_guesses(self, make, points):
+    def test_values_columns_and_precision(self, make, points):
         X = points(3, 2)
         torch.testing.assert_close(make()(X), wave_at(X, numbers(1.0, 2.0)))
+        X, values = points(4, 3), points(2, 2, seed=1)
+        found = make(inputs=[2, 0])(X, values)
+        torch.testing.assert_close(found, wave_at(X[:, [2, 0]], values))
+        X, values = points(4, 2).float(), points(2, 2, seed=1)
+        found = make()(X, values)
+        assert found.dtype == torch.float32
+        torch.testing.assert_close(found, wave_at(X, values.float()))
 
     @pytest.mark.parametrize("lead", [(), (3,), (1,)], ids=str)
     @pytest.mark.parametrize("batch", [(), (3,), (3, 1), (4, 3)], ids=str)
@@ -217,7 +205,7 @@ class TestCalls:
             torch.testing.assert_close(found, expected)
         torch.testing.assert_close(physics.or_nan(X, values), expected)
 
-    def test_expanded_inputs_and_equal_parameters_are_evaluated_once(self, points):
+    def test_equal_parameters_are_evaluated_once_and_other_shapes_refused(self, points):
         asked = []
 
         def record(X, p):
@@ -229,27 +217,11 @@ class TestCalls:
         found = physics(X.expand(4, 3, 5, 2), values)
         torch.testing.assert_close(found, wave_at(X, values).expand(4, 3, 5, 2))
         assert asked == [15]
-
-    def test_inputs_of_some_columns(self, make, points):
-        X, values = points(4, 3), points(2, 2, seed=1)
-        found = make(inputs=[2, 0])(X, values)
-        torch.testing.assert_close(found, wave_at(X[:, [2, 0]], values))
-
-    def test_single_precision(self, make, points):
-        X, values = points(4, 2).float(), points(2, 2, seed=1)
-        found = make()(X, values)
-        assert found.dtype == torch.float32
-        torch.testing.assert_close(found, wave_at(X, values.float()))
-
-    @pytest.mark.parametrize("values", [torch.ones(3), torch.ones(()), 1.0])
-    def test_of_another_shape(self, values, points):
-        message = r"has 2 unknown parameter\(s\): a, b; expected parameters of shape ... x 2, found"
-        with pytest.raises(ValueError, match=message):
-            MAKE["function"]()(points(3, 2), values)
-
-    def test_of_a_physics_that_has_none(self, points):
-        with pytest.raises(ValueError, match=r"'sin' has 0 unknown"):
-            FunctionPhysics(torch.sin)(points(3, 2), torch.ones(2))
+        says = r"has 2 unknown parameter\(s\): a, b; expected parameters of shape ... x 2, found"
+        for values in (torch.ones(3), torch.ones(()), 1.0):
+            refused(ValueError, says, MAKE["function"](), points(3, 2), values)
+        known = FunctionPhysics(torch.sin)
+        refused(ValueError, r"'sin' has 0 unknown", known, points(3, 2), torch.ones(2))
 
 
 class TestGradients:
@@ -317,21 +289,15 @@ class TestFailures:
         assert physics.or_nan(X, numbers(5.0)).isnan().all()
         assert not physics.or_nan(X, numbers(0.5).expand(2, 1)).isnan().any()
 
-    @pytest.mark.parametrize("name", ROOTS)
-    def test_or_nan_of_nothing_else(self, name):
-        physics, X = ROOTS[name](), numbers(1.0).unsqueeze(-1)
-        if name == "NaN":  # whose shape says what it returns
-            assert physics.or_nan(X, numbers(2.0)).isnan().all()
-        else:
-            with pytest.raises(PhysicsError, match="below zero"):
-                physics.or_nan(X, numbers(2.0, 3.0).unsqueeze(-1))
-
-    def test_or_nan_of_an_error_without_rows(self):
-        physics = FunctionPhysics(lambda X, p: [1.0], unknowns=LOW)
-        with pytest.raises(PhysicsError, match="list, expected a real tensor"):
-            physics.or_nan(torch.ones(2, 1), torch.zeros(1))
-
-    def test_or_nan_runs_a_simulation_once(self):
+    def test_or_nan_of_nothing_else_runs_a_simulation_once(self):
+        X = numbers(1.0).unsqueeze(-1)
+        assert ROOTS["NaN"]().or_nan(X, numbers(2.0)).isnan().all()  # its shape is known
+        for name in ("error", "rows"):
+            both = numbers(2.0, 3.0).unsqueeze(-1)
+            refused(PhysicsError, "below zero", ROOTS[name]().or_nan, X, both)
+        no_tensor = FunctionPhysics(lambda X, p: [1.0], unknowns=LOW)
+        args = torch.ones(2, 1), torch.zeros(1)
+        refused(PhysicsError, "list, expected a real tensor", no_tensor.or_nan, *args)
         asked = []
 
         def simulate(x, p):
@@ -356,10 +322,7 @@ def test_pickles_and_copies(name, points):
 def test_a_function_that_takes_other_arguments_is_told_what_it_is_called_with():
     X = torch.ones(2, 1, dtype=torch.float64)
     without = FunctionPhysics(lambda X: X[:, 0], unknowns={"a": Unknown(1.0, sd=1.0)})
-    with pytest.raises(PhysicsError, match=r"unknown parameters, p, .*p\.a"):
-        without(X)
-    with pytest.raises(PhysicsError, match="are named as unknowns="):
-        FunctionPhysics(lambda X, p: p.a * X[:, 0])(X)
+    refused(PhysicsError, r"unknown parameters, p, .*p\.a", without, X)
+    refused(PhysicsError, "are named as unknowns=", FunctionPhysics(lambda X, p: p.a * X[:, 0]), X)
     misspelt = FunctionPhysics(lambda X, p: p.b * X[:, 0], unknowns={"a": Unknown(1.0, sd=1.0)})
-    with pytest.raises(PhysicsError, match=r"no parameter 'b'.*a\."):
-        misspelt(X)
+    refused(PhysicsError, r"no parameter 'b'.*a\.", misspelt, X)
