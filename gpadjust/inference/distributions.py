@@ -13,7 +13,8 @@ from linear_operator import to_dense
 from torch import Tensor
 from torch.nn import Parameter
 
-from gpadjust.gp import GroupedRBFKernel, SumOfTerms
+from gpadjust.gp import SumOfTerms
+from gpadjust.gp.categories import GroupedRBFKernel
 from gpadjust.gp.gaussian import LikelihoodValue, scaled
 from gpadjust.gp.kernels import Pairs, Profile, Stationary, stationary_parts
 from gpadjust.gp.noise import Noise

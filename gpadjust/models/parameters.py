@@ -15,15 +15,10 @@ from gpytorch.likelihoods import GaussianLikelihood, Likelihood
 from torch import Size, Tensor
 from torch.nn import Module, Parameter
 
-from gpadjust.gp import (
-    GroupedRBFKernel,
-    OffsetKernel,
-    OrthogonalKernel,
-    PhysicsScaledKernel,
-    SumOfTerms,
-    Unit,
-)
+from gpadjust.gp import OrthogonalKernel, PhysicsScaledKernel, SumOfTerms
+from gpadjust.gp.categories import GroupedRBFKernel, OffsetKernel
 from gpadjust.gp.noise import Noise
+from gpadjust.gp.term import Unit
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,9 @@ from botorch.models.transforms.input import Normalize
 from botorch.models.transforms.outcome import nanstd
 from torch import Tensor
 
-from gpadjust.gp import AppendedPhysics, OffsetKernel, PhysicsInput, Unit
+from gpadjust.gp import AppendedPhysics, PhysicsInput
+from gpadjust.gp.categories import OffsetKernel
+from gpadjust.gp.term import Unit
 from gpadjust.models.hyperparameter_samples import adjusts, take_samples, uses_physics
 from gpadjust.models.parameters import Hyperparameter, hyperparameters
 

@@ -18,17 +18,12 @@ from gpytorch.likelihoods.gaussian_likelihood import _GaussianLikelihoodBase
 from torch import Size, Tensor
 from torch.nn import Module
 
-from gpadjust.gp import (
-    AppendedPhysics,
-    CategoricalInput,
-    PhysicsInput,
-    Term,
-    Unit,
-    VanishingKernel,
-)
+from gpadjust.gp import AppendedPhysics, PhysicsInput, Term, VanishingKernel
+from gpadjust.gp.categories import CategoricalInput
 from gpadjust.gp.gaussian import least_squares
 from gpadjust.gp.noise import Noise, RowSource
 from gpadjust.gp.physics_columns import check_one_to_one
+from gpadjust.gp.term import Unit
 from gpadjust.models.levels import values_of
 from gpadjust.models.links import Logit
 from gpadjust.models.parameters import scaled_offsets, scaled_rbf

@@ -24,10 +24,11 @@ from torch.nn.functional import pad
 
 import gpadjust
 from gpadjust.checks import checked_whole
-from gpadjust.gp import SumOfTerms, Term, TermsMean
+from gpadjust.gp import SumOfTerms, Term
 from gpadjust.gp.gaussian import negative_log_likelihood
 from gpadjust.gp.kernels import Stationary
 from gpadjust.gp.noise import RowNoise
+from gpadjust.gp.term import TermsMean
 from gpadjust.models.exact_conditioning import ExactConditioning
 from gpadjust.models.hyperparameter_samples import (
     HOLDS_SAMPLES,

@@ -18,8 +18,9 @@ from torch.nn import Module
 from torch.nn.functional import pad
 
 from gpadjust.checks import check_level, checked_whole
-from gpadjust.gp import AppendedPhysics, PhysicsInput, SumOfTerms, Term, Unit, WeightedSum
+from gpadjust.gp import AppendedPhysics, PhysicsInput, SumOfTerms, Term, WeightedSum
 from gpadjust.gp.noise import Noise
+from gpadjust.gp.term import Unit
 from gpadjust.models.hyperparameter_samples import take_samples
 from gpadjust.models.levels import coded
 from gpadjust.models.links import plain

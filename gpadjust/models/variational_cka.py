@@ -16,7 +16,8 @@ from torch import Size, Tensor
 from torch.nn import Buffer
 
 from gpadjust.checks import checked_whole
-from gpadjust.gp import Term, TermsMean, Unit, VanishingKernel, WeightedSum
+from gpadjust.gp import Term, VanishingKernel, WeightedSum
+from gpadjust.gp.term import TermsMean, Unit
 from gpadjust.models.parameters import scaled_rbf
 from gpadjust.models.sparse_conditioning import SparseConditioning
 from gpadjust.models.structures import CKA

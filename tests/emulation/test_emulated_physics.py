@@ -18,7 +18,6 @@ from gpadjust import (
     load,
     save,
 )
-from gpadjust.emulation import next_runs
 from gpadjust.emulation.error_kernel import error_covariance, unresolved
 from gpadjust.report import report
 from gpadjust.sklearn import CKARegressor
@@ -210,22 +209,6 @@ def test_details_that_the_emulator_takes_for_noise_are_errors_of_a_certain_simul
     assert ((more > 0.03**2) & (more < 0.15**2)).all()
 
 
-def test_new_runs_are_proposed_where_they_tell_most(with_parameter):
-    runs = torch.tensor([[0.0], [0.3], [0.6], [0.9], [2.8]], dtype=torch.float64)
-    crude = EmulatedPhysics(runs, wave(runs), fit_options=MAP)
-    X = 2.8 * line(8)
-    model = CKA(X[::3], truth(X[::3]), physics=crude)
-    fit(model, "map")
-    first, second = next_runs(model, X, 2).flatten()
-    assert 0.9 < first < 2.8
-    assert abs(first - second) > 0.1
-    # The parameter of a run is a likely one.
-    X = 0.1 + 2.8 * line(12)
-    model = CalibratedPhysics(X, simulated(X, 1.6), physics=with_parameter)
-    fit(model)
-    assert abs(next_runs(model, X)[0, 1] - 1.6) < 0.3
-
-
 def test_bad_input():
     X = line(5)
     refused(ValueError, r"inputs=.* names 2 columns", EmulatedPhysics, X, X, inputs=[0, 1])
@@ -234,5 +217,4 @@ def test_bad_input():
     refused(ValueError, "and then 1 unknown parameter", EmulatedPhysics, X, X, unknowns=W)
     crude = EmulatedPhysics(X, X.sin(), fit_options=MAP)
     refused(ValueError, r"inputs=\[...\]", crude, torch.zeros(3, 2).double())
-    refused(TypeError, "single EmulatedPhysics", next_runs, CKA(X, X, physics=torch.sin), X)
     refused(ValueError, "FunctionPhysics", RRA, X, X, physics=crude)

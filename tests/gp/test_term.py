@@ -8,7 +8,8 @@ from gpytorch.kernels import MaternKernel, RBFKernel, ScaleKernel
 from gpytorch.test.base_kernel_test_case import BaseKernelTestCase
 from torch import Size
 
-from gpadjust.gp import AppendedPhysics, SumOfTerms, Term, TermsMean
+from gpadjust.gp import AppendedPhysics, SumOfTerms, Term
+from gpadjust.gp.term import TermsMean
 from tests.systems import refused
 
 

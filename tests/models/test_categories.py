@@ -19,7 +19,7 @@ from gpadjust import (
     load,
     save,
 )
-from gpadjust.gp import GroupedRBFKernel
+from gpadjust.gp.categories import GroupedRBFKernel
 from gpadjust.gp.gaussian import LikelihoodValue
 from gpadjust.inference.distributions import ByModules, stationary_terms
 from gpadjust.inference.vectors import Parameters
