@@ -104,58 +104,37 @@ def fit(
 
     ``"bayes"``, the default where it can be done: full Bayes. The model then is a fully Bayesian
     model as BoTorch has them: it holds samples of its hyper-parameters, its posterior is a
-    ``GaussianMixturePosterior``, and acquisition functions average over the samples. A search, as
-    below, finds modes; draws around them, and as many of the prior, move to the posterior by
-    annealed Hamiltonian Monte Carlo. Parameters without a prior get that of
-    :func:`~gpadjust.inference.register_priors`, and the size of a constant and of a linear trend
-    (of up to three inputs) in the data has no vote on how smooth the functions are, that of a
-    quadratic one (of one or two) a quarter of a vote. The parameters of a network that is the
-    physics are at their most likely values.
+    ``GaussianMixturePosterior``, and acquisition functions average over the samples. Draws around
+    the modes, and as many of the prior, move to the posterior by annealed Hamiltonian Monte Carlo.
+    Parameters without a prior get that of :func:`~gpadjust.inference.register_priors`. The size of
+    a constant and of a linear trend in the data says nothing of how smooth the functions are. The
+    parameters of a network that is the physics are at their most likely values.
 
     *A physics that misleads* is left out, *and one that is right* is left as it is, each with the
     probability that the data give it: beside the model itself (prior probability 0.32) there are
     the same without the physics, a Gaussian process around the mean of the targets (0.08), and the
-    physics alone with noise, its rho and delta at their prior means (0.6). The posterior
-    probability of each, by its evidence, is the share of its samples among those that the model
-    holds; ``result.relevance`` is that of the two with the physics, ``result.sufficiency`` that of
-    the physics alone, which data can refute, and hardly confirm: it stays near its prior where all
-    fits. At most three quarters of the samples are of the physics alone, which can learn nothing
-    from later observations (:meth:`~gpadjust.CKA.update` lets go of them). So are weighed, by 3 to
-    150 observations, models whose prior means are known and whose kernels have the default priors
-    and an outputscale. Without the physics: a :class:`~gpadjust.CKA` or :class:`~gpadjust.RRA` of a
-    physics without unknown or learnt parameters; of others ``relevance`` is None. The physics
-    alone: what has f_p in the mean, and no other functions than rho and one delta; if it has
-    unknown parameters, of one output, with draws of these of its own. A constant between physics
-    and targets, however large, does not count against the physics.
+    physics alone with noise (0.6). The posterior probability of each is the share of its samples
+    among those that the model holds; ``result.relevance`` is that of the two with the physics,
+    ``result.sufficiency`` that of the physics alone, of which are at most three quarters of the
+    samples. So are weighed, by 3 to 150 observations, models whose prior means are known and whose
+    kernels have the default priors and an outputscale; of others both are None.
 
-    *Where left-out observations are missed* by more than predicted, variances are larger: near a
-    kink or a jump, as by dry friction or an impact, of which stationary kernels are too sure. All
-    that predicts the sum has it (``predict``, ``interval``, ``posterior``, sampled functions), not
-    the terms apart; means stay. So of ``"bayes"``, where all kernels are RBF or Matern.
+    *Where left-out observations are missed* by more than predicted, as near a kink or a jump, the
+    variances of the sum are larger; means stay. So of ``"bayes"`` with RBF and Matern kernels.
 
     *Unknown parameters of the physics*, which all outputs share, are learnt with all else, by
-    either method: least squares from several starts, then by turns with the hyper-parameters, from
-    which they are integrated out near their most likely values. ``"bayes"`` then draws them given
-    each of some samples of the hyper-parameters, by least squares of randomised targets (Bardsley
-    et al. 2014) about each of their optima, and weights the pairs, or moves them where weights
-    say little: each sample that the model holds has its own physics. There is a ``SamplingWarning``
-    if they still remember where they began, or if there are likely optima that no search came to.
-    ``model.physics_parameters`` is what is known of them.
+    either method; ``model.physics_parameters`` is what is known of them. With ``"bayes"`` each
+    sample that the model holds has its own physics (least squares of randomised targets, Bardsley
+    et al. 2014).
 
-    ``"map"``: the most likely values. Random starts are screened in one batch beside the model's
-    current parameters; L-BFGS then runs from the best of them, for all outputs in lockstep, on a
-    likelihood whose overall scale (and constant means, where they are unknown) is at its optimum in
-    closed form. With more than some 150 points the search is made on 96 of them, and its best
-    optima are refined on all. Starts and bounds follow the data's scales, so that units of inputs,
-    targets and physics make no difference. The result is never less likely than the parameters that
-    the model came with. Priors registered on the model are honoured (maximum a posteriori,
-    otherwise maximum likelihood). With few data its intervals are far too narrow. It is the default
-    for models of other libraries, and for batches of data sets.
+    ``"map"``: the most likely values, by L-BFGS from the best of many random starts and from the
+    current parameters, so that the result is never less likely than these. Priors registered on
+    the model are honoured (maximum a posteriori, otherwise maximum likelihood). With few data its
+    intervals are far too narrow. It is the default for models of other libraries, and for batches
+    of data sets, and all that a :class:`~gpadjust.VariationalCKA` has.
 
-    A :class:`~gpadjust.VariationalCKA` has ``"map"`` alone: the search is that of an exact model of
-    up to 1,000 of its observations, and what it finds goes on by the evidence lower bound. The
-    inducing points, the distribution there, and the sizes of ``rest`` and noise are found with it.
-
+    Starts and bounds follow the data's scales, so that units of inputs, targets and physics make no
+    difference.
     Parameters with ``requires_grad=False`` stay. A model that holds samples lets go of them first.
     Small problems are computed with one thread; the user's setting is restored after.
 
