@@ -76,18 +76,6 @@ def test_an_environment_that_can_make_no_step_is_an_error_in_the_third_episode(p
     assert isinstance(found.value.__cause__, OSError)
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit])
-def test_an_interruption_comes_through(point_env, error):
-    class Interrupted(Faulty):
-        def step(self, action):
-            raise error
-
-    env = StepGuard(Interrupted(point_env(), {}))
-    env.reset()
-    with pytest.raises(error):
-        env.step(ACTION)
-
-
 def test_an_episode_that_cannot_begin_is_an_error(make_agent, point_env):
     class Blind(Faulty):
         def reset(self, **options):
