@@ -11,7 +11,7 @@ import time
 
 import pytest
 import torch
-from botorch.acquisition import LogExpectedImprovement, qKnowledgeGradient
+from botorch.acquisition import LogExpectedImprovement
 from botorch.models import SingleTaskGP
 from botorch.models.transforms import Normalize
 
@@ -124,11 +124,6 @@ class TestMeasuring:
 
         result = collect(**laboratory(model_factory=factory, budget=5))
         assert isinstance(result.model, SingleTaskGP)
-
-    def test_knowledge_gradient(self, laboratory):
-        acquisition = lambda model: qKnowledgeGradient(model, num_fantasies=2)  # noqa: E731
-        result = collect(**laboratory(acquisition=acquisition, budget=5))
-        assert result.X.shape == (5, 2)
 
 
 class TestFailures:

@@ -42,16 +42,6 @@ def test_perfect_physics_are_the_real_environment(cart_pole, cart_pole_dynamics)
         np.testing.assert_array_equal(seen[-1][i], seen[0][i])
 
 
-def test_one_call_of_the_model_moves_all_particles(point_particles, point_dynamics, rise):
-    calls = []
-    step = point_dynamics.sample
-    point_dynamics.sample = lambda *args: calls.append(len(args[0])) or step(*args)
-    particles = point_particles(num_envs=7)
-    particles.reset()
-    particles.step(rise(7))
-    assert calls == [7]
-
-
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_observations_have_the_type_of_the_space(point_particles, dtype, rise):
     space = spaces.Box(-np.inf, np.inf, (1,), dtype)
