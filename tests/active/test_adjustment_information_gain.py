@@ -8,7 +8,6 @@ import pytest
 import torch
 from botorch.models import ModelListGP
 from botorch.models.transforms import Normalize
-from botorch.optim import optimize_acqf
 
 from gpadjust import BlackBoxPhysics, VariationalCKA, fit
 from gpadjust.active import qAdjustmentInformationGain
@@ -346,15 +345,6 @@ class TestGradient:
                 expected.view(-1)[i] = change / 2e-5
         size = expected.abs().max().item()
         torch.testing.assert_close(gradient, expected, rtol=1e-5, atol=1e-5 * size)
-
-    @pytest.mark.parametrize("about", ABOUT)
-    def test_optimize(self, model, uniform, about):
-        acquisition = qAdjustmentInformationGain(model, about)
-        options = {"num_restarts": 2, "raw_samples": 16, "options": {"maxiter": 20}}
-        points, value = optimize_acqf(acquisition, BOUNDS, q=2, **options)
-        assert points.shape == (2, 2)
-        assert ((points >= BOUNDS[0]) & (points <= BOUNDS[1])).all()
-        assert value >= ask(model, uniform(64, 2, 2, high=2.0, seed=9), about).max() - 1e-9
 
 
 class TestLife:

@@ -11,7 +11,7 @@ import time
 
 import pytest
 import torch
-from botorch.acquisition import LogExpectedImprovement, qKnowledgeGradient
+from botorch.acquisition import LogExpectedImprovement
 from botorch.models import SingleTaskGP
 from botorch.models.transforms import Normalize
 
@@ -85,16 +85,6 @@ class TestMeasuring:
         assert same(first, again)
         assert not same(first, collect(**laboratory(budget=5, seed=1)))
 
-    def test_several_outputs(self, laboratory):
-        result = collect(
-            **laboratory(
-                oracle=lambda X: torch.cat([truth(X), -truth(X)], -1).numpy(),
-                acquisition=lambda model: qAdjustmentInformationGain(model, "rho"),
-                budget=5,
-            )
-        )
-        assert result.Y.shape == (5, 2)
-
     def test_forms_of_outcomes(self, laboratory):
         for form in (lambda Y: Y[:, 0], lambda Y: Y.numpy(), torch.Tensor.float, torch.Tensor.item):
             result = collect(**laboratory(oracle=lambda X, f=form: f(truth(X)), budget=2))
@@ -127,11 +117,6 @@ class TestMeasuring:
         collect(**laboratory(budget=7)).model  # noqa: B018
         assert started == [(5, 4), (6, 5), (7, 6)]
 
-    @pytest.mark.slow
-    def test_the_default_fit(self, laboratory):
-        result = collect(**laboratory(budget=6, fit=None))
-        assert result.model.num_samples == 16
-
     def test_a_model_of_botorch(self, laboratory, bounds):
 
         def factory(X, Y):
@@ -139,11 +124,6 @@ class TestMeasuring:
 
         result = collect(**laboratory(model_factory=factory, budget=5))
         assert isinstance(result.model, SingleTaskGP)
-
-    def test_knowledge_gradient(self, laboratory):
-        acquisition = lambda model: qKnowledgeGradient(model, num_fantasies=2)  # noqa: E731
-        result = collect(**laboratory(acquisition=acquisition, budget=5))
-        assert result.X.shape == (5, 2)
 
 
 class TestFailures:
@@ -297,28 +277,6 @@ class TestResultsThatCannotBeTaken:
         assert collection.num_measured == 5
         assert same(collect(**laboratory(log=path)), whole)
 
-    @pytest.mark.slow
-    def test_a_full_disk(self, laboratory, tmp_path, monkeypatch):
-        def full(file):
-            raise OSError(28, "No space left on device")
-
-        def fill(Y):
-            monkeypatch.setattr(os, "fsync", full)
-            return Y
-
-        path = tmp_path / "log.jsonl"
-        oracle = Oracle(n3=fill)
-        with pytest.raises(CollectionError, match=r"are in this error's `.result`.*No space") as e:
-            collect(**laboratory(oracle=oracle, log=path))
-        monkeypatch.undo()
-        assert torch.equal(e.value.result, truth(e.value.X))
-        e.value.collection.tell(e.value.X, e.value.result)
-        e.value.collection.close()
-        again = Oracle()
-        result = collect(**laboratory(oracle=again, log=path))
-        assert len(again.asked) == 4
-        assert same(result, collect(**laboratory()))
-
 
 class TestResuming:
     @pytest.mark.slow
@@ -468,27 +426,14 @@ def _parameters(model):
     return torch.cat([parameter.detach().reshape(-1) for parameter in model.parameters()])
 
 
-def test_a_bar_of_progress(laboratory, capsys):
-    collect(**laboratory(budget=2, progress=True))
-    assert "2/2" in capsys.readouterr().err
-    collect(**laboratory(budget=2))
-    assert capsys.readouterr().err == ""
-
-
 GIVEN = torch.ones(4, 2, dtype=torch.float64)
 REFUSED = [
     ({"budget": 0}, "budget must be at", ValueError),
-    ({"batch_size": "3"}, "batch_size must be a whole", TypeError),
-    ({"max_failures": 2.5}, "max_failures must be a whole", TypeError),
-    ({"num_outputs": -1}, "num_outputs must be at", ValueError),
     ({"bounds": [0.0, 1.0]}, r"shape 2 x d.* got \(2,\)", ValueError),
     ({"model_factory": 3}, "Expected (the )?model_factory to be callable, got 3", TypeError),
     ({"acquisition": 3}, "Expected (the )?acquisition to be callable, got 3", TypeError),
-    ({"oracle": 3}, "Expected (the )?oracle to be callable, got 3", TypeError),
-    ({"fit": 3}, "Expected (the )?fit to be callable, got 3", TypeError),
     ({"acquisition": lambda model: model}, "BoTorch AcquisitionFunction, got CKA", TypeError),
     ({"initial": 1}, "initial, a number of points, must", ValueError),
-    ({"initial": "three"}, "initial, a number of points, must", TypeError),
     ({"initial": [[5.0, 0.0], [1.0, 0.0]]}, r"initial within the bounds .*5.0, 0.0", ValueError),
     ({"initial": torch.ones(3, 1)}, r"Expected initial of shape n x 2", ValueError),
     ({"initial": [[1.0, 0.0], [0.0, 0.0], [1.0, 0.0]]}, "points of initial to differ", ValueError),

@@ -126,17 +126,6 @@ def test_some_of_the_outputs(make, tmp_path, missing):
             each.model  # noqa: B018
 
 
-def test_a_failure_of_an_earlier_version_stays_one(make, tmp_path):
-    path = tmp_path / "log.jsonl"
-    make(log=path, num_outputs=2).ask()
-    record = {"x": [0.5, 0.5], "y": [50.0, None], "failed": "measured [50.0, nan]"}
-    with path.open("a") as file:
-        file.write(json.dumps(record) + "\n")
-    collection = make(log=path, num_outputs=2)
-    assert len(collection.X) == 0
-    assert len(collection.failed_X) == 1
-
-
 def test_failing_and_withdrawing(make, tmp_path):
     collection = make(log=tmp_path / "log.jsonl")
     X = collection.ask(4)
@@ -179,11 +168,6 @@ def test_a_log_of_another_structure_is_no_hindrance(make, tmp_path):
     collection = make(log=path, model_factory=factory)
     assert collection.ask().shape == (1, 2)
     assert isinstance(collection.model, PhysicsMeanGP)
-
-
-def test_a_model_needs_data(make):
-    with pytest.raises(RuntimeError, match="at least 2 measurements of each output, there are 0"):
-        make().model  # noqa: B018
 
 
 REFUSED = [
@@ -275,16 +259,6 @@ def test_a_record_that_does_not_belong(make, tmp_path):
         path.write_text(before + line + "\n")
         with pytest.raises(ValueError, match=rf"Line 4 of the .*jsonl, .* 2 inputs.*{words}"):
             make(log=path)
-
-
-def test_parameters_that_are_none_are_no_hindrance(make, tmp_path):
-    path = tmp_path / "log.jsonl"
-    filled(make(log=path), 4)
-    before = path.read_text()
-    for parameters in ("abc", {"a": [[1.0], [1.0, 2.0]]}):
-        asked = {"asked": [[0.5, 0.5]], "parameters": parameters}
-        path.write_text(before + json.dumps(asked) + "\n")
-        assert make(log=path).ask().shape == (1, 2)
 
 
 def test_pending_points_of_the_acquisition_functions_own_count_too(make):

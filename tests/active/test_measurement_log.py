@@ -142,13 +142,6 @@ class TestHolding:
         with pytest.raises(LogError, match="is held by process"):
             log.append(RECORDS)
 
-    def test_by_any_name(self, log, tmp_path, monkeypatch):
-        (tmp_path / "link").symlink_to(log.path)
-        monkeypatch.chdir(log.path.parent)
-        for name in (tmp_path / "link", "log.jsonl"):
-            with pytest.raises(LogError, match="is held by process"):
-                MeasurementLog(name).open(BOUNDS)
-
     def test_until_it_is_deleted(self, tmp_path):
         log = MeasurementLog(tmp_path / "log.jsonl")
         log.open(BOUNDS)

@@ -235,17 +235,6 @@ def test_it_goes_on_with_the_first_trials_from_a_file(named, tmp_path, trials):
         assert found == expected
 
 
-def test_several_physics_are_saved_too(named, tmp_path):
-    ours = of_one({"y": {"coarse": named, "fine": "torch:sin"}}, 1)
-    ours.save_to_json_file(str(tmp_path / "client.json"))
-    again = Client.load_from_json_file(str(tmp_path / "client.json"))
-    (config,) = specs(again)[0].metric_to_model_configs["y"]
-    assert config.model_options["physics"] == {
-        "coarse": ParameterPhysics(named),
-        "fine": ParameterPhysics("torch:sin"),
-    }
-
-
 def test_a_lambda_cannot_be_saved(tmp_path):
     ours = of_one({"y": lambda x: x}, 0)
     with pytest.raises(JSONEncodeError, match=r"the physics '<lambda>'.*Write `def f_p"):

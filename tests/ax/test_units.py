@@ -1,7 +1,5 @@
 """What a physics is asked, and the units in which it answers, whatever Ax transforms."""
 
-import sys
-
 import pytest
 import torch
 from ax.adapter.registry import Cont_X_trans, Generators, MBM_X_trans, Mixed_transforms, Y_trans
@@ -10,7 +8,6 @@ from ax.adapter.transforms.unit_x import UnitX
 from ax.api.client import Client
 from ax.api.configs import ChoiceParameterConfig, RangeParameterConfig
 from ax.exceptions.core import UserInputError
-from ax.generators.torch.botorch_modular import surrogate as ax_surrogate
 from ax.generators.torch.botorch_modular.surrogate import SurrogateSpec
 from ax.generators.torch.botorch_modular.utils import ModelConfig
 from botorch.models.transforms.input import Normalize
@@ -248,15 +245,6 @@ def test_a_plain_model_config_says_what_is_missing():
         adapter(experiment(), Recorded(), [*MBM_X_trans, *Y_trans])
 
 
-def test_without_this_room_it_is_an_error_too(monkeypatch):
-    own = ax_surrogate._submodel_input_constructor_base
-    monkeypatch.setattr(ax_surrogate, "submodel_input_constructor", own)
-    monkeypatch.delitem(sys.modules, "gpadjust.ax")
-    config = {"input_transform_classes": None}
-    with pytest.raises(ValueError, match=r"other units than its own. Import gpadjust.ax"):
-        adapter(experiment(), Recorded(), [*MBM_X_trans, *Y_trans], config)
-
-
 LATE, LOGGED = [*TRANSFORMS, UnitX], [*MBM_X_trans, LogY, TellPhysics]
 REFUSED = [
     ({"transforms": LATE}, "TellPhysics as the last.*found UnitX after it"),
@@ -274,16 +262,6 @@ def test_what_cannot_be_right_is_an_error():
     for change, words in REFUSED:
         with pytest.raises((ValueError, UserInputError, RuntimeError), match=words):
             adapter(experiment(), **{"physics": Recorded(), **change})
-
-
-def test_a_physics_of_all_metrics_is_of_none():
-    config = ModelConfig(botorch_model_class=CKA, model_options={"physics": Recorded()})
-    with pytest.raises(ValueError, match="for one metric, found one for cost, load"):
-        Generators.BOTORCH_MODULAR(
-            experiment=experiment(),
-            surrogate_spec=SurrogateSpec(model_configs=[config]),
-            transforms=TRANSFORMS,
-        )
 
 
 def test_of_a_single_metric_it_is_of_that():

@@ -252,13 +252,11 @@ REFUSED = [
     ((STATES.repeat(1, 2), ACTIONS), {}, ValueError, r"initial_states of shape \.\.\. x 1"),
     ((STATES, ACTIONS.float()), {}, TypeError, "actions in float64"),
     ((STATES / 0, ACTIONS), {}, ValueError, "initial_states to be finite"),
-    ((STATES, ACTIONS), {"level": 95}, ValueError, "level must be.* found 95"),
     ((STATES, ACTIONS), {"start_noise": "known"}, ValueError, "as .learnt. or a tensor"),
     ((STATES, ACTIONS), {"start_noise": -torch.ones(1)}, ValueError, "start_noise of 0 or"),
     ((STATES, ACTIONS), {"process_noise": STATES[:1, 0] / 0}, ValueError, "process_.*nan_to_num"),
     ((STATES, ACTIONS), {"process_noise": "learnt"}, ValueError, "such as noise=smoothed.noise"),
     ((STATES, ACTIONS), {"noise": "learnt"}, ValueError, "noise as True or False or a tensor"),
-    ((STATES, ACTIONS), {"num_functions": 39.0}, TypeError, "num_functions must be a whole"),
     ((STATES, ACTIONS), {"state_bounds": torch.ones(2)}, ValueError, "state_bounds of shape 2 x 1"),
 ]
 

@@ -162,14 +162,3 @@ def test_windows_of_records_are_chosen_and_scored():
     np.testing.assert_allclose(scores.rmse[:, 0], [0.1, 0.2, 0.3])
     np.testing.assert_allclose(scores.median[:, 0], [0.1, 0.2, 0.3])
     assert scores.nlpd.isnan().all()
-
-
-def test_what_was_measured_is_checked(run, measured):
-    for given, error, words in (
-        (measured[:, :1], ValueError, r"\(4, 3, 2\), .* got \(4, 1, 2\); of `windows`"),
-        (measured[..., :1], ValueError, r"measured of shape \.\.\. x 2"),
-        (measured.float(), TypeError, r"float64, got torch\.float32; use `measured\.double"),
-        (measured / 0, ValueError, "infinity; put NaN where"),
-    ):
-        with pytest.raises(error, match=words):
-            run.score(given)

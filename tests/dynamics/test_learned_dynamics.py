@@ -6,11 +6,10 @@ from functools import partial
 import pytest
 import torch
 
-from gpadjust import CKA, ScaleGP
+from gpadjust import CKA
 from gpadjust.dynamics import LearnedDynamics, StateSpec
 from gpadjust.models import TermBuilder, TermsGP
 from gpadjust.models.parameters import scaled_rbf
-from gpadjust.validation import trust
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:f_p is nearly zero", "ignore::gpadjust.inference.SamplingWarning"
@@ -192,24 +191,6 @@ def test_a_function_makes_the_model(cart_pole_system):
         LearnedDynamics(system.spec, model=lambda X, Y, **given: None).update(*system.trial(0))
 
 
-def test_it_is_described_by_what_all_fits_are_told_and_what_is_given_beside(cart_pole_system):
-    spec = cart_pole_system.spec
-
-    def described(given=None, **options):
-        fitted = {"fit_options": options} if options else {}
-        return LearnedDynamics(spec, cart_pole_system.crude, **fitted, **(given or {})).describe()
-
-    plain, moving = described(), spec.states[spec.moving[0]]
-    assert plain == described(num_starts=2, num_samples=None)
-    assert described(num_samples=8, seed=3) == {**plain, "num_samples": "8", "seed": "3"}
-    assert described(method="map") == {**plain, "method": "'map'"}
-    assert plain == described({"num_features": 1024, "physics_error": {}})
-    for name, value in (("num_features", 256), ("physics_error", {moving: 0.1})):
-        found = described({name: value})
-        assert {k: v for k, v in found.items() if k != name} == plain
-        assert name in found
-
-
 @pytest.mark.slow
 def test_each_transition_costs_one_row_of_the_physics(uniform):
     rows = []
@@ -317,36 +298,3 @@ def test_bad_data_are_refused_and_what_was_learnt_stands(cart_pole_system, make)
         dynamics.predict(states[:, :3], actions)
     assert dynamics.num_transitions == 6
     assert torch.equal(dynamics.predict(states, actions).mean, before)
-
-
-@pytest.mark.filterwarnings("default")
-def test_a_warning_of_the_model_is_given_once(recwarn):
-    still = StateSpec(["x"], ["v"])
-    dynamics = LearnedDynamics(still, lambda X: X[:, :1] + 0.1 * X[:, 1:], model=ScaleGP)
-    x = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
-    with pytest.warns(UserWarning, match="nearly zero"):
-        dynamics.update(x, x, x + 0.12 * x)
-    recwarn.clear()
-    dynamics.update(x + 0.01, x, x + 0.01 + 0.12 * x)
-    assert not recwarn.list
-
-
-@pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
-def test_the_model_has_the_names_of_the_spec(uniform):
-    spec = StateSpec(
-        ["theta", "omega", "last"], ["torque"], angles=["theta"], previous={"last": "torque"}
-    )
-    states, actions = uniform(6, 3), uniform(6, 1, seed=1)
-    following = torch.cat([states[:, :2] + 0.1 * states[:, :2].sin(), actions], -1)
-    options = {"method": "map", "num_starts": 1, "num_screened": 8}
-    dynamics = LearnedDynamics(spec, lambda X: 0.9 * X[:, :2], fit_options=options)
-    dynamics.update(states, actions, following)
-    model = dynamics.model
-    assert model.input_names == ("theta", "omega", "torque", "last")
-    assert model.output_names == ("change of theta", "change of omega")
-    text = model.summary()
-    for name in ("sin(theta)", "cos(theta)", "omega", "torque", "last"):
-        assert f"lengthscale of {name}:" in text
-    assert trust(model).input_names == model.input_names
-    absolute = LearnedDynamics(spec, lambda X: X[:, :2], target="absolute")
-    assert absolute.targets.output_names == ("theta", "omega")

@@ -2,14 +2,12 @@
 
 import io
 import warnings
-from functools import partial
 
 import pytest
 import torch
 from botorch.models.transforms.outcome import Standardize
-from gpytorch.kernels import MaternKernel, ScaleKernel
 
-from gpadjust import CKA, fit
+from gpadjust import fit
 from gpadjust.inference.warm_start import warm_start
 
 pytestmark = pytest.mark.filterwarnings(
@@ -103,27 +101,6 @@ def test_a_warm_start_is_the_same_in_the_users_units(cart_pole_system, make):
     )
     torch.testing.assert_close(states + mean, before.mean, rtol=0, atol=1e-7)
     torch.testing.assert_close(variance, before.variance, rtol=1e-2, atol=0)
-
-
-@pytest.mark.slow
-def test_kernels_of_the_users(cart_pole_system, make):
-    system = cart_pole_system
-
-    def matern(num_inputs, batch_shape):
-        base = MaternKernel(ard_num_dims=num_inputs, batch_shape=batch_shape)
-        return ScaleKernel(base, batch_shape=batch_shape)
-
-    module = matern(6, torch.Size([4]))
-    initial = {name: p.clone() for name, p in module.named_parameters()}
-    options = {"rho_covar_module": matern, "delta_covar_module": module}
-    dynamics = make("CKA", system.spec, system.crude, model=partial(CKA, **options))
-    for seed in range(2):
-        dynamics.update(*system.trial(seed))
-    assert dynamics.model.term_names == ("rho", "delta")
-    for term in dynamics.model.terms:
-        assert isinstance(term.kernel.base_kernel, MaternKernel)
-    assert all(torch.equal(p, initial[name]) for name, p in module.named_parameters())
-    assert dynamics.score(*system.trial(9)).rmse.isfinite().all()
 
 
 @pytest.mark.slow

@@ -70,13 +70,3 @@ def test_a_free_run(dynamics):
     truth = torch.stack(path[1:], dim=1)
     assert (run.mean - truth).abs().max() < 0.1
     assert ((run.lower < truth) & (truth < run.upper)).double().mean() > 0.8
-
-
-def test_they_are_not_conditioned_or_sampled(dynamics):
-    with pytest.raises(NotImplementedError, match="build it of all data"):
-        dynamics.condition(*transitions(5))
-    assert dynamics.num_transitions == 100
-    with pytest.raises(ValueError, match="got 'bayes'"):
-        make(fit_options={"method": "bayes"})
-    with pytest.raises(ValueError, match="has no option 'num_samples'"):
-        make(fit_options={"num_samples": 8})

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gpadjust import ZeroMeanGP
-from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
+from gpadjust.dynamics import LearnedDynamics, StateSpec
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:f_p is nearly zero", "ignore::gpadjust.inference.SamplingWarning"
@@ -27,13 +27,6 @@ def assert_same(found, expected, columns=slice(None), **tolerance):
         torch.testing.assert_close(one[..., columns], other[..., columns], **tolerance)
 
 
-def test_targets_of_missing_entries_are_missing(cart_pole_system, make, holed):
-    for target in ("difference", "absolute"):
-        targets = make("CKA", cart_pole_system.spec, cart_pole_system.crude, target=target).targets
-        Y = targets.encode(holed[0], holed[2])
-        assert torch.equal(Y.isnan(), holed[2].isnan())
-
-
 @pytest.mark.slow
 def test_each_state_is_learnt_from_its_own_rows(cart_pole_system, make, costly_kind, holed):
     system, test, kind = cart_pole_system, cart_pole_system.trial(9)[:2], costly_kind
@@ -50,20 +43,6 @@ def test_each_state_is_learnt_from_its_own_rows(cart_pole_system, make, costly_k
         alone.update(states, actions, filled)
         alone.load_state_dict({**alone.state_dict(), "model": dynamics.state_dict()["model"]})
         assert_same(alone.predict(*test), dynamics.predict(*test), column, rtol=1e-4, atol=1e-7)
-
-
-@pytest.mark.slow
-def test_learning_goes_on(cart_pole_system, make, holed):
-    system, test = cart_pole_system, cart_pole_system.trial(9)
-    dynamics, other = (make("CKA", system.spec, system.crude) for _ in range(2))
-    dynamics.update(*system.trial(1))
-    before = dynamics.score(*test).rmse
-    dynamics.update(*holed)
-    assert (dynamics.score(*test).rmse < before).all()
-    dynamics.condition(*holed)
-    assert dynamics.num_transitions == 75
-    other.load_state_dict(dynamics.state_dict())
-    assert_same(other.predict(*test[:2]), dynamics.predict(*test[:2]))
 
 
 @pytest.mark.slow
@@ -136,14 +115,3 @@ def test_declared_states_are_checked_where_they_were_measured():
     following[6, 1] = math.nan  # all that the model predicts
     with pytest.raises(ValueError, match=r"predicted entries of next_states.*row 6"):
         dynamics.update(states, actions, following)
-
-
-@pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
-def test_a_physics_of_differences_is_still_found_out(cart_pole_system, holed):
-    system = cart_pole_system
-
-    def change(X):
-        return system.crude(X) - X[:, :4]
-
-    with pytest.warns(UserWarning, match="seems to return the change"):
-        PhysicsDynamics(system.spec, change).update(*holed)

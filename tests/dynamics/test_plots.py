@@ -3,7 +3,6 @@
 import math
 
 import matplotlib as mpl
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
@@ -58,31 +57,3 @@ def test_free_runs_lie_on_what_was_measured():
     assert axes[1, 0].get_xlabel() == "time in s"
     (legend,) = axes[0, 0].figure.legends
     assert [t.get_text() for t in legend.texts] == ["95 %", "free run", "slow", "measured"]
-
-
-def test_windows_states_and_axes_are_chosen():
-    windows, run = turns()
-    given = plt.figure().subplots(1, 2)
-    axes = plot_free_run(run, windows, rows=[2, 0], states=["v"], axes=given)
-    assert list(axes[0]) == list(given)
-    assert axes[0, 0].get_xlabel() == "steps"
-    shown = [ax.lines[0].get_ydata()[-1] for ax in axes[0]]
-    np.testing.assert_allclose(shown, run.mean[[2, 0], -1, 1])
-
-
-def test_what_is_no_free_run_of_these_windows():
-    windows, run = turns()
-    for options, error, words in (
-        ({"run": None}, TypeError, "run as a FreeRun, got NoneType; pass `dynamics"),
-        ({"windows": ()}, TypeError, "windows as Windows, got tuple; pass `records"),
-        ({"windows": turns(3)[0]}, ValueError, r"\(3, 20, 2\), got .*\(4, 20, 2\); .* by `rows`"),
-        ({"others": {"old": turns(4, 9)[1]}}, ValueError, r"old of these windows, .* \(4, 9, 2\)"),
-        ({"rows": [4]}, ValueError, r"windows from 0 to 3, got \[4\]"),
-        ({"rows": []}, ValueError, "windows from 0 to 3"),
-        ({"states": ["omega"]}, ValueError, "states of theta, v, found 'omega'"),
-        ({"states": []}, ValueError, "states of theta, v, found none"),
-        ({"units": {"w": "m"}}, ValueError, "units of theta, v, u, time, found 'w'"),
-        ({"axes": []}, ValueError, "Expected 2 x 3 axes, got 0"),
-    ):
-        with pytest.raises(error, match=words):
-            plot_free_run(**{"run": run, "windows": windows, **options})

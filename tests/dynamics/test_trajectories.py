@@ -20,13 +20,6 @@ def starts(windows):
     return windows.initial_states.flatten().tolist()
 
 
-def test_they_unpack_to_three_tensors():
-    data = count(2, 3)
-    states, actions, next_states = data
-    assert torch.equal(states + 1, next_states)
-    assert torch.equal(actions, 10 * states)
-
-
 def test_windows_do_not_cross_the_ends_of_episodes():
     data = count(6, 3, 8)
     assert data.longest == 8

@@ -7,15 +7,13 @@ import pytest
 import torch
 
 from gpadjust.control.random_state import RandomState
-from gpadjust.physics import ODEPhysics
 from paper.arm import SLOW, Arm, Reaching, ReachingSettings, Settings, evaluation
 from paper.arm.arm import load_maps
 from paper.arm.claims import claims as arm_claims
 from paper.arm.claims import distance_from_start
 from paper.arm.evaluation import hundred, reach, score
 from paper.arm.reaching import dynamics
-from paper.arm.system.torque_arm import ARM_TIME_STEP, believed_arm
-from paper.cartpole.control import load, run
+from paper.cartpole.control import load
 from paper.common.runner import main, runs_file
 from paper.common.runs import rounded
 from paper.common.verdicts import Curves, judge
@@ -91,14 +89,6 @@ class TestArm:
         assert len(record["maps"]["2"]["last_five"]) == 4
         assert record["episodes"]["updates"] == [5 + 2 * 5] * 2
 
-    @pytest.mark.slow
-    @pytest.mark.usefixtures("_few_targets")
-    @pytest.mark.parametrize("name", Arm.known)
-    def test_every_scenario_runs(self, name):
-        experiment = Arm(settings=TINY_ARM)
-        found = run(experiment, name, 0)
-        assert found["evaluations"]["episode"] == [0, 1, 2]
-
     def test_verdicts_follow_the_numbers(self):
         found = arm_verdicts(
             mf=lambda e: 40 - e, gp=lambda e: 20 - e / 4, phy=lambda e: max(9.5, 20 - e),
@@ -164,48 +154,3 @@ def test_the_slow_learner_is_told_apart_by_its_settings():
 @pytest.mark.parametrize("system", Reaching.axes["system"])
 def test_all_models_are_known(system, learner):
     assert dynamics(FEW, system, learner).spec.states[0] == "theta_s"
-
-
-def physics(gains=None, **changes):
-    """A time step of a torque arm."""
-    equation = replace(believed_arm(gains) if gains else believed_arm(), **changes)
-    return ODEPhysics(equation, step=ARM_TIME_STEP, state_dim=4, substeps=8)
-
-
-def transitions(physics, n=40):
-    """Of an arm, at states all over."""
-    torch.manual_seed(0)
-    states = torch.rand(n, 6, dtype=torch.float64)
-    actions = torch.rand(n, 4, dtype=torch.float64)
-    following = states.clone()
-    following[:, :4] = physics(torch.cat([states[:, :4], actions], dim=1))
-    return states, actions, following
-
-
-@pytest.mark.slow
-def test_the_fitted_baseline_finds_damping_and_strengths():
-    data = transitions(physics((7.0, 5.0), damping=0.7))
-    fitted = dynamics(FEW, "plain", "fitted")
-    before = fitted.score(*data).rmse
-    fitted.update(*data)
-    assert (fitted.score(*data).rmse < before / 50).all()
-
-
-@pytest.mark.slow
-def test_networks_learn_what_physics_lacks():
-    data = transitions(physics((9.0, 5.0)), 200)
-    ensemble = dynamics(FEW, "plain", "ensemble")
-    known = ensemble.before_data()
-    ensemble.update(*(part[:150] for part in data))
-    states, actions, following = (part[150:] for part in data)
-
-    def error(model):
-        return (model.predict(states, actions).mean - following)[:, :4].square().mean().sqrt()
-
-    assert error(ensemble) < error(known) / 2
-    mean = ensemble.mean_function()(states[None], actions[None])[0]
-    torch.testing.assert_close(mean, ensemble.predict(states, actions).mean)
-    blocks = ensemble.sample_functions(6, seed=0)(states.expand(6, -1, -1), actions)
-    torch.testing.assert_close(blocks.mean(0), mean)
-    assert ensemble.sample(states, actions).shape == states.shape
-    assert (ensemble.noise_variance(states, actions) == 0).all()

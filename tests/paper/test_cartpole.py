@@ -17,7 +17,6 @@ from paper.cartpole import (
     Settings,
 )
 from paper.cartpole.claims import CLAIMS
-from paper.cartpole.control import run
 from paper.cartpole.planning import dynamics, environment, mc_pilco_reward
 from paper.cartpole.system import evaluate, fixed_starts
 from paper.common.runner import main, runs_file
@@ -72,13 +71,6 @@ class TestCartPole:
         assert len(episodes["cka"]["rmse"][1]) == 4
         assert all(0 < cost <= 1 for of in episodes.values() for cost in of["cost"])
 
-    @pytest.mark.slow
-    @pytest.mark.parametrize("name", CartPole.known)
-    def test_every_scenario_runs(self, name):
-        experiment = CartPole(settings=TINY)
-        found = run(experiment, name, 0)
-        assert len(found["episodes"]["cost"]) == 3
-
     def test_an_evaluation_draws_no_random_number(self):
         experiment = CartPole(settings=TINY)
         setup = experiment.setup("gp-paper", 0)
@@ -101,11 +93,6 @@ class TestCartPole:
             in_model = 0 if episode > 25 else settings.updates_in_model()
             of_others = settings.updates_after(episode, model_free=False)
             assert settings.updates_after(episode, model_free=True) == in_model + of_others
-
-    def test_cases_go_seed_by_seed(self):
-        cases = CartPole(only=("mf", "cka-4"), runs=5, seed=7).cases()
-        assert cases[:4] == [("mf", 7), ("cka-4", 7), ("mf", 8), ("cka-4", 8)]
-        assert len(cases) == 2 * 4 + 1
 
     def test_verdicts(self):
         found = judged(

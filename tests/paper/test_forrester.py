@@ -4,7 +4,7 @@ import pandas as pd
 import pytest
 import torch
 
-from paper.common.runner import main, runs_file
+from paper.common.runner import runs_file
 from paper.forrester import Forrester, Settings
 from paper.forrester.forrester import NAMES, judge
 from paper.forrester.problem import CRUDE, POINTS, observations, truth
@@ -43,14 +43,6 @@ def test_smoke(tmp_path):
     records = list(runs_file(Forrester(out=RESULTS / "forrester")).read().values())[:50]
     assert "F7 | RRA about 50 %" in experiment.tables(records)["claims-B"].text
     assert "CKA | " in experiment.first_look(records)
-
-
-@pytest.mark.slow
-def test_command(tmp_path, capsys):
-    settings = Settings(steps=2, lengthscales=(0.5, 1.0), ridges=(0.01,))
-    main(Forrester(out=tmp_path, runs=2, jobs=1, settings=settings))
-    assert "Claims, on reading B" in capsys.readouterr().out
-    assert (tmp_path / "forrester_paper.png").stat().st_size > 20_000
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ from paper.machines.real import load
 from paper.machines.records import DATA, REAL
 from paper.machines.tanks import Start, blocks, chosen, follow, without
 from paper.machines.tanks import load as tanks_load
-from paper.machines.tanks_systems import FIXED, UNKNOWNS, measured, narx_spec, physics, rates
+from paper.machines.tanks_systems import FIXED, UNKNOWNS, measured, physics, rates
 
 MACHINES = {"double": DOUBLE_PENDULUM, "single": PENDULUM}
 VALUES = {**{name: known.guess for name, known in UNKNOWNS.items()}, "power": 0.5}
@@ -242,9 +242,3 @@ def test_free_run_ends_where_inflow_is_outflow():
     path = follow(physics("overflow", VALUES), Start(5.0, 1.0), actions, lower)
     assert path[0] == 5.0
     assert float(path[-1]) == pytest.approx(4.0, abs=0.01)  # 2 = sqrt(level)
-
-
-def test_states_without_physics():
-    spec = narx_spec(3)
-    assert spec.states == ("lower", "lower_1", "lower_2", "pump_1", "pump_2")
-    assert narx_spec(1).states == ("lower",)

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from paper.published import FORMULA_CELLS, Formula
+from paper.published import Formula
 from paper.published.formula import cells
 
 RUN = {"group": "kinds", "problem": "decay", "size": 5, "noise": 0.0, "held": [0.9]}
@@ -29,7 +29,3 @@ def test_ratios(tmp_path):
     found = cells(runs, experiment)
     assert found.groupby("cell")["gap"].mean().tolist() == pytest.approx([math.log(1.05), 0.0])
     assert "| all | 2 | 1.02 " in experiment.tables(runs)["groups"].text
-
-
-def test_cells_are_apart():
-    assert len({*FORMULA_CELLS}) == len(FORMULA_CELLS)

@@ -12,7 +12,6 @@ from typing import ClassVar
 import pytest
 from cloudpickle import register_pickle_by_value, unregister_pickle_by_value
 
-from paper.__main__ import main as paper_main
 from paper.common import runner
 from paper.common.experiment import Axes, Experiment, Table
 from paper.common.runner import Refused, main, run_missing, runs_file
@@ -199,15 +198,6 @@ def test_a_commit_is_that_of_the_repository_and_says_if_files_are_changed(tmp_pa
     assert found() == git("rev-parse", "HEAD") + "+"
 
 
-def test_without_git_there_is_no_commit(monkeypatch):
-    monkeypatch.setenv("PATH", "")
-    commit_of.cache_clear()
-    try:
-        assert commit_of(ROOT) is None
-    finally:
-        commit_of.cache_clear()
-
-
 def test_a_torn_line_is_not_read_and_not_glued_to_the_next(tmp_path):
     toy = Toy(out=tmp_path, runs=2)
     run_missing(toy)
@@ -281,9 +271,3 @@ def test_help_is_quick_and_imports_nothing_slow():
     )
     assert "--gamma" in made.stdout
     assert "--evaluate-every" in made.stdout
-
-
-def test_report_takes_no_options(monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["paper", "report", "--force"])
-    with pytest.raises(SystemExit, match="report takes no options; found --force"):
-        paper_main()

@@ -155,15 +155,6 @@ def test_actions_that_vary_within_a_step_and_angles_that_jump_are_said():
     assert not any("vary" in each for each in quickly(Records(held, spec), physics).advice)
 
 
-@pytest.mark.slow
-def test_gaps_are_said():
-    record = oscillation(121)
-    kept = (record.times < 6.0) | (record.times > 6.35)
-    parted = Record(record.times[kept], record.states[kept], record.actions[kept])
-    found = quickly(Records(parted, SPEC), spring(Unknown(1.5, factor=1.5)))
-    assert "Gaps part the log into 2 stretches, each smoothed by itself." in found.advice
-
-
 def test_an_angle_that_jumps_by_a_turn_is_said():
     t, angled = (
         0.1 * torch.arange(100).double(),

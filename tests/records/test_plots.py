@@ -47,13 +47,3 @@ def test_a_record_shows_its_gaps_and_segments():
     dots = [line for line in axes[1].lines if line.get_marker() == "."]
     assert sum(len(line.get_xdata()) for line in dots) == int((~record.states[:, 1].isnan()).sum())
     assert axes[2].lines[0].get_drawstyle() == "steps-post"
-
-
-def test_what_is_no_record_of_this_machine():
-    for record, spec, error, words in (
-        ([turning()], SPEC, TypeError, "record as a Record, got list; of `records` draw each"),
-        (turning(), "theta", TypeError, "spec as a StateSpec, got str"),
-        (turning(), StateSpec(["x"], ["u"]), ValueError, "states, x, and .* found 2 and 1 columns"),
-    ):
-        with pytest.raises(error, match=words):
-            plot_record(record, spec)

@@ -316,26 +316,6 @@ def test_gaps_are_not_interpolated_over_unless_they_are_said_to_be_none():
     assert len(data.states) == 29
 
 
-def test_resampling_that_cannot_be():
-    parts = ["short"] * 5 + ["single"] + ["long"] * 24
-    records = Records([counted(5), counted(30, name="long", segments=parts)], SPEC)
-    with pytest.warns(UserWarning, match="no stretch as long as a step of 0.1: unnamed"):
-        even = records.resampled(0.1)
-    assert [record.name for record in even] == ["long"]
-    with pytest.warns(UserWarning, match="2 of 3 stretches"):
-        assert even.trajectories().states.flatten().tolist() == pytest.approx([6, 16])
-    with pytest.raises(ValueError, match=r"as a step, 0\.5, found none"):
-        records.resampled(0.5)
-    with pytest.raises(ValueError, match=r"half a sampling step, 0\.005, .* got 0\.004"):
-        records.resampled(0.004)
-    with pytest.raises(TypeError, match="max_gap must be a number"):
-        records.resampled(0.01, max_gap="1")
-    rough = counted(6, at=torch.tensor([0, 1, 3, 4, 7, 8.0]).double())
-    with pytest.raises(ValueError, match=r"records\.resampled\(step, max_gap="):
-        Records([rough], SPEC).resampled(1)
-    assert len(Records([rough], SPEC).resampled(1, max_gap=3).trajectories().states) == 8
-
-
 def test_windows_have_the_steps_of_transitions():
     records = Records([counted(31, segments=[0] * 14 + [1] * 17), counted(23, first=50.0)], SPEC)
     windows = records.windows(3, 0.02)
@@ -404,16 +384,12 @@ THREE = torch.arange(3).double()
 
 REFUSED = [
     ({"times": torch.tensor([0, 2, 1.0]).double()}, ValueError, "row 2: .*found 1 after 2"),
-    ({"times": torch.tensor([0, 1, 1.0]).double()}, ValueError, "row 2: .*found 1 after 1"),
     ({"times": torch.tensor([0, math.nan, 1]).double()}, ValueError, "row 1: .*nan .* times"),
     ({"times": THREE.unsqueeze(-1)}, ValueError, r"times of shape N, got \(3, 1\)"),
     ({"states": THREE}, ValueError, r"N x state_dim, got \(3,\); .*reshape\(-1, 1\)"),
     ({"states": column(0, math.inf, 0)}, ValueError, "row 1: .*inf in column 0 of states; put N"),
     ({"actions": column(0, 0, math.nan)}, ValueError, "row 2: .*nan in column 0 of actions"),
     ({"actions": column(0, 0)}, ValueError, "3 of times, 3 of states, 2 of actions"),
-    ({"actions": THREE.new_zeros(3, 0)}, ValueError, r"N x action_dim, got \(3, 0\)"),
-    ({"states": column(0, 0, 0).float()}, TypeError, "states in float64, .*`states.double"),
-    ({"states": [[0], [1], [2]]}, TypeError, "states to be a torch tensor"),
     ({"states": np.array([["a"], ["b"], ["c"]])}, TypeError, "hold numbers only"),
     ({"segments": [1, 1]}, ValueError, "3 of actions, 2 of segments"),
     ({"segments": [1, math.nan, 1]}, ValueError, "row 1: expected a label .*found nan"),
@@ -426,23 +402,6 @@ def test_what_is_no_record():
     for changed, error, words in REFUSED:
         with pytest.raises(error, match=words):
             Record(**{**good, **changed}, name="r")
-
-
-def test_what_are_no_records():
-    with pytest.raises(ValueError, match="one record or more, found none"):
-        Records([], SPEC)
-    with pytest.raises(TypeError, match="each record as a Record"):
-        Records([torch.zeros(3)], SPEC)
-    with pytest.raises(TypeError, match="spec as a StateSpec"):
-        Records([counted(3)], ["x"])
-    with pytest.raises(
-        ValueError, match=r"'unnamed': expected 2 columns of states, x, v, .*found 1"
-    ):
-        Records([counted(3)], POINT)
-    assert len(Records(counted(3), SPEC)) == 1
-    assert repr(Records(counted(3, name="a"), SPEC)) == (
-        "Records([Record('a', 3 rows every 0.01, 1 state, 1 action)])"
-    )
 
 
 @pytest.fixture
@@ -524,24 +483,6 @@ def test_what_is_no_file_of_a_record(csv):
     ):
         with pytest.raises(ValueError, match=f"log.csv{words}"):
             Records.read_csv([good, csv(text)], POINT, **NAMES)
-
-
-def test_what_is_asked_of_files_is_there(csv, tmp_path):
-    file = csv("time,x,v,u,part\n0,1,2,3,a\n1,4,5,6,\n")
-    latin, none = csv("time,é\n", "latin.csv", encoding="latin-1"), tmp_path / "none.csv"
-    for files, options, error, words in (
-        (file, {"segment": "part"}, ValueError, r"line 3, column 5 \('part'\): .* text, found ''"),
-        (file, {"states": {"y": "q"}}, ValueError, r"no 'y' among the states of the spec, \('x', "),
-        (file, {"actions": ["u"]}, TypeError, r"actions as a dictionary .*, found \['u'\]"),
-        (file, {"time": 0}, ValueError, "time must be finite and above 0"),
-        ([], {}, ValueError, "one record or more, found none"),
-        (none, {}, FileNotFoundError, "none"),
-        (latin, {}, ValueError, "expected a CSV file in UTF-8, but"),
-    ):
-        with pytest.raises(error, match=words):
-            Records.read_csv(files, POINT, **options)
-    with pytest.raises(TypeError, match="spec as a StateSpec"):
-        Records.read_csv(file, ["x"])
 
 
 def test_windows_are_drawn_evenly_and_are_records_again():

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gpadjust import CalibratedPhysics
-from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
+from gpadjust.dynamics import LearnedDynamics, StateSpec
 from gpadjust.dynamics.particles import varying_parameters
 from gpadjust.models import PhysicsParameters
 from gpadjust.physics import FunctionPhysics, ODEPhysics, Unknown
@@ -164,17 +164,6 @@ def test_bad_variations():
     ):
         with pytest.raises(error, match=words):
             dynamics.free_run(states, actions, variation=variation)
-
-
-@pytest.mark.slow
-def test_there_have_to_be_unknown_parameters():
-    physics = spring()
-    states, actions = torch.zeros(1, 2).double(), torch.zeros(1, 2, 1).double()
-    with pytest.raises(ValueError, match="found PhysicsDynamics"):
-        PhysicsDynamics(SPEC, physics).free_run(states, actions, variation=0.1)
-    known = ODEPhysics(lambda x, u: rates(x, u, {"stiffness": 4.0, "damping": 0.3}), STEP, 2)
-    with pytest.raises(ValueError, match="no unknown parameters"):
-        _ = smooth(strokes(3, 0.0, seed=0), known).variation
 
 
 @pytest.mark.slow

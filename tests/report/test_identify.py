@@ -137,23 +137,16 @@ def test_python_makes_the_same_page_of_an_identification(folder, read, undrawn_l
 
 BAD = {
     ("--states", "angel,rate"): "expected a column 'angel', found .* Is it 'angle.*--hidden",
-    ("--delimiter", "ab"): "--delimiter as one character",
     ("--hidden", "speed=0+-1"): "--hidden names 'speed', which is none of --states",
     ("--hidden", "rate"): r"such as 'rate \[rad/s\]=0 \+- 2', found 'rate'",
     ("--hidden", "rate=0..1"): "mean and standard deviation",
-    ("--actions", "force"): "expected a column 'force'",
-    ("--time", "clock"): "expected a column 'clock'",
     ("--angles", "torque"): "--angles names 'torque'",
-    ("--unknown", "c=1"): "Expected --unknown such as",
     ("--unknown", "z=1+-1"): "--unknown names 'z', which is in no equation",
     ("--physics", "rate' = rate"): "one equation for each state",
     ("--physics", "swing:physics"): "Expected swing:physics alone",
     ("--physics", "x' = rate"): "equation for each of angle, rate.* found those of angle, rate, x",
     ("--held-out", "0.8"): "at most 0.5",
     ("--step", "0.013"): "whole multiple of the sampling step",
-    ("--segment", "day"): "expected a column 'day'",
-    ("--out", "none/page.html"): "There is no folder 'none'",
-    ("--out", "page.pdf"): "Expected a page such as 'report.html'",
 }
 
 
@@ -178,7 +171,6 @@ BAD_LOGS = {
     "time,angle,torque\n0,1,0\n1,1,\n": r"column 3 \('torque'\): expected a number",
     "time,angle,torque\n0,1,0\n1,x,0\n": r"column 2 \('angle'\): expected a number, or nothing",
     "time,angle,torque\n0,1,0\n1,1,0\n2,1,0\n": "8 control steps or more",
-    "time;angle;torque\n0;1;0\n": "say so by --delimiter ';'",
 }
 
 

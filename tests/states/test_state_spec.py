@@ -67,38 +67,23 @@ def test_sine_and_cosine_that_are_elsewhere_are_found():
     ARM.check_observations(ARM.observe(torch.randn(5, 3)))
 
 
-def test_equal_specs_are_equal_and_hashable():
-    again = StateSpec(
-        ["goal", "q", "v"], ("torque",), angles=("q",), exogenous=["goal"], integrated={"q": "v"},
-        step=0.1,
-    )  # fmt: skip
-    assert again == ARM
-    assert hash(again) == hash(ARM)
-
-
 REFUSED = [
     ({"states": "xv"}, TypeError, "states must be a sequence of names; found 'xv'"),
-    ({"states": [1, 2]}, TypeError, "states must hold names, as strings; found 1"),
     ({"states": []}, ValueError, "states must be one or more"),
     ({"states": ["x", "x"]}, ValueError, r"states must be different names; found \('x', 'x'\)"),
-    ({"actions": []}, ValueError, "actions must be one or more"),
     ({"angles": ["y"]}, ValueError, "'y'"),
     ({"exogenous": ["x", "v"]}, ValueError, "No state is left to predict"),
     ({"integrated": ["x"]}, TypeError, r"such as {'x': 'x_dot'}; found \['x'\]"),
     ({"integrated": {"x": "v"}}, ValueError, "step must be the duration of a step"),
-    ({"integrated": {"x": 2}, "step": 0.1}, TypeError, "as strings; found 2"),
-    ({"previous": ["x"]}, TypeError, r"such as {'last_force': 'force'}; found \['x'\]"),
     ({"previous": {"y": "a"}}, ValueError, "There is no state 'y'"),
     ({"previous": {"x": "b"}}, ValueError, r"'b', which is neither: .* actions are \('a',\)"),
     ({"previous": {"x": "v"}, "actions": ["a", "v"]}, ValueError, "'v', which is both"),
-    ({"previous": {"x": "x"}}, ValueError, "round in a circle, x -> x; let it end"),
     ({"previous": {"x": "v", "v": "x"}}, ValueError, "circle, x -> v -> x"),
     ({"previous": {"x": "v"}, "angles": ["x"]}, ValueError, "'x' is one .* and 'v' is not"),
     ({"previous": {"x": "v"}, "angles": ["v"]}, ValueError, "'v' is one .* and 'x' is not"),
     ({"previous": {"x": "a"}, "exogenous": ["x"]}, ValueError, "'x' is said to be two things"),
     ({"previous": {"x": "a"}, "angles": ["x"]}, ValueError, "'x' is one .* and 'a' is not"),
     ({"step": "fast"}, TypeError, "step must be a number or None; found 'fast'"),
-    ({"step": 0}, ValueError, "step must be finite and above 0; found 0"),
 ]
 
 

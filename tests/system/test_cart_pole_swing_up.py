@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
-from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from gpadjust.systems import CartPoleEquation, CartPoleSwingUpEnv
 from gpadjust.systems.swing_up import (
@@ -45,11 +44,6 @@ def upright(**arguments):
 @pytest.mark.parametrize("encode_angle", [True, False])
 def test_gymnasium_finds_no_fault(encode_angle):
     check_env(gym.make(ID, encode_angle=encode_angle).unwrapped)
-
-
-@pytest.mark.filterwarnings("ignore:We recommend you to use a symmetric and normalized:UserWarning")
-def test_stable_baselines_finds_no_fault():
-    sb3_check_env(gym.make(ID, render_mode="rgb_array").unwrapped)
 
 
 def test_episode_is_truncated_after_25_steps():
@@ -164,14 +158,6 @@ def test_frame_shows_pole_goal_and_force():
     assert above < 150 < red_level()
 
 
-def test_frame_follows_the_cart():
-    env = CartPoleSwingUpEnv(render_mode="rgb_array")
-    for x in (-40.0, 0.0, 40.0):
-        env.reset(options={"state": [x, 0.5, 0.0, 0.0]})
-        frame = env.render().astype(int)
-        assert ((frame[..., 2] > 110) & (frame[..., 0] < 60)).sum() > 500, "the cart is seen"
-
-
 def test_window_is_drawn_in_each_step_and_closed():
     import pygame
 
@@ -183,11 +169,6 @@ def test_window_is_drawn_in_each_step_and_closed():
     env.close()
     assert pygame.display.get_surface() is None
     env.close()
-
-
-def test_render_without_a_mode_warns():
-    with pytest.warns(UserWarning, match="without a render mode"):
-        assert upright().render() is None
 
 
 def test_missing_pygame_is_named(monkeypatch):
@@ -203,14 +184,7 @@ def test_bad_actions_starts_and_options_are_refused():
         with pytest.raises(ValueError, match="one finite force"):
             env.step(action)
         assert np.array_equal(env.state, np.zeros(4))
-    for state in (
-        [0.0, 1.0],
-        [0, math.nan, 0, 0],
-        [[0.0] * 4],
-        "up",
-        [[1], [2, 3]],
-        [0, 0, 1e39, 0],
-    ):
+    for state in ([0.0, 1.0], [0, math.nan, 0, 0], "up", [0, 0, 1e39, 0]):
         with pytest.raises(ValueError, match="four finite numbers"):
             env.reset(options={"state": state})
     with pytest.raises(ValueError, match="'start'"):
@@ -220,8 +194,6 @@ def test_bad_actions_starts_and_options_are_refused():
     for options, error, words in (
         ({"render_mode": "ascii"}, ValueError, "'ascii'"),
         ({"encode_angle": "no"}, TypeError, "encode_angle must be True or False; found 'no'"),
-        ({"equation": None}, TypeError, r"equation must be a CartPoleEquation.*found None"),
-        ({"time_step": "fast"}, TypeError, "time_step must be a number; found 'fast'"),
     ):
         with pytest.raises(error, match=words):
             CartPoleSwingUpEnv(**options)

@@ -35,19 +35,6 @@ def test_the_action_is_remembered_as_the_environment_takes_it():
         assert np.array_equal(observation[:-1], expected)
 
 
-def test_what_else_a_step_says_is_passed_on():
-    class Failing(CartPoleSwingUpEnv):
-        def step(self, action):
-            observation, reward, *_ = super().step(action)
-            return observation, reward, False, True, {"step_failed": True}
-
-    env = RememberAction(Failing())
-    env.reset(seed=0)
-    *_, truncated, info = env.step(np.array([2.0], dtype=np.float32))
-    assert truncated
-    assert info == {"step_failed": True}
-
-
 @pytest.mark.parametrize(
     ("dtype", "expected"), [(np.float64, np.float64), (np.float16, np.float16), (int, np.float64)]
 )

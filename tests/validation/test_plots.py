@@ -1,7 +1,6 @@
 """Figures: what is drawn is what was predicted."""
 
 import sys
-from dataclasses import replace
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
@@ -132,18 +131,6 @@ def test_adjustments_are_slices_through_the_base_point(plane):
             np.testing.assert_allclose(drawn[:, 1], mean)
 
 
-def test_lists_will_do_for_numbers(plane):
-    bounds, base = [[0.1, 0.2], [1.0, 1.5]], [0.5, 0.7]
-    axes = plot_adjustment(plane, bounds=bounds, base=base, num_points=3)
-    np.testing.assert_allclose(curve(axes[0, 1], "mean").get_xdata(), [0.2, 0.85, 1.5])
-
-
-def test_an_input_that_never_changed():
-    X = torch.rand(8, 2, dtype=torch.float64)
-    X[:, 1] = 0.5
-    assert plot_adjustment(CKA(X, X[:, :1].exp(), physics=lambda X: X[:, :1])).shape == (2, 2)
-
-
 def test_a_row_for_each_physics(uniform):
     X = uniform(9, 2)
     Y = torch.cat([X.prod(-1, keepdim=True), X[:, :1]], dim=-1)
@@ -214,81 +201,6 @@ def test_points_that_were_not_observed_are_not_drawn(data, build):
     np.testing.assert_allclose(ticks.get_xdata(), X[rest, 0])
 
 
-def test_a_truth_that_is_not_known_everywhere(line, forrester):
-    truth = forrester.truth(forrester.test_X)
-    truth[::2] = torch.nan
-    ax = plot_prediction(line, forrester.test_X, truth)
-    np.testing.assert_allclose(curve(ax, "truth").get_ydata(), truth[1::2, 0])
-
-
-def test_an_output_without_observations_is_not_drawn(plane, data):
-    loo = leave_one_out(plane)
-    loo.Y[:, 1] = torch.nan
-    for draw in (
-        plot_leave_one_out,
-        plot_pit,
-        plot_coverage,
-        lambda loo, output: plot_prediction(plane, data()[0], loo.Y, output=output),
-    ):
-        with pytest.raises(ValueError, match=r"Output 1 has no observed value .* another `output`"):
-            draw(loo, output=1)
-    assert not plt.get_fignums()
-    assert plot_pit(loo).get_title() == "$y_{1}$"
-
-
-def test_names_of_columns_are_on_the_axes(line, plane, data, forrester):
-    X, Y = data(num_outputs=2)
-    loo = leave_one_out(plane)
-    assert plot_prediction(plane, X, Y, output=1).get_xlabel() == "true $y_{2}$"
-    assert plot_leave_one_out(loo, output=1)[0].get_xlabel() == "observed $y_{2}$"
-    assert plot_leave_one_out(leave_one_out(line))[0].get_xlabel() == "observed"
-    plane.input_names, plane.output_names = ("pressure [Pa]", "x2"), ("force [N]", "flow")
-    axes = plot_adjustment(plane, output=1, num_points=4)
-    assert [ax.get_xlabel() for ax in axes[1]] == ["pressure [Pa]", "$x_{2}$"]
-    assert [ax.get_ylabel() for ax in axes[:, 0]] == ["$\\rho$\nfor flow", "$\\delta$\nfor flow"]
-    ax = plot_prediction(plane, X, Y, output=1)
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("true flow", "predicted flow")
-    named = replace(loo, output_names=plane.output_names)
-    assert plot_leave_one_out(named, output=1)[0].get_xlabel() == "observed flow"
-    assert plot_coverage(named, output=1).get_title() == "flow"
-    assert plot_pit(named).get_title() == "force [N]"
-    line.input_names, line.output_names = ("time [s]",), ("force [N]",)
-    ax = plot_prediction(line, forrester.test_X)
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("time [s]", "force [N]")
-    assert plot_adjustment(line, num_points=4)[0, 0].get_ylabel() == r"$\rho$"
-
-
-REFUSED = [
-    ({"num_points": 1}, ValueError, "must be at least 2; found 1"),
-    ({"num_points": 2.5}, TypeError, "num_points must be a whole number"),
-    ({"output": 2}, ValueError, "no output 2; there are 2"),
-    ({"output": 0.0}, TypeError, "output must be a whole number"),
-    ({"bounds": [0.0, 1.0]}, ValueError, "Expected bounds of shape 2 x 2"),
-    ({"bounds": torch.zeros(2, 2)}, ValueError, "Expected finite bounds, each lower one below"),
-    ({"bounds": "wide"}, TypeError, "Expected bounds to be real numbers"),
-    ({"base": [[0.5, 0.5]]}, ValueError, "Expected a base point of 2 inputs, finite, got"),
-    ({"base": [0.5, float("nan")]}, ValueError, "Expected a base point of 2 inputs, finite, got"),
-    ({"base": "wide"}, TypeError, "Expected base to be real numbers"),
-    ({"axes": [1, 2]}, ValueError, "Expected 2 x 2 axes, got 0"),
-]
-
-
-def test_bad_options_of_adjustments(plane):
-    before = plt.get_fignums()
-    for options, error, words in REFUSED:
-        with pytest.raises(error, match=words):
-            plot_adjustment(plane, **options)
-    assert plt.get_fignums() == before
-
-
-def test_models_that_have_nothing_to_draw(line, data):
-    with pytest.raises(TypeError, match="ZeroMeanGP has neither rho nor delta to draw"):
-        plot_adjustment(ZeroMeanGP(*data()))
-    for draw in (plot_coverage, plot_pit, plot_leave_one_out):
-        with pytest.raises(TypeError, match=r"got CKA; pass `leave_one_out\(model\)`"):
-            draw(line)
-
-
 def test_bad_input(line, plane, data, forrester):
     X, Y = data(num_outputs=2)
     loo, one = leave_one_out(plane), forrester.test_X
@@ -298,14 +210,8 @@ def test_bad_input(line, plane, data, forrester):
         (lambda: plot_prediction(plane, X, Y[:, :1]), ValueError, "Y with the 2 outputs of the m"),
         (lambda: plot_prediction(plane, X[None], Y), ValueError, "Expected X of shape n x d"),
         (lambda: plot_prediction(plane, X[:0], Y[:0]), ValueError, "n x d, one point or more"),
-        (lambda: plot_prediction(plane, X.numpy(), Y), TypeError, r"got ndarray; .*as_tensor\(X, "),
-        (lambda: plot_prediction(plane, X, Y.tolist()), TypeError, "torch tensor, got list"),
-        (lambda: plot_prediction(line, one, level=95), ValueError, "level must be between 0 and 1"),
         (lambda: plot_prediction(line, one, ax=Figure().subplots(2)), ValueError, "1 x 1 axes"),
-        (lambda: plot_leave_one_out(loo, level="95 %"), TypeError, "level must be a number"),
         (lambda: plot_pit(torch.tensor([0.5, 1.5])), ValueError, "PIT values between 0 and 1"),
-        (lambda: plot_pit(loo, bins=1.5), TypeError, r"bins must be a whole number; found 1\.5"),
-        (lambda: plot_pit(loo.score().pit.numpy()), TypeError, "values themselves as a torch tens"),
         (lambda: plot_coverage(loo, output=2), ValueError, "no output 2; there are 2, from 0"),
     ):
         with pytest.raises(error, match=words):

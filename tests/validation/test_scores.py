@@ -138,12 +138,8 @@ def test_bad_input(prediction, data, build):
     negative[0, 1, 2], nan[0, 1, 2] = -0.5, torch.nan
     for values, error, words in (
         ((mean.numpy(), variance, y), TypeError, r"got ndarray; convert .*as_tensor\(mean, "),
-        ((mean, variance.numpy(), y), TypeError, r"variance as a .* tensor, got ndarray"),
-        ((mean, variance, y.tolist()), TypeError, "y to be a torch tensor, got list"),
-        ((mean.long(), variance, y), TypeError, r"int64; convert with `torch.as_tensor\(mean"),
         ((mean, negative, y), ValueError, r"at least 0, got -0.5; .*`variance.clamp_min\(0\)`"),
         ((mean, nan, y), ValueError, "Expected variance without NaN, found 1 of 42"),
-        ((nan, variance, y), ValueError, "Expected mean without NaN, found 1 of 42"),
         ((mean[0, :, 0],) * 3, ValueError, r"y of shape ... x n x m.*unsqueeze\(-1\)"),
         ((mean, variance[..., :2], y), ValueError, r"\(2, 7, 3\) and \(2, 7, 2\)"),
         ((mean, variance, y[..., :1]), ValueError, r"y's shape \(2, 7, 1\)"),
