@@ -7,7 +7,6 @@ import torch
 from gpytorch.kernels import MaternKernel, RBFKernel, ScaleKernel
 from gpytorch.test.base_kernel_test_case import BaseKernelTestCase
 from gpytorch.test.base_mean_test_case import BaseMeanTestCase
-from torch import Size
 
 from gpadjust.gp import PhysicsMean, PhysicsScaledKernel
 from tests.systems import refused
@@ -53,25 +52,6 @@ def test_one_output_of_several(uniform):
     with pytest.raises(ValueError, match="last_dim_is_batch"):
         kernel.forward(uniform(5, 2), uniform(5, 2), last_dim_is_batch=True)
     assert not PhysicsScaledKernel(RBFKernel(), physics).is_stationary
-
-
-def test_a_batch_and_gradients(uniform):
-    base, X = RBFKernel(batch_shape=Size([2])).double(), uniform(6, 2)
-    base.lengthscale = torch.tensor([0.4, 0.9]).reshape(2, 1, 1)
-    kernel = PhysicsScaledKernel(base, physics)
-    values = kernel(X).to_dense()
-    assert kernel.batch_shape == (2,)
-    torch.testing.assert_close(kernel[1](X).to_dense(), values[1])
-    torch.testing.assert_close(kernel[torch.tensor([1, 0, 1])](X).to_dense(), values[[1, 0, 1]])
-    wide = kernel.expand_batch(Size([3, 2]))
-    assert wide.batch_shape == (3, 2)
-    torch.testing.assert_close(wide(X).to_dense(), values.expand(3, 2, 6, 6))
-    assert kernel.batch_shape == (2,)
-    kernel = PhysicsScaledKernel(RBFKernel().double(), physics)
-    X = uniform(5, 2).requires_grad_()
-    kernel(X).to_dense().sum().backward()
-    assert kernel.base_kernel.raw_lengthscale.grad.abs() > 0
-    assert X.grad.abs().max() > 0
 
 
 # The physics as a mean function

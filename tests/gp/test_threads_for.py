@@ -2,13 +2,12 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from threading import Barrier, Thread
 
 import pytest
 import torch
 from threadpoolctl import threadpool_info
 
-from gpadjust import CKA, fit
+from gpadjust import CKA
 from gpadjust.gp.gaussian import threads_for
 
 
@@ -86,42 +85,6 @@ def test_sections_that_overlap_in_two_threads(first_out):
         assert threads[last].submit(torch.get_num_threads).result() == 1
         seen[last] = threads[last].submit(leave, last).result()
     assert seen == {0: 2, 1: 2}
-
-
-def test_many_at_once():
-    start, found = Barrier(8), []
-
-    def work():
-        start.wait()
-        for _ in range(20):
-            with threads_for(12):
-                found.append(torch.get_num_threads())
-            found.append(torch.get_num_threads())
-
-    threads = [Thread(target=work) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert found.count(1) == found.count(2) == 8 * 20
-
-
-def test_fits_in_two_threads(uniform):
-    def work(seed):
-        X = uniform(8, 1, seed=seed)
-        model = CKA(X, X.sin(), physics=lambda X: X)
-        fit(model, "map", num_starts=2, num_screened=8)
-        return torch.get_num_threads()
-
-    # A thread that asks for its number first while another sets its own may begin with that.
-    begun = Barrier(2)
-
-    def begin():
-        torch.get_num_threads()
-        begun.wait()
-
-    with ThreadPoolExecutor(2, initializer=begin) as pool:
-        assert set(pool.map(work, range(4))) == {2}
 
 
 def test_predictions_leave_threads_alone(uniform, monkeypatch):

@@ -363,15 +363,6 @@ def test_the_generator_decides():
     assert not torch.equal(first.positions, third.positions)
 
 
-def test_densities_that_few_draws_meet_and_that_are_far_narrower():
-    def narrow(x):
-        return standard(x).where(x[..., 0].abs() < 1e-3, math.inf)
-
-    for seed in range(5):
-        assert (draw(narrow, around(0.0), seed=seed).positions[..., 0].abs() < 1e-3).all()
-    assert draw(lambda x: standard(x / 1e-4), around(1.0), 1000 * PARTICLES).power == 1
-
-
 class TestProposals:
     @pytest.fixture
     def parts(self):

@@ -21,11 +21,8 @@ def model(uniform):
 BAD = [
     ("num_starts", 0, ValueError, "num_starts must be at least 1; found 0"),
     ("num_starts", 1.5, TypeError, r"num_starts must be a whole number; found 1\.5"),
-    ("num_starts", True, TypeError, "num_starts must be a whole number; found True"),
     ("num_screened", -1, ValueError, "num_screened must be at least 0; found -1"),
     ("max_iterations", 0, ValueError, "max_iterations must be at least 1; found 0"),
-    ("max_iterations", None, TypeError, "max_iterations .* found None"),
-    ("seed", None, TypeError, "seed must be a whole number; found None"),
     ("seed", -1, ValueError, "seed must be at least 0; found -1"),
     ("nmu_starts", 2, ValueError, "no option 'nmu_starts'; expected num_starts, "),
 ]
@@ -126,14 +123,3 @@ class TestThreads:
         X = uniform(300, 1)
         fit(CKA(X, 2 * ripple(X), physics=ripple), "map", num_screened=0, max_iterations=1)
         assert set(seen) == {2}
-
-    def test_after_an_error(self, model):
-        def fail(*args, **options):
-            raise KeyboardInterrupt
-
-        torch.linalg.cholesky_ex = fail
-        X, Y = model.train_inputs[0][0, :, :2], model.train_targets.mT
-        for attempt in (lambda: fit(model), lambda: compare(X, Y, ripple)):
-            with pytest.raises(KeyboardInterrupt):
-                attempt()
-            assert torch.get_num_threads() == 2

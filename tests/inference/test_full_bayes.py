@@ -6,7 +6,6 @@ from copy import deepcopy
 import pyro
 import pytest
 import torch
-from botorch.models import ModelListGP, SingleTaskGP
 from gpytorch.constraints import GreaterThan, Interval
 from gpytorch.kernels import RBFKernel, ScaleKernel
 from gpytorch.likelihoods import GaussianLikelihood
@@ -15,20 +14,12 @@ from pyro.infer import MCMC, NUTS
 from pyro.ops.stats import effective_sample_size
 
 from gpadjust import CKA, PhysicsMeanGP, ZeroMeanGP, fit
-from gpadjust.inference import (
-    FitResult,
-    SampleResult,
-    SamplingWarning,
-    bayes,
-    register_priors,
-)
+from gpadjust.inference import SampleResult, SamplingWarning, bayes, register_priors
 from gpadjust.inference.optimise import Search, optima
 from gpadjust.inference.proposals import Both, Mixture, laplace_root
 from gpadjust.inference.targets import LogPosterior
-from gpadjust.models import BiasGP
 from gpadjust.physics import FunctionPhysics, Unknown
-from gpadjust.validation import leave_one_out
-from tests.systems import Sine, line, refused, ripple
+from tests.systems import Sine, refused, ripple
 
 quick = pytest.mark.filterwarnings("ignore::gpadjust.inference.SamplingWarning")  # few draws
 SHORT = {"num_samples": 8, "num_draws": 64, "num_starts": 1, "num_screened": 8}
@@ -138,19 +129,6 @@ def test_it_errs_less_than_a_point_estimate_and_its_intervals_hold(noise):
 
 
 @pytest.mark.slow
-def test_the_default_samples_where_it_can(XY, build, data):
-    model = CKA(*XY, physics=ripple)
-    assert isinstance(fit(model, **SHORT), SampleResult)
-    point = {"num_starts": 1, "num_screened": 8}
-    for other in (
-        SingleTaskGP(*XY),
-        build("CKA", *data(batch_shape=(2,))),
-    ):
-        assert isinstance(fit(other, **point), FitResult)
-    refused(ValueError, "no option 'num_draws'", fit, SingleTaskGP(*XY), num_draws=64)
-
-
-@pytest.mark.slow
 def test_a_physics_that_learns_is_at_its_most_likely_parameters(XY):
     physics, other = Sine(2.0, 2.0), Sine(2.0, 2.0)
     options = {"num_starts": 2, "num_screened": 16}
@@ -255,25 +233,6 @@ def test_nuts_agrees(XY):
 
 
 @pytest.mark.slow
-@quick
-def test_missing_targets(uniform):
-    X = uniform(10, 1)
-    Y = torch.cat([1.5 * ripple(X) + X, ripple(X) * X], -1)
-    Y[2:5, 1] = torch.nan
-    seen = ~Y[:, 1].isnan()
-    both = CKA(X, Y, physics=lambda X: ripple(X).expand(*X.shape[:-1], 2))
-    alone = CKA(X[seen], Y[seen][:, 1:], physics=ripple)
-    for model in (both, alone):
-        fit(model, num_samples=64)
-    found, expected = both.predict(X), alone.predict(X)
-    sd = expected.variance[:, 0].sqrt()
-    assert ((found.mean[:, 1] - expected.mean[:, 0]).abs() < sd).all()
-    loo = leave_one_out(both)
-    assert torch.equal(loo.Y.isnan(), Y.isnan())
-    assert loo.mean.isfinite().all()
-
-
-@pytest.mark.slow
 def test_pyros_nuts_in_gpytorchs_way(XY):
     X, Y = XY
     model = CKA(X, Y, physics=ripple)
@@ -319,50 +278,12 @@ def test_constraints_hold(XY, lengths, noises, options):
 class TestBeforeAndAfter:
     """A fit does not depend on what the model did before."""
 
-    @pytest.mark.slow
-    @pytest.mark.parametrize(
-        "before", [pytest.param("predicted", marks=pytest.mark.slow), "fitted"]
-    )
-    def test_a_physics_that_learns(self, before):
-        X = line(8)
-        Y = 2 * (6 * X).sin() + X
-        model = CKA(X, Y, physics=Sine(5.0))
-        model.predict(X)
-        if before == "fitted":
-            fit(model, **SHORT)
-            with torch.no_grad():
-                model.physics.function.rate.fill_(5.0)
-        fit(model, **SHORT)
-        assert (model.predict(X).mean - Y).abs().max() < 0.05
-
     def test_the_most_likely_values_after_samples(self, XY):
         first, second = (CKA(*XY, physics=ripple) for _ in range(2))
         fit(first)
         found = fit(first, "map").log_likelihood
         torch.testing.assert_close(found, fit(second, "map").log_likelihood, rtol=1e-4, atol=1e-4)
         assert first.terms[0].basis.center.item() == 0.0
-
-
-@quick
-def test_a_list_of_models_of_few_and_many_points(uniform):
-    X = uniform(45, 1)
-    Y = ripple(X) + X.exp() + 0.1 * torch.randn(45, 1, dtype=torch.float64)
-    few, many = CKA(X[:8], Y[:8], physics=ripple), BiasGP(X, Y, physics=ripple)
-    models = ModelListGP(few, many)
-    results = fit(models, num_draws=64, num_starts=1, num_screened=8)
-    assert [type(result) for result in results] == [SampleResult] * 2
-    assert few.num_samples == many.num_samples == 8
-    assert models.posterior(X[:5]).mean.shape == (8, 5, 2)
-
-
-def test_narrow_constraints_are_kept(uniform):
-    X = uniform(20, 8)
-    base = RBFKernel(ard_num_dims=8, lengthscale_constraint=Interval(0.9, 1.1))
-    kernel = {"delta_covar_module": ScaleKernel(base)}
-    model = CKA(X, X.sum(-1, keepdim=True).sin(), physics=lambda X: X[:, :1], **kernel)
-    fit(model)
-    assert ((base.lengthscale >= 0.9) & (base.lengthscale <= 1.1)).all()
-    assert model.predict(X).mean.isfinite().all()
 
 
 @pytest.mark.slow

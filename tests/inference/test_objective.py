@@ -245,22 +245,6 @@ def test_packing_is_undone_and_bounds_hold_the_start_and_the_draws(model):
 
 
 class TestVagueTrend:
-    @pytest.mark.parametrize("name", ["CKA", "AR1", "RRA", "missing", "two outputs"])
-    def test_gradient(self, name):
-        X = line(9)
-        Y = ripple(X) + X.square()
-        Y = torch.cat([Y, 2 * Y - X], -1) if name in ("two outputs", "missing") else Y
-        if name == "missing":
-            Y[3, 0] = torch.nan
-        if name == "AR1":
-            model = AR1(X, Y, physics=ripple, bounds=torch.tensor([[0.0], [1.0]]))
-        elif name == "RRA":
-            model = BUILD[name](X, Y)
-        else:
-            model = CKA(X, Y, physics=lambda X: ripple(X).expand(*X.shape[:-1], Y.shape[-1]))
-        objective = LogPosterior(model)
-        assert_gradient(objective, objective.parameters.current() + 0.2, 1e-5)
-
     def test_what_the_prior_of_a_trend_costs(self):
         # delta is nearly linear at this lengthscale, so that its variance is that of a line.
         X = line(9)

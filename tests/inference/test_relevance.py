@@ -22,9 +22,6 @@ from gpadjust.inference.relevance import (
     without_physics,
 )
 from gpadjust.inference.targets import LogPosterior
-from gpadjust.inference.warm_start import warm_start
-from gpadjust.models.hyperparameter_samples import adjusts
-from gpadjust.physics import FunctionPhysics, Unknown
 from gpadjust.validation import trust
 from tests.systems import around, line, normal, same, uniform
 
@@ -218,48 +215,6 @@ class TestAlone:
         assert {*sufficiency[1::2]} == {None}
         assert "left as it is in" in model.summary()
 
-    @pytest.mark.slow
-    def test_some_samples_can_learn(self):
-        """Of a physics that is right up to now."""
-        X = uniform(60, 2)
-
-        def f_p(X):
-            return torch.cat([truth(X[:, :1]), truth(X[:, 1:])], dim=-1)
-
-        Y = f_p(X) + 0.1 * normal(60, 2, seed=50)
-        model = CKA(X, Y, physics=f_p)
-        fit(model, num_samples=8)
-        learns = adjusts(model)
-        assert (learns.sum(0) >= 2).all()
-        assert not learns.all()
-        warm_start(CKA(X, Y, physics=f_p), model)
-        before = (model.predict(X).mean - Y - 1).square().mean()
-        model.update(X, Y + 1, forget=60)
-        assert adjusts(model).all()
-        assert (model.predict(X).mean - Y - 1).square().mean() < 0.1 * before
-
-    @pytest.mark.slow
-    def test_parameters_of_a_right_physics(self):
-        law = FunctionPhysics(
-            lambda X, p: p.a * (3 * X[:, 0]).sin(), unknowns={"a": Unknown(2.0, sd=1.0)}
-        )
-        X = uniform(30, 1)
-        Y = 1.5 * (3 * X).sin() + 0.1 * normal(30, 1)
-        model = PhysicsMeanGP(X, Y, physics=law)
-        result = fit(model)
-        assert result.relevance is None
-        assert 0.2 < result.sufficiency < 1
-        assert 0 < (~adjusts(model)).sum() <= 0.75 * len(adjusts(model))
-        later = PhysicsMeanGP(X, Y, physics=law)
-        warm_start(later, model)
-        assert later.input_transform.coordinates.isfinite().all()
-        low, high = model.physics_parameters.interval()
-        assert low < 1.5 < high
-        fit(later, num_samples=1)
-        other = PhysicsMeanGP(X, Y, physics=law)
-        warm_start(other, later)
-        assert other.input_transform.coordinates.isfinite().all()
-
     def test_shares_of_samples(self):
         shares = {ADJUSTED: [0.3, 0.05, 0.0], WITHOUT: [0.1, 0.05, 0.0], ALONE: [0.6, 0.9, 1.0]}
         shares = {name: torch.tensor(each, dtype=torch.float64) for name, each in shares.items()}
@@ -364,17 +319,6 @@ class TestFit:
         assert (mean[:, :1] - expected).abs().max() < 0.01
         assert (mean[:, 1:] - truth(Z)).abs().max() < 1e-4
 
-    def test_with_noise_too(self, data):
-        X, Y, Z = data
-        Y = Y + 0.2 * torch.randn(Y.shape, dtype=torch.float64)
-        model, plain = CKA(X, Y, physics=unrelated), ZeroMeanGP(X, Y)
-        relevance = fit(model).relevance
-        fit(plain)
-        assert relevance.shape == ()
-        assert relevance < 0.5
-        found, expected = model.predict(Z), plain.predict(Z)
-        assert ((found.mean - expected.mean).abs() < expected.variance.sqrt()).all()
-
     def test_the_rho_of_a_physics_of_no_use_is_none_and_the_most_likely_values_are_as_ever(
         self, fitted, data
     ):
@@ -425,9 +369,6 @@ class TestPartlyOff:
         parts = model.rho(Z), model.delta(Z)
         assert all(each.variance.isfinite().all() for each in parts)
         torch.testing.assert_close(parts[0].mean, rho.mean(0))
-        *_, Z = data
-        model, *_ = partly
-        mean, _ = model.components(Z, False)
         torch.testing.assert_close(model.mean_functions()(Z), mean)
         torch.manual_seed(0)
         values = model.sample_functions(200, num_features=256)(Z)
@@ -436,8 +377,6 @@ class TestPartlyOff:
         sd = found.variance.sqrt()
         assert ((values.mean(0) - found.mean).abs() < 4 * sd / math.sqrt(200)).all()
         assert (values.var(0) / found.variance - 1).abs().median() < 0.2
-        *_, Z = data
-        model, *_ = partly
         both = model.predict(Z)
         for i in range(2):
             one = model.subset_output([i]).predict(Z)
@@ -459,10 +398,9 @@ class TestPartlyOff:
             a, b = (m.term(name, Z) for m in (found, expected))
             torch.testing.assert_close(a.mean, b.mean, rtol=1e-5, atol=1e-6)
 
-    @pytest.mark.parametrize("which", ["fitted", "partly"])
-    def test_saved_and_loaded_it_predicts_the_same(self, request, which, data, tmp_path):
+    def test_saved_and_loaded_it_predicts_the_same(self, partly, data, tmp_path):
         *_, Z = data
-        model, *_ = request.getfixturevalue(which)
+        model, *_ = partly
         save(model, tmp_path / "model.pt")
         again = load(tmp_path / "model.pt", physics=unrelated_and_double)
         assert again.num_samples == model.num_samples
@@ -488,18 +426,6 @@ class TestTracesOfSamplesWithoutPhysics:
         noise = torch.randn(100, 1, generator=g, dtype=torch.float64)
         Y = 1.5 * physics(X) + 0.3 * X[:, :1] + 0.5 * noise
         assert fit(CKA(X, Y, physics=physics)).relevance > 0.95
-
-    @pytest.mark.slow
-    def test_a_warm_start_after_the_physics_was_off(self, data):
-        X, Y, _ = data
-        again = 3 * unrelated(X) + X
-        model = CKA(X, Y, physics=unrelated)
-        fit(model)
-        new, cold = (CKA(X, again, physics=unrelated) for _ in range(2))
-        warm_start(new, model)
-        for each in (new, cold):
-            fit(each, "map", num_screened=0, num_starts=1)
-        assert new.log_evidence()[1] > cold.log_evidence()[1] - 1
 
     def test_a_center_that_moved(self, data):
         X, Y, _ = data

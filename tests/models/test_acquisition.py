@@ -9,13 +9,11 @@ from botorch.acquisition import (
     qNegIntegratedPosteriorVariance,
 )
 from botorch.acquisition.monte_carlo import qPosteriorStandardDeviation
-from botorch.acquisition.objective import ScalarizedPosteriorTransform
 from botorch.models.transforms import Normalize
 from botorch.optim import optimize_acqf
 from botorch.sampling import SobolQMCNormalSampler
 
 from gpadjust import CKA, BlackBoxPhysics
-from tests.systems import crude
 
 BOUNDS = torch.tensor([[0.0, 0.0], [2.0, 2.0]], dtype=torch.float64)
 QUICK = {"num_restarts": 2, "raw_samples": 8, "options": {"maxiter": 5, "batch_limit": 2}}
@@ -48,14 +46,6 @@ def test_gradients_through_the_physics(data, build, uniform, gradient_is_right, 
     gradient_is_right(function, uniform(1, q, 2, high=2.0, seed=5))
 
 
-@pytest.mark.parametrize("name", ["variance", "deviation", "noisy improvement"])
-def test_gradients_of_a_black_box(data, uniform, gradient_is_right, name):
-    X, Y = data()
-    physics = BlackBoxPhysics(lambda X: crude(torch.from_numpy(X))[:, :1].numpy())
-    function, q = acquisition_function(name, CKA(X, Y, physics=physics).eval(), X, X)
-    gradient_is_right(function, uniform(1, q, 2, high=2.0, seed=5))
-
-
 def optimize(acquisition, uniform, q, **options):
     """The optimiser stays within the bounds, and beats most random points."""
     candidates, value = optimize_acqf(acquisition, BOUNDS, q=q, **{**QUICK, **options})
@@ -73,13 +63,6 @@ def test_optimize(data, build, uniform, name, kind):
     model = build(kind, X, Y, input_transform=Normalize(2)).eval()
     acquisition, q = acquisition_function(name, model, X, uniform(30, 2, high=2.0))
     optimize(acquisition, uniform, 1 if q == 5 else q)
-
-
-def test_several_outputs(data, build, uniform):
-    model = build("CKA", *data(num_outputs=2)).eval()
-    weigh = ScalarizedPosteriorTransform(torch.tensor([0.5, 0.5], dtype=torch.float64))
-    options = {"mc_points": uniform(30, 2, high=2.0), "posterior_transform": weigh}
-    optimize(qNegIntegratedPosteriorVariance(model, **options), uniform, 1)
 
 
 @pytest.mark.filterwarnings("ignore:No gradient flows:UserWarning")

@@ -81,11 +81,8 @@ def test_recursive_co_kriging_on_nested_designs(rbf, close, uniform, kernel_of):
     close(posterior.variance.squeeze(-1).detach(), variance.diagonal(), 1e-6)
 
 
-def test_rho_and_low_values(levels, uniform):
+def test_low_values_are_those_of_the_physics(levels, uniform):
     X, Y, low_X, low_Y = levels
-    assert AR1(X, Y, low_X=low_X, low_Y=low_Y).rho_constant.shape == ()
-    two = AR1(X, torch.cat([Y, 2 * Y], -1), low_X=low_X, low_Y=torch.cat([low_Y, low_Y], -1))
-    assert two.rho_constant.shape == (2,)
     given = AR1(X, Y, low_X=low_X, low_Y=low_Y)
     computed = AR1(X, Y, low_X=low_X, physics=lambda X: crude(X)[:, :1])
     Z = uniform(5, 2)

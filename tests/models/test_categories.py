@@ -7,18 +7,7 @@ import pytest
 import torch
 from gpytorch.kernels import MaternKernel, ScaleKernel
 
-from gpadjust import (
-    CKA,
-    RRA,
-    PhysicsMeanGP,
-    StackedGP,
-    VariationalCKA,
-    ZeroMeanGP,
-    compare,
-    fit,
-    load,
-    save,
-)
+from gpadjust import CKA, PhysicsMeanGP, StackedGP, ZeroMeanGP, compare, fit, load, save
 from gpadjust.gp.categories import GroupedRBFKernel
 from gpadjust.gp.gaussian import LikelihoodValue
 from gpadjust.inference.distributions import ByModules, stationary_terms
@@ -132,16 +121,6 @@ def test_files_scores_and_stacking(model, tmp_path):
         FRAME, Y, head, structures=["physics mean", "zero mean"], batch="rig", num_starts=2
     )
     assert predicted(comparison.recommended, NEW).mean.isfinite().all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", [RRA, VariationalCKA])
-def test_other_models(kind):
-    model = kind(FRAME, Y, physics=head, batch="rig")
-    fit(model, "map", num_starts=1, num_screened=8)
-    assert (predicted(model, FRAME).mean - Y).std() < 0.1
-    assert (predicted(model, NEW).variance > predicted(model, FRAME[:4]).variance).all()
-    assert model.predict(X).mean.isfinite().all()
 
 
 def test_arrays_outputs_and_declared_levels():

@@ -94,16 +94,6 @@ def test_fantasies_average_to_the_model(data, build, kind, uniform):
     torch.testing.assert_close(average, model.posterior(Z).mean[None], rtol=1e-2, atol=1e-2)
 
 
-def test_fantasies_share_the_base(data, build, num_outputs, uniform):
-    model = build("CKA", *data(num_outputs=num_outputs))
-    fantasy = model.fantasize(uniform(4, 1, 2), sampler(3)).prediction_strategy.factors()
-    base = model.prediction_strategy.factors().base
-    assert fantasy.base is base or fantasy.base.data_ptr() == base.data_ptr()
-    outputs = () if num_outputs == 1 else (num_outputs,)
-    assert fantasy.rows.shape == (4, *outputs, 1, 10)
-    assert fantasy.alpha.shape == (3, 4, *outputs, 10)
-
-
 @pytest.mark.filterwarnings("ignore:Non-strict enforcement")
 def test_no_new_points_and_batches_of_them(data, build, kind, num_outputs, uniform, close):
     model, Z = build(kind, *data(num_outputs=num_outputs)), uniform(5, 2)

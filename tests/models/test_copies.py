@@ -38,9 +38,7 @@ def test_state_dict(make, shuffle, uniform, tmp_path, same):
 
 
 @pytest.mark.parametrize(
-    "copied",
-    [copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m))],
-    ids=["deep", "pickle"],
+    "copied", [copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m))], ids=["deep", "pickle"]
 )
 def test_copy(make, shuffle, uniform, copied, same):
     model = shuffle(make())

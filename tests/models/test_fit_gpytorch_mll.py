@@ -1,7 +1,5 @@
 """BoTorch's `fit_gpytorch_mll` ends where the library's own search ends, noise or none."""
 
-import subprocess
-import sys
 import warnings
 
 import pytest
@@ -9,8 +7,6 @@ import torch
 from botorch.exceptions.warnings import OptimizationWarning
 from botorch.fit import fit_gpytorch_mll
 from botorch.models import ModelListGP
-from botorch.models.transforms import Normalize, Standardize
-from botorch.optim.closures import get_loss_closure_with_grads
 from botorch.optim.fit import fit_gpytorch_mll_scipy
 from gpytorch.mlls import (
     ExactMarginalLogLikelihood,
@@ -19,7 +15,7 @@ from gpytorch.mlls import (
 )
 from gpytorch.priors import LogNormalPrior
 
-from gpadjust import CKA, CalibratedPhysics, fit
+from gpadjust import CalibratedPhysics, fit
 from gpadjust.inference.targets import LogLikelihood
 from gpadjust.physics import FunctionPhysics, Unknown
 from tests.systems import line, refused
@@ -63,20 +59,6 @@ def test_as_likely_as_the_search(data, build, kind, num_outputs, noise, unit, n)
     assert own_likelihood(model) > own_likelihood(searched) - 0.1
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("center", ["learn", "mean", 0.0])
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("normalised", [False, True])
-def test_without_noise(data, center, seed, normalised):
-    X, Y = data(n=12, seed=seed)
-    options = {"input_transform": Normalize(2)} if normalised else {}
-    model = CKA(X, Y, physics=lambda X: 3 * X[:, :1].sin() + X[:, 1:], center=center, **options)
-    before = own_likelihood(model)
-    fit_by_botorch(model)
-    assert own_likelihood(model) > before + 10
-    assert (model.posterior(X).mean - Y).abs().max() < 0.01 * Y.std()
-
-
 def test_parameters_of_the_physics():
     t = line(8, 0.1)
     law = FunctionPhysics(
@@ -109,32 +91,6 @@ def test_missing_targets_priors_and_what_is_fixed(data, build):
     fit_by_botorch(model)
     assert torch.equal(rest, before)
     assert not torch.equal(model.terms[1].kernel.raw_outputscale, other)
-
-
-SETTINGS = {
-    "plain": lambda Y: {},
-    "raw units": lambda Y: {"outcome_transform": None, "input_transform": Normalize(2)},
-    "standardize": lambda Y: {
-        "outcome_transform": Standardize(Y.shape[-1], batch_shape=Y.shape[:-2])
-    },
-}
-
-
-# The search may look at hyper-parameters of which a kernel is nearly singular; where, depends on
-# the processor.
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:A not p.d., added jitter")
-@pytest.mark.parametrize("setting", SETTINGS)
-@pytest.mark.parametrize("batch_shape", [(), (2,)], ids=["single", "batch"])
-@pytest.mark.parametrize("kind", ["CKA", "AR1", "RRA"])
-def test_settings_and_batches(data, build, kind, num_outputs, setting, batch_shape):
-    X, Y = data(batch_shape=batch_shape, num_outputs=num_outputs)
-    Yvar = None if setting == "plain" else torch.full_like(Y, 1e-3)
-    model = build(kind, X, Y, Yvar, **SETTINGS[setting](Y))
-    before = own_likelihood(model)
-    fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
-    assert not model.training
-    assert own_likelihood(model) > before + 0.01
 
 
 @pytest.mark.filterwarnings("ignore:A not p.d., added jitter")
@@ -176,25 +132,6 @@ class TestWhatTheCallerAsksFor:
         fit_by_botorch(model, optimizer=optimizer, optimizer_kwargs={"method": "SLSQP"})
         assert [call["method"] for call in calls] == ["SLSQP"]
 
-    def test_options_of_the_optimizer(self, model):
-        twin = own_likelihood(model)
-        fit_by_botorch(model, optimizer_kwargs={"options": {"maxiter": 1}})
-        once = own_likelihood(model)
-        fit_by_botorch(model, optimizer_kwargs={})  # nothing special
-        assert twin < once < own_likelihood(model)
-
-    def test_closure(self, model):
-        mll = ExactMarginalLogLikelihood(model.likelihood, model)
-        named = {n: p for n, p in mll.named_parameters() if p.requires_grad}
-        closure, calls = get_loss_closure_with_grads(mll, named), []
-        fit_by_botorch(model, closure=lambda: calls.append(1) or closure())
-        assert len(calls) > 1
-
-    def test_attempts(self, model):
-        before = own_likelihood(model)
-        fit_by_botorch(model, max_attempts=2, pick_best_of_all_attempts=True)
-        assert own_likelihood(model) > before
-
     def test_another_objective(self, data, build):
         X, Y = data(n=12)
         model, found = build("CKA", X, Y, torch.full_like(Y, 0.01)), []
@@ -205,19 +142,3 @@ class TestWhatTheCallerAsksFor:
                 found.append(mll(model(*model.train_inputs), model.train_targets).item())
             model.eval()
         assert found[1] > found[0]
-
-
-@pytest.mark.slow
-def test_whichever_room_the_model_is_imported_from():
-    code = """
-import torch
-from botorch.fit import fit_gpytorch_mll
-from gpytorch.mlls import ExactMarginalLogLikelihood
-from gpadjust.models import CKA
-X = torch.rand(12, 2, generator=torch.Generator().manual_seed(0)).double()
-f = lambda X: X.sin().sum(-1, keepdim=True)
-model = CKA(X, 1.3 * f(X) + X[:, :1] ** 2, physics=f)
-fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
-assert (model.posterior(X).variance < 1e-6).all()
-"""
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

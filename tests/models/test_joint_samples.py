@@ -183,13 +183,6 @@ class TestMixed:
             density = posterior.density((low[i] + high[i]).squeeze() / 2)[i]
             torch.testing.assert_close(density * (high - low)[i] / 1e-4, torch.ones(1).double())
 
-    def test_batches(self, held):
-        model, Z = held("CKA", True, 2)
-        posterior = model.rho(Z.reshape(4, 3, 2))
-        assert posterior.rsample(torch.Size([5])).shape == (5, 4, 3, 2)
-        assert SobolQMCNormalSampler(torch.Size([5]))(posterior).shape == (5, 4, 3, 2)
-        torch.testing.assert_close(posterior.mean.flatten(0, 1), model.rho(Z).mean)
-
 
 @pytest.mark.parametrize("num_outputs", [1, 2])
 def test_no_variance_is_rounded_up(model_of, uniform, num_outputs):
@@ -304,16 +297,6 @@ def test_quantiles_are_those_of_the_interval(sized, uniform, size):
     sd = draws.std(0)
     for level, found in zip(LEVELS, (low, middle, high), strict=True):
         assert ((draws.quantile(float(level), dim=0) - found).abs() < 0.05 * sd).all()
-
-
-@pytest.mark.parametrize("level", [0.0, 1.0, -0.5, float("nan")])
-def test_quantiles_of_one_level_and_of_none(sized, uniform, level):
-    posterior = sized(CKA, 1.0, 2, True, 3).posterior(uniform(5, 4, 2))
-    single = posterior.quantile(LEVELS[1])
-    assert single.shape == (5, 4, 2)
-    assert torch.equal(posterior.quantile(LEVELS)[1], single)
-    posterior = sized(CKA, 1.0, 1, True, 3).posterior(uniform(4, 2))
-    refused(ValueError, "between 0 and 1", posterior.quantile, torch.tensor(level))
 
 
 @pytest.mark.parametrize("method", ["bayes", "map"])

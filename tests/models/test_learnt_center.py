@@ -98,19 +98,6 @@ def test_later_models(XY, uniform):
     assert model.predict(X).mean.isfinite().all()
     warm_start(CKA(X, Y, physics=lambda X: 2.0 + 0 * X[..., :1], center="learn"), model)
 
-    class Physics(torch.nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.center = torch.nn.Parameter(torch.tensor(1.0, dtype=torch.float64))
-
-        def forward(self, X):
-            return crude(X) + self.center
-
-    physics = Physics()
-    models = [CKA(*XY, physics=physics) for _ in range(2)]
-    warm_start(*models)
-    assert models[0].predict(XY[0]).mean.isfinite().all()
-
 
 @pytest.mark.parametrize("method", ["map", "bayes"])
 def test_one_that_is_held_fixed_stays(XY, method):

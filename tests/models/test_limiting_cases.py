@@ -5,7 +5,7 @@ import pytest
 import torch
 from botorch.models.transforms import Normalize, Standardize
 
-from gpadjust import CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP, fit
+from gpadjust import CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP
 from gpadjust.models import BiasGP
 from gpadjust.validation import leave_one_out
 from tests.systems import crude
@@ -194,18 +194,6 @@ def test_each_output_is_the_model_of_its_own_rows(
         one = {name: values[new][:, [j]] for name, values in known.items()}
         later = single.condition_on_observations(new_X[new], new_Y[new][:, [j]], **one)
         same(later, more, Z, 1e-7, [j])
-
-
-@pytest.mark.slow
-def test_fits_and_samples(gaps, build, kind, uniform):
-    X, Y = gaps
-    model, Z = build(kind, X, Y), uniform(5, 2, high=2.0, seed=4)
-    result = fit(model, "map", num_screened=8, num_starts=2)
-    assert result.log_likelihood.isfinite().all()
-    functions, posterior = model.sample_functions(400, seed=0), model.posterior(Z)
-    error = functions(Z).mean(0) - posterior.mean
-    assert (error.abs() < 0.3 * posterior.variance.sqrt() + 1e-3 * Y.nanmean()).all()
-    assert posterior.rsample(torch.Size([3])).isfinite().all()
 
 
 def test_missing_observations_of_samples_and_units(gaps, held, uniform, same, build):

@@ -4,23 +4,11 @@ from functools import partial
 
 import pytest
 import torch
-from botorch.acquisition import qLogExpectedImprovement
 from botorch.models.transforms.outcome import Log
 
-from gpadjust import (
-    CKA,
-    CalibratedPhysics,
-    PhysicsMeanGP,
-    StackedGP,
-    VariationalCKA,
-    compare,
-    fit,
-    load,
-    save,
-)
+from gpadjust import CKA, CalibratedPhysics, PhysicsMeanGP, StackedGP, compare, fit, load, save
 from gpadjust.models import Logit
 from gpadjust.physics import FunctionPhysics, PhysicsError, Unknown
-from gpadjust.sklearn import CKARegressor
 from gpadjust.validation import leave_one_out, score
 from tests.systems import line
 
@@ -167,17 +155,6 @@ def test_links_are_compared_and_stacked():
         stacked.predict(NEW, torch.ones_like(NEW))
     with pytest.raises(ValueError, match="Expected models of one link"):
         compare(X, Y, decades, structures=[CKA, partial(CKA, outcome_transform="log")])
-
-
-def test_acquisition_regression_and_many_rows(log_model):
-    gain = qLogExpectedImprovement(log_model, best_f=Y.max())(NEW.unsqueeze(1))
-    assert gain.isfinite().all()
-    regressor = CKARegressor(decades, model=partial(CKA, outcome_transform="log"), random_state=0)
-    regressor.set_params(fit_method="map").fit(X.numpy(), Y.flatten().numpy())
-    assert (regressor.predict(NEW.numpy()) > 0).all()
-    many = VariationalCKA(X, Y, physics=decades, num_inducing=6, outcome_transform="log")
-    fit(many)
-    torch.testing.assert_close(many.predict(X).mean, Y, rtol=0.3, atol=0.0)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 import torch
 
-from gpadjust import CKA, CalibratedPhysics, ZeroMeanGP, fit, load, save
+from gpadjust import CKA, CalibratedPhysics, fit, load, save
 from gpadjust.models.noisy_inputs import NoisyInputs
 from gpadjust.models.training_data import training_data
 from gpadjust.physics import BlackBoxPhysics, FunctionPhysics, PhysicsError, Unknown
@@ -122,19 +122,6 @@ def test_no_noise_changes_nothing_and_samples_are_saved(data, tmp_path):
     save(model, tmp_path / "model.pt")
     again = load(tmp_path / "model.pt", physics=f_p)
     assert torch.allclose(again.predict(TEST).mean, model.predict(TEST).mean)
-
-
-@pytest.mark.slow
-def test_several_outputs_and_models_without_physics(data):
-    X, Y = data
-    two = CKA(X, torch.cat([Y, 2 * Y], -1), physics=lambda X: f_p(X).repeat(1, 2), train_Xvar=0.001)
-    QUICK(two)
-    one = two.subset_output([1])
-    assert torch.allclose(one.predict(TEST).mean, two.predict(TEST).mean[:, 1:])
-    QUICK(one)
-    plain = ZeroMeanGP(X, Y, train_Xvar=SD**2)
-    QUICK(plain)
-    assert plain.noise.rows.added.any()
 
 
 def test_an_unknown_parameter_is_nearer_to_the_truth():

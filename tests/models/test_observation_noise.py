@@ -120,19 +120,17 @@ class TestInTheUsersUnits:
 
 
 class TestRefused:
-    @pytest.fixture(params=["CKA", "RRA", "AR1", "samples", "mixture"])
+    @pytest.fixture(params=["CKA", "mixture"])
     def model(self, request, large, build):
-        X, Y = large(2)
-        if request.param == "mixture":
-            return StackedGP({"CKA": build("CKA", X, Y)}, [[1.0, 1.0]], num_components=2)
-        if request.param == "samples":
-            return holding(build("CKA", X, Y), *STEPS)
-        return build(request.param, X, Y)
+        model = build("CKA", *large(2))
+        if request.param == "CKA":
+            return model
+        return StackedGP({"CKA": model}, [[1.0, 1.0]], num_components=2)
 
     def test_what_is_no_variance(self, model, uniform):
         Z, noise = uniform(5, 2), torch.ones(5, 2, dtype=torch.float64)
         methods = model.posterior, model.predict, model.interval
-        for wrong in (-1.0, -1e-300, float("nan"), float("inf")):
+        for wrong in (-1e-300, float("nan"), float("inf")):
             noise[2, 1] = wrong
             for method in (*methods, partial(model.posterior, output_indices=[1])):
                 refused(ValueError, "finite and not negative", method, Z, observation_noise=noise)

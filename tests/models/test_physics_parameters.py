@@ -5,8 +5,6 @@ from copy import deepcopy
 import pytest
 import torch
 from botorch.models.transforms import Standardize
-from botorch.sampling import SobolQMCNormalSampler
-from torch import Size
 
 from gpadjust import (
     CKA,
@@ -152,14 +150,6 @@ class TestPhysicsParameters:
             says = r"no unknown parameter.*unknowns="
             refused(ValueError, says, CalibratedPhysics, X, Y, physics=known)
 
-    def test_of_a_model_that_was_not_fitted(self, make, waves):
-        X, Y, _ = waves(2)
-        parameters = make(X, Y).physics_parameters
-        torch.testing.assert_close(
-            parameters.draws, torch.tensor([[1.0, 2.0]], dtype=torch.float64)
-        )
-        assert parameters.sd.tolist() == [0.0, 0.0]
-
     @pytest.mark.slow
     def test_after_a_fit(self, make, waves):
         X, Y, Z = waves(1)
@@ -247,12 +237,8 @@ class TestWaysOfHeldModels:
         torch.testing.assert_close(model.predict(Z).mean, first)
         assert model.input_transform.coordinates.shape == (2,)
 
-    def test_fantasies_and_functions(self, held):
+    def test_functions(self, held):
         model, Z, _ = held
-        for X in (Z[:2], Z.reshape(2, 2, 2)):
-            fantasies = model.fantasize(X, SobolQMCNormalSampler(Size([4])))
-            mean = fantasies.posterior(Z).mean
-            assert mean.shape == (4, *X.shape[:-2], 3, 4, model.num_outputs)
         functions = model.sample_functions(5, seed=0)
         values, away = functions(Z), Z.expand(5, 4, 2) + torch.arange(5.0)[:, None, None]
         torch.testing.assert_close(functions.each(Z.expand(5, 4, 2)), values)
@@ -294,13 +280,6 @@ class TestStates:
             same(other.eval().predict(Z), model.predict(Z))
             assert torch.equal(other.physics_parameters.draws, model.physics_parameters.draws)
             assert other.num_samples == model.num_samples
-
-    def test_of_no_samples_into_one_that_holds_some(self, others, make, waves, num_outputs):
-        X, Y, Z = waves(num_outputs)
-        before = others[2].predict(Z)
-        with pytest.raises(RuntimeError, match=r"another model.*release_samples\(\)"):
-            others[2].load_state_dict(make(X, Y).state_dict())
-        same(others[2].predict(Z), before)
 
     def test_as_files(self, model, waves, num_outputs, tmp_path):
         Z, path = waves(1)[2], tmp_path / "model.pt"

@@ -2,12 +2,9 @@
 
 import pytest
 import torch
-from botorch.fit import fit_gpytorch_mll
 from botorch.models import SingleTaskGP
 from botorch.models.transforms import Normalize, Standardize
-from gpytorch.mlls import ExactMarginalLogLikelihood
 
-from gpadjust import fit
 from tests.systems import crude, refused
 
 
@@ -68,18 +65,6 @@ def test_outputs_are_independent_and_data_are_met(data, build, kind, uniform, nu
     assert error < 0.1 * Y.std(0).max()
 
 
-@pytest.mark.parametrize("batch_shape", [(), (3,)], ids=["single", "batch"])
-def test_terms(data, build, kind, num_outputs, batch_shape, uniform):
-    X, Y = data(batch_shape=batch_shape, num_outputs=num_outputs)
-    model = build(kind, X, Y)
-    for name in model.term_names:
-        for leading in ((), (5, *batch_shape)):
-            posterior = model.term(name, uniform(*leading, 4, 2))
-            expected = (*(leading or batch_shape), 4, num_outputs)
-            assert posterior.mean.shape == posterior.variance.shape == expected
-    refused(ValueError, "'gamma'; it has '", model.term, "gamma", X)
-
-
 # Subsets of a model's outputs
 
 
@@ -121,23 +106,3 @@ def test_a_subset_is_the_whole_posterior_and_leaves_the_whole(
             parameter += 0.5
     three_outputs.train()
     torch.testing.assert_close(three_outputs.posterior(Z).mean.detach(), before)
-
-
-# BoTorch's fit adds no nugget but after a warning.
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:A not p.d.")
-@pytest.mark.parametrize(("kind", "indices"), [("CKA", [1]), ("AR1", [2, 0]), ("RRA", [2, 0])])
-def test_it_can_be_fitted_again(data, build, kind, uniform, indices):
-    X, Y = data(num_outputs=2)
-    # With noise, so that rounding errors do not decide which optimum is reached.
-    Y = torch.cat([Y, Y[:, :1].sin() + 3], dim=-1) + 0.1 * uniform(len(X), 3, seed=5)
-    whole = build(kind, X, Y, physics=three)
-    part, refitted = whole.subset_output(indices), whole.subset_output(indices)
-    # A subset still reads all columns of f_p.
-    assert part.posterior(X).mean.shape == (len(X), len(indices))
-    from_there = {"num_screened": 0, "num_starts": 1}
-    reached, expected = fit(refitted, "map", **from_there), fit(whole, "map", **from_there)
-    part_of_whole = expected.log_likelihood[indices].reshape(reached.log_likelihood.shape)
-    torch.testing.assert_close(reached.log_likelihood, part_of_whole, rtol=1e-3, atol=1e-3)
-    fit_gpytorch_mll(ExactMarginalLogLikelihood(part.likelihood, part))
-    assert (part.posterior(X).mean - Y[:, indices]).abs().mean() < Y.std()

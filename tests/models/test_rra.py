@@ -27,10 +27,7 @@ def rra(request, data, build, num_outputs, shuffle):
     if request.param == "centerd":
         options["center"] = "mean"
     if request.param == "transformed":
-        options |= {
-            "input_transform": Normalize(2),
-            "outcome_transform": Standardize(num_outputs),
-        }
+        options |= {"input_transform": Normalize(2), "outcome_transform": Standardize(num_outputs)}
     if request.param == "learnt mean":
         options["rho_mean"] = "learn"  # one weight more
     Yvar = torch.full_like(Y, 0.02) if request.param == "known-noise" else None

@@ -123,15 +123,6 @@ def test_seeds_and_later_fits(data, build, monkeypatch, kind, shuffle, uniform):
     torch.testing.assert_close(copy.deepcopy(functions)(Z), before)
 
 
-def test_a_batch_of_models(data, build, kind, num_outputs, uniform):
-    model = build(kind, *data((3,), num_outputs=num_outputs))
-    functions = model.sample_functions(2, seed=0)
-    Z = uniform(4, 3, 5, 2)
-    values = functions(Z)
-    assert values.shape == (2, 4, 3, 5, num_outputs)
-    torch.testing.assert_close(functions(Z[1]), values[:, 1])
-
-
 @pytest.mark.slow
 def test_botorch_draws_paths(data, build, kind, num_outputs, uniform):
     model = build(kind, *data(num_outputs=num_outputs)).eval()

@@ -1,4 +1,4 @@
-"""Conditioning and seeded draws in one thread, while another asks the same model."""
+"""Conditioning in one thread, while another asks the same model."""
 
 from concurrent.futures import ThreadPoolExecutor
 from threading import Event
@@ -51,61 +51,3 @@ def test_conditioning_leaves_the_model_whole_also_in_another_thread(model, data,
             parameter.add_(1.0)
     torch.testing.assert_close(model.predict(Z), before)
     assert all(torch.equal(v, state[n]) for n, v in model.state_dict().items())
-
-
-@pytest.mark.slow
-def test_seeded_functions(model, uniform):
-    Z = uniform(6, 2)
-    expected = [model.sample_functions(2, seed=seed)(Z) for seed in range(4)]
-    torch.manual_seed(11)
-    following = torch.rand(3)
-
-    def draw(i):
-        if i % 5 == 4:
-            return model.sample_functions(2)(Z)  # from the generator that all threads share
-        return model.sample_functions(2, seed=i % 5)(Z)
-
-    with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(draw, range(30)))
-    for i, values in enumerate(found):
-        if i % 5 < 4:
-            assert torch.equal(values, expected[i % 5])
-    torch.manual_seed(11)
-    model.sample_functions(2, seed=3)
-    assert torch.equal(torch.rand(3), following)
-
-
-# One model asked by several threads at once
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("kind", "num_outputs", "known_noise"),
-    [("CKA", 2, True), ("CKA", 1, False), ("AR1", 1, False), ("RRA", 1, False), ("RRA", 2, True)],
-)
-def test_answers_are_those_of_one_thread(data, build, kind, uniform, num_outputs, known_noise):
-    X, Y = data(num_outputs=num_outputs)
-    Yvar = 0.01 * torch.ones_like(Y) if known_noise else None
-    fresh, model = build(kind, X, Y, Yvar), build(kind, X, Y, Yvar)
-    questions = [uniform(6, 2, high=2.0, seed=s) for s in range(4)]
-
-    def ask(model, Z):
-        answers = [model.posterior(Z).mean, model.predict(Z).variance]
-        answers += [model.term(name, Z).variance for name in model.term_names]
-        assert model.posterior(Z).rsample().isfinite().all()
-        assert model.sample_functions(2)(Z).isfinite().all()
-        return answers
-
-    with torch.no_grad():
-        expected = [ask(model, Z) for Z in questions]
-    for _ in range(2):
-        with ThreadPoolExecutor(8) as pool:
-            found = list(pool.map(lambda Z: ask(fresh, Z), 4 * questions))
-        for i, answers in enumerate(found):
-            for actual, right in zip(answers, expected[i % 4], strict=True):
-                torch.testing.assert_close(actual.detach(), right)
-        fresh.train()
-
-
-MORE = [(kind, m, m > 1) for kind in ("CKA", "AR1", "RRA") for m in (1, 2)]
-MORE += [(k, m, m == 1) for k in ("ZeroMeanGP", "PhysicsMeanGP", "ScaleGP", "CKA") for m in (1, 2)]

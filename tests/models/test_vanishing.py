@@ -1,17 +1,13 @@
 """A formula that is right somewhere, through the whole library."""
 
-from functools import partial
-
 import numpy as np
 import pandas as pd
 import pytest
 import torch
-from botorch.models.transforms import Normalize
 
-from gpadjust import CKA, PhysicsMeanGP, ScaleGP, VariationalCKA, compare, fit, load, save
+from gpadjust import CKA, PhysicsMeanGP, ScaleGP, VariationalCKA, fit, load, save
 from gpadjust.models import vanishing_rbf
 from gpadjust.physics import FunctionPhysics, Unknown
-from gpadjust.sklearn import CKARegressor
 from gpadjust.validation import leave_one_out
 from tests.systems import refused
 
@@ -69,21 +65,6 @@ def test_the_whole_house(valve, at_open, tmp_path, uniform):
         load(saved.path, physics=PIPE, covar_module=vanishing_rbf({"valve": 0.5}))
 
 
-@pytest.mark.slow
-def test_compared_reported_and_in_scikit_learn(valve, at_open, tmp_path):
-    from gpadjust.report import report
-
-    vanishing = partial(CKA, delta_covar_module=OPEN, rho_covar_module=OPEN)
-    found = compare(*valve, PIPE, structures=["CKA", vanishing], num_starts=1, num_screened=4)
-    assert len(found.models) == 2
-    page = report(found, tmp_path / "page.html")
-    assert "valve" in page.read_text()
-    options = {"num_samples": 8}
-    regressor = CKARegressor(PIPE, model=partial(PhysicsMeanGP, covar_module=vanishing_rbf({0: 1})))
-    regressor.set_params(fit_options=options).fit(valve[0], valve[1].to_numpy()[:, 0])
-    assert regressor.model_.delta(at_open).variance.max() < 1e-9
-
-
 @pytest.mark.parametrize("structure", ["CKA", "ScaleGP"])
 def test_rho_is_its_mean_there(structure, valve, at_open):
     X, Y = valve
@@ -98,17 +79,6 @@ def test_rho_is_its_mean_there(structure, valve, at_open):
     rho = model.rho(at_open)
     assert (rho.mean - 1).abs().max() < 1e-9
     assert rho.variance.max() < 1e-9
-
-
-@pytest.mark.slow
-def test_several_outputs_and_a_transform_of_inputs(valve, at_open):
-    X, Y = valve
-    both = np.concatenate([Y, 2 * Y], 1)
-    options = {"physics": lambda X: X[:, :2], "delta_covar_module": OPEN, "center": 0.0}
-    model = CKA(X, both, input_transform=Normalize(2), **options)
-    fit(model, num_samples=2)
-    assert model.delta(at_open).variance.max() < 1e-9
-    assert model.sample_functions(2, seed=0)(at_open).shape == (2, 7, 2)
 
 
 def test_beside_and_for_categories(valve):

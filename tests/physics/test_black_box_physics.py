@@ -46,13 +46,6 @@ class Handle:
             return waves(X)
 
 
-class NumpyModule(torch.nn.Module):
-    """A module that computes with NumPy."""
-
-    def forward(self, X):
-        return waves(X)
-
-
 class TestValues:
     @given(
         batch=st.lists(st.integers(1, 3), max_size=2), n=st.integers(1, 4), batched=st.booleans()
@@ -270,7 +263,7 @@ class TestParallel:
 
 
 class TestCopies:
-    def test_handles_lambdas_and_modules_are_copied(self, points):
+    def test_handles_and_lambdas_are_copied(self, points):
         physics = BlackBoxPhysics(Handle())
         assert copy.deepcopy(torch.nn.ModuleList([physics]))[0] is physics
         assert torch.allclose(copy.copy(physics)(points(3, 2)), torch_waves(points(3, 2)))
@@ -285,9 +278,6 @@ class TestCopies:
         (found,) = torch.autograd.grad(Y.sum(), X)
         (expected,) = torch.autograd.grad(3.0 * torch_waves(X).sum(), X)
         assert torch.allclose(found, expected)
-        physics = BlackBoxPhysics(NumpyModule())
-        X = points(3, 2)
-        assert torch.equal(pickle.loads(pickle.dumps(physics))(X), physics(X))
 
 
 UNKNOWNS = {"gain": Unknown(1.0, sd=1.0), "rate": Unknown(2.0, factor=1.5)}
@@ -323,13 +313,6 @@ class TestUnknownParameters:
             Y.sum().backward()
         assert caught.value.rows == (3,)
         assert caught.value.inputs.tolist() == [[1.0, 1.0, 2.0]]
-
-    def test_in_threads(self, points):
-        X, values = points(3, 2), points(2, 2, seed=1)
-        physics = BlackBoxPhysics(self.decay, unknowns=UNKNOWNS, batched=False, memo=0)
-        expected = physics(X, values)
-        with joblib.parallel_config(backend="threading", n_jobs=2):
-            torch.testing.assert_close(physics(X, values), expected)
 
 
 class TestCentralDifference:

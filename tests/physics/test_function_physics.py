@@ -1,9 +1,7 @@
 """Torch functions as physics, and `as_physics`."""
 
-import pickle
 import warnings
 
-import cloudpickle
 import numpy as np
 import pytest
 import torch
@@ -20,24 +18,10 @@ from gpadjust.physics.array_physics import array_physics
 from tests.systems import refused
 
 
-def test_names_and_parameters_of_modules(points):
+def test_names():
     assert FunctionPhysics(torch.sin).name == "sin"
     assert FunctionPhysics(torch.nn.Tanh()).name == "Tanh"
     assert FunctionPhysics(torch.sin, name="wave").name == "wave"
-    physics = FunctionPhysics(torch.nn.Linear(3, 2, dtype=torch.float64))
-    X = points(20, 3)
-    target = X @ points(3, 2, seed=1) + 1.0
-    optimizer = torch.optim.LBFGS(physics.parameters(), max_iter=50)
-
-    def loss():
-        optimizer.zero_grad()
-        value = (physics(X) - target).square().mean()
-        value.backward()
-        return value
-
-    optimizer.step(loss)
-    assert torch.allclose(physics(X), target, atol=1e-4)
-    assert torch.allclose(physics.function.bias, torch.ones(2, dtype=torch.float64), atol=1e-4)
 
 
 @pytest.mark.parametrize("grad", [False, True])
@@ -69,34 +53,6 @@ def test_missing_gradient_warns_once(points):
 
 def double(X):
     return 2 * X
-
-
-class Owner:
-    """Something that holds a physics made of its own method."""
-
-    def __init__(self):
-        self.physics = FunctionPhysics(self.formula)
-
-    def formula(self, X):
-        return X + 1
-
-
-def test_cloudpickle_keeps_a_lambda_and_what_it_shares(points):
-    shift = [1.0]
-    physics = FunctionPhysics(lambda X: X + shift[0])
-    physics(points(3, 2))
-    loaded, kept = pickle.loads(cloudpickle.dumps((physics, shift)))
-    kept[0] = 2.0
-    loaded.forget()
-    assert torch.equal(loaded(points(3, 2)), points(3, 2) + 2.0)
-
-
-@pytest.mark.parametrize("dumps", [pickle.dumps, cloudpickle.dumps])
-def test_pickle_of_a_method_that_holds_its_physics(dumps, points):
-    loaded = pickle.loads(dumps(Owner()))
-    assert torch.equal(loaded.physics(points(3, 2)), points(3, 2) + 1)
-    loaded = pickle.loads(dumps(Owner().physics))
-    assert torch.equal(loaded(points(3, 2)), points(3, 2) + 1)
 
 
 def test_as_physics(points):

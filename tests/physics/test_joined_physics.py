@@ -73,13 +73,6 @@ class TestValues:
         joined.forget()
         joined(X)
         assert len(numpy_counter.rows) == 10
-        numpy_counter.rows.clear()
-        linear = torch.nn.Linear(2, 2, dtype=torch.float64)
-        joined = JoinedPhysics([linear, BlackBoxPhysics(numpy_counter)])
-        for _ in range(2):
-            joined(points(3, 2)).sum().backward()
-        assert len(numpy_counter.rows) == 3
-        assert linear.weight.grad is not None
 
 
 class TestErrors:
@@ -170,11 +163,3 @@ class TestUnknownParameters:
             joined(X, values)
         assert caught.value.rows == (2, 4, 5)
         assert caught.value.inputs[0].tolist() == [1.0, 3.0, 1.0, 1.5]
-
-    def test_or_nan_leaves_the_memos_alone(self, numpy_counter, points):
-        counted = BlackBoxPhysics(lambda X, p: numpy_counter(X), unknowns={"mass": MASS})
-        joined = JoinedPhysics([counted, torch.sin])
-        for _ in range(2):
-            joined.or_nan(points(3, 2), torch.ones(1))
-        assert len(numpy_counter.rows) == 6
-        assert not len(counted._memo)

@@ -142,19 +142,13 @@ class TestErrors:
     def test_settings(self):
         for changes, says in (
             ({"step": 0.0}, "step must be finite and above 0; found 0.0"),
-            ({"step": float("inf")}, "step must be finite and above 0; found inf"),
-            ({"step": float("nan")}, "step must be finite and above 0; found nan"),
             ({"state_dim": 0}, "state_dim must be at least 1; found 0"),
-            ({"substeps": 0}, "substeps must be at least 1; found 0"),
             ({"max_steps": 0}, "max_steps must be at least 1; found 0"),
             ({"rtol": -1e-3}, "rtol must be finite and at least 0; found -0.001"),
-            ({"atol": float("nan")}, "atol must be finite and at least 0; found nan"),
             ({"method": "magic"}, "Unknown method 'magic'.*euler.*rk4.*dopri5"),
             ({"gradient": "none"}, r"'none'.*'autograd' or 'finite"),
             ({"step": "x"}, "step must be a number; found 'x'"),
-            ({"rtol": None}, "rtol must be a number; found None"),
             ({"state_dim": 1.5}, "state_dim must be a whole number; found 1.5"),
-            ({"substeps": 1.5}, "substeps must be a whole number; found 1.5"),
             ({"rhs": "decay"}, "rhs must be callable; found str"),
         ):
             is_type = "number; found" in says or "callable" in says

@@ -271,13 +271,6 @@ class TestCopies:
             assert torch.equal(duplicate(X), 7.0 * X)
             assert torch.equal(physics(X), expected)
         assert (duplicate.name, duplicate.num_outputs) == ("spring", 1)
-        physics = FunctionPhysics(Scale())
-        physics.owners = [physics]
-        duplicate = copy.deepcopy(physics)
-        assert duplicate.owners[0] is duplicate
-        physics = FunctionPhysics(Scale())
-        physics(points(3, 1))
-        assert set(physics.state_dict()) == {"function.gain", "function.offset"}
         physics = BlackBoxPhysics(Scale())
         X = points(3, 1)
         with torch.no_grad():
@@ -290,24 +283,6 @@ class TestCopies:
 
 
 class TestThreads:
-    def test_dtypes_and_states_are_kept_apart(self, in_threads, points):
-        physics = BlackBoxPhysics(Scale())
-        X = points(40, 1)
-
-        def ask(number):
-            generator = torch.Generator().manual_seed(number)
-            dtype = torch.float32 if number % 2 else torch.float64
-            for _ in range(100):
-                rows = X[torch.randint(40, (10,), generator=generator)].to(dtype)
-                with torch.no_grad():
-                    Y = physics(rows)
-                if number == 0:
-                    physics.forget()
-                assert Y.dtype == dtype
-                assert torch.equal(Y, (2.0 * rows.double()).to(dtype))
-
-        in_threads(ask)
-
     def test_forget_holds_for_rows_under_evaluation(self, points):
         inside, go = threading.Event(), threading.Event()
 

@@ -3,7 +3,6 @@
 import sys
 import time
 
-import joblib
 import pytest
 import torch
 
@@ -111,13 +110,3 @@ def test_outputs_are_kept_on_disk(law, tmp_path):
     with pytest.raises(PhysicsError):
         made()(torch.tensor([[3.0]]).double())
     assert len([*cache.iterdir()]) == 2  # a failure is not kept
-
-
-@pytest.mark.slow
-def test_processes_share_a_cache(law, tmp_path):
-    physics = SubprocessPhysics([*law, "{0}", "1"], cache=tmp_path / "cache", memo=0)
-    X = line(4)
-    with joblib.parallel_config(backend="loky", n_jobs=2):
-        values = physics(X.repeat(5, 1))
-    torch.testing.assert_close(values[:, 1:], X.repeat(5, 1))
-    assert len([*(tmp_path / "cache").iterdir()]) == 4

@@ -145,17 +145,6 @@ def test_what_is_no_prior():
         refused(error, message, Unknown, *guess, **options)
 
 
-def test_a_prior_as_text():
-    for options, text in (
-        ({"sd": 0.5}, "2 ± 0.5"),
-        ({"factor": 1.5}, "2, factor 1.5"),
-        ({"bounds": (0, 3)}, "0 to 3"),
-        ({"sd": 0.5, "bounds": (0, INF)}, "2 ± 0.5, above 0"),
-        ({"factor": 1.5, "bounds": (-INF, 3)}, "2, factor 1.5, below 3"),
-    ):
-        assert Unknown(2.0, **options).prior_text == text
-
-
 def test_names_and_priors_that_are_none():
     for name in ("two words", "1st", "_hidden", "lambda", "rows", "numpy", "keys", 3):
         says = rf"names.*found {name!r}"
