@@ -10,6 +10,7 @@ import pytest
 import torch
 from gymnasium.wrappers import TransformObservation
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.noise import NormalActionNoise
 
 from gpadjust.control import (
     Agent,
@@ -70,6 +71,14 @@ def test_without_a_physics_the_first_episode_is_random(make_agent, kind, point_d
     assert agent.promised_reward is None
     assert agent.model is not None
     assert agent.learn(5).recorded_episodes().num_transitions == 10
+
+
+@pytest.mark.slow
+def test_the_first_episodes_can_be_random(make_agent, kind):
+    """Two episodes of five steps begin before the sixth step; the third is brought home."""
+    agent = make_agent(kind, random_steps=6).learn(15)
+    rewards = agent.recorded_episodes().rewards.reshape(3, 5).sum(1)
+    assert rewards[:2].max() < -2 < rewards[2]
 
 
 class Farthest(Agent):
@@ -138,6 +147,22 @@ def test_episodes_are_played_to_their_end_and_told(make_agent, kind, capsys):
         assert any(said.startswith(event) for said in lines) == (event in search)
 
 
+def test_scores_of_each_new_episode_are_told(make_agent):
+    log = Log("fit")
+    make_agent(MPCAgent, score_horizons=(4, 2)).learn(10, log)
+    assert {*log[0]} == {"fit_seconds", "real_reward"}
+    known = {"nlpd", "coverage", "rmse/x", "overrides", "energy_2", "coverage_4"}
+    assert known <= {*log[1]}
+    assert all(np.isfinite([*each.values()]).all() for each in log)
+
+
+def test_noise_explores(make_agent):
+    noise = NormalActionNoise(np.zeros(1), 0.5 * np.ones(1))
+    plain, noisy = (make_agent(MPCAgent, action_noise=each).learn(5) for each in (None, noise))
+    assert not torch.equal(plain.recorded_episodes().actions, noisy.recorded_episodes().actions)
+    assert noisy.recorded_episodes().actions.abs().max() <= 2
+
+
 # Promises
 
 
@@ -183,6 +208,22 @@ def test_promises_that_are_not_kept_are_told(make_agent, point_dynamics):
         make_agent(PolicySearchAgent, dynamics=wrong).learn(5)
 
 
+@pytest.mark.slow
+def test_a_promise_that_data_made_against_the_physics_is_told(make_agent, crude_dynamics):
+    """After an episode the model knows that the point moves some ten times as far."""
+
+    class Boasts(PolicySearchAgent):
+        def promise(self, state):
+            return {"promised_reward": 10.0 * self.num_episodes}
+
+    known, log = crude_dynamics(lambda X: X[:, :1] + 0.05 * X[:, 1:]), Log("fit")
+    agent = make_agent(PolicySearchAgent, dynamics=known).learn(5)
+    agent.__class__ = Boasts
+    with pytest.warns(UserWarning, match="In 100% of its predictions data had overridden the phys"):
+        agent.learn(5, log)
+    assert log[0]["overrides"] == 1
+
+
 def test_promises_are_of_the_steps_that_are_made(make_agent):
     """Each step costs 1 until the point is home, which ends the episode; no warning is given."""
     agent = make_agent(
@@ -204,7 +245,25 @@ def test_plans_that_leave_the_bounds_are_told(make_agent, crude_dynamics):
     assert log[0]["left_bounds"] == 1
 
 
+def test_policies_that_leave_the_bounds_are_told(make_agent):
+    bounds = torch.tensor([[0.99], [1.01]], dtype=torch.float64)
+    starts = {"initial_states": lambda n: torch.ones(n, 1).double()}
+    agent = make_agent(PolicySearchAgent, state_bounds=bounds, **starts)
+    with pytest.warns(UserWarning, match="left the bounds of the states in the model"):
+        agent.learn(5)
+
+
 # Errors lose nothing
+
+
+@pytest.mark.slow
+def test_an_error_loses_no_episode(make_agent, kind, point_reward):
+    agent = make_agent(kind, reward=lambda s, a, n: -3 * n[:, 0].square())
+    with pytest.raises(ValueError, match="is not the environment's"):
+        agent.learn(5)
+    agent.task = replace(agent.task, reward=point_reward)
+    assert agent.learn(5).task.dynamics.num_transitions == 10
+    assert agent.num_episodes == 2
 
 
 class Jams(gymnasium.Wrapper):
@@ -224,6 +283,17 @@ def test_a_step_that_failed_is_no_data_and_ends_its_episode(make_agent, point_en
     assert recorded.episode.tolist() == 5 * [0] + [1] + 5 * [2]
     moved = recorded.next_states - recorded.states
     torch.testing.assert_close(moved, 0.5 * recorded.actions, atol=0.1, rtol=0)
+
+
+@pytest.mark.filterwarnings("ignore:.*promised")
+def test_an_episode_without_a_step_counts_for_nothing(make_agent, point_env):
+    class Boasts(Farthest):
+        def promise(self, state):
+            return {"promised_reward": 100.0 if self.num_timesteps == 5 else -1.0}
+
+    agent = make_agent(Boasts, Jams(point_env(), 6), reward_tolerance=None).learn(11)
+    assert agent.num_episodes == 2
+    assert agent.promised_reward == -1.0
 
 
 def test_a_physics_that_is_to_be_fitted_learns_all_episodes(make_agent, point_task):
@@ -288,6 +358,20 @@ def test_an_unknown_time_limit_is_refused(make_agent, point_env):
     with pytest.raises(ValueError, match=r"no time limit .*give the task an episode_length"):
         make_agent(MPCAgent, point_env().unwrapped, episode_length=None).learn(5)
     assert make_agent(MPCAgent, episode_length=None).learn(5).num_episodes == 1
+
+
+def test_what_is_recorded_is_read_once_an_episode(make_agent, monkeypatch):
+    """To plan a step does not go through all that was recorded before it."""
+    read = []
+    whole = MPCAgent.recorded_episodes
+    monkeypatch.setattr(
+        MPCAgent, "recorded_episodes", lambda self, *given: read.append(1) or whole(self, *given)
+    )
+    agent = make_agent(MPCAgent).learn(10)
+    assert len(read) <= 5  # before the first, and two of each
+    for _ in range(3):
+        agent.predict(np.array([0.5]))
+    assert len(read) <= 5
 
 
 @pytest.mark.slow

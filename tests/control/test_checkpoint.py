@@ -9,9 +9,11 @@ import sys
 import textwrap
 import threading
 import zipfile
+from dataclasses import replace
 
 import gymnasium
 import pytest
+import torch
 from filelock import FileLock
 
 from gpadjust.control import MPC, EpisodeCheckpoint, MPCAgent, PolicySearchAgent, resume
@@ -187,6 +189,37 @@ def test_a_task_with_other_dynamics_is_refused(make_agent, point_task, tmp_path)
         agent.save(tmp_path / "run.ckpt")
 
 
+def test_a_task_that_an_agent_changed_is_kept(make_agent, again, tmp_path):
+    agent = make_agent(MPCAgent).learn(5)
+    agent.shaped = replace(agent.model, reward=seven)
+    agent.save(tmp_path / "run.ckpt")
+    resumed = resume(tmp_path / "run.ckpt", *again())
+    assert resumed.shaped.reward is seven
+    assert resumed.shaped.dynamics is resumed.model.dynamics
+
+
+def seven(states, actions, next_states):
+    return torch.full((len(states),), -7.0, dtype=torch.float64)
+
+
+class Broken:
+    """What fails as it is unpickled."""
+
+    def __getstate__(self):
+        return {"name": 1}
+
+    def __setstate__(self, state):
+        state["missing"]
+
+
+def test_an_error_of_the_users_own_is_not_that_of_another_file(make_agent, again, tmp_path):
+    agent = make_agent(MPCAgent)
+    agent.notes["broken"] = Broken()
+    agent.save(tmp_path / "run.ckpt")
+    with pytest.raises(KeyError, match="missing"):
+        resume(tmp_path / "run.ckpt", *again())
+
+
 class Planning(MPCAgent):
     """One that keeps what holds a task, which it makes again where it is missing."""
 
@@ -338,6 +371,25 @@ def test_two_processes_do_not_write_one_file(make_agent, tmp_path):
         other.kill()  # which releases it
     agent.learn(5, EpisodeCheckpoint(path))
     assert path.exists()
+
+
+def test_a_lock_is_released_after_an_error_and_held_by_one_run(make_agent, tmp_path):
+    path = tmp_path / "run.ckpt"
+    checkpoint = EpisodeCheckpoint(path)
+    with pytest.raises(PowerCut):
+        make_agent(MPCAgent).learn(10, [checkpoint, cut_at(3)])
+    lock = FileLock(f"{path}.lock")
+    lock.acquire(blocking=False)
+    lock.release()
+    other = make_agent(MPCAgent, seed=1)
+
+    def writes_too(agent, event, values):
+        with pytest.raises(RuntimeError, match="Another run writes"):
+            other.save(path)
+
+    make_agent(MPCAgent).learn(5, [checkpoint, writes_too])
+    lock.acquire(blocking=False)
+    lock.release()
 
 
 @pytest.mark.slow

@@ -208,6 +208,16 @@ def test_a_search_keeps_within_bounds(origin):
     assert plan.value > -3  # to stay costs 6
 
 
+def test_leaving_does_not_pay_where_rewards_are_none(origin):
+    task = replace(
+        half_steps(state_bounds=torch.tensor([[-0.8], [0.8]])),
+        reward=lambda states, actions, next_states: 0 * next_states[:, 0],
+    )
+    far = Return(terminal_value=lambda states: -100 * (states[:, 0] - 3).square())
+    plan = Planner(far, num_random=64).plan(task, origin, BOUNDS, 3)
+    assert plan.left_bounds == 0
+
+
 class Wrong(Objective):
     def of(self, task):
         return lambda rollout: rollout.rewards.sum(-1)  # k x n
@@ -238,6 +248,13 @@ def test_what_gives_no_plan_is_refused(origin, options, arguments, message):
     given = {"task": half_steps(), "state": origin, "action_bounds": BOUNDS, "num_steps": 3}
     with pytest.raises(ValueError, match=message):
         Planner(**options).plan(**{**given, **arguments})
+
+
+def test_a_plan_needs_dynamics_that_have_learnt_and_takes_bounds_as_lists(origin):
+    nothing = task_of(LearnedDynamics(SPEC, model=ZeroMeanGP))
+    with pytest.raises(RuntimeError, match="has not learnt"):
+        Planner().plan(nothing, origin, BOUNDS, 3)
+    assert len(Planner().plan(half_steps(), origin, [[-1.0], [1.0]], 2).actions) == 2
 
 
 @pytest.fixture

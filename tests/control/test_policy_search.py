@@ -194,6 +194,12 @@ def test_rewards_without_gradient_are_told():
         PolicySearch(updates=1).improve(linear(SPEC, BOUNDS), task)
 
 
+def test_a_guide_needs_bounds():
+    policy, task = torch.nn.Linear(1, 1).double(), task_of(PhysicsDynamics(SPEC, step))
+    with pytest.raises(TypeError, match=r"which only a BoundedPolicy says, .* found Linear"):
+        PolicySearch(updates=1, guide=Planner()).improve(policy, task)
+
+
 @pytest.mark.slow
 def test_a_policy_comes_back_from_the_bounds():
     """The reward lies beyond them; within, the nearest is best."""

@@ -95,10 +95,23 @@ def test_bounds_leave_room_for_what_the_physics_reaches(moved):
     assert torch.equal(moved.complete(still, 5, FORCES).state_bounds, moved.bounds())
 
 
+def test_a_physics_that_fails_everywhere_reaches_nothing(moved):
+    def fails(X):
+        raise PhysicsError("no", rows=[], partial=None)
+
+    task = Task(PhysicsDynamics(POINT_SPEC, fails), reward)
+    assert torch.equal(moved.complete(task, 5, FORCES).state_bounds, moved.bounds())
+
+
 def test_an_episode_that_a_bound_may_have_held_is_told(moved):
     with pytest.warns(UserWarning, match=r"came to x = 1\.3, .*beyond 1\.31: .*state_bounds"):
         moved.warn_of_bounds(torch.tensor([[-1.0], [1.31]]))
     moved.warn_of_bounds(torch.tensor([[-3.0], [3.0]]))
+
+
+def test_the_environments_functions_pass(recorded):
+    recorded(6).check(task())
+    recorded(6, terminal=True).check(task(terminated=lambda states: (states[:, 0] % 3) > 2))
 
 
 @pytest.mark.parametrize(
@@ -151,6 +164,13 @@ class Own(Dynamics):
         self.learnt = states
 
 
+class Stiff(Own):
+    """Dynamics that have no functions."""
+
+    def sample_functions(self, num_functions, seed=None):
+        raise NotImplementedError("No features of this kernel.")
+
+
 def scores(dynamics, moved, horizons=()):
     known = moved.complete(Task(dynamics, reward), 5, FORCES)
     return learn_dynamics(known, moved, moved, horizons)
@@ -177,3 +197,17 @@ def test_trajectories_are_scored_as_far_as_episodes_go(moved, learnt_dynamics):
     assert 0 <= found["coverage_4"] <= 1
     assert found["energy_2"] > 0
     assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_what_has_no_doubt_has_energies_alone(moved, point_dynamics):
+    found = scores(point_dynamics, moved, (1, 5))
+    assert found.keys() >= {"energy_1", "energy_5"}
+    assert not any("nlpd" in name or "coverage" in name for name in found)
+
+
+def test_dynamics_without_functions_are_learnt_without_scores_of_trajectories(moved):
+    with pytest.warns(UserWarning, match=r"No features of this kernel\. Pass score_horizons"):
+        found = scores(Stiff(POINT_SPEC), moved, (1, 5))
+    assert "coverage" in found
+    assert "energy_1" not in found
+    assert "coverage" in scores(Stiff(POINT_SPEC), moved)

@@ -90,3 +90,12 @@ def test_a_set_point_that_is_an_angle_goes_round():
     task = Task(dynamics, near, reference=turns, episode_length=8)
     how = {"each_step": PLAN, "first": PLAN, "reward_tolerance": 1e9, "score_horizons": ()}
     assert MPCAgent(Turning(), task, **how).learn(8).num_episodes == 1
+
+
+@pytest.mark.parametrize(
+    ("reference", "message"),
+    [(lambda s, t: s, r"shape \(2, 1\).*found \(2, 2\)"), (lambda s, t: s[:, :1] / 0, "finite")],
+)
+def test_what_a_reference_returns_is_checked_before_the_first_step(reference, message):
+    with pytest.raises(ValueError, match=message):
+        MPCAgent(Tracking(), point(reference), PLAN, first=PLAN).learn(8)

@@ -25,7 +25,7 @@ from gpadjust.control.smoothed_episodes import Seen, smooth_episodes
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
 from gpadjust.models import ZeroMeanGP
 from gpadjust.states import Sensors, StateSpec
-from gpadjust.systems import System, cart_pole
+from gpadjust.systems import NoisySensors, System, cart_pole
 from tests.point import linear
 
 SPEC = StateSpec(["x", "v"], ["force"])
@@ -195,6 +195,17 @@ def test_a_policy_keeps_its_estimates_and_forgets_them_where_an_episode_begins()
     torch.testing.assert_close(state[1].estimate.covariance, before[1].covariance)
 
 
+def test_an_environment_shows_what_sensors_measure():
+    env, task = glider(sensors=Sensors(["both"], lambda s: s.sum(-1, keepdim=True)), noise=None)
+    assert env.observation_space.shape == (1,)
+    seen, _ = env.reset(seed=0)
+    assert seen.item() == pytest.approx(env.unwrapped.state.sum())
+    assert task.observed.states == ("both",)
+    assert task.describe()["sensors"] == {"outputs": ["both"], "function": True}
+    with pytest.raises(ValueError, match=r"no output 'x'; the outputs are \('both',\)"):
+        NoisySensors(Glider(), SPEC, {"x": 1.0}, task.sensors)
+
+
 def test_what_cannot_be_done_with_sensors_is_refused_before_a_real_step():
     env, task = glider()
     with pytest.raises(ValueError, match="spec of the sensors says"):
@@ -207,6 +218,16 @@ def test_what_cannot_be_done_with_sensors_is_refused_before_a_real_step():
         with pytest.raises(ValueError, match=message):
             agent.learn(LENGTH)
         assert agent.num_timesteps == 0
+
+
+def test_learners_of_stable_baselines_refuse_sensors():
+    from gpadjust.rl import DynaSAC, ModelVecEnv
+
+    env, task = glider()
+    with pytest.raises(ValueError, match="DynaSAC cannot learn a task with sensors; MPCAgent"):
+        DynaSAC("MlpPolicy", env, task)
+    with pytest.raises(ValueError, match="ModelVecEnv cannot learn a task with sensors"):
+        ModelVecEnv(task, 1, env.observation_space, env.action_space)
 
 
 @pytest.mark.parametrize(

@@ -47,6 +47,19 @@ def test_good_steps_are_as_without_a_guard(point_env):
     assert StepGuard.around(guarded) is guarded
 
 
+def test_the_last_good_observation_is_kept_though_the_environment_writes_over_it(point_env):
+    class Reuses(Faulty):
+        def step(self, action):
+            found = super().step(action)
+            self.unwrapped.x[:] = found[0]
+            return found
+
+    env = StepGuard(Reuses(point_env(), {1: "nan"}))
+    first = env.reset(seed=0)[0].copy()
+    with pytest.warns(FailedStepWarning):
+        assert np.array_equal(env.step(ACTION)[0], first)
+
+
 def test_an_environment_that_can_make_no_step_is_an_error_in_the_third_episode(point_env):
     env = StepGuard(Faulty(point_env(), dict.fromkeys((2, 3, 4, 5, 6), "raises")))
     env.reset()
@@ -61,6 +74,18 @@ def test_an_environment_that_can_make_no_step_is_an_error_in_the_third_episode(p
     with pytest.raises(RuntimeError, match="Nor was there a good step in the 2 ep") as found:
         env.step(ACTION)
     assert isinstance(found.value.__cause__, OSError)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit])
+def test_an_interruption_comes_through(point_env, error):
+    class Interrupted(Faulty):
+        def step(self, action):
+            raise error
+
+    env = StepGuard(Interrupted(point_env(), {}))
+    env.reset()
+    with pytest.raises(error):
+        env.step(ACTION)
 
 
 def test_an_episode_that_cannot_begin_is_an_error(make_agent, point_env):

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 import torch
 
-from gpadjust import CKA
+from gpadjust import AR1, CKA, VariationalCKA
 from gpadjust.models.training_data import to_tensor
 from gpadjust.physics import BlackBoxPhysics, PhysicsError
 from gpadjust.records import Record
@@ -99,10 +99,25 @@ def test_times_of_a_record_are_seconds_since_the_first(times):
     assert record.times.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
 
 
+def test_velocities_are_in_seconds():
+    """A point that moves by 3 m/s, every 250 ms, by the clock of a pandas frame."""
+    index = pd.date_range("2020-03-29 00:59:59", periods=9, freq="250ms", tz="Europe/London")
+    frame = pd.DataFrame({"x": 0.75 * np.arange(9.0), "u": 0.0}, index=index)
+    record = Record(frame.index, frame[["x"]], frame[["u"]])  # the clocks change in it
+    assert record.sampling_step == 0.25
+    speed = record.states.diff(dim=0) / record.times.diff().unsqueeze(-1)
+    assert speed.flatten().tolist() == [3.0] * 8
+
+
 def test_scikit_learn_is_asked_before_it_makes_numbers_of_them():
     regressor = CKARegressor(lambda X: X[:, 0], fit_method="map")
     dates, y = DATES.reshape(-1, 1), ONE_TO_SIX
     refused(TypeError, "X to hold numbers.*dates or times", regressor.fit, dates, y)
+    refused(
+        TypeError, "y to hold numbers.*dates or times", regressor.fit, NUMBERS, DATES - DATES[0]
+    )
+    refused(ValueError, "X without masked", regressor.fit, MASKED, y)
+    refused(ValueError, "y without masked", regressor.fit, NUMBERS, MASKED[:, 0])
     known = {"train_Yvar": MASKED[:, 0]}
     refused(ValueError, "train_Yvar without masked", regressor.fit, NUMBERS, y, **known)
     predict = regressor.fit(NUMBERS, y).predict
@@ -137,3 +152,11 @@ def test_real_numbers_are_taken():
         pd.RangeIndex(1, N + 1),
     ):
         assert to_tensor(values, "X").tolist() == ONE_TO_SIX.tolist()
+
+
+def test_inputs_of_one_dimension():
+    X, Y = torch.as_tensor(ONE_TO_SIX), torch.as_tensor(NUMBERS)
+    for values in (X, ONE_TO_SIX, pd.Series(ONE_TO_SIX)):
+        refused(ValueError, r"train_X.reshape\(-1, 1\)", cka, values)
+    refused(ValueError, r"train_X.reshape\(-1, 1\)", AR1, X, Y, low_X=Y, low_Y=Y)
+    refused(ValueError, r"train_X.*2 dimensions", VariationalCKA, X, Y, physics=physics)

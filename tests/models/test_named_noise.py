@@ -5,9 +5,10 @@ import math
 import pytest
 import torch
 
-from gpadjust import CKA, VariationalCKA, ZeroMeanGP, fit, load, save
+from gpadjust import CKA, RRA, VariationalCKA, ZeroMeanGP, compare, fit, load, save
 from gpadjust.models import Logit
 from gpadjust.models.heavy_tails import SHARE
+from gpadjust.report import report
 from gpadjust.validation import leave_one_out
 from tests.systems import refused
 
@@ -106,6 +107,22 @@ def test_the_whole_house(names, gross, tmp_path):
     assert bool((more.predict(one).variance < model.predict(one).variance).all())
     before = fit(model, "map")
     assert before.converged.shape == (2,)
+
+
+@pytest.mark.slow
+def test_a_page_tells_outliers(gross, tmp_path):
+    found = compare(*gross, physics=wave, likelihood="heavy-tailed", structures=["CKA"])
+    assert "outlier" in report(found, tmp_path / "page.html").read_text().lower()
+
+
+@pytest.mark.parametrize(
+    ("kind", "known"), [(CKA, 0.03**2), pytest.param(RRA, None, marks=pytest.mark.slow)]
+)
+def test_random_features_and_known_noise_have_outliers_too(gross, kind, known):
+    X, Y = gross
+    model = kind(X, Y, known, physics=wave, likelihood="heavy-tailed")
+    fit(model, **OPTIONS)
+    assert bool((model.outliers()[OUTLIERS] > 0.5).all())
 
 
 def test_bad_input(gross):

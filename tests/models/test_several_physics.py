@@ -191,17 +191,55 @@ def test_the_right_one_of_three_has_the_weight():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["ScaleGP", "CKA", "RRA"])
-def test_each_row_of_a_simulator_is_evaluated_once(data, build, uniform, num_outputs, kind):
-    counts = Counter()
+def test_two_physics_each_right_in_half_of_the_box():
+    def first(X):
+        return wave(12.0, 0.0)(X) * torch.cos(9 * X[:, 1:])
 
-    def simulate(X):
-        counts.update(tuple(row) for row in X.tolist())
-        return crude(torch.from_numpy(X))[..., :num_outputs].numpy()
+    def second(X):
+        return torch.cos(10 * X[:, :1] + 8 * X[:, 1:]) + X[:, 1:]
 
+    def truth(X):
+        share = torch.sigmoid((X[:, :1] - 0.5) / 0.05)
+        return (1 - share) * first(X) + share * second(X)
+
+    ratios = []
+    for seed in range(5):
+        X, Z = latin_hypercube(20, 2, seed)
+        errors = []
+        for physics in ({"a": first, "b": second}, first, second):
+            model = CKA(X, truth(X), physics=physics, center=0.0)
+            fit(model, "map")
+            errors.append(error(model, Z, truth))
+        ratios.append(errors[0] / min(errors[1:]))
+    assert sum(ratio <= 0.5 for ratio in ratios) >= 4
+
+
+# How often the physics is evaluated: a simulator once a row, a formula once a call
+
+
+@pytest.fixture
+def counting():
+    """The crude physics, with a record of the rows it was asked for."""
+
+    def counting(X):
+        counting.rows.update(tuple(row) for row in X.detach().tolist())
+        return crude(X)[..., : counting.num_outputs]
+
+    counting.rows, counting.num_outputs = Counter(), 1
+    return counting
+
+
+PHYSICAL = ["ScaleGP", "CKA", "RRA"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", PHYSICAL)
+def test_each_row_is_evaluated_once(data, build, uniform, counting, num_outputs, kind):
+    counting.num_outputs = num_outputs
     X, Y = data(num_outputs=num_outputs)
     Z, new_X = uniform(4, 2, seed=1), uniform(2, 2, seed=2)
-    model = build(kind, X, Y, physics=BlackBoxPhysics(simulate))
+    simulator = BlackBoxPhysics(lambda x: counting(torch.from_numpy(x)).numpy())
+    model = build(kind, X, Y, physics=simulator)
     fit(model, "map", num_screened=8, num_starts=1)
     with torch.no_grad():
         model.posterior(Z)
@@ -215,5 +253,26 @@ def test_each_row_of_a_simulator_is_evaluated_once(data, build, uniform, num_out
         for name in model.term_names:
             model.term(name, uniform(4, 2, low=-3.0, seed=3))
     expected = {tuple(row) for row in torch.cat([X, Z, new_X]).tolist()}
-    assert set(counts) == expected
-    assert set(counts.values()) == {1}
+    assert set(counting.rows) == expected
+    assert set(counting.rows.values()) == {1}
+
+
+@pytest.mark.parametrize("kind", PHYSICAL)
+def test_each_call_evaluates_it_once(data, build, uniform, counting, kind):
+    X, Y = data()
+    model = build(kind, X, Y, physics=FunctionPhysics(counting)).eval()
+    functions = model.sample_functions(3)
+    model.posterior(X)
+    counting.rows.clear()
+    for number, call in enumerate((model.posterior, model.predict, functions), start=1):
+        call(X)
+        assert set(counting.rows.values()) == {number}
+
+
+def test_ar1_evaluates_the_samples_only(data, build, uniform, counting):
+    X, Y = data()
+    model = build("AR1", X, Y, physics=counting, num_low=10)
+    fit(model, "map", num_screened=8, num_starts=1)
+    model.posterior(uniform(4, 2))
+    assert len(counting.rows) == 10
+    assert set(counting.rows.values()) == {1}

@@ -3,16 +3,20 @@
 import copy
 import pickle
 from functools import cache
+from inspect import signature
 
 import pytest
 import torch
 from botorch.acquisition import UpperConfidenceBound
 from botorch.acquisition.knowledge_gradient import qKnowledgeGradient
 from botorch.acquisition.logei import qLogExpectedImprovement, qLogNoisyExpectedImprovement
+from botorch.acquisition.objective import ScalarizedPosteriorTransform
 from botorch.acquisition.thompson_sampling import PathwiseThompsonSampling
+from botorch.models import ModelListGP
 from botorch.models.transforms import Normalize
 from botorch.optim import optimize_acqf
 from botorch.sampling import SobolQMCNormalSampler
+from botorch.sampling.pathwise import draw_matheron_paths
 from torch import Size
 
 from gpadjust import CKA, StackedGP, VariationalCKA, compare, fit, load, save
@@ -134,7 +138,7 @@ def test_all_that_predicts_agrees(close, fitted, rest):
     torch.testing.assert_close(draws.std(0), sd.detach(), rtol=0.15, atol=0)
 
 
-def test_the_prior_before_a_fit(close, num_outputs):
+def test_the_prior_before_a_fit_and_shapes_after_it(close, num_outputs, fitted):
     X, Y = problem(30, num_outputs)
     model, Z = make(X, Y), problem(7)[0]
     mean, variance = model.predict(Z)
@@ -142,6 +146,17 @@ def test_the_prior_before_a_fit(close, num_outputs):
     prior = model.covar_module.at(model.model_inputs(Z)).variance() * model.units()[1].square()
     close(variance, model.outputs_last(prior), 1e-6)
     assert model.evidence.isnan().all()
+    X = problem(24)[0].reshape(2, 3, 4, 1)
+    posterior = fitted.posterior(X)
+    assert posterior.mean.shape == (2, 3, 4, num_outputs)
+    assert posterior.rsample(torch.Size([5])).shape == (5, 2, 3, 4, num_outputs)
+    close(posterior.mean[1, 2], fitted.posterior(X[1, 2]).mean)
+    weights = torch.ones(num_outputs, dtype=torch.float64)
+    sums = fitted.posterior(X, posterior_transform=ScalarizedPosteriorTransform(weights))
+    close(sums.mean, posterior.mean.sum(-1, keepdim=True))
+    last = fitted.posterior(X, output_indices=[num_outputs - 1])
+    close(last.mean, posterior.mean[..., -1:])
+    close(last.variance, posterior.variance[..., -1:], 1e-6)
 
 
 def test_acquisition_functions(one):
@@ -160,7 +175,30 @@ def test_acquisition_functions(one):
     assert value[0] > value[1]
 
 
-def test_gradients_to_inputs(one, gradient_is_right):
+@pytest.mark.slow
+def test_paths_of_botorch(close, fitted):
+    X, m = problem(4)[0], fitted.num_outputs
+    torch.manual_seed(0)
+    paths = draw_matheron_paths(fitted, torch.Size([200, 2]))
+    values = paths(X)
+    assert values.shape == ((200, 2, 2, 4) if m > 1 else (200, 2, 4))
+    mean, variance = (fitted.outputs_first(each).detach() for each in fitted.predict(X))
+    assert ((values.mean((0, 1)) - mean).abs() < 5 * (variance / 400).sqrt()).all()
+    torch.testing.assert_close(values.flatten(0, 1).std(0), variance.sqrt(), rtol=0.2, atol=0)
+    close(paths(X.expand(3, 200, 2, 4, 1)), values.expand(3, *values.shape))
+    own = paths(X.repeat(50, 1)[:, None, None].expand(-1, 2, 1, 1))  # a point for each of 200
+    assert own.shape == ((200, 2, 2, 1) if m > 1 else (200, 2, 1))
+    close(own[7, ..., 0], values[7, ..., 3])
+
+
+def test_lists_of_models_and_gradients_to_inputs(close, one, gradient_is_right):
+    X, Y = problem(120)
+    exact = CKA(X[:20], Y[:20], physics=wave)
+    both = ModelListGP(one, exact)
+    close(both.posterior(LINE).mean[:, :1], one.posterior(LINE).mean)
+    results = fit(both, "map", num_starts=1, num_screened=0)
+    assert len(results) == 2
+    assert both.subset_output([0]).posterior(LINE).mean.shape == (2, 1)
     X = torch.tensor([[0.3], [0.7]], dtype=torch.float64)
     gradient_is_right(lambda X: one.predict(X).mean.sum(), X)
     gradient_is_right(lambda X: one.posterior(X).variance.sum(), X)
@@ -195,7 +233,7 @@ def test_all_of_a_model_moves(noise):
     assert {t.device.type for t in tensors if t is not None} == {"meta"}
 
 
-def test_rows_and_states(close):
+def test_rows_arguments_and_states(close):
     X, Y = problem(1500)
     asked = []
 
@@ -206,6 +244,11 @@ def test_rows_and_states(close):
     model = VariationalCKA(X, Y, physics=physics, num_inducing=5)
     fit(model, num_screened=0, max_iterations=1)
     assert sorted(asked)[-2:] == [1000, 1500]
+    ours, theirs = (signature(each).parameters for each in (VariationalCKA, CKA))
+    assert ours.keys() - theirs.keys() == {"num_inducing", "seed"}
+    assert {name: ours[name].default for name in theirs} == {
+        name: each.default for name, each in theirs.items()
+    }
     X, Y = problem(40)
     model = make(5 * X, 3 * Y, input_transform=Normalize(1))
     other = make(X, Y, input_transform=Normalize(1))
@@ -243,6 +286,18 @@ def test_outputs_of_a_model(close):
     refused(ValueError, "numbers of outputs from 0 to 1", model.subset_output, [2])
 
 
+@pytest.mark.parametrize("transform", [None, Normalize(2)], ids=["raw", "Normalize"])
+def test_transforms(close, transform):
+    X, Y = problem(50)
+    X = torch.cat([X, 100 * X.flip(0)], dim=-1)
+    options = {"input_transform": transform, "outcome_transform": None}
+    model = make(X, Y, **options)
+    close(model.data()["train_Y"], Y)
+    close(model.data()["train_X"], X)
+    fit(model, num_screened=0)
+    assert (model.predict(X).mean - Y).std() < 0.15
+
+
 def test_what_is_refused(one):
     class Halves(ComponentNoise):
         def selection(self, inputs):
@@ -268,3 +323,16 @@ def test_what_is_refused(one):
     refused(TypeError, "TermsGP, got VariationalCKA", compare, X, Y, wave, **options)
     with pytest.warns(UserWarning, match="VariationalCKA"):
         CKA(*problem(5001), physics=wave)  # an exact model of many points
+
+
+def test_texts(one):
+    assert repr(one) == "VariationalCKA of 'wave': 120 points, 1 input, 1 output"
+    lines = one.summary().splitlines()
+    assert lines[2].startswith("  physics alone: RMSE ")
+    assert lines[3].startswith("  evidence lower bound ")
+    assert "  rest: none" in lines
+    give_rest(one)
+    assert any(line.startswith("    sd") for line in one.summary().split("  rest: ")[1].split("\n"))
+    assert "  not fitted" in make(*problem(10)).summary().splitlines()
+    assert one.term_names == ("rho", "delta")
+    assert one.term("rest", LINE).mean.abs().max() == 0

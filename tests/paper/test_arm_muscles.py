@@ -4,6 +4,8 @@ import os
 import pickle
 import subprocess
 import sys
+from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 
 import gymnasium as gym
@@ -12,11 +14,15 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
+from gpadjust.control import Task
+from gpadjust.dynamics import LearnedDynamics
+from gpadjust.rl import DynaOptions, DynaSAC
 from paper.arm import system
 from paper.arm.system import MuscleArmEnv, hand_distance_cm, hand_position
-from paper.arm.system.opensim import MUSCLES
-from paper.arm.system.reaching import ARM_MEMORY_SPEC, arm_reward
+from paper.arm.system.opensim import MUSCLES, load_opensim
+from paper.arm.system.reaching import ARM_MEMORY_SPEC, ARM_SPEC, arm_reward
 
 ROOT = Path(__file__).parents[2]
 ID = "paper.arm.system:MuscleArm-v0"
@@ -208,6 +214,27 @@ def test_bad_action_is_refused_and_changes_nothing(arm):
     arm.step(GENTLE)
 
 
+def test_bad_options_and_arguments_are_refused(arm):
+    for options, message in (
+        ({"state": [0.0, 0.0, 1e4, 0.0]}, "4 numbers theta_s.* at most 6.283, 6.283, 100, 100"),
+        ({"target": [0.0, 1.0, 2.0]}, "2 numbers target_s"),
+        ({"start": START}, "Unknown option 'start'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            arm.reset(options=options)
+    for name, value in (("strength", 2.1), ("accuracy", 1.0)):
+        with pytest.raises(ValueError, match=name):
+            MuscleArmEnv(**{name: value})
+
+
+def test_step_and_render_need_a_reset():
+    env = MuscleArmEnv(render_mode="rgb_array")
+    with pytest.raises(gym.error.ResetNeeded, match="before the first step"):
+        env.step(GENTLE)
+    with pytest.raises(gym.error.ResetNeeded, match="reset"):
+        env.render()
+
+
 @pytest.mark.parametrize("speed", [1e3, 1e9])
 def test_failed_integration_truncates_and_reset_recovers(arm, speed):
     expected = rollout(start(arm))
@@ -239,7 +266,30 @@ def test_random_trials_do_not_fail(arm):
             assert arm.observation_space.contains(observation)
 
 
-BLUE, RED, GREEN, LIGHT = (31, 79, 130), (204, 77, 77), (44, 140, 68), (215, 215, 215)
+@pytest.mark.slow
+def test_resets_do_not_leak_memory(arm):
+    def resident():
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+    def trial():
+        arm.reset()
+        arm.step(GENTLE)
+
+    for _ in range(50):
+        trial()
+    before = resident()
+    for _ in range(1000):
+        trial()
+    assert resident() - before < 1e7
+
+
+BLUE, RED, GREEN, GREY, LIGHT = (
+    (31, 79, 130),
+    (204, 77, 77),
+    (44, 140, 68),
+    (110, 110, 110),
+    (215, 215, 215),
+)
 
 
 def near(frame, place, colour, margin):
@@ -280,6 +330,15 @@ def test_frame_shows_the_target_where_it_is(frame):
         upper_middle = 0.309 / 2 * np.array([np.cos(target[0]), np.sin(target[0])])
         assert near(shown, upper_middle, LIGHT, 1) == (9, 9)
         assert near(shown, hand_position(torch.tensor(START[:2])), GREEN, 2) == (25, 25)
+
+
+def test_frame_shows_the_links_where_they_are(frame):
+    for shoulder, elbow in ((0.6, 1.1), (0.3, 0.8)):
+        shown = frame((shoulder, elbow), (0.0, 0.0))
+        upper = 0.309 * np.array([np.cos(shoulder), np.sin(shoulder)])
+        fore = 0.333 * np.array([np.cos(shoulder + elbow), np.sin(shoulder + elbow)])
+        for middle in (upper / 2, upper + fore / 2):
+            assert near(shown, middle, GREY, 1) == (9, 9)
 
 
 @pytest.mark.parametrize("muscle", range(6))
@@ -334,6 +393,70 @@ def test_without_opensim_its_environment_and_its_black_box_are_missing(tmp_path)
     assert run.stdout.splitlines() == [message, message]
 
 
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("raise ImportError('libosimCommon.so: cannot open shared object file')", "libosimCommon"),
+        ("import opensim.missing_part", "No module named 'opensim.missing_part'"),
+    ],
+)
+def test_a_broken_opensim_says_so_itself(tmp_path, monkeypatch, content, message):
+    (tmp_path / "opensim").mkdir()
+    (tmp_path / "opensim" / "__init__.py").write_text(content)
+    for name in [name for name in sys.modules if name.partition(".")[0] == "opensim"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ImportError, match=message) as error:
+        load_opensim.__wrapped__()
+    assert "pip install" not in str(error.value)
+
+
+@pytest.mark.slow
+def test_child_processes_load_libraries_of_their_own(tmp_path):
+    if find_spec("casadi") is None:  # imported here, it would meet OpenSim's libraries
+        pytest.skip("there is no CasADi")
+    code = (
+        "import subprocess, sys\n"
+        "from paper.arm.system.opensim import load_opensim\n"
+        "load_opensim()\n"
+        "subprocess.run([sys.executable, '-c', 'import casadi; print(casadi.SX(2))'], check=True)\n"
+    )
+    run = python(code, tmp_path)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.strip() == "2"
+
+
+def test_the_logger_is_switched_off_once():
+    opensim = load_opensim()
+    opensim.Logger.setLevelString("critical")
+    try:
+        MuscleArmEnv()
+        assert opensim.Logger.getLevelString().lower() == "critical"
+    finally:
+        opensim.Logger.setLevelString("off")
+
+
+@pytest.mark.slow
+def test_arms_in_processes_of_their_own_are_the_same():
+    make = [partial(gym.make, ID)] * 2
+    here, there = DummyVecEnv(make), SubprocVecEnv(make)
+    try:
+        for envs in (here, there):
+            envs.seed(3)
+        assert np.array_equal(here.reset(), there.reset())
+        actions = np.random.default_rng(0).uniform(0, 1, (16, 2, 4)).astype(np.float32)
+        for action in actions:  # beyond the end of an episode
+            states, rewards, ends, _ = there.step(action)
+            expected = here.step(action)
+            assert np.array_equal(states, expected[0])
+            assert np.array_equal(
+                rewards.astype(np.float32), expected[1]
+            )  # as DummyVecEnv has them
+            assert np.array_equal(ends, expected[2])
+    finally:
+        there.close()
+
+
 def test_the_system_with_memory_and_noise():
     reaching = system.arm(memory=True, noise={"theta_s": 0.01}, strength=0.3)
     assert reaching.spec is ARM_MEMORY_SPEC
@@ -345,3 +468,13 @@ def test_the_system_with_memory_and_noise():
     reaching.task().draw_initial_states(2)
     excite = np.array([0.0, 0.0, 0.5, 0.0], dtype=np.float32)
     assert env.step(excite)[0][6:].tolist() == [0.0, 0.0, 0.5, 0.0]
+
+
+@pytest.mark.slow
+def test_a_learner_takes_the_environment_and_the_physics():
+    task = Task(LearnedDynamics(ARM_SPEC, system.arm().physics), arm_reward)
+    small = {"batch_size": 8, "policy_kwargs": {"net_arch": [8]}, "seed": 0, "device": "cpu"}
+    options = DynaOptions(model_episodes=2)
+    agent = DynaSAC("MlpPolicy", gym.make(ID), task, options, **small).learn(30)
+    assert agent.num_episodes == 2
+    assert agent.replay_buffer.model_buffer.size() == 2 * 2 * 15

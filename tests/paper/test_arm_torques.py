@@ -4,6 +4,7 @@ import math
 import pickle
 from dataclasses import replace
 
+import joblib
 import numpy as np
 import pytest
 import sympy
@@ -92,6 +93,26 @@ def test_equation_takes_any_batch_and_is_differentiable(states_and_actions):
     assert torch.autograd.gradcheck(OTHER_ARM, inputs)
 
 
+def test_other_columns_and_impossible_parameters_are_refused():
+    with pytest.raises(ValueError, match=r"states \.\.\. x 4 .* actions \.\.\. x 4"):
+        REAL_ARM(torch.zeros(2, 4), torch.zeros(2, 2))
+    for name, value in (
+        ("masses", (1.0, 0.0)),
+        ("centres", (0.1, -0.1)),
+        ("damping", -0.1),
+        ("gains", (1.0, 2.0, 3.0)),
+    ):
+        with pytest.raises(ValueError, match=name):
+            ArmEquation(**{name: value})
+    for function, columns in ((hand_distance_cm, 4), (hand_position, 3)):
+        with pytest.raises(ValueError, match=rf"of shape \.\.\. x \d.*, got \(2, {columns}\)"):
+            function(torch.zeros(2, columns))
+    with pytest.raises(ValueError, match="n must be at least 0; found -1"):
+        arm_start(-1)
+    with pytest.raises(ValueError, match="no unknown parameters"):
+        arm(opensim=True, unknowns=True)
+
+
 def test_torque_arm_is_a_tenth_too_heavy_and_takes_any_gains():
     np.testing.assert_allclose(believed_arm().masses, (1.1 * 1.82, 1.1 * 1.43))
     np.testing.assert_allclose(believed_arm().inertias, (1.1 * 0.018, 1.1 * 0.018))
@@ -131,6 +152,19 @@ def test_opensim_physics_has_a_memo_and_a_light_pickle(states_and_actions):
     assert torch.equal(copy(X), Y)
     physics.function = None
     assert torch.equal(physics(X), Y)
+
+
+def test_threads_take_turns_in_opensim(states_and_actions):
+    X = torch.cat(states_and_actions(12), dim=-1)
+    expected = arm(opensim=True).physics(X)
+    with joblib.parallel_config(backend="threading", n_jobs=3):
+        assert torch.equal(arm(opensim=True).physics(X), expected)
+
+
+def test_torque_arm_physics_can_be_pickled(states_and_actions):
+    physics = arm().physics
+    X = torch.cat(states_and_actions(5), dim=-1)
+    assert torch.equal(pickle.loads(pickle.dumps(physics))(X), physics(X))
 
 
 def test_unknown_parameters_make_the_same_physics_of_their_guesses(states_and_actions):

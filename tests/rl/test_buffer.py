@@ -104,6 +104,14 @@ def test_add_rows_keeps_the_newest_rows_in_order(buffer, chunks):
     assert in_order(many) == in_order(one)
 
 
+def test_extend_is_that_of_stable_baselines(buffer):
+    made = buffer()
+    steps = [real_row(i) for i in range(1, 4)]
+    made.extend(*zip(*steps, strict=True))
+    assert made.size() == 3
+    np.testing.assert_array_equal(made.rewards[:3, 0], [1, 2, 3])
+
+
 def test_several_real_environments(buffer):
     made = buffer(6, 6, n_envs=2, buffer_size=20, real_fraction=0.5)
     assert made.model_buffer.n_envs == 1
@@ -149,3 +157,9 @@ def test_samples_are_normalised(buffer, point_env):
         batch.next_observations, (plain.next_observations - shift) / 2, rtol=1e-4
     )
     np.testing.assert_allclose(batch.rewards, plain.rewards / 10, rtol=1e-4)
+
+
+def test_reset_empties_both(buffer):
+    made = buffer(5, 5)
+    made.reset()
+    assert made.size() == made.model_buffer.size() == 0

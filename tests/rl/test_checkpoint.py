@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from filelock import FileLock
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
@@ -15,6 +15,7 @@ from tests.point import (
     Shouting,
     assert_read_without_pickle,
     forbid_unpickling,
+    robot,
     scramble,
 )
 
@@ -132,6 +133,26 @@ def test_a_refused_call_does_not_spend_the_generators(
         go_on(agent, EpisodeCheckpoint(path))
     scramble()
     assert_same(whole, go_on(agent, EpisodeCheckpoint(path)))
+
+
+def test_an_environment_that_cannot_be_pickled_is_reset_but_its_wrappers_keep_their_statistics(
+    point_agent, point_env, point_task, tmp_path
+):
+    def normalised():
+        env = robot(point_env())
+        return VecNormalize(DummyVecEnv([lambda: env]))
+
+    path = tmp_path / "run.ckpt"
+    agent = point_agent(normalised())
+    agent.notes["costs"] = [1.0]
+    with pytest.warns(UserWarning, match="environment cannot be saved .*pickle"):
+        agent.learn(10, CallbackList([EpisodeCheckpoint(path)]))
+    again = resume(path, normalised(), point_task())
+    assert again.notes == {"costs": [1.0]}
+    assert again.get_vec_normalize_env().obs_rms.count == agent.env.obs_rms.count
+    go_on(again)
+    assert again.num_episodes == 4
+    assert again.replay_buffer.size() == TOTAL
 
 
 def test_what_does_not_fit_is_refused_before_anything_is_unpickled(

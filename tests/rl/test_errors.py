@@ -5,9 +5,12 @@ from contextlib import suppress
 import gymnasium
 import pytest
 import torch
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from gpadjust.control import FailedStepWarning
+from gpadjust.physics import PhysicsError
+from gpadjust.rl import ModelVecEnv
 from tests.point import Faulty
 from tests.rl.conftest import model_rows
 
@@ -28,6 +31,44 @@ def test_a_wrong_reward_is_mended_and_nothing_is_lost(point_agent, point_task, l
     )
     assert agent.num_episodes == 2
     assert model_rows(agent) == 2 * 2 * 5
+
+
+@pytest.mark.parametrize("fails", ["fit", "rollout"])
+def test_a_physics_that_fails_for_a_while_loses_no_transition(
+    point_agent, crude_dynamics, fails, monkeypatch
+):
+    """Where the dynamics learn, or after that, where particles move."""
+    broken = []
+
+    def physics(X):
+        if broken:
+            raise PhysicsError("the simulator's licence has expired")
+        return X[:, :1] + 0.4 * X[:, 1:]
+
+    dynamics = crude_dynamics(physics)
+    agent = point_agent(dynamics=dynamics)
+    agent.learn(5)
+    if fails == "rollout":
+        monkeypatch.setattr(ModelVecEnv, "reset", lambda env: broken.append(1) or env._states)
+    breaks = BreaksAt(8, broken) if fails == "fit" else None
+    with pytest.raises(PhysicsError, match="licence"):
+        agent.learn(5, breaks, reset_num_timesteps=False)
+    assert dynamics.num_transitions == (5 if fails == "fit" else 10)
+    broken.clear()
+    monkeypatch.undo()
+    agent.learn(5, reset_num_timesteps=False)
+    assert torch.equal(
+        dynamics.state_dict()["transitions"]["states"], agent.recorded_episodes().states
+    )
+    assert agent.num_episodes == 3
+
+
+def test_other_dynamics_learn_all_that_there_is(point_agent, point_task, learnt_dynamics):
+    agent = point_agent(dynamics=learnt_dynamics()).learn(10)
+    other = learnt_dynamics()
+    agent.task = point_task(dynamics=other)
+    agent.learn(5, reset_num_timesteps=False)
+    assert other.num_transitions == 15
 
 
 FAILS = {1: "raises", 4: "nan", 9: "1e30", 12: "reward nan", 13: "reward 1e30", 18: "inf"}
@@ -66,6 +107,18 @@ def test_a_vectorised_environment_without_guards_gives_no_bad_data(point_agent, 
             agent.learn(10, reset_num_timesteps=False)
     assert agent.replay_buffer.size() == agent.num_timesteps - 2
     assert agent.recorded_episodes().rewards.isfinite().all()
+
+
+class BreaksAt(BaseCallback):
+    """At a step, what was empty is not any more."""
+
+    def __init__(self, step, broken):
+        super().__init__()
+        self.step, self.broken = step, broken
+
+    def _on_step(self):
+        self.broken += [True] * (self.num_timesteps == self.step)
+        return True
 
 
 class Jams(gymnasium.Wrapper):

@@ -1,14 +1,19 @@
 """What an iteration of Dyna does: real steps, updates, model, model episodes."""
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
 
-from gpadjust.dynamics import PhysicsDynamics, StateSpec
-from gpadjust.rl import DynaSAC, DynaTD3
+from gpadjust.control import Task
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
+from gpadjust.rl import DynaOptions, DynaSAC, DynaTD3
+from gpadjust.systems import cart_pole as swing_up
+from gpadjust.systems.swing_up import CART_POLE_SPEC, cart_pole_reward
 from tests.rl.conftest import model_rows
 
 
@@ -56,6 +61,18 @@ def test_model_rows_are_transitions_of_the_model(point_agent):
     np.testing.assert_array_equal(dones, timeouts)
 
 
+def test_options_of_the_model_are_taken(point_agent):
+    starts = {"initial_states": lambda n: torch.full((n, 1), 0.25)}
+    one = point_agent(**starts, train_freq=(15, "step"), model_episodes=4).learn(15)
+    assert one.num_episodes == 3  # each is followed by its episodes in the model
+    assert model_rows(one) == 3 * 4 * 5
+    assert (one.replay_buffer.model_buffer.observations[:12] == 0.25).all()
+    other = point_agent(model_buffer_size=15, seed=1).learn(10)
+    assert other.replay_buffer.buffer_size == 500
+    assert model_rows(other) == 15
+    assert (one.replay_buffer.rewards[:5] != other.replay_buffer.rewards[:5]).any()
+
+
 def test_episodes_that_terminate_in_the_model_end_there(point_agent, point_env):
     agent = point_agent(
         point_env(end=1.2),
@@ -84,6 +101,20 @@ def test_after_last_model_episode_batches_hold_no_model_rows(point_agent):
     agent.learn(20)
     assert mixed == [True] * 2 * (5 + 10) + [False] * 2 * 5
     assert model_rows(agent) == 2 * 2 * 5
+
+
+@pytest.mark.slow
+def test_a_long_run_in_pieces_goes_on(point_agent, sampled_dynamics):
+    dynamics = sampled_dynamics()
+    agent = point_agent(dynamics=dynamics)
+    for total in (10, 20):  # the second call counts time steps from zero again
+        agent.learn(10)
+        assert dynamics.num_transitions == total
+        assert agent.num_episodes == total // 5
+        assert model_rows(agent) == 2 * total
+    agent.learn(5, reset_num_timesteps=False)
+    assert dynamics.num_transitions == 25
+    assert agent.num_episodes == 5
 
 
 @pytest.mark.slow
@@ -149,6 +180,22 @@ def test_model_episodes_that_teach_nothing_are_warned_of(point_agent):
         agent.learn(5)
 
 
+def test_a_first_episode_of_a_single_step_waits_for_the_second(
+    point_agent, point_env, learnt_dynamics
+):
+    dynamics = learnt_dynamics()
+    agent = point_agent(
+        point_env(end=-9),
+        terminated=lambda states: states[:, 0] > -9,
+        dynamics=dynamics,
+        updates_per_model_step=1,
+    )
+    assert agent.learn(1).num_episodes == 0
+    agent.learn(2, reset_num_timesteps=False)
+    assert agent.num_episodes == dynamics.num_transitions == 3
+    assert agent._n_updates == 3 + 3 * 2
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("algorithm", [DynaSAC, DynaTD3])
 def test_a_trivial_task_is_improved(point_agent, algorithm):
@@ -174,6 +221,55 @@ def test_a_trivial_task_is_improved(point_agent, algorithm):
     assert cost(agent) < 0.2 * before
 
 
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:The draws of")  # there are 16
+def test_cart_pole(cart_pole):
+    dynamics = LearnedDynamics(
+        CART_POLE_SPEC,
+        swing_up(0).physics,
+        fit_options={"num_screened": 8, "num_starts": 1, "num_samples": 3, "num_draws": 16},
+    )
+    agent = DynaSAC(
+        "MlpPolicy",
+        cart_pole(),
+        Task(dynamics, cart_pole_reward),
+        DynaOptions(model_episodes=1, sampling="trajectory", score_horizons=()),
+        batch_size=8,
+        policy_kwargs={"net_arch": [8]},
+        seed=0,
+        device="cpu",
+    ).learn(50)
+    assert dynamics.num_transitions == 50
+    assert 2 <= model_rows(agent) <= 50
+    assert all(agent.wall_time[part] > 0 for part in ("fit", "rollout", "update"))
+
+
+def pendulum_step(X):
+    """Gymnasium's Pendulum-v1."""
+    theta, speed, torque = X.unbind(-1)
+    speed = (speed + (15 * theta.sin() + 3 * torque) * 0.05).clamp(-8, 8)
+    return torch.stack([theta + speed * 0.05, speed], dim=-1)
+
+
+def test_a_system_with_an_angle_of_another_order(point_agent):
+    class SineFirst(gymnasium.ObservationWrapper):
+        def observation(self, observation):
+            return observation[[1, 0, 2]]
+
+    def reward(states, actions, next_states):
+        theta, speed = states.unbind(-1)
+        theta = torch.atan2(theta.sin(), theta.cos())
+        return -(theta.square() + 0.1 * speed.square() + 0.001 * actions[:, 0].square())
+
+    env = SineFirst(gymnasium.make("Pendulum-v1", max_episode_steps=8))
+    env.observation_space = spaces.Box(-8, 8, (3,))
+    spec = StateSpec(["theta", "speed"], ["torque"], angles=["theta"])
+    agent = point_agent(
+        env, dynamics=PhysicsDynamics(spec, pendulum_step), reward=reward, episode_length=None
+    ).learn(16)
+    assert model_rows(agent) == 2 * 2 * 8
+
+
 def test_several_environments(point_agent, point_env, learnt_dynamics):
     dynamics = learnt_dynamics()
     env = make_vec_env(point_env, n_envs=2, seed=0)
@@ -184,6 +280,18 @@ def test_several_environments(point_agent, point_env, learnt_dynamics):
     assert dynamics.num_transitions == 40
     learnt = dynamics.state_dict()["transitions"]["states"]
     assert torch.equal(learnt.sort(0).values, agent.recorded_episodes().states.sort(0).values)
+
+
+def test_normalised_environments(point_agent, normalised, learnt_dynamics):
+    env = normalised()
+    dynamics = learnt_dynamics()
+    agent = point_agent(env, dynamics=dynamics).learn(15)
+    assert env.obs_rms.count > 15
+    raw = agent.recorded_episodes()
+    assert torch.allclose(raw.next_states, raw.states + 0.5 * raw.actions, atol=0.1)
+    rows = agent.replay_buffer.model_buffer
+    start = torch.from_numpy(rows.observations[:2, 0]).double()
+    assert torch.isin(start, raw.states).all()
 
 
 def test_normalised_observations_are_what_the_policy_sees_in_the_model(

@@ -1,12 +1,15 @@
 """A family: SAC and TD3 with a model."""
 
 import numpy as np
+import pytest
 import torch
 from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 
-from gpadjust.rl import Dyna, DynaSAC, DynaTD3
+from gpadjust.control import Task
+from gpadjust.rl import Dyna, DynaOptions, DynaSAC, DynaTD3
 from gpadjust.rl.buffer import CompactReplayBuffer
+from gpadjust.systems.swing_up import cart_pole_reward, cart_pole_start
 from tests.point import assert_equal
 from tests.rl.conftest import model_rows
 
@@ -50,6 +53,31 @@ def test_another_learner_needs_no_code(point_agent, point_env, point_task, tmp_p
     agent.save(tmp_path / "agent.zip")
     again = Other.load(tmp_path / "agent.zip", env=point_env(), task=point_task())
     assert_equal(again.policy.state_dict(), agent.policy.state_dict())
+
+
+@pytest.mark.slow
+def test_td3_swings_up_the_cart_pole(cart_pole, cart_pole_dynamics):
+    """In the known system, after 12 episodes; to hang costs .95, to swing up some .3."""
+    agent = DynaTD3(
+        "MlpPolicy",
+        cart_pole(),
+        Task(cart_pole_dynamics, cart_pole_reward, initial_states=cart_pole_start),
+        DynaOptions(model_episodes=20, num_particles=5),
+        action_noise=NormalActionNoise(np.zeros(1), np.full(1, 0.2)),
+        learning_rate=1e-3,
+        gamma=0.95,
+        tau=0.02,
+        policy_kwargs={"net_arch": [128, 128]},
+        device="cpu",
+        seed=0,
+    ).learn(12 * 25)
+    torch.manual_seed(1)
+    env = agent.model_env(20)
+    obs, costs = env.reset(), []
+    for _ in range(25):
+        obs, rewards, _, _ = env.step(agent.predict(obs, deterministic=True)[0])
+        costs.append(-rewards.mean())
+    assert np.mean(costs) < 0.6
 
 
 def test_particles_have_action_noise_of_their_own(point_agent):

@@ -73,6 +73,12 @@ def test_callbacks_of_stable_baselines(point_agent, normalised, point_env, tmp_p
     } <= names
 
 
+def test_progress_bar(point_agent, capsys):
+    with pytest.warns(match="rich is experimental"):
+        point_agent().learn(10, progress_bar=True)
+    assert "10/10" in capsys.readouterr().out
+
+
 class Watch(DynaCallback):
     def __init__(self):
         super().__init__()
@@ -101,6 +107,19 @@ def test_hooks_of_the_model(point_agent, learnt_dynamics):
     assert len(watch.fits) == 2
 
 
+def test_a_hook_that_raises_lets_nothing_be_learnt_twice(point_agent, learnt_dynamics):
+    class Raises(DynaCallback):
+        def on_model_fit(self, metrics):
+            raise OSError("full")
+
+    dynamics = learnt_dynamics()
+    agent = point_agent(dynamics=dynamics)
+    with pytest.raises(OSError, match="full"):
+        agent.learn(5, Raises())
+    agent.learn(5, reset_num_timesteps=False)
+    assert dynamics.num_transitions == 10
+
+
 @pytest.mark.slow
 def test_scores_of_trajectories_are_logged_and_change_nothing(
     point_agent, sampled_dynamics, assert_same
@@ -121,3 +140,12 @@ def test_progress_is_printed(point_agent, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert [line.partition(" ")[0] for line in lines] == ["trial", "fit:"] * 2
     assert re.fullmatch(r"trial 2: reward -\d\S* a step, 5 steps in \d+\.\d s", lines[2])
+
+
+def test_its_representation_says_what_it_is(point_agent):
+    last = point_agent().learn(10)
+    assert "DynaSAC(Point, PhysicsDynamics, 2 episodes learnt, 10 steps, last reward -" in repr(
+        last
+    )
+    last.task = None
+    assert repr(last) == "DynaSAC(Point, no task)"

@@ -7,7 +7,7 @@ import pytest
 import torch
 from gymnasium import spaces
 from stable_baselines3 import PPO, SAC
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from gpadjust.control import Task
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
@@ -42,6 +42,16 @@ def test_perfect_physics_are_the_real_environment(cart_pole, cart_pole_dynamics)
         np.testing.assert_array_equal(seen[-1][i], seen[0][i])
 
 
+def test_one_call_of_the_model_moves_all_particles(point_particles, point_dynamics, rise):
+    calls = []
+    step = point_dynamics.sample
+    point_dynamics.sample = lambda *args: calls.append(len(args[0])) or step(*args)
+    particles = point_particles(num_envs=7)
+    particles.reset()
+    particles.step(rise(7))
+    assert calls == [7]
+
+
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_observations_have_the_type_of_the_space(point_particles, dtype, rise):
     space = spaces.Box(-np.inf, np.inf, (1,), dtype)
@@ -49,6 +59,17 @@ def test_observations_have_the_type_of_the_space(point_particles, dtype, rise):
     assert particles.reset().dtype == dtype
     obs, rewards, dones, _ = particles.step(rise(3))
     assert (obs.dtype, rewards.dtype, dones.dtype) == (dtype, np.float32, bool)
+
+
+def test_soft_actor_critic_learns_in_it(point_particles):
+    env = VecMonitor(point_particles())
+    agent = SAC(
+        "MlpPolicy", env, learning_starts=6, batch_size=8, policy_kwargs={"net_arch": [8]}, seed=0
+    )
+    agent.learn(30)
+    assert agent._n_updates > 0
+    assert [info["l"] for info in agent.ep_info_buffer] == [5] * 6
+    assert np.isfinite([info["r"] for info in agent.ep_info_buffer]).all()
 
 
 LEARNERS = {
@@ -276,3 +297,35 @@ def test_rewards_may_be_whole_numbers_or_carry_gradients(point_particles, rise, 
     particles = point_particles(reward=reward)
     particles.reset()
     assert particles.step(rise(3))[1].tolist() == [1, 1, 1]
+
+
+def test_attributes_are_those_of_all_particles(point_particles):
+    particles = point_particles()
+    assert particles.get_attr("episode_length", indices=[0, 2]) == [5, 5]
+    particles.set_attr("worst_reward", 0.5)
+    assert particles.get_attr("worst_reward") == [0.5, 0.5, 0.5]
+    assert particles.env_is_wrapped(VecMonitor) == [False] * 3
+    with pytest.raises(ValueError, match="all at once"):
+        particles.set_attr("worst_reward", 0.5, indices=0)
+    with pytest.raises(NotImplementedError, match="fly"):
+        particles.env_method("fly")
+
+
+def test_functions_are_drawn_once_for_what_is_refreshed_and_the_episodes_after(
+    point_particles, unsure_dynamics, monkeypatch, rise
+):
+    drawn = []
+    draw = unsure_dynamics.sample_functions
+    monkeypatch.setattr(
+        unsure_dynamics, "sample_functions", lambda n, *seed: drawn.append(n) or draw(n, *seed)
+    )
+    env = point_particles(dynamics=unsure_dynamics, sampling="trajectory")
+    buffer = CompactReplayBuffer(5, env.observation_space, env.action_space, "cpu")
+    zeros = np.zeros(2)
+    buffer.add_rows(np.ones((2, 1)), np.ones((2, 1)), np.ones((2, 1)), zeros, zeros, zeros)
+    env.refresh(buffer)
+    env.reset()
+    assert drawn == [3]
+    env.step(rise(3))
+    env.reset()  # other functions for other episodes
+    assert drawn == [3, 3]

@@ -72,6 +72,12 @@ def starts_of(episodes):
     return sorted(set(episodes.draw_starts(200)[:, 0].tolist()))
 
 
+def test_starts_are_those_of_episodes(recorded):
+    episodes = recorded(8, n_envs=2)
+    assert starts_of(episodes) == [0, 3, 6, 100, 103, 106]
+    assert episodes.draw_starts(5).shape == (5, 2)
+
+
 def test_the_oldest_row_of_a_full_buffer_may_be_no_start(recorded):
     assert starts_of(recorded(8, capacity=4)) == [6]  # the rows are 4, 5, 6, 7
 

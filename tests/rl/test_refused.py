@@ -30,7 +30,14 @@ OPTIONS = [
     ({"replay_buffer_class": dict}, "must be MixedReplayBuffer .*found dict"),
     ({"optimize_memory_usage": True}, "optimize_memory_usage"),
     ({"real_fraction": 2}, "real_fraction must be .*; found 2"),
+    ({"updates_per_model_step": float("inf")}, "updates_per_model_step must be .*; found inf"),
+    ({"model_buffer_size": 0}, "model_buffer_size must be at least 1; found 0"),
+    ({"model_episodes": 2.5}, "model_episodes must be a whole number; found 2.5"),
+    ({"last_model_episode": -1}, "last_model_episode must be at least 0; found -1"),
+    ({"num_particles": 0}, "num_particles must be at least 1; found 0"),
     ({"sampling": "swarm"}, "Unknown sampling 'swarm'"),
+    ({"refresh_model_data": 1}, "refresh_model_data must be True or False; found 1"),
+    ({"reward_tolerance": "no"}, "reward_tolerance must be a number; found 'no'"),
     ({"gradient_steps": 0}, "gradient_steps"),
     ({"policy": "MultiInputPolicy", "env": Shaped(spaces.Dict({"x": LINE}), LINE)}, "has 1 entri"),
     ({"env": Shaped(PLANE, LINE)}, "observation has 1 entries"),
@@ -100,6 +107,11 @@ def test_wrong_functions_are_found_before_the_first_real_step(point_agent, parts
     assert agent.num_timesteps == 0
 
 
+def test_discrete_actions_are_refused_by_stable_baselines(point_agent):
+    with pytest.raises(AssertionError, match=r"only supports.*Box.*Discrete"):
+        point_agent(Shaped(LINE, spaces.Discrete(2)))
+
+
 def test_terminations_that_come_late_are_refused(point_agent, point_env):
     env = point_env()
     agent = point_agent(env).learn(5)
@@ -124,6 +136,8 @@ def test_a_time_limit_put_around_by_hand_is_read(point_agent):
 
 PARTICLES = [
     ({"observation_space": PLANE}, "observation has 1 entries"),
+    ({"observation_space": spaces.Discrete(2)}, "observation has 1 entries"),
+    ({"num_envs": 0}, "num_envs must be at least 1; found 0"),
     ({"sampling": "swarm"}, "Unknown sampling 'swarm'"),
     ({"initial_states": None}, "needs a task with initial_states"),
     ({"initial_states": torch.zeros}, r"initial_states\(3\) must return .* 3 x 1; found \(3,\)"),

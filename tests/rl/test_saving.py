@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from gpadjust.dynamics import PhysicsDynamics, StateSpec
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
+from gpadjust.models import ZeroMeanGP
 from gpadjust.rl import DynaCallback, DynaSAC
 
 
@@ -76,6 +77,21 @@ def test_what_the_dynamics_learnt_outlives_an_agent_without_them(
     assert dynamics.num_transitions == agent.task.dynamics.num_transitions
 
 
+def test_dynamics_of_another_kind_are_not_loaded(saved, point_task):
+    _, path = saved
+    other = LearnedDynamics(StateSpec(["x"], ["v"]), model=ZeroMeanGP)
+    with pytest.raises(RuntimeError, match=r"model is .*CKA.* in the state, .*ZeroMeanGP.* here"):
+        DynaSAC.load(path, task=point_task(dynamics=other))
+
+
+def test_a_wrong_reward_is_found_after_loading_too(saved, point_env, learnt_dynamics, point_task):
+    _, path = saved
+    task = point_task(dynamics=learnt_dynamics(), reward=lambda s, a, n: s[:, 0])
+    loaded = DynaSAC.load(path, env=point_env(), task=task)
+    with pytest.raises(ValueError, match="is not the environment's"):
+        loaded.learn(5)
+
+
 def test_the_file_holds_neither_physics_nor_functions_nor_environment(
     point_agent, point_env, tmp_path
 ):
@@ -136,6 +152,18 @@ def test_parameters_can_be_moved(saved, point_agent, learnt_dynamics):
         )
 
 
+def test_parameters_without_dynamics_are_refused_unless_told(saved, point_agent, learnt_dynamics):
+    agent, _ = saved
+    networks = {k: v for k, v in agent.get_parameters().items() if k != "dynamics"}
+    other = point_agent(dynamics=learnt_dynamics(), seed=9)
+    with pytest.raises(
+        ValueError, match=r"with the state of the dynamics, 'dynamics'; found \['act"
+    ):
+        other.set_parameters(networks)
+    other.set_parameters(networks, exact_match=False)
+    assert not other.task.dynamics.is_fitted
+
+
 def test_a_task_that_is_given_after_loading_knows_what_was_learnt(
     saved, point_env, point_task, crude_dynamics
 ):
@@ -146,3 +174,20 @@ def test_a_task_that_is_given_after_loading_knows_what_was_learnt(
     loaded.task = point_task(dynamics=crude_dynamics(agent.task.dynamics.physics))
     loaded.learn(5, reset_num_timesteps=False)
     assert loaded.task.dynamics.num_transitions == 15
+
+
+def test_parameters_are_taken_as_a_whole(saved, point_agent, learnt_dynamics, tensors_of):
+    agent, _ = saved
+    broken = agent.get_parameters()
+    broken["policy"] = {}
+    other = point_agent(dynamics=learnt_dynamics(), seed=9).learn(5)
+    with pytest.raises(RuntimeError, match="Missing key"):
+        other.set_parameters(broken)
+    assert other.task.dynamics.num_transitions == 5
+
+
+def test_another_physics_is_not_loaded(saved, point_task, crude_dynamics):
+    _, path = saved
+    other = crude_dynamics(lambda X: X[:, :1] + 0.1 * X[:, 1:])
+    with pytest.raises(RuntimeError, match="physics"):
+        DynaSAC.load(path, task=point_task(dynamics=other))

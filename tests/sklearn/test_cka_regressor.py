@@ -14,7 +14,7 @@ from sklearn.base import clone
 from sklearn.compose import TransformedTargetRegressor
 from sklearn.exceptions import NotFittedError
 from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.model_selection import GridSearchCV
+from sklearn.model_selection import GridSearchCV, cross_val_score
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.utils.estimator_checks import parametrize_with_checks
@@ -23,6 +23,7 @@ from gpadjust import (
     AR1,
     CKA,
     BlackBoxPhysics,
+    PhysicsError,
     PhysicsMeanGP,
     PhysicsWarning,
     Unknown,
@@ -37,6 +38,10 @@ FAST = {"num_starts": 2, "num_screened": 16}
 
 def wave(X):
     return np.sin(6 * X[:, 0])
+
+
+def waves(X):
+    return np.column_stack([wave(X), wave(X) ** 2])
 
 
 def torch_wave(X):
@@ -114,6 +119,24 @@ def test_it_says_what_the_model_says(data, method, noise):
     np.testing.assert_allclose(np.diag(covariance), variance, rtol=1e-6)
 
 
+def test_numpy_and_torch_are_one(data):
+    by_numpy, by_torch = (fast(f).fit(*data).predict(Z) for f in (wave, torch_wave))
+    np.testing.assert_allclose(by_numpy, by_torch, rtol=1e-6)
+
+
+def test_several_outputs(data):
+    X, y = data
+    Y = np.column_stack([y, y**2 + X[:, 0]])
+    regressor = fast(waves, fit_method=None).fit(X, Y)
+    mean, std = regressor.predict(Z, return_std=True)
+    _, covariance = regressor.predict(Z, return_cov=True)
+    assert mean.shape == std.shape == (7, 2)
+    assert covariance.shape == (7, 7, 2)
+    np.testing.assert_allclose(np.einsum("iij->ij", covariance), std**2, rtol=1e-4)
+    assert regressor.sample_y(Z, 3).shape == (7, 2, 3)
+    assert regressor.score(X, Y) > 0.9
+
+
 @pytest.mark.parametrize("columns", [1, 2])
 def test_shapes_are_those_of_a_gaussian_process_regressor(data, columns):
     X, y = data
@@ -163,6 +186,20 @@ def test_the_seed_of_draws(data):
     assert (regressor.sample_y(Z, 1, state) != regressor.sample_y(Z, 1, state)).all()
 
 
+@pytest.mark.slow
+def test_the_seed_of_the_fit(data):
+    def scales(state):
+        regressor = CKARegressor(wave, random_state=state, fit_options={"num_draws": 16})
+        return [p.detach() for p in regressor.fit(*data).model_.parameters()]
+
+    def same(a, b):
+        return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
+
+    assert same(scales(5), scales(5))
+    assert not same(scales(5), scales(6))
+    assert same(scales(np.random.RandomState(0)), scales(np.random.RandomState(0)))
+
+
 def test_physics_none_is_a_gaussian_process_without_physics(data):
     X, y = data
     for regressor in (fast(None), fast(wave, model="zero_mean")):
@@ -182,6 +219,16 @@ def test_a_class_of_models_with_options(data):
     assert options == {"rho_mean": "learn", "train_Yvar": 0.05**2}
 
 
+def test_parameters_are_left_as_they_are(data):
+    linear, model = torch.nn.Linear(1, 1).double(), partial(CKA, center=0.0)
+    before = linear.weight.item()
+    regressor = fast(linear, model=model).fit(*data)
+    assert linear.weight.item() == before != regressor.model_.physics.function.weight.item()
+    parameters = regressor.get_params()
+    assert parameters["physics"] is linear
+    assert parameters["model"] is model
+
+
 def test_unknown_parameters(data):
     X = data[0]
     law = BlackBoxPhysics(
@@ -192,6 +239,13 @@ def test_unknown_parameters(data):
     assert regressor.physics_parameters_["rate"].mean().item() == pytest.approx(6, abs=0.2)
     regressor.set_params(physics=wave, model="cka").fit(*data)
     assert not hasattr(regressor, "physics_parameters_")
+
+
+def test_several_physics(data):
+    physics = {"coarse": lambda X: X[:, 0], "fine": torch_wave}
+    regressor = fast(physics).fit(*data)
+    assert regressor.model_.rho_names == ("rho_coarse", "rho_fine")
+    assert regressor.score(*data) > 0.9
 
 
 def test_the_physics_sees_what_the_regressor_is_given(data):
@@ -228,11 +282,33 @@ def test_a_physics_that_is_off_is_said_to_be(data):
 def test_grid_search_over_models_and_physics(data):
     X, y = data
     rows = np.random.RandomState(0).permutation(len(X))
-    grid = [{"model": ["cka", "physics_mean"], "physics": [wave, torch_wave]}, {"physics": [None]}]
+    grid = [
+        {"model": ["cka", "physics_mean"], "physics": [wave, torch_wave]},
+        {"physics": [None]},
+    ]
     search = GridSearchCV(fast(), grid, cv=2).fit(X[rows], y[rows])
     assert np.isfinite(search.cv_results_["mean_test_score"]).all()
     assert search.best_params_["physics"] is not None
     assert search.best_estimator_.predict(Z).shape == (7,)
+
+
+@pytest.mark.slow
+def test_processes_take_a_lambda(data):
+    X, y = data
+    search = GridSearchCV(
+        fast(lambda X: np.sin(6 * X[:, 0])), {"model": ["cka", "physics_mean"]}, cv=2, n_jobs=2
+    )
+    assert np.isfinite(search.fit(X, y).cv_results_["mean_test_score"]).all()
+
+
+def test_other_tools(data):
+    X, y = data
+    rows = np.random.RandomState(0).permutation(len(X))
+    assert cross_val_score(fast(), X[rows], y[rows], cv=2, n_jobs=1).mean() > 0.8
+    doubled = TransformedTargetRegressor(
+        fast(lambda X: wave(X) / 2), func=lambda y: y / 2, inverse_func=lambda y: 2 * y
+    )
+    np.testing.assert_allclose(doubled.fit(X, y).predict(X), fast().fit(X, y).predict(X), rtol=1e-6)
 
 
 def test_a_frame_gives_names(data):
@@ -249,6 +325,16 @@ def test_a_frame_gives_names(data):
         regressor.predict(frame[["load", "time"]])
     with pytest.warns(UserWarning, match="feature names"):
         regressor.predict(frame.to_numpy())
+
+
+def test_kinds_of_arrays(data):
+    X, y = data
+    expected = fast().fit(X, y).predict(Z)
+    X.setflags(write=False)
+    for made in (np.ndarray.tolist, np.float32, torch.tensor, np.asarray):
+        found = fast().fit(made(X.copy() if made is torch.tensor else X), made(y)).predict(made(Z))
+        assert found.dtype == np.float64
+        np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize(("physics", "method"), [(wave, None), (torch_wave, "map"), (None, "map")])
@@ -276,8 +362,17 @@ def test_a_lambda_needs_cloudpickle(data):
 
 def test_bad_data(data):
     X, y = data
-    with pytest.raises(ValueError, match="returned 1 columns, expected 2"):
-        fast().fit(X, np.column_stack([y, y]))
+    for rows, words in (
+        ((X * np.nan, y), "Input X contains NaN"),
+        ((X, y * np.nan), "Input y contains NaN"),
+        ((X, y * 1j), "Complex data not supported"),
+        ((X[:, 0], y), "Expected 2D array, got 1D"),
+        ((X, y[1:]), "inconsistent numbers of samples"),
+        ((X[:1], y[:1]), "minimum of 2 is required"),
+        ((X, np.column_stack([y, y])), "returned 1 columns, expected 2"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            fast().fit(*rows)
 
 
 REFUSED = [
@@ -286,6 +381,9 @@ REFUSED = [
     ({"model": 3}, TypeError, r"callable \(X, Y, \*\*physics\) .*got 3"),
     ({"model": lambda X, Y, physics: X}, TypeError, "to make a gpadjust TermsModel, got nda"),
     ({"model": "rra", "physics": None}, ValueError, "without one take model='zero_mean'"),
+    ({"physics": "wave"}, TypeError, "physics must be a Physics or a callable"),
+    ({"physics": lambda X: X[:, 0] * np.nan}, PhysicsError, "finite"),
+    ({"fit_method": "hmc"}, ValueError, "Unknown method 'hmc'; expected 'bayes' or 'map'"),
     ({"fit_options": {"num_samples": 4}}, ValueError, "it is one of method 'bayes'"),
     ({"model": partial(CKA, centre=0)}, TypeError, r"argument 'centre'; it takes .*center"),
     ({"physics": None, "model": CKA}, TypeError, "argument: 'physics'"),
@@ -309,6 +407,9 @@ def test_inducing_points(data):
     assert np.abs(mean - y).max() < 0.2
     _, covariance = regressor.predict(X, return_cov=True)
     np.testing.assert_allclose(np.diag(covariance), std**2, rtol=1e-6)
+    assert regressor.sample_y(Z, 3).shape == (7, 3)
+    again = pickle.loads(pickle.dumps(regressor))
+    np.testing.assert_array_equal(again.predict(Z), regressor.predict(Z))
 
 
 def test_bad_requests(data):
