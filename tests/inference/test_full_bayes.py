@@ -356,6 +356,7 @@ def test_a_list_of_models_of_few_and_many_points(uniform):
     assert models.posterior(X[:5]).mean.shape == (8, 5, 2)
 
 
+@pytest.mark.slow
 def test_narrow_constraints_are_kept(uniform):
     X = uniform(20, 8)
     base = RBFKernel(ard_num_dims=8, lengthscale_constraint=Interval(0.9, 1.1))

@@ -261,6 +261,7 @@ class TestCopies:
 
 
 class TestLettingGo:
+    @pytest.mark.slow
     @pytest.mark.filterwarnings("ignore::gpadjust.inference.SamplingWarning")
     def test_it_can_be_fitted_again(self, data, build):
         model, fresh = (build("CKA", *data(num_outputs=2)) for _ in range(2))
