@@ -232,6 +232,19 @@ class TestCopies:
 
 
 class TestLettingGo:
+    @pytest.mark.slow
+    @pytest.mark.filterwarnings("ignore::gpadjust.inference.SamplingWarning")
+    def test_it_can_be_fitted_again(self, data, build):
+        model, fresh = (build("CKA", *data(num_outputs=2)) for _ in range(2))
+        options = {"num_screened": 16, "num_starts": 2}
+        fit(model, num_draws=64, num_samples=4, **options)
+        fit(model, num_draws=64, num_samples=6, **options)
+        assert model.num_samples == 6
+        found = fit(model, "map", **options).log_likelihood
+        assert model.num_samples is None
+        expected = fit(fresh, "map", **options).log_likelihood
+        assert (found > expected - 1.0).all()
+
     def test_it_keeps_them_if_a_fit_fails(self, held, data, uniform):
         model, _ = held("CKA", *data())
         Z = uniform(4, 2)

@@ -82,7 +82,7 @@ def test_with_missing_targets_and_from_a_start_below_it():
     assert_above(model, Y)
 
 
-@pytest.mark.parametrize("num_screened", [0, 32])
+@pytest.mark.parametrize("num_screened", [0, pytest.param(32, marks=pytest.mark.slow)])
 def test_from_a_model_of_much_smaller_residuals(num_screened):
     few, Y = crude(X[:5]) + 1e-3 * X[:5], TARGETS["in the class"]
     previous, model = CKA(X[:5], few, physics=crude), CKA(X, Y, physics=of(Y))
@@ -93,7 +93,9 @@ def test_from_a_model_of_much_smaller_residuals(num_screened):
 
 
 @pytest.mark.filterwarnings("ignore::gpadjust.inference.SamplingWarning")
-@pytest.mark.parametrize("targets", ["in the class", "of outputs of many sizes"])
+@pytest.mark.parametrize(
+    "targets", ["in the class", pytest.param("of outputs of many sizes", marks=pytest.mark.slow)]
+)
 def test_of_samples(targets):
     Y = TARGETS[targets]
     model = CKA(X, Y, physics=of(Y))

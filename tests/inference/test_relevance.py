@@ -449,7 +449,8 @@ class TestTracesOfSamplesWithoutPhysics:
         expected = (moments.mean - unrelated(found.X)).abs() / half
         torch.testing.assert_close(found.override, expected, rtol=0.01, atol=0.01)
 
-    @pytest.mark.parametrize("scale", [1e-3, pytest.param(1e3, marks=pytest.mark.slow)])
+    @pytest.mark.slow
+    @pytest.mark.parametrize("scale", [1e-3, 1e3])
     def test_a_physics_of_any_unit_is_switched_off(self, data, scale):
         X, Y, Z = data
         found = []

@@ -220,6 +220,7 @@ def test_noise_that_the_user_set_stays():
     assert model.likelihood.raw_noise.isfinite().all()
 
 
+@pytest.mark.slow
 def test_priors_count():
     X, _, Y = problem(100)
     free, bound = make(X, Y), make(X, Y)

@@ -79,11 +79,13 @@ def test_what_is_refused(arrays, says):
     ("call", "name", "says"),
     [
         (lambda: cka(column(TEXT[0])), "train_X", TEXTS),
+        (lambda: cka(column(TEXT[5])), "train_X", TEXTS),  # names of rows are no categories
         (lambda: cka(pd.DataFrame({"t": DATES, "x": ONE_TO_SIX})), "train_X", DATED),
         (lambda: cka(NUMBERS, column(COMPLEX[0])), "train_Y", COMPLEXES),
         (lambda: cka().predict(column(DATES)), "X", DATED),
         (lambda: cka().condition_on_observations(NUMBERS, column(TEXT[4])), "Y", TEXTS),
         (lambda: Record(COMPLEX[3], NUMBERS, NUMBERS), "times", COMPLEXES),
+        (lambda: Record(COMPLEX[4], NUMBERS, NUMBERS), "times", COMPLEXES),
         (lambda: Record(DAYS, NUMBERS, NUMBERS), "times", DATED),
         (lambda: Record(CLOCK, NUMBERS, NUMBERS), "times", DATED),
         (lambda: Record(ONE_TO_SIX, column(DATES), NUMBERS), "states", DATED),

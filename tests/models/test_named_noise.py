@@ -73,6 +73,7 @@ def test_outliers_are_found_and_hardly_count(gross):
     assert float(loo.score().rmse) < 0.1
 
 
+@pytest.mark.slow
 def test_without_outliers_nothing_changes(gross):
     X, Y = gross
     keep = [i for i in range(len(X)) if i not in OUTLIERS]

@@ -112,6 +112,7 @@ def test_it_works_through_the_house(data, tmp_path):
     assert report(model, tmp_path / "page.html").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_no_noise_changes_nothing_and_samples_are_saved(data, tmp_path):
     plain, model = CKA(*data, physics=f_p), CKA(*data, physics=f_p, train_Xvar=0.0)
     for each in (plain, model):

@@ -258,7 +258,7 @@ def test_rows_arguments_and_states(close):
     close(other.train_targets * model.outcome_transform.stdvs.squeeze(), Y.squeeze(-1))
 
 
-@pytest.mark.parametrize("noise", [None, 0.01])
+@pytest.mark.parametrize("noise", [None, pytest.param(0.01, marks=pytest.mark.slow)])
 def test_files(tmp_path, noise):
     X, Y = problem(60, 2)
     model = make(X, Y, noise, input_transform=None, center="mean", num_inducing=5)

@@ -229,7 +229,7 @@ class TestFailures:
 
 
 class TestParallel:
-    def test_threads_and_processes_share_the_rows(self, points):
+    def test_threads_share_the_rows(self, points):
         barrier = threading.Barrier(2, timeout=10)
 
         def simulate(x):
@@ -241,6 +241,8 @@ class TestParallel:
         with joblib.parallel_config(backend="threading", n_jobs=2):
             assert torch.equal(physics(X), X[:, :1])
 
+    @pytest.mark.slow
+    def test_processes_share_the_rows(self):
         class UnpicklableError(Exception):
             def __init__(self, code, reason):
                 super().__init__(f"{reason} ({code})")
