@@ -286,18 +286,6 @@ class TestBeforeAndAfter:
         assert first.terms[0].basis.center.item() == 0.0
 
 
-@quick
-def test_a_list_of_models_of_few_and_many_points(uniform):
-    X = uniform(45, 1)
-    Y = ripple(X) + X.exp() + 0.1 * torch.randn(45, 1, dtype=torch.float64)
-    few, many = CKA(X[:8], Y[:8], physics=ripple), BiasGP(X, Y, physics=ripple)
-    models = ModelListGP(few, many)
-    results = fit(models, num_draws=64, num_starts=1, num_screened=8)
-    assert [type(result) for result in results] == [SampleResult] * 2
-    assert few.num_samples == many.num_samples == 8
-    assert models.posterior(X[:5]).mean.shape == (8, 5, 2)
-
-
 @pytest.mark.slow
 def test_narrow_constraints_are_kept(uniform):
     X = uniform(20, 8)
