@@ -399,9 +399,10 @@ def check_stackable(first: TermsGP, other: TermsGP) -> None:
             f"{other!r} differ."
         )
     if getattr(first.link, "bounds", None) != getattr(other.link, "bounds", None):
+        bounds = [getattr(model.link, "bounds", "none") for model in (first, other)]
         raise ValueError(
-            f"Expected models of one link, but the outcome_transform of {first!r} and of "
-            f"{other!r} differ: give all the same."
+            f"Expected models of one link, but the bounds of outcome_transform are {bounds[0]} of "
+            f"one and {bounds[1]} of another: give all structures the same."
         )
 
 

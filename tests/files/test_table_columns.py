@@ -1,4 +1,4 @@
-"""Columns of CSV files as they come; what reads records is in tests/dynamics/test_records.py."""
+"""Columns of CSV files as they come; what reads records is in tests/records/test_records.py."""
 
 import pytest
 
