@@ -23,6 +23,7 @@ from gpadjust.control.task import Task
 from gpadjust.models.sampled_functions import seeded
 
 _SHORTEST, _LONGEST = 8, 30  # steps ahead
+_SEGMENT = 1.5  # horizons of a step
 
 EACH_STEP = Planner(
     search=CrossEntropy(1, num_elites=12, correlation=0.5),
@@ -36,7 +37,7 @@ FIRST = Planner(
     num_random=128,
     spread=0.15,
 )
-"""The default plan of an episode that begins: the whole of it."""
+"""The default plan of an episode that begins: the whole of it, at once and in segments."""
 
 
 class Planned(NamedTuple):
@@ -87,8 +88,9 @@ class MPC:
             of the episode, of 8 to 30 steps. A horizon must be as long as the manoeuvre
             needs, as energy must be put into a pole before it can stand: try it in f_p alone
             (:class:`~gpadjust.dynamics.PhysicsDynamics`) first.
-        first: Plans when an episode begins, which has not to be in time. Default: the whole
-            episode; as far as ``each_step`` looks if the task does not say how long an episode is.
+        first: Plans when an episode begins, which has not to be in time. Default: two searches of
+            the whole episode, from random sequences and from a plan in segments, half as long again
+            as ``each_step`` looks; as far as that if the task does not say how long an episode is.
             Objective and functions are those of ``each_step``.
         tolerance: Where the plan of a step is worth less than what was promised of its steps when
             the whole was planned, by more than this share of the range of the promised rewards (a
@@ -143,6 +145,7 @@ class MPC:
                 objective=each_step.objective,
                 num_functions=each_step.num_functions,
                 horizon=each_step.horizon if length is None else None,
+                segment=each_step.horizon and _SEGMENT * each_step.horizon,
             )
         for planner in (each_step, first):
             planner.steps_ahead(spec)  # or an error
@@ -252,7 +255,7 @@ class MPC:
         if self.each_step.seconds is None:
             return planner
         left = begun + self.each_step.seconds - time.perf_counter()
-        return replace(planner, seconds=max(left, 1e-9))
+        return replace(planner, seconds=max(left, 1e-9), segment=None)
 
     @staticmethod
     def _begun(plan: Plan, earlier: Planned | None, before: Tensor | None) -> Planned:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from contextlib import suppress
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -82,6 +82,10 @@ class Planner:
         seconds: The most time that a plan takes. A round of the search that would take longer does
             not begin; if even the first one would, its sequences are followed, and compared, as far
             as there is time, one step of the model at least. Default: as long as it takes.
+        segment: Without an earlier plan, one more search begins with a plan in segments of this
+            duration (in the unit of ``horizon``): half of a segment is made in the model, where the
+            next one is planned. Of an unstable system, random sequences of a whole episode tell
+            nothing. Default: none.
 
     Raises:
         TypeError: If objective or search is none, or a number is of another kind.
@@ -108,6 +112,7 @@ class Planner:
     max_hold: int = 5
     spread: float = 0.1
     seconds: float | None = None
+    segment: float | None = None
 
     def __post_init__(self) -> None:
         """Check objective, search and numbers."""
@@ -118,11 +123,13 @@ class Planner:
             checked_whole(name, getattr(self, name), 1)
         if self.num_functions is not None:
             checked_whole("num_functions", self.num_functions, 1)
-        for name in ("horizon", "seconds"):
+        for name in ("horizon", "seconds", "segment"):
             if getattr(self, name) is not None:
                 checked_number(name, getattr(self, name), above=0)
         self.objective.check_functions(self.num_functions)
         checked_number("spread", self.spread, above=0, below=1)
+        if None not in (self.seconds, self.segment):
+            raise ValueError("A plan in segments has no time limit; leave out seconds or segment.")
 
     def steps_ahead(self, spec: StateSpec) -> int | None:
         """Return the horizon in steps; None to the end of the episode.
@@ -130,15 +137,7 @@ class Planner:
         Raises:
             ValueError: If it is shorter than a step.
         """
-        if self.horizon is None:
-            return None
-        step = spec.step or 1.0
-        if self.horizon < step * (1 - 1e-9):
-            raise ValueError(
-                f"horizon must be one step at least, which takes {step:g} in the time unit of "
-                f"StateSpec(step=...); found {self.horizon:g}."
-            )
-        return round(self.horizon / step)
+        return in_steps("horizon", self.horizon, spec)
 
     @torch.no_grad()
     def plan(
@@ -196,14 +195,43 @@ class Planner:
                 best.append(Plan.of(rollout, found, float(scores[found])))
             return scores
 
-        with suppress(_TimeIsUp):
+        def search(known: Tensor | None) -> None:
             first = self._proposed(num_steps, action_bounds, known)
             self.search.best(scored, first, action_bounds)
+
+        known = None if known is None or not len(known) else known
+        segment = in_steps("segment", self.segment, spec)
+        with suppress(_TimeIsUp):
+            search(known)
+            if known is None and segment is not None and segment < num_steps:
+                where = task, state, action_bounds, num_steps
+                search(self._in_segments(*where, before, steps_done))
         return best[-1]
+
+    def _in_segments(
+        self,
+        task: Task,
+        state: Tensor,
+        action_bounds: Tensor,
+        num_steps: int,
+        before: Tensor | None,
+        steps_done: int,
+    ) -> Tensor:
+        """Actions ``num_steps x action_dim`` of segments, each begun in the middle of the last."""
+        ahead = replace(self, horizon=self.segment, segment=None)
+        actions, known = action_bounds[:0], None
+        while (left := num_steps - len(actions)) > 0:
+            done = steps_done + len(actions)
+            how: dict[str, Any] = {"known": known, "before": before, "steps_done": done}
+            plan = ahead.plan(task, state, action_bounds, left, **how)
+            k = left if len(plan.actions) == left else -(-len(plan.actions) // 2)
+            actions, known = torch.cat([actions, plan.actions[:k]]), plan.actions[k:]
+            state, before = plan.next_states[k - 1], plan.actions[k - 1]
+        return actions
 
     def _proposed(self, num_steps: int, bounds: Tensor, known: Tensor | None) -> Tensor:
         """The sequences that a search begins with, ``n x num_steps x action_dim``."""
-        if known is None or not len(known):
+        if known is None:
             return random_sequences(self.num_random, num_steps, bounds, self.max_hold)
         if known.dim() != 2 or known.shape[-1] != bounds.shape[-1]:
             raise ValueError(
@@ -246,3 +274,20 @@ class Planner:
 
 class _TimeIsUp(Exception):  # noqa: N818 - no error
     """Raised in a search whose next round would take too long."""
+
+
+def in_steps(name: str, duration: float | None, spec: StateSpec) -> int | None:
+    """Return the number of steps nearest to a duration in the time unit of the spec.
+
+    Raises:
+        ValueError: If it is shorter than a step.
+    """
+    if duration is None:
+        return None
+    step = spec.step or 1.0
+    if duration < step * (1 - 1e-9):
+        raise ValueError(
+            f"{name} must be one step at least, which takes {step:g} in the time unit of "
+            f"StateSpec(step=...); found {duration:g}."
+        )
+    return round(duration / step)

@@ -114,6 +114,7 @@ def test_the_default_plans_look_a_third_of_the_episode_ahead_but_not_for_ever(ta
         dynamics = PhysicsDynamics(replace(SPEC, step=step), lambda X: X.sum(-1, True))
         mpc = MPC(replace(task, dynamics=dynamics, episode_length=length), BOUNDS)
         assert mpc.each_step.horizon == pytest.approx(horizon)
+        assert mpc.first.segment == pytest.approx(1.5 * horizon)
     with pytest.raises(ValueError, match="horizon must be one step at least"):
         MPC(replace(task, dynamics=dynamics), BOUNDS, quick(horizon=0.01))
 

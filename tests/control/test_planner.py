@@ -307,3 +307,19 @@ def test_horizons_are_in_the_time_unit_of_the_step(origin):
         assert len(Planner(horizon=horizon).plan(task, origin, BOUNDS).actions) == planned
     with pytest.raises(ValueError, match=r"horizon must be one step at least, .* 0\.1 in the time"):
         Planner(horizon=0.05).plan(task, origin, BOUNDS)
+
+
+def test_a_plan_in_segments_holds_what_is_unstable():
+    """Where x grows by half in each step, all random sequences of a whole episode run away."""
+    dynamics = PhysicsDynamics(SPEC, lambda X: 1.5 * X[:, :1] + X[:, 1:])
+    task = task_of(dynamics, state_bounds=torch.tensor([[-9.0], [9.0]]))
+    start, found = torch.full((1,), 0.3).double(), {}
+    for segment in (None, 6):
+        torch.manual_seed(0)
+        planner = Planner(search=CrossEntropy(2), num_random=40, segment=segment)
+        found[segment] = planner.plan(replace(task), start, BOUNDS, 25)
+    assert found[None].left_bounds == 1
+    assert found[6].left_bounds == 0
+    assert found[6].made.tolist() == [1] * 25
+    states = torch.cat([start, found[6].next_states[:-1, 0]]).unsqueeze(-1)
+    torch.testing.assert_close(found[6].next_states, 1.5 * states + found[6].actions)

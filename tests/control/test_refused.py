@@ -50,6 +50,7 @@ VALUES = [
     (lambda at: Planner(num_functions=0), "num_functions must be at least 1; found 0"),
     (lambda at: Planner(search="cem"), r"a CrossEntropy\(...\); found 'cem'"),
     (lambda at: Planner(horizon=0), "horizon must be finite and above 0; found 0"),
+    (lambda at: Planner(segment=2.0, seconds=1.0), "leave out seconds or segment"),
     (lambda at: Planner(spread=0.0), "spread must be above 0 and below 1; found 0.0"),
     (lambda at: Planner(max_hold=True), "max_hold must be a whole number; found True"),
     (
