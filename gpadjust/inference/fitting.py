@@ -116,8 +116,12 @@ def fit(
     physics alone with noise (0.6). The posterior probability of each is the share of its samples
     among those that the model holds; ``result.relevance`` is that of the two with the physics,
     ``result.sufficiency`` that of the physics alone, of which are at most three quarters of the
-    samples. So are weighed, by 3 to 150 observations, models whose prior means are known and whose
-    kernels have the default priors and an outputscale; of others both are None.
+    samples; data can refute it, and hardly confirm it. So are weighed, by 3 to 150 observations,
+    models whose prior means are known and whose kernels have the default priors and an outputscale.
+    Without the physics: a :class:`~gpadjust.CKA` or :class:`~gpadjust.RRA` of a physics without
+    unknown or learnt parameters; of others ``relevance`` is None. The physics alone: what has f_p in
+    the mean and no other functions than rho and one delta, of one output if it has unknown
+    parameters; of others ``sufficiency`` is None.
 
     *Where left-out observations are missed* by more than predicted, as near a kink or a jump, the
     variances of the sum are larger; means stay. So of ``"bayes"`` with RBF and Matern kernels.

@@ -298,8 +298,8 @@ def compare(
                     train_Yvar=train_Yvar,
                     physics=deepcopy(part) if structure.uses_physics else None,
                 )
-                for first in [*models.values()][:1]:
-                    check_stackable(first, model)
+                if models:
+                    check_stackable(next(iter(models.values())), model)
                 warnings.simplefilter("ignore", OptimizationWarning)
                 warnings.simplefilter("ignore", SamplingWarning)  # the advice says so
                 with threads_for(len(data.X)):
