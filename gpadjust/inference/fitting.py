@@ -119,8 +119,8 @@ def fit(
     samples; data can refute it, and hardly confirm it. So are weighed, by 3 to 150 observations,
     models whose prior means are known and whose kernels have the default priors and an outputscale.
     Without the physics: a :class:`~gpadjust.CKA` or :class:`~gpadjust.RRA` of a physics without
-    unknown or learnt parameters; of others ``relevance`` is None. The physics alone: what has f_p in
-    the mean and no other functions than rho and one delta, of one output if it has unknown
+    unknown or learnt parameters; of others ``relevance`` is None. The physics alone: what has f_p
+    in the mean and no other functions than rho and one delta, of one output if it has unknown
     parameters; of others ``sufficiency`` is None.
 
     *Where left-out observations are missed* by more than predicted, as near a kink or a jump, the
