@@ -78,12 +78,19 @@ def run_missing(experiment: Experiment) -> None:
     """Run the cases that there is no run of, and add them to the file.
 
     Raises:
-        Refused: If the runs that are there were made with other settings.
+        Refused: If the runs that are there were made with other settings; or by other versions or
+            defaults, if there are more to be run.
     """
     file = runs_file(experiment)
     done, cases = file.read(), experiment.cases()
     check_settings(file.path, done, experiment)
     missing = [case for case in cases if case not in done]
+    others = [differ for run in done.values() if (differ := _made_otherwise(run, experiment))]
+    if missing and others:
+        raise Refused(
+            f"{file.path} has runs that differ from those to come: {others[0]}. Choose another "
+            "--out, or remove the file and run all again."
+        )
     shown = _first_look(experiment, done.values()) if missing else True
     bar = tqdm(total=len(cases), initial=len(cases) - len(missing), unit="run", disable=not missing)
     with bar:
@@ -123,6 +130,14 @@ def check_settings(path: Path, done: Mapping[Case, Run], experiment: Experiment)
                 f"{path}: {'-'.join(map(str, case))} was made with other settings: {differ}. "
                 "Choose another --out, or the settings of the runs that are there."
             )
+
+
+def _made_otherwise(run: Run, experiment: Experiment) -> str:
+    """The first package or default in which a run differs; empty if there is none."""
+    if experiment.calls and not run.get("defaults"):
+        return "the defaults of the library are not said of them"
+    now = {"versions": versions(experiment.packages), "defaults": experiment.defaults()}
+    return differences({name: run.get(name, {}) for name in now}, now)
 
 
 @cache

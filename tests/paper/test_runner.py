@@ -141,6 +141,16 @@ def test_runs_of_other_settings_are_refused(tmp_path):
     assert len(calls(tmp_path)) == 6
 
 
+def test_runs_of_other_versions_are_not_added_to(tmp_path, monkeypatch):
+    main(Toy(out=tmp_path))
+    later = {**versions(Toy.packages), "numpy": "99"}
+    monkeypatch.setattr(runner, "versions", lambda packages: later)
+    main(Toy(out=tmp_path))  # nothing is missing
+    with pytest.raises(Refused, match=r"versions\.numpy was .* and is now 99\. Choose another"):
+        main(Toy(out=tmp_path, runs=4))
+    assert len(calls(tmp_path)) == 6
+
+
 @dataclass(frozen=True, kw_only=True)
 class Pairs(Experiment):
     """Three kinds of pairs by two learners, of which one has fewer seeds."""
