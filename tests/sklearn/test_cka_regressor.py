@@ -83,12 +83,14 @@ def expected_failures(regressor):
     return {"check_regressor_multioutput": "y has five columns, the physics has one"}
 
 
+@pytest.mark.filterwarnings("ignore:.*equal an earlier row")  # the irises are so
 @pytest.mark.slow
 @parametrize_with_checks([CKARegressor(fit_method="map", fit_options=FAST)], legacy=True)
 def test_scikit_learn_accepts_it(estimator, check):
     check(estimator)
 
 
+@pytest.mark.filterwarnings("ignore:.*equal an earlier row")  # the irises are so
 @pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
 @pytest.mark.slow
 @parametrize_with_checks(
