@@ -1,0 +1,62 @@
+"""The core: sums of Gaussian processes on a physics, with one table of unknown numbers.
+
+Read it in this order: ``unknowns``, ``kernels``, ``terms``, ``noise``, ``gaussian``, ``sample``,
+``fit``, ``model``, ``structures``.
+"""
+
+from gpadjust.core.fit import FitResult, fit
+from gpadjust.core.functions import Functions
+from gpadjust.core.kernels import (
+    MATERN12,
+    MATERN32,
+    MATERN52,
+    RBF,
+    Fourier,
+    Kernel,
+    OfGPyTorch,
+    Profile,
+    Stationary,
+)
+from gpadjust.core.model import GP
+from gpadjust.core.noise import KnownNoise, Noise
+from gpadjust.core.posterior import MixturePosterior, Prediction
+from gpadjust.core.structures import (
+    CKA,
+    RRA,
+    CalibratedPhysics,
+    PhysicsMeanGP,
+    ScaleGP,
+    ZeroMeanGP,
+)
+from gpadjust.core.terms import Term
+from gpadjust.core.unknowns import Choice, LogNormal, Row
+
+__all__ = [
+    "CKA",
+    "GP",
+    "MATERN12",
+    "MATERN32",
+    "MATERN52",
+    "RBF",
+    "RRA",
+    "CalibratedPhysics",
+    "Choice",
+    "FitResult",
+    "Fourier",
+    "Functions",
+    "Kernel",
+    "KnownNoise",
+    "LogNormal",
+    "MixturePosterior",
+    "Noise",
+    "OfGPyTorch",
+    "PhysicsMeanGP",
+    "Prediction",
+    "Profile",
+    "Row",
+    "ScaleGP",
+    "Stationary",
+    "Term",
+    "ZeroMeanGP",
+    "fit",
+]

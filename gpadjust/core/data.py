@@ -1,0 +1,248 @@
+"""The data of a model: what is taken and checked, names of columns, and units of the targets."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from datetime import date, time, timedelta
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from botorch.models.transforms.input import InputTransform
+from torch import Tensor
+
+from gpadjust.checks import check_finite, check_observed, marked_rows
+
+ArrayLike = Any
+"""A float64 tensor, or a NumPy array, DataFrame or Series (pandas or polars) of numbers."""
+
+_FAINT = 1e-6  # of the size of the targets: their unit where the prior mean meets them
+
+# What NumPy would turn into numbers: kinds of arrays, types of objects, and the way out.
+_NO_NUMBERS: dict[str, tuple[str, tuple[type, ...], str]] = {
+    "text": ("SU", (str, bytes), "convert numbers in text with `.astype(float)`, drop other text"),
+    "complex numbers": ("c", (complex, np.complexfloating), "give both parts, or take `.real`"),
+    "dates or times": (
+        "mM",
+        (date, time, timedelta, np.datetime64, np.timedelta64),
+        "convert them to seconds since the first with `(t - t.min()) / np.timedelta64(1, 's')`",
+    ),
+}
+
+
+class Data(NamedTuple):
+    """Training data of a model.
+
+    Args:
+        X: Inputs in the user's units, ``... x n x d``.
+        Y: Targets in the user's units, ``... x n x m``; NaN where one is missing.
+        Yvar: Known variances of the targets, ``... x n x m``, or None.
+        input_names: Names of the inputs.
+        output_names: Names of the outputs.
+        transform: A one-to-one BoTorch transform of what kernels see of the inputs, or None; the
+            physics sees X.
+    """
+
+    X: Tensor
+    Y: Tensor
+    Yvar: Tensor | None
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    transform: InputTransform | None = None
+
+    @classmethod
+    def of(
+        cls,
+        train_X: ArrayLike,
+        train_Y: ArrayLike,
+        train_Yvar: ArrayLike = None,
+        input_transform: InputTransform | None = None,
+    ) -> Data:
+        """Return checked data.
+
+        Raises:
+            TypeError: If one of them is neither a float64 tensor nor an array or frame of numbers.
+            ValueError: If shapes disagree, there are fewer than two points or two observations of
+                an output, or values are not finite.
+        """
+        X, Y = as_tensor(train_X, "train_X"), as_tensor(train_Y, "train_Y")
+        if hasattr(train_Y, "to_numpy") and Y.dim() == 1:  # a Series is a column
+            Y = Y.unsqueeze(-1)
+        for name, tensor in (("train_X", X), ("train_Y", Y)):
+            if tensor.dim() != 2:
+                raise ValueError(
+                    f"Expected {name} of two dimensions, points x columns; found shape "
+                    f"{tuple(tensor.shape)}. One column is `{name}.reshape(-1, 1)`."
+                )
+        shapes = f"found train_X of shape {tuple(X.shape)} and train_Y of {tuple(Y.shape)}"
+        if len(X) != len(Y):
+            raise ValueError(f"Expected a row of targets for each row of inputs; {shapes}.")
+        if X.shape[-1] < 1 or Y.shape[-1] < 1:
+            raise ValueError(f"Expected at least one input and one output; {shapes}.")
+        if len(X) < 2:
+            raise ValueError(
+                f"Expected at least 2 points in train_X; found {len(X)}, which no scale can be "
+                "learnt from. Use the physics alone until there are two."
+            )
+        check_finite("train_X", X)
+        check_observed("train_Y", Y)
+        seldom = (~Y.isnan()).sum(-2) < 2
+        if seldom.any():
+            raise ValueError(
+                "Expected at least 2 observations of each output, but train_Y has fewer in "
+                f"column(s) {marked_rows(seldom)}; leave these out."
+            )
+        X, Y = X.detach().clone(), Y.detach().clone()
+        Yvar = None if train_Yvar is None else variances_of(train_Yvar, Y, "train_Yvar")
+        inputs = column_names(train_X) or default_names("x", X.shape[-1])
+        outputs = column_names(train_Y) or default_names("y", Y.shape[-1])
+        if input_transform is not None:
+            input_transform = input_transform.double().train()
+            input_transform(X)
+            input_transform.eval()
+        _warn_of_copies(X, Y)
+        return cls(X, Y, Yvar, inputs, outputs, input_transform)
+
+    def new_X(self, X: ArrayLike) -> Tensor:
+        """Return checked inputs ``... x q x d`` of a call."""
+        names = column_names(X)
+        if names is not None and names != self.input_names:
+            if sorted(names) == sorted(self.input_names):
+                raise ValueError(f"Expected the columns {self.input_names}, in this order; found {names}.")
+        X = as_tensor(X, "X")
+        d = len(self.input_names)
+        if X.dim() < 2 or X.shape[-1] != d:
+            way = "" if X.dim() > 1 or d != 1 else "; a column is `X.reshape(-1, 1)`"
+            raise ValueError(
+                f"Expected X of shape ... x q x {d}, the columns {', '.join(self.input_names)}; "
+                f"found {tuple(X.shape)}{way}."
+            )
+        if not torch.isfinite(X.detach().sum()):
+            check_finite("X", X)
+        return X
+
+    def kernel_inputs(self, X: Tensor) -> Tensor:
+        """Return what kernels see of inputs ``... x n x d``."""
+        return X if self.transform is None else self.transform(X)
+
+
+def unit_of(Y: Tensor, mean: Tensor) -> Tensor:
+    """Return the unit of targets ``n x m`` with a prior mean: ``m x 1``.
+
+    It is the root mean square of their difference or the standard deviation of the targets,
+    whichever is less: a good physics then leaves a small unit, and a bad one does no harm. Where
+    the prior mean meets the targets but for rounding it is a millionth of their size (or 1 if they
+    are zero).
+    """
+
+    def rms(values: Tensor) -> Tensor:
+        size = values.abs().nan_to_num().amax(-2, keepdim=True)
+        size = size.where(size > 0, torch.ones_like(size))
+        return size * (values / size).square().nanmean(-2, keepdim=True).sqrt()
+
+    size, away, spread = rms(Y), rms(Y - mean), rms(Y - Y.nanmean(-2, keepdim=True))
+    unit = torch.where(spread > 1e-12 * size, away.minimum(spread), away)
+    tiny = _FAINT * size.where(size > 0, torch.full_like(size, 1 / _FAINT))
+    return unit.where(unit > 1e-13 * size, tiny).mT
+
+
+def as_tensor(values: ArrayLike, name: str) -> Tensor:
+    """Return a float64 tensor as it is, or one of an array or frame of numbers.
+
+    Raises:
+        TypeError: If values are something else: text, complex numbers, dates or times, too.
+        ValueError: If values are masked.
+    """
+    if isinstance(values, Tensor):
+        if values.is_complex():
+            raise TypeError(_not_numbers(name, "complex numbers"))
+        if values.dtype != torch.float64:
+            raise TypeError(
+                f"Expected {name} in float64; found {values.dtype}, in which Cholesky factors of "
+                f"these kernels fail. Convert it with `{name}.double()`."
+            )
+        return values
+    array = values.to_numpy() if hasattr(values, "to_numpy") else values
+    if not isinstance(array, np.ndarray):
+        raise TypeError(
+            f"Expected {name} as a torch tensor, a NumPy array or a DataFrame; found "
+            f"{type(values).__name__}. Convert it with `torch.tensor({name}, dtype=torch.float64)`."
+        )
+    if np.ma.is_masked(array):
+        raise ValueError(
+            f"Expected {name} without masked values; found {np.ma.count_masked(array)}. Leave their "
+            f"rows out, or make them NaN by `{name}.filled(np.nan)`, if they are targets."
+        )
+    objects = {type(value) for value in array.flat} if array.dtype.kind == "O" else set()
+    for what, (kinds, types, _) in _NO_NUMBERS.items():
+        if array.dtype.kind in kinds or any(issubclass(each, types) for each in objects):
+            raise TypeError(_not_numbers(name, what))
+    try:
+        return torch.as_tensor(np.array(array, dtype=np.float64))
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            f"Expected {name} to contain numbers only, but {error}. Select the numeric columns, "
+            "and encode or drop the others."
+        ) from error
+
+
+def _not_numbers(name: str, what: str) -> str:
+    return f"Expected {name} to contain numbers only; found {what}: {_NO_NUMBERS[what][2]}."
+
+
+def variances_of(values: ArrayLike, Y: Tensor, name: str) -> Tensor:
+    """Return known variances of the shape of ``Y``; their mean where there is no observation."""
+    if isinstance(values, int | float | list | tuple):
+        values = torch.tensor(values, dtype=torch.float64, device=Y.device)
+    variances = as_tensor(values, name)
+    m = Y.shape[-1]
+    if variances.shape != Y.shape and variances.shape not in ((), (1,), (m,)):
+        raise ValueError(
+            f"Expected {name} (known variances) as one number, {m} numbers (one for each output), "
+            f"or of the targets' shape {tuple(Y.shape)}; found {tuple(variances.shape)}."
+        )
+    variances = variances.expand(Y.shape).masked_fill(Y.isnan(), torch.nan)
+    variances = variances.where(~Y.isnan(), variances.nanmean(-2, keepdim=True))
+    check_finite(name, variances)
+    if (variances < 0).any():
+        raise ValueError(f"Expected {name} (variances) not negative; found {variances.min():.3g}.")
+    return variances
+
+
+def column_names(values: ArrayLike) -> tuple[str, ...] | None:
+    """Return the names of a frame's columns or of a Series, or None."""
+    columns = getattr(values, "columns", None)
+    if columns is not None:
+        return tuple(map(str, columns))
+    name = getattr(values, "name", None)
+    return None if name is None or isinstance(values, Tensor) else (str(name),)
+
+
+def default_names(letter: str, number: int) -> tuple[str, ...]:
+    """Return ``x``, or ``x1`` and so on."""
+    return (letter,) if number == 1 else tuple(f"{letter}{i + 1}" for i in range(number))
+
+
+def as_given(values: Tensor, X: ArrayLike, names: Sequence[str]) -> Any:
+    """Return values ``... x q x m`` as X came: a tensor, an array, or a frame with these names."""
+    if isinstance(X, Tensor):
+        return values
+    array, library = values.detach().cpu().numpy(), type(X).__module__.partition(".")[0]
+    if library == "pandas":
+        return type(X)(array, index=X.index, columns=list(names))
+    return type(X)(array, schema=list(names)) if library == "polars" else array
+
+
+def _warn_of_copies(X: Tensor, Y: Tensor) -> None:
+    missing = Y.isnan()
+    rows = torch.cat([X, Y.masked_fill(missing, 0.0), missing.to(X)], dim=-1)
+    copies = len(rows) - len(rows.unique(dim=0))
+    if copies:
+        warnings.warn(
+            f"{copies} of {len(rows)} rows equal an earlier row in all inputs and outputs. If the "
+            "same measurements are in the data twice, as in files joined twice, the noise comes "
+            "out too small: drop them, `frame.drop_duplicates()`. Repeats that are equal by "
+            "rounding may stay.",
+            stacklevel=4,
+        )

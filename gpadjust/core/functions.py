@@ -1,0 +1,132 @@
+"""Functions drawn from the posterior of a model, to be called anywhere."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+from botorch.sampling.pathwise import SamplePath
+from torch import Size, Tensor
+
+from gpadjust.core.terms import WeightedSum
+
+if TYPE_CHECKING:
+    from gpadjust.core.model import GP
+
+
+class Functions(torch.nn.Module):
+    r"""Deterministic functions from a posterior, by Matheron's rule (Wilson et al. 2020).
+
+    Each is a function from the prior, on random features :math:`\varphi` of the terms, plus the
+    update that makes it meet the data:
+
+    .. math:: f(x) = m(x) + \varphi(x)^T w + k(x, X) v, \quad
+        v = K^{-1} (y - f_{prior}(X) - \varepsilon).
+
+    Args:
+        model: The model; later changes of it have no effect.
+        number: Number ``k`` of functions, spread over the draws of the model.
+        num_features: Number of features for each kernel, an even one.
+        seed: Seed.
+    """
+
+    def __init__(self, model: GP, number: int, num_features: int, seed: int) -> None:
+        super().__init__()
+        if number < 1 or num_features < 2 or num_features % 2:
+            raise ValueError(
+                "Expected at least one function, and an even number of features; found "
+                f"{number} and {num_features}."
+            )
+        generator = torch.Generator().manual_seed(seed)
+        rows = torch.randperm(len(model.u), generator=generator)
+        rows = rows[torch.arange(number) % len(model.u)]
+        self.model = model.subset_draws(rows).requires_grad_(False)
+        self.number = number
+        with torch.no_grad():
+            self.data = self.model.conditioning()
+            f = self.data.train
+            self.features: dict[str, Any] = {}
+            self.weights: dict[str, Tensor] = {}
+            shape = (number, model.num_outputs)
+            for term in f.terms:
+                if term.kernel is not None:
+                    features = term.kernel.features(f.own(term), num_features, generator)
+                    size = features(f.x).shape[-1]
+                    self.features[term.name] = features
+                    self.weights[term.name] = _randn((*shape, size), generator, f.x)
+                if term.constant is not None:
+                    self.weights[f"{term.name}.constant"] = _randn((*shape, 1), generator, f.x)
+            noise = self.data.noise.sqrt() * _randn(self.data.noise.shape, generator, f.x)
+            away = (self.data.targets - self._prior(f) - noise).nan_to_num()
+            self.update = self.data.solve(away * self.data.observed)
+
+    def forward(self, X: Tensor) -> Tensor:
+        """Return the values ``k x ... x q x m`` of all functions at ``... x q x d``."""
+        values = self._values(self.model.data.new_X(X))  # ... x k x q x m
+        return values.movedim(-3, 0)
+
+    def each(self, X: Tensor) -> Tensor:
+        """Return the values ``k x q x m`` of each function at points of its own, ``k x q x d``."""
+        if X.dim() != 3 or len(X) != self.number:
+            raise ValueError(
+                f"Expected points for each of {self.number} functions, {self.number} x q x d; "
+                f"found {tuple(X.shape)}."
+            )
+        values = self._values(X)  # k x k x q x m: each function at each block of points
+        return values.diagonal(dim1=0, dim2=1).movedim(-1, 0)
+
+    def _values(self, X: Tensor) -> Tensor:
+        f = self.model.at(X)
+        cross = f.cross(self.data.train) * self.data.observed.unsqueeze(-2)
+        values = self._prior(f) + (cross @ self.update.unsqueeze(-1)).squeeze(-1)
+        return (values * self.model.unit).mT
+
+    def _prior(self, f: WeightedSum) -> Tensor:
+        """Return the functions from the prior, ``... x k x m x q``."""
+        total = f.mean
+        for term in f.terms:
+            value: Tensor | float = 0.0
+            if term.name in self.features:
+                phi = self.features[term.name](f.x)
+                value = (phi @ self.weights[term.name].unsqueeze(-1)).squeeze(-1)
+            if term.constant is not None:
+                sd = f.values[f"{term.name}.constant"].sqrt()
+                value = value + sd * self.weights[f"{term.name}.constant"]
+            weight = f.weights.get(term.name)
+            total = total + (value if weight is None else weight * value)
+        return total
+
+
+class Paths(SamplePath):
+    """Functions with the shapes of BoTorch's pathwise samples: ``sample_shape x ... x (m) x q``.
+
+    Args:
+        functions: The functions.
+        sample_shape: Their numbers, of which the product is ``k``.
+    """
+
+    def __init__(self, functions: Functions, sample_shape: Size) -> None:
+        super().__init__()
+        self.functions, self.sample_shape = functions, sample_shape
+
+    def set_ensemble_as_batch(self, ensemble_as_batch: bool) -> None:
+        """Do nothing, as the draws of a model are no batch."""
+
+    def forward(self, X: Tensor, **_: Any) -> Tensor:
+        """Return the values at ``... x q x d``; dimensions of samples in front of X are its own."""
+        k, m = self.functions.number, self.functions.model.num_outputs
+        if m > 1 and X.dim() > 2 and X.shape[-3] == 1:  # the place of outputs
+            X = X.squeeze(-3)
+        lead = len(self.sample_shape)
+        if k > 1 and X.shape[:lead] == self.sample_shape and X.dim() > lead + 1:
+            rest = X.shape[lead:-2].numel()
+            values = self.functions.each(X.reshape(k, rest * X.shape[-2], X.shape[-1]))
+            values = values.reshape(*self.sample_shape, *X.shape[lead:-1], values.shape[-1])
+        else:
+            values = self.functions(X)
+            values = values.reshape(*self.sample_shape, *values.shape[1:])
+        return values.squeeze(-1) if values.shape[-1] == 1 else values.mT
+
+
+def _randn(shape: Any, generator: torch.Generator, like: Tensor) -> Tensor:
+    return torch.randn(tuple(shape), generator=generator, dtype=like.dtype).to(like)

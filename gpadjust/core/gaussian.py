@@ -1,0 +1,186 @@
+"""Gaussian processes as linear algebra: likelihood, conditioning, joint and left-out predictions."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gpadjust.core.terms import WeightedSum
+
+_EPS = torch.finfo(torch.float64).eps
+
+
+def factor(K: Tensor, observed: Tensor) -> Tensor:
+    """Return Cholesky factors of covariances ``... x n x n``, which contain the noise.
+
+    Targets that are not ``observed`` (``... x n``) are independent of everything. A nugget of some
+    rounding errors of each variance is added, and more where a matrix is not positive definite; NaN
+    where it never is.
+    """
+    all_observed = bool(observed.all())
+    if not all_observed:
+        K = K * (observed.unsqueeze(-1) & observed.unsqueeze(-2))
+    diagonal = K.diagonal(dim1=-1, dim2=-2)
+    least = 1e-10 * diagonal.mean(-1, keepdim=True)
+    nugget = max(100, K.shape[-1]) * _EPS * diagonal.maximum(least)
+    for _ in range(6):
+        added = nugget if all_observed else nugget + (~observed).to(K)
+        chol, info = torch.linalg.cholesky_ex(K + torch.diag_embed(added))
+        if not info.any():
+            return chol
+        nugget = nugget * (1 + 9 * (info > 0).to(K).unsqueeze(-1))
+    return chol.masked_fill((info > 0)[..., None, None], math.nan)
+
+
+def add_noise(K: Tensor, noise: Tensor) -> Tensor:
+    """Return covariances ``... x n x n`` plus variances ``... x n`` (or 1) on the diagonal."""
+    return K + torch.diag_embed(noise.expand(torch.broadcast_shapes(noise.shape, K.shape[:-1])))
+
+
+class Likelihood(NamedTuple):
+    """A log likelihood and its derivatives, for a residual ``... x n`` and its covariance."""
+
+    value: Tensor  # ...
+    by_mean: Tensor  # ... x n
+    by_covariance: Tensor  # ... x n x n
+
+
+def log_likelihood(residual: Tensor, K: Tensor, observed: Tensor) -> Likelihood:
+    r"""Return log N(residual | 0, K) and its derivatives.
+
+    With :math:`\alpha = K^{-1} r` (Rasmussen and Williams 2006, algorithm 2.1 and eq. 5.9)
+
+    .. math::
+        -\tfrac12 r^T \alpha - \tfrac12 \log |K| - \tfrac{n}{2} \log 2 \pi, \quad
+        \partial / \partial K = \tfrac12 (\alpha \alpha^T - K^{-1}).
+    """
+    chol = factor(K, observed)
+    alpha = torch.cholesky_solve(residual.unsqueeze(-1), chol)
+    log_det = chol.diagonal(dim1=-1, dim2=-2).log().sum(-1)  # log |K| / 2
+    quadratic = (residual.unsqueeze(-1) * alpha).sum((-1, -2))
+    value = -0.5 * quadratic - log_det - 0.5 * observed.sum(-1) * math.log(2 * math.pi)
+    D = 0.5 * (alpha @ alpha.mT - torch.cholesky_inverse(chol))
+    if not observed.all():
+        D = D * (observed.unsqueeze(-1) & observed.unsqueeze(-2))
+    return Likelihood(value, alpha.squeeze(-1), D)
+
+
+class Conditioning:
+    """The posterior of weighted sums, given noisy observations of one.
+
+    Args:
+        train: The sum that was observed, at the training inputs.
+        noise: The variances of the observations, ``... x S x m x n`` (or 1).
+        targets: The observations, ``... x 1 x m x n``; NaN where one is missing. Their leading
+            dimensions may be more than those of the covariance, whose factor all of them share.
+
+    Attributes:
+        alpha: :math:`K^{-1} (y - \bar f)`, ``... x S x m x n``.
+    """
+
+    def __init__(self, train: WeightedSum, noise: Tensor, targets: Tensor) -> None:
+        K = train.cross(train)
+        noise = noise.expand(torch.broadcast_shapes(noise.shape, K.shape[:-1]))
+        self._set(train, noise, targets)
+        self.chol = factor(add_noise(K, noise), self.observed)
+        self.alpha = self.solve(self._residual())
+        self._inverse: Tensor | None = None
+
+    def _set(self, train: WeightedSum, noise: Tensor, targets: Tensor) -> None:
+        self.train, self.noise, self.targets = train, noise, targets
+        observed = ~targets.isnan()
+        # What is missing is the same for all fantasies of the same points.
+        while observed.dim() > noise.dim():
+            observed = observed[0]
+        self.observed = observed
+
+    def _residual(self) -> Tensor:
+        return (self.targets - self.train.mean).nan_to_num() * self.observed
+
+    @classmethod
+    def appended(
+        cls, old: Conditioning, train: WeightedSum, noise: Tensor, targets: Tensor
+    ) -> Conditioning:
+        r"""Return the conditioning on further rows at the end, from the factor of those before.
+
+        .. math::
+            L = \begin{pmatrix} L_1 & 0 \\ B & L_2 \end{pmatrix}, \quad B^T = L_1^{-1} K_{12},
+            \quad L_2 L_2^T = K_{22} - B B^T.
+        """
+        n, new = old.chol.shape[-1], cls.__new__(cls)
+        late = WeightedSum(
+            train.terms, train.values, train.x[..., n:, :], train.mean[..., n:],
+            {name: None if w is None else w[..., n:] for name, w in train.weights.items()},
+        )  # fmt: skip
+        K22, K21 = late.cross(late), late.cross(old.train)
+        lead = torch.broadcast_shapes(K22.shape[:-2], old.chol.shape[:-2])
+        new._set(train, noise.expand(*lead, train.x.shape[-2]), targets)
+        L1 = old.chol.expand(*lead, n, n)
+        seen = new.observed[..., n:]
+        K21 = (K21 * seen.unsqueeze(-1) * old.observed.unsqueeze(-2)).expand(*lead, -1, n)
+        B = K21 @ old.inverse_factor().mT
+        K22 = K22 + torch.diag_embed(new.noise[..., n:])
+        # The nugget of the new rows is that of their own variances.
+        nugget = max(100, train.x.shape[-2]) * _EPS * K22.diagonal(dim1=-1, dim2=-2)
+        L2 = factor(K22 - B @ B.mT + torch.diag_embed(nugget), seen)
+        zero = L1.new_zeros(*lead, n, L2.shape[-1])
+        L2 = L2.expand(*lead, *L2.shape[-2:])
+        new.chol = torch.cat([torch.cat([L1, zero], -1), torch.cat([B, L2], -1)], -2)
+        new._inverse = None
+        new.alpha = new.solve(new._residual())
+        return new
+
+    def solve(self, residual: Tensor) -> Tensor:
+        """Return :math:`K^{-1} r` for residuals ``... x n``."""
+        if residual.dim() > self.chol.dim() - 1:  # fantasies, which share one factor
+            extra = residual.dim() - self.chol.dim() + 1
+            flat = residual.flatten(0, extra - 1).movedim(0, -1)
+            flat = torch.cholesky_solve(flat, self.chol).movedim(-1, 0)
+            return flat.reshape(*residual.shape[:extra], *flat.shape[1:])
+        return torch.cholesky_solve(residual.unsqueeze(-1), self.chol).squeeze(-1)
+
+    def inverse_factor(self) -> Tensor:
+        """Return :math:`L^{-1}`, computed once, so that predictions are products."""
+        if self._inverse is None:
+            eye = torch.eye(self.chol.shape[-1]).to(self.chol)
+            self._inverse = torch.linalg.solve_triangular(self.chol, eye, upper=False)
+        return self._inverse
+
+    def mean(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
+        r"""Return means :math:`\bar f + k \alpha`, and covariances k with the training inputs."""
+        cross = sought.cross(self.train)
+        if not self.observed.all():
+            cross = cross * self.observed.unsqueeze(-2)
+        return sought.mean + (cross @ self.alpha.unsqueeze(-1)).squeeze(-1), cross
+
+    def marginals(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
+        """Return means and variances at each point, ``... x S x m x q``."""
+        mean, cross = self.mean(sought)
+        white = cross @ self.inverse_factor().mT
+        prior = sought.variance()
+        left = prior - white.square().sum(-1)
+        # Not below the rounding errors of the difference.
+        return mean, left.maximum(4 * self.chol.shape[-1] * _EPS * prior)
+
+    def joint(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
+        """Return means ``... x S x m x q``, and covariances ``... x S x m x q x q``."""
+        mean, cross = self.mean(sought)
+        white = cross @ self.inverse_factor().mT
+        prior = sought.cross(sought)
+        least = 4 * self.chol.shape[-1] * _EPS * prior.diagonal(dim1=-1, dim2=-2)
+        K = prior - white @ white.mT
+        raised = (least - K.diagonal(dim1=-1, dim2=-2)).clamp_min(0.0)
+        return mean, K + torch.diag_embed(raised)
+
+    def left_out(self) -> tuple[Tensor, Tensor]:
+        r"""Return means and variances of each observation given all others, noise included.
+
+        .. math:: y_i - \alpha_i / [K^{-1}]_{ii}, \quad 1 / [K^{-1}]_{ii}
+
+        (Rasmussen and Williams 2006, eqs. 5.10 to 5.12).
+        """
+        precision = self.inverse_factor().square().sum(-2)
+        return self.targets - self.alpha / precision, precision.reciprocal()

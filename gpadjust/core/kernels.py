@@ -1,0 +1,415 @@
+"""Kernels: a covariance, and what carries derivatives of a likelihood back to its parameters."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from copy import deepcopy
+from typing import Any, NamedTuple
+
+import torch
+from gpytorch.kernels import Kernel as AnyGPyTorchKernel
+from torch import Tensor
+from torch.func import functional_call
+
+from gpadjust.core.unknowns import LogNormal, Row, Values
+
+PullBack = Callable[[Tensor], Values]
+Features = Callable[[Tensor], Tensor]
+
+RHO = LogNormal(0.001, 100.0)  # prior variance of a scaling's process
+DELTA = LogNormal(0.1, 1000.0)  # that of a process in squared units of the targets
+_LENGTH_FACTOR = 7.4
+
+
+class Kernel(ABC):
+    """The covariance function of a Gaussian process, and the priors of its parameters.
+
+    A kernel of one's own needs ``rows`` and ``covariance``; derivatives are then autograd's.
+    Inputs x are ``... x 1 x 1 x n x d``, parameters ``S x m x k``, covariances ``... x S x m x n x
+    n'``: the last two dimensions before the points are draws and outputs.
+    """
+
+    @abstractmethod
+    def rows(self, x: Tensor, num_outputs: int) -> list[Row]:
+        """Return the unknown parameters, for training inputs ``n x d``."""
+
+    @abstractmethod
+    def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
+        """Return the covariances of inputs with others, or with themselves."""
+
+    def variance(self, own: Values, x: Tensor) -> Tensor:
+        """Return the prior variances, ``... x S x m x n`` (or 1 where all are equal)."""
+        return self.covariance(own, x).diagonal(dim1=-1, dim2=-2)
+
+    def with_pull_back(self, own: Values, x: Tensor) -> tuple[Tensor, PullBack]:
+        r"""Return the covariance K, and a function of D = df/dK that gives df by the parameters."""
+        leaves = {name: value.detach().clone().requires_grad_() for name, value in own.items()}
+        with torch.enable_grad():
+            K = self.covariance(leaves, x)
+
+        def pull_back(D: Tensor) -> Values:
+            slopes = torch.autograd.grad(K, [*leaves.values()], D, allow_unused=True)
+            pairs = zip(leaves.items(), slopes, strict=True)
+            return {n: torch.zeros_like(v) if s is None else s for (n, v), s in pairs}
+
+        return K.detach(), pull_back
+
+    def features(self, own: Values, number: int, generator: torch.Generator) -> Features:
+        """Return random features whose inner products are about the kernel.
+
+        They map inputs ``... x n x d`` to ``... x S x m x n x D``.
+
+        Raises:
+            NotImplementedError: If the kernel has none.
+        """
+        raise NotImplementedError(
+            f"{self} has no random features, which functions are drawn with. Give its class a "
+            "method features, or draw joint samples: model.posterior(X).rsample()."
+        )
+
+    def __repr__(self) -> str:
+        return type(self).__name__
+
+
+class Profile(NamedTuple):
+    """A stationary kernel as a function of e = -r^2 / 2.
+
+    Args:
+        name: The name.
+        value: k(e).
+        slope: dk / de, which is -2 dk / d(r^2).
+        degrees: Degrees of freedom of its spectrum, a Student t.
+    """
+
+    name: str
+    value: Callable[[Tensor], Tensor]
+    slope: Callable[[Tensor], Tensor]
+    degrees: float
+
+
+def _matern(p: int) -> Profile:
+    """Return the Matern kernel with nu = p + 1/2 (Rasmussen and Williams 2006, eq. 4.16)."""
+    nu2 = 2 * p + 1
+    polynomials = {0: lambda t: 1.0, 1: lambda t: 1 + t, 2: lambda t: 1 + t + t.square() / 3}
+    slopes = {
+        0: lambda t: 1 / t.clamp_min(1e-8),
+        1: lambda t: 1.0,
+        2: lambda t: (1 + t) / 3,
+    }
+
+    def root(e: Tensor) -> Tensor:  # t = sqrt(2 nu) r
+        return (-2 * nu2 * e).clamp_min(1e-30).sqrt()
+
+    def value(e: Tensor) -> Tensor:
+        t = root(e)
+        return polynomials[p](t) * (-t).exp()
+
+    def slope(e: Tensor) -> Tensor:  # dk/de = nu2 * (-k'(t) / t)
+        t = root(e)
+        return nu2 * slopes[p](t) * (-t).exp() * (e < 0 if p == 0 else 1.0)
+
+    return Profile(f"matern{nu2}/2", value, slope, float(nu2))
+
+
+RBF = Profile("rbf", torch.exp, torch.exp, math.inf)
+MATERN12, MATERN32, MATERN52 = (_matern(p) for p in range(3))
+PROFILES = {each.name: each for each in (RBF, MATERN12, MATERN32, MATERN52)}
+
+
+def exponents(z: Tensor, other: Tensor | None = None) -> Tensor:
+    """Return -r^2 / 2 of all pairs of ``... x n x d`` and ``... x n' x d``."""
+    if other is not None:
+        half = z.square().sum(-1, keepdim=True) / 2
+        return (z @ other.mT - half - other.square().sum(-1, keepdim=True).mT / 2).clamp_max(0.0)
+    z = z - z.mean(-2, keepdim=True)
+    half = z.square().sum(-1, keepdim=True) / 2
+    e = z @ z.mT - half - half.mT
+    return (e - torch.diag_embed(e.diagonal(dim1=-1, dim2=-2))).clamp_max(0.0)
+
+
+class Stationary(Kernel):
+    r"""A kernel :math:`s \, k(|(x - x') / \ell|)` with a lengthscale for each input.
+
+    Args:
+        profile: k.
+        outputscale: The prior of s, in squared units of the targets (of a scaling without unit).
+    """
+
+    def __init__(self, profile: Profile = RBF, outputscale: LogNormal = DELTA) -> None:
+        self.profile, self.outputscale = profile, outputscale
+
+    def rows(self, x: Tensor, num_outputs: int) -> list[Row]:
+        """Return lengthscales like d times the ranges of the inputs, and the outputscale."""
+        ranges = x.amax(-2) - x.amin(-2)
+        ranges = ranges.where(ranges > 0, torch.ones_like(ranges))
+        length = (len(ranges) * ranges).expand(num_outputs, -1)
+        scale = length.new_full((num_outputs, 1), self.outputscale.median)
+        return [
+            Row.positive("lengthscale", length, _LENGTH_FACTOR),
+            Row.positive("outputscale", scale, self.outputscale.factor),
+        ]
+
+    def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
+        """Return ``s k(|(x - x') / l|)``."""
+        length = own["lengthscale"].unsqueeze(-2)
+        shift = x.detach()[..., :1, :]  # distances of large inputs, as of years, lose no digits
+        z = (x - shift) / length
+        e = exponents(z, None if other is None else (other - shift) / length)
+        return own["outputscale"].unsqueeze(-1) * self.profile.value(e)
+
+    def variance(self, own: Values, x: Tensor) -> Tensor:
+        """Return ``s``."""
+        return own["outputscale"]
+
+    def with_pull_back(self, own: Values, x: Tensor) -> tuple[Tensor, PullBack]:
+        r"""Return K and its derivatives in closed form.
+
+        With D = df/dK and :math:`M = s D \circ dk/de`,
+
+        .. math::
+            \frac{\partial f}{\partial s} = \sum D \circ k, \quad
+            \frac{\partial f}{\partial \ell_k} = \frac{1}{\ell_k} \sum_{ij} M_{ij}
+            (z_{ik} - z_{jk})^2.
+        """
+        length = own["lengthscale"].unsqueeze(-2)
+        z, scale = (x - x[..., :1, :]) / length, own["outputscale"].unsqueeze(-1)
+        e = exponents(z)
+        k = self.profile.value(e)
+        slope = k if self.profile is RBF else self.profile.slope(e)
+
+        def pull_back(D: Tensor) -> Values:
+            M = scale * D * slope
+            by_log = 2 * (z * (z * M.sum(-1, keepdim=True) - M @ z)).sum(-2)
+            by_scale = (D * k).sum((-1, -2)).unsqueeze(-1)
+            return {"lengthscale": by_log / own["lengthscale"], "outputscale": by_scale}
+
+        return scale * k, pull_back
+
+    def features(self, own: Values, number: int, generator: torch.Generator) -> Features:
+        """Return sines and cosines of frequencies of the kernel's spectrum."""
+        d = own["lengthscale"].shape[-1]
+        w = torch.randn(d, number // 2, generator=generator, dtype=torch.float64)
+        if math.isfinite(self.profile.degrees):  # chi^2 with an odd number of degrees, as squares
+            normals = torch.randn(
+                int(self.profile.degrees), number // 2, generator=generator, dtype=torch.float64
+            )
+            w = w * (self.profile.degrees / normals.square().sum(0)).sqrt()
+        return lambda x: _fourier(own, x, w)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.profile.name})"
+
+
+def _fourier(own: Values, x: Tensor, w: Tensor) -> Tensor:
+    """Return sines and cosines of frequencies ``d x D/2``."""
+    a = (x / own["lengthscale"].unsqueeze(-2)) @ w.to(x)
+    size = (own["outputscale"] / w.shape[-1]).sqrt().unsqueeze(-1)
+    return size * torch.cat([a.sin(), a.cos()], -1)
+
+
+class Fourier(Stationary):
+    r"""The kernel :math:`\varphi(x)^T \varphi(x')` of finitely many random Fourier features.
+
+    With it the process is a Bayesian linear model, ridge regression (Rahimi and Recht 2007).
+
+    Args:
+        num_inputs: ``d``.
+        num_features: ``D``, an even number.
+        seed: Seed of the frequencies.
+        outputscale: As of :class:`Stationary`.
+    """
+
+    def __init__(
+        self, num_inputs: int, num_features: int, seed: int = 0, outputscale: LogNormal = DELTA
+    ) -> None:
+        super().__init__(RBF, outputscale)
+        generator = torch.Generator().manual_seed(seed)
+        self.frequencies = torch.randn(
+            num_inputs, num_features // 2, generator=generator, dtype=torch.float64
+        )
+
+    def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
+        """Return the inner products of the features."""
+        phi = _fourier(own, x, self.frequencies)
+        return phi @ (phi if other is None else _fourier(own, other, self.frequencies)).mT
+
+    def with_pull_back(self, own: Values, x: Tensor) -> tuple[Tensor, PullBack]:
+        """Return K and its derivatives in closed form."""
+        w = self.frequencies.to(x)
+        z = x / own["lengthscale"].unsqueeze(-2)
+        a, half = z @ w, w.shape[-1]
+        phi = torch.cat([a.sin(), a.cos()], -1) / math.sqrt(half)
+        k, scale = phi @ phi.mT, own["outputscale"].unsqueeze(-1)
+
+        def pull_back(D: Tensor) -> Values:
+            by_phi = 2 * scale * D @ phi
+            by_angle = by_phi[..., :half] * phi[..., half:] - by_phi[..., half:] * phi[..., :half]
+            by_length = -((by_angle @ w.mT) * z).sum(-2) / own["lengthscale"]
+            return {"lengthscale": by_length, "outputscale": (D * k).sum((-1, -2)).unsqueeze(-1)}
+
+        return scale * k, pull_back
+
+    def features(self, own: Values, number: int, generator: torch.Generator) -> Features:
+        """Return the kernel's own features; ``number`` is not used."""
+        return lambda x: _fourier(own, x, self.frequencies)
+
+
+class OfGPyTorch(Kernel):
+    """Any GPyTorch kernel, with its constraints and priors.
+
+    A parameter without a prior is known to a factor (or, if it may be negative, with a standard
+    deviation of 1) around the value that the kernel has when it is given; an ``outputscale`` so has
+    the prior of the term that it is the kernel of. Values are in units of the targets.
+
+    Args:
+        kernel: The kernel, without batch shape.
+        outputscale: The prior of ``outputscale`` of a ``ScaleKernel`` without prior of its own.
+    """
+
+    def __init__(self, kernel: AnyGPyTorchKernel, outputscale: LogNormal = DELTA) -> None:
+        if not isinstance(kernel, AnyGPyTorchKernel):
+            raise TypeError(
+                "Expected a kernel of gpadjust.core or GPyTorch, such as Stationary(MATERN52) or "
+                f"ScaleKernel(MaternKernel()); found {type(kernel).__name__}."
+            )
+        if kernel.batch_shape:
+            raise ValueError(
+                f"Expected a kernel without batch shape, which draws and outputs add; found "
+                f"{tuple(kernel.batch_shape)}."
+            )
+        self.kernel, self.outputscale = deepcopy(kernel).double(), outputscale
+        self.kernel.requires_grad_(False).eval()
+        self._as_batch: bool | None = None
+
+    def rows(self, x: Tensor, num_outputs: int) -> list[Row]:
+        """Return a row for each parameter that is learnt."""
+        priors = {}
+        for _, module, prior, closure, _ in self.kernel.named_priors():
+            for name, parameter in self._raw.items():
+                if _reads(closure, module, parameter):
+                    priors[name] = prior
+        rows = []
+        for name, (raw, constraint) in self._constraints.items():
+            value = (raw if constraint is None else constraint.transform(raw)).reshape(-1)
+            positive = constraint is not None and bool((constraint.lower_bound >= 0).all())
+            prior, scale = priors.get(name), _LENGTH_FACTOR if positive else math.e
+            density = None if prior is None else _density(prior, raw.shape)
+            if prior is None and name.endswith("raw_outputscale"):
+                value, scale = torch.full_like(value, self.outputscale[0]), self.outputscale[1]
+            location = (value.clamp_min(1e-12).log() if positive else value).expand(num_outputs, -1)
+            rows.append(Row(name, location, math.log(scale), positive, log_density=density))
+        return rows
+
+    def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
+        """Return the kernel's covariances, a batch at once where the kernel can."""
+        lead = next(iter(own.values())).shape[:-1] if own else torch.Size([1, 1])
+        if self._as_batch is None:
+            self._as_batch = self._is_the_same_as_a_batch(own, x, lead)
+        evaluate = self._of_batch if self._as_batch else self._one_by_one
+        return evaluate(own, x, x if other is None else other, lead)
+
+    @property
+    def _raw(self) -> dict[str, Tensor]:
+        return dict(self.kernel.named_parameters())
+
+    @property
+    def _constraints(self) -> dict[str, tuple[Tensor, Any]]:
+        named = self.kernel.named_parameters_and_constraints()
+        return {name: (raw, constraint) for name, raw, constraint in named}
+
+    def _with(self, values: Values, lead: torch.Size) -> dict[str, Tensor]:
+        """Return raw parameters of values ``*lead x k``."""
+        raw = {}
+        for name, (old, constraint) in self._constraints.items():
+            value = values[name].reshape(torch.Size([*lead, *old.shape]))
+            if constraint is not None:
+                low, high = constraint.lower_bound.to(value), constraint.upper_bound.to(value)
+                value = value.maximum(low + 1e-12 * low.abs().nan_to_num(posinf=0.0))
+                value = value.minimum(high - 1e-12 * high.abs().nan_to_num(posinf=0.0))
+                value = constraint.inverse_transform(value)
+            raw[name] = value
+        return raw
+
+    def _of_batch(self, own: Values, x: Tensor, other: Tensor, lead: torch.Size) -> Tensor:
+        kernel = deepcopy(self.kernel)
+        for each in kernel.modules():
+            if isinstance(each, AnyGPyTorchKernel):
+                each.batch_shape = lead
+        shape = torch.broadcast_shapes(lead, x.shape[:-2], other.shape[:-2])
+        x, other = (v.expand(*shape, *v.shape[-2:]) for v in (x, other))
+        return _dense(kernel, self._with(own, lead), x, other)
+
+    def _one_by_one(self, own: Values, x: Tensor, other: Tensor, lead: torch.Size) -> Tensor:
+        x, other = (v.expand(*v.shape[:-4], *lead, *v.shape[-2:]) for v in (x, other))
+        rows = []
+        for i in range(lead[0]):
+            parts = []
+            for j in range(lead[1]):
+                one = {name: value[i, j] for name, value in own.items()}
+                raw = self._with(one, torch.Size())
+                parts.append(_dense(self.kernel, raw, x[..., i, j, :, :], other[..., i, j, :, :]))
+            rows.append(torch.stack(parts, -3))
+        return torch.stack(rows, -4)
+
+    def _is_the_same_as_a_batch(self, own: Values, x: Tensor, lead: torch.Size) -> bool:
+        """Return whether evaluating a batch gives what each of its elements gives."""
+        few = {name: value.detach()[:2].repeat(2, 1, 1)[:2] for name, value in own.items()}
+        size = torch.Size([2, lead[1]])
+        x = x.detach().reshape(-1, *x.shape[-2:])[0, :5].reshape(1, 1, -1, x.shape[-1])
+        expected = self._one_by_one(few, x, x, size)
+        try:
+            batch = self._of_batch(few, x, x, size)
+        except Exception:
+            return False
+        return batch.shape == expected.shape and torch.allclose(batch, expected, rtol=1e-9)
+
+    def __repr__(self) -> str:
+        return repr(self.kernel).replace("\n", " ")
+
+
+class _Dense(torch.nn.Module):
+    """A kernel whose matrix is computed at the call, and so with the parameters of the call."""
+
+    def __init__(self, kernel: AnyGPyTorchKernel) -> None:
+        super().__init__()
+        self.kernel = kernel
+
+    def forward(self, x: Tensor, other: Tensor) -> Tensor:
+        """Return the covariances."""
+        dense: Tensor = self.kernel(x, other).to_dense()
+        return dense
+
+
+def _dense(kernel: AnyGPyTorchKernel, raw: dict[str, Tensor], x: Tensor, other: Tensor) -> Tensor:
+    named = {f"kernel.{name}": value for name, value in raw.items()}
+    dense: Tensor = functional_call(_Dense(kernel), named, (x, other))
+    return dense
+
+
+def _reads(closure: Callable[..., Tensor], module: Any, parameter: Tensor) -> bool:
+    """Return whether a prior's value depends on a parameter."""
+    with torch.enable_grad():
+        wanted = parameter.requires_grad
+        parameter.requires_grad_(True)
+        reads = bool(closure(module).requires_grad)
+        parameter.requires_grad_(wanted)
+    return reads
+
+
+def _density(prior: Any, shape: torch.Size) -> Callable[[Tensor], Tensor]:
+    """Return the log density of numbers ``... x k`` by a prior of GPyTorch."""
+
+    def log_density(theta: Tensor) -> Tensor:
+        value: Tensor = prior.log_prob(theta.reshape(*theta.shape[:-1], *shape))
+        return value.reshape(*theta.shape[:-1], -1).sum(-1)
+
+    return log_density
+
+
+def as_kernel(kernel: Any, outputscale: LogNormal = DELTA) -> Kernel:
+    """Return a kernel of this library: itself, a wrapped one of GPyTorch, or the default RBF."""
+    if kernel is None:
+        return Stationary(RBF, outputscale)
+    return kernel if isinstance(kernel, Kernel) else OfGPyTorch(kernel, outputscale)

@@ -1,0 +1,115 @@
+"""The noise of observations: known variances, or learnt ones with shares that depend on the place."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from gpadjust.core.terms import Places
+from gpadjust.core.unknowns import LogNormal, Row, Values
+
+_PRIOR = LogNormal(1e-3, 55.0)
+_LEAST = 1e-11  # of the squared unit of the targets
+
+
+class Noise:
+    r"""Independent noise of observations, with variances :math:`\sum_k h_k(x) \, v_k`.
+
+    The :math:`v_k` are learnt for each output. A noise of one's own overrides ``shares``, h: one
+    column for each name. ``1`` and the square of f_p, say, are noise of a constant standard
+    deviation and one that is a share of f_p.
+
+    Args:
+        names: The names of the shares.
+        priors: The priors of v, in squared units of the targets (times those of 1 / h).
+    """
+
+    known: Tensor | None = None
+
+    def __init__(
+        self, names: Sequence[str] = ("variance",), priors: Sequence[LogNormal] | None = None
+    ) -> None:
+        self.names = tuple(names)
+        self.priors = [_PRIOR] * len(self.names) if priors is None else [*priors]
+
+    def shares(self, places: Places) -> Tensor | None:
+        """Return h, which broadcasts with ``... x S x m x n x K``; None for a single share of 1."""
+        return None
+
+    def rows(self, num_points: int, num_outputs: int, like: Tensor) -> list[Row]:
+        """Return the unknown variances."""
+        pairs = zip(self.names, self.priors, strict=True)
+        return [
+            Row.positive(f"noise.{name}", like.new_full((num_outputs, 1), prior.median), prior.factor)
+            for name, prior in pairs
+        ]
+
+    def variance(self, values: Values, places: Places, is_training: bool = False) -> Tensor:
+        """Return the variances, ``... x S x m x n`` (or 1 where all are equal)."""
+        v = torch.cat([values[f"noise.{name}"] for name in self.names], -1) + _LEAST
+        shares = self.shares(places)
+        return v if shares is None else (v.unsqueeze(-2) * shares).sum(-1)
+
+    def pull_back(self, values: Values, places: Places, by: Tensor) -> Values:
+        """Return derivatives by v, of derivatives by the training variances ``S x m x n``."""
+        shares = self.shares(places)
+        if shares is None:
+            return {f"noise.{self.names[0]}": by.sum(-1, keepdim=True)}
+        slopes = (by.unsqueeze(-1) * shares).sum(-2)
+        parts = slopes.split(1, -1)
+        return {f"noise.{name}": part for name, part in zip(self.names, parts, strict=True)}
+
+    def appended(self, variances: Tensor | None, num_points: int) -> Noise:
+        """Return the noise of more observations, for training data with further rows.
+
+        Raises:
+            ValueError: If variances are given, as the noise is learnt.
+        """
+        if variances is not None:
+            raise ValueError(
+                "Expected no noise, as the model learns its own; build it with train_Yvar to give "
+                "the variances of observations."
+            )
+        return self
+
+    def of_outputs(self, outputs: Sequence[int]) -> Noise:
+        """Return the noise of some outputs."""
+        return self
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({', '.join(self.names)})"
+
+
+class KnownNoise(Noise):
+    """Noise of known variances.
+
+    Args:
+        variances: The variances of the training targets, ``... x m x n``, in squared units.
+    """
+
+    def __init__(self, variances: Tensor) -> None:
+        super().__init__(())
+        self.known: Tensor = variances
+
+    def variance(self, values: Values, places: Places, is_training: bool = False) -> Tensor:
+        """Return the known variances; at other places their mean in each output."""
+        known = self.known.unsqueeze(-3)  # ... x 1 x m x n
+        return known if is_training else known.mean(-1, keepdim=True)
+
+    def pull_back(self, values: Values, places: Places, by: Tensor) -> Values:
+        """Return nothing, as nothing is learnt."""
+        return {}
+
+    def appended(self, variances: Tensor | None, num_points: int) -> KnownNoise:
+        """Return the noise of more observations, of given variances or the mean of those known."""
+        if variances is None:
+            variances = self.known.mean(-1, keepdim=True).expand(*self.known.shape[:-1], num_points)
+        lead = torch.broadcast_shapes(self.known.shape[:-1], variances.shape[:-1])
+        parts = [v.expand(*lead, v.shape[-1]) for v in (self.known, variances)]
+        return KnownNoise(torch.cat(parts, -1))
+
+    def of_outputs(self, outputs: Sequence[int]) -> KnownNoise:
+        """Return the noise of some outputs."""
+        return KnownNoise(self.known[..., list(outputs), :])

@@ -1,0 +1,172 @@
+"""The posterior of a model that holds draws: a mixture of Gaussians, as BoTorch wants it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from botorch.posteriors.gpytorch import GPyTorchPosterior
+from gpytorch.distributions import MultitaskMultivariateNormal, MultivariateNormal
+from linear_operator import to_linear_operator
+from torch import Size, Tensor
+
+DRAWS = -3  # the dimension of draws in ... x S x q x m
+
+
+class Prediction(NamedTuple):
+    """Predictions at points by themselves.
+
+    Args:
+        mean: Means, ``... x q x m``, in the units of the targets.
+        variance: Variances, ``... x q x m``, in their square.
+    """
+
+    mean: Tensor
+    variance: Tensor
+
+
+def moments(mean: Tensor, variance: Tensor) -> Prediction:
+    """Return the mean and variance of mixtures of components ``... x S x q x m``."""
+    if mean.shape[DRAWS] == 1:
+        return Prediction(mean.squeeze(DRAWS), variance.squeeze(DRAWS))
+    between = mean.var(DRAWS, correction=0)
+    return Prediction(mean.mean(DRAWS), variance.mean(DRAWS) + between)
+
+
+def mixture_quantile(mean: Tensor, variance: Tensor, level: float) -> Tensor:
+    """Return quantiles ``... x q x m`` of mixtures of Gaussians ``... x S x q x m``, by bisection."""
+    sd = variance.sqrt().clamp_min(1e-300)
+    ends = mean + torch.special.ndtri(torch.tensor(level).to(mean)) * sd
+    low, high = ends.amin(DRAWS), ends.amax(DRAWS)
+    for _ in range(50 if mean.shape[DRAWS] > 1 else 0):
+        middle = (low + high) / 2
+        below = torch.special.ndtr((middle.unsqueeze(DRAWS) - mean) / sd).mean(DRAWS) < level
+        low, high = torch.where(below, middle, low), torch.where(below, high, middle)
+    return (low + high) / 2
+
+
+def correlation_root(K: Tensor) -> Tensor:
+    """Return a lower root of covariances ``... x q x q``, with a jitter relative to each variance."""
+    sd = K.diagonal(dim1=-1, dim2=-2).clamp_min(1e-300).sqrt()
+    R = K / (sd.unsqueeze(-1) * sd.unsqueeze(-2))
+    eye = torch.eye(K.shape[-1]).to(K)
+    for jitter in (1e-10, 1e-8, 1e-6, 1e-4, 1e-2, 1.0):
+        root, info = torch.linalg.cholesky_ex((R + jitter * eye) / (1 + jitter))
+        if not info.any():
+            break
+    scaled: Tensor = root * sd.unsqueeze(-1)
+    return scaled
+
+
+def _joint(mean: Tensor, K: Tensor) -> MultivariateNormal:
+    """Return the distribution of means ``... x m x q`` with a covariance ``... x m q x m q``."""
+    lazy = to_linear_operator(K)  # without a factor until one is asked for
+    if mean.shape[-2] == 1:
+        return MultivariateNormal(mean.squeeze(-2), lazy)
+    return MultitaskMultivariateNormal(mean.mT, lazy, interleaved=False)
+
+
+def _block_diagonal(K: Tensor) -> Tensor:
+    """Return ``... x m q x m q`` of covariances ``... x m x q x q``."""
+    if K.shape[-3] == 1:
+        return K.squeeze(-3)
+    # ... x m x q x m x q
+    return torch.diag_embed(K.movedim(-3, -1), dim1=-4, dim2=-2).flatten(-2).flatten(-3, -2)
+
+
+class MixturePosterior(GPyTorchPosterior):
+    """A mixture of ``S`` equally likely Gaussians, each of independent outputs.
+
+    To BoTorch it is one posterior over ``... x q x m``, without a dimension for the draws. Samples
+    are exact: each is of one component, which one further base sample picks. The ``distribution``,
+    which BoTorch takes where it asks for a Gaussian, has the joint mean and covariance.
+
+    Args:
+        mean: Means of the components, ``... x S x m x q``.
+        covariance: Their covariances, ``... x S x m x q x q``.
+    """
+
+    def __init__(self, mean: Tensor, covariance: Tensor) -> None:
+        covariance = covariance.expand(*mean.shape, mean.shape[-1])
+        self.components = (mean, covariance)
+        center = mean.mean(-3)
+        away = (mean - center.unsqueeze(-3)).flatten(-2)  # ... x S x m q
+        between = away.mT @ away / away.shape[-2]
+        super().__init__(_joint(center, _block_diagonal(covariance.mean(-4)) + between))
+
+    @property
+    def base_sample_shape(self) -> Size:
+        """``... x q m``, and of several components one more, which picks the component."""
+        mean, _ = self.components
+        S, m, q = mean.shape[-3:]
+        return Size([*mean.shape[:-3], q * m + (S > 1)])
+
+    @property
+    def variance(self) -> Tensor:
+        """The variances, ``... x q x m``, however small."""
+        mean, K = self.components
+        return moments(mean.mT, K.diagonal(dim1=-1, dim2=-2).mT).variance
+
+    @property
+    def batch_range(self) -> tuple[int, int]:
+        """The batch dimensions of base samples."""
+        return 0, -1
+
+    def rsample(self, sample_shape: Size | None = None) -> Tensor:
+        """Return samples ``sample_shape x ... x q x m``, with a graph."""
+        shape = Size([1]) if sample_shape is None else sample_shape
+        mean, _ = self.components
+        base = torch.randn(*shape, *self.base_sample_shape, dtype=mean.dtype, device=mean.device)
+        return self.rsample_from_base_samples(shape, base)
+
+    def rsample_from_base_samples(self, sample_shape: Size, base_samples: Tensor) -> Tensor:
+        """Return samples made of N(0, 1) base samples, ``sample_shape x base_sample_shape``."""
+        mean, K = self.components
+        S, m, q = mean.shape[-3:]
+        batch = mean.shape[:-3]
+        base = base_samples.expand(*sample_shape, *batch, base_samples.shape[-1])
+        which = (torch.special.ndtr(base[..., -1].detach()) * S).long().clamp(0, S - 1)
+        z = base[..., : q * m].reshape(*sample_shape, *batch, q, m).mT
+        root = correlation_root(K)
+        # Components in front, batches behind samples: pick without expanding the roots.
+        flat_mean, flat_root = mean.reshape(-1, S, m, q), root.reshape(-1, S, m, q, q)
+        which, z = which.reshape(-1, len(flat_mean)), z.reshape(-1, len(flat_mean), m, q)
+        rows = torch.arange(len(flat_mean), device=which.device).expand_as(which)
+        drawn = flat_mean[rows, which] + _products(flat_root, z, rows, which)
+        return drawn.reshape(*sample_shape, *batch, m, q).mT
+
+    def quantile(self, value: Tensor) -> Tensor:
+        """Return quantiles ``... x q x m`` of the mixture; several levels are in front."""
+        mean, K = self.components
+        parts = (mean.mT, K.diagonal(dim1=-1, dim2=-2).mT)
+        quantiles = [mixture_quantile(*parts, float(level)) for level in value.flatten()]
+        return torch.stack(quantiles) if value.numel() > 1 else quantiles[0]
+
+    def density(self, value: Tensor) -> Tensor:
+        """Return the density of each output at each point, at values ``... x q x m``."""
+        mean, K = self.components
+        sd = K.diagonal(dim1=-1, dim2=-2).mT.sqrt()
+        each = torch.distributions.Normal(mean.mT, sd).log_prob(value.unsqueeze(DRAWS)).exp()
+        return each.mean(DRAWS)
+
+
+    def scalarized(self, weights: Tensor, offset: float = 0.0) -> MixturePosterior:
+        """Return the posterior of a weighted sum of the outputs, plus an offset."""
+        mean, K = self.components
+        w = weights.to(mean).unsqueeze(-1)
+        total = (w * mean).sum(-2, keepdim=True) + offset
+        return MixturePosterior(total, (w.square().unsqueeze(-1) * K).sum(-3, keepdim=True))
+
+
+def _products(root: Tensor, z: Tensor, rows: Tensor, which: Tensor) -> Tensor:
+    """Return the picked roots ``b x S x m x q x q`` times ``N x b x m x q``."""
+    if root.shape[-1] == 1:
+        return root[rows, which].squeeze(-1) * z
+    drawn = torch.zeros_like(z)
+    for s in range(root.shape[1]):
+        mine = which == s
+        if mine.any():
+            at = mine.nonzero()
+            part = (root[at[:, 1], s] @ z[mine].unsqueeze(-1)).squeeze(-1)
+            drawn = drawn.index_put((at[:, 0], at[:, 1]), part)
+    return drawn

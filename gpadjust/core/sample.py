@@ -1,0 +1,256 @@
+"""Draws of coordinates from the prior N(0, I) to the posterior, and their most likely values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from scipy.optimize import minimize
+from torch import Tensor
+
+LogLikelihood = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""Of coordinates ``N x B x P``: log likelihoods ``N x B`` and their gradients ``N x B x P``."""
+
+GROUPS = 2  # of draws that are resampled apart, so that their difference shows the error
+_LEAPS, _ACCEPTED, _LAST_MOVES, _MOVES, _FAR = 5, 0.8, 4, 2, 60.0
+_SEARCHES, _GAIN = 5, 0.01  # of searches, and of log density, below which there are no more
+_WIDER = 1.5  # than Laplace's approximation
+
+
+class Normal(NamedTuple):
+    """Normal distributions of ``B`` problems.
+
+    Args:
+        mean: ``B x P``.
+        root: A lower root of the covariances, ``B x P x P``.
+    """
+
+    mean: Tensor
+    root: Tensor
+
+    @classmethod
+    def standard(cls, shape: tuple[int, int], like: Tensor) -> Normal:
+        """Return N(0, I)."""
+        eye = torch.eye(shape[1]).to(like).expand(shape[0], -1, -1)
+        return cls(like.new_zeros(shape), eye)
+
+    def log_density(self, u: Tensor) -> tuple[Tensor, Tensor]:
+        """Return log densities ``N x B`` at ``N x B x P``, and their gradients."""
+        white = torch.linalg.solve_triangular(self.root, (u - self.mean).unsqueeze(-1), upper=False)
+        size = self.root.diagonal(dim1=-1, dim2=-2).log().sum(-1)
+        size = size + 0.5 * u.shape[-1] * math.log(2 * math.pi)
+        slope = torch.linalg.solve_triangular(self.root.mT, white, upper=True).squeeze(-1)
+        return -0.5 * white.square().sum((-1, -2)) - size, -slope
+
+
+class Draws(NamedTuple):
+    """Draws from a posterior.
+
+    Args:
+        u: Equally likely coordinates, ``N x B x P``; the first and second half are resampled apart.
+        log_evidence: The log evidence of each half, ``2 x B``.
+        effective: The number of starting draws that count, ``B``.
+    """
+
+    u: Tensor
+    log_evidence: Tensor
+    effective: Tensor
+
+
+@torch.no_grad()
+def sample(
+    log_likelihood: LogLikelihood,
+    like: Tensor,
+    number: int,
+    seed: int,
+    start: Normal | None = None,
+    first: int = 8,
+    with_moves: bool = True,
+) -> Draws:
+    r"""Draw from :math:`N(u | 0, I) \, L(u)` by sequential Monte Carlo (Del Moral et al. 2006).
+
+    Draws of a start, ``first`` times as many as are kept, are weighted by a power of the ratio of
+    the posterior to the start, as large as half of them still count, resampled and moved by
+    Hamiltonian Monte Carlo; the power rises until it is 1.
+
+    Args:
+        log_likelihood: L of ``B`` problems.
+        like: A tensor ``B x P``, for shape and device.
+        number: Number of draws, an even one.
+        seed: Seed.
+        start: The start. Default: the prior.
+        first: How many draws begin for each that is kept.
+        with_moves: Whether draws are moved; without, they are weighted and resampled once.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    shape = (like.shape[0], like.shape[1])
+    prior = Normal.standard(shape, like)
+    begin = prior if start is None else start
+
+    def ratio(u: Tensor) -> tuple[Tensor, Tensor]:
+        value, slope = log_likelihood(u)
+        if start is None:
+            return value, slope
+        (a, by_a), (b, by_b) = prior.log_density(u), start.log_density(u)
+        return value + a - b, slope + by_a - by_b
+
+    u = _randn((first * number, *shape), generator, like)
+    u = begin.mean + (begin.root @ u.unsqueeze(-1)).squeeze(-1)
+    value, slope = ratio(u)
+    power, evidence = like.new_zeros(shape[0]), like.new_zeros(GROUPS, shape[0])
+    length, problems = torch.full_like(power, 0.3), torch.arange(shape[0], device=like.device)
+    least, effective = number / 2, None
+    while True:
+        step = _step(value, power, least if with_moves else 0.0)
+        logs = (step * value).nan_to_num(nan=-math.inf)
+        halves = logs.reshape(GROUPS, -1, shape[0])
+        evidence = evidence + halves.logsumexp(1) - math.log(halves.shape[1])
+        power, weights = power + step, logs.softmax(0)
+        if effective is None:
+            effective = weights.square().sum(0).reciprocal()
+        root = _root(u, weights)
+        rows = _resampled(halves, number // GROUPS, generator)
+        u, value, slope, least = u[rows, problems], value[rows, problems], slope[rows, problems], number / 2
+        is_done = bool((power >= 1).all()) or not with_moves
+        for _ in range((_LAST_MOVES if is_done else _MOVES) * with_moves):
+            u, value, slope, rate = _move(
+                ratio, begin, u, value, slope, power, root, length, generator
+            )
+            length = length * (rate - _ACCEPTED).exp()
+        if is_done:
+            return Draws(u, evidence, effective)
+
+
+def _move(
+    ratio: LogLikelihood,
+    begin: Normal,
+    u: Tensor,
+    value: Tensor,
+    slope: Tensor,
+    power: Tensor,
+    root: Tensor,
+    length: Tensor,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return draws after a Hamiltonian move of the density begin x ratio^power, and acceptance.
+
+    Momenta are N(0, I) in the coordinates that ``root`` makes white.
+    """
+    t = power.unsqueeze(-1)
+
+    def force(slope: Tensor, prior_slope: Tensor) -> Tensor:
+        return (root.mT @ (t * slope + prior_slope).unsqueeze(-1)).squeeze(-1)
+
+    p = _randn(u.shape, generator, u)
+    jitter = torch.rand(u.shape[:-1], generator=generator, dtype=u.dtype).to(u)
+    leap = (length * (0.6 + 0.8 * jitter)).unsqueeze(-1)
+    prior, by_prior = begin.log_density(u)
+    energy = power * value + prior - 0.5 * p.square().sum(-1)
+    new, new_value, new_slope = u, value, slope
+    p = p + 0.5 * leap * force(slope, by_prior)
+    for i in range(_LEAPS):
+        new = (new + leap * (root @ p.unsqueeze(-1)).squeeze(-1)).clamp(-_FAR, _FAR)
+        new_value, new_slope = ratio(new)
+        prior, by_prior = begin.log_density(new)
+        half = 0.5 if i + 1 == _LEAPS else 1.0
+        p = p + half * leap * force(new_slope, by_prior)
+    after = power * new_value + prior - 0.5 * p.square().sum(-1)
+    chance = (after - energy).exp().nan_to_num(nan=0.0).clamp_max(1.0)
+    taken = torch.rand(chance.shape, generator=generator, dtype=u.dtype).to(u) < chance
+    moved = taken.unsqueeze(-1)
+    u, slope = torch.where(moved, new, u), torch.where(moved, new_slope, slope)
+    return u, torch.where(taken, new_value, value), slope, chance.mean(0)
+
+
+def _step(value: Tensor, power: Tensor, least: float) -> Tensor:
+    """Return the largest steps of the power, ``B``, after which so many draws count."""
+
+    def counts(step: Tensor) -> Tensor:
+        weights = (step * value).nan_to_num(nan=-math.inf).softmax(0)
+        return weights.square().sum(0).reciprocal()
+
+    left = 1 - power
+    low, high = torch.zeros_like(left), left
+    if bool((counts(left) >= least).all()):
+        return left
+    low = torch.where(counts(left) >= least, left, low)
+    middle = 0.1 * high
+    for _ in range(40):
+        enough = counts(middle) >= least
+        low, high = torch.where(enough, middle, low).maximum(low), torch.where(enough, high, middle)
+        middle = torch.where(low > 0, (low * high).sqrt(), 0.1 * high).minimum(left)
+    return low.where(low > 0, high).minimum(left)
+
+
+def _resampled(logs: Tensor, number: int, generator: torch.Generator) -> Tensor:
+    """Return numbers of rows ``(G number) x B``, systematic in each of the groups of weights."""
+    groups, size, problems = logs.shape
+    weights = logs.softmax(1)
+    offset = torch.rand(groups, 1, problems, generator=generator, dtype=logs.dtype).to(logs)
+    steps = torch.arange(number).to(logs).reshape(1, -1, 1)
+    heights = ((steps + offset) / number).movedim(1, -1).contiguous()
+    total = weights.cumsum(1).movedim(1, -1).contiguous()
+    rows = torch.searchsorted(total, heights).clamp_max(size - 1).movedim(-1, 1)
+    shift = size * torch.arange(groups, device=logs.device).reshape(-1, 1, 1)
+    return (rows + shift).reshape(-1, problems)
+
+
+def _root(u: Tensor, weights: Tensor) -> Tensor:
+    """Return a root of the draws' covariances, shrunk to their diagonals as far as they are few."""
+    away = u - (weights.unsqueeze(-1) * u).sum(0)
+    covariance = torch.einsum("nb,nbi,nbj->bij", weights, away, away)
+    size = weights.square().sum(0).reciprocal()
+    share = (size / (size + u.shape[-1]))[:, None, None]
+    diagonal = torch.diag_embed(covariance.diagonal(dim1=-1, dim2=-2).clamp_min(1e-12))
+    root: Tensor = torch.linalg.cholesky(share * covariance + (1 - share) * diagonal)
+    return root
+
+
+def _randn(shape: tuple[int, ...], generator: torch.Generator, like: Tensor) -> Tensor:
+    return torch.randn(shape, generator=generator, dtype=like.dtype).to(like)
+
+
+@torch.no_grad()
+def maximise(log_likelihood: LogLikelihood, u: Tensor) -> Tensor:
+    """Return the coordinates ``B x P`` of highest density N(u | 0, I) L(u), by L-BFGS from u.
+
+    The search begins anew where it ended, as long as that pays: a line search may fail for one
+    problem where others still have a way to go.
+    """
+    best, shape = u.clone(), u.shape
+    top = u.new_full(shape[:1], -math.inf)
+
+    def negative(flat: object) -> tuple[float, object]:
+        point = torch.as_tensor(flat).to(u).reshape(1, *shape)
+        value, slope = log_likelihood(point)
+        density = (value - 0.5 * point.square().sum(-1))[0]
+        better = density > top
+        top[better], best[better] = density[better], point[0, better]
+        density = density.nan_to_num(neginf=-1e10)
+        return -float(density.sum()), (point - slope).nan_to_num().flatten().cpu().numpy()
+
+    for _ in range(_SEARCHES):
+        before = float(top.nan_to_num(neginf=-1e10).sum())
+        minimize(negative, best.flatten().cpu().numpy(), jac=True, method="L-BFGS-B")
+        if float(top.sum()) < before + _GAIN:
+            break
+    return best
+
+
+@torch.no_grad()
+def around_mode(log_likelihood: LogLikelihood, mode: Tensor) -> tuple[Normal, Tensor]:
+    """Return Laplace's approximation at a mode ``B x P``, made wider, and the log evidence by it.
+
+    The Hessian is that of central differences of the gradient.
+    """
+    p = mode.shape[-1]
+    step = 0.1 * torch.eye(p).to(mode).unsqueeze(1)
+    value, slope = log_likelihood(torch.cat([mode.unsqueeze(0), mode + step, mode - step]))
+    hessian = -(slope[1 : p + 1] - slope[p + 1 :]).movedim(0, -2) / 0.2
+    values, vectors = torch.linalg.eigh(0.5 * (hessian + hessian.mT).nan_to_num())
+    precision = 1 + values.clamp_min(0.0)
+    root = vectors * (_WIDER * precision.rsqrt()).unsqueeze(-2)
+    evidence = value[0] - 0.5 * mode.square().sum(-1) - 0.5 * precision.log().sum(-1)
+    return Normal(mode, torch.linalg.cholesky(root @ root.mT)), evidence

@@ -1,0 +1,246 @@
+"""A model is a sum of terms, each a basis times a Gaussian process: the one place that sums."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gpadjust.core.kernels import Kernel, PullBack
+from gpadjust.core.unknowns import LogNormal, Row, Values
+
+
+class Term(NamedTuple):
+    r"""A term :math:`b(x) g(x)` of a model, :math:`g \sim GP(\text{mean}, k + \kappa)`.
+
+    The basis b is a physics, or 1.
+
+    Args:
+        name: The name.
+        kernel: k; None for none.
+        mean: The prior mean of g.
+        constant: The prior of :math:`\kappa`, the variance of an unknown constant in g; None for
+            none. In squared units of the targets, where b is 1.
+        physics: The number of the physics that is the basis; None for 1.
+        has_center: Whether g's deviation from its mean is multiplied by b - c instead of b, with an
+            unknown c: then a constant in both f_p and the targets makes no difference. The prior
+            mean of the sum does not depend on c.
+    """
+
+    name: str
+    kernel: Kernel | None = None
+    mean: float = 0.0
+    constant: LogNormal | None = None
+    physics: int | None = None
+    has_center: bool | float = False
+
+    @property
+    def varies(self) -> bool:
+        """Whether g is not just its mean."""
+        return self.kernel is not None or self.constant is not None
+
+
+class Places(NamedTuple):
+    """Where a sum is sought.
+
+    Args:
+        x: Inputs of kernels, ``... x 1 x 1 x n x d``.
+        f: The outputs of each physics there, ``... x S x m x n`` (1 for S).
+    """
+
+    x: Tensor
+    f: Sequence[Tensor] = ()
+
+
+@dataclass
+class WeightedSum:
+    r"""A sum :math:`\bar f(x) + \sum_t w_t(x) \tilde g_t(x)` at some places, and its covariances.
+
+    :math:`\tilde g_t` are the deviations of the terms from their means. The function itself is such
+    a sum, and so are rho, delta and every other part of it.
+    """
+
+    terms: Sequence[Term]
+    values: Values
+    x: Tensor
+    mean: Tensor  # ... x S x m x n
+    weights: dict[str, Tensor | None] = field(default_factory=dict)  # w_t; None for 1
+
+    def own(self, term: Term) -> Values:
+        """Return the parameters of a term's kernel."""
+        start = f"{term.name}.kernel."
+        return {n.removeprefix(start): v for n, v in self.values.items() if n.startswith(start)}
+
+    def variance(self) -> Tensor:
+        r"""Return the prior variances, :math:`\sum_t w_t^2 (k_t(x, x) + \kappa_t)`."""
+        total = torch.zeros_like(self.x[..., 0])
+        for term, weight in self._parts():
+            k = self._constant(term)
+            if term.kernel is not None:
+                k = k + self._process(term) * term.kernel.variance(self.own(term), self.x)
+            total = total + (k if weight is None else k * weight.square())
+        return total
+
+    def cross(self, other: WeightedSum) -> Tensor:
+        r"""Return the prior covariances with another sum, ``... x S x m x n x n'``.
+
+        .. math:: \sum_t w_t(x) \, (k_t(x, x') + \kappa_t) \, w'_t(x')
+        """
+        total = self.x.new_zeros(self.x.shape[-2], other.x.shape[-2])
+        for term, weight in self._parts():
+            if term.name not in other.weights:
+                continue
+            point = None if other is self else other.x
+            k = self._constant(term).unsqueeze(-1)
+            if term.kernel is not None:
+                K = term.kernel.covariance(self.own(term), self.x, point)
+                k = k + (K if self._is_whole(term) else K * self._process(term).unsqueeze(-1))
+            if weight is not None:
+                k = k * weight.unsqueeze(-1)
+            other_weight = other.weights[term.name]
+            if other_weight is not None:
+                k = k * other_weight.unsqueeze(-2)
+            total = total + k
+        return total
+
+    def with_pull_back(self) -> tuple[Tensor, PullBack]:
+        """Return the covariance, and what gives derivatives by all parameters.
+
+        Derivatives by the weights have the names ``"<term>.weight"``.
+        """
+        nothing = self.x.new_zeros(*self.x.shape[:-1], self.x.shape[-2])
+        total, steps = nothing, []
+        for term, w in self._parts():
+            k, back = nothing, None
+            if term.kernel is not None:
+                k, back = term.kernel.with_pull_back(self.own(term), self.x)
+                k = k if self._is_whole(term) else k * self._process(term).unsqueeze(-1)
+            if term.constant is not None:
+                k = k + self._constant(term).unsqueeze(-1)
+            ww = None if w is None else w.unsqueeze(-1) * w.unsqueeze(-2)
+            total = total + (k if ww is None else k * ww)
+            steps.append((term, w, ww, k, back))
+
+        def pull_back(D: Tensor) -> Values:
+            by: Values = {}
+            for term, w, ww, k, back in steps:
+                by_k = D if ww is None else D * ww
+                if back is not None:
+                    part = by_k if self._is_whole(term) else by_k * self._process(term).unsqueeze(-1)
+                    by |= {f"{term.name}.kernel.{n}": slope for n, slope in back(part).items()}
+                if term.constant is not None:
+                    by[f"{term.name}.constant"] = by_k.sum((-1, -2)).unsqueeze(-1)
+                if w is not None:  # K = w_i k_ij w_j
+                    by[f"{term.name}.weight"] = 2 * ((D * k) @ w.unsqueeze(-1)).squeeze(-1)
+            return by
+
+        return total, pull_back
+
+    def _parts(self) -> list[tuple[Term, Tensor | None]]:
+        """Return the terms that vary and have a weight, and their weights."""
+        return [(t, self.weights[t.name]) for t in self.terms if t.name in self.weights and t.varies]
+
+    def _is_whole(self, term: Term) -> bool:
+        return f"{term.name}.process" not in self.values
+
+    def _process(self, term: Term) -> Tensor:
+        """Return 1, or 0 for draws of nested models without the term's process, ``S x m x 1``."""
+        one = torch.ones_like(self.x[..., :1, 0])
+        return self.values.get(f"{term.name}.process", one)
+
+    def _constant(self, term: Term) -> Tensor:
+        """Return kappa, ``S x m x 1``."""
+        if term.constant is None:
+            return torch.zeros_like(self.x[..., :1, 0])
+        return self.values[f"{term.name}.constant"]
+
+
+class TermSum:
+    """The terms of a model: their unknown numbers, and the weighted sums that they make.
+
+    Args:
+        terms: The terms, with different names.
+        f: The outputs of each physics at the training inputs, ``m x n``, in units of the targets.
+
+    Raises:
+        ValueError: If names are equal, contain a dot, or a term's physics does not exist.
+    """
+
+    def __init__(self, terms: Sequence[Term], f: Sequence[Tensor]) -> None:
+        names = [term.name for term in terms]
+        if len({*names}) < len(names) or not names or any("." in name for name in names):
+            raise ValueError(f"Expected terms with different names without dots; found {names}.")
+        for term in terms:
+            if term.physics is not None and not 0 <= term.physics < len(f):
+                raise ValueError(
+                    f"Term {term.name!r} has physics number {term.physics}, but the model has "
+                    f"{len(f)}; pass it in physics=[...]."
+                )
+        self.terms, self.f = tuple(terms), [v.reshape(-1, v.shape[-1]) for v in f]
+
+    def rows(self, x: Tensor, num_outputs: int) -> list[Row]:
+        """Return the unknown numbers of all terms, for training inputs ``n x d``."""
+        rows: list[Row] = []
+        for term in self.terms:
+            if term.kernel is not None:
+                for row in term.kernel.rows(x, num_outputs):
+                    rows.append(row._replace(name=f"{term.name}.kernel.{row.name}"))
+            if term.constant is not None:
+                median = x.new_full((num_outputs, 1), term.constant.median)
+                rows.append(Row.positive(f"{term.name}.constant", median, term.constant.factor))
+            if term.has_center is True and term.physics is not None:
+                f = self.f[term.physics]
+                # c has a scale of its own in each output, so that its coordinate has none.
+                rows.append(Row(f"{term.name}.center", torch.zeros_like(f[:, :1])))
+        return rows
+
+    def center(self, term: Term, values: Values) -> Tensor | float:
+        """Return c, ``S x m x 1``: normal around the mean of f_p, with three standard deviations."""
+        if not term.has_center or term.physics is None:
+            return 0.0
+        if term.has_center is not True:
+            return term.has_center
+        f = self.f[term.physics]
+        return f.mean(-1, keepdim=True) + self.center_scale(term) * values[f"{term.name}.center"]
+
+    def center_scale(self, term: Term) -> Tensor:
+        """Return the derivative of c by its coordinate, ``m x 1``."""
+        return 3 * self.f[term.physics or 0].std(-1, keepdim=True)
+
+    def mean_of(self, term: Term, values: Values) -> Tensor | float:
+        """Return the prior mean of a term's process, which is zero in some nested models."""
+        factor = values.get(f"{term.name}.mean")
+        return term.mean if factor is None else term.mean * factor
+
+    def at(self, values: Values, places: Places) -> WeightedSum:
+        r"""Return the function itself, :math:`\sum_t b_t g_t`."""
+        mean, weights = torch.zeros_like(places.x[..., 0]), {}
+        for term in self.terms:
+            b = None if term.physics is None else places.f[term.physics]
+            own = self.mean_of(term, values)
+            mean = mean + (own if b is None else own * b)
+            weights[term.name] = b
+            if b is not None and term.has_center:
+                weights[term.name] = b - self.center(term, values)
+        return WeightedSum(self.terms, values, places.x, mean, weights)
+
+    def term(self, name: str, values: Values, places: Places) -> WeightedSum:
+        r"""Return the process of a term in the user's meaning, :math:`f = \sum_t b_t g_t`.
+
+        A term without a basis is then its own process less c times each one that has a center, as
+        :math:`\rho (f_p - c) + \delta' = \rho f_p + (\delta' - c \tilde\rho)`. Of several such terms
+        the first one takes these.
+        """
+        term = next(t for t in self.terms if t.name == name)
+        weights: dict[str, Tensor | None] = {name: None}
+        plain = [t.name for t in self.terms if t.physics is None]
+        if name in plain[:1]:
+            for other in self.terms:
+                if other.has_center and other.physics is not None:
+                    c = torch.as_tensor(self.center(other, values)).to(places.x)
+                    weights[other.name] = -c * torch.ones_like(places.x[..., 0])
+        mean = self.mean_of(term, values) * torch.ones_like(places.x[..., 0])
+        return WeightedSum(self.terms, values, places.x, mean, weights)

@@ -1,0 +1,221 @@
+"""Unknown numbers: each is a standard normal coordinate u by its prior, whatever it stands for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+Values = dict[str, Tensor]
+"""Numbers by the names of their rows: ``S x m x k``, of shared rows ``S x k``."""
+
+_CHOICE = "choice"
+
+
+class LogNormal(NamedTuple):
+    """The prior of a positive number.
+
+    Args:
+        median: The median.
+        factor: What one standard deviation multiplies or divides it by; 1 for a known number.
+    """
+
+    median: float
+    factor: float
+
+
+class Row(NamedTuple):
+    r"""Unknown numbers of one name: a row of the table of a model.
+
+    A number is :math:`\theta = a + b u`, or :math:`e^{a + b u}` if it is positive, so that it is
+    normal or log-normal where its coordinate is :math:`u \sim N(0, 1)`.
+
+    Args:
+        name: The name, such as ``"delta.lengthscale"``.
+        location: a, ``m x k``, for each output; ``k`` if all outputs share the numbers.
+        scale: b.
+        is_positive: Whether the numbers are positive.
+        is_shared: Whether all outputs share them.
+        log_density: The log prior density of the numbers, ``... x k`` to ``...``, if it is another
+            one than the normal or log-normal, which then only says where to look.
+    """
+
+    name: str
+    location: Tensor
+    scale: float = 1.0
+    is_positive: bool = False
+    is_shared: bool = False
+    log_density: Callable[[Tensor], Tensor] | None = None
+
+    @classmethod
+    def positive(cls, name: str, median: Tensor, factor: float) -> Row:
+        """Return a row of positive numbers, known to a factor around medians ``m x k``."""
+        return cls(name, median.log(), math.log(factor), is_positive=True)
+
+    @property
+    def count(self) -> int:
+        """``k``."""
+        return self.location.shape[-1]
+
+    def value(self, u: Tensor) -> Tensor:
+        """Return the numbers at coordinates ``S x m x k`` (of a shared row ``S x k``)."""
+        theta = self.location + self.scale * u
+        return theta.exp() if self.is_positive else theta
+
+    def slope(self, value: Tensor) -> Tensor | float:
+        """Return the derivatives of the numbers by their coordinates."""
+        return self.scale * value if self.is_positive else self.scale
+
+
+class Choice(NamedTuple):
+    """One of several nested models: the whole model with some numbers set to zero.
+
+    Args:
+        text: What it means, for summaries.
+        probability: Its prior probability.
+        zeros: The names of what is zero in it: numbers, such as ``"rho.constant"``, or the prior
+            mean of a term or its process without the constant, ``"rho.mean"``, ``"rho.process"``.
+    """
+
+    text: str
+    probability: float
+    zeros: tuple[str, ...] = ()
+
+
+class Table:
+    r"""All unknown numbers of a model, and vectors of their coordinates.
+
+    Vectors u are ``S x B x P``: ``S`` draws of the coordinates of ``B`` independent problems.
+    Outputs are problems of their own, ``B = m``; where they share numbers, there is one problem of
+    all outputs, ``B = 1``. With choices, the last coordinate of each output says which of the
+    nested models holds: an interval of u, in which the first choice contains 0.
+
+    Args:
+        rows: The rows.
+        num_outputs: ``m``.
+        choices: Nested models; none, or at least two, whose probabilities sum to 1.
+
+    Attributes:
+        problems: ``B``.
+        size: ``P``.
+    """
+
+    def __init__(
+        self, rows: Sequence[Row], num_outputs: int, choices: Sequence[Choice] = ()
+    ) -> None:
+        self.choices = tuple(choices)
+        self.own = [row for row in rows if not row.is_shared]
+        if self.choices:
+            zero = self.own[0].location.new_zeros(num_outputs, 1)
+            self.own.append(Row(_CHOICE, zero))
+        self.shared = [row for row in rows if row.is_shared]
+        self.num_outputs = num_outputs
+        self.problems = 1 if self.shared else num_outputs
+        self._width = sum(row.count for row in self.own)
+        self._own_size = self._width * (num_outputs // self.problems)
+        self.size = self._own_size + sum(row.count for row in self.shared)
+
+    def values(self, u: Tensor) -> Values:
+        """Return all numbers at coordinates ``S x B x P``."""
+        own = u[..., : self._own_size].reshape(len(u), self.num_outputs, self._width)
+        parts = own.split([row.count for row in self.own], -1) if self.own else ()
+        values = {row.name: row.value(z) for row, z in zip(self.own, parts, strict=True)}
+        if self.shared:
+            parts = u[:, 0, self._own_size :].split([row.count for row in self.shared], -1)
+            values |= {row.name: row.value(z) for row, z in zip(self.shared, parts, strict=True)}
+        if self.choices:
+            self._set_zeros(values)
+        return values
+
+    def gradient(self, by: Values, values: Values) -> Tensor:
+        """Return derivatives by u, ``S x B x P``, of derivatives by the numbers."""
+        number = len(next(iter(values.values())))
+
+        def of(row: Row) -> Tensor:
+            shape = (number, *row.location.shape)
+            if row.name not in by:
+                return row.location.new_zeros(shape)
+            return (row.slope(values[row.name]) * by[row.name]).reshape(shape)
+
+        parts = [of(row).unsqueeze(1) for row in self.shared]
+        if self.own:
+            own = torch.cat([of(row) for row in self.own], -1)
+            parts.insert(0, own.reshape(number, self.problems, self._own_size))
+        return torch.cat(parts, -1)
+
+    def log_prior_ratio(self, u: Tensor) -> Tensor | None:
+        r"""Return what other priors than N(0, I) add to the log density, ``S x B``.
+
+        With :math:`\theta(u)` it is :math:`\log p(\theta) + \log |d\theta / du| - \log N(u | 0, 1)`.
+        """
+        others = [row for row in (*self.own, *self.shared) if row.log_density is not None]
+        if not others:
+            return None
+        values, total = self.values(u), u.new_zeros(len(u), self.problems)
+        for row in others:
+            theta = values[row.name]
+            z = (theta.log() if row.is_positive else theta) - row.location
+            z = z / row.scale
+            size = theta.log() if row.is_positive else torch.zeros_like(theta)
+            size = size + math.log(row.scale) + 0.5 * z.square() + 0.5 * math.log(2 * math.pi)
+            part = row.log_density(theta) + size.sum(-1)  # type: ignore[misc]
+            part = part.unsqueeze(-1) if row.is_shared else part  # S x 1 or S x m
+            total = total + (part if part.shape[-1] == self.problems else part.sum(-1, True))
+        return total
+
+    def of_outputs(self, outputs: Sequence[int]) -> Table:
+        """Return the table of some outputs."""
+        own = [row._replace(location=row.location[list(outputs)]) for row in self.own]
+        return self._with(own, self.shared, len(outputs))
+
+    def coordinates_of_outputs(self, u: Tensor, outputs: Sequence[int]) -> Tensor:
+        """Return the coordinates ``S x B x P`` of some outputs."""
+        own = u[..., : self._own_size].reshape(len(u), self.num_outputs, self._width)
+        own = own[:, list(outputs)]
+        if self.problems == self.num_outputs and not self.shared:
+            return own
+        return torch.cat([own.flatten(1).unsqueeze(1), u[..., self._own_size :]], -1)
+
+    def to(self, like: Tensor) -> Table:
+        """Return the table on the device of a tensor."""
+        own, shared = (
+            [row._replace(location=row.location.to(like)) for row in rows]
+            for rows in (self.own, self.shared)
+        )
+        return self._with(own, shared, self.num_outputs)
+
+    def _with(self, own: list[Row], shared: list[Row], num_outputs: int) -> Table:
+        own = [row for row in own if row.name != _CHOICE]
+        return Table([*own, *shared], num_outputs, self.choices)
+
+    # Nested models.
+
+    def chosen(self, values: Values) -> Tensor:
+        """Return which of the choices each draw holds, ``S x m``."""
+        order, ends = self._intervals(values[_CHOICE])
+        return order[torch.bucketize(values[_CHOICE].detach().squeeze(-1), ends)]
+
+    def with_choice(self, u: Tensor, number: int) -> Tensor:
+        """Return coordinates with the given choice for all outputs."""
+        order, ends = self._intervals(u)
+        below = torch.cat([ends.new_zeros(1), torch.special.ndtr(ends), ends.new_ones(1)])
+        place = int((order == number).nonzero())
+        middle = torch.special.ndtri((below[place] + below[place + 1]) / 2) if number else 0.0
+        columns = torch.arange(self._width - 1, self._own_size, self._width)
+        return u.index_fill(-1, columns.to(u.device), float(middle))
+
+    def _intervals(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the choices from left to right, and the ends of their intervals of u."""
+        order = [*range(2, len(self.choices)), 0, 1]
+        shares = torch.tensor([self.choices[k].probability for k in order]).to(like)
+        return torch.tensor(order, device=like.device), torch.special.ndtri(shares.cumsum(0)[:-1])
+
+    def _set_zeros(self, values: Values) -> None:
+        chosen = self.chosen(values).unsqueeze(-1)
+        for k, choice in enumerate(self.choices):
+            for name in choice.zeros:
+                value = values.get(name, torch.ones_like(values[_CHOICE]))
+                values[name] = value.masked_fill(chosen == k, 0.0)

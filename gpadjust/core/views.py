@@ -1,0 +1,169 @@
+"""The model as GPyTorch sees it: its mean, kernel and noise as modules that read the one table.
+
+They have no parameters of their own: all of them are functions of the model's coordinates ``u``, and
+differentiable in it. Values are in the user's units. Draws and outputs are batch dimensions, ``... x
+(S) x (m) x n``, which are left out where there is one.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import torch
+from gpytorch.kernels import AdditiveKernel, Kernel
+from gpytorch.likelihoods import GaussianLikelihood
+from gpytorch.likelihoods.noise_models import Noise as NoiseModule
+from gpytorch.means import Mean
+from gpytorch.mlls import AddedLossTerm
+from gpytorch.priors import Prior
+from linear_operator.operators import DiagLinearOperator
+from torch import Tensor
+from torch.distributions import constraints
+
+if TYPE_CHECKING:
+    from gpadjust.core.model import GP
+
+_MISSING = 1e12  # times the unit squared: the noise of a target that was not observed
+
+
+def squeezed(values: Tensor, dim: int) -> Tensor:
+    """Return values ``... x S x m x n (x n)`` without S and m where these are 1.
+
+    Args:
+        values: The values.
+        dim: The dimension of outputs, -2 or -3.
+    """
+    if values.shape[dim] == 1:
+        values = values.squeeze(dim)
+        dim += 1
+    return values.squeeze(dim - 1) if values.shape[dim - 1] == 1 else values
+
+
+class MeanView(Mean):
+    """The prior mean of a model, f_p for an adjustment."""
+
+    def __init__(self, model: GP) -> None:
+        super().__init__()
+        self.owner = [model]  # in a list, as it is no part of the view
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return the mean at ``... x n x d``."""
+        (model,) = self.owner
+        f = model.at(x)
+        shape = torch.broadcast_shapes(f.mean.shape, (*model.num_draws_and_outputs, 1))
+        return squeezed(f.mean.expand(shape) * model.unit, -2)
+
+
+class TermView(Kernel):
+    """The kernel of a term, scaled by its basis on both sides: diag(b) (k + kappa) diag(b)."""
+
+    def __init__(self, model: GP, name: str) -> None:
+        super().__init__()
+        self.owner, self.name = [model], name
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """``(S) x (m)``."""
+        (model,) = self.owner
+        return torch.Size([size for size in model.num_draws_and_outputs if size > 1])
+
+    @batch_shape.setter
+    def batch_shape(self, shape: torch.Size) -> None:
+        """Ignore what GPyTorch sets, as the shape is the model's."""
+
+    def forward(
+        self, x1: Tensor, x2: Tensor, diag: bool = False, last_dim_is_batch: bool = False, **_: Any
+    ) -> Tensor:
+        """Return covariances ``... x n x n'``, or variances ``... x n``."""
+        (model,) = self.owner
+        one = model.at(x1)
+        one.weights = {self.name: one.weights[self.name]}
+        shape = (*model.num_draws_and_outputs, 1)
+        if diag:
+            variance = one.variance() * model.unit.square()
+            return squeezed(variance.expand(torch.broadcast_shapes(variance.shape, shape)), -2)
+        other = one if x2 is x1 else model.at(x2)
+        K = one.cross(other) * model.unit.square().unsqueeze(-1)
+        return squeezed(K.expand(torch.broadcast_shapes(K.shape, (*shape, 1))), -3)
+
+
+def kernel_view(model: GP) -> Kernel:
+    """Return the prior covariance of a model: the sum of its terms' scaled kernels."""
+    return AdditiveKernel(*(TermView(model, t.name) for t in model.terms if t.varies))
+
+
+class NoiseView(NoiseModule):
+    """The noise of a model's observations."""
+
+    def __init__(self, model: GP) -> None:
+        super().__init__()
+        self.owner = [model]
+
+    @property
+    def noise(self) -> Tensor:
+        """The variances at the training inputs, ``(S) x (m) x n``."""
+        (model,) = self.owner
+        return squeezed(self._variance(model, model.data.X, True), -2)
+
+    def forward(
+        self, *params: Any, shape: Any = None, noise: Tensor | None = None, **_: Any
+    ) -> DiagLinearOperator:
+        """Return the diagonal covariance of observations ``shape``.
+
+        Shapes of the training targets are taken for these, so that missing ones have no weight.
+        """
+        if noise is not None:
+            return DiagLinearOperator(noise)
+        (model,) = self.owner
+        is_training = model.training and shape is not None and shape[-1] == len(model.data.Y)
+        if is_training or not params or not isinstance(params[0], Tensor):
+            variance = self._variance(model, model.data.X, is_training)
+            variance = variance if is_training else variance.mean(-1, keepdim=True)
+        else:
+            variance = self._variance(model, params[0], False)
+        return DiagLinearOperator(squeezed(variance, -2).expand(shape))
+
+    @staticmethod
+    def _variance(model: GP, X: Tensor, is_training: bool) -> Tensor:
+        values = model.values
+        v = model.noise.variance(values, model.places(X, values), is_training)
+        v = v.expand(torch.broadcast_shapes(v.shape, (*model.num_draws_and_outputs, X.shape[-2])))
+        if is_training:
+            v = v + _MISSING * model.data.Y.isnan().mT
+        return v * model.unit.square()
+
+
+def likelihood_view(model: GP) -> GaussianLikelihood:
+    """Return a Gaussian likelihood whose noise is the model's."""
+    likelihood = GaussianLikelihood()
+    likelihood.noise_covar = NoiseView(model)
+    return likelihood
+
+
+class StandardNormal(Prior):
+    """The prior N(0, 1) of coordinates, as GPyTorch asks for it."""
+
+    arg_constraints: dict[str, Any] = {}  # noqa: RUF012
+    support = constraints.real
+
+    def __init__(self) -> None:
+        torch.nn.Module.__init__(self)
+        self.batch_size = 0
+
+    def log_prob(self, u: Tensor) -> Tensor:
+        """Return log densities of each coordinate."""
+        return -0.5 * u.square() - 0.5 * math.log(2 * math.pi)
+
+
+class OtherPriors(AddedLossTerm):
+    """What priors of GPyTorch's kernels add to the density of coordinates."""
+
+    def __init__(self, model: GP) -> None:
+        self.owner = [model]
+
+    def loss(self, *params: Any) -> Tensor:
+        """Return the log density, of each output."""
+        (model,) = self.owner
+        ratio = model.table.log_prior_ratio(model.u)
+        return model.u.new_zeros(()) if ratio is None else ratio.squeeze()
