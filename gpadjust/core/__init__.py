@@ -1,10 +1,10 @@
 """The core: sums of Gaussian processes on a physics, with one table of unknown numbers.
 
 Read it in this order: ``unknowns``, ``kernels``, ``terms``, ``noise``, ``gaussian``, ``sample``,
-``fit``, ``model``, ``structures``.
+``fitting``, ``model``, ``structures``.
 """
 
-from gpadjust.core.fit import FitResult, fit
+from gpadjust.core.fitting import FitResult, fit
 from gpadjust.core.functions import Functions
 from gpadjust.core.kernels import (
     MATERN12,
@@ -20,6 +20,8 @@ from gpadjust.core.kernels import (
 from gpadjust.core.model import GP
 from gpadjust.core.noise import KnownNoise, Noise
 from gpadjust.core.posterior import MixturePosterior, Prediction
+from gpadjust.core.saving import load, save
+from gpadjust.core.stacked import StackedGP
 from gpadjust.core.structures import (
     CKA,
     RRA,
@@ -55,8 +57,11 @@ __all__ = [
     "Profile",
     "Row",
     "ScaleGP",
+    "StackedGP",
     "Stationary",
     "Term",
     "ZeroMeanGP",
     "fit",
+    "load",
+    "save",
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from copy import deepcopy
 from datetime import date, time, timedelta
 from typing import Any, NamedTuple
 
@@ -98,7 +99,7 @@ class Data(NamedTuple):
         inputs = column_names(train_X) or default_names("x", X.shape[-1])
         outputs = column_names(train_Y) or default_names("y", Y.shape[-1])
         if input_transform is not None:
-            input_transform = input_transform.double().train()
+            input_transform = deepcopy(input_transform).double().train()
             input_transform(X)
             input_transform.eval()
         _warn_of_copies(X, Y)
@@ -107,9 +108,8 @@ class Data(NamedTuple):
     def new_X(self, X: ArrayLike) -> Tensor:
         """Return checked inputs ``... x q x d`` of a call."""
         names = column_names(X)
-        if names is not None and names != self.input_names:
-            if sorted(names) == sorted(self.input_names):
-                raise ValueError(f"Expected the columns {self.input_names}, in this order; found {names}.")
+        if names is not None and names != self.input_names and {*names} & {*self.input_names}:
+            raise ValueError(f"Expected the columns {self.input_names}, in this order; found {names}.")
         X = as_tensor(X, "X")
         d = len(self.input_names)
         if X.dim() < 2 or X.shape[-1] != d:

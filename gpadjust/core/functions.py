@@ -8,6 +8,7 @@ import torch
 from botorch.sampling.pathwise import SamplePath
 from torch import Size, Tensor
 
+from gpadjust.checks import checked_whole
 from gpadjust.core.terms import WeightedSum
 
 if TYPE_CHECKING:
@@ -32,11 +33,9 @@ class Functions(torch.nn.Module):
 
     def __init__(self, model: GP, number: int, num_features: int, seed: int) -> None:
         super().__init__()
-        if number < 1 or num_features < 2 or num_features % 2:
-            raise ValueError(
-                "Expected at least one function, and an even number of features; found "
-                f"{number} and {num_features}."
-            )
+        checked_whole("num_functions", number, 1)
+        if checked_whole("num_features", num_features, 2) % 2:
+            raise ValueError(f"Expected an even number of features; found {num_features}.")
         generator = torch.Generator().manual_seed(seed)
         rows = torch.randperm(len(model.u), generator=generator)
         rows = rows[torch.arange(number) % len(model.u)]
@@ -56,7 +55,10 @@ class Functions(torch.nn.Module):
                     self.weights[term.name] = _randn((*shape, size), generator, f.x)
                 if term.constant is not None:
                     self.weights[f"{term.name}.constant"] = _randn((*shape, 1), generator, f.x)
-            noise = self.data.noise.sqrt() * _randn(self.data.noise.shape, generator, f.x)
+            # The nugget of the factor is noise, too.
+            total = self.data.chol.square().sum(-1) - f.variance()
+            noise = total.maximum(self.data.noise).sqrt()
+            noise = noise * _randn(noise.shape, generator, f.x)
             away = (self.data.targets - self._prior(f) - noise).nan_to_num()
             self.update = self.data.solve(away * self.data.observed)
 
@@ -67,6 +69,7 @@ class Functions(torch.nn.Module):
 
     def each(self, X: Tensor) -> Tensor:
         """Return the values ``k x q x m`` of each function at points of its own, ``k x q x d``."""
+        X = self.model.data.new_X(X)
         if X.dim() != 3 or len(X) != self.number:
             raise ValueError(
                 f"Expected points for each of {self.number} functions, {self.number} x q x d; "
@@ -76,7 +79,7 @@ class Functions(torch.nn.Module):
         return values.diagonal(dim1=0, dim2=1).movedim(-1, 0)
 
     def _values(self, X: Tensor) -> Tensor:
-        f = self.model.at(X)
+        f = self.model.at(X, self.data.train.values)
         cross = f.cross(self.data.train) * self.data.observed.unsqueeze(-2)
         values = self._prior(f) + (cross @ self.update.unsqueeze(-1)).squeeze(-1)
         return (values * self.model.unit).mT
@@ -89,6 +92,7 @@ class Functions(torch.nn.Module):
             if term.name in self.features:
                 phi = self.features[term.name](f.x)
                 value = (phi @ self.weights[term.name].unsqueeze(-1)).squeeze(-1)
+                value = value * f.values.get(f"{term.name}.process", 1.0)
             if term.constant is not None:
                 sd = f.values[f"{term.name}.constant"].sqrt()
                 value = value + sd * self.weights[f"{term.name}.constant"]

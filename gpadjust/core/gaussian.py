@@ -13,6 +13,14 @@ from gpadjust.core.terms import WeightedSum
 _EPS = torch.finfo(torch.float64).eps
 
 
+def add_noise(K: Tensor, noise: Tensor) -> Tensor:
+    """Return covariances ``... x n x n`` plus variances ``... x n`` (or 1) on the diagonal."""
+    shape = torch.broadcast_shapes(noise.shape, K.shape[:-1])
+    K = K.expand(*shape, shape[-1]).clone()
+    K.diagonal(dim1=-1, dim2=-2).add_(noise)
+    return K
+
+
 def factor(K: Tensor, observed: Tensor) -> Tensor:
     """Return Cholesky factors of covariances ``... x n x n``, which contain the noise.
 
@@ -28,16 +36,11 @@ def factor(K: Tensor, observed: Tensor) -> Tensor:
     nugget = max(100, K.shape[-1]) * _EPS * diagonal.maximum(least)
     for _ in range(6):
         added = nugget if all_observed else nugget + (~observed).to(K)
-        chol, info = torch.linalg.cholesky_ex(K + torch.diag_embed(added))
+        chol, info = torch.linalg.cholesky_ex(add_noise(K, added))
         if not info.any():
             return chol
         nugget = nugget * (1 + 9 * (info > 0).to(K).unsqueeze(-1))
     return chol.masked_fill((info > 0)[..., None, None], math.nan)
-
-
-def add_noise(K: Tensor, noise: Tensor) -> Tensor:
-    """Return covariances ``... x n x n`` plus variances ``... x n`` (or 1) on the diagonal."""
-    return K + torch.diag_embed(noise.expand(torch.broadcast_shapes(noise.shape, K.shape[:-1])))
 
 
 class Likelihood(NamedTuple):
@@ -48,8 +51,10 @@ class Likelihood(NamedTuple):
     by_covariance: Tensor  # ... x n x n
 
 
-def log_likelihood(residual: Tensor, K: Tensor, observed: Tensor) -> Likelihood:
-    r"""Return log N(residual | 0, K) and its derivatives.
+def log_likelihood(
+    residual: Tensor, K: Tensor, observed: Tensor, with_gradient: bool = True
+) -> Likelihood:
+    r"""Return log N(residual | 0, K) and its derivatives (that by K is K if not asked for).
 
     With :math:`\alpha = K^{-1} r` (Rasmussen and Williams 2006, algorithm 2.1 and eq. 5.9)
 
@@ -62,6 +67,8 @@ def log_likelihood(residual: Tensor, K: Tensor, observed: Tensor) -> Likelihood:
     log_det = chol.diagonal(dim1=-1, dim2=-2).log().sum(-1)  # log |K| / 2
     quadratic = (residual.unsqueeze(-1) * alpha).sum((-1, -2))
     value = -0.5 * quadratic - log_det - 0.5 * observed.sum(-1) * math.log(2 * math.pi)
+    if not with_gradient:
+        return Likelihood(value, alpha.squeeze(-1), K)
     D = 0.5 * (alpha @ alpha.mT - torch.cholesky_inverse(chol))
     if not observed.all():
         D = D * (observed.unsqueeze(-1) & observed.unsqueeze(-2))
@@ -92,8 +99,8 @@ class Conditioning:
     def _set(self, train: WeightedSum, noise: Tensor, targets: Tensor) -> None:
         self.train, self.noise, self.targets = train, noise, targets
         observed = ~targets.isnan()
-        # What is missing is the same for all fantasies of the same points.
-        while observed.dim() > noise.dim():
+        # Fantasies of the same points share a factor, if the same ones are missing.
+        while observed.dim() > noise.dim() and bool((observed == observed[0]).all()):
             observed = observed[0]
         self.observed = observed
 
@@ -108,7 +115,8 @@ class Conditioning:
 
         .. math::
             L = \begin{pmatrix} L_1 & 0 \\ B & L_2 \end{pmatrix}, \quad B^T = L_1^{-1} K_{12},
-            \quad L_2 L_2^T = K_{22} - B B^T.
+            \quad L_2 L_2^T = K_{22} - B B^T, \quad
+            L^{-1} = \begin{pmatrix} L_1^{-1} & 0 \\ -L_2^{-1} B L_1^{-1} & L_2^{-1} \end{pmatrix}.
         """
         n, new = old.chol.shape[-1], cls.__new__(cls)
         late = WeightedSum(
@@ -118,18 +126,20 @@ class Conditioning:
         K22, K21 = late.cross(late), late.cross(old.train)
         lead = torch.broadcast_shapes(K22.shape[:-2], old.chol.shape[:-2])
         new._set(train, noise.expand(*lead, train.x.shape[-2]), targets)
+        lead = torch.broadcast_shapes(lead, new.observed.shape[:-1])
         L1 = old.chol.expand(*lead, n, n)
         seen = new.observed[..., n:]
         K21 = (K21 * seen.unsqueeze(-1) * old.observed.unsqueeze(-2)).expand(*lead, -1, n)
-        B = K21 @ old.inverse_factor().mT
-        K22 = K22 + torch.diag_embed(new.noise[..., n:])
+        inverse = old.inverse_factor()
+        B = K21 @ inverse.mT
+        K22 = add_noise(K22, new.noise[..., n:])
         # The nugget of the new rows is that of their own variances.
         nugget = max(100, train.x.shape[-2]) * _EPS * K22.diagonal(dim1=-1, dim2=-2)
-        L2 = factor(K22 - B @ B.mT + torch.diag_embed(nugget), seen)
-        zero = L1.new_zeros(*lead, n, L2.shape[-1])
+        L2 = factor(add_noise(K22 - B @ B.mT, nugget), seen)
         L2 = L2.expand(*lead, *L2.shape[-2:])
-        new.chol = torch.cat([torch.cat([L1, zero], -1), torch.cat([B, L2], -1)], -2)
-        new._inverse = None
+        new.chol = _lower(L1, B, L2)
+        inverse2 = torch.linalg.solve_triangular(L2, torch.eye(L2.shape[-1]).to(L2), upper=False)
+        new._inverse = _lower(inverse.expand(*lead, n, n), -inverse2 @ B @ inverse, inverse2)
         new.alpha = new.solve(new._residual())
         return new
 
@@ -173,7 +183,7 @@ class Conditioning:
         least = 4 * self.chol.shape[-1] * _EPS * prior.diagonal(dim1=-1, dim2=-2)
         K = prior - white @ white.mT
         raised = (least - K.diagonal(dim1=-1, dim2=-2)).clamp_min(0.0)
-        return mean, K + torch.diag_embed(raised)
+        return mean, add_noise(K, raised)
 
     def left_out(self) -> tuple[Tensor, Tensor]:
         r"""Return means and variances of each observation given all others, noise included.
@@ -183,4 +193,11 @@ class Conditioning:
         (Rasmussen and Williams 2006, eqs. 5.10 to 5.12).
         """
         precision = self.inverse_factor().square().sum(-2)
-        return self.targets - self.alpha / precision, precision.reciprocal()
+        variance = precision.reciprocal().masked_fill(~self.observed, math.nan)
+        return self.targets - self.alpha * variance, variance
+
+
+def _lower(A: Tensor, B: Tensor, C: Tensor) -> Tensor:
+    """Return the lower triangular matrix of blocks A, B and C."""
+    zero = A.new_zeros(*A.shape[:-1], C.shape[-1])
+    return torch.cat([torch.cat([A, zero], -1), torch.cat([B, C], -1)], -2)

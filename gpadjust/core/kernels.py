@@ -120,13 +120,14 @@ PROFILES = {each.name: each for each in (RBF, MATERN12, MATERN32, MATERN52)}
 
 def exponents(z: Tensor, other: Tensor | None = None) -> Tensor:
     """Return -r^2 / 2 of all pairs of ``... x n x d`` and ``... x n' x d``."""
-    if other is not None:
-        half = z.square().sum(-1, keepdim=True) / 2
-        return (z @ other.mT - half - other.square().sum(-1, keepdim=True).mT / 2).clamp_max(0.0)
-    z = z - z.mean(-2, keepdim=True)
-    half = z.square().sum(-1, keepdim=True) / 2
-    e = z @ z.mT - half - half.mT
-    return (e - torch.diag_embed(e.diagonal(dim1=-1, dim2=-2))).clamp_max(0.0)
+    if other is not None:  # (z, 1, -|z|^2 / 2) (z', -|z'|^2 / 2, 1)^T
+        half, other_half = (-v.square().sum(-1, keepdim=True) / 2 for v in (z, other))
+        left = torch.cat([z, torch.ones_like(half), half], -1)
+        right = torch.cat([other, other_half, torch.ones_like(other_half)], -1)
+        return (left @ right.mT).clamp_max_(0.0)
+    e = z @ z.mT
+    half = e.diagonal(dim1=-1, dim2=-2) / 2  # so that the diagonal is 0 exactly
+    return (e - half.unsqueeze(-1)).sub_(half.unsqueeze(-2)).clamp_max_(0.0)
 
 
 class Stationary(Kernel):
@@ -154,7 +155,7 @@ class Stationary(Kernel):
     def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
         """Return ``s k(|(x - x') / l|)``."""
         length = own["lengthscale"].unsqueeze(-2)
-        shift = x.detach()[..., :1, :]  # distances of large inputs, as of years, lose no digits
+        shift = (x if other is None else other).detach()[..., :1, :]  # distances of large inputs, as of years, lose no digits
         z = (x - shift) / length
         e = exponents(z, None if other is None else (other - shift) / length)
         return own["outputscale"].unsqueeze(-1) * self.profile.value(e)

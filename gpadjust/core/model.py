@@ -9,14 +9,18 @@ from typing import Any, Self
 import gpytorch
 import torch
 from botorch.acquisition.objective import PosteriorTransform, ScalarizedPosteriorTransform
+from botorch.models import SingleTaskGP
 from botorch.models.model import FantasizeMixin, Model
 from botorch.models.transforms.outcome import Standardize
 from botorch.posteriors import Posterior
 from botorch.sampling.pathwise.posterior_samplers import DrawMatheronPaths
+from botorch.settings import validate_input_scaling
 from gpytorch.distributions import MultivariateNormal
+from gpytorch.priors import NormalPrior
+from linear_operator import to_linear_operator
 from torch import Size, Tensor
 
-from gpadjust.core.data import ArrayLike, Data, as_given, as_tensor, unit_of, variances_of
+from gpadjust.core.data import ArrayLike, Data, as_given, as_tensor, unit_of
 from gpadjust.core.functions import Functions, Paths
 from gpadjust.core.gaussian import Conditioning, add_noise, log_likelihood
 from gpadjust.core.noise import KnownNoise, Noise
@@ -32,7 +36,6 @@ from gpadjust.core.unknowns import Choice, Row, Table, Values
 from gpadjust.core.views import (
     MeanView,
     OtherPriors,
-    StandardNormal,
     kernel_view,
     likelihood_view,
     squeezed,
@@ -123,7 +126,7 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
         )
         self.unit = unit_of(Y, mean.mT)
         self._f_train = [v / self.unit for v in f]
-        self.term_sum = TermSum(terms, self._f_train)
+        self.term_sum = TermSum(terms, self._f_train, self.unit)
         if self.data.Yvar is not None:
             if noise is not None:
                 raise ValueError("Expected train_Yvar or noise; found both.")
@@ -137,7 +140,7 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
         self.draws = self.u.detach()
         self.likelihood = likelihood_view(self)
         self.mean_module, self.covar_module = MeanView(self), kernel_view(self)
-        self.register_prior("u_prior", StandardNormal(), _coordinates, _set_coordinates)
+        self.register_prior("u_prior", _standard_normal(Y), _coordinates, _set_coordinates)
         if any(row.log_density is not None for row in rows):
             self.register_added_loss_term("other_priors")
             self.update_added_loss_term("other_priors", OtherPriors(self))
@@ -165,53 +168,104 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
         """Hold coordinates ``N x B x P``, of which predictions average over some, evenly taken.
 
         Args:
-            draws: The coordinates.
+            draws: The coordinates; minus infinity where a positive number is 0.
             number: How many predictions take. Default: all.
+
+        Raises:
+            ValueError: If they have another shape, or are NaN or infinite.
         """
+        shape = torch.Size([self.table.problems, self.table.size])
+        if draws.shape[1:] != shape or not len(draws) or not (draws < torch.inf).all():
+            raise ValueError(
+                f"Expected finite coordinates of shape N x {shape[0]} x {shape[1]}; found "
+                f"{tuple(draws.shape)}."
+            )
         step = max(1, len(draws) // (number or len(draws)))
         self.draws = draws.detach()
-        self.u = torch.nn.Parameter(self.draws[::step].clone())
+        self.u = torch.nn.Parameter(self.draws[step // 2 :: step].clone())
         self._cached = None
 
-    def log_likelihood(self, u: Tensor) -> tuple[Tensor, Tensor]:
+    def log_likelihood(self, u: Tensor, with_gradient: bool = True) -> tuple[Tensor, Tensor]:
         """Return the log likelihood of the targets at coordinates ``S x B x P``, and its gradient.
 
-        It is in units of the targets, minus infinity where it or f_p is not finite.
+        It is in units of the targets, minus infinity where it or f_p is not finite. The gradient is
+        zero if it is not asked for.
         """
         with torch.no_grad():
             values, y = self.table.values(u), self.data.Y.mT / self.unit
-            f, f_slopes = self._physics_with_slopes(values)
+            f, f_slopes = self._physics_with_slopes(values, with_gradient)
             places = Places(self._kernel_inputs(self.data.X), f)
             total = self.term_sum.at(values, places)
-            K, pull_back = total.with_pull_back()
-            noise = self.noise.variance(values, places, True)
-            K = add_noise(K, noise)
+            if with_gradient:
+                K, pull_back = total.with_pull_back()
+            else:
+                K = total.cross(total)
+            K = add_noise(K, self.noise.variance(values, places, True))
             shape = torch.broadcast_shapes(K.shape[:-1], total.mean.shape)
             residual, K = (y - total.mean).expand(shape), K.expand(*shape, shape[-1])
             observed = ~y.isnan()
-            found = log_likelihood(residual.nan_to_num() * observed, K, observed)
-            by = pull_back(found.by_covariance)
-            by |= self.noise.pull_back(values, places, found.by_covariance.diagonal(dim1=-1, dim2=-2))
-            by_f = [torch.zeros_like(found.by_mean) for _ in self.physics]
-            for term in self.terms:
-                if term.physics is None:
-                    continue
-                by_weight = by.get(f"{term.name}.weight", torch.zeros_like(found.by_mean))
-                by_f[term.physics] += by_weight
-                by_f[term.physics] += self.term_sum.mean_of(term, values) * found.by_mean
-                if term.has_center is True:  # the weight is f_p - c
-                    by_c = -by_weight.sum(-1, keepdim=True)
-                    by[f"{term.name}.center"] = by_c * self.term_sum.center_scale(term)
-            for name, slopes in f_slopes.items():
-                total_slope = sum((a * b).sum((-1, -2)) for a, b in zip(by_f, slopes, strict=True))
-                by[f"physics.{name}"] = torch.as_tensor(total_slope).unsqueeze(-1)
-            gradient, value = self.table.gradient(by, values), found.value
+            found = log_likelihood(residual.nan_to_num() * observed, K, observed, with_gradient)
+            value, gradient = found.value, torch.zeros_like(u)
+            if with_gradient:
+                by = pull_back(found.by_covariance)
+                by_noise = found.by_covariance.diagonal(dim1=-1, dim2=-2)
+                by |= self.noise.pull_back(values, places, by_noise)
+                by |= self._by_physics(values, places, by, found.by_mean, by_noise, f_slopes)
+                gradient = self.table.gradient(by, values)
             if self.table.problems < value.shape[-1]:
                 value = value.sum(-1, keepdim=True)
         ratio, by_ratio = self._other_priors(u)
         value, gradient = value + ratio, gradient + by_ratio
         bad = ~(value.isfinite() & gradient.isfinite().all(-1))
         return value.masked_fill(bad, -torch.inf), gradient.masked_fill(bad.unsqueeze(-1), 0.0)
+
+    def _by_physics(
+        self,
+        values: Values,
+        places: Places,
+        by: Values,
+        by_mean: Tensor,
+        by_variance: Tensor,
+        f_slopes: dict[str, list[Tensor]],
+    ) -> Values:
+        """Return derivatives by centers and by the coordinates of a physics' parameters.
+
+        Args:
+            values: All numbers.
+            places: The training inputs, and f_p there.
+            by: Derivatives by the terms' weights, among others.
+            by_mean: Derivatives by the mean of the sum, ``S x m x n``.
+            by_variance: Derivatives by the variances of the noise, ``S x m x n``.
+            f_slopes: Derivatives of each physics by each coordinate.
+        """
+        slopes: Values = {}
+        by_f = [torch.zeros_like(by_mean) for _ in self.physics]
+        for term in self.terms:
+            if term.physics is None:
+                continue
+            by_weight = by.get(f"{term.name}.weight", torch.zeros_like(by_mean))
+            # f_p is in the mean, times g's, and in the weight f_p - c.
+            by_f[term.physics] += self.term_sum.mean_of(term, values) * by_mean + by_weight
+            if term.has_center is True:
+                by_c = -by_weight.sum(-1, keepdim=True)
+                slopes[f"{term.name}.center"] = by_c * self.term_sum.center_scale(term)
+        if f_slopes and type(self.noise).shares is not Noise.shares:
+            parts_of_noise = self._noise_by_f(values, places, by_variance)
+            by_f = [a + b for a, b in zip(by_f, parts_of_noise, strict=True)]
+        for name, parts in f_slopes.items():
+            products = [(a * b).sum((-1, -2)) for a, b in zip(by_f, parts, strict=True)]
+            slopes[f"physics.{name}"] = torch.stack(products).sum(0).unsqueeze(-1)
+        return slopes
+
+    def _noise_by_f(self, values: Values, places: Places, by_variance: Tensor) -> list[Tensor]:
+        """Return derivatives by each f_p, of a noise whose shares depend on it."""
+        with torch.enable_grad():
+            leaves = [f.detach().clone().requires_grad_() for f in places.f]
+            variance = self.noise.variance(values, Places(places.x, leaves), True)
+            slopes = torch.autograd.grad(
+                variance.expand_as(by_variance), leaves, by_variance, allow_unused=True
+            )
+        return [torch.zeros_like(f) if s is None else s for f, s in zip(leaves, slopes, strict=True)]
 
     def _other_priors(self, u: Tensor) -> tuple[Tensor | float, Tensor | float]:
         """Return the log density of priors other than N(0, I), and its gradient."""
@@ -238,27 +292,31 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
             outputs.append(self._of_outputs(Y) / self.unit)
         return outputs
 
-    def _physics_with_slopes(self, values: Values) -> tuple[list[Tensor], dict[str, list[Tensor]]]:
+    def _physics_with_slopes(
+        self, values: Values, with_slopes: bool
+    ) -> tuple[list[Tensor], dict[str, list[Tensor]]]:
         """Return each physics at the training inputs, and its derivatives by each coordinate.
 
         Derivatives are central differences, of one call for all. NaN where a physics fails.
         """
         if not self._unknowns:
-            return self._f_train, {}
+            return self._physics_at(self.data.X, {}), {}
         names = [*self._unknowns]
         S, p = len(values[f"physics.{names[0]}"]), len(names)
         z = torch.cat([values[f"physics.{name}"] for name in names], -1)  # S x p
-        eye = _STEP * torch.eye(p).to(z).unsqueeze(1)
-        z = torch.cat([z.unsqueeze(0), z + eye, z - eye]).reshape(-1, p)
+        steps = _STEP * torch.eye(p if with_slopes else 0, p).to(z).unsqueeze(1)
+        z = torch.cat([z.unsqueeze(0), z + steps, z - steps]).reshape(-1, p)
         moved = {f"physics.{name}": z[:, [i]] for i, name in enumerate(names)}
         f, slopes = [], []
         for physics in self.physics:
             given = (self._parameters_of(physics, moved),) if physics.unknowns else ()
             Y = physics.or_nan(self.data.X.unsqueeze(-3), *given).mT
             Y = self._of_outputs(Y).expand(len(z), -1, -1) / self.unit
-            Y = Y.reshape(2 * p + 1, S, *Y.shape[-2:])
+            Y = Y.reshape(2 * len(steps) + 1, S, *Y.shape[-2:])
             f.append(Y[0])
-            slopes.append((Y[1 : p + 1] - Y[p + 1 :]) / (2 * _STEP))
+            slopes.append((Y[1 : len(steps) + 1] - Y[len(steps) + 1 :]) / (2 * _STEP))
+        if not with_slopes:
+            return f, {}
         return f, {name: [each[i] for each in slopes] for i, name in enumerate(names)}
 
     def _parameters_of(self, physics: Physics, values: Values) -> Tensor:
@@ -329,7 +387,7 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
         """Return means and variances of each draw, ``... x S x q x m``, in the user's units."""
         X, conditioning = self.data.new_X(X), self.conditioning()
         with self._graph_for(X):
-            mean, variance = conditioning.marginals(self.at(X))
+            mean, variance = conditioning.marginals(self.at(X, conditioning.train.values))
             variance = variance + self._noise_at(X, observation_noise)
             mean, variance = torch.broadcast_tensors(
                 mean * self.unit, variance * self.unit.square()
@@ -376,10 +434,12 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
         posterior_transform: PosteriorTransform | None = None,
     ) -> Posterior:
         """Return the joint posterior at ``X``, ``... x q x d``, as BoTorch asks for it."""
+        if output_indices is not None:
+            output_indices = self._checked_outputs(output_indices)
         self.eval()
         X, conditioning = self.data.new_X(X), self.conditioning()
         with self._graph_for(X):
-            mean, K = conditioning.joint(self.at(X))
+            mean, K = conditioning.joint(self.at(X, conditioning.train.values))
             noise = self._noise_at(X, observation_noise)
             if isinstance(noise, Tensor):
                 K = add_noise(K, noise)
@@ -405,7 +465,7 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
         has_unit = self.terms[names.index(name)].physics is None
         unit = self.unit if has_unit else torch.ones_like(self.unit)
         with self._graph_for(X):
-            values = self.values
+            values = conditioning.train.values
             places = self.places(X, values, with_physics=False)
             mean, K = conditioning.joint(self.term_sum.term(name, values, places))
             return self._as_posterior(mean, K, unit, None)
@@ -457,23 +517,28 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
         """Return variances ``... x S x m x q`` in units of the targets; 0 if none are asked for."""
         if asked is False:
             return 0.0
-        values = self.values
         if asked is True:
+            values = self.conditioning().train.values
             return self.noise.variance(values, self.places(X, values))
-        if not isinstance(asked, Tensor):
+        return self._checked_noise(asked, X).mT.unsqueeze(-3) / self.unit.square()
+
+    def _checked_noise(self, noise: Any, X: Tensor) -> Tensor:
+        """Return given variances of observations at ``X``, ``... x q x m``."""
+        if not isinstance(noise, Tensor):
             raise TypeError(
-                "Expected observation_noise as True, False, or a tensor of variances; found "
-                f"{asked!r}. Known noise belongs to the model, in train_Yvar."
+                "Expected noise as True, False, or a tensor of variances; found "
+                f"{noise!r}. Known noise belongs to the model, in train_Yvar."
             )
-        sizes = zip(asked.shape[-2:], (X.shape[-2], self.num_outputs), strict=True)
-        if asked.dim() < 2 or any(have not in (1, want) for have, want in sizes):
+        shape = (X.shape[-2], self.num_outputs)
+        sizes = zip(noise.shape[-2:], shape, strict=True) if noise.dim() > 1 else [(0, 1)]
+        if any(have not in (1, want) for have, want in sizes):
             raise ValueError(
-                f"Expected variances of shape ... x {X.shape[-2]} x {self.num_outputs} as "
-                f"observation_noise; found {tuple(asked.shape)}."
+                f"Expected variances of shape ... x {shape[0]} x {shape[1]} as noise; found "
+                f"{tuple(noise.shape)}."
             )
-        if not (asked >= 0).all():
-            raise ValueError("Expected observation_noise (variances) not to be negative or NaN.")
-        return asked.mT.unsqueeze(-3) / self.unit.square()
+        if not (noise >= 0).all():
+            raise ValueError("Expected noise (variances) that is not negative or NaN.")
+        return noise.expand(*noise.shape[:-2], *shape)
 
     # Other data, other outputs.
 
@@ -502,15 +567,25 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
         lead = torch.broadcast_shapes(lead, Y.shape[:-2], self.data.Y.shape[:-2])
         targets = [v.expand(*lead, *v.shape[-2:]) for v in (self.data.Y, Y)]
         Yvar = None
-        if noise is not None and self.data.Yvar is not None:
-            Yvar = variances_of(noise, Y, "noise").mT / self.unit.square()
+        if noise is not None and self.noise.known is not None:
+            unused = noise.isnan() & Y.isnan()
+            noise = noise if not unused.any() else torch.ones_like(Y).where(unused, noise)
+            Yvar = self._checked_noise(noise, X).mT / self.unit.square()
         elif noise is not None:
             Yvar = noise
         new.noise = self.noise.appended(Yvar, X.shape[-2])
         new.data = self.data._replace(X=torch.cat(parts, -2), Y=torch.cat(targets, -2))
-        new._f_train = []
-        values = self.values
-        with torch.set_grad_enabled(torch.is_grad_enabled() and (X.requires_grad or Y.requires_grad)):
+        if new.noise.known is not None:
+            new.data = new.data._replace(Yvar=new.noise.known.mT * self.unit.square().mT)
+        values = old.train.values
+        has_graph = X.requires_grad or Y.requires_grad or old.alpha.requires_grad
+        with torch.set_grad_enabled(has_graph and torch.is_grad_enabled()):
+            if not self._unknowns:  # f_p is asked at the new points only
+                late = self._physics_at(X, values)
+                new._f_train = [
+                    torch.cat([a.expand(*b.shape[:-1], a.shape[-1]), b], -1)
+                    for a, b in zip(self._f_train, late, strict=True)
+                ]
             places = new.places(new.data.X, values)
             total = new.term_sum.at(values, places)
             variance = new.noise.variance(values, places, True)
@@ -534,10 +609,7 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
         Raises:
             ValueError: If there are none, or a number is out of range.
         """
-        m = self.num_outputs
-        if not idcs or any(not isinstance(i, int) or not -m <= i < m for i in idcs):
-            raise ValueError(f"Expected numbers of outputs from 0 to {m - 1}; found {idcs}.")
-        idcs = [i % m for i in idcs]
+        idcs = self._checked_outputs(idcs)
         new = self._copy()
         new.data = self.data._replace(
             Y=self.data.Y[..., idcs], output_names=tuple(self.data.output_names[i] for i in idcs)
@@ -547,10 +619,30 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
         new.unit, new.noise = self.unit[idcs], self.noise.of_outputs(idcs)
         new._f_train = [f[..., idcs, :] for f in self._f_train]
         new._outputs = idcs if self._outputs is None else [self._outputs[i] for i in idcs]
-        new.term_sum = TermSum(self.terms, [f[idcs] for f in self.term_sum.f])
+        new.term_sum = TermSum(self.terms, [f[idcs] for f in self.term_sum.f], new.unit)
         new.table = self.table.of_outputs(idcs)
         new.set_draws(self.table.coordinates_of_outputs(self.draws, idcs))
         new.u = torch.nn.Parameter(self.table.coordinates_of_outputs(self.u.detach(), idcs))
+        return new
+
+    def _checked_outputs(self, outputs: list[int]) -> list[int]:
+        m = self.num_outputs
+        if not outputs or any(not isinstance(i, int) or not -m <= i < m for i in outputs):
+            raise ValueError(f"Expected numbers of outputs from 0 to {m - 1}; found {outputs}.")
+        return [i % m for i in outputs]
+
+    def subset_rows(self, rows: Tensor) -> Self | None:
+        """Return the model of some of its observations, with the same units and priors.
+
+        None if its noise cannot do with fewer.
+        """
+        noise = self.noise.of_rows(rows)
+        if noise is None:
+            return None
+        new = self._copy()
+        new.noise = noise
+        new.data = self.data._replace(X=self.data.X[rows], Y=self.data.Y[rows])
+        new._f_train, new._cached = [f[..., rows] for f in self._f_train], None
         return new
 
     def subset_draws(self, rows: Tensor) -> Self:
@@ -571,7 +663,8 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
         data = [v.to(self.u) if isinstance(v, Tensor) else v for v in self.data]
         self.data, self.unit, self.draws = Data(*data), self.unit.to(self.u), self.draws.to(self.u)
         self._f_train = [f.to(self.u) for f in self._f_train]
-        self.term_sum = TermSum(self.terms, [f.to(self.u) for f in self.term_sum.f])
+        f = [each.to(self.u) for each in self.term_sum.f]
+        self.term_sum = TermSum(self.terms, f, self.unit)
         self.table = self.table.to(self.u)
         if isinstance(self.noise, KnownNoise):
             self.noise = KnownNoise(self.noise.known.to(self.u))
@@ -622,7 +715,8 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
         if not self.training:
             mean, K = self.conditioning().joint(self.at(self.data.new_X(x)))
             K = (K * self.unit.square().unsqueeze(-1)).expand(*mean.shape, mean.shape[-1])
-            return MultivariateNormal(squeezed(mean * self.unit, -2), squeezed(K, -3))
+            lazy = to_linear_operator(squeezed(K, -3))
+            return MultivariateNormal(squeezed(mean * self.unit, -2), lazy)
         if len(self.u) > 1:
             raise RuntimeError(
                 f"The model holds {len(self.u)} draws of its unknown numbers, of which a loss has no "
@@ -632,7 +726,7 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
             raise RuntimeError("In training mode call the model on its training inputs.")
         return self.forward(self.data.X)
 
-    def as_single_task_gp(self, draw: int | None = None) -> Any:
+    def as_single_task_gp(self, draw: int | None = None) -> SingleTaskGP:
         """Return BoTorch's ``SingleTaskGP`` of one output at one draw, for code that asks for one.
 
         Its mean, kernel and noise are the model's and are not learnt.
@@ -643,8 +737,6 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
         Raises:
             ValueError: If the model has several outputs or missing targets.
         """
-        from botorch.models import SingleTaskGP
-
         if self.num_outputs > 1 or self.data.Y.isnan().any():
             raise ValueError(
                 "Expected one output without missing targets; take model.subset_output([0]), and "
@@ -657,10 +749,11 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
         own.set_draws(self.u[[draw]])
         own.requires_grad_(False)
         noise = own.likelihood.noise.detach().reshape(self.data.Y.shape)
-        return SingleTaskGP(
-            self.data.X, self.data.Y, noise, covar_module=own.covar_module,
-            mean_module=own.mean_module, outcome_transform=None, input_transform=None,
-        )  # fmt: skip
+        with validate_input_scaling(False):  # the model has units of its own
+            return SingleTaskGP(
+                self.data.X, self.data.Y, noise, covar_module=own.covar_module,
+                mean_module=own.mean_module, outcome_transform=None, input_transform=None,
+            )  # fmt: skip
 
     def __repr__(self) -> str:
         n, m = self.data.Y.shape[-2:]
@@ -697,7 +790,12 @@ def _coordinates(model: GP) -> Tensor:
 
 
 def _set_coordinates(model: GP, u: Tensor) -> None:
-    model.set_draws(u.reshape(1, *model.u.shape[1:]))
+    with torch.no_grad():
+        model.u.copy_(u.reshape(model.u.shape))
+
+
+def _standard_normal(like: Tensor) -> NormalPrior:
+    return NormalPrior(like.new_zeros(()), like.new_ones(()))
 
 
 def _resize(model: Any, state: dict[str, Any], prefix: str, *_: Any) -> None:

@@ -78,6 +78,10 @@ class Noise:
         """Return the noise of some outputs."""
         return self
 
+    def of_rows(self, rows: Tensor) -> Noise | None:
+        """Return the noise of some observations, or None if it cannot do with fewer."""
+        return self
+
     def __repr__(self) -> str:
         return f"{type(self).__name__}({', '.join(self.names)})"
 
@@ -109,6 +113,10 @@ class KnownNoise(Noise):
         lead = torch.broadcast_shapes(self.known.shape[:-1], variances.shape[:-1])
         parts = [v.expand(*lead, v.shape[-1]) for v in (self.known, variances)]
         return KnownNoise(torch.cat(parts, -1))
+
+    def of_rows(self, rows: Tensor) -> KnownNoise:
+        """Return the noise of some observations."""
+        return KnownNoise(self.known[..., rows])
 
     def of_outputs(self, outputs: Sequence[int]) -> KnownNoise:
         """Return the noise of some outputs."""

@@ -29,8 +29,9 @@ def moments(mean: Tensor, variance: Tensor) -> Prediction:
     """Return the mean and variance of mixtures of components ``... x S x q x m``."""
     if mean.shape[DRAWS] == 1:
         return Prediction(mean.squeeze(DRAWS), variance.squeeze(DRAWS))
-    between = mean.var(DRAWS, correction=0)
-    return Prediction(mean.mean(DRAWS), variance.mean(DRAWS) + between)
+    center = mean.mean(DRAWS)
+    between = (mean - center.unsqueeze(DRAWS)).square().mean(DRAWS)
+    return Prediction(center, variance.mean(DRAWS) + between)
 
 
 def mixture_quantile(mean: Tensor, variance: Tensor, level: float) -> Tensor:
@@ -58,12 +59,26 @@ def correlation_root(K: Tensor) -> Tensor:
     return scaled
 
 
+class _Normal(MultivariateNormal):
+    """GPyTorch's distribution, with variances below its least one, too."""
+
+    @property
+    def variance(self) -> Tensor:
+        """The variances."""
+        variance: Tensor = self.lazy_covariance_matrix.diagonal(dim1=-1, dim2=-2)
+        return variance
+
+
+class _MultitaskNormal(MultitaskMultivariateNormal, _Normal):
+    """The same of several outputs."""
+
+
 def _joint(mean: Tensor, K: Tensor) -> MultivariateNormal:
     """Return the distribution of means ``... x m x q`` with a covariance ``... x m q x m q``."""
     lazy = to_linear_operator(K)  # without a factor until one is asked for
     if mean.shape[-2] == 1:
-        return MultivariateNormal(mean.squeeze(-2), lazy)
-    return MultitaskMultivariateNormal(mean.mT, lazy, interleaved=False)
+        return _Normal(mean.squeeze(-2), lazy)
+    return _MultitaskNormal(mean.mT, lazy, interleaved=False)
 
 
 def _block_diagonal(K: Tensor) -> Tensor:
@@ -145,14 +160,18 @@ class MixturePosterior(GPyTorchPosterior):
     def density(self, value: Tensor) -> Tensor:
         """Return the density of each output at each point, at values ``... x q x m``."""
         mean, K = self.components
-        sd = K.diagonal(dim1=-1, dim2=-2).mT.sqrt()
-        each = torch.distributions.Normal(mean.mT, sd).log_prob(value.unsqueeze(DRAWS)).exp()
-        return each.mean(DRAWS)
+        sd = K.diagonal(dim1=-1, dim2=-2).mT.sqrt().clamp_min(1e-300)
+        z = (value.expand(self.mean.shape).unsqueeze(DRAWS) - mean.mT) / sd
+        return ((-0.5 * z.square()).exp() / (sd * (2 * torch.pi) ** 0.5)).mean(DRAWS)
 
 
     def scalarized(self, weights: Tensor, offset: float = 0.0) -> MixturePosterior:
         """Return the posterior of a weighted sum of the outputs, plus an offset."""
         mean, K = self.components
+        if weights.shape != (mean.shape[-2],):
+            raise ValueError(
+                f"Expected weights of {mean.shape[-2]} outputs; found {tuple(weights.shape)}."
+            )
         w = weights.to(mean).unsqueeze(-1)
         total = (w * mean).sum(-2, keepdim=True) + offset
         return MixturePosterior(total, (w.square().unsqueeze(-1) * K).sum(-3, keepdim=True))

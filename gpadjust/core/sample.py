@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
-LogLikelihood = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""Of coordinates ``N x B x P``: log likelihoods ``N x B`` and their gradients ``N x B x P``."""
+
+class LogLikelihood(Protocol):
+    """The log likelihood of coordinates of ``B`` independent problems."""
+
+    def __call__(self, u: Tensor, with_gradient: bool = True) -> tuple[Tensor, Tensor]:
+        """Return values ``N x B`` at ``N x B x P``, and gradients (zeros if not asked for)."""
+
 
 GROUPS = 2  # of draws that are resampled apart, so that their difference shows the error
 _LEAPS, _ACCEPTED, _LAST_MOVES, _MOVES, _FAR = 5, 0.8, 4, 2, 60.0
-_SEARCHES, _GAIN = 5, 0.01  # of searches, and of log density, below which there are no more
+_SEARCHES, _GAIN = 3, 0.01  # of searches, and of log density, below which there are no more
 _WIDER = 1.5  # than Laplace's approximation
 
 
@@ -68,12 +72,14 @@ def sample(
     start: Normal | None = None,
     first: int = 8,
     with_moves: bool = True,
-) -> Draws:
+    floor: Tensor | None = None,
+) -> Draws | None:
     r"""Draw from :math:`N(u | 0, I) \, L(u)` by sequential Monte Carlo (Del Moral et al. 2006).
 
     Draws of a start, ``first`` times as many as are kept, are weighted by a power of the ratio of
     the posterior to the start, as large as half of them still count, resampled and moved by
-    Hamiltonian Monte Carlo; the power rises until it is 1.
+    Hamiltonian Monte Carlo; the power rises until it is 1. Where a start is so good that more draws
+    count than are kept, they are not moved.
 
     Args:
         log_likelihood: L of ``B`` problems.
@@ -83,14 +89,18 @@ def sample(
         start: The start. Default: the prior.
         first: How many draws begin for each that is kept.
         with_moves: Whether draws are moved; without, they are weighted and resampled once.
+        floor: A log evidence ``B`` below which no draws are wanted.
+
+    Returns:
+        The draws, or None as soon as the evidence is below the floor in all problems.
     """
     generator = torch.Generator().manual_seed(seed)
     shape = (like.shape[0], like.shape[1])
     prior = Normal.standard(shape, like)
     begin = prior if start is None else start
 
-    def ratio(u: Tensor) -> tuple[Tensor, Tensor]:
-        value, slope = log_likelihood(u)
+    def ratio(u: Tensor, with_gradient: bool = True) -> tuple[Tensor, Tensor]:
+        value, slope = log_likelihood(u, with_gradient)
         if start is None:
             return value, slope
         (a, by_a), (b, by_b) = prior.log_density(u), start.log_density(u)
@@ -98,27 +108,38 @@ def sample(
 
     u = _randn((first * number, *shape), generator, like)
     u = begin.mean + (begin.root @ u.unsqueeze(-1)).squeeze(-1)
-    value, slope = ratio(u)
+    value, slope = ratio(u, False)
     power, evidence = like.new_zeros(shape[0]), like.new_zeros(GROUPS, shape[0])
     length, problems = torch.full_like(power, 0.3), torch.arange(shape[0], device=like.device)
     least, effective = number / 2, None
     while True:
+        # The highest power at which enough draws count.
         step = _step(value, power, least if with_moves else 0.0)
         logs = (step * value).nan_to_num(nan=-math.inf)
         halves = logs.reshape(GROUPS, -1, shape[0])
         evidence = evidence + halves.logsumexp(1) - math.log(halves.shape[1])
         power, weights = power + step, logs.softmax(0)
+        is_first = effective is None
         if effective is None:
             effective = weights.square().sum(0).reciprocal()
-        root = _root(u, weights)
-        rows = _resampled(halves, number // GROUPS, generator)
-        u, value, slope, least = u[rows, problems], value[rows, problems], slope[rows, problems], number / 2
+            with_moves = with_moves and (start is None or bool((effective < number).any()))
+        if floor is not None:
+            # What is left of the evidence is at most that of the most likely draw.
+            top = evidence.amax(0) + (1 - power) * value.amax(0)
+            if bool((top < floor).all()):
+                return None
         is_done = bool((power >= 1).all()) or not with_moves
+        # Resample, and move.
+        root, rows = _root(u, weights), _resampled(halves, number // GROUPS, generator)
+        u, value, slope = u[rows, problems], value[rows, problems], slope[rows, problems]
+        if is_first and with_moves:
+            value, slope = ratio(u)
         for _ in range((_LAST_MOVES if is_done else _MOVES) * with_moves):
             u, value, slope, rate = _move(
                 ratio, begin, u, value, slope, power, root, length, generator
             )
             length = length * (rate - _ACCEPTED).exp()
+        least = number / 2
         if is_done:
             return Draws(u, evidence, effective)
 
@@ -213,11 +234,11 @@ def _randn(shape: tuple[int, ...], generator: torch.Generator, like: Tensor) -> 
 
 
 @torch.no_grad()
-def maximise(log_likelihood: LogLikelihood, u: Tensor) -> Tensor:
+def maximise(log_likelihood: LogLikelihood, u: Tensor, is_precise: bool = False) -> Tensor:
     """Return the coordinates ``B x P`` of highest density N(u | 0, I) L(u), by L-BFGS from u.
 
-    The search begins anew where it ended, as long as that pays: a line search may fail for one
-    problem where others still have a way to go.
+    A precise search begins anew where it ended, as long as that pays: a line search may fail for
+    one problem where others still have a way to go.
     """
     best, shape = u.clone(), u.shape
     top = u.new_full(shape[:1], -math.inf)
@@ -231,9 +252,12 @@ def maximise(log_likelihood: LogLikelihood, u: Tensor) -> Tensor:
         density = density.nan_to_num(neginf=-1e10)
         return -float(density.sum()), (point - slope).nan_to_num().flatten().cpu().numpy()
 
-    for _ in range(_SEARCHES):
+    options = {} if is_precise else {"ftol": 1e-6}
+    for _ in range(_SEARCHES if is_precise else 1):
         before = float(top.nan_to_num(neginf=-1e10).sum())
-        minimize(negative, best.flatten().cpu().numpy(), jac=True, method="L-BFGS-B")
+        minimize(
+            negative, best.flatten().cpu().numpy(), jac=True, method="L-BFGS-B", options=options
+        )
         if float(top.sum()) < before + _GAIN:
             break
     return best
@@ -243,13 +267,22 @@ def maximise(log_likelihood: LogLikelihood, u: Tensor) -> Tensor:
 def around_mode(log_likelihood: LogLikelihood, mode: Tensor) -> tuple[Normal, Tensor]:
     """Return Laplace's approximation at a mode ``B x P``, made wider, and the log evidence by it.
 
-    The Hessian is that of central differences of the gradient.
+    The Hessian is that of central differences of the gradient, along the coordinates that have any
+    influence.
     """
     p = mode.shape[-1]
-    step = 0.1 * torch.eye(p).to(mode).unsqueeze(1)
+    _, at_random = log_likelihood(mode.unsqueeze(0) + 0.1)
+    moved = (at_random[0] != 0).any(0).nonzero().flatten()
+    step = 0.1 * torch.eye(p)[moved].to(mode).unsqueeze(1)
     value, slope = log_likelihood(torch.cat([mode.unsqueeze(0), mode + step, mode - step]))
-    hessian = -(slope[1 : p + 1] - slope[p + 1 :]).movedim(0, -2) / 0.2
-    values, vectors = torch.linalg.eigh(0.5 * (hessian + hessian.mT).nan_to_num())
+    hessian = mode.new_zeros(len(mode), p, p)
+    number = len(moved)
+    half = -(slope[1 : number + 1] - slope[number + 1 :]).movedim(0, -2) / 0.2
+    hessian[:, moved] = half.nan_to_num()
+    hessian = (
+        hessian[:, :, moved].new_zeros(hessian.shape).index_copy(2, moved, hessian[:, :, moved])
+    )
+    values, vectors = torch.linalg.eigh(0.5 * (hessian + hessian.mT))
     precision = 1 + values.clamp_min(0.0)
     root = vectors * (_WIDER * precision.rsqrt()).unsqueeze(-2)
     evidence = value[0] - 0.5 * mode.square().sum(-1) - 0.5 * precision.log().sum(-1)

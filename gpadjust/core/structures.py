@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from gpadjust.core.data import ArrayLike
+from gpadjust.core.data import ArrayLike, as_tensor
 from gpadjust.core.kernels import DELTA, RHO, Fourier, Kernel, as_kernel
 from gpadjust.core.model import GP
 from gpadjust.core.terms import Term
@@ -121,7 +121,7 @@ class RRA(CKA):
     ) -> None:
         if num_features < 2 or num_features % 2:
             raise ValueError(f"Expected an even number of features; found {num_features}.")
-        d = train_X.shape[-1]
+        d = as_tensor(train_X, "train_X").shape[-1]
         super().__init__(
             train_X, train_Y, train_Yvar, physics=physics,
             rho_covar_module=Fourier(d, num_features, 2 * seed, RHO),
@@ -271,6 +271,8 @@ def _delta(kernel: Kernel | None, mean: float, constants: bool) -> Term:
 
 def _several(physics: Any) -> tuple[list[str], list[Any]]:
     """Return the names of the scalings, and the physics."""
+    if isinstance(physics, list | tuple | Mapping) and not physics:
+        raise ValueError("Expected at least one physics; found none. Without, take ZeroMeanGP.")
     if isinstance(physics, Mapping):
         return [f"rho_{name}" for name in physics], [*physics.values()]
     if isinstance(physics, list | tuple):

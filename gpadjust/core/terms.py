@@ -21,7 +21,7 @@ class Term(NamedTuple):
     Args:
         name: The name.
         kernel: k; None for none.
-        mean: The prior mean of g.
+        mean: The prior mean of g; in the user's units, where b is 1.
         constant: The prior of :math:`\kappa`, the variance of an unknown constant in g; None for
             none. In squared units of the targets, where b is 1.
         physics: The number of the physics that is the basis; None for 1.
@@ -140,8 +140,18 @@ class WeightedSum:
         return total, pull_back
 
     def _parts(self) -> list[tuple[Term, Tensor | None]]:
-        """Return the terms that vary and have a weight, and their weights."""
-        return [(t, self.weights[t.name]) for t in self.terms if t.name in self.weights and t.varies]
+        """Return the terms that vary and have a weight, and their weights.
+
+        A process that no draw contains is left out.
+        """
+        parts = []
+        for term in self.terms:
+            process = self.values.get(f"{term.name}.process")
+            if process is not None and not process.any():
+                term = term._replace(kernel=None)
+            if term.name in self.weights and term.varies:
+                parts.append((term, self.weights[term.name]))
+        return parts
 
     def _is_whole(self, term: Term) -> bool:
         return f"{term.name}.process" not in self.values
@@ -164,12 +174,13 @@ class TermSum:
     Args:
         terms: The terms, with different names.
         f: The outputs of each physics at the training inputs, ``m x n``, in units of the targets.
+        unit: That unit, ``m x 1``.
 
     Raises:
         ValueError: If names are equal, contain a dot, or a term's physics does not exist.
     """
 
-    def __init__(self, terms: Sequence[Term], f: Sequence[Tensor]) -> None:
+    def __init__(self, terms: Sequence[Term], f: Sequence[Tensor], unit: Tensor) -> None:
         names = [term.name for term in terms]
         if len({*names}) < len(names) or not names or any("." in name for name in names):
             raise ValueError(f"Expected terms with different names without dots; found {names}.")
@@ -179,7 +190,8 @@ class TermSum:
                     f"Term {term.name!r} has physics number {term.physics}, but the model has "
                     f"{len(f)}; pass it in physics=[...]."
                 )
-        self.terms, self.f = tuple(terms), [v.reshape(-1, v.shape[-1]) for v in f]
+        self.terms, self.unit = tuple(terms), unit
+        self.f = [v.reshape(-1, v.shape[-1]) for v in f]
 
     def rows(self, x: Tensor, num_outputs: int) -> list[Row]:
         """Return the unknown numbers of all terms, for training inputs ``n x d``."""
@@ -202,7 +214,7 @@ class TermSum:
         if not term.has_center or term.physics is None:
             return 0.0
         if term.has_center is not True:
-            return term.has_center
+            return term.has_center / self.unit
         f = self.f[term.physics]
         return f.mean(-1, keepdim=True) + self.center_scale(term) * values[f"{term.name}.center"]
 
@@ -212,8 +224,9 @@ class TermSum:
 
     def mean_of(self, term: Term, values: Values) -> Tensor | float:
         """Return the prior mean of a term's process, which is zero in some nested models."""
+        mean = term.mean / (self.unit if term.physics is None else 1.0)
         factor = values.get(f"{term.name}.mean")
-        return term.mean if factor is None else term.mean * factor
+        return mean if factor is None else mean * factor
 
     def at(self, values: Values, places: Places) -> WeightedSum:
         r"""Return the function itself, :math:`\sum_t b_t g_t`."""

@@ -216,6 +216,8 @@ class Table:
     def _set_zeros(self, values: Values) -> None:
         chosen = self.chosen(values).unsqueeze(-1)
         for k, choice in enumerate(self.choices):
+            if not (chosen == k).any():
+                continue
             for name in choice.zeros:
                 value = values.get(name, torch.ones_like(values[_CHOICE]))
                 values[name] = value.masked_fill(chosen == k, 0.0)

@@ -7,7 +7,6 @@ differentiable in it. Values are in the user's units. Draws and outputs are batc
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -16,10 +15,8 @@ from gpytorch.likelihoods import GaussianLikelihood
 from gpytorch.likelihoods.noise_models import Noise as NoiseModule
 from gpytorch.means import Mean
 from gpytorch.mlls import AddedLossTerm
-from gpytorch.priors import Prior
 from linear_operator.operators import DiagLinearOperator
 from torch import Tensor
-from torch.distributions import constraints
 
 if TYPE_CHECKING:
     from gpadjust.core.model import GP
@@ -139,21 +136,6 @@ def likelihood_view(model: GP) -> GaussianLikelihood:
     likelihood = GaussianLikelihood()
     likelihood.noise_covar = NoiseView(model)
     return likelihood
-
-
-class StandardNormal(Prior):
-    """The prior N(0, 1) of coordinates, as GPyTorch asks for it."""
-
-    arg_constraints: dict[str, Any] = {}  # noqa: RUF012
-    support = constraints.real
-
-    def __init__(self) -> None:
-        torch.nn.Module.__init__(self)
-        self.batch_size = 0
-
-    def log_prob(self, u: Tensor) -> Tensor:
-        """Return log densities of each coordinate."""
-        return -0.5 * u.square() - 0.5 * math.log(2 * math.pi)
 
 
 class OtherPriors(AddedLossTerm):

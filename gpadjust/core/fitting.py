@@ -1,0 +1,318 @@
+"""Fit a model: draw its unknown numbers given the data, or bring them to their most likely values."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from gpadjust.core.sample import GROUPS, Draws, Normal, around_mode, maximise, sample
+
+if TYPE_CHECKING:
+    from gpadjust.core.model import GP
+
+_SMALL, _MEDIUM = 40, 150  # points: up to these draws begin with the prior, and are moved
+_ENTRIES = 150_000  # of covariances that are computed at once, which caches hold
+_SELDOM = 1e-3  # a nested model of less probability at its mode is not drawn from
+_MOVED = 0.35  # predicted standard deviations by which another seed may move the mean
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """What :func:`fit` has found; its text is what to read first.
+
+    Args:
+        method: ``"bayes"`` or ``"map"``.
+        log_evidence: The log probability of the targets of each output, ``m``, in their units (of
+            outputs that share unknown numbers, of all together); None of a point fit.
+        probabilities: The probability of each nested model by its text, for each output; empty if
+            there is one model only.
+        effective: The least number of starting draws that count, of all outputs.
+        error: By how many predicted standard deviations another seed would move the mean at a
+            training input that is left out, root mean square; NaN of a point fit.
+        num_draws: How many draws predictions average over.
+    """
+
+    method: str
+    log_evidence: Tensor | None
+    probabilities: dict[str, list[float]]
+    effective: float
+    error: float
+    num_draws: int
+
+    @property
+    def converged(self) -> bool:
+        """Whether predictions hardly depend on the seed."""
+        return not self.error > _MOVED
+
+    def __str__(self) -> str:
+        lines = []
+        outputs = max((len(shares) for shares in self.probabilities.values()), default=0)
+        for j in range(outputs):
+            shares = [f"{text} {p[j]:.2f}" for text, p in self.probabilities.items()]
+            which = f" (output {j + 1})" if outputs > 1 else ""
+            lines.append(f"Probabilities{which}: {', '.join(shares)}.")
+        if self.method == "map":
+            lines.append("Point fit: intervals ignore what is unknown of the hyper-parameters.")
+        else:
+            lines.append(
+                f"{self.num_draws} draws; another seed would move predictions by {self.error:.2f} "
+                "of their standard deviation."
+            )
+        return "\n".join(lines)
+
+
+def fit(
+    model: GP, method: str = "bayes", *, num_draws: int | None = None, seed: int = 0
+) -> FitResult:
+    """Fit a model to its data, from the prior: what it held before has no influence.
+
+    ``"bayes"`` draws all unknown numbers from their posterior: by sequential Monte Carlo from the
+    prior up to 40 points, from Laplace's approximation beyond; beyond 150 points its draws are
+    weighted once and not moved. Nested models are drawn from apart and pooled by their posterior
+    probabilities. ``"map"`` brings the numbers of the whole model to their most likely values.
+
+    Args:
+        model: The model.
+        method: ``"bayes"`` or ``"map"``.
+        num_draws: Number of draws, a multiple of 4. Default: 80, 32 or 16, of a physics with
+            unknown parameters 256; predictions average over 16, 8 or 4 of them, else over every fourth.
+        seed: Seed.
+
+    Warns:
+        UserWarning: If another seed would move predictions by much.
+
+    Raises:
+        ValueError: If the method is unknown, the number of draws no positive multiple of 4, or the
+            data a batch.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust.core import ZeroMeanGP, fit
+        >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+        >>> fit(ZeroMeanGP(X, X.sin())).converged
+        True
+    """
+    if method not in ("bayes", "map"):
+        raise ValueError(f"Unknown method {method!r}; expected 'bayes' or 'map'.")
+    if num_draws is not None and (num_draws < 4 or num_draws % 4):
+        raise ValueError(f"Expected num_draws as a multiple of 4; found {num_draws}.")
+    if model.batch_shape:
+        raise ValueError(
+            f"Expected a model of one data set; found a batch {tuple(model.batch_shape)}, of "
+            "fantasies. Fit the model that they are made of."
+        )
+    if method == "map":
+        model.set_draws(_mode(_Target(model, 0), seed, is_precise=True).unsqueeze(0))
+        return FitResult(method, None, {}, math.nan, math.nan, 1)
+    n, number = len(model.data.Y), num_draws or _default_number(model)
+    sampled = _sampled(model, number, seed)
+    weights = _weights(model, {k: draws.log_evidence for k, draws in sampled.items()})
+    kept = _default_kept(n) if num_draws is None else number // 4
+    model.set_draws(_pooled(sampled, weights.mean(1), number), kept)
+    error = _error(model, sampled, weights, number) * math.sqrt(number / kept)
+    whole = weights.mean(1)
+    result = FitResult(
+        method,
+        _evidence(model, sampled),
+        {c.text: whole[k].expand(model.num_outputs).tolist() for k, c in enumerate(model.table.choices)},
+        min(float(draws.effective.min()) for draws in sampled.values()),
+        error,
+        len(model.u),
+    )
+    if not result.converged:
+        warnings.warn(
+            f"Predictions depend on the seed: another one would move them by {error:.2f} of their "
+            f"standard deviation. Draw more: fit(model, num_draws={4 * number}).",
+            stacklevel=2,
+        )
+    return result
+
+
+def _default_number(model: GP) -> int:
+    n = len(model.data.Y)
+    if model.table.shared and n <= _MEDIUM:
+        return 256
+    if n <= _SMALL:
+        return 80
+    return 32 if n <= _MEDIUM else 16
+
+
+def _default_kept(n: int) -> int:
+    if n <= _SMALL:
+        return 16
+    return 8 if n <= _MEDIUM else 4
+
+
+class _Target:
+    """The log likelihood of one nested model, at coordinates ``N x B x P``."""
+
+    def __init__(self, model: GP, choice: int) -> None:
+        self.model, self.choice, self.table = model, choice, model.table
+        self.like = model.u.detach().new_zeros(model.table.problems, model.table.size)
+
+    def chosen(self, u: Tensor) -> Tensor:
+        """Return coordinates of this nested model."""
+        return self.table.with_choice(u, self.choice) if self.table.choices else u
+
+    def __call__(self, u: Tensor, with_gradient: bool = True) -> tuple[Tensor, Tensor]:
+        """Return values ``N x B`` and gradients, of so many draws at once as caches hold."""
+        n = len(self.model.data.Y)
+        size = max(1, _ENTRIES // (n * n * self.model.num_outputs))
+        rows = self.chosen(u).split(size)
+        parts = [self.model.log_likelihood(part, with_gradient) for part in rows]
+        value, slope = (torch.cat(each) for each in zip(*parts, strict=True))
+        return value, slope
+
+    def log_density(self, u: Tensor) -> Tensor:
+        """Return the log posterior density but for a constant, ``N x B``."""
+        density = self(u, False)[0] - 0.5 * u.square().sum(-1)
+        return density.nan_to_num(nan=-math.inf)
+
+
+def _sampled(model: GP, number: int, seed: int) -> dict[int, Draws]:
+    """Return draws of each nested model that is likely enough.
+
+    The whole model comes first; of the others those go on that may be as likely as a thousandth.
+    """
+    n, choices = len(model.data.Y), range(max(1, len(model.table.choices)))
+    prior = _log_prior(model)
+    sampled: dict[int, Draws] = {}
+    if n <= _SMALL:
+        floor = None
+        for k in choices:
+            target = _Target(model, k)
+            draws = sample(target, target.like, number, seed, floor=floor)
+            if draws is None:
+                continue
+            sampled[k] = draws._replace(u=target.chosen(draws.u))
+            joint = torch.stack([prior[i] + d.log_evidence.mean(0) for i, d in sampled.items()])
+            floor = joint.amax(0) + math.log(_SELDOM) - prior[(k + 1) % len(prior)]
+        return sampled
+    starts = _starts(model, seed)
+    for k, (start, _) in starts.items():
+        target = _Target(model, k)
+        draws = sample(target, target.like, number, seed, start, 4, n <= _MEDIUM)
+        if draws is not None:
+            sampled[k] = draws._replace(u=target.chosen(draws.u))
+    return sampled
+
+
+def _starts(model: GP, seed: int) -> dict[int, tuple[Normal, Tensor]]:
+    """Return Laplace's approximation of each nested model that is likely enough.
+
+    Modes are searched by some of the rows first. A nested model that is unlikely by these is left
+    out: that its odds recover has a probability of the odds at most (Ville's inequality).
+    """
+    n, choices = len(model.data.Y), [*range(max(1, len(model.table.choices)))]
+    generator = torch.Generator().manual_seed(seed)
+    rows = torch.randperm(n, generator=generator)[:_SMALL].sort().values
+    some = model.subset_rows(rows) if n > 2 * _SMALL else None
+    modes = {k: _mode(_Target(some or model, k), seed) for k in choices}
+    if some is not None:
+        evidence = {k: around_mode(_Target(some, k), mode)[1] for k, mode in modes.items()}
+        choices = _likely(model, evidence)
+        modes = {k: maximise(_Target(model, k), modes[k]) for k in choices}
+    starts = {k: around_mode(_Target(model, k), modes[k]) for k in choices}
+    kept = _likely(model, {k: evidence for k, (_, evidence) in starts.items()})
+    return {k: starts[k] for k in kept}
+
+
+def _mode(target: _Target, seed: int, is_precise: bool = False) -> Tensor:
+    """Return the most likely coordinates, ``B x P``, searched from the best of some.
+
+    A precise search also begins with the medians of the priors.
+    """
+    like = target.like
+    number = max(16, 6400 // max(len(target.model.data.Y), 25))
+    generator = torch.Generator().manual_seed(seed)
+    u = torch.randn(number, *like.shape, generator=generator, dtype=like.dtype).to(like)
+    u[0] = 0.0
+    problems = torch.arange(len(like))
+    best = u[target.log_density(u).argmax(0), problems]
+    if not is_precise:
+        return target.chosen(maximise(target, best))
+    ends = torch.stack([maximise(target, start, True) for start in (best, u[0])])
+    return target.chosen(ends[target.log_density(ends).argmax(0), problems])
+
+
+def _log_prior(model: GP) -> Tensor:
+    """Return the log prior probabilities of nested models, 0 of a single one."""
+    return model.u.detach().new_tensor([c.probability for c in model.table.choices] or [1.0]).log()
+
+
+def _likely(model: GP, log_evidence: dict[int, Tensor]) -> list[int]:
+    """Return the nested models that are not unlikely in all problems."""
+    weights = _weights(model, {k: value.unsqueeze(0) for k, value in log_evidence.items()})
+    return [k for k in log_evidence if bool((weights[k] > _SELDOM).any())]
+
+
+def _weights(model: GP, log_evidence: dict[int, Tensor]) -> Tensor:
+    """Return posterior probabilities ``K x G x B`` by log evidences ``G x B``."""
+    prior = _log_prior(model)
+    like = next(iter(log_evidence.values()))
+    logs = like.new_full((len(prior), *like.shape), -math.inf)
+    for k, value in log_evidence.items():
+        logs[k] = prior[k] + value
+    return logs.softmax(0)
+
+
+def _evidence(model: GP, sampled: dict[int, Draws]) -> Tensor:
+    """Return the log evidence of each problem, in the user's units."""
+    prior = _log_prior(model)
+    logs = torch.stack([prior[k] + draws.log_evidence for k, draws in sampled.items()])
+    total = logs.logsumexp(0).logsumexp(0) - math.log(GROUPS)
+    units = (~model.data.Y.isnan()).sum(0) * model.unit.squeeze(-1).log()
+    return total - (units if len(total) > 1 else units.sum())
+
+
+def _pooled(draws: Mapping[int, Draws], weights: Tensor, number: int, part: int = 0) -> Tensor:
+    """Return ``number x B x P`` draws of all nested models in proportion to weights ``K x B``.
+
+    Args:
+        draws: The draws of nested models.
+        weights: Their weights.
+        number: How many to return.
+        part: 0 for all draws, or 1 or 2 for one of the groups.
+    """
+    problems = []
+    for b in range(weights.shape[-1]):
+        rows = []
+        for k, count in enumerate(_counts(weights[:, b], number)):
+            if count:
+                u = draws[k].u if not part else draws[k].u.chunk(GROUPS)[part - 1]
+                at = (torch.arange(count) + 0.5) * len(u) / count
+                rows.append(u[at.long(), b])
+        problems.append(torch.cat(rows))
+    return torch.stack(problems, 1)
+
+
+def _counts(shares: Tensor, number: int) -> list[int]:
+    """Return whole numbers in proportion to shares, of a given sum, by largest remainders."""
+    exact = shares * number
+    counts = exact.floor()
+    order = (counts - exact).argsort()
+    counts[order[: number - int(counts.sum())]] += 1
+    return [int(count) for count in counts]
+
+
+def _error(model: GP, sampled: dict[int, Draws], weights: Tensor, number: int) -> float:
+    """Return how far another seed would move the mean, in predicted standard deviations.
+
+    The draws are two groups that were resampled apart; with the weights of nested models by each of
+    them they predict the left-out targets. The difference of two means of N / 2 draws has a
+    standard deviation twice that of one of N.
+    """
+    groups = []
+    for g in range(GROUPS):
+        u = _pooled(sampled, weights[:, g], number // GROUPS, g + 1)
+        groups.append(model.left_out_at(u))
+    mean, variance = (torch.cat(each) for each in zip(*groups, strict=True))
+    sd = (variance.mean(0) + mean.var(0, correction=0)).sqrt()
+    difference = (groups[0][0].mean(0) - groups[1][0].mean(0)) / 2
+    return float((difference / sd).square().nanmean().sqrt())

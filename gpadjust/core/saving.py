@@ -1,0 +1,265 @@
+"""Models as files: data, settings and draws, and the physics by its name."""
+
+from __future__ import annotations
+
+import secrets
+import sys
+import warnings
+from copy import deepcopy
+from inspect import signature
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from gpadjust.checks import check_kind, check_switch
+from gpadjust.core.data import unit_of
+from gpadjust.core.model import GP
+from gpadjust.core.noise import Noise
+from gpadjust.physics import PhysicsError
+from gpadjust.physics.import_path import import_path, is_formula, physics_from_path
+
+_FORMAT = 4
+
+
+class Saved(NamedTuple):
+    """A file, the import paths of its physics, and which arguments it could not hold."""
+
+    path: Path
+    physics: tuple[str, ...]
+    missing: tuple[str, ...]
+
+
+def save(model: GP, path: str | Path) -> Saved:
+    """Save a model: its class, settings, data and draws, and its physics by the import path.
+
+    Arguments that are not plain values (kernels, noises, transforms, lambdas, and the terms of a
+    plain ``GP``) are to be given to :func:`load` again. The file is written under a fresh name and
+    renamed: it is complete or not there, and a symbolic link at ``path`` is replaced.
+
+    Args:
+        model: The model. A class of one's own takes train_X, train_Y and train_Yvar first, and
+            its ``settings`` are all its other arguments but ``physics``.
+        path: The file.
+
+    Warns:
+        UserWarning: If another program cannot import the physics: a lambda, or one of a script.
+
+    Raises:
+        TypeError: If it is not a model of this library.
+        ValueError: If its class is not in a module, it has fantasies or a part of a model's rows
+            or outputs, or the path is a folder, or in none that exists.
+
+    Example:
+        >>> import tempfile, torch
+        >>> from gpadjust.core import CKA
+        >>> from torch.nn.functional import silu
+        >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+        >>> model = CKA(X, 2 * silu(X) + X, physics=silu)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     saved = save(model, f"{folder}/model.pt")
+        ...     again = load(f"{folder}/model.pt", trusted=True)
+        >>> saved.missing, torch.equal(again.predict(X).mean, model.predict(X).mean)
+        ((), True)
+    """
+    check_kind("model", model, GP, "a model of gpadjust.core")
+    path = Path(path)
+    if path.is_dir() or not path.parent.is_dir():
+        raise ValueError(f"Expected path as a file in a folder that exists; found {str(path)!r}.")
+    content = _content(model)
+    missing, names = content["missing"], content["physics"]
+    if "physics" in missing or any(name.startswith("__main__:") for name in names):
+        warnings.warn(
+            f"Other programs cannot import the physics of {path.name}, a lambda or a part of the "
+            f"running script. Pass it again: load(path, {_call({'physics', *missing})}).",
+            stacklevel=2,
+        )
+    part = path.with_name(f".{secrets.token_hex(8)}.part")
+    try:
+        with part.open("xb") as file:  # not an existing file, nor where a link points to
+            torch.save(content, file)
+        part.replace(path)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+    return Saved(path, tuple(filter(None, names)), tuple(missing))
+
+
+def load(path: str | Path, *, trusted: bool = False, **objects: Any) -> Any:
+    """Load a model that :func:`save` wrote.
+
+    A stranger's file executes nothing: its class is one of an imported module, and its physics is
+    given, or a formula. Only a trusted file's physics is imported, which runs its module.
+
+    Args:
+        path: The file.
+        trusted: Whether to import a physics that is not given.
+        objects: ``physics``, and what the file could not hold; an error names it.
+
+    Raises:
+        OSError: If the file cannot be read.
+        PhysicsError: If a physics fails at the training inputs.
+        TypeError: If ``trusted`` is not True or False.
+        ValueError: If it is another kind of file, or damaged; if objects are missing, too many, or
+            others than the model was built with; if the module of the class was not imported; or
+            if the physics is code that is not trusted, or cannot be imported.
+    """
+    check_switch("trusted", trusted)
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+        return _model(content, objects, trusted)
+    except (OSError, PhysicsError):
+        raise
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    except Exception as error:
+        cause = f"it is another kind of file, damaged, or an object is a wrong one ({error!r})"
+        raise ValueError(f"Expected {path} as a model that gpadjust saved; {cause}.") from error
+
+
+def _content(model: GP) -> dict[str, Any]:
+    """Return what the file of a model holds."""
+    model_class, data, settings = type(model), model.data, _settings(model)
+    module, name = model_class.__module__, model_class.__qualname__
+    if getattr(sys.modules[module], name, None) is not model_class:
+        raise ValueError(f"Expected a class of a module; found {name}. Move it out of functions.")
+    n = _rows_of_fit(model)
+    if model.batch_shape or model._outputs is not None or not 0 < n <= len(data.Y):
+        raise ValueError(
+            "Expected a model of one data set and all its outputs; found fantasies, or a part of "
+            "the rows or outputs. Save the model that it was made from."
+        )
+    parameters = signature(model_class).parameters.values()
+    takes_physics = any(p.name == "physics" or p.kind is p.VAR_KEYWORD for p in parameters)
+    names = [import_path(each) for each in model.physics] if takes_physics else []
+    missing = [name for name, value in settings.items() if not _is_plain(value)]
+    scalings = [term.name for term in model.terms if term.physics is not None]
+    is_mapping = model_class is not GP and all(each.startswith("rho_") for each in scalings)
+    tensors = {"X": data.X, "Y": data.Y, "Yvar": data.Yvar, "u": model.u, "draws": model.draws}
+    return {
+        "format": _FORMAT,
+        "class": f"{module}:{name}",
+        "settings": {name: value for name, value in settings.items() if name not in missing},
+        "missing": missing + ["physics"] * (None in names),
+        "physics": [name or "" for name in names],
+        "physics_names": [each.removeprefix("rho_") for each in scalings if is_mapping],
+        "rows_of_fit": n,
+        "names": [list(data.input_names), list(data.output_names)],
+        "built_with": _built_with(model, n),
+        **{name: v if v is None else v.detach().cpu().clone() for name, v in tensors.items()},
+    }
+
+
+def _settings(model: GP) -> dict[str, Any]:
+    """Return the arguments of a model other than data and physics."""
+    if type(model) is not GP:
+        return {n: value for n, value in model.settings.items() if n != "outcome_transform"}
+    noise: Any = model.noise
+    if model.data.Yvar is not None or (type(noise) is Noise and vars(noise) == vars(Noise())):
+        noise = None
+    settings = {"terms": model.terms, "choices": model.table.choices or None, "noise": noise}
+    settings |= {"input_transform": model.data.transform}
+    return {name: value for name, value in settings.items() if value is not None}
+
+
+def _is_plain(value: Any) -> bool:
+    """Return whether ``torch.load`` reads a value with ``weights_only=True``."""
+    if type(value) in (list, tuple):
+        return all(map(_is_plain, value))
+    return type(value) in (bool, int, float, str, type(None), Tensor)
+
+
+def _rows_of_fit(model: GP) -> int:
+    """Return on how many rows, the first, the model was built: its unit is theirs."""
+    if model.term_sum.f:
+        return model.term_sum.f[0].shape[-1]
+    Y = model.data.Y
+    mean = torch.full_like(Y, sum(term.mean for term in model.terms))
+    units = ((n, unit_of(Y[:n], mean[:n])) for n in range(len(Y), 1, -1))
+    return next((n for n, u in units if torch.allclose(u, model.unit, 1e-12, 0.0)), 0)
+
+
+@torch.no_grad()
+def _built_with(model: GP, n: int) -> dict[str, Tensor]:
+    """Return numbers at the first n inputs and the prior's middle, which tell models apart."""
+    values, X = model.table.values(torch.zeros_like(model.u[:1])), model.data.X[:n]
+    places = model.places(X, values)
+    total = model.term_sum.at(values, places)
+    noise = model.noise.variance(values, places, True)[..., :n]
+    numbers = {f"physics {i + 1}": f * model.unit for i, f in enumerate(places.f)}
+    numbers |= {"unit": model.unit, "mean": total.mean, "noise": noise}
+    for row in (*model.table.own, *model.table.shared):
+        numbers[f"prior of {row.name}"] = torch.stack([row.location, row.location + row.scale])
+    for choice in model.table.choices:
+        numbers[f"choice {choice[0]} {choice[2]}"] = torch.tensor(choice.probability)
+    numbers["kernel"] = total.cross(total).sum(-1)
+    return {name: value.detach().cpu().clone() for name, value in numbers.items()}
+
+
+def _model(content: dict[str, Any], objects: dict[str, Any], trusted: bool) -> GP:
+    """Return the model of a file, with the objects that are given."""
+    if content["format"] != _FORMAT:
+        raise ValueError(f"expected format {_FORMAT}; found {content['format']}.")
+    known = {*content["missing"], *["physics"] * bool(content["physics"])}
+    if objects.keys() - known or {*content["missing"]} - objects.keys():
+        raise ValueError(
+            f"expected what the file could not hold, load(path, {_call(content['missing'])}), and "
+            f"nothing else but its physics; found load(path, {_call(objects)})."
+        )
+    module, _, name = content["class"].partition(":")
+    model_class = getattr(sys.modules.get(module), name, None)  # nothing is imported for it
+    if not isinstance(model_class, type) or not issubclass(model_class, GP):
+        raise ValueError(f"no model {content['class']} was found; import its module first.")
+    settings = content["settings"] | {n: deepcopy(objects[n]) for n in content["missing"]}
+    if content["physics"]:
+        given = "physics" in objects
+        settings["physics"] = objects["physics"] if given else _physics(content, trusted)
+    n, X, Y, Yvar = (content[name] for name in ("rows_of_fit", "X", "Y", "Yvar"))
+    data = [X, Y] if Yvar is None or settings.get("noise") else [X, Y, Yvar]
+    inputs, outputs = (tuple(map(str, names)) for names in content["names"])
+    is_right = type(n) is int and 2 <= n <= len(X) and all(len(v) == len(X) for v in data)
+    if not is_right or (len(inputs), len(outputs)) != (X.shape[-1], Y.shape[-1]):
+        raise ValueError("expected data of one length, and a name of each input and output.")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # they came when the model was built
+        model: GP = model_class(*(v[:n] for v in data), **settings)
+    built_with = _built_with(model, n)
+    if other := built_with.keys() ^ content["built_with"].keys():
+        raise ValueError(f"it was saved with other kernels: {', '.join(sorted(other))}.")
+    for name, value in built_with.items():
+        expected, size = content["built_with"][name], 1e-6 * value.abs() + 1e-9 * value.abs().max()
+        is_near = expected.shape == value.shape and ((expected - value).abs() <= size).all()
+        if not is_near:
+            raise ValueError(
+                f"it was saved with another {name}: numbers at the training inputs differ. Give "
+                "what the model was built with (several physics in the same order)."
+            )
+    model.set_draws(content["u"].double())
+    u = model.u
+    model.set_draws(content["draws"].double())
+    model.u = u
+    model.data = model.data._replace(input_names=inputs, output_names=outputs)
+    if n < len(X):
+        late = None if Yvar is None or Yvar[n:].allclose(Yvar[:n].mean(0)) else Yvar[n:]
+        model = model.condition_on_observations(X[n:], Y[n:], late)
+    return model.eval()
+
+
+def _physics(content: dict[str, Any], trusted: bool) -> Any:
+    """Return the physics that a file names."""
+    for name in content["physics"]:
+        if not trusted and not is_formula(name):
+            raise ValueError(
+                f"its physics is the code {name}. Give the physics, load(path, physics=...), or "
+                "have it imported if you trust the file, load(path, trusted=True)."
+            )
+    parts = [physics_from_path(name) for name in content["physics"]]
+    if content["physics_names"]:
+        return dict(zip(content["physics_names"], parts, strict=True))
+    is_list = len(parts) > 1 or content["class"] == f"{GP.__module__}:GP"
+    return parts if is_list else parts[0]
+
+
+def _call(names: Any) -> str:
+    return ", ".join(f"{name}=..." for name in sorted(names)) or "..."

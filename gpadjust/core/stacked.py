@@ -1,0 +1,244 @@
+"""A mixture of several models of the same targets, as one model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, Self
+
+import torch
+from botorch.acquisition.objective import PosteriorTransform, ScalarizedPosteriorTransform
+from botorch.models.model import FantasizeMixin, Model
+from botorch.posteriors import Posterior
+from torch import Size, Tensor
+from torch.distributions import Normal
+from torch.nn import Module, ModuleList
+from torch.quasirandom import SobolEngine
+
+from gpadjust.checks import checked_whole
+from gpadjust.core.data import ArrayLike, Data
+from gpadjust.core.model import GP
+from gpadjust.core.posterior import DRAWS, MixturePosterior
+
+_ROUNDS = 1000  # of the search for weights
+
+
+class StackedGP(Model, FantasizeMixin):
+    r"""The mixture of several models, :math:`p(f(x)) = \sum_k w_k \, p_k(f(x))` (Yao et al. 2018).
+
+    Its components are draws of each model in proportion to the weight. By a weight of each model
+    these are mixed as wholes, by weights of each output the outputs are independent.
+
+    Args:
+        models: Fitted models of the same data, by name.
+        weights: The weight of each model, or of each model and output ``K x m``, in the order of
+            the models or by name; they sum to 1.
+        num_components: Number ``S`` of components; weights are rounded to multiples of ``1 / S``.
+
+    Raises:
+        TypeError: If models are not GPs by name.
+        ValueError: If data of models differ, or weights have another shape, sum or sign.
+
+    Example:
+        >>> from gpadjust.core import PhysicsMeanGP, ZeroMeanGP
+        >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+        >>> one, other = PhysicsMeanGP(X, X.exp(), physics=torch.sin), ZeroMeanGP(X, X.exp())
+        >>> StackedGP({"sin": one, "zero": other}, [0.75, 0.25]).predict(X).mean.shape
+        torch.Size([8, 1])
+    """
+
+    likelihood = None  # FantasizeMixin reads it
+    predict: Any = GP.predict
+    interval: Any = GP.interval
+
+    def __init__(self, models: Mapping[str, GP], weights: Any, num_components: int = 64) -> None:
+        super().__init__()
+        _check_models(models)
+        shares, S = _shares(models, weights), checked_whole("num_components", num_components, 1)
+        heights = ((torch.arange(S) + 0.5) / S).to(shares).repeat(shares.shape[-1], 1)
+        owners = torch.searchsorted(shares.cumsum(0).mT.contiguous(), heights).mT
+        used, owners = owners.clamp_max(len(shares) - 1).unique(return_inverse=True)
+        self.names = [[*models][i] for i in used]
+        self.models: Any = ModuleList(models[name] for name in self.names)
+        picks, start = torch.zeros_like(owners), 0
+        for i, name in enumerate(self.names):
+            mine, draws = owners == i, len(models[name].u)
+            rows = (mine.cumsum(0) - 0.5) * draws / mine.sum(0)  # evenly from all draws
+            picks[mine] = start + rows.long()[mine]
+            start += draws
+        order = torch.arange(S).unsqueeze(-1)
+        if shares.shape[-1] > 1:  # pairs of components of two outputs fill a square evenly
+            order = SobolEngine(shares.shape[-1]).draw(S).argsort(0).argsort(0)
+        # S x m: the model of each component and output, and its row in the draws of all models.
+        sizes = (S, self.num_outputs)
+        self.owners: Tensor = owners.gather(0, order).expand(sizes)
+        self.picks: Tensor = picks.gather(0, order).expand(sizes)
+
+    @classmethod
+    def by_left_out(cls, models: Mapping[str, GP], num_components: int = 64) -> Self:
+        """Return the mixture of each output with the highest density of left-out targets.
+
+        The density is a mean of logarithms, which expectation maximisation of weights increases.
+        """
+        _check_models(models)
+        scores = []
+        for model in models.values():
+            mean, variance = model.left_out()
+            density = Normal(mean, variance.sqrt(), False).log_prob(model.data.Y).logsumexp(0)
+            scores.append((density - math.log(len(mean))).nan_to_num())  # 0 where one is missing
+        weights = torch.full_like(torch.stack(scores)[:, 0], 1 / len(models))  # K x m
+        for _ in range(_ROUNDS):
+            weights = (torch.stack(scores) + weights.log().unsqueeze(1)).softmax(0).mean(1)
+        return cls(models, weights, num_components)
+
+    @property
+    def weights(self) -> dict[str, list[float]]:
+        """The weights of each model that has any after rounding, one for each output."""
+        return {n: (self.owners == i).double().mean(0).tolist() for i, n in enumerate(self.names)}
+
+    @property
+    def data(self) -> Data:
+        """The training data."""
+        return self.models[0].data
+
+    @property
+    def num_outputs(self) -> int:
+        """``m``."""
+        return self.models[0].num_outputs
+
+    @property
+    def batch_shape(self) -> Size:
+        """The batch shape of the data: empty but for fantasies."""
+        return self.models[0].batch_shape
+
+    def components(
+        self, X: ArrayLike, observation_noise: bool | Tensor = False
+    ) -> tuple[Tensor, Tensor]:
+        """Return means and variances of all components, ``... x S x q x m``."""
+        parts = [model.components(X, observation_noise) for model in self.models]
+        mean, variance = (torch.cat(each, DRAWS).mT for each in zip(*parts, strict=True))
+        columns = torch.arange(self.num_outputs)
+        return mean[..., self.picks, columns, :].mT, variance[..., self.picks, columns, :].mT
+
+    def posterior(
+        self,
+        X: ArrayLike,
+        output_indices: list[int] | None = None,
+        observation_noise: bool | Tensor = False,
+        posterior_transform: PosteriorTransform | None = None,
+    ) -> Posterior:
+        """Return the joint posterior at ``X``, ``... x q x d``, as BoTorch asks for it."""
+        self.eval()
+        parts = [model.posterior(X, None, observation_noise).components for model in self.models]
+        means, covariances = zip(*parts, strict=True)
+        mean, K = torch.cat(means, -3), torch.cat(covariances, -4)
+        columns = torch.arange(self.num_outputs)[output_indices or slice(None)]
+        picks = self.picks[:, columns]
+        posterior = MixturePosterior(mean[..., picks, columns, :], K[..., picks, columns, :, :])
+        if posterior_transform is None:
+            return posterior
+        if isinstance(posterior_transform, ScalarizedPosteriorTransform):
+            return posterior.scalarized(posterior_transform.weights, posterior_transform.offset)
+        return posterior_transform(posterior=posterior, X=X)
+
+    def condition_on_observations(
+        self, X: ArrayLike, Y: ArrayLike, noise: Tensor | None = None, **_: Any
+    ) -> Self:
+        """Return the mixture of the conditioned models; the weights stay as they are."""
+        return self._of([each.condition_on_observations(X, Y, noise) for each in self.models])
+
+    def subset_output(self, idcs: list[int]) -> Self:
+        """Return the mixture of some outputs; a ValueError if there are none of these numbers."""
+        new = self._of([each.subset_output(idcs) for each in self.models])
+        new.owners, new.picks = self.owners[:, idcs], self.picks[:, idcs]
+        return new
+
+    def _of(self, models: list[GP]) -> Self:
+        """Return the mixture of other models with as many draws."""
+        new = type(self).__new__(type(self))
+        Model.__init__(new)
+        new.names, new.models = self.names, ModuleList(models)
+        new.owners, new.picks = self.owners, self.picks
+        return new.eval()
+
+    def sample_functions(
+        self, num_functions: int, seed: int | None = None, num_features: int = 1024
+    ) -> StackedFunctions:
+        """Draw functions ``... x q x d`` to ``k x ... x q x m``, in proportion to the weights."""
+        seed = int(torch.randint(2**31, ())) if seed is None else seed
+        return StackedFunctions(self, num_functions, num_features, seed)
+
+    def summary(self) -> str:
+        """Return the weights, and what each of the models has learnt."""
+        lines = [repr(self)]
+        for model, (name, weights) in zip(self.models, self.weights.items(), strict=True):
+            shares = ", ".join(f"{weight:.0%}" for weight in weights)
+            lines.append(f"{shares} of {name}: {model.summary()}")
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({len(self.picks)} components of {', '.join(self.names)})"
+
+
+class StackedFunctions(Module):
+    """Functions from a mixture, each output of one component; see :class:`Functions`."""
+
+    def __init__(self, model: StackedGP, number: int, num_features: int, seed: int) -> None:
+        super().__init__()
+        order = torch.randperm(len(model.picks), generator=torch.Generator().manual_seed(seed))
+        order = order[torch.arange(checked_whole("num_functions", number, 1)) % len(order)]
+        self.owners, picks = model.owners[order], model.picks[order]  # k x m
+        outputs = [[j] for j in range(model.num_outputs)]
+        if (picks == picks[:, :1]).all():  # models as wholes
+            outputs = [[*range(model.num_outputs)]]
+        self.parts: list[list[Any]] = [[] for _ in outputs]
+        for columns, parts in zip(outputs, self.parts, strict=True):
+            start = 0
+            for i, each in enumerate(model.models):
+                rows = (self.owners[:, columns[0]] == i).nonzero().squeeze(-1)
+                if len(rows):
+                    own = each.subset_draws(picks[rows, columns[0]] - start).subset_output(columns)
+                    own_seed = seed + columns[0] * len(model.models) + i
+                    parts.append((rows, own.sample_functions(len(rows), own_seed, num_features)))
+                start += len(each.u)
+
+    def forward(self, X: Tensor) -> Tensor:
+        """Return the values ``k x ... x q x m`` of all functions at ``... x q x d``."""
+        return self._side_by_side(lambda functions, rows: functions(X))
+
+    def each(self, X: Tensor) -> Tensor:
+        """Return the values ``k x q x m`` of each function at points of its own, ``k x q x d``."""
+        return self._side_by_side(lambda functions, rows: functions.each(X[rows]))
+
+    def _side_by_side(self, evaluate: Callable[[Any, Tensor], Tensor]) -> Tensor:
+        values = []
+        for parts in self.parts:
+            order = torch.cat([rows for rows, _ in parts]).argsort()
+            own = torch.cat([evaluate(functions, rows) for rows, functions in parts])
+            values.append(own[order])
+        return torch.cat(values, -1)
+
+
+def _check_models(models: Any) -> None:
+    is_right = isinstance(models, Mapping) and all(isinstance(m, GP) for m in models.values())
+    if not is_right or not models:
+        raise TypeError(f"Expected GPs by name, {{'CKA': model, ...}}; found {models!r}.")
+    sets = [model.data for model in models.values()]
+    if len({str([d.X.tolist(), d.Y.tolist(), d.input_names, d.output_names]) for d in sets}) > 1:
+        raise ValueError(f"Expected models of the same data; found others in {[*models]}.")
+
+
+def _shares(models: Mapping[str, GP], weights: Any) -> Tensor:
+    """Return weights as a tensor ``K x 1`` or ``K x m``."""
+    if isinstance(weights, Mapping) and weights.keys() == models.keys():
+        weights = [weights[name] for name in models]
+    try:
+        shares = torch.stack([torch.as_tensor(w, dtype=torch.float64) for w in weights])
+    except (TypeError, ValueError, RuntimeError):
+        shares = torch.zeros(0)
+    shares = shares.detach().unsqueeze(-1) if shares.dim() == 1 else shares.detach()
+    shapes = [(len(models), 1), (len(models), next(iter(models.values())).num_outputs)]
+    is_right = shares.shape in shapes and bool((shares >= 0).all())
+    if not is_right or not torch.allclose(shares.sum(0), shares.new_ones(())):
+        raise ValueError(f"Expected weights that sum to 1 in shape {shapes}; found {weights}.")
+    return shares

@@ -1,0 +1,122 @@
+"""Functions drawn from the posterior."""
+
+import copy
+
+import pytest
+import torch
+from botorch.models.transforms import Normalize
+from botorch.sampling.pathwise import draw_matheron_paths
+from gpytorch.kernels import RBFKernel
+
+from gpadjust.core import CKA, MATERN12, MATERN32, MATERN52, RRA, Noise, Stationary, ZeroMeanGP
+from tests.systems import crude, line, refused
+
+
+class Relative(Noise):
+    def __init__(self):
+        super().__init__(("constant", "relative"))
+
+    def shares(self, places):
+        f = places.f[0]
+        return torch.stack([torch.ones_like(f), f.square()], -1)
+
+
+def kernels(rho, delta):
+    return {"rho_covar_module": Stationary(rho), "delta_covar_module": Stationary(delta)}
+
+
+CASES = {
+    "CKA": (CKA, {"physics": crude, "input_transform": Normalize(2)}, 0),
+    "nested line": (CKA, {"physics": crude}, 1),
+    "nested, no physics": (CKA, {"physics": crude}, 2),
+    "all nested": (CKA, {"physics": crude}, None),
+    "Matern": (CKA, {"physics": crude, **kernels(MATERN52, MATERN32)}, 0),
+    "Matern 1/2": (ZeroMeanGP, {"covar_module": Stationary(MATERN12)}, 0),
+    "RRA": (RRA, {"physics": crude, "nested": False}, 0),
+    "relative noise": (CKA, {"physics": crude, "noise": Relative()}, 0),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_moments(name, data, drawn, uniform):
+    cls, options, choice = CASES[name]
+    X, Y = data(num_outputs=2, n=6)
+    Y[2, 0] = Y[4:, 1] = torch.nan
+    model = drawn(cls(X, Y, **options), choice=choice)
+    Z = uniform(4, 2, high=2.0, seed=4)
+    with torch.no_grad():  # of several seeds, as frequencies are few
+        values = [model.sample_functions(150, seed, 256)(Z) for seed in range(12)]
+        values, posterior = torch.cat(values), model.posterior(Z)
+    assert values.shape == (1800, 4, 2)
+    covariance = posterior.distribution.covariance_matrix
+    sd = covariance.diagonal().sqrt()
+    standard = (values.mT.flatten(1) - posterior.mean.mT.flatten()) / sd
+    assert (standard.mean(0).abs() < 0.1).all()
+    torch.testing.assert_close(standard.mT.cov(), covariance / sd.outer(sd), rtol=0, atol=0.15)
+
+
+def test_functions_meet_exact_data(data, drawn):
+    X, Y = data(num_outputs=2)
+    model = drawn(CKA(X, Y, 1e-8, physics=crude), choice=0)
+    torch.testing.assert_close(
+        model.sample_functions(5, 0)(X), Y.expand(5, 9, 2), rtol=0, atol=0.01
+    )
+
+
+@pytest.mark.parametrize("later", [False, True], ids=["", "conditioned"])
+def test_spread_without_noise(later):
+    """The nugget of the covariance is noise to the posterior, and to functions drawn from it."""
+    X, Z = line(8), line(7, 0.05, 0.95)
+    Y, options = 2 * (6 * X).sin() + X, {"num_features": 100, "nested": False}  # exact features
+    model = RRA(X, Y, 0.0, physics=lambda X: (6 * X).sin(), **options)
+    if later:
+        more = Z[[1, 4]] + 0.03
+        model = model.condition_on_observations(more, model.predict(more).mean)
+    values, (mean, variance) = model.sample_functions(1500, 0)(Z), model.predict(Z)
+    assert ((values.mean(0) - mean).abs() < 0.2 * variance.sqrt()).all()
+    assert ((values.std(0) / variance.sqrt() - 1).abs() < 0.2).all()
+
+
+def test_shapes_seeds_and_gradients(data, drawn, uniform):
+    model = drawn(CKA(*data(num_outputs=2), physics=crude), 5)
+    functions, Z = model.sample_functions(3, seed=1), uniform(2, 6, 5, 2)
+    values = functions(Z)
+    assert values.shape == (3, 2, 6, 5, 2)
+    torch.testing.assert_close(functions(Z[1, 4]), values[:, 1, 4])
+    torch.testing.assert_close(
+        functions.each(Z[1, :3]), torch.stack([values[i, 1, i] for i in range(3)])
+    )
+    state = torch.get_rng_state()
+    assert torch.equal(model.sample_functions(3, seed=1)(Z), values)
+    assert torch.equal(torch.get_rng_state(), state)
+    assert not torch.equal(model.sample_functions(3)(Z), model.sample_functions(3)(Z))
+    assert torch.autograd.gradcheck(functions, uniform(3, 2, seed=3).requires_grad_())
+    for k in (1, 2, 12):  # fewer or more than the draws
+        assert model.sample_functions(k, seed=0)(Z[0, 0]).shape == (k, 5, 2)
+    model.set_draws(torch.zeros_like(model.u))
+    assert torch.equal(functions(Z), values)
+    assert torch.equal(copy.deepcopy(functions)(Z), values)
+
+
+def test_paths_of_botorch(data, drawn, uniform):
+    X, Y = data()
+    model = drawn(CKA(X, Y, physics=lambda X: crude(X)[..., :1]))
+    Z = uniform(5, 2)
+    assert draw_matheron_paths(model, torch.Size([4]))(Z).shape == (4, 5)
+    values, posterior = draw_matheron_paths(model, torch.Size([600]))(Z), model.posterior(Z)
+    error = values.mean(0) - posterior.mean.squeeze(-1)
+    assert (error.abs() < 0.15 * posterior.variance.sqrt().squeeze(-1)).all()
+
+
+def test_wrong_numbers_kernels_and_points(data, drawn, uniform):
+    X, Y = data(num_outputs=2)
+    model = drawn(CKA(X, Y, physics=crude))
+    for number in (0, -1, 2.5):
+        refused((ValueError, TypeError), "Expected|must be", model.sample_functions, number)
+    refused(ValueError, "even number of features", model.sample_functions, 1, num_features=7)
+    functions = model.sample_functions(3, seed=0)
+    for shape in ((2, 4, 2), (4, 2), (1, 3, 4, 2)):
+        refused(ValueError, r"3 functions, 3 x q x d", functions.each, uniform(*shape))
+    refused(ValueError, r"X of shape \.\.\. x q x 2", functions, uniform(4, 3))
+    own = CKA(X, Y, physics=crude, delta_covar_module=RBFKernel())
+    refused(NotImplementedError, "no random features", own.sample_functions, 2)

@@ -1,0 +1,258 @@
+"""What users of GPyTorch and BoTorch write runs on the core's models unchanged."""
+
+import gpytorch
+import pytest
+import torch
+from botorch.acquisition import (
+    LogExpectedImprovement,
+    UpperConfidenceBound,
+    qKnowledgeGradient,
+    qLogExpectedImprovement,
+    qLogNoisyExpectedImprovement,
+)
+from botorch.acquisition.multi_objective.logei import qLogNoisyExpectedHypervolumeImprovement
+from botorch.fit import fit_gpytorch_mll
+from botorch.generation import MaxPosteriorSampling
+from botorch.models import ModelListGP, SingleTaskGP
+from botorch.models.transforms import Normalize, Standardize
+from botorch.optim import optimize_acqf
+from botorch.sampling import SobolQMCNormalSampler
+from botorch.sampling.pathwise import draw_matheron_paths, get_matheron_path_model
+from gpytorch.kernels import RBFKernel, ScaleKernel
+from gpytorch.mlls import ExactMarginalLogLikelihood, SumMarginalLogLikelihood
+
+from gpadjust.core import CKA, fit
+from gpadjust.gpytorch import PhysicsMean, PhysicsScaledKernel
+
+BOUNDS = torch.tensor([[0.0, 0.0], [1.0, 1.0]], dtype=torch.float64)
+SEARCH = {"num_restarts": 2, "raw_samples": 8, "options": {"maxiter": 5}}
+
+
+def wave(X):
+    return torch.sin(6 * X[..., :1])
+
+
+def both(X):
+    return torch.cat([wave(X), X[..., 1:].square()], -1)
+
+
+def noisy():
+    generator = torch.Generator().manual_seed(0)
+    X = torch.rand(12, 2, generator=generator, dtype=torch.float64)
+    Y = torch.cat([2 * wave(X) + X[:, :1], 2 * X[:, 1:].square() + 0.1], -1)
+    return X, Y + 0.05 * torch.randn(12, 2, generator=generator, dtype=torch.float64)
+
+
+@pytest.fixture
+def data():
+    return noisy()
+
+
+@pytest.fixture(scope="module", params=["bayes", "map"])
+def models(request):
+    """A model of one output and one of two, fitted by each method."""
+    X, Y = noisy()
+    fitted = CKA(X, Y[:, :1], physics=wave), CKA(X, Y, physics=both)
+    for model in fitted:
+        fit(model, request.param)
+    return fitted
+
+
+def loss(model):
+    mll = ExactMarginalLogLikelihood(model.likelihood, model)
+    model.train()
+    return -mll(model(*model.train_inputs), model.train_targets)
+
+
+def test_three_ways_to_the_most_likely_numbers(data, uniform):
+    X, Y = data
+    by_adam, by_mll, by_fit = (CKA(X, Y[:, :1], physics=wave, nested=False) for _ in range(3))
+    optimizer = torch.optim.Adam([p for p in by_adam.parameters() if p.requires_grad], lr=0.1)
+    for _ in range(200):
+        optimizer.zero_grad()
+        value = loss(by_adam)
+        value.backward()
+        optimizer.step()
+    fit_gpytorch_mll(ExactMarginalLogLikelihood(by_mll.likelihood, by_mll))
+    fit(by_fit, "map")
+    best = loss(by_fit).item()
+    assert loss(by_mll).item() == pytest.approx(loss(by_adam).item(), abs=1e-4)
+    assert best < loss(by_mll).item() + 1e-5
+    Z = uniform(5, 2, seed=3)
+    observed = by_adam.eval().likelihood(by_adam(Z))
+    expected = by_adam.predict(Z, observation_noise=True)
+    torch.testing.assert_close(observed.mean.unsqueeze(-1), expected.mean)
+    torch.testing.assert_close(observed.variance.unsqueeze(-1), expected.variance)
+
+
+def test_the_loss_is_the_density_and_differentiable(data):
+    X, Y = data
+    Y[3, 1] = torch.nan
+    for model in (CKA(X, Y, physics=both), CKA(X, Y, 0.01, physics=both)):
+        with torch.no_grad():
+            model.u += 0.3 * torch.randn(model.u.shape, dtype=torch.float64)
+        value = -loss(model).sum() * len(X)
+        (slope,) = torch.autograd.grad(value, model.u)
+        density, expected = model.log_likelihood(model.u.detach())
+        torch.testing.assert_close(slope, expected - model.u.detach(), rtol=1e-6, atol=1e-6)
+
+
+def test_lists_of_models(data, uniform):
+    X, Y = data
+    ours, theirs = CKA(X, Y[:, :1], physics=wave), SingleTaskGP(X, Y[:, 1:])
+    both_models = ModelListGP(ours, theirs)
+    fit_gpytorch_mll(SumMarginalLogLikelihood(both_models.likelihood, both_models))
+    Z = uniform(5, 2, seed=3)
+    posterior = both_models.posterior(Z)
+    torch.testing.assert_close(posterior.mean[:, :1], ours.predict(Z).mean)
+    assert posterior.rsample(torch.Size([3])).shape == (3, 5, 2)
+    fit(ours)
+    torch.testing.assert_close(both_models.posterior(Z).variance[:, :1], ours.predict(Z).variance)
+    plain = ModelListGP(ours, CKA(X, Y[:, 1:], physics=lambda X: X[:, 1:]))
+    later = plain.condition_on_observations([Z, Z], uniform(5, 2, seed=4))
+    assert later.posterior(Z).mean.shape == (5, 2)
+
+
+def test_state(data, models, uniform):
+    X, Y = data
+    Z = uniform(5, 2, seed=3)
+    for model, (columns, physics) in zip(models, (([0], wave), ([0, 1], both)), strict=True):
+        again = CKA(X, Y[:, columns], physics=physics)
+        again.load_state_dict(model.state_dict())
+        assert torch.equal(again.predict(Z).variance, model.predict(Z).variance)
+    for j in range(2):
+        part = models[1].subset_output([j]).predict(Z)
+        torch.testing.assert_close(part.mean, models[1].predict(Z).mean[:, [j]])
+
+
+def test_transforms(data, uniform):
+    X, Y = data
+    Z = uniform(5, 2, seed=3)
+    plain = CKA(X, Y, physics=both)
+    options = {"input_transform": Normalize(2), "outcome_transform": Standardize(2)}
+    other = CKA(X, Y, physics=both, **options)
+    # Lengthscales have medians like the ranges of what the kernels see.
+    torch.testing.assert_close(other.predict(Z).mean, plain.predict(Z).mean)
+    torch.testing.assert_close(other.posterior(Z).variance, plain.posterior(Z).variance)
+
+
+@pytest.mark.parametrize("name", ["LogEI", "UCB", "qLogEI", "qLogNEI", "qKG", "qLogNEHVI"])
+def test_acquisition(models, data, name):
+    X, Y = data
+    one, two = models
+    sampler = SobolQMCNormalSampler(torch.Size([16]))
+    function = {
+        "LogEI": lambda: LogExpectedImprovement(one, Y[:, 0].max()),
+        "UCB": lambda: UpperConfidenceBound(one, 2.0),
+        "qLogEI": lambda: qLogExpectedImprovement(one, Y[:, 0].max(), sampler=sampler),
+        "qLogNEI": lambda: qLogNoisyExpectedImprovement(one, X, sampler=sampler),
+        "qKG": lambda: qKnowledgeGradient(one, num_fantasies=4),
+        "qLogNEHVI": lambda: qLogNoisyExpectedHypervolumeImprovement(
+            two, ref_point=[0.0, 0.0], X_baseline=X, sampler=sampler
+        ),
+    }[name]()
+    q = 2 if name.startswith("q") else 1
+    candidates, value = optimize_acqf(function, BOUNDS, q=q, **SEARCH)
+    assert candidates.shape == (q, 2)
+    assert value.isfinite().all()
+
+
+def test_thompson_samples_and_paths(models, uniform):
+    one, two = models
+    X = uniform(6, 2, seed=5)
+    assert MaxPosteriorSampling(one)(X, num_samples=5).shape == (5, 2)
+    assert MaxPosteriorSampling(one)(X.expand(3, 6, 2), num_samples=5).shape == (3, 5, 2)
+    assert draw_matheron_paths(one, torch.Size([2, 3]))(X).shape == (2, 3, 6)
+    assert draw_matheron_paths(two, torch.Size([3]))(X).shape == (3, 2, 6)
+    assert get_matheron_path_model(two)(X).shape == (6, 2)
+    assert get_matheron_path_model(two, torch.Size([3]))(X.expand(3, 6, 2)).shape == (3, 6, 2)
+
+
+def test_it_reads_as_a_gpytorch_model(models, uniform):
+    Z = uniform(5, 2, seed=3)
+    for model, physics in zip(models, (wave, both), strict=True):
+        S, m = model.num_draws_and_outputs
+        lead = [size for size in (S, m) if size > 1]
+        expected = physics(Z).mT.expand(S, m, 5)
+        prior = model.forward(Z)
+        if not model.values.get("rho.mean", torch.zeros(1)).any():  # no draw without physics
+            torch.testing.assert_close(model.mean_module(Z), expected.reshape(*lead, 5))
+        K = model.covar_module(Z).to_dense()
+        assert K.shape == (*lead, 5, 5)
+        torch.testing.assert_close(prior.covariance_matrix, K)
+        diagonal = model.covar_module(Z, diag=True)
+        torch.testing.assert_close(diagonal, K.diagonal(dim1=-1, dim2=-2))
+        assert len(model.covar_module.kernels) == 2
+        # rho's part of equation 2 is the kernel of rho, scaled by f_p - c on both sides.
+        values = model.values
+        f = physics(Z).mT - model.term_sum.center(model.terms[0], values) * model.unit
+        own = model.at(Z).own(model.terms[0])
+        k = model.terms[0].kernel.covariance(own, Z) * values.get(
+            "rho.process", torch.ones(1)
+        ).unsqueeze(-1)
+        k = (k + values["rho.constant"].unsqueeze(-1)) * f.unsqueeze(-1) * f.unsqueeze(-2)
+        rho = model.covar_module.kernels[0](Z).to_dense()
+        torch.testing.assert_close(rho, k.reshape(rho.shape))
+    model = models[0]
+    if len(model.u) == 1:
+        grad = torch.autograd.grad(model.covar_module(Z).to_dense().sum(), model.u)[0]
+        assert grad.abs().sum() > 0
+
+
+class OwnCKA(gpytorch.models.ExactGP):
+    """The paper's model in ordinary modules."""
+
+    def __init__(self, X, y, likelihood, f_p):
+        super().__init__(X, y, likelihood)
+        self.mean_module = PhysicsMean(f_p)
+        self.rho_covar_module = PhysicsScaledKernel(ScaleKernel(RBFKernel(ard_num_dims=2)), f_p)
+        self.delta_covar_module = ScaleKernel(RBFKernel(ard_num_dims=2))
+
+    def forward(self, x):
+        covar = self.rho_covar_module(x) + self.delta_covar_module(x)
+        return gpytorch.distributions.MultivariateNormal(self.mean_module(x), covar)
+
+
+def test_an_exact_gp_of_ones_own_is_cka(data, uniform):
+    X, Y = data
+    Z = uniform(5, 2, seed=3)
+    model = CKA(X, Y[:, :1], physics=wave, center=0.0, constants=False)
+    model.set_draws(model.u + 0.2 * torch.randn(model.u.shape, dtype=torch.float64))
+    own = OwnCKA(X, Y[:, 0], gpytorch.likelihoods.GaussianLikelihood(), wave).double()
+    values, unit = model.values, model.unit.item()
+    kernels = (own.rho_covar_module.base_kernel, "rho", 1.0), (own.delta_covar_module, "delta", unit)
+    for kernel, name, size in kernels:
+        kernel.base_kernel.lengthscale = values[f"{name}.kernel.lengthscale"].detach()[0]
+        kernel.outputscale = values[f"{name}.kernel.outputscale"].detach()[0, 0, 0] * size**2
+    own.likelihood.noise = model.likelihood.noise.detach()[0]
+    own.eval()
+    with torch.no_grad(), gpytorch.settings.fast_computations(False, False, False):
+        posterior = own(Z)
+        expected = model.predict(Z)
+        torch.testing.assert_close(posterior.mean, expected.mean[:, 0], rtol=1e-10, atol=1e-10)
+        variance = posterior.variance
+    torch.testing.assert_close(variance, expected.variance[:, 0], rtol=1e-8, atol=1e-10)
+
+
+def test_as_single_task_gp(models, uniform):
+    Z = uniform(5, 2, seed=3)
+    model = models[0]
+    for draw in (None, len(model.u) - 1):
+        single = model.as_single_task_gp(draw)
+        assert isinstance(single, SingleTaskGP)
+        if draw is not None:
+            expected = model.subset_draws(torch.tensor([draw])).predict(Z)
+            torch.testing.assert_close(single.posterior(Z).mean, expected.mean)
+            torch.testing.assert_close(single.posterior(Z).variance, expected.variance, rtol=1e-4, atol=1e-7)
+    with pytest.raises(ValueError, match="Expected one output"):
+        models[1].as_single_task_gp()
+
+
+def test_what_training_mode_refuses(data):
+    X, Y = data
+    model = CKA(X, Y, physics=both)
+    with pytest.raises(RuntimeError, match="call the model on its training inputs"):
+        model(X[:3])
+    model.set_draws(model.u.detach().expand(4, -1, -1))
+    with pytest.raises(RuntimeError, match="The model holds 4 draws"):
+        model(X)

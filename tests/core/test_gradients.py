@@ -1,0 +1,228 @@
+"""The gradient of the log likelihood against central differences, and what leaves models alone."""
+
+import pytest
+import torch
+from gpytorch.kernels import LinearKernel, MaternKernel, PeriodicKernel, RBFKernel, ScaleKernel
+from gpytorch.priors import GammaPrior
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gpadjust.core import (
+    CKA,
+    MATERN12,
+    MATERN32,
+    MATERN52,
+    RRA,
+    CalibratedPhysics,
+    Kernel,
+    Noise,
+    PhysicsMeanGP,
+    Row,
+    ScaleGP,
+    Stationary,
+    ZeroMeanGP,
+)
+from gpadjust.physics import FunctionPhysics, Unknown
+from tests.systems import crude, normal, truth, uniform
+
+
+class Relative(Noise):
+    def __init__(self):
+        super().__init__(("constant", "relative"))
+
+    def shares(self, places):
+        f = places.f[0]
+        return torch.stack([torch.ones_like(f), f.square()], -1)
+
+
+class Own(Kernel):
+    """A rational quadratic kernel, without derivatives by hand."""
+
+    def rows(self, x, num_outputs):
+        return [Row.positive("size", x.new_ones(num_outputs, 1), 2.0)]
+
+    def covariance(self, own, x, other=None):
+        other = x if other is None else other
+        squares = (x.unsqueeze(-2) - other.unsqueeze(-3)).square().sum(-1)
+        return 1 / (1 + squares / own["size"].unsqueeze(-1))
+
+
+def law(X, p):
+    return torch.stack([p.a * (p.w * X[..., 0]).sin() + X[..., 1], p.a + X[..., 1]], -1)
+
+
+def known(values):
+    return FunctionPhysics(
+        law, unknowns={"a": Unknown(1.0, sd=0.5), "w": Unknown(3.0, factor=1.3)} | values
+    )
+
+
+def second(X, p):
+    return law(X, p).cos()
+
+
+def of(cls, *Yvar, **options):
+    return lambda X, Y: cls(X, Y, *Yvar, **options)
+
+
+def delta(kernel):
+    return of(CKA, physics=crude, delta_covar_module=kernel, nested=False)
+
+
+UNKNOWN = known({})
+OTHER = FunctionPhysics(second, unknowns=UNKNOWN.unknowns)
+BOUNDED = known({"w": Unknown(3.0, bounds=(2.0, 4.0))})
+MODELS = {
+    "CKA": of(CKA, physics=crude),
+    "RRA": of(RRA, physics=crude, num_features=12),
+    "PhysicsMeanGP, known noise": of(PhysicsMeanGP, 0.01, physics=crude),
+    "ScaleGP": of(ScaleGP, physics=crude),
+    "ZeroMeanGP": of(ZeroMeanGP),
+    "two physics": of(CKA, physics=[crude, lambda X: crude(X).sin()], rho_mean=[0.7, 0.1]),
+    "given numbers": of(CKA, physics=crude, center=0.7, rho_mean=1.5, delta_mean=-2.0),
+    "no constants": of(CKA, physics=crude, constants=False, center=False),
+    "unknown parameters": of(CKA, physics=UNKNOWN),
+    "two physics with the same parameters": of(CKA, physics=[UNKNOWN, OTHER]),
+    "known and unknown": of(CKA, physics=[crude, BOUNDED]),
+    "calibrated": of(CalibratedPhysics, physics=UNKNOWN),
+    "calibrated, known noise": of(CalibratedPhysics, 0.01, physics=UNKNOWN),
+    "relative noise": of(CKA, physics=crude, noise=Relative()),
+    "relative noise of unknown parameters": of(CKA, physics=UNKNOWN, noise=Relative()),
+    "Matern 1/2": delta(Stationary(MATERN12)),
+    "Matern 3/2": delta(Stationary(MATERN32)),
+    "Matern 5/2": delta(Stationary(MATERN52)),
+    "own kernel": delta(Own()),
+    "GPyTorch": delta(ScaleKernel(MaternKernel(nu=2.5, ard_num_dims=2)) + PeriodicKernel()),
+    "GPyTorch, product": delta(RBFKernel(active_dims=[0]) * LinearKernel()),
+    "GPyTorch, prior": delta(ScaleKernel(RBFKernel(lengthscale_prior=GammaPrior(3.0, 6.0)))),
+}
+
+
+def problem(seed=0, n=9):
+    """Inputs, and targets of which some are missing."""
+    X = uniform(n, 2, high=2.0, seed=seed)
+    Y = truth(X) + 0.1 * normal(n, 2, seed=seed + 1)
+    Y[3, 0] = Y[5, 1] = torch.nan
+    return X, Y
+
+
+def coordinates(model, seed=0, choice=None, number=2):
+    u = 0.3 * normal(number, model.table.problems, model.table.size, seed=seed)
+    return model.table.with_choice(u, choice) if model.table.choices else u
+
+
+def assert_right(model, u, tolerance=1e-7):
+    value, gradient = model.log_likelihood(u)
+    assert value.isfinite().all()
+    expected = torch.zeros_like(u)
+    for i in range(u.shape[-1]):
+        step = torch.zeros_like(u)
+        step[..., i] = 1e-5
+        high, low = (model.log_likelihood(u + sign * step)[0] for sign in (1, -1))
+        expected[..., i] = (high - low) / 2e-5
+    size = expected.abs().max().item()
+    torch.testing.assert_close(gradient, expected, rtol=1e-5, atol=tolerance * max(size, 1.0))
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_every_model(name):
+    model = MODELS[name](*problem())
+    for choice in range(max(1, len(model.table.choices))):
+        assert_right(model, coordinates(model, choice=choice))
+
+
+@settings(max_examples=15, deadline=None, derandomize=True)
+@given(st.integers(0, 2**31), st.sampled_from(list(MODELS)), st.integers(0, 2))
+def test_rows_in_another_order(seed, name, choice):
+    X, Y = problem(seed)
+    order = torch.randperm(len(X), generator=torch.Generator().manual_seed(seed))
+    one, other = MODELS[name](X, Y), MODELS[name](X[order], Y[order])
+    u = coordinates(one, seed, choice)
+    value, gradient = one.log_likelihood(u)
+    torch.testing.assert_close(other.log_likelihood(u)[0], value, rtol=1e-7, atol=1e-7)
+    size = gradient.abs().max().item()
+    torch.testing.assert_close(other.log_likelihood(u)[1], gradient, rtol=1e-6, atol=1e-6 * size)
+    Z = uniform(4, 2, seed=seed)
+    for model in (one, other):
+        model.set_draws(u)
+    for ask in (lambda model: model.predict(Z), lambda model: model.predict(Z, True)):
+        torch.testing.assert_close(ask(one), ask(other), rtol=1e-6, atol=1e-8)
+    torch.testing.assert_close(
+        [v[:, order].nan_to_num() for v in one.left_out()],
+        [v.nan_to_num() for v in other.left_out()],
+        rtol=1e-6,
+        atol=1e-8,
+    )  # fmt: skip
+
+
+APART = [name for name in MODELS if "unknown" not in name and "calibrated" not in name]
+APART.remove("two physics with the same parameters")
+
+
+@settings(max_examples=10, deadline=None, derandomize=True)
+@given(st.integers(0, 2**31), st.sampled_from(APART), st.integers(0, 2))
+def test_outputs_are_independent(seed, name, choice):
+    X, Y = problem(seed)
+    Y[:, 1].nan_to_num_(5.0)
+    one, other = (
+        MODELS[name](X, torch.stack([Y[:, 0], y], -1)) for y in (Y[:, 1], Y[:, 1].flip(0))
+    )
+    u = coordinates(one, seed, choice)
+    found = []
+    for model in (one, other):
+        model.set_draws(u)
+        value, gradient = model.log_likelihood(u)
+        predicted = torch.cat([*model.predict(X[:3])])
+        found.append((value[:, 0], gradient[:, 0], predicted[:, 0]))
+        assert value[:, 1].isfinite().all()
+    torch.testing.assert_close(*found, rtol=1e-9, atol=1e-9)
+    assert not torch.allclose(one.predict(X).mean[:, 1], other.predict(X).mean[:, 1])
+
+
+@settings(max_examples=10, deadline=None, derandomize=True)
+@given(st.integers(0, 2**31), st.floats(-1e4, 1e4), st.integers(0, 1), st.sampled_from([CKA, RRA]))
+def test_a_constant_of_physics_and_targets(seed, offset, choice, cls):
+    X, Y = problem(seed)
+    one = cls(X, Y, physics=crude)
+    other = cls(X, Y + offset, physics=lambda X: crude(X) + offset)
+    u = coordinates(one, seed, choice)
+    (value, gradient), (other_value, other_gradient) = (m.log_likelihood(u) for m in (one, other))
+    torch.testing.assert_close(other_value, value, rtol=1e-6, atol=1e-6)
+    size = gradient.abs().max().item()
+    torch.testing.assert_close(other_gradient, gradient, rtol=1e-5, atol=1e-5 * size)
+    Z = uniform(4, 2, high=2.0, seed=seed)
+    for model in (one, other):
+        model.set_draws(u)
+    mean, variance = other.predict(Z)
+    torch.testing.assert_close(
+        (mean - offset, variance), tuple(one.predict(Z)), rtol=1e-6, atol=1e-7
+    )
+
+
+@pytest.mark.parametrize(
+    "kernel", [Stationary(p) for p in (MATERN12, MATERN32, MATERN52)], ids=repr
+)
+@pytest.mark.parametrize("gap", [0.0, 1e-12, 1e-8, 1e-4])
+def test_near_duplicate_inputs(kernel, gap):
+    X, Y = problem()
+    X, Y = torch.cat([X, X[:3] + gap]), torch.cat([Y, Y[:3] + 1e-3])
+    model = ZeroMeanGP(X, Y, covar_module=kernel)
+    assert_right(
+        model, coordinates(model), 1e-4
+    )  # distances of 1e-8 are known to half of the digits
+
+
+def test_gradients_of_predictions(gradient_is_right):
+    X, Y = problem()
+    model = MODELS["CKA"](X, Y)
+    model.set_draws(torch.cat([coordinates(model, choice=k) for k in range(3)]))
+    functions = model.sample_functions(3, seed=0)
+    for ask in (
+        lambda Z: model.predict(Z).mean[..., 0].sum(),
+        lambda Z: model.predict(Z).variance[..., 1].sum(),
+        lambda Z: model.posterior(Z).distribution.covariance_matrix[0, 1],
+        lambda Z: model.rho(Z).mean.sum(),
+        lambda Z: model.delta(Z).variance.sum(),
+        lambda Z: functions(Z).square().sum(),
+    ):
+        gradient_is_right(ask, torch.cat([X[:1], uniform(2, 2, seed=4)]))

@@ -1,0 +1,363 @@
+"""Models as files."""
+
+import os
+import secrets
+import stat
+import sys
+
+import pytest
+import torch
+from botorch.models.transforms import Normalize
+from gpytorch.kernels import MaternKernel, ScaleKernel
+from torch.nn.functional import relu, silu
+
+from gpadjust.core import (
+    CKA,
+    GP,
+    MATERN32,
+    MATERN52,
+    RBF,
+    RRA,
+    CalibratedPhysics,
+    Choice,
+    KnownNoise,
+    LogNormal,
+    Noise,
+    PhysicsMeanGP,
+    ScaleGP,
+    Stationary,
+    Term,
+    ZeroMeanGP,
+    load,
+    save,
+)
+from gpadjust.core.saving import _built_with
+from gpadjust.physics import FormulaPhysics, FunctionPhysics, Unknown
+
+X = torch.rand(7, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) - 0.3
+Y = relu(X) * 1.2 + X.square()
+Y[2, 1] = torch.nan
+Z = X[:4] + 0.05
+FORMULA = FormulaPhysics("a * x, x", ["x", "z"], unknowns={"a": Unknown(1.0, factor=1.5)})
+
+
+class Gained(CKA):
+    """A structure of one's own, with a setting and a physics of its own."""
+
+    def __init__(self, train_X, train_Y, train_Yvar=None, *, gain):
+        super().__init__(train_X, train_Y, train_Yvar, physics=lambda X: gain * relu(X))
+        self.settings = {"gain": gain}
+
+
+class Fixed(CKA):
+    """A structure with a physics of its own."""
+
+    def __init__(self, train_X, train_Y):
+        super().__init__(train_X, train_Y, physics=lambda X: relu(X))
+        self.settings = {}
+
+
+class Relative(Noise):
+    """Noise with a share of f_p."""
+
+    def __init__(self):
+        super().__init__(("variance", "relative"), [LogNormal(0.01, 10.0)] * 2)
+
+    def shares(self, places):
+        f = places.f[0]
+        return torch.stack([torch.ones_like(f), f.square()], -1)
+
+
+def drawn(model, number=3):
+    """Return the model with some draws."""
+    shape = (number, *model.u.shape[1:])
+    u = torch.randn(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    model.set_draws(0.3 * u)
+    model.u = torch.nn.Parameter(model.u[:2].detach().clone())
+    return model
+
+
+def same(one, other):
+    for a, b in zip(one.predict(Z, True), other.predict(Z, True), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-14)
+    assert torch.equal(one.u, other.u)
+    assert torch.equal(one.draws, other.draws)
+    assert type(one) is type(other)
+    assert one.data.input_names == other.data.input_names
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "model.pt"
+
+
+def terms():
+    return [Term("f", Stationary(MATERN52), 0.2, LogNormal(1.0, 10.0)), Term("g", physics=0)]
+
+
+CHOICES = [Choice("all", 0.5), Choice("no f", 0.5, ("f.process", "f.constant"))]
+MODELS = {
+    "CKA": (lambda: CKA(X, Y, physics=relu, delta_mean=0.1, rho_mean=0.9, center=0.2), ()),
+    "several": (lambda: CKA(X, Y, 0.01, physics={"a": relu, "b": silu}, rho_mean=[1.0, 0.5]), ()),
+    "a list": (lambda: PhysicsMeanGP(X, Y, physics=[silu, relu]), ()),
+    "RRA": (lambda: RRA(X, Y, physics=relu, num_features=16, seed=3), ()),
+    "scale": (lambda: ScaleGP(X, Y, torch.rand_like(Y), physics=relu, noise=None), ()),
+    "no physics": (lambda: ZeroMeanGP(X, Y, constants=False), ()),
+    "parameters": (lambda: CKA(X, Y, physics=FORMULA), ()),
+    "calibrated": (lambda: CalibratedPhysics(X, Y, physics=FORMULA), ()),
+    "own class": (lambda: Gained(X, Y, gain=2.0), ()),
+    "own physics": (lambda: Fixed(X, Y), ()),
+    "kernel": (
+        lambda **o: CKA(X, Y, physics=relu, **o),
+        {
+            "delta_covar_module": ScaleKernel(MaternKernel(1.5)),
+            "noise": Relative(),
+            "input_transform": Normalize(2),
+        },
+    ),
+    "known noise": (
+        lambda **o: CKA(X, Y, physics=relu, **o),
+        {"noise": KnownNoise(torch.rand_like(Y.mT))},
+    ),
+    "terms": (lambda **o: GP(X, Y, physics=[relu], **o), {"terms": terms()}),
+    "choices": (
+        lambda **o: GP(X, Y, physics=[relu], **o),
+        {
+            "terms": terms(),
+            "choices": CHOICES,
+            "noise": Relative(),
+            "input_transform": Normalize(2),
+        },
+    ),
+    "known": (lambda: GP(X, Y, 0.1, terms=terms()[:1]), {"terms": terms()[:1]}),
+}
+
+
+@pytest.mark.parametrize("conditioned", [False, True])
+@pytest.mark.parametrize("name", list(MODELS))
+def test_a_model_comes_back(name, conditioned, path):
+    build, objects = MODELS[name]
+    model = drawn(build(**objects) if build.__code__.co_flags & 8 else build())
+    if conditioned:
+        noise = torch.full_like(Y[:3], 0.2) if model.data.Yvar is not None else None
+        model = model.condition_on_observations(3 * X[:3] + 1.0, Y[2:5] * 9.0, noise)
+    model.data = model.data._replace(input_names=("left [m]", "right [m]"))
+    saved = save(model, path)
+    assert set(saved.missing) == set(objects)
+    assert torch.load(path, weights_only=True)["missing"] == list(saved.missing)
+    same(load(path, trusted=True, **dict(objects)), model)
+
+
+def test_steps_of_conditioning(path):
+    model = drawn(ZeroMeanGP(X, Y))
+    for i in range(3):
+        model = model.condition_on_observations(2 * X[[i]], Y[[i]] - 3.0)
+    save(model, path)
+    for a, b in zip(load(path).predict(Z), model.predict(Z), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("own", [relu, {"a": relu}, [relu, silu]])
+def test_a_physics_that_is_given(own, path):
+    model = drawn(CKA(X, Y, physics=own))
+    save(model, path)
+    same(load(path, physics=own), model)
+
+
+def test_a_lambda_is_given_again(path):
+    physics = FunctionPhysics(lambda X, p: p.a[:, None] * X, unknowns={"a": Unknown(1.0, sd=0.1)})
+    model = drawn(CKA(X, Y, physics=physics))
+    with pytest.warns(UserWarning, match=r"load\(path, physics=\.\.\.\)"):
+        saved = save(model, path)
+    assert saved == (path, (), ("physics",))
+    same(load(path, physics=physics), model)
+
+
+def test_formulas_need_no_trust(path):
+    model = drawn(CKA(X, Y, physics=FORMULA))
+    assert save(model, path).physics[0].startswith("formula:")
+    same(load(path), model)
+
+
+def altered(path, **changes):
+    """Write a file of a CKA with changes of its content, at which None deletes."""
+    save(drawn(CKA(X, Y, physics=relu)), path)
+    content = torch.load(path, weights_only=True)
+    content |= changes
+    content = {n: value for n, value in content.items() if n not in changes or value is not None}
+    torch.save(content, path)
+    return content
+
+
+def bad(tensor):
+    """Return a copy with NaN in it."""
+    return torch.cat([tensor[:1] * torch.nan, tensor[1:]])
+
+
+MODEL = drawn(CKA(X, Y, physics=relu))
+CHECKS = _built_with(MODEL, 7)
+BAD_FILES = {
+    "NaN u": ({"u": bad(MODEL.u.detach())}, "finite coord"),
+    "infinite draws": ({"draws": MODEL.draws / 0}, "finite coord"),
+    "no draws": ({"u": MODEL.u[:0].detach()}, "finite coord"),
+    "other draws": ({"draws": MODEL.draws[..., 1:]}, "finite coord"),
+    "NaN X": ({"X": bad(X)}, "finite"),
+    "infinite Y": ({"Y": Y / 0}, "finite"),
+    "moved X": ({"X": X + 0.1}, "another physics 1"),
+    "longer Y": ({"Y": torch.cat([Y, Y])}, "one length"),
+    "rows": ({"rows_of_fit": 1}, "one length"),
+    "fewer rows": ({"rows_of_fit": 6}, "another physics 1"),
+    "no such rows": ({"rows_of_fit": True}, "one length"),
+    "names": ({"names": [["a"], ["b", "c"]]}, "a name of each"),
+    "a later format": ({"format": 99}, "expected format"),
+    "no checks": ({"built_with": {}}, "other kernels"),
+    "no check": ({"built_with": None}, "damaged"),
+    "NaN check": ({"built_with": CHECKS | {"mean": bad(CHECKS["mean"])}}, "another mean"),
+    "another class": ({"class": "gpadjust.core.structures:RRA"}, "kernels|damaged|another"),
+    "no model": ({"class": "builtins:dict"}, "import its module first"),
+    "not imported": ({"class": "antigravity:GP"}, "import its module first"),
+    "other settings": ({"settings": {"nested": False}}, "other kernels"),
+    "other priors": ({"settings": {"rho_mean": 0.5}}, "another unit"),
+    "unknown settings": ({"settings": {"gain": 2.0}}, "wrong one"),
+    "a path of code": ({"physics": ["antigravity:geohash"]}, "is the code antigravity"),
+    "a bad formula": ({"physics": ["formula:{}"]}, "formula"),
+}
+
+
+@pytest.mark.parametrize("name", list(BAD_FILES))
+def test_a_bad_file(name, path):
+    changes, match = BAD_FILES[name]
+    altered(path, **changes)
+    objects = {} if "physics" in changes else {"physics": relu}
+    with pytest.raises(ValueError, match=match):
+        load(path, **objects)
+    assert "antigravity" not in sys.modules
+
+
+def test_a_file_of_code_is_not_executed(path):
+    class Bomb:
+        def __reduce__(self):
+            return os.mkdir, (str(path) + ".bomb",)
+
+    for content in ({"format": 4, "class": Bomb()}, [1], "text", {}):
+        torch.save(content, path)
+        with pytest.raises(ValueError, match=r"Expected .* as a model"):
+            load(path)
+    path.write_bytes(b"no file of torch")
+    with pytest.raises(ValueError, match=r"Expected .* as a model"):
+        load(path)
+    assert [each.name for each in path.parent.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize(
+    ("name", "objects", "match"),
+    [
+        ("CKA", {}, "is the code torch.nn.functional:silu"),
+        ("CKA", {"physics": relu}, "another physics 1"),
+        ("CKA", {"physics": [silu, silu]}, "kernels"),
+        ("CKA", {"physics": silu, "terms": 1}, "nothing else"),
+        ("kernel", {"physics": silu}, r"load\(path, delta_covar_module=\.\.\., noise"),
+        (
+            "kernel",
+            {"delta_covar_module": Stationary(MATERN32), "noise": Noise()},
+            "another kernel",
+        ),
+        ("kernel", {"delta_covar_module": Stationary(RBF), "noise": Relative()}, "other kernels"),
+        ("kernel", {"delta_covar_module": Stationary(RBF), "noise": 3}, "wrong one"),
+    ],
+)
+def test_wrong_objects(name, objects, match, path):
+    own = {"delta_covar_module": Stationary(MATERN52), "noise": Noise()} if name != "CKA" else {}
+    save(drawn(CKA(X, Y, physics=silu, **own)), path)
+    objects = {"physics": silu, **objects} if own else objects
+    with pytest.raises(ValueError, match=match):
+        load(path, **objects)
+
+
+def test_other_noise_and_priors_are_refused(path):
+    own = {"terms": terms(), "noise": KnownNoise(torch.ones_like(Y.mT)), "physics": [relu]}
+    save(drawn(GP(X, Y, **own)), path)
+    load(path, **own)
+    with pytest.raises(ValueError, match="another noise"):
+        load(path, **own | {"noise": KnownNoise(2 * torch.ones_like(Y.mT))})
+    choices = {"terms": terms(), "choices": CHOICES, "physics": [relu]}
+    save(drawn(GP(X, Y, **choices)), path)
+    more = [CHOICES[0]._replace(probability=0.6), CHOICES[1]._replace(probability=0.4)]
+    with pytest.raises(ValueError, match="another choice all"):
+        load(path, **choices | {"choices": more})
+    save(drawn(GP(X, Y, **own)), path)
+    wider = [terms()[0]._replace(constant=LogNormal(1.0, 11.0)), terms()[1]]
+    with pytest.raises(ValueError, match="another prior"):
+        load(path, **own | {"terms": wider})
+
+
+def local():
+    class Local(CKA):
+        pass
+
+    return Local(X, Y, physics=relu)
+
+
+@pytest.mark.parametrize(
+    ("make", "match"),
+    [
+        (lambda: CKA(X, Y, physics=relu).subset_output([0]), "a part of"),
+        (lambda: CKA(X, Y, physics=relu).subset_rows(torch.arange(4)), "a part of"),
+        (lambda: ZeroMeanGP(X, Y).subset_rows(torch.arange(4)), "a part of"),
+        (lambda: MODEL.condition_on_observations(X[:1].expand(3, 1, 2), Y[:1]), "fantasies"),
+        (local, "Move it out of functions"),
+    ],
+)
+def test_models_that_cannot_be_saved(make, match, path):
+    with pytest.raises(ValueError, match=match):
+        save(make(), path)
+    assert not [*path.parent.iterdir()]
+
+
+def test_paths(path, tmp_path):
+    with pytest.raises(TypeError, match="a model of"):
+        save(torch.nn.Linear(1, 1), path)
+    for wrong in (tmp_path, tmp_path / "none" / "model.pt"):
+        with pytest.raises(ValueError, match="a folder that exists"):
+            save(MODEL, wrong)
+    with pytest.raises(FileNotFoundError):
+        load(path)
+    with pytest.raises(TypeError, match="trusted"):
+        load(path, trusted=1)
+
+
+def test_a_link_is_replaced_and_not_followed(path, tmp_path):
+    other = tmp_path / "other"
+    other.write_text("kept")
+    path.symlink_to(other)
+    save(MODEL, path)
+    assert other.read_text() == "kept"
+    assert not path.is_symlink()
+    plain = tmp_path / "plain"
+    plain.touch()
+    assert stat.S_IMODE(path.stat().st_mode) == stat.S_IMODE(plain.stat().st_mode)
+
+
+def test_a_failure_leaves_what_was_there(path, monkeypatch):
+    save(MODEL, path)
+    before = path.read_bytes()
+
+    def full(content, file):
+        file.write(b"half")
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(torch, "save", full)
+    with pytest.raises(OSError, match="No space"):
+        save(MODEL, path)
+    assert path.read_bytes() == before
+    assert [*path.parent.iterdir()] == [path]
+
+
+def test_names_of_parts_cannot_be_guessed(path, monkeypatch):
+    """A name that exists, as a link of somebody else, is not written to."""
+    secret = path.with_name("secret")
+    path.with_name(".taken.part").symlink_to(secret)
+    monkeypatch.setattr(secrets, "token_hex", lambda number: "taken")
+    with pytest.raises(FileExistsError):
+        save(MODEL, path)
+    assert not secret.exists()

@@ -1,0 +1,231 @@
+"""Mixtures of several models."""
+
+import pytest
+import torch
+from botorch.acquisition import LogExpectedImprovement, qKnowledgeGradient, qLogExpectedImprovement
+from botorch.acquisition.objective import ScalarizedPosteriorTransform
+from botorch.sampling import SobolQMCNormalSampler
+
+from gpadjust.core import PhysicsMeanGP, StackedGP, ZeroMeanGP
+from gpadjust.core.posterior import mixture_quantile
+
+X = torch.rand(9, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+Z = torch.linspace(0, 1, 4, dtype=torch.float64).unsqueeze(-1)
+
+
+def physics(X):
+    return torch.cat([X.sin(), X.cos()], -1)
+
+
+def parts(m=1, draws=(4, 8), Y=None):
+    """Return two models of the same data, with some draws."""
+    Y = torch.cat([(3 * X).sin(), X.exp()], -1)[:, :m] if Y is None else Y
+    models = {
+        "mean": PhysicsMeanGP(X, Y, physics=lambda X: physics(X)[:, :m]),
+        "zero": ZeroMeanGP(X, Y),
+    }
+    for model, number in zip(models.values(), draws, strict=True):
+        generator = torch.Generator().manual_seed(number)
+        shape = (number, *model.u.shape[1:])
+        model.set_draws(0.3 * torch.randn(shape, dtype=torch.float64, generator=generator))
+    return models
+
+
+def test_it_is_the_mixture_by_hand():
+    models = parts()
+    stacked = StackedGP(models, {"zero": [0.75], "mean": [0.25]}, 32)  # 8 and 24 components
+    pairs = [models["mean"].components(Z), models["zero"].components(Z)]
+    mean, variance = (
+        torch.cat([a.repeat_interleave(2, 0), b.repeat_interleave(3, 0)])
+        for a, b in zip(*pairs, strict=True)
+    )
+    found = stacked.components(Z)
+    torch.testing.assert_close(found[0], mean)
+    torch.testing.assert_close(found[1], variance)
+    assert stacked.weights == {"mean": [0.25], "zero": [0.75]}
+    expected = [0.25 * models["mean"].predict(Z).mean + 0.75 * models["zero"].predict(Z).mean]
+    torch.testing.assert_close(stacked.predict(Z).mean, expected[0])
+    torch.testing.assert_close(stacked.predict(Z.numpy()).mean, expected[0].numpy())
+    lower, upper = stacked.interval(Z, 0.9)
+    torch.testing.assert_close(lower, mixture_quantile(mean, variance, 0.05))
+    torch.testing.assert_close(upper, mixture_quantile(mean, variance, 0.95))
+    posterior = stacked.posterior(Z.expand(3, 4, 1))
+    assert posterior.mean.shape == (3, 4, 1)
+    torch.testing.assert_close(posterior.mean[0], expected[0])
+    torch.testing.assert_close(posterior.variance[1], stacked.predict(Z).variance)
+    noisy = stacked.posterior(Z, observation_noise=True).variance
+    torch.testing.assert_close(noisy, stacked.predict(Z, True).variance)
+
+
+def test_one_model_is_itself():
+    models = parts(2)
+    for weights in ([1.0, 0.0], [[1.0, 1.0], [0.0, 0.0]]):
+        stacked = StackedGP(models, weights, 8)
+        assert stacked.names == ["mean"]
+        torch.testing.assert_close(stacked.predict(Z), models["mean"].predict(Z))
+    one = StackedGP(models, [1.0, 0.0], 4).posterior(Z)
+    torch.testing.assert_close(
+        one.mvn.covariance_matrix, models["mean"].posterior(Z).mvn.covariance_matrix
+    )
+
+
+def test_outputs_have_weights_of_their_own():
+    models = parts(2)
+    weights = torch.tensor([[0.25, 1.0], [0.75, 0.0]], dtype=torch.float64)
+    stacked = StackedGP(models, weights, 16)
+    mean = stacked.predict(Z).mean
+    for j in range(2):
+        alone = StackedGP(models, weights[:, [j]], 16).predict(Z).mean
+        torch.testing.assert_close(mean[:, j], alone[:, j])
+        subset = stacked.subset_output([j - 2])
+        assert subset.num_outputs == 1
+        torch.testing.assert_close(subset.predict(Z).mean, mean[:, [j]])
+        own = stacked.posterior(Z, output_indices=[j])
+        torch.testing.assert_close(own.mean, mean[:, [j]])
+    assert stacked.weights == {"mean": [0.25, 1.0], "zero": [0.75, 0.0]}
+
+
+def test_outputs_are_independent_or_mixed_as_wholes():
+    models = parts(2, (1, 1))
+    models["zero"].set_draws(models["zero"].u.detach() + 3.0)  # another mean
+    whole, apart = (StackedGP(models, w).posterior(Z[:1]) for w in ([0.5, 0.5], [[0.5] * 2] * 2))
+    covariance = [each.mvn.covariance_matrix[0, 1] for each in (whole, apart)]
+    step = models["mean"].predict(Z[:1]).mean - models["zero"].predict(Z[:1]).mean
+    torch.testing.assert_close(covariance[0], step.prod() / 4)
+    assert abs(covariance[1]) < 0.05 * abs(covariance[0])
+    torch.testing.assert_close(whole.variance, apart.variance)
+
+
+def test_conditioning_and_fantasies():
+    models = parts()
+    stacked = StackedGP(models, [0.5, 0.5], 16)
+    more = stacked.condition_on_observations(Z, Z.cos())
+    again = StackedGP(
+        {n: model.condition_on_observations(Z, Z.cos()) for n, model in models.items()},
+        [0.5, 0.5],
+        16,
+    )
+    torch.testing.assert_close(more.predict(X), again.predict(X))
+    assert len(more.data.X) == 13
+    fantasies = stacked.fantasize(Z[:2].expand(3, 2, 1), SobolQMCNormalSampler(torch.Size([5])))
+    assert fantasies.batch_shape == (5, 3)
+    assert fantasies.posterior(Z).mean.shape == (5, 3, 4, 1)
+    assert fantasies.predict(Z[:2]).mean.std(0).min() > 0
+    assert stacked.batch_shape == ()
+
+
+def test_acquisition_functions():
+    stacked = StackedGP(parts(2), [[0.5, 0.3], [0.5, 0.7]], 8)
+    transform = ScalarizedPosteriorTransform(torch.tensor([1.0, -2.0], dtype=torch.float64))
+    mean = stacked.posterior(Z, posterior_transform=transform).mean
+    torch.testing.assert_close(
+        mean, stacked.predict(Z).mean @ torch.tensor([[1.0], [-2.0]]).double()
+    )
+    single = stacked.subset_output([0])
+    for acquisition in (
+        LogExpectedImprovement(single, 0.5),
+        qLogExpectedImprovement(single, 0.5),
+        qKnowledgeGradient(single, num_fantasies=2),
+    ):
+        points = Z.unsqueeze(1).expand(4, 3, 1).clone().requires_grad_()
+        points = points[:, :1] if isinstance(acquisition, LogExpectedImprovement) else points
+        value = acquisition(points)
+        assert value.shape == (4,)
+        (slope,) = torch.autograd.grad(value.sum(), points)
+        assert slope.isfinite().all()
+
+
+@pytest.mark.parametrize("weights", [[0.25, 0.75], [[0.25, 0.5], [0.75, 0.5]]])
+def test_functions_are_of_each_model_in_proportion(weights):
+    models = parts(2, (1, 1))
+    zero = models["zero"]
+    models["mean"] = zero.condition_on_observations(Z, torch.zeros(4, 2, dtype=torch.float64))
+    models["mean"].data, models["zero"].data = zero.data, zero.data
+    stacked = StackedGP(models, weights, 8)
+    functions = stacked.sample_functions(16, seed=1, num_features=64)
+    values = functions(Z[:2])
+    assert values.shape == (16, 2, 2)
+    torch.testing.assert_close(functions(Z[:2].expand(3, 2, 1))[:, 1], values)
+    points = torch.stack([Z[i % 3 : i % 3 + 2] for i in range(16)])
+    each = functions.each(points)
+    for i in range(16):
+        torch.testing.assert_close(each[i], functions(points[i])[i])
+    shares = torch.tensor(weights).reshape(2, -1).expand(2, 2)
+    assert torch.equal((functions.owners == 0).float().mean(0), shares[0])
+    repeated = stacked.sample_functions(16, seed=1, num_features=64)(Z[:2])
+    assert torch.equal(repeated, values)
+
+
+@pytest.mark.parametrize("weights", [[0.5, 0.5], [[0.5, 0.25], [0.5, 0.75]]])
+def test_functions_have_the_moments_of_the_mixture(weights):
+    stacked = StackedGP(parts(2), weights, 8)
+    values = stacked.sample_functions(2000, seed=0, num_features=256)(Z)
+    mean, variance = stacked.predict(Z)
+    torch.testing.assert_close(
+        (values.mean(0) - mean) / variance.sqrt(), 0 * mean, rtol=0, atol=0.1
+    )
+    torch.testing.assert_close(values.var(0), variance, rtol=0.15, atol=0)
+
+
+def test_weights_by_left_out():
+    Y = torch.cat([3 * X.sin() + 0.1, X.cos() + 0.01 * (40 * X).sin()], -1)
+    Y[3, 1] = torch.nan
+    models = parts(2, Y=Y)
+    stacked = StackedGP.by_left_out(models, 200)
+    weights = torch.tensor([*stacked.weights.values()], dtype=torch.float64)
+
+    def score(w):  # of each output
+        total = 0.0
+        for share, model in zip(w, models.values(), strict=True):
+            mean, variance = model.left_out()
+            density = torch.distributions.Normal(mean, variance.sqrt(), False).log_prob(Y).exp()
+            total = total + share * density.mean(0)
+        return total.log().nanmean(0)
+
+    grid = torch.linspace(0, 1, 201, dtype=torch.float64)
+    best = torch.stack([score(torch.stack([w, 1 - w])) for w in grid]).amax(0)
+    assert (score(weights) > best - 1e-3).all()
+    assert abs(weights[0, 0] - weights[0, 1]) > 0.1
+    assert 0 < weights[0, 1] < 1
+
+
+def test_summary():
+    stacked = StackedGP(parts(2), [[0.25, 0.5], [0.75, 0.5]], 8)
+    text = stacked.summary()
+    assert text.startswith("StackedGP(8 components of mean, zero)\n25%, 50% of mean: ")
+    assert repr(stacked) == text.splitlines()[0]
+
+
+OTHER = ZeroMeanGP(X, X.sin())
+GOOD = parts()
+
+
+@pytest.mark.parametrize(
+    ("models", "weights", "error", "match"),
+    [
+        ([OTHER], [1.0], TypeError, "by name"),
+        ({}, [], TypeError, "by name"),
+        ({"a": 1}, [1.0], TypeError, "by name"),
+        (GOOD | {"a": OTHER}, [1.0, 0.0, 0.0], ValueError, "same data"),
+        (GOOD, [0.5, 0.4], ValueError, "sum to 1"),
+        (GOOD, [1.5, -0.5], ValueError, "sum to 1"),
+        (GOOD, [1.0, torch.nan], ValueError, "sum to 1"),
+        (GOOD, [1.0], ValueError, "sum to 1"),
+        (GOOD, [[0.5, 0.5], [0.5, 0.5]], ValueError, "in shape"),
+        (GOOD, {"mean": 0.5, "none": 0.5}, ValueError, "in shape"),
+        (GOOD, "no", ValueError, "in shape"),
+        (GOOD, 1.0, ValueError, "in shape"),
+    ],
+)
+def test_wrong_arguments(models, weights, error, match):
+    with pytest.raises(error, match=match):
+        StackedGP(models, weights)
+
+
+def test_wrong_numbers():
+    with pytest.raises(ValueError, match="num_components"):
+        StackedGP(GOOD, [0.5, 0.5], 0)
+    with pytest.raises(ValueError, match="num_functions"):
+        StackedGP(GOOD, [0.5, 0.5]).sample_functions(0)
+    with pytest.raises(ValueError, match="outputs"):
+        StackedGP(GOOD, [0.5, 0.5]).subset_output([1])

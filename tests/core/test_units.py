@@ -1,0 +1,162 @@
+"""Units of targets and inputs, constants, and forms of inputs."""
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from botorch.acquisition.objective import ScalarizedPosteriorTransform
+from botorch.models.transforms import Normalize
+
+from gpadjust.core import CKA, GP, RRA, PhysicsMeanGP, ScaleGP, Term, ZeroMeanGP
+from tests.systems import crude
+
+SIZES = [1e-12, 1e-6, 1e6, 1e12]
+LEVELS = torch.tensor([0.025, 0.5, 0.975], dtype=torch.float64)
+WEIGHTS = torch.tensor([1.0, -3.0], dtype=torch.float64)
+
+
+def posteriors(model, Z):
+    """By name: a posterior, and whether it has the units of the targets."""
+    yield "f", model.posterior(Z), True
+    yield "observations", model.posterior(Z, observation_noise=True), True
+    for term in model.terms:
+        if term.varies:
+            yield term.name, model.term(term.name, Z), term.physics is None
+    yield "output", model.posterior(Z, [1]), True
+    weighted = ScalarizedPosteriorTransform(WEIGHTS)
+    yield "weighted", model.posterior(Z, posterior_transform=weighted), True
+
+
+def moments(model, Z, size):
+    """What posteriors say, in multiples of the size."""
+    low, high = model.interval(Z)
+    found = {"predict": model.predict(Z).variance / size**2, "interval": (high - low) / size}
+    left_out = model.left_out()
+    found |= {"left out": left_out[0] / size, "and its variance": left_out[1] / size**2}
+    for name, posterior, has_unit in posteriors(model, Z):
+        unit = size if has_unit else 1.0
+        found[f"{name}, mean"] = posterior.mean / unit
+        found[f"{name}, variance"] = posterior.variance / unit**2
+        found[f"{name}, covariance"] = posterior.distribution.covariance_matrix / unit**2
+        found[f"{name}, quantiles"] = posterior.quantile(LEVELS) / unit
+        found[f"{name}, density"] = posterior.density(posterior.mean) * unit
+        torch.manual_seed(0)
+        found[f"{name}, samples"] = posterior.rsample(torch.Size([4])) / unit
+    return found
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("cls", [CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP])
+def test_multiples_of_the_size(cls, size, data, drawn, uniform, close):
+    X, Y = data(n=12, num_outputs=2)
+    Z = uniform(7, 2, high=2.0, seed=1)
+
+    def model(size):
+        physics = {} if cls is ZeroMeanGP else {"physics": lambda X: size * crude(X)}
+        return drawn(cls(X, size * Y, **physics), choice=0)
+
+    found, expected = moments(model(size), Z, size), moments(model(1.0), Z, 1.0)
+    for name, values in expected.items():
+        close(found[name], values, 1e-4 if "samples" in name else 1e-7)
+
+
+@pytest.mark.parametrize("size", [1e-9, 1.0])
+def test_no_variance_is_rounded_up(size, data, drawn, uniform, close):
+    """GPyTorch's own distribution has variances of at least 1e-10, with a warning (an error)."""
+    X, Y = data(n=12, num_outputs=2)
+    model = drawn(CKA(X, size * Y, physics=lambda X: size * crude(X)))
+    posterior = model.posterior(uniform(5, 2))
+    close(posterior.distribution.variance, posterior.variance, 1e-10)
+
+
+@pytest.mark.parametrize("offset", [1.0, 1e4, 1e8])
+def test_a_constant_of_both_makes_no_difference(offset, data, drawn, uniform, close):
+    X, Y = data(n=12, num_outputs=2)
+    one = drawn(CKA(X, Y, physics=crude), choice=0)
+    other = CKA(X, Y + offset, physics=lambda X: crude(X) + offset)
+    other.set_draws(one.u)
+    Z, tolerance = uniform(5, 2, high=2.0, seed=1), max(1e-8, 1e-13 * offset)
+    close(other.predict(Z).mean - offset, one.predict(Z).mean, tolerance)
+    close(other.predict(Z).variance, one.predict(Z).variance, tolerance)
+    close(other.rho(Z).mean, one.rho(Z).mean, tolerance)
+
+
+@pytest.mark.parametrize("cls", [CKA, RRA])
+def test_units_of_inputs(cls, data, drawn, uniform, close):
+    X, Y = data(n=12, num_outputs=2)
+    Z, stretch = uniform(5, 2, high=2.0, seed=1), torch.tensor([1e-3, 1e5], dtype=torch.float64)
+    one = drawn(cls(X, Y, physics=crude))
+
+    def moved(X):
+        return 2000 * stretch + stretch * X
+
+    other = cls(moved(X), Y, physics=lambda X: crude(X / stretch - 2000))
+    other.set_draws(one.u)
+    close(other.predict(moved(Z)).mean, one.predict(Z).mean)
+    close(other.predict(moved(Z)).variance, one.predict(Z).variance)
+
+
+def test_the_physics_sees_inputs_before_their_transform(data, drawn, uniform, close):
+    X, Y = data(n=12, num_outputs=2)
+    Z, seen = uniform(4, 2, high=2.0, seed=1), []
+
+    def physics(X):
+        seen.append(X.max().item())
+        return crude(X / 50)
+
+    transform = Normalize(2)
+    model = drawn(CKA(50 * X, Y, physics=physics, input_transform=transform))
+    plain = drawn(CKA(X, Y, physics=crude))
+    close(model.predict(50 * Z).mean, plain.predict(Z).mean)
+    assert min(seen) > 50
+    before = model.predict(50 * Z).mean
+    CKA(X, Y, physics=crude, input_transform=transform)  # has learnt a transform of its own
+    close(model.predict(50 * Z).mean, before)
+
+
+def test_inputs_come_back_as_they_came(data, drawn, uniform):
+    X, Y = (values.numpy() for values in data(n=12, num_outputs=2))
+    frames = pd.DataFrame(X, columns=["a", "b"]), pd.DataFrame(Y, columns=["p", "q"])
+    Z = uniform(4, 2)
+    expected = drawn(CKA(torch.tensor(X), torch.tensor(Y), physics=crude)).predict(Z)
+    for train in ((X, Y), frames):
+        model = drawn(CKA(*train, physics=crude))
+        for values in (*model.predict(Z.numpy()), *model.interval(Z.numpy())):
+            assert isinstance(values, np.ndarray)
+            assert values.shape == (4, 2)
+        np.testing.assert_allclose(model.predict(Z.numpy()).mean, expected.mean)
+        assert model.posterior(Z.numpy()).mean.shape == (4, 2)
+        functions = model.sample_functions(2, seed=0)
+        assert torch.equal(functions(Z.numpy()), functions(Z))
+        assert functions.each(Z.expand(2, 4, 2).numpy()).shape == (2, 4, 2)
+        later = model.condition_on_observations(*(values[:2] + 0.1 for values in train))
+        assert later.predict(Z).mean.shape == (4, 2)
+    frame = pd.DataFrame(Z.numpy(), columns=["a", "b"], index=[3, 5, 7, 9])
+    for values in (*model.predict(frame), *model.interval(frame)):
+        assert list(values.columns) == ["p", "q"]
+        assert list(values.index) == [3, 5, 7, 9]
+    np.testing.assert_allclose(model.predict(frame).mean, expected.mean)
+    for wrong in (frame[["b", "a"]], frame.rename(columns={"b": "c"})):
+        with pytest.raises(ValueError, match="columns"):
+            model.predict(wrong)
+    series = ZeroMeanGP(frames[0], frames[1]["p"])
+    assert list(series.predict(frame).mean.columns) == ["p"]
+
+
+def test_the_unit_of_targets(data):
+    """Small where the prior mean is near the targets, their spread where it is far away."""
+    X, Y = data(n=30, num_outputs=2)
+
+    def unit(Y, physics):
+        rho = Term("rho", mean=1.0, physics=0)
+        return GP(X, Y, terms=[rho, Term("delta")], physics=[physics]).unit.mT
+
+    spread = Y.std(0, correction=0, keepdim=True)
+    torch.testing.assert_close(unit(Y, lambda X: 0 * crude(X)), spread)
+    torch.testing.assert_close(unit(Y, lambda X: 1e6 * crude(X)), spread)
+    near = (Y - crude(X)).square().mean(0, keepdim=True).sqrt()
+    torch.testing.assert_close(unit(Y, crude), near.minimum(spread))
+    met, size = unit(1e-3 * crude(X), lambda X: 1e-3 * crude(X)), crude(X).square().mean(0).sqrt()
+    torch.testing.assert_close(met, 1e-9 * size.unsqueeze(0))
+    constant = torch.full_like(Y, 3.0)
+    torch.testing.assert_close(unit(constant, lambda X: 0 * crude(X)), constant[:1])
