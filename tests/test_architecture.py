@@ -4,11 +4,13 @@ import ast
 import sys
 from pathlib import Path
 
+import gpytorch
 import pytest
 import torch
+from botorch.models.model import Model
 
 import gpadjust
-from gpadjust import CKA, fit
+from gpadjust import CKA, core, fit
 from gpadjust.__main__ import main
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.physics import as_physics
@@ -18,7 +20,7 @@ from tests.systems import line, wave
 
 ROOT = Path(gpadjust.__file__).parent
 FLOORS = [
-    *("checks", "physics", "states", "files", "gp", "models", "inference"),
+    *("checks", "physics", "core", "states", "files", "gp", "models", "inference"),
     *("validation", "emulation"),
     *(
         "sklearn",
@@ -38,6 +40,7 @@ FLOORS = [
 CSV_TO_FREE_RUN = 48  # files that a log passes on the way to a judged free run
 TRIAL, ITERATION = 60, 60  # that a planned trial and an iteration of Dyna pass, fits included
 OF_CONTROL, OF_CONTROL_AND_RL = 14, 14  # of these
+CORE_FILES, CORE_CLASSES, CORE_FUNCTIONS, CORE_LINES = 12, 14, 90, 3600  # of the core
 FILES, CLASSES, FUNCTIONS = 32, 36, 265  # that the ten lines of the README pass; fewer are better
 REPORT, WITH_A_REPORT = 15, 34  # of report and validation, and of what is below, by a point fit
 
@@ -81,6 +84,61 @@ def test_the_ten_lines_pass_few_files_classes_and_functions():
     assert len(files) <= FILES, sorted(files)
     assert len(classes) <= CLASSES, sorted(classes)
     assert len(functions) <= FUNCTIONS, sorted(functions)
+
+
+def ten_lines_of_the_core():
+    X = line(8)
+    model = core.CKA(X, 2 * wave(X) + X, physics=wave)
+    core.fit(model)
+    return model.predict(X)
+
+
+def test_the_core_is_small():
+    files, classes, functions = passed(ten_lines_of_the_core)
+    assert len(files) <= CORE_FILES, sorted(files)
+    assert len(classes) <= CORE_CLASSES, sorted(classes)
+    assert len(functions) <= CORE_FUNCTIONS, sorted(functions)
+    texts = [path.read_text() for path in (ROOT / "core").glob("*.py")]
+    assert sum(text.count("\n") for text in texts) <= CORE_LINES
+
+
+def test_the_core_asks_the_physics_through_few_frames():
+    depths = []
+
+    def physics(X):
+        frame, depth = sys._getframe(), 0
+        while frame is not None:
+            depth += frame.f_code.co_filename.startswith(str(ROOT))
+            frame = frame.f_back
+        depths.append(depth)
+        return wave(X)
+
+    X = line(8)
+    core.CKA(X, 2 * wave(X), physics=physics).predict(X + 0.01)
+    assert max(depths) <= 8
+
+
+def test_the_core_reads_only_what_is_below_it_and_public():
+    ours, theirs, own = set(), set(), set()
+    for path in (ROOT / "core").glob("*.py"):
+        ours |= {name.split(".")[1] for name in imports(path)}
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Attribute) and node.attr.startswith("_"):
+                stored = isinstance(node.ctx, ast.Store)
+                (own if stored else theirs).add(node.attr)
+            elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+                own.add(node.name)
+            elif isinstance(node, ast.ImportFrom) and not node.module.startswith("gpadjust."):
+                theirs |= {alias.name for alias in node.names if alias.name.startswith("_")}
+            elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+                own.add(node.target.id)
+    assert ours <= {"core", "checks", "physics"}
+    theirs = {name for name in theirs if not name.startswith("__") and name != "_replace"}
+    assert theirs <= own
+    # No name of ours hides one of PyTorch's, GPyTorch's or BoTorch's classes.
+    others = {*dir(torch.nn.Module()), *dir(gpytorch.models.GP()), *dir(Model)}
+    private = {name for name in own if name.startswith("_") and not name.startswith("__")}
+    assert private & others == set()
 
 
 def csv_to_free_run(file):

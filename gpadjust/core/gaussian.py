@@ -15,28 +15,29 @@ _EPS = torch.finfo(torch.float64).eps
 
 def add_noise(K: Tensor, noise: Tensor) -> Tensor:
     """Return covariances ``... x n x n`` plus variances ``... x n`` (or 1) on the diagonal."""
-    shape = torch.broadcast_shapes(noise.shape, K.shape[:-1])
-    K = K.expand(*shape, shape[-1]).clone()
+    if noise.dim() >= K.dim() or noise.shape[:-1] != K.shape[:-2]:
+        shape = torch.broadcast_shapes(noise.shape, K.shape[:-1])
+        K = K.expand(*shape, shape[-1])
+    K = K.clone()
     K.diagonal(dim1=-1, dim2=-2).add_(noise)
     return K
 
 
-def factor(K: Tensor, observed: Tensor) -> Tensor:
-    """Return Cholesky factors of covariances ``... x n x n``, which contain the noise.
+def factor(K: Tensor, noise: Tensor, observed: Tensor) -> Tensor:
+    """Return Cholesky factors of covariances ``... x n x n`` with noise ``... x n`` (or 1).
 
     Targets that are not ``observed`` (``... x n``) are independent of everything. A nugget of some
     rounding errors of each variance is added, and more where a matrix is not positive definite; NaN
     where it never is.
     """
-    all_observed = bool(observed.all())
-    if not all_observed:
+    if not observed.all():
         K = K * (observed.unsqueeze(-1) & observed.unsqueeze(-2))
-    diagonal = K.diagonal(dim1=-1, dim2=-2)
+        noise = noise * observed + (~observed).to(K)
+    diagonal = K.diagonal(dim1=-1, dim2=-2) + noise
     least = 1e-10 * diagonal.mean(-1, keepdim=True)
     nugget = max(100, K.shape[-1]) * _EPS * diagonal.maximum(least)
     for _ in range(6):
-        added = nugget if all_observed else nugget + (~observed).to(K)
-        chol, info = torch.linalg.cholesky_ex(add_noise(K, added))
+        chol, info = torch.linalg.cholesky_ex(add_noise(K, noise + nugget))
         if not info.any():
             return chol
         nugget = nugget * (1 + 9 * (info > 0).to(K).unsqueeze(-1))
@@ -52,9 +53,9 @@ class Likelihood(NamedTuple):
 
 
 def log_likelihood(
-    residual: Tensor, K: Tensor, observed: Tensor, with_gradient: bool = True
+    residual: Tensor, K: Tensor, noise: Tensor, observed: Tensor, with_gradient: bool = True
 ) -> Likelihood:
-    r"""Return log N(residual | 0, K) and its derivatives (that by K is K if not asked for).
+    r"""Return log N(residual | 0, K + noise) and its derivatives (that by K is K if not asked for).
 
     With :math:`\alpha = K^{-1} r` (Rasmussen and Williams 2006, algorithm 2.1 and eq. 5.9)
 
@@ -62,14 +63,15 @@ def log_likelihood(
         -\tfrac12 r^T \alpha - \tfrac12 \log |K| - \tfrac{n}{2} \log 2 \pi, \quad
         \partial / \partial K = \tfrac12 (\alpha \alpha^T - K^{-1}).
     """
-    chol = factor(K, observed)
+    chol = factor(K, noise, observed)
     alpha = torch.cholesky_solve(residual.unsqueeze(-1), chol)
     log_det = chol.diagonal(dim1=-1, dim2=-2).log().sum(-1)  # log |K| / 2
     quadratic = (residual.unsqueeze(-1) * alpha).sum((-1, -2))
     value = -0.5 * quadratic - log_det - 0.5 * observed.sum(-1) * math.log(2 * math.pi)
     if not with_gradient:
         return Likelihood(value, alpha.squeeze(-1), K)
-    D = 0.5 * (alpha @ alpha.mT - torch.cholesky_inverse(chol))
+    D = torch.cholesky_inverse(chol).mul_(-0.5)
+    D = torch.baddbmm(*(v.flatten(0, -3) for v in (D, alpha, alpha.mT)), alpha=0.5).reshape(D.shape)
     if not observed.all():
         D = D * (observed.unsqueeze(-1) & observed.unsqueeze(-2))
     return Likelihood(value, alpha.squeeze(-1), D)
@@ -92,7 +94,7 @@ class Conditioning:
         K = train.cross(train)
         noise = noise.expand(torch.broadcast_shapes(noise.shape, K.shape[:-1]))
         self._set(train, noise, targets)
-        self.chol = factor(add_noise(K, noise), self.observed)
+        self.chol = factor(K, noise, self.observed)
         self.alpha = self.solve(self._residual())
         self._inverse: Tensor | None = None
 
@@ -132,10 +134,11 @@ class Conditioning:
         K21 = (K21 * seen.unsqueeze(-1) * old.observed.unsqueeze(-2)).expand(*lead, -1, n)
         inverse = old.inverse_factor()
         B = K21 @ inverse.mT
-        K22 = add_noise(K22, new.noise[..., n:])
+        late_noise = new.noise[..., n:]
         # The nugget of the new rows is that of their own variances.
-        nugget = max(100, train.x.shape[-2]) * _EPS * K22.diagonal(dim1=-1, dim2=-2)
-        L2 = factor(add_noise(K22 - B @ B.mT, nugget), seen)
+        variance = K22.diagonal(dim1=-1, dim2=-2) + late_noise
+        late_noise = late_noise + max(100, train.x.shape[-2]) * _EPS * variance
+        L2 = factor(K22 - B @ B.mT, late_noise, seen)
         L2 = L2.expand(*lead, *L2.shape[-2:])
         new.chol = _lower(L1, B, L2)
         inverse2 = torch.linalg.solve_triangular(L2, torch.eye(L2.shape[-1]).to(L2), upper=False)

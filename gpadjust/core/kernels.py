@@ -170,23 +170,25 @@ class Stationary(Kernel):
         With D = df/dK and :math:`M = s D \circ dk/de`,
 
         .. math::
-            \frac{\partial f}{\partial s} = \sum D \circ k, \quad
+            \frac{\partial f}{\partial s} = \frac{1}{s} \sum D \circ K, \quad
             \frac{\partial f}{\partial \ell_k} = \frac{1}{\ell_k} \sum_{ij} M_{ij}
             (z_{ik} - z_{jk})^2.
         """
         length = own["lengthscale"].unsqueeze(-2)
         z, scale = (x - x[..., :1, :]) / length, own["outputscale"].unsqueeze(-1)
         e = exponents(z)
-        k = self.profile.value(e)
-        slope = k if self.profile is RBF else self.profile.slope(e)
+        K = (e.exp_() if self.profile is RBF else self.profile.value(e)).mul_(scale)
+        slope = K if self.profile is RBF else self.profile.slope(e).mul_(scale)
 
         def pull_back(D: Tensor) -> Values:
-            M = scale * D * slope
-            by_log = 2 * (z * (z * M.sum(-1, keepdim=True) - M @ z)).sum(-2)
-            by_scale = (D * k).sum((-1, -2)).unsqueeze(-1)
+            M = D * slope
+            sums = M.sum(-1, keepdim=True)
+            by_log = 2 * (z * (z * sums - M @ z)).sum(-2)
+            total = sums.sum(-2) if slope is K else (D * K).sum((-1, -2)).unsqueeze(-1)
+            by_scale = total / own["outputscale"].clamp_min(1e-300)
             return {"lengthscale": by_log / own["lengthscale"], "outputscale": by_scale}
 
-        return scale * k, pull_back
+        return K, pull_back
 
     def features(self, own: Values, number: int, generator: torch.Generator) -> Features:
         """Return sines and cosines of frequencies of the kernel's spectrum."""

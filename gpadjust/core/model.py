@@ -200,11 +200,11 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
                 K, pull_back = total.with_pull_back()
             else:
                 K = total.cross(total)
-            K = add_noise(K, self.noise.variance(values, places, True))
-            shape = torch.broadcast_shapes(K.shape[:-1], total.mean.shape)
+            noise = self.noise.variance(values, places, True)
+            shape, observed = (len(u), *y.shape), ~y.isnan()
             residual, K = (y - total.mean).expand(shape), K.expand(*shape, shape[-1])
-            observed = ~y.isnan()
-            found = log_likelihood(residual.nan_to_num() * observed, K, observed, with_gradient)
+            residual = residual.nan_to_num() * observed
+            found = log_likelihood(residual, K, noise, observed, with_gradient)
             value, gradient = found.value, torch.zeros_like(u)
             if with_gradient:
                 by = pull_back(found.by_covariance)

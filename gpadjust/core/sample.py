@@ -18,8 +18,9 @@ class LogLikelihood(Protocol):
 
 
 GROUPS = 2  # of draws that are resampled apart, so that their difference shows the error
-_LEAPS, _ACCEPTED, _LAST_MOVES, _MOVES, _FAR = 5, 0.8, 4, 2, 60.0
+_LEAPS, _ACCEPTED, _LAST_MOVES, _MOVES, _FAR = 3, 0.8, 4, 3, 60.0
 _SEARCHES, _GAIN = 3, 0.01  # of searches, and of log density, below which there are no more
+_SHARE = 0.5  # of draws that count after each step of the power
 _WIDER = 1.5  # than Laplace's approximation
 
 
@@ -70,7 +71,7 @@ def sample(
     number: int,
     seed: int,
     start: Normal | None = None,
-    first: int = 8,
+    first: int = 16,
     with_moves: bool = True,
     floor: Tensor | None = None,
 ) -> Draws | None:
@@ -111,7 +112,7 @@ def sample(
     value, slope = ratio(u, False)
     power, evidence = like.new_zeros(shape[0]), like.new_zeros(GROUPS, shape[0])
     length, problems = torch.full_like(power, 0.3), torch.arange(shape[0], device=like.device)
-    least, effective = number / 2, None
+    least, effective = _SHARE * number, None
     while True:
         # The highest power at which enough draws count.
         step = _step(value, power, least if with_moves else 0.0)
@@ -139,7 +140,6 @@ def sample(
                 ratio, begin, u, value, slope, power, root, length, generator
             )
             length = length * (rate - _ACCEPTED).exp()
-        least = number / 2
         if is_done:
             return Draws(u, evidence, effective)
 

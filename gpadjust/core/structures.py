@@ -1,4 +1,4 @@
-"""The structures: each a list of terms."""
+"""The structures: each a list of terms. Their arguments and errors are as of GP, and their own."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gpadjust.core.data import ArrayLike, as_tensor
-from gpadjust.core.kernels import DELTA, RHO, Fourier, Kernel, as_kernel
+from gpadjust.core.kernels import DELTA, RHO, Fourier, as_kernel
 from gpadjust.core.model import GP
 from gpadjust.core.terms import Term
 from gpadjust.core.unknowns import Choice, LogNormal
@@ -24,15 +24,14 @@ class CKA(GP):
         f_a(x) = \rho(x) f_p(x) + \delta(x), \quad
         \rho \sim GP(1, k_\rho), \quad \delta \sim GP(0, k_\delta),
 
-    so that :math:`f_a \sim GP(f_p, F_p k_\rho F_p^T + k_\delta)`: where there are no data, the model
-    falls back to the physics. Both processes contain an unknown constant with a variance of its own,
-    and with ``nested`` the model is averaged with its constants alone, :math:`a f_p + b`, and with
-    :math:`\delta` alone, which ignores the physics.
+    so that :math:`f_a \sim GP(f_p, F_p k_\rho F_p^T + k_\delta)`: where there are no data, the
+    model falls back to the physics. Both processes contain an unknown constant with a variance of
+    its own, and with ``nested`` the model is averaged with its constants alone,
+    :math:`a f_p + b`, and with :math:`\delta` alone, which ignores the physics.
+
+    Args as of :class:`GP`, and:
 
     Args:
-        train_X: As of :class:`GP`, whose other arguments and errors are the same.
-        train_Y: As of :class:`GP`.
-        train_Yvar: As of :class:`GP`.
         physics: The physics f_p, a function of ``n x d`` to ``n x m`` (or ``n``) or a
             :class:`~gpadjust.physics.Physics`; several as a list, or a mapping from their names:
             then :math:`f_a = \sum_i \rho_i f_i + \delta`.
@@ -41,8 +40,8 @@ class CKA(GP):
         rho_mean: The prior mean of rho; of several physics one for each. Default: 1, of k physics
             1 / k.
         delta_mean: The prior mean of delta, in the user's units.
-        center: Whether the kernel of rho is scaled by f_p - c with an unknown c, or the number c; the
-            paper's model has 0.
+        center: Whether the kernel of rho is scaled by f_p - c with an unknown c, or the number c;
+            the paper's model has 0.
         constants: Whether rho and delta contain unknown constants.
         nested: Whether nested models are averaged over; only with constants and one physics.
 
@@ -57,38 +56,24 @@ class CKA(GP):
     """
 
     def __init__(
-        self,
-        train_X: ArrayLike,
-        train_Y: ArrayLike,
-        train_Yvar: ArrayLike = None,
-        *,
-        physics: Any,
-        rho_covar_module: Any = None,
-        delta_covar_module: Any = None,
-        rho_mean: float | Sequence[float] | None = None,
-        delta_mean: float = 0.0,
-        center: bool | float = True,
-        constants: bool = True,
-        nested: bool = True,
-        **options: Any,
-    ) -> None:
-        names, functions = _several(physics)
-        means = _means(rho_mean, len(functions))
-        constant = RHO_CONSTANT if constants else None
-        rhos = [
-            Term(name, as_kernel(rho_covar_module, RHO), mean, constant, i, center)
-            for i, (name, mean) in enumerate(zip(names, means, strict=True))
-        ]
-        delta = _delta(delta_covar_module, delta_mean, constants)
-        is_nested = nested and constants and len(rhos) == 1
+        self, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike = None, *,
+        physics: Any, rho_covar_module: Any = None, delta_covar_module: Any = None,
+        rho_mean: float | Sequence[float] | None = None, delta_mean: float = 0.0,
+        center: bool | float = True, constants: bool = True, nested: bool = True, **options: Any,
+    ) -> None:  # fmt: skip
         settings = {
             "rho_covar_module": rho_covar_module, "delta_covar_module": delta_covar_module,
             "rho_mean": rho_mean, "delta_mean": delta_mean, "center": center,
             "constants": constants, "nested": nested,
         }  # fmt: skip
+        rhos, functions = _scalings(physics, rho_mean)
+        kernel, constant = as_kernel(rho_covar_module, RHO), RHO_CONSTANT if constants else None
+        rhos = [rho._replace(kernel=kernel, constant=constant, has_center=center) for rho in rhos]
+        delta = _delta(delta_covar_module, delta_mean, constants)
+        is_nested = nested and constants and len(rhos) == 1
         super().__init__(
             train_X, train_Y, train_Yvar, terms=[*rhos, delta], physics=functions,
-            choices=_nested(rhos[0], delta) if is_nested else (),
+            choices=_nested(rhos[0].name) if is_nested else (),
             settings=settings | options, **options,
         )  # fmt: skip
 
@@ -99,26 +84,17 @@ class RRA(CKA):
     rho and delta are Bayesian linear models (Wannawas and Faisal 2023, section 2.2), which tend to
     those of :class:`CKA` as features grow.
 
+    Args as of :class:`CKA` but for its kernels, and:
+
     Args:
-        train_X: As of :class:`CKA`, whose other arguments and errors are the same.
-        train_Y: As of :class:`CKA`.
-        train_Yvar: As of :class:`CKA`.
-        physics: As of :class:`CKA`.
         num_features: Number of features of each of the two, an even one.
         seed: Seed of their frequencies.
     """
 
     def __init__(
-        self,
-        train_X: ArrayLike,
-        train_Y: ArrayLike,
-        train_Yvar: ArrayLike = None,
-        *,
-        physics: Any,
-        num_features: int = 128,
-        seed: int = 0,
-        **options: Any,
-    ) -> None:
+        self, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike = None, *,
+        physics: Any, num_features: int = 128, seed: int = 0, **options: Any,
+    ) -> None:  # fmt: skip
         if num_features < 2 or num_features % 2:
             raise ValueError(f"Expected an even number of features; found {num_features}.")
         d = as_tensor(train_X, "train_X").shape[-1]
@@ -135,31 +111,19 @@ class RRA(CKA):
 class PhysicsMeanGP(GP):
     r"""A Gaussian process with the physics as its mean, :math:`f_a = f_p + \delta`.
 
-    The arguments and errors are those of :class:`GP`, and:
+    Args as of :class:`GP`, and:
 
     Args:
-        train_X: As of :class:`GP`.
-        train_Y: As of :class:`GP`.
-        train_Yvar: As of :class:`GP`.
         physics: As of :class:`CKA`.
         covar_module: The kernel of delta. Default: RBF.
         constants: Whether delta contains an unknown constant.
     """
 
     def __init__(
-        self,
-        train_X: ArrayLike,
-        train_Y: ArrayLike,
-        train_Yvar: ArrayLike = None,
-        *,
-        physics: Any,
-        covar_module: Any = None,
-        constants: bool = True,
-        **options: Any,
-    ) -> None:
-        names, functions = _several(physics)
-        means = _means(None, len(functions))
-        rhos = [Term(n, mean=mean, physics=i) for i, (n, mean) in enumerate(zip(names, means))]  # noqa: B905
+        self, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike = None, *,
+        physics: Any, covar_module: Any = None, constants: bool = True, **options: Any,
+    ) -> None:  # fmt: skip
+        rhos, functions = _scalings(physics)
         super().__init__(
             train_X, train_Y, train_Yvar, terms=[*rhos, _delta(covar_module, 0.0, constants)],
             physics=functions,
@@ -170,28 +134,18 @@ class PhysicsMeanGP(GP):
 class ScaleGP(GP):
     r"""An adjustment by a scaling alone, :math:`f_a = \rho f_p`, :math:`\rho \sim GP(1, k)`.
 
-    It cannot adjust where f_p is zero. The arguments and errors are those of :class:`GP`, and:
+    It cannot adjust where f_p is zero. Args as of :class:`GP`, and:
 
     Args:
-        train_X: As of :class:`GP`.
-        train_Y: As of :class:`GP`.
-        train_Yvar: As of :class:`GP`.
-        physics: As of :class:`CKA`.
+        physics: The physics f_p, as of :class:`CKA`, but one.
         covar_module: The kernel of rho. Default: RBF.
         constants: Whether rho contains an unknown constant.
     """
 
     def __init__(
-        self,
-        train_X: ArrayLike,
-        train_Y: ArrayLike,
-        train_Yvar: ArrayLike = None,
-        *,
-        physics: Any,
-        covar_module: Any = None,
-        constants: bool = True,
-        **options: Any,
-    ) -> None:
+        self, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike = None, *,
+        physics: Any, covar_module: Any = None, constants: bool = True, **options: Any,
+    ) -> None:  # fmt: skip
         constant = RHO_CONSTANT if constants else None
         rho = Term("rho", as_kernel(covar_module, LogNormal(0.01, 100.0)), 1.0, constant, 0)
         super().__init__(
@@ -203,30 +157,20 @@ class ScaleGP(GP):
 class ZeroMeanGP(GP):
     r"""A Gaussian process without physics, around an unknown constant.
 
-    The arguments and errors are those of :class:`GP`, and:
+    Args as of :class:`GP`, and:
 
     Args:
-        train_X: As of :class:`GP`.
-        train_Y: As of :class:`GP`.
-        train_Yvar: As of :class:`GP`.
         covar_module: The kernel. Default: RBF.
         constants: Whether there is the constant.
     """
 
     def __init__(
-        self,
-        train_X: ArrayLike,
-        train_Y: ArrayLike,
-        train_Yvar: ArrayLike = None,
-        *,
-        covar_module: Any = None,
-        constants: bool = True,
-        **options: Any,
-    ) -> None:
-        constant = DELTA_CONSTANT if constants else None
+        self, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike = None, *,
+        covar_module: Any = None, constants: bool = True, **options: Any,
+    ) -> None:  # fmt: skip
         super().__init__(
             train_X, train_Y, train_Yvar,
-            terms=[Term("f", as_kernel(covar_module, DELTA), constant=constant)],
+            terms=[_delta(covar_module, 0.0, constants)._replace(name="f")],
             settings={"covar_module": covar_module, "constants": constants} | options, **options,
         )  # fmt: skip
 
@@ -235,69 +179,59 @@ class CalibratedPhysics(GP):
     r"""The physics and noise alone, :math:`y = f_p(x; \theta) + \epsilon`: nonlinear regression.
 
     Where the physics is wrong, intervals of its parameters are too narrow: compare it with
-    :class:`CKA` of the same physics.
+    :class:`CKA` of the same physics. Args as of :class:`GP`, and:
 
     Args:
-        train_X: As of :class:`GP`, whose other arguments and errors are the same.
-        train_Y: As of :class:`GP`.
-        train_Yvar: As of :class:`GP`.
-        physics: As of :class:`CKA`, with unknown parameters.
+        physics: The physics f_p, one with unknown parameters.
     """
 
     def __init__(
-        self,
-        train_X: ArrayLike,
-        train_Y: ArrayLike,
-        train_Yvar: ArrayLike = None,
-        *,
-        physics: Any,
-        **options: Any,
-    ) -> None:
+        self, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike = None, *,
+        physics: Any, **options: Any,
+    ) -> None:  # fmt: skip
         super().__init__(
             train_X, train_Y, train_Yvar, terms=[Term("rho", mean=1.0, physics=0)],
             physics=[physics], settings=options, **options,
         )  # fmt: skip
         if not self.physics[0].unknowns:
             raise ValueError(
-                f"Physics {self.physics[0].name!r} has no unknown parameter, so that there is "
-                "nothing to calibrate; name them: unknowns={'mass': Unknown(1.0, factor=1.5)}."
+                "Expected a physics with unknown parameters; found none in "
+                f"{self.physics[0].name!r}. Name them: unknowns={{'mass': Unknown(1.0, sd=0.5)}}."
             )
 
 
-def _delta(kernel: Kernel | None, mean: float, constants: bool) -> Term:
+def _scalings(
+    physics: Any, means: float | Sequence[float] | None = None
+) -> tuple[list[Term], list[Any]]:
+    """Return a scaling of each physics by its prior mean, and the physics."""
+    names, functions = ["rho"], [physics]
+    if isinstance(physics, list | tuple):
+        functions = [*physics]
+        names = [f"rho{i + 1}" for i in range(len(functions))] if len(functions) > 1 else names
+    elif isinstance(physics, Mapping):
+        functions = [*physics.values()]
+        names = [f"rho_{name}" for name in physics]
+    number = len(functions)
+    if not number:
+        raise ValueError("Expected at least one physics; found none. Without, take ZeroMeanGP.")
+    if means is None:
+        means = 1.0 / number
+    means = [float(means)] * number if isinstance(means, int | float) else [*map(float, means)]
+    if len(means) != number:
+        raise ValueError(f"Expected rho_mean for each of {number} physics; found {means}.")
+    pairs = enumerate(zip(names, means, strict=True))
+    return [Term(name, mean=mean, physics=i) for i, (name, mean) in pairs], functions
+
+
+def _delta(kernel: Any, mean: float, constants: bool) -> Term:
     constant = DELTA_CONSTANT if constants else None
     return Term("delta", as_kernel(kernel, DELTA), mean, constant)
 
 
-def _several(physics: Any) -> tuple[list[str], list[Any]]:
-    """Return the names of the scalings, and the physics."""
-    if isinstance(physics, list | tuple | Mapping) and not physics:
-        raise ValueError("Expected at least one physics; found none. Without, take ZeroMeanGP.")
-    if isinstance(physics, Mapping):
-        return [f"rho_{name}" for name in physics], [*physics.values()]
-    if isinstance(physics, list | tuple):
-        names = [f"rho{i + 1}" for i in range(len(physics))]
-        return (names if len(physics) > 1 else ["rho"]), [*physics]
-    return ["rho"], [physics]
-
-
-def _means(means: float | Sequence[float] | None, number: int) -> list[float]:
-    if means is None:
-        means = 1.0 / number
-    several = [float(means)] * number if isinstance(means, int | float) else [*map(float, means)]
-    if len(several) != number or not number:
-        raise ValueError(
-            f"Expected a prior mean of rho for each of {number} physics (at least one); found "
-            f"{several}."
-        )
-    return several
-
-
-def _nested(rho: Term, delta: Term) -> tuple[Choice, ...]:
-    processes = (f"{rho.name}.process", f"{delta.name}.process")
-    physics = (f"{rho.name}.mean", f"{rho.name}.constant", f"{rho.name}.process")
+def _nested(rho: str) -> tuple[Choice, ...]:
+    processes = (f"{rho}.process", "delta.process")
     return (
         Choice("your formula corrected", CORRECTED),
         Choice("as it is up to a factor and an offset", AS_IT_IS, processes),
-        Choice("of no use", OF_NO_USE, physics),
+        Choice("of no use", OF_NO_USE, (f"{rho}.mean", f"{rho}.constant", f"{rho}.process")),
     )

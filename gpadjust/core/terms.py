@@ -111,30 +111,34 @@ class WeightedSum:
 
         Derivatives by the weights have the names ``"<term>.weight"``.
         """
-        nothing = self.x.new_zeros(*self.x.shape[:-1], self.x.shape[-2])
-        total, steps = nothing, []
+        steps = []
+        total = self.x.new_zeros(self.x.shape[-2], self.x.shape[-2])
         for term, w in self._parts():
-            k, back = nothing, None
+            K, back = None, None
+            one = torch.ones_like(self.x[..., 0]) if w is None else w
             if term.kernel is not None:
-                k, back = term.kernel.with_pull_back(self.own(term), self.x)
-                k = k if self._is_whole(term) else k * self._process(term).unsqueeze(-1)
-            if term.constant is not None:
-                k = k + self._constant(term).unsqueeze(-1)
-            ww = None if w is None else w.unsqueeze(-1) * w.unsqueeze(-2)
-            total = total + (k if ww is None else k * ww)
-            steps.append((term, w, ww, k, back))
+                K, back = term.kernel.with_pull_back(self.own(term), self.x)
+                K = K if self._is_whole(term) else K * self._process(term).unsqueeze(-1)
+                total = total + K if w is None else _scaled(K, w).add_(total)
+            if term.constant is not None:  # kappa w_i w_j
+                left = (self._constant(term) * one).unsqueeze(-1)
+                total = torch.addcmul(total, left, one.unsqueeze(-2))
+            steps.append((term, w, K, back))
 
         def pull_back(D: Tensor) -> Values:
             by: Values = {}
-            for term, w, ww, k, back in steps:
-                by_k = D if ww is None else D * ww
+            for term, w, K, back in steps:
+                by_k = _scaled(D, w)
                 if back is not None:
                     part = by_k if self._is_whole(term) else by_k * self._process(term).unsqueeze(-1)
                     by |= {f"{term.name}.kernel.{n}": slope for n, slope in back(part).items()}
                 if term.constant is not None:
                     by[f"{term.name}.constant"] = by_k.sum((-1, -2)).unsqueeze(-1)
-                if w is not None:  # K = w_i k_ij w_j
-                    by[f"{term.name}.weight"] = 2 * ((D * k) @ w.unsqueeze(-1)).squeeze(-1)
+                if w is not None:  # of w_i (K_ij + kappa) w_j it is 2 sum_j D_ij (K_ij + kappa) w_j
+                    column = w.unsqueeze(-1)
+                    by_w = self._constant(term) * (D @ column).squeeze(-1)
+                    by_w = by_w if K is None else by_w + ((D * K) @ column).squeeze(-1)
+                    by[f"{term.name}.weight"] = 2 * by_w
             return by
 
         return total, pull_back
@@ -168,6 +172,11 @@ class WeightedSum:
         return self.values[f"{term.name}.constant"]
 
 
+def _scaled(K: Tensor, w: Tensor | None) -> Tensor:
+    """Return ``w_i K_ij w_j``."""
+    return K if w is None else (K * w.unsqueeze(-1)).mul_(w.unsqueeze(-2))
+
+
 class TermSum:
     """The terms of a model: their unknown numbers, and the weighted sums that they make.
 
@@ -192,6 +201,8 @@ class TermSum:
                 )
         self.terms, self.unit = tuple(terms), unit
         self.f = [v.reshape(-1, v.shape[-1]) for v in f]
+        self._middle = [v.mean(-1, keepdim=True) for v in self.f]
+        self._spread = [3 * v.std(-1, keepdim=True) for v in self.f]
 
     def rows(self, x: Tensor, num_outputs: int) -> list[Row]:
         """Return the unknown numbers of all terms, for training inputs ``n x d``."""
@@ -215,12 +226,12 @@ class TermSum:
             return 0.0
         if term.has_center is not True:
             return term.has_center / self.unit
-        f = self.f[term.physics]
-        return f.mean(-1, keepdim=True) + self.center_scale(term) * values[f"{term.name}.center"]
+        scale = self._spread[term.physics]
+        return self._middle[term.physics] + scale * values[f"{term.name}.center"]
 
     def center_scale(self, term: Term) -> Tensor:
         """Return the derivative of c by its coordinate, ``m x 1``."""
-        return 3 * self.f[term.physics or 0].std(-1, keepdim=True)
+        return self._spread[term.physics or 0]
 
     def mean_of(self, term: Term, values: Values) -> Tensor | float:
         """Return the prior mean of a term's process, which is zero in some nested models."""

@@ -1,0 +1,170 @@
+"""What docs/architecture.md shows for something new in the core: each recipe runs as it stands.
+
+Each also with four outputs after the default fit, of which every one has to be as by itself.
+"""
+
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+from gpadjust.core import CKA, GP, Noise, Stationary, Term, fit
+
+PAGE = Path(__file__).parents[2] / "docs" / "architecture.md"
+START = "\n## Something new in the core\n"
+
+
+def recipe(heading):
+    """The names that the code below a heading makes."""
+    text = PAGE.read_text().split(START, 1)[1].split(f"\n**{heading}**", 1)[1]
+    names = {"__name__": "recipe"}
+    exec(re.search(r"```python\n(.*?)```", text, flags=re.DOTALL)[1], names)
+    return names
+
+
+def law(X):
+    return torch.cat([torch.sin(k * X[..., :1]) for k in (3, 4, 5, 6)], -1)
+
+
+def one(X):
+    return law(X)[..., 2:3]
+
+
+@pytest.fixture(params=[1, 4])
+def problem(request, uniform):
+    """Inputs, targets and a physics of one or four outputs, of very different noise."""
+    X, sizes = uniform(14, 1), torch.tensor([0.01, 0.03, 0.05, 0.1], dtype=torch.float64)
+    physics = one if request.param == 1 else law
+    F = physics(X)
+    return X, 1.3 * F + X + sizes[-F.shape[-1] :] * torch.randn_like(F), physics
+
+
+def check(model, X, Y):
+    """Outputs are as by themselves, and conditioning, functions and joint draws agree."""
+    m = Y.shape[-1]
+    Z = torch.linspace(-0.1, 1.1, 7, dtype=torch.float64).unsqueeze(-1)
+    mean, variance = model.predict(Z, observation_noise=True)
+    assert mean.isfinite().all()
+    assert (variance > 0).all()
+    assert ((model.predict(X).mean - Y).square().mean(0) < 0.2 * Y.var(0)).all()
+    for j in range(m):
+        part = model.subset_output([j]).predict(Z, observation_noise=True)
+        torch.testing.assert_close(part.mean, mean[:, [j]], rtol=1e-6, atol=1e-8)
+        torch.testing.assert_close(part.variance, variance[:, [j]], rtol=1e-6, atol=1e-10)
+        joint = model.posterior(Z, [j], observation_noise=True)
+        torch.testing.assert_close(joint.variance, variance[:, [j]], rtol=1e-6, atol=1e-10)
+    assert model.posterior(Z).rsample(torch.Size([5])).shape == (5, 7, m)
+    later = model.condition_on_observations(Z[:2], mean[:2])
+    assert (later.predict(Z[:2]).variance < model.predict(Z[:2]).variance).all()
+    assert model.summary().count("noise:") == m
+
+
+def test_a_structure(problem):
+    X, Y, physics = problem
+    model = recipe("A structure")["SeasonalCKA"](X, Y, physics=physics)
+    fit(model)
+    check(model, X, Y)
+    parts = model.rho(X).mean * physics(X) + model.delta(X).mean + model.term("season", X).mean
+    single = model.subset_draws(torch.tensor([0]))
+    parts = single.rho(X).mean * physics(X) + single.delta(X).mean + single.term("season", X).mean
+    torch.testing.assert_close(parts, single.predict(X).mean, atol=1e-6, rtol=1e-6)
+
+
+def test_a_kernel(problem):
+    X, Y, physics = problem
+    names = recipe("A kernel")
+    for kernel in (Stationary(names["RATIONAL_QUADRATIC"]), names["Linear"]()):
+        model = CKA(X, Y, physics=physics, delta_covar_module=kernel)
+        fit(model)
+        check(model, X, Y)
+    k = Stationary(names["RATIONAL_QUADRATIC"])
+    own = {n: torch.ones(1, 1, 1, dtype=torch.float64) for n in ("lengthscale", "outputscale")}
+    expected = 1 / (1 + (X - X.T).square() / 2)
+    torch.testing.assert_close(k.covariance(own, X).squeeze(), expected)
+
+
+def test_a_noise(problem):
+    X, Y, physics = problem
+    model = CKA(X, Y, physics=physics, noise=recipe("A noise")["PartlyRelativeNoise"]())
+    fit(model)
+    check(model, X, Y)
+    values = model.values
+    noise = model.predict(X, True).variance - model.predict(X).variance
+    f = model.places(X, values).f[0]
+    v = [values[f"noise.{name}"].detach() for name in ("constant", "relative")]
+    expected = ((v[0] + v[1] * f.square() + 1e-11 * (1 + f.square())) * model.unit**2).mean(0).mT
+    torch.testing.assert_close(noise, expected, rtol=1e-6, atol=1e-12)
+
+
+class Levels(Noise):
+    """Learnt noise times a known level of each output, which a subset of outputs has to take along."""
+
+    def __init__(self, levels):
+        super().__init__(("level",))
+        self.levels = levels
+
+    def shares(self, places):
+        return self.levels.reshape(-1, 1, 1)
+
+    def of_outputs(self, outputs):
+        return type(self)(self.levels[list(outputs)])
+
+
+def test_a_noise_with_numbers_of_each_output(uniform):
+    X = uniform(14, 1)
+    Y = law(X) + 0.05 * torch.randn(14, 4, dtype=torch.float64)
+    levels = torch.tensor([1.0, 10.0, 30.0, 100.0], dtype=torch.float64)
+    model = CKA(X, Y, physics=law, noise=Levels(levels))
+    fit(model)
+    check(model, X, Y)
+    forgetful = CKA(X, Y, physics=law, noise=Levels(levels))
+    forgetful.noise.of_outputs = lambda outputs: forgetful.noise
+    with pytest.raises(ValueError, match="of_outputs"):
+        forgetful.subset_output([0]).predict(X, observation_noise=True)
+
+
+def test_a_basis(problem):
+    X, Y, physics = problem
+    model = recipe("A basis")["TrendCKA"](X, Y, physics=physics)
+    fit(model)
+    check(model, X, Y)
+    # Far away the trend goes on.
+    far = torch.tensor([[8.0]], dtype=torch.float64)
+    slope = (model.predict(far + 1).mean - model.predict(far).mean) - (physics(far + 1) - physics(far))
+    assert slope.isfinite().all()
+
+
+def test_an_inference_method(problem):
+    X, Y, physics = problem
+    model = CKA(X, Y, physics=physics, nested=False)
+    before = torch.random.get_rng_state()
+    recipe("An inference method")["laplace"](model, number=8)
+    assert torch.equal(before, torch.random.get_rng_state())
+    assert len(model.u) == 8
+    check(model, X, Y)
+
+
+def test_a_link(problem):
+    X, Y, physics = problem
+    positive = recipe("A link")["LogCKA"](X, Y.exp(), physics=lambda X: physics(X).exp())
+    fit(positive.model)
+    low, high = positive.interval(X)
+    assert (low > 0).all()
+    assert ((low < Y.exp() * 1.2) & (high > Y.exp() / 1.2)).double().mean() > 0.8
+    mean, variance = positive.predict(X)
+    draws = positive.model.posterior(X[:1]).rsample(torch.Size([100_000])).exp()
+    torch.testing.assert_close(draws.mean(0), mean[:1], rtol=0.02, atol=0)
+    torch.testing.assert_close(draws.std(0), variance[:1].sqrt(), rtol=0.05, atol=0)
+
+
+def test_terms_of_ones_own_are_checked(uniform):
+    X = uniform(5, 1)
+    for terms, words in (
+        ([], "different names"),
+        ([Term("f"), Term("f")], "different names"),
+        ([Term("a.b")], "without dots"),
+        ([Term("rho", physics=0)], "has physics number 0"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            GP(X, X, terms=terms)
