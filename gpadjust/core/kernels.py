@@ -80,13 +80,14 @@ class Profile(NamedTuple):
         name: The name.
         value: k(e).
         slope: dk / de, which is -2 dk / d(r^2).
-        degrees: Degrees of freedom of its spectrum, a Student t.
+        degrees: Degrees of freedom of its spectrum, if that is a Student t; None without random
+            features.
     """
 
     name: str
     value: Callable[[Tensor], Tensor]
     slope: Callable[[Tensor], Tensor]
-    degrees: float
+    degrees: float | None = None
 
 
 def _matern(p: int) -> Profile:
@@ -192,6 +193,8 @@ class Stationary(Kernel):
 
     def features(self, own: Values, number: int, generator: torch.Generator) -> Features:
         """Return sines and cosines of frequencies of the kernel's spectrum."""
+        if self.profile.degrees is None:
+            return super().features(own, number, generator)
         d = own["lengthscale"].shape[-1]
         w = torch.randn(d, number // 2, generator=generator, dtype=torch.float64)
         if math.isfinite(self.profile.degrees):  # chi^2 with an odd number of degrees, as squares

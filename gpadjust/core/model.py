@@ -31,7 +31,7 @@ from gpadjust.core.posterior import (
     moments,
 )
 from gpadjust.core.summary import summary
-from gpadjust.core.terms import Places, Term, TermSum, WeightedSum
+from gpadjust.core.terms import Places, Term, TermSum, WeightedSum, check_terms
 from gpadjust.core.unknowns import Choice, Row, Table, Values
 from gpadjust.core.views import (
     MeanView,
@@ -120,10 +120,10 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
         self._f_train: list[Tensor] = []
         f = self._physics_at(X, {f"physics.{name}": Y.new_zeros(1, 1) for name in self._unknowns})
         self._check_outputs(f)
-        mean = sum(
-            (t.mean * (torch.ones_like(Y.mT) if t.physics is None else f[t.physics][0]) for t in terms),
-            torch.zeros_like(Y.mT),
-        )
+        check_terms(terms, len(f))
+        mean = torch.zeros_like(Y.mT)
+        for t in terms:
+            mean = mean + t.mean * (1.0 if t.physics is None else f[t.physics][0])
         self.unit = unit_of(Y, mean.mT)
         self._f_train = [v / self.unit for v in f]
         self.term_sum = TermSum(terms, self._f_train, self.unit)
@@ -265,7 +265,9 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
             slopes = torch.autograd.grad(
                 variance.expand_as(by_variance), leaves, by_variance, allow_unused=True
             )
-        return [torch.zeros_like(f) if s is None else s for f, s in zip(leaves, slopes, strict=True)]
+        return [
+            torch.zeros_like(f) if s is None else s for f, s in zip(leaves, slopes, strict=True)
+        ]
 
     def _other_priors(self, u: Tensor) -> tuple[Tensor | float, Tensor | float]:
         """Return the log density of priors other than N(0, I), and its gradient."""

@@ -50,7 +50,15 @@ class Noise:
         """Return the variances, ``... x S x m x n`` (or 1 where all are equal)."""
         v = torch.cat([values[f"noise.{name}"] for name in self.names], -1) + _LEAST
         shares = self.shares(places)
-        return v if shares is None else (v.unsqueeze(-2) * shares).sum(-1)
+        if shares is None:
+            return v
+        variances = (v.unsqueeze(-2) * shares).sum(-1)
+        if variances.shape[-2] != v.shape[-2]:
+            raise ValueError(
+                f"Expected shares of {v.shape[-2]} outputs or of 1; found {variances.shape[-2]}. A "
+                "noise with numbers of each output says in of_outputs what some of them have."
+            )
+        return variances
 
     def pull_back(self, values: Values, places: Places, by: Tensor) -> Values:
         """Return derivatives by v, of derivatives by the training variances ``S x m x n``."""

@@ -130,7 +130,9 @@ class WeightedSum:
             for term, w, K, back in steps:
                 by_k = _scaled(D, w)
                 if back is not None:
-                    part = by_k if self._is_whole(term) else by_k * self._process(term).unsqueeze(-1)
+                    part = (
+                        by_k if self._is_whole(term) else by_k * self._process(term).unsqueeze(-1)
+                    )
                     by |= {f"{term.name}.kernel.{n}": slope for n, slope in back(part).items()}
                 if term.constant is not None:
                     by[f"{term.name}.constant"] = by_k.sum((-1, -2)).unsqueeze(-1)
@@ -177,6 +179,19 @@ def _scaled(K: Tensor, w: Tensor | None) -> Tensor:
     return K if w is None else (K * w.unsqueeze(-1)).mul_(w.unsqueeze(-2))
 
 
+def check_terms(terms: Sequence[Term], num_physics: int) -> None:
+    """Raise a ValueError if names are equal or contain a dot, or a term's physics does not exist."""
+    names = [term.name for term in terms]
+    if len({*names}) < len(names) or not names or any("." in name for name in names):
+        raise ValueError(f"Expected terms with different names without dots; found {names}.")
+    for term in terms:
+        if term.physics is not None and not 0 <= term.physics < num_physics:
+            raise ValueError(
+                f"Term {term.name!r} has physics number {term.physics}, but the model has "
+                f"{num_physics}; pass it in physics=[...]."
+            )
+
+
 class TermSum:
     """The terms of a model: their unknown numbers, and the weighted sums that they make.
 
@@ -184,21 +199,9 @@ class TermSum:
         terms: The terms, with different names.
         f: The outputs of each physics at the training inputs, ``m x n``, in units of the targets.
         unit: That unit, ``m x 1``.
-
-    Raises:
-        ValueError: If names are equal, contain a dot, or a term's physics does not exist.
     """
 
     def __init__(self, terms: Sequence[Term], f: Sequence[Tensor], unit: Tensor) -> None:
-        names = [term.name for term in terms]
-        if len({*names}) < len(names) or not names or any("." in name for name in names):
-            raise ValueError(f"Expected terms with different names without dots; found {names}.")
-        for term in terms:
-            if term.physics is not None and not 0 <= term.physics < len(f):
-                raise ValueError(
-                    f"Term {term.name!r} has physics number {term.physics}, but the model has "
-                    f"{len(f)}; pass it in physics=[...]."
-                )
         self.terms, self.unit = tuple(terms), unit
         self.f = [v.reshape(-1, v.shape[-1]) for v in f]
         self._middle = [v.mean(-1, keepdim=True) for v in self.f]
