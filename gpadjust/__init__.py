@@ -124,7 +124,18 @@ _ROOMS = (
     "dynamics",
 )
 # Rooms that are not searched for names; most need an extra.
-_OTHER_ROOMS = ("ax", "control", "core", "export", "files", "records", "report", "rl", "sklearn", "systems")
+_OTHER_ROOMS = (
+    "ax",
+    "control",
+    "core",
+    "export",
+    "files",
+    "records",
+    "report",
+    "rl",
+    "sklearn",
+    "systems",
+)
 
 
 def __getattr__(name: str) -> Any:

@@ -42,7 +42,10 @@ def test_the_core(n, benchmark):
     X, Y = problem(n)
     Z = torch.rand(200, 2, dtype=torch.float64)
     new, old = fitted(core, X, Y), fitted(gpadjust, X, Y)
-    pairs = {"step": steps(X, Y), "fit": (lambda: fitted(core, X, Y), lambda: fitted(gpadjust, X, Y))}
+    pairs = {
+        "step": steps(X, Y),
+        "fit": (lambda: fitted(core, X, Y), lambda: fitted(gpadjust, X, Y)),
+    }
     actions = {
         "predict": lambda model: model.predict(Z),
         "posterior": lambda model: model.posterior(Z[:5]).rsample(torch.Size([16])),

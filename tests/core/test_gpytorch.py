@@ -93,7 +93,7 @@ def test_the_loss_is_the_density_and_differentiable(data):
             model.u += 0.3 * torch.randn(model.u.shape, dtype=torch.float64)
         value = -loss(model).sum() * len(X)
         (slope,) = torch.autograd.grad(value, model.u)
-        density, expected = model.log_likelihood(model.u.detach())
+        _, expected = model.log_likelihood(model.u.detach())
         torch.testing.assert_close(slope, expected - model.u.detach(), rtol=1e-6, atol=1e-6)
 
 
@@ -220,7 +220,10 @@ def test_an_exact_gp_of_ones_own_is_cka(data, uniform):
     model.set_draws(model.u + 0.2 * torch.randn(model.u.shape, dtype=torch.float64))
     own = OwnCKA(X, Y[:, 0], gpytorch.likelihoods.GaussianLikelihood(), wave).double()
     values, unit = model.values, model.unit.item()
-    kernels = (own.rho_covar_module.base_kernel, "rho", 1.0), (own.delta_covar_module, "delta", unit)
+    kernels = (
+        (own.rho_covar_module.base_kernel, "rho", 1.0),
+        (own.delta_covar_module, "delta", unit),
+    )
     for kernel, name, size in kernels:
         kernel.base_kernel.lengthscale = values[f"{name}.kernel.lengthscale"].detach()[0]
         kernel.outputscale = values[f"{name}.kernel.outputscale"].detach()[0, 0, 0] * size**2
@@ -243,7 +246,9 @@ def test_as_single_task_gp(models, uniform):
         if draw is not None:
             expected = model.subset_draws(torch.tensor([draw])).predict(Z)
             torch.testing.assert_close(single.posterior(Z).mean, expected.mean)
-            torch.testing.assert_close(single.posterior(Z).variance, expected.variance, rtol=1e-4, atol=1e-7)
+            torch.testing.assert_close(
+                single.posterior(Z).variance, expected.variance, rtol=1e-4, atol=1e-7
+            )
     with pytest.raises(ValueError, match="Expected one output"):
         models[1].as_single_task_gp()
 

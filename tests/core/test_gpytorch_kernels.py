@@ -27,7 +27,9 @@ KERNELS = {
     "scale": lambda: kernels.ScaleKernel(kernels.RBFKernel(), outputscale_prior=GammaPrior(2, 2)),
     "sum": lambda: kernels.ConstantKernel() + kernels.PolynomialKernel(power=1),
     "product": lambda: kernels.LinearKernel() * kernels.ScaleKernel(kernels.PeriodicKernel()),
-    "one column": lambda: kernels.RBFKernel(active_dims=[1]) * kernels.LinearKernel(active_dims=[0]),
+    "one column": lambda: (
+        kernels.RBFKernel(active_dims=[1]) * kernels.LinearKernel(active_dims=[0])
+    ),
     "interval": lambda: kernels.RBFKernel(lengthscale_constraint=Interval(0.1, 1.0)),
 }
 
@@ -74,7 +76,9 @@ def test_covariance_and_gradient(data, name):
 @pytest.mark.parametrize("name", ["cylindrical", "sum", "product", "scale"])
 def test_fit(data, name):
     X, Y = data
-    model = CKA(X, Y, physics=wave, rho_covar_module=KERNELS[name](), delta_covar_module=KERNELS[name]())
+    model = CKA(
+        X, Y, physics=wave, rho_covar_module=KERNELS[name](), delta_covar_module=KERNELS[name]()
+    )
     for method in ("map", "bayes"):
         fit(model, method)
         assert model.predict(X).variance.isfinite().all()

@@ -98,7 +98,7 @@ def test_a_noise(problem):
 
 
 class Levels(Noise):
-    """Learnt noise times a known level of each output, which a subset of outputs has to take along."""
+    """Learnt noise times a known level of each output, which a subset takes along."""
 
     def __init__(self, levels):
         super().__init__(("level",))
@@ -131,7 +131,9 @@ def test_a_basis(problem):
     check(model, X, Y)
     # Far away the trend goes on.
     far = torch.tensor([[8.0]], dtype=torch.float64)
-    slope = (model.predict(far + 1).mean - model.predict(far).mean) - (physics(far + 1) - physics(far))
+    slope = (model.predict(far + 1).mean - model.predict(far).mean) - (
+        physics(far + 1) - physics(far)
+    )
     assert slope.isfinite().all()
 
 
