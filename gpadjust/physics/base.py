@@ -16,6 +16,8 @@ from gpadjust.physics.error import PhysicsError, described
 from gpadjust.physics.gradient import central_difference
 from gpadjust.physics.unknown import ParameterValues, Unknown, Unknowns
 
+_NONE = Unknowns(None)
+
 
 class Physics(torch.nn.Module, ABC):
     r"""The crude model :math:`f_p : \mathbb{R}^d \to \mathbb{R}^m` of a system.
@@ -63,7 +65,7 @@ class Physics(torch.nn.Module, ABC):
         name: str | None = None,
     ) -> None:
         super().__init__()
-        self.unknowns = Unknowns(unknowns)
+        self.unknowns = Unknowns(unknowns) if unknowns else _NONE
         self._p = len(unknowns or ())
         self.inputs: tuple[int, ...] | None = None
         if inputs is not None:
