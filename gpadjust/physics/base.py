@@ -65,7 +65,7 @@ class Physics(torch.nn.Module, ABC):
         name: str | None = None,
     ) -> None:
         super().__init__()
-        self.unknowns = Unknowns(unknowns) if unknowns else _NONE
+        self.unknowns = _NONE if unknowns is None else Unknowns(unknowns)
         self._p = len(unknowns or ())
         self.inputs: tuple[int, ...] | None = None
         if inputs is not None:
