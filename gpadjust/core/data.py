@@ -33,40 +33,20 @@ _NO_NUMBERS: dict[str, tuple[str, tuple[type, ...], str]] = {
 
 
 class Data(NamedTuple):
-    """Training data of a model.
+    """Training data of a model, in the user's units."""
 
-    Args:
-        X: Inputs in the user's units, ``... x n x d``.
-        Y: Targets in the user's units, ``... x n x m``; NaN where one is missing.
-        Yvar: Known variances of the targets, ``... x n x m``, or None.
-        input_names: Names of the inputs.
-        output_names: Names of the outputs.
-        transform: A one-to-one BoTorch transform of what kernels see of the inputs, or None; the
-            physics sees X.
-    """
-
-    X: Tensor
-    Y: Tensor
-    Yvar: Tensor | None
+    X: Tensor  # ... x n x d
+    Y: Tensor  # ... x n x m; NaN where one is missing
+    Yvar: Tensor | None  # known variances of Y
     input_names: tuple[str, ...]
     output_names: tuple[str, ...]
-    transform: InputTransform | None = None
+    transform: InputTransform | None = None  # of what kernels see of X; the physics sees X
 
     @classmethod
     def of(
-        cls,
-        train_X: ArrayLike,
-        train_Y: ArrayLike,
-        train_Yvar: ArrayLike = None,
-        input_transform: InputTransform | None = None,
+        cls, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike, input_transform: Any
     ) -> Data:
-        """Return checked data.
-
-        Raises:
-            TypeError: If one of them is neither a float64 tensor nor an array or frame of numbers.
-            ValueError: If shapes disagree, there are fewer than two points or two observations of
-                an output, or values are not finite.
-        """
+        """Return checked data, detached from any graph."""
         X, Y = as_tensor(train_X, "train_X"), as_tensor(train_Y, "train_Y")
         if hasattr(train_Y, "to_numpy") and Y.dim() == 1:  # a Series is a column
             Y = Y.unsqueeze(-1)
@@ -76,11 +56,11 @@ class Data(NamedTuple):
                     f"Expected {name} of two dimensions, points x columns; found shape "
                     f"{tuple(tensor.shape)}. One column is `{name}.reshape(-1, 1)`."
                 )
-        shapes = f"found train_X of shape {tuple(X.shape)} and train_Y of {tuple(Y.shape)}"
-        if len(X) != len(Y):
-            raise ValueError(f"Expected a row of targets for each row of inputs; {shapes}.")
-        if X.shape[-1] < 1 or Y.shape[-1] < 1:
-            raise ValueError(f"Expected at least one input and one output; {shapes}.")
+        if len(X) != len(Y) or X.shape[-1] < 1 or Y.shape[-1] < 1:
+            raise ValueError(
+                "Expected a row of targets for each row of inputs, and a column of both; found "
+                f"train_X of shape {tuple(X.shape)} and train_Y of {tuple(Y.shape)}."
+            )
         if len(X) < 2:
             raise ValueError(
                 f"Expected at least 2 points in train_X; found {len(X)}, which no scale can be "
@@ -95,9 +75,9 @@ class Data(NamedTuple):
                 f"column(s) {marked_rows(seldom)}; leave these out."
             )
         X, Y = X.detach().clone(), Y.detach().clone()
-        Yvar = None if train_Yvar is None else variances_of(train_Yvar, Y, "train_Yvar")
-        inputs = column_names(train_X) or default_names("x", X.shape[-1])
-        outputs = column_names(train_Y) or default_names("y", Y.shape[-1])
+        Yvar = None if train_Yvar is None else variances_of(train_Yvar, Y)
+        inputs = column_names(train_X) or _default_names("x", X.shape[-1])
+        outputs = column_names(train_Y) or _default_names("y", Y.shape[-1])
         if input_transform is not None:
             input_transform = deepcopy(input_transform).double().train()
             input_transform(X)
@@ -105,18 +85,16 @@ class Data(NamedTuple):
         _warn_of_copies(X, Y)
         return cls(X, Y, Yvar, inputs, outputs, input_transform)
 
-    def new_X(self, X: ArrayLike) -> Tensor:
+    def new_inputs(self, X: ArrayLike) -> Tensor:
         """Return checked inputs ``... x q x d`` of a call."""
         names = column_names(X)
         if names is not None and names != self.input_names and {*names} & {*self.input_names}:
-            raise ValueError(f"Expected the columns {self.input_names}, in this order; found {names}.")
-        X = as_tensor(X, "X")
-        d = len(self.input_names)
+            raise ValueError(f"Expected columns {self.input_names}, in this order; found {names}.")
+        X, d = as_tensor(X, "X"), len(self.input_names)
         if X.dim() < 2 or X.shape[-1] != d:
-            way = "" if X.dim() > 1 or d != 1 else "; a column is `X.reshape(-1, 1)`"
             raise ValueError(
                 f"Expected X of shape ... x q x {d}, the columns {', '.join(self.input_names)}; "
-                f"found {tuple(X.shape)}{way}."
+                f"found {tuple(X.shape)}. One column is `X.reshape(-1, 1)`."
             )
         if not torch.isfinite(X.detach().sum()):
             check_finite("X", X)
@@ -125,6 +103,24 @@ class Data(NamedTuple):
     def kernel_inputs(self, X: Tensor) -> Tensor:
         """Return what kernels see of inputs ``... x n x d``."""
         return X if self.transform is None else self.transform(X)
+
+    def appended(self, X: Tensor, Y: Tensor) -> Data:
+        """Return the data with further rows; Y may have more dimensions in front than X."""
+        inputs = appended(self.X, X)
+        Y = Y.expand(*torch.broadcast_shapes(inputs.shape[:-2], Y.shape[:-2]), *Y.shape[-2:])
+        return self._replace(X=inputs, Y=appended(self.Y, Y))
+
+    def of_outputs(self, outputs: Sequence[int]) -> Data:
+        """Return the data of some outputs."""
+        Yvar = None if self.Yvar is None else self.Yvar[..., outputs]
+        names = tuple(self.output_names[i] for i in outputs)
+        return self._replace(Y=self.Y[..., outputs], Yvar=Yvar, output_names=names)
+
+
+def appended(old: Tensor, new: Tensor, dim: int = -2) -> Tensor:
+    """Return two tensors one after the other; their dimensions in front broadcast."""
+    lead = torch.broadcast_shapes(old.shape[:dim], new.shape[:dim])
+    return torch.cat([v.expand(*lead, *v.shape[dim:]) for v in (old, new)], dim)
 
 
 def unit_of(Y: Tensor, mean: Tensor) -> Tensor:
@@ -148,19 +144,13 @@ def unit_of(Y: Tensor, mean: Tensor) -> Tensor:
 
 
 def as_tensor(values: ArrayLike, name: str) -> Tensor:
-    """Return a float64 tensor as it is, or one of an array or frame of numbers.
-
-    Raises:
-        TypeError: If values are something else: text, complex numbers, dates or times, too.
-        ValueError: If values are masked.
-    """
+    """Return a float64 tensor as it is, or one of an array or frame of numbers."""
     if isinstance(values, Tensor):
         if values.is_complex():
             raise TypeError(_not_numbers(name, "complex numbers"))
-        if values.dtype != torch.float64:
+        if values.dtype != torch.float64:  # Cholesky factors of these kernels fail in float32
             raise TypeError(
-                f"Expected {name} in float64; found {values.dtype}, in which Cholesky factors of "
-                f"these kernels fail. Convert it with `{name}.double()`."
+                f"Expected {name} in float64; found {values.dtype}; take `{name}.double()`."
             )
         return values
     array = values.to_numpy() if hasattr(values, "to_numpy") else values
@@ -171,8 +161,8 @@ def as_tensor(values: ArrayLike, name: str) -> Tensor:
         )
     if np.ma.is_masked(array):
         raise ValueError(
-            f"Expected {name} without masked values; found {np.ma.count_masked(array)}. Leave their "
-            f"rows out, or make them NaN by `{name}.filled(np.nan)`, if they are targets."
+            f"Expected {name} without masked values; found {np.ma.count_masked(array)}. Leave out "
+            f"their rows; if they are targets, make them NaN, `{name}.filled(np.nan)`."
         )
     objects = {type(value) for value in array.flat} if array.dtype.kind == "O" else set()
     for what, (kinds, types, _) in _NO_NUMBERS.items():
@@ -191,36 +181,33 @@ def _not_numbers(name: str, what: str) -> str:
     return f"Expected {name} to contain numbers only; found {what}: {_NO_NUMBERS[what][2]}."
 
 
-def variances_of(values: ArrayLike, Y: Tensor, name: str) -> Tensor:
+def variances_of(values: ArrayLike, Y: Tensor) -> Tensor:
     """Return known variances of the shape of ``Y``; their mean where there is no observation."""
     if isinstance(values, int | float | list | tuple):
         values = torch.tensor(values, dtype=torch.float64, device=Y.device)
-    variances = as_tensor(values, name)
-    m = Y.shape[-1]
+    variances, m = as_tensor(values, "train_Yvar"), Y.shape[-1]
     if variances.shape != Y.shape and variances.shape not in ((), (1,), (m,)):
         raise ValueError(
-            f"Expected {name} (known variances) as one number, {m} numbers (one for each output), "
-            f"or of the targets' shape {tuple(Y.shape)}; found {tuple(variances.shape)}."
+            f"Expected train_Yvar (known variances) as one number, {m} (one for each output), or "
+            f"of the targets' shape {tuple(Y.shape)}; found {tuple(variances.shape)}."
         )
     variances = variances.expand(Y.shape).masked_fill(Y.isnan(), torch.nan)
     variances = variances.where(~Y.isnan(), variances.nanmean(-2, keepdim=True))
-    check_finite(name, variances)
+    check_finite("train_Yvar", variances)
     if (variances < 0).any():
-        raise ValueError(f"Expected {name} (variances) not negative; found {variances.min():.3g}.")
+        raise ValueError(f"Expected variances in train_Yvar; found {variances.min():.3g}.")
     return variances
 
 
 def column_names(values: ArrayLike) -> tuple[str, ...] | None:
     """Return the names of a frame's columns or of a Series, or None."""
-    columns = getattr(values, "columns", None)
-    if columns is not None:
-        return tuple(map(str, columns))
+    if hasattr(values, "columns"):
+        return tuple(map(str, values.columns))
     name = getattr(values, "name", None)
     return None if name is None or isinstance(values, Tensor) else (str(name),)
 
 
-def default_names(letter: str, number: int) -> tuple[str, ...]:
-    """Return ``x``, or ``x1`` and so on."""
+def _default_names(letter: str, number: int) -> tuple[str, ...]:
     return (letter,) if number == 1 else tuple(f"{letter}{i + 1}" for i in range(number))
 
 
@@ -241,8 +228,7 @@ def _warn_of_copies(X: Tensor, Y: Tensor) -> None:
     if copies:
         warnings.warn(
             f"{copies} of {len(rows)} rows equal an earlier row in all inputs and outputs. If the "
-            "same measurements are in the data twice, as in files joined twice, the noise comes "
-            "out too small: drop them, `frame.drop_duplicates()`. Repeats that are equal by "
-            "rounding may stay.",
+            "same measurements are in the data twice, the noise comes out too small: drop them, "
+            "`frame.drop_duplicates()`. Repeats that are equal by rounding may stay.",
             stacklevel=4,
         )

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 _SMALL, _MEDIUM = 40, 150  # points: up to these draws begin with the prior, and are moved
 _ENTRIES = 150_000  # of covariances that are computed at once, which caches hold
 _SELDOM = 1e-3  # a nested model of less probability at its mode is not drawn from
+_SEARCHES = 4  # for the mode
+_NEAR, _LESS_LIKELY = 0.3, 5.0  # coordinates of one end; log density of one that is left out
 _MOVED = 0.35  # predicted standard deviations by which another seed may move the mean
 
 
@@ -108,7 +110,7 @@ def fit(
             "fantasies. Fit the model that they are made of."
         )
     if method == "map":
-        model.set_draws(_mode(_Target(model, 0), seed, is_precise=True).unsqueeze(0))
+        model.set_draws(_modes(_Target(model, 0), seed, is_precise=True)[:1])
         return FitResult(method, None, {}, math.nan, math.nan, 1)
     n, number = len(model.data.Y), num_draws or _default_number(model)
     sampled = _sampled(model, number, seed)
@@ -213,32 +215,41 @@ def _starts(model: GP, seed: int) -> dict[int, tuple[Normal, Tensor]]:
     generator = torch.Generator().manual_seed(seed)
     rows = torch.randperm(n, generator=generator)[:_SMALL].sort().values
     some = model.subset_rows(rows) if n > 2 * _SMALL else None
-    modes = {k: _mode(_Target(some or model, k), seed) for k in choices}
+    ends = {k: _modes(_Target(some or model, k), seed) for k in choices}
     if some is not None:
-        evidence = {k: around_mode(_Target(some, k), mode)[1] for k, mode in modes.items()}
+        evidence = {k: around_mode(_Target(some, k), several[0])[1] for k, several in ends.items()}
         choices = _likely(model, evidence)
-        modes = {k: maximise(_Target(model, k), modes[k]) for k in choices}
+        ends = {k: _sorted(_Target(model, k), maximise(_Target(model, k), ends[k])) for k in choices}
+    modes = {k: several[0] for k, several in ends.items()}
     starts = {k: around_mode(_Target(model, k), modes[k]) for k in choices}
     kept = _likely(model, {k: evidence for k, (_, evidence) in starts.items()})
     return {k: starts[k] for k in kept}
 
 
-def _mode(target: _Target, seed: int, is_precise: bool = False) -> Tensor:
-    """Return the most likely coordinates, ``B x P``, searched from the best of some.
+def _modes(target: _Target, seed: int, is_precise: bool = False) -> Tensor:
+    """Return the most likely end of some searches, or two that are nearly as likely, ``2 x B x P``.
 
-    A precise search also begins with the medians of the priors.
+    Searches begin with the most likely of some draws from the prior, and the medians of the priors.
     """
     like = target.like
     number = max(16, 6400 // max(len(target.model.data.Y), 25))
     generator = torch.Generator().manual_seed(seed)
     u = torch.randn(number, *like.shape, generator=generator, dtype=like.dtype).to(like)
-    u[0] = 0.0
-    problems = torch.arange(len(like))
-    best = u[target.log_density(u).argmax(0), problems]
-    if not is_precise:
-        return target.chosen(maximise(target, best))
-    ends = torch.stack([maximise(target, start, True) for start in (best, u[0])])
-    return target.chosen(ends[target.log_density(ends).argmax(0), problems])
+    searches = _SEARCHES if target.choice == 0 else _SEARCHES // 2
+    begins = torch.cat([_sorted(target, u)[: searches - 1], torch.zeros_like(u[:1])])
+    ends = _sorted(target, maximise(target, begins, is_precise))
+    density = target.log_density(ends)
+    is_near = (ends - ends[0]).abs().amax(-1) < _NEAR
+    rival, second = density.masked_fill(is_near, -math.inf).max(0)
+    if not (rival > density[0] - _LESS_LIKELY).any():
+        return ends[:1]
+    return torch.stack([ends[0], ends[second, torch.arange(len(like))]])
+
+
+def _sorted(target: _Target, u: Tensor) -> Tensor:
+    """Return coordinates ``N x B x P`` of a nested model, the most likely ones first."""
+    order = target.log_density(u).argsort(0, descending=True)
+    return target.chosen(u.gather(0, order.unsqueeze(-1).expand_as(u)))
 
 
 def _log_prior(model: GP) -> Tensor:

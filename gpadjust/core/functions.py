@@ -10,6 +10,7 @@ from torch import Size, Tensor
 
 from gpadjust.checks import checked_whole
 from gpadjust.core.terms import WeightedSum
+from gpadjust.core.unknowns import standard_normal
 
 if TYPE_CHECKING:
     from gpadjust.core.model import GP
@@ -24,13 +25,11 @@ class Functions(torch.nn.Module):
     .. math:: f(x) = m(x) + \varphi(x)^T w + k(x, X) v, \quad
         v = K^{-1} (y - f_{prior}(X) - \varepsilon).
 
-    Args:
-        model: The model; later changes of it have no effect.
-        number: Number ``k`` of functions, spread over the draws of the model.
-        num_features: Number of features for each kernel, an even one.
-        seed: Seed.
+    The number ``k`` of functions is spread over the draws of the model; later changes of it have no
+    effect. Each kernel has an even number of features.
     """
 
+    @torch.no_grad()
     def __init__(self, model: GP, number: int, num_features: int, seed: int) -> None:
         super().__init__()
         checked_whole("num_functions", number, 1)
@@ -41,35 +40,33 @@ class Functions(torch.nn.Module):
         rows = rows[torch.arange(number) % len(model.u)]
         self.model = model.subset_draws(rows).requires_grad_(False)
         self.number = number
-        with torch.no_grad():
-            self.data = self.model.conditioning()
-            f = self.data.train
-            self.features: dict[str, Any] = {}
-            self.weights: dict[str, Tensor] = {}
-            shape = (number, model.num_outputs)
-            for term in f.terms:
-                if term.kernel is not None:
-                    features = term.kernel.features(f.own(term), num_features, generator)
-                    size = features(f.x).shape[-1]
-                    self.features[term.name] = features
-                    self.weights[term.name] = _randn((*shape, size), generator, f.x)
-                if term.constant is not None:
-                    self.weights[f"{term.name}.constant"] = _randn((*shape, 1), generator, f.x)
-            # The nugget of the factor is noise, too.
-            total = self.data.chol.square().sum(-1) - f.variance()
-            noise = total.maximum(self.data.noise).sqrt()
-            noise = noise * _randn(noise.shape, generator, f.x)
-            away = (self.data.targets - self._prior(f) - noise).nan_to_num()
-            self.update = self.data.solve(away * self.data.observed)
+        self.data = self.model.conditioning()
+        f, shape = self.data.train, (number, model.num_outputs)
+        self.features: dict[str, Any] = {}
+        self.weights: dict[str, Tensor] = {}
+        for term in f.terms:
+            if term.kernel is not None:
+                features = term.kernel.features(f.own(term), num_features, generator)
+                size = features(f.x).shape[-1]
+                self.features[term.name] = features
+                self.weights[term.name] = standard_normal((*shape, size), generator, f.x)
+            if term.constant is not None:
+                weight = standard_normal((*shape, 1), generator, f.x)
+                self.weights[f"{term.name}.constant"] = weight
+        # The nugget of the factor is noise, too.
+        total = self.data.chol.square().sum(-1) - f.variance()
+        noise = total.maximum(self.data.noise).sqrt()
+        noise = noise * standard_normal(noise.shape, generator, f.x)
+        away = (self.data.targets - self._prior(f) - noise).nan_to_num()
+        self.update = self.data.solve(away * self.data.observed)
 
     def forward(self, X: Tensor) -> Tensor:
         """Return the values ``k x ... x q x m`` of all functions at ``... x q x d``."""
-        values = self._values(self.model.data.new_X(X))  # ... x k x q x m
-        return values.movedim(-3, 0)
+        return self._values(self.model.data.new_inputs(X)).movedim(-3, 0)
 
     def each(self, X: Tensor) -> Tensor:
         """Return the values ``k x q x m`` of each function at points of its own, ``k x q x d``."""
-        X = self.model.data.new_X(X)
+        X = self.model.data.new_inputs(X)
         if X.dim() != 3 or len(X) != self.number:
             raise ValueError(
                 f"Expected points for each of {self.number} functions, {self.number} x q x d; "
@@ -102,12 +99,7 @@ class Functions(torch.nn.Module):
 
 
 class Paths(SamplePath):
-    """Functions with the shapes of BoTorch's pathwise samples: ``sample_shape x ... x (m) x q``.
-
-    Args:
-        functions: The functions.
-        sample_shape: Their numbers, of which the product is ``k``.
-    """
+    """Functions with the shapes of BoTorch's pathwise samples: ``sample_shape x ... x (m) x q``."""
 
     def __init__(self, functions: Functions, sample_shape: Size) -> None:
         super().__init__()
@@ -123,14 +115,9 @@ class Paths(SamplePath):
             X = X.squeeze(-3)
         lead = len(self.sample_shape)
         if k > 1 and X.shape[:lead] == self.sample_shape and X.dim() > lead + 1:
-            rest = X.shape[lead:-2].numel()
-            values = self.functions.each(X.reshape(k, rest * X.shape[-2], X.shape[-1]))
-            values = values.reshape(*self.sample_shape, *X.shape[lead:-1], values.shape[-1])
+            values = self.functions.each(X.reshape(k, -1, X.shape[-1]))
+            values = values.unflatten(1, X.shape[lead:-1])
         else:
             values = self.functions(X)
-            values = values.reshape(*self.sample_shape, *values.shape[1:])
+        values = values.reshape(*self.sample_shape, *values.shape[1:])
         return values.squeeze(-1) if values.shape[-1] == 1 else values.mT
-
-
-def _randn(shape: Any, generator: torch.Generator, like: Tensor) -> Tensor:
-    return torch.randn(tuple(shape), generator=generator, dtype=like.dtype).to(like)

@@ -1,4 +1,4 @@
-"""Gaussian processes as linear algebra: likelihood, conditioning, joint and left-out predictions."""
+"""Gaussian processes as linear algebra: likelihood, conditioning and predictions."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def factor(K: Tensor, noise: Tensor, observed: Tensor) -> Tensor:
 
 
 class Likelihood(NamedTuple):
-    """A log likelihood and its derivatives, for a residual ``... x n`` and its covariance."""
+    """A log likelihood and its derivatives."""
 
     value: Tensor  # ...
     by_mean: Tensor  # ... x n
@@ -78,73 +78,64 @@ def log_likelihood(
 
 
 class Conditioning:
-    """The posterior of weighted sums, given noisy observations of one.
+    r"""The posterior of weighted sums, given noisy observations of one.
 
     Args:
         train: The sum that was observed, at the training inputs.
         noise: The variances of the observations, ``... x S x m x n`` (or 1).
         targets: The observations, ``... x 1 x m x n``; NaN where one is missing. Their leading
             dimensions may be more than those of the covariance, whose factor all of them share.
+        old: The conditioning on the first rows, of which the factor is used again.
 
     Attributes:
         alpha: :math:`K^{-1} (y - \bar f)`, ``... x S x m x n``.
     """
 
-    def __init__(self, train: WeightedSum, noise: Tensor, targets: Tensor) -> None:
-        K = train.cross(train)
-        noise = noise.expand(torch.broadcast_shapes(noise.shape, K.shape[:-1]))
-        self._set(train, noise, targets)
-        self.chol = factor(K, noise, self.observed)
-        self.alpha = self.solve(self._residual())
-        self._inverse: Tensor | None = None
+    chol: Tensor
 
-    def _set(self, train: WeightedSum, noise: Tensor, targets: Tensor) -> None:
-        self.train, self.noise, self.targets = train, noise, targets
+    def __init__(
+        self, train: WeightedSum, noise: Tensor, targets: Tensor, old: Conditioning | None = None
+    ) -> None:
+        self.train, self.targets = train, targets
+        late = train if old is None else train.rows_from(old.chol.shape[-1])
+        K = late.cross(late)
+        batch = noise.shape[:-1] if old is None else old.chol.shape[:-2]
+        lead = torch.broadcast_shapes(K.shape[:-2], batch)
+        self.noise = noise.expand(*lead, train.x.shape[-2])
         observed = ~targets.isnan()
         # Fantasies of the same points share a factor, if the same ones are missing.
-        while observed.dim() > noise.dim() and bool((observed == observed[0]).all()):
+        while observed.dim() > self.noise.dim() and bool((observed == observed[0]).all()):
             observed = observed[0]
         self.observed = observed
+        self._inverse: Tensor | None = None
+        if old is None:
+            self.chol = factor(K, self.noise, observed)
+        else:
+            self.chol, self._inverse = self._appended(old, late.cross(old.train), K)
+        self.alpha = self.solve((targets - train.mean).nan_to_num() * observed)
 
-    def _residual(self) -> Tensor:
-        return (self.targets - self.train.mean).nan_to_num() * self.observed
-
-    @classmethod
-    def appended(
-        cls, old: Conditioning, train: WeightedSum, noise: Tensor, targets: Tensor
-    ) -> Conditioning:
-        r"""Return the conditioning on further rows at the end, from the factor of those before.
+    def _appended(self, old: Conditioning, K21: Tensor, K22: Tensor) -> tuple[Tensor, Tensor]:
+        r"""Return the factor of old and further rows, and its inverse.
 
         .. math::
             L = \begin{pmatrix} L_1 & 0 \\ B & L_2 \end{pmatrix}, \quad B^T = L_1^{-1} K_{12},
             \quad L_2 L_2^T = K_{22} - B B^T, \quad
             L^{-1} = \begin{pmatrix} L_1^{-1} & 0 \\ -L_2^{-1} B L_1^{-1} & L_2^{-1} \end{pmatrix}.
         """
-        n, new = old.chol.shape[-1], cls.__new__(cls)
-        late = WeightedSum(
-            train.terms, train.values, train.x[..., n:, :], train.mean[..., n:],
-            {name: None if w is None else w[..., n:] for name, w in train.weights.items()},
-        )  # fmt: skip
-        K22, K21 = late.cross(late), late.cross(old.train)
-        lead = torch.broadcast_shapes(K22.shape[:-2], old.chol.shape[:-2])
-        new._set(train, noise.expand(*lead, train.x.shape[-2]), targets)
-        lead = torch.broadcast_shapes(lead, new.observed.shape[:-1])
-        L1 = old.chol.expand(*lead, n, n)
-        seen = new.observed[..., n:]
+        n, inverse1 = old.chol.shape[-1], old.inverse_factor()
+        lead = torch.broadcast_shapes(self.noise.shape[:-1], self.observed.shape[:-1])
+        seen = self.observed[..., n:]
         K21 = (K21 * seen.unsqueeze(-1) * old.observed.unsqueeze(-2)).expand(*lead, -1, n)
-        inverse = old.inverse_factor()
-        B = K21 @ inverse.mT
-        late_noise = new.noise[..., n:]
+        B = K21 @ inverse1.mT
+        late_noise = self.noise[..., n:]
         # The nugget of the new rows is that of their own variances.
         variance = K22.diagonal(dim1=-1, dim2=-2) + late_noise
-        late_noise = late_noise + max(100, train.x.shape[-2]) * _EPS * variance
+        late_noise = late_noise + max(100, self.noise.shape[-1]) * _EPS * variance
         L2 = factor(K22 - B @ B.mT, late_noise, seen)
         L2 = L2.expand(*lead, *L2.shape[-2:])
-        new.chol = _lower(L1, B, L2)
-        inverse2 = torch.linalg.solve_triangular(L2, torch.eye(L2.shape[-1]).to(L2), upper=False)
-        new._inverse = _lower(inverse.expand(*lead, n, n), -inverse2 @ B @ inverse, inverse2)
-        new.alpha = new.solve(new._residual())
-        return new
+        inverse2 = _inverse(L2)
+        inverse = _lower(inverse1.expand(*lead, n, n), -inverse2 @ B @ inverse1, inverse2)
+        return _lower(old.chol.expand(*lead, n, n), B, L2), inverse
 
     def solve(self, residual: Tensor) -> Tensor:
         """Return :math:`K^{-1} r` for residuals ``... x n``."""
@@ -158,8 +149,7 @@ class Conditioning:
     def inverse_factor(self) -> Tensor:
         """Return :math:`L^{-1}`, computed once, so that predictions are products."""
         if self._inverse is None:
-            eye = torch.eye(self.chol.shape[-1]).to(self.chol)
-            self._inverse = torch.linalg.solve_triangular(self.chol, eye, upper=False)
+            self._inverse = _inverse(self.chol)
         return self._inverse
 
     def mean(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
@@ -174,19 +164,21 @@ class Conditioning:
         mean, cross = self.mean(sought)
         white = cross @ self.inverse_factor().mT
         prior = sought.variance()
-        left = prior - white.square().sum(-1)
-        # Not below the rounding errors of the difference.
-        return mean, left.maximum(4 * self.chol.shape[-1] * _EPS * prior)
+        return mean, (prior - white.square().sum(-1)).maximum(self._least(prior))
 
     def joint(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Return means ``... x S x m x q``, and covariances ``... x S x m x q x q``."""
         mean, cross = self.mean(sought)
         white = cross @ self.inverse_factor().mT
         prior = sought.cross(sought)
-        least = 4 * self.chol.shape[-1] * _EPS * prior.diagonal(dim1=-1, dim2=-2)
         K = prior - white @ white.mT
+        least = self._least(prior.diagonal(dim1=-1, dim2=-2))
         raised = (least - K.diagonal(dim1=-1, dim2=-2)).clamp_min(0.0)
         return mean, add_noise(K, raised)
+
+    def _least(self, prior: Tensor) -> Tensor:
+        """Return the rounding errors of variances, differences from prior ones."""
+        return 4 * self.chol.shape[-1] * _EPS * prior
 
     def left_out(self) -> tuple[Tensor, Tensor]:
         r"""Return means and variances of each observation given all others, noise included.
@@ -198,6 +190,10 @@ class Conditioning:
         precision = self.inverse_factor().square().sum(-2)
         variance = precision.reciprocal().masked_fill(~self.observed, math.nan)
         return self.targets - self.alpha * variance, variance
+
+
+def _inverse(L: Tensor) -> Tensor:
+    return torch.linalg.solve_triangular(L, torch.eye(L.shape[-1]).to(L), upper=False)
 
 
 def _lower(A: Tensor, B: Tensor, C: Tensor) -> Tensor:

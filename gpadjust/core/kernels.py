@@ -6,6 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from copy import deepcopy
+from itertools import product
 from typing import Any, NamedTuple
 
 import torch
@@ -27,8 +28,8 @@ class Kernel(ABC):
     """The covariance function of a Gaussian process, and the priors of its parameters.
 
     A kernel of one's own needs ``rows`` and ``covariance``; derivatives are then autograd's.
-    Inputs x are ``... x 1 x 1 x n x d``, parameters ``S x m x k``, covariances ``... x S x m x n x
-    n'``: the last two dimensions before the points are draws and outputs.
+    Inputs x are ``... x 1 x 1 x n x d``, parameters ``S x m x k``, covariances
+    ``... x S x m x n x n'``: draws and outputs are the last two dimensions before the points.
     """
 
     @abstractmethod
@@ -50,9 +51,8 @@ class Kernel(ABC):
             K = self.covariance(leaves, x)
 
         def pull_back(D: Tensor) -> Values:
-            slopes = torch.autograd.grad(K, [*leaves.values()], D, allow_unused=True)
-            pairs = zip(leaves.items(), slopes, strict=True)
-            return {n: torch.zeros_like(v) if s is None else s for (n, v), s in pairs}
+            slopes = torch.autograd.grad(K, [*leaves.values()], D, materialize_grads=True)
+            return dict(zip(leaves, slopes, strict=True))
 
         return K.detach(), pull_back
 
@@ -60,9 +60,6 @@ class Kernel(ABC):
         """Return random features whose inner products are about the kernel.
 
         They map inputs ``... x n x d`` to ``... x S x m x n x D``.
-
-        Raises:
-            NotImplementedError: If the kernel has none.
         """
         raise NotImplementedError(
             f"{self} has no random features, which functions are drawn with. Give its class a "
@@ -76,29 +73,20 @@ class Kernel(ABC):
 class Profile(NamedTuple):
     """A stationary kernel as a function of e = -r^2 / 2.
 
-    Args:
-        name: The name.
-        value: k(e).
-        slope: dk / de, which is -2 dk / d(r^2).
-        degrees: Degrees of freedom of its spectrum, if that is a Student t; None without random
-            features.
+    Random features are of a spectrum that is a Student t: normal, with infinitely many degrees.
     """
 
     name: str
-    value: Callable[[Tensor], Tensor]
-    slope: Callable[[Tensor], Tensor]
-    degrees: float | None = None
+    value: Callable[[Tensor], Tensor]  # k(e)
+    slope: Callable[[Tensor], Tensor]  # dk / de, which is -2 dk / d(r^2)
+    degrees: float | None = None  # of freedom of the spectrum; None if it is another one
 
 
 def _matern(p: int) -> Profile:
     """Return the Matern kernel with nu = p + 1/2 (Rasmussen and Williams 2006, eq. 4.16)."""
     nu2 = 2 * p + 1
     polynomials = {0: lambda t: 1.0, 1: lambda t: 1 + t, 2: lambda t: 1 + t + t.square() / 3}
-    slopes = {
-        0: lambda t: 1 / t.clamp_min(1e-8),
-        1: lambda t: 1.0,
-        2: lambda t: (1 + t) / 3,
-    }
+    slopes = {0: lambda t: 1 / t.clamp_min(1e-8), 1: lambda t: 1.0, 2: lambda t: (1 + t) / 3}
 
     def root(e: Tensor) -> Tensor:  # t = sqrt(2 nu) r
         return (-2 * nu2 * e).clamp_min(1e-30).sqrt()
@@ -116,7 +104,6 @@ def _matern(p: int) -> Profile:
 
 RBF = Profile("rbf", torch.exp, torch.exp, math.inf)
 MATERN12, MATERN32, MATERN52 = (_matern(p) for p in range(3))
-PROFILES = {each.name: each for each in (RBF, MATERN12, MATERN32, MATERN52)}
 
 
 def exponents(z: Tensor, other: Tensor | None = None) -> Tensor:
@@ -156,7 +143,8 @@ class Stationary(Kernel):
     def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
         """Return ``s k(|(x - x') / l|)``."""
         length = own["lengthscale"].unsqueeze(-2)
-        shift = (x if other is None else other).detach()[..., :1, :]  # distances of large inputs, as of years, lose no digits
+        # Without a shift distances of large inputs, as of years, would lose digits.
+        shift = (x if other is None else other).detach()[..., :1, :]
         z = (x - shift) / length
         e = exponents(z, None if other is None else (other - shift) / length)
         return own["outputscale"].unsqueeze(-1) * self.profile.value(e)
@@ -193,19 +181,20 @@ class Stationary(Kernel):
 
     def features(self, own: Values, number: int, generator: torch.Generator) -> Features:
         """Return sines and cosines of frequencies of the kernel's spectrum."""
-        if self.profile.degrees is None:
+        degrees, half = self.profile.degrees, number // 2
+        if degrees is None:
             return super().features(own, number, generator)
-        d = own["lengthscale"].shape[-1]
-        w = torch.randn(d, number // 2, generator=generator, dtype=torch.float64)
-        if math.isfinite(self.profile.degrees):  # chi^2 with an odd number of degrees, as squares
-            normals = torch.randn(
-                int(self.profile.degrees), number // 2, generator=generator, dtype=torch.float64
-            )
-            w = w * (self.profile.degrees / normals.square().sum(0)).sqrt()
+        w = _normal(own["lengthscale"].shape[-1], half, generator)
+        if math.isfinite(degrees):  # chi^2 with an odd number of degrees, as squares
+            w = w * (degrees / _normal(int(degrees), half, generator).square().sum(0)).sqrt()
         return lambda x: _fourier(own, x, w)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.profile.name})"
+
+
+def _normal(rows: int, columns: int, generator: torch.Generator) -> Tensor:
+    return torch.randn(rows, columns, generator=generator, dtype=torch.float64)
 
 
 def _fourier(own: Values, x: Tensor, w: Tensor) -> Tensor:
@@ -218,13 +207,8 @@ def _fourier(own: Values, x: Tensor, w: Tensor) -> Tensor:
 class Fourier(Stationary):
     r"""The kernel :math:`\varphi(x)^T \varphi(x')` of finitely many random Fourier features.
 
-    With it the process is a Bayesian linear model, ridge regression (Rahimi and Recht 2007).
-
-    Args:
-        num_inputs: ``d``.
-        num_features: ``D``, an even number.
-        seed: Seed of the frequencies.
-        outputscale: As of :class:`Stationary`.
+    With it the process is a Bayesian linear model, ridge regression (Rahimi and Recht 2007). The
+    number of features is even; the seed is that of their frequencies.
     """
 
     def __init__(
@@ -232,9 +216,7 @@ class Fourier(Stationary):
     ) -> None:
         super().__init__(RBF, outputscale)
         generator = torch.Generator().manual_seed(seed)
-        self.frequencies = torch.randn(
-            num_inputs, num_features // 2, generator=generator, dtype=torch.float64
-        )
+        self.frequencies = _normal(num_inputs, num_features // 2, generator)
 
     def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
         """Return the inner products of the features."""
@@ -282,7 +264,7 @@ class OfGPyTorch(Kernel):
             )
         if kernel.batch_shape:
             raise ValueError(
-                f"Expected a kernel without batch shape, which draws and outputs add; found "
+                "Expected a kernel without batch shape, which draws and outputs add; found "
                 f"{tuple(kernel.batch_shape)}."
             )
         self.kernel, self.outputscale = deepcopy(kernel).double(), outputscale
@@ -293,7 +275,7 @@ class OfGPyTorch(Kernel):
         """Return a row for each parameter that is learnt."""
         priors = {}
         for _, module, prior, closure, _ in self.kernel.named_priors():
-            for name, parameter in self._raw.items():
+            for name, parameter in self.kernel.named_parameters():
                 if _reads(closure, module, parameter):
                     priors[name] = prior
         rows = []
@@ -303,7 +285,10 @@ class OfGPyTorch(Kernel):
             prior, scale = priors.get(name), _LENGTH_FACTOR if positive else math.e
             density = None if prior is None else _density(prior, raw.shape)
             if prior is None and name.endswith("raw_outputscale"):
-                value, scale = torch.full_like(value, self.outputscale[0]), self.outputscale[1]
+                value, scale = (
+                    torch.full_like(value, self.outputscale.median),
+                    self.outputscale.factor,
+                )
             location = (value.clamp_min(1e-12).log() if positive else value).expand(num_outputs, -1)
             rows.append(Row(name, location, math.log(scale), positive, log_density=density))
         return rows
@@ -317,26 +302,23 @@ class OfGPyTorch(Kernel):
         return evaluate(own, x, x if other is None else other, lead)
 
     @property
-    def _raw(self) -> dict[str, Tensor]:
-        return dict(self.kernel.named_parameters())
-
-    @property
     def _constraints(self) -> dict[str, tuple[Tensor, Any]]:
+        """Raw parameters and their constraints by name."""
         named = self.kernel.named_parameters_and_constraints()
         return {name: (raw, constraint) for name, raw, constraint in named}
 
-    def _with(self, values: Values, lead: torch.Size) -> dict[str, Tensor]:
-        """Return raw parameters of values ``*lead x k``."""
+    def _dense(self, kernel: AnyGPyTorchKernel, values: Values, x: Tensor, other: Tensor) -> Tensor:
+        """Return covariances of a kernel at values of its parameters."""
         raw = {}
         for name, (old, constraint) in self._constraints.items():
-            value = values[name].reshape(torch.Size([*lead, *old.shape]))
+            value = values[name].unflatten(-1, old.shape) if old.dim() else values[name].squeeze(-1)
             if constraint is not None:
                 low, high = constraint.lower_bound.to(value), constraint.upper_bound.to(value)
                 value = value.maximum(low + 1e-12 * low.abs().nan_to_num(posinf=0.0))
                 value = value.minimum(high - 1e-12 * high.abs().nan_to_num(posinf=0.0))
                 value = constraint.inverse_transform(value)
-            raw[name] = value
-        return raw
+            raw[f"kernel.{name}"] = value
+        return functional_call(_Dense(kernel), raw, (x, other))
 
     def _of_batch(self, own: Values, x: Tensor, other: Tensor, lead: torch.Size) -> Tensor:
         kernel = deepcopy(self.kernel)
@@ -345,19 +327,16 @@ class OfGPyTorch(Kernel):
                 each.batch_shape = lead
         shape = torch.broadcast_shapes(lead, x.shape[:-2], other.shape[:-2])
         x, other = (v.expand(*shape, *v.shape[-2:]) for v in (x, other))
-        return _dense(kernel, self._with(own, lead), x, other)
+        return self._dense(kernel, own, x, other)
 
     def _one_by_one(self, own: Values, x: Tensor, other: Tensor, lead: torch.Size) -> Tensor:
         x, other = (v.expand(*v.shape[:-4], *lead, *v.shape[-2:]) for v in (x, other))
-        rows = []
-        for i in range(lead[0]):
-            parts = []
-            for j in range(lead[1]):
-                one = {name: value[i, j] for name, value in own.items()}
-                raw = self._with(one, torch.Size())
-                parts.append(_dense(self.kernel, raw, x[..., i, j, :, :], other[..., i, j, :, :]))
-            rows.append(torch.stack(parts, -3))
-        return torch.stack(rows, -4)
+        parts = []
+        for i, j in product(*map(range, lead)):
+            one = {name: value[i, j] for name, value in own.items()}
+            points = (x[..., i, j, :, :], other[..., i, j, :, :])
+            parts.append(self._dense(self.kernel, one, *points))
+        return torch.stack(parts, -3).unflatten(-3, lead)
 
     def _is_the_same_as_a_batch(self, own: Values, x: Tensor, lead: torch.Size) -> bool:
         """Return whether evaluating a batch gives what each of its elements gives."""
@@ -383,24 +362,15 @@ class _Dense(torch.nn.Module):
         self.kernel = kernel
 
     def forward(self, x: Tensor, other: Tensor) -> Tensor:
-        """Return the covariances."""
-        dense: Tensor = self.kernel(x, other).to_dense()
-        return dense
-
-
-def _dense(kernel: AnyGPyTorchKernel, raw: dict[str, Tensor], x: Tensor, other: Tensor) -> Tensor:
-    named = {f"kernel.{name}": value for name, value in raw.items()}
-    dense: Tensor = functional_call(_Dense(kernel), named, (x, other))
-    return dense
+        return self.kernel(x, other).to_dense()
 
 
 def _reads(closure: Callable[..., Tensor], module: Any, parameter: Tensor) -> bool:
-    """Return whether a prior's value depends on a parameter."""
+    """Return whether a prior's value depends on a parameter, of which no graph is recorded."""
     with torch.enable_grad():
-        wanted = parameter.requires_grad
         parameter.requires_grad_(True)
         reads = bool(closure(module).requires_grad)
-        parameter.requires_grad_(wanted)
+        parameter.requires_grad_(False)
     return reads
 
 
@@ -408,8 +378,8 @@ def _density(prior: Any, shape: torch.Size) -> Callable[[Tensor], Tensor]:
     """Return the log density of numbers ``... x k`` by a prior of GPyTorch."""
 
     def log_density(theta: Tensor) -> Tensor:
-        value: Tensor = prior.log_prob(theta.reshape(*theta.shape[:-1], *shape))
-        return value.reshape(*theta.shape[:-1], -1).sum(-1)
+        lead = theta.shape[:-1]
+        return prior.log_prob(theta.reshape(*lead, *shape)).reshape(*lead, -1).sum(-1)
 
     return log_density
 

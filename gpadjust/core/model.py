@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from typing import Any, Self
 
 import gpytorch
 import torch
-from botorch.acquisition.objective import PosteriorTransform, ScalarizedPosteriorTransform
 from botorch.models import SingleTaskGP
-from botorch.models.model import FantasizeMixin, Model
 from botorch.models.transforms.outcome import Standardize
-from botorch.posteriors import Posterior
 from botorch.sampling.pathwise.posterior_samplers import DrawMatheronPaths
 from botorch.settings import validate_input_scaling
 from gpytorch.distributions import MultivariateNormal
@@ -20,18 +17,13 @@ from gpytorch.priors import NormalPrior
 from linear_operator import to_linear_operator
 from torch import Size, Tensor
 
-from gpadjust.core.data import ArrayLike, Data, as_given, as_tensor, unit_of
+from gpadjust.core.data import ArrayLike, Data, appended, as_tensor, unit_of
 from gpadjust.core.functions import Functions, Paths
-from gpadjust.core.gaussian import Conditioning, add_noise, log_likelihood
+from gpadjust.core.gaussian import Conditioning, Likelihood, add_noise, log_likelihood
 from gpadjust.core.noise import KnownNoise, Noise
-from gpadjust.core.posterior import (
-    MixturePosterior,
-    Prediction,
-    mixture_quantile,
-    moments,
-)
+from gpadjust.core.posterior import MixturePosterior, Predictive
 from gpadjust.core.summary import summary
-from gpadjust.core.terms import Places, Term, TermSum, WeightedSum, check_terms
+from gpadjust.core.terms import Places, Term, TermSum, WeightedSum
 from gpadjust.core.unknowns import Choice, Row, Table, Values
 from gpadjust.core.views import (
     MeanView,
@@ -42,16 +34,19 @@ from gpadjust.core.views import (
 )
 from gpadjust.physics import Physics, Unknown, as_physics
 
+Slopes = dict[str, list[Tensor]]
+"""Derivatives of each physics by the coordinate of each unknown parameter, ``S x m x n``."""
+
 _STEP = 1e-4  # of differences by parameters of a physics, in coordinates
 
 
-class GP(gpytorch.models.GP, FantasizeMixin, Model):
+class GP(gpytorch.models.GP, Predictive):
     r"""A sum of terms :math:`f(x) = \sum_t b_t(x) g_t(x)`, conditioned exactly on noisy targets.
 
     Each :math:`g_t` is a Gaussian process and each basis :math:`b_t` a physics or 1. All unknown
-    numbers, of kernels, noise and physics, are rows of one ``table``, and ``u`` holds draws of their
-    standard normal coordinates: one, all 0, until the model is fitted. Predictions are averages
-    over the draws. Outputs are independent given the numbers.
+    numbers, of kernels, noise and physics, are rows of one ``table``, and ``u`` holds draws of
+    their standard normal coordinates: one, all 0, until the model is fitted. Predictions are
+    averages over the draws. Outputs are independent given the numbers.
 
     The model is a BoTorch ``Model``, of which posteriors are ordinary ones without a dimension for
     draws, and a ``gpytorch.models.GP`` with a mean, a kernel, a likelihood and the parameter ``u``.
@@ -65,9 +60,8 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
         noise: A :class:`Noise`. Default: one learnt variance of each output.
         choices: Nested models, which are averaged over by their posterior probabilities.
         input_transform: A one-to-one BoTorch transform of what kernels see; the physics sees X.
-        outcome_transform: None or BoTorch's ``Standardize``, which has no effect, as priors are in
-            units of the targets.
-        settings: The arguments by which :func:`~gpadjust.core.save` builds the model again.
+        outcome_transform: None or BoTorch's ``Standardize``, which has no effect: units are learnt.
+        settings: The arguments by which :func:`~gpadjust.core.save` builds a subclass again.
 
     Attributes:
         u: Coordinates of the draws that predictions average over, ``S x B x P``.
@@ -90,19 +84,11 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
     """
 
     def __init__(
-        self,
-        train_X: ArrayLike,
-        train_Y: ArrayLike,
-        train_Yvar: ArrayLike = None,
-        *,
-        terms: Sequence[Term],
-        physics: Sequence[Any] = (),
-        noise: Noise | None = None,
-        choices: Sequence[Choice] = (),
-        input_transform: Any = None,
-        outcome_transform: Any = None,
-        settings: Mapping[str, Any] | None = None,
-    ) -> None:
+        self, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike = None, *,
+        terms: Sequence[Term], physics: Sequence[Any] = (), noise: Noise | None = None,
+        choices: Sequence[Choice] = (), input_transform: Any = None,
+        outcome_transform: Any = None, settings: Mapping[str, Any] | None = None,
+    ) -> None:  # fmt: skip
         super().__init__()
         if outcome_transform is not None and not isinstance(outcome_transform, Standardize):
             raise ValueError(
@@ -110,37 +96,44 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
                 f"{outcome_transform!r}. Transform the targets and the physics before."
             )
         self.data = Data.of(train_X, train_Y, train_Yvar, input_transform)
+        X, Y = self.data.X, self.data.Y
+        m = Y.shape[-1]
+        self.rows_of_fit = len(Y)  # later ones are conditioned on, in the unit of these
         self.physics = [as_physics(each) for each in physics]
+        if type(self) is GP:
+            settings = {"terms": terms, "noise": noise, "choices": choices}
+            settings["input_transform"] = input_transform
         self.settings = dict(settings or {})
         self._outputs: list[int] | None = None
         self._cached: tuple[Tensor, Conditioning] | None = None
-        X, Y = self.data.X, self.data.Y
-        self.unit = Y.new_ones(Y.shape[-1], 1)
         self._unknowns = _unknowns_of(self.physics)
         self._f_train: list[Tensor] = []
-        f = self._physics_at(X, {f"physics.{name}": Y.new_zeros(1, 1) for name in self._unknowns})
-        self._check_outputs(f)
-        check_terms(terms, len(f))
-        mean = torch.zeros_like(Y.mT)
-        for t in terms:
-            mean = mean + t.mean * (1.0 if t.physics is None else f[t.physics][0])
-        self.unit = unit_of(Y, mean.mT)
-        self._f_train = [v / self.unit for v in f]
+        self.unit = Y.new_ones(1, 1)  # the user's, until the prior mean is known
+        places = self.places(X, {f"physics.{n}": Y.new_zeros(1, 1) for n in self._unknowns})
+        for own, f in zip(self.physics, places.f, strict=True):
+            if f.shape[-2] != m:
+                raise ValueError(
+                    f"Expected {m} outputs of physics {own.name!r}, as many as of train_Y; found "
+                    f"{f.shape[-2]}."
+                )
+        mean = TermSum(terms, places.f, self.unit).mean({}, places)
+        self.unit = unit_of(Y, mean[0].mT)
+        self._f_train = [f / self.unit for f in places.f]
         self.term_sum = TermSum(terms, self._f_train, self.unit)
         if self.data.Yvar is not None:
             if noise is not None:
                 raise ValueError("Expected train_Yvar or noise; found both.")
             noise = KnownNoise(self.data.Yvar.mT / self.unit.square())
         self.noise = Noise() if noise is None else noise
-        rows = self.term_sum.rows(self.data.kernel_inputs(X), Y.shape[-1])
-        rows += self.noise.rows(len(Y), Y.shape[-1], Y)
+        rows = self.term_sum.rows(self.data.kernel_inputs(X), m) + self.noise.rows(Y)
         rows += [Row(f"physics.{n}", Y.new_zeros(1), is_shared=True) for n in self._unknowns]
-        self.table = Table(rows, Y.shape[-1], choices)
+        self.table = Table(rows, m, choices)
         self.u = torch.nn.Parameter(Y.new_zeros(1, self.table.problems, self.table.size))
         self.draws = self.u.detach()
         self.likelihood = likelihood_view(self)
         self.mean_module, self.covar_module = MeanView(self), kernel_view(self)
-        self.register_prior("u_prior", _standard_normal(Y), _coordinates, _set_coordinates)
+        prior = NormalPrior(Y.new_zeros(()), Y.new_ones(()))
+        self.register_prior("u_prior", prior, _coordinates, _set_coordinates)
         if any(row.log_density is not None for row in rows):
             self.register_added_loss_term("other_priors")
             self.update_added_loss_term("other_priors", OtherPriors(self))
@@ -165,14 +158,9 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
         return {n: p.value(values[f"physics.{n}"][..., 0]) for n, p in self._unknowns.items()}
 
     def set_draws(self, draws: Tensor, number: int | None = None) -> None:
-        """Hold coordinates ``N x B x P``, of which predictions average over some, evenly taken.
+        """Hold coordinates ``N x B x P``; predictions average over a number of them, or all.
 
-        Args:
-            draws: The coordinates; minus infinity where a positive number is 0.
-            number: How many predictions take. Default: all.
-
-        Raises:
-            ValueError: If they have another shape, or are NaN or infinite.
+        Minus infinity stands for a positive number that is 0; others are finite, or a ValueError.
         """
         shape = torch.Size([self.table.problems, self.table.size])
         if draws.shape[1:] != shape or not len(draws) or not (draws < torch.inf).all():
@@ -185,59 +173,45 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
         self.u = torch.nn.Parameter(self.draws[step // 2 :: step].clone())
         self._cached = None
 
+    @torch.no_grad()
     def log_likelihood(self, u: Tensor, with_gradient: bool = True) -> tuple[Tensor, Tensor]:
         """Return the log likelihood of the targets at coordinates ``S x B x P``, and its gradient.
 
         It is in units of the targets, minus infinity where it or f_p is not finite. The gradient is
         zero if it is not asked for.
         """
-        with torch.no_grad():
-            values, y = self.table.values(u), self.data.Y.mT / self.unit
-            f, f_slopes = self._physics_with_slopes(values, with_gradient)
-            places = Places(self._kernel_inputs(self.data.X), f)
-            total = self.term_sum.at(values, places)
-            if with_gradient:
-                K, pull_back = total.with_pull_back()
-            else:
-                K = total.cross(total)
-            noise = self.noise.variance(values, places, True)
-            shape, observed = (len(u), *y.shape), ~y.isnan()
-            residual, K = (y - total.mean).expand(shape), K.expand(*shape, shape[-1])
-            residual = residual.nan_to_num() * observed
-            found = log_likelihood(residual, K, noise, observed, with_gradient)
-            value, gradient = found.value, torch.zeros_like(u)
-            if with_gradient:
-                by = pull_back(found.by_covariance)
-                by_noise = found.by_covariance.diagonal(dim1=-1, dim2=-2)
-                by |= self.noise.pull_back(values, places, by_noise)
-                by |= self._by_physics(values, places, by, found.by_mean, by_noise, f_slopes)
-                gradient = self.table.gradient(by, values)
-            if self.table.problems < value.shape[-1]:
-                value = value.sum(-1, keepdim=True)
+        values, y = self.table.values(u), self.data.Y.mT / self.unit
+        f, f_slopes = self._physics_with_slopes(values, with_gradient)
+        places = self.places(self.data.X, values, False)._replace(f=f)
+        total = self.term_sum.at(values, places)
+        if with_gradient:
+            K, pull_back = total.with_pull_back()
+        else:
+            K = total.cross(total)
+        noise = self.noise.variance(values, places, True)
+        shape, observed = (len(u), *y.shape), ~y.isnan()
+        residual, K = (y - total.mean).expand(shape), K.expand(*shape, shape[-1])
+        residual = residual.nan_to_num() * observed
+        found = log_likelihood(residual, K, noise, observed, with_gradient)
+        value, gradient = found.value, torch.zeros_like(u)
+        if with_gradient:
+            by = pull_back(found.by_covariance)
+            by_variance = found.by_covariance.diagonal(dim1=-1, dim2=-2)
+            by |= self.noise.pull_back(values, places, by_variance)
+            by |= self._by_physics(values, places, by, found, f_slopes)
+            gradient = self.table.gradient(by, values)
+        if self.table.problems < value.shape[-1]:
+            value = value.sum(-1, keepdim=True)
         ratio, by_ratio = self._other_priors(u)
         value, gradient = value + ratio, gradient + by_ratio
         bad = ~(value.isfinite() & gradient.isfinite().all(-1))
         return value.masked_fill(bad, -torch.inf), gradient.masked_fill(bad.unsqueeze(-1), 0.0)
 
     def _by_physics(
-        self,
-        values: Values,
-        places: Places,
-        by: Values,
-        by_mean: Tensor,
-        by_variance: Tensor,
-        f_slopes: dict[str, list[Tensor]],
+        self, values: Values, places: Places, by: Values, found: Likelihood, f_slopes: Slopes
     ) -> Values:
-        """Return derivatives by centers and by the coordinates of a physics' parameters.
-
-        Args:
-            values: All numbers.
-            places: The training inputs, and f_p there.
-            by: Derivatives by the terms' weights, among others.
-            by_mean: Derivatives by the mean of the sum, ``S x m x n``.
-            by_variance: Derivatives by the variances of the noise, ``S x m x n``.
-            f_slopes: Derivatives of each physics by each coordinate.
-        """
+        """Return derivatives by centers and by the coordinates of a physics' parameters."""
+        by_mean = found.by_mean
         slopes: Values = {}
         by_f = [torch.zeros_like(by_mean) for _ in self.physics]
         for term in self.terms:
@@ -250,24 +224,21 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
                 by_c = -by_weight.sum(-1, keepdim=True)
                 slopes[f"{term.name}.center"] = by_c * self.term_sum.center_scale(term)
         if f_slopes and type(self.noise).shares is not Noise.shares:
-            parts_of_noise = self._noise_by_f(values, places, by_variance)
-            by_f = [a + b for a, b in zip(by_f, parts_of_noise, strict=True)]
+            by_shares = self._noise_by_f(values, places, found.by_covariance)
+            by_f = [a + b for a, b in zip(by_f, by_shares, strict=True)]
         for name, parts in f_slopes.items():
             products = [(a * b).sum((-1, -2)) for a, b in zip(by_f, parts, strict=True)]
             slopes[f"physics.{name}"] = torch.stack(products).sum(0).unsqueeze(-1)
         return slopes
 
-    def _noise_by_f(self, values: Values, places: Places, by_variance: Tensor) -> list[Tensor]:
+    def _noise_by_f(self, values: Values, places: Places, by_covariance: Tensor) -> list[Tensor]:
         """Return derivatives by each f_p, of a noise whose shares depend on it."""
+        by_variance = by_covariance.diagonal(dim1=-1, dim2=-2)
         with torch.enable_grad():
             leaves = [f.detach().clone().requires_grad_() for f in places.f]
             variance = self.noise.variance(values, Places(places.x, leaves), True)
-            slopes = torch.autograd.grad(
-                variance.expand_as(by_variance), leaves, by_variance, allow_unused=True
-            )
-        return [
-            torch.zeros_like(f) if s is None else s for f, s in zip(leaves, slopes, strict=True)
-        ]
+            variance = variance.expand_as(by_variance)
+            return [*torch.autograd.grad(variance, leaves, by_variance, materialize_grads=True)]
 
     def _other_priors(self, u: Tensor) -> tuple[Tensor | float, Tensor | float]:
         """Return the log density of priors other than N(0, I), and its gradient."""
@@ -285,95 +256,67 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
         """Return each physics at ``... x n x d``: ``... x S x m x n``, in units of the targets."""
         if self._f_train and not self._unknowns and X is self.data.X:
             return self._f_train
-        outputs = []
-        for physics in self.physics:
-            if physics.unknowns:
-                Y = physics(X.unsqueeze(-3), self._parameters_of(physics, values)).mT
-            else:
-                Y = physics(X).mT.unsqueeze(-3)
-            outputs.append(self._of_outputs(Y) / self.unit)
-        return outputs
+        return [self._outputs_of(each, each, X, values) for each in self.physics]
 
     def _physics_with_slopes(
         self, values: Values, with_slopes: bool
-    ) -> tuple[list[Tensor], dict[str, list[Tensor]]]:
-        """Return each physics at the training inputs, and its derivatives by each coordinate.
+    ) -> tuple[list[Tensor], Slopes]:
+        """Return each physics at the training inputs, NaN where it fails, and its derivatives.
 
-        Derivatives are central differences, of one call for all. NaN where a physics fails.
+        These are central differences, of one call for all.
         """
-        if not self._unknowns:
-            return self._physics_at(self.data.X, {}), {}
-        names = [*self._unknowns]
-        S, p = len(values[f"physics.{names[0]}"]), len(names)
+        X, names = self.data.X, [*self._unknowns]
+        if not names:
+            return self._physics_at(X, {}), {}
         z = torch.cat([values[f"physics.{name}"] for name in names], -1)  # S x p
-        steps = _STEP * torch.eye(p if with_slopes else 0, p).to(z).unsqueeze(1)
-        z = torch.cat([z.unsqueeze(0), z + steps, z - steps]).reshape(-1, p)
-        moved = {f"physics.{name}": z[:, [i]] for i, name in enumerate(names)}
+        p = len(names) if with_slopes else 0
+        steps = _STEP * torch.eye(p, len(names)).to(z).unsqueeze(1)
+        shifted = torch.cat([z.unsqueeze(0), z + steps, z - steps])  # (1 + 2 p) x S x p
+        moved = {f"physics.{n}": shifted[..., [i]].flatten(0, 1) for i, n in enumerate(names)}
         f, slopes = [], []
         for physics in self.physics:
-            given = (self._parameters_of(physics, moved),) if physics.unknowns else ()
-            Y = physics.or_nan(self.data.X.unsqueeze(-3), *given).mT
-            Y = self._of_outputs(Y).expand(len(z), -1, -1) / self.unit
-            Y = Y.reshape(2 * len(steps) + 1, S, *Y.shape[-2:])
+            Y = self._outputs_of(physics, physics.or_nan, X, moved)
+            Y = Y.expand(len(shifted) * len(z), -1, -1).unflatten(0, shifted.shape[:2])
             f.append(Y[0])
-            slopes.append((Y[1 : len(steps) + 1] - Y[len(steps) + 1 :]) / (2 * _STEP))
-        if not with_slopes:
-            return f, {}
-        return f, {name: [each[i] for each in slopes] for i, name in enumerate(names)}
+            slopes.append((Y[1 : p + 1] - Y[p + 1 :]) / (2 * _STEP))
+        return f, {name: [each[i] for each in slopes] for i, name in enumerate(names[:p])}
 
-    def _parameters_of(self, physics: Physics, values: Values) -> Tensor:
-        """Return a physics' parameters ``S x p`` at their coordinates."""
-        z = torch.cat([values[f"physics.{name}"] for name in physics.unknowns], -1)
-        return physics.unknowns.at(z)
-
-    def _of_outputs(self, Y: Tensor) -> Tensor:
-        return Y if self._outputs is None else Y[..., self._outputs, :]
-
-    def _check_outputs(self, f: Sequence[Tensor]) -> None:
-        m = self.data.Y.shape[-1]
-        for physics, values in zip(self.physics, f, strict=True):
-            if values.shape[-2] != m:
-                raise ValueError(
-                    f"Expected as many outputs of physics {physics.name!r} as train_Y has columns, "
-                    f"{m}; found {values.shape[-2]}."
-                )
+    def _outputs_of(
+        self, physics: Physics, call: Callable[..., Tensor], X: Tensor, values: Values
+    ) -> Tensor:
+        """Return a physics by a call of it, at its parameters' coordinates."""
+        parameters = []
+        if physics.unknowns:
+            z = torch.cat([values[f"physics.{name}"] for name in physics.unknowns], -1)
+            parameters.append(physics.unknowns.at(z))
+        Y = call(X.unsqueeze(-3), *parameters).mT
+        return (Y if self._outputs is None else Y[..., self._outputs, :]) / self.unit
 
     # Predictions.
 
-    def _kernel_inputs(self, X: Tensor) -> Tensor:
-        return self.data.kernel_inputs(X).unsqueeze(-3).unsqueeze(-3)
-
     def places(self, X: Tensor, values: Values, with_physics: bool = True) -> Places:
         """Return what terms and noise read at inputs ``... x n x d``."""
-        f = self._physics_at(X, values) if with_physics else []
-        return Places(self._kernel_inputs(X), f)
+        x = self.data.kernel_inputs(X).unsqueeze(-3).unsqueeze(-3)
+        return Places(x, self._physics_at(X, values) if with_physics else [])
 
     def at(self, X: Tensor, values: Values | None = None) -> WeightedSum:
-        """Return the function at inputs ``... x n x d``, at the draws ``u`` unless values are given."""
+        """Return the function at ``... x n x d``, at the draws ``u`` unless values are given."""
         values = self.values if values is None else values
         return self.term_sum.at(values, self.places(X, values))
 
     def conditioning(self) -> Conditioning:
-        """Return the posterior given the data; it is kept until the draws change.
-
-        It has no graph of the draws.
-        """
+        """Return the posterior given the data, without a graph of the draws; kept for these."""
         if self._cached is None or not torch.equal(self._cached[0], self.u):
             with torch.no_grad():
-                self._cached = (self.u.detach().clone(), self._condition(self.values))
+                conditioning = Conditioning(*self._observed(self.values))
+            self._cached = (self.u.detach().clone(), conditioning)
         return self._cached[1]
 
-    def _condition(self, values: Values) -> Conditioning:
+    def _observed(self, values: Values) -> tuple[WeightedSum, Tensor, Tensor]:
+        """Return the function at the training inputs, the variances of the noise, and targets."""
         places = self.places(self.data.X, values)
         noise = self.noise.variance(values, places, True)
-        y = self.data.Y.mT.unsqueeze(-3) / self.unit
-        return Conditioning(self.term_sum.at(values, places), noise, y)
-
-    def left_out_at(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Return each target given all others, at coordinates ``S x B x P``: ``S x n x m``."""
-        with torch.no_grad():
-            mean, variance = self._condition(self.table.values(u)).left_out()
-        return (mean * self.unit).mT, (variance * self.unit.square()).mT
+        return self.term_sum.at(values, places), noise, self.data.Y.mT.unsqueeze(-3) / self.unit
 
     def left_out(self) -> tuple[Tensor, Tensor]:
         """Return means and variances of each target given all others, of each draw ``S x n x m``.
@@ -383,94 +326,53 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
         mean, variance = self.conditioning().left_out()
         return (mean * self.unit).mT, (variance * self.unit.square()).mT
 
+    @torch.no_grad()
+    def left_out_at(self, u: Tensor) -> tuple[Tensor, Tensor]:
+        """Return :meth:`left_out` at other coordinates, ``S x B x P``."""
+        mean, variance = Conditioning(*self._observed(self.table.values(u))).left_out()
+        return (mean * self.unit).mT, (variance * self.unit.square()).mT
+
     def components(
         self, X: ArrayLike, observation_noise: bool | Tensor = False
     ) -> tuple[Tensor, Tensor]:
         """Return means and variances of each draw, ``... x S x q x m``, in the user's units."""
-        X, conditioning = self.data.new_X(X), self.conditioning()
+        X, conditioning = self.data.new_inputs(X), self.conditioning()
         with self._graph_for(X):
             mean, variance = conditioning.marginals(self.at(X, conditioning.train.values))
             variance = variance + self._noise_at(X, observation_noise)
-            mean, variance = torch.broadcast_tensors(
-                mean * self.unit, variance * self.unit.square()
-            )
+            variance = variance * self.unit.square()
+            mean, variance = torch.broadcast_tensors(mean * self.unit, variance)
         return mean.mT, variance.mT
 
-    def predict(self, X: ArrayLike, observation_noise: bool | Tensor = False) -> Prediction:
-        """Predict each point by itself, without the covariances between them.
-
-        Args:
-            X: Inputs, ``... x q x d``.
-            observation_noise: If True, of observations instead of the function; or the variances
-                of their noise, ``... x q x m``.
-
-        Returns:
-            Mean and variance, ``... x q x m``, as ``X`` came: tensors, arrays or frames.
-        """
-        mean, variance = moments(*self.components(X, observation_noise))
-        names = self.data.output_names
-        return Prediction(as_given(mean, X, names), as_given(variance, X, names))
-
-    def interval(
-        self, X: ArrayLike, level: float = 0.95, observation_noise: bool | Tensor = False
-    ) -> tuple[Any, Any]:
-        """Return the lower and upper ends of the central interval at each point, as ``X`` came.
-
-        Raises:
-            ValueError: If ``level`` is not between 0 and 1.
-        """
-        if not 0 < level < 1:
-            raise ValueError(f"Expected level between 0 and 1; found {level}; 95 % is 0.95.")
-        with torch.no_grad():
-            parts = self.components(X, observation_noise)
-            lower = mixture_quantile(*parts, (1 - level) / 2)
-            upper = mixture_quantile(*parts, (1 + level) / 2)
-        names = self.data.output_names
-        return as_given(lower, X, names), as_given(upper, X, names)
-
-    def posterior(
-        self,
-        X: ArrayLike,
-        output_indices: list[int] | None = None,
-        observation_noise: bool | Tensor = False,
-        posterior_transform: PosteriorTransform | None = None,
-    ) -> Posterior:
-        """Return the joint posterior at ``X``, ``... x q x d``, as BoTorch asks for it."""
-        if output_indices is not None:
-            output_indices = self._checked_outputs(output_indices)
-        self.eval()
-        X, conditioning = self.data.new_X(X), self.conditioning()
+    def mixture(
+        self, X: ArrayLike, outputs: list[int] | slice, observation_noise: bool | Tensor
+    ) -> MixturePosterior:
+        """Return the joint posterior of some outputs: a Gaussian of each draw."""
+        X, conditioning = self.data.new_inputs(X), self.conditioning()
         with self._graph_for(X):
             mean, K = conditioning.joint(self.at(X, conditioning.train.values))
             noise = self._noise_at(X, observation_noise)
             if isinstance(noise, Tensor):
                 K = add_noise(K, noise)
-            posterior = self._as_posterior(mean, K, self.unit, output_indices)
-        if posterior_transform is None:
-            return posterior
-        if isinstance(posterior_transform, ScalarizedPosteriorTransform):
-            return posterior.scalarized(posterior_transform.weights, posterior_transform.offset)
-        return posterior_transform(posterior=posterior, X=X)
+            mean, K = mean * self.unit, K * self.unit.square().unsqueeze(-1)
+            return MixturePosterior(mean[..., outputs, :], K[..., outputs, :, :])
 
     def term(self, name: str, X: ArrayLike) -> MixturePosterior:
         """Return the joint posterior of a term's process at ``X``, without asking the physics.
 
         The process of a basis has no unit, that of another term the targets'.
-
-        Raises:
-            ValueError: If there is no such term.
         """
         names = [term.name for term in self.terms]
         if name not in names:
             raise ValueError(f"Unknown term {name!r}; expected one of {', '.join(names)}.")
-        X, conditioning = self.data.new_X(X), self.conditioning()
+        X, conditioning = self.data.new_inputs(X), self.conditioning()
         has_unit = self.terms[names.index(name)].physics is None
         unit = self.unit if has_unit else torch.ones_like(self.unit)
         with self._graph_for(X):
             values = conditioning.train.values
             places = self.places(X, values, with_physics=False)
             mean, K = conditioning.joint(self.term_sum.term(name, values, places))
-            return self._as_posterior(mean, K, unit, None)
+            return MixturePosterior(mean * unit, K * unit.square().unsqueeze(-1))
 
     def rho(self, X: ArrayLike) -> MixturePosterior:
         """Return the posterior of the scaling of the physics; see :meth:`term`."""
@@ -483,15 +385,12 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
     def sample_functions(
         self, num_functions: int, seed: int | None = None, num_features: int = 1024
     ) -> Functions:
-        """Draw functions from the posterior, to be called anywhere.
+        """Draw functions ``... x q x d`` to ``k x ... x q x m`` from the posterior.
 
         Args:
             num_functions: Number ``k`` of functions, spread over the draws.
             seed: Seed. Default: one of PyTorch's generator.
             num_features: Number of random features for each kernel, an even one.
-
-        Returns:
-            A module that maps ``... x q x d`` to ``k x ... x q x m``, in the user's units.
         """
         seed = int(torch.randint(2**31, ())) if seed is None else seed
         return Functions(self, num_functions, num_features, seed)
@@ -505,16 +404,6 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
         asked = X.requires_grad or self.conditioning().alpha.requires_grad
         return torch.set_grad_enabled(asked and torch.is_grad_enabled())
 
-    def _as_posterior(
-        self, mean: Tensor, K: Tensor, unit: Tensor, outputs: list[int] | None
-    ) -> MixturePosterior:
-        mean, K = mean * unit, K * unit.square().unsqueeze(-1)
-        if outputs is not None:
-            mean, K = mean[..., outputs, :], K[..., outputs, :, :]
-        lead = torch.broadcast_shapes(mean.shape, K.shape[:-1])
-        mean, K = mean.expand(lead), K.expand(*lead, lead[-1])
-        return MixturePosterior(mean, K)
-
     def _noise_at(self, X: Tensor, asked: bool | Tensor) -> Tensor | float:
         """Return variances ``... x S x m x q`` in units of the targets; 0 if none are asked for."""
         if asked is False:
@@ -526,23 +415,18 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
 
     def _checked_noise(self, noise: Any, X: Tensor) -> Tensor:
         """Return given variances of observations at ``X``, ``... x q x m``."""
-        if not isinstance(noise, Tensor):
-            raise TypeError(
-                "Expected noise as True, False, or a tensor of variances; found "
-                f"{noise!r}. Known noise belongs to the model, in train_Yvar."
-            )
-        shape = (X.shape[-2], self.num_outputs)
-        sizes = zip(noise.shape[-2:], shape, strict=True) if noise.dim() > 1 else [(0, 1)]
-        if any(have not in (1, want) for have, want in sizes):
-            raise ValueError(
-                f"Expected variances of shape ... x {shape[0]} x {shape[1]} as noise; found "
-                f"{tuple(noise.shape)}."
-            )
-        if not (noise >= 0).all():
-            raise ValueError("Expected noise (variances) that is not negative or NaN.")
-        return noise.expand(*noise.shape[:-2], *shape)
+        q, m, found = X.shape[-2], self.num_outputs, noise
+        if isinstance(noise, Tensor):
+            found = tuple(noise.shape)
+            fits = found[-2:-1] in ((1,), (q,)) and found[-1] in (1, m)
+            if fits and (noise >= 0).all():
+                return noise.expand(*found[:-2], q, m)
+        raise ValueError(
+            f"Expected noise as True, False or variances ... x {q} x {m}, not negative or NaN; "
+            f"found {found!r}. Known noise belongs to the model, in train_Yvar."
+        )
 
-    # Other data, other outputs.
+    # Other data, outputs and draws.
 
     def condition_on_observations(
         self, X: ArrayLike, Y: ArrayLike, noise: Tensor | None = None, **_: Any
@@ -556,27 +440,19 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
             noise: Variances of the shape of ``Y``, of a model with known noise. Default: their
                 mean.
         """
-        X, Y = self.data.new_X(X), as_tensor(Y, "Y")
+        X, Y = self.data.new_inputs(X), as_tensor(Y, "Y")
         if Y.shape[-2:] != (X.shape[-2], self.num_outputs) or Y.isinf().any():
             raise ValueError(
-                f"Expected finite Y of shape ... x {X.shape[-2]} x {self.num_outputs}, or NaN where "
-                f"an output is missing; found {tuple(Y.shape)}."
+                f"Expected finite Y of shape ... x {X.shape[-2]} x {self.num_outputs}, or NaN "
+                f"where an output is missing; found {tuple(Y.shape)}."
             )
-        old = self.conditioning()
-        new = self._copy()
-        lead = torch.broadcast_shapes(X.shape[:-2], self.data.X.shape[:-2])
-        parts = [v.expand(*lead, *v.shape[-2:]) for v in (self.data.X, X)]
-        lead = torch.broadcast_shapes(lead, Y.shape[:-2], self.data.Y.shape[:-2])
-        targets = [v.expand(*lead, *v.shape[-2:]) for v in (self.data.Y, Y)]
-        Yvar = None
         if noise is not None and self.noise.known is not None:
             unused = noise.isnan() & Y.isnan()
-            noise = noise if not unused.any() else torch.ones_like(Y).where(unused, noise)
-            Yvar = self._checked_noise(noise, X).mT / self.unit.square()
-        elif noise is not None:
-            Yvar = noise
-        new.noise = self.noise.appended(Yvar, X.shape[-2])
-        new.data = self.data._replace(X=torch.cat(parts, -2), Y=torch.cat(targets, -2))
+            noise = noise.masked_fill(unused, 1.0) if unused.any() else noise
+            noise = self._checked_noise(noise, X).mT / self.unit.square()
+        old, new = self.conditioning(), self._copy()
+        new.noise = self.noise.appended(noise, X.shape[-2])
+        new.data = self.data.appended(X, Y)
         if new.noise.known is not None:
             new.data = new.data._replace(Yvar=new.noise.known.mT * self.unit.square().mT)
         values = old.train.values
@@ -584,20 +460,14 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
         with torch.set_grad_enabled(has_graph and torch.is_grad_enabled()):
             if not self._unknowns:  # f_p is asked at the new points only
                 late = self._physics_at(X, values)
-                new._f_train = [
-                    torch.cat([a.expand(*b.shape[:-1], a.shape[-1]), b], -1)
-                    for a, b in zip(self._f_train, late, strict=True)
-                ]
-            places = new.places(new.data.X, values)
-            total = new.term_sum.at(values, places)
-            variance = new.noise.variance(values, places, True)
-            y = new.data.Y.mT.unsqueeze(-3) / new.unit
-            appended = Conditioning.appended(old, total, variance, y)
-        new._cached = (self.u.detach().clone(), appended)
+                pairs = zip(self._f_train, late, strict=True)
+                new._f_train = [appended(f, f_late, -1) for f, f_late in pairs]
+            conditioning = Conditioning(*new._observed(values), old)
+        new._cached = (self.u.detach().clone(), conditioning)
         return new.eval()
 
     def get_fantasy_model(self, inputs: Any, targets: Tensor, **options: Any) -> Self:
-        """Return :meth:`condition_on_observations` of targets ``... x (m) x k``, as GPyTorch has it."""
+        """Condition on observations of targets ``... x (m) x k``, as GPyTorch has them."""
         X = inputs if isinstance(inputs, Tensor) else inputs[0]
         Y = targets.unsqueeze(-1) if self.num_outputs == 1 else targets.mT
         noise = options.get("noise")
@@ -606,18 +476,10 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
         return self.condition_on_observations(X, Y, noise)
 
     def subset_output(self, idcs: list[int]) -> Self:
-        """Return the model of some outputs.
-
-        Raises:
-            ValueError: If there are none, or a number is out of range.
-        """
-        idcs = self._checked_outputs(idcs)
+        """Return the model of some outputs; a ValueError if there are none of these numbers."""
+        idcs = self.checked_outputs(idcs)
         new = self._copy()
-        new.data = self.data._replace(
-            Y=self.data.Y[..., idcs], output_names=tuple(self.data.output_names[i] for i in idcs)
-        )
-        if self.data.Yvar is not None:
-            new.data = new.data._replace(Yvar=self.data.Yvar[..., idcs])
+        new.data = self.data.of_outputs(idcs)
         new.unit, new.noise = self.unit[idcs], self.noise.of_outputs(idcs)
         new._f_train = [f[..., idcs, :] for f in self._f_train]
         new._outputs = idcs if self._outputs is None else [self._outputs[i] for i in idcs]
@@ -627,17 +489,8 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
         new.u = torch.nn.Parameter(self.table.coordinates_of_outputs(self.u.detach(), idcs))
         return new
 
-    def _checked_outputs(self, outputs: list[int]) -> list[int]:
-        m = self.num_outputs
-        if not outputs or any(not isinstance(i, int) or not -m <= i < m for i in outputs):
-            raise ValueError(f"Expected numbers of outputs from 0 to {m - 1}; found {outputs}.")
-        return [i % m for i in outputs]
-
     def subset_rows(self, rows: Tensor) -> Self | None:
-        """Return the model of some of its observations, with the same units and priors.
-
-        None if its noise cannot do with fewer.
-        """
+        """Return the model of some observations in the same units; None if its noise cannot."""
         noise = self.noise.of_rows(rows)
         if noise is None:
             return None
@@ -655,18 +508,19 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
 
     def _copy(self) -> Self:
         """Return a copy that shares what is never changed in place."""
-        shared = (self.data, self.physics, self.table, self.term_sum, self.noise, self.unit)
-        shared = (*shared, self._f_train, self._cached, self.draws, self.settings)
+        shared = [self.data, self.physics, self.table, self.term_sum, self.noise, self.unit]
+        shared += [self._f_train, self._cached, self.draws, self.settings]
         return deepcopy(self, {id(each): each for each in shared})
 
     def to(self, *args: Any, **options: Any) -> Self:
         """Move the model to a device, with its data."""
         super().to(*args, **options)
-        data = [v.to(self.u) if isinstance(v, Tensor) else v for v in self.data]
-        self.data, self.unit, self.draws = Data(*data), self.unit.to(self.u), self.draws.to(self.u)
+        Yvar = None if self.data.Yvar is None else self.data.Yvar.to(self.u)
+        X, Y = self.data.X.to(self.u), self.data.Y.to(self.u)
+        self.data = self.data._replace(X=X, Y=Y, Yvar=Yvar)
+        self.unit, self.draws = self.unit.to(self.u), self.draws.to(self.u)
         self._f_train = [f.to(self.u) for f in self._f_train]
-        f = [each.to(self.u) for each in self.term_sum.f]
-        self.term_sum = TermSum(self.terms, f, self.unit)
+        self.term_sum = TermSum(self.terms, [f.to(self.u) for f in self.term_sum.f], self.unit)
         self.table = self.table.to(self.u)
         if isinstance(self.noise, KnownNoise):
             self.noise = KnownNoise(self.noise.known.to(self.u))
@@ -697,32 +551,24 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
 
     @property
     def train_targets(self) -> Tensor:
-        """The targets, ``(m) x n``, 0 where one is missing: the likelihood then gives it no weight."""
+        """The targets, ``(m) x n``; 0 where one is missing, of a noise that gives it no weight."""
         return squeezed(self.data.Y.mT.unsqueeze(-3), -2).nan_to_num()
-
-    def transform_inputs(self, X: Tensor, input_transform: Any = None) -> Tensor:
-        """Return X itself, as the model takes inputs in the user's units everywhere."""
-        return X if input_transform is None else input_transform(X)
 
     def forward(self, x: Tensor) -> MultivariateNormal:
         """Return the prior at inputs ``... x n x d``."""
         return MultivariateNormal(self.mean_module(x), self.covar_module(x))
 
     def __call__(self, x: Tensor) -> MultivariateNormal:
-        """Return the prior at the training inputs in training mode, else the posterior.
-
-        Raises:
-            RuntimeError: In training mode, if the inputs are others, or the model holds draws.
-        """
+        """Return the prior in training mode, at the training inputs only, else the posterior."""
         if not self.training:
-            mean, K = self.conditioning().joint(self.at(self.data.new_X(x)))
+            mean, K = self.conditioning().joint(self.at(self.data.new_inputs(x)))
             K = (K * self.unit.square().unsqueeze(-1)).expand(*mean.shape, mean.shape[-1])
             lazy = to_linear_operator(squeezed(K, -3))
             return MultivariateNormal(squeezed(mean * self.unit, -2), lazy)
         if len(self.u) > 1:
             raise RuntimeError(
-                f"The model holds {len(self.u)} draws of its unknown numbers, of which a loss has no "
-                "use: build a new model for a point fit, or call model.set_draws(model.u[:1])."
+                f"The model holds {len(self.u)} draws of its unknown numbers, a loss needs one: "
+                "build a new model for a point fit, or call model.set_draws(model.u[:1])."
             )
         if x.shape != self.data.X.shape or not torch.equal(x, self.data.X):
             raise RuntimeError("In training mode call the model on its training inputs.")
@@ -731,13 +577,8 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
     def as_single_task_gp(self, draw: int | None = None) -> SingleTaskGP:
         """Return BoTorch's ``SingleTaskGP`` of one output at one draw, for code that asks for one.
 
-        Its mean, kernel and noise are the model's and are not learnt.
-
-        Args:
-            draw: The number of the draw. Default: the most likely one.
-
-        Raises:
-            ValueError: If the model has several outputs or missing targets.
+        Its mean, kernel and noise are the model's and are not learnt. The draw is, by default, the
+        most likely one. A ValueError if there are several outputs or missing targets.
         """
         if self.num_outputs > 1 or self.data.Y.isnan().any():
             raise ValueError(
@@ -763,7 +604,7 @@ class GP(gpytorch.models.GP, FantasizeMixin, Model):
         return f"{type(self).__name__}({n} points, {d} inputs, {m} outputs, {len(self.u)} draws)"
 
 
-@DrawMatheronPaths.register(GP)
+@DrawMatheronPaths.register(GP)  # type: ignore[untyped-decorator]
 def _draw_matheron_paths(model: GP, *, sample_shape: Size, **_: Any) -> Paths:
     """Draw functions for BoTorch's ``draw_matheron_paths``, by the model's own features."""
     functions = model.sample_functions(max(1, sample_shape.numel()))
@@ -794,10 +635,6 @@ def _coordinates(model: GP) -> Tensor:
 def _set_coordinates(model: GP, u: Tensor) -> None:
     with torch.no_grad():
         model.u.copy_(u.reshape(model.u.shape))
-
-
-def _standard_normal(like: Tensor) -> NormalPrior:
-    return NormalPrior(like.new_zeros(()), like.new_ones(()))
 
 
 def _resize(model: Any, state: dict[str, Any], prefix: str, *_: Any) -> None:

@@ -1,4 +1,4 @@
-"""The noise of observations: known variances, or learnt ones with shares that depend on the place."""
+"""The noise of observations: known variances, or learnt ones with shares that depend on x."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from gpadjust.core.data import appended
 from gpadjust.core.terms import Places
 from gpadjust.core.unknowns import LogNormal, Row, Values
 
@@ -19,7 +20,8 @@ class Noise:
 
     The :math:`v_k` are learnt for each output. A noise of one's own overrides ``shares``, h: one
     column for each name. ``1`` and the square of f_p, say, are noise of a constant standard
-    deviation and one that is a share of f_p.
+    deviation and one that is a share of f_p. If h has numbers of each output, ``of_outputs`` has to
+    return the noise of some of them.
 
     Args:
         names: The names of the shares.
@@ -38,13 +40,13 @@ class Noise:
         """Return h, which broadcasts with ``... x S x m x n x K``; None for a single share of 1."""
         return None
 
-    def rows(self, num_points: int, num_outputs: int, like: Tensor) -> list[Row]:
-        """Return the unknown variances."""
-        pairs = zip(self.names, self.priors, strict=True)
-        return [
-            Row.positive(f"noise.{name}", like.new_full((num_outputs, 1), prior.median), prior.factor)
-            for name, prior in pairs
-        ]
+    def rows(self, Y: Tensor) -> list[Row]:
+        """Return the unknown variances, for targets ``n x m``."""
+        rows = []
+        for name, prior in zip(self.names, self.priors, strict=True):
+            median = Y.new_full((Y.shape[-1], 1), prior.median)
+            rows.append(Row.positive(f"noise.{name}", median, prior.factor))
+        return rows
 
     def variance(self, values: Values, places: Places, is_training: bool = False) -> Tensor:
         """Return the variances, ``... x S x m x n`` (or 1 where all are equal)."""
@@ -65,16 +67,11 @@ class Noise:
         shares = self.shares(places)
         if shares is None:
             return {f"noise.{self.names[0]}": by.sum(-1, keepdim=True)}
-        slopes = (by.unsqueeze(-1) * shares).sum(-2)
-        parts = slopes.split(1, -1)
-        return {f"noise.{name}": part for name, part in zip(self.names, parts, strict=True)}
+        slopes = (by.unsqueeze(-1) * shares).sum(-2).split(1, -1)
+        return {f"noise.{name}": slope for name, slope in zip(self.names, slopes, strict=True)}
 
     def appended(self, variances: Tensor | None, num_points: int) -> Noise:
-        """Return the noise of more observations, for training data with further rows.
-
-        Raises:
-            ValueError: If variances are given, as the noise is learnt.
-        """
+        """Return the noise of further rows, too; a ValueError if a learnt one is given any."""
         if variances is not None:
             raise ValueError(
                 "Expected no noise, as the model learns its own; build it with train_Yvar to give "
@@ -95,11 +92,7 @@ class Noise:
 
 
 class KnownNoise(Noise):
-    """Noise of known variances.
-
-    Args:
-        variances: The variances of the training targets, ``... x m x n``, in squared units.
-    """
+    """Noise of known variances: those of the targets, ``... x m x n``, in squared units."""
 
     def __init__(self, variances: Tensor) -> None:
         super().__init__(())
@@ -115,12 +108,10 @@ class KnownNoise(Noise):
         return {}
 
     def appended(self, variances: Tensor | None, num_points: int) -> KnownNoise:
-        """Return the noise of more observations, of given variances or the mean of those known."""
+        """Return the noise of further rows, too: of given variances or the mean of those known."""
         if variances is None:
             variances = self.known.mean(-1, keepdim=True).expand(*self.known.shape[:-1], num_points)
-        lead = torch.broadcast_shapes(self.known.shape[:-1], variances.shape[:-1])
-        parts = [v.expand(*lead, v.shape[-1]) for v in (self.known, variances)]
-        return KnownNoise(torch.cat(parts, -1))
+        return KnownNoise(appended(self.known, variances, -1))
 
     def of_rows(self, rows: Tensor) -> KnownNoise:
         """Return the noise of some observations."""

@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import torch
+from botorch.acquisition.objective import PosteriorTransform, ScalarizedPosteriorTransform
+from botorch.models.model import FantasizeMixin, Model
+from botorch.posteriors import Posterior
 from botorch.posteriors.gpytorch import GPyTorchPosterior
 from gpytorch.distributions import MultitaskMultivariateNormal, MultivariateNormal
 from linear_operator import to_linear_operator
 from torch import Size, Tensor
 
+from gpadjust.core.data import ArrayLike, as_given
+
 DRAWS = -3  # the dimension of draws in ... x S x q x m
 
 
 class Prediction(NamedTuple):
-    """Predictions at points by themselves.
+    """Predictions at points by themselves, in the units of the targets."""
 
-    Args:
-        mean: Means, ``... x q x m``, in the units of the targets.
-        variance: Variances, ``... x q x m``, in their square.
-    """
-
-    mean: Tensor
+    mean: Tensor  # ... x q x m
     variance: Tensor
 
 
@@ -35,7 +36,7 @@ def moments(mean: Tensor, variance: Tensor) -> Prediction:
 
 
 def mixture_quantile(mean: Tensor, variance: Tensor, level: float) -> Tensor:
-    """Return quantiles ``... x q x m`` of mixtures of Gaussians ``... x S x q x m``, by bisection."""
+    """Return quantiles ``... x q x m`` of mixtures ``... x S x q x m``, by bisection."""
     sd = variance.sqrt().clamp_min(1e-300)
     ends = mean + torch.special.ndtri(torch.tensor(level).to(mean)) * sd
     low, high = ends.amin(DRAWS), ends.amax(DRAWS)
@@ -47,7 +48,7 @@ def mixture_quantile(mean: Tensor, variance: Tensor, level: float) -> Tensor:
 
 
 def correlation_root(K: Tensor) -> Tensor:
-    """Return a lower root of covariances ``... x q x q``, with a jitter relative to each variance."""
+    """Return a lower root of covariances, with a jitter relative to each variance."""
     sd = K.diagonal(dim1=-1, dim2=-2).clamp_min(1e-300).sqrt()
     R = K / (sd.unsqueeze(-1) * sd.unsqueeze(-2))
     eye = torch.eye(K.shape[-1]).to(K)
@@ -55,8 +56,7 @@ def correlation_root(K: Tensor) -> Tensor:
         root, info = torch.linalg.cholesky_ex((R + jitter * eye) / (1 + jitter))
         if not info.any():
             break
-    scaled: Tensor = root * sd.unsqueeze(-1)
-    return scaled
+    return root * sd.unsqueeze(-1)
 
 
 class _Normal(MultivariateNormal):
@@ -65,8 +65,7 @@ class _Normal(MultivariateNormal):
     @property
     def variance(self) -> Tensor:
         """The variances."""
-        variance: Tensor = self.lazy_covariance_matrix.diagonal(dim1=-1, dim2=-2)
-        return variance
+        return self.lazy_covariance_matrix.diagonal(dim1=-1, dim2=-2)
 
 
 class _MultitaskNormal(MultitaskMultivariateNormal, _Normal):
@@ -74,7 +73,7 @@ class _MultitaskNormal(MultitaskMultivariateNormal, _Normal):
 
 
 def _joint(mean: Tensor, K: Tensor) -> MultivariateNormal:
-    """Return the distribution of means ``... x m x q`` with a covariance ``... x m q x m q``."""
+    """Return the distribution of means ``... x m x q`` and a covariance ``... x m q x m q``."""
     lazy = to_linear_operator(K)  # without a factor until one is asked for
     if mean.shape[-2] == 1:
         return _Normal(mean.squeeze(-2), lazy)
@@ -92,17 +91,15 @@ def _block_diagonal(K: Tensor) -> Tensor:
 class MixturePosterior(GPyTorchPosterior):
     """A mixture of ``S`` equally likely Gaussians, each of independent outputs.
 
-    To BoTorch it is one posterior over ``... x q x m``, without a dimension for the draws. Samples
-    are exact: each is of one component, which one further base sample picks. The ``distribution``,
-    which BoTorch takes where it asks for a Gaussian, has the joint mean and covariance.
-
-    Args:
-        mean: Means of the components, ``... x S x m x q``.
-        covariance: Their covariances, ``... x S x m x q x q``.
+    Their means are ``... x S x m x q``, their covariances ``... x S x m x q x q``. To BoTorch it is
+    one posterior over ``... x q x m``, without a dimension for the draws. Samples are exact: each
+    is of one component, which one further base sample picks. The ``distribution``, which BoTorch
+    takes where it asks for a Gaussian, has the joint mean and covariance.
     """
 
     def __init__(self, mean: Tensor, covariance: Tensor) -> None:
-        covariance = covariance.expand(*mean.shape, mean.shape[-1])
+        shape = torch.broadcast_shapes(mean.shape, covariance.shape[:-1])
+        mean, covariance = mean.expand(shape), covariance.expand(*shape, shape[-1])
         self.components = (mean, covariance)
         center = mean.mean(-3)
         away = (mean - center.unsqueeze(-3)).flatten(-2)  # ... x S x m q
@@ -117,10 +114,15 @@ class MixturePosterior(GPyTorchPosterior):
         return Size([*mean.shape[:-3], q * m + (S > 1)])
 
     @property
+    def marginals(self) -> tuple[Tensor, Tensor]:
+        """Means and variances of the components at each point, ``... x S x q x m``."""
+        mean, K = self.components
+        return mean.mT, K.diagonal(dim1=-1, dim2=-2).mT
+
+    @property
     def variance(self) -> Tensor:
         """The variances, ``... x q x m``, however small."""
-        mean, K = self.components
-        return moments(mean.mT, K.diagonal(dim1=-1, dim2=-2).mT).variance
+        return moments(*self.marginals).variance
 
     @property
     def batch_range(self) -> tuple[int, int]:
@@ -138,40 +140,37 @@ class MixturePosterior(GPyTorchPosterior):
         """Return samples made of N(0, 1) base samples, ``sample_shape x base_sample_shape``."""
         mean, K = self.components
         S, m, q = mean.shape[-3:]
-        batch = mean.shape[:-3]
-        base = base_samples.expand(*sample_shape, *batch, base_samples.shape[-1])
+        shape = (*sample_shape, *mean.shape[:-3])
+        base = base_samples.expand(*shape, -1)
         which = (torch.special.ndtr(base[..., -1].detach()) * S).long().clamp(0, S - 1)
-        z = base[..., : q * m].reshape(*sample_shape, *batch, q, m).mT
-        root = correlation_root(K)
+        z = base[..., : q * m].reshape(*shape, q, m).mT
         # Components in front, batches behind samples: pick without expanding the roots.
-        flat_mean, flat_root = mean.reshape(-1, S, m, q), root.reshape(-1, S, m, q, q)
+        flat_mean = mean.reshape(-1, S, m, q)
+        flat_root = correlation_root(K).reshape(-1, S, m, q, q)
         which, z = which.reshape(-1, len(flat_mean)), z.reshape(-1, len(flat_mean), m, q)
         rows = torch.arange(len(flat_mean), device=which.device).expand_as(which)
         drawn = flat_mean[rows, which] + _products(flat_root, z, rows, which)
-        return drawn.reshape(*sample_shape, *batch, m, q).mT
+        return drawn.reshape(*shape, m, q).mT
 
     def quantile(self, value: Tensor) -> Tensor:
         """Return quantiles ``... x q x m`` of the mixture; several levels are in front."""
-        mean, K = self.components
-        parts = (mean.mT, K.diagonal(dim1=-1, dim2=-2).mT)
-        quantiles = [mixture_quantile(*parts, float(level)) for level in value.flatten()]
+        levels = value.flatten().tolist()
+        quantiles = [mixture_quantile(*self.marginals, level) for level in levels]
         return torch.stack(quantiles) if value.numel() > 1 else quantiles[0]
 
     def density(self, value: Tensor) -> Tensor:
         """Return the density of each output at each point, at values ``... x q x m``."""
-        mean, K = self.components
-        sd = K.diagonal(dim1=-1, dim2=-2).mT.sqrt().clamp_min(1e-300)
-        z = (value.expand(self.mean.shape).unsqueeze(DRAWS) - mean.mT) / sd
+        mean, variance = self.marginals
+        sd = variance.sqrt().clamp_min(1e-300)
+        z = (value.expand(self.mean.shape).unsqueeze(DRAWS) - mean) / sd
         return ((-0.5 * z.square()).exp() / (sd * (2 * torch.pi) ** 0.5)).mean(DRAWS)
-
 
     def scalarized(self, weights: Tensor, offset: float = 0.0) -> MixturePosterior:
         """Return the posterior of a weighted sum of the outputs, plus an offset."""
         mean, K = self.components
-        if weights.shape != (mean.shape[-2],):
-            raise ValueError(
-                f"Expected weights of {mean.shape[-2]} outputs; found {tuple(weights.shape)}."
-            )
+        m = mean.shape[-2]
+        if weights.shape != (m,):
+            raise ValueError(f"Expected weights of {m} outputs; found {tuple(weights.shape)}.")
         w = weights.to(mean).unsqueeze(-1)
         total = (w * mean).sum(-2, keepdim=True) + offset
         return MixturePosterior(total, (w.square().unsqueeze(-1) * K).sum(-3, keepdim=True))
@@ -189,3 +188,65 @@ def _products(root: Tensor, z: Tensor, rows: Tensor, which: Tensor) -> Tensor:
             part = (root[at[:, 1], s] @ z[mine].unsqueeze(-1)).squeeze(-1)
             drawn = drawn.index_put((at[:, 0], at[:, 1]), part)
     return drawn
+
+
+class Predictive(Model, FantasizeMixin):
+    """A model whose predictions are mixtures of equally likely Gaussians.
+
+    A subclass has ``components`` of X and observation_noise, the means and variances of each,
+    ``... x S x q x m``, and ``mixture`` of X, outputs and observation_noise, the joint posterior.
+    """
+
+    components: Callable[..., tuple[Tensor, Tensor]]
+    mixture: Callable[..., MixturePosterior]
+
+    def predict(self, X: ArrayLike, observation_noise: bool | Tensor = False) -> Prediction:
+        """Predict each point by itself, without the covariances between them.
+
+        Args:
+            X: Inputs, ``... x q x d``.
+            observation_noise: If True, of observations instead of the function; or the variances
+                of their noise, ``... x q x m``.
+
+        Returns:
+            Mean and variance, ``... x q x m``, as ``X`` came: tensors, arrays or frames.
+        """
+        prediction = moments(*self.components(X, observation_noise))
+        return Prediction(*(as_given(each, X, self.data.output_names) for each in prediction))
+
+    @torch.no_grad()
+    def interval(
+        self, X: ArrayLike, level: float = 0.95, observation_noise: bool | Tensor = False
+    ) -> tuple[Any, Any]:
+        """Return the lower and upper ends of the central interval at each point, as ``X`` came."""
+        if not 0 < level < 1:
+            raise ValueError(f"Expected level between 0 and 1; found {level}; 95 % is 0.95.")
+        parts = self.components(X, observation_noise)
+        ends, names = ((1 - level) / 2, (1 + level) / 2), self.data.output_names
+        lower, upper = (as_given(mixture_quantile(*parts, end), X, names) for end in ends)
+        return lower, upper
+
+    def posterior(
+        self,
+        X: ArrayLike,
+        output_indices: list[int] | None = None,
+        observation_noise: bool | Tensor = False,
+        posterior_transform: PosteriorTransform | None = None,
+    ) -> Posterior:
+        """Return the joint posterior at ``X``, ``... x q x d``, as BoTorch asks for it."""
+        self.eval()
+        is_part = output_indices is not None
+        outputs = self.checked_outputs(output_indices) if is_part else slice(None)
+        posterior = self.mixture(X, outputs, observation_noise)
+        if posterior_transform is None:
+            return posterior
+        if isinstance(posterior_transform, ScalarizedPosteriorTransform):
+            return posterior.scalarized(posterior_transform.weights, posterior_transform.offset)
+        return posterior_transform(posterior=posterior, X=X)
+
+    def checked_outputs(self, outputs: list[int] | None) -> list[int]:
+        """Return the numbers of outputs; negative ones count from the end."""
+        m = self.num_outputs
+        if not outputs or any(not isinstance(i, int) or not -m <= i < m for i in outputs):
+            raise ValueError(f"Expected numbers of outputs from 0 to {m - 1}; found {outputs}.")
+        return [i % m for i in outputs]

@@ -235,24 +235,23 @@ def _randn(shape: tuple[int, ...], generator: torch.Generator, like: Tensor) -> 
 
 @torch.no_grad()
 def maximise(log_likelihood: LogLikelihood, u: Tensor, is_precise: bool = False) -> Tensor:
-    """Return the coordinates ``B x P`` of highest density N(u | 0, I) L(u), by L-BFGS from u.
+    """Return coordinates ``N x B x P`` of high density N(u | 0, I) L(u), by L-BFGS from each of N.
 
     A precise search begins anew where it ended, as long as that pays: a line search may fail for
     one problem where others still have a way to go.
     """
-    best, shape = u.clone(), u.shape
-    top = u.new_full(shape[:1], -math.inf)
+    best, top = u.clone(), u.new_full(u.shape[:2], -math.inf)
 
     def negative(flat: object) -> tuple[float, object]:
-        point = torch.as_tensor(flat).to(u).reshape(1, *shape)
+        point = torch.as_tensor(flat).to(u).reshape(u.shape)
         value, slope = log_likelihood(point)
-        density = (value - 0.5 * point.square().sum(-1))[0]
+        density = value - 0.5 * point.square().sum(-1)
         better = density > top
-        top[better], best[better] = density[better], point[0, better]
+        top[better], best[better] = density[better], point[better]
         density = density.nan_to_num(neginf=-1e10)
         return -float(density.sum()), (point - slope).nan_to_num().flatten().cpu().numpy()
 
-    options = {} if is_precise else {"ftol": 1e-6}
+    options = {} if is_precise else {"ftol": 1e-5}
     for _ in range(_SEARCHES if is_precise else 1):
         before = float(top.nan_to_num(neginf=-1e10).sum())
         minimize(

@@ -14,9 +14,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.checks import check_kind, check_switch
-from gpadjust.core.data import unit_of
 from gpadjust.core.model import GP
-from gpadjust.core.noise import Noise
 from gpadjust.physics import PhysicsError
 from gpadjust.physics.import_path import import_path, is_formula, physics_from_path
 
@@ -49,7 +47,7 @@ def save(model: GP, path: str | Path) -> Saved:
     Raises:
         TypeError: If it is not a model of this library.
         ValueError: If its class is not in a module, it has fantasies or a part of a model's rows
-            or outputs, or the path is a folder, or in none that exists.
+            or outputs, or the path is not a file in a folder that exists.
 
     Example:
         >>> import tempfile, torch
@@ -101,9 +99,8 @@ def load(path: str | Path, *, trusted: bool = False, **objects: Any) -> Any:
         OSError: If the file cannot be read.
         PhysicsError: If a physics fails at the training inputs.
         TypeError: If ``trusted`` is not True or False.
-        ValueError: If it is another kind of file, or damaged; if objects are missing, too many, or
-            others than the model was built with; if the module of the class was not imported; or
-            if the physics is code that is not trusted, or cannot be imported.
+        ValueError: If the file is another kind or damaged, objects are missing or others than the
+            model was built with, or the class or physics is not imported, or not trusted.
     """
     check_switch("trusted", trusted)
     try:
@@ -120,12 +117,11 @@ def load(path: str | Path, *, trusted: bool = False, **objects: Any) -> Any:
 
 def _content(model: GP) -> dict[str, Any]:
     """Return what the file of a model holds."""
-    model_class, data, settings = type(model), model.data, _settings(model)
+    model_class, data, n = type(model), model.data, model.rows_of_fit
     module, name = model_class.__module__, model_class.__qualname__
     if getattr(sys.modules[module], name, None) is not model_class:
         raise ValueError(f"Expected a class of a module; found {name}. Move it out of functions.")
-    n = _rows_of_fit(model)
-    if model.batch_shape or model._outputs is not None or not 0 < n <= len(data.Y):
+    if model.batch_shape or model._outputs is not None or n > len(data.Y):
         raise ValueError(
             "Expected a model of one data set and all its outputs; found fantasies, or a part of "
             "the rows or outputs. Save the model that it was made from."
@@ -133,6 +129,7 @@ def _content(model: GP) -> dict[str, Any]:
     parameters = signature(model_class).parameters.values()
     takes_physics = any(p.name == "physics" or p.kind is p.VAR_KEYWORD for p in parameters)
     names = [import_path(each) for each in model.physics] if takes_physics else []
+    settings = {n: value for n, value in model.settings.items() if n != "outcome_transform"}
     missing = [name for name, value in settings.items() if not _is_plain(value)]
     scalings = [term.name for term in model.terms if term.physics is not None]
     is_mapping = model_class is not GP and all(each.startswith("rho_") for each in scalings)
@@ -151,33 +148,11 @@ def _content(model: GP) -> dict[str, Any]:
     }
 
 
-def _settings(model: GP) -> dict[str, Any]:
-    """Return the arguments of a model other than data and physics."""
-    if type(model) is not GP:
-        return {n: value for n, value in model.settings.items() if n != "outcome_transform"}
-    noise: Any = model.noise
-    if model.data.Yvar is not None or (type(noise) is Noise and vars(noise) == vars(Noise())):
-        noise = None
-    settings = {"terms": model.terms, "choices": model.table.choices or None, "noise": noise}
-    settings |= {"input_transform": model.data.transform}
-    return {name: value for name, value in settings.items() if value is not None}
-
-
 def _is_plain(value: Any) -> bool:
     """Return whether ``torch.load`` reads a value with ``weights_only=True``."""
     if type(value) in (list, tuple):
         return all(map(_is_plain, value))
     return type(value) in (bool, int, float, str, type(None), Tensor)
-
-
-def _rows_of_fit(model: GP) -> int:
-    """Return on how many rows, the first, the model was built: its unit is theirs."""
-    if model.term_sum.f:
-        return model.term_sum.f[0].shape[-1]
-    Y = model.data.Y
-    mean = torch.full_like(Y, sum(term.mean for term in model.terms))
-    units = ((n, unit_of(Y[:n], mean[:n])) for n in range(len(Y), 1, -1))
-    return next((n for n, u in units if torch.allclose(u, model.unit, 1e-12, 0.0)), 0)
 
 
 @torch.no_grad()
@@ -228,9 +203,8 @@ def _model(content: dict[str, Any], objects: dict[str, Any], trusted: bool) -> G
     if other := built_with.keys() ^ content["built_with"].keys():
         raise ValueError(f"it was saved with other kernels: {', '.join(sorted(other))}.")
     for name, value in built_with.items():
-        expected, size = content["built_with"][name], 1e-6 * value.abs() + 1e-9 * value.abs().max()
-        is_near = expected.shape == value.shape and ((expected - value).abs() <= size).all()
-        if not is_near:
+        saved, size = content["built_with"][name], 1e-6 * value.abs() + 1e-9 * value.abs().max()
+        if saved.shape != value.shape or not ((saved - value).abs() <= size).all():
             raise ValueError(
                 f"it was saved with another {name}: numbers at the training inputs differ. Give "
                 "what the model was built with (several physics in the same order)."

@@ -7,9 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Self
 
 import torch
-from botorch.acquisition.objective import PosteriorTransform, ScalarizedPosteriorTransform
-from botorch.models.model import FantasizeMixin, Model
-from botorch.posteriors import Posterior
+from botorch.models.model import Model
 from torch import Size, Tensor
 from torch.distributions import Normal
 from torch.nn import Module, ModuleList
@@ -18,12 +16,12 @@ from torch.quasirandom import SobolEngine
 from gpadjust.checks import checked_whole
 from gpadjust.core.data import ArrayLike, Data
 from gpadjust.core.model import GP
-from gpadjust.core.posterior import DRAWS, MixturePosterior
+from gpadjust.core.posterior import DRAWS, MixturePosterior, Predictive
 
 _ROUNDS = 1000  # of the search for weights
 
 
-class StackedGP(Model, FantasizeMixin):
+class StackedGP(Predictive):
     r"""The mixture of several models, :math:`p(f(x)) = \sum_k w_k \, p_k(f(x))` (Yao et al. 2018).
 
     Its components are draws of each model in proportion to the weight. By a weight of each model
@@ -35,10 +33,6 @@ class StackedGP(Model, FantasizeMixin):
             the models or by name; they sum to 1.
         num_components: Number ``S`` of components; weights are rounded to multiples of ``1 / S``.
 
-    Raises:
-        TypeError: If models are not GPs by name.
-        ValueError: If data of models differ, or weights have another shape, sum or sign.
-
     Example:
         >>> from gpadjust.core import PhysicsMeanGP, ZeroMeanGP
         >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
@@ -48,8 +42,6 @@ class StackedGP(Model, FantasizeMixin):
     """
 
     likelihood = None  # FantasizeMixin reads it
-    predict: Any = GP.predict
-    interval: Any = GP.interval
 
     def __init__(self, models: Mapping[str, GP], weights: Any, num_components: int = 64) -> None:
         super().__init__()
@@ -70,15 +62,15 @@ class StackedGP(Model, FantasizeMixin):
         if shares.shape[-1] > 1:  # pairs of components of two outputs fill a square evenly
             order = SobolEngine(shares.shape[-1]).draw(S).argsort(0).argsort(0)
         # S x m: the model of each component and output, and its row in the draws of all models.
-        sizes = (S, self.num_outputs)
-        self.owners: Tensor = owners.gather(0, order).expand(sizes)
-        self.picks: Tensor = picks.gather(0, order).expand(sizes)
+        shape = (S, self.num_outputs)
+        self.owners: Tensor = owners.gather(0, order).expand(shape)
+        self.picks: Tensor = picks.gather(0, order).expand(shape)
 
     @classmethod
     def by_left_out(cls, models: Mapping[str, GP], num_components: int = 64) -> Self:
         """Return the mixture of each output with the highest density of left-out targets.
 
-        The density is a mean of logarithms, which expectation maximisation of weights increases.
+        Expectation maximisation of weights increases the mean of its logarithms.
         """
         _check_models(models)
         scores = []
@@ -117,29 +109,18 @@ class StackedGP(Model, FantasizeMixin):
         """Return means and variances of all components, ``... x S x q x m``."""
         parts = [model.components(X, observation_noise) for model in self.models]
         mean, variance = (torch.cat(each, DRAWS).mT for each in zip(*parts, strict=True))
-        columns = torch.arange(self.num_outputs)
-        return mean[..., self.picks, columns, :].mT, variance[..., self.picks, columns, :].mT
+        picks, outputs = self.picks, torch.arange(self.num_outputs)
+        return mean[..., picks, outputs, :].mT, variance[..., picks, outputs, :].mT
 
-    def posterior(
-        self,
-        X: ArrayLike,
-        output_indices: list[int] | None = None,
-        observation_noise: bool | Tensor = False,
-        posterior_transform: PosteriorTransform | None = None,
-    ) -> Posterior:
-        """Return the joint posterior at ``X``, ``... x q x d``, as BoTorch asks for it."""
-        self.eval()
+    def mixture(
+        self, X: ArrayLike, outputs: list[int] | slice, observation_noise: bool | Tensor
+    ) -> MixturePosterior:
+        """Return the joint posterior of some outputs, each of its own components."""
         parts = [model.posterior(X, None, observation_noise).components for model in self.models]
         means, covariances = zip(*parts, strict=True)
         mean, K = torch.cat(means, -3), torch.cat(covariances, -4)
-        columns = torch.arange(self.num_outputs)[output_indices or slice(None)]
-        picks = self.picks[:, columns]
-        posterior = MixturePosterior(mean[..., picks, columns, :], K[..., picks, columns, :, :])
-        if posterior_transform is None:
-            return posterior
-        if isinstance(posterior_transform, ScalarizedPosteriorTransform):
-            return posterior.scalarized(posterior_transform.weights, posterior_transform.offset)
-        return posterior_transform(posterior=posterior, X=X)
+        picks, columns = self.picks[:, outputs], torch.arange(self.num_outputs)[outputs]
+        return MixturePosterior(mean[..., picks, columns, :], K[..., picks, columns, :, :])
 
     def condition_on_observations(
         self, X: ArrayLike, Y: ArrayLike, noise: Tensor | None = None, **_: Any
@@ -214,8 +195,7 @@ class StackedFunctions(Module):
         values = []
         for parts in self.parts:
             order = torch.cat([rows for rows, _ in parts]).argsort()
-            own = torch.cat([evaluate(functions, rows) for rows, functions in parts])
-            values.append(own[order])
+            values.append(torch.cat([evaluate(f, rows) for rows, f in parts])[order])
         return torch.cat(values, -1)
 
 

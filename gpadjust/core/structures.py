@@ -111,12 +111,8 @@ class RRA(CKA):
 class PhysicsMeanGP(GP):
     r"""A Gaussian process with the physics as its mean, :math:`f_a = f_p + \delta`.
 
-    Args as of :class:`GP`, and:
-
-    Args:
-        physics: As of :class:`CKA`.
-        covar_module: The kernel of delta. Default: RBF.
-        constants: Whether delta contains an unknown constant.
+    Args as of :class:`GP`; physics and constants as of :class:`CKA`. ``covar_module`` is the kernel
+    of delta, by default RBF.
     """
 
     def __init__(
@@ -134,12 +130,8 @@ class PhysicsMeanGP(GP):
 class ScaleGP(GP):
     r"""An adjustment by a scaling alone, :math:`f_a = \rho f_p`, :math:`\rho \sim GP(1, k)`.
 
-    It cannot adjust where f_p is zero. Args as of :class:`GP`, and:
-
-    Args:
-        physics: The physics f_p, as of :class:`CKA`, but one.
-        covar_module: The kernel of rho. Default: RBF.
-        constants: Whether rho contains an unknown constant.
+    It cannot adjust where f_p is zero. Args as of :class:`GP`; one physics, and constants, as of
+    :class:`CKA`. ``covar_module`` is the kernel of rho, by default RBF.
     """
 
     def __init__(
@@ -157,11 +149,8 @@ class ScaleGP(GP):
 class ZeroMeanGP(GP):
     r"""A Gaussian process without physics, around an unknown constant.
 
-    Args as of :class:`GP`, and:
-
-    Args:
-        covar_module: The kernel. Default: RBF.
-        constants: Whether there is the constant.
+    Args as of :class:`GP`; constants as of :class:`CKA`. ``covar_module`` is the kernel, by default
+    RBF.
     """
 
     def __init__(
@@ -179,10 +168,7 @@ class CalibratedPhysics(GP):
     r"""The physics and noise alone, :math:`y = f_p(x; \theta) + \epsilon`: nonlinear regression.
 
     Where the physics is wrong, intervals of its parameters are too narrow: compare it with
-    :class:`CKA` of the same physics. Args as of :class:`GP`, and:
-
-    Args:
-        physics: The physics f_p, one with unknown parameters.
+    :class:`CKA` of the same physics. Args as of :class:`GP`; one physics, with unknown parameters.
     """
 
     def __init__(

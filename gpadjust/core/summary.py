@@ -33,9 +33,9 @@ def summary(model: GP) -> str:
 
 def _title(model: GP) -> str:
     """Return the class, the sizes of the data, and the number of draws."""
-    counts = [model.data.Y.shape[-2], model.data.X.shape[-1], model.num_outputs, len(model.draws)]
-    nouns = zip(counts, ("point", "input", "output", "draw"), strict=True)
-    parts = [f"{n} {noun}" + "s" * (n != 1) for n, noun in nouns]
+    n, d = model.data.X.shape[-2:]
+    counts = {"point": n, "input": d, "output": model.num_outputs, "draw": len(model.draws)}
+    parts = [f"{n} {noun}" + "s" * (n != 1) for noun, n in counts.items()]
     parts += [] if model.draws.any() else ["not fitted"]
     return f"{type(model).__name__}: {', '.join(parts)}"
 
@@ -56,10 +56,9 @@ def _choices(model: GP, values: Values, j: int) -> list[str]:
     choices = model.table.choices
     if not choices or len(model.draws) < 2:
         return []
-    chosen = model.table.chosen(values)[:, j]
-    shares = [float((chosen == k).double().mean()) for k in range(len(choices))]
-    named = zip(choices, shares, strict=True)
-    return ["  probabilities: " + ", ".join(f"{c.text} {share:.0%}" for c, share in named)]
+    chosen = model.table.chosen(values)[:, j].tolist()
+    shares = [f"{c.text} {chosen.count(k) / len(chosen):.0%}" for k, c in enumerate(choices)]
+    return [f"  probabilities: {', '.join(shares)}"]
 
 
 def _of_term(model: GP, term: Term, values: Values, j: int) -> list[str]:
@@ -71,15 +70,14 @@ def _of_term(model: GP, term: Term, values: Values, j: int) -> list[str]:
     if term.kernel is not None and not kept.all():
         head += f", varies in {int(kept.sum())} of {len(kept)} draws"
     lines, start = [head], f"{term.name}.kernel."
-    names = [row.name for row in (*model.table.own, *model.table.shared)]
-    for name in names if kept.any() else []:
+    for name in values if kept.any() else ():
         if name.startswith(start):
             lines += _of_kernel(model, name.removeprefix(start), values[name][kept], unit)
     constant = values.get(f"{term.name}.constant", torch.zeros(1))
     if constant.any():
         lines.append(f"    standard deviation of the constant: {_sd(constant[constant > 0], unit)}")
     if f"{term.name}.center" in values:
-        c = torch.as_tensor(model.term_sum.center(term, model.table.values(model.draws)))
+        c = model.term_sum.center(term, model.table.values(model.draws))
         lines.append(f"    center: {_text(c[:, j] * model.unit[j])}")
     return lines
 

@@ -16,18 +16,18 @@ from gpadjust.core.unknowns import LogNormal, Row, Values
 class Term(NamedTuple):
     r"""A term :math:`b(x) g(x)` of a model, :math:`g \sim GP(\text{mean}, k + \kappa)`.
 
-    The basis b is a physics, or 1.
+    The basis b is a physics, or 1. Where it is 1, numbers of g are in the targets' unit.
 
     Args:
         name: The name.
         kernel: k; None for none.
         mean: The prior mean of g; in the user's units, where b is 1.
         constant: The prior of :math:`\kappa`, the variance of an unknown constant in g; None for
-            none. In squared units of the targets, where b is 1.
+            none.
         physics: The number of the physics that is the basis; None for 1.
         has_center: Whether g's deviation from its mean is multiplied by b - c instead of b, with an
             unknown c: then a constant in both f_p and the targets makes no difference. The prior
-            mean of the sum does not depend on c.
+            mean of the sum does not depend on c. Or the number c.
     """
 
     name: str
@@ -44,15 +44,10 @@ class Term(NamedTuple):
 
 
 class Places(NamedTuple):
-    """Where a sum is sought.
+    """Where a sum is sought."""
 
-    Args:
-        x: Inputs of kernels, ``... x 1 x 1 x n x d``.
-        f: The outputs of each physics there, ``... x S x m x n`` (1 for S).
-    """
-
-    x: Tensor
-    f: Sequence[Tensor] = ()
+    x: Tensor  # inputs of kernels, ... x 1 x 1 x n x d
+    f: Sequence[Tensor] = ()  # the outputs of each physics, ... x S x m x n (1 for S)
 
 
 @dataclass
@@ -69,6 +64,12 @@ class WeightedSum:
     mean: Tensor  # ... x S x m x n
     weights: dict[str, Tensor | None] = field(default_factory=dict)  # w_t; None for 1
 
+    def rows_from(self, n: int) -> WeightedSum:
+        """Return the sum at the places from the n-th on."""
+        weights = {name: None if w is None else w[..., n:] for name, w in self.weights.items()}
+        x, mean = self.x[..., n:, :], self.mean[..., n:]
+        return WeightedSum(self.terms, self.values, x, mean, weights)
+
     def own(self, term: Term) -> Values:
         """Return the parameters of a term's kernel."""
         start = f"{term.name}.kernel."
@@ -80,7 +81,8 @@ class WeightedSum:
         for term, weight in self._parts():
             k = self._constant(term)
             if term.kernel is not None:
-                k = k + self._process(term) * term.kernel.variance(self.own(term), self.x)
+                variance = term.kernel.variance(self.own(term), self.x)
+                k = k + self._process(term, variance.unsqueeze(-1)).squeeze(-1)
             total = total + (k if weight is None else k * weight.square())
         return total
 
@@ -93,14 +95,13 @@ class WeightedSum:
         for term, weight in self._parts():
             if term.name not in other.weights:
                 continue
-            point = None if other is self else other.x
+            other_weight = other.weights[term.name]
             k = self._constant(term).unsqueeze(-1)
             if term.kernel is not None:
-                K = term.kernel.covariance(self.own(term), self.x, point)
-                k = k + (K if self._is_whole(term) else K * self._process(term).unsqueeze(-1))
+                point = None if other is self else other.x
+                k = k + self._process(term, term.kernel.covariance(self.own(term), self.x, point))
             if weight is not None:
                 k = k * weight.unsqueeze(-1)
-            other_weight = other.weights[term.name]
             if other_weight is not None:
                 k = k * other_weight.unsqueeze(-2)
             total = total + k
@@ -111,14 +112,13 @@ class WeightedSum:
 
         Derivatives by the weights have the names ``"<term>.weight"``.
         """
-        steps = []
-        total = self.x.new_zeros(self.x.shape[-2], self.x.shape[-2])
+        total, steps = self.x.new_zeros(self.x.shape[-2], self.x.shape[-2]), []
         for term, w in self._parts():
             K, back = None, None
             one = torch.ones_like(self.x[..., 0]) if w is None else w
             if term.kernel is not None:
                 K, back = term.kernel.with_pull_back(self.own(term), self.x)
-                K = K if self._is_whole(term) else K * self._process(term).unsqueeze(-1)
+                K = self._process(term, K)
                 total = total + K if w is None else _scaled(K, w).add_(total)
             if term.constant is not None:  # kappa w_i w_j
                 left = (self._constant(term) * one).unsqueeze(-1)
@@ -130,10 +130,8 @@ class WeightedSum:
             for term, w, K, back in steps:
                 by_k = _scaled(D, w)
                 if back is not None:
-                    part = (
-                        by_k if self._is_whole(term) else by_k * self._process(term).unsqueeze(-1)
-                    )
-                    by |= {f"{term.name}.kernel.{n}": slope for n, slope in back(part).items()}
+                    by_own = back(self._process(term, by_k))
+                    by |= {f"{term.name}.kernel.{n}": slope for n, slope in by_own.items()}
                 if term.constant is not None:
                     by[f"{term.name}.constant"] = by_k.sum((-1, -2)).unsqueeze(-1)
                 if w is not None:  # of w_i (K_ij + kappa) w_j it is 2 sum_j D_ij (K_ij + kappa) w_j
@@ -146,10 +144,7 @@ class WeightedSum:
         return total, pull_back
 
     def _parts(self) -> list[tuple[Term, Tensor | None]]:
-        """Return the terms that vary and have a weight, and their weights.
-
-        A process that no draw contains is left out.
-        """
+        """Return the terms that vary and have a weight, without processes that no draw contains."""
         parts = []
         for term in self.terms:
             process = self.values.get(f"{term.name}.process")
@@ -159,13 +154,10 @@ class WeightedSum:
                 parts.append((term, self.weights[term.name]))
         return parts
 
-    def _is_whole(self, term: Term) -> bool:
-        return f"{term.name}.process" not in self.values
-
-    def _process(self, term: Term) -> Tensor:
-        """Return 1, or 0 for draws of nested models without the term's process, ``S x m x 1``."""
-        one = torch.ones_like(self.x[..., :1, 0])
-        return self.values.get(f"{term.name}.process", one)
+    def _process(self, term: Term, K: Tensor) -> Tensor:
+        """Return covariances of a term's process, 0 for draws of nested models without it."""
+        process = self.values.get(f"{term.name}.process")
+        return K if process is None else K * process.unsqueeze(-1)
 
     def _constant(self, term: Term) -> Tensor:
         """Return kappa, ``S x m x 1``."""
@@ -179,30 +171,26 @@ def _scaled(K: Tensor, w: Tensor | None) -> Tensor:
     return K if w is None else (K * w.unsqueeze(-1)).mul_(w.unsqueeze(-2))
 
 
-def check_terms(terms: Sequence[Term], num_physics: int) -> None:
-    """Raise a ValueError if names are equal or contain a dot, or a term's physics does not exist."""
-    names = [term.name for term in terms]
-    if len({*names}) < len(names) or not names or any("." in name for name in names):
-        raise ValueError(f"Expected terms with different names without dots; found {names}.")
-    for term in terms:
-        if term.physics is not None and not 0 <= term.physics < num_physics:
-            raise ValueError(
-                f"Term {term.name!r} has physics number {term.physics}, but the model has "
-                f"{num_physics}; pass it in physics=[...]."
-            )
-
-
 class TermSum:
     """The terms of a model: their unknown numbers, and the weighted sums that they make.
 
-    Args:
-        terms: The terms, with different names.
-        f: The outputs of each physics at the training inputs, ``m x n``, in units of the targets.
-        unit: That unit, ``m x 1``.
+    It holds the outputs of each physics at the training inputs, ``m x n``, in a unit ``m x 1``.
     """
 
     def __init__(self, terms: Sequence[Term], f: Sequence[Tensor], unit: Tensor) -> None:
-        self.terms, self.unit = tuple(terms), unit
+        names = [term.name for term in terms]
+        if len({*names}) < len(names) or not names or any("." in name for name in names):
+            raise ValueError(f"Expected terms with different names without dots; found {names}.")
+        for term in terms:
+            if term.physics is not None and not 0 <= term.physics < len(f):
+                raise ValueError(
+                    f"Term {term.name!r} has physics number {term.physics} of {len(f)}; pass it "
+                    "in physics=[...]."
+                )
+        self.terms = tuple(
+            term if term.physics is not None else term._replace(has_center=False) for term in terms
+        )
+        self.unit = unit
         self.f = [v.reshape(-1, v.shape[-1]) for v in f]
         self._middle = [v.mean(-1, keepdim=True) for v in self.f]
         self._spread = [3 * v.std(-1, keepdim=True) for v in self.f]
@@ -212,25 +200,22 @@ class TermSum:
         rows: list[Row] = []
         for term in self.terms:
             if term.kernel is not None:
-                for row in term.kernel.rows(x, num_outputs):
-                    rows.append(row._replace(name=f"{term.name}.kernel.{row.name}"))
+                of_kernel = term.kernel.rows(x, num_outputs)
+                rows += [row._replace(name=f"{term.name}.kernel.{row.name}") for row in of_kernel]
             if term.constant is not None:
                 median = x.new_full((num_outputs, 1), term.constant.median)
                 rows.append(Row.positive(f"{term.name}.constant", median, term.constant.factor))
-            if term.has_center is True and term.physics is not None:
-                f = self.f[term.physics]
+            if term.has_center is True:
                 # c has a scale of its own in each output, so that its coordinate has none.
-                rows.append(Row(f"{term.name}.center", torch.zeros_like(f[:, :1])))
+                rows.append(Row(f"{term.name}.center", x.new_zeros(num_outputs, 1)))
         return rows
 
-    def center(self, term: Term, values: Values) -> Tensor | float:
-        """Return c, ``S x m x 1``: normal around the mean of f_p, with three standard deviations."""
-        if not term.has_center or term.physics is None:
-            return 0.0
+    def center(self, term: Term, values: Values) -> Tensor:
+        """Return c, ``S x m x 1``: normal around the mean of f_p, by three standard deviations."""
         if term.has_center is not True:
             return term.has_center / self.unit
-        scale = self._spread[term.physics]
-        return self._middle[term.physics] + scale * values[f"{term.name}.center"]
+        coordinate = values[f"{term.name}.center"]
+        return self._middle[term.physics or 0] + self.center_scale(term) * coordinate
 
     def center_scale(self, term: Term) -> Tensor:
         """Return the derivative of c by its coordinate, ``m x 1``."""
@@ -242,32 +227,35 @@ class TermSum:
         factor = values.get(f"{term.name}.mean")
         return mean if factor is None else mean * factor
 
+    def mean(self, values: Values, places: Places) -> Tensor:
+        """Return the prior mean of the sum, ``... x S x m x n``."""
+        total = torch.zeros_like(places.x[..., 0])
+        for term in self.terms:
+            own = self.mean_of(term, values)
+            total = total + (own if term.physics is None else own * places.f[term.physics])
+        return total
+
     def at(self, values: Values, places: Places) -> WeightedSum:
         r"""Return the function itself, :math:`\sum_t b_t g_t`."""
-        mean, weights = torch.zeros_like(places.x[..., 0]), {}
+        weights: dict[str, Tensor | None] = {}
         for term in self.terms:
             b = None if term.physics is None else places.f[term.physics]
-            own = self.mean_of(term, values)
-            mean = mean + (own if b is None else own * b)
-            weights[term.name] = b
             if b is not None and term.has_center:
-                weights[term.name] = b - self.center(term, values)
-        return WeightedSum(self.terms, values, places.x, mean, weights)
+                b = b - self.center(term, values)
+            weights[term.name] = b
+        return WeightedSum(self.terms, values, places.x, self.mean(values, places), weights)
 
     def term(self, name: str, values: Values, places: Places) -> WeightedSum:
         r"""Return the process of a term in the user's meaning, :math:`f = \sum_t b_t g_t`.
 
-        A term without a basis is then its own process less c times each one that has a center, as
-        :math:`\rho (f_p - c) + \delta' = \rho f_p + (\delta' - c \tilde\rho)`. Of several such terms
-        the first one takes these.
+        A term without a basis, of several the first, is then its own process less c times each one
+        that has a center: :math:`\rho (f_p - c) + \delta' = \rho f_p + (\delta' - c \tilde\rho)`.
         """
         term = next(t for t in self.terms if t.name == name)
+        one = torch.ones_like(places.x[..., 0])
         weights: dict[str, Tensor | None] = {name: None}
-        plain = [t.name for t in self.terms if t.physics is None]
-        if name in plain[:1]:
-            for other in self.terms:
-                if other.has_center and other.physics is not None:
-                    c = torch.as_tensor(self.center(other, values)).to(places.x)
-                    weights[other.name] = -c * torch.ones_like(places.x[..., 0])
-        mean = self.mean_of(term, values) * torch.ones_like(places.x[..., 0])
+        if term is next((t for t in self.terms if t.physics is None), None):
+            centered = [t for t in self.terms if t.has_center]
+            weights |= {t.name: -self.center(t, values) * one for t in centered}
+        mean = self.mean_of(term, values) * one
         return WeightedSum(self.terms, values, places.x, mean, weights)

@@ -15,37 +15,29 @@ Values = dict[str, Tensor]
 _CHOICE = "choice"
 
 
-class LogNormal(NamedTuple):
-    """The prior of a positive number.
+def standard_normal(shape: Sequence[int], generator: torch.Generator, like: Tensor) -> Tensor:
+    """Return draws from N(0, 1), the same on every device."""
+    return torch.randn(*shape, generator=generator, dtype=like.dtype).to(like)
 
-    Args:
-        median: The median.
-        factor: What one standard deviation multiplies or divides it by; 1 for a known number.
-    """
+
+class LogNormal(NamedTuple):
+    """The prior of a positive number."""
 
     median: float
-    factor: float
+    factor: float  # what one standard deviation multiplies or divides it by; 1 if it is known
 
 
 class Row(NamedTuple):
     r"""Unknown numbers of one name: a row of the table of a model.
 
     A number is :math:`\theta = a + b u`, or :math:`e^{a + b u}` if it is positive, so that it is
-    normal or log-normal where its coordinate is :math:`u \sim N(0, 1)`.
-
-    Args:
-        name: The name, such as ``"delta.lengthscale"``.
-        location: a, ``m x k``, for each output; ``k`` if all outputs share the numbers.
-        scale: b.
-        is_positive: Whether the numbers are positive.
-        is_shared: Whether all outputs share them.
-        log_density: The log prior density of the numbers, ``... x k`` to ``...``, if it is another
-            one than the normal or log-normal, which then only says where to look.
+    normal or log-normal where its coordinate is :math:`u \sim N(0, 1)`. A log prior density of the
+    numbers, ``... x k`` to ``...``, replaces this one, which then only says where to look.
     """
 
-    name: str
-    location: Tensor
-    scale: float = 1.0
+    name: str  # such as "delta.kernel.lengthscale"
+    location: Tensor  # a, m x k, for each output; k if all outputs share the numbers
+    scale: float = 1.0  # b
     is_positive: bool = False
     is_shared: bool = False
     log_density: Callable[[Tensor], Tensor] | None = None
@@ -56,7 +48,7 @@ class Row(NamedTuple):
         return cls(name, median.log(), math.log(factor), is_positive=True)
 
     @property
-    def count(self) -> int:
+    def count(self) -> int:  # type: ignore[override]
         """``k``."""
         return self.location.shape[-1]
 
@@ -73,15 +65,12 @@ class Row(NamedTuple):
 class Choice(NamedTuple):
     """One of several nested models: the whole model with some numbers set to zero.
 
-    Args:
-        text: What it means, for summaries.
-        probability: Its prior probability.
-        zeros: The names of what is zero in it: numbers, such as ``"rho.constant"``, or the prior
-            mean of a term or its process without the constant, ``"rho.mean"``, ``"rho.process"``.
+    These are named: numbers, such as ``"rho.constant"``, or the prior mean of a term or its process
+    without the constant, ``"rho.mean"``, ``"rho.process"``.
     """
 
-    text: str
-    probability: float
+    text: str  # what it means, for summaries
+    probability: float  # the prior one
     zeros: tuple[str, ...] = ()
 
 
@@ -91,12 +80,8 @@ class Table:
     Vectors u are ``S x B x P``: ``S`` draws of the coordinates of ``B`` independent problems.
     Outputs are problems of their own, ``B = m``; where they share numbers, there is one problem of
     all outputs, ``B = 1``. With choices, the last coordinate of each output says which of the
-    nested models holds: an interval of u, in which the first choice contains 0.
-
-    Args:
-        rows: The rows.
-        num_outputs: ``m``.
-        choices: Nested models; none, or at least two, whose probabilities sum to 1.
+    nested models holds: an interval of u, in which the first choice contains 0. There are none, or
+    at least two, whose probabilities sum to 1.
 
     Attributes:
         problems: ``B``.
@@ -106,13 +91,11 @@ class Table:
     def __init__(
         self, rows: Sequence[Row], num_outputs: int, choices: Sequence[Choice] = ()
     ) -> None:
-        self.choices = tuple(choices)
+        self.choices, self.num_outputs = tuple(choices), num_outputs
         self.own = [row for row in rows if not row.is_shared]
-        if self.choices:
-            zero = self.own[0].location.new_zeros(num_outputs, 1)
-            self.own.append(Row(_CHOICE, zero))
         self.shared = [row for row in rows if row.is_shared]
-        self.num_outputs = num_outputs
+        if self.choices:
+            self.own.append(Row(_CHOICE, self.own[0].location.new_zeros(num_outputs, 1)))
         self.problems = 1 if self.shared else num_outputs
         self._width = sum(row.count for row in self.own)
         self._own_size = self._width * (num_outputs // self.problems)
@@ -120,15 +103,21 @@ class Table:
 
     def values(self, u: Tensor) -> Values:
         """Return all numbers at coordinates ``S x B x P``."""
-        own = u[..., : self._own_size].reshape(len(u), self.num_outputs, self._width)
-        parts = own.split([row.count for row in self.own], -1) if self.own else ()
-        values = {row.name: row.value(z) for row, z in zip(self.own, parts, strict=True)}
-        if self.shared:
-            parts = u[:, 0, self._own_size :].split([row.count for row in self.shared], -1)
-            values |= {row.name: row.value(z) for row, z in zip(self.shared, parts, strict=True)}
+        values: Values = {}
+        for rows, z in ((self.own, self._own(u)), (self.shared, u[:, 0, self._own_size :])):
+            parts = z.split([row.count for row in rows], -1) if rows else ()
+            values |= {row.name: row.value(z) for row, z in zip(rows, parts, strict=True)}
         if self.choices:
-            self._set_zeros(values)
+            chosen = self.chosen(values).unsqueeze(-1)
+            for k, choice in enumerate(self.choices):
+                for name in choice.zeros if (chosen == k).any() else ():
+                    value = values.get(name, torch.ones_like(values[_CHOICE]))
+                    values[name] = value.masked_fill(chosen == k, 0.0)
         return values
+
+    def _own(self, u: Tensor) -> Tensor:
+        """Return the coordinates of each output, ``S x m x k``."""
+        return u[..., : self._own_size].reshape(len(u), self.num_outputs, self._width)
 
     def gradient(self, by: Values, values: Values) -> Tensor:
         """Return derivatives by u, ``S x B x P``, of derivatives by the numbers."""
@@ -149,7 +138,8 @@ class Table:
     def log_prior_ratio(self, u: Tensor) -> Tensor | None:
         r"""Return what other priors than N(0, I) add to the log density, ``S x B``.
 
-        With :math:`\theta(u)` it is :math:`\log p(\theta) + \log |d\theta / du| - \log N(u | 0, 1)`.
+        Of :math:`\theta(u)` it is
+        :math:`\log p(\theta) + \log |d\theta / du| - \log N(u | 0, 1)`.
         """
         others = [row for row in (*self.own, *self.shared) if row.log_density is not None]
         if not others:
@@ -157,9 +147,8 @@ class Table:
         values, total = self.values(u), u.new_zeros(len(u), self.problems)
         for row in others:
             theta = values[row.name]
-            z = (theta.log() if row.is_positive else theta) - row.location
-            z = z / row.scale
             size = theta.log() if row.is_positive else torch.zeros_like(theta)
+            z = ((size if row.is_positive else theta) - row.location) / row.scale
             size = size + math.log(row.scale) + 0.5 * z.square() + 0.5 * math.log(2 * math.pi)
             part = row.log_density(theta) + size.sum(-1)  # type: ignore[misc]
             part = part.unsqueeze(-1) if row.is_shared else part  # S x 1 or S x m
@@ -168,28 +157,23 @@ class Table:
 
     def of_outputs(self, outputs: Sequence[int]) -> Table:
         """Return the table of some outputs."""
-        own = [row._replace(location=row.location[list(outputs)]) for row in self.own]
-        return self._with(own, self.shared, len(outputs))
+        own = [row._replace(location=row.location[outputs]) for row in self.own]
+        return self._of([*own, *self.shared], len(outputs))
 
     def coordinates_of_outputs(self, u: Tensor, outputs: Sequence[int]) -> Tensor:
         """Return the coordinates ``S x B x P`` of some outputs."""
-        own = u[..., : self._own_size].reshape(len(u), self.num_outputs, self._width)
-        own = own[:, list(outputs)]
-        if self.problems == self.num_outputs and not self.shared:
+        own = self._own(u)[:, outputs]
+        if not self.shared:
             return own
         return torch.cat([own.flatten(1).unsqueeze(1), u[..., self._own_size :]], -1)
 
     def to(self, like: Tensor) -> Table:
         """Return the table on the device of a tensor."""
-        own, shared = (
-            [row._replace(location=row.location.to(like)) for row in rows]
-            for rows in (self.own, self.shared)
-        )
-        return self._with(own, shared, self.num_outputs)
+        rows = [row._replace(location=row.location.to(like)) for row in (*self.own, *self.shared)]
+        return self._of(rows, self.num_outputs)
 
-    def _with(self, own: list[Row], shared: list[Row], num_outputs: int) -> Table:
-        own = [row for row in own if row.name != _CHOICE]
-        return Table([*own, *shared], num_outputs, self.choices)
+    def _of(self, rows: Sequence[Row], num_outputs: int) -> Table:
+        return Table([row for row in rows if row.name != _CHOICE], num_outputs, self.choices)
 
     # Nested models.
 
@@ -212,12 +196,3 @@ class Table:
         order = [*range(2, len(self.choices)), 0, 1]
         shares = torch.tensor([self.choices[k].probability for k in order]).to(like)
         return torch.tensor(order, device=like.device), torch.special.ndtri(shares.cumsum(0)[:-1])
-
-    def _set_zeros(self, values: Values) -> None:
-        chosen = self.chosen(values).unsqueeze(-1)
-        for k, choice in enumerate(self.choices):
-            if not (chosen == k).any():
-                continue
-            for name in choice.zeros:
-                value = values.get(name, torch.ones_like(values[_CHOICE]))
-                values[name] = value.masked_fill(chosen == k, 0.0)

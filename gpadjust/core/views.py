@@ -1,8 +1,8 @@
 """The model as GPyTorch sees it: its mean, kernel and noise as modules that read the one table.
 
-They have no parameters of their own: all of them are functions of the model's coordinates ``u``, and
-differentiable in it. Values are in the user's units. Draws and outputs are batch dimensions, ``... x
-(S) x (m) x n``, which are left out where there is one.
+They have no parameters of their own: all of them are functions of the model's coordinates ``u``,
+and differentiable in it. Values are in the user's units. Draws and outputs are batch dimensions,
+``... x (S) x (m) x n``, which are left out where there is one.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ _MISSING = 1e12  # times the unit squared: the noise of a target that was not ob
 
 
 def squeezed(values: Tensor, dim: int) -> Tensor:
-    """Return values ``... x S x m x n (x n)`` without S and m where these are 1.
+    """Return values ``... x S x m x n (x n)`` without S and m (at ``dim``) where these are 1."""
+    for each in (dim - 1, dim):
+        values = values.squeeze(each) if values.shape[each] == 1 else values
+    return values
 
-    Args:
-        values: The values.
-        dim: The dimension of outputs, -2 or -3.
-    """
-    if values.shape[dim] == 1:
-        values = values.squeeze(dim)
-        dim += 1
-    return values.squeeze(dim - 1) if values.shape[dim - 1] == 1 else values
+
+def _of_all(values: Tensor, model: GP, dim: int) -> Tensor:
+    """Return values of each draw and output, ``... (x S) (x m) x n (x n)``."""
+    shape = (*model.num_draws_and_outputs, *[1] * (-dim - 1))
+    return squeezed(values.expand(torch.broadcast_shapes(values.shape, shape)), dim)
 
 
 class MeanView(Mean):
@@ -47,9 +47,7 @@ class MeanView(Mean):
     def forward(self, x: Tensor) -> Tensor:
         """Return the mean at ``... x n x d``."""
         (model,) = self.owner
-        f = model.at(x)
-        shape = torch.broadcast_shapes(f.mean.shape, (*model.num_draws_and_outputs, 1))
-        return squeezed(f.mean.expand(shape) * model.unit, -2)
+        return _of_all(model.at(x).mean * model.unit, model, -2)
 
 
 class TermView(Kernel):
@@ -76,13 +74,10 @@ class TermView(Kernel):
         (model,) = self.owner
         one = model.at(x1)
         one.weights = {self.name: one.weights[self.name]}
-        shape = (*model.num_draws_and_outputs, 1)
         if diag:
-            variance = one.variance() * model.unit.square()
-            return squeezed(variance.expand(torch.broadcast_shapes(variance.shape, shape)), -2)
+            return _of_all(one.variance() * model.unit.square(), model, -2)
         other = one if x2 is x1 else model.at(x2)
-        K = one.cross(other) * model.unit.square().unsqueeze(-1)
-        return squeezed(K.expand(torch.broadcast_shapes(K.shape, (*shape, 1))), -3)
+        return _of_all(one.cross(other) * model.unit.square().unsqueeze(-1), model, -3)
 
 
 def kernel_view(model: GP) -> Kernel:
@@ -101,7 +96,7 @@ class NoiseView(NoiseModule):
     def noise(self) -> Tensor:
         """The variances at the training inputs, ``(S) x (m) x n``."""
         (model,) = self.owner
-        return squeezed(self._variance(model, model.data.X, True), -2)
+        return _of_all(self._variance(model, model.data.X, True), model, -2)
 
     def forward(
         self, *params: Any, shape: Any = None, noise: Tensor | None = None, **_: Any
@@ -113,22 +108,21 @@ class NoiseView(NoiseModule):
         if noise is not None:
             return DiagLinearOperator(noise)
         (model,) = self.owner
-        is_training = model.training and shape is not None and shape[-1] == len(model.data.Y)
-        if is_training or not params or not isinstance(params[0], Tensor):
-            variance = self._variance(model, model.data.X, is_training)
-            variance = variance if is_training else variance.mean(-1, keepdim=True)
-        else:
+        if model.training and shape is not None and shape[-1] == len(model.data.Y):
+            variance = self._variance(model, model.data.X, True)
+        elif params and isinstance(params[0], Tensor):
             variance = self._variance(model, params[0], False)
-        return DiagLinearOperator(squeezed(variance, -2).expand(shape))
+        else:
+            variance = self._variance(model, model.data.X, False).mean(-1, keepdim=True)
+        return DiagLinearOperator(_of_all(variance, model, -2).expand(shape))
 
     @staticmethod
     def _variance(model: GP, X: Tensor, is_training: bool) -> Tensor:
         values = model.values
         v = model.noise.variance(values, model.places(X, values), is_training)
-        v = v.expand(torch.broadcast_shapes(v.shape, (*model.num_draws_and_outputs, X.shape[-2])))
         if is_training:
             v = v + _MISSING * model.data.Y.isnan().mT
-        return v * model.unit.square()
+        return v.expand(*v.shape[:-1], X.shape[-2]) * model.unit.square()
 
 
 def likelihood_view(model: GP) -> GaussianLikelihood:
