@@ -1,17 +1,18 @@
-"""Fit a model: draw its unknown numbers given the data, or bring them to their most likely values."""
+"""Fit a model: draw its unknown numbers given the data, or find their most likely values."""
 
 from __future__ import annotations
 
 import math
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from gpadjust.core.sample import GROUPS, Draws, Normal, around_mode, maximise, sample
+from gpadjust.core.unknowns import standard_normal
 
 if TYPE_CHECKING:
     from gpadjust.core.model import GP
@@ -32,8 +33,7 @@ class FitResult:
         method: ``"bayes"`` or ``"map"``.
         log_evidence: The log probability of the targets of each output, ``m``, in their units (of
             outputs that share unknown numbers, of all together); None of a point fit.
-        probabilities: The probability of each nested model by its text, for each output; empty if
-            there is one model only.
+        probabilities: The probability of each nested model by its text, for each output.
         effective: The least number of starting draws that count, of all outputs.
         error: By how many predicted standard deviations another seed would move the mean at a
             training input that is left out, root mean square; NaN of a point fit.
@@ -41,11 +41,11 @@ class FitResult:
     """
 
     method: str
-    log_evidence: Tensor | None
-    probabilities: dict[str, list[float]]
-    effective: float
-    error: float
-    num_draws: int
+    log_evidence: Tensor | None = None
+    probabilities: dict[str, list[float]] = field(default_factory=dict)
+    effective: float = math.nan
+    error: float = math.nan
+    num_draws: int = 1
 
     @property
     def converged(self) -> bool:
@@ -53,12 +53,11 @@ class FitResult:
         return not self.error > _MOVED
 
     def __str__(self) -> str:
-        lines = []
-        outputs = max((len(shares) for shares in self.probabilities.values()), default=0)
-        for j in range(outputs):
-            shares = [f"{text} {p[j]:.2f}" for text, p in self.probabilities.items()]
-            which = f" (output {j + 1})" if outputs > 1 else ""
-            lines.append(f"Probabilities{which}: {', '.join(shares)}.")
+        lines, outputs = [], [*zip(*self.probabilities.values(), strict=True)]
+        for j, shares in enumerate(outputs):
+            parts = [f"{text} {p:.2f}" for text, p in zip(self.probabilities, shares, strict=True)]
+            which = f" (output {j + 1})" if len(outputs) > 1 else ""
+            lines.append(f"Probabilities{which}: {', '.join(parts)}.")
         if self.method == "map":
             lines.append("Point fit: intervals ignore what is unknown of the hyper-parameters.")
         else:
@@ -82,16 +81,15 @@ def fit(
     Args:
         model: The model.
         method: ``"bayes"`` or ``"map"``.
-        num_draws: Number of draws, a multiple of 4. Default: 80, 32 or 16, of a physics with
-            unknown parameters 256; predictions average over 16, 8 or 4 of them, else over every fourth.
+        num_draws: Number of draws, a multiple of 4; predictions average over every fourth.
+            Default: 80, 32 or 16 and 16, 8 or 4 of them; 256 if outputs share unknown numbers.
         seed: Seed.
 
     Warns:
         UserWarning: If another seed would move predictions by much.
 
     Raises:
-        ValueError: If the method is unknown, the number of draws no positive multiple of 4, or the
-            data a batch.
+        ValueError: If the method or number of draws is another one, or the data are a batch.
 
     Example:
         >>> import torch
@@ -105,28 +103,23 @@ def fit(
     if num_draws is not None and (num_draws < 4 or num_draws % 4):
         raise ValueError(f"Expected num_draws as a multiple of 4; found {num_draws}.")
     if model.batch_shape:
-        raise ValueError(
-            f"Expected a model of one data set; found a batch {tuple(model.batch_shape)}, of "
-            "fantasies. Fit the model that they are made of."
-        )
+        batch = tuple(model.batch_shape)
+        raise ValueError(f"Expected a model of one data set; found fantasies, a batch {batch}.")
     if method == "map":
         model.set_draws(_modes(_Target(model, 0), seed, is_precise=True)[:1])
-        return FitResult(method, None, {}, math.nan, math.nan, 1)
-    n, number = len(model.data.Y), num_draws or _default_number(model)
+        return FitResult(method)
+    number, kept = _default_numbers(model) if num_draws is None else (num_draws, num_draws // 4)
     sampled = _sampled(model, number, seed)
     weights = _weights(model, {k: draws.log_evidence for k, draws in sampled.items()})
-    kept = _default_kept(n) if num_draws is None else number // 4
-    model.set_draws(_pooled(sampled, weights.mean(1), number), kept)
+    shares = weights.mean(1)  # K x B
+    model.set_draws(_pooled(sampled, shares, number), kept)
     error = _error(model, sampled, weights, number) * math.sqrt(number / kept)
-    whole = weights.mean(1)
+    choices = zip(model.table.choices, shares.expand(-1, model.num_outputs).tolist(), strict=False)
+    effective = min(float(draws.effective.min()) for draws in sampled.values())
     result = FitResult(
-        method,
-        _evidence(model, sampled),
-        {c.text: whole[k].expand(model.num_outputs).tolist() for k, c in enumerate(model.table.choices)},
-        min(float(draws.effective.min()) for draws in sampled.values()),
-        error,
-        len(model.u),
-    )
+        method, _evidence(model, sampled), {choice.text: p for choice, p in choices},
+        effective, error, len(model.u),
+    )  # fmt: skip
     if not result.converged:
         warnings.warn(
             f"Predictions depend on the seed: another one would move them by {error:.2f} of their "
@@ -136,37 +129,32 @@ def fit(
     return result
 
 
-def _default_number(model: GP) -> int:
-    n = len(model.data.Y)
-    if model.table.shared and n <= _MEDIUM:
-        return 256
+def _default_numbers(model: GP) -> tuple[int, int]:
+    """Return how many draws are made, and over how many of them predictions average."""
+    n, is_shared = len(model.data.Y), bool(model.table.shared)
     if n <= _SMALL:
-        return 80
-    return 32 if n <= _MEDIUM else 16
-
-
-def _default_kept(n: int) -> int:
-    if n <= _SMALL:
-        return 16
-    return 8 if n <= _MEDIUM else 4
+        return 256 if is_shared else 80, 16
+    if n <= _MEDIUM:
+        return 256 if is_shared else 32, 8
+    return 16, 4
 
 
 class _Target:
     """The log likelihood of one nested model, at coordinates ``N x B x P``."""
 
     def __init__(self, model: GP, choice: int) -> None:
-        self.model, self.choice, self.table = model, choice, model.table
-        self.like = model.u.detach().new_zeros(model.table.problems, model.table.size)
+        self.model, self.choice = model, choice
+        self.like = model.u.detach()[0]
 
     def chosen(self, u: Tensor) -> Tensor:
         """Return coordinates of this nested model."""
-        return self.table.with_choice(u, self.choice) if self.table.choices else u
+        table = self.model.table
+        return table.with_choice(u, self.choice) if table.choices else u
 
     def __call__(self, u: Tensor, with_gradient: bool = True) -> tuple[Tensor, Tensor]:
         """Return values ``N x B`` and gradients, of so many draws at once as caches hold."""
-        n = len(self.model.data.Y)
-        size = max(1, _ENTRIES // (n * n * self.model.num_outputs))
-        rows = self.chosen(u).split(size)
+        n, m = self.model.data.Y.shape
+        rows = self.chosen(u).split(max(1, _ENTRIES // (n * n * m)))
         parts = [self.model.log_likelihood(part, with_gradient) for part in rows]
         value, slope = (torch.cat(each) for each in zip(*parts, strict=True))
         return value, slope
@@ -182,36 +170,32 @@ def _sampled(model: GP, number: int, seed: int) -> dict[int, Draws]:
 
     The whole model comes first; of the others those go on that may be as likely as a thousandth.
     """
-    n, choices = len(model.data.Y), range(max(1, len(model.table.choices)))
-    prior = _log_prior(model)
+    n, prior = len(model.data.Y), _log_prior(model)
+    starts: Mapping[int, Normal | None] = dict.fromkeys(range(len(prior)))
+    if n > _SMALL:
+        starts = _starts(model, seed)
     sampled: dict[int, Draws] = {}
-    if n <= _SMALL:
-        floor = None
-        for k in choices:
-            target = _Target(model, k)
-            draws = sample(target, target.like, number, seed, floor=floor)
-            if draws is None:
-                continue
-            sampled[k] = draws._replace(u=target.chosen(draws.u))
+    floor = None
+    for k, start in starts.items():
+        target = _Target(model, k)
+        first = 16 if start is None else 4
+        draws = sample(target, target.like, number, seed, start, first, n <= _MEDIUM, floor)
+        if draws is None:
+            continue
+        sampled[k] = draws._replace(u=target.chosen(draws.u))
+        if start is None:
             joint = torch.stack([prior[i] + d.log_evidence.mean(0) for i, d in sampled.items()])
             floor = joint.amax(0) + math.log(_SELDOM) - prior[(k + 1) % len(prior)]
-        return sampled
-    starts = _starts(model, seed)
-    for k, (start, _) in starts.items():
-        target = _Target(model, k)
-        draws = sample(target, target.like, number, seed, start, 4, n <= _MEDIUM)
-        if draws is not None:
-            sampled[k] = draws._replace(u=target.chosen(draws.u))
     return sampled
 
 
-def _starts(model: GP, seed: int) -> dict[int, tuple[Normal, Tensor]]:
+def _starts(model: GP, seed: int) -> dict[int, Normal]:
     """Return Laplace's approximation of each nested model that is likely enough.
 
     Modes are searched by some of the rows first. A nested model that is unlikely by these is left
     out: that its odds recover has a probability of the odds at most (Ville's inequality).
     """
-    n, choices = len(model.data.Y), [*range(max(1, len(model.table.choices)))]
+    n, choices = len(model.data.Y), [*range(len(_log_prior(model)))]
     generator = torch.Generator().manual_seed(seed)
     rows = torch.randperm(n, generator=generator)[:_SMALL].sort().values
     some = model.subset_rows(rows) if n > 2 * _SMALL else None
@@ -219,11 +203,12 @@ def _starts(model: GP, seed: int) -> dict[int, tuple[Normal, Tensor]]:
     if some is not None:
         evidence = {k: around_mode(_Target(some, k), several[0])[1] for k, several in ends.items()}
         choices = _likely(model, evidence)
-        ends = {k: _sorted(_Target(model, k), maximise(_Target(model, k), ends[k])) for k in choices}
+        targets = {k: _Target(model, k) for k in choices}
+        ends = {k: _sorted(each, maximise(each, ends[k])) for k, each in targets.items()}
     modes = {k: several[0] for k, several in ends.items()}
     starts = {k: around_mode(_Target(model, k), modes[k]) for k in choices}
-    kept = _likely(model, {k: evidence for k, (_, evidence) in starts.items()})
-    return {k: starts[k] for k in kept}
+    likely = _likely(model, {k: evidence for k, (_, evidence) in starts.items()})
+    return {k: starts[k][0] for k in likely}
 
 
 def _modes(target: _Target, seed: int, is_precise: bool = False) -> Tensor:
@@ -234,7 +219,7 @@ def _modes(target: _Target, seed: int, is_precise: bool = False) -> Tensor:
     like = target.like
     number = max(16, 6400 // max(len(target.model.data.Y), 25))
     generator = torch.Generator().manual_seed(seed)
-    u = torch.randn(number, *like.shape, generator=generator, dtype=like.dtype).to(like)
+    u = standard_normal((number, *like.shape), generator, like)
     searches = _SEARCHES if target.choice == 0 else _SEARCHES // 2
     begins = torch.cat([_sorted(target, u)[: searches - 1], torch.zeros_like(u[:1])])
     ends = _sorted(target, maximise(target, begins, is_precise))
@@ -285,11 +270,7 @@ def _evidence(model: GP, sampled: dict[int, Draws]) -> Tensor:
 def _pooled(draws: Mapping[int, Draws], weights: Tensor, number: int, part: int = 0) -> Tensor:
     """Return ``number x B x P`` draws of all nested models in proportion to weights ``K x B``.
 
-    Args:
-        draws: The draws of nested models.
-        weights: Their weights.
-        number: How many to return.
-        part: 0 for all draws, or 1 or 2 for one of the groups.
+    They are of all draws, or, with the part 1 or 2, of one of the groups.
     """
     problems = []
     for b in range(weights.shape[-1]):
@@ -319,10 +300,8 @@ def _error(model: GP, sampled: dict[int, Draws], weights: Tensor, number: int) -
     them they predict the left-out targets. The difference of two means of N / 2 draws has a
     standard deviation twice that of one of N.
     """
-    groups = []
-    for g in range(GROUPS):
-        u = _pooled(sampled, weights[:, g], number // GROUPS, g + 1)
-        groups.append(model.left_out_at(u))
+    draws = [_pooled(sampled, weights[:, g], number // GROUPS, g + 1) for g in range(GROUPS)]
+    groups = [model.left_out_at(u) for u in draws]
     mean, variance = (torch.cat(each) for each in zip(*groups, strict=True))
     sd = (variance.mean(0) + mean.var(0, correction=0)).sqrt()
     difference = (groups[0][0].mean(0) - groups[1][0].mean(0)) / 2

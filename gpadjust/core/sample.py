@@ -9,6 +9,8 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
+from gpadjust.core.unknowns import standard_normal
+
 
 class LogLikelihood(Protocol):
     """The log likelihood of coordinates of ``B`` independent problems."""
@@ -25,56 +27,34 @@ _WIDER = 1.5  # than Laplace's approximation
 
 
 class Normal(NamedTuple):
-    """Normal distributions of ``B`` problems.
+    """Normal distributions of ``B`` problems."""
 
-    Args:
-        mean: ``B x P``.
-        root: A lower root of the covariances, ``B x P x P``.
-    """
-
-    mean: Tensor
-    root: Tensor
-
-    @classmethod
-    def standard(cls, shape: tuple[int, int], like: Tensor) -> Normal:
-        """Return N(0, I)."""
-        eye = torch.eye(shape[1]).to(like).expand(shape[0], -1, -1)
-        return cls(like.new_zeros(shape), eye)
+    mean: Tensor  # B x P
+    root: Tensor  # a lower root of the covariances, B x P x P
 
     def log_density(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Return log densities ``N x B`` at ``N x B x P``, and their gradients."""
         white = torch.linalg.solve_triangular(self.root, (u - self.mean).unsqueeze(-1), upper=False)
-        size = self.root.diagonal(dim1=-1, dim2=-2).log().sum(-1)
-        size = size + 0.5 * u.shape[-1] * math.log(2 * math.pi)
+        log_det = self.root.diagonal(dim1=-1, dim2=-2).log().sum(-1)
+        size = log_det + 0.5 * u.shape[-1] * math.log(2 * math.pi)
         slope = torch.linalg.solve_triangular(self.root.mT, white, upper=True).squeeze(-1)
         return -0.5 * white.square().sum((-1, -2)) - size, -slope
 
 
 class Draws(NamedTuple):
-    """Draws from a posterior.
+    """Equally likely draws from a posterior; the two halves are resampled apart."""
 
-    Args:
-        u: Equally likely coordinates, ``N x B x P``; the first and second half are resampled apart.
-        log_evidence: The log evidence of each half, ``2 x B``.
-        effective: The number of starting draws that count, ``B``.
-    """
-
-    u: Tensor
-    log_evidence: Tensor
-    effective: Tensor
+    u: Tensor  # N x B x P
+    log_evidence: Tensor  # of each half, 2 x B
+    effective: Tensor  # the number of starting draws that count, B
 
 
 @torch.no_grad()
 def sample(
-    log_likelihood: LogLikelihood,
-    like: Tensor,
-    number: int,
-    seed: int,
-    start: Normal | None = None,
-    first: int = 16,
-    with_moves: bool = True,
+    log_likelihood: LogLikelihood, like: Tensor, number: int, seed: int,
+    start: Normal | None = None, first: int = 16, with_moves: bool = True,
     floor: Tensor | None = None,
-) -> Draws | None:
+) -> Draws | None:  # fmt: skip
     r"""Draw from :math:`N(u | 0, I) \, L(u)` by sequential Monte Carlo (Del Moral et al. 2006).
 
     Draws of a start, ``first`` times as many as are kept, are weighted by a power of the ratio of
@@ -90,14 +70,11 @@ def sample(
         start: The start. Default: the prior.
         first: How many draws begin for each that is kept.
         with_moves: Whether draws are moved; without, they are weighted and resampled once.
-        floor: A log evidence ``B`` below which no draws are wanted.
-
-    Returns:
-        The draws, or None as soon as the evidence is below the floor in all problems.
+        floor: A log evidence ``B``: if that of all problems is below, None is returned.
     """
-    generator = torch.Generator().manual_seed(seed)
-    shape = (like.shape[0], like.shape[1])
-    prior = Normal.standard(shape, like)
+    generator, shape = torch.Generator().manual_seed(seed), like.shape
+    eye = torch.eye(shape[1]).to(like).expand(shape[0], -1, -1)
+    prior = Normal(torch.zeros_like(like), eye)
     begin = prior if start is None else start
 
     def ratio(u: Tensor, with_gradient: bool = True) -> tuple[Tensor, Tensor]:
@@ -107,7 +84,7 @@ def sample(
         (a, by_a), (b, by_b) = prior.log_density(u), start.log_density(u)
         return value + a - b, slope + by_a - by_b
 
-    u = _randn((first * number, *shape), generator, like)
+    u = standard_normal((first * number, *shape), generator, like)
     u = begin.mean + (begin.root @ u.unsqueeze(-1)).squeeze(-1)
     value, slope = ratio(u, False)
     power, evidence = like.new_zeros(shape[0]), like.new_zeros(GROUPS, shape[0])
@@ -136,40 +113,33 @@ def sample(
         if is_first and with_moves:
             value, slope = ratio(u)
         for _ in range((_LAST_MOVES if is_done else _MOVES) * with_moves):
-            u, value, slope, rate = _move(
-                ratio, begin, u, value, slope, power, root, length, generator
-            )
+            here = (u, value, slope)
+            u, value, slope, rate = _move(ratio, begin, here, power, root, length, generator)
             length = length * (rate - _ACCEPTED).exp()
         if is_done:
             return Draws(u, evidence, effective)
 
 
 def _move(
-    ratio: LogLikelihood,
-    begin: Normal,
-    u: Tensor,
-    value: Tensor,
-    slope: Tensor,
-    power: Tensor,
-    root: Tensor,
-    length: Tensor,
-    generator: torch.Generator,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return draws after a Hamiltonian move of the density begin x ratio^power, and acceptance.
+    ratio: LogLikelihood, begin: Normal, here: tuple[Tensor, Tensor, Tensor],
+    power: Tensor, root: Tensor, length: Tensor, generator: torch.Generator,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    """Move draws, their values and slopes by Hamiltonian dynamics; return them and acceptance.
 
-    Momenta are N(0, I) in the coordinates that ``root`` makes white.
+    The density is begin x ratio^power; momenta are N(0, I) where ``root`` makes draws white.
     """
+    u, value, slope = here
     t = power.unsqueeze(-1)
 
     def force(slope: Tensor, prior_slope: Tensor) -> Tensor:
         return (root.mT @ (t * slope + prior_slope).unsqueeze(-1)).squeeze(-1)
 
-    p = _randn(u.shape, generator, u)
+    p = standard_normal(u.shape, generator, u)
     jitter = torch.rand(u.shape[:-1], generator=generator, dtype=u.dtype).to(u)
     leap = (length * (0.6 + 0.8 * jitter)).unsqueeze(-1)
     prior, by_prior = begin.log_density(u)
     energy = power * value + prior - 0.5 * p.square().sum(-1)
-    new, new_value, new_slope = u, value, slope
+    new, new_value, new_slope = here
     p = p + 0.5 * leap * force(slope, by_prior)
     for i in range(_LEAPS):
         new = (new + leap * (root @ p.unsqueeze(-1)).squeeze(-1)).clamp(-_FAR, _FAR)
@@ -229,10 +199,6 @@ def _root(u: Tensor, weights: Tensor) -> Tensor:
     return root
 
 
-def _randn(shape: tuple[int, ...], generator: torch.Generator, like: Tensor) -> Tensor:
-    return torch.randn(shape, generator=generator, dtype=like.dtype).to(like)
-
-
 @torch.no_grad()
 def maximise(log_likelihood: LogLikelihood, u: Tensor, is_precise: bool = False) -> Tensor:
     """Return coordinates ``N x B x P`` of high density N(u | 0, I) L(u), by L-BFGS from each of N.
@@ -254,9 +220,8 @@ def maximise(log_likelihood: LogLikelihood, u: Tensor, is_precise: bool = False)
     options = {} if is_precise else {"ftol": 1e-5}
     for _ in range(_SEARCHES if is_precise else 1):
         before = float(top.nan_to_num(neginf=-1e10).sum())
-        minimize(
-            negative, best.flatten().cpu().numpy(), jac=True, method="L-BFGS-B", options=options
-        )
+        start = best.flatten().cpu().numpy()
+        minimize(negative, start, jac=True, method="L-BFGS-B", options=options)
         if float(top.sum()) < before + _GAIN:
             break
     return best
@@ -269,18 +234,15 @@ def around_mode(log_likelihood: LogLikelihood, mode: Tensor) -> tuple[Normal, Te
     The Hessian is that of central differences of the gradient, along the coordinates that have any
     influence.
     """
-    p = mode.shape[-1]
-    _, at_random = log_likelihood(mode.unsqueeze(0) + 0.1)
+    p, here = mode.shape[-1], mode.unsqueeze(0)
+    _, at_random = log_likelihood(here + 0.1)
     moved = (at_random[0] != 0).any(0).nonzero().flatten()
     step = 0.1 * torch.eye(p)[moved].to(mode).unsqueeze(1)
-    value, slope = log_likelihood(torch.cat([mode.unsqueeze(0), mode + step, mode - step]))
+    value, slope = log_likelihood(torch.cat([here, mode + step, mode - step]))
+    up, down = slope[1:].chunk(2)
+    rows = -(up - down).movedim(0, -2) / 0.2
     hessian = mode.new_zeros(len(mode), p, p)
-    number = len(moved)
-    half = -(slope[1 : number + 1] - slope[number + 1 :]).movedim(0, -2) / 0.2
-    hessian[:, moved] = half.nan_to_num()
-    hessian = (
-        hessian[:, :, moved].new_zeros(hessian.shape).index_copy(2, moved, hessian[:, :, moved])
-    )
+    hessian[:, moved.unsqueeze(-1), moved] = rows.nan_to_num()[..., moved]
     values, vectors = torch.linalg.eigh(0.5 * (hessian + hessian.mT))
     precision = 1 + values.clamp_min(0.0)
     root = vectors * (_WIDER * precision.rsqrt()).unsqueeze(-2)
