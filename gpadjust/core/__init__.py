@@ -6,6 +6,7 @@ Read it in this order: ``unknowns``, ``kernels``, ``terms``, ``noise``, ``gaussi
 
 from gpadjust.core.fitting import FitResult, fit
 from gpadjust.core.functions import Functions
+from gpadjust.core.gaussian import Prediction
 from gpadjust.core.kernels import (
     MATERN12,
     MATERN32,
@@ -19,7 +20,7 @@ from gpadjust.core.kernels import (
 )
 from gpadjust.core.model import GP
 from gpadjust.core.noise import KnownNoise, Noise
-from gpadjust.core.posterior import MixturePosterior, Prediction
+from gpadjust.core.posterior import MixturePosterior
 from gpadjust.core.saving import load, save
 from gpadjust.core.stacked import StackedGP
 from gpadjust.core.structures import (

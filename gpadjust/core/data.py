@@ -66,8 +66,10 @@ class Data(NamedTuple):
                 f"Expected at least 2 points in train_X; found {len(X)}, which no scale can be "
                 "learnt from. Use the physics alone until there are two."
             )
-        check_finite("train_X", X)
-        check_observed("train_Y", Y)
+        if not X.isfinite().all():
+            check_finite("train_X", X)
+        if not Y.isfinite().all():
+            check_observed("train_Y", Y)
         seldom = (~Y.isnan()).sum(-2) < 2
         if seldom.any():
             raise ValueError(
@@ -76,8 +78,8 @@ class Data(NamedTuple):
             )
         X, Y = X.detach().clone(), Y.detach().clone()
         Yvar = None if train_Yvar is None else variances_of(train_Yvar, Y)
-        inputs = column_names(train_X) or _default_names("x", X.shape[-1])
-        outputs = column_names(train_Y) or _default_names("y", Y.shape[-1])
+        inputs = column_names(train_X) or default_names("x", X.shape[-1])
+        outputs = column_names(train_Y) or default_names("y", Y.shape[-1])
         if input_transform is not None:
             input_transform = deepcopy(input_transform).double().train()
             input_transform(X)
@@ -131,13 +133,10 @@ def unit_of(Y: Tensor, mean: Tensor) -> Tensor:
     the prior mean meets the targets but for rounding it is a millionth of their size (or 1 if they
     are zero).
     """
-
-    def rms(values: Tensor) -> Tensor:
-        size = values.abs().nan_to_num().amax(-2, keepdim=True)
-        size = size.where(size > 0, torch.ones_like(size))
-        return size * (values / size).square().nanmean(-2, keepdim=True).sqrt()
-
-    size, away, spread = rms(Y), rms(Y - mean), rms(Y - Y.nanmean(-2, keepdim=True))
+    values = torch.stack([Y, Y - mean, Y - Y.nanmean(-2, keepdim=True)])
+    largest = values.abs().nan_to_num().amax(-2, keepdim=True)
+    largest = largest.where(largest > 0, torch.ones_like(largest))
+    size, away, spread = largest * (values / largest).square().nanmean(-2, keepdim=True).sqrt()
     unit = torch.where(spread > 1e-12 * size, away.minimum(spread), away)
     tiny = _FAINT * size.where(size > 0, torch.full_like(size, 1 / _FAINT))
     return unit.where(unit > 1e-13 * size, tiny).mT
@@ -193,7 +192,8 @@ def variances_of(values: ArrayLike, Y: Tensor) -> Tensor:
         )
     variances = variances.expand(Y.shape).masked_fill(Y.isnan(), torch.nan)
     variances = variances.where(~Y.isnan(), variances.nanmean(-2, keepdim=True))
-    check_finite("train_Yvar", variances)
+    if not variances.isfinite().all():
+        check_finite("train_Yvar", variances)
     if (variances < 0).any():
         raise ValueError(f"Expected variances in train_Yvar; found {variances.min():.3g}.")
     return variances
@@ -207,7 +207,8 @@ def column_names(values: ArrayLike) -> tuple[str, ...] | None:
     return None if name is None or isinstance(values, Tensor) else (str(name),)
 
 
-def _default_names(letter: str, number: int) -> tuple[str, ...]:
+def default_names(letter: str, number: int) -> tuple[str, ...]:
+    """Return ``x``, or ``x1`` and so on."""
     return (letter,) if number == 1 else tuple(f"{letter}{i + 1}" for i in range(number))
 
 

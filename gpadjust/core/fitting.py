@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from gpadjust.core.sample import GROUPS, Draws, Normal, around_mode, maximise, sample
+from gpadjust.core.sample import (
+    GROUPS,
+    Draws,
+    LogLikelihood,
+    Normal,
+    around_mode,
+    maximise,
+    sample,
+)
 from gpadjust.core.unknowns import standard_normal
 
 if TYPE_CHECKING:
@@ -102,11 +110,11 @@ def fit(
         raise ValueError(f"Unknown method {method!r}; expected 'bayes' or 'map'.")
     if num_draws is not None and (num_draws < 4 or num_draws % 4):
         raise ValueError(f"Expected num_draws as a multiple of 4; found {num_draws}.")
-    if model.batch_shape:
+    if model.data.Y.dim() > 2:
         batch = tuple(model.batch_shape)
         raise ValueError(f"Expected a model of one data set; found fantasies, a batch {batch}.")
     if method == "map":
-        model.set_draws(_modes(_Target(model, 0), seed, is_precise=True)[:1])
+        model.set_draws(_modes(model, 0, seed, is_precise=True)[:1])
         return FitResult(method)
     number, kept = _default_numbers(model) if num_draws is None else (num_draws, num_draws // 4)
     sampled = _sampled(model, number, seed)
@@ -120,7 +128,7 @@ def fit(
         method, _evidence(model, sampled), {choice.text: p for choice, p in choices},
         effective, error, len(model.u),
     )  # fmt: skip
-    if not result.converged:
+    if error > _MOVED:
         warnings.warn(
             f"Predictions depend on the seed: another one would move them by {error:.2f} of their "
             f"standard deviation. Draw more: fit(model, num_draws={4 * number}).",
@@ -139,30 +147,18 @@ def _default_numbers(model: GP) -> tuple[int, int]:
     return 16, 4
 
 
-class _Target:
-    """The log likelihood of one nested model, at coordinates ``N x B x P``."""
+def _target(model: GP, choice: int) -> LogLikelihood:
+    """Return the log likelihood of a nested model, of so many draws at once as caches hold."""
+    n, m = model.data.Y.shape
+    size = max(1, _ENTRIES // (n * n * m))
 
-    def __init__(self, model: GP, choice: int) -> None:
-        self.model, self.choice = model, choice
-        self.like = model.u.detach()[0]
-
-    def chosen(self, u: Tensor) -> Tensor:
-        """Return coordinates of this nested model."""
-        table = self.model.table
-        return table.with_choice(u, self.choice) if table.choices else u
-
-    def __call__(self, u: Tensor, with_gradient: bool = True) -> tuple[Tensor, Tensor]:
-        """Return values ``N x B`` and gradients, of so many draws at once as caches hold."""
-        n, m = self.model.data.Y.shape
-        rows = self.chosen(u).split(max(1, _ENTRIES // (n * n * m)))
-        parts = [self.model.log_likelihood(part, with_gradient) for part in rows]
+    def log_likelihood(u: Tensor, with_gradient: bool = True) -> tuple[Tensor, Tensor]:
+        rows = model.table.with_choice(u, choice).split(size)
+        parts = [model.log_likelihood(part, with_gradient) for part in rows]
         value, slope = (torch.cat(each) for each in zip(*parts, strict=True))
         return value, slope
 
-    def log_density(self, u: Tensor) -> Tensor:
-        """Return the log posterior density but for a constant, ``N x B``."""
-        density = self(u, False)[0] - 0.5 * u.square().sum(-1)
-        return density.nan_to_num(nan=-math.inf)
+    return log_likelihood
 
 
 def _sampled(model: GP, number: int, seed: int) -> dict[int, Draws]:
@@ -170,19 +166,18 @@ def _sampled(model: GP, number: int, seed: int) -> dict[int, Draws]:
 
     The whole model comes first; of the others those go on that may be as likely as a thousandth.
     """
-    n, prior = len(model.data.Y), _log_prior(model)
+    n, prior = len(model.data.Y), model.table.log_prior
     starts: Mapping[int, Normal | None] = dict.fromkeys(range(len(prior)))
     if n > _SMALL:
         starts = _starts(model, seed)
     sampled: dict[int, Draws] = {}
     floor = None
     for k, start in starts.items():
-        target = _Target(model, k)
-        first = 16 if start is None else 4
-        draws = sample(target, target.like, number, seed, start, first, n <= _MEDIUM, floor)
+        first, like = 16 if start is None else 4, model.u.detach()[0]
+        draws = sample(_target(model, k), like, number, seed, start, first, n <= _MEDIUM, floor)
         if draws is None:
             continue
-        sampled[k] = draws._replace(u=target.chosen(draws.u))
+        sampled[k] = draws._replace(u=model.table.with_choice(draws.u, k))
         if start is None:
             joint = torch.stack([prior[i] + d.log_evidence.mean(0) for i, d in sampled.items()])
             floor = joint.amax(0) + math.log(_SELDOM) - prior[(k + 1) % len(prior)]
@@ -195,35 +190,33 @@ def _starts(model: GP, seed: int) -> dict[int, Normal]:
     Modes are searched by some of the rows first. A nested model that is unlikely by these is left
     out: that its odds recover has a probability of the odds at most (Ville's inequality).
     """
-    n, choices = len(model.data.Y), [*range(len(_log_prior(model)))]
+    n, choices = len(model.data.Y), [*range(len(model.table.log_prior))]
     generator = torch.Generator().manual_seed(seed)
     rows = torch.randperm(n, generator=generator)[:_SMALL].sort().values
     some = model.subset_rows(rows) if n > 2 * _SMALL else None
-    ends = {k: _modes(_Target(some or model, k), seed) for k in choices}
+    ends = {k: _modes(some or model, k, seed) for k in choices}
     if some is not None:
-        evidence = {k: around_mode(_Target(some, k), several[0])[1] for k, several in ends.items()}
+        evidence = {k: around_mode(_target(some, k), several[0])[1] for k, several in ends.items()}
         choices = _likely(model, evidence)
-        targets = {k: _Target(model, k) for k in choices}
-        ends = {k: _sorted(each, maximise(each, ends[k])) for k, each in targets.items()}
-    modes = {k: several[0] for k, several in ends.items()}
-    starts = {k: around_mode(_Target(model, k), modes[k]) for k in choices}
+        ends = {k: _sorted(model, k, maximise(_target(model, k), ends[k])) for k in choices}
+    starts = {k: around_mode(_target(model, k), ends[k][0]) for k in choices}
     likely = _likely(model, {k: evidence for k, (_, evidence) in starts.items()})
     return {k: starts[k][0] for k in likely}
 
 
-def _modes(target: _Target, seed: int, is_precise: bool = False) -> Tensor:
+def _modes(model: GP, choice: int, seed: int, is_precise: bool = False) -> Tensor:
     """Return the most likely end of some searches, or two that are nearly as likely, ``2 x B x P``.
 
     Searches begin with the most likely of some draws from the prior, and the medians of the priors.
     """
-    like = target.like
-    number = max(16, 6400 // max(len(target.model.data.Y), 25))
+    like, number = model.u.detach()[0], max(16, 6400 // max(len(model.data.Y), 25))
     generator = torch.Generator().manual_seed(seed)
     u = standard_normal((number, *like.shape), generator, like)
-    searches = _SEARCHES if target.choice == 0 else _SEARCHES // 2
-    begins = torch.cat([_sorted(target, u)[: searches - 1], torch.zeros_like(u[:1])])
-    ends = _sorted(target, maximise(target, begins, is_precise))
-    density = target.log_density(ends)
+    searches = _SEARCHES if choice == 0 else _SEARCHES // 2
+    begins = torch.cat([_sorted(model, choice, u)[: searches - 1], torch.zeros_like(u[:1])])
+    ends = maximise(_target(model, choice), begins, is_precise)
+    ends = _sorted(model, choice, ends)
+    density = _log_density(model, choice, ends)
     is_near = (ends - ends[0]).abs().amax(-1) < _NEAR
     rival, second = density.masked_fill(is_near, -math.inf).max(0)
     if not (rival > density[0] - _LESS_LIKELY).any():
@@ -231,15 +224,16 @@ def _modes(target: _Target, seed: int, is_precise: bool = False) -> Tensor:
     return torch.stack([ends[0], ends[second, torch.arange(len(like))]])
 
 
-def _sorted(target: _Target, u: Tensor) -> Tensor:
+def _sorted(model: GP, choice: int, u: Tensor) -> Tensor:
     """Return coordinates ``N x B x P`` of a nested model, the most likely ones first."""
-    order = target.log_density(u).argsort(0, descending=True)
-    return target.chosen(u.gather(0, order.unsqueeze(-1).expand_as(u)))
+    order = _log_density(model, choice, u).argsort(0, descending=True)
+    return model.table.with_choice(u.gather(0, order.unsqueeze(-1).expand_as(u)), choice)
 
 
-def _log_prior(model: GP) -> Tensor:
-    """Return the log prior probabilities of nested models, 0 of a single one."""
-    return model.u.detach().new_tensor([c.probability for c in model.table.choices] or [1.0]).log()
+def _log_density(model: GP, choice: int, u: Tensor) -> Tensor:
+    """Return the log posterior density of a nested model but for a constant, ``N x B``."""
+    density = _target(model, choice)(u, False)[0] - 0.5 * u.square().sum(-1)
+    return density.nan_to_num(nan=-math.inf)
 
 
 def _likely(model: GP, log_evidence: dict[int, Tensor]) -> list[int]:
@@ -250,7 +244,7 @@ def _likely(model: GP, log_evidence: dict[int, Tensor]) -> list[int]:
 
 def _weights(model: GP, log_evidence: dict[int, Tensor]) -> Tensor:
     """Return posterior probabilities ``K x G x B`` by log evidences ``G x B``."""
-    prior = _log_prior(model)
+    prior = model.table.log_prior
     like = next(iter(log_evidence.values()))
     logs = like.new_full((len(prior), *like.shape), -math.inf)
     for k, value in log_evidence.items():
@@ -260,7 +254,7 @@ def _weights(model: GP, log_evidence: dict[int, Tensor]) -> Tensor:
 
 def _evidence(model: GP, sampled: dict[int, Draws]) -> Tensor:
     """Return the log evidence of each problem, in the user's units."""
-    prior = _log_prior(model)
+    prior = model.table.log_prior
     logs = torch.stack([prior[k] + draws.log_evidence for k, draws in sampled.items()])
     total = logs.logsumexp(0).logsumexp(0) - math.log(GROUPS)
     units = (~model.data.Y.isnan()).sum(0) * model.unit.squeeze(-1).log()

@@ -200,3 +200,36 @@ def _lower(A: Tensor, B: Tensor, C: Tensor) -> Tensor:
     """Return the lower triangular matrix of blocks A, B and C."""
     zero = A.new_zeros(*A.shape[:-1], C.shape[-1])
     return torch.cat([torch.cat([A, zero], -1), torch.cat([B, C], -1)], -2)
+
+
+# Mixtures of Gaussians.
+
+DRAWS = -3  # the dimension of draws in ... x S x q x m
+
+
+class Prediction(NamedTuple):
+    """Predictions at points by themselves, in the units of the targets."""
+
+    mean: Tensor  # ... x q x m
+    variance: Tensor
+
+
+def moments(mean: Tensor, variance: Tensor) -> Prediction:
+    """Return the mean and variance of mixtures of components ``... x S x q x m``."""
+    if mean.shape[DRAWS] == 1:
+        return Prediction(mean.squeeze(DRAWS), variance.squeeze(DRAWS))
+    center = mean.mean(DRAWS)
+    between = (mean - center.unsqueeze(DRAWS)).square().mean(DRAWS)
+    return Prediction(center, variance.mean(DRAWS) + between)
+
+
+def mixture_quantile(mean: Tensor, variance: Tensor, level: float) -> Tensor:
+    """Return quantiles ``... x q x m`` of mixtures ``... x S x q x m``, by bisection."""
+    sd = variance.sqrt().clamp_min(1e-300)
+    ends = mean + torch.special.ndtri(torch.tensor(level).to(mean)) * sd
+    low, high = ends.amin(DRAWS), ends.amax(DRAWS)
+    for _ in range(50 if mean.shape[DRAWS] > 1 else 0):
+        middle = (low + high) / 2
+        below = torch.special.ndtr((middle.unsqueeze(DRAWS) - mean) / sd).mean(DRAWS) < level
+        low, high = torch.where(below, middle, low), torch.where(below, high, middle)
+    return (low + high) / 2

@@ -8,20 +8,33 @@ from typing import Any, Self
 
 import gpytorch
 import torch
+from botorch.acquisition.objective import PosteriorTransform, ScalarizedPosteriorTransform
 from botorch.models import SingleTaskGP
+from botorch.models.model import FantasizeMixin, Model
 from botorch.models.transforms.outcome import Standardize
+from botorch.posteriors import Posterior
 from botorch.sampling.pathwise.posterior_samplers import DrawMatheronPaths
 from botorch.settings import validate_input_scaling
 from gpytorch.distributions import MultivariateNormal
+from gpytorch.kernels import AdditiveKernel
+from gpytorch.likelihoods import GaussianLikelihood
 from gpytorch.priors import NormalPrior
 from linear_operator import to_linear_operator
 from torch import Size, Tensor
 
-from gpadjust.core.data import ArrayLike, Data, appended, as_tensor, unit_of
+from gpadjust.core.data import ArrayLike, Data, appended, as_given, as_tensor, unit_of
 from gpadjust.core.functions import Functions, Paths
-from gpadjust.core.gaussian import Conditioning, Likelihood, add_noise, log_likelihood
+from gpadjust.core.gaussian import (
+    Conditioning,
+    Likelihood,
+    Prediction,
+    add_noise,
+    log_likelihood,
+    mixture_quantile,
+    moments,
+)
 from gpadjust.core.noise import KnownNoise, Noise
-from gpadjust.core.posterior import MixturePosterior, Predictive
+from gpadjust.core.posterior import MixturePosterior
 from gpadjust.core.summary import summary
 from gpadjust.core.terms import Places, Term, TermSum, WeightedSum
 from gpadjust.core.unknowns import Choice, Row, Table, Values
@@ -38,6 +51,68 @@ Slopes = dict[str, list[Tensor]]
 """Derivatives of each physics by the coordinate of each unknown parameter, ``S x m x n``."""
 
 _STEP = 1e-4  # of differences by parameters of a physics, in coordinates
+
+
+class Predictive(Model, FantasizeMixin):
+    """A model whose predictions are mixtures of equally likely Gaussians.
+
+    A subclass has ``components`` of X and observation_noise, the means and variances of each,
+    ``... x S x q x m``, and ``mixture`` of X, outputs and observation_noise, the joint posterior.
+    """
+
+    components: Callable[..., tuple[Tensor, Tensor]]
+    mixture: Callable[..., MixturePosterior]
+
+    def predict(self, X: ArrayLike, observation_noise: bool | Tensor = False) -> Prediction:
+        """Predict each point by itself, without the covariances between them.
+
+        Args:
+            X: Inputs, ``... x q x d``.
+            observation_noise: If True, of observations instead of the function; or the variances
+                of their noise, ``... x q x m``.
+
+        Returns:
+            Mean and variance, ``... x q x m``, as ``X`` came: tensors, arrays or frames.
+        """
+        prediction = moments(*self.components(X, observation_noise))
+        return Prediction(*(as_given(each, X, self.data.output_names) for each in prediction))
+
+    @torch.no_grad()
+    def interval(
+        self, X: ArrayLike, level: float = 0.95, observation_noise: bool | Tensor = False
+    ) -> tuple[Any, Any]:
+        """Return the lower and upper ends of the central interval at each point, as ``X`` came."""
+        if not 0 < level < 1:
+            raise ValueError(f"Expected level between 0 and 1; found {level}; 95 % is 0.95.")
+        parts = self.components(X, observation_noise)
+        ends, names = ((1 - level) / 2, (1 + level) / 2), self.data.output_names
+        lower, upper = (as_given(mixture_quantile(*parts, end), X, names) for end in ends)
+        return lower, upper
+
+    def posterior(
+        self,
+        X: ArrayLike,
+        output_indices: list[int] | None = None,
+        observation_noise: bool | Tensor = False,
+        posterior_transform: PosteriorTransform | None = None,
+    ) -> Posterior:
+        """Return the joint posterior at ``X``, ``... x q x d``, as BoTorch asks for it."""
+        self.eval()
+        is_part = output_indices is not None
+        outputs = self.checked_outputs(output_indices) if is_part else slice(None)
+        posterior = self.mixture(X, outputs, observation_noise)
+        if posterior_transform is None:
+            return posterior
+        if isinstance(posterior_transform, ScalarizedPosteriorTransform):
+            return posterior.scalarized(posterior_transform.weights, posterior_transform.offset)
+        return posterior_transform(posterior=posterior, X=X)
+
+    def checked_outputs(self, outputs: list[int] | None) -> list[int]:
+        """Return the numbers of outputs; negative ones count from the end."""
+        m = self.num_outputs
+        if not outputs or any(not isinstance(i, int) or not -m <= i < m for i in outputs):
+            raise ValueError(f"Expected numbers of outputs from 0 to {m - 1}; found {outputs}.")
+        return [i % m for i in outputs]
 
 
 class GP(gpytorch.models.GP, Predictive):
@@ -130,11 +205,9 @@ class GP(gpytorch.models.GP, Predictive):
         self.table = Table(rows, m, choices)
         self.u = torch.nn.Parameter(Y.new_zeros(1, self.table.problems, self.table.size))
         self.draws = self.u.detach()
-        self.likelihood = likelihood_view(self)
-        self.mean_module, self.covar_module = MeanView(self), kernel_view(self)
         prior = NormalPrior(Y.new_zeros(()), Y.new_ones(()))
         self.register_prior("u_prior", prior, _coordinates, _set_coordinates)
-        if any(row.log_density is not None for row in rows):
+        if self.table.has_other_priors:
             self.register_added_loss_term("other_priors")
             self.update_added_loss_term("other_priors", OtherPriors(self))
         self.register_load_state_dict_pre_hook(_resize)
@@ -202,8 +275,9 @@ class GP(gpytorch.models.GP, Predictive):
             gradient = self.table.gradient(by, values)
         if self.table.problems < value.shape[-1]:
             value = value.sum(-1, keepdim=True)
-        ratio, by_ratio = self._other_priors(u)
-        value, gradient = value + ratio, gradient + by_ratio
+        if self.table.has_other_priors:
+            ratio, by_ratio = self._other_priors(u)
+            value, gradient = value + ratio, gradient + by_ratio
         bad = ~(value.isfinite() & gradient.isfinite().all(-1))
         return value.masked_fill(bad, -torch.inf), gradient.masked_fill(bad.unsqueeze(-1), 0.0)
 
@@ -240,13 +314,11 @@ class GP(gpytorch.models.GP, Predictive):
             variance = variance.expand_as(by_variance)
             return [*torch.autograd.grad(variance, leaves, by_variance, materialize_grads=True)]
 
-    def _other_priors(self, u: Tensor) -> tuple[Tensor | float, Tensor | float]:
+    def _other_priors(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Return the log density of priors other than N(0, I), and its gradient."""
         with torch.enable_grad():
             leaf = u.detach().requires_grad_()
             ratio = self.table.log_prior_ratio(leaf)
-            if ratio is None:
-                return 0.0, 0.0
             (slope,) = torch.autograd.grad(ratio.sum(), leaf)
         return ratio.detach(), slope
 
@@ -339,7 +411,8 @@ class GP(gpytorch.models.GP, Predictive):
         X, conditioning = self.data.new_inputs(X), self.conditioning()
         with self._graph_for(X):
             mean, variance = conditioning.marginals(self.at(X, conditioning.train.values))
-            variance = variance + self._noise_at(X, observation_noise)
+            if observation_noise is not False:
+                variance = variance + self._noise_at(X, observation_noise)
             variance = variance * self.unit.square()
             mean, variance = torch.broadcast_tensors(mean * self.unit, variance)
         return mean.mT, variance.mT
@@ -351,9 +424,8 @@ class GP(gpytorch.models.GP, Predictive):
         X, conditioning = self.data.new_inputs(X), self.conditioning()
         with self._graph_for(X):
             mean, K = conditioning.joint(self.at(X, conditioning.train.values))
-            noise = self._noise_at(X, observation_noise)
-            if isinstance(noise, Tensor):
-                K = add_noise(K, noise)
+            if observation_noise is not False:
+                K = add_noise(K, self._noise_at(X, observation_noise))
             mean, K = mean * self.unit, K * self.unit.square().unsqueeze(-1)
             return MixturePosterior(mean[..., outputs, :], K[..., outputs, :, :])
 
@@ -404,10 +476,8 @@ class GP(gpytorch.models.GP, Predictive):
         asked = X.requires_grad or self.conditioning().alpha.requires_grad
         return torch.set_grad_enabled(asked and torch.is_grad_enabled())
 
-    def _noise_at(self, X: Tensor, asked: bool | Tensor) -> Tensor | float:
-        """Return variances ``... x S x m x q`` in units of the targets; 0 if none are asked for."""
-        if asked is False:
-            return 0.0
+    def _noise_at(self, X: Tensor, asked: bool | Tensor) -> Tensor:
+        """Return variances ``... x S x m x q`` in units of the targets."""
         if asked is True:
             values = self.conditioning().train.values
             return self.noise.variance(values, self.places(X, values))
@@ -533,6 +603,21 @@ class GP(gpytorch.models.GP, Predictive):
     def num_outputs(self) -> int:
         """``m``."""
         return self.data.Y.shape[-1]
+
+    @property
+    def mean_module(self) -> MeanView:
+        """The prior mean, f_p for an adjustment, in the user's units."""
+        return MeanView(self)
+
+    @property
+    def covar_module(self) -> AdditiveKernel:
+        """The prior covariance: the sum of the kernels of rho, scaled by f_p - c, and of delta."""
+        return kernel_view(self)
+
+    @property
+    def likelihood(self) -> GaussianLikelihood:
+        """The Gaussian likelihood with the model's noise."""
+        return likelihood_view(self)
 
     @property
     def num_draws_and_outputs(self) -> tuple[int, int]:

@@ -2,49 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
-
 import torch
-from botorch.acquisition.objective import PosteriorTransform, ScalarizedPosteriorTransform
-from botorch.models.model import FantasizeMixin, Model
-from botorch.posteriors import Posterior
 from botorch.posteriors.gpytorch import GPyTorchPosterior
 from gpytorch.distributions import MultitaskMultivariateNormal, MultivariateNormal
 from linear_operator import to_linear_operator
 from torch import Size, Tensor
 
-from gpadjust.core.data import ArrayLike, as_given
-
-DRAWS = -3  # the dimension of draws in ... x S x q x m
-
-
-class Prediction(NamedTuple):
-    """Predictions at points by themselves, in the units of the targets."""
-
-    mean: Tensor  # ... x q x m
-    variance: Tensor
-
-
-def moments(mean: Tensor, variance: Tensor) -> Prediction:
-    """Return the mean and variance of mixtures of components ``... x S x q x m``."""
-    if mean.shape[DRAWS] == 1:
-        return Prediction(mean.squeeze(DRAWS), variance.squeeze(DRAWS))
-    center = mean.mean(DRAWS)
-    between = (mean - center.unsqueeze(DRAWS)).square().mean(DRAWS)
-    return Prediction(center, variance.mean(DRAWS) + between)
-
-
-def mixture_quantile(mean: Tensor, variance: Tensor, level: float) -> Tensor:
-    """Return quantiles ``... x q x m`` of mixtures ``... x S x q x m``, by bisection."""
-    sd = variance.sqrt().clamp_min(1e-300)
-    ends = mean + torch.special.ndtri(torch.tensor(level).to(mean)) * sd
-    low, high = ends.amin(DRAWS), ends.amax(DRAWS)
-    for _ in range(50 if mean.shape[DRAWS] > 1 else 0):
-        middle = (low + high) / 2
-        below = torch.special.ndtr((middle.unsqueeze(DRAWS) - mean) / sd).mean(DRAWS) < level
-        low, high = torch.where(below, middle, low), torch.where(below, high, middle)
-    return (low + high) / 2
+from gpadjust.core.gaussian import DRAWS, mixture_quantile, moments
 
 
 def correlation_root(K: Tensor) -> Tensor:
@@ -188,65 +152,3 @@ def _products(root: Tensor, z: Tensor, rows: Tensor, which: Tensor) -> Tensor:
             part = (root[at[:, 1], s] @ z[mine].unsqueeze(-1)).squeeze(-1)
             drawn = drawn.index_put((at[:, 0], at[:, 1]), part)
     return drawn
-
-
-class Predictive(Model, FantasizeMixin):
-    """A model whose predictions are mixtures of equally likely Gaussians.
-
-    A subclass has ``components`` of X and observation_noise, the means and variances of each,
-    ``... x S x q x m``, and ``mixture`` of X, outputs and observation_noise, the joint posterior.
-    """
-
-    components: Callable[..., tuple[Tensor, Tensor]]
-    mixture: Callable[..., MixturePosterior]
-
-    def predict(self, X: ArrayLike, observation_noise: bool | Tensor = False) -> Prediction:
-        """Predict each point by itself, without the covariances between them.
-
-        Args:
-            X: Inputs, ``... x q x d``.
-            observation_noise: If True, of observations instead of the function; or the variances
-                of their noise, ``... x q x m``.
-
-        Returns:
-            Mean and variance, ``... x q x m``, as ``X`` came: tensors, arrays or frames.
-        """
-        prediction = moments(*self.components(X, observation_noise))
-        return Prediction(*(as_given(each, X, self.data.output_names) for each in prediction))
-
-    @torch.no_grad()
-    def interval(
-        self, X: ArrayLike, level: float = 0.95, observation_noise: bool | Tensor = False
-    ) -> tuple[Any, Any]:
-        """Return the lower and upper ends of the central interval at each point, as ``X`` came."""
-        if not 0 < level < 1:
-            raise ValueError(f"Expected level between 0 and 1; found {level}; 95 % is 0.95.")
-        parts = self.components(X, observation_noise)
-        ends, names = ((1 - level) / 2, (1 + level) / 2), self.data.output_names
-        lower, upper = (as_given(mixture_quantile(*parts, end), X, names) for end in ends)
-        return lower, upper
-
-    def posterior(
-        self,
-        X: ArrayLike,
-        output_indices: list[int] | None = None,
-        observation_noise: bool | Tensor = False,
-        posterior_transform: PosteriorTransform | None = None,
-    ) -> Posterior:
-        """Return the joint posterior at ``X``, ``... x q x d``, as BoTorch asks for it."""
-        self.eval()
-        is_part = output_indices is not None
-        outputs = self.checked_outputs(output_indices) if is_part else slice(None)
-        posterior = self.mixture(X, outputs, observation_noise)
-        if posterior_transform is None:
-            return posterior
-        if isinstance(posterior_transform, ScalarizedPosteriorTransform):
-            return posterior.scalarized(posterior_transform.weights, posterior_transform.offset)
-        return posterior_transform(posterior=posterior, X=X)
-
-    def checked_outputs(self, outputs: list[int] | None) -> list[int]:
-        """Return the numbers of outputs; negative ones count from the end."""
-        m = self.num_outputs
-        if not outputs or any(not isinstance(i, int) or not -m <= i < m for i in outputs):
-            raise ValueError(f"Expected numbers of outputs from 0 to {m - 1}; found {outputs}.")
-        return [i % m for i in outputs]

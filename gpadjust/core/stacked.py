@@ -15,8 +15,9 @@ from torch.quasirandom import SobolEngine
 
 from gpadjust.checks import checked_whole
 from gpadjust.core.data import ArrayLike, Data
-from gpadjust.core.model import GP
-from gpadjust.core.posterior import DRAWS, MixturePosterior, Predictive
+from gpadjust.core.gaussian import DRAWS
+from gpadjust.core.model import GP, Predictive
+from gpadjust.core.posterior import MixturePosterior
 
 _ROUNDS = 1000  # of the search for weights
 

@@ -150,7 +150,8 @@ class WeightedSum:
             process = self.values.get(f"{term.name}.process")
             if process is not None and not process.any():
                 term = term._replace(kernel=None)
-            if term.name in self.weights and term.varies:
+            varies = term.kernel is not None or term.constant is not None
+            if term.name in self.weights and varies:
                 parts.append((term, self.weights[term.name]))
         return parts
 
@@ -215,7 +216,8 @@ class TermSum:
         if term.has_center is not True:
             return term.has_center / self.unit
         coordinate = values[f"{term.name}.center"]
-        return self._middle[term.physics or 0] + self.center_scale(term) * coordinate
+        i = term.physics or 0
+        return self._middle[i] + self._spread[i] * coordinate
 
     def center_scale(self, term: Term) -> Tensor:
         """Return the derivative of c by its coordinate, ``m x 1``."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from statistics import NormalDist
 from typing import NamedTuple
 
 import torch
@@ -46,11 +47,6 @@ class Row(NamedTuple):
     def positive(cls, name: str, median: Tensor, factor: float) -> Row:
         """Return a row of positive numbers, known to a factor around medians ``m x k``."""
         return cls(name, median.log(), math.log(factor), is_positive=True)
-
-    @property
-    def count(self) -> int:  # type: ignore[override]
-        """``k``."""
-        return self.location.shape[-1]
 
     def value(self, u: Tensor) -> Tensor:
         """Return the numbers at coordinates ``S x m x k`` (of a shared row ``S x k``)."""
@@ -97,16 +93,24 @@ class Table:
         if self.choices:
             self.own.append(Row(_CHOICE, self.own[0].location.new_zeros(num_outputs, 1)))
         self.problems = 1 if self.shared else num_outputs
-        self._width = sum(row.count for row in self.own)
+        self._sizes = [[r.location.shape[-1] for r in rows] for rows in (self.own, self.shared)]
+        self._width = sum(self._sizes[0])
         self._own_size = self._width * (num_outputs // self.problems)
-        self.size = self._own_size + sum(row.count for row in self.shared)
+        self.size = self._own_size + sum(self._sizes[1])
+        self.has_other_priors = any(row.log_density is not None for row in rows)
+        # The choices from left to right, the ends of their intervals of u, and log probabilities.
+        self._order = [*range(2, len(self.choices)), 0, 1][: max(1, len(self.choices))]
+        shares = torch.tensor([c.probability for c in self.choices] or [1.0], dtype=torch.float64)
+        self._ends = torch.special.ndtri(shares[self._order].cumsum(0)[:-1])
+        self.log_prior = shares.log()
 
     def values(self, u: Tensor) -> Values:
         """Return all numbers at coordinates ``S x B x P``."""
         values: Values = {}
-        for rows, z in ((self.own, self._own(u)), (self.shared, u[:, 0, self._own_size :])):
-            parts = z.split([row.count for row in rows], -1) if rows else ()
-            values |= {row.name: row.value(z) for row, z in zip(rows, parts, strict=True)}
+        parts = (self._own(u), u[:, 0, self._own_size :])
+        for rows, sizes, part in zip((self.own, self.shared), self._sizes, parts, strict=True):
+            split = part.split(sizes, -1) if rows else ()
+            values |= {row.name: row.value(z) for row, z in zip(rows, split, strict=True)}
         if self.choices:
             chosen = self.chosen(values).unsqueeze(-1)
             for k, choice in enumerate(self.choices):
@@ -135,15 +139,13 @@ class Table:
             parts.insert(0, own.reshape(number, self.problems, self._own_size))
         return torch.cat(parts, -1)
 
-    def log_prior_ratio(self, u: Tensor) -> Tensor | None:
+    def log_prior_ratio(self, u: Tensor) -> Tensor:
         r"""Return what other priors than N(0, I) add to the log density, ``S x B``.
 
         Of :math:`\theta(u)` it is
         :math:`\log p(\theta) + \log |d\theta / du| - \log N(u | 0, 1)`.
         """
         others = [row for row in (*self.own, *self.shared) if row.log_density is not None]
-        if not others:
-            return None
         values, total = self.values(u), u.new_zeros(len(u), self.problems)
         for row in others:
             theta = values[row.name]
@@ -179,20 +181,15 @@ class Table:
 
     def chosen(self, values: Values) -> Tensor:
         """Return which of the choices each draw holds, ``S x m``."""
-        order, ends = self._intervals(values[_CHOICE])
-        return order[torch.bucketize(values[_CHOICE].detach().squeeze(-1), ends)]
+        u = values[_CHOICE].detach().squeeze(-1)
+        return torch.tensor(self._order).to(u.device)[torch.bucketize(u, self._ends.to(u))]
 
     def with_choice(self, u: Tensor, number: int) -> Tensor:
         """Return coordinates with the given choice for all outputs."""
-        order, ends = self._intervals(u)
-        below = torch.cat([ends.new_zeros(1), torch.special.ndtr(ends), ends.new_ones(1)])
-        place = int((order == number).nonzero())
-        middle = torch.special.ndtri((below[place] + below[place + 1]) / 2) if number else 0.0
+        if not self.choices:
+            return u
+        below = [0.0, *torch.special.ndtr(self._ends).tolist(), 1.0]
+        place = self._order.index(number)
+        middle = NormalDist().inv_cdf((below[place] + below[place + 1]) / 2) if number else 0.0
         columns = torch.arange(self._width - 1, self._own_size, self._width)
-        return u.index_fill(-1, columns.to(u.device), float(middle))
-
-    def _intervals(self, like: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the choices from left to right, and the ends of their intervals of u."""
-        order = [*range(2, len(self.choices)), 0, 1]
-        shares = torch.tensor([self.choices[k].probability for k in order]).to(like)
-        return torch.tensor(order, device=like.device), torch.special.ndtri(shares.cumsum(0)[:-1])
+        return u.index_fill(-1, columns.to(u.device), middle)

@@ -80,7 +80,7 @@ class TermView(Kernel):
         return _of_all(one.cross(other) * model.unit.square().unsqueeze(-1), model, -3)
 
 
-def kernel_view(model: GP) -> Kernel:
+def kernel_view(model: GP) -> AdditiveKernel:
     """Return the prior covariance of a model: the sum of its terms' scaled kernels."""
     return AdditiveKernel(*(TermView(model, t.name) for t in model.terms if t.varies))
 
@@ -141,5 +141,4 @@ class OtherPriors(AddedLossTerm):
     def loss(self, *params: Any) -> Tensor:
         """Return the log density, of each output."""
         (model,) = self.owner
-        ratio = model.table.log_prior_ratio(model.u)
-        return model.u.new_zeros(()) if ratio is None else ratio.squeeze()
+        return model.table.log_prior_ratio(model.u).squeeze()

@@ -93,7 +93,7 @@ def test_a_prior_is_that_of_the_kernel():
     row = next(row for row in model.table.own if row.log_density is not None)
     u = torch.linspace(-2, 2, 9, dtype=torch.float64).reshape(9, 1, 1)
     coordinates = torch.zeros(9, 1, model.table.size, dtype=torch.float64)
-    names = [r.name for r in model.table.own for _ in range(r.count)]
+    names = [r.name for r in model.table.own for _ in range(r.location.shape[-1])]
     coordinates[..., names.index(row.name)] = u[..., 0]
     ratio = model.table.log_prior_ratio(coordinates).flatten()
     theta = row.value(u).flatten()

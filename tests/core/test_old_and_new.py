@@ -42,7 +42,9 @@ def pair(data, numbers):
         old = getattr(gpadjust, cls)(X, Y, Yvar, **physics, **own)
         new = getattr(core, cls)(X, Y, Yvar, **physics, **other)
         u = 0.5 * torch.randn(1, m, new.table.size, dtype=torch.float64)
-        for i, name in enumerate(row.name for row in new.table.own for _ in range(row.count)):
+        for i, name in enumerate(
+            row.name for row in new.table.own for _ in range(row.location.shape[-1])
+        ):
             u[..., i] *= not name.endswith("center")  # the mean of the physics
         new.set_draws(u)
         values, unit = numbers(new), old.units()[1].reshape(m)

@@ -7,7 +7,7 @@ from botorch.acquisition.objective import ScalarizedPosteriorTransform
 from botorch.sampling import SobolQMCNormalSampler
 
 from gpadjust.core import PhysicsMeanGP, StackedGP, ZeroMeanGP
-from gpadjust.core.posterior import mixture_quantile
+from gpadjust.core.gaussian import mixture_quantile
 
 X = torch.rand(9, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
 Z = torch.linspace(0, 1, 4, dtype=torch.float64).unsqueeze(-1)
