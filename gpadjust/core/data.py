@@ -78,8 +78,7 @@ class Data(NamedTuple):
             )
         X, Y = X.detach().clone(), Y.detach().clone()
         Yvar = None if train_Yvar is None else variances_of(train_Yvar, Y)
-        inputs = column_names(train_X) or default_names("x", X.shape[-1])
-        outputs = column_names(train_Y) or default_names("y", Y.shape[-1])
+        inputs, outputs = names_of(train_X, "x", X), names_of(train_Y, "y", Y)
         if input_transform is not None:
             input_transform = deepcopy(input_transform).double().train()
             input_transform(X)
@@ -89,7 +88,7 @@ class Data(NamedTuple):
 
     def new_inputs(self, X: ArrayLike) -> Tensor:
         """Return checked inputs ``... x q x d`` of a call."""
-        names = column_names(X)
+        names = None if isinstance(X, Tensor) else column_names(X)
         if names is not None and names != self.input_names and {*names} & {*self.input_names}:
             raise ValueError(f"Expected columns {self.input_names}, in this order; found {names}.")
         X, d = as_tensor(X, "X"), len(self.input_names)
@@ -199,17 +198,21 @@ def variances_of(values: ArrayLike, Y: Tensor) -> Tensor:
     return variances
 
 
+def names_of(values: ArrayLike, letter: str, tensor: Tensor) -> tuple[str, ...]:
+    """Return the names of columns, ``x`` or ``x1`` and so on if they have none."""
+    names, number = None, tensor.shape[-1]
+    if not isinstance(values, Tensor):
+        names = column_names(values)
+    default = (letter,) if number == 1 else tuple(f"{letter}{i + 1}" for i in range(number))
+    return names or default
+
+
 def column_names(values: ArrayLike) -> tuple[str, ...] | None:
     """Return the names of a frame's columns or of a Series, or None."""
     if hasattr(values, "columns"):
         return tuple(map(str, values.columns))
     name = getattr(values, "name", None)
     return None if name is None or isinstance(values, Tensor) else (str(name),)
-
-
-def default_names(letter: str, number: int) -> tuple[str, ...]:
-    """Return ``x``, or ``x1`` and so on."""
-    return (letter,) if number == 1 else tuple(f"{letter}{i + 1}" for i in range(number))
 
 
 def as_given(values: Tensor, X: ArrayLike, names: Sequence[str]) -> Any:

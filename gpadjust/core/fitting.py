@@ -122,7 +122,7 @@ def fit(
     shares = weights.mean(1)  # K x B
     model.set_draws(_pooled(sampled, shares, number), kept)
     error = _error(model, sampled, weights, number) * math.sqrt(number / kept)
-    choices = zip(model.table.choices, shares.expand(-1, model.num_outputs).tolist(), strict=False)
+    choices = zip(model.table.choices, shares.expand(-1, len(model.unit)).tolist(), strict=False)
     effective = min(float(draws.effective.min()) for draws in sampled.values())
     result = FitResult(
         method, _evidence(model, sampled), {choice.text: p for choice, p in choices},

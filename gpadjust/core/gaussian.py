@@ -164,7 +164,9 @@ class Conditioning:
         mean, cross = self.mean(sought)
         white = cross @ self.inverse_factor().mT
         prior = sought.variance()
-        return mean, (prior - white.square().sum(-1)).maximum(self._least(prior))
+        variance = prior - white.square().sum(-1)
+        # Not below the rounding errors of the difference.
+        return mean, variance.maximum(4 * self.chol.shape[-1] * _EPS * prior)
 
     def joint(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Return means ``... x S x m x q``, and covariances ``... x S x m x q x q``."""
@@ -172,13 +174,9 @@ class Conditioning:
         white = cross @ self.inverse_factor().mT
         prior = sought.cross(sought)
         K = prior - white @ white.mT
-        least = self._least(prior.diagonal(dim1=-1, dim2=-2))
+        least = 4 * self.chol.shape[-1] * _EPS * prior.diagonal(dim1=-1, dim2=-2)
         raised = (least - K.diagonal(dim1=-1, dim2=-2)).clamp_min(0.0)
         return mean, add_noise(K, raised)
-
-    def _least(self, prior: Tensor) -> Tensor:
-        """Return the rounding errors of variances, differences from prior ones."""
-        return 4 * self.chol.shape[-1] * _EPS * prior
 
     def left_out(self) -> tuple[Tensor, Tensor]:
         r"""Return means and variances of each observation given all others, noise included.

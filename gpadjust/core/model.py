@@ -75,6 +75,8 @@ class Predictive(Model, FantasizeMixin):
             Mean and variance, ``... x q x m``, as ``X`` came: tensors, arrays or frames.
         """
         prediction = moments(*self.components(X, observation_noise))
+        if isinstance(X, Tensor):
+            return prediction
         return Prediction(*(as_given(each, X, self.data.output_names) for each in prediction))
 
     @torch.no_grad()
@@ -181,7 +183,8 @@ class GP(gpytorch.models.GP, Predictive):
         self.settings = dict(settings or {})
         self._outputs: list[int] | None = None
         self._cached: tuple[Tensor, Conditioning] | None = None
-        self._unknowns = _unknowns_of(self.physics)
+        has_unknowns = any(each.unknowns for each in self.physics)
+        self._unknowns = _unknowns_of(self.physics) if has_unknowns else {}
         self._f_train: list[Tensor] = []
         self.unit = Y.new_ones(1, 1)  # the user's, until the prior mean is known
         places = self.places(X, {f"physics.{n}": Y.new_zeros(1, 1) for n in self._unknowns})
@@ -254,8 +257,11 @@ class GP(gpytorch.models.GP, Predictive):
         zero if it is not asked for.
         """
         values, y = self.table.values(u), self.data.Y.mT / self.unit
-        f, f_slopes = self._physics_with_slopes(values, with_gradient)
-        places = self.places(self.data.X, values, False)._replace(f=f)
+        f_slopes: Slopes = {}
+        places = self.places(self.data.X, values, with_physics=not self._unknowns)
+        if self._unknowns:
+            f, f_slopes = self._physics_with_slopes(values, with_gradient)
+            places = places._replace(f=f)
         total = self.term_sum.at(values, places)
         if with_gradient:
             K, pull_back = total.with_pull_back()
@@ -296,7 +302,7 @@ class GP(gpytorch.models.GP, Predictive):
             by_f[term.physics] += self.term_sum.mean_of(term, values) * by_mean + by_weight
             if term.has_center is True:
                 by_c = -by_weight.sum(-1, keepdim=True)
-                slopes[f"{term.name}.center"] = by_c * self.term_sum.center_scale(term)
+                slopes[f"{term.name}.center"] = by_c * self.term_sum.spread[term.physics]
         if f_slopes and type(self.noise).shares is not Noise.shares:
             by_shares = self._noise_by_f(values, places, found.by_covariance)
             by_f = [a + b for a, b in zip(by_f, by_shares, strict=True)]
@@ -338,8 +344,6 @@ class GP(gpytorch.models.GP, Predictive):
         These are central differences, of one call for all.
         """
         X, names = self.data.X, [*self._unknowns]
-        if not names:
-            return self._physics_at(X, {}), {}
         z = torch.cat([values[f"physics.{name}"] for name in names], -1)  # S x p
         p = len(names) if with_slopes else 0
         steps = _STEP * torch.eye(p, len(names)).to(z).unsqueeze(1)
@@ -380,7 +384,7 @@ class GP(gpytorch.models.GP, Predictive):
         """Return the posterior given the data, without a graph of the draws; kept for these."""
         if self._cached is None or not torch.equal(self._cached[0], self.u):
             with torch.no_grad():
-                conditioning = Conditioning(*self._observed(self.values))
+                conditioning = Conditioning(*self._observed(self.table.values(self.u)))
             self._cached = (self.u.detach().clone(), conditioning)
         return self._cached[1]
 

@@ -193,8 +193,9 @@ class TermSum:
         )
         self.unit = unit
         self.f = [v.reshape(-1, v.shape[-1]) for v in f]
-        self._middle = [v.mean(-1, keepdim=True) for v in self.f]
-        self._spread = [3 * v.std(-1, keepdim=True) for v in self.f]
+        # The prior mean and standard deviation of a center, m x 1.
+        self.middle = [v.mean(-1, keepdim=True) for v in self.f]
+        self.spread = [3 * v.std(-1, keepdim=True) for v in self.f]
 
     def rows(self, x: Tensor, num_outputs: int) -> list[Row]:
         """Return the unknown numbers of all terms, for training inputs ``n x d``."""
@@ -217,11 +218,7 @@ class TermSum:
             return term.has_center / self.unit
         coordinate = values[f"{term.name}.center"]
         i = term.physics or 0
-        return self._middle[i] + self._spread[i] * coordinate
-
-    def center_scale(self, term: Term) -> Tensor:
-        """Return the derivative of c by its coordinate, ``m x 1``."""
-        return self._spread[term.physics or 0]
+        return self.middle[i] + self.spread[i] * coordinate
 
     def mean_of(self, term: Term, values: Values) -> Tensor | float:
         """Return the prior mean of a term's process, which is zero in some nested models."""

@@ -126,18 +126,16 @@ class Table:
     def gradient(self, by: Values, values: Values) -> Tensor:
         """Return derivatives by u, ``S x B x P``, of derivatives by the numbers."""
         number = len(next(iter(values.values())))
-
-        def of(row: Row) -> Tensor:
-            shape = (number, *row.location.shape)
-            if row.name not in by:
-                return row.location.new_zeros(shape)
-            return (row.slope(values[row.name]) * by[row.name]).reshape(shape)
-
-        parts = [of(row).unsqueeze(1) for row in self.shared]
-        if self.own:
-            own = torch.cat([of(row) for row in self.own], -1)
-            parts.insert(0, own.reshape(number, self.problems, self._own_size))
-        return torch.cat(parts, -1)
+        parts = []
+        for row in (*self.own, *self.shared):
+            slope = row.location.new_zeros(number, *row.location.shape)
+            if row.name in by:
+                slope = (row.slope(values[row.name]) * by[row.name]).reshape(slope.shape)
+            parts.append(slope)
+        own, shared = parts[: len(self.own)], parts[len(self.own) :]
+        if own:
+            own = [torch.cat(own, -1).reshape(number, self.problems, self._own_size)]
+        return torch.cat([*own, *(slope.unsqueeze(1) for slope in shared)], -1)
 
     def log_prior_ratio(self, u: Tensor) -> Tensor:
         r"""Return what other priors than N(0, I) add to the log density, ``S x B``.
