@@ -106,6 +106,8 @@ def fit(
         >>> fit(ZeroMeanGP(X, X.sin())).converged
         True
     """
+    if not hasattr(model, "log_likelihood"):
+        raise TypeError(f"Expected a model of gpadjust.core; found {type(model).__name__}.")
     if method not in ("bayes", "map"):
         raise ValueError(f"Unknown method {method!r}; expected 'bayes' or 'map'.")
     if num_draws is not None and (num_draws < 4 or num_draws % 4):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from botorch.sampling.pathwise import SamplePath
@@ -11,9 +11,6 @@ from torch import Size, Tensor
 from gpadjust.checks import checked_whole
 from gpadjust.core.terms import WeightedSum
 from gpadjust.core.unknowns import standard_normal
-
-if TYPE_CHECKING:
-    from gpadjust.core.model import GP
 
 
 class Functions(torch.nn.Module):
@@ -30,7 +27,7 @@ class Functions(torch.nn.Module):
     """
 
     @torch.no_grad()
-    def __init__(self, model: GP, number: int, num_features: int, seed: int) -> None:
+    def __init__(self, model: Any, number: int, num_features: int, seed: int) -> None:
         super().__init__()
         checked_whole("num_functions", number, 1)
         if checked_whole("num_features", num_features, 2) % 2:

@@ -6,6 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from copy import deepcopy
+from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -42,10 +43,13 @@ class Kernel(ABC):
 
     def variance(self, own: Values, x: Tensor) -> Tensor:
         """Return the prior variances, ``... x S x m x n`` (or 1 where all are equal)."""
-        return self.covariance(own, x).diagonal(dim1=-1, dim2=-2)
+        points = x.movedim(-2, 0).unsqueeze(-2)  # n x ... x 1 x d
+        return self.covariance(own, points)[..., 0, 0].movedim(0, -1)
 
     def with_pull_back(self, own: Values, x: Tensor) -> tuple[Tensor, PullBack]:
         r"""Return the covariance K, and a function of D = df/dK that gives df by the parameters."""
+        if not own:
+            return self.covariance(own, x), lambda D: {}
         leaves = {name: value.detach().clone().requires_grad_() for name, value in own.items()}
         with torch.enable_grad():
             K = self.covariance(leaves, x)
@@ -85,25 +89,32 @@ class Profile(NamedTuple):
 def _matern(p: int) -> Profile:
     """Return the Matern kernel with nu = p + 1/2 (Rasmussen and Williams 2006, eq. 4.16)."""
     nu2 = 2 * p + 1
-    polynomials = {0: lambda t: 1.0, 1: lambda t: 1 + t, 2: lambda t: 1 + t + t.square() / 3}
-    slopes = {0: lambda t: 1 / t.clamp_min(1e-8), 1: lambda t: 1.0, 2: lambda t: (1 + t) / 3}
+    return Profile(
+        f"matern{nu2}/2", partial(_matern_value, p), partial(_matern_slope, p), float(nu2)
+    )
 
-    def root(e: Tensor) -> Tensor:  # t = sqrt(2 nu) r
-        return (-2 * nu2 * e).clamp_min(1e-30).sqrt()
 
-    def value(e: Tensor) -> Tensor:
-        t = root(e)
-        return polynomials[p](t) * (-t).exp()
+def _matern_value(p: int, e: Tensor) -> Tensor:
+    t = (-2 * (2 * p + 1) * e).clamp_min(1e-30).sqrt()  # sqrt(2 nu) r
+    return (1.0, 1 + t, 1 + t + t.square() / 3)[p] * (-t).exp()
 
-    def slope(e: Tensor) -> Tensor:  # dk/de = nu2 * (-k'(t) / t)
-        t = root(e)
-        return nu2 * slopes[p](t) * (-t).exp() * (e < 0 if p == 0 else 1.0)
 
-    return Profile(f"matern{nu2}/2", value, slope, float(nu2))
+def _matern_slope(p: int, e: Tensor) -> Tensor:
+    nu2 = 2 * p + 1
+    t = (-2 * nu2 * e).clamp_min(1e-30).sqrt()
+    polynomial = (1 / t.clamp_min(1e-8), 1.0, (1 + t) / 3)[p]
+    slope = nu2 * polynomial * (-t).exp()  # dk/de = -2 nu k'(t) / t
+    return slope * (e < 0) if p == 0 else slope
 
 
 RBF = Profile("rbf", torch.exp, torch.exp, math.inf)
-MATERN12, MATERN32, MATERN52 = (_matern(p) for p in range(3))
+"""The squared exponential kernel, exp(-r^2 / 2)."""
+MATERN12 = _matern(0)
+"""The exponential kernel, Matern with nu = 1/2."""
+MATERN32 = _matern(1)
+"""The Matern kernel with nu = 3/2."""
+MATERN52 = _matern(2)
+"""The Matern kernel with nu = 5/2."""
 
 
 def exponents(z: Tensor, other: Tensor | None = None) -> Tensor:
@@ -184,17 +195,19 @@ class Stationary(Kernel):
         degrees, half = self.profile.degrees, number // 2
         if degrees is None:
             return super().features(own, number, generator)
-        w = _normal(own["lengthscale"].shape[-1], half, generator)
+        S, d = own["lengthscale"].shape[0], own["lengthscale"].shape[-1]
+        w = _normal((S, 1, d, half), generator)  # each function has frequencies of its own
         if math.isfinite(degrees):  # chi^2 with an odd number of degrees, as squares
-            w = w * (degrees / _normal(int(degrees), half, generator).square().sum(0)).sqrt()
+            chi2 = _normal((S, 1, int(degrees), half), generator).square().sum(-2, keepdim=True)
+            w = w * (degrees / chi2).sqrt()
         return lambda x: _fourier(own, x, w)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.profile.name})"
 
 
-def _normal(rows: int, columns: int, generator: torch.Generator) -> Tensor:
-    return torch.randn(rows, columns, generator=generator, dtype=torch.float64)
+def _normal(shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
+    return torch.randn(shape, generator=generator, dtype=torch.float64)
 
 
 def _fourier(own: Values, x: Tensor, w: Tensor) -> Tensor:
@@ -216,7 +229,7 @@ class Fourier(Stationary):
     ) -> None:
         super().__init__(RBF, outputscale)
         generator = torch.Generator().manual_seed(seed)
-        self.frequencies = _normal(num_inputs, num_features // 2, generator)
+        self.frequencies = _normal((num_inputs, num_features // 2), generator)
 
     def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
         """Return the inner products of the features."""
@@ -279,7 +292,7 @@ class OfGPyTorch(Kernel):
                 if _reads(closure, module, parameter):
                     priors[name] = prior
         rows = []
-        for name, (raw, constraint) in self._constraints.items():
+        for name, (raw, constraint) in self._raw_parameters.items():
             value = (raw if constraint is None else constraint.transform(raw)).reshape(-1)
             positive = constraint is not None and bool((constraint.lower_bound >= 0).all())
             prior, scale = priors.get(name), _LENGTH_FACTOR if positive else math.e
@@ -302,7 +315,7 @@ class OfGPyTorch(Kernel):
         return evaluate(own, x, x if other is None else other, lead)
 
     @property
-    def _constraints(self) -> dict[str, tuple[Tensor, Any]]:
+    def _raw_parameters(self) -> dict[str, tuple[Tensor, Any]]:
         """Raw parameters and their constraints by name."""
         named = self.kernel.named_parameters_and_constraints()
         return {name: (raw, constraint) for name, raw, constraint in named}
@@ -310,7 +323,7 @@ class OfGPyTorch(Kernel):
     def _dense(self, kernel: AnyGPyTorchKernel, values: Values, x: Tensor, other: Tensor) -> Tensor:
         """Return covariances of a kernel at values of its parameters."""
         raw = {}
-        for name, (old, constraint) in self._constraints.items():
+        for name, (old, constraint) in self._raw_parameters.items():
             value = values[name].unflatten(-1, old.shape) if old.dim() else values[name].squeeze(-1)
             if constraint is not None:
                 low, high = constraint.lower_bound.to(value), constraint.upper_bound.to(value)
@@ -379,7 +392,11 @@ def _density(prior: Any, shape: torch.Size) -> Callable[[Tensor], Tensor]:
 
     def log_density(theta: Tensor) -> Tensor:
         lead = theta.shape[:-1]
-        return prior.log_prob(theta.reshape(*lead, *shape)).reshape(*lead, -1).sum(-1)
+        value = theta.reshape(*lead, *shape)
+        is_possible = prior.support.check(value)
+        log_prob = prior.log_prob(value.where(is_possible, torch.as_tensor(prior.mean).to(value)))
+        log_prob = log_prob.masked_fill(~is_possible, -math.inf)
+        return log_prob.reshape(*lead, -1).sum(-1)
 
     return log_density
 

@@ -33,6 +33,7 @@ from gpadjust.core.gaussian import (
     mixture_quantile,
     moments,
 )
+from gpadjust.core.kernels import DELTA, RHO, as_kernel
 from gpadjust.core.noise import KnownNoise, Noise
 from gpadjust.core.posterior import MixturePosterior
 from gpadjust.core.summary import summary
@@ -142,7 +143,6 @@ class GP(gpytorch.models.GP, Predictive):
 
     Attributes:
         u: Coordinates of the draws that predictions average over, ``S x B x P``.
-        draws: All coordinates that the last fit has drawn, ``N x B x P``.
         data: The training data.
         unit: The unit of each output's targets, ``m x 1``.
 
@@ -177,6 +177,7 @@ class GP(gpytorch.models.GP, Predictive):
         m = Y.shape[-1]
         self.rows_of_fit = len(Y)  # later ones are conditioned on, in the unit of these
         self.physics = [as_physics(each) for each in physics]
+        terms = [_with_kernel(term) for term in terms]
         if type(self) is GP:
             settings = {"terms": terms, "noise": noise, "choices": choices}
             settings["input_transform"] = input_transform
@@ -202,12 +203,22 @@ class GP(gpytorch.models.GP, Predictive):
             if noise is not None:
                 raise ValueError("Expected train_Yvar or noise; found both.")
             noise = KnownNoise(self.data.Yvar.mT / self.unit.square())
+        if noise is not None and not isinstance(noise, Noise):
+            raise TypeError(
+                f"Expected noise as a Noise; found {noise!r}. A variance is train_Yvar."
+            )
         self.noise = Noise() if noise is None else noise
         rows = self.term_sum.rows(self.data.kernel_inputs(X), m) + self.noise.rows(Y)
         rows += [Row(f"physics.{n}", Y.new_zeros(1), is_shared=True) for n in self._unknowns]
         self.table = Table(rows, m, choices)
+        known = {row.name for row in rows}
+        known |= {f"{t.name}.{part}" for t in terms for part in ("mean", "process")}
+        if unknown := {name for choice in choices for name in choice.zeros} - known:
+            raise ValueError(
+                f"Unknown numbers {sorted(unknown)} in choices; expected some of {sorted(known)}."
+            )
         self.u = torch.nn.Parameter(Y.new_zeros(1, self.table.problems, self.table.size))
-        self.draws = self.u.detach()
+        self._draws = self.u.detach()
         prior = NormalPrior(Y.new_zeros(()), Y.new_ones(()))
         self.register_prior("u_prior", prior, _coordinates, _set_coordinates)
         if self.table.has_other_priors:
@@ -228,6 +239,11 @@ class GP(gpytorch.models.GP, Predictive):
         return self.table.values(self.u)
 
     @property
+    def draws(self) -> Tensor:
+        """All coordinates that the last fit has drawn, ``N x B x P``; without a fit ``u``."""
+        return self._draws if len(self._draws) > len(self.u) else self.u.detach()
+
+    @property
     def physics_parameters(self) -> dict[str, Tensor]:
         """Draws ``N`` of each unknown parameter of the physics, in the user's units."""
         values = self.table.values(self.draws)
@@ -245,8 +261,8 @@ class GP(gpytorch.models.GP, Predictive):
                 f"{tuple(draws.shape)}."
             )
         step = max(1, len(draws) // (number or len(draws)))
-        self.draws = draws.detach()
-        self.u = torch.nn.Parameter(self.draws[step // 2 :: step].clone())
+        self._draws = draws.detach()
+        self.u = torch.nn.Parameter(self._draws[step // 2 :: step].clone())
         self._cached = None
 
     @torch.no_grad()
@@ -316,7 +332,7 @@ class GP(gpytorch.models.GP, Predictive):
         by_variance = by_covariance.diagonal(dim1=-1, dim2=-2)
         with torch.enable_grad():
             leaves = [f.detach().clone().requires_grad_() for f in places.f]
-            variance = self.noise.variance(values, Places(places.x, leaves), True)
+            variance = self.noise.variance(values, places._replace(f=leaves), True)
             variance = variance.expand_as(by_variance)
             return [*torch.autograd.grad(variance, leaves, by_variance, materialize_grads=True)]
 
@@ -334,7 +350,18 @@ class GP(gpytorch.models.GP, Predictive):
         """Return each physics at ``... x n x d``: ``... x S x m x n``, in units of the targets."""
         if self._f_train and not self._unknowns and X is self.data.X:
             return self._f_train
-        return [self._outputs_of(each, each, X, values) for each in self.physics]
+        f = []
+        for each in self.physics:
+            Y = each(X.unsqueeze(-3), *self._arguments(each, values)).mT
+            f.append((Y if self._outputs is None else Y[..., self._outputs, :]) / self.unit)
+        return f
+
+    def _arguments(self, physics: Physics, values: Values) -> list[Tensor]:
+        """Return a physics' parameters ``S x p`` at their coordinates, if it has any."""
+        if not physics.unknowns:
+            return []
+        z = torch.cat([values[f"physics.{name}"] for name in physics.unknowns], -1)
+        return [physics.unknowns.at(z)]
 
     def _physics_with_slopes(
         self, values: Values, with_slopes: bool
@@ -351,29 +378,20 @@ class GP(gpytorch.models.GP, Predictive):
         moved = {f"physics.{n}": shifted[..., [i]].flatten(0, 1) for i, n in enumerate(names)}
         f, slopes = [], []
         for physics in self.physics:
-            Y = self._outputs_of(physics, physics.or_nan, X, moved)
+            Y = physics.or_nan(X.unsqueeze(-3), *self._arguments(physics, moved)).mT
+            Y = (Y if self._outputs is None else Y[..., self._outputs, :]) / self.unit
             Y = Y.expand(len(shifted) * len(z), -1, -1).unflatten(0, shifted.shape[:2])
             f.append(Y[0])
             slopes.append((Y[1 : p + 1] - Y[p + 1 :]) / (2 * _STEP))
         return f, {name: [each[i] for each in slopes] for i, name in enumerate(names[:p])}
-
-    def _outputs_of(
-        self, physics: Physics, call: Callable[..., Tensor], X: Tensor, values: Values
-    ) -> Tensor:
-        """Return a physics by a call of it, at its parameters' coordinates."""
-        parameters = []
-        if physics.unknowns:
-            z = torch.cat([values[f"physics.{name}"] for name in physics.unknowns], -1)
-            parameters.append(physics.unknowns.at(z))
-        Y = call(X.unsqueeze(-3), *parameters).mT
-        return (Y if self._outputs is None else Y[..., self._outputs, :]) / self.unit
 
     # Predictions.
 
     def places(self, X: Tensor, values: Values, with_physics: bool = True) -> Places:
         """Return what terms and noise read at inputs ``... x n x d``."""
         x = self.data.kernel_inputs(X).unsqueeze(-3).unsqueeze(-3)
-        return Places(x, self._physics_at(X, values) if with_physics else [])
+        f = self._physics_at(X, values) if with_physics else []
+        return Places(x, f, X.unsqueeze(-3).unsqueeze(-3))
 
     def at(self, X: Tensor, values: Values | None = None) -> WeightedSum:
         """Return the function at ``... x n x d``, at the draws ``u`` unless values are given."""
@@ -414,7 +432,9 @@ class GP(gpytorch.models.GP, Predictive):
         """Return means and variances of each draw, ``... x S x q x m``, in the user's units."""
         X, conditioning = self.data.new_inputs(X), self.conditioning()
         with self._graph_for(X):
-            mean, variance = conditioning.marginals(self.at(X, conditioning.train.values))
+            values = conditioning.train.values
+            f = self.term_sum.at(values, self.places(X, values))
+            mean, variance = conditioning.marginals(f)
             if observation_noise is not False:
                 variance = variance + self._noise_at(X, observation_noise)
             variance = variance * self.unit.square()
@@ -583,7 +603,7 @@ class GP(gpytorch.models.GP, Predictive):
     def _copy(self) -> Self:
         """Return a copy that shares what is never changed in place."""
         shared = [self.data, self.physics, self.table, self.term_sum, self.noise, self.unit]
-        shared += [self._f_train, self._cached, self.draws, self.settings]
+        shared += [self._f_train, self._cached, self._draws, self.settings]
         return deepcopy(self, {id(each): each for each in shared})
 
     def to(self, *args: Any, **options: Any) -> Self:
@@ -592,7 +612,7 @@ class GP(gpytorch.models.GP, Predictive):
         Yvar = None if self.data.Yvar is None else self.data.Yvar.to(self.u)
         X, Y = self.data.X.to(self.u), self.data.Y.to(self.u)
         self.data = self.data._replace(X=X, Y=Y, Yvar=Yvar)
-        self.unit, self.draws = self.unit.to(self.u), self.draws.to(self.u)
+        self.unit, self._draws = self.unit.to(self.u), self._draws.to(self.u)
         self._f_train = [f.to(self.u) for f in self._f_train]
         self.term_sum = TermSum(self.terms, [f.to(self.u) for f in self.term_sum.f], self.unit)
         self.table = self.table.to(self.u)
@@ -698,6 +718,15 @@ def _draw_matheron_paths(model: GP, *, sample_shape: Size, **_: Any) -> Paths:
     """Draw functions for BoTorch's ``draw_matheron_paths``, by the model's own features."""
     functions = model.sample_functions(max(1, sample_shape.numel()))
     return Paths(functions, sample_shape)
+
+
+def _with_kernel(term: Any) -> Term:
+    """Return a term of a kernel of this library or of GPyTorch."""
+    if not isinstance(term, Term):
+        raise TypeError(f"Expected terms as a list of Term(name, kernel, ...); found {term!r}.")
+    if term.kernel is None:
+        return term
+    return term._replace(kernel=as_kernel(term.kernel, DELTA if term.physics is None else RHO))
 
 
 def _unknowns_of(physics: Sequence[Physics]) -> dict[str, Unknown]:

@@ -53,7 +53,11 @@ class Noise:
         v = torch.cat([values[f"noise.{name}"] for name in self.names], -1) + _LEAST
         shares = self.shares(places)
         if shares is None:
+            if len(self.names) != 1:
+                raise ValueError(f"Expected shares for {self}; override the method shares.")
             return v
+        if (shares < 0).any():
+            raise ValueError(f"Expected shares of {self} that are not negative.")
         variances = (v.unsqueeze(-2) * shares).sum(-1)
         if variances.shape[-2] != v.shape[-2]:
             raise ValueError(

@@ -44,6 +44,7 @@ class CKA(GP):
             the paper's model has 0.
         constants: Whether rho and delta contain unknown constants.
         nested: Whether nested models are averaged over; only with constants and one physics.
+        extra_terms: Further terms, which the formula as it is does not have.
 
     Example:
         >>> import torch
@@ -59,21 +60,26 @@ class CKA(GP):
         self, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike = None, *,
         physics: Any, rho_covar_module: Any = None, delta_covar_module: Any = None,
         rho_mean: float | Sequence[float] | None = None, delta_mean: float = 0.0,
-        center: bool | float = True, constants: bool = True, nested: bool = True, **options: Any,
+        center: bool | float = True, constants: bool = True, nested: bool = True,
+        extra_terms: Sequence[Term] = (), **options: Any,
     ) -> None:  # fmt: skip
+        if not isinstance(center, bool | int | float):
+            raise TypeError(f"Expected center as True, False or a number; found {center!r}.")
         settings = {
             "rho_covar_module": rho_covar_module, "delta_covar_module": delta_covar_module,
             "rho_mean": rho_mean, "delta_mean": delta_mean, "center": center,
             "constants": constants, "nested": nested,
         }  # fmt: skip
+        if extra_terms:
+            settings["extra_terms"] = extra_terms
         rhos, functions = _scalings(physics, rho_mean)
         kernel, constant = as_kernel(rho_covar_module, RHO), RHO_CONSTANT if constants else None
         rhos = [rho._replace(kernel=kernel, constant=constant, has_center=center) for rho in rhos]
         delta = _delta(delta_covar_module, delta_mean, constants)
         is_nested = nested and constants and len(rhos) == 1
         super().__init__(
-            train_X, train_Y, train_Yvar, terms=[*rhos, delta], physics=functions,
-            choices=_nested(rhos[0].name) if is_nested else (),
+            train_X, train_Y, train_Yvar, terms=[*rhos, delta, *extra_terms],
+            physics=functions, choices=_nested(rhos[0].name, extra_terms) if is_nested else (),
             settings=settings | options, **options,
         )  # fmt: skip
 
@@ -214,10 +220,11 @@ def _delta(kernel: Any, mean: float, constants: bool) -> Term:
     return Term("delta", as_kernel(kernel, DELTA), mean, constant)
 
 
-def _nested(rho: str) -> tuple[Choice, ...]:
-    processes = (f"{rho}.process", "delta.process")
+def _nested(rho: str, extra_terms: Sequence[Term]) -> tuple[Choice, ...]:
+    processes = [f"{rho}.process", "delta.process", *(f"{t.name}.process" for t in extra_terms)]
+    processes += [f"{t.name}.constant" for t in extra_terms if t.constant is not None]
     return (
         Choice("your formula corrected", CORRECTED),
-        Choice("as it is up to a factor and an offset", AS_IT_IS, processes),
+        Choice("as it is up to a factor and an offset", AS_IT_IS, tuple(processes)),
         Choice("of no use", OF_NO_USE, (f"{rho}.mean", f"{rho}.constant", f"{rho}.process")),
     )

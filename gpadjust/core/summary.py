@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from gpadjust.core.noise import KnownNoise, Noise
 from gpadjust.core.terms import Term
-
-if TYPE_CHECKING:
-    from gpadjust.core.model import GP
-    from gpadjust.core.unknowns import Values
+from gpadjust.core.unknowns import Values
 
 
 @torch.no_grad()
-def summary(model: GP) -> str:
+def summary(model: Any) -> str:
     """Return the unknown numbers of a model, medians of its draws and ranges of 95 % of them."""
     values, X = model.table.values(model.draws), model.data.X
     reads_physics = type(model.noise) not in (Noise, KnownNoise)
@@ -31,7 +28,7 @@ def summary(model: GP) -> str:
     return "\n".join(lines)
 
 
-def _title(model: GP) -> str:
+def _title(model: Any) -> str:
     """Return the class, the sizes of the data, and the number of draws."""
     n, d = model.data.X.shape[-2:]
     counts = {"point": n, "input": d, "output": model.num_outputs, "draw": len(model.draws)}
@@ -40,7 +37,7 @@ def _title(model: GP) -> str:
     return f"{type(model).__name__}: {', '.join(parts)}"
 
 
-def _of_physics(model: GP) -> list[str]:
+def _of_physics(model: Any) -> list[str]:
     """Return the unknown parameters of the physics, and their priors."""
     unknowns = {name: unknown for each in model.physics for name, unknown in each.unknowns.items()}
     lines = ["parameters of the physics:"] if unknowns else []
@@ -51,7 +48,7 @@ def _of_physics(model: GP) -> list[str]:
     return lines
 
 
-def _choices(model: GP, values: Values, j: int) -> list[str]:
+def _choices(model: Any, values: Values, j: int) -> list[str]:
     """Return the probabilities of nested models of an output, their shares of the draws."""
     choices = model.table.choices
     if not choices or len(model.draws) < 2:
@@ -61,7 +58,7 @@ def _choices(model: GP, values: Values, j: int) -> list[str]:
     return [f"  probabilities: {', '.join(shares)}"]
 
 
-def _of_term(model: GP, term: Term, values: Values, j: int) -> list[str]:
+def _of_term(model: Any, term: Term, values: Values, j: int) -> list[str]:
     """Return the numbers of a term of an output, at the draws that contain them."""
     unit = float(model.unit[j]) if term.physics is None else 1.0  # a scaling has none
     everywhere = torch.ones(len(model.draws), 1)
@@ -82,7 +79,7 @@ def _of_term(model: GP, term: Term, values: Values, j: int) -> list[str]:
     return lines
 
 
-def _of_kernel(model: GP, name: str, numbers: Tensor, unit: float) -> list[str]:
+def _of_kernel(model: Any, name: str, numbers: Tensor, unit: float) -> list[str]:
     """Return some numbers ``N x k`` of a kernel."""
     name = name.replace("raw_", "")
     if name.endswith("outputscale"):

@@ -47,7 +47,8 @@ class Places(NamedTuple):
     """Where a sum is sought."""
 
     x: Tensor  # inputs of kernels, ... x 1 x 1 x n x d
-    f: Sequence[Tensor] = ()  # the outputs of each physics, ... x S x m x n (1 for S)
+    f: Sequence[Tensor]  # the outputs of each physics, ... x S x m x n (1 for S)
+    X: Tensor  # the inputs as the user gave them, ... x 1 x 1 x n x d
 
 
 @dataclass
@@ -247,13 +248,15 @@ class TermSum:
     def term(self, name: str, values: Values, places: Places) -> WeightedSum:
         r"""Return the process of a term in the user's meaning, :math:`f = \sum_t b_t g_t`.
 
-        A term without a basis, of several the first, is then its own process less c times each one
-        that has a center: :math:`\rho (f_p - c) + \delta' = \rho f_p + (\delta' - c \tilde\rho)`.
+        delta (without one of this name, the first term without a basis) is then its own process
+        less c times each one that has a center:
+        :math:`\rho (f_p - c) + \delta' = \rho f_p + (\delta' - c \tilde\rho)`.
         """
         term = next(t for t in self.terms if t.name == name)
         one = torch.ones_like(places.x[..., 0])
         weights: dict[str, Tensor | None] = {name: None}
-        if term is next((t for t in self.terms if t.physics is None), None):
+        plain = [t.name for t in self.terms if t.physics is None]
+        if name == ("delta" if "delta" in plain else next(iter(plain), None)):
             centered = [t for t in self.terms if t.has_center]
             weights |= {t.name: -self.center(t, values) * one for t in centered}
         mean = self.mean_of(term, values) * one

@@ -76,8 +76,8 @@ class Table:
     Vectors u are ``S x B x P``: ``S`` draws of the coordinates of ``B`` independent problems.
     Outputs are problems of their own, ``B = m``; where they share numbers, there is one problem of
     all outputs, ``B = 1``. With choices, the last coordinate of each output says which of the
-    nested models holds: an interval of u, in which the first choice contains 0. There are none, or
-    at least two, whose probabilities sum to 1.
+    nested models holds: an interval of ``|u|``, of which the first choice has the lowest. It has no
+    gradient; :meth:`with_choice` sets it.
 
     Attributes:
         problems: ``B``.
@@ -98,11 +98,19 @@ class Table:
         self._own_size = self._width * (num_outputs // self.problems)
         self.size = self._own_size + sum(self._sizes[1])
         self.has_other_priors = any(row.log_density is not None for row in rows)
-        # The choices from left to right, the ends of their intervals of u, and log probabilities.
-        self._order = [*range(2, len(self.choices)), 0, 1][: max(1, len(self.choices))]
         shares = torch.tensor([c.probability for c in self.choices] or [1.0], dtype=torch.float64)
-        self._ends = torch.special.ndtri(shares[self._order].cumsum(0)[:-1])
+        if (
+            len(shares) == len(self.choices) == 1
+            or abs(shares.sum() - 1) > 1e-9
+            or (shares <= 0).any()
+        ):
+            raise ValueError(
+                "Expected no choices, or several whose probabilities are positive and sum to 1; "
+                f"found {shares.tolist()}."
+            )
         self.log_prior = shares.log()
+        # P(|u| < end) is the probability of the choices up to one.
+        self._ends = torch.special.ndtri((1 + shares.cumsum(0)[:-1]) / 2)
 
     def values(self, u: Tensor) -> Values:
         """Return all numbers at coordinates ``S x B x P``."""
@@ -180,14 +188,14 @@ class Table:
     def chosen(self, values: Values) -> Tensor:
         """Return which of the choices each draw holds, ``S x m``."""
         u = values[_CHOICE].detach().squeeze(-1)
-        return torch.tensor(self._order).to(u.device)[torch.bucketize(u, self._ends.to(u))]
+        return torch.bucketize(u.abs(), self._ends.to(u))
 
     def with_choice(self, u: Tensor, number: int) -> Tensor:
         """Return coordinates with the given choice for all outputs."""
         if not self.choices:
             return u
-        below = [0.0, *torch.special.ndtr(self._ends).tolist(), 1.0]
-        place = self._order.index(number)
-        middle = NormalDist().inv_cdf((below[place] + below[place + 1]) / 2) if number else 0.0
+        # The middle of the choice's interval of |u|, by probability.
+        ends = [0.5, *torch.special.ndtr(self._ends).tolist(), 1.0]
+        middle = NormalDist().inv_cdf((ends[number] + ends[number + 1]) / 2) if number else 0.0
         columns = torch.arange(self._width - 1, self._own_size, self._width)
         return u.index_fill(-1, columns.to(u.device), middle)

@@ -7,7 +7,7 @@ and differentiable in it. Values are in the user's units. Draws and outputs are 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from gpytorch.kernels import AdditiveKernel, Kernel
@@ -17,9 +17,6 @@ from gpytorch.means import Mean
 from gpytorch.mlls import AddedLossTerm
 from linear_operator.operators import DiagLinearOperator
 from torch import Tensor
-
-if TYPE_CHECKING:
-    from gpadjust.core.model import GP
 
 _MISSING = 1e12  # times the unit squared: the noise of a target that was not observed
 
@@ -31,7 +28,7 @@ def squeezed(values: Tensor, dim: int) -> Tensor:
     return values
 
 
-def _of_all(values: Tensor, model: GP, dim: int) -> Tensor:
+def _of_all(values: Tensor, model: Any, dim: int) -> Tensor:
     """Return values of each draw and output, ``... (x S) (x m) x n (x n)``."""
     shape = (*model.num_draws_and_outputs, *[1] * (-dim - 1))
     return squeezed(values.expand(torch.broadcast_shapes(values.shape, shape)), dim)
@@ -40,7 +37,7 @@ def _of_all(values: Tensor, model: GP, dim: int) -> Tensor:
 class MeanView(Mean):
     """The prior mean of a model, f_p for an adjustment."""
 
-    def __init__(self, model: GP) -> None:
+    def __init__(self, model: Any) -> None:
         super().__init__()
         self.owner = [model]  # in a list, as it is no part of the view
 
@@ -53,7 +50,7 @@ class MeanView(Mean):
 class TermView(Kernel):
     """The kernel of a term, scaled by its basis on both sides: diag(b) (k + kappa) diag(b)."""
 
-    def __init__(self, model: GP, name: str) -> None:
+    def __init__(self, model: Any, name: str) -> None:
         super().__init__()
         self.owner, self.name = [model], name
 
@@ -80,7 +77,7 @@ class TermView(Kernel):
         return _of_all(one.cross(other) * model.unit.square().unsqueeze(-1), model, -3)
 
 
-def kernel_view(model: GP) -> AdditiveKernel:
+def kernel_view(model: Any) -> AdditiveKernel:
     """Return the prior covariance of a model: the sum of its terms' scaled kernels."""
     return AdditiveKernel(*(TermView(model, t.name) for t in model.terms if t.varies))
 
@@ -88,7 +85,7 @@ def kernel_view(model: GP) -> AdditiveKernel:
 class NoiseView(NoiseModule):
     """The noise of a model's observations."""
 
-    def __init__(self, model: GP) -> None:
+    def __init__(self, model: Any) -> None:
         super().__init__()
         self.owner = [model]
 
@@ -117,7 +114,7 @@ class NoiseView(NoiseModule):
         return DiagLinearOperator(_of_all(variance, model, -2).expand(shape))
 
     @staticmethod
-    def _variance(model: GP, X: Tensor, is_training: bool) -> Tensor:
+    def _variance(model: Any, X: Tensor, is_training: bool) -> Tensor:
         values = model.values
         v = model.noise.variance(values, model.places(X, values), is_training)
         if is_training:
@@ -125,7 +122,7 @@ class NoiseView(NoiseModule):
         return v.expand(*v.shape[:-1], X.shape[-2]) * model.unit.square()
 
 
-def likelihood_view(model: GP) -> GaussianLikelihood:
+def likelihood_view(model: Any) -> GaussianLikelihood:
     """Return a Gaussian likelihood whose noise is the model's."""
     likelihood = GaussianLikelihood()
     likelihood.noise_covar = NoiseView(model)
@@ -135,7 +132,7 @@ def likelihood_view(model: GP) -> GaussianLikelihood:
 class OtherPriors(AddedLossTerm):
     """What priors of GPyTorch's kernels add to the density of coordinates."""
 
-    def __init__(self, model: GP) -> None:
+    def __init__(self, model: Any) -> None:
         self.owner = [model]
 
     def loss(self, *params: Any) -> Tensor:

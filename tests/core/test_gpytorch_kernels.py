@@ -56,7 +56,7 @@ def test_covariance_and_gradient(data, name):
     with torch.no_grad():
         K = term.kernel.covariance(own, X.expand(1, 1, 9, 2)).squeeze()
         kernel = term.kernel.kernel
-        for key, (raw, constraint) in term.kernel._constraints.items():
+        for key, (raw, constraint) in term.kernel._raw_parameters.items():
             value = own[key].reshape(raw.shape)
             raw.copy_(value if constraint is None else constraint.inverse_transform(value))
         torch.testing.assert_close(K, kernel(X).to_dense(), rtol=1e-8, atol=1e-10)
