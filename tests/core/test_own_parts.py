@@ -1,4 +1,4 @@
-"""Parts that others bring: nested models, terms, kernels and noises, and what is refused of them."""
+"""Parts that others bring: nested models, terms, kernels, noises, and what is refused of them."""
 
 import pickle
 
