@@ -27,7 +27,8 @@ class CKA(GP):
     so that :math:`f_a \sim GP(f_p, F_p k_\rho F_p^T + k_\delta)`: where there are no data, the
     model falls back to the physics. Both processes contain an unknown constant with a variance of
     its own, and with ``nested`` the model is averaged with its constants alone,
-    :math:`a f_p + b`, and with :math:`\delta` alone, which ignores the physics.
+    :math:`a f_p + b`, and with :math:`\delta` alone, which ignores the physics; a physics with
+    unknown parameters also with :math:`f_p` as it is.
 
     Args as of :class:`GP`, and:
 
@@ -76,10 +77,13 @@ class CKA(GP):
         kernel, constant = as_kernel(rho_covar_module, RHO), RHO_CONSTANT if constants else None
         rhos = [rho._replace(kernel=kernel, constant=constant, has_center=center) for rho in rhos]
         delta = _delta(delta_covar_module, delta_mean, constants)
-        is_nested = nested and constants and len(rhos) == 1
+        choices: tuple[Choice, ...] = ()
+        if nested and constants and len(rhos) == 1:
+            has_unknowns = bool(getattr(functions[0], "unknowns", None))
+            choices = _nested(rhos[0].name, extra_terms, has_unknowns)
         super().__init__(
             train_X, train_Y, train_Yvar, terms=[*rhos, delta, *extra_terms],
-            physics=functions, choices=_nested(rhos[0].name, extra_terms) if is_nested else (),
+            physics=functions, choices=choices,
             settings=settings | options, **options,
         )  # fmt: skip
 
@@ -220,11 +224,21 @@ def _delta(kernel: Any, mean: float, constants: bool) -> Term:
     return Term("delta", as_kernel(kernel, DELTA), mean, constant)
 
 
-def _nested(rho: str, extra_terms: Sequence[Term]) -> tuple[Choice, ...]:
+def _nested(rho: str, extra_terms: Sequence[Term], has_unknowns: bool) -> tuple[Choice, ...]:
+    """Return the nested models.
+
+    A physics with unknown parameters may also be right as it is, which tells these much more of
+    them than a physics up to a factor and an offset does.
+    """
     processes = [f"{rho}.process", "delta.process", *(f"{t.name}.process" for t in extra_terms)]
     processes += [f"{t.name}.constant" for t in extra_terms if t.constant is not None]
-    return (
+    constants = [f"{rho}.constant", "delta.constant"]
+    up_to = AS_IT_IS / 2 if has_unknowns else AS_IT_IS
+    choices = [
         Choice("your formula corrected", CORRECTED),
-        Choice("as it is up to a factor and an offset", AS_IT_IS, tuple(processes)),
+        Choice("as it is up to a factor and an offset", up_to, tuple(processes)),
         Choice("of no use", OF_NO_USE, (f"{rho}.mean", f"{rho}.constant", f"{rho}.process")),
-    )
+    ]
+    if has_unknowns:
+        choices.insert(1, Choice("as it is", AS_IT_IS - up_to, (*processes, *constants)))
+    return tuple(choices)

@@ -22,6 +22,7 @@ from gpadjust.core import (
     ZeroMeanGP,
     fit,
 )
+from gpadjust.physics import FunctionPhysics, Unknown
 
 
 def wave(X):
@@ -210,3 +211,24 @@ def test_functions_of_rough_kernels_have_the_spread_of_the_model(profile):
     values = model.sample_functions(200, seed=0, num_features=512)(Z)
     ratio = values.std(0) / model.predict(Z).variance.sqrt()
     assert ratio.median().item() == pytest.approx(1.0, abs=0.3)
+
+
+@pytest.mark.slow
+def test_a_right_law_with_unknown_parameters_may_be_right_as_it_is():
+    """Its parameters are then known better than those of a law up to a factor and an offset."""
+    law = FunctionPhysics(
+        lambda X, p: p.a * (p.w * X[:, 0]).sin(),
+        unknowns={"a": Unknown(1.0, sd=0.5), "w": Unknown(5.0, factor=1.3)},
+    )
+    X = torch.linspace(0, 1, 15, dtype=torch.float64).unsqueeze(-1)
+    Y = 1.3 * (6 * X).sin() + 0.05 * torch.randn(15, 1, dtype=torch.float64)
+    spread = []
+    for nested in (True, False):
+        model = CKA(X, Y, physics=law, nested=nested)
+        result = fit(model)
+        a = model.physics_parameters["a"]
+        spread.append(a.std().item())
+        assert abs(a.mean().item() - 1.3) < 3 * a.std().item()
+        if nested:
+            assert [*result.probabilities][1] == "as it is"
+    assert spread[0] < 0.7 * spread[1]
