@@ -1,0 +1,147 @@
+"""Draws, evidence and probabilities against numerical integrals, and what a fit promises."""
+
+import warnings
+
+import pytest
+import torch
+from botorch.sampling import SobolQMCNormalSampler
+
+from gpadjust.core import CKA, GP, Choice, LogNormal, Term, ZeroMeanGP, fit
+
+
+def wave(X):
+    return torch.sin(6 * X[..., :1])
+
+
+def noisy(n, seed=0, noise=0.05):
+    generator = torch.Generator().manual_seed(seed)
+    X = torch.rand(n, 2, generator=generator, dtype=torch.float64)
+    return X, noise * torch.randn(n, 1, generator=generator, dtype=torch.float64)
+
+
+def integral(model):
+    """The log evidence and the moments of the only coordinate, by a fine grid."""
+    u = torch.linspace(-8, 8, 4001, dtype=torch.float64)
+    at = u.reshape(-1, 1, 1)
+    logs = model.log_likelihood(at, False)[0].flatten() - 0.5 * u.square()
+    logs = logs - 0.5 * torch.log(torch.tensor(2 * torch.pi, dtype=torch.float64))
+    weights = logs.softmax(0)
+    mean = (weights * u).sum()
+    sd = (weights * (u - mean).square()).sum().sqrt()
+    units = len(model.data.Y) * model.unit.log().sum()
+    return logs.logsumexp(0) + (u[1] - u[0]).log() - units, mean, sd
+
+
+@pytest.mark.parametrize("n", [5, 20, 60, pytest.param(200, marks=pytest.mark.slow)])
+def test_evidence_and_draws(n):
+    """Of noise alone, with its variance as the only unknown number."""
+    X, Y = noisy(n)
+    model = GP(X, Y, terms=[Term("f")])
+    assert model.table.size == 1
+    expected, mean, sd = integral(model)
+    result = fit(model, num_draws=256)
+    assert result.log_evidence.item() == pytest.approx(expected.item(), abs=0.15)
+    draws = model.draws.flatten()
+    assert draws.mean().item() == pytest.approx(mean.item(), abs=0.3 * sd.item())
+    assert draws.std().item() == pytest.approx(sd.item(), rel=0.25)
+    fit(model, "map")
+    values, _ = model.log_likelihood(torch.linspace(-3, 3, 601, dtype=torch.float64)[:, None, None])
+    grid = torch.linspace(-3, 3, 601, dtype=torch.float64)
+    best = grid[(values.flatten() - 0.5 * grid.square()).argmax()]
+    assert model.u.item() == pytest.approx(best.item(), abs=0.02)
+
+
+@pytest.mark.parametrize("n", [8, 60])
+def test_probabilities_of_nested_models(n):
+    """A constant is in the targets or not: Bayes' rule by two integrals."""
+    X, Y = noisy(n)
+    Y = Y + 0.02
+    terms = [Term("f", constant=LogNormal(0.3, 1.0))]
+    choices = [Choice("some", 0.6), Choice("none", 0.4, ("f.constant",))]
+    both = GP(X, Y, terms=terms, choices=choices)
+    logs = []
+    for k in range(2):
+        u = torch.zeros(4001, 1, both.table.size, dtype=torch.float64)
+        u[:, 0, 1] = torch.linspace(-8, 8, 4001)  # the noise; the constant's variance is known
+        own = both.log_likelihood(both.table.with_choice(u, k), False)[0].flatten()
+        logs.append((own - 0.5 * u[:, 0, 1].square()).logsumexp(0))
+    shares = torch.tensor([0.6, 0.4]).double() * torch.stack(logs).softmax(0)
+    expected = (shares / shares.sum())[0].item()
+    result = fit(both, num_draws=256)
+    assert result.probabilities["some"][0] == pytest.approx(expected, abs=0.06)
+    chosen = both.table.chosen(both.table.values(both.draws)).double().mean().item()
+    assert 1 - chosen == pytest.approx(result.probabilities["some"][0], abs=0.01)
+
+
+@pytest.mark.parametrize("n", [12, 60])
+def test_fitted_twice_is_fitted_once(n):
+    X, e = noisy(n)
+    Y = 1.3 * wave(X) + X[:, 1:] + e
+    model = CKA(X, Y, physics=wave)
+    first = fit(model, seed=3)
+    once = model.predict(X)
+    fit(model, "map")
+    second = fit(model, seed=3)
+    twice = model.predict(X)
+    assert torch.equal(once.mean, twice.mean)
+    assert torch.equal(once.variance, twice.variance)
+    assert torch.equal(first.log_evidence, second.log_evidence)
+
+
+def test_the_generator_is_left_alone():
+    X, e = noisy(12)
+    before = torch.random.get_rng_state()
+    fit(CKA(X, wave(X) + e, physics=wave))
+    assert torch.equal(before, torch.random.get_rng_state())
+
+
+def test_it_shrinks_to_the_formula_or_leaves_it():
+    X, e = noisy(15)
+    Z, _ = noisy(200, seed=1)
+    truth = 1.3 * wave(Z) + 0.4
+    right = CKA(X, 1.3 * wave(X) + 0.4 + e, physics=wave)
+    result = fit(right)
+    assert result.probabilities["as it is up to a factor and an offset"][0] > 0.4
+    A = torch.cat([wave(X), torch.ones_like(e)], 1)
+    a, b = torch.linalg.lstsq(A, 1.3 * wave(X) + 0.4 + e).solution.flatten()
+    least = (a * wave(Z) + b - truth).square().mean().sqrt()
+    assert (right.predict(Z).mean - truth).square().mean().sqrt() < 1.6 * least
+    useless = CKA(X, 3 * X[:, 1:] + X[:, :1].square() + e, physics=lambda X: (40 * X[:, :1]).cos())
+    result = fit(useless)
+    assert result.probabilities["of no use"][0] > 0.5
+    assert "of no use 0." in str(result) or "of no use 1." in str(result)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("n", "noise"), [(256, 0.0), (100, 0.05)])
+def test_convergence_is_judged_by_predictions(n, noise):
+    """Exact data of many points raise no alarm, and seeds agree as far as they are said to."""
+    X, e = noisy(n, noise=noise)
+    Z, _ = noisy(100, seed=1)
+    Y = 1.3 * wave(X) * (1 + X[:, 1:]) + 0.3 * X[:, :1] + e
+    means, errors = [], []
+    for seed in range(3):
+        model = CKA(X, Y, physics=lambda X: wave(X) * (1 + X[..., 1:]))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            result = fit(model, seed=seed)
+        assert result.converged
+        means.append(model.predict(Z).mean)
+        errors.append(result.error)
+    moved = torch.stack(means).std(0) / model.predict(Z).variance.sqrt()
+    assert moved.square().mean().sqrt() < max(0.35, 4 * max(errors))
+
+
+def test_what_is_refused():
+    X, e = noisy(6)
+    model = ZeroMeanGP(X, e)
+    for arguments, words in (
+        ({"method": "vi"}, "Unknown method 'vi'"),
+        ({"num_draws": 6}, "multiple of 4"),
+        ({"num_draws": 0}, "multiple of 4"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            fit(model, **arguments)
+    fantasy = model.fantasize(X[:2].expand(3, 2, 2), SobolQMCNormalSampler(torch.Size([2])))
+    with pytest.raises(ValueError, match="one data set"):
+        fit(fantasy)
