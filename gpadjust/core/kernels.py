@@ -155,7 +155,7 @@ class Stationary(Kernel):
         """Return ``s k(|(x - x') / l|)``."""
         length = own["lengthscale"].unsqueeze(-2)
         # Without a shift distances of large inputs, as of years, would lose digits.
-        shift = (x if other is None else other).detach()[..., :1, :]
+        shift = (x if other is None else other).detach().mean(-2, keepdim=True)
         z = (x - shift) / length
         e = exponents(z, None if other is None else (other - shift) / length)
         return own["outputscale"].unsqueeze(-1) * self.profile.value(e)
@@ -175,7 +175,7 @@ class Stationary(Kernel):
             (z_{ik} - z_{jk})^2.
         """
         length = own["lengthscale"].unsqueeze(-2)
-        z, scale = (x - x[..., :1, :]) / length, own["outputscale"].unsqueeze(-1)
+        z, scale = (x - x.mean(-2, keepdim=True)) / length, own["outputscale"].unsqueeze(-1)
         e = exponents(z)
         K = (e.exp_() if self.profile is RBF else self.profile.value(e)).mul_(scale)
         slope = K if self.profile is RBF else self.profile.slope(e).mul_(scale)

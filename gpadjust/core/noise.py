@@ -96,7 +96,10 @@ class Noise:
 
 
 class KnownNoise(Noise):
-    """Noise of known variances: those of the targets, ``... x m x n``, in squared units."""
+    """Noise of known variances of the targets.
+
+    They are ``... x m x n``, in squared units of the targets.
+    """
 
     def __init__(self, variances: Tensor) -> None:
         super().__init__(())

@@ -67,11 +67,11 @@ def test_variances(cls, n, length, give):
             (model.rho(Z), rho),
             (model.delta(Z), delta),
         ):
-            torch.testing.assert_close(found.variance, exact, rtol=0.02, atol=0.0)
+            torch.testing.assert_close(found.variance, exact, rtol=0.06, atol=0.0)
         half = give(cls(X[::2], Y[::2], **options), numbers)
         later = half.condition_on_observations(X[1::2], Y[1::2])
         for found in (later.posterior(Z), later.predict(Z)):
-            assert ((found.variance / whole).log().abs() < (0.1 if cls is RRA else 1.0)).all()
+            assert ((found.variance / whole).log().abs() < (0.3 if cls is RRA else 1.0)).all()
 
 
 @pytest.mark.parametrize("kernel", [Stationary(), Stationary(MATERN12)], ids=repr)
