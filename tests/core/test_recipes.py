@@ -74,11 +74,11 @@ def test_a_structure(problem):
 def test_a_kernel(problem):
     X, Y, physics = problem
     names = recipe("A kernel")
-    for kernel in (Stationary(names["RATIONAL_QUADRATIC"]), names["Linear"]()):
+    for kernel in (Stationary(names["RATIONAL"]), names["Linear"]()):
         model = CKA(X, Y, physics=physics, delta_covar_module=kernel)
         fit(model)
         check(model, X, Y)
-    k = Stationary(names["RATIONAL_QUADRATIC"])
+    k = Stationary(names["RATIONAL"])
     own = {n: torch.ones(1, 1, 1, dtype=torch.float64) for n in ("lengthscale", "outputscale")}
     expected = 1 / (1 + (X - X.T).square() / 2)
     torch.testing.assert_close(k.covariance(own, X).squeeze(), expected)
