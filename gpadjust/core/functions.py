@@ -59,7 +59,8 @@ class Functions(torch.nn.Module):
 
     def forward(self, X: Tensor) -> Tensor:
         """Return the values ``k x ... x q x m`` of all functions at ``... x q x d``."""
-        return self._values(self.model.data.new_inputs(X)).movedim(-3, 0)
+        X = self.model.data.new_inputs(X)
+        return self._values(self.model.at(X, self.data.train.values)).movedim(-3, 0)
 
     def each(self, X: Tensor) -> Tensor:
         """Return the values ``k x q x m`` of each function at points of its own, ``k x q x d``."""
@@ -69,11 +70,10 @@ class Functions(torch.nn.Module):
                 f"Expected points for each of {self.number} functions, {self.number} x q x d; "
                 f"found {tuple(X.shape)}."
             )
-        values = self._values(X)  # k x k x q x m: each function at each block of points
-        return values.diagonal(dim1=0, dim2=1).movedim(-1, 0)
+        return self._values(self.model.at_each(X, self.data.train.values))
 
-    def _values(self, X: Tensor) -> Tensor:
-        f = self.model.at(X, self.data.train.values)
+    def _values(self, f: WeightedSum) -> Tensor:
+        """Return the functions at the places of a sum, ``... x k x q x m``."""
         cross = f.cross(self.data.train) * self.data.observed.unsqueeze(-2)
         values = self._prior(f) + (cross @ self.update.unsqueeze(-1)).squeeze(-1)
         return (values * self.model.unit).mT

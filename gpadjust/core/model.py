@@ -347,14 +347,15 @@ class GP(gpytorch.models.GP, Predictive):
     # The physics.
 
     def _physics_at(self, X: Tensor, values: Values) -> list[Tensor]:
-        """Return each physics at ``... x n x d``: ``... x S x m x n``, in units of the targets."""
-        if self._f_train and not self._unknowns and X is self.data.X:
-            return self._f_train
+        """Return each physics at ``... x S x n x d`` (1 for S): ``... x S x m x n``, in units."""
         f = []
         for each in self.physics:
-            Y = each(X.unsqueeze(-3), *self._arguments(each, values)).mT
-            f.append((Y if self._outputs is None else Y[..., self._outputs, :]) / self.unit)
+            f.append(self._in_units(each(X, *self._arguments(each, values))))  # noqa: PERF401
         return f
+
+    def _in_units(self, Y: Tensor) -> Tensor:
+        """Return ``... x m x n`` of a physics' outputs, in units of the targets."""
+        return (Y.mT if self._outputs is None else Y.mT[..., self._outputs, :]) / self.unit
 
     def _arguments(self, physics: Physics, values: Values) -> list[Tensor]:
         """Return a physics' parameters ``S x p`` at their coordinates, if it has any."""
@@ -378,9 +379,12 @@ class GP(gpytorch.models.GP, Predictive):
         moved = {f"physics.{n}": shifted[..., [i]].flatten(0, 1) for i, n in enumerate(names)}
         f, slopes = [], []
         for physics in self.physics:
-            Y = physics.or_nan(X.unsqueeze(-3), *self._arguments(physics, moved)).mT
-            Y = (Y if self._outputs is None else Y[..., self._outputs, :]) / self.unit
-            Y = Y.expand(len(shifted) * len(z), -1, -1).unflatten(0, shifted.shape[:2])
+            Y = physics.or_nan(X.unsqueeze(-3), *self._arguments(physics, moved))
+            Y = (
+                self._in_units(Y)
+                .expand(len(shifted) * len(z), -1, -1)
+                .unflatten(0, shifted.shape[:2])
+            )
             f.append(Y[0])
             slopes.append((Y[1 : p + 1] - Y[p + 1 :]) / (2 * _STEP))
         return f, {name: [each[i] for each in slopes] for i, name in enumerate(names[:p])}
@@ -390,13 +394,23 @@ class GP(gpytorch.models.GP, Predictive):
     def places(self, X: Tensor, values: Values, with_physics: bool = True) -> Places:
         """Return what terms and noise read at inputs ``... x n x d``."""
         x = self.data.kernel_inputs(X).unsqueeze(-3).unsqueeze(-3)
-        f = self._physics_at(X, values) if with_physics else []
+        f: Sequence[Tensor] = []
+        if self._f_train and not self._unknowns and X is self.data.X:
+            f = self._f_train
+        elif with_physics:
+            f = self._physics_at(X.unsqueeze(-3), values)
         return Places(x, f, X.unsqueeze(-3).unsqueeze(-3))
 
     def at(self, X: Tensor, values: Values | None = None) -> WeightedSum:
         """Return the function at ``... x n x d``, at the draws ``u`` unless values are given."""
         values = self.values if values is None else values
         return self.term_sum.at(values, self.places(X, values))
+
+    def at_each(self, X: Tensor, values: Values) -> WeightedSum:
+        """Return the function of each draw at points of its own, ``S x n x d``."""
+        x = self.data.kernel_inputs(X).unsqueeze(-3)
+        places = Places(x, self._physics_at(X, values), X.unsqueeze(-3))
+        return self.term_sum.at(values, places)
 
     def conditioning(self) -> Conditioning:
         """Return the posterior given the data, without a graph of the draws; kept for these."""
@@ -553,7 +567,7 @@ class GP(gpytorch.models.GP, Predictive):
         has_graph = X.requires_grad or Y.requires_grad or old.alpha.requires_grad
         with torch.set_grad_enabled(has_graph and torch.is_grad_enabled()):
             if not self._unknowns:  # f_p is asked at the new points only
-                late = self._physics_at(X, values)
+                late = self._physics_at(X.unsqueeze(-3), values)
                 pairs = zip(self._f_train, late, strict=True)
                 new._f_train = [appended(f, f_late, -1) for f, f_late in pairs]
             conditioning = Conditioning(*new._observed(values), old)

@@ -7,20 +7,10 @@ import torch
 from botorch.models.transforms import Normalize
 from botorch.sampling import SobolQMCNormalSampler
 
-from gpadjust.core import CKA, RRA, CalibratedPhysics, Noise, ZeroMeanGP
+from gpadjust.core import CKA, RRA, CalibratedPhysics, ZeroMeanGP
 from gpadjust.physics import FunctionPhysics, Unknown
+from tests.core.noises import Relative
 from tests.systems import crude, refused
-
-
-class Relative(Noise):
-    """Noise of a constant standard deviation, and one that is a share of the physics."""
-
-    def __init__(self):
-        super().__init__(("constant", "relative"))
-
-    def shares(self, places):
-        f = places.f[0]
-        return torch.stack([torch.ones_like(f), f.square()], -1)
 
 
 def calibrated(X, Y, Yvar=None, cls=CalibratedPhysics):

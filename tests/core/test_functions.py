@@ -8,17 +8,10 @@ from botorch.models.transforms import Normalize
 from botorch.sampling.pathwise import draw_matheron_paths
 from gpytorch.kernels import RBFKernel
 
-from gpadjust.core import CKA, MATERN12, MATERN32, MATERN52, RRA, Noise, Stationary, ZeroMeanGP
+from gpadjust.core import CKA, MATERN12, MATERN32, MATERN52, RRA, Stationary, ZeroMeanGP
+from gpadjust.physics import FunctionPhysics, Unknown
+from tests.core.noises import Relative
 from tests.systems import crude, line, refused
-
-
-class Relative(Noise):
-    def __init__(self):
-        super().__init__(("constant", "relative"))
-
-    def shares(self, places):
-        f = places.f[0]
-        return torch.stack([torch.ones_like(f), f.square()], -1)
 
 
 def kernels(rho, delta):
@@ -120,3 +113,22 @@ def test_wrong_numbers_kernels_and_points(data, drawn, uniform):
     refused(ValueError, r"X of shape \.\.\. x q x 2", functions, uniform(4, 3))
     own = CKA(X, Y, physics=crude, delta_covar_module=RBFKernel())
     refused(NotImplementedError, "no random features", own.sample_functions, 2)
+
+
+def test_each_function_is_evaluated_at_its_own_points_only(data, uniform):
+    X, Y = data(n=8)
+    asked = []
+
+    def law(X, p):
+        asked.append(len(X))
+        return p.a * crude(X)[:, 0]
+
+    physics = FunctionPhysics(law, unknowns={"a": Unknown(1.0, factor=1.5)})
+    model = CKA(X, Y[:, :1], physics=physics, nested=False)
+    model.set_draws(0.3 * torch.randn(3, *model.u.shape[1:], dtype=torch.float64))
+    functions = model.sample_functions(6, seed=0)
+    points = uniform(6, 4, 2, high=2.0, seed=1)
+    expected = torch.stack([functions(points[i])[i] for i in range(6)])
+    asked.clear()
+    torch.testing.assert_close(functions.each(points), expected)
+    assert sum(asked) == 6 * 4

@@ -15,7 +15,6 @@ from gpadjust.core import (
     RRA,
     CalibratedPhysics,
     Kernel,
-    Noise,
     PhysicsMeanGP,
     Row,
     ScaleGP,
@@ -23,16 +22,8 @@ from gpadjust.core import (
     ZeroMeanGP,
 )
 from gpadjust.physics import FunctionPhysics, Unknown
+from tests.core.noises import Relative
 from tests.systems import crude, normal, truth, uniform
-
-
-class Relative(Noise):
-    def __init__(self):
-        super().__init__(("constant", "relative"))
-
-    def shares(self, places):
-        f = places.f[0]
-        return torch.stack([torch.ones_like(f), f.square()], -1)
 
 
 class Own(Kernel):
