@@ -11,6 +11,7 @@ from torch import Tensor
 from gpadjust.core.terms import WeightedSum
 
 _EPS = torch.finfo(torch.float64).eps
+_NOISY = 1e-8  # of the largest variance given earlier rows: above, the inverse factor is exact
 
 
 def add_noise(K: Tensor, noise: Tensor) -> Tensor:
@@ -112,30 +113,37 @@ class Conditioning:
             self.chol = factor(K, self.noise, observed)
         else:
             self.chol, self._inverse = self._appended(old, late.cross(old.train), K)
+        pivots = self.chol.diagonal(dim1=-1, dim2=-2).square()
+        self._is_noisy = bool(pivots.min() > _NOISY * pivots.max())
         self.alpha = self.solve((targets - train.mean).nan_to_num() * observed)
 
-    def _appended(self, old: Conditioning, K21: Tensor, K22: Tensor) -> tuple[Tensor, Tensor]:
-        r"""Return the factor of old and further rows, and its inverse.
+    def _appended(
+        self, old: Conditioning, K21: Tensor, K22: Tensor
+    ) -> tuple[Tensor, Tensor | None]:
+        r"""Return the factor of old and further rows, and its inverse with noise.
 
         .. math::
             L = \begin{pmatrix} L_1 & 0 \\ B & L_2 \end{pmatrix}, \quad B^T = L_1^{-1} K_{12},
             \quad L_2 L_2^T = K_{22} - B B^T, \quad
             L^{-1} = \begin{pmatrix} L_1^{-1} & 0 \\ -L_2^{-1} B L_1^{-1} & L_2^{-1} \end{pmatrix}.
         """
-        n, inverse1 = old.chol.shape[-1], old.inverse_factor()
+        n = old.chol.shape[-1]
         lead = torch.broadcast_shapes(self.noise.shape[:-1], self.observed.shape[:-1])
         seen = self.observed[..., n:]
         K21 = (K21 * seen.unsqueeze(-1) * old.observed.unsqueeze(-2)).expand(*lead, -1, n)
-        B = K21 @ inverse1.mT
+        B = old._white(K21)
         late_noise = self.noise[..., n:]
         # The nugget of the new rows is that of their own variances.
         variance = K22.diagonal(dim1=-1, dim2=-2) + late_noise
         late_noise = late_noise + max(100, self.noise.shape[-1]) * _EPS * variance
         L2 = factor(K22 - B @ B.mT, late_noise, seen)
         L2 = L2.expand(*lead, *L2.shape[-2:])
-        inverse2 = _inverse(L2)
-        inverse = _lower(inverse1.expand(*lead, n, n), -inverse2 @ B @ inverse1, inverse2)
-        return _lower(old.chol.expand(*lead, n, n), B, L2), inverse
+        chol = _lower(old.chol.expand(*lead, n, n), B, L2)
+        if not old._is_noisy:
+            return chol, None
+        inverse1, inverse2 = old.inverse_factor(), _inverse(L2)
+        inverse1 = inverse1.expand(*lead, n, n)
+        return chol, _lower(inverse1, -inverse2 @ B @ inverse1, inverse2)
 
     def solve(self, residual: Tensor) -> Tensor:
         """Return :math:`K^{-1} r` for residuals ``... x n``."""
@@ -152,6 +160,12 @@ class Conditioning:
             self._inverse = _inverse(self.chol)
         return self._inverse
 
+    def _white(self, cross: Tensor) -> Tensor:
+        """Return :math:`k L^{-T}`: a product, or without noise a solve, which is exacter."""
+        if self._is_noisy:
+            return cross @ self.inverse_factor().mT
+        return torch.linalg.solve_triangular(self.chol, cross.mT, upper=False).mT
+
     def mean(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         r"""Return means :math:`\bar f + k \alpha`, and covariances k with the training inputs."""
         cross = sought.cross(self.train)
@@ -162,7 +176,7 @@ class Conditioning:
     def marginals(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Return means and variances at each point, ``... x S x m x q``."""
         mean, cross = self.mean(sought)
-        white = cross @ self.inverse_factor().mT
+        white = self._white(cross)
         prior = sought.variance()
         variance = prior - white.square().sum(-1)
         # Not below the rounding errors of the difference.
@@ -171,7 +185,7 @@ class Conditioning:
     def joint(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Return means ``... x S x m x q``, and covariances ``... x S x m x q x q``."""
         mean, cross = self.mean(sought)
-        white = cross @ self.inverse_factor().mT
+        white = self._white(cross)
         prior = sought.cross(sought)
         K = prior - white @ white.mT
         least = 4 * self.chol.shape[-1] * _EPS * prior.diagonal(dim1=-1, dim2=-2)

@@ -67,7 +67,7 @@ def test_variances(cls, n, length, give):
             (model.rho(Z), rho),
             (model.delta(Z), delta),
         ):
-            torch.testing.assert_close(found.variance, exact, rtol=0.06, atol=0.0)
+            torch.testing.assert_close(found.variance, exact, rtol=0.02, atol=0.0)
         half = give(cls(X[::2], Y[::2], **options), numbers)
         later = half.condition_on_observations(X[1::2], Y[1::2])
         for found in (later.posterior(Z), later.predict(Z)):
