@@ -40,7 +40,7 @@ FLOORS = [
 CSV_TO_FREE_RUN = 48  # files that a log passes on the way to a judged free run
 TRIAL, ITERATION = 60, 60  # that a planned trial and an iteration of Dyna pass, fits included
 OF_CONTROL, OF_CONTROL_AND_RL = 14, 14  # of these
-CORE_FILES, CORE_CLASSES, CORE_FUNCTIONS, CORE_LINES = 12, 14, 105, 4100  # of the core
+CORE_FILES, CORE_CLASSES, CORE_FUNCTIONS, CORE_LINES = 12, 16, 114, 4250  # of the core
 FILES, CLASSES, FUNCTIONS = 32, 36, 265  # that the ten lines of the README pass; fewer are better
 REPORT, WITH_A_REPORT = 15, 34  # of report and validation, and of what is below, by a point fit
 

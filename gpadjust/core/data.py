@@ -47,7 +47,10 @@ class Data(NamedTuple):
         cls, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike, input_transform: Any
     ) -> Data:
         """Return checked data, detached from any graph."""
-        X, Y = as_tensor(train_X, "train_X"), as_tensor(train_Y, "train_Y")
+        if input_transform is not None:
+            input_transform = deepcopy(input_transform).double().train()
+        inputs, outputs = names_of(train_X, "x"), names_of(train_Y, "y")
+        X, Y = as_tensor(_coded(train_X, input_transform), "train_X"), as_tensor(train_Y, "train_Y")
         if hasattr(train_Y, "to_numpy") and Y.dim() == 1:  # a Series is a column
             Y = Y.unsqueeze(-1)
         for name, tensor in (("train_X", X), ("train_Y", Y)):
@@ -78,9 +81,7 @@ class Data(NamedTuple):
             )
         X, Y = X.detach().clone(), Y.detach().clone()
         Yvar = None if train_Yvar is None else variances_of(train_Yvar, Y)
-        inputs, outputs = names_of(train_X, "x", X), names_of(train_Y, "y", Y)
         if input_transform is not None:
-            input_transform = deepcopy(input_transform).double().train()
             input_transform(X)
             input_transform.eval()
         _warn_of_copies(X, Y)
@@ -91,7 +92,7 @@ class Data(NamedTuple):
         names = None if isinstance(X, Tensor) else column_names(X)
         if names is not None and names != self.input_names and {*names} & {*self.input_names}:
             raise ValueError(f"Expected columns {self.input_names}, in this order; found {names}.")
-        X, d = as_tensor(X, "X"), len(self.input_names)
+        X, d = as_tensor(_coded(X, self.transform), "X"), len(self.input_names)
         if X.dim() < 2 or X.shape[-1] != d:
             raise ValueError(
                 f"Expected X of shape ... x q x {d}, the columns {', '.join(self.input_names)}; "
@@ -198,13 +199,19 @@ def variances_of(values: ArrayLike, Y: Tensor) -> Tensor:
     return variances
 
 
-def names_of(values: ArrayLike, letter: str, tensor: Tensor) -> tuple[str, ...]:
+def _coded(X: ArrayLike, transform: Any) -> ArrayLike:
+    """Return inputs with numbers in place of what a transform makes numbers of."""
+    return transform.coded(X) if hasattr(transform, "coded") else X
+
+
+def names_of(values: ArrayLike, letter: str) -> tuple[str, ...]:
     """Return the names of columns, ``x`` or ``x1`` and so on if they have none."""
-    names, number = None, tensor.shape[-1]
-    if not isinstance(values, Tensor):
-        names = column_names(values)
-    default = (letter,) if number == 1 else tuple(f"{letter}{i + 1}" for i in range(number))
-    return names or default
+    names = None if isinstance(values, Tensor) else column_names(values)
+    if names is not None:
+        return names
+    shape = [*getattr(values, "shape", ())]
+    number = int(shape[-1]) if len(shape) > 1 else 1
+    return (letter,) if number == 1 else tuple(f"{letter}{i + 1}" for i in range(number))
 
 
 def column_names(values: ArrayLike) -> tuple[str, ...] | None:

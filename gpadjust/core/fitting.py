@@ -6,11 +6,13 @@ import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from gpadjust.core.noise import Noise
 from gpadjust.core.sample import (
     GROUPS,
     Draws,
@@ -115,6 +117,7 @@ def fit(
     if model.data.Y.dim() > 2:
         batch = tuple(model.batch_shape)
         raise ValueError(f"Expected a model of one data set; found fantasies, a batch {batch}.")
+    model.noise = model.noise.learnt(model, partial(_roughly_fitted, model, seed))
     if method == "map":
         model.set_draws(_modes(model, 0, seed, is_precise=True)[:1])
         return FitResult(method)
@@ -137,6 +140,13 @@ def fit(
             stacklevel=2,
         )
     return result
+
+
+def _roughly_fitted(model: GP, seed: int, noise: Noise) -> GP:
+    """Return a copy of a model with another noise, at its most likely numbers."""
+    copy = model.with_noise(noise)
+    copy.set_draws(_modes(copy, 0, seed)[:1])
+    return copy
 
 
 def _default_numbers(model: GP) -> tuple[int, int]:
@@ -259,8 +269,8 @@ def _evidence(model: GP, sampled: dict[int, Draws]) -> Tensor:
     prior = model.table.log_prior
     logs = torch.stack([prior[k] + draws.log_evidence for k, draws in sampled.items()])
     total = logs.logsumexp(0).logsumexp(0) - math.log(GROUPS)
-    units = (~model.data.Y.isnan()).sum(0) * model.unit.squeeze(-1).log()
-    return total - (units if len(total) > 1 else units.sum())
+    units = model.log_unit()
+    return total + (units if len(total) > 1 else units.sum())
 
 
 def _pooled(draws: Mapping[int, Draws], weights: Tensor, number: int, part: int = 0) -> Tensor:

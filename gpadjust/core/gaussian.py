@@ -226,22 +226,43 @@ class Prediction(NamedTuple):
     variance: Tensor
 
 
-def moments(mean: Tensor, variance: Tensor) -> Prediction:
-    """Return the mean and variance of mixtures of components ``... x S x q x m``."""
-    if mean.shape[DRAWS] == 1:
-        return Prediction(mean.squeeze(DRAWS), variance.squeeze(DRAWS))
-    center = mean.mean(DRAWS)
-    between = (mean - center.unsqueeze(DRAWS)).square().mean(DRAWS)
-    return Prediction(center, variance.mean(DRAWS) + between)
+class Marginals(NamedTuple):
+    """Mixtures of equally likely Gaussians at points by themselves."""
 
+    means: Tensor  # of the components, ... x S x q x m
+    variances: Tensor
 
-def mixture_quantile(mean: Tensor, variance: Tensor, level: float) -> Tensor:
-    """Return quantiles ``... x q x m`` of mixtures ``... x S x q x m``, by bisection."""
-    sd = variance.sqrt().clamp_min(1e-300)
-    ends = mean + torch.special.ndtri(torch.tensor(level).to(mean)) * sd
-    low, high = ends.amin(DRAWS), ends.amax(DRAWS)
-    for _ in range(50 if mean.shape[DRAWS] > 1 else 0):
-        middle = (low + high) / 2
-        below = torch.special.ndtr((middle.unsqueeze(DRAWS) - mean) / sd).mean(DRAWS) < level
-        low, high = torch.where(below, middle, low), torch.where(below, high, middle)
-    return (low + high) / 2
+    @property
+    def prediction(self) -> Prediction:
+        """The mean and variance of the mixtures, ``... x q x m``."""
+        means, variances = self.means, self.variances
+        if means.shape[DRAWS] == 1:
+            return Prediction(means.squeeze(DRAWS), variances.squeeze(DRAWS))
+        center = means.mean(DRAWS)
+        between = (means - center.unsqueeze(DRAWS)).square().mean(DRAWS)
+        return Prediction(center, variances.mean(DRAWS) + between)
+
+    def quantile(self, level: float) -> Tensor:
+        """Return the quantiles ``... x q x m`` of a level, by bisection."""
+        means, sd = self.means, self._sd
+        ends = means + torch.special.ndtri(torch.tensor(level).to(means)) * sd
+        low, high = ends.amin(DRAWS), ends.amax(DRAWS)
+        for _ in range(50 if means.shape[DRAWS] > 1 else 0):
+            middle = (low + high) / 2
+            below = self.probability(middle) < level
+            low, high = torch.where(below, middle, low), torch.where(below, high, middle)
+        return (low + high) / 2
+
+    def probability(self, Y: Tensor) -> Tensor:
+        """Return the probability of values below ``Y``, ``... x q x m``."""
+        return torch.special.ndtr((Y.unsqueeze(DRAWS) - self.means) / self._sd).mean(DRAWS)
+
+    def log_density(self, Y: Tensor) -> Tensor:
+        """Return the log density at values ``Y``, ``... x q x m``; NaN where they are."""
+        z = (Y.unsqueeze(DRAWS) - self.means) / self._sd
+        each = -0.5 * z.square() - self._sd.log() - 0.5 * math.log(2 * math.pi)
+        return each.logsumexp(DRAWS) - math.log(self.means.shape[DRAWS])
+
+    @property
+    def _sd(self) -> Tensor:
+        return self.variances.sqrt().clamp_min(1e-300)

@@ -41,6 +41,10 @@ class Kernel(ABC):
     def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
         """Return the covariances of inputs with others, or with themselves."""
 
+    def of_data(self, data: Any) -> Kernel:
+        """Return the kernel for a model's data, whose columns have names; itself by default."""
+        return self
+
     def variance(self, own: Values, x: Tensor) -> Tensor:
         """Return the prior variances, ``... x S x m x n`` (or 1 where all are equal)."""
         points = x.movedim(-2, 0).unsqueeze(-2)  # n x ... x 1 x d

@@ -27,11 +27,10 @@ from gpadjust.core.functions import Functions, Paths
 from gpadjust.core.gaussian import (
     Conditioning,
     Likelihood,
+    Marginals,
     Prediction,
     add_noise,
     log_likelihood,
-    mixture_quantile,
-    moments,
 )
 from gpadjust.core.kernels import DELTA, RHO, as_kernel
 from gpadjust.core.noise import KnownNoise, Noise
@@ -47,6 +46,7 @@ from gpadjust.core.views import (
     squeezed,
 )
 from gpadjust.physics import Physics, Unknown, as_physics
+from gpadjust.physics.parameters import PhysicsParameters
 
 Slopes = dict[str, list[Tensor]]
 """Derivatives of each physics by the coordinate of each unknown parameter, ``S x m x n``."""
@@ -75,7 +75,7 @@ class Predictive(Model, FantasizeMixin):
         Returns:
             Mean and variance, ``... x q x m``, as ``X`` came: tensors, arrays or frames.
         """
-        prediction = moments(*self.components(X, observation_noise))
+        prediction = self.marginals_of(*self.components(X, observation_noise)).prediction
         if isinstance(X, Tensor):
             return prediction
         return Prediction(*(as_given(each, X, self.data.output_names) for each in prediction))
@@ -87,10 +87,18 @@ class Predictive(Model, FantasizeMixin):
         """Return the lower and upper ends of the central interval at each point, as ``X`` came."""
         if not 0 < level < 1:
             raise ValueError(f"Expected level between 0 and 1; found {level}; 95 % is 0.95.")
-        parts = self.components(X, observation_noise)
-        ends, names = ((1 - level) / 2, (1 + level) / 2), self.data.output_names
-        lower, upper = (as_given(mixture_quantile(*parts, end), X, names) for end in ends)
+        marginals, names = self.marginals(X, observation_noise), self.data.output_names
+        ends = ((1 - level) / 2, (1 + level) / 2)
+        lower, upper = (as_given(marginals.quantile(end), X, names) for end in ends)
         return lower, upper
+
+    def marginals(self, X: ArrayLike, observation_noise: bool | Tensor = False) -> Marginals:
+        """Return the distributions at each point by itself; arguments as of :meth:`predict`."""
+        return self.marginals_of(*self.components(X, observation_noise))
+
+    def marginals_of(self, means: Tensor, variances: Tensor) -> Marginals:
+        """Return the distributions of Gaussian components ``... x S x q x m``."""
+        return Marginals(means, variances)
 
     def posterior(
         self,
@@ -137,7 +145,9 @@ class GP(gpytorch.models.GP, Predictive):
         physics: What the bases of the terms are: functions or Physics with ``m`` outputs.
         noise: A :class:`Noise`. Default: one learnt variance of each output.
         choices: Nested models, which are averaged over by their posterior probabilities.
-        input_transform: A one-to-one BoTorch transform of what kernels see; the physics sees X.
+        input_transform: A one-to-one BoTorch transform of what kernels see; the physics sees X. It
+            may have the methods ``coded(X)``, which makes numbers of a frame, and ``terms(terms)``,
+            which returns the terms of a model of such inputs.
         outcome_transform: None or BoTorch's ``Standardize``, which has no effect: units are learnt.
         settings: The arguments by which :func:`~gpadjust.core.save` builds a subclass again.
 
@@ -177,10 +187,16 @@ class GP(gpytorch.models.GP, Predictive):
         m = Y.shape[-1]
         self.rows_of_fit = len(Y)  # later ones are conditioned on, in the unit of these
         self.physics = [as_physics(each) for each in physics]
+        for each in self.physics:
+            each.check_names(self.data.input_names)
         terms = [_with_kernel(term) for term in terms]
         if type(self) is GP:
             settings = {"terms": terms, "noise": noise, "choices": choices}
             settings["input_transform"] = input_transform
+        transform: Any = self.data.transform
+        if hasattr(transform, "terms"):
+            terms = transform.terms(terms)
+        terms = [_of_data(term, self.data) for term in terms]
         self.settings = dict(settings or {})
         self._outputs: list[int] | None = None
         self._cached: tuple[Tensor, Conditioning] | None = None
@@ -196,26 +212,25 @@ class GP(gpytorch.models.GP, Predictive):
                     f"{f.shape[-2]}."
                 )
         mean = TermSum(terms, places.f, self.unit).mean({}, places)
-        self.unit = unit_of(Y, mean[0].mT)
+        self.unit = unit_of(self.on_gaussian_scale(Y), mean[0].mT)
         self._f_train = [f / self.unit for f in places.f]
         self.term_sum = TermSum(terms, self._f_train, self.unit)
-        if self.data.Yvar is not None:
-            if noise is not None:
-                raise ValueError("Expected train_Yvar or noise; found both.")
-            noise = KnownNoise(self.data.Yvar.mT / self.unit.square())
         if noise is not None and not isinstance(noise, Noise):
             raise TypeError(
                 f"Expected noise as a Noise; found {noise!r}. A variance is train_Yvar."
             )
+        if self.data.Yvar is not None:
+            known = KnownNoise(self.noise_in_units(Y, self.data.Yvar))
+            noise = known if noise is None else noise.with_known(known)
         self.noise = Noise() if noise is None else noise
         rows = self.term_sum.rows(self.data.kernel_inputs(X), m) + self.noise.rows(Y)
         rows += [Row(f"physics.{n}", Y.new_zeros(1), is_shared=True) for n in self._unknowns]
         self.table = Table(rows, m, choices)
-        known = {row.name for row in rows}
-        known |= {f"{t.name}.{part}" for t in terms for part in ("mean", "process")}
-        if unknown := {name for choice in choices for name in choice.zeros} - known:
+        names = {row.name for row in rows}
+        names |= {f"{t.name}.{part}" for t in terms for part in ("mean", "process")}
+        if unknown := {name for choice in choices for name in choice.zeros} - names:
             raise ValueError(
-                f"Unknown numbers {sorted(unknown)} in choices; expected some of {sorted(known)}."
+                f"Unknown numbers {sorted(unknown)} in choices; expected some of {sorted(names)}."
             )
         self.u = torch.nn.Parameter(Y.new_zeros(1, self.table.problems, self.table.size))
         self._draws = self.u.detach()
@@ -244,10 +259,16 @@ class GP(gpytorch.models.GP, Predictive):
         return self._draws if len(self._draws) > len(self.u) else self.u.detach()
 
     @property
-    def physics_parameters(self) -> dict[str, Tensor]:
+    def physics_parameters(self) -> PhysicsParameters:
         """Draws ``N`` of each unknown parameter of the physics, in the user's units."""
         values = self.table.values(self.draws)
-        return {n: p.value(values[f"physics.{n}"][..., 0]) for n, p in self._unknowns.items()}
+        draws = [p.value(values[f"physics.{n}"][..., 0]) for n, p in self._unknowns.items()]
+        return PhysicsParameters(self._unknowns, draws)
+
+    @property
+    def is_fitted(self) -> bool:
+        """Whether the unknown numbers are others than the middle of their priors."""
+        return bool(self.draws.any())
 
     def set_draws(self, draws: Tensor, number: int | None = None) -> None:
         """Hold coordinates ``N x B x P``; predictions average over a number of them, or all.
@@ -272,7 +293,7 @@ class GP(gpytorch.models.GP, Predictive):
         It is in units of the targets, minus infinity where it or f_p is not finite. The gradient is
         zero if it is not asked for.
         """
-        values, y = self.table.values(u), self.data.Y.mT / self.unit
+        values, y = self.table.values(u), self._targets()
         f_slopes: Slopes = {}
         places = self.places(self.data.X, values, with_physics=not self._unknowns)
         if self._unknowns:
@@ -353,8 +374,25 @@ class GP(gpytorch.models.GP, Predictive):
             f.append(self._in_units(each(X, *self._arguments(each, values))))  # noqa: PERF401
         return f
 
+    def on_gaussian_scale(self, Y: Tensor) -> Tensor:
+        """Return targets or outputs of a physics, ``... x n x m``, where the model is Gaussian."""
+        return Y
+
+    def noise_in_units(self, Y: Tensor, Yvar: Tensor) -> Tensor:
+        """Return known variances ``... x n x m`` of targets as ``... x m x n``, in units."""
+        return Yvar.mT / self.unit.square()
+
+    def log_unit(self) -> Tensor:
+        """Return the log densities of the targets, ``m``, in the user's units less the model's."""
+        return -(~self.data.Y.isnan()).sum(-2) * self.unit.squeeze(-1).log()
+
+    def _targets(self) -> Tensor:
+        """Return the targets less the mean of the noise, ``... x m x n``, in their unit."""
+        return self.on_gaussian_scale(self.data.Y).mT / self.unit - self.noise.shift
+
     def _in_units(self, Y: Tensor) -> Tensor:
         """Return ``... x m x n`` of a physics' outputs, in units of the targets."""
+        Y = self.on_gaussian_scale(Y)
         return (Y.mT if self._outputs is None else Y.mT[..., self._outputs, :]) / self.unit
 
     def _arguments(self, physics: Physics, values: Values) -> list[Tensor]:
@@ -424,19 +462,17 @@ class GP(gpytorch.models.GP, Predictive):
         """Return the function at the training inputs, the variances of the noise, and targets."""
         places = self.places(self.data.X, values)
         noise = self.noise.variance(values, places, True)
-        return self.term_sum.at(values, places), noise, self.data.Y.mT.unsqueeze(-3) / self.unit
+        return self.term_sum.at(values, places), noise, self._targets().unsqueeze(-3)
 
-    def left_out(self) -> tuple[Tensor, Tensor]:
-        """Return means and variances of each target given all others, of each draw ``S x n x m``.
-
-        Noise is included; NaN where a target is missing.
-        """
+    def left_out(self) -> Marginals:
+        """Return the distribution of each target given all others, with noise; NaN if missing."""
         mean, variance = self.conditioning().left_out()
-        return (mean * self.unit).mT, (variance * self.unit.square()).mT
+        mean = mean + self.noise.shift
+        return self.marginals_of((mean * self.unit).mT, (variance * self.unit.square()).mT)
 
     @torch.no_grad()
     def left_out_at(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Return :meth:`left_out` at other coordinates, ``S x B x P``."""
+        """Return means and variances of left-out targets at coordinates ``S x B x P``."""
         mean, variance = Conditioning(*self._observed(self.table.values(u))).left_out()
         return (mean * self.unit).mT, (variance * self.unit.square()).mT
 
@@ -554,15 +590,18 @@ class GP(gpytorch.models.GP, Predictive):
                 f"Expected finite Y of shape ... x {X.shape[-2]} x {self.num_outputs}, or NaN "
                 f"where an output is missing; found {tuple(Y.shape)}."
             )
+        old, new = self.conditioning(), self._copy()
+        new.data = self.data.appended(X, Y)
+        if noise is None and self.data.Yvar is not None:
+            noise = self.data.Yvar.mean(-2, keepdim=True)
         if noise is not None and self.noise.known is not None:
             unused = noise.isnan() & Y.isnan()
             noise = noise.masked_fill(unused, 1.0) if unused.any() else noise
-            noise = self._checked_noise(noise, X).mT / self.unit.square()
-        old, new = self.conditioning(), self._copy()
+            noise = self._checked_noise(noise, X)
+            if self.data.Yvar is not None:
+                new.data = new.data._replace(Yvar=appended(self.data.Yvar, noise))
+            noise = self.noise_in_units(Y, noise)
         new.noise = self.noise.appended(noise, X.shape[-2])
-        new.data = self.data.appended(X, Y)
-        if new.noise.known is not None:
-            new.data = new.data._replace(Yvar=new.noise.known.mT * self.unit.square().mT)
         values = old.train.values
         has_graph = X.requires_grad or Y.requires_grad or old.alpha.requires_grad
         with torch.set_grad_enabled(has_graph and torch.is_grad_enabled()):
@@ -604,8 +643,15 @@ class GP(gpytorch.models.GP, Predictive):
             return None
         new = self._copy()
         new.noise = noise
-        new.data = self.data._replace(X=self.data.X[rows], Y=self.data.Y[rows])
+        Yvar = None if self.data.Yvar is None else self.data.Yvar[rows]
+        new.data = self.data._replace(X=self.data.X[rows], Y=self.data.Y[rows], Yvar=Yvar)
         new._f_train, new._cached = [f[..., rows] for f in self._f_train], None
+        return new
+
+    def with_noise(self, noise: Noise) -> Self:
+        """Return the model with another noise of the same unknown numbers."""
+        new = self._copy()
+        new.noise, new._cached = noise, None
         return new
 
     def subset_draws(self, rows: Tensor) -> Self:
@@ -630,8 +676,7 @@ class GP(gpytorch.models.GP, Predictive):
         self._f_train = [f.to(self.u) for f in self._f_train]
         self.term_sum = TermSum(self.terms, [f.to(self.u) for f in self.term_sum.f], self.unit)
         self.table = self.table.to(self.u)
-        if isinstance(self.noise, KnownNoise):
-            self.noise = KnownNoise(self.noise.known.to(self.u))
+        self.noise = self.noise.to(self.u)
         self._cached = None
         return self
 
@@ -675,7 +720,7 @@ class GP(gpytorch.models.GP, Predictive):
     @property
     def train_targets(self) -> Tensor:
         """The targets, ``(m) x n``; 0 where one is missing, of a noise that gives it no weight."""
-        return squeezed(self.data.Y.mT.unsqueeze(-3), -2).nan_to_num()
+        return squeezed(self._targets().mul(self.unit).unsqueeze(-3), -2).nan_to_num()
 
     def forward(self, x: Tensor) -> MultivariateNormal:
         """Return the prior at inputs ``... x n x d``."""
@@ -741,6 +786,11 @@ def _with_kernel(term: Any) -> Term:
     if term.kernel is None:
         return term
     return term._replace(kernel=as_kernel(term.kernel, DELTA if term.physics is None else RHO))
+
+
+def _of_data(term: Term, data: Data) -> Term:
+    """Return a term whose kernel knows the names of the inputs."""
+    return term if term.kernel is None else term._replace(kernel=term.kernel.of_data(data))
 
 
 def _unknowns_of(physics: Sequence[Physics]) -> dict[str, Unknown]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -29,6 +30,8 @@ class Noise:
     """
 
     known: Tensor | None = None
+    shift: Tensor | float = 0.0
+    """What the noise adds to the training targets in the mean, ``m x n``, in their unit."""
 
     def __init__(
         self, names: Sequence[str] = ("variance",), priors: Sequence[LogNormal] | None = None
@@ -83,8 +86,27 @@ class Noise:
             )
         return self
 
+    def learnt(self, model: Any, fitted: Callable[[Noise], Any]) -> Noise:
+        """Return the noise with what rough fits tell of each row; :func:`fit` begins with it.
+
+        Args:
+            model: The model, before it is fitted.
+            fitted: Returns the model with a noise, at its most likely numbers.
+        """
+        return self
+
+    def with_known(self, known: KnownNoise) -> Noise:
+        """Return the noise of targets with known variances; a ValueError if it learns them."""
+        raise ValueError(
+            f"Expected train_Yvar or a noise that learns variances; found both, {self}."
+        )
+
     def of_outputs(self, outputs: Sequence[int]) -> Noise:
         """Return the noise of some outputs."""
+        return self
+
+    def to(self, like: Tensor) -> Noise:
+        """Return the noise on the device of a tensor."""
         return self
 
     def of_rows(self, rows: Tensor) -> Noise | None:
@@ -119,6 +141,10 @@ class KnownNoise(Noise):
         if variances is None:
             variances = self.known.mean(-1, keepdim=True).expand(*self.known.shape[:-1], num_points)
         return KnownNoise(appended(self.known, variances, -1))
+
+    def to(self, like: Tensor) -> KnownNoise:
+        """Return the noise on the device of a tensor."""
+        return KnownNoise(self.known.to(like))
 
     def of_rows(self, rows: Tensor) -> KnownNoise:
         """Return the noise of some observations."""

@@ -8,7 +8,7 @@ from gpytorch.distributions import MultitaskMultivariateNormal, MultivariateNorm
 from linear_operator import to_linear_operator
 from torch import Size, Tensor
 
-from gpadjust.core.gaussian import DRAWS, mixture_quantile, moments
+from gpadjust.core.gaussian import Marginals
 
 
 def correlation_root(K: Tensor) -> Tensor:
@@ -78,15 +78,15 @@ class MixturePosterior(GPyTorchPosterior):
         return Size([*mean.shape[:-3], q * m + (S > 1)])
 
     @property
-    def marginals(self) -> tuple[Tensor, Tensor]:
-        """Means and variances of the components at each point, ``... x S x q x m``."""
+    def marginals(self) -> Marginals:
+        """The mixtures at each point by itself."""
         mean, K = self.components
-        return mean.mT, K.diagonal(dim1=-1, dim2=-2).mT
+        return Marginals(mean.mT, K.diagonal(dim1=-1, dim2=-2).mT)
 
     @property
     def variance(self) -> Tensor:
         """The variances, ``... x q x m``, however small."""
-        return moments(*self.marginals).variance
+        return self.marginals.prediction.variance
 
     @property
     def batch_range(self) -> tuple[int, int]:
@@ -119,15 +119,12 @@ class MixturePosterior(GPyTorchPosterior):
     def quantile(self, value: Tensor) -> Tensor:
         """Return quantiles ``... x q x m`` of the mixture; several levels are in front."""
         levels = value.flatten().tolist()
-        quantiles = [mixture_quantile(*self.marginals, level) for level in levels]
+        quantiles = [self.marginals.quantile(level) for level in levels]
         return torch.stack(quantiles) if value.numel() > 1 else quantiles[0]
 
     def density(self, value: Tensor) -> Tensor:
         """Return the density of each output at each point, at values ``... x q x m``."""
-        mean, variance = self.marginals
-        sd = variance.sqrt().clamp_min(1e-300)
-        z = (value.expand(self.mean.shape).unsqueeze(DRAWS) - mean) / sd
-        return ((-0.5 * z.square()).exp() / (sd * (2 * torch.pi) ** 0.5)).mean(DRAWS)
+        return self.marginals.log_density(value.expand(self.mean.shape)).exp()
 
     def scalarized(self, weights: Tensor, offset: float = 0.0) -> MixturePosterior:
         """Return the posterior of a weighted sum of the outputs, plus an offset."""

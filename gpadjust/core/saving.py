@@ -6,19 +6,24 @@ import secrets
 import sys
 import warnings
 from copy import deepcopy
+from importlib import import_module
 from inspect import signature
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from botorch.models.transforms.input import InputTransform
 from torch import Tensor
 
 from gpadjust.checks import check_kind, check_switch
+from gpadjust.core.kernels import Kernel
 from gpadjust.core.model import GP
+from gpadjust.core.noise import Noise
 from gpadjust.physics import PhysicsError
 from gpadjust.physics.import_path import import_path, is_formula, physics_from_path
 
 _FORMAT = 4
+_PARTS = (Kernel, Noise, InputTransform)  # of a model, which a file may hold
 
 
 class Saved(NamedTuple):
@@ -32,9 +37,10 @@ class Saved(NamedTuple):
 def save(model: GP, path: str | Path) -> Saved:
     """Save a model: its class, settings, data and draws, and its physics by the import path.
 
-    Arguments that are not plain values (kernels, noises, transforms, lambdas, and the terms of a
-    plain ``GP``) are to be given to :func:`load` again. The file is written under a fresh name and
-    renamed: it is complete or not there, and a symbolic link at ``path`` is replaced.
+    Arguments that are not plain values (kernels, noises and transforms without ``settings``,
+    lambdas, and the terms of a plain ``GP``) are to be given to :func:`load` again. The file is
+    written under a fresh name and renamed: it is complete or not there, and a symbolic link at
+    ``path`` is replaced.
 
     Args:
         model: The model. A class of one's own takes train_X, train_Y and train_Yvar first, and
@@ -129,7 +135,9 @@ def _content(model: GP) -> dict[str, Any]:
     parameters = signature(model_class).parameters.values()
     takes_physics = any(p.name == "physics" or p.kind is p.VAR_KEYWORD for p in parameters)
     names = [import_path(each) for each in model.physics] if takes_physics else []
-    settings = {n: value for n, value in model.settings.items() if n != "outcome_transform"}
+    settings = {n: _packed(v) for n, v in model.settings.items() if n != "outcome_transform"}
+    if settings.get("noise") is not None:
+        settings["noise"] = _packed(model.noise.of_rows(torch.arange(n)))
     missing = [name for name, value in settings.items() if not _is_plain(value)]
     scalings = [term.name for term in model.terms if term.physics is not None]
     is_mapping = model_class is not GP and all(each.startswith("rho_") for each in scalings)
@@ -148,10 +156,34 @@ def _content(model: GP) -> dict[str, Any]:
     }
 
 
+def _packed(value: Any) -> Any:
+    """Return a noise, kernel or transform as its class and settings, if it has any."""
+    if not isinstance(value, _PARTS) or not hasattr(value, "settings"):
+        return value
+    own = type(value)
+    settings = {name: _packed(each) for name, each in value.settings.items()}
+    return {"class": f"{own.__module__}:{own.__qualname__}", "settings": settings}
+
+
+def _unpacked(value: Any) -> Any:
+    """Return what was packed; its class is one of this library or of an imported module."""
+    if not isinstance(value, dict):
+        return value
+    module, _, name = value["class"].partition(":")
+    if module.startswith("gpadjust."):
+        import_module(module)
+    own = getattr(sys.modules.get(module), name, None)
+    if not isinstance(own, type) or not issubclass(own, _PARTS):
+        raise ValueError(f"no class {value['class']} was found; import its module first.")
+    return own(**{name: _unpacked(each) for name, each in value["settings"].items()})
+
+
 def _is_plain(value: Any) -> bool:
     """Return whether ``torch.load`` reads a value with ``weights_only=True``."""
     if type(value) in (list, tuple):
         return all(map(_is_plain, value))
+    if type(value) is dict:
+        return all(map(_is_plain, value.values()))
     return type(value) in (bool, int, float, str, type(None), Tensor)
 
 
@@ -186,12 +218,13 @@ def _model(content: dict[str, Any], objects: dict[str, Any], trusted: bool) -> G
     model_class = getattr(sys.modules.get(module), name, None)  # nothing is imported for it
     if not isinstance(model_class, type) or not issubclass(model_class, GP):
         raise ValueError(f"no model {content['class']} was found; import its module first.")
-    settings = content["settings"] | {n: deepcopy(objects[n]) for n in content["missing"]}
+    settings = {name: _unpacked(value) for name, value in content["settings"].items()}
+    settings |= {n: deepcopy(objects[n]) for n in content["missing"]}
     if content["physics"]:
         given = "physics" in objects
         settings["physics"] = objects["physics"] if given else _physics(content, trusted)
     n, X, Y, Yvar = (content[name] for name in ("rows_of_fit", "X", "Y", "Yvar"))
-    data = [X, Y] if Yvar is None or settings.get("noise") else [X, Y, Yvar]
+    data = [X, Y] if Yvar is None else [X, Y, Yvar]
     inputs, outputs = (tuple(map(str, names)) for names in content["names"])
     is_right = type(n) is int and 2 <= n <= len(X) and all(len(v) == len(X) for v in data)
     if not is_right or (len(inputs), len(outputs)) != (X.shape[-1], Y.shape[-1]):

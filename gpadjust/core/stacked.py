@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from typing import Any, Self
 
 import torch
 from botorch.models.model import Model
 from torch import Size, Tensor
-from torch.distributions import Normal
 from torch.nn import Module, ModuleList
 from torch.quasirandom import SobolEngine
 
@@ -76,9 +74,8 @@ class StackedGP(Predictive):
         _check_models(models)
         scores = []
         for model in models.values():
-            mean, variance = model.left_out()
-            density = Normal(mean, variance.sqrt(), False).log_prob(model.data.Y).logsumexp(0)
-            scores.append((density - math.log(len(mean))).nan_to_num())  # 0 where one is missing
+            density = model.left_out().log_density(model.data.Y)
+            scores.append(density.nan_to_num())  # 0 where one is missing
         weights = torch.full_like(torch.stack(scores)[:, 0], 1 / len(models))  # K x m
         for _ in range(_ROUNDS):
             weights = (torch.stack(scores) + weights.log().unsqueeze(1)).softmax(0).mean(1)

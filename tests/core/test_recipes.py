@@ -149,12 +149,12 @@ def test_an_inference_method(problem):
 def test_a_link(problem):
     X, Y, physics = problem
     positive = recipe("A link")["LogCKA"](X, Y.exp(), physics=lambda X: physics(X).exp())
-    fit(positive.model)
+    fit(positive)
     low, high = positive.interval(X)
     assert (low > 0).all()
     assert ((low < Y.exp() * 1.2) & (high > Y.exp() / 1.2)).double().mean() > 0.8
     mean, variance = positive.predict(X)
-    draws = positive.model.posterior(X[:1]).rsample(torch.Size([100_000])).exp()
+    draws = positive.posterior(X[:1]).rsample(torch.Size([100_000])).exp()
     torch.testing.assert_close(draws.mean(0), mean[:1], rtol=0.02, atol=0)
     torch.testing.assert_close(draws.std(0), variance[:1].sqrt(), rtol=0.05, atol=0)
 

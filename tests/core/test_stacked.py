@@ -7,7 +7,7 @@ from botorch.acquisition.objective import ScalarizedPosteriorTransform
 from botorch.sampling import SobolQMCNormalSampler
 
 from gpadjust.core import PhysicsMeanGP, StackedGP, ZeroMeanGP
-from gpadjust.core.gaussian import mixture_quantile
+from gpadjust.core.gaussian import Marginals
 
 X = torch.rand(9, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
 Z = torch.linspace(0, 1, 4, dtype=torch.float64).unsqueeze(-1)
@@ -47,8 +47,8 @@ def test_it_is_the_mixture_by_hand():
     torch.testing.assert_close(stacked.predict(Z).mean, expected[0])
     torch.testing.assert_close(stacked.predict(Z.numpy()).mean, expected[0].numpy())
     lower, upper = stacked.interval(Z, 0.9)
-    torch.testing.assert_close(lower, mixture_quantile(mean, variance, 0.05))
-    torch.testing.assert_close(upper, mixture_quantile(mean, variance, 0.95))
+    torch.testing.assert_close(lower, Marginals(mean, variance).quantile(0.05))
+    torch.testing.assert_close(upper, Marginals(mean, variance).quantile(0.95))
     posterior = stacked.posterior(Z.expand(3, 4, 1))
     assert posterior.mean.shape == (3, 4, 1)
     torch.testing.assert_close(posterior.mean[0], expected[0])

@@ -1,0 +1,77 @@
+"""Draws of the unknown parameters of a physics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from gpadjust.checks import check_level
+from gpadjust.physics.unknown import Unknown
+
+
+class PhysicsParameters(dict[str, Tensor]):
+    """The posterior of the unknown parameters of a physics, as draws.
+
+    It maps names to their draws, ``K`` each: one, the value itself, after a point fit (``"map"``)
+    or before any. Conditioning on further observations leaves them as they are.
+
+    Args:
+        unknowns: The parameters.
+        draws: Draws of each, ``K``, in their units.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust.core import CalibratedPhysics, fit
+        >>> from gpadjust.physics import FunctionPhysics, Unknown
+        >>> g = Unknown(9.0, sd=1.0, unit="m/s²")
+        >>> law = FunctionPhysics(lambda t, p: 0.5 * p.g * t[:, 0] ** 2, unknowns={"g": g})
+        >>> t = torch.linspace(0.1, 1, 8, dtype=torch.float64).unsqueeze(-1)
+        >>> model = CalibratedPhysics(t, 0.5 * 9.81 * t**2, physics=law)
+        >>> result = fit(model)
+        >>> len(model.physics_parameters["g"])
+        256
+    """
+
+    def __init__(self, unknowns: Mapping[str, Unknown], draws: Sequence[Tensor]) -> None:
+        super().__init__(zip(unknowns, draws, strict=True))
+        self.unknowns = unknowns
+
+    @property
+    def draws(self) -> Tensor:
+        """All draws, ``K x p``."""
+        return torch.stack([*self.values()], -1)
+
+    def __missing__(self, name: str) -> Tensor:
+        names = ", ".join(self) or "none"
+        raise KeyError(f"Unknown parameter {name!r}; expected one of {names}.")
+
+    @property
+    def mean(self) -> Tensor:
+        """Means, ``p``, in the parameters' units."""
+        return self.draws.mean(0)
+
+    @property
+    def sd(self) -> Tensor:
+        """Standard deviations, ``p``; zero of a single draw."""
+        return self.draws.std(0, correction=0)
+
+    def interval(self, level: float = 0.95) -> tuple[Tensor, Tensor]:
+        """Lower and upper ends of the central intervals of probability ``level``, ``p`` each."""
+        check_level(level)
+        ends = torch.tensor([(1 - level) / 2, (1 + level) / 2]).to(self.draws)
+        low, high = self.draws.quantile(ends, dim=0)
+        return low, high
+
+    def __repr__(self) -> str:
+        low, high = self.interval()
+        rows = [("", "mean", "95 % interval", "prior", "unit")]
+        for i, (name, unknown) in enumerate(self.unknowns.items()):
+            interval = f"{low[i]:.4g} to {high[i]:.4g}" if low[i] < high[i] else "-"  # a point fit
+            rows.append((name, f"{self.mean[i]:.4g}", interval, unknown.prior_text, unknown.unit))
+        padded = (
+            [cell.ljust(max(map(len, column))) for cell in column]
+            for column in zip(*rows, strict=True)
+        )
+        return "\n".join("  ".join(row).rstrip() for row in zip(*padded, strict=True))
