@@ -56,21 +56,20 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gpadjust.emulation import EmulatedPhysics
-    from gpadjust.inference import fit
-    from gpadjust.models import (
-        AR1,
+    from gpadjust.core import (
         CKA,
         RRA,
         CalibratedPhysics,
         PhysicsMeanGP,
         ScaleGP,
         StackedGP,
-        VariationalCKA,
         ZeroMeanGP,
+        fit,
         load,
         save,
     )
+    from gpadjust.kinds import AR1, EmulatedPhysics
+    from gpadjust.many import VariationalCKA
     from gpadjust.physics import (
         BlackBoxPhysics,
         FormulaPhysics,
@@ -112,22 +111,11 @@ __all__ = [
 ]
 
 # Rooms that need no extra, in the order in which a name of `__all__` is looked for.
-_ROOMS = (
-    "physics",
-    "models",
-    "inference",
-    "validation",
-    "emulation",
-    "gp",
-    "states",
-    "active",
-    "dynamics",
-)
+_ROOMS = ("physics", "core", "kinds", "many", "validation", "states", "active", "dynamics")
 # Rooms that are not searched for names; most need an extra.
 _OTHER_ROOMS = (
     "ax",
     "control",
-    "core",
     "export",
     "files",
     "records",
@@ -148,7 +136,7 @@ def __getattr__(name: str) -> Any:
     if name in __all__:
         for room in _ROOMS:
             module = import_module(f"gpadjust.{room}")
-            if name in module.__all__:
+            if name in getattr(module, "__all__", ()):
                 globals()[name] = getattr(module, name)
                 return globals()[name]
     raise AttributeError(f"module 'gpadjust' has no attribute {name!r}")

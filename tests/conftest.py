@@ -6,10 +6,8 @@ from itertools import combinations
 import pytest
 import torch
 
-from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP
-from gpadjust.models import BiasGP
 from tests import systems
-from tests.systems import around, crude, truth
+from tests.systems import truth
 
 torch.set_num_threads(1)
 
@@ -113,42 +111,6 @@ def forrester():
     return Forrester()
 
 
-@pytest.fixture
-def shuffle():
-    """Moves each learnable hyper-parameter of a model by a random factor, in place."""
-
-    def shuffle(model, seed=0, spread=0.3):
-        generator = torch.Generator().manual_seed(seed)
-        with torch.no_grad():
-            for parameter in model.parameters():
-                if parameter.requires_grad:
-                    step = torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
-                    parameter += spread * step.to(parameter)
-        return model.eval()
-
-    return shuffle
-
-
-_CLASSES = {
-    "ZeroMeanGP": ZeroMeanGP,
-    "PhysicsMeanGP": PhysicsMeanGP,
-    "ScaleGP": ScaleGP,
-    "CKA": CKA,
-    "AR1": AR1,
-    "RRA": RRA,
-    "BiasGP": BiasGP,
-}
-# One of each class; where there is no physics, or no delta, in the slow run.
-_KINDS = ["CKA", "AR1", "RRA"]
-_SLOW = ["ZeroMeanGP", "ScaleGP"]
-
-
-@pytest.fixture(params=[*_KINDS, *(pytest.param(kind, marks=pytest.mark.slow) for kind in _SLOW)])
-def kind(request):
-    """The name of each model, for `build`."""
-    return request.param
-
-
 @pytest.fixture(params=[1, 2], ids=["1-output", "2-outputs"])
 def num_outputs(request):
     return request.param
@@ -163,26 +125,6 @@ def data():
         return X, truth(X)[..., :num_outputs]
 
     return make
-
-
-@pytest.fixture
-def build():
-    """Builds a model by its name, with the crude physics for as many outputs as Y has."""
-
-    def build(kind, X, Y, Yvar=None, **options):
-        m = Y.shape[-1]
-        if kind != "ZeroMeanGP":
-            options.setdefault("physics", lambda X: crude(X)[..., :m])
-        if kind in ("CKA", "RRA"):
-            options.setdefault("center", 0.0)  # the literal model, which the formulas are of
-        if kind == "AR1":
-            options.setdefault("num_low", 12)
-            options.setdefault("bounds", torch.tensor([[0.0] * X.shape[-1], [2.0] * X.shape[-1]]))
-        if kind == "RRA":
-            options.setdefault("num_features", 24)
-        return _CLASSES[kind](X, Y, Yvar, **options)
-
-    return build
 
 
 @pytest.fixture
@@ -218,29 +160,3 @@ def gradient_is_right():
         torch.testing.assert_close(gradient, expected, rtol=1e-4, atol=1e-4 * size)
 
     return gradient_is_right
-
-
-@pytest.fixture
-def held(build):
-    """Makes a model that holds samples, and one plain model for each of them.
-
-    `held(kind, X, Y, ..., num_samples=3, spread=0.3)`; the models are built by `make`, if given.
-    """
-
-    def held(*args, num_samples=3, spread=0.3, make=None, **options):
-        def construct():
-            return make() if make else build(*args, **options)
-
-        model = construct()
-        samples = around(model, num_samples, spread)
-        singles = [construct() for _ in range(num_samples)]
-        for i, single in enumerate(singles):
-            named = dict(single.named_parameters())
-            with torch.no_grad():
-                for name, values in samples.items():
-                    named[name].copy_(values[i])
-            single.eval()
-        model.hold_samples(samples)
-        return model, singles
-
-    return held

@@ -60,29 +60,6 @@ class Sine(torch.nn.Module):
         return torch.cat([angle.sin() + self.offset, angle.cos()], -1)[..., : self.num_outputs]
 
 
-def learnable(model):
-    """The values of a model's learnable parameters, by name."""
-    return {name: p.detach() for name, p in model.named_parameters() if p.requires_grad}
-
-
-def around(model, number, spread=0.3, seed=0):
-    """Random samples around the learnable parameters of a model, by name."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def draw(value):
-        away = torch.randn(number, *value.shape, generator=generator, dtype=torch.float64)
-        return value + spread * away
-
-    return {name: draw(value) for name, value in learnable(model).items()}
-
-
-def holding(model, *steps):
-    """The model, which now holds a sample of its hyper-parameters at each step from where it is."""
-    values = learnable(model).items()
-    model.hold_samples({name: torch.stack([p + step for step in steps]) for name, p in values})
-    return model
-
-
 def same(ours, theirs, **tolerance):
     """Asserts that tensors are close, one by one: moments of two predictions, say."""
     for one, other in zip(ours, theirs, strict=True):

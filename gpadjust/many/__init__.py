@@ -1,0 +1,1 @@
+"""Many rows: the adjustment on inducing points."""
