@@ -1,4 +1,4 @@
-"""Checks of the numbers, shapes and options that a user gives, and progress bars, for all rooms.
+"""Checks of the numbers, shapes and options that a user gives, progress bars and seeds, for all.
 
 A function ``check_...`` raises an error or returns nothing; one called ``checked_...`` also returns
 the value in the form that is worked with. The name of the argument comes first. A wrong kind is a
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from numbers import Real
 from operator import index
 from typing import Any
@@ -302,3 +303,12 @@ def progress_bar(shown: bool, iterable: Iterable[Any] = (), **options: Any) -> A
     except ImportError as error:
         raise ImportError("A progress bar needs tqdm; run `pip install tqdm`.") from error
     return tqdm(iterable, **options)
+
+
+@contextmanager
+def seeded(seed: int | None) -> Iterator[None]:
+    """Draw from PyTorch's generator of the CPU, from a copy of it if there is a seed."""
+    with nullcontext() if seed is None else torch.random.fork_rng(devices=[]):
+        if seed is not None:
+            torch.default_generator.manual_seed(seed)  # those of GPUs are no copies
+        yield

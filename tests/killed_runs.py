@@ -21,7 +21,7 @@ from gpadjust.control import (
 from gpadjust.control.random_state import RandomState
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.rl import DynaOptions, DynaSAC
-from tests.point import POINT_SPEC, QUICK, Faulty, Point, linear, near_one
+from tests.point import POINT_SPEC, Faulty, Point, linear, near_one
 
 TOTAL = 40  # steps, of episodes of five where none fails
 FAILS = {8: "raises", 16: "nan", 23: "reward 1e30"}
@@ -35,7 +35,7 @@ def reward(states, actions, next_states):
 def point(**parts):
     """The point, some of whose steps fail, and its task."""
     env = Faulty(gymnasium.wrappers.TimeLimit(Point(), 5), FAILS)
-    fit = {"method": "map", **QUICK}
+    fit = {"method": "map"}
     dynamics = LearnedDynamics(POINT_SPEC, lambda X: X[:, :1] + 0.4 * X[:, 1:], fit_options=fit)
     return env, Task(dynamics, reward, episode_length=5, **parts)
 

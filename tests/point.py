@@ -20,8 +20,7 @@ from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 
 linear = partial(mlp_policy, net_arch=())
 POINT_SPEC = StateSpec(["x"], ["v"])
-QUICK = {"num_starts": 1, "num_screened": 0}
-FEW_SAMPLES = {**QUICK, "num_samples": 3, "num_draws": 16}
+FEW = {"num_draws": 8}
 
 
 class Point(gymnasium.Env):
@@ -63,9 +62,9 @@ def point_dynamics():
 
 @pytest.fixture
 def crude_dynamics(point_dynamics):
-    """Makes dynamics that learn the point from a physics, by a quick search."""
-    quick = {"method": "map", **QUICK}
-    return lambda physics: LearnedDynamics(point_dynamics.spec, physics, fit_options=quick)
+    """Makes dynamics that learn the point from a physics, by a point fit."""
+    fit = {"method": "map"}
+    return lambda physics: LearnedDynamics(point_dynamics.spec, physics, fit_options=fit)
 
 
 @pytest.fixture
@@ -76,9 +75,9 @@ def learnt_dynamics(crude_dynamics):
 
 @pytest.fixture
 def sampled_dynamics(point_dynamics):
-    """As `learnt_dynamics`, by full Bayes, with few samples."""
+    """As `learnt_dynamics`, by full Bayes, with few draws."""
     return lambda: LearnedDynamics(
-        point_dynamics.spec, lambda X: X[:, :1] + 0.4 * X[:, 1:], fit_options=FEW_SAMPLES
+        point_dynamics.spec, lambda X: X[:, :1] + 0.4 * X[:, 1:], fit_options=FEW
     )
 
 

@@ -11,7 +11,6 @@ from typing import Any, Self
 
 import torch
 from botorch.acquisition import AcquisitionFunction, AnalyticAcquisitionFunction
-from botorch.models.model import Model
 from torch import Tensor
 
 from gpadjust.active.keep import Keep
@@ -24,16 +23,16 @@ from gpadjust.active.measurements import (
     refusal,
 )
 from gpadjust.active.points import among, best_points, sobol_points
-from gpadjust.active.warm_refit import load_parameter_values, parameter_values, refit
 from gpadjust.checks import (
     checked_bounds,
     checked_number,
     checked_points,
     checked_whole,
     progress_bar,
+    seeded,
 )
-from gpadjust.models.factory import ModelFactory, make_model
-from gpadjust.models.sampled_functions import seeded
+from gpadjust.core import fit as fit_by_default
+from gpadjust.kinds.factory import ModelFactory, make_model
 
 
 class MeasurementWarning(UserWarning):
@@ -91,8 +90,7 @@ class Collection(Measurements):
             given, safe by what you know, such as f_p; they are not checked. Default: no limits.
         probability: That of a measurement, noise included, being within the limits of ``keep``.
         num_outputs: Number ``m`` of outputs. Default: that of the first measurement.
-        fit: Fits a new model, in place. Default: :func:`gpadjust.fit`. A point fit,
-            ``lambda model: fit(model, "map")``, begins where the last one was.
+        fit: Fits a new model, in place. Default: :func:`gpadjust.fit`, for models of this library.
         optimizer_options: Arguments of ``optimize_acqf``, which ``keep`` does without.
         log: The file of the log.
         seed: Seed of the design and of the acquisition function's maximisation. The global random
@@ -172,7 +170,8 @@ class Collection(Measurements):
                     "Expected the points of initial to differ, got some twice. To measure a point "
                     "again, tell() what came out."
                 )
-        self._fit, self._initial = fit, checked_whole("initial, a number of points,", initial, 2)
+        self._fit = fit or fit_by_default
+        self._initial = checked_whole("initial, a number of points,", initial, 2)
         self._options = as_options(optimizer_options)
         if keep is not None and self._options:
             raise ValueError(
@@ -189,7 +188,6 @@ class Collection(Measurements):
                 f"{len(self._first_points)} and {self.num_observed}."
             )
         self._model: Any = None
-        self._last_model: tuple[Any, int] = (None, 0)
         if not isinstance(log, str | os.PathLike | None):
             raise TypeError(f"Expected log to be the path of a file, got {log!r}.")
         self.log = None if log is None else MeasurementLog(log)
@@ -234,12 +232,9 @@ class Collection(Measurements):
                     f"A model needs at least 2 measurements of each output, there are "
                     f"{self.num_observed}."
                 )
-            previous, count = self._previous()
-            if count < len(self.X):
-                model = self._make_model(len(self.X))
-                refit(model, previous, self._fit)
-                self._last_model = model, len(self.X)
-            self._model = self._last_model[0]
+            model = make_model(self.model_factory, self.X, self.Y)
+            self._fit(model)
+            self._model = model
         return self._model
 
     def ask(self, q: int | None = None) -> Tensor:
@@ -273,7 +268,6 @@ class Collection(Measurements):
                         function, self.model, self.bounds, q, self.X, *taken
                     )
                     record = {"left_out": left_out.tolist()}
-            record["parameters"] = parameter_values(self.model)
         self._enter([{"asked": points.tolist(), **record}])
         return points
 
@@ -424,19 +418,6 @@ class Collection(Measurements):
                 "batch_size=1, or take the acquisition function whose name begins with q."
             )
         return function
-
-    def _make_model(self, count: int) -> Model:
-        """A new model of the first so many measurements."""
-        model: Model = make_model(self.model_factory, self.X[:count], self.Y[:count])
-        return model
-
-    def _previous(self) -> tuple[Any, int]:
-        """The model fitted last, made again from the log if need be, and its number of points."""
-        if self._last_model[0] is None and self._last_fit is not None:
-            count, values = self._last_fit
-            model = self._make_model(count)
-            self._last_model = (model, count) if load_parameter_values(model, values) else (None, 0)
-        return self._last_model
 
     def _enter(self, records: list[Record]) -> None:
         """Log records, take them in, and warn of measurements that failed."""

@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Literal, get_args
 
 import torch
 from botorch.acquisition import AcquisitionFunction
-from botorch.utils.transforms import (
-    average_over_ensemble_models,
-    concatenate_pending_points,
-    t_batch_mode_transform,
-)
+from botorch.utils.transforms import concatenate_pending_points, t_batch_mode_transform
 from torch import Tensor
 
-from gpadjust.gp import SumOfTerms
-from gpadjust.gp.gaussian import cholesky
-from gpadjust.models import TermsModel, VariationalCKA
-from gpadjust.models.exact_conditioning import Factors, conditional_covariance
-from gpadjust.models.terms_gp import TermsGP
+from gpadjust.core import GP
+from gpadjust.core.gaussian import Conditioning, factor
+from gpadjust.core.terms import WeightedSum
+from gpadjust.many import VariationalCKA
 
 About = Literal["rho", "delta", "both"]
-Covariance = Callable[[Tensor], Tensor]
 
 
 class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch names its own
@@ -55,11 +49,10 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
     Where :math:`f_p(x) = 0` an observation is of delta alone. It still tells about rho as far as
     it tells what delta was at measured points nearby.
 
-    It needs no samples, is differentiable as far as f_p is, and counts independent outputs
-    together. An unknown constant mean (``rho_mean="learn"``) is a part of its function. Of a model
-    that holds samples of its hyper-parameters, the information is averaged over them. New
-    observations are as noisy as the model thinks; with known noise (``train_Yvar``), as noisy as
-    the old ones on average.
+    It needs no samples, is differentiable as far as f_p is, sums the information of independent
+    outputs, and is averaged over the draws of the model's unknown numbers. Unknown constants are
+    part of their functions. New observations are as noisy as the model predicts; with known noise
+    (``train_Yvar``), as noisy as the old ones on average.
 
     References:
         M. C. Kennedy and A. O'Hagan, *Predicting the output from a complex computer code when fast
@@ -70,16 +63,13 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
         learning for classification and preference learning*, arXiv:1112.5745, 2011.
 
     Args:
-        model: A :class:`~gpadjust.CKA`, :class:`~gpadjust.RRA`,
-            :class:`~gpadjust.ScaleGP` or
-            :class:`~gpadjust.PhysicsMeanGP`.
-        about: ``"rho"``, ``"delta"``, or ``"both"``: all that the model does not know. Of a model
-            with one of them only, ``"both"`` is about that one.
+        model: A :class:`~gpadjust.CKA`, or another model with a physics and with rho or delta.
+        about: ``"rho"``, ``"delta"``, or ``"both"``: all unknown functions of the model.
         X_pending: Points that are being measured, ``k x d``.
 
     Raises:
-        TypeError: If the model has no such adjustment, or is no adjustment of a physics. What is
-            told of unknown parameters of the physics does not count.
+        TypeError: If the model has no such adjustment, or none of a physics. Information about
+            unknown parameters of the physics is not counted.
         ValueError: If ``about`` is unknown, or ``"delta"`` of a model with a center, as by default,
             whose delta is not independent of rho a priori; with ``center=0.0`` it is.
 
@@ -96,18 +86,15 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
         torch.Size([2, 1])
     """
 
-    def __init__(
-        self, model: TermsModel, about: About = "both", X_pending: Tensor | None = None
-    ) -> None:
-        _check(model, about)
+    def __init__(self, model: GP, about: About = "both", X_pending: Tensor | None = None) -> None:
+        self._remaining_names = _remaining(model, about)
         super().__init__(model=model)
         self.about = about
         self.set_X_pending(X_pending)
-        self._made: tuple[Any, Covariance, Covariance | None] | None = None
+        self._cached: tuple[Conditioning, Conditioning] | None = None
 
     @concatenate_pending_points  # type: ignore[untyped-decorator]
     @t_batch_mode_transform()  # type: ignore[untyped-decorator]
-    @average_over_ensemble_models  # type: ignore[untyped-decorator]
     def forward(self, X: Tensor) -> Tensor:
         """Return the information in nats.
 
@@ -117,171 +104,77 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
         Returns:
             The information of each batch of ``q`` points, ``batch_shape``.
         """
-        self.model.eval()
-        _, whole, remaining = self._covariances()
-        return information_gain(self.model, X, whole, remaining)
-
-    def _covariances(self) -> tuple[Any, Covariance, Covariance | None]:
-        """Covariance of f_a given the data, and given also the adjustment in question.
-
-        The first entry tells of which data: they are made again after the model is given others.
-        """
         model: Any = self.model
-        source = model.conditioning()
-        if self._made is None or self._made[0] is not source:
-            whole: Covariance = (
-                (lambda inputs: model.conditioning().joint(model.at(inputs))[1])
-                if isinstance(model, VariationalCKA)
-                else UnknownCovariance(model)
-            )
-            kept = {"rho": model.other_names, "delta": model.rho_names, "both": ()}[self.about]
-            others = tuple(name for name in kept if name in model.term_names)
-            self._made = source, whole, UnknownCovariance(model, others) if others else None
-        return self._made
+        conditioning = model.conditioning()
+        values = conditioning.train.values
+        places = model.places(X, values)
+        f, noise = model.term_sum.at(values, places), model.noise.variance(values, places)
+        gain = _log_sds(conditioning.joint(f)[1], noise)
+        if self._remaining_names:
+            remaining = self._without_adjustment(conditioning)
+            gain = gain - _log_sds(remaining.joint(self._part(f))[1], noise)
+        return gain.sum(-1).mean(-1)
+
+    def _without_adjustment(self, conditioning: Conditioning) -> Conditioning:
+        """Return the posterior of the other terms, as if the data were of these and noise alone."""
+        if self._cached is None or self._cached[0] is not conditioning:
+            train = self._part(conditioning.train)
+            part = Conditioning(train, conditioning.noise, conditioning.targets)
+            self._cached = (conditioning, part)
+        return self._cached[1]
+
+    def _part(self, f: WeightedSum) -> WeightedSum:
+        """Return the sum of the terms that are not asked about."""
+        weights = {n: w for n, w in f.weights.items() if n in self._remaining_names}
+        return replace(f, weights=weights)
 
 
-def _check(model: Any, about: str) -> None:
-    """Raise what :class:`qAdjustmentInformationGain` raises."""
+def _remaining(model: Any, about: str) -> tuple[str, ...]:
+    """Return the names of the terms that are not asked about, or raise an error."""
     if about not in get_args(About):
         raise ValueError(f"Unknown {about=}; expected 'rho', 'delta' or 'both'.")
     name = type(model).__name__
-    if isinstance(model, TermsModel) and not model.term_names:
+    if not isinstance(model, GP) or not model.physics:
         raise TypeError(
-            f"{name} has neither rho nor delta to learn about; what observations "
-            "tell of parameters of the physics is not computed. CKA has both."
+            f"Expected a model with a physics and with rho or delta, such as CKA; found {name}. "
+            "Without them take BoTorch's qNegIntegratedPosteriorVariance."
         )
-    if not isinstance(model, TermsModel) or not model.rho_names:
+    terms = [term for term in model.terms if term.varies]
+    parts = {
+        "rho": tuple(term.name for term in terms if term.physics is not None),
+        "delta": tuple(term.name for term in terms if term.physics is None),
+    }
+    if not terms:
         raise TypeError(
-            f"Expected a model with rho or delta (CKA, RRA, ScaleGP, PhysicsMeanGP, BiasGP), got "
-            f"{name}; for a model without them, take BoTorch's qNegIntegratedPosteriorVariance."
+            f"{name} has neither rho nor delta to learn about, and the information about "
+            "parameters of the physics is not computed. Take CKA, which has both."
         )
     if about == "both":
-        return
+        return ()
     if isinstance(model, VariationalCKA):
         raise TypeError(
             "The inducing values of a VariationalCKA do not tell what would remain unknown if "
             f"{about} were known: ask about 'both', or take an exact CKA of some thousand points."
         )
-    if not set(model.rho_names if about == "rho" else ("delta",)) & set(model.term_names):
-        other = "delta" if about == "rho" else "rho"
+    other = "delta" if about == "rho" else "rho"
+    if not parts[about]:
         raise TypeError(f"{name} has no unknown {about}; ask about {other!r}, or take CKA.")
-    if about == "delta" and model.has_center:
+    if about == "delta" and any(term.has_center for term in terms):
         raise ValueError(
-            f"The {name} takes a center from f_p (by default it is learnt), so that delta is not "
+            f"The {name} has a center of f_p (by default an unknown one), so that delta is not "
             "independent of rho a priori and its information has no closed form: ask about 'rho' "
             "or 'both', or build and fit the model with center=0.0."
         )
-
-
-class UnknownCovariance:
-    r"""Posterior covariance of a sum of terms, as if the data were of these and noise alone.
-
-    With the terms' covariance K of the data, noise included, and U of new points with the data,
-
-    .. math:: k(X, X) - U K^{-1} U^T.
-
-    Where constant means with the bases H and the prior variances :math:`\kappa` are unknown, K is
-    that without them, and :math:`R (\mathrm{diag}(\kappa)^{-1} + H^T K^{-1} H)^{-1} R^T` with
-    :math:`R = H_X - U K^{-1} H` is added (Rasmussen and Williams 2006, eq. 2.42), so that vague
-    priors cost no digits.
-
-    Args:
-        model: The model, in eval mode.
-        names: The names of the terms. Default: all.
-    """
-
-    def __init__(self, model: TermsGP, names: tuple[str, ...] | None = None) -> None:
-        conditioning = model.conditioning()
-        (self.train,) = conditioning.train_inputs
-        self.terms = [t for t in model.terms if names is None or t.name in names]
-        self.constants = [term for term in self.terms if term.learns_mean]
-        self.kernel = SumOfTerms(self.terms, known_means=True)
-        self.has_kernel = any(term.kernel is not None for term in self.terms)
-        if names is None and not self.constants:
-            self.factors = conditioning.factors()
-            return
-        covariance = torch.diag_embed(conditioning.target_noise())
-        if self.has_kernel:
-            covariance = covariance + self.kernel.forward(self.train, self.train)
-        self.factors = Factors.of(covariance, conditioning.targets)
-
-    def __call__(self, inputs: Tensor) -> Tensor:
-        """Return ``... x q x q`` without noise, at transformed inputs ``... x q x d``."""
-        batch = torch.broadcast_shapes(inputs.shape[:-2], self.train.shape[:-2])
-        train = self.train.expand(*batch, *self.train.shape[-2:])
-        if self.has_kernel:
-            prior, cross = self.kernel.forward(inputs, inputs), self.kernel.forward(inputs, train)
-        else:
-            q, n = inputs.shape[-2], self.train.shape[-2]
-            prior, cross = inputs.new_zeros(*batch, q, q), inputs.new_zeros(*batch, q, n)
-        white = self.factors.whiten(cross)
-        covariance = conditional_covariance(prior, white)
-        if not self.constants:
-            return covariance
-        # In units of the constants' prior, where the matrix to invert is at least the identity.
-        known = self.factors.whiten(self._columns(self.train).mT)
-        rest = self._columns(inputs) - white @ known.mT
-        identity = torch.eye(known.shape[-2], dtype=known.dtype, device=known.device)
-        chol = torch.linalg.cholesky(identity + known @ known.mT)
-        root = torch.linalg.solve_triangular(chol, rest.mT, upper=False)
-        return covariance + root.mT @ root
-
-    def _columns(self, inputs: Tensor) -> Tensor:
-        """The constants' bases, for a prior variance of one, ``... x q x k``."""
-        columns: Any = self.kernel.basis_of_means(inputs)
-        return columns * torch.stack([t.mean_variance.sqrt() for t in self.constants], dim=-1)
-
-
-def information_gain(
-    model: TermsModel,
-    X: Tensor,
-    unknown: Covariance,
-    remaining: Covariance | None = None,
-    counted: Tensor | None = None,
-) -> Tensor:
-    r"""The information of noisy observations at a batch of points, in nats.
-
-    With the covariance C of what is unknown at the points X and the noise variances S it is
-    :math:`\tfrac{1}{2} \log\det(I + S^{-1/2} C S^{-1/2})`, which is never singular, less the same
-    for what would remain unknown; summed over the independent outputs.
-
-    Args:
-        model: The model, in eval mode.
-        X: Raw inputs, ``batch_shape x q x d``.
-        unknown: The covariance given the data.
-        remaining: The covariance if the function in question were known, too. Default: none.
-        counted: Which observations are made, ``batch_shape x q`` booleans. Default: all.
-
-    Returns:
-        The information, ``batch_shape``; of a model that holds samples of its hyper-parameters, of
-        each of these, ``batch_shape x S``.
-    """
-    inputs = model.model_inputs(X)
-    (train,) = model.conditioning().train_inputs
-    batch_shape = torch.broadcast_shapes(inputs.shape[:-2], train.shape[:-2])
-    inputs = inputs.expand(*batch_shape, *inputs.shape[-2:])
-    noise = model.observation_noise(inputs).expand(inputs.shape[:-1])
-    if counted is not None:
-        for _ in range(noise.dim() - counted.dim()):
-            counted = counted.unsqueeze(-2)
-        noise = noise.masked_fill(~counted, torch.inf)  # such an observation tells nothing
-    information = _log_sds(unknown(inputs), noise)
-    if remaining is not None:
-        information = information - _log_sds(remaining(inputs), noise)
-    return information.sum(-1) if model.num_outputs > 1 else information
+    return parts[other]
 
 
 def _log_sds(covariance: Tensor, noise: Tensor) -> Tensor:
-    """Half the log-determinant of noisy observations' covariance, in units of their noise."""
+    """Return half the log determinant of noisy observations, in units of their noise.
+
+    The covariance without noise is ``... x q x q``, the noise variances ``... x q`` (or 1).
+    """
     sd = noise.sqrt()
-    identity = torch.eye(sd.shape[-1], dtype=sd.dtype, device=sd.device)
-    matrix = covariance / (sd.unsqueeze(-1) * sd.unsqueeze(-2)) + identity
-    chol, info = torch.linalg.cholesky_ex(matrix)
-    if info.any():
-        # What rounding leaves of a covariance far above the noise. Elsewhere the eigenvalues are 1
-        # or more, and a nugget would be taken for information.
-        failed = (info > 0)[..., None, None]
-        sound = torch.linalg.cholesky(torch.where(failed, identity, matrix))
-        chol = torch.where(failed, cholesky(matrix)[0], sound)
-    log_sds: Tensor = chol.diagonal(dim1=-1, dim2=-2).log().sum(-1)
-    return log_sds
+    scaled = covariance / (sd.unsqueeze(-1) * sd.unsqueeze(-2))
+    one = torch.ones_like(scaled[..., 0])
+    chol = factor(scaled, one, one.bool())
+    return chol.diagonal(dim1=-1, dim2=-2).log().sum(-1)

@@ -39,8 +39,8 @@ class Keep:
         for some in X.split(_AT_ONCE):
             posterior = model.posterior(some.unsqueeze(-2), observation_noise=True)
             numbers = self.limits(posterior.rsample(torch.Size([_DRAWS])))
-            inside = (numbers <= 0).all(-1)  # draws x n x ...
-            found.append(inside.transpose(0, 1).flatten(1).double().mean(1))
+            inside = (numbers <= 0).all(-1)  # draws x n x 1
+            found.append(inside.double().mean((0, -1)))
         return torch.cat(found)
 
     def best_points(

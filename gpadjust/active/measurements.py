@@ -19,9 +19,8 @@ class Measurements:
 
     A record is one of
 
-    - ``{"asked": [x, ...], "parameters": {...}, "left_out": [x, ...]}``: points that are to be
-      measured; the parameters of the model that chose them, if one did; and what it left out, if
-      there are limits to keep;
+    - ``{"asked": [x, ...], "left_out": [x, ...]}``: points that are to be measured; and what was
+      left out, if there are limits to keep;
     - ``{"x": x, "y": y}``: a measurement, null where an output was not measured;
     - ``{"x": x, "failed": message}``: one that failed, whether it has a ``"y"`` or not;
     - ``{"withdrawn": [x, ...]}``: points that are not to be measured any more;
@@ -56,7 +55,6 @@ class Measurements:
         self.num_measured = 0
         self.num_outputs = num_outputs
         self._num_asks = 0
-        self._last_fit: tuple[int, Record] | None = None  # of how many points, and its result
         if data is not None:
             if not isinstance(data, tuple | list) or len(data) != 2:
                 raise TypeError(f"Expected data to be a pair (X, Y), got {data!r}.")
@@ -80,8 +78,6 @@ class Measurements:
             self._asked = torch.cat([self._asked, asked])
             self.left_out = torch.cat([self.left_out, self._points(record.get("left_out", []))])
             self._num_asks += 1
-            if record.get("parameters"):
-                self._last_fit = (len(self.X), record["parameters"])
         elif "withdrawn" in record:
             for x in self._points(record["withdrawn"]):
                 point = self._no_longer_pending(x)

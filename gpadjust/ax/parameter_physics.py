@@ -65,7 +65,7 @@ class ParameterPhysics:
         return self._path or import_path(self.physics)
 
     def names_of(self, parameters: Sequence[str]) -> tuple[str, ...]:
-        """The parameters that it reads, in its order.
+        """Return the parameters that it reads, in its order.
 
         Args:
             parameters: Those of the search space, in its order.
@@ -88,7 +88,7 @@ class ParameterPhysics:
         return tuple(parameters)
 
     def of(self, names: tuple[str, ...]) -> Physics:
-        """The same as a physics of rows with the columns ``names``, those of :meth:`names_of`.
+        """Return it as a physics of rows with the columns ``names``, those of :meth:`names_of`.
 
         It is made once, so that what is remembered of f_p outlives a model.
         """
@@ -101,11 +101,11 @@ class ParameterPhysics:
         return self._made[names]
 
     def __repr__(self) -> str:
-        """Its path, or the name of a physics without one."""
+        """Return its path, or the name of a physics without one."""
         return f"{type(self).__name__}({self.path or self.name!r})"
 
     def __eq__(self, other: object) -> bool:
-        """True if it is of the same physics."""
+        """Return whether it is of the same physics."""
         return isinstance(other, ParameterPhysics) and (
             self.physics is other.physics or (self.path is not None and self.path == other.path)
         )
@@ -115,11 +115,11 @@ class ParameterPhysics:
         return hash(self.name)
 
     def __deepcopy__(self, memo: Any) -> Self:
-        """Itself: Ax copies settings before each fit."""
+        """Return itself: Ax copies settings before each fit."""
         return self
 
     def _arguments(self) -> dict[str, Any]:
-        """The named arguments of a function, with their defaults."""
+        """Return the named arguments of a function, with their defaults."""
         if isinstance(self.physics, Module):
             return {}
         try:
@@ -131,7 +131,7 @@ class ParameterPhysics:
 
 
 def parts_of(physics: Any) -> list[Any]:
-    """The physics of a metric: several are a list, a tuple, or a dictionary; None is none."""
+    """Return the physics of a metric: a list, tuple or dictionary of several; none of None."""
     if isinstance(physics, Mapping):
         return [*physics.values()]
     if isinstance(physics, list | tuple):
@@ -140,7 +140,7 @@ def parts_of(physics: Any) -> list[Any]:
 
 
 def of_each(change: Callable[[Any], Any], physics: Any) -> Any:
-    """The physics of a metric, each changed, in the form in which they are given."""
+    """Return the physics of a metric, each changed, in the form in which they are given."""
     if isinstance(physics, Mapping):
         return {name: change(part) for name, part in physics.items()}
     if isinstance(physics, list | tuple):
@@ -149,5 +149,5 @@ def of_each(change: Callable[[Any], Any], physics: Any) -> Any:
 
 
 def _of_columns(function: Callable[..., Tensor], names: tuple[str, ...], X: Tensor) -> Tensor:
-    """A function of named arguments as one of rows."""
+    """Return a function of named arguments at rows."""
     return function(**dict(zip(names, X.unbind(-1), strict=True)))

@@ -18,7 +18,7 @@ from ax.generators.torch.botorch_modular.utils import ModelConfig
 
 from gpadjust.ax.parameter_physics import ParameterPhysics, of_each
 from gpadjust.ax.tell_physics import TellPhysics
-from gpadjust.models import CKA, TermsGP, ZeroMeanGP
+from gpadjust.core import CKA, GP, ZeroMeanGP
 
 TRANSFORMS: list[type[Transform]] = [*MBM_X_trans, Derelativize, StandardizeY, TellPhysics]
 """Ax's transforms of parameters; of metrics shift and scale alone, as others would bend what f_p
@@ -28,10 +28,10 @@ says (``Winsorize``, ``BilogY``); and ``TellPhysics``."""
 def generator_kwargs(
     physics: Mapping[str, Any],
     *,
-    model: type[TermsGP] | partial[TermsGP] = CKA,
+    model: type[GP] | partial[GP] = CKA,
     fit_options: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """The arguments of Ax's ``BOTORCH_MODULAR`` generator, for a ``GeneratorSpec`` of one's own.
+    """Return arguments of Ax's ``BOTORCH_MODULAR`` generator, for your own ``GeneratorSpec``.
 
     Args:
         physics: For each metric that has one, its physics, as :class:`ParameterPhysics` takes it;
@@ -76,11 +76,11 @@ def generator_kwargs(
 def generation_strategy(
     physics: Mapping[str, Any],
     *,
-    model: type[TermsGP] | partial[TermsGP] = CKA,
+    model: type[GP] | partial[GP] = CKA,
     fit_options: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> GenerationStrategy:
-    """Ax's default strategy, with models that adjust a physics in place of its own.
+    """Return Ax's default strategy, with models that adjust a physics in place of its own.
 
     Its first trials are Ax's, the center of the search space and Sobol points.
 
@@ -116,19 +116,17 @@ def generation_strategy(
     strategy = choose_generation_strategy(
         struct, model_config=ModelConfig(name=_class_of(model)[0].__name__)
     )
-    for node in strategy._nodes:
-        if node.name == "MBM":
-            node.generator_specs[0].generator_kwargs.update(own)
+    strategy.nodes_by_name["MBM"].generator_specs[0].generator_kwargs.update(own)
     return strategy
 
 
-def _class_of(model: Any) -> tuple[type[TermsGP], dict[str, Any]]:
-    """The class that a model factory is of, and the arguments that it adds."""
+def _class_of(model: Any) -> tuple[type[GP], dict[str, Any]]:
+    """Return the class of a model factory, and the arguments that it adds."""
     options: dict[str, Any] = {}
     factory = model
     if isinstance(model, partial) and not model.args:
         factory, options = model.func, dict(model.keywords)
-    if not isinstance(factory, type) or not issubclass(factory, TermsGP):
+    if not isinstance(factory, type) or not issubclass(factory, GP):
         raise TypeError(
             "Expected model as a class of models, such as CKA, or functools.partial of one with "
             f"keyword arguments, as Ax makes models of classes, got {model!r}."

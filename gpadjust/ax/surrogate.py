@@ -20,15 +20,15 @@ from botorch.utils.types import DEFAULT
 from gpadjust.ax.parameter_physics import ParameterPhysics, parts_of
 from gpadjust.ax.tell_physics import TellPhysics
 from gpadjust.ax.units import PhysicsInUnits
-from gpadjust.inference import fit
-from gpadjust.models import (
+from gpadjust.core import (
     CKA,
+    GP,
     RRA,
     CalibratedPhysics,
     PhysicsMeanGP,
     ScaleGP,
-    TermsGP,
     ZeroMeanGP,
+    fit,
 )
 
 _PARTS = (
@@ -41,8 +41,8 @@ _PARTS = (
 
 def register() -> None:
     """Enter functions, models, transform, node and physics where Ax looks for them."""
-    submodel_input_constructor.register(TermsGP)(model_inputs)
-    fit_botorch_model.register(TermsGP)(fit_model)
+    submodel_input_constructor.register(GP)(model_inputs)
+    fit_botorch_model.register(GP)(fit_model)
     for model in (CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP, CalibratedPhysics):
         register_model(model)
     register_transform(TellPhysics)
@@ -51,19 +51,19 @@ def register() -> None:
 
 
 def model_inputs(
-    botorch_model_class: type[TermsGP],
+    botorch_model_class: type[GP],
     model_config: ModelConfig,
     dataset: SupervisedDataset,
     search_space_digest: SearchSpaceDigest,
     surrogate: Surrogate,
 ) -> dict[str, Any]:
-    """The arguments of a model: the data as Ax transformed them, and ``model_options``.
+    """Return the arguments of a model: the data as Ax transformed them, and ``model_options``.
 
     The models scale inputs and targets by themselves, so that Ax's default input transform is left
-    out. Other arguments are as Ax says.
+    out. Other arguments are as of Ax.
 
     Raises:
-        ValueError: If a physics was not told of Ax's transforms, or if something is asked for that
+        ValueError: If a physics is not behind ``TellPhysics``, or if something is asked for that
             these models do not have.
     """
     name = botorch_model_class.__name__
@@ -93,16 +93,16 @@ def model_inputs(
                 "'transforms': gpadjust.ax.TRANSFORMS}; or let "
                 "gpadjust.ax.generation_strategy({'the metric': f_p}) do it."
             )
-    return botorch_model_class.construct_inputs(dataset, **model_config.model_options)
+    return {**botorch_model_class.construct_inputs(dataset), **model_config.model_options}
 
 
-def fit_model(model: TermsGP, mll_class: Any, mll_options: dict[str, Any] | None = None) -> None:
+def fit_model(model: GP, mll_class: Any, mll_options: dict[str, Any] | None = None) -> None:
     """Fit a model by :func:`gpadjust.fit`, whose options are ``mll_options``."""
     fit(model, **(mll_options or {}))
 
 
 def as_dict(physics: ParameterPhysics) -> dict[str, Any]:
-    """A physics as Ax saves it: by its import path.
+    """Return a physics as Ax saves it: by its import path.
 
     Raises:
         JSONEncodeError: If it has none.

@@ -39,7 +39,7 @@ _NEXT_TO = 1e-6  # of a whole number
 
 
 class Units:
-    """From what a model in Ax sees to the units of the search space, and back for the metrics.
+    """Units of the search space from a model's inputs in Ax, and a model's units of the metrics.
 
     It is differentiable but for coded choices, and holds plain values, not Ax's objects, so
     that models can be copied and pickled.
@@ -85,7 +85,7 @@ class Units:
         self._forth = [_FORTH[type(t)](t) for t in transforms if type(t) in _FORTH]
 
     def raw(self, X: Tensor, names: Sequence[str]) -> Tensor:
-        """Parameters in the units of the search space.
+        """Return parameters in the units of the search space.
 
         Args:
             X: Inputs of the model, ``N x d'``.
@@ -110,7 +110,7 @@ class Units:
         return torch.stack([self._within(name, columns[name].expand(len(X))) for name in names], -1)
 
     def _within(self, name: str, values: Tensor) -> Tensor:
-        """The nearest values that a parameter can have; their derivative is kept."""
+        """Return the nearest values that a parameter can have, with their derivative."""
         near = values.detach()
         if name in self.choices:
             listed = self.choices[name].to(near)
@@ -122,17 +122,10 @@ class Units:
         return near + (values - values.detach())
 
     def metric(self, Y: Tensor, metric: str) -> Tensor:
-        """Values of a metric, in its units, as the model is to see them."""
+        """Return values of a metric in its units as the model gets them."""
         for steps in self._forth:
             if metric in steps:
-                Y = steps[metric][0](Y)
-        return Y
-
-    def of_metric(self, Y: Tensor, metric: str) -> Tensor:
-        """The reverse; what was clipped stays so."""
-        for steps in reversed(self._forth):
-            if metric in steps:
-                Y = steps[metric][1](Y)
+                Y = steps[metric](Y)
         return Y
 
 
@@ -156,7 +149,7 @@ class PhysicsInUnits(Physics):
         self.inner = inner
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """The physics in the search space's units, and what the transforms make of it.
+        """Return the physics in the search space's units, transformed as its metric is.
 
         Args:
             X: ``N x d'``, as the model sees it.
@@ -177,10 +170,6 @@ class PhysicsInUnits(Physics):
             )
         return self.units.metric(Y, self.metric)
 
-    def in_user_units(self, values: Tensor) -> Tensor:
-        """Return values in the units of the metric."""
-        return self.units.of_metric(values, self.metric)
-
 
 def _change(function: Change, name: str, columns: Columns) -> None:
     if name in columns:
@@ -193,7 +182,7 @@ def _constant(name: str, value: float, columns: Columns) -> None:
 
 
 def _value_of(name: str, values: Sequence[Any], one_hot: Sequence[str], columns: Columns) -> None:
-    """A choice, of its number or of a column for each value, of which the largest counts."""
+    """Set a choice, of its number or of a column for each value, of which the largest counts."""
     if one_hot:
         index = torch.stack([columns.pop(each) for each in one_hot], dim=-1).argmax(-1)
     else:
@@ -203,12 +192,12 @@ def _value_of(name: str, values: Sequence[Any], one_hot: Sequence[str], columns:
 
 
 def _are_numbers(values: Sequence[Any]) -> bool:
-    """True if values of a parameter are numbers, as a physics reads them."""
+    """Return whether values of a parameter are numbers, as a physics reads them."""
     return all(isinstance(value, bool | int | float) for value in values)
 
 
-def _bent(bend: Change, bound: float, Y: Tensor) -> Tensor:
-    return bound + (Y - bound).sign() * bend((Y - bound).abs())
+def _bent(bound: float, Y: Tensor) -> Tensor:
+    return bound + (Y - bound).sign() * (Y - bound).abs().log1p()
 
 
 def _scaled(mean: float, sd: float, Y: Tensor) -> Tensor:
@@ -217,10 +206,6 @@ def _scaled(mean: float, sd: float, Y: Tensor) -> Tensor:
 
 def _unscaled(mean: float, sd: float, Y: Tensor) -> Tensor:
     return mean + sd * Y
-
-
-def _as_it_is(Y: Tensor) -> Tensor:
-    return Y
 
 
 def _fixed(t: RemoveFixed) -> list[Step]:
@@ -252,21 +237,18 @@ _BACK: Mapping[type[Transform], Callable[[Any], list[Step]]] = {
     RemoveFixed: _fixed,
 }
 """By transform, the steps that undo it."""
-_FORTH: Mapping[type[Transform], Callable[[Any], dict[str, tuple[Change, Change]]]] = {
+_FORTH: Mapping[type[Transform], Callable[[Any], dict[str, Change]]] = {
     Winsorize: lambda t: {
-        metric: (partial(torch.clamp, min=low, max=high), _as_it_is)
-        for metric, (low, high) in t.cutoffs.items()
+        metric: partial(torch.clamp, min=low, max=high) for metric, (low, high) in t.cutoffs.items()
     },
     BilogY: lambda t: {
-        metric: (partial(_bent, torch.log1p, bound), partial(_bent, torch.expm1, bound))
-        for metric, bound in t.metric_to_bound.items()
+        metric: partial(_bent, bound) for metric, bound in t.metric_to_bound.items()
     },
     StandardizeY: lambda t: {
-        metric: (partial(_scaled, float(mean), sd), partial(_unscaled, float(mean), sd))
+        metric: partial(_scaled, float(mean), float(t.Ystd[metric]))
         for metric, mean in t.Ymean.items()
-        for sd in [float(t.Ystd[metric])]
     },
 }
-"""By transform, what it does to a metric, and the reverse."""
+"""By transform, its effect on a metric."""
 # MapKeyToFloat adds a parameter, which the physics does not read, if there are learning curves.
 _NEITHER = (FillMissingParameters, Cast, IntToFloat, MapKeyToFloat, Derelativize)

@@ -13,14 +13,13 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from gpadjust.checks import check_kind, checked_bounds, checked_number
+from gpadjust.checks import check_kind, checked_bounds, checked_number, seeded
 from gpadjust.control.constraints import margins
 from gpadjust.control.planner import Plan, Planner
 from gpadjust.control.search import CrossEntropy
 from gpadjust.control.state_filter import Estimate, StateFilter
 from gpadjust.control.step_guard import check_observation
 from gpadjust.control.task import Task
-from gpadjust.models.sampled_functions import seeded
 
 _SHORTEST, _LONGEST = 8, 30  # steps ahead
 _SEGMENT = 1.5  # horizons of a step

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from gpadjust.checks import seeded
 from gpadjust.control.search import random_sequences
 from gpadjust.dynamics import Dynamics
 from gpadjust.dynamics.particles import step_or_nan
-from gpadjust.models.sampled_functions import seeded
 from gpadjust.physics import PhysicsError
 
 _EPISODES = 64

@@ -16,7 +16,6 @@ from gpadjust.control.reach import reach
 from gpadjust.control.task import Task
 from gpadjust.dynamics import Dynamics, LearnedDynamics, Trajectories
 from gpadjust.dynamics.free_run import typical_change
-from gpadjust.models import TermsModel
 from gpadjust.physics import PhysicsError
 from gpadjust.states import StateSpec
 from gpadjust.validation.trust import trust
@@ -311,7 +310,7 @@ def _scores(
     found |= {f"rmse/{name}": float(e) for name, e in zip(names, score.rmse, strict=True)}
     if isinstance(dynamics, LearnedDynamics):
         model, inputs = dynamics.model, dynamics.targets.inputs(new.states, new.actions)
-        if isinstance(model, TermsModel) and model.rho_names:
+        if any(term.physics is not None for term in model.terms):
             found["overrides"] = float(trust(model, inputs).data.mean())
     possible = [k for k in horizons if k <= new.longest]
     if not possible:

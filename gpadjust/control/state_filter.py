@@ -8,11 +8,11 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor
 
+from gpadjust.checks import seeded
 from gpadjust.control.rollouts import Rollouts
 from gpadjust.control.search import random_sequences
 from gpadjust.control.task import Task
 from gpadjust.dynamics.linearised import derivatives, linearised
-from gpadjust.models.sampled_functions import seeded
 from gpadjust.records.kalman import Array, measure
 
 _SHARE = 0.1  # of what changes in a step: sd of noises, as long as nothing is known of them

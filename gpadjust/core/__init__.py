@@ -4,7 +4,7 @@ Read it in this order: ``unknowns``, ``kernels``, ``terms``, ``noise``, ``gaussi
 ``fitting``, ``model``, ``structures``.
 """
 
-from gpadjust.core.fitting import FitResult, fit
+from gpadjust.core.fitting import FitResult, SamplingWarning, fit
 from gpadjust.core.functions import Functions
 from gpadjust.core.gaussian import Prediction
 from gpadjust.core.kernels import (
@@ -37,6 +37,6 @@ from gpadjust.core.unknowns import Choice, LogNormal, Row
 __all__ = [
     "CKA", "GP", "MATERN12", "MATERN32", "MATERN52", "RBF", "RRA", "CalibratedPhysics", "Choice",
     "FitResult", "Fourier", "Functions", "Kernel", "KnownNoise", "LogNormal", "MixturePosterior",
-    "Noise", "OfGPyTorch", "PhysicsMeanGP", "Prediction", "Profile", "Row", "ScaleGP",
-    "StackedGP", "Stationary", "Term", "ZeroMeanGP", "fit", "load", "save",
+    "Noise", "OfGPyTorch", "PhysicsMeanGP", "Prediction", "Profile", "Row", "SamplingWarning",
+    "ScaleGP", "StackedGP", "Stationary", "Term", "ZeroMeanGP", "fit", "load", "save",
 ]  # fmt: skip

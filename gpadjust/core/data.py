@@ -180,22 +180,22 @@ def _not_numbers(name: str, what: str) -> str:
     return f"Expected {name} to contain numbers only; found {what}: {_NO_NUMBERS[what][2]}."
 
 
-def variances_of(values: ArrayLike, Y: Tensor) -> Tensor:
+def variances_of(values: ArrayLike, Y: Tensor, name: str = "train_Yvar") -> Tensor:
     """Return known variances of the shape of ``Y``; their mean where there is no observation."""
     if isinstance(values, int | float | list | tuple):
         values = torch.tensor(values, dtype=torch.float64, device=Y.device)
-    variances, m = as_tensor(values, "train_Yvar"), Y.shape[-1]
+    variances, m = as_tensor(values, name), Y.shape[-1]
     if variances.shape != Y.shape and variances.shape not in ((), (1,), (m,)):
         raise ValueError(
-            f"Expected train_Yvar (known variances) as one number, {m} (one for each output), or "
-            f"of the targets' shape {tuple(Y.shape)}; found {tuple(variances.shape)}."
+            f"Expected {name} (known variances) as one number, {m} (one for each column), or of the "
+            f"data's shape {tuple(Y.shape)}; found {tuple(variances.shape)}."
         )
     variances = variances.expand(Y.shape).masked_fill(Y.isnan(), torch.nan)
     variances = variances.where(~Y.isnan(), variances.nanmean(-2, keepdim=True))
     if not variances.isfinite().all():
-        check_finite("train_Yvar", variances)
+        check_finite(name, variances)
     if (variances < 0).any():
-        raise ValueError(f"Expected variances in train_Yvar; found {variances.min():.3g}.")
+        raise ValueError(f"Expected variances in {name}; found {variances.min():.3g}.")
     return variances
 
 

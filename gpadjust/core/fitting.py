@@ -35,6 +35,10 @@ _NEAR, _LESS_LIKELY = 0.3, 5.0  # coordinates of one end; log density of one tha
 _MOVED = 0.35  # predicted standard deviations by which another seed may move the mean
 
 
+class SamplingWarning(UserWarning):
+    """Another seed would move predictions by much."""
+
+
 @dataclass(frozen=True)
 class FitResult:
     """What :func:`fit` has found; its text is what to read first.
@@ -42,7 +46,8 @@ class FitResult:
     Args:
         method: ``"bayes"`` or ``"map"``.
         log_evidence: The log probability of the targets of each output, ``m``, in their units (of
-            outputs that share unknown numbers, of all together); None of a point fit.
+            outputs that share unknown numbers, of all together); None of a point fit, a lower bound
+            of many rows.
         probabilities: The probability of each nested model by its text, for each output.
         effective: The least number of starting draws that count, of all outputs.
         error: By how many predicted standard deviations another seed would move the mean at a
@@ -96,7 +101,7 @@ def fit(
         seed: Seed.
 
     Warns:
-        UserWarning: If another seed would move predictions by much.
+        SamplingWarning: If another seed would move predictions by much.
 
     Raises:
         ValueError: If the method or number of draws is another one, or the data are a batch.
@@ -117,9 +122,11 @@ def fit(
     if model.data.Y.dim() > 2:
         batch = tuple(model.batch_shape)
         raise ValueError(f"Expected a model of one data set; found fantasies, a batch {batch}.")
+    if (itself := model.fit_itself(method, num_draws, seed)) is not None:
+        return itself
     model.noise = model.noise.learnt(model, partial(_roughly_fitted, model, seed))
     if method == "map":
-        model.set_draws(_modes(model, 0, seed, is_precise=True)[:1])
+        model.set_draws(modes(model, 0, seed, is_precise=True)[:1])
         return FitResult(method)
     number, kept = _default_numbers(model) if num_draws is None else (num_draws, num_draws // 4)
     sampled = _sampled(model, number, seed)
@@ -137,6 +144,7 @@ def fit(
         warnings.warn(
             f"Predictions depend on the seed: another one would move them by {error:.2f} of their "
             f"standard deviation. Draw more: fit(model, num_draws={4 * number}).",
+            SamplingWarning,
             stacklevel=2,
         )
     return result
@@ -145,13 +153,13 @@ def fit(
 def _roughly_fitted(model: GP, seed: int, noise: Noise) -> GP:
     """Return a copy of a model with another noise, at its most likely numbers."""
     copy = model.with_noise(noise)
-    copy.set_draws(_modes(copy, 0, seed)[:1])
+    copy.set_draws(modes(copy, 0, seed)[:1])
     return copy
 
 
 def _default_numbers(model: GP) -> tuple[int, int]:
     """Return how many draws are made, and over how many of them predictions average."""
-    n, is_shared = len(model.data.Y), bool(model.table.shared)
+    n, is_shared = model.targets().shape[-1], bool(model.table.shared)
     if n <= _SMALL:
         return 256 if is_shared else 80, 16
     if n <= _MEDIUM:
@@ -161,7 +169,7 @@ def _default_numbers(model: GP) -> tuple[int, int]:
 
 def _target(model: GP, choice: int) -> LogLikelihood:
     """Return the log likelihood of a nested model, of so many draws at once as caches hold."""
-    n, m = model.data.Y.shape
+    m, n = model.targets().shape
     size = max(1, _ENTRIES // (n * n * m))
 
     def log_likelihood(u: Tensor, with_gradient: bool = True) -> tuple[Tensor, Tensor]:
@@ -178,7 +186,7 @@ def _sampled(model: GP, number: int, seed: int) -> dict[int, Draws]:
 
     The whole model comes first; of the others those go on that may be as likely as a thousandth.
     """
-    n, prior = len(model.data.Y), model.table.log_prior
+    n, prior = model.targets().shape[-1], model.table.log_prior
     starts: Mapping[int, Normal | None] = dict.fromkeys(range(len(prior)))
     if n > _SMALL:
         starts = _starts(model, seed)
@@ -206,7 +214,7 @@ def _starts(model: GP, seed: int) -> dict[int, Normal]:
     generator = torch.Generator().manual_seed(seed)
     rows = torch.randperm(n, generator=generator)[:_SMALL].sort().values
     some = model.subset_rows(rows) if n > 2 * _SMALL else None
-    ends = {k: _modes(some or model, k, seed) for k in choices}
+    ends = {k: modes(some or model, k, seed) for k in choices}
     if some is not None:
         evidence = {k: around_mode(_target(some, k), several[0])[1] for k, several in ends.items()}
         choices = _likely(model, evidence)
@@ -216,7 +224,7 @@ def _starts(model: GP, seed: int) -> dict[int, Normal]:
     return {k: starts[k][0] for k in likely}
 
 
-def _modes(model: GP, choice: int, seed: int, is_precise: bool = False) -> Tensor:
+def modes(model: GP, choice: int, seed: int, is_precise: bool = False) -> Tensor:
     """Return the most likely end of some searches, or two that are nearly as likely, ``2 x B x P``.
 
     Searches begin with the most likely of some draws from the prior, and the medians of the priors.

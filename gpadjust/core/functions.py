@@ -34,7 +34,8 @@ class Functions(torch.nn.Module):
             raise ValueError(f"Expected an even number of features; found {num_features}.")
         generator = torch.Generator().manual_seed(seed)
         rows = torch.randperm(len(model.u), generator=generator)
-        rows = rows[torch.arange(number) % len(model.u)]
+        if len(rows) > 1:  # a single draw is conditioned once
+            rows = rows[torch.arange(number) % len(rows)]
         self.model = model.subset_draws(rows).requires_grad_(False)
         self.number = number
         self.data = self.model.conditioning()
@@ -43,19 +44,15 @@ class Functions(torch.nn.Module):
         self.weights: dict[str, Tensor] = {}
         for term in f.terms:
             if term.kernel is not None:
-                features = term.kernel.features(f.own(term), num_features, generator)
+                own = {n: v.expand(number, *v.shape[1:]) for n, v in f.own(term).items()}
+                features = term.kernel.features(own, num_features, generator)
                 size = features(f.x).shape[-1]
                 self.features[term.name] = features
                 self.weights[term.name] = standard_normal((*shape, size), generator, f.x)
             if term.constant is not None:
                 weight = standard_normal((*shape, 1), generator, f.x)
                 self.weights[f"{term.name}.constant"] = weight
-        # The nugget of the factor is noise, too.
-        total = self.data.chol.square().sum(-1) - f.variance()
-        noise = total.maximum(self.data.noise).sqrt()
-        noise = noise * standard_normal(noise.shape, generator, f.x)
-        away = (self.data.targets - self._prior(f) - noise).nan_to_num()
-        self.update = self.data.solve(away * self.data.observed)
+        self.update = self.data.update(self._prior(f), generator)
 
     def forward(self, X: Tensor) -> Tensor:
         """Return the values ``k x ... x q x m`` of all functions at ``... x q x d``."""
@@ -76,12 +73,15 @@ class Functions(torch.nn.Module):
         """Return the functions at the places of a sum, ``... x k x q x m``."""
         cross = f.cross(self.data.train) * self.data.observed.unsqueeze(-2)
         values = self._prior(f) + (cross @ self.update.unsqueeze(-1)).squeeze(-1)
-        return (values * self.model.unit).mT
+        Y: Tensor = self.model.off_gaussian_scale((values * self.model.unit).mT)
+        return Y
 
     def _prior(self, f: WeightedSum) -> Tensor:
         """Return the functions from the prior, ``... x k x m x q``."""
         total = f.mean
         for term in f.terms:
+            if term.name not in f.weights:
+                continue
             value: Tensor | float = 0.0
             if term.name in self.features:
                 phi = self.features[term.name](f.x)
@@ -90,7 +90,7 @@ class Functions(torch.nn.Module):
             if term.constant is not None:
                 sd = f.values[f"{term.name}.constant"].sqrt()
                 value = value + sd * self.weights[f"{term.name}.constant"]
-            weight = f.weights.get(term.name)
+            weight = f.weights[term.name]
             total = total + (value if weight is None else weight * value)
         return total
 

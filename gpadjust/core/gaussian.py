@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.core.terms import WeightedSum
+from gpadjust.core.unknowns import Values, standard_normal
 
 _EPS = torch.finfo(torch.float64).eps
 _NOISY = 1e-8  # of the largest variance given earlier rows: above, the inverse factor is exact
@@ -78,6 +79,30 @@ def log_likelihood(
     return Likelihood(value, alpha.squeeze(-1), D)
 
 
+class Evidence(NamedTuple):
+    """The log likelihood of observations of a weighted sum, ``S x m``, and its derivatives."""
+
+    value: Tensor
+    by: Values  # by numbers of kernels, and by the weights of terms at the inputs
+    by_mean: Tensor  # S x m x n
+    by_variance: Tensor  # by the variances of the noise, S x m x n
+
+
+def evidence(
+    train: WeightedSum, residual: Tensor, noise: Tensor, observed: Tensor, with_gradient: bool
+) -> Evidence:
+    """Return the evidence of residuals ``S x m x n`` of a sum; 0 where they are not observed."""
+    if not with_gradient:
+        K = train.cross(train).expand(*residual.shape, residual.shape[-1])
+        found = log_likelihood(residual, K, noise, observed, False)
+        return Evidence(found.value, {}, residual, residual)
+    K, pull_back = train.with_pull_back()
+    K = K.expand(*residual.shape, residual.shape[-1])
+    found = log_likelihood(residual, K, noise, observed)
+    by_variance = found.by_covariance.diagonal(dim1=-1, dim2=-2)
+    return Evidence(found.value, pull_back(found.by_covariance), found.by_mean, by_variance)
+
+
 class Conditioning:
     r"""The posterior of weighted sums, given noisy observations of one.
 
@@ -98,10 +123,10 @@ class Conditioning:
         self, train: WeightedSum, noise: Tensor, targets: Tensor, old: Conditioning | None = None
     ) -> None:
         self.train, self.targets = train, targets
-        late = train if old is None else train.rows_from(old.chol.shape[-1])
+        late = train if old is None else train.of_rows(slice(old.chol.shape[-1], None))
         K = late.cross(late)
-        batch = noise.shape[:-1] if old is None else old.chol.shape[:-2]
-        lead = torch.broadcast_shapes(K.shape[:-2], batch)
+        batch = () if old is None else old.chol.shape[:-2]
+        lead = torch.broadcast_shapes(K.shape[:-2], noise.shape[:-1], batch)
         self.noise = noise.expand(*lead, train.x.shape[-2])
         observed = ~targets.isnan()
         # Fantasies of the same points share a factor, if the same ones are missing.
@@ -131,7 +156,7 @@ class Conditioning:
         lead = torch.broadcast_shapes(self.noise.shape[:-1], self.observed.shape[:-1])
         seen = self.observed[..., n:]
         K21 = (K21 * seen.unsqueeze(-1) * old.observed.unsqueeze(-2)).expand(*lead, -1, n)
-        B = old._white(K21)
+        B = old.white(K21)
         late_noise = self.noise[..., n:]
         # The nugget of the new rows is that of their own variances.
         variance = K22.diagonal(dim1=-1, dim2=-2) + late_noise
@@ -160,7 +185,7 @@ class Conditioning:
             self._inverse = _inverse(self.chol)
         return self._inverse
 
-    def _white(self, cross: Tensor) -> Tensor:
+    def white(self, cross: Tensor) -> Tensor:
         """Return :math:`k L^{-T}`: a product, or without noise a solve, which is exacter."""
         if self._is_noisy:
             return cross @ self.inverse_factor().mT
@@ -176,7 +201,7 @@ class Conditioning:
     def marginals(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Return means and variances at each point, ``... x S x m x q``."""
         mean, cross = self.mean(sought)
-        white = self._white(cross)
+        white = self.white(cross)
         prior = sought.variance()
         variance = prior - white.square().sum(-1)
         # Not below the rounding errors of the difference.
@@ -185,12 +210,23 @@ class Conditioning:
     def joint(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Return means ``... x S x m x q``, and covariances ``... x S x m x q x q``."""
         mean, cross = self.mean(sought)
-        white = self._white(cross)
+        white = self.white(cross)
         prior = sought.cross(sought)
         K = prior - white @ white.mT
         least = 4 * self.chol.shape[-1] * _EPS * prior.diagonal(dim1=-1, dim2=-2)
         raised = (least - K.diagonal(dim1=-1, dim2=-2)).clamp_min(0.0)
         return mean, add_noise(K, raised)
+
+    def update(self, prior: Tensor, generator: torch.Generator) -> Tensor:
+        """Return what makes functions from the prior, with these values, meet the observations.
+
+        It weighs the covariances with the training inputs.
+        """
+        # The nugget of the factor is noise, too.
+        total = self.chol.square().sum(-1) - self.train.variance()
+        sd = total.maximum(self.noise).sqrt()
+        noise = sd * standard_normal(prior.shape, generator, prior)
+        return self.solve((self.targets - prior - noise).nan_to_num() * self.observed)
 
     def left_out(self) -> tuple[Tensor, Tensor]:
         r"""Return means and variances of each observation given all others, noise included.
@@ -243,15 +279,24 @@ class Marginals(NamedTuple):
         return Prediction(center, variances.mean(DRAWS) + between)
 
     def quantile(self, level: float) -> Tensor:
-        """Return the quantiles ``... x q x m`` of a level, by bisection."""
-        means, sd = self.means, self._sd
-        ends = means + torch.special.ndtri(torch.tensor(level).to(means)) * sd
-        low, high = ends.amin(DRAWS), ends.amax(DRAWS)
-        for _ in range(50 if means.shape[DRAWS] > 1 else 0):
+        r"""Return the quantiles ``... x q x m`` of a level, by bisection.
+
+        Their gradient is that of :math:`F(q) = p`: :math:`dq = -dF / F'(q)`.
+        """
+        ends = self.means + torch.special.ndtri(torch.tensor(level).to(self.means)) * self._sd
+        if self.means.shape[DRAWS] == 1:
+            return ends.squeeze(DRAWS)
+        with torch.no_grad():
+            low, high = ends.amin(DRAWS), ends.amax(DRAWS)
+            for _ in range(50):
+                middle = (low + high) / 2
+                below = self.probability(middle) < level
+                low, high = torch.where(below, middle, low), torch.where(below, high, middle)
             middle = (low + high) / 2
-            below = self.probability(middle) < level
-            low, high = torch.where(below, middle, low), torch.where(below, high, middle)
-        return (low + high) / 2
+        if not ends.requires_grad:
+            return middle
+        below, slope = self.probability(middle), self.log_density(middle).exp().detach()
+        return middle - (below - below.detach()) / slope.clamp_min(1e-300)
 
     def probability(self, Y: Tensor) -> Tensor:
         """Return the probability of values below ``Y``, ``... x q x m``."""

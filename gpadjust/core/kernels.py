@@ -33,6 +33,9 @@ class Kernel(ABC):
     ``... x S x m x n x n'``: draws and outputs are the last two dimensions before the points.
     """
 
+    has_constant = True
+    """Whether a term may add an unknown constant to the process."""
+
     @abstractmethod
     def rows(self, x: Tensor, num_outputs: int) -> list[Row]:
         """Return the unknown parameters, for training inputs ``n x d``."""
@@ -43,6 +46,10 @@ class Kernel(ABC):
 
     def of_data(self, data: Any) -> Kernel:
         """Return the kernel for a model's data, whose columns have names; itself by default."""
+        return self
+
+    def of_term(self, outputscale: LogNormal) -> Kernel:
+        """Return the kernel for a term, with its prior variance if it has none; or itself."""
         return self
 
     def variance(self, own: Values, x: Tensor) -> Tensor:
@@ -409,4 +416,6 @@ def as_kernel(kernel: Any, outputscale: LogNormal = DELTA) -> Kernel:
     """Return a kernel of this library: itself, a wrapped one of GPyTorch, or the default RBF."""
     if kernel is None:
         return Stationary(RBF, outputscale)
-    return kernel if isinstance(kernel, Kernel) else OfGPyTorch(kernel, outputscale)
+    if isinstance(kernel, Kernel):
+        return kernel.of_term(outputscale)
+    return OfGPyTorch(kernel, outputscale)

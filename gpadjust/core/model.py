@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import gpytorch
 import torch
@@ -12,7 +12,6 @@ from botorch.acquisition.objective import PosteriorTransform, ScalarizedPosterio
 from botorch.models import SingleTaskGP
 from botorch.models.model import FantasizeMixin, Model
 from botorch.models.transforms.outcome import Standardize
-from botorch.posteriors import Posterior
 from botorch.sampling.pathwise.posterior_samplers import DrawMatheronPaths
 from botorch.settings import validate_input_scaling
 from gpytorch.distributions import MultivariateNormal
@@ -26,11 +25,11 @@ from gpadjust.core.data import ArrayLike, Data, appended, as_given, as_tensor, u
 from gpadjust.core.functions import Functions, Paths
 from gpadjust.core.gaussian import (
     Conditioning,
-    Likelihood,
+    Evidence,
     Marginals,
     Prediction,
     add_noise,
-    log_likelihood,
+    evidence,
 )
 from gpadjust.core.kernels import DELTA, RHO, as_kernel
 from gpadjust.core.noise import KnownNoise, Noise
@@ -45,8 +44,11 @@ from gpadjust.core.views import (
     likelihood_view,
     squeezed,
 )
-from gpadjust.physics import Physics, Unknown, as_physics
+from gpadjust.physics import Physics, PhysicsError, Unknown, as_physics
 from gpadjust.physics.parameters import PhysicsParameters
+
+if TYPE_CHECKING:
+    from gpadjust.core.fitting import FitResult
 
 Slopes = dict[str, list[Tensor]]
 """Derivatives of each physics by the coordinate of each unknown parameter, ``S x m x n``."""
@@ -100,18 +102,22 @@ class Predictive(Model, FantasizeMixin):
         """Return the distributions of Gaussian components ``... x S x q x m``."""
         return Marginals(means, variances)
 
+    def posterior_of(self, mixture: MixturePosterior, outputs: list[int] | slice) -> Any:
+        """Return the posterior of some outputs of a mixture where the model is Gaussian."""
+        return mixture
+
     def posterior(
         self,
         X: ArrayLike,
         output_indices: list[int] | None = None,
         observation_noise: bool | Tensor = False,
         posterior_transform: PosteriorTransform | None = None,
-    ) -> Posterior:
+    ) -> Any:
         """Return the joint posterior at ``X``, ``... x q x d``, as BoTorch asks for it."""
         self.eval()
         is_part = output_indices is not None
         outputs = self.checked_outputs(output_indices) if is_part else slice(None)
-        posterior = self.mixture(X, outputs, observation_noise)
+        posterior = self.posterior_of(self.mixture(X, outputs, observation_noise), outputs)
         if posterior_transform is None:
             return posterior
         if isinstance(posterior_transform, ScalarizedPosteriorTransform):
@@ -184,6 +190,7 @@ class GP(gpytorch.models.GP, Predictive):
             )
         self.data = Data.of(train_X, train_Y, train_Yvar, input_transform)
         X, Y = self.data.X, self.data.Y
+        self.read_scale(Y)
         m = Y.shape[-1]
         self.rows_of_fit = len(Y)  # later ones are conditioned on, in the unit of these
         self.physics = [as_physics(each) for each in physics]
@@ -204,13 +211,8 @@ class GP(gpytorch.models.GP, Predictive):
         self._unknowns = _unknowns_of(self.physics) if has_unknowns else {}
         self._f_train: list[Tensor] = []
         self.unit = Y.new_ones(1, 1)  # the user's, until the prior mean is known
-        places = self.places(X, {f"physics.{n}": Y.new_zeros(1, 1) for n in self._unknowns})
-        for own, f in zip(self.physics, places.f, strict=True):
-            if f.shape[-2] != m:
-                raise ValueError(
-                    f"Expected {m} outputs of physics {own.name!r}, as many as of train_Y; found "
-                    f"{f.shape[-2]}."
-                )
+        with torch.no_grad():  # a physics may have parameters, as a network does
+            places = self.places(X, {f"physics.{n}": Y.new_zeros(1, 1) for n in self._unknowns})
         mean = TermSum(terms, places.f, self.unit).mean({}, places)
         self.unit = unit_of(self.on_gaussian_scale(Y), mean[0].mT)
         self._f_train = [f / self.unit for f in places.f]
@@ -222,7 +224,7 @@ class GP(gpytorch.models.GP, Predictive):
         if self.data.Yvar is not None:
             known = KnownNoise(self.noise_in_units(Y, self.data.Yvar))
             noise = known if noise is None else noise.with_known(known)
-        self.noise = Noise() if noise is None else noise
+        self.noise = (Noise() if noise is None else noise).of_terms(self.term_sum)
         rows = self.term_sum.rows(self.data.kernel_inputs(X), m) + self.noise.rows(Y)
         rows += [Row(f"physics.{n}", Y.new_zeros(1), is_shared=True) for n in self._unknowns]
         self.table = Table(rows, m, choices)
@@ -293,27 +295,20 @@ class GP(gpytorch.models.GP, Predictive):
         It is in units of the targets, minus infinity where it or f_p is not finite. The gradient is
         zero if it is not asked for.
         """
-        values, y = self.table.values(u), self._targets()
+        values, y = self.table.values(u), self.targets()
         f_slopes: Slopes = {}
         places = self.places(self.data.X, values, with_physics=not self._unknowns)
         if self._unknowns:
             f, f_slopes = self._physics_with_slopes(values, with_gradient)
             places = places._replace(f=f)
         total = self.term_sum.at(values, places)
-        if with_gradient:
-            K, pull_back = total.with_pull_back()
-        else:
-            K = total.cross(total)
         noise = self.noise.variance(values, places, True)
-        shape, observed = (len(u), *y.shape), ~y.isnan()
-        residual, K = (y - total.mean).expand(shape), K.expand(*shape, shape[-1])
-        residual = residual.nan_to_num() * observed
-        found = log_likelihood(residual, K, noise, observed, with_gradient)
+        observed = ~y.isnan()
+        residual = (y - total.mean).expand(len(u), *y.shape).nan_to_num() * observed
+        found = self.evidence(total, residual, noise, observed, with_gradient)
         value, gradient = found.value, torch.zeros_like(u)
         if with_gradient:
-            by = pull_back(found.by_covariance)
-            by_variance = found.by_covariance.diagonal(dim1=-1, dim2=-2)
-            by |= self.noise.pull_back(values, places, by_variance)
+            by = found.by | self.noise.pull_back(values, places, found.by_variance)
             by |= self._by_physics(values, places, by, found, f_slopes)
             gradient = self.table.gradient(by, values)
         if self.table.problems < value.shape[-1]:
@@ -324,8 +319,25 @@ class GP(gpytorch.models.GP, Predictive):
         bad = ~(value.isfinite() & gradient.isfinite().all(-1))
         return value.masked_fill(bad, -torch.inf), gradient.masked_fill(bad.unsqueeze(-1), 0.0)
 
+    def evidence(
+        self, train: WeightedSum, residual: Tensor, noise: Tensor, observed: Tensor,
+        with_gradient: bool,
+    ) -> Evidence:  # fmt: skip
+        """Return the log likelihood of residuals ``S x m x n`` of a sum; a subclass may bound it."""
+        return evidence(train, residual, noise, observed, with_gradient)
+
+    def conditioned(
+        self, train: WeightedSum, noise: Tensor, targets: Tensor, old: Any = None
+    ) -> Conditioning:
+        """Return the posterior given observations of a sum, of which the first ones made an old."""
+        return Conditioning(train, noise, targets, old)
+
+    def fit_itself(self, method: str, num_draws: int | None, seed: int) -> FitResult | None:
+        """Return None; a subclass that is not fitted by draws fits itself, for :func:`fit`."""
+        return None
+
     def _by_physics(
-        self, values: Values, places: Places, by: Values, found: Likelihood, f_slopes: Slopes
+        self, values: Values, places: Places, by: Values, found: Evidence, f_slopes: Slopes
     ) -> Values:
         """Return derivatives by centers and by the coordinates of a physics' parameters."""
         by_mean = found.by_mean
@@ -340,17 +352,16 @@ class GP(gpytorch.models.GP, Predictive):
             if term.has_center is True:
                 by_c = -by_weight.sum(-1, keepdim=True)
                 slopes[f"{term.name}.center"] = by_c * self.term_sum.spread[term.physics]
-        if f_slopes and type(self.noise).shares is not Noise.shares:
-            by_shares = self._noise_by_f(values, places, found.by_covariance)
+        if f_slopes and self.noise.has_shares:
+            by_shares = self._noise_by_f(values, places, found.by_variance)
             by_f = [a + b for a, b in zip(by_f, by_shares, strict=True)]
         for name, parts in f_slopes.items():
             products = [(a * b).sum((-1, -2)) for a, b in zip(by_f, parts, strict=True)]
             slopes[f"physics.{name}"] = torch.stack(products).sum(0).unsqueeze(-1)
         return slopes
 
-    def _noise_by_f(self, values: Values, places: Places, by_covariance: Tensor) -> list[Tensor]:
+    def _noise_by_f(self, values: Values, places: Places, by_variance: Tensor) -> list[Tensor]:
         """Return derivatives by each f_p, of a noise whose shares depend on it."""
-        by_variance = by_covariance.diagonal(dim1=-1, dim2=-2)
         with torch.enable_grad():
             leaves = [f.detach().clone().requires_grad_() for f in places.f]
             variance = self.noise.variance(values, places._replace(f=leaves), True)
@@ -371,29 +382,66 @@ class GP(gpytorch.models.GP, Predictive):
         """Return each physics at ``... x S x n x d`` (1 for S): ``... x S x m x n``, in units."""
         f = []
         for each in self.physics:
-            f.append(self._in_units(each(X, *self._arguments(each, values))))  # noqa: PERF401
+            Y = each(X, *self._arguments(each, values))
+            self._check_physics(each, X, Y)
+            f.append(self._in_units(Y))
         return f
+
+    def _check_physics(self, physics: Physics, X: Tensor, Y: Tensor) -> None:
+        """Raise an error unless outputs of a physics, ``... x n x m``, are what targets may be."""
+        if self._outputs is None and Y.shape[-1] != self.num_outputs:
+            raise ValueError(
+                f"Expected {self.num_outputs} outputs of physics {physics.name!r}, as many as of "
+                f"train_Y; found {Y.shape[-1]}."
+            )
+        bad = ~self.holds(Y)
+        if bad.any():
+            rows = bad.any(-1).to(X).sum_to_size(X.shape[:-1]).flatten().nonzero().flatten()
+            error = PhysicsError(
+                f"Physics {physics.name!r} returned {float(Y[bad][0].detach()):.6g}, which targets "
+                f"cannot be, as {self.scale} is modelled; clamp its outputs.", rows.tolist()
+            )  # fmt: skip
+            error.inputs = X.detach().reshape(-1, X.shape[-1])[rows]
+            raise error
+
+    scale: str = ""
+    """The scale on which the model is Gaussian, as a formula; empty for that of the targets."""
+
+    def read_scale(self, Y: Tensor) -> None:
+        """Do nothing; a subclass may keep what its scale depends on of the training targets."""
+
+    def holds(self, Y: Tensor) -> Tensor:
+        """Return which values targets may have."""
+        return torch.ones_like(Y, dtype=torch.bool)
 
     def on_gaussian_scale(self, Y: Tensor) -> Tensor:
         """Return targets or outputs of a physics, ``... x n x m``, where the model is Gaussian."""
         return Y
 
+    def off_gaussian_scale(self, Z: Tensor) -> Tensor:
+        """Return the reverse, of functions ``... x n x m``."""
+        return Z
+
     def noise_in_units(self, Y: Tensor, Yvar: Tensor) -> Tensor:
         """Return known variances ``... x n x m`` of targets as ``... x m x n``, in units."""
         return Yvar.mT / self.unit.square()
+
+    def usual_noise(self, Y: Tensor) -> Tensor | None:
+        """Return the mean of the known variances, for observations ``... x k x m`` without any."""
+        return None if self.data.Yvar is None else self.data.Yvar.mean(-2, keepdim=True)
 
     def log_unit(self) -> Tensor:
         """Return the log densities of the targets, ``m``, in the user's units less the model's."""
         return -(~self.data.Y.isnan()).sum(-2) * self.unit.squeeze(-1).log()
 
-    def _targets(self) -> Tensor:
+    def targets(self) -> Tensor:
         """Return the targets less the mean of the noise, ``... x m x n``, in their unit."""
         return self.on_gaussian_scale(self.data.Y).mT / self.unit - self.noise.shift
 
     def _in_units(self, Y: Tensor) -> Tensor:
         """Return ``... x m x n`` of a physics' outputs, in units of the targets."""
-        Y = self.on_gaussian_scale(Y)
-        return (Y.mT if self._outputs is None else Y.mT[..., self._outputs, :]) / self.unit
+        Y = Y if self._outputs is None else Y[..., self._outputs]
+        return self.on_gaussian_scale(Y).mT / self.unit
 
     def _arguments(self, physics: Physics, values: Values) -> list[Tensor]:
         """Return a physics' parameters ``S x p`` at their coordinates, if it has any."""
@@ -418,20 +466,21 @@ class GP(gpytorch.models.GP, Predictive):
         f, slopes = [], []
         for physics in self.physics:
             Y = physics.or_nan(X.unsqueeze(-3), *self._arguments(physics, moved))
-            Y = (
-                self._in_units(Y)
-                .expand(len(shifted) * len(z), -1, -1)
-                .unflatten(0, shifted.shape[:2])
-            )
+            Y = self._in_units(Y.masked_fill(~self.holds(Y), torch.nan))
+            Y = Y.expand(len(shifted) * len(z), -1, -1).unflatten(0, shifted.shape[:2])
             f.append(Y[0])
             slopes.append((Y[1 : p + 1] - Y[p + 1 :]) / (2 * _STEP))
         return f, {name: [each[i] for each in slopes] for i, name in enumerate(names[:p])}
 
     # Predictions.
 
+    def kernel_inputs(self, X: Tensor) -> Tensor:
+        """Return what kernels see at inputs ``... x n x d``; a kind of data may add to it."""
+        return self.data.kernel_inputs(X)
+
     def places(self, X: Tensor, values: Values, with_physics: bool = True) -> Places:
         """Return what terms and noise read at inputs ``... x n x d``."""
-        x = self.data.kernel_inputs(X).unsqueeze(-3).unsqueeze(-3)
+        x = self.kernel_inputs(X).unsqueeze(-3).unsqueeze(-3)
         f: Sequence[Tensor] = []
         if self._f_train and not self._unknowns and X is self.data.X:
             f = self._f_train
@@ -446,7 +495,7 @@ class GP(gpytorch.models.GP, Predictive):
 
     def at_each(self, X: Tensor, values: Values) -> WeightedSum:
         """Return the function of each draw at points of its own, ``S x n x d``."""
-        x = self.data.kernel_inputs(X).unsqueeze(-3)
+        x = self.kernel_inputs(X).unsqueeze(-3)
         places = Places(x, self._physics_at(X, values), X.unsqueeze(-3))
         return self.term_sum.at(values, places)
 
@@ -454,7 +503,7 @@ class GP(gpytorch.models.GP, Predictive):
         """Return the posterior given the data, without a graph of the draws; kept for these."""
         if self._cached is None or not torch.equal(self._cached[0], self.u):
             with torch.no_grad():
-                conditioning = Conditioning(*self._observed(self.table.values(self.u)))
+                conditioning = self.conditioned(*self._observed(self.table.values(self.u)))
             self._cached = (self.u.detach().clone(), conditioning)
         return self._cached[1]
 
@@ -462,7 +511,7 @@ class GP(gpytorch.models.GP, Predictive):
         """Return the function at the training inputs, the variances of the noise, and targets."""
         places = self.places(self.data.X, values)
         noise = self.noise.variance(values, places, True)
-        return self.term_sum.at(values, places), noise, self._targets().unsqueeze(-3)
+        return self.term_sum.at(values, places), noise, self.targets().unsqueeze(-3)
 
     def left_out(self) -> Marginals:
         """Return the distribution of each target given all others, with noise; NaN if missing."""
@@ -473,7 +522,7 @@ class GP(gpytorch.models.GP, Predictive):
     @torch.no_grad()
     def left_out_at(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Return means and variances of left-out targets at coordinates ``S x B x P``."""
-        mean, variance = Conditioning(*self._observed(self.table.values(u))).left_out()
+        mean, variance = self.conditioned(*self._observed(self.table.values(u))).left_out()
         return (mean * self.unit).mT, (variance * self.unit.square()).mT
 
     def components(
@@ -555,9 +604,9 @@ class GP(gpytorch.models.GP, Predictive):
         if asked is True:
             values = self.conditioning().train.values
             return self.noise.variance(values, self.places(X, values))
-        return self._checked_noise(asked, X).mT.unsqueeze(-3) / self.unit.square()
+        return self.checked_noise(asked, X).mT.unsqueeze(-3) / self.unit.square()
 
-    def _checked_noise(self, noise: Any, X: Tensor) -> Tensor:
+    def checked_noise(self, noise: Any, X: Tensor) -> Tensor:
         """Return given variances of observations at ``X``, ``... x q x m``."""
         q, m, found = X.shape[-2], self.num_outputs, noise
         if isinstance(noise, Tensor):
@@ -590,17 +639,18 @@ class GP(gpytorch.models.GP, Predictive):
                 f"Expected finite Y of shape ... x {X.shape[-2]} x {self.num_outputs}, or NaN "
                 f"where an output is missing; found {tuple(Y.shape)}."
             )
+        self.on_gaussian_scale(Y)  # an error if targets cannot have such values
         old, new = self.conditioning(), self._copy()
         new.data = self.data.appended(X, Y)
-        if noise is None and self.data.Yvar is not None:
-            noise = self.data.Yvar.mean(-2, keepdim=True)
+        is_usual = noise is None
+        noise = self.usual_noise(Y) if noise is None else noise
         if noise is not None and self.noise.known is not None:
             unused = noise.isnan() & Y.isnan()
             noise = noise.masked_fill(unused, 1.0) if unused.any() else noise
-            noise = self._checked_noise(noise, X)
+            noise = self.checked_noise(noise, X)
             if self.data.Yvar is not None:
                 new.data = new.data._replace(Yvar=appended(self.data.Yvar, noise))
-            noise = self.noise_in_units(Y, noise)
+            noise = None if is_usual else self.noise_in_units(Y, noise)
         new.noise = self.noise.appended(noise, X.shape[-2])
         values = old.train.values
         has_graph = X.requires_grad or Y.requires_grad or old.alpha.requires_grad
@@ -609,7 +659,7 @@ class GP(gpytorch.models.GP, Predictive):
                 late = self._physics_at(X.unsqueeze(-3), values)
                 pairs = zip(self._f_train, late, strict=True)
                 new._f_train = [appended(f, f_late, -1) for f, f_late in pairs]
-            conditioning = Conditioning(*new._observed(values), old)
+            conditioning = new.conditioned(*new._observed(values), old)
         new._cached = (self.u.detach().clone(), conditioning)
         return new.eval()
 
@@ -652,6 +702,12 @@ class GP(gpytorch.models.GP, Predictive):
         """Return the model with another noise of the same unknown numbers."""
         new = self._copy()
         new.noise, new._cached = noise, None
+        return new
+
+    def with_conditioning(self, conditioning: Any) -> Self:
+        """Return the model with another posterior than its data's, of the same draws."""
+        new = self._copy()
+        new._cached = (self.u.detach().clone(), conditioning)
         return new
 
     def subset_draws(self, rows: Tensor) -> Self:
@@ -720,7 +776,7 @@ class GP(gpytorch.models.GP, Predictive):
     @property
     def train_targets(self) -> Tensor:
         """The targets, ``(m) x n``; 0 where one is missing, of a noise that gives it no weight."""
-        return squeezed(self._targets().mul(self.unit).unsqueeze(-3), -2).nan_to_num()
+        return squeezed(self.targets().mul(self.unit).unsqueeze(-3), -2).nan_to_num()
 
     def forward(self, x: Tensor) -> MultivariateNormal:
         """Return the prior at inputs ``... x n x d``."""
@@ -785,7 +841,8 @@ def _with_kernel(term: Any) -> Term:
         raise TypeError(f"Expected terms as a list of Term(name, kernel, ...); found {term!r}.")
     if term.kernel is None:
         return term
-    return term._replace(kernel=as_kernel(term.kernel, DELTA if term.physics is None else RHO))
+    kernel = as_kernel(term.kernel, DELTA if term.physics is None else RHO)
+    return term._replace(kernel=kernel, constant=term.constant if kernel.has_constant else None)
 
 
 def _of_data(term: Term, data: Data) -> Term:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.core.data import appended
-from gpadjust.core.terms import Places
+from gpadjust.core.terms import Places, TermSum
 from gpadjust.core.unknowns import LogNormal, Row, Values
 
 _PRIOR = LogNormal(1e-3, 55.0)
@@ -38,6 +38,20 @@ class Noise:
     ) -> None:
         self.names = tuple(names)
         self.priors = [_PRIOR] * len(self.names) if priors is None else [*priors]
+
+    @property
+    def has_shares(self) -> bool:
+        """Whether the variances depend on x, by :meth:`shares`."""
+        return type(self).shares is not Noise.shares
+
+    @property
+    def is_outlier(self) -> Tensor | None:
+        """Mask ``n x m`` of the training targets that hardly count; None if none is searched."""
+        return None
+
+    def of_terms(self, terms: TermSum) -> Noise:
+        """Return the noise for a model of these terms; itself by default."""
+        return self
 
     def shares(self, places: Places) -> Tensor | None:
         """Return h, which broadcasts with ``... x S x m x n x K``; None for a single share of 1."""
@@ -127,6 +141,10 @@ class KnownNoise(Noise):
         super().__init__(())
         self.known: Tensor = variances
 
+    def of_variances(self, variances: Tensor) -> KnownNoise:
+        """Return the noise of the same kind with other variances."""
+        return KnownNoise(variances)
+
     def variance(self, values: Values, places: Places, is_training: bool = False) -> Tensor:
         """Return the known variances; at other places their mean in each output."""
         known = self.known.unsqueeze(-3)  # ... x 1 x m x n
@@ -140,16 +158,16 @@ class KnownNoise(Noise):
         """Return the noise of further rows, too: of given variances or the mean of those known."""
         if variances is None:
             variances = self.known.mean(-1, keepdim=True).expand(*self.known.shape[:-1], num_points)
-        return KnownNoise(appended(self.known, variances, -1))
+        return self.of_variances(appended(self.known, variances, -1))
 
     def to(self, like: Tensor) -> KnownNoise:
         """Return the noise on the device of a tensor."""
-        return KnownNoise(self.known.to(like))
+        return self.of_variances(self.known.to(like))
 
     def of_rows(self, rows: Tensor) -> KnownNoise:
         """Return the noise of some observations."""
-        return KnownNoise(self.known[..., rows])
+        return self.of_variances(self.known[..., rows])
 
     def of_outputs(self, outputs: Sequence[int]) -> KnownNoise:
         """Return the noise of some outputs."""
-        return KnownNoise(self.known[..., list(outputs), :])
+        return self.of_variances(self.known[..., list(outputs), :])

@@ -200,11 +200,13 @@ def _root(u: Tensor, weights: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def maximise(log_likelihood: LogLikelihood, u: Tensor, is_precise: bool = False) -> Tensor:
+def maximise(
+    log_likelihood: LogLikelihood, u: Tensor, is_precise: bool = False, most: int = 15_000
+) -> Tensor:
     """Return coordinates ``N x B x P`` of high density N(u | 0, I) L(u), by L-BFGS from each of N.
 
     A precise search begins anew where it ended, as long as that pays: a line search may fail for
-    one problem where others still have a way to go.
+    one problem where others still have a way to go. It takes so many iterations at most.
     """
     best, top = u.clone(), u.new_full(u.shape[:2], -math.inf)
 
@@ -217,7 +219,7 @@ def maximise(log_likelihood: LogLikelihood, u: Tensor, is_precise: bool = False)
         density = density.nan_to_num(neginf=-1e10)
         return -float(density.sum()), (point - slope).nan_to_num().flatten().cpu().numpy()
 
-    options = {} if is_precise else {"ftol": 1e-5}
+    options = {"maxiter": most} | ({} if is_precise else {"ftol": 1e-5})
     for _ in range(_SEARCHES if is_precise else 1):
         before = float(top.nan_to_num(neginf=-1e10).sum())
         start = best.flatten().cpu().numpy()

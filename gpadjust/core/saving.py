@@ -6,23 +6,28 @@ import secrets
 import sys
 import warnings
 from copy import deepcopy
+from dataclasses import dataclass
 from importlib import import_module
 from inspect import signature
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from botorch.models.transforms.input import InputTransform
 from torch import Tensor
 
 from gpadjust.checks import check_kind, check_switch
+from gpadjust.core.data import names_of
 from gpadjust.core.kernels import Kernel
 from gpadjust.core.model import GP
 from gpadjust.core.noise import Noise
+from gpadjust.core.stacked import StackedGP
 from gpadjust.physics import PhysicsError
 from gpadjust.physics.import_path import import_path, is_formula, physics_from_path
 
 _FORMAT = 4
+_COMPARED = 100  # rows whose covariances with all others tell kernels apart
 _PARTS = (Kernel, Noise, InputTransform)  # of a model, which a file may hold
 
 
@@ -34,7 +39,22 @@ class Saved(NamedTuple):
     missing: tuple[str, ...]
 
 
-def save(model: GP, path: str | Path) -> Saved:
+@dataclass
+class _Frame:
+    """Inputs whose columns have names, which kernels and transforms may ask for."""
+
+    values: Tensor
+    columns: tuple[str, ...]
+
+    @property
+    def shape(self) -> torch.Size:
+        return self.values.shape
+
+    def to_numpy(self) -> np.ndarray:
+        return self.values.numpy()
+
+
+def save(model: GP | StackedGP, path: str | Path) -> Saved:
     """Save a model: its class, settings, data and draws, and its physics by the import path.
 
     Arguments that are not plain values (kernels, noises and transforms without ``settings``,
@@ -43,7 +63,7 @@ def save(model: GP, path: str | Path) -> Saved:
     ``path`` is replaced.
 
     Args:
-        model: The model. A class of one's own takes train_X, train_Y and train_Yvar first, and
+        model: The model, or a mixture of several. A class of one's own takes train_X, train_Y and train_Yvar first, and
             its ``settings`` are all its other arguments but ``physics``.
         path: The file.
 
@@ -67,11 +87,11 @@ def save(model: GP, path: str | Path) -> Saved:
         >>> saved.missing, torch.equal(again.predict(X).mean, model.predict(X).mean)
         ((), True)
     """
-    check_kind("model", model, GP, "a model of gpadjust.core")
+    check_kind("model", model, GP | StackedGP, "a model of gpadjust.core")
     path = Path(path)
     if path.is_dir() or not path.parent.is_dir():
         raise ValueError(f"Expected path as a file in a folder that exists; found {str(path)!r}.")
-    content = _content(model)
+    content = _stack_content(model) if isinstance(model, StackedGP) else _content(model)
     missing, names = content["missing"], content["physics"]
     if "physics" in missing or any(name.startswith("__main__:") for name in names):
         warnings.warn(
@@ -111,7 +131,8 @@ def load(path: str | Path, *, trusted: bool = False, **objects: Any) -> Any:
     check_switch("trusted", trusted)
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-        return _model(content, objects, trusted)
+        make = _stack if "models" in content else _model
+        return make(content, objects, trusted)
     except (OSError, PhysicsError):
         raise
     except ValueError as error:
@@ -138,6 +159,8 @@ def _content(model: GP) -> dict[str, Any]:
     settings = {n: _packed(v) for n, v in model.settings.items() if n != "outcome_transform"}
     if settings.get("noise") is not None:
         settings["noise"] = _packed(model.noise.of_rows(torch.arange(n)))
+    if settings.get("input_transform") is not None:
+        settings["input_transform"] = _packed(data.transform)
     missing = [name for name, value in settings.items() if not _is_plain(value)]
     scalings = [term.name for term in model.terms if term.physics is not None]
     is_mapping = model_class is not GP and all(each.startswith("rho_") for each in scalings)
@@ -152,8 +175,22 @@ def _content(model: GP) -> dict[str, Any]:
         "rows_of_fit": n,
         "names": [list(data.input_names), list(data.output_names)],
         "built_with": _built_with(model, n),
+        "buffers": {name: v.cpu() for name, v in model.named_buffers(recurse=False)},
         **{name: v if v is None else v.detach().cpu().clone() for name, v in tensors.items()},
     }
+
+
+def _stack_content(model: StackedGP) -> dict[str, Any]:
+    """Return what the file of a mixture holds: its models, and a weight of each, or each output."""
+    models = {n: _content(each) for n, each in zip(model.names, model.models, strict=True)}
+    is_whole = bool((model.picks == model.picks[:, :1]).all())
+    weights = {name: own[0] if is_whole else own for name, own in model.weights.items()}
+    return {
+        "class": f"{type(model).__module__}:{type(model).__qualname__}",
+        "models": models, "weights": weights, "num_components": len(model.picks),
+        "missing": [*dict.fromkeys(n for each in models.values() for n in each["missing"])],
+        "physics": [*dict.fromkeys(n for each in models.values() for n in each["physics"])],
+    }  # fmt: skip
 
 
 def _packed(value: Any) -> Any:
@@ -167,7 +204,7 @@ def _packed(value: Any) -> Any:
 
 def _unpacked(value: Any) -> Any:
     """Return what was packed; its class is one of this library or of an imported module."""
-    if not isinstance(value, dict):
+    if not isinstance(value, dict) or value.keys() != {"class", "settings"}:
         return value
     module, _, name = value["class"].partition(":")
     if module.startswith("gpadjust."):
@@ -193,31 +230,70 @@ def _built_with(model: GP, n: int) -> dict[str, Tensor]:
     values, X = model.table.values(torch.zeros_like(model.u[:1])), model.data.X[:n]
     places = model.places(X, values)
     total = model.term_sum.at(values, places)
-    noise = model.noise.variance(values, places, True)[..., :n]
+    own = model.noise.of_rows(torch.arange(n)) or model.noise
+    noise = own.variance(values, places, True)[..., :n]
     numbers = {f"physics {i + 1}": f * model.unit for i, f in enumerate(places.f)}
     numbers |= {"unit": model.unit, "mean": total.mean, "noise": noise}
     for row in (*model.table.own, *model.table.shared):
         numbers[f"prior of {row.name}"] = torch.stack([row.location, row.location + row.scale])
     for choice in model.table.choices:
         numbers[f"choice {choice[0]} {choice[2]}"] = torch.tensor(choice.probability)
-    numbers["kernel"] = total.cross(total).sum(-1)
+    numbers["kernel"] = total.cross(total.of_rows(slice(_COMPARED))).sum(-1)
     return {name: value.detach().cpu().clone() for name, value in numbers.items()}
 
 
-def _model(content: dict[str, Any], objects: dict[str, Any], trusted: bool) -> GP:
-    """Return the model of a file, with the objects that are given."""
-    if content["format"] != _FORMAT:
-        raise ValueError(f"expected format {_FORMAT}; found {content['format']}.")
+def _stack(content: dict[str, Any], objects: dict[str, Any], trusted: bool) -> StackedGP:
+    """Return the mixture of a file; of several physics each model takes its own."""
+    _check_objects(content, objects)
+    models = {}
+    for name, each in content["models"].items():
+        own = {n: v for n, v in objects.items() if n in each["missing"] or n == "physics"}
+        choices = [own.pop("physics", None)] if each["physics"] else []
+        if isinstance(choices[0] if choices else None, dict) and not each["physics_names"]:
+            choices = [*choices[0].values()]
+        models[name] = _first_that_fits(each, own, choices, trusted)
+    return _class_of(content, StackedGP)(models, content["weights"], content["num_components"])
+
+
+def _first_that_fits(
+    content: dict[str, Any], objects: dict[str, Any], physics: list[Any], trusted: bool
+) -> GP:
+    """Return the model of a file with the first of several physics that it was built with."""
+    for i, each in enumerate(physics or [None]):
+        own = objects if each is None else objects | {"physics": each}
+        try:
+            return _model(content, own, trusted)
+        except ValueError:
+            if i + 1 >= len(physics):
+                raise
+    raise AssertionError
+
+
+def _check_objects(content: dict[str, Any], objects: dict[str, Any]) -> None:
+    """Raise a ValueError unless objects are what a file needs, with its physics or without."""
     known = {*content["missing"], *["physics"] * bool(content["physics"])}
     if objects.keys() - known or {*content["missing"]} - objects.keys():
         raise ValueError(
             f"expected what the file could not hold, load(path, {_call(content['missing'])}), and "
             f"nothing else but its physics; found load(path, {_call(objects)})."
         )
+
+
+def _class_of(content: dict[str, Any], kind: type[Any]) -> Any:
+    """Return the class of a file's model, of a module that is imported."""
     module, _, name = content["class"].partition(":")
-    model_class = getattr(sys.modules.get(module), name, None)  # nothing is imported for it
-    if not isinstance(model_class, type) or not issubclass(model_class, GP):
+    found = getattr(sys.modules.get(module), name, None)  # nothing is imported for it
+    if not isinstance(found, type) or not issubclass(found, kind):
         raise ValueError(f"no model {content['class']} was found; import its module first.")
+    return found
+
+
+def _model(content: dict[str, Any], objects: dict[str, Any], trusted: bool) -> GP:
+    """Return the model of a file, with the objects that are given."""
+    if content["format"] != _FORMAT:
+        raise ValueError(f"expected format {_FORMAT}; found {content['format']}.")
+    _check_objects(content, objects)
+    model_class = _class_of(content, GP)
     settings = {name: _unpacked(value) for name, value in content["settings"].items()}
     settings |= {n: deepcopy(objects[n]) for n in content["missing"]}
     if content["physics"]:
@@ -229,9 +305,10 @@ def _model(content: dict[str, Any], objects: dict[str, Any], trusted: bool) -> G
     is_right = type(n) is int and 2 <= n <= len(X) and all(len(v) == len(X) for v in data)
     if not is_right or (len(inputs), len(outputs)) != (X.shape[-1], Y.shape[-1]):
         raise ValueError("expected data of one length, and a name of each input and output.")
+    named = X[:n] if inputs == names_of(X, "x") else _Frame(X[:n], inputs)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # they came when the model was built
-        model: GP = model_class(*(v[:n] for v in data), **settings)
+        model: GP = model_class(named, *(v[:n] for v in data[1:]), **settings)
     built_with = _built_with(model, n)
     if other := built_with.keys() ^ content["built_with"].keys():
         raise ValueError(f"it was saved with other kernels: {', '.join(sorted(other))}.")
@@ -246,6 +323,8 @@ def _model(content: dict[str, Any], objects: dict[str, Any], trusted: bool) -> G
     u = model.u
     model.set_draws(content["draws"].double())
     model.u = u
+    for name, value in content["buffers"].items():
+        setattr(model, name, value)
     model.data = model.data._replace(input_names=inputs, output_names=outputs)
     if n < len(X):
         late = None if Yvar is None or Yvar[n:].allclose(Yvar[:n].mean(0)) else Yvar[n:]

@@ -13,7 +13,7 @@ from torch.quasirandom import SobolEngine
 
 from gpadjust.checks import checked_whole
 from gpadjust.core.data import ArrayLike, Data
-from gpadjust.core.gaussian import DRAWS
+from gpadjust.core.gaussian import DRAWS, Marginals
 from gpadjust.core.model import GP, Predictive
 from gpadjust.core.posterior import MixturePosterior
 
@@ -97,6 +97,20 @@ class StackedGP(Predictive):
         return self.models[0].num_outputs
 
     @property
+    def outcome_transform(self) -> Any:
+        """The sign of the models' posteriors for BoTorch's lists of models, if they have one."""
+        return self.models[0].outcome_transform
+
+    def marginals_of(self, means: Tensor, variances: Tensor) -> Marginals:
+        """Return the distributions of Gaussian components, as the models do."""
+        marginals: Marginals = self.models[0].marginals_of(means, variances)
+        return marginals
+
+    def posterior_of(self, mixture: MixturePosterior, outputs: list[int] | slice) -> Any:
+        """Return the posterior of a mixture where the models are Gaussian, as they do."""
+        return self.models[0].posterior_of(mixture, outputs)
+
+    @property
     def batch_shape(self) -> Size:
         """The batch shape of the data: empty but for fantasies."""
         return self.models[0].batch_shape
@@ -114,7 +128,9 @@ class StackedGP(Predictive):
         self, X: ArrayLike, outputs: list[int] | slice, observation_noise: bool | Tensor
     ) -> MixturePosterior:
         """Return the joint posterior of some outputs, each of its own components."""
-        parts = [model.posterior(X, None, observation_noise).components for model in self.models]
+        parts = [
+            model.mixture(X, slice(None), observation_noise).components for model in self.models
+        ]
         means, covariances = zip(*parts, strict=True)
         mean, K = torch.cat(means, -3), torch.cat(covariances, -4)
         picks, columns = self.picks[:, outputs], torch.arange(self.num_outputs)[outputs]
@@ -204,6 +220,9 @@ def _check_models(models: Any) -> None:
     sets = [model.data for model in models.values()]
     if len({str([d.X.tolist(), d.Y.tolist(), d.input_names, d.output_names]) for d in sets}) > 1:
         raise ValueError(f"Expected models of the same data; found others in {[*models]}.")
+    scales = {model.scale or "y" for model in models.values()}
+    if len(scales) > 1:
+        raise ValueError(f"Expected models of one scale of y; found {', '.join(sorted(scales))}.")
 
 
 def _shares(models: Mapping[str, GP], weights: Any) -> Tensor:

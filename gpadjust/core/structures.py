@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from gpadjust.core.data import ArrayLike, as_tensor
+from gpadjust.core.data import ArrayLike, names_of
 from gpadjust.core.kernels import DELTA, RHO, Fourier, as_kernel
 from gpadjust.core.model import GP
 from gpadjust.core.terms import Term
@@ -42,9 +42,10 @@ class CKA(GP):
             1 / k.
         delta_mean: The prior mean of delta, in the user's units.
         center: Whether the kernel of rho is scaled by f_p - c with an unknown c, or the number c;
-            the paper's model has 0.
+            the paper's model has 0, as has one whose delta cannot contain a constant.
         constants: Whether rho and delta contain unknown constants.
-        nested: Whether nested models are averaged over; only with constants and one physics.
+        nested: Whether nested models are averaged over, with constants and one physics; or the
+            nested models.
         extra_terms: Further terms, which the formula as it is does not have.
 
     Example:
@@ -61,8 +62,8 @@ class CKA(GP):
         self, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike = None, *,
         physics: Any, rho_covar_module: Any = None, delta_covar_module: Any = None,
         rho_mean: float | Sequence[float] | None = None, delta_mean: float = 0.0,
-        center: bool | float = True, constants: bool = True, nested: bool = True,
-        extra_terms: Sequence[Term] = (), **options: Any,
+        center: bool | float = True, constants: bool = True,
+        nested: bool | Sequence[Choice] = True, extra_terms: Sequence[Term] = (), **options: Any,
     ) -> None:  # fmt: skip
         if not isinstance(center, bool | int | float):
             raise TypeError(f"Expected center as True, False or a number; found {center!r}.")
@@ -75,10 +76,13 @@ class CKA(GP):
             settings["extra_terms"] = extra_terms
         rhos, functions = _scalings(physics, rho_mean)
         kernel, constant = as_kernel(rho_covar_module, RHO), RHO_CONSTANT if constants else None
-        rhos = [rho._replace(kernel=kernel, constant=constant, has_center=center) for rho in rhos]
         delta = _delta(delta_covar_module, delta_mean, constants)
-        choices: tuple[Choice, ...] = ()
-        if nested and constants and len(rhos) == 1:
+        has_both = kernel.has_constant and as_kernel(delta.kernel).has_constant
+        if center is True and kernel.has_constant and not has_both:
+            center = 0.0  # another one would add a constant to delta
+        rhos = [rho._replace(kernel=kernel, constant=constant, has_center=center) for rho in rhos]
+        choices: tuple[Choice, ...] = () if isinstance(nested, bool) else tuple(nested)
+        if nested is True and constants and has_both and len(rhos) == 1:
             has_unknowns = bool(getattr(functions[0], "unknowns", None))
             choices = _nested(rhos[0].name, extra_terms, has_unknowns)
         super().__init__(
@@ -107,7 +111,7 @@ class RRA(CKA):
     ) -> None:  # fmt: skip
         if num_features < 2 or num_features % 2:
             raise ValueError(f"Expected an even number of features; found {num_features}.")
-        d = as_tensor(train_X, "train_X").shape[-1]
+        d = len(names_of(train_X, "x"))
         super().__init__(
             train_X, train_Y, train_Yvar, physics=physics,
             rho_covar_module=Fourier(d, num_features, 2 * seed, RHO),

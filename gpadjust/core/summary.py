@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -24,7 +25,7 @@ def summary(model: Any) -> str:
         lines += [f"{name}:", *_choices(model, values, j)]
         for term in model.terms:
             lines += _of_term(model, term, own, j)
-        lines.append(f"  noise: {_of_noise(variance[..., j, :].sqrt() * model.unit[j])}")
+        lines += _of_noise(model, variance[..., j, :].sqrt() * model.unit[j], j)
     return "\n".join(lines)
 
 
@@ -34,6 +35,7 @@ def _title(model: Any) -> str:
     counts = {"point": n, "input": d, "output": model.num_outputs, "draw": len(model.draws)}
     parts = [f"{n} {noun}" + "s" * (n != 1) for noun, n in counts.items()]
     parts += [] if model.draws.any() else ["not fitted"]
+    parts += [f"of {model.scale}"] if model.scale else []
     return f"{type(model).__name__}: {', '.join(parts)}"
 
 
@@ -69,7 +71,9 @@ def _of_term(model: Any, term: Term, values: Values, j: int) -> list[str]:
     lines, start = [head], f"{term.name}.kernel."
     for name in values if kept.any() else ():
         if name.startswith(start):
-            lines += _of_kernel(model, name.removeprefix(start), values[name][kept], unit)
+            names = getattr(term.kernel, "input_names", None)
+            own = values[name][kept]
+            lines += _of_kernel(model, name.removeprefix(start), own, unit, names)
     constant = values.get(f"{term.name}.constant", torch.zeros(1))
     if constant.any():
         lines.append(f"    standard deviation of the constant: {_sd(constant[constant > 0], unit)}")
@@ -79,7 +83,9 @@ def _of_term(model: Any, term: Term, values: Values, j: int) -> list[str]:
     return lines
 
 
-def _of_kernel(model: Any, name: str, numbers: Tensor, unit: float) -> list[str]:
+def _of_kernel(
+    model: Any, name: str, numbers: Tensor, unit: float, names: Sequence[str] | None
+) -> list[str]:
     """Return some numbers ``N x k`` of a kernel."""
     name = name.replace("raw_", "")
     if name.endswith("outputscale"):
@@ -87,20 +93,31 @@ def _of_kernel(model: Any, name: str, numbers: Tensor, unit: float) -> list[str]
     columns = [""] if numbers.shape[-1] == 1 else [f" {i + 1}" for i in range(numbers.shape[-1])]
     after = ""
     if name.endswith("lengthscale"):
-        after = " after the transform" if model.data.transform is not None else ""
-        if len(columns) == len(model.data.input_names):
-            columns = [f" of {each}" for each in model.data.input_names]
+        if names is None:
+            names, transform = model.data.input_names, model.data.transform
+            if hasattr(transform, "column_names"):
+                names = transform.column_names(names)
+            elif transform is not None:
+                after = " after the transform"
+        if len(columns) == len(names):
+            columns = [f" of {each}" for each in names]
     pairs = zip(columns, numbers.unbind(-1), strict=True)
     return [f"    {name}{column}{after}: {_text(each)}" for column, each in pairs]
 
 
-def _of_noise(sd: Tensor) -> str:
-    """Return standard deviations ``... x S x n``, and how far they differ at the inputs."""
+def _of_noise(model: Any, sd: Tensor, j: int) -> list[str]:
+    """Return standard deviations ``S x n`` of an output, how far they differ, and outliers."""
+    lines, mask = [], model.noise.is_outlier
+    if mask is not None and mask[:, j].any():
+        rows = mask[:, j].nonzero().flatten().tolist()
+        lines = [f"  outliers: rows {', '.join(map(str, rows))}"]
+        sd = sd[..., ~mask[:, j]]
     mean = sd.square().mean(-1).sqrt()
     ends = sd.reshape(-1, sd.shape[-1]).median(0).values
     low, high = (f"{float(end):.3g}" for end in (ends.min(), ends.max()))
-    text = f"standard deviation {_text(mean)}"
-    return text if low == high else f"{text}, from {low} to {high} at the training inputs"
+    text = f"  noise: standard deviation {_text(mean)}"
+    text = text if low == high else f"{text}, from {low} to {high} at the training inputs"
+    return [text, *lines]
 
 
 def _sd(variances: Tensor, unit: float) -> str:

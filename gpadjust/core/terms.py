@@ -65,10 +65,10 @@ class WeightedSum:
     mean: Tensor  # ... x S x m x n
     weights: dict[str, Tensor | None] = field(default_factory=dict)  # w_t; None for 1
 
-    def rows_from(self, n: int) -> WeightedSum:
-        """Return the sum at the places from the n-th on."""
-        weights = {name: None if w is None else w[..., n:] for name, w in self.weights.items()}
-        x, mean = self.x[..., n:, :], self.mean[..., n:]
+    def of_rows(self, rows: slice) -> WeightedSum:
+        """Return the sum at some of its places."""
+        weights = {name: None if w is None else w[..., rows] for name, w in self.weights.items()}
+        x, mean = self.x[..., rows, :], self.mean[..., rows]
         return WeightedSum(self.terms, self.values, x, mean, weights)
 
     def own(self, term: Term) -> Values:

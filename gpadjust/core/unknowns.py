@@ -53,6 +53,10 @@ class Row(NamedTuple):
         theta = self.location + self.scale * u
         return theta.exp() if self.is_positive else theta
 
+    def coordinate(self, value: Tensor) -> Tensor:
+        """Return the coordinates of numbers."""
+        return ((value.log() if self.is_positive else value) - self.location) / self.scale
+
     def slope(self, value: Tensor) -> Tensor | float:
         """Return the derivatives of the numbers by their coordinates."""
         return self.scale * value if self.is_positive else self.scale
@@ -126,6 +130,15 @@ class Table:
                     value = values.get(name, torch.ones_like(values[_CHOICE]))
                     values[name] = value.masked_fill(chosen == k, 0.0)
         return values
+
+    def with_values(self, u: Tensor, values: Values) -> Tensor:
+        """Return coordinates ``S x B x P`` of which some make numbers of the outputs these values."""
+        parts = []
+        for row, part in zip(self.own, self._own(u).split(self._sizes[0], -1), strict=True):
+            is_given = row.name in values
+            parts.append(row.coordinate(values[row.name]).expand_as(part) if is_given else part)
+        own = torch.cat(parts, -1).reshape(*u.shape[:2], self._own_size)
+        return torch.cat([own, u[..., self._own_size :]], -1)
 
     def _own(self, u: Tensor) -> Tensor:
         """Return the coordinates of each output, ``S x m x k``."""

@@ -64,6 +64,11 @@ class AngleInput(InputTransform):
             found += [f"sin({name})", f"cos({name})"] if i in self.columns else [name]
         return found
 
+    @property
+    def settings(self) -> dict[str, list[int]]:
+        """The arguments that make it again."""
+        return {"columns": [*self.columns]}
+
     def equals(self, other: InputTransform) -> bool:
         """True if ``other`` replaces the same columns."""
         return isinstance(other, AngleInput) and self.columns == other.columns

@@ -9,7 +9,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from gpadjust.checks import check_columns, check_level
+from gpadjust.checks import check_columns, check_level, seeded
+from gpadjust.core import Prediction
 from gpadjust.dynamics.free_run import (
     FreeRun,
     check_start,
@@ -29,8 +30,6 @@ from gpadjust.dynamics.particles import (
 from gpadjust.dynamics.state import fingerprint
 from gpadjust.dynamics.targets import check_spec
 from gpadjust.dynamics.trajectories import Trajectories, check_doubles
-from gpadjust.models import Prediction
-from gpadjust.models.sampled_functions import seeded
 from gpadjust.states import StateSpec
 from gpadjust.validation import Scores
 
@@ -71,7 +70,7 @@ class Dynamics(ABC):
         """Learn from further transitions, ``N`` rows each."""
 
     @abstractmethod
-    def predict(self, states: Tensor, actions: Tensor) -> Prediction[Tensor]:
+    def predict(self, states: Tensor, actions: Tensor) -> Prediction:
         """Mean and variance of the next states, ``N x state_dim`` each, entry by entry."""
 
     @abstractmethod

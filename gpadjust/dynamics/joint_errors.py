@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 import torch
+from botorch.models.model import Model
 from torch import Tensor
 
-from gpadjust.models import TermsGP, TermsModel
-from gpadjust.validation import leave_one_out
+from gpadjust.core import GP
 
 _CLEAR = 3.5  # standard errors, below which a correlation counts as none
 _LEAST = 1e-6  # eigenvalue of a correlation matrix
 
 
-def error_correlation(model: TermsModel) -> Tensor | None:
+def error_correlation(model: Model) -> Tensor | None:
     r"""The correlation of outputs by a model's left-out errors, ``m x m``; None if none is clear.
 
     A correlation r of n pairs has the standard error :math:`(1 - r^2) / \sqrt n`. It counts where
     :math:`|r| \sqrt n` is more than 3.5, and is shrunk by the share of its square that is chance
     (Schaefer and Strimmer 2005).
     """
-    if model.num_outputs < 2 or not isinstance(model, TermsGP):
+    if model.num_outputs < 2 or not isinstance(model, GP):
         return None
-    errors = leave_one_out(model).residuals
+    errors = model.data.Y - model.left_out().prediction.mean
     seen = ~errors.isnan()
     errors, seen = errors.nan_to_num(nan=0.0), seen.double()
     number = (seen.mT @ seen).clamp_min(1.0)

@@ -8,31 +8,26 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gpadjust.checks import check_switch
+from gpadjust.checks import check_switch, checked_whole
+from gpadjust.core import CKA, GP, FitResult, Prediction
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.joint_errors import error_correlation
 from gpadjust.dynamics.learning import (
-    DynamicsFitOptions,
     Learnt,
     Recipe,
     check_enough_observed,
     checked_fit_options,
-    kept,
     made_by,
 )
 from gpadjust.dynamics.particles import varying_parameters
 from gpadjust.dynamics.physics_dynamics import PhysicsDynamics
 from gpadjust.dynamics.state import check_fingerprint, fingerprint
-from gpadjust.dynamics.targets import Target, Targets, check_physics, checked_physics_error
-from gpadjust.inference import FitResult, SampleResult
-from gpadjust.models import CKA, Prediction, TermsModel
-from gpadjust.models.factory import ModelFactory
-from gpadjust.models.sampled_functions import check_num_features
-from gpadjust.models.term_builder import PhysicsLike
+from gpadjust.dynamics.targets import Target, Targets, checked_physics_error, named_physics
+from gpadjust.kinds.factory import ModelFactory
 from gpadjust.states import StateSpec
 
 _NUM_FEATURES = 1024  # by default
-_MEAN_ROWS = 256  # kernel rows of a mean: transitions times samples of the hyper-parameters
+_MEAN_ROWS = 256  # kernel rows of a mean: transitions times draws
 
 
 class LearnedDynamics(Dynamics):
@@ -51,20 +46,18 @@ class LearnedDynamics(Dynamics):
             the actions; angles in rad. Several: a list, or a dictionary with their names, as of
             :class:`~gpadjust.CKA`. None for a model without physics.
         model: Makes the model from ``(X, Y, physics=...)``: :class:`~gpadjust.CKA`, another class
-            of :mod:`gpadjust.models` (:class:`~gpadjust.ZeroMeanGP` is the one without physics),
-            your own, or a function. Further arguments by ``functools.partial``, such as
-            ``partial(RRA, num_features=128)``; a kernel among them may be a function of the number
-            of inputs and the batch shape that makes it, one that is a module is copied for each
-            fit. A function gets ``input_transform``, too, where the state has angles.
+            of models (:class:`~gpadjust.ZeroMeanGP` is the one without physics), your own, or a
+            function. Further arguments by ``functools.partial``, such as
+            ``partial(RRA, num_features=128)``. A function gets ``input_transform``, too, where the
+            state has angles.
         target: What the model learns: the ``"difference"`` of next state and state, of an angle
             the shortest way round, or the next state itself (``"absolute"``). A scaling of an
             absolute position or angle depends on where its origin is; one of a change does not.
         encode_angles: Whether the model reads the sine and cosine of angles; the physics always
             reads the angles.
-        fit_options: Options of the search that :func:`gpadjust.fit` makes at the first fit, and of
-            all fits ``method``, ``num_samples``, ``num_draws`` and ``seed``. By default the
-            hyper-parameters are sampled, and what is predicted has their uncertainty, too;
-            ``"map"`` takes the most likely ones.
+        fit_options: Options of :func:`gpadjust.fit`: ``method``, ``num_draws`` and ``seed``. By
+            default the hyper-parameters are drawn, and what is predicted has their uncertainty,
+            too; ``"map"`` takes the most likely ones.
         num_features: Number of random features that stand for each kernel in sampled functions, an
             even one. Fewer are faster: 256 for a policy search, whose functions are many.
         physics_error: Standard deviations of the error of a step of the physics, by the name of the
@@ -92,31 +85,33 @@ class LearnedDynamics(Dynamics):
     def __init__(
         self,
         spec: StateSpec,
-        physics: PhysicsLike | None = None,
+        physics: Any = None,
         *,
         model: ModelFactory = CKA,
         target: Target = "difference",
         encode_angles: bool = True,
-        fit_options: DynamicsFitOptions | None = None,
+        fit_options: Mapping[str, Any] | None = None,
         num_features: int = _NUM_FEATURES,
         physics_error: Mapping[str, float] | None = None,
     ) -> None:
         super().__init__(spec)
-        check_num_features(num_features)
+        if checked_whole("num_features", num_features, 2) % 2:
+            raise ValueError(f"Expected num_features to be even; found {num_features}.")
         check_switch("encode_angles", encode_angles)
         self.targets = Targets(spec, target)
-        self.physics = None if physics is None else check_physics(physics, spec)
+        parts = {} if physics is None else named_physics(physics, spec)
+        self.physics = next(iter(parts.values())) if len(parts) == 1 else None  # if it is one
         self.encode_angles = encode_angles
-        self.fit_result: FitResult | SampleResult | None = None
+        self.fit_result: FitResult | None = None
         self.make_model = model
-        self._recipe = Recipe(self.targets, self.physics, model, encode_angles)
-        self.fit_options = checked_fit_options(fit_options, model)
+        self._recipe = Recipe(self.targets, parts, model, encode_angles)
+        self.fit_options = checked_fit_options(fit_options)
         self.num_features = num_features
         self.physics_error = checked_physics_error(spec, physics_error)
         self._learnt: Learnt | None = None
         self._compared = False  # the physics with transitions
-        self._means: tuple[TermsModel, Any] | None = None  # of a model, made once
-        self._root: tuple[TermsModel, Tensor | None] | None = None  # likewise
+        self._means: tuple[GP, GP] | None = None  # of a model: with few draws
+        self._root: tuple[GP, Tensor | None] | None = None  # likewise
 
     @property
     def is_fitted(self) -> bool:
@@ -124,7 +119,7 @@ class LearnedDynamics(Dynamics):
         return self._learnt is not None
 
     @property
-    def model(self) -> TermsModel:
+    def model(self) -> GP:
         """The model, whose targets are what ``target`` says of the predicted states."""
         return self._known_so_far().model
 
@@ -136,9 +131,8 @@ class LearnedDynamics(Dynamics):
     def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
         """Learn from further transitions, beside the earlier ones.
 
-        The hyper-parameters are searched for at first and again whenever the number of transitions
-        has doubled since the last search; else they are fitted again from where they were. If this
-        raises an error, what was learnt before stands; so it does in all methods below.
+        All unknown numbers are fitted again to all transitions. If this raises an error, what was
+        learnt before stands; so it does in all methods below.
 
         Args:
             states: ``N x state_dim``.
@@ -162,19 +156,17 @@ class LearnedDynamics(Dynamics):
             if previous is None and not self._compared:
                 self._recipe.compare_physics(data, known)
             self._recipe.tell_physics(data, known)
-            model, result, searched_at = self._recipe.fit(data, previous, self.fit_options)
-            if self._recipe.physics_learns:
-                known = self._recipe.physics_at(data.states, data.actions)
+            model, result = self._recipe.fit(data, previous is None, self.fit_options)
         self._compared = self._compared or previous is None
         self.fit_result = result
-        self._learnt = Learnt(data, known, (len(data.states),), searched_at, model, model)
+        self._learnt = Learnt(data, known, (len(data.states),), model, model)
 
     def try_physics(self, states: Tensor, actions: Tensor) -> None:
         """Call the physics once, to find what is wrong with it before there are transitions."""
         self._recipe.physics_at(states, actions)
 
     def condition(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
-        """Condition on further transitions with the hyper-parameters as they are.
+        """Condition on further transitions with the unknown numbers as they are.
 
         In :math:`O(n^2 N)` for ``N`` new transitions beside ``n``; the arguments and errors are
         those of :meth:`update`, and a RuntimeError if nothing was learnt yet.
@@ -191,7 +183,7 @@ class LearnedDynamics(Dynamics):
 
     def predict(
         self, states: Tensor, actions: Tensor, *, observation_noise: bool = True
-    ) -> Prediction[Tensor]:
+    ) -> Prediction:
         """Mean and variance of the next states, entry by entry.
 
         Args:
@@ -218,8 +210,7 @@ class LearnedDynamics(Dynamics):
 
     def physics_alone(self) -> Dynamics | None:
         """The physics, with the guesses of unknown parameters; None unless it is a single one."""
-        alone = self.physics is not None and len(self._recipe.parts) == 1
-        if not (alone and self.physics):
+        if self.physics is None:
             return None
         return PhysicsDynamics(self.spec, self.physics, physics_error=self.physics_error)
 
@@ -248,20 +239,21 @@ class LearnedDynamics(Dynamics):
     def mean_function(self) -> TransitionFunctions:
         """The mean of the predictions, as a function of any ``k`` blocks, with gradients.
 
-        Of many transitions it is that of two or more of the hyper-parameters' samples, as many as
-        keep it quick, which differ less the more is known.
+        Of many transitions it is that of two or more of the draws, as many as keep it quick, which
+        differ less the more is known.
 
         Raises:
             RuntimeError: If nothing was learnt yet.
         """
         model = self.model
         if self._means is None or self._means[0] is not model:
-            most = max(2, _MEAN_ROWS // self.num_transitions)
-            self._means = model, model.mean_functions(most)
-        _, functions = self._means
+            number = min(len(model.u), max(2, _MEAN_ROWS // self.num_transitions))
+            rows = ((torch.arange(number) + 0.5) * len(model.u) / number).long()
+            self._means = model, model.subset_draws(rows)
+        _, few = self._means
 
         def mean(inputs: Tensor) -> Tensor:
-            values: Tensor = functions(inputs.flatten(0, -2)).mean(0)
+            values = few.predict(inputs.flatten(0, -2)).mean
             return values.unflatten(0, inputs.shape[:-1])
 
         def step(states: Tensor, actions: Tensor) -> Tensor:
@@ -290,13 +282,15 @@ class LearnedDynamics(Dynamics):
         """Each setting of these dynamics as a text; of objects, the class."""
         parts = [*self._recipe.parts]
         several: dict[str, Any] = {"physics": parts} if len(parts) > 1 else {}
-        if self.physics is not None and self.physics.unknowns:
-            several["unknowns"] = {name: repr(u) for name, u in self.physics.unknowns.items()}
+        unknowns: dict[str, str] = {}
+        for part in self._recipe.parts.values():
+            unknowns |= {name: repr(unknown) for name, unknown in part.unknowns.items()}
+        if unknowns:
+            several["unknowns"] = unknowns
         if self.num_features != _NUM_FEATURES:
             several["num_features"] = self.num_features
         if self.physics_error:
             several["physics_error"] = self.physics_error
-        later = {k: v for k, v in kept(self.fit_options).items() if v is not None}
         return fingerprint(
             type(self),
             self.spec,
@@ -305,11 +299,11 @@ class LearnedDynamics(Dynamics):
             target=self.targets.target,
             encode_angles=self.encode_angles,
             model_options=getattr(self.make_model, "keywords", {}),
-            **{"method": None, **later},
+            **{"method": None, **self.fit_options},
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """All that was learnt, in tensors and plain values: data, f_p there, hyper-parameters."""
+        """All that was learnt, in tensors and plain values: data, f_p there, draws."""
         if self._learnt is None:
             return {}
         return {"fingerprint": self.describe(), **self._learnt.state_dict()}
@@ -338,7 +332,7 @@ class LearnedDynamics(Dynamics):
     ) -> Callable[[int, int | None], TransitionFunctions]:
         """Like `sample_functions`, each function with parameters of its own."""
         learnt = self._known_so_far()
-        if self.physics is None or not self.physics.unknowns or len(self._recipe.parts) > 1:
+        if self.physics is None or not self.physics.unknowns:
             return super()._varied(variation)
         drawn = learnt.model.physics_parameters
         vary = varying_parameters(self.physics, self.spec, drawn, learnt.data.actions, variation)

@@ -4,37 +4,26 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
-from copy import deepcopy
+from contextlib import contextmanager
 from functools import partial
 from inspect import signature
 from typing import Any, NamedTuple
 
 import torch
-from botorch.exceptions.warnings import OptimizationWarning
 from torch import Tensor
 from torch.nn import Module
 
+from gpadjust.checks import check_choice, checked_options
+from gpadjust.core import GP, FitResult, ZeroMeanGP, fit
 from gpadjust.dynamics.angle_input import AngleInput
 from gpadjust.dynamics.state import PhysicsProbes, copies, expect, loaded, saved
-from gpadjust.dynamics.targets import TargetPhysics, Targets, parts_of, warn_of_differences
+from gpadjust.dynamics.targets import TargetPhysics, Targets, warn_of_differences
 from gpadjust.dynamics.trajectories import Trajectories
-from gpadjust.inference import FitOptions, FitResult, SampleResult, fit
-from gpadjust.inference.fitting import check_options
-from gpadjust.inference.warm_start import warm_start
-from gpadjust.models import TermsModel, ZeroMeanGP
-from gpadjust.models.factory import ModelFactory, make_model
-from gpadjust.physics import Physics, as_physics
+from gpadjust.kinds.factory import ModelFactory, make_model
+from gpadjust.physics import Physics
 from gpadjust.states import StateSpec
 
-_SEARCH = FitOptions(num_screened=64, num_starts=4, max_iterations=30)
-_REFIT = FitOptions(num_screened=0, num_starts=1, max_iterations=15)
-
-
-class DynamicsFitOptions(FitOptions, total=False):
-    """The options of :func:`gpadjust.fit` for dynamics, the method among them."""
-
-    method: str | None
+_STATE = ("transitions", "physics", "chunks", "model", "draws", "noise")
 
 
 class Learnt(NamedTuple):
@@ -43,9 +32,8 @@ class Learnt(NamedTuple):
     data: Trajectories
     known: Tensor | None  # what the physics says of the targets there
     chunks: tuple[int, ...]  # numbers of transitions: fitted, then conditioned on in turn
-    searched_at: int  # number of transitions at the last search of the hyper-parameters
-    fitted: TermsModel  # of the first chunk
-    model: TermsModel  # of all
+    fitted: GP  # of the first chunk
+    model: GP  # of all
 
     def with_rows(self, data: Trajectories, known: Tensor | None) -> tuple[Trajectories, Any]:
         """All transitions, and what the physics says there, with those of further ones."""
@@ -59,14 +47,15 @@ class Learnt(NamedTuple):
             "transitions": saved(self.data),
             "physics": None if self.known is None else self.known.clone(),
             "chunks": [*self.chunks],
-            "searched_at": self.searched_at,
             "model": {name: t.clone() for name, t in self.fitted.state_dict().items()},
+            "draws": self.fitted.draws.clone(),
+            "noise": {name: t.clone() for name, t in _tensors_of(self.fitted.noise).items()},
         }
 
     @staticmethod
     def loaded(state: Mapping[str, Any], recipe: Recipe) -> Learnt:
         """Return a copy of a state's entries; a RuntimeError if one is missing or wrong."""
-        for name in ("transitions", "physics", "chunks", "searched_at", "model"):
+        for name in _STATE:
             if name not in state:
                 raise RuntimeError(f"The state is damaged: it lacks {name!r}.")
         data, known = loaded(state["transitions"], recipe.targets.spec), state["physics"]
@@ -79,25 +68,32 @@ class Learnt(NamedTuple):
             )
         if known is not None:
             (known,) = copies([known], "physics", (n, num_known))
-        chunks, searched_at, parameters = (state[k] for k in ("chunks", "searched_at", "model"))
+        chunks, parameters, draws, noise = (state[name] for name in _STATE[2:])
         sizes: list[Any] = [*chunks] if isinstance(chunks, list | tuple) else [None]
         whole = all(isinstance(size, int) and 1 <= size <= n for size in sizes)
         expect(whole and sum(sizes) == n, "chunks", f"numbers of transitions, {n} in all")
-        whole = isinstance(searched_at, int) and 1 <= searched_at <= n
-        expect(whole, "searched_at", f"a number of transitions, at most {n}")
-        whole = isinstance(parameters, Mapping) and all(map(torch.is_tensor, parameters.values()))
-        whole = whole and not any(tensor.isnan().any() for tensor in parameters.values())
-        expect(whole, "model", "a dictionary of tensors without NaN")
+        for name, tensors in (("model", parameters), ("noise", noise), ("draws", {"": draws})):
+            whole = isinstance(tensors, Mapping) and all(map(torch.is_tensor, tensors.values()))
+            whole = whole and not any(tensor.isnan().any() for tensor in tensors.values())
+            expect(whole, name, "tensors without NaN")
         parts = [data.some(rows) for rows in torch.arange(n).split(sizes)]
         with recipe.restored_on_error():
             recipe.tell_physics(data, known)
             fitted = recipe.build(parts[0], quiet=True)
+            if noise:
+                own: Any = fitted.noise
+                own = type(own)(**{**own.settings, **noise}).of_terms(fitted.term_sum)
+                fitted = fitted.with_noise(own)
             fitted.load_state_dict(dict(parameters))
+            number, shape = len(fitted.u), fitted.u.shape[1:]
+            whole = draws.shape[1:] == shape and len(draws) >= number
+            expect(whole, "draws", f"{number} or more coordinates {tuple(shape)}")
+            fitted.set_draws(draws.clone(), number)
             recipe.check_same_physics(data, known)
             model = fitted.eval()
             for part in parts[1:]:
                 model = recipe.condition(model, part)
-        return Learnt(data, known, tuple(sizes), searched_at, fitted, model)
+        return Learnt(data, known, tuple(sizes), fitted, model)
 
 
 class Recipe:
@@ -108,42 +104,46 @@ class Recipe:
     """
 
     def __init__(
-        self, targets: Targets, physics: Physics | None, make: ModelFactory, encode_angles: bool
+        self,
+        targets: Targets,
+        physics: Mapping[str, Physics],
+        make: ModelFactory,
+        encode_angles: bool,
     ) -> None:
         self.targets = targets
-        self.parts = {
-            name: TargetPhysics(part, targets)
-            for name, part in ({} if physics is None else parts_of(physics)).items()
-        }
-        self.physics = as_physics(self.parts) if self.parts else None
-        self.options: dict[str, Any] = {} if self.physics is None else {"physics": self.physics}
+        self.parts = {name: TargetPhysics(part, targets) for name, part in physics.items()}
+        self.options: dict[str, Any] = {}
+        if self.parts:
+            self.options["physics"] = self.parts
+            if len(self.parts) == 1:
+                (self.options["physics"],) = self.parts.values()
         if encode_angles and targets.angles:
             self.options["input_transform"] = AngleInput(targets.angles)
         check_factory(make, self.options)
         self.make = make
 
-    def build(self, data: Trajectories, quiet: bool) -> TermsModel:
+    def build(self, data: Trajectories, quiet: bool) -> GP:
         """The model of some transitions; quiet where the first one has given its warnings."""
         with warnings.catch_warnings():
             if quiet:
                 warnings.simplefilter("ignore")
-            given = {n: v if n == "physics" else deepcopy(v) for n, v in self.options.items()}
-            model: TermsModel = make_model(self.make, *self._rows(data), kind=TermsModel, **given)
-        model.input_names = self.targets.input_names
-        model.output_names = self.targets.output_names
+            model: GP = make_model(self.make, *self._rows(data), kind=GP, **self.options)
+        names = {name: getattr(self.targets, name) for name in ("input_names", "output_names")}
+        model.data = model.data._replace(**names)
         return model
 
-    def condition(self, model: TermsModel, data: Trajectories) -> TermsModel:
-        """The model with further transitions, its hyper-parameters as they are."""
+    def condition(self, model: GP, data: Trajectories) -> GP:
+        """The model with further transitions, its unknown numbers as they are."""
         with torch.no_grad():
             return model.condition_on_observations(*self._rows(data))
 
     def physics_at(self, states: Tensor, actions: Tensor) -> Tensor | None:
         """Targets by the physics, those of its parts side by side."""
-        if self.physics is None:
+        if not self.parts:
             return None
+        inputs = self.targets.inputs(states, actions)
         with torch.no_grad():
-            return self.physics(self.targets.inputs(states, actions))
+            return torch.cat([part(inputs) for part in self.parts.values()], -1)
 
     def tell_physics(self, data: Trajectories, known: Tensor | None) -> None:
         """Give the physics its values at some transitions, so that it need not run there again."""
@@ -154,9 +154,9 @@ class Recipe:
     def compare_physics(self, data: Trajectories, known: Tensor | None) -> None:
         """Warn of a physics that returns differences."""
         predicted = self.targets.spec.predicted
-        for name, (_, own) in zip(self.parts, self._of_parts(known), strict=False):
+        for part, own in self._of_parts(known):
             change = self.targets.decode(data.states, own) - data.states[:, predicted]
-            warn_of_differences(name, self.targets.spec, data, predicted, change)
+            warn_of_differences(part.name, self.targets.spec, data, predicted, change)
 
     def check_same_physics(self, data: Trajectories, known: Tensor | None) -> None:
         """Raise a RuntimeError if the physics says something else at 3 of the transitions."""
@@ -171,37 +171,21 @@ class Recipe:
 
     @contextmanager
     def restored_on_error(self) -> Iterator[None]:
-        """Leave the physics, and what it was told, as it was if there is an error."""
-        with ExitStack() as stack:
-            for part in self.parts.values():
-                stack.enter_context(part.restored_on_error())
+        """Leave what the physics was told as it was if there is an error."""
+        known = {part: part.known for part in self.parts.values()}
+        try:
             yield
-
-    @property
-    def physics_learns(self) -> bool:
-        """True if the physics has parameters to learn, so that its values change with a fit."""
-        return any(p.requires_grad for part in self.parts.values() for p in part.parameters())
+        except BaseException:
+            for part, before in known.items():
+                part.known = before
+            raise
 
     def fit(
-        self, data: Trajectories, previous: Learnt | None, options: DynamicsFitOptions
-    ) -> tuple[TermsModel, FitResult | SampleResult, int]:
-        """Fit a model of all transitions, from where the one of earlier ones was, if there is one.
-
-        Returns:
-            The model, what the fit has reached, and the number of transitions at the last search
-            of the hyper-parameters.
-        """
-        n, given = len(data.states), dict[str, Any](options)
-        model = self.build(data, quiet=previous is not None)
-        if previous is None:
-            return model, fit(model, **given), n
-        warm_start(model, previous.model)
-        searches = n >= 2 * previous.searched_at
-        with warnings.catch_warnings():
-            # The next update goes on from where this one stops.
-            warnings.simplefilter("ignore", OptimizationWarning)
-            result = fit(model, **kept(given), **(_SEARCH if searches else _REFIT))
-        return model, result, n if searches else previous.searched_at
+        self, data: Trajectories, is_first: bool, options: Mapping[str, Any]
+    ) -> tuple[GP, FitResult]:
+        """Fit a model of all transitions, and return it and what the fit has found."""
+        model = self.build(data, quiet=not is_first)
+        return model, fit(model, **options)
 
     def _of_parts(self, known: Tensor | None) -> Iterator[tuple[TargetPhysics, Tensor]]:
         if known is not None:
@@ -213,14 +197,20 @@ class Recipe:
         return inputs, self.targets.encode(data.states, data.next_states)
 
 
+def _tensors_of(noise: Any) -> dict[str, Tensor]:
+    """Return what a fit has learnt of single observations."""
+    settings = getattr(noise, "settings", {})
+    return {name: value for name, value in settings.items() if isinstance(value, Tensor)}
+
+
 def check_factory(make: Any, options: Mapping[str, Any]) -> None:
     """Raise a TypeError unless a model can be made of inputs, targets and these options."""
     if isinstance(make, Module) or not callable(make):
         is_module = isinstance(make, Module)
         found = f"an instance of {type(make).__name__}" if is_module else repr(make)
         raise TypeError(
-            "Expected model as what makes one of (X, Y, physics=...): a class of gpadjust.models, "
-            "such as CKA, PhysicsMeanGP or ZeroMeanGP, a functools.partial of it with further "
+            "Expected model as what makes one of (X, Y, physics=...): a class of gpadjust, such "
+            "as CKA, PhysicsMeanGP or ZeroMeanGP, a functools.partial of it with further "
             f"arguments, or a function; found {found}."
         )
     taken = {"train_X", "train_Y", "train_Yvar", "physics", "input_transform"}
@@ -246,25 +236,12 @@ def check_factory(make: Any, options: Mapping[str, Any]) -> None:
         ) from None
 
 
-def checked_fit_options(options: DynamicsFitOptions | None, make: Any) -> DynamicsFitOptions:
-    """The options of the first fit, once they are found to be right."""
-    if options is not None and not isinstance(options, Mapping):
-        raise TypeError(
-            f"Expected fit_options as a dictionary of options of gpadjust.fit, found {options!r}."
-        )
-    own: Any = {**(options or {})}
-    method = own.pop("method", None)
-    if why := getattr(made_by(make), "not_sampled", ""):
-        if method == "bayes":
-            raise ValueError(why)
-        method = method or "map"
-    check_options("bayes" if method is None else method, own)
-    return {**(options or {})}
-
-
-def kept(options: Mapping[str, Any]) -> dict[str, Any]:
-    """The options that later fits have, too: all but those of the first search."""
-    return {name: value for name, value in options.items() if name not in _REFIT}
+def checked_fit_options(options: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return the options of :func:`gpadjust.fit`, without those that are None."""
+    checked = checked_options("fit_options", options, ("method", "num_draws", "seed"))
+    checked = {name: value for name, value in checked.items() if value is not None}
+    check_choice("method", checked.get("method", "bayes"), ("bayes", "map"))
+    return checked
 
 
 def check_enough_observed(spec: StateSpec, data: Trajectories) -> None:

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from gpadjust.checks import checked_tensor, checked_whole
-from gpadjust.models import PhysicsParameters
 from gpadjust.physics import Physics, PhysicsError
+from gpadjust.physics.parameters import PhysicsParameters
 from gpadjust.states import StateSpec
 
 _AT_ONCE = 8  # windows whose particles move together: more leave the cache, at half the speed

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
 import torch
+from scipy.optimize import least_squares
 from torch import Tensor
 
 from gpadjust.checks import checked_whole
+from gpadjust.core import Prediction
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
+from gpadjust.dynamics.particles import even_normal
 from gpadjust.dynamics.state import (
     PhysicsProbes,
     check_fingerprint,
@@ -27,16 +31,19 @@ from gpadjust.dynamics.targets import (
     warn_of_differences,
 )
 from gpadjust.dynamics.trajectories import Trajectories
-from gpadjust.inference.calibrate import warn_of_parameters
-from gpadjust.inference.calibration import Misfit, or_infinite
-from gpadjust.inference.least_squares import descend, least_squares, spread_normal
-from gpadjust.models import Prediction
-from gpadjust.models.physics_parameters import PhysicsParameters
-from gpadjust.physics import Physics
+from gpadjust.physics import Physics, PhysicsWarning
+from gpadjust.physics.parameters import PhysicsParameters
 from gpadjust.states import StateSpec
 
-_SEARCHED = 512  # transitions by which parameters are searched for; all of them refine the best
 _DRAWS = 1024
+_SEARCHED = 512  # transitions by which parameters are searched for; all of them refine the best
+_GUESSES, _STARTS = 512, 6  # draws from the prior, and how many of the best are started from
+_ROUNDS, _CALLS = 30, 6  # of least squares and variances by turns, and of the physics in each
+_ROUGH, _SETTLED = 0.1, 1e-4  # changes of the log of variances, below which a search ends
+_SILENT = 1e-14  # the mean square of errors, relative to that of the changes, that is none
+_STEP = 1e-4  # of differences, in standard deviations of the prior
+_UNTOLD, _TAKES_PART = 0.15, 0.3  # precision next to nothing; cosine of a parameter with it
+_FAR = 3.0  # standard deviations of the prior
 
 
 class PhysicsDynamics(Dynamics):
@@ -52,7 +59,7 @@ class PhysicsDynamics(Dynamics):
     with the errors :math:`r_{ij}` of the :math:`n_i` measured next values of state i, so that each
     state counts in units of its own error, and the coordinates z of the parameters, which are
     standard normal by their prior (:class:`~gpadjust.physics.Unknown`). The search begins at the
-    guesses and the best of 512 draws from the prior, and is the same for the same transitions. A
+    best of the guesses and 512 draws from the prior, and is the same for the same transitions. A
     parameter of which they tell nothing stays in the middle of its prior, with a warning. The
     errors that are left are taken as the noise of measured next states; the functions have none.
 
@@ -113,20 +120,15 @@ class PhysicsDynamics(Dynamics):
 
         The draws are of the normal distribution (of the coordinates z) whose precision the slopes
         of the physics at the optimum say; their ``sd`` are the standard errors, with the prior.
-
-        Raises:
-            ValueError: If the physics has none.
         """
         unknowns = self.physics.unknowns
-        if not unknowns:
-            return PhysicsParameters.of(None)
         if self._fitted is None:
-            return PhysicsParameters(unknowns, unknowns.guess.unsqueeze(0))
+            return PhysicsParameters(unknowns, [*unknowns.guess.unsqueeze(-1)])
         point, precision = self._fitted.point, self._fitted.precision
-        spread = spread_normal((_DRAWS, len(point)), torch.Generator().manual_seed(0))
+        spread = even_normal(_DRAWS, len(point), seed=0)
         chol = torch.linalg.cholesky(precision + torch.eye(len(point)).to(precision))
         away = torch.linalg.solve_triangular(chol.mT, spread.mT, upper=True).mT
-        return PhysicsParameters(unknowns, unknowns.at(point + away))
+        return PhysicsParameters(unknowns, unknowns.at(point + away).unbind(-1))
 
     def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
         """Fit unknown parameters to these and all earlier transitions.
@@ -139,7 +141,7 @@ class PhysicsDynamics(Dynamics):
             PhysicsError: If the physics fails at the guesses.
 
         Warns:
-            ParameterWarning: If the transitions say next to nothing of a parameter, or contradict
+            PhysicsWarning: If the transitions say next to nothing of a parameter, or contradict
                 its prior.
         """
         data = self._checked(states, actions, next_states)
@@ -155,7 +157,7 @@ class PhysicsDynamics(Dynamics):
             self.physics.forget()
         self._compared = True
 
-    def predict(self, states: Tensor, actions: Tensor) -> Prediction[Tensor]:
+    def predict(self, states: Tensor, actions: Tensor) -> Prediction:
         """The next states, and the variance of the noise; before a fit, of the stated error."""
         with torch.no_grad():
             following = self._step(states, actions, self._values)
@@ -280,50 +282,99 @@ class _Fitted(NamedTuple):
         return cls(data, *copies(tensors, "fitted", (p,), (p, p), (spec.state_dim,)))
 
 
-class _Steps(Misfit):
+class _Errors:
     """Errors of a physics in one step, by the coordinates of its unknown parameters."""
 
     def __init__(self, physics: Physics, spec: StateSpec, data: Trajectories) -> None:
         self.physics, self.spec, self.data = physics, spec, data
         self.inputs = spec.physics_inputs(data.states, data.actions)
-        self.targets = spec.change(data.states, data.next_states)[:, spec.moving].mT
-        self.observed = ~self.targets.isnan()
+        changes = spec.change(data.states, data.next_states)[:, spec.moving].mT
+        self.observed = ~changes.isnan()
+        self.count = self.observed.sum(-1).double()  # n_i
+        self.least = _SILENT * changes.square().nanmean(-1) + torch.finfo(changes.dtype).tiny
 
-    @property
-    def point(self) -> Tensor:
-        """The coordinates of the guesses."""
-        return self.physics.unknowns.coordinates(self.physics.unknowns.guess)
-
-    def residuals(self, points: Tensor) -> Tensor:
-        """Next states less those of the physics, ``... x m x n``, of angles the shortest way."""
-        spec, values = self.spec, self.physics.unknowns.at(points)
-        following = or_infinite(self.physics.or_nan(self.inputs, values))
-        failed = ~following.isfinite()
+    def at(self, z: Tensor) -> Tensor:
+        """Return next states less those of the physics, ``... x m x n``; infinite if it fails."""
+        following = self.physics.or_nan(self.inputs, self.physics.unknowns.at(z))
         predicted = self.data.states.expand(*following.shape[:-1], -1).clone()
-        predicted[..., spec.moving] = following.masked_fill(failed, 0.0)
-        error = spec.change(predicted, self.data.next_states)[..., spec.moving]
-        error = error.masked_fill(failed, torch.inf).mT
-        return error.where(self.observed, torch.zeros_like(error))
+        predicted[..., self.spec.moving] = following
+        errors = self.spec.change(predicted, self.data.next_states)[..., self.spec.moving].mT
+        errors = errors.where(self.observed, torch.zeros_like(errors))
+        return errors.nan_to_num(nan=torch.inf)
+
+    def slopes(self, z: Tensor) -> Tensor:
+        """Return derivatives of the errors at ``p`` coordinates, ``p x m x n``."""
+        steps = _STEP * torch.eye(len(z)).to(z)
+        up, down = self.at(torch.cat([z + steps, z - steps])).chunk(2)
+        return ((up - down) / (2 * _STEP)).nan_to_num(0.0, 0.0, 0.0)
+
+    def variances(self, errors: Tensor) -> Tensor:
+        """Return mean squares of the errors, ``... x m``."""
+        return (errors.square().sum(-1) / self.count.clamp_min(1)).maximum(self.least)
+
+    def loss(self, z: Tensor) -> Tensor:
+        """Return what is minimised, at coordinates ``... x p``."""
+        logs = self.variances(self.at(z)).log()
+        return (0.5 * self.count * logs).sum(-1) + 0.5 * z.square().sum(-1)
+
+    def descend(self, z: Tensor, settled: float = _SETTLED) -> Tensor:
+        """Return where least squares leads from coordinates ``p`` at which the physics works."""
+        variances = self.variances(self.at(z))
+        for _ in range(_ROUNDS):
+            sd = variances.sqrt().unsqueeze(-1)
+
+            def residuals(point: Any, sd: Tensor = sd) -> Any:
+                errors = self.at(torch.from_numpy(point)) / sd
+                return torch.cat([errors.flatten(), torch.from_numpy(point)]).numpy()
+
+            def jacobian(point: Any, sd: Tensor = sd) -> Any:
+                slopes = (self.slopes(torch.from_numpy(point)) / sd).flatten(1).mT
+                return torch.cat([slopes, torch.eye(len(point)).double()]).numpy()
+
+            found = least_squares(residuals, z.numpy(), jacobian, max_nfev=_CALLS)
+            z, before = torch.from_numpy(found.x), variances
+            variances = self.variances(self.at(z))
+            if ((variances / before).log().abs() < settled).all():
+                break
+        return z
 
 
 @torch.no_grad()
 def _fit(physics: Physics, spec: StateSpec, data: Trajectories) -> _Fitted:
-    """The most likely parameters by all transitions."""
+    """Return the most likely parameters by all transitions."""
     n, unknowns = len(data.states), physics.unknowns
-    whole = _Steps(physics, spec, data)
-    if not whole.residuals(whole.point).isfinite().all():
+    whole = _Errors(physics, spec, data)
+    guess = unknowns.coordinates(unknowns.guess)
+    if not whole.at(guess).isfinite().all():
         physics(whole.inputs)  # which says where it fails
     rows = torch.linspace(0, n - 1, min(n, _SEARCHED), dtype=torch.float64).round().long()
-    generator = torch.Generator().manual_seed(0)
-    points = least_squares(_Steps(physics, spec, data.some(rows)), generator).points
-    found, values, variances, _ = descend(whole, points)
-    best = int(values.argmin())
-    near = whole.linearized(found[best])
-    weighted = near.slope / variances[best][:, None, None]
-    precision = (weighted.mT @ near.slope).sum(-3)
-    count = whole.observed.sum()
+    some = _Errors(physics, spec, data.some(rows))
+    starts = torch.cat([guess.unsqueeze(0), even_normal(_GUESSES, len(guess), seed=0)])
+    best = some.loss(starts).nan_to_num(nan=torch.inf).argsort()[:_STARTS]
+    ends = [some.descend(z, _ROUGH) for z in starts[best] if some.loss(z).isfinite()]
+    point = whole.descend(min(ends, key=some.loss))
+    errors = whole.at(point)
+    weighted = whole.slopes(point) / whole.variances(errors).sqrt().unsqueeze(-1)
+    precision = torch.einsum("pmn,qmn->pq", weighted, weighted)
+    freedom = whole.count.sum() / (whole.count.sum() - len(unknowns)).clamp_min(1)
     noise = torch.zeros(spec.state_dim, dtype=torch.float64)
-    square = near.residual.square().sum(-1) / whole.observed.sum(-1).clamp_min(1)
-    noise[spec.moving] = square * count / (count - len(unknowns)).clamp_min(1)
-    warn_of_parameters(unknowns.names, precision, near.point, stacklevel=4)
-    return _Fitted(data, near.point, precision, noise)
+    noise[spec.moving] = errors.square().sum(-1) / whole.count.clamp_min(1) * freedom
+    _warn_of_parameters(unknowns.names, precision, point)
+    return _Fitted(data, point, precision, noise)
+
+
+def _warn_of_parameters(names: tuple[str, ...], precision: Tensor, point: Tensor) -> None:
+    """Warn of parameters of which transitions tell next to nothing, or that contradict a prior.
+
+    The first take part in directions in which the transitions have next to none of the prior's
+    precision, ``p x p``; the second are at coordinates far from its middle.
+    """
+    values, vectors = torch.linalg.eigh(precision)
+    silent = vectors[:, values < _UNTOLD].norm(dim=-1) > _TAKES_PART
+    for which, message in (
+        (silent, "Transitions say next to nothing of {} of the physics: give narrower priors"),
+        (point.abs() > _FAR, "Transitions and prior disagree about {} of the physics: look at it"),
+    ):
+        if which.any():
+            told = ", ".join(name for name, is_one in zip(names, which, strict=True) if is_one)
+            warnings.warn(f"{message.format(told)}.", PhysicsWarning, stacklevel=4)

@@ -4,24 +4,15 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from typing import Any, Literal, cast, get_args
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
 
 from gpadjust.checks import check_choice, checked_number
 from gpadjust.dynamics.trajectories import Trajectories
-from gpadjust.models.term_builder import PhysicsLike
-from gpadjust.physics import (
-    JoinedPhysics,
-    ODEPhysics,
-    ParameterValues,
-    Physics,
-    PhysicsError,
-    as_physics,
-)
+from gpadjust.physics import ODEPhysics, ParameterValues, Physics, PhysicsError, as_physics
 from gpadjust.physics.memo import RowMemo, row_keys
 from gpadjust.states import StateSpec
 from gpadjust.states.state_spec import side_by_side
@@ -89,7 +80,7 @@ class TargetPhysics(Physics):
         self.physics = physics
         self.targets = targets
         self.num_outputs = len(targets.predicted)
-        self._known = RowMemo(_ALL)
+        self.known = RowMemo(_ALL)
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """The targets that the physics stands for, ``N x m``."""
@@ -120,41 +111,24 @@ class TargetPhysics(Physics):
 
     def know(self, X: Tensor, values: Tensor) -> None:
         """Take the values at inputs ``N x d`` as given; they replace those known so far."""
-        self._known = RowMemo(_ALL)
-        self._known.store(row_keys(X), values)
+        self.known = RowMemo(_ALL)
+        self.known.store(row_keys(X), values)
 
     def forget(self) -> None:
         """Forget what was given, and what the physics remembers."""
-        self._known = RowMemo(_ALL)
+        self.known = RowMemo(_ALL)
         self.physics.forget()
 
     def of_rows(self, rows: Tensor) -> Tensor:
         """Like the base class; values that were given are not asked for again."""
         asks = torch.is_grad_enabled() and rows.requires_grad
-        if asks or not len(self._known) or self.unknowns or self._state():
+        if asks or not len(self.known) or self.unknowns:
             return super().of_rows(rows)
-        return self._known.recall(rows, super().of_rows, learn=False)
+        return self.known.recall(rows, super().of_rows, learn=False)
 
     def fresh_rows(self, rows: Tensor) -> Tensor:
         """Like :meth:`of_rows`, evaluated whatever was given or is remembered."""
         return self._targets_of(self.physics.fresh_rows, *self._arguments(rows))
-
-    def _state(self) -> list[Tensor]:
-        """Tensors that the physics depends on besides X, as far as torch knows."""
-        return [*self.parameters(), *self.buffers()]
-
-    @contextmanager
-    def restored_on_error(self) -> Iterator[None]:
-        """Take back what it was given, and its parameters, if there is an error."""
-        known, state = self._known, [(tensor, tensor.detach().clone()) for tensor in self._state()]
-        try:
-            yield
-        except BaseException:
-            self._known = known
-            with torch.no_grad():
-                for tensor, before in state:
-                    tensor.copy_(before)
-            raise
 
     def extra_repr(self) -> str:
         """The settings that ``repr`` shows."""
@@ -162,7 +136,7 @@ class TargetPhysics(Physics):
 
     def __getstate__(self) -> dict[str, Any]:
         """All but what is known, which belongs to the data."""
-        return {**self.__dict__, "_known": RowMemo(_ALL)}
+        return {**self.__dict__, "known": RowMemo(_ALL)}
 
 
 def check_spec(spec: StateSpec) -> None:
@@ -174,10 +148,16 @@ def check_spec(spec: StateSpec) -> None:
         )
 
 
-def check_physics(physics: PhysicsLike, spec: StateSpec) -> Physics:
-    """A physics of next states, or several of them joined, from what the user gave."""
-    whole = as_physics(physics)
-    for part in parts_of(whole).values():
+def named_physics(physics: Any, spec: StateSpec) -> dict[str, Physics]:
+    """Return checked physics of next states by name: one, or those of a list or mapping."""
+    given = physics if isinstance(physics, list | tuple | Mapping) else [physics]
+    if not isinstance(given, Mapping):
+        given = {str(i + 1): each for i, each in enumerate(given)}
+    parts: dict[str, Physics] = {}
+    for name, each in given.items():
+        part = parts[name] = as_physics(each)
+        if isinstance(physics, Mapping) and part is not each:  # a wrapper of ours
+            part.name = name
         if isinstance(part, ODEPhysics) and part.difference:
             raise ValueError(
                 f"Physics {part.name!r} returns the change of the state (difference=True), but "
@@ -189,23 +169,16 @@ def check_physics(physics: PhysicsLike, spec: StateSpec) -> Physics:
                 f"Physics {part.name!r} makes steps of {step:g}, but the spec says {spec.step:g}; "
                 f"build it with step={spec.step:g}, or correct the spec."
             )
-    return whole
+    return parts
 
 
-def one_physics(physics: PhysicsLike, spec: StateSpec, otherwise: str) -> Physics:
-    """A physics of next states; a ValueError, with the way out, if there are several."""
-    whole = check_physics(physics, spec)
-    if len(parts := parts_of(whole)) > 1:
-        names = ", ".join(map(repr, parts))
+def one_physics(physics: Any, spec: StateSpec, otherwise: str) -> Physics:
+    """Return a physics of next states; a ValueError, with the way out, unless there is one."""
+    parts = [*named_physics(physics, spec).values()]
+    if len(parts) != 1:
+        names = ", ".join(repr(part.name) for part in parts)
         raise ValueError(f"Expected one physics to follow, got {names}; {otherwise}.")
-    return whole
-
-
-def parts_of(physics: Physics) -> dict[str, Physics]:
-    """The physics that a joined one holds, by their names; of any other, that one itself."""
-    if isinstance(physics, JoinedPhysics):
-        return {n: cast(Physics, p) for n, p in zip(physics.names, physics.parts, strict=True)}
-    return {physics.name: physics}
+    return parts[0]
 
 
 def check_next_values(physics: Physics, Y: Tensor, num_states: int) -> None:

@@ -10,26 +10,26 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gpadjust.core import GP
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.export.finite_sum import Column, FiniteSum, finite_sum, model_of
 from gpadjust.export.transition import next_state, next_variance, target_columns
-from gpadjust.models import TermsModel
 
 _KERNELS = {  # of r, the squared distance in lengthscales
     "rbf": "exp(-0.5 * r)",
-    "matern0.5": "exp(-sqrt(r))",
-    "matern1.5": "(1.0 + sqrt(3.0 * r)) * exp(-sqrt(3.0 * r))",
-    "matern2.5": "(1.0 + sqrt(5.0 * r) + 5.0 / 3.0 * r) * exp(-sqrt(5.0 * r))",
+    "matern1/2": "exp(-sqrt(r))",
+    "matern3/2": "(1.0 + sqrt(3.0 * r)) * exp(-sqrt(3.0 * r))",
+    "matern5/2": "(1.0 + sqrt(5.0 * r) + 5.0 / 3.0 * r) * exp(-sqrt(5.0 * r))",
     "constant": "0.0",
 }
 _BEGIN = Template("""\
-    double each[SAMPLES * OUTPUTS]$spread;
-    for (int g = 0; g < SAMPLES * OUTPUTS; g++) {
-        double phi[FEATURES] = {0.0}, sum = start[g]$prior;
+    double each[DRAWS * OUTPUTS]$spread;
+    for (int g = 0; g < DRAWS * OUTPUTS; g++) {
+        double phi[FEATURES] = {0.0}, sum = 0.0$prior;
 """)
 _TERM = Template("""\
-        const double b$t = $basis; /* $name */
-        sum += b$t * mean$t[g];
+        const double f$t = $basis, b$t = f$t - center$t[g]; /* $name */
+        sum += f$t * mean$t[g];
 """)
 _PRIOR = Template("        prior += b$t * b$t * (amplitude$t[g] + constant$t[g]);\n")
 _KERNEL = Template("""\
@@ -52,66 +52,45 @@ _WAVES = Template("""\
 """)
 _MEAN = """\
         for (int i = 0; i < FEATURES; i++) sum += phi[i] * weights[g][i];
-        each[g] = shift[g] + scale[g] * sum;
+        each[g] = scale[g] * sum;
 """
-_VARIANCE = """\
+_SOLVED = """\
         if (!variance) continue;
-        double found = 0.0;
-"""
-_LOWER = """\
         const double *column = lower[g];
-        found = prior;
+        double squares = 0.0;
         for (int k = 0; k < FEATURES; column += FEATURES - k, k++) {
             const double u = phi[k] / column[0];
-            found -= u * u;
+            squares += u * u;
             for (int i = 0; i < FEATURES - k; i++) phi[k + i] -= column[i] * u;
-            phi[k] = u;
         }
 """
-_ROOT = """\
-        const double *row = root[g];
-        double u[FEATURES] = {0.0};
-        for (int k = 0; k < FEATURES; row += FEATURES - k, k++)
-            for (int i = 0; i < FEATURES - k; i++) u[k + i] += row[i] * phi[k];
-        for (int i = 0; i < FEATURES; i++) found += u[i] * u[i];
+_MULTIPLIED = """\
+        if (!variance) continue;
+        const double *column = lower[g];
+        double squares = 0.0, u[FEATURES] = {0.0};
+        for (int k = 0; k < FEATURES; column += FEATURES - k, k++)
+            for (int i = 0; i < FEATURES - k; i++) u[k + i] += column[i] * phi[k];
+        for (int i = 0; i < FEATURES; i++) squares += u[i] * u[i];
 """
-_SPREAD = """\
-        spread[g] = scale[g] * scale[g] * (fmax(found, $least * prior) + noise[g]);
-"""
+_SPREAD = Template("        spread[g] = scale[g] * scale[g] * ($left + noise[g]);\n")
 _MIXED = """\
     }
     for (int j = 0; j < OUTPUTS; j++) {
         mean[j] = 0.0;
-        for (int g = j; g < SAMPLES * OUTPUTS; g += OUTPUTS) mean[j] += each[g] / SAMPLES;
-"""
-_WIDER = """\
-        if (!variance) continue;
-        double wider = 1.0;
-"""
-_ERRORS = """\
-        double errors = 1.0, near = 1.0;
-        for (int i = 0; i < ERRORS; i++) {
-            double r = 0.0;
-            for (int k = 0; k < INPUTS; k++) {
-                const double u = (z[k] - error_points[i][k]) * error_rate[j][k];
-                r += u * u;
-            }
-            near += exp(-0.5 * r);
-            errors += exp(-0.5 * r) * error_squares[j][i];
-        }
-        wider = fmax(1.0, errors / near) * error_factor[j];
+        for (int g = j; g < DRAWS * OUTPUTS; g += OUTPUTS) mean[j] += each[g] / DRAWS;
 """
 _MIXED_VARIANCE = """\
+        if (!variance) continue;
         variance[j] = 0.0;
-        for (int g = j; g < SAMPLES * OUTPUTS; g += OUTPUTS) {
+        for (int g = j; g < DRAWS * OUTPUTS; g += OUTPUTS) {
             const double off = each[g] - mean[j];
-            variance[j] += (wider * spread[g] + off * off) / SAMPLES;
+            variance[j] += (spread[g] + off * off) / DRAWS;
         }
 """
 
 
 def c_source(
-    fitted: TermsModel | LearnedDynamics,
+    fitted: GP | LearnedDynamics,
     name: str,
     *,
     variance: bool = True,
@@ -131,8 +110,8 @@ def c_source(
         fitted: The model, or dynamics that have learnt.
         name: What the names of functions begin with.
         variance: Whether there is a variance. Its tables are the most of the file: the square of
-            the number of points or features, for each output and sample.
-        observation_noise: Whether the variance has the noise that was learnt.
+            the number of points or features, for each output and draw.
+        observation_noise: If True, the variance includes that of the noise.
 
     Raises:
         TypeError: If it is neither.
@@ -151,17 +130,17 @@ def c_source(
     if not (isinstance(name, str) and name.isidentifier() and name.isascii()):
         raise ValueError(f"Expected name as one of C, such as 'pump', got {name!r}.")
     model = model_of(fitted)
-    found = finite_sum(model, variance, observation_noise)
+    found, data = finite_sum(model, variance, observation_noise), model.data
     is_step, body = isinstance(fitted, LearnedDynamics), "".join(_body(found, variance))
     tables = {n: t for n, t in _tables(found).items() if re.search(rf"\b{n}\[", body)}
     given = ["const double *f_p"] * bool(found.num_physics) + ["double *mean"]
     given += ["double *variance"] * variance
     about = [
         f"{model!r}. Made by gpadjust; numbers are in the units of the data.",
-        f"x: {', '.join(model.input_names)}.",
+        f"x: {', '.join(data.input_names)}.",
         f"f_p: {found.num_physics} values that the physics returns at x.",
         *_told(fitted, model),
-        f"mean: {', '.join(model.output_names)}.",
+        f"mean: {', '.join(data.output_names)}.",
         "variance: in their square, "
         f"{'with' if observation_noise else 'without'} the noise; NULL if it is not wanted.",
         f"Numbers in tables: {sum(table.numel() for table in tables.values())}.",
@@ -176,76 +155,72 @@ def c_source(
     return "\n".join(lines) + "\n"
 
 
-def _told(fitted: TermsModel | LearnedDynamics, model: TermsModel) -> Iterator[str]:
-    """Lines on the parameters that f_p has in this model, and on the step of dynamics."""
-    if model.has_unknowns:
-        means = model.physics_parameters
-        pairs = zip(means.unknowns, means.mean.tolist(), strict=True)
+def _told(fitted: GP | LearnedDynamics, model: GP) -> Iterator[str]:
+    """Return lines on the parameters of f_p in this model, and on the step of dynamics."""
+    if model.physics_parameters:
+        means = model.physics_parameters.mean.tolist()
+        pairs = zip(model.physics_parameters, means, strict=True)
         yield f"Its parameters are {', '.join(f'{name} = {value!r}' for name, value in pairs)}."
     if isinstance(fitted, LearnedDynamics) and fitted.spec.step is not None:
         yield f"A step lasts {fitted.spec.step!r}."
 
 
 def _sizes(s: FiniteSum, num_outputs: int) -> str:
-    """The sizes of the tables, as names."""
+    """Return the sizes of the tables, as names."""
     sizes = {
         "INPUTS": len(s.columns),
         "OUTPUTS": num_outputs,
-        "SAMPLES": len(s.weights) // num_outputs,
+        "DRAWS": len(s.weights) // num_outputs,
         "FEATURES": s.weights.shape[-1],
         "POINT_SETS": len(s.points),
-        "ERRORS": 0 if s.errors is None else len(s.errors.points),
     }
     return f"enum {{ {', '.join(f'{name} = {size}' for name, size in sizes.items())} }};"
 
 
 def _tables(s: FiniteSum) -> dict[str, Tensor]:
-    """All numbers, by the names that they have in C."""
+    """Return all numbers, by their names in C."""
     found = s._asdict()
     for t, term in enumerate(s.terms):
         found |= {f"{name}{t}": value for name, value in term._asdict().items()}
-    if s.errors is not None:
-        found |= {f"error_{name}": value for name, value in s.errors._asdict().items()}
-    rows, columns = torch.triu_indices(*2 * s.weights.shape[-1:])
     if s.lower is not None:  # by columns: loops along them have no sum to wait for
+        rows, columns = torch.triu_indices(*2 * s.weights.shape[-1:])
         found["lower"] = s.lower[:, columns, rows]
-    if s.root is not None:
-        found["root"] = s.root[:, rows, columns]
     return {name: value for name, value in found.items() if isinstance(value, Tensor)}
 
 
 def _body(s: FiniteSum, variance: bool) -> Iterator[str]:
-    """The sum at one point."""
+    """Return the sum at one point."""
     yield f"    const double z[INPUTS] = {{{', '.join(map(_input, s.columns))}}};\n"
-    more = {"spread": ", spread[SAMPLES * OUTPUTS]", "prior": ", prior = 0.0"}
-    yield _BEGIN.substitute(more if variance else dict.fromkeys(more, ""))
+    more = {"spread": ", spread[DRAWS * OUTPUTS]" * variance}
+    more["prior"] = ", prior = 0.0" * (variance and s.is_remainder)
+    yield _BEGIN.substitute(more)
     first = 0
     for t, term in enumerate(s.terms):
-        basis = f"(f_p[column{t}[g % OUTPUTS]] - origin{t}[g]) / unit{t}[g]"
-        basis = "1.0" if term.column is None else basis
+        basis = "1.0" if term.column is None else f"f_p[column{t}[g % OUTPUTS]] / unit{t}[g]"
         yield _TERM.substitute(t=t, basis=basis, name=term.name.replace("*/", "* /"))
-        if s.lower is not None:
+        if more["prior"]:
             yield _PRIOR.substitute(t=t)
         if term.frequencies is not None:
             half = len(term.frequencies)
             yield _WAVES.substitute(t=t, half=half, first=first)
             first += 2 * half
-            if term.constant.any():
+            if term.has_constant:
                 yield f"        phi[{first}] = b{t} * sqrt(constant{t}[g]);\n"
                 first += 1
         elif term.kind:
             yield _KERNEL.substitute(t=t, kernel=_KERNELS[term.kind])
     yield _MEAN
     if variance:
-        yield from (_VARIANCE, _LOWER * (s.lower is not None), _ROOT * (s.root is not None))
-        yield Template(_SPREAD).substitute(least=s.least)
+        left = f"fmax(prior - squares, {s.least} * prior)" if s.is_remainder else "squares"
+        yield _SOLVED if s.is_solved else _MULTIPLIED
+        yield _SPREAD.substitute(left=left)
     yield _MIXED
     if variance:
-        yield from (_WIDER, _ERRORS * (s.errors is not None), _MIXED_VARIANCE)
+        yield _MIXED_VARIANCE
 
 
 def _input(column: Column) -> str:
-    """An input of the kernels in C."""
+    """Return an input of the kernels in C."""
     value = f"x[{column.source}]"
     value = f"{column.function}({value})" if column.function else value
     plain = (column.offset, column.size) == (0.0, 1.0)
@@ -253,14 +228,14 @@ def _input(column: Column) -> str:
 
 
 def _declared(name: str, table: Tensor) -> str:
-    """A table in C."""
+    """Return a table in C."""
     kind = "double" if table.is_floating_point() else "int"
     shape = "".join(f"[{size}]" for size in table.shape)
     return f"static const {kind} {name}{shape} = {_braces(table.tolist())};"
 
 
 def _braces(values: list[Any]) -> str:
-    """Nested numbers in C, a few in a line."""
+    """Return nested numbers in C, a few in a line."""
     if isinstance(values[0], list):
         return "{" + ",\n".join(map(_braces, values)) + "}"
     parts = [", ".join(map(repr, values[i : i + 6])) for i in range(0, len(values), 6)]
@@ -270,7 +245,7 @@ def _braces(values: list[Any]) -> str:
 def _step(
     dynamics: LearnedDynamics, name: str, given: list[str], num_physics: int
 ) -> Iterator[str]:
-    """The function of dynamics, which calls that of their model."""
+    """Return the function of dynamics, which calls that of their model."""
     spec, m = dynamics.spec, dynamics.model.num_outputs
     state, action = _entries("state", spec.state_dim), _entries("action", spec.action_dim)
     yield f"/* state, mean: {', '.join(spec.states)}; action: {', '.join(spec.actions)}."

@@ -8,17 +8,17 @@ from typing import Any
 
 from torch import Tensor
 
+from gpadjust.core import GP
 from gpadjust.dynamics import LearnedDynamics
-from gpadjust.export.finite_sum import ErrorTables, FiniteSum, finite_sum, model_of
+from gpadjust.export.finite_sum import FiniteSum, finite_sum, model_of
 from gpadjust.export.transition import next_state, next_variance, target_columns
-from gpadjust.models import TermsModel
 
 ca: Any = None  # CasADi, once it is needed: its libraries and OpenSim's cannot share a process
 _TINY = 1e-30  # of a squared distance, at which its root has a derivative
 
 
 def casadi_function(
-    fitted: TermsModel | LearnedDynamics,
+    fitted: GP | LearnedDynamics,
     name: str = "predict",
     *,
     physics: Callable[[Any], Any] | None = None,
@@ -38,7 +38,7 @@ def casadi_function(
         physics: f_p in CasADi, to take the place of that argument: a ``casadi.Function``, or one of
             Python, from the column of what f_p reads to the column of what it returns.
         variance: Whether there is a variance.
-        observation_noise: Whether the variance has the noise that was learnt.
+        observation_noise: If True, the variance includes that of the noise.
 
     Raises:
         ImportError: Without CasADi.
@@ -67,7 +67,7 @@ def casadi_function(
         ) from error
     dynamics = fitted if isinstance(fitted, LearnedDynamics) else None
     if dynamics is None:
-        given = {"x": ca.MX.sym("x", len(model.input_names))}
+        given = {"x": ca.MX.sym("x", len(model.data.input_names))}
         (x,), count = map(ca.vertsplit, given.values()), found.num_physics
         read = x
     else:
@@ -105,49 +105,46 @@ def casadi_function(
 
 
 def _moments(s: FiniteSum, m: int, x: list[Any], f_p: list[Any]) -> tuple[list[Any], list[Any]]:
-    """Mean and variance of each of ``m`` outputs."""
+    """Return the mean and variance of each of ``m`` outputs."""
     inputs = []
     for source, function, offset, size in s.columns:
         value = getattr(ca, function)(x[source]) if function else x[source]
         inputs.append((value - offset) / size)
     z, means, variances = ca.horzcat(*inputs), list[Any](), list[Any]()
     for g in range(len(s.weights)):
-        shift, scale = float(s.shift[g]), float(s.scale[g])
+        scale = float(s.scale[g])
         features, start, prior = _features(s, g, g % m, z, f_p)
-        means.append(shift + scale * (start + ca.dot(_matrix(s.weights[g]), features)))
-        found = 0.0
+        means.append(scale * (start + ca.dot(_matrix(s.weights[g]), features)))
+        spread = 0.0
         if s.lower is not None:
-            features = ca.solve(_triangle(s.lower[g]), features)
-            found = prior - ca.sumsqr(features)
-        if s.root is not None:
-            found = found + ca.sumsqr(_triangle(s.root[g].mT) @ features)
-        least = 0.0 if s.lower is None else s.least * prior
-        variances.append(scale**2 * (ca.fmax(found, least) + float(s.noise[g])))
+            lower = ca.tril(_matrix(s.lower[g]))
+            u = ca.solve(lower, features) if s.is_solved else lower @ features
+            spread = ca.sumsqr(u)
+            if s.is_remainder:
+                spread = ca.fmax(prior - spread, s.least * prior)
+        variances.append(scale**2 * (spread + float(s.noise[g])))
     mean = [sum(means[j::m]) * (m / len(means)) for j in range(m)]
-    spread = []
+    mixed = []
     for j in range(m):
-        wider = 1.0 if s.errors is None else _wider(s.errors, j, z)
         off = [(each - mean[j]) ** 2 for each in means[j::m]] if len(means) > m else []
-        spread.append((wider * sum(variances[j::m]) + sum(off)) * (m / len(means)))
-    return mean, spread
+        mixed.append((sum(variances[j::m]) + sum(off)) * (m / len(means)))
+    return mean, mixed
 
 
 def _features(s: FiniteSum, g: int, j: int, z: Any, f_p: list[Any]) -> tuple[Any, Any, Any]:
-    """Features of a Gaussian of output j, its prior mean, and its prior variance."""
-    kernels, waves, mean, variance = 0.0, list[Any](), float(s.start[g]), 0.0
+    """Return the features of a Gaussian of output j, its prior mean, and its prior variance."""
+    kernels, waves, mean, variance = 0.0, list[Any](), 0.0, 0.0
     for term in s.terms:
         amplitude, constant = float(term.amplitude[g]), float(term.constant[g])
-        basis = 1.0
-        if term.column is not None:
-            column, origin = f_p[int(term.column[j])], float(term.origin[g])
-            basis = (column - origin) / float(term.unit[g])
-        mean = mean + basis * float(term.mean[g])
+        f = 1.0 if term.column is None else f_p[int(term.column[j])] / float(term.unit[g])
+        basis = f - float(term.center[g])
+        mean = mean + f * float(term.mean[g])
         variance = variance + basis * basis * (amplitude + constant)
         if term.frequencies is not None:
             angle = _matrix(term.frequencies * term.rate[g]) @ z.T
             size = basis * math.sqrt(amplitude / len(term.frequencies))
             waves += [size * ca.cos(angle), size * ca.sin(angle)]
-            waves += [basis * math.sqrt(constant)] if term.constant.any() else []
+            waves += [basis * math.sqrt(constant)] * term.has_constant
         elif term.kind:
             squares = _squares(s.points[j % len(s.points)], term.rate[g], z)
             kernel = amplitude * _kernel(term.kind, squares) + constant
@@ -156,34 +153,22 @@ def _features(s: FiniteSum, g: int, j: int, z: Any, f_p: list[Any]) -> tuple[Any
 
 
 def _squares(points: Tensor, rate: Tensor, z: Any) -> Any:
-    """Squared distances to points ``P x d``, in lengthscales, a column."""
+    """Return squared distances to points ``P x d``, in lengthscales, a column."""
     u = _matrix(points * rate) - ca.repmat(z * _matrix(rate).T, len(points), 1)
     return ca.sum2(u**2)
 
 
 def _kernel(kind: str, squares: Any) -> Any:
-    """A kernel of squared distances."""
+    """Return a kernel of squared distances."""
     if kind == "rbf":
         return ca.exp(-squares / 2)
     if kind == "constant":
         return 0.0 * squares
-    factor = 2 * float(kind.removeprefix("matern"))
+    factor = int(kind.removeprefix("matern")[0])  # 2 nu
     t = ca.sqrt(factor * ca.fmax(squares, _TINY))
-    return ({1: 1.0, 3: 1.0 + t, 5: 1.0 + t + t**2 / 3}[int(factor)]) * ca.exp(-t)
-
-
-def _wider(errors: ErrorTables, j: int, z: Any) -> Any:
-    """The factor of the variance of output j."""
-    near = _kernel("rbf", _squares(errors.points, errors.rate[j], z))
-    total = 1.0 + ca.dot(_matrix(errors.squares[j]), near)
-    return ca.fmax(1.0, total / (1.0 + ca.sum1(near))) * float(errors.factor[j])
+    return {1: 1.0, 3: 1.0 + t, 5: 1.0 + t + t**2 / 3}[factor] * ca.exp(-t)
 
 
 def _matrix(values: Tensor) -> Any:
-    """Numbers in CasADi, a vector as a column."""
+    """Return numbers in CasADi, a vector as a column."""
     return ca.DM(values.tolist())
-
-
-def _triangle(values: Tensor) -> Any:
-    """A lower triangle in CasADi, which solves by substitution."""
-    return ca.tril(_matrix(values))

@@ -13,7 +13,7 @@ Scalars = Sequence[Any]
 def target_columns(
     dynamics: LearnedDynamics, state: Scalars, f_p: Scalars, wrapped: Callable[[Any], Any]
 ) -> list[Any]:
-    """The columns of f_p in the model, made of next values, as :class:`TargetPhysics` does."""
+    """Return columns of f_p in the model, made of next values as by :class:`TargetPhysics`."""
     spec, targets = dynamics.spec, dynamics.targets
     found = []
     for first in range(0, len(f_p), len(spec.moving)):
@@ -27,7 +27,7 @@ def target_columns(
 def next_state(
     dynamics: LearnedDynamics, state: Scalars, action: Scalars, learnt: Scalars
 ) -> list[Any]:
-    """The next state by what the model says, as :meth:`StateSpec.complete` makes it."""
+    """Return the next state by the model, as :meth:`StateSpec.complete` makes it."""
     spec, found = dynamics.spec, [*state]
     for i, value in zip(spec.predicted, learnt, strict=True):
         found[i] = state[i] + value if dynamics.targets.target == "difference" else value
@@ -41,7 +41,7 @@ def next_state(
 
 
 def next_variance(dynamics: LearnedDynamics, learnt: Scalars, zero: Any) -> list[Any]:
-    """The variance of the next state, as :meth:`StateSpec.complete_variance` makes it."""
+    """Return the variance of the next state, as :meth:`StateSpec.complete_variance` makes it."""
     spec = dynamics.spec
     known = dict(zip(spec.predicted, learnt, strict=True))
     found = [known.get(i, zero) for i in range(spec.state_dim)]

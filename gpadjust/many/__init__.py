@@ -1,1 +1,5 @@
 """Many rows: the adjustment on inducing points."""
+
+from gpadjust.many.variational_cka import VariationalCKA
+
+__all__ = ["VariationalCKA"]

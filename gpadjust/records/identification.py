@@ -14,8 +14,8 @@ from gpadjust.checks import checked_number, checked_whole
 from gpadjust.dynamics import Dynamics, FreeRun, PhysicsDynamics, Windows
 from gpadjust.dynamics.base import TransitionFunctions
 from gpadjust.dynamics.targets import one_physics
-from gpadjust.models import PhysicsParameters
 from gpadjust.physics import Physics
+from gpadjust.physics.parameters import PhysicsParameters
 from gpadjust.records.record import Record, Stretch, in_control_steps
 from gpadjust.records.records import Records
 from gpadjust.records.smoothed_records import SmoothedRecords, smooth

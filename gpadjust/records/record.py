@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.checks import checked_number
-from gpadjust.models.training_data import ArrayLike, to_tensor
+from gpadjust.core.data import ArrayLike, as_tensor
 from gpadjust.states import StateSpec
 
 _GAP = 1.5  # typical steps: a longer time between two rows is a gap
@@ -137,7 +137,7 @@ class Record:
         return torch.tensor(changes, dtype=torch.bool)
 
     def _numbers(self, values: ArrayLike, name: str, dims: int) -> Tensor:
-        tensor = to_tensor(values, name).detach().clone()
+        tensor = as_tensor(values, name).detach().clone()
         if tensor.dim() != dims or 0 in tensor.shape[1:]:
             expected = "N" if dims == 1 else f"N x {name.removesuffix('s')}_dim"
             raise ValueError(

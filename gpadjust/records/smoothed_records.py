@@ -16,8 +16,8 @@ from torch import Tensor
 from gpadjust.checks import checked_whole
 from gpadjust.dynamics.particles import even_normal, of_states
 from gpadjust.dynamics.targets import one_physics
-from gpadjust.models.physics_parameters import PhysicsParameters
 from gpadjust.physics import ODEPhysics, Physics
+from gpadjust.physics.parameters import PhysicsParameters
 from gpadjust.records.chain import Chain, Known
 from gpadjust.records.kalman import Array, draw_paths
 from gpadjust.records.record import Record, Stretch, in_control_steps
@@ -53,19 +53,15 @@ class SmoothedRecords:
 
     @property
     def physics_parameters(self) -> PhysicsParameters:
-        """The posterior of the unknown parameters of the physics.
-
-        Raises:
-            ValueError: If it has none.
-        """
+        """The posterior of the unknown parameters of the physics; empty if it has none."""
         unknowns, last = self._chain.physics.unknowns, self._found.stretches[0].states
         if not unknowns:
-            return PhysicsParameters.of(None)
+            return PhysicsParameters({}, [])
         p = len(unknowns)
         mean, covariance = (torch.from_numpy(part[0, ..., -p:].copy()) for part in last)
         values, vectors = torch.linalg.eigh(covariance[-p:])
         spread = even_normal(_DRAWS, p, seed=0) * values.clamp_min(0).sqrt()
-        return PhysicsParameters(unknowns, unknowns.at(mean + spread @ vectors.mT))
+        return PhysicsParameters(unknowns, unknowns.at(mean + spread @ vectors.mT).unbind(-1))
 
     @cached_property
     def variation(self) -> Tensor:
@@ -82,7 +78,7 @@ class SmoothedRecords:
             ValueError: If the physics has no unknown parameters.
         """
         if not self._chain.physics.unknowns:
-            PhysicsParameters.of(None)
+            raise ValueError("Expected a physics with unknown parameters; found none, that vary.")
         return variation(self._chain, self._found)
 
     def draw(self, seed: int = 0) -> Records:

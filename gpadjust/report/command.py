@@ -6,13 +6,18 @@ import math
 import shlex
 import warnings
 from argparse import Namespace
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from gpadjust.core import CKA, GP, Noise, fit
 from gpadjust.files.table_columns import LARGEST
-from gpadjust.inference import fit
-from gpadjust.models import CKA, TermsGP
+from gpadjust.kinds.categories import Categories
+from gpadjust.kinds.factory import with_options
+from gpadjust.kinds.heavy_tails import HeavyTails
+from gpadjust.kinds.noisy_inputs import NoisyInputs
+from gpadjust.kinds.relative import RelativeNoise
+from gpadjust.physics import PhysicsWarning
 from gpadjust.report.given_physics import (
     GivenPhysics,
     columns_of,
@@ -21,6 +26,7 @@ from gpadjust.report.given_physics import (
     unknowns_of,
 )
 from gpadjust.report.inputs import (
+    Columns,
     TableData,
     mark_of,
     names_of,
@@ -36,6 +42,7 @@ from gpadjust.report.page import checked_path, write
 from gpadjust.report.sections import Origin, headline
 from gpadjust.report.subject import subject_of
 from gpadjust.validation import Comparison, compare
+from gpadjust.validation.plausibility import complaint
 
 
 def run(arguments: Namespace, command: Sequence[str]) -> None:
@@ -62,7 +69,7 @@ def run(arguments: Namespace, command: Sequence[str]) -> None:
     named = [*categories, *batches]
     inputs = _inputs(arguments, table.names, outputs, [*unknowns], named)
     data = read_table(table, inputs, outputs, units, named, arguments.rows, arguments.seed)
-    options = _options(arguments, inputs, data.levels)
+    options = _options(arguments, inputs, data)
     physics = given_physics(arguments.physics, data, unknowns)
     names = (listed(data.Y.columns), listed(data.X.columns))
     say(f"{arguments.data}: {plural(len(data.lines), 'row')}, {names[0]} from {names[1]}.")
@@ -91,7 +98,7 @@ def run(arguments: Namespace, command: Sequence[str]) -> None:
 
 
 def _comparing(command: Sequence[str]) -> str:
-    """The command that compares structures: the same without ``--fit``."""
+    """Return the command that compares structures: the same without ``--fit``."""
     kept: list[str] = []
     words = iter(command)
     for word in words:
@@ -110,12 +117,17 @@ def _fitted(
     physics: GivenPhysics,
     variances: list[float] | None,
     options: dict[str, Any],
-) -> Comparison | TermsGP:
+) -> Comparison | GP:
     X, Y, f_p = data.X, data.Y, physics.physics
+    if isinstance(noise := options.get("noise"), NoisyInputs):
+        X = Columns(X.columns, noise.points)
     if arguments.fit == "compare":
         return compare(X, Y, f_p, variances, seed=arguments.seed, progress=True, **options)
     say(f"Fitting CKA by {arguments.fit!r} ...")
-    model = CKA(X, Y, variances, physics=f_p, **options)
+    model: GP = with_options(CKA, options)(X, Y, variances, physics=f_p)
+    for part in model.physics:
+        if text := complaint(part, model.data):
+            warnings.warn(text, PhysicsWarning, stacklevel=1)
     fit(model, arguments.fit, seed=arguments.seed)
     return model
 
@@ -127,7 +139,7 @@ def _inputs(
     unknowns: Sequence[str],
     groups: Sequence[str],
 ) -> list[str]:
-    """The names of the inputs: those given, or the columns that formulas have, and groups."""
+    """Return the names of the inputs: by the option, or of formulas and groups."""
     if arguments.inputs is not None:
         return names_of(arguments.inputs, "--inputs")
     if paths := [text for text in arguments.physics if is_path(text)]:
@@ -143,42 +155,40 @@ def _inputs(
     return found + [name for name in groups if name not in found and name not in bare]
 
 
-def _options(
-    arguments: Namespace,
-    inputs: Sequence[str],
-    levels: Mapping[str, Sequence[str]],
-) -> dict[str, Any]:
-    """The options of a model that a command line says, for the columns as the file names them.
+def _options(arguments: Namespace, inputs: Sequence[str], data: TableData) -> dict[str, Any]:
+    """Return the options of a model that a command line has.
 
     Args:
         arguments: A command line as parsed by :func:`gpadjust.__main__.parser`.
-        inputs: The names of the inputs there, in the order of the columns.
-        levels: The levels of the categories among the columns, by the names that models have.
+        inputs: The names of the inputs as in the file, in the order of the columns.
+        data: The data.
 
     Raises:
-        ValueError: If one is no number, or names what is no input.
+        ValueError: If one is not a number, or names what is not an input.
     """
     found: dict[str, Any] = {}
-    noises = ["relative"] * (arguments.noise == "relative") + ["heavy-tailed"] * arguments.outliers
-    if noises:
-        found["likelihood"] = noises if len(noises) > 1 else noises[0]
-    if arguments.positive:
-        found["outcome_transform"] = "log"
-    if arguments.bounds is not None:
-        found["outcome_transform"] = _bounds(arguments.bounds)
+    noise: Noise | None = RelativeNoise() if arguments.noise == "relative" else None
+    if arguments.outliers:
+        noise = HeavyTails(base=noise)
     if arguments.input_noise is not None:
-        found["train_Xvar"] = _variances(arguments.input_noise, inputs)
-    if levels:
-        found["categorical"] = dict(levels)
-    if arguments.batches:
-        bare = {name_and_unit(name)[0]: name for name in levels}
-        batches = names_of(arguments.batches, "--batches")
-        found["batch"] = [name if name in levels else bare[name] for name in batches]
+        noise = NoisyInputs(data.X.values, _variances(arguments.input_noise, inputs), noise)
+    if noise is not None:
+        found["noise"] = noise
+    if arguments.positive:
+        found["link"] = "log"
+    if arguments.bounds is not None:
+        found["link"] = _bounds(arguments.bounds)
+    if data.levels:
+        bare = {name_and_unit(name)[0]: name for name in data.levels}
+        batches = names_of(arguments.batches, "--batches") if arguments.batches else []
+        batches = [bare.get(name, name) for name in batches]
+        columns = [name for name in data.levels if name not in batches]
+        found["input_transform"] = Categories(columns, batches, data.levels)
     return found
 
 
 def _bounds(text: str) -> tuple[float, float]:
-    """The two numbers of ``"0,1"``."""
+    """Return the two numbers of ``"0,1"``."""
     ends = [_number(each) for each in text.split(",")]
     if len(ends) != 2 or not ends[0] < ends[1]:
         raise ValueError(f"Expected --bounds as two numbers, the lower first: 0,1; found {text!r}.")
@@ -186,7 +196,7 @@ def _bounds(text: str) -> tuple[float, float]:
 
 
 def _variances(text: str, inputs: Sequence[str]) -> list[float]:
-    """The variance of each input, of the standard deviations that a command line has."""
+    """Return the variance of each input, of the standard deviations that a command line has."""
     given = pairs(text, "--input-noise")
     if unknown := [name for name in given if name not in inputs]:
         raise ValueError(f"--input-noise names {unknown[0]!r}, which is none of --inputs.")

@@ -9,7 +9,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from gpadjust.models.levels import on_levels
+from gpadjust.kinds.categories import on_levels
 from gpadjust.physics import PhysicsError
 from gpadjust.report.markup import Markup, image, name_and_unit, number, with_unit
 from gpadjust.report.subject import Subject
@@ -147,7 +147,7 @@ def _slice(subject: Subject, i: int, number_of_points: int) -> Tensor:
     pad = 0.5 * low.abs().clamp_min(1.0) if low == high else torch.zeros_like(low)
     X = subject.base.repeat(number_of_points, 1)
     X[:, i] = torch.linspace(float(low - pad), float(high + pad), number_of_points, dtype=X.dtype)
-    return on_levels(X, subject.model.levels) if subject.model.levels else X
+    return on_levels(subject.model, X)
 
 
 def _prediction(subject: Subject, output: int, i: int, ax: Any) -> None:
@@ -156,7 +156,7 @@ def _prediction(subject: Subject, output: int, i: int, ax: Any) -> None:
     mean, half = mean_and_half_width(subject.model.predict(X), output, 0.95)
     band(ax, x, mean, half, 0.95)
     curves = subject.physics_at(X, output)
-    for k, (name, values) in enumerate(curves):
+    for k, (name, values) in enumerate(curves.items()):
         ax.plot(x, values, color=GREY, ls=_STYLES[k % 3], lw=1.2, label=name)
     if len(subject.inputs) == 1:
         ax.plot(subject.X[:, 0], column(subject.Y, output), color=RED, **DOTS)

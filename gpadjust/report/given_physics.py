@@ -23,7 +23,6 @@ from gpadjust.physics import (
     Physics,
     PhysicsError,
     Unknown,
-    as_physics,
 )
 from gpadjust.physics.array_physics import array_physics
 from gpadjust.physics.formula import names_in, symbol
@@ -43,13 +42,13 @@ class GivenPhysics(NamedTuple):
     """A physics, and the Python code by which a program that loads its model gives it.
 
     Attributes:
-        physics: The physics.
+        physics: The physics; several by their names.
         code: An expression by its name: ``""`` of a single physics. None if the model's file holds
             all, as formulas.
         modules: The modules that these need.
     """
 
-    physics: Physics
+    physics: Physics | dict[str, Physics]
     code: dict[str, str] | None
     modules: tuple[str, ...]
 
@@ -178,7 +177,7 @@ def given_physics(
         raise ValueError(f"--unknown names {absent[0]!r}, which is in no formula.{way}")
     modules = tuple(dict.fromkeys(path.partition(":")[0] for path in paths))
     if len(parts) > 1:
-        return GivenPhysics(as_physics({**parts}), code if paths else None, modules)
+        return GivenPhysics(parts, code if paths else None, modules)
     ((key, physics),) = parts.items()
     return GivenPhysics(physics, {"": code[key]} if paths else None, modules)
 

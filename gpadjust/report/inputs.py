@@ -37,8 +37,13 @@ class Columns:
     columns: tuple[str, ...]
     values: Tensor
 
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """``n`` and ``k``."""
+        return tuple(self.values.shape)
+
     def to_numpy(self) -> Any:
-        """The values, as an array."""
+        """Return the values, as an array."""
         return self.values.numpy()
 
 
@@ -94,7 +99,7 @@ def read_table(
         inputs: The columns of the inputs, in the order in which the physics takes them.
         outputs: Those of the outputs, in the order in which the physics returns them.
         units: Units of columns whose names do not have them.
-        categories: The inputs that are categories, which may be texts.
+        categories: The inputs that are categories; others that are texts are, too.
         most: The most rows to take; of more, so many are drawn.
         seed: Of the drawing.
 
@@ -120,10 +125,10 @@ def read_table(
     names = _with_units(headers, asked, units)
     values, levels = [], {}
     for i, name in enumerate(headers):
-        if asked[i] in categories:
+        if i < d and (asked[i] in categories or _are_names(table, name)):
             column, levels[names[i]] = table.categories(name)
         else:
-            column = _numbers(table, name, may_miss=i >= d)
+            column = table.numbers(name, may_miss=i >= d)
         values.append(column)
     X, Y = torch.stack(values[:d], -1), torch.stack(values[d:], -1)
     seen = ~Y.isnan().all(-1)
@@ -156,33 +161,20 @@ def read_table(
         )
     for name, own in levels.items():
         if isinstance(own[0], str):
-            told = listed(f"{k} is {level}" for k, level in enumerate(own))
-            remarks.append(f"The physics reads {name_and_unit(name)[0]} as a number: {told}.")
+            numbers = listed(f"{k} is {level}" for k, level in enumerate(own))
+            remarks.append(f"The physics reads {name_and_unit(name)[0]} as a number: {numbers}.")
     digest = digest_of(table.file)
     columns = Columns(tuple(names[:d]), X), Columns(tuple(names[d:]), Y)
     return TableData(*columns, tuple(lines.tolist()), tuple(remarks), digest, levels)
 
 
-def _numbers(table: TableColumns, name: str, may_miss: bool) -> Tensor:
-    """The numbers of a column; the error says what to do if they are names of an input."""
-    try:
-        return table.numbers(name, may_miss=may_miss)
-    except ValueError as error:
-        if may_miss or not _are_names(table, name):
-            raise
-        bare = name_and_unit(name)[0]
-        raise ValueError(
-            f"{error} If these are names, say so by --categories {bare}, or by --batches {bare} if "
-            "each only shifts the outputs, as a rig does."
-        ) from error
-
-
 def _are_names(table: TableColumns, name: str) -> bool:
-    """Return whether all fields of a column begin with a letter; not if one is empty."""
+    """Return whether all fields of a column begin with a letter, and most of them repeat."""
     try:
-        return all(text[0].isalpha() for text in table.texts(name))
-    except ValueError:
+        texts = table.texts(name)
+    except ValueError:  # one is empty
         return False
+    return all(text[0].isalpha() for text in texts) and 2 * len({*texts}) <= max(8, len(texts))
 
 
 def mark_of(text: str) -> str:

@@ -8,8 +8,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from gpadjust.checks import progress_bar
-from gpadjust.models import StackedGP, TermsGP
-from gpadjust.models.saving import Saved, save
+from gpadjust.core import GP, StackedGP, save
+from gpadjust.core.saving import Saved
 from gpadjust.records import Identification
 from gpadjust.report import log_page, sections
 from gpadjust.report.log_page import LogOrigin
@@ -20,7 +20,7 @@ from gpadjust.validation import Comparison
 
 
 def report(
-    model: TermsGP | StackedGP | Comparison | Identification,
+    model: GP | StackedGP | Comparison | Identification,
     file: str | Path = "report.html",
     *,
     title: str | None = None,
@@ -63,8 +63,8 @@ def report(
 
     Raises:
         TypeError: If ``model`` is something else, or there are ``rows`` for a log.
-        ValueError: If the model was not fitted, is of a batch of data sets, ``rows`` are not ``n``,
-            or ``file`` is not ``*.html``. Nothing is written then.
+        ValueError: If the model was not fitted, ``rows`` are not ``n``, or ``file`` is not
+            ``*.html``. Nothing is written then.
         OSError: If the files cannot be written.
 
     Example:
@@ -174,7 +174,7 @@ def page(
         f"{listed(subject.outputs)} from {listed(subject.inputs)}: "
         f"{plural(len(subject.X), 'row')} of data, f_a(x) = rho(x) f_p(x) + delta(x)."
     )
-    if not subject.physics and not subject.is_sampled:
+    if not subject.has_physics:
         lead = lead.replace(", f_a(x) = rho(x) f_p(x) + delta(x)", ", without physics")
     first = sections.verdicts(subject, origin.how)
     return document(title, lead, "Does the physics help?", first, made)

@@ -11,15 +11,20 @@ from functools import partial
 from importlib.metadata import version
 from typing import Any
 
-from botorch.models.transforms.outcome import nanstd
+import torch
 from scipy.stats import binom
 from torch import Tensor
 
 import gpadjust
-from gpadjust.models import CalibratedPhysics, PhysicsParameters, StackedGP, TermsGP
-from gpadjust.models.saving import Saved
+from gpadjust.core import GP, CalibratedPhysics, KnownNoise, StackedGP
+from gpadjust.core.saving import Saved
+from gpadjust.kinds.categories import Categories, levels_of
+from gpadjust.kinds.heavy_tails import HeavyTails, RowNoise
+from gpadjust.kinds.noisy_inputs import NoisyInputs
+from gpadjust.kinds.relative import RelativeNoise
 from gpadjust.physics import PhysicsError
 from gpadjust.physics.import_path import is_formula
+from gpadjust.physics.parameters import PhysicsParameters
 from gpadjust.report import figures
 from gpadjust.report.given_physics import needs_inf
 from gpadjust.report.markup import (
@@ -40,14 +45,15 @@ from gpadjust.report.markup import (
 )
 from gpadjust.report.subject import Adjusted, Subject
 from gpadjust.validation import Trust, trust
+from gpadjust.validation.plots.adjustments import unadjusted
 from gpadjust.validation.plots.drawing import quantile
+from gpadjust.validation.ranking import spread_of
 from gpadjust.validation.structures import ALONE, STACKED
 
 COMPARE = "report(compare(train_X, train_Y, physics))"
 _WHAT = {
     "zero mean": "no physics: a Gaussian process of the data alone",
     "physics mean": "f_p + delta(x): the physics, and a bias that depends on the inputs",
-    "constant rho": "rho f_p + mu + delta(x): a fitted scale and offset, and a bias",
     "CKA": "rho(x) f_p + delta(x): a scale and a bias that depend on the inputs",
     "calibrated physics": "f_p with fitted parameters, and nothing else",
     ALONE: "f_p as it is, with noise that the other observations tell; no candidate",
@@ -55,11 +61,11 @@ _WHAT = {
 }
 _ERRORS = {ALONE: "your formula", "calibrated physics": "your formula, calibrated"}
 _BANDS = "Solid lines are means; bands hold 95 % of the function, without measurement noise."
-_ROUNDING = 1e-9  # of the observations' standard deviation
 _APART = (
     "Observations are of rho f_p + delta alone: how much of it is rho's and how much delta's the "
     "data tell far less surely than their sum."
 )
+_NONE = "There is no physics that could be adjusted, trusted or overridden."
 _WORST = 5
 _LEVELS = (0.5, 0.8, 0.95)
 _MADE = ("BlackBoxPhysics", "FormulaPhysics", "Unknown")
@@ -119,7 +125,7 @@ def headline(subject: Subject, how: str = COMPARE) -> str:
 def verdict(subject: Subject, output: int, how: str = COMPARE) -> tuple[str, list[str]]:
     """The answer for an output, and sentences: those of the comparison, if any."""
     name, comparison = subject.outputs[output], subject.comparison
-    if not subject.physics and not subject.is_sampled:
+    if not subject.has_physics:
         return "No physics", [f"The model of {name} has no physics to be judged."]
     if comparison is None:
         return "Not asked", [
@@ -176,7 +182,7 @@ def structures(subject: Subject) -> Markup:
     for j, output in enumerate(comparison.table):
         head = ["structure", "elpd", "less the best", "its error", "weight"]
         head += [with_unit("RMSE", output, "{} [{}]"), "RMSE / sd", "in 95 %"]
-        spread = spread_of(subject, j)
+        spread = spread_of(subject.Y[:, j])
         rows = [
             [
                 row.structure,
@@ -211,12 +217,6 @@ def advice(subject: Subject, notes: list[str]) -> Markup:
     return bullets(sentences) if sentences else Markup()
 
 
-def spread_of(subject: Subject, output: int) -> float:
-    """The standard deviation of the observations of an output, as tables of `compare` have it."""
-    spread = float(nanstd(subject.Y[:, output : output + 1], dim=0))
-    return spread if spread > 0 else 1.0
-
-
 def errors(subject: Subject, output: int) -> dict[str, str]:
     """The errors of the formula, its adjustment and the data alone, with the unit."""
     name = subject.outputs[output]
@@ -228,9 +228,9 @@ def errors(subject: Subject, output: int) -> dict[str, str]:
             ALONE if len(shown) == 1 else f"{ALONE} of {physics}": float(
                 (Y - values).square().nanmean().sqrt()
             )
-            for physics, values in shown
+            for physics, values in shown.items()
         }
-        own = "adjusted" if subject.physics or subject.is_sampled else "data alone"
+        own = "adjusted" if subject.has_physics else "data alone"
         found[own] = float(subject.loo.score().rmse[output])
     fitted = ", with fitted parameters" if subject.as_it_is != "as it is" else ""
     told = {}
@@ -248,7 +248,7 @@ def _errors(subject: Subject, output: int) -> list[Markup]:
     note = "root mean square errors of left-out observations"
     if subject.comparison is None and len(shown) > 1:
         note += "; the formula's at the data, with the model's parameters if it has unknown ones"
-    elif subject.model.batches:
+    elif subject.batches:
         note += "; each with an offset for each batch"
     return large_numbers(shown, note) if shown else []
 
@@ -299,7 +299,7 @@ def trusted(subject: Subject) -> Markup:
         except PhysicsError as error:
             parts.append(tag("p", f"{name}: {failure(error)}", class_="caution"))
     if not shares:
-        return join([*parts, *([] if parts else [tag("p", _none(subject))])])
+        return join([*parts, *([] if parts else [tag("p", _NONE)])])
     rows = []
     for name, shown, found in shares:
         three = (found.physics, found.data, found.neither)
@@ -325,20 +325,13 @@ def trusted(subject: Subject) -> Markup:
     return join(parts)
 
 
-def _none(subject: Subject) -> str:
-    """Why neither rho and delta nor trust can be shown."""
-    if subject.is_sampled:
-        return "AR1 knows its physics through samples alone, so that nothing is held against it."
-    return "There is no physics that could be adjusted, trusted or overridden."
-
-
 def _words(subject: Subject, shown: Adjusted | None, output: int) -> list[str]:
     """The words above the figures of an output."""
     if shown is None:
-        return [f"{_none(subject)} The figures show the prediction. {_BANDS}"]
+        return [f"{_NONE} The figures show the prediction. {_BANDS}"]
     name = subject.outputs[output]
     found = []
-    for physics, values in subject.physics_at(subject.X, output):
+    for physics, values in subject.physics_at(subject.X, output).items():
         off = subject.judged[:, output] - values
         off = off[~off.isnan()]
         rms, mean = float(off.square().mean().sqrt()), float(off.mean())
@@ -355,11 +348,7 @@ def _words(subject: Subject, shown: Adjusted | None, output: int) -> list[str]:
     found.append(f"Topmost: {top}.")
     if terms := shown.terms:
         weight = "" if shown.weight == 1 else f" (weight {shown.weight:.2f})"
-        back = []
-        for term in terms:
-            mean = shown.model.term_mean(term, shown.output)
-            none = abs(mean) < _ROUNDING * spread_of(subject, output)
-            back.append(f"{term} = {number(0.0 if none else mean)}")
+        back = [f"{term} = {number(unadjusted(shown.model, term))}" for term in terms]
         found.append(
             f"Below: {listed(terms)} of {shown.structure}{weight}, with ticks at the data; dashed, "
             f"what they fall back to without data, {listed(back)}."
@@ -377,7 +366,7 @@ def predictions(subject: Subject) -> Markup:
         rmse = float(scores.rmse[j])
         words = (
             f"{name}: {plural(subject.counts[j], 'observation')}, root mean square error "
-            f"{with_unit(number(rmse), name)}, {percent(rmse / spread_of(subject, j))} of the "
+            f"{with_unit(number(rmse), name)}, {percent(rmse / spread_of(subject.Y[:, j]))} of the "
             "standard deviation of the observations."
         )
         if out := subject.outliers(j):
@@ -413,13 +402,13 @@ def coverage(subject: Subject) -> Markup:
 
 
 def _how(subject: Subject) -> str:
-    """The way in which observations were left out."""
+    """Return the way in which observations were left out."""
     first = "Each observation is predicted by a model that has not seen it"
-    if subject.comparison is not None and subject.comparison.left_out:
+    if subject.comparison is not None:
         return (
             f"{first}, as in the table above. Of a mixture its weights, which have seen all, stay."
         )
-    if subject.model.num_samples is None:
+    if isinstance(subject.model, GP) and len(subject.model.u) == 1:
         return (
             "Each observation is predicted from all others; hyper-parameters (and fitted "
             "parameters of the physics) stay as they are, and have seen it: with few data the "
@@ -432,6 +421,8 @@ def _worst(subject: Subject, j: int) -> Markup:
     """The observations that are farthest from their predictions, in standard deviations."""
     loo, name = subject.loo, subject.outputs[j]
     sure = loo.residuals[:, j].abs().nan_to_num(nan=-1.0)
+    if loo.is_outlier is not None:
+        sure = sure.masked_fill(loo.is_outlier[:, j], torch.inf)
     order = [i for i in sure.argsort(descending=True).tolist() if sure[i] >= 0][:_WORST]
     few = len(subject.inputs) <= 4
     said = [with_unit(what, name, "{} [{}]") for what in ("observed", "predicted")]
@@ -455,7 +446,7 @@ def parameters(subject: Subject) -> Markup:
     parts = []
     seen: set[str] = set()
     for shown in subject.adjusted:
-        if shown is None or not shown.model.has_unknowns or shown.structure in seen:
+        if shown is None or not shown.model.physics_parameters or shown.structure in seen:
             continue  # outputs share them
         seen.add(shown.structure)
         caption = f"Parameters of the physics, by {shown.structure}"
@@ -514,50 +505,41 @@ def data(subject: Subject, origin: Origin) -> Markup:
             rows.append([short, kind, unit or "-", *numbers, str(len(column) - len(seen))])
     head = ["column", "is", "unit", "least", "median", "most", "missing"]
     remarks = [f"{plural(len(subject.X), 'row')} of data.", *_repeats(subject), *origin.remarks]
-    remarks += _assumed(subject.model)
+    remarks.append(_assumed(subject.model))
     return join([table("Columns", head, rows), bullets(remarks)])
 
 
-def _assumed(model: TermsGP | StackedGP) -> list[str]:
-    """What a model takes its data for, in sentences."""
-    told = _told(model)
-    outputs, found = listed(name_and_unit(name)[0] for name in model.output_names), []
-    if "relative" in told:
-        found.append("noise that grows with the physics, beside a constant one (relative)")
-    if "heavy-tailed" in told:
-        found.append("noise with heavy tails, so that outliers count for little")
-    if "train_Yvar" in told:
-        found.append("noise of known variance")
-    if (variances := told.get("train_Xvar")) is not None:
-        sds = variances.reshape(-1, len(model.input_names)).mean(0).sqrt().tolist()
-        noisy = zip(model.input_names, sds, strict=True)
-        each = [f"{name_and_unit(n)[0]} by {with_unit(number(sd), n)}" for n, sd in noisy if sd > 0]
-        found.append(f"inputs that are noisy themselves: {listed(each)} (standard deviations)")
-    if (link := told.get("link")) is not None:
-        found.append(f"{outputs} {getattr(link, 'where', 'within bounds')}")
-    batches = [model.input_names[i] for i in model.batches]
-    if plain := [name for name in told.get("categorical", []) if name not in batches]:
-        found.append(f"categories in {listed(map(str, plain))}")
+def _assumed(model: GP | StackedGP) -> str:
+    """Return what a model takes its data for, in a sentence."""
+    one: Any = model.models[0] if isinstance(model, StackedGP) else model
+    data, noise, levels = one.data, one.noise, levels_of(one)
+    outputs = listed(name_and_unit(name)[0] for name in data.output_names)
+    found: list[str] = []
+    while isinstance(noise, RowNoise):
+        if isinstance(noise, HeavyTails):
+            found.insert(0, "noise with heavy tails, so that outliers count for little")
+        if isinstance(noise, NoisyInputs):
+            sds = noise.settings["variances"].mean(0).sqrt().tolist()
+            noisy = [pair for pair in zip(data.input_names, sds, strict=True) if pair[1] > 0]
+            each = [f"{name_and_unit(n)[0]} by {with_unit(number(sd), n)}" for n, sd in noisy]
+            found.append(f"inputs that are noisy themselves: {listed(each)} (standard deviations)")
+        noise = noise.base
+    if isinstance(noise, RelativeNoise):
+        found.insert(0, "noise that grows with the physics, beside a constant one (relative)")
+    if isinstance(noise, KnownNoise):
+        found.insert(0, "noise of known variance")
+    if (link := getattr(one, "link", None)) is not None:
+        below = f" and below {link.upper:g}" * math.isfinite(link.upper)
+        found.append(f"{outputs} above {link.lower:g}{below}")
+    batches = data.transform.batches if isinstance(data.transform, Categories) else []
+    if plain := [data.input_names[i] for i in levels if i not in batches]:
+        found.append(f"categories in {listed(plain)}")
     if batches:
-        found.append(f"offsets of {listed(map(str, batches))}, whatever the other inputs are")
+        names = listed(data.input_names[i] for i in batches)
+        found.append(f"offsets of {names}, whatever the other inputs are")
     if not found:
-        return ["Assumed: noise of one size, exact inputs, numbers that may be of any size."]
-    return [f"Assumed: {'; '.join(found)}."]
-
-
-def _told(model: TermsGP | StackedGP) -> dict[str, Any]:
-    """Return the kinds of data that a model was told of, and the values that it was told."""
-    one: Any = model.parts[0][0].model if isinstance(model, StackedGP) else model
-    likelihood = one.options.get("likelihood") or ()
-    found: dict[str, Any] = dict.fromkeys(
-        [likelihood] if isinstance(likelihood, str) else likelihood
-    )
-    found |= {name: v for name, v in one.data().items() if name.endswith("var") and v is not None}
-    if getattr(one, "link", None) is not None:
-        found["link"] = one.link
-    if one.levels:
-        found["categorical"] = [one.input_names[i] for i in one.levels]
-    return found
+        return "Assumed: noise of one size, exact inputs, numbers that may be of any size."
+    return f"Assumed: {'; '.join(found)}."
 
 
 def _repeats(subject: Subject) -> list[str]:
@@ -589,13 +571,12 @@ def _pooled_sd(y: Tensor, index: Tensor) -> float | None:
 
 def settings(subject: Subject, origin: Origin) -> Markup:
     """The settings, versions, and the date."""
-    physics = ", ".join(
-        f"{name} ({type(each).__name__}{', learns' * bool([*each.parameters()])})"
-        for name, each in subject.physics.items()
-    )
+    physics = ", ".join(f"{name} ({type(each).__name__})" for name, each in subject.physics.items())
     rows = [[name, value] for name, value in origin.settings.items()]
-    physics = physics or ("known through samples" if subject.is_sampled else "none")
-    rows += [["model", repr(subject.model)], ["physics", physics]]
+    rows += [
+        ["model", repr(subject.model)],
+        ["physics", physics or ("known through samples" if subject.has_physics else "none")],
+    ]
     return settings_table(rows)
 
 
@@ -643,7 +624,7 @@ def loading(subject: Subject, saved: Saved | str, origin: Origin) -> Markup:
     numbered = []
     for i, own in subject.names.items():
         each = [f"{k} is {name}" for k, name in enumerate(own)]
-        each += ["any other number is a new one"] if i in subject.model.batches else []
+        each += ["any other number is a new one"] if i in subject.batches else []
         numbered.append(f"# {subject.inputs[i]}: {', '.join(each)}")
     lines = [
         *imports,

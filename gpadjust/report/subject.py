@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from gpadjust.gp import PhysicsInput
-from gpadjust.models import AR1, StackedGP, TermsGP, VariationalCKA
-from gpadjust.physics import JoinedPhysics, Physics
+from gpadjust.core import GP, StackedGP
+from gpadjust.kinds.ar1 import AR1
+from gpadjust.kinds.categories import Categories, levels_of
+from gpadjust.physics import Physics
 from gpadjust.validation import Comparison, LeaveOneOut, leave_one_out
 from gpadjust.validation.leave_one_out import observations
+from gpadjust.validation.plots.adjustments import adjustments_of
 from gpadjust.validation.plots.drawing import column
-from gpadjust.validation.plots.predictions import physics_curves
+from gpadjust.validation.plots.predictions import physics_at
 
 
 class Adjusted(NamedTuple):
@@ -29,14 +31,14 @@ class Adjusted(NamedTuple):
     """
 
     structure: str
-    model: TermsGP
+    model: GP
     output: int
     weight: float
 
     @property
-    def terms(self) -> tuple[str, ...]:
+    def terms(self) -> list[str]:
         """The names of rho and delta, as far as the model has them."""
-        return tuple(name for name in self.model.term_names if name != "f")
+        return adjustments_of(self.model)
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ class Subject:
         adjusted: For each output what is shown of rho and delta; None if no physics is adjusted.
     """
 
-    model: TermsGP | StackedGP
+    model: GP | StackedGP
     comparison: Comparison | None
     X: Tensor
     Y: Tensor
@@ -64,12 +66,12 @@ class Subject:
     @property
     def inputs(self) -> tuple[str, ...]:
         """The names of the inputs."""
-        return tuple(self.model.input_names)
+        return self.model.data.input_names
 
     @property
     def outputs(self) -> tuple[str, ...]:
         """The names of the outputs."""
-        return tuple(self.model.output_names)
+        return self.model.data.output_names
 
     @property
     def counts(self) -> list[int]:
@@ -84,7 +86,7 @@ class Subject:
         return self.Y if outlier is None else self.Y.masked_fill(outlier, torch.nan)
 
     def outliers(self, output: int) -> list[str]:
-        """The names of the rows whose observation of an output counts as an outlier."""
+        """Return the names of the rows whose observation of an output counts as an outlier."""
         outlier = self.loo.is_outlier
         if outlier is None:
             return []
@@ -93,34 +95,33 @@ class Subject:
     @property
     def names(self) -> dict[int, tuple[str, ...]]:
         """The names of the categories that are texts, by their column; their numbers are from 0."""
-        levels = self.model.levels.items()
-        return {i: (*own,) for i, own in levels if all(isinstance(name, str) for name in own)}
+        levels = levels_of(self.model).items()
+        texts = {i: tuple(str(name) for name in own) for i, own in levels}
+        return {i: texts[i] for i, own in levels if own == texts[i]}
+
+    @property
+    def batches(self) -> list[int]:
+        """The columns of batches."""
+        transform = self.model.data.transform
+        return transform.batches if isinstance(transform, Categories) else []
 
     @property
     def base(self) -> Tensor:
         """The medians of the inputs, ``d``, for slices; of categories a level."""
         middle, level = self.X.quantile(0.5, dim=0), self.X.median(0).values
-        which = [i in self.model.levels for i in range(len(middle))]
+        levels = levels_of(self.model)
+        which = [i in levels for i in range(len(middle))]
         return level.where(torch.tensor(which), middle)
 
     @property
     def physics(self) -> dict[str, Physics]:
         """The physics by their names."""
-        found: dict[str, Physics] = {}
-        for model in self._models():
-            transform: Any = getattr(model, "input_transform", None)
-            if isinstance(transform, PhysicsInput):
-                given: Any = transform.physics
-                several = isinstance(given, JoinedPhysics)
-                found |= (
-                    zip(given.names, given.parts, strict=True) if several else {given.name: given}
-                )
-        return found
+        return {part.name: part for model in self._models() for part in model.physics}
 
     @property
-    def is_sampled(self) -> bool:
-        """True if the physics is known through samples alone, as AR1 has it."""
-        return any(isinstance(model, AR1) for model in self._models())
+    def has_physics(self) -> bool:
+        """Whether there is a physics; AR1 knows it through samples alone."""
+        return bool(self.physics) or any(isinstance(model, AR1) for model in self._models())
 
     @property
     def as_it_is(self) -> str:
@@ -128,26 +129,24 @@ class Subject:
         unknown = any(physics.unknowns for physics in self.physics.values())
         return "with fitted parameters" if unknown else "as it is"
 
-    def physics_at(self, X: Tensor, output: int) -> list[tuple[str, Tensor]]:
-        """Values of an output by each physics shown, ``n``, parameters at their means."""
+    def physics_at(self, X: Tensor, output: int) -> dict[str, Tensor]:
+        """Return an output of each physics that is shown, ``n``."""
         shown = self.adjusted[output]
         if shown is None:
-            return []
-        with torch.no_grad():
-            curves = physics_curves(shown.model)
-            return [(name, column(f_p(X), output)) for name, f_p in curves]
+            return {}
+        return {name: column(f, output) for name, f in physics_at(shown.model, X).items()}
 
-    def _models(self) -> Iterator[TermsGP]:
+    def _models(self) -> Iterator[GP]:
         if self.comparison is not None:
             yield from self.comparison.models.values()
         elif isinstance(self.model, StackedGP):
-            yield from (part.model for parts in self.model.parts for part in parts)
+            yield from self.model.models
         else:
             yield self.model
 
 
 def subject_of(thing: object, rows: Sequence[object] | None = None) -> Subject:
-    """The subject that a model, a mixture of models, or a comparison is.
+    """Return the subject that a model, a mixture of models, or a comparison is.
 
     Args:
         thing: One of these.
@@ -155,62 +154,40 @@ def subject_of(thing: object, rows: Sequence[object] | None = None) -> Subject:
 
     Raises:
         TypeError: If it is none of these.
-        ValueError: If it was not fitted, is of a batch of data sets, or ``rows`` are not as many as
-            those of its data.
+        ValueError: If it was not fitted, or ``rows`` are not as many as those of its data.
     """
     comparison = thing if isinstance(thing, Comparison) else None
     model = comparison.recommended if comparison is not None else thing
-    if isinstance(model, VariationalCKA):
-        raise TypeError(
-            "VariationalCKA has no leave-one-out predictions, expected a model that has: report "
-            "on `gpadjust.compare` of some hundred of its rows."
-        )
-    if not isinstance(model, TermsGP | StackedGP):
+    if not isinstance(model, GP | StackedGP):
         raise TypeError(
             "Expected a fitted model of gpadjust, a StackedGP, or a Comparison (which `compare` "
-            f"makes), got {type(thing).__name__}."
+            f"makes); found {type(thing).__name__}. Of many rows report on `gpadjust.compare` of "
+            "some hundred."
         )
-    if isinstance(model, TermsGP):
-        if model.batch_shape and model.num_samples is None:
-            raise ValueError(
-                f"Expected a model of one data set, got one of batch_shape "
-                f"{tuple(model.batch_shape)}; report on the data sets one by one."
-            )
-        if not model.is_fitted:
-            raise ValueError(
-                f"{model!r} was not fitted: call `gpadjust.fit(model)` first. To learn whether the "
-                "physics helps, report on `gpadjust.compare(train_X, train_Y, physics)`."
-            )
+    if isinstance(model, GP) and not model.is_fitted:
+        raise ValueError(
+            f"Expected a fitted model; found {model!r}: call `gpadjust.fit(model)` first. To learn "
+            "whether the physics helps, report on `gpadjust.compare(train_X, train_Y, physics)`."
+        )
     X, Y = observations(model)
-    if comparison is not None and comparison.left_out:
-        loo = comparison.leave_one_out()
-    else:
-        loo = leave_one_out(model)
+    loo = leave_one_out(model) if comparison is None else comparison.leave_one_out()
     names = [f"row {i}" for i in range(len(X))] if rows is None else [str(row) for row in rows]
     if len(names) != len(X):
-        raise ValueError(f"Expected {len(X)} names of rows, one for each, got {len(names)}.")
+        raise ValueError(f"Expected {len(X)} names of rows, one for each, found {len(names)}.")
     adjusted = [_adjusted(model, comparison, j) for j in range(Y.shape[-1])]
     return Subject(model, comparison, X, Y, loo, names, adjusted)
 
 
-def _adjusted(
-    model: TermsGP | StackedGP, comparison: Comparison | None, output: int
-) -> Adjusted | None:
-    """The structure of most weight that adjusts a physics, of what predicts an output."""
-    candidates: list[tuple[str, TermsGP, int, float]]
+def _adjusted(model: GP | StackedGP, comparison: Comparison | None, output: int) -> Adjusted | None:
+    """Return the structure of most weight that adjusts a physics, of what predicts an output."""
+    candidates = [(type(model).__name__, model, 1.0)]
     if comparison is not None:
         rows = [*comparison.table.values()][output]
-        ranked = sorted(rows, key=lambda row: -row.weight)
-        candidates = [
-            (row.structure, comparison.models[row.structure], output, row.weight) for row in ranked
-        ]
+        candidates = [(r.structure, comparison.models[r.structure], r.weight) for r in rows]
     elif isinstance(model, StackedGP):
-        total = model.num_samples
-        parts = sorted(model.parts[output], key=lambda part: -part.number)
-        candidates = [(part.name, part.model, 0, part.number / total) for part in parts]
-    else:
-        candidates = [(type(model).__name__, model, output, 1.0)]
-    for name, each, j, weight in candidates:
-        if isinstance(each, TermsGP) and each.rho_names:
-            return Adjusted(name, each, j, weight)
+        weights = zip(model.weights.items(), model.models, strict=True)
+        candidates = [(name, each, own[output]) for (name, own), each in weights]
+    for name, each, weight in sorted(candidates, key=lambda each: -each[2]):
+        if isinstance(each, GP) and each.physics:
+            return Adjusted(name, each, output, weight)
     return None

@@ -3,44 +3,42 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from copy import deepcopy
 from numbers import Integral
 from typing import Any, Literal, Self
 
 import numpy as np
 import torch
-from botorch.posteriors.fully_bayesian import MCMC_DIM
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted, validate_data
 from torch import Size, Tensor
 
-from gpadjust.checks import checked_whole
-from gpadjust.inference import FitResult, SampleResult, fit
-from gpadjust.models import (
+from gpadjust.checks import checked_whole, seeded
+from gpadjust.core import (
     CKA,
     RRA,
     CalibratedPhysics,
+    FitResult,
     PhysicsMeanGP,
-    PhysicsParameters,
     ScaleGP,
-    TermsModel,
-    VariationalCKA,
     ZeroMeanGP,
+    fit,
 )
-from gpadjust.models.factory import ModelFactory, make_model, with_options
-from gpadjust.models.levels import Levels, coded, several, texts_of
-from gpadjust.models.plausibility import is_standardised
-from gpadjust.models.sampled_functions import seeded
-from gpadjust.models.training_data import check_array, column_names
+from gpadjust.core.data import as_tensor, column_names
+from gpadjust.core.model import Predictive
+from gpadjust.kinds.categories import Categories
+from gpadjust.kinds.factory import ModelFactory, make_model, with_options
+from gpadjust.many import VariationalCKA
 from gpadjust.physics import PhysicsWarning
 from gpadjust.physics.array_physics import array_physics
+from gpadjust.physics.parameters import PhysicsParameters
+from gpadjust.validation.plausibility import complaint
 
 Array = NDArray[np.float64]
 
-MODELS: dict[str, type[TermsModel]] = {
+MODELS: dict[str, type[Predictive]] = {
     "cka": CKA,
     "rra": RRA,
     "physics_mean": PhysicsMeanGP,
@@ -55,14 +53,14 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     r"""A physics adjusted to data, in the conventions of ``GaussianProcessRegressor``.
 
     It is :class:`~gpadjust.CKA`, or another model of this library, behind ``fit`` and ``predict``
-    of NumPy arrays and frames, for pipelines, ``cross_val_score`` and ``GridSearchCV``: the
-    fitted ``model_`` says all that a model says, such as ``model_.rho`` and ``model_.summary()``.
+    of NumPy arrays and frames, for pipelines, ``cross_val_score`` and ``GridSearchCV``. The
+    fitted ``model_`` has all methods of a model, such as ``model_.rho`` and ``model_.summary()``.
     The model finds its own scales of inputs and targets; it needs no scaler.
 
-    *What the physics sees* is the X that the regressor is given, columns by their order, as arrays.
-    After a ``StandardScaler`` in a pipeline, that is the scaled X: undo it in the physics, or scale
-    inside of the model, by ``partial(CKA, input_transform=Normalize(d))`` of BoTorch. It
-    must return what y is in: ``TransformedTargetRegressor`` transforms y, not the physics.
+    *The physics reads* the X that the regressor is given, columns by their order, as arrays. After
+    a ``StandardScaler`` in a pipeline, that is the scaled X: undo it in the physics, or scale
+    inside of the model, by ``model_options={"input_transform": Normalize(d)}`` of BoTorch. The
+    physics must return what y is in: ``TransformedTargetRegressor`` transforms y, not the physics.
 
     *NumPy or torch.* Any function of rows will do. One that returns a tensor, or takes nothing
     else, is a torch function; others get NumPy arrays. ``fit`` finds out, by the first row of X.
@@ -72,33 +70,28 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     Args:
         physics: The physics f_p: a function of rows ``N x d`` to ``N`` or ``N x m``, of NumPy
-            arrays or of torch tensors; a torch module, of which ``fit`` trains a copy; or a
-            :class:`~gpadjust.physics.Physics`, such as ``BlackBoxPhysics(function, batched=False)``
-            of single rows, or one with unknown parameters. Several: a list, or a dictionary with
-            their names. None: no physics; the model is then :class:`~gpadjust.ZeroMeanGP`, which is
-            what CKA of :math:`f_p = 0` is.
+            arrays or of torch tensors; or a :class:`~gpadjust.physics.Physics`, such as
+            ``BlackBoxPhysics(function, batched=False)`` of single rows, or one with unknown
+            parameters. Several: a list, or a dictionary with their names. None: no physics; the
+            model is then :class:`~gpadjust.ZeroMeanGP`.
         model: ``"cka"``, ``"variational"`` (of very many rows), ``"rra"``, ``"physics_mean"``,
             ``"scale"``, ``"calibrated_physics"``, ``"zero_mean"`` (which leaves the physics out, to
             compare with), or a callable that makes a model of X and y, with the keyword
             ``physics`` if there is one: a class of models, or ``functools.partial`` of one with
-            further arguments, such as ``partial(CKA, delta_mean="learn")``, or
+            further arguments, such as ``partial(CKA, center=0.0)``, or
             ``partial(CKA, train_Yvar=0.01)`` for noise of known variance. Each fit takes a copy.
-        model_options: What the data are, as in :class:`~gpadjust.CKA`: ``likelihood``,
-            ``outcome_transform``, ``input_transform`` and others that all models share, such as
-            ``{"outcome_transform": Standardize(m=1)}``. Each fit takes copies. Those with a value
-            for each row are arguments of :meth:`fit`.
-        fit_method: ``"bayes"`` or ``"map"``, as in :func:`gpadjust.fit`. None: the library's
-            calibrated default, full Bayes where the model can have it.
-        fit_options: Further arguments of :func:`gpadjust.fit`, such as ``{"num_samples": 32}``.
-            Its ``seed`` is ``random_state``, unless it is among them.
+        model_options: The kind of data: ``noise``, ``link``, ``input_transform`` and others that
+            all models share, such as ``{"link": "log"}``. Each fit takes copies.
+        fit_method: ``"bayes"`` or ``"map"``, as in :func:`gpadjust.fit`.
+        num_draws: As in :func:`gpadjust.fit`.
         random_state: The seed of the fit; a ``RandomState``, or None for NumPy's, draws it.
 
     Attributes:
         model_: The fitted model; its own methods return what they are given, frames, arrays or
             tensors.
         fit_result_: The result of :func:`gpadjust.fit`.
-        physics_parameters_: The :class:`~gpadjust.models.PhysicsParameters`, draws of the unknown
-            parameters of the physics by their names. Only if it has some.
+        physics_parameters_: The :class:`~gpadjust.physics.parameters.PhysicsParameters`, draws of
+            the unknown parameters of the physics by their names. Only if it has some.
         n_features_in_: The number ``d`` of columns of X.
         feature_names_in_: Their names, if X was a frame.
 
@@ -115,8 +108,8 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         (1,)
     """
 
-    model_: TermsModel
-    fit_result_: FitResult | SampleResult
+    model_: Any
+    fit_result_: FitResult
     physics_parameters_: PhysicsParameters
 
     def __init__(
@@ -125,18 +118,18 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         *,
         model: str | ModelFactory = "cka",
         model_options: dict[str, Any] | None = None,
-        fit_method: Literal["bayes", "map"] | None = None,
-        fit_options: dict[str, Any] | None = None,
+        fit_method: Literal["bayes", "map"] = "bayes",
+        num_draws: int | None = None,
         random_state: int | np.random.RandomState | None = None,
     ) -> None:
         self.physics = physics
         self.model = model
         self.model_options = model_options
         self.fit_method = fit_method
-        self.fit_options = fit_options
+        self.num_draws = num_draws
         self.random_state = random_state
 
-    def fit(self, X: Any, y: Any, train_Yvar: Any = None, train_Xvar: Any = None) -> Self:
+    def fit(self, X: Any, y: Any, train_Yvar: Any = None) -> Self:
         """Build the model on the data, and fit it.
 
         Args:
@@ -147,7 +140,6 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             train_Yvar: Known variances of the observations, of the shape of y, as in
                 :class:`~gpadjust.CKA`; scikit-learn takes it apart with the rows, as
                 ``cross_val_score(..., params={"train_Yvar": variances})``.
-            train_Xvar: Known variances of the inputs, of the shape of X, likewise.
 
         Returns:
             The regressor.
@@ -163,28 +155,37 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 data are dates or times.
             PhysicsError: If the physics fails, or returns NaN or a wrong shape.
         """
-        _check_measured(X=X, y=y)
-        names_of_y, options = column_names(y), _checked(self.model_options)
-        names = [*several(options.get("categorical")), *several(options.get("batch"))]
-        levels, frame = texts_of(X, names), X
-        X = _in_numbers(X, levels)
-        X, y = validate_data(
-            self, X, y, dtype=np.float64, multi_output=True, y_numeric=True, ensure_min_samples=2
-        )
+        _check_measured(y=y)
+        options, output_names = _checked(self.model_options), column_names(y)
+        if _has_texts(X):
+            options.setdefault("input_transform", Categories())
+        numbers = _in_numbers(X, deepcopy(options.get("input_transform")))
+        _check_measured(X=numbers)
+        rows, y = validate_data(
+            self, numbers, y, dtype=np.float64, multi_output=True, y_numeric=True,
+            ensure_min_samples=2,
+        )  # fmt: skip
         targets = np.asarray(y, dtype=np.float64).reshape(len(y), -1)
-        rows = {"train_Yvar": train_Yvar, "train_Xvar": train_Xvar}
-        rows = {name: np.asanyarray(each) for name, each in rows.items() if each is not None}
-        if "train_Yvar" in rows and rows["train_Yvar"].shape == (len(y),):
-            rows["train_Yvar"] = rows["train_Yvar"].reshape(-1, 1)
-        given = frame if levels or names else X  # of a frame the model knows columns and texts
-        model = self._build(given, X, targets, {**options, **rows})
-        model.input_names = tuple(getattr(self, "feature_names_in_", model.input_names))
-        model.output_names = names_of_y or model.output_names
-        search = {"seed": _seed(self.random_state), **(self.fit_options or {})}
-        result: Any = fit(model, self.fit_method, **search)
-        self.model_, self.fit_result_ = model, result
+        if train_Yvar is not None:
+            train_Yvar = np.asanyarray(train_Yvar)
+            is_column = train_Yvar.shape == (len(y),)
+            options["train_Yvar"] = train_Yvar.reshape(-1, 1) if is_column else train_Yvar
+        # A model reads the texts of a frame by itself.
+        model = self._build(rows if numbers is X else X, rows, targets, options)
+        input_names = tuple(getattr(self, "feature_names_in_", model.data.input_names))
+        names = {
+            "input_names": input_names,
+            "output_names": output_names or model.data.output_names,
+        }
+        model.data = model.data._replace(**names)
+        if len(model.physics) == 1 and (text := complaint(model.physics[0], model.data)):
+            message = f"Physics {model.physics[0].name!r}: {text}"
+            warnings.warn(message, PhysicsWarning, stacklevel=2)
+        seed = _seed(self.random_state)
+        self.fit_result_ = fit(model, self.fit_method, num_draws=self.num_draws, seed=seed)
+        self.model_ = model
         self.__dict__.pop("physics_parameters_", None)
-        if model.has_unknowns:
+        if len(model.physics_parameters):
             self.physics_parameters_ = model.physics_parameters
         return self
 
@@ -201,13 +202,12 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             X: Inputs, ``q x d``.
             return_std: Whether to return standard deviations, too.
             return_cov: Whether to return the covariances of the points, too.
-            observation_noise: Whether these are to be of observations, instead of the function
-                without noise, which scikit-learn predicts, unless a ``WhiteKernel`` says otherwise.
+            observation_noise: If True, predict observations instead of the function without noise.
 
         Returns:
             The means, ``q`` or, of several outputs, ``q x m``. With ``return_std`` also standard
             deviations of the same shape; with ``return_cov`` also covariances, ``q x q`` or
-            ``q x q x m``. After full Bayes, all are those of the mixture over hyper-parameters.
+            ``q x q x m``. All are those of the mixture over draws.
 
         Raises:
             NotFittedError: If the regressor was not fitted.
@@ -236,9 +236,6 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     ) -> Array:
         """Draw functions from the posterior, jointly at all points.
 
-        After full Bayes each is drawn with one of the held samples of hyper-parameters, over which
-        the draws are spread evenly.
-
         Args:
             X: Inputs, ``q x d``.
             n_samples: The number of draws.
@@ -253,16 +250,14 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             ValueError: If ``n_samples`` is not positive; and as :meth:`predict`.
         """
         checked_whole("n_samples", n_samples, 1)
-        inputs, held = self._inputs(X), self.model_.num_samples or 1
+        inputs = self._inputs(X)
         with torch.no_grad(), seeded(_seed(random_state)):
             posterior = self.model_.posterior(inputs, observation_noise=observation_noise)
-            draws = posterior.rsample(Size([-(-int(n_samples) // held)]))
-            draws = draws.reshape(-1, *draws.shape[-2:])
-            draws = draws[torch.randperm(len(draws))[:n_samples]]
+            draws = posterior.rsample(Size([int(n_samples)]))
         return _array(draws.permute(1, 2, 0), dim=1)
 
-    def _build(self, given: Any, X: Array, Y: Array, options: dict[str, Any]) -> TermsModel:
-        """The model that the parameters say, with further options, of inputs as they are given."""
+    def _build(self, X: Any, rows: Array, Y: Array, options: dict[str, Any]) -> Any:
+        """Return the model that the parameters say, with further options."""
         factory: Any = self.model
         if isinstance(factory, str):
             if factory not in MODELS:
@@ -280,88 +275,85 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 )
         physics = None
         if self.physics is not None and factory is not ZeroMeanGP:
-            physics = array_physics(self.physics, X)
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", PhysicsWarning)
-            factory = with_options(deepcopy(factory), options)
-            model: TermsModel = make_model(factory, given, Y, kind=TermsModel, physics=physics)
-        for each in caught:
-            hints = _hints(X, Y) if issubclass(each.category, PhysicsWarning) else ""
-            warnings.warn(f"{each.message}{hints}", each.category, stacklevel=3)
-        return model
+            physics = _physics_of_arrays(self.physics, rows)
+        factory = with_options(deepcopy(factory), options)
+        return make_model(factory, X, Y, kind=Predictive, physics=physics)
 
     def _inputs(self, X: Any) -> Tensor:
+        """Return checked inputs of a call."""
         check_is_fitted(self)
-        _check_measured(X=X)
-        X = _in_numbers(X, self.model_.levels, self.model_.batches)
-        rows = validate_data(self, X, dtype=np.float64, reset=False)
+        numbers = _in_numbers(X, self.model_.data.transform)
+        _check_measured(X=numbers)
+        rows = validate_data(self, numbers, dtype=np.float64, reset=False)
         return torch.tensor(np.ascontiguousarray(rows))  # others may run backwards
 
     def _covariance(self, X: Tensor, observation_noise: bool) -> Tensor:
-        """The covariances of the points, ``q x q x m``."""
+        """Return the covariances of the points, ``q x q x m``."""
         covariances = []
         for output in range(self.model_.num_outputs):
-            posterior: Any = self.model_.posterior(X, [output], observation_noise)
-            mean, covariance = posterior.mean, posterior.distribution.covariance_matrix
-            if self.model_.num_samples is not None:
-                spread = mean - mean.mean(MCMC_DIM, keepdim=True)  # S x q x 1
-                covariance = (covariance + spread @ spread.mT).mean(0)
-            covariances.append(covariance)
+            posterior = self.model_.posterior(X, [output], observation_noise)
+            covariances.append(posterior.distribution.covariance_matrix)
         return torch.stack(covariances, dim=-1)
 
 
 def _check_measured(**data: Any) -> None:
-    """Refuse masked values and times, which scikit-learn would turn into numbers."""
+    """Raise an error of masked values and times, which scikit-learn would turn into numbers."""
     for name, values in data.items():
-        if hasattr(values, "dtype") or hasattr(values, "dtypes"):
-            check_array(np.asanyarray(values), name, ["dates or times"])
-
-
-def _hints(X: Array, Y: Array) -> str:
-    """Advice on scaled data in the terms of scikit-learn."""
-    hints = ""
-    if is_standardised(torch.tensor(X)):
-        hints += (
-            " X is scaled, as by a StandardScaler before this step of a pipeline: leave it out, as "
-            "the model finds its own scales, or undo it in the physics, scaler.inverse_transform."
+        array = (
+            np.asanyarray(values) if hasattr(values, "dtype") or hasattr(values, "dtypes") else 0
         )
-    if is_standardised(torch.tensor(Y)):
-        hints += (
-            " y is scaled, as by a TransformedTargetRegressor, which does not transform the "
-            "physics: leave it out, too."
-        )
-    return hints
+        if isinstance(array, np.ndarray) and (array.dtype.kind in "mM" or np.ma.is_masked(array)):
+            as_tensor(array, name)
 
 
-def _in_numbers(X: Any, levels: Levels, batches: Sequence[int] = ()) -> Any:
-    """A frame with the numbers of levels in place of texts; anything else as it is."""
-    found = coded(X, levels, batches)
-    return X if found is X else type(X)(found.astype(float), index=X.index, columns=X.columns)
+def _physics_of_arrays(physics: Any, X: Array) -> Any:
+    """Return a physics, or several in their form, of NumPy or torch functions."""
+    if isinstance(physics, dict):
+        return {name: array_physics(part, X) for name, part in physics.items()}
+    if isinstance(physics, list | tuple):
+        return [array_physics(part, X) for part in physics]
+    return array_physics(physics, X)
+
+
+def _has_texts(X: Any) -> bool:
+    """Return whether X is a frame with a column of texts."""
+    if not hasattr(X, "iloc") or not hasattr(X, "columns"):
+        return False
+    columns = (X.iloc[:, i].tolist() for i in range(X.shape[1]))
+    return any(all(isinstance(value, str) for value in column) for column in columns if column)
+
+
+def _in_numbers(X: Any, transform: Any) -> Any:
+    """Return a frame with numbers where a transform makes numbers of it; anything else as it is."""
+    if not hasattr(transform, "coded") or not hasattr(X, "iloc"):
+        return X
+    numbers = np.asarray(transform.coded(X), dtype=np.float64)
+    return type(X)(numbers, index=X.index, columns=X.columns)
 
 
 def _checked(options: Any) -> dict[str, Any]:
-    """The options of a model, by their names; a TypeError if they are something else."""
+    """Return the options of a model by their names; a TypeError if they are something else."""
     if options is not None and not isinstance(options, dict):
         raise TypeError(
             "Expected model_options as a dictionary of arguments that models share, such as "
-            f"{{'outcome_transform': None}}, got {options!r}."
+            f"{{'link': 'log'}}, got {options!r}."
         )
     for name in ("train_X", "train_Y", "physics"):
         if name in (options or {}):
             raise TypeError(
                 f"Found {name!r} in model_options, where it is an argument of its own, expected "
-                "what models share, such as 'outcome_transform'."
+                "what models share, such as 'link'."
             )
     return {**(options or {})}
 
 
 def _array(values: Tensor, dim: int = -1) -> Array:
-    """An array without the dimension of outputs if there is one output."""
+    """Return an array without the dimension of outputs if there is one output."""
     return np.asarray(values.squeeze(dim).numpy())
 
 
 def _seed(random_state: int | np.random.RandomState | None) -> int:
-    """An integer as it is, so that results are those of the library with that seed."""
+    """Return an integer as it is, so that results are those of the library with that seed."""
     if isinstance(random_state, Integral):
         return int(random_state)
     return int(check_random_state(random_state).randint(2**31 - 1))

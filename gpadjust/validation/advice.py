@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from types import MappingProxyType
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from gpadjust.models import TermsGP
-from gpadjust.models.parameters import shared_parameters
+from gpadjust.core import GP, FitResult
 from gpadjust.validation.leave_one_out import LeaveOneOut
 from gpadjust.validation.ranking import ENOUGH, SURE, Candidate, densities, difference, sign_of
 from gpadjust.validation.structures import Structure
@@ -27,8 +25,7 @@ class Gain(NamedTuple):
         elpd: The difference of expected log predictive densities, the sum over the observations, in
             nats.
         se: Its standard error.
-        structure: The structure with the physics; one without unknown constants, which may help by
-            themselves, if that is shown to be better.
+        structure: The structure with the physics.
         without: The structure without the physics.
         shown: 1 if the physics is shown to help, by two standard errors and by the evidence of
             models that were weighed without it; -1 if it is shown to make predictions worse, where
@@ -53,7 +50,7 @@ class Gain(NamedTuple):
         return _ANSWERS[self.shown]
 
     def sentences(self, output: str) -> list[str]:
-        """The verdict in words: what is found, with its number, and why no more is, if so.
+        """Return the verdict in words: what is found, with its number, and why no more is, if so.
 
         Args:
             output: The name of the output.
@@ -68,7 +65,7 @@ class Gain(NamedTuple):
         return [finding] if self.shown else [finding, self._reason()]
 
     def _reason(self) -> str:
-        """Why the physics is neither shown to help nor to do harm."""
+        """Return why the physics is neither shown to help nor to do harm."""
         sign = sign_of(self.elpd, self.se)
         if self.number < ENOUGH:
             return (
@@ -87,12 +84,6 @@ class Gain(NamedTuple):
                 "compared is a model that leaves a physics of no use out by itself: so none is "
                 "said to do harm."
             )
-        if sign > 0:
-            return (
-                f"{self.structure} is better by more than two standard errors, but its unknown "
-                "constants may do that by themselves: the best structure without such constants is "
-                "not shown to be better."
-            )
         return (
             "That is not to say that it does not help: the difference is within two standard "
             "errors, and more observations may show one."
@@ -103,13 +94,13 @@ def physics_gain(
     structures: Mapping[str, Structure],
     order: Iterable[str],
     density: Mapping[str, Tensor],
-    relevance: Mapping[str, float] = MappingProxyType({}),
+    relevance: Mapping[str, float],
 ) -> Gain | None:
-    """The gain by the physics; None if no structure uses it, or none is without it.
+    """Return the gain by the physics; None if no structure uses it, or all do.
 
     Structures, log predictive densities ``n`` of left-out observations, and ``relevance``
-    (probabilities that the physics is of use, of structures that were weighed without it) are by
-    name, the ``order`` best first. Of a structure that was not weighed, the highest probability
+    (probabilities that the physics is of use, of models that are averaged with one without it) are
+    by name, the ``order`` best first. Of a structure without such a probability the highest one
     counts: of several physics one may be of use, and others not.
     """
     names = [*order]
@@ -117,68 +108,61 @@ def physics_gain(
     others = [name for name in names if not structures[name].uses_physics]
     if not (physical and others):
         return None
-    number = len(density[physical[0]])
-    shows = number >= ENOUGH  # of fewer the error is itself unknown
-    fair = next((name for name in physical if not structures[name].unknowns), physical[0])
-    elpd, se = difference(density[fair], density[others[0]])
-    helps = shows and sign_of(elpd, se) > 0
-    if helps and relevance.get(fair, max(relevance.values(), default=1.0)) > 0.5:
-        return Gain(elpd, se, fair, others[0], 1, number=number)
-    elpd, se = difference(density[physical[0]], density[others[0]])
-    sign = sign_of(elpd, se) if shows else 0
-    by_evidence = helps if sign > 0 else sign < 0 and bool(relevance)
-    shown = 0 if relevance else min(sign, 0)
-    return Gain(elpd, se, physical[0], others[0], shown, by_evidence, number)
+    best, without = physical[0], others[0]
+    number = len(density[best])
+    elpd, se = difference(density[best], density[without])
+    sign = sign_of(elpd, se) if number >= ENOUGH else 0  # of fewer the error is itself unknown
+    probability = relevance.get(best, max(relevance.values(), default=1.0))
+    is_doubted = probability <= 0.5 if sign > 0 else bool(relevance)
+    by_evidence = bool(sign) and is_doubted
+    return Gain(elpd, se, best, without, 0 if by_evidence else sign, by_evidence, number)
+
+
+def relevance_of(model: GP, result: FitResult) -> list[float]:
+    """Return the probability that the physics is of use, of each output; empty if not asked."""
+    without = [c.text for c in model.table.choices if any(z.endswith(".mean") for z in c.zeros)]
+    shares = [result.probabilities[text] for text in without if text in result.probabilities]
+    return [1 - sum(each) for each in zip(*shares, strict=True)]
 
 
 def advice(
     structures: Sequence[Structure],
-    models: dict[str, TermsGP],
-    left_out: dict[str, LeaveOneOut],
-    converged: dict[str, Tensor],
-    relevance: dict[str, Tensor],
-    table: dict[str, list[Candidate]],
-    X: Tensor,
+    models: Mapping[str, GP],
+    results: Mapping[str, FitResult],
+    left_out: Mapping[str, LeaveOneOut],
+    table: Mapping[str, list[Candidate]],
 ) -> tuple[dict[str, Gain], list[str]]:
-    """The gain by the physics of outputs where there is one without it, and sentences on all else.
+    """Return the gain by the physics of each output where there is one, and all else in sentences.
 
-    Models, predictions, ``converged`` (whether samples are of the posterior, ``m``) and
-    ``relevance`` (probabilities that the physics is of use, ``m``) are by the names of structures,
-    rankings by those of outputs.
+    Models, results of their fits and predictions are by the names of structures, rankings by the
+    names of outputs.
     """
-    by_name = {structure.name: structure for structure in structures}
+    named = {structure.name: structure for structure in structures}
+    relevance = {name: relevance_of(model, results[name]) for name, model in models.items()}
     gains: dict[str, Gain] = {}
     sentences = []
     for j, (output, rows) in enumerate(table.items()):
         where = f"{output}: " if len(table) > 1 else ""
         density = dict(zip(left_out, densities(left_out, j).unbind(-1), strict=True))
-        probable = {name: float(each[j]) for name, each in relevance.items()}
+        probable = {name: each[j] for name, each in relevance.items() if each}
         order = [row.structure for row in rows]
-        gain = physics_gain(by_name, order, density, probable)
+        gain = physics_gain(named, order, density, probable)
         if gain is not None:
             gains[output] = gain
         found = [_best(rows)]
         if gain is None or gain.shown > 0:
-            found += _scaling(by_name, order, density)
+            found += _scaling(named, order, density)
         found += [
             f"By the evidence of {name} with and without it, f_p is of use: {probability:.2f}."
             for name, probability in probable.items()
         ]
-        found += _preferred(models[rows[0].structure], X, j)
-        found += _unsampled(rows, converged, j)
+        found += _preferred(models[order[0]], j)
         sentences += [where + sentence for sentence in found]
-    flattered = [name for name, model in models.items() if shared_parameters(model)]
-    if flattered:
-        sentences.append(
-            f"{', '.join(flattered)}: left-out observations have had their say in the parameters "
-            "of the physics, so that these elpd are too high. Freeze them with "
-            "requires_grad_(False) for a fair comparison."
-        )
-    return gains, sentences
+    return gains, sentences + _unsampled(table, results)
 
 
 def _best(rows: list[Candidate]) -> str:
-    """The best structure, and those not shown to be worse."""
+    """Return the best structure, and those not shown to be worse."""
     best, *others = rows
     near = [row for row in others if not sign_of(row.elpd_diff, row.se_diff)]
     sentence = f"{best.structure} predicts left-out observations best (weight {best.weight:.2f})"
@@ -191,9 +175,9 @@ def _best(rows: list[Candidate]) -> str:
 
 
 def _scaling(
-    structures: dict[str, Structure], order: list[str], density: dict[str, Tensor]
+    structures: Mapping[str, Structure], order: Sequence[str], density: Mapping[str, Tensor]
 ) -> list[str]:
-    """The gain of scaling the physics over taking it as the mean."""
+    """Return the gain of scaling the physics over taking it as the mean."""
     adjusting = next((name for name in order if structures[name].adjusts), None)
     plain = next((n for n in order if structures[n].uses_physics and not structures[n].adjusts), "")
     if adjusting is None or not plain:
@@ -209,40 +193,37 @@ def _elpd(value: float, error: float, better: str, otherwise: str, worse: str) -
     return f"elpd {nats} ({better}) over that {otherwise} ({worse})"
 
 
-def _unsampled(rows: list[Candidate], converged: dict[str, Tensor], output: int) -> list[str]:
-    """The structures with weight whose draws are not of their posterior."""
-    names = [row.structure for row in rows if row.weight > _COUNTS]
-    low = [name for name in names if not converged[name][output]]
+def _unsampled(table: Mapping[str, list[Candidate]], results: Mapping[str, FitResult]) -> list[str]:
+    """Return which structures with weight predict otherwise by other seeds."""
+    names = {row.structure for rows in table.values() for row in rows if row.weight > _COUNTS}
+    low = [name for name, result in results.items() if name in names and not result.converged]
     if not low:
         return []
     return [
-        f"The samples of {', '.join(low)} are of an approximation rather than of the posterior: "
-        "doubt the intervals, and fit again with more num_draws or narrower priors."
+        f"Predictions of {', '.join(low)} depend on the seed: doubt the intervals, and fit again "
+        "with more num_draws or narrower priors."
     ]
 
 
-def _preferred(model: TermsGP, X: Tensor, output: int) -> list[str]:
-    """The physics that a model of several relies on, and where."""
-    names = getattr(model, "rho_names", ())
+def _preferred(model: GP, output: int) -> list[str]:
+    """Return which physics a model of several relies on, and where."""
+    names, X = [t.name for t in model.terms if t.physics is not None], model.data.X
     if len(names) < 2:
         return []
     with torch.no_grad():
-        if set(names) <= set(model.term_names):
-            means = [model.term(name, X).mean for name in names]
-            sizes = torch.stack([mean[:, output].abs() for mean in means])  # k x n
-        else:
-            constants = [abs(model.term_mean(n, output)) for n in names]
-            sizes = torch.tensor(constants).unsqueeze(-1).expand(-1, len(X)).to(X)
+        means = [model.term(name, X).mean[:, output].abs() for name in names]
+    sizes = torch.stack(means)  # k x n
     labels = [name.removeprefix("rho_") for name in names]
-    overall = sizes.mean(-1)
-    shares = ", ".join(f"{n} {w:.2g}" for n, w in zip(labels, overall.tolist(), strict=True))
-    sentences = [f"Mean size of rho at the data: {shares}."]
+    shares = zip(labels, sizes.mean(-1).tolist(), strict=True)
+    sentences = [
+        f"Mean size of rho at the data: {', '.join(f'{n} {share:.2g}' for n, share in shares)}."
+    ]
     for i in range(X.shape[-1]):
         low = X[:, i] <= X[:, i].median()
         a, b = (int(sizes[:, part].mean(-1).argmax()) for part in (low, ~low))
         if a != b and not low.all():
             sentences.append(
-                f"Below the median of {model.input_names[i]} the data prefer {labels[a]}, above it "
-                f"{labels[b]}."
+                f"Below the median of {model.data.input_names[i]} the data prefer {labels[a]}, "
+                f"above it {labels[b]}."
             )
     return sentences

@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from botorch.models import ModelListGP
-from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
+from botorch.models import ModelListGP, SingleTaskGP
 from botorch.models.transforms.outcome import Standardize
-from botorch.posteriors.fully_bayesian import MCMC_DIM
-from botorch.utils.transforms import is_fully_bayesian
-from linear_operator import to_dense
 from torch import Tensor
 
-from gpadjust.gp.noise import Noise
-from gpadjust.models import StackedGP, TermsGP, VariationalCKA
-from gpadjust.models.exact_conditioning import Factors
-from gpadjust.models.heavy_tails import with_tails
-from gpadjust.models.stacked import Part
+from gpadjust.core import StackedGP
+from gpadjust.core.gaussian import DRAWS, Marginals
 from gpadjust.validation.scores import Scores, central_share
 
 ROUNDING = 1e-8  # of the observations' standard deviation; to predict better shows nothing
+_FAR = 6.0  # standard deviations, where a probability next to 1 is rounded
+_COMPONENTS = 64  # that draws are resampled to, for each observation
 
 
 @dataclass(frozen=True)
@@ -31,20 +25,17 @@ class LeaveOneOut:
     """Predictions of each observation from all the others, in the user's units.
 
     Attributes:
-        X: Raw inputs, ``batch_shape x n x d``.
-        Y: Observations, ``batch_shape x n x m``; NaN where there is none.
-        mean: Their predictions, of the same shape.
+        X: Inputs, ``n x d``.
+        Y: Observations, ``n x m``; NaN where there is none.
+        mean: Their predictions, ``n x m``; medians of a model with a link.
         variance: The variances of the predictions, observation noise included.
-        log_density: The log predictive densities of the observations, in nats, of the same shape;
-            of a mixture its own, whose shape the other scores take as Gaussian; of standard
+        log_density: The log predictive densities of the observations, in nats; of standard
             deviations of at least 1e-8 of that of the observations, as less is rounding. NaN where
             there is no observation.
+        pit: The predicted probabilities of less than was observed; NaN where nothing was.
         output_names: The names of the outputs; empty if the model has none.
-        pit: The predicted probabilities of less than was observed, of outputs with a link, whose
-            predictions are not Gaussian; else None.
-        is_outlier: Mask of the observations that count as outliers of a noise with heavy tails, of
-            the shape of ``Y``; None of other noise. Mean and variance are of an observation that is
-            none; the density allows that it may be one. Scores leave them out, but for the density.
+        is_outlier: Whether an observation is an outlier of a noise with heavy tails, ``n x m``;
+            None of other noise. Scores leave these out, but for the density.
     """
 
     X: Tensor
@@ -52,63 +43,53 @@ class LeaveOneOut:
     mean: Tensor
     variance: Tensor
     log_density: Tensor
+    pit: Tensor
     output_names: tuple[str, ...] = ()
-    pit: Tensor | None = None
     is_outlier: Tensor | None = None
 
     @property
     def residuals(self) -> Tensor:
-        """Standardized residuals, ``(Y - mean) / sd``, ``batch_shape x n x m``.
+        """Normal numbers of the same probability as the observations, ``n x m``.
 
-        Of outputs with a link they are those of normal numbers of the same probability.
+        Of a Gaussian prediction, and far out, they are ``(Y - mean) / sd``.
         """
-        if self.pit is not None:
-            return torch.special.ndtri(self.pit.clamp(1e-15, 1 - 1e-15))
-        return (self.Y - self.mean) / self.variance.sqrt()
-
-    def below(self) -> Tensor:
-        """The predicted probabilities of less than was observed, ``batch_shape x n x m``."""
-        return torch.special.ndtr(self.residuals) if self.pit is None else self.pit
+        z = torch.special.ndtri(self.pit)
+        return torch.where(z.abs() < _FAR, z, (self.Y - self.mean) / self.variance.sqrt())
 
     def score(self, level: float = 0.95) -> Scores:
-        """The scores of the predictions; the density is that of a mixture where they are one.
+        """Return the scores of the predictions.
 
         Args:
             level: Nominal coverage, between 0 and 1.
         """
-        names = self.output_names
         Y = self.Y if self.is_outlier is None else self.Y.masked_fill(self.is_outlier, torch.nan)
-        scores = Scores.of(self.mean, self.variance, Y, level=level, output_names=names)
-        if self.pit is not None:
-            scores = replace(scores, pit=self.pit, coverage=central_share(self.pit, level))
-        return replace(scores, nlpd=-self.log_density.nanmean(-2))
+        names, pit = self.output_names, self.pit.masked_fill(Y.isnan(), torch.nan)
+        mean = self.mean.nan_to_num()  # where nothing was observed
+        scores = Scores.of(mean, self.variance, Y, level=level, output_names=names)
+        share, nlpd = central_share(pit, level), -self.log_density.nanmean(-2)
+        return replace(scores, pit=pit, coverage=share, nlpd=nlpd)
 
 
-def leave_one_out(
-    model: BatchedMultiOutputGPyTorchModel | ModelListGP | StackedGP,
-) -> LeaveOneOut:
+@torch.no_grad()
+def leave_one_out(model: Any) -> LeaveOneOut:
     r"""Predict each observation from all the others, without fitting again.
 
-    The hyper-parameters (and the scale of the outcomes) stay as they are, so that each left-out
-    observation has had its say in them: with few points the scores are optimistic. With the
-    covariance :math:`K` of the observations, noise included, and
-    :math:`\alpha = K^{-1} (y - m)`,
+    With the covariance :math:`K` of the observations, noise included, and
+    :math:`\alpha = K^{-1} (y - m)`, each draw of the unknown numbers predicts
 
     .. math:: \mu_{-i} = y_i - \alpha_i / [K^{-1}]_{ii}, \quad
         \sigma^2_{-i} = 1 / [K^{-1}]_{ii}
 
-    (Rasmussen and Williams 2006, eqs. 5.10-5.12; Sundararajan and Keerthi 2001). Of an
-    :class:`~gpadjust.AR1` only points of the high level are left out.
-
-    Of a model that holds samples of its hyper-parameters, these *are* without the left-out
-    observation: a sample has the weight :math:`1 / p(y_i | y_{-i}, \theta)`, at most
-    :math:`\sqrt S` times the average (Gelfand et al. 1992; Ionides 2008), and mean and variance
-    are those of the weighted mixture. Of a :class:`~gpadjust.StackedGP` it is the mixture of its
-    parts' predictions; its weights stay.
+    (Rasmussen and Williams 2006, eqs. 5.10-5.12; Sundararajan and Keerthi 2001). The draws have
+    seen the observation; for its prediction they have the weights
+    :math:`1 / p(y_i | y_{-i}, \theta)`, at most :math:`\sqrt S` times the average (Gelfand et al.
+    1992; Ionides 2008). After a point fit there is one draw, and scores of few points are
+    optimistic. Of a :class:`~gpadjust.StackedGP` it is the mixture of its models' predictions; its
+    weights, and the scale of the outcomes, have seen all.
 
     Args:
-        model: Any model of this library, a ``SingleTaskGP``, or a ``ModelListGP`` of such with the
-            same training inputs. It stays as it is.
+        model: A model of this library, a ``SingleTaskGP``, or a ``ModelListGP`` of such with the
+            same training inputs.
 
     Raises:
         TypeError: If the model is of another kind.
@@ -126,187 +107,108 @@ def leave_one_out(
         (torch.Size([8, 1]), True)
     """
     if isinstance(model, ModelListGP):
-        return _join([leave_one_out(part) for part in model.models])
+        return _side_by_side([leave_one_out(part) for part in model.models])
+    if isinstance(model, SingleTaskGP):
+        return _of_botorch(model)
+    if not isinstance(model, StackedGP) and not hasattr(model, "left_out"):
+        raise TypeError(
+            "Expected a model of this library, a SingleTaskGP, or a ModelListGP of such; found "
+            f"{type(model).__name__}. Of a model without leave-one-out predictions hold some "
+            "observations out, and compare model.interval(X) with them."
+        )
+    marginals, data = _left_out(model), model.data
+    Y = data.Y
+    is_outlier = getattr(getattr(model, "noise", None), "is_outlier", None)
+    return LeaveOneOut(
+        data.X, Y, *marginals.prediction, marginals.log_density(Y), marginals.probability(Y),
+        data.output_names, is_outlier,
+    )  # fmt: skip
+
+
+def _left_out(model: Any) -> Marginals:
+    """Return the predictions of left-out observations, by components of equal weights."""
     if isinstance(model, StackedGP):
-        return _join([_of_parts(parts) for parts in model.parts])
-    if isinstance(model, VariationalCKA):
-        raise TypeError(
-            "Expected an exact model, got a VariationalCKA: of so many observations hold some out, "
-            "build the model of the others, and compare model.interval(X) with what was held out."
-        )
-    if not isinstance(model, BatchedMultiOutputGPyTorchModel):
-        raise TypeError(
-            "Expected a model of this library, a SingleTaskGP, or a ModelListGP of such, got "
-            f"{type(model).__name__}."
-        )
+        return model.marginals_of(*_mixed(model, [_left_out(each) for each in model.models]))
+    means, variances = model.left_out()[:2]
+    y = model.on_gaussian_scale(model.data.Y)
+    spread = (y - y.nanmean(-2, keepdim=True)).square().nanmean(-2, keepdim=True)
+    variances = variances.maximum(ROUNDING**2 * spread)
+    log_density = -0.5 * ((y - means).square() / variances + variances.log())
+    rows = _without_each(log_density)
+    return model.marginals_of(means.gather(DRAWS, rows), variances.gather(DRAWS, rows))
+
+
+def _without_each(log_density: Tensor) -> Tensor:
+    """Return which draws, ``S' x n x m``, are those without each observation, by densities."""
+    S = len(log_density)
+    weight = (-log_density).nan_to_num(nan=0.0).softmax(0).clamp_max(S**-0.5)
+    ends = (weight / weight.sum(0)).cumsum(0)
+    heights = (torch.arange(_COMPONENTS if S > 1 else 1).to(ends) + 0.5) / _COMPONENTS
+    return (heights.reshape(-1, 1, 1, 1) > ends).sum(1).clamp_max(S - 1)
+
+
+def _mixed(model: StackedGP, parts: list[Marginals]) -> Tensor:
+    """Return means and variances ``2 x S x n x m`` of the components of a mixture."""
+    outputs = []
+    for j in range(model.num_outputs):
+        chosen = []
+        for i, part in enumerate(parts):
+            count = int((model.owners[:, j] == i).sum())
+            rows = ((torch.arange(count) + 0.5) * len(part.means) / max(1, count)).long()
+            chosen.append(torch.stack([each[rows, :, j] for each in (part.means, part.variances)]))
+        outputs.append(torch.cat(chosen, 1))
+    return torch.stack(outputs, -1)
+
+
+def _of_botorch(model: SingleTaskGP) -> LeaveOneOut:
+    """Return leave-one-out predictions by a model of BoTorch, in the user's units."""
     transform = getattr(model, "outcome_transform", None)
     if transform is not None and not isinstance(transform, Standardize):
         raise ValueError(
-            f"The outcome transform {type(transform).__name__} is not a shift and scale, so the "
-            "predictions are not Gaussian in the user's units; use Standardize or None, and "
-            "transform the data beforehand."
+            "Expected outcome_transform as Standardize or None, so that predictions are Gaussian "
+            f"in the user's units; found {type(transform).__name__}. Transform the data before."
         )
-    with _evaluating(model), torch.no_grad():
-        X, rows = _measurements(model)
-        mean, variance = model.left_out() if isinstance(model, TermsGP) else _targets(model)
-        targets = model.train_targets
-        if isinstance(model, TermsGP):
-            targets, mean = model.measured_targets(), mean + model.measured_targets() - targets
-        Y, mean, variance = (
-            _outputs_last(model, t)[..., rows, :] for t in (targets, mean, variance)
+    was_training = model.training
+    model.train()  # in which its inputs are the user's
+    X, y = model.train_inputs[0], model.train_targets
+    prior = model.likelihood(model(X), [X])
+    alpha = torch.linalg.solve(prior.covariance_matrix, (y - prior.mean).unsqueeze(-1)).squeeze(-1)
+    variance = prior.covariance_matrix.inverse().diagonal(dim1=-1, dim2=-2).reciprocal()
+    model.train(was_training)
+    several = model.num_outputs > 1
+    X = X[0] if several else X
+    Y, mean, variance = (
+        each.mT if several else each.unsqueeze(-1) for each in (y, y - alpha * variance, variance)
+    )
+    if transform is not None:
+        Y, _ = transform.untransform(Y)
+        mean, variance = transform.untransform(mean, variance)
+    marginals = Marginals(mean.unsqueeze(DRAWS), variance.unsqueeze(DRAWS))
+    return LeaveOneOut(X, Y, mean, variance, marginals.log_density(Y), marginals.probability(Y))
+
+
+def _side_by_side(parts: Sequence[LeaveOneOut]) -> LeaveOneOut:
+    """Return the outputs of several models as those of one."""
+    first = parts[0]
+    if any(part.X.shape != first.X.shape or not torch.equal(part.X, first.X) for part in parts):
+        raise ValueError(
+            "Expected models of the same training inputs in the list; found others: call "
+            "`leave_one_out` on each of `model.models`."
         )
-        # A missing observation is predicted from all that there are, but not compared.
-        missing, link, own_pit = Y.isnan(), getattr(model, "link", None), None
-        mean, variance = mean.masked_fill(missing, 0.0), variance.masked_fill(missing, 1.0)
-        if transform is not None:
-            # Of a model with a link these are in its units.
-            Y, mean = (Standardize.untransform(transform, values)[0] for values in (Y, mean))
-            variance = variance * transform.stdvs.square()
-        if is_fully_bayesian(model):
-            X, Y = X.select(MCMC_DIM, 0), Y.select(MCMC_DIM, 0)
-        else:
-            mean, variance = mean.unsqueeze(MCMC_DIM), variance.unsqueeze(MCMC_DIM)
-        density, is_outlier = log_densities(mean, variance, Y), None
-        if isinstance(model, TermsGP) and model.has_heavy_tails:
-            density = with_tails(density, Y.unsqueeze(MCMC_DIM) - mean, variance)
-            kept = _outputs_last(model, model.noise.trusted(model.train_targets))[..., rows, :]
-            kept = kept.select(MCMC_DIM, 0) if is_fully_bayesian(model) else kept
-            is_outlier = kept.isnan() & ~Y.isnan()
-        weight = _without_each(density)
-        if link is not None:
-            below = torch.special.ndtr((Y.unsqueeze(MCMC_DIM) - mean) / variance.sqrt())
-            own_pit = (weight * below).sum(MCMC_DIM).clamp(0, 1)  # but for rounding
-            own_pit = own_pit.masked_fill(Y.isnan(), torch.nan)
-            (mean, variance), Y = link.moments(mean, variance), link.inverse(Y)
-            density = density + link.log_slope(Y).unsqueeze(MCMC_DIM)
-        mean, variance, density = _mixture_of(mean, variance, density, weight)
-    X, Y = X[..., rows, :].expand(*mean.shape[:-1], X.shape[-1]), Y.expand(mean.shape)
-    names = getattr(model, "output_names", ())
-    return LeaveOneOut(X.clone(), Y.clone(), mean, variance, density, names, own_pit, is_outlier)
-
-
-def log_densities(mean: Tensor, variance: Tensor, Y: Tensor) -> Tensor:
-    """Return log densities ``... x n x m`` by Gaussians ``... x S x n x m``; NaN if missing."""
-    spread = (Y - Y.nanmean(-2, keepdim=True)).square().nanmean(-2, keepdim=True).sqrt()
-    sd = torch.maximum(variance.sqrt(), ROUNDING * spread.unsqueeze(MCMC_DIM))
-    normal = torch.distributions.Normal(mean, sd, validate_args=False)
-    return normal.log_prob(Y.unsqueeze(MCMC_DIM))
-
-
-def _without_each(density: Tensor) -> Tensor:
-    """Weights of samples that have seen all, for each observation to have had no say in them."""
-    weight = (-density).nan_to_num(nan=0.0).softmax(MCMC_DIM)
-    weight = weight.clamp_max(weight.shape[MCMC_DIM] ** -0.5)
-    return weight / weight.sum(MCMC_DIM, keepdim=True)
-
-
-def _mixture_of(
-    mean: Tensor, variance: Tensor, density: Tensor, weight: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean, variance and log density of mixtures with weights, 1 in all, along ``MCMC_DIM``."""
-    center = (weight * mean).sum(MCMC_DIM, keepdim=True)
-    spread = (mean - center).square()
-    total = (weight.log() + density).logsumexp(MCMC_DIM)
-    return center.squeeze(MCMC_DIM), (weight * (variance + spread)).sum(MCMC_DIM), total
-
-
-def _of_parts(parts: Sequence[Part]) -> LeaveOneOut:
-    """Return leave-one-out predictions by the mixture of several models of one output."""
-    numbers = torch.tensor([part.number for part in parts], dtype=torch.float64)
-    weight = (numbers / numbers.sum()).reshape(-1, 1, 1)
-    return mixed([leave_one_out(part.model) for part in parts], weight)
-
-
-def mixed(each: Sequence[LeaveOneOut], weight: Tensor) -> LeaveOneOut:
-    """The predictions by a mixture of ``K`` models with weights ``K x 1 x m``, 1 in all."""
-    parts = ((loo.mean, loo.variance, loo.log_density) for loo in each)
-    mean, variance, density = (torch.stack(p, MCMC_DIM) for p in zip(*parts, strict=True))
-    mean, variance, density = _mixture_of(mean, variance, density, weight)
-    pit = None
-    if any(loo.pit is not None for loo in each):
-        pit = (weight * torch.stack([loo.below() for loo in each], MCMC_DIM)).sum(MCMC_DIM)
-        pit = pit.clamp(0, 1)
-    return replace(each[0], mean=mean, variance=variance, log_density=density, pit=pit)
+    names = ("Y", "mean", "variance", "log_density", "pit")
+    columns: dict[str, Any] = {n: torch.cat([getattr(p, n) for p in parts], -1) for n in names}
+    masks = [part.is_outlier for part in parts]
+    if any(mask is not None for mask in masks):
+        none = [torch.zeros_like(part.Y, dtype=torch.bool) for part in parts]
+        pairs = zip(masks, none, strict=True)
+        columns["is_outlier"] = torch.cat([n if mask is None else mask for mask, n in pairs], -1)
+    outputs = tuple(name for part in parts for name in part.output_names)
+    return replace(first, output_names=outputs, **columns)
 
 
 def observations(model: Any) -> tuple[Tensor, Tensor]:
-    """The observations that a model was given, ``n x d`` and ``n x m`` in the user's units.
-
-    Of an :class:`~gpadjust.AR1` those of the high level; of a batch the first.
-    """
-    if isinstance(model, ModelListGP | StackedGP):
-        several = isinstance(model, ModelListGP)
-        models = model.models if several else [parts[0].model for parts in model.parts]
-        parts = [observations(part) for part in models]
-        return parts[0][0], torch.cat([Y for _, Y in parts], dim=-1)
-    if isinstance(model, VariationalCKA):
-        data: Any = model.data()
-        return data["train_X"], data["train_Y"]
-    with _evaluating(model), torch.no_grad():
-        X, rows = _measurements(model)
-        targets = model.measured_targets() if isinstance(model, TermsGP) else model.train_targets
-        Y = _outputs_last(model, targets)
-        transform = getattr(model, "outcome_transform", None)
-        Y = Y if transform is None else transform.untransform(Y)[0]
-    X, Y = X[..., rows, :], Y[..., rows, :]
-    return X.reshape(-1, *X.shape[-2:])[0], Y.reshape(-1, *Y.shape[-2:])[0]
-
-
-def _targets(model: Any) -> tuple[Tensor, Tensor]:
-    """Return left-out predictions of targets, for models of other libraries."""
-    inputs, y = model.train_inputs[0], model.train_targets
-    covariance = to_dense(model.covar_module(inputs))
-    residual = y - model.mean_module(inputs).expand(covariance.shape[:-1])
-    noise = Noise(model.likelihood).at(inputs)
-    factors = Factors.of(covariance + torch.diag_embed(noise.expand(residual.shape)), residual)
-    variance = factors.squared_columns().reciprocal()
-    return y - factors.alpha * variance, variance
-
-
-def _measurements(model: Any) -> tuple[Tensor, slice]:
-    """Raw training inputs, ``... x n x d``, and which rows of them can be left out."""
-    inputs = model.train_inputs[0]
-    raw = getattr(model, "_original_train_inputs", None)
-    inputs = inputs if raw is None else raw
-    if model.num_outputs > 1:
-        inputs = inputs[..., 0, :, :]
-    return model.measured_rows(inputs) if isinstance(model, TermsGP) else (inputs, slice(None))
-
-
-def _outputs_last(model: Any, values: Tensor) -> Tensor:
-    """Bring ``... x (m) x n`` to ``... x n x m``."""
-    return values.mT if model.num_outputs > 1 else values.unsqueeze(-1)
-
-
-@contextmanager
-def _evaluating(model: Any) -> Iterator[None]:
-    """Put the model in eval mode, in which its training inputs are transformed, for a while."""
-    was_training = model.training
-    model.eval()
-    try:
-        yield
-    finally:
-        if was_training:
-            model.train()
-
-
-def _join(parts: list[LeaveOneOut]) -> LeaveOneOut:
-    """Put the outputs of several models side by side."""
-    X = parts[0].X
-    for part in parts[1:]:
-        if part.X.shape != X.shape or not torch.equal(part.X, X):
-            raise ValueError(
-                "The models of the list have different training inputs, so their observations do "
-                "not belong to the same points; call `leave_one_out` on each of `model.models`."
-            )
-    columns = ((part.Y, part.mean, part.variance, part.log_density) for part in parts)
-    Y, mean, variance, density = (torch.cat(each, dim=-1) for each in zip(*columns, strict=True))
-    names = tuple(name for part in parts for name in part.output_names)
-    linked = any(part.pit is not None for part in parts)
-    pit = torch.cat([part.below() for part in parts], dim=-1) if linked else None
-    masks = [part.is_outlier for part in parts]
-    told = any(mask is not None for mask in masks)
-    pairs = zip(parts, masks, strict=True)
-    none_too = [torch.zeros_like(p.Y, dtype=torch.bool) if m is None else m for p, m in pairs]
-    is_outlier = torch.cat(none_too, dim=-1) if told else None
-    return LeaveOneOut(X, Y, mean, variance, density, names, pit, is_outlier)
+    """Return the observations of a model in the user's units, ``n x d`` and ``n x m``."""
+    if hasattr(model, "data"):
+        return model.data.X, model.data.Y
+    loo = leave_one_out(model)
+    return loo.X, loo.Y

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.distributions import Normal
 
 from gpadjust.checks import check_columns, check_level
-from gpadjust.models.links import LinkedPosterior
+from gpadjust.core.gaussian import DRAWS, Marginals
 
 
 def rmse(mean: Tensor, y: Tensor, *, mixture_dim: int | None = None) -> Tensor:
@@ -260,9 +260,9 @@ def score(posterior: Posterior, Y: Tensor, level: float = 0.95) -> Scores:
     noisy.
 
     Args:
-        posterior: Any BoTorch posterior that is Gaussian at each point; that of a fully Bayesian
-            model (``GaussianMixturePosterior``) is judged as the mixture that it is. That of an
-            output with a link is judged as it is, but for ``crps``, by its mean and variance.
+        posterior: That of a model of this library, which is judged as the mixture that it is (with
+            a link ``crps`` is by the prediction and its variance), or any of BoTorch that is
+            Gaussian at each point, or a ``GaussianMixturePosterior``.
         Y: Observations, ``... x n x m``, NaN where there is none.
         level: Nominal coverage, between 0 and 1.
 
@@ -283,12 +283,8 @@ def score(posterior: Posterior, Y: Tensor, level: float = 0.95) -> Scores:
         >>> scores.rmse.shape, scores.pit.shape
         (torch.Size([1]), torch.Size([20, 1]))
     """
-    if isinstance(posterior, LinkedPosterior):
-        of_moments = Scores.of(posterior.mixture_mean, posterior.mixture_variance, Y, level=level)
-        below, density = posterior.judged(Y)
-        nlpd_ = -_mean_over_observed(density, Y)
-        share = central_share(below, level)
-        return replace(of_moments, nlpd=nlpd_, pit=below, coverage=share)
+    if isinstance(marginals := getattr(posterior, "marginals", None), Marginals):
+        return _of_marginals(marginals, Y, level)
     dim = MCMC_DIM if isinstance(posterior, GaussianMixturePosterior) else None
     mean, variance = getattr(posterior, "mean", None), getattr(posterior, "variance", None)
     if not (isinstance(mean, Tensor) and isinstance(variance, Tensor)):
@@ -298,6 +294,16 @@ def score(posterior: Posterior, Y: Tensor, level: float = 0.95) -> Scores:
         )
     _components(Y, dim, mean=mean, variance=variance)
     return Scores.of(mean, variance, Y, level=level, mixture_dim=dim)
+
+
+def _of_marginals(marginals: Marginals, Y: Tensor, level: float) -> Scores:
+    """Return the scores of mixtures at each point by itself, as of a model with a link."""
+    if type(marginals) is Marginals:
+        return Scores.of(*marginals, Y, level=level, mixture_dim=DRAWS)
+    scores = Scores.of(*marginals.prediction, Y, level=level)
+    below = marginals.probability(Y)
+    nlpd_ = -_mean_over_observed(marginals.log_density(Y), Y)
+    return replace(scores, nlpd=nlpd_, pit=below, coverage=central_share(below, level))
 
 
 def energy_score(draws: Tensor, y: Tensor) -> Tensor:

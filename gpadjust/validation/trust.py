@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from statistics import NormalDist
+from typing import Any
 
 import torch
 from botorch.utils.sampling import draw_sobol_samples
 from torch import Tensor
 
 from gpadjust.checks import check_level, checked_whole
-from gpadjust.models import StackedGP, TermsModel
-from gpadjust.models.levels import coded, on_levels
-from gpadjust.models.training_data import ArrayLike, to_tensor
+from gpadjust.core import StackedGP
+from gpadjust.core.data import ArrayLike
+from gpadjust.core.model import Predictive
+from gpadjust.kinds.categories import on_levels
 from gpadjust.validation.leave_one_out import observations
 
 SIDES = ("physics", "data", "neither")
@@ -64,10 +66,9 @@ class Trust:
         return (self.side == SIDES.index(side)).double().mean(0)
 
 
-def trust(
-    model: TermsModel, X: ArrayLike = None, *, level: float = 0.95, num_points: int = 512
-) -> Trust:
-    r"""Tell where a model's predictions rest on the physics, on the data, or on neither.
+@torch.no_grad()
+def trust(model: Any, X: ArrayLike = None, *, level: float = 0.95, num_points: int = 512) -> Trust:
+    r"""Return where a model's predictions rest on the physics, on the data, or on neither.
 
     With its mean :math:`\mu(x)`, the half width :math:`w(x)` of its central interval (without
     noise), and the typical discrepancy D of the training data, the root mean square of
@@ -84,14 +85,13 @@ def trust(
 
     The share of the points with *data* is the share of the predictions that override the physics.
     It does not depend on units: w and D are taken to be at least a thousandth of the standard
-    deviation of the targets, as less makes no difference to speak of. Of several physics
-    :math:`f_p` is their weighted sum, as of :meth:`~gpadjust.models.TermsModel.fallback`.
+    deviation of the targets, as less makes no difference to speak of. :math:`f_p` is the prior mean
+    of the model, of several physics their weighted sum.
 
     Args:
         model: A model with a physics, such as :class:`~gpadjust.CKA`; that of
-            ``LearnedDynamics``, too. One that holds samples is judged by the moments of their
-            mixture.
-        X: Raw inputs, ``n x d``, such as states and actions that were visited. Default:
+            ``LearnedDynamics``, too.
+        X: Inputs, ``n x d``, such as states and actions that were visited. Default:
             ``num_points`` in the box of the training inputs, by Sobol's sequence.
         level: Nominal coverage of the interval.
         num_points: Number of points if there is no ``X``.
@@ -99,8 +99,7 @@ def trust(
     Raises:
         TypeError: If the model has no physics to be trusted, or is a :class:`~gpadjust.StackedGP`,
             or ``level`` is no number.
-        ValueError: If ``X`` has the wrong shape, the model is of a batch of data sets, or ``level``
-            or ``num_points`` is out of range.
+        ValueError: If ``X`` has the wrong shape, or ``level`` or ``num_points`` is out of range.
         PhysicsError: If the physics fails.
 
     Example:
@@ -117,51 +116,46 @@ def trust(
     check_level(level)
     if isinstance(model, StackedGP):
         raise TypeError(
-            "Expected a model of one structure, got a StackedGP, whose parts differ in what they "
-            "rest on; take one of the models that it was made of, such as "
-            "comparison.models['CKA']."
+            "Expected a model of one structure; found a StackedGP, whose models rest on different "
+            "parts: take one of these, such as comparison.models['CKA']."
         )
-    if not isinstance(model, TermsModel) or not model.rho_names:
+    if not isinstance(model, Predictive) or not getattr(model, "physics", None):
         raise TypeError(
-            f"Expected a model with a physics that it could trust, such as CKA, got "
-            f"{type(model).__name__}; of LearnedDynamics pass its `model`."
+            "Expected a model with a physics that it could trust, such as CKA; found "
+            f"{type(model).__name__}. Of LearnedDynamics pass its `model`."
         )
-    if model.batch_shape and model.num_samples is None:
+    train_X, train_Y = observations(model)
+    points = _points(model, train_X, num_points) if X is None else model.data.new_inputs(X)
+    if points.dim() != 2 or not len(points):
         raise ValueError(
-            f"Expected a model of one data set, got one with batch_shape "
-            f"{tuple(model.batch_shape)}; judge the data sets one by one."
+            f"Expected X of shape n x d, one point or more; found {tuple(points.shape)}."
         )
-    with torch.no_grad():
-        train_X, train_Y = observations(model)
-        if X is None:
-            X = _points(train_X, num_points)
-            X = on_levels(X, model.levels) if model.levels else X
-        X = coded(X, model.levels, model.batches) if model.levels else X
-        X = to_tensor(X, "X")
-        if X.dim() != 2 or not len(X):
-            raise ValueError(f"Expected X of shape n x d, one point or more, got {tuple(X.shape)}.")
-        mean, variance = model.predict(X)
-        away = (mean - model.fallback(X)).abs()
-        discrepancy = _rms(train_Y - model.fallback(train_X))
-        least = _NOTHING * _rms(train_Y - train_Y.nanmean(0))
+    mean, variance = model.predict(points)
+    away = (mean - prior_mean(model, points)).abs()
+    discrepancy = _rms(train_Y - prior_mean(model, train_X))
+    least = _NOTHING * _rms(train_Y - train_Y.nanmean(0))
     least = least.clamp_min(torch.finfo(least.dtype).tiny)
     half = torch.maximum(NormalDist().inv_cdf((1 + level) / 2) * variance.sqrt(), least)
-    return Trust(
-        X=X,
-        override=away / half,
-        doubt=half / torch.maximum(discrepancy, least),
-        input_names=model.input_names,
-        output_names=model.output_names,
-    )
+    doubt = half / torch.maximum(discrepancy, least)
+    names = model.data.input_names, model.data.output_names
+    return Trust(points, away / half, doubt, *names)
 
 
-def _points(train_X: Tensor, num_points: int) -> Tensor:
-    """Points in the box of the training inputs."""
+def prior_mean(model: Any, X: Tensor) -> Tensor:
+    """Return what the model says without data, ``n x m``: its physics, whether of use or not."""
+    values = model.table.values(model.table.with_choice(model.u.detach(), 0))
+    mean = (model.at(X, values).mean * model.unit).mT  # S x n x m
+    prior: Tensor = model.marginals_of(mean, torch.zeros_like(mean)).prediction.mean
+    return prior
+
+
+def _points(model: Any, train_X: Tensor, num_points: int) -> Tensor:
+    """Return points in the box of the training inputs, on the levels of categories."""
     num_points = checked_whole("num_points", num_points, 1)
     bounds = torch.stack([train_X.amin(0), train_X.amax(0)])
-    return draw_sobol_samples(bounds, n=num_points, q=1, seed=0).squeeze(-2)
+    return on_levels(model, draw_sobol_samples(bounds, n=num_points, q=1, seed=0).squeeze(-2))
 
 
 def _rms(values: Tensor) -> Tensor:
-    """The root mean square of each output where it was observed, ``m``."""
+    """Return the root mean square of each output where it was observed, ``m``."""
     return values.square().nanmean(0).sqrt()

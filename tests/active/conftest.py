@@ -4,7 +4,7 @@ import pytest
 import torch
 from botorch.acquisition import qNegIntegratedPosteriorVariance
 
-from gpadjust import CKA, fit
+from gpadjust import CKA
 
 BOUNDS = torch.tensor([[0.0, -1.0], [2.0, 1.0]], dtype=torch.float64)
 
@@ -38,7 +38,7 @@ def laboratory(request):
             "acquisition": lambda model: qNegIntegratedPosteriorVariance(model, mc_points=points),
             "budget": 7,
             "initial": 4,
-            "fit": lambda model: fit(model, "map", num_screened=8, num_starts=1),
+            "fit": lambda model: None,  # of the loop, the priors' medians are enough
             "optimizer_options": {
                 "num_restarts": 1,
                 "raw_samples": 4,

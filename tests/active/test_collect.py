@@ -11,9 +11,11 @@ import time
 
 import pytest
 import torch
+from botorch import fit_gpytorch_mll
 from botorch.acquisition import LogExpectedImprovement
 from botorch.models import SingleTaskGP
 from botorch.models.transforms import Normalize
+from gpytorch.mlls import ExactMarginalLogLikelihood
 
 from gpadjust.active import (
     Collection,
@@ -68,7 +70,7 @@ class TestMeasuring:
         assert [len(X) for X in oracle.asked] == ([1] * 7 if batch_size == 1 else [3, 3, 1])
         assert ((bounds[0] <= result.X) & (bounds[1] >= result.X)).all()
         torch.testing.assert_close(result.Y, truth(result.X))
-        assert result.model.train_targets.shape == (7,)
+        assert len(result.model.data.Y) == 7
 
     @pytest.mark.slow
     def test_it_teaches_more_than_chance(self, laboratory, bounds):
@@ -105,24 +107,15 @@ class TestMeasuring:
         design = collect(**laboratory(budget=2))
         assert not (result.X[4:, None] == design.X).all(-1).any()
 
-    @pytest.mark.slow
-    def test_warm_started_fits(self, laboratory, monkeypatch):
-        started = []
-        from gpadjust.active import warm_refit
-
-        def watch(model, previous):
-            started.append((len(model.train_targets), len(previous.train_targets)))
-
-        monkeypatch.setattr(warm_refit, "warm_start", watch)
-        collect(**laboratory(budget=7)).model  # noqa: B018
-        assert started == [(5, 4), (6, 5), (7, 6)]
-
     def test_a_model_of_botorch(self, laboratory, bounds):
 
         def factory(X, Y):
             return SingleTaskGP(X, Y, input_transform=Normalize(2, bounds=bounds))
 
-        result = collect(**laboratory(model_factory=factory, budget=5))
+        def fit(model):
+            fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
+
+        result = collect(**laboratory(model_factory=factory, fit=fit, budget=5))
         assert isinstance(result.model, SingleTaskGP)
 
 
@@ -202,7 +195,7 @@ class TestFailures:
         assert whole.Y[:, 0].isfinite().all()
         assert 0 < whole.Y[:, 1].isnan().sum() < 6
         assert len(whole.failed_X) == 0
-        assert torch.equal(whole.model.train_targets.isnan(), whole.Y.mT.isnan())
+        assert torch.equal(whole.model.data.Y.isnan(), whole.Y.isnan())
         with pytest.raises(KeyboardInterrupt):
             collect(**laboratory(oracle=oracle(at), log=path, **options))
         result = collect(**laboratory(oracle=oracle(), log=path, **options))
@@ -319,15 +312,8 @@ class TestResuming:
         assert same(result, whole)
         assert torch.equal(_parameters(result.model), _parameters(whole.model))
 
-    @pytest.mark.parametrize("learn", [pytest.param(False, marks=pytest.mark.slow), True])
-    def test_killed_at_any_byte(self, laboratory, tmp_path, learn):
+    def test_killed_at_any_byte(self, laboratory, tmp_path):
         options = {"batch_size": 2, "budget": 6, "initial": 4}
-        if learn:
-            from gpadjust import CKA
-
-            options["model_factory"] = lambda X, Y: CKA(
-                X, Y, physics=lambda X: 2 + X[..., :1], rho_mean="learn", delta_mean="learn"
-            )
         path = tmp_path / "log.jsonl"
         whole = collect(**laboratory(log=path, **options))
         content = path.read_bytes()
@@ -444,7 +430,7 @@ REFUSED = [
     ({"seed": -1}, "seed to be a whole number >= 0", ValueError),
     ({"optimizer_options": [1]}, r"to be a dictionary, got \[1\]", TypeError),
     ({"optimizer_options": {"q": 2}}, r"without \['q'\]", ValueError),
-    ({"model_factory": lambda X, Y: 3}, "factory to make a botorch Model, got int", TypeError),
+    ({"model_factory": lambda X, Y: 3}, "factory to make a botorch Model; found int", TypeError),
     ({"log": 3}, "log to be the path of a file, got 3", TypeError),
 ]
 

@@ -22,7 +22,7 @@ from gpadjust.ax import (
 )
 from gpadjust.physics import FunctionPhysics
 
-FAST = {"method": "map", "num_starts": 1, "num_screened": 8}
+FAST = {"method": "map"}
 # Data without noise, on which Ax's acquisition functions are nearly singular.
 pytestmark = pytest.mark.filterwarnings(
     "ignore::linear_operator.utils.warnings.NumericalWarning",
@@ -96,9 +96,9 @@ def test_trials_constraints_and_predictions():
 def test_the_model_is_the_one_that_the_library_fits():
     ours = try_out(client(), 6)
     model = adapter(ours).generator.surrogate.model.models[0]
-    data, units = model.data(), adapter(ours).transforms["StandardizeY"]
-    Y = data["train_Y"] * units.Ystd["output"] + units.Ymean["output"]
-    log_time = CKA(data["train_X"], Y, physics=lambda X: crude(10 ** X[:, 0], X[:, 1]))
+    data, units = model.data, adapter(ours).transforms["StandardizeY"]
+    Y = data.Y * units.Ystd["output"] + units.Ymean["output"]
+    log_time = CKA(data.X, Y, physics=lambda X: crude(10 ** X[:, 0], X[:, 1]))
     fit(log_time, **FAST)
     point = torch.tensor([[0.2, 1.4]], dtype=torch.float64)
     mean, variance = log_time.predict(point)
@@ -116,11 +116,10 @@ def test_cross_validation_leaves_each_trial_out(fit_options):
     model = adapter(ours).generator.surrogate.model.models[0]
     if fit_options is not None:
         units = adapter(ours).transforms["StandardizeY"]
-        mean = model.left_out()[0].flatten()
+        mean = model.left_out().prediction.mean.flatten()
         by_arm = {r.observed.arm_name: r.predicted for r in results}
-        shift, scale = model.units()
         for i, name in enumerate(sorted(by_arm)):
-            m = (mean[i] * scale + shift).item() * units.Ystd["output"] + units.Ymean["output"]
+            m = mean[i].item() * units.Ystd["output"] + units.Ymean["output"]
             index = by_arm[name].metric_signatures.index("output")
             assert by_arm[name].means[index] == pytest.approx(m, rel=1e-2, abs=0.2)
     assert all(math.isfinite(r.predicted.means[0]) for r in results)
@@ -136,10 +135,10 @@ def test_a_strategy_is_ax_s_own_but_for_the_model():
 
 
 def test_other_models_and_their_options():
-    kwargs = generator_kwargs({"output": crude}, model=partial(PhysicsMeanGP, rho_mean=2.0))
+    kwargs = generator_kwargs({"output": crude}, model=partial(PhysicsMeanGP, constants=False))
     (config,) = kwargs["surrogate_spec"].metric_to_model_configs["output"]
     assert config.botorch_model_class is PhysicsMeanGP
-    assert config.model_options["rho_mean"] == 2.0
+    assert config.model_options["constants"] is False
     for model in (lambda X, Y, physics: CKA(X, Y, physics=physics), 3, partial(CKA, None)):
         with pytest.raises(TypeError, match=r"class of models, such as CKA, or functools\.partial"):
             generator_kwargs({"output": crude}, model=model)
@@ -161,7 +160,7 @@ def test_full_bayes_is_the_default_and_finds_the_best():
     torch.manual_seed(0)
     ours = try_out(client(fit_options=None), 9)
     models = adapter(ours).generator.surrogate.model.models
-    assert {each.num_samples for each in models} == {16}
+    assert {len(each.u) for each in models} == {16}
     best, *_ = ours.get_best_parameterization()
     assert truth(**best)["output"] > 78
 

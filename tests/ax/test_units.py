@@ -12,7 +12,7 @@ from ax.generators.torch.botorch_modular.surrogate import SurrogateSpec
 from ax.generators.torch.botorch_modular.utils import ModelConfig
 from botorch.models.transforms.input import Normalize
 
-from gpadjust import CKA, BlackBoxPhysics, PhysicsWarning
+from gpadjust import CKA, BlackBoxPhysics
 from gpadjust.ax import TRANSFORMS, ParameterPhysics, TellPhysics, generator_kwargs
 
 # Data without noise, on which Ax's acquisition functions are nearly singular.
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.filterwarnings(
     "ignore:Optimization failed",
 )
 
-FAST = {"method": "map", "num_starts": 1, "num_screened": 4}
+FAST = {"method": "map"}
 PARAMETERS = [
     RangeParameterConfig(name="rate", parameter_type="float", bounds=(1e-4, 1.0), scaling="log"),
     RangeParameterConfig(name="width", parameter_type="int", bounds=(1, 9)),
@@ -42,9 +42,6 @@ ARMS = [
     {"rate": 0.2, "width": 2, "x": 1.5, "glue": "b", "size": 0.5, "grid": 5},
     {"rate": 1e-3, "width": 7, "x": -0.4, "glue": "a", "size": 8.0, "grid": 3},
 ]
-
-
-NAMES = ("rate", "width", "x", "size", "grid")
 
 
 def truth(rate, width, x, size, grid):
@@ -104,11 +101,10 @@ def test_the_physics_is_asked_in_the_search_space_and_answers_as_the_metric(tran
     expected = torch.tensor([[arm[n] for n in names] for arm in ARMS], dtype=torch.float64)
     torch.testing.assert_close(f_p.asked[0], expected, rtol=1e-9, atol=1e-12)
     for model in models(fitted).values():
-        data = model.data()
         # f_p is the truth, so that what it says is what Ax made of the data.
-        f = model.input_transform.values(data["train_X"])
-        torch.testing.assert_close(f, data["train_Y"], rtol=1e-9, atol=1e-9)
-    size, cost = data["train_X"].shape[-1], data["train_Y"]
+        f = model.physics[0](model.data.X)
+        torch.testing.assert_close(f, model.data.Y, rtol=1e-9, atol=1e-9)
+    size, cost = model.data.X.shape[-1], model.data.Y
     assert size > 6  # codes of choices are columns
     assert cost.abs().max() < 5  # and metrics standardised
 
@@ -130,21 +126,21 @@ def test_what_is_asked_for_a_candidate_is_in_the_search_space():
 def test_it_is_asked_within_the_search_space_alone():
     fitted = adapter(experiment(), Recorded(), metrics=["cost"])
     model = models(fitted)["cost"]
-    inside = model.data()["train_X"][:1].clone()
+    inside = model.data.X[:1].clone()
     beyond = inside - 0.7 * torch.eye(inside.shape[-1], dtype=torch.float64)[:3]
-    asked = model.physics.units.raw(beyond, ["rate", "width", "x"])
+    asked = model.physics[0].units.raw(beyond, ["rate", "width", "x"])
     assert asked[0].tolist() == [1e-4, 1.0, -2.0]
     assert (asked >= torch.tensor([1e-4, 1.0, -2.0], dtype=torch.float64)).all()
     beyond.requires_grad_()
-    (slope,) = torch.autograd.grad(model.physics(beyond).sum(), beyond)
+    (slope,) = torch.autograd.grad(model.physics[0](beyond).sum(), beyond)
     assert (slope[:, :2] != 0).any()  # or a search that begins at a bound would stay there
 
 
 def test_gradients_pass_the_transforms():
     fitted = adapter(experiment(), Recorded())
     for model in models(fitted).values():
-        X = model.data()["train_X"].clone()
-        physics = model.physics
+        X = model.data.X.clone()
+        (physics,) = model.physics
         inner = X[1:2, :2].clone().requires_grad_()  # rate and width, which are numbers
         point = torch.cat([inner, X[1:2, 2:]], dim=-1)
         (slope,) = torch.autograd.grad(physics(point).sum(), inner)
@@ -157,7 +153,6 @@ def test_gradients_pass_the_transforms():
 WIDTHS = {"name": "width", "parameter_type": "int"}
 
 
-@pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
 @pytest.mark.parametrize(
     "config",
     [
@@ -183,10 +178,10 @@ def test_whole_numbers_reach_the_physics_as_they_are_listed(config):
     arms = [{"width": kind(n), "x": 0.2 * i - 1} for i, n in enumerate(values)]
     fitted = adapter(experiment([config, PARAMETERS[2]], arms), f_p, metrics=["cost"])
     assert asked[0].tolist() == values
-    X = models(fitted)["cost"].data()["train_X"]
+    X = models(fitted)["cost"].data.X
     near = X + 1e-12 * torch.randn(X.shape, dtype=torch.float64)
     asked.clear()
-    models(fitted)["cost"].physics(near)
+    models(fitted)["cost"].physics[0](near)
     assert asked[0].tolist() == values
 
 
@@ -194,7 +189,7 @@ def test_between_choices_the_nearest_is_asked():
     parameters = [PARAMETERS[4], PARAMETERS[2]]
     arms = [{"size": arm["size"], "x": arm["x"]} for arm in ARMS]
     fitted = adapter(experiment(parameters, arms), lambda size, x: size * x, metrics=["cost"])
-    units = models(fitted)["cost"].physics.units
+    units = models(fitted)["cost"].physics[0].units
     between = torch.tensor([[0.0, 0.0], [1.2, 0.0], [1.3, 0.0], [9.0, 0.0]], dtype=torch.float64)
     between.requires_grad_()
     raw = units.raw(between, ["size"])
@@ -203,7 +198,6 @@ def test_between_choices_the_nearest_is_asked():
     assert (slope[:, 0] == 1).all()
 
 
-@pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
 def test_a_tensor_has_the_columns_of_the_search_space_fixed_ones_too():
     fixed = ChoiceParameterConfig(**WIDTHS, values=[4])
     asked = []
@@ -229,11 +223,11 @@ def test_a_second_experiment_leaves_the_units_of_the_first():
     f_p = ParameterPhysics(Recorded())
     kwargs = generator_kwargs({"cost": f_p}, fit_options=FAST)
     first = Generators.BOTORCH_MODULAR(experiment=experiment(), **kwargs)
-    before = models(first)["cost"].physics.units
+    before = models(first)["cost"].physics[0].units
     shifted = experiment(arms=ARMS[:4])
     second = Generators.BOTORCH_MODULAR(experiment=shifted, **kwargs)
-    assert models(first)["cost"].physics.units is before
-    assert models(second)["cost"].physics.units is not before
+    assert models(first)["cost"].physics[0].units is before
+    assert models(second)["cost"].physics[0].units is not before
     assert first.generator.surrogate_spec is not second.generator.surrogate_spec
     assert kwargs["surrogate_spec"].metric_to_model_configs["cost"][0].model_options == {
         "physics": f_p
@@ -272,21 +266,4 @@ def test_of_a_single_metric_it_is_of_that():
         surrogate_spec=SurrogateSpec(model_configs=[config]),
         transforms=TRANSFORMS,
     )
-    assert models(fitted)["cost"].physics.metric == "cost"
-
-
-def test_a_physics_that_is_off_is_told_in_units_of_the_metric():
-    def f_p(rate, x, width, size, grid):
-        return 1000 * truth(rate, width, x, size, grid)
-
-    with pytest.warns(PhysicsWarning) as caught:
-        fitted = adapter(experiment(), f_p, metrics=["cost"])
-    Y = torch.tensor([[truth(**{k: arm[k] for k in NAMES})] for arm in ARMS], dtype=torch.float64)
-    (text,) = (str(each.message) for each in caught if each.category is PhysicsWarning)
-    assert f"the targets have a standard deviation of {float(Y.std()):.3g}:" in text
-    assert "about 1,000 times too large" in text
-    assert "standardised" not in text
-    physics = models(fitted)["cost"].physics
-    seen = physics.units.metric(Y, "cost")
-    assert (seen - Y).abs().min() > 1
-    torch.testing.assert_close(physics.in_user_units(seen), Y)
+    assert models(fitted)["cost"].physics[0].metric == "cost"

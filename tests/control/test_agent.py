@@ -12,6 +12,7 @@ from gymnasium.wrappers import TransformObservation
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.noise import NormalActionNoise
 
+from gpadjust import ZeroMeanGP
 from gpadjust.control import (
     Agent,
     MPCAgent,
@@ -20,7 +21,6 @@ from gpadjust.control import (
     print_progress,
 )
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
-from gpadjust.models import ZeroMeanGP
 from gpadjust.physics import FunctionPhysics, PhysicsError, Unknown
 from gpadjust.systems import CartPoleSwingUpEnv, cart_pole
 from gpadjust.systems.swing_up import CART_POLE_SPEC, cart_pole_reward
@@ -61,7 +61,7 @@ def test_the_first_episode_goes_by_the_physics(make_agent, kind):
 
 
 def test_without_a_physics_the_first_episode_is_random(make_agent, kind, point_dynamics):
-    fit = {"method": "map", "num_starts": 1, "num_screened": 0}
+    fit = {"method": "map"}
     blind = LearnedDynamics(point_dynamics.spec, model=ZeroMeanGP, fit_options=fit)
     agent = make_agent(kind, dynamics=blind)
     message = KINDS[kind].untrained

@@ -140,7 +140,7 @@ def test_a_careful_plan_keeps_away_from_what_is_not_known():
     """Beyond x = 0 nobody knows what v does: the mean gains there, a low quantile loses."""
     x = torch.linspace(-2, 0, 30, dtype=torch.float64).unsqueeze(-1)
     v = torch.zeros_like(x).uniform_(-1, 1, generator=torch.Generator().manual_seed(0))
-    fit = {"method": "map", "num_starts": 1, "num_screened": 0}
+    fit = {"method": "map"}
     dynamics = LearnedDynamics(SPEC, lambda X: X[:, :1] + 0.5 * X[:, 1:], fit_options=fit)
     noise = 0.3 * torch.randn(30, 1, generator=torch.Generator().manual_seed(1)).double()
     dynamics.update(x, v, x + 0.5 * v + noise * (x + 2))

@@ -7,16 +7,16 @@ from dataclasses import replace
 import pytest
 import torch
 
+from gpadjust import ZeroMeanGP
 from gpadjust.control import CrossEntropy, Objective, Planner, Return, Rollouts, Task
 from gpadjust.control.search import random_sequences
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
-from gpadjust.models import ZeroMeanGP
 from gpadjust.physics import PhysicsError
 
 pytestmark = pytest.mark.filterwarnings("ignore:L-BFGS did not converge")
 BOUNDS = torch.tensor([[-1.0], [2.0]], dtype=torch.float64)
 SPEC = StateSpec(["x"], ["v"])
-QUICK = {"method": "map", "num_starts": 1, "num_screened": 0, "max_iterations": 15}
+QUICK = {"method": "map"}
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from tests.point import linear
 
 SPEC = StateSpec(["x"], ["v"])
 BOUNDS = torch.tensor([[-1.0], [2.0]], dtype=torch.float64)
-QUICK = {"method": "map", "num_starts": 1, "num_screened": 0}
+QUICK = {"method": "map"}
 
 
 def to_zero(states, actions, next_states):

@@ -8,8 +8,8 @@ import torch
 
 from gpadjust.control import RecordedEpisodes, Task
 from gpadjust.control.recorded_episodes import learn_dynamics
+from gpadjust.core import Prediction
 from gpadjust.dynamics import Dynamics, PhysicsDynamics, StateSpec
-from gpadjust.models import Prediction
 from gpadjust.physics import PhysicsError
 from tests.point import POINT_SPEC
 

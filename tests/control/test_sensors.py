@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from gpadjust import ZeroMeanGP
 from gpadjust.control import (
     MPC,
     CrossEntropy,
@@ -23,7 +24,6 @@ from gpadjust.control import (
 )
 from gpadjust.control.smoothed_episodes import Seen, smooth_episodes
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
-from gpadjust.models import ZeroMeanGP
 from gpadjust.states import Sensors, StateSpec
 from gpadjust.systems import NoisySensors, System, cart_pole
 from tests.point import linear
@@ -68,9 +68,7 @@ class Glider(gym.Env):
 
 
 def glider(**given):
-    dynamics = LearnedDynamics(
-        SPEC, glide, fit_options={"method": "map", "num_starts": 1, "num_screened": 0}
-    )
+    dynamics = LearnedDynamics(SPEC, glide, fit_options={"method": "map"})
     parts = {
         "sensors": Sensors(["x"], noise={"x": NOISE}),
         "noise": {"x": NOISE},

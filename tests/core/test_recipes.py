@@ -11,7 +11,7 @@ import torch
 
 from gpadjust.core import CKA, GP, Noise, Stationary, Term, fit
 
-PAGE = Path(__file__).parents[2] / "docs" / "architecture.md"
+PAGE = Path(__file__).parents[2] / "docs" / "extending.md"
 START = "\n## Something new in the core\n"
 
 

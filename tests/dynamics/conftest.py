@@ -76,7 +76,7 @@ def pushed(n=20, seed=0):
     return X[:, :2], X[:, 2:], push(X)
 
 
-FEW_SAMPLES = {"num_starts": 1, "num_screened": 8, "num_samples": 3, "num_draws": 16}
+FEW = {"num_draws": 8}
 _MODELS = {
     "GP": ZeroMeanGP,
     "PhysicsMean": PhysicsMeanGP,
@@ -105,10 +105,10 @@ def costly_kind(request):
 
 @pytest.fixture
 def make():
-    """Makes dynamics by the name of their model, with a quick search and few samples."""
+    """Makes dynamics by the name of their model, with few draws."""
 
     def make(kind, spec, physics, **options):
-        options.setdefault("fit_options", FEW_SAMPLES)
+        options.setdefault("fit_options", FEW)
         model = options.pop("model", _MODELS[kind])
         if kind == "RRA":
             model = partial(model, num_features=32)
@@ -121,6 +121,6 @@ def make():
 def learnt_cart_pole():
     """CKA that has learnt from trial 1 of the cart-pole, for tests that only look at it."""
     system = CartPole()
-    dynamics = LearnedDynamics(system.spec, system.crude, fit_options=FEW_SAMPLES)
+    dynamics = LearnedDynamics(system.spec, system.crude, fit_options=FEW)
     dynamics.update(*system.trial(1))
     return dynamics

@@ -8,10 +8,10 @@ import pytest
 import torch
 from botorch.models import SingleTaskGP
 
-from gpadjust import CKA, PhysicsMeanGP, VariationalCKA, ZeroMeanGP
+from gpadjust import CKA, PhysicsMeanGP, ZeroMeanGP
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.physics import FunctionPhysics, ODEPhysics, PhysicsError
-from tests.dynamics.conftest import FEW_SAMPLES, push, pushed
+from tests.dynamics.conftest import FEW, push, pushed
 from tests.dynamics.conftest import PUSHED as SPEC
 
 
@@ -24,20 +24,9 @@ def transitions(n=12, seed=0):
     return states, actions, following + 0.02 * states.sin()
 
 
-class Gain(torch.nn.Module):
-    """A physics that learns."""
-
-    def __init__(self):
-        super().__init__()
-        self.gain = torch.nn.Parameter(torch.tensor(0.05, dtype=torch.float64))
-
-    def forward(self, X):
-        return push(X, self.gain)
-
-
 def learning(physics=push):
     """Dynamics that have learnt from 12 transitions, then were conditioned on 4."""
-    dynamics = LearnedDynamics(SPEC, physics, fit_options=FEW_SAMPLES)
+    dynamics = LearnedDynamics(SPEC, physics, fit_options=FEW)
     dynamics.update(*transitions())
     dynamics.condition(*transitions(4, seed=1))
     return dynamics
@@ -51,7 +40,7 @@ def learnt():
     def learnt(physics=push):
         if physics is not push:
             return learning(physics)
-        dynamics = LearnedDynamics(SPEC, push, fit_options=FEW_SAMPLES)
+        dynamics = LearnedDynamics(SPEC, push, fit_options=FEW)
         dynamics.load_state_dict(state)
         return dynamics
 
@@ -86,7 +75,6 @@ def damaged(change):
     return damage
 
 
-RAW_NOISE = "likelihood.noise_covar.raw_noise"
 DAMAGES = [
     (lambda state: None, TypeError, "dictionary that `state_dict` gave, found None"),
     (lambda state: {"weights": 1}, RuntimeError, "does not say of what dynamics"),
@@ -97,10 +85,10 @@ DAMAGES = [
             (lambda s: s["transitions"]["actions"][3].fill_(math.nan), r"transitions.*\(row 3\)"),
             (lambda s: s.update(physics=s["physics"][1:]), r"finite float64 .* \(20, 2\)"),
             (lambda s: s.update(chunks=[12, 3]), "20 in all"),
-            (lambda s: s.update(searched_at=0), "'searched_at'"),
-            (lambda s: s["model"].pop(RAW_NOISE), "of another model than this CKA"),
-            (lambda s: s["model"].update({RAW_NOISE: torch.ones(9)}), "another model than this"),
-            (lambda s: s["model"][RAW_NOISE].fill_(math.nan), "tensors without NaN"),
+            (lambda s: s["model"].pop("u"), "for CKA"),
+            (lambda s: s["model"].update(u=torch.ones(2, 2, 3)), "size mismatch for u"),
+            (lambda s: s["model"]["u"].fill_(math.nan), "tensors without NaN"),
+            (lambda s: s.update(draws=s["draws"][:1]), "2 or more coordinates"),
             (lambda s: s.update(physics=None), "without a physics, but there is one here"),
             (lambda s: s["physics"].mul_(1.1), "another physics than 'push' .* not deterministic"),
         )
@@ -112,7 +100,7 @@ DAMAGES = [
 def test_a_state_that_cannot_be_loaded_changes_nothing(learnt):
     dynamics = learnt()
     before = dynamics.state_dict()
-    other = LearnedDynamics(SPEC, push, fit_options=FEW_SAMPLES)
+    other = LearnedDynamics(SPEC, push, fit_options=FEW)
     other.update(*transitions(20, seed=3))
     for change, error, message in DAMAGES:
         with pytest.raises(error, match=message):
@@ -120,31 +108,11 @@ def test_a_state_that_cannot_be_loaded_changes_nothing(learnt):
     unchanged(dynamics, before, learnt())
 
 
-@pytest.mark.slow
-def test_a_physics_that_learns_is_stored_and_restored(learnt):
-    physics = Gain()
-    dynamics = learnt(physics)
-    gain = physics.gain.item()
-    assert gain != 0.05
-    state = dynamics.state_dict()
-    other = LearnedDynamics(SPEC, Gain(), fit_options=FEW_SAMPLES)
-    other.load_state_dict(state)
-    states, actions, _ = transitions(seed=5)
-    assert torch.equal(other.predict(states, actions).mean, dynamics.predict(states, actions).mean)
-    changed = copy.deepcopy(state)
-    changed["physics"] += 1
-    key = next(name for name in changed["model"] if name.endswith("gain"))
-    changed["model"][key] += 1
-    with pytest.raises(RuntimeError, match="another physics"):
-        dynamics.load_state_dict(changed)
-    assert physics.gain.item() == gain
-
-
 def test_dynamics_of_another_physics_are_refused(learnt):
     seen = PhysicsDynamics(SPEC, push)
     seen.update(*transitions())
     for one in (learnt(), seen):
-        known = {"fit_options": FEW_SAMPLES} if isinstance(one, LearnedDynamics) else {}
+        known = {"fit_options": FEW} if isinstance(one, LearnedDynamics) else {}
         other = type(one)(SPEC, stronger, **known)
         with pytest.raises(
             RuntimeError, match=r"another physics than 'stronger'.* of 'v', this one"
@@ -162,7 +130,7 @@ def test_loading_asks_the_physics_at_three_rows(learnt):
         rows.append(len(X))
         return push(X)
 
-    LearnedDynamics(SPEC, counted, fit_options=FEW_SAMPLES).load_state_dict(learnt().state_dict())
+    LearnedDynamics(SPEC, counted, fit_options=FEW).load_state_dict(learnt().state_dict())
     assert sum(rows) == 3
     seen = PhysicsDynamics(SPEC, push)
     seen.update(*transitions())
@@ -172,15 +140,15 @@ def test_loading_asks_the_physics_at_three_rows(learnt):
 
 def test_a_physics_may_differ_by_rounding(learnt):
     state = learnt().state_dict()
-    nearly = LearnedDynamics(SPEC, lambda X: push(X) * (1 + 1e-9), fit_options=FEW_SAMPLES)
+    nearly = LearnedDynamics(SPEC, lambda X: push(X) * (1 + 1e-9), fit_options=FEW)
     nearly.load_state_dict(state)
 
     def still(X):
         return X[:, :2]
 
-    dynamics = LearnedDynamics(SPEC, still, model=PhysicsMeanGP, fit_options=FEW_SAMPLES)
+    dynamics = LearnedDynamics(SPEC, still, model=PhysicsMeanGP, fit_options=FEW)
     dynamics.update(*transitions())
-    again = LearnedDynamics(SPEC, still, model=PhysicsMeanGP, fit_options=FEW_SAMPLES)
+    again = LearnedDynamics(SPEC, still, model=PhysicsMeanGP, fit_options=FEW)
     again.load_state_dict(dynamics.state_dict())
     assert again.num_transitions == 12
 
@@ -202,7 +170,7 @@ def test_a_whole_turn_is_no_difference():
 
 def test_a_loaded_state_is_a_copy(learnt):
     state = learnt().state_dict()
-    dynamics = LearnedDynamics(SPEC, push, fit_options=FEW_SAMPLES)
+    dynamics = LearnedDynamics(SPEC, push, fit_options=FEW)
     dynamics.load_state_dict(state)
     before = copy.deepcopy(state)
     state["transitions"]["states"].zero_()
@@ -284,19 +252,13 @@ def test_an_integrated_state_hides_no_failure():
 REFUSED = [
     ({"physics": None}, TypeError, "CKA cannot make.*'physics'.*model=ZeroMeanGP"),
     ({"model": ZeroMeanGP}, TypeError, "ZeroMeanGP takes no physics.*model=CKA"),
-    ({"model": "CKA"}, TypeError, "class of gpadjust.models.*found 'CKA'"),
+    ({"model": "CKA"}, TypeError, "class of gpadjust,.*found 'CKA'"),
     ({"model": SingleTaskGP}, TypeError, "SingleTaskGP cannot make.*'physics'"),
     ({"model": lambda X, Y: None}, TypeError, "cannot make .*physics=.*'physics'"),
     ({"model": partial(CKA, physics=None)}, TypeError, "found physics in the functools.partial"),
     ({"model": partial(CKA, train_Yvar=1)}, TypeError, "found train_Yvar in the functools.partial"),
     ({"fit_options": {"method": "gibbs"}}, ValueError, "Unknown method 'gibbs'"),
-    ({"fit_options": {"method": "map", "num_samples": 8}}, ValueError, "is one of method 'bayes'"),
-    (
-        {"model": VariationalCKA, "fit_options": {"num_samples": 8}},
-        ValueError,
-        "'map' has no option",
-    ),
-    ({"model": VariationalCKA, "fit_options": {"method": "bayes"}}, ValueError, "not sampled"),
+    ({"fit_options": {"num_starts": 8}}, ValueError, "Unknown fit_option 'num_starts'"),
     ({"target": 3}, ValueError, "Unknown target 3"),
     ({"spec": ["x", "v"]}, TypeError, "Expected spec as a StateSpec"),
     ({"physics": ODEPhysics(lambda s, a: s, 0.1, 2, difference=True)}, ValueError, "=False"),

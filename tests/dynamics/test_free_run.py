@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from gpadjust.core import Prediction
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.dynamics.particles import step_or_nan
-from gpadjust.models import Prediction
 from gpadjust.physics import PhysicsError
 from gpadjust.records import Record, Records
 

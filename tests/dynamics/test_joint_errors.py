@@ -26,7 +26,7 @@ def learnt(correlation, n=120, seed=0):
     white = torch.randn(n, 2, generator=generator, dtype=torch.float64)
     white[:, 1] = correlation * white[:, 0] + math.sqrt(1 - correlation**2) * white[:, 1]
     following = pendulum(X) + 0.02 * X[:, :1].sin() + SD * white
-    dynamics = LearnedDynamics(SPEC, pendulum, fit_options={"num_draws": 256})
+    dynamics = LearnedDynamics(SPEC, pendulum, fit_options={"num_draws": 8})
     dynamics.update(X[:, :2], X[:, 2:], following)
     return dynamics
 

@@ -5,11 +5,11 @@ import math
 import pytest
 import torch
 
+from gpadjust import ZeroMeanGP
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
-from gpadjust.models import ZeroMeanGP
 from gpadjust.records import Record, Records
 
-QUICK = {"method": "map", "num_starts": 2, "num_screened": 16}
+QUICK = {"method": "map"}
 LAGS = {"y_1": "y", "u_1": "u"}
 FIRST_ORDER = StateSpec(["y"], ["u"])
 NARX = StateSpec(["y", *LAGS], ["u"], previous=LAGS)
@@ -70,7 +70,7 @@ def test_physics_knows_the_present_only_and_a_model_both():
     alone = PhysicsDynamics(NARX, physics)
     alone.update(states, actions[:, 0], following[:, 0])
     assert widths == {2}
-    assert dynamics.model.input_names == ("y", "u", "y_1", "u_1")
+    assert dynamics.model.data.input_names == ("y", "u", "y_1", "u_1")
     for each in (alone, dynamics):
         moved = each.sample(states, actions[:, 0])
         assert torch.equal(moved[:, 1:], torch.cat([states[:, :1], actions[:, 0]], -1))

@@ -2,9 +2,9 @@
 
 import torch
 
+from gpadjust import ZeroMeanGP
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.dynamics.linearised import linearised
-from gpadjust.models import ZeroMeanGP
 
 SPEC = StateSpec(["angle", "rate", "target"], ["torque"], angles=["angle"], exogenous=["target"])
 

@@ -9,7 +9,6 @@ from gpadjust import VariationalCKA
 from gpadjust.dynamics import LearnedDynamics, StateSpec
 
 SPEC = StateSpec(["x", "v"], ["u"])
-QUICK = {"num_screened": 16, "num_starts": 2}
 
 
 def step(X):
@@ -32,14 +31,14 @@ def make(**options):
 
 @pytest.fixture(scope="module")
 def dynamics():
-    dynamics = make(fit_options=QUICK)
+    dynamics = make()
     dynamics.update(*transitions(100))
     return dynamics
 
 
 @pytest.mark.slow
 def test_they_come_back_and_go_on(dynamics):
-    before, dynamics = dynamics, make(fit_options=QUICK)
+    before, dynamics = dynamics, make()
     dynamics.load_state_dict(before.state_dict())
     X = transitions(5)[:2]
     for ours, theirs in zip(dynamics.predict(*X), before.predict(*X), strict=True):

@@ -9,7 +9,7 @@ from gpadjust import ZeroMeanGP
 from gpadjust.dynamics import LearnedDynamics, StateSpec
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore:f_p is nearly zero", "ignore::gpadjust.inference.SamplingWarning"
+    "ignore:f_p is nearly zero", "ignore::gpadjust.core.SamplingWarning"
 )
 
 

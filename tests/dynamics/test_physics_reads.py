@@ -7,7 +7,6 @@ from gpadjust import Unknown
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.physics import FunctionPhysics
 from gpadjust.records import Record, Records, smooth
-from tests.point import QUICK
 
 SPEC = StateSpec(
     ["u_1", "x", "load"],
@@ -42,8 +41,7 @@ def test_the_physics_reads_what_the_spec_names(rows):
 
 
 def test_models_read_what_the_physics_reads(rows):
-    options = {"method": "map", **QUICK}
-    dynamics = LearnedDynamics(SPEC, late, fit_options=options)
+    dynamics = LearnedDynamics(SPEC, late, fit_options={"method": "map"})
     assert dynamics.targets.input_names == ("x", "u", "u_1", "load")
     dynamics.update(*rows)
     assert torch.allclose(dynamics.predict(*rows[:2]).mean, rows[2], atol=1e-4)

@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
-from gpadjust.physics import JoinedPhysics, PhysicsError
+from gpadjust.physics import PhysicsError
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore:f_p is nearly zero", "ignore::gpadjust.inference.SamplingWarning"
+    "ignore:f_p is nearly zero", "ignore::gpadjust.core.SamplingWarning"
 )
-POINT_FIT = {"method": "map", "num_starts": 1, "num_screened": 0}
+POINT_FIT = {"method": "map"}
 SEVERAL = ["PhysicsMean", "Scale", "CKA", "RRA"]
 
 
@@ -39,9 +39,8 @@ def test_targets_are_those_of_each_part(cart_pole_system, make, still):
     dynamics = make("CKA", system.spec, [system.crude, still])
     states, actions, _ = system.trial(0)
     one = [make("CKA", system.spec, part) for part in (system.crude, still)]
-    inputs = dynamics.targets.inputs(states, actions)
-    expected = torch.cat([each._recipe.physics(inputs) for each in one], -1)
-    assert torch.equal(dynamics._recipe.physics(inputs), expected)
+    expected = torch.cat([each._recipe.physics_at(states, actions) for each in one], -1)
+    assert torch.equal(dynamics._recipe.physics_at(states, actions), expected)
 
 
 def test_the_better_physics_gets_the_weight(cart_pole_system, make, still):
@@ -52,7 +51,7 @@ def test_the_better_physics_gets_the_weight(cart_pole_system, make, still):
     torch.testing.assert_close(
         dynamics.predict(states, actions).mean, next_states, rtol=0, atol=1e-4
     )
-    rho = dynamics.model.rho(dynamics.targets.inputs(states, actions), "truth").mean
+    rho = dynamics.model.term("rho_truth", dynamics.targets.inputs(states, actions)).mean
     torch.testing.assert_close(rho, torch.ones_like(rho), rtol=0, atol=1e-3)
 
 
@@ -91,7 +90,7 @@ def test_each_part_is_checked(cart_pole_system, make, still):
     system = cart_pole_system
     with pytest.raises(ValueError, match="Expected one physics to follow"):
         PhysicsDynamics(system.spec, [system.crude, still])
-    assert PhysicsDynamics(system.spec, JoinedPhysics([still])).is_fitted
+    assert PhysicsDynamics(system.spec, {"still": still}).is_fitted
     parts = {"rod": system.crude, "late": lambda X: system.crude(X) - X[:, :4]}
     with pytest.warns(UserWarning, match="'late' seems to return the change"):
         make("CKA", system.spec, parts, fit_options=POINT_FIT).update(*system.trial(0))

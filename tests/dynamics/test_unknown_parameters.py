@@ -10,7 +10,7 @@ from gpadjust.physics import FunctionPhysics
 
 SPEC = StateSpec(["q", "dq"], ["u"], angles=["q"])
 UNKNOWNS = {"k": Unknown(1.0, factor=2.0), "c": Unknown(0.2, bounds=(0.0, 1.0))}
-FEW = {"num_samples": 3, "num_draws": 32, "num_starts": 1, "num_screened": 8}
+FEW = {"num_draws": 64}
 
 
 def pendulum(state, action, p):

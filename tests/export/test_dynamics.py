@@ -16,7 +16,7 @@ from tests.export.apart import apart
 from tests.export.conftest import called, compiled
 from tests.systems import normal, uniform
 
-pytestmark = pytest.mark.filterwarnings("ignore:L-BFGS did not converge")
+
 SPEC = StateSpec(
     ["goal", "angle", "x", "rate", "speed", "last"],
     ["force"],
@@ -57,7 +57,7 @@ def transitions():
 
 @functools.cache
 def learnt(target="difference", model=CKA, physics=pushed, reads=()):
-    options = {"method": "map", "num_starts": 1, "num_screened": 8, "max_iterations": 5}
+    options = {"method": "map"}
     physics = STILL if physics is None else physics
     dynamics = LearnedDynamics(
         replace(SPEC, physics_reads=reads), physics, model=model, target=target, fit_options=options
@@ -137,7 +137,7 @@ def test_a_step_in_place_is_that_into_another_array(tmp_path):
     states, actions = normal(20, 3), normal(20, 1, seed=1)
     v = states[:, :1] + 0.5 * actions
     moved = torch.cat([v, states[:, 1:2] + 0.05 * (states[:, :1] + v), states[:, :1]], dim=-1)
-    options = {"method": "map", "num_starts": 1, "num_screened": 8, "max_iterations": 5}
+    options = {"method": "map"}
     dynamics = LearnedDynamics(spec, model=ZeroMeanGP, fit_options=options)
     dynamics.update(states, actions, moved)
     program = compiled(c_source(dynamics, "cart", variance=False), tmp_path)

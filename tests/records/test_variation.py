@@ -8,15 +8,15 @@ import torch
 from gpadjust import CalibratedPhysics
 from gpadjust.dynamics import LearnedDynamics, StateSpec
 from gpadjust.dynamics.particles import varying_parameters
-from gpadjust.models import PhysicsParameters
 from gpadjust.physics import FunctionPhysics, ODEPhysics, Unknown
+from gpadjust.physics.parameters import PhysicsParameters
 from gpadjust.records import Record, Records, smooth
 from gpadjust.records.smoothing import log_evidence
 
 STEP, FACTOR = 0.1, 1.5
 SPEC = StateSpec(["x", "v"], ["force"])
 NOISE = torch.tensor([0.005, 0.02]).double()
-FEW = {"num_samples": 4, "num_draws": 32, "num_starts": 1, "num_screened": 8}
+FEW = {"num_draws": 64}
 
 
 def rates(state, action, p):

@@ -227,7 +227,7 @@ def test_cart_pole(cart_pole):
     dynamics = LearnedDynamics(
         CART_POLE_SPEC,
         swing_up(0).physics,
-        fit_options={"num_screened": 8, "num_starts": 1, "num_samples": 3, "num_draws": 16},
+        fit_options={"num_draws": 8},
     )
     agent = DynaSAC(
         "MlpPolicy",

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from gpadjust import ZeroMeanGP
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
-from gpadjust.models import ZeroMeanGP
 from gpadjust.rl import DynaCallback, DynaSAC
 
 

@@ -9,6 +9,7 @@ import cloudpickle
 import numpy as np
 import pandas as pd
 import pytest
+import sklearn
 import torch
 from sklearn.base import clone
 from sklearn.compose import TransformedTargetRegressor
@@ -20,7 +21,6 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from gpadjust import (
-    AR1,
     CKA,
     BlackBoxPhysics,
     PhysicsError,
@@ -31,9 +31,9 @@ from gpadjust import (
     ZeroMeanGP,
     fit,
 )
+from gpadjust.kinds.heavy_tails import HeavyTails
+from gpadjust.kinds.links import LinkedCKA
 from gpadjust.sklearn import CKARegressor
-
-FAST = {"num_starts": 2, "num_screened": 16}
 
 
 def wave(X):
@@ -49,7 +49,7 @@ def torch_wave(X):
 
 
 def fast(physics=wave, **parameters):
-    options = {"fit_method": "map", "fit_options": FAST, "random_state": 0, **parameters}
+    options = {"fit_method": "map", "random_state": 0, **parameters}
     return CKARegressor(physics, **options)
 
 
@@ -85,7 +85,7 @@ def expected_failures(regressor):
 
 @pytest.mark.filterwarnings("ignore:.*equal an earlier row")  # the irises are so
 @pytest.mark.slow
-@parametrize_with_checks([CKARegressor(fit_method="map", fit_options=FAST)], legacy=True)
+@parametrize_with_checks([CKARegressor(fit_method="map")], legacy=True)
 def test_scikit_learn_accepts_it(estimator, check):
     check(estimator)
 
@@ -103,7 +103,7 @@ def test_scikit_learn_accepts_it_by_full_bayes_and_with_physics(estimator, check
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", [None, "map"])
+@pytest.mark.parametrize("method", ["bayes", "map"])
 @pytest.mark.parametrize("noise", [False, True])
 def test_it_says_what_the_model_says(data, method, noise):
     X, y = data
@@ -129,7 +129,7 @@ def test_numpy_and_torch_are_one(data):
 def test_several_outputs(data):
     X, y = data
     Y = np.column_stack([y, y**2 + X[:, 0]])
-    regressor = fast(waves, fit_method=None).fit(X, Y)
+    regressor = fast(waves, fit_method="bayes").fit(X, Y)
     mean, std = regressor.predict(Z, return_std=True)
     _, covariance = regressor.predict(Z, return_cov=True)
     assert mean.shape == std.shape == (7, 2)
@@ -166,7 +166,7 @@ def test_columns_backward_rows_and_copies_make_no_difference(data):
     np.testing.assert_allclose(regressor.predict(Z[::-1]), regressor.predict(Z)[::-1], rtol=1e-9)
 
 
-@pytest.mark.parametrize(("method", "noise"), [(None, True), ("map", False)])
+@pytest.mark.parametrize(("method", "noise"), [("bayes", True), ("map", False)])
 def test_moments_of_draws(data, method, noise):
     regressor = fast(fit_method=method).fit(*data)
     draws = regressor.sample_y(Z, 20_000, random_state=1, observation_noise=noise)
@@ -180,7 +180,7 @@ def test_moments_of_draws(data, method, noise):
 
 
 def test_the_seed_of_draws(data):
-    regressor = fast(fit_method=None).fit(*data)
+    regressor = fast(fit_method="bayes").fit(*data)
     first = regressor.sample_y(Z, 3)
     np.testing.assert_array_equal(first, regressor.sample_y(Z, 3, random_state=0))
     assert (first != regressor.sample_y(Z, 3, random_state=1)).all()
@@ -191,7 +191,7 @@ def test_the_seed_of_draws(data):
 @pytest.mark.slow
 def test_the_seed_of_the_fit(data):
     def scales(state):
-        regressor = CKARegressor(wave, random_state=state, fit_options={"num_draws": 16})
+        regressor = CKARegressor(wave, random_state=state, num_draws=16)
         return [p.detach() for p in regressor.fit(*data).model_.parameters()]
 
     def same(a, b):
@@ -207,25 +207,25 @@ def test_physics_none_is_a_gaussian_process_without_physics(data):
     for regressor in (fast(None), fast(wave, model="zero_mean")):
         assert type(regressor.fit(X, y).model_) is ZeroMeanGP
     model = ZeroMeanGP(X, y.reshape(-1, 1))
-    fit(model, "map", **FAST, seed=0)
+    fit(model, "map", seed=0)
     np.testing.assert_array_equal(regressor.predict(Z), model.predict(Z).mean[:, 0])
 
 
 def test_a_class_of_models_with_options(data):
     X, y = data
-    options = {"rho_mean": "learn", "train_Yvar": 0.05**2}
+    options = {"constants": False, "train_Yvar": 0.05**2}
     regressor = fast(model=partial(PhysicsMeanGP, **options)).fit(X, y)
     model = PhysicsMeanGP(X, y.reshape(-1, 1), physics=BlackBoxPhysics(wave), **options)
-    fit(model, "map", **FAST, seed=0)
+    fit(model, "map", seed=0)
     np.testing.assert_array_equal(regressor.predict(Z), model.predict(Z).mean[:, 0])
-    assert options == {"rho_mean": "learn", "train_Yvar": 0.05**2}
+    assert options == {"constants": False, "train_Yvar": 0.05**2}
 
 
 def test_parameters_are_left_as_they_are(data):
     linear, model = torch.nn.Linear(1, 1).double(), partial(CKA, center=0.0)
     before = linear.weight.item()
     regressor = fast(linear, model=model).fit(*data)
-    assert linear.weight.item() == before != regressor.model_.physics.function.weight.item()
+    assert linear.weight.item() == before
     parameters = regressor.get_params()
     assert parameters["physics"] is linear
     assert parameters["model"] is model
@@ -236,7 +236,7 @@ def test_unknown_parameters(data):
     law = BlackBoxPhysics(
         lambda X, p: np.sin(p.rate * X[:, 0]), unknowns={"rate": Unknown(5.0, sd=1.0)}
     )
-    regressor = fast(law, fit_method=None, model="calibrated_physics")
+    regressor = fast(law, fit_method="bayes", model="calibrated_physics")
     regressor.fit(X, data[1] - X[:, 0] - wave(X))
     assert regressor.physics_parameters_["rate"].mean().item() == pytest.approx(6, abs=0.2)
     regressor.set_params(physics=wave, model="cka").fit(*data)
@@ -246,7 +246,7 @@ def test_unknown_parameters(data):
 def test_several_physics(data):
     physics = {"coarse": lambda X: X[:, 0], "fine": torch_wave}
     regressor = fast(physics).fit(*data)
-    assert regressor.model_.rho_names == ("rho_coarse", "rho_fine")
+    assert [t.name for t in regressor.model_.terms] == ["rho_coarse", "rho_fine", "delta"]
     assert regressor.score(*data) > 0.9
 
 
@@ -259,7 +259,7 @@ def test_the_physics_sees_what_the_regressor_is_given(data):
         return wave(X)
 
     pipeline = make_pipeline(StandardScaler(), fast(records))
-    with pytest.warns(PhysicsWarning, match=r"inputs scaled\? .*X is scaled, as by") as warned:
+    with pytest.warns(PhysicsWarning, match=r"inputs scaled\?") as warned:
         pipeline.fit(X, y)
     assert len(warned) == 1
     scaled = StandardScaler().fit_transform(X)
@@ -277,7 +277,7 @@ def test_a_physics_that_is_off_is_said_to_be(data):
     assert "is scaled" not in str(caught[0].message)
     large = fast(lambda X: 1000 * wave(X))
     scaled = TransformedTargetRegressor(large, transformer=StandardScaler())
-    with pytest.warns(PhysicsWarning, match="y is scaled, as by a TransformedTargetRegressor"):
+    with pytest.warns(PhysicsWarning, match="The targets were standardised"):
         scaled.fit(X, y)
 
 
@@ -319,14 +319,49 @@ def test_a_frame_gives_names(data):
     regressor = fast().fit(frame, pd.Series(y, name="height"))
     assert [*regressor.feature_names_in_] == ["time", "load"]
     assert regressor.n_features_in_ == 2
-    assert regressor.model_.input_names == ("time", "load")
-    assert regressor.model_.output_names == ("height",)
+    assert regressor.model_.data.input_names == ("time", "load")
+    assert regressor.model_.data.output_names == ("height",)
     assert regressor.predict(frame).shape == (10,)
     assert regressor.sample_y(frame).shape == (10, 1)
     with pytest.raises(ValueError, match="feature names"):
         regressor.predict(frame[["load", "time"]])
     with pytest.warns(UserWarning, match="feature names"):
         regressor.predict(frame.to_numpy())
+
+
+def test_kinds_of_data(data):
+    X, y = data
+    for options in ({"link": (-5.0, 5.0)}, {"noise": HeavyTails()}):
+        regressor = fast(model_options=options).fit(X, y)
+        mean, std = regressor.predict(Z, return_std=True)
+        assert regressor.score(X, y) > 0.9
+        assert (std > 0).all()
+        assert regressor.sample_y(Z, 2).shape == (7, 2)
+    assert isinstance(fast(model_options={"link": (-5, 5)}).fit(X, y).model_, LinkedCKA)
+
+
+def test_texts_of_a_frame_are_categories(data):
+    X, y = data
+    frame = pd.DataFrame({"x": np.tile(X[:, 0], 2), "metal": ["iron"] * 10 + ["zinc"] * 10})
+    y = np.concatenate([y, y + 1])
+    regressor = fast(lambda X: wave(X)).fit(frame, y)
+    mean = regressor.predict(pd.DataFrame({"x": [0.5, 0.5], "metal": ["iron", "zinc"]}))
+    assert mean[1] - mean[0] == pytest.approx(1, abs=0.2)
+    assert regressor.sample_y(frame).shape == (20, 1)
+    assert regressor.feature_names_in_.tolist() == ["x", "metal"]
+    with pytest.raises(ValueError, match="lead"):
+        regressor.predict(pd.DataFrame({"x": [0.5], "metal": ["lead"]}))
+
+
+def test_known_variances_are_taken_apart_with_the_rows(data):
+    X, y = data
+    variances = np.full(10, 0.05**2)
+    regressor = fast().set_fit_request(train_Yvar=True)
+    with sklearn.config_context(enable_metadata_routing=True):
+        scores = cross_val_score(regressor, X, y, cv=2, params={"train_Yvar": variances})
+    assert np.isfinite(scores).all()
+    known = fast().fit(X, y, train_Yvar=variances).model_.data.Yvar
+    np.testing.assert_array_equal(known, variances.reshape(-1, 1))
 
 
 def test_kinds_of_arrays(data):
@@ -339,7 +374,9 @@ def test_kinds_of_arrays(data):
         np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.parametrize(("physics", "method"), [(wave, None), (torch_wave, "map"), (None, "map")])
+@pytest.mark.parametrize(
+    ("physics", "method"), [(wave, "bayes"), (torch_wave, "map"), (None, "map")]
+)
 def test_a_pickle_of_what_was_fitted(data, physics, method):
     regressor = fast(physics, fit_method=method).fit(*data)
     again = pickle.loads(pickle.dumps(regressor))
@@ -379,16 +416,17 @@ def test_bad_data(data):
 
 REFUSED = [
     ({"model": "krr"}, ValueError, "one of 'cka', 'rra'.*got 'krr'"),
-    ({"model": AR1}, ValueError, "AR1 samples f_p in `bounds`"),
-    ({"model": 3}, TypeError, r"callable \(X, Y, \*\*physics\) .*got 3"),
-    ({"model": lambda X, Y, physics: X}, TypeError, "to make a gpadjust TermsModel, got nda"),
+    ({"model": 3}, TypeError, r"callable \(X, Y, \*\*physics\) .*found 3"),
+    ({"model": lambda X, Y, physics: X}, TypeError, "to make a gpadjust Predictive; found nda"),
     ({"model": "rra", "physics": None}, ValueError, "without one take model='zero_mean'"),
     ({"physics": "wave"}, TypeError, "physics must be a Physics or a callable"),
     ({"physics": lambda X: X[:, 0] * np.nan}, PhysicsError, "finite"),
     ({"fit_method": "hmc"}, ValueError, "Unknown method 'hmc'; expected 'bayes' or 'map'"),
-    ({"fit_options": {"num_samples": 4}}, ValueError, "it is one of method 'bayes'"),
-    ({"model": partial(CKA, centre=0)}, TypeError, r"argument 'centre'; it takes .*center"),
+    ({"num_draws": 3}, ValueError, "a multiple of 4; found 3"),
+    ({"model": partial(CKA, centre=0)}, TypeError, "argument 'centre'"),
     ({"physics": None, "model": CKA}, TypeError, "argument: 'physics'"),
+    ({"model_options": ["log"]}, TypeError, "Expected model_options as a dictionary"),
+    ({"model_options": {"physics": wave}}, TypeError, "an argument of its own"),
     ({"random_state": "seed"}, ValueError, "cannot be used to seed"),
 ]
 

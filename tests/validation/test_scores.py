@@ -8,6 +8,9 @@ from botorch.posteriors import GPyTorchPosterior
 from botorch.posteriors.fully_bayesian import GaussianMixturePosterior
 from gpytorch.distributions import MultitaskMultivariateNormal, MultivariateNormal
 
+from gpadjust.core import CKA
+from gpadjust.core.posterior import MixturePosterior
+from gpadjust.kinds.links import LinkedCKA
 from gpadjust.validation import Scores, coverage, crps, nlpd, pit, rmse, score
 from gpadjust.validation.scores import energy_score
 
@@ -124,6 +127,22 @@ def test_score_of_a_posterior(uniform, num_outputs, mixed):
     torch.testing.assert_close(scores.coverage, coverage(mean, variance, y, 0.5, **options))
 
 
+def test_score_of_a_model_is_that_of_its_mixture(mixture, data):
+    mean, variance, y = (each[0] for each in mixture)
+    posterior = MixturePosterior(mean.mT, torch.diag_embed(variance.mT))
+    scores, expected = score(posterior, y), Scores.of(mean, variance, y, mixture_dim=-3)
+    for name in ("rmse", "nlpd", "crps", "coverage", "pit"):
+        torch.testing.assert_close(getattr(scores, name), getattr(expected, name))
+    X, Y = data()
+    linked = LinkedCKA(X, Y.exp(), physics=lambda X: X[:, :1].exp())
+    plain = CKA(X, Y, physics=lambda X: X[:, :1])
+    with torch.no_grad():
+        scores = score(linked.posterior(X), Y.exp())
+        expected = score(plain.posterior(X), Y)
+    torch.testing.assert_close(scores.pit, expected.pit)
+    torch.testing.assert_close(scores.nlpd, expected.nlpd + Y.mean(0))
+
+
 def test_predictions_without_variance_have_their_limits():
     mean, y = torch.tensor([[1.0], [2.0]]).double(), torch.tensor([[1.5], [2.0]]).double()
     variance = torch.zeros_like(mean)
@@ -132,7 +151,7 @@ def test_predictions_without_variance_have_their_limits():
     assert coverage(mean, variance, y) == 0.5
 
 
-def test_bad_input(prediction, data, build):
+def test_bad_input(prediction, data):
     mean, variance, y = (t.clone() for t in prediction)
     negative, nan = variance.clone(), mean.clone()
     negative[0, 1, 2], nan[0, 1, 2] = -0.5, torch.nan
@@ -157,7 +176,7 @@ def test_bad_input(prediction, data, build):
         coverage(*prediction, level=95)
     X, Y = data()
     with pytest.raises(TypeError, match=r"got CKA; that of a model is `model.posterior\(X, "):
-        score(build("CKA", X, Y), Y)
+        score(CKA(X, Y, physics=lambda X: X[:, :1]), Y)
 
 
 @pytest.mark.parametrize("mixed", [False, True])

@@ -5,16 +5,16 @@ import numpy as np
 import pytest
 import torch
 
-from gpadjust import CKA, StackedGP, VariationalCKA, ZeroMeanGP, fit
+from gpadjust.core import CKA, RRA, PhysicsMeanGP, ScaleGP, StackedGP, ZeroMeanGP, fit
 from gpadjust.dynamics import LearnedDynamics, StateSpec
-from gpadjust.models import BiasGP
+from gpadjust.kinds.links import LinkedCKA
 from gpadjust.validation import Trust, trust
 from gpadjust.validation.plots import plot_trust
+from gpadjust.validation.trust import prior_mean
 from tests.systems import crude
 
 mpl.use("Agg")
 pytestmark = pytest.mark.usefixtures("closed_figures")
-Z95 = 1.959963984540054
 
 
 def line(low, high, n):
@@ -83,11 +83,11 @@ def test_without_data_there_is_neither():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("shift", [0.0, 1e3])
-def test_units_make_no_difference(half, shift):
+def test_units_make_no_difference(shift):
     X = line(0, 1, 20)
     Y = wave(X) + (X - 0.5).clamp_min(0.0).square()
-    other = BiasGP(50 * X, 1e6 * (Y + shift), physics=lambda X: 1e6 * (wave(X / 50) + shift))
-    plain = BiasGP(X, Y, physics=wave)
+    other = PhysicsMeanGP(50 * X, 1e6 * (Y + shift), physics=lambda X: 1e6 * (wave(X / 50) + shift))
+    plain = PhysicsMeanGP(X, Y, physics=wave)
     for model in (other, plain):
         fit(model)
     Z = line(-0.5, 1.5, 50)
@@ -96,10 +96,10 @@ def test_units_make_no_difference(half, shift):
     assert (one.side != two.side).sum() <= 1
 
 
-def test_outputs_are_judged_one_by_one(data, build):
+def test_outputs_are_judged_one_by_one(data):
     X, Y = data(num_outputs=2)
     Y[:3, 0] = torch.nan
-    model = build("CKA", X, Y)
+    model = CKA(X, Y, physics=crude)
     found = trust(model, num_points=16)
     assert found.side.shape == found.override.shape == found.doubt.shape == (16, 2)
     torch.testing.assert_close(found.physics + found.data + found.neither, torch.ones(2).double())
@@ -108,41 +108,18 @@ def test_outputs_are_judged_one_by_one(data, build):
     torch.testing.assert_close(second.doubt, found.doubt[:, 1:])
 
 
-def test_all_models_with_a_physics_fall_back_to_it(data, build):
-    X, Y = data(num_outputs=2)
+def test_the_prior_mean_is_the_physics_also_of_draws_without_it(data):
+    X, Y = data()
     Z = 3 * torch.rand(7, 2, dtype=torch.float64)
-    models = [build(kind, X, Y) for kind in ("CKA", "PhysicsMeanGP", "ScaleGP", "RRA")]
-    Y[:3, 0] = torch.nan
-    for model in (*models, VariationalCKA(X, Y, physics=crude)):
-        torch.testing.assert_close(model.fallback(Z), crude(Z))
-        assert trust(model, Z).side.shape == (7, 2)
-    assert trust(model, num_points=9).side.shape == (9, 2)
-
-
-@pytest.mark.slow
-def test_of_several_physics_the_weighted_sum_counts():
-    X = line(0, 1, 12)
-    physics = {"wave": wave, "line": lambda X: X}
-    model = CKA(X, 2 * wave(X) - 3 * X, physics=physics)
-    Z = line(0, 2, 9)
-    torch.testing.assert_close(model.fallback(Z), 2 * wave(Z) - 3 * Z)
-    fit(model)
-    assert trust(model).physics.item() == 1
-    known = CKA(X, 2 * wave(X) - 3 * X, physics=physics, rho_mean=(1.0, 0.5), center="mean")
-    torch.testing.assert_close(known.fallback(Z), wave(Z) + 0.5 * Z)
-
-
-@pytest.mark.parametrize("num_outputs", [1, 2])
-def test_a_model_that_holds_samples_is_judged_as_their_mixture(data, held, num_outputs):
-    X, Y = data(num_outputs=num_outputs)
-    model, singles = held("CKA", X, Y, center="learn")
-    Z = torch.rand(5, 2, dtype=torch.float64)
-    found = trust(model, Z)
-    mean = torch.stack([single.predict(Z).mean for single in singles]).mean(0)
-    sd = model.predict(Z).variance.sqrt()
-    expected = (mean - singles[0].fallback(Z)).abs() / (Z95 * sd)
-    torch.testing.assert_close(found.override, expected)
-    torch.testing.assert_close(model.fallback(Z), singles[0].fallback(Z))
+    f_p = lambda X: 5 + crude(X)[..., :1]  # noqa: E731
+    for kind in (CKA, PhysicsMeanGP, ScaleGP, RRA, LinkedCKA):
+        model = kind(X, 5 + Y, physics=f_p)
+        if model.table.choices:
+            u = torch.cat([model.table.with_choice(model.u.detach(), k) for k in range(3)])
+            model.set_draws(u)
+        torch.testing.assert_close(prior_mean(model, Z), f_p(Z))
+    both = CKA(X, Y, physics=[f_p, lambda X: X[..., :1]], rho_mean=(1.0, 0.5), delta_mean=2.0)
+    torch.testing.assert_close(prior_mean(both, Z), f_p(Z) + 0.5 * Z[:, :1] + 2)
 
 
 @pytest.mark.slow
@@ -159,16 +136,14 @@ def test_the_model_of_learned_dynamics(uniform):
 
 def test_bad_input(half, data):
     X, Y = data()
-    batch = CKA(X.expand(2, -1, -1), Y.expand(2, -1, -1), physics=lambda X: X[..., :1])
-    stacked = StackedGP({"CKA": half}, [[1.0] * half.num_outputs])
+    stacked = StackedGP({"CKA": half}, [1.0])
     for call, error, words in (
-        (lambda: trust(ZeroMeanGP(X, Y)), TypeError, "could trust, such as CKA, got ZeroMeanGP"),
-        (lambda: trust(stacked), TypeError, r"got a StackedGP.*comparison\.models\['CKA'\]"),
-        (lambda: trust("CKA"), TypeError, "of LearnedDynamics pass its `model`"),
+        (lambda: trust(ZeroMeanGP(X, Y)), TypeError, "could trust, such as CKA; found ZeroMeanGP"),
+        (lambda: trust(stacked), TypeError, r"found a StackedGP.*comparison\.models\['CKA'\]"),
+        (lambda: trust("CKA"), TypeError, "Of LearnedDynamics pass its `model`"),
         (lambda: trust(half, X), ValueError, "columns"),
         (lambda: trust(half, X[:0, :1]), ValueError, "one point or more"),
         (lambda: trust(half, X[None, :, :1]), ValueError, "Expected X of shape n x d"),
-        (lambda: trust(batch), ValueError, r"of one data set, got one with batch_shape \(2,\)"),
     ):
         with pytest.raises(error, match=words):
             call()

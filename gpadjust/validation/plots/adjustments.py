@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from torch import Tensor
 
 from gpadjust.checks import checked_bounds, checked_tensor, checked_whole
-from gpadjust.models.levels import on_levels
+from gpadjust.kinds.categories import on_levels
 from gpadjust.validation.leave_one_out import observations
 from gpadjust.validation.plots.drawing import (
     BLUE,
@@ -82,11 +82,11 @@ def plot_adjustment(
         x = torch.linspace(bounds[0, i], bounds[1, i], num_points, dtype=base.dtype)
         X = base.repeat(num_points, 1)
         X[:, i] = x
-        X = on_levels(X, model.levels) if getattr(model, "levels", None) else X
+        X = on_levels(model, X)
         for ax, name in zip(axes[:, i], names, strict=True):
             with torch.no_grad():
                 mean, half = mean_and_half_width(model.term(name, X), output, level)
-            ax.axhline(_unadjusted(model, name, output), color=GREY, lw=1, ls="--")
+            ax.axhline(unadjusted(model, name), color=GREY, lw=1, ls="--")
             band(ax, x, mean, half, level)
             bottom = ax.get_xaxis_transform()
             ax.plot(train_X[:, i], torch.zeros(len(train_X)), "|", color=RED, transform=bottom)
@@ -103,30 +103,29 @@ def plot_adjustment(
 
 
 def adjustments_of(model: Any) -> list[str]:
-    """The names of the rhos and deltas of a model, if it has any."""
-    return [name for name in getattr(model, "term_names", ()) if name != "f"]
+    """Return the names of the rhos and deltas of a model that vary, if it has a physics."""
+    terms = model.terms if getattr(model, "physics", None) else ()
+    return [t.name for t in terms if t.varies and t.name not in model.data.input_names]
 
 
 def _adjustments(model: Any) -> list[str]:
-    """The names of the rhos and deltas of a model, one at least."""
+    """Return the names of the rhos and deltas of a model, one at least."""
     names = adjustments_of(model)
     if not names:
         raise TypeError(
-            f"{type(model).__name__} has neither rho nor delta to draw; CKA, RRA, ScaleGP and "
-            "PhysicsMeanGP have."
+            "Expected a model with rho or delta to draw, such as CKA, RRA, ScaleGP and "
+            f"PhysicsMeanGP; found {type(model).__name__}."
         )
     return names
 
 
-def _unadjusted(model: Any, name: str, output: int) -> float:
-    """The value of a rho or a delta away from data."""
-    if hasattr(model, "term_mean"):
-        return float(model.term_mean(name, output))
-    return 1.0 if name.startswith("rho") else 0.0
+def unadjusted(model: Any, name: str) -> float:
+    """Return the value of a rho or a delta away from data."""
+    return float(next(term.mean for term in model.terms if term.name == name))
 
 
 def _symbol(name: str) -> str:
-    """The symbols of ``rho``, ``rho_coarse`` and ``delta``."""
+    """Return the symbols of ``rho``, ``rho_coarse`` and ``delta``."""
     symbol, _, physics = name.partition("_")
     if symbol not in ("rho", "delta"):
         return name
@@ -134,7 +133,7 @@ def _symbol(name: str) -> str:
 
 
 def domain(model: Any, bounds: Any, base: Any, output: int) -> tuple[Tensor, Tensor, Tensor, str]:
-    """Inputs at which the output was observed, the range, the base point, and whose they are."""
+    """Return inputs at which the output was observed, the range, the base point, and a label."""
     X, Y = observations(model)
     d, num_outputs = X.shape[-1], Y.shape[-1]
     seen = ~column(Y, output).isnan()
@@ -203,7 +202,7 @@ def plot_trust(trust: Trust, *, output: int = 0, bins: int = 10, axes: Any = Non
 
 
 def _side_and_names(trust: Trust, output: int) -> tuple[Tensor, dict[str, str]]:
-    """The basis of each prediction of an output, and the legend's text of the shares."""
+    """Return the basis of each prediction of an output, and the legend's text of the shares."""
     if not isinstance(trust, Trust):
         raise TypeError(f"Expected a Trust, got {type(trust).__name__}; pass `trust(model)`.")
     side = column(trust.side, output)

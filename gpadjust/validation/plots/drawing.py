@@ -14,6 +14,7 @@ from matplotlib.mathtext import MathTextParser
 from torch import Tensor
 
 from gpadjust.checks import check_level, checked_whole
+from gpadjust.core.model import Predictive
 
 BLUE, RED, GREY = "#0072B2", "#D55E00", "0.45"  # told apart by the colour-blind, too
 BAND: dict[str, Any] = {"color": BLUE, "alpha": 0.2, "lw": 0}
@@ -26,12 +27,10 @@ def quantile(level: float) -> float:
     return NormalDist().inv_cdf((1 + level) / 2)
 
 
-def mean_and_half_width(posterior: Any, output: int, level: float) -> tuple[Tensor, Tensor]:
-    """Mean and half the width of the interval of one output, ``n`` each."""
-    mean = getattr(posterior, "mixture_mean", None)
-    variance = posterior.variance if mean is None else posterior.mixture_variance
-    mean = posterior.mean if mean is None else mean
-    return column(mean, output), quantile(level) * column(variance.sqrt(), output)
+def mean_and_half_width(prediction: Any, output: int, level: float) -> tuple[Tensor, Tensor]:
+    """Return mean and half the width of the interval of one output, ``n`` each."""
+    sd = column(prediction.variance.sqrt(), output)
+    return column(prediction.mean, output), quantile(level) * sd
 
 
 def column(values: Tensor, output: int) -> Tensor:
@@ -58,10 +57,11 @@ def observed(values: Tensor, output: int) -> Tensor:
 
 
 def labels(of: Any, kind: str, number: int) -> list[str]:
-    """The names of the inputs or outputs (``kind``), or x or y with subscripts."""
+    """Return the names of the inputs or outputs (``kind``), or x or y with subscripts."""
     symbol = {"input": "x", "output": "y"}[kind]
     default = [symbol] if number == 1 else [f"{symbol}{k + 1}" for k in range(number)]
-    names = getattr(of, f"{kind}_names", None) or default
+    owner = of.data if isinstance(of, Predictive) else of  # a model
+    names = getattr(owner, f"{kind}_names", None) or default
     return [re.sub(r"^([xy])(\d+)$", r"$\1_{\2}$", _as_text(name)) for name in names]
 
 

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from itertools import cycle
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from gpadjust.checks import checked_whole
-from gpadjust.models.levels import on_levels
+from gpadjust.kinds.categories import on_levels
 from gpadjust.validation.leave_one_out import observations
 from gpadjust.validation.plots.adjustments import adjustments_of, domain, plot_adjustment
 from gpadjust.validation.plots.drawing import (
     DOTS,
-    GREY,
     RED,
     axes_of,
     band,
@@ -24,7 +22,7 @@ from gpadjust.validation.plots.drawing import (
     quantile,
     tidy,
 )
-from gpadjust.validation.plots.predictions import physics_curves
+from gpadjust.validation.plots.predictions import draw_physics
 
 
 def plot_model(
@@ -39,7 +37,7 @@ def plot_model(
 ) -> Any:
     r"""Draw predictions, and :math:`\rho` and :math:`\delta` below, along each input.
 
-    ``model.plot()`` does this. The first row has the mean, the central interval and the physics; of
+    The first row has the mean, the central interval and the physics; of
     one input also the data, of several ticks at the bottom, at the training inputs, as the curves
     are slices through the base point. The other rows are those of :func:`plot_adjustment`, if the
     model adjusts a physics.
@@ -54,7 +52,7 @@ def plot_model(
         >>> from gpadjust import CKA
         >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
         >>> model = CKA(X, 2 * torch.sin(6 * X) + X, physics=lambda X: torch.sin(6 * X))
-        >>> model.plot().shape
+        >>> plot_model(model).shape
         (3, 1)
     """
     names = adjustments_of(model)
@@ -67,12 +65,10 @@ def plot_model(
     for i, ax in enumerate(axes[0]):
         X = base.repeat(num_points, 1)
         X[:, i] = x = torch.linspace(bounds[0, i], bounds[1, i], num_points, dtype=base.dtype)
-        X = on_levels(X, getattr(model, "levels", {}))
+        X = on_levels(model, X)
         with torch.no_grad():
-            mean, half = mean_and_half_width(model.posterior(X), output, level)
-            styles = cycle(("--", "-.", ":"))
-            for (name, physics), style in zip(physics_curves(model), styles, strict=False):
-                ax.plot(x, column(physics(X), output), color=GREY, ls=style, lw=1.2, label=name)
+            mean, half = mean_and_half_width(model.predict(X), output, level)
+            draw_physics(ax, model, X, x, output)
         band(ax, x, mean, half, level)
         if d == 1:
             ax.plot(train_X[:, 0], y[~y.isnan()], color=RED, **DOTS, label="data")

@@ -12,7 +12,6 @@ from scipy.stats import binom
 from torch import Tensor
 
 from gpadjust.checks import checked_whole
-from gpadjust.physics import JoinedPhysics
 from gpadjust.validation.leave_one_out import LeaveOneOut, observations
 from gpadjust.validation.plots.drawing import (
     BAND,
@@ -97,11 +96,7 @@ def plot_prediction(
     order = X[:, 0].argsort()
     x = X[order, 0].detach()
     band(ax, x, mean[order], half[order], level)
-    styles = cycle(("--", "-.", ":"))
-    for (name, physics), style in zip(physics_curves(model), styles, strict=False):
-        with torch.no_grad():
-            f_p = column(physics(X[order]), output)
-        ax.plot(x, f_p, color=GREY, ls=style, lw=1.2, label=name)
+    draw_physics(ax, model, X[order], x, output)
     if Y is not None:
         order = order[seen[order]]
         ax.plot(X[order, 0].detach(), truth[order], color="black", lw=1, ls=":", label="truth")
@@ -148,33 +143,39 @@ def plot_leave_one_out(
         )
     z = quantile(level)
     seen = observed(column(loo.Y, output), output)
-    Y, mean, sd = (column(t, output)[seen] for t in (loo.Y, loo.mean, loo.variance.sqrt()))
+    values = (loo.Y, loo.mean, loo.variance.sqrt(), loo.residuals)
+    Y, mean, sd, residuals = (column(each, output)[seen] for each in values)
     label = labels(loo, "output", loo.Y.shape[-1])[output]
     axes = axes_of(axes, 1, 2)[0]
     of = "" if label == "y" else f" {label}"
     against_truth(axes[0], Y, mean, z * sd, level, f"observed{of}", "predicted without it")
     axes[1].axhspan(-z, z, **BAND, label=f"{100 * level:g} %")
     axes[1].axhline(0, color=GREY, lw=1, ls="--")
-    axes[1].plot(mean, (Y - mean) / sd, color=BLUE, **DOTS)
-    top = 1.35 * max(z, ((Y - mean) / sd).abs().max().item())  # room for the legend
+    axes[1].plot(mean, residuals, color=BLUE, **DOTS)
+    top = 1.35 * max(z, residuals.abs().max().item())  # room for the legend
     axes[1].set(xlabel="predicted without it", ylabel="standardized residual", ylim=(-top, top))
     legend(axes[1])
     return axes
 
 
-def physics_curves(model: Any) -> list[tuple[str, Any]]:
-    """The physics of a model with their names, unknown parameters at their means."""
-    physics: Any = getattr(model, "physics", None)
-    known = model.physics_parameters if getattr(model, "has_unknowns", False) else {}
+@torch.no_grad()
+def physics_at(model: Any, X: Tensor) -> dict[str, Tensor]:
+    """Return the outputs ``n x m`` of each physics by name, the means of their draws."""
+    found: dict[str, Tensor] = {}
+    names = {t.physics: t.name.removeprefix("rho_") for t in getattr(model, "terms", ())}
+    f = model.places(X, model.values).f if getattr(model, "physics", None) else []
+    for i, outputs in enumerate(f):
+        name = f"physics {names.get(i, i + 1)}" if len(f) > 1 else "physics"
+        values = (outputs * model.unit).mT
+        found[name] = model.marginals_of(values, torch.zeros_like(values)).prediction.mean
+    return found
 
-    def at_means(part: Any) -> Any:
-        values = [known[name].mean() for name in getattr(part, "unknowns", ())]
-        return (lambda X: part(X, torch.stack(values))) if values else part
 
-    if isinstance(physics, JoinedPhysics):
-        parts = zip(physics.names, physics.parts, strict=True)
-        return [(f"physics {name}", at_means(part)) for name, part in parts]
-    return [("physics", at_means(physics))] if callable(physics) else []
+def draw_physics(ax: Axes, model: Any, X: Tensor, x: Tensor, output: int) -> None:
+    """Draw an output of each physics at ``X``, over one of its columns."""
+    styles = cycle(("--", "-.", ":"))
+    for (name, f_p), style in zip(physics_at(model, X).items(), styles, strict=False):
+        ax.plot(x, column(f_p, output), color=GREY, ls=style, lw=1.2, label=name)
 
 
 def _check_inputs(X: Tensor, Y: Tensor | None) -> None:
@@ -270,7 +271,7 @@ def plot_pit(
 def _pit_and_axes(
     prediction: Tensor | LeaveOneOut | Scores, output: int, ax: Axes | None, size: float
 ) -> tuple[Tensor, Axes]:
-    """The PIT values of what was observed, and the axes; new ones say which output, if need be."""
+    """Return the PIT values of what was observed, and the axes; new ones have a title."""
     prediction = prediction.score() if isinstance(prediction, LeaveOneOut) else prediction
     pit = prediction if isinstance(prediction, Tensor) else getattr(prediction, "pit", None)
     if not isinstance(pit, Tensor):

@@ -1,0 +1,239 @@
+"""AR1 co-kriging of two levels of fidelity."""
+
+from __future__ import annotations
+
+from typing import Any, Self
+
+import torch
+from botorch.utils.sampling import draw_sobol_samples
+from torch import Tensor
+
+from gpadjust.checks import checked_bounds, checked_whole
+from gpadjust.core import GP, KnownNoise, Noise, Row, Term
+from gpadjust.core.data import ArrayLike, Data, appended, as_tensor, unit_of
+from gpadjust.core.gaussian import Marginals
+from gpadjust.core.kernels import Features, Kernel, PullBack, as_kernel
+from gpadjust.core.structures import DELTA_CONSTANT
+from gpadjust.core.terms import Places
+from gpadjust.core.unknowns import Values
+from gpadjust.physics import as_physics
+
+_EXACT = 1e-6  # of the squared unit: the noise of a low level beside known variances of the high
+
+
+class AR1(GP):
+    r"""Auto-regressive co-kriging, :math:`f_2(x) = \rho f_1(x) + \delta(x)` with a constant rho.
+
+    The classic of multi-fidelity modelling (Kennedy and O'Hagan 2000; Wannawas and Faisal 2023,
+    sec. 2.1.3), for comparison: a Gaussian process of the data and ``N_1`` samples of f_p, with one
+    noise level each, far from which it forgets the physics. Data, predictions and left-out targets
+    are of the high level. Args and errors as of :class:`~gpadjust.core.GP`, and:
+
+    Args:
+        physics: The low level f_p, sampled in ``bounds``.
+        bounds: ``2 x d`` lower and upper bounds of the inputs.
+        num_low: Number ``N_1`` of samples of f_p.
+        low_X: Instead of the three above, the inputs of the low level, ``n_1 x d``;
+        low_Y: and its values, ``n_1 x m``, NaN where one is missing (by default f_p's).
+        low_covar_module: The kernel of the low level. Default: RBF.
+        delta_covar_module: The kernel of delta. Default: RBF.
+        seed: Seed of the (scrambled Sobol) samples.
+
+    Raises:
+        ValueError: If neither ``physics`` with ``bounds`` nor ``low_X`` with its values is given.
+    """
+
+    low: Data | None = None  # not before units of the high level are known
+
+    def __init__(
+        self, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike = None, *,
+        physics: Any = None, bounds: Any = None, num_low: int = 40, low_X: ArrayLike = None,
+        low_Y: ArrayLike = None, low_covar_module: Any = None, delta_covar_module: Any = None,
+        input_transform: Any = None, seed: int = 0,
+    ) -> None:  # fmt: skip
+        if low_Y is None and physics is None or low_X is None and (bounds is None or physics is None):
+            raise ValueError(
+                "Expected a low level: physics with bounds (2 x d) or low_X, or low_X with low_Y."
+            )
+        if low_X is None:
+            d = as_tensor(train_X, "train_X").shape[-1]
+            number, box = checked_whole("num_low", num_low, 2), checked_bounds("bounds", bounds, d)
+            low_X = draw_sobol_samples(box, n=number, q=1, seed=checked_whole("seed", seed))
+            low_X = low_X.squeeze(-2)
+        if low_Y is None:
+            f_p = as_physics(physics)
+            if f_p.unknowns:
+                raise ValueError(
+                    f"Expected a physics without unknown parameters, as it is sampled once; found "
+                    f"{', '.join(f_p.unknowns)} of {f_p.name!r}. CKA learns them."
+                )
+            with torch.no_grad():
+                low_Y = f_p(as_tensor(low_X, "low_X"))
+        low = Data.of(low_X, low_Y, None, None)
+        terms = [
+            Term("low", AtLevels(as_kernel(low_covar_module), low.X, has_rho=True)),
+            Term("delta", AtLevels(as_kernel(delta_covar_module), low.X)),
+        ]
+        super().__init__(
+            train_X, train_Y, train_Yvar, terms=terms, noise=LevelNoise(("low", "high")),
+            input_transform=input_transform,
+            settings={
+                "low_X": low.X, "low_Y": low.Y, "low_covar_module": low_covar_module,
+                "delta_covar_module": delta_covar_module, "input_transform": input_transform,
+            },
+        )  # fmt: skip
+        if low.X.shape[-1] != self.data.X.shape[-1] or low.Y.shape[-1] != self.num_outputs:
+            raise ValueError(
+                f"Expected a low level of {self.data.X.shape[-1]} inputs and {self.num_outputs} "
+                f"outputs, as the high one; found {low.X.shape[-1]} and {low.Y.shape[-1]}."
+            )
+        self.low = low
+
+    @property
+    def rho_constant(self) -> Tensor:
+        r"""The constant :math:`\rho` of each draw and output, ``S x m``."""
+        rho = self.values["low.kernel.rho"].squeeze(-1)
+        return rho * (self.unit / self._low_unit()).squeeze(-1)
+
+    def kernel_inputs(self, X: Tensor) -> Tensor:
+        """Return inputs and their level, 1; before the training inputs those of level 0."""
+        x = self.data.kernel_inputs(X)
+        high = torch.cat([x, torch.ones_like(x[..., :1])], -1)
+        if self.low is None or X is not self.data.X:
+            return high
+        x = self.data.kernel_inputs(self.low.X.to(X))
+        return appended(torch.cat([x, torch.zeros_like(x[..., :1])], -1), high)
+
+    def targets(self) -> Tensor:
+        """Return the targets of both levels, each in its unit, ``... x m x (n_1 + n)``."""
+        high = super().targets()
+        if self.low is None:
+            return high
+        return appended((self.low.Y.mT / self._low_unit()).to(high), high, -1)
+
+    def left_out(self) -> Marginals:
+        """Return the distribution of each target of the high level given all others."""
+        return Marginals(*(each[..., self._num_low :, :] for each in super().left_out()))
+
+    def left_out_at(self, u: Tensor) -> tuple[Tensor, Tensor]:
+        """Return means and variances of targets of the high level, left out, at coordinates."""
+        mean, variance = super().left_out_at(u)
+        return mean[..., self._num_low :, :], variance[..., self._num_low :, :]
+
+    def subset_output(self, idcs: list[int]) -> Self:
+        """Return the model of some outputs; a ValueError if there are none of these numbers."""
+        new = super().subset_output(idcs)
+        new.low = self._low.of_outputs(self.checked_outputs(idcs))
+        return new
+
+    def as_single_task_gp(self, draw: int | None = None) -> Any:
+        """Raise a ValueError, as such a model has no rows of a low level."""
+        raise ValueError("Expected a model of one level; AR1 has rows of two. Take posterior.")
+
+    @property
+    def _num_low(self) -> int:
+        return 0 if self.low is None else len(self.low.X)
+
+    def _low_unit(self) -> Tensor:
+        """Return the unit of each output of the low level, ``m x 1``."""
+        return unit_of(self.low.Y, torch.zeros_like(self.low.Y)).to(self.unit)
+
+
+class AtLevels(Kernel):
+    r"""The kernel :math:`b(l) \, (k(x, x') + \kappa) \, b(l')` of levels l, the last input.
+
+    b is :math:`\rho^l`, with a normal prior of rho in units of both levels, or l.
+
+    Args:
+        kernel: k.
+        low_x: Inputs of the low level, which lengthscales are to fit, too.
+        has_rho: Whether b is :math:`\rho^l`.
+    """
+
+    def __init__(self, kernel: Kernel, low_x: Tensor, has_rho: bool = False) -> None:
+        self.kernel, self.low_x, self.has_rho = kernel, low_x, has_rho
+
+    def of_data(self, data: Data) -> AtLevels:
+        """Return the kernel of transformed inputs, and with names."""
+        return AtLevels(self.kernel.of_data(data), data.kernel_inputs(self.low_x), self.has_rho)
+
+    def rows(self, x: Tensor, num_outputs: int) -> list[Row]:
+        """Return the numbers of k, kappa and rho."""
+        one = x.new_ones(num_outputs, 1)
+        rows = self.kernel.rows(torch.cat([self.low_x, x]), num_outputs)
+        rows += [Row.positive("constant", DELTA_CONSTANT.median * one, DELTA_CONSTANT.factor)]
+        return rows + [Row("rho", one, 3.0)] * self.has_rho
+
+    def basis(self, own: Values, x: Tensor) -> Tensor:
+        """Return b, ``... x S x m x n``."""
+        return 1 + x[..., -1] * (own["rho"] - 1) if self.has_rho else x[..., -1]
+
+    def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
+        """Return the covariances of inputs with others, or with themselves."""
+        point = None if other is None else other[..., :-1]
+        k = self.kernel.covariance(own, x[..., :-1], point) + own["constant"].unsqueeze(-1)
+        left, right = (self.basis(own, each) for each in (x, x if other is None else other))
+        return left.unsqueeze(-1) * k * right.unsqueeze(-2)
+
+    def variance(self, own: Values, x: Tensor) -> Tensor:
+        """Return the prior variances, ``... x S x m x n``."""
+        k = self.kernel.variance(own, x[..., :-1]) + own["constant"]
+        return self.basis(own, x).square() * k
+
+    def with_pull_back(self, own: Values, x: Tensor) -> tuple[Tensor, PullBack]:
+        """Return the covariance, and what gives derivatives by the numbers."""
+        k, back = self.kernel.with_pull_back(own, x[..., :-1])
+        k, b = k + own["constant"].unsqueeze(-1), self.basis(own, x)
+
+        def pull_back(D: Tensor) -> Values:
+            by_k = b.unsqueeze(-1) * D * b.unsqueeze(-2)
+            by = back(by_k) | {"constant": by_k.sum((-1, -2)).unsqueeze(-1)}
+            if self.has_rho:  # db_i / drho = l_i
+                by_b = 2 * ((D * k) @ b.unsqueeze(-1)).squeeze(-1)
+                by["rho"] = (x[..., -1] * by_b).sum(-1, keepdim=True)
+            return by
+
+        return b.unsqueeze(-1) * k * b.unsqueeze(-2), pull_back
+
+    def features(self, own: Values, number: int, generator: torch.Generator) -> Features:
+        """Return those of k and the constant, times b."""
+        of_k = self.kernel.features(own, number, generator)
+
+        def features(x: Tensor) -> Tensor:
+            phi, b = of_k(x[..., :-1]), self.basis(own, x).unsqueeze(-1)
+            one = own["constant"].sqrt().unsqueeze(-1).expand_as(phi[..., :1])
+            return torch.cat([phi, one], -1) * b
+
+        return features
+
+    def __repr__(self) -> str:
+        return f"{'rho^level' if self.has_rho else 'level'} x {self.kernel}"
+
+
+class LevelNoise(Noise):
+    """A learnt variance of each level."""
+
+    def shares(self, places: Places) -> Tensor:
+        """Return which of the two variances an input has, ``... x 1 x 1 x n x 2``."""
+        level = places.x[..., -1]
+        return torch.stack([1 - level, level], -1)
+
+    def with_known(self, known: KnownNoise) -> Noise:
+        """Return noise of known variances of the high level, and a low one next to exact."""
+        return KnownAtHigh(known.known)
+
+
+class KnownAtHigh(KnownNoise):
+    """Known variances of the high level, and a low one next to exact."""
+
+    def of_variances(self, variances: Tensor) -> KnownNoise:
+        """Return the noise with other variances."""
+        return KnownAtHigh(variances)
+
+    def variance(self, values: Values, places: Places, is_training: bool = False) -> Tensor:
+        """Return the variances, of both levels at the training inputs."""
+        variances = super().variance(values, places, is_training)
+        if not is_training:
+            return variances
+        num_low = places.x.shape[-2] - variances.shape[-1]
+        return torch.nn.functional.pad(variances, (num_low, 0), value=_EXACT)

@@ -1,0 +1,277 @@
+"""A simulator that is known by its runs, as physics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.quasirandom import SobolEngine
+
+from gpadjust.checks import checked_whole
+from gpadjust.core import MATERN52, RBF, Stationary, ZeroMeanGP, fit
+from gpadjust.core.model import GP
+from gpadjust.core.unknowns import standard_normal
+from gpadjust.physics import Physics, Unknown
+from gpadjust.physics.unknown import ParameterValues
+
+_PLACES = 128  # at which errors are told apart
+_WAVES = 8  # whose sum is noise
+
+
+class EmulatedPhysics(Physics):
+    r"""A simulator that is known by its runs, with what an emulator of them does not know.
+
+    The emulator is a Gaussian process of the runs, fitted when the physics is made. f_p is one of
+    the functions that the simulator may be by its posterior,
+
+    .. math:: f_p(x) = m(x) + \sum_{k=1}^K z_k v_k(x), \quad z_k \sim N(0, 1),
+
+    with its mean m and the principal components v of its errors. The z are further unknown
+    parameters ``emulator_1`` and so on, so that each draw of a model contains one function, and
+    intervals are wide where there are no runs; measurements correct the emulator, too. Where they
+    are 0, as before a fit, f_p is the mean. With unknown parameters that are inputs of the runs,
+    ``CKA`` and ``PhysicsMeanGP`` are the calibration of Kennedy and O'Hagan (2001), with the
+    emulator fitted to the runs alone.
+
+    Args:
+        runs_X: Inputs of the runs, ``N x (d + p)``: those that the data have, and then values of
+            the unknown parameters; in a frame these are the columns of their names, with or
+            without a unit, as ``"drag [1]"``.
+        runs_Y: Outputs of the runs, ``N x m``; NaN where one is missing, a row of NaN is a run
+            that failed.
+        inputs: The columns of the data that are the first ``d`` inputs of the runs, in their order.
+            Default: all.
+        unknowns: The unknown parameters by name.
+        is_random: Whether the simulator is random, and f_p its mean. Otherwise what the emulator
+            takes for noise of the runs is their finest detail, which is unknown between them.
+        model_factory: Makes the emulator of ``X`` and ``Y``. Default: ``ZeroMeanGP`` with an RBF
+            kernel or a Matern one (5/2), whichever predicts runs that are left out with the higher
+            density. ``functools.partial(CKA, physics=...)`` of a formula needs fewer runs.
+        fit_options: Options of its :func:`~gpadjust.fit`, such as ``{"method": "map"}``.
+        num_components: Number ``K`` of components; they have the variance of those left out, too.
+        seed: Seed of the places at which components are computed.
+        name: The name in messages. Default: the class's.
+
+    Attributes:
+        emulator: The fitted model of the runs, to look at: ``emulator.left_out()``.
+
+    Raises:
+        TypeError: If the factory makes no exact model of this library.
+        ValueError: If there are fewer columns than unknown parameters, or the runs are no data.
+
+    Example:
+        >>> from gpadjust.core import PhysicsMeanGP
+        >>> runs_X = torch.linspace(0, 3, 9, dtype=torch.float64).unsqueeze(-1)
+        >>> simulator = EmulatedPhysics(runs_X, torch.sin(2 * runs_X), num_components=4)
+        >>> X = torch.linspace(0, 3, 5, dtype=torch.float64).unsqueeze(-1)
+        >>> model = PhysicsMeanGP(X, torch.sin(2 * X) + X, physics=simulator)
+        >>> result = fit(model)
+        >>> round(model.predict(torch.tensor([[1.1]]).double()).mean.item(), 1)
+        1.9
+    """
+
+    def __init__(
+        self, runs_X: Any, runs_Y: Any, *, inputs: Sequence[int] | None = None,
+        unknowns: Mapping[str, Unknown] | None = None, is_random: bool = False,
+        model_factory: Callable[[Any, Any], GP] | None = None,
+        fit_options: Mapping[str, Any] | None = None, num_components: int = 8, seed: int = 0,
+        name: str | None = None,
+    ) -> None:  # fmt: skip
+        own, number = dict(unknowns or {}), checked_whole("num_components", num_components, 1)
+        further = {f"emulator_{k + 1}": Unknown(0.0, sd=1.0) for k in range(number)}
+        if taken := own.keys() & further.keys():
+            raise ValueError(f"Expected other names than {sorted(taken)}, of the emulator's error.")
+        super().__init__(unknowns=own | further, inputs=inputs, name=name)
+        runs_X = _with_unknowns_last(runs_X, [*own], self.name)
+        failed = _missing_rows(runs_Y)
+        if failed.any():
+            runs_X, runs_Y = (_rows(each, ~failed) for each in (runs_X, runs_Y))
+        shape = tuple(runs_X.shape)
+        if len(shape) != 2 or shape[-1] <= len(own):
+            raise ValueError(
+                f"Expected runs N x (d + {len(own)}): inputs that the data have, and then "
+                f"{len(own)} unknown parameter(s); found shape {shape}."
+            )
+        self.num_inputs = shape[-1] - len(own)
+        if self.inputs is not None and len(self.inputs) != self.num_inputs:
+            raise ValueError(
+                f"Expected inputs as the numbers of {self.num_inputs} columns of the data, which "
+                f"the runs have besides unknown parameters; found {self.inputs}."
+            )
+        emulator = _fitted(runs_X, runs_Y, model_factory, dict(fit_options or {}))
+        self.num_outputs = emulator.num_outputs
+        # In a tuple, no submodule: it is no part of a model that a fit changes or a copy copies.
+        self._emulator = (emulator,)
+        self._components = _Components(emulator, number, seed, self.num_inputs, not is_random)
+        self._kept: tuple[Tensor, Tensor] | None = None  # the components at the last rows
+
+    @property
+    def emulator(self) -> GP:
+        """The fitted model of the runs."""
+        return self._emulator[0]
+
+    def read(self, X: Tensor) -> Tensor:
+        """Return the columns of ``X`` that the runs have, checked."""
+        columns = super().read(X)
+        if columns.shape[-1] != self.num_inputs:
+            raise ValueError(
+                f"Expected {self.num_inputs} columns, as the runs of {self.name!r} have besides "
+                f"the unknown parameters; found {columns.shape[-1]}. Name those of the data with "
+                "inputs=[...], and which inputs of the runs are unknown with unknowns={...}."
+            )
+        return columns
+
+    def check_names(self, names: Sequence[str]) -> None:
+        """Raise a ValueError if the data have the inputs of the runs in another order."""
+        own = self.emulator.data.input_names[: self.num_inputs]
+        columns = tuple(names) if self.inputs is None else tuple(names[i] for i in self.inputs)
+        if columns != own and {*columns} == {*own}:
+            raise ValueError(
+                f"Expected the inputs {own} of the runs of {self.name!r} in this order; found "
+                f"{columns}. Give inputs=[...], the numbers of the columns."
+            )
+
+    def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
+        """Return the outputs ``N x m`` of the function that each row's parameters name."""
+        p = self.emulator.data.X.shape[-1] - self.num_inputs
+        values = parameters[0].rows
+        rows, z = torch.cat([X, values[:, :p]], -1).double(), values[:, p:]
+        if rows.requires_grad and torch.is_grad_enabled():
+            return self._sum(self._components.at(rows), z)
+        rows, place = _distinct(rows)
+        if self._kept is None or not torch.equal(self._kept[0], rows):
+            self._kept = (rows, self._components.at(rows))
+        return self._sum(self._kept[1][place], z)
+
+    def _sum(self, parts: Tensor, z: Tensor) -> Tensor:
+        """Return ``m + sum_k z_k v_k``, of ``N x m x (1 + K)``."""
+        return parts[..., 0] + (parts[..., 1:] @ z.to(parts).unsqueeze(-1)).squeeze(-1)
+
+
+class _Components:
+    r"""The mean of an emulator and the principal components of its errors.
+
+    With the posterior covariance :math:`C(R, R) = E \Lambda E^T` at some places R it is
+    :math:`v_k(x) = C(x, R) \, e_k / \sqrt{\lambda_k}` (Nystrom). C is that of the mixture,
+    :math:`E_s C_s + Cov_s(m_s, m_s)`, for an emulator that contains draws s.
+    """
+
+    @torch.no_grad()
+    def __init__(
+        self, emulator: GP, number: int, seed: int, num_inputs: int, has_details: bool
+    ) -> None:
+        X = emulator.data.X
+        self.emulator, self.num_inputs = emulator, num_inputs
+        low, high = X.amin(0), X.amax(0)
+        places = SobolEngine(len(low), seed=seed, scramble=True).draw(_PLACES, dtype=low.dtype)
+        self.low, self.range = low, (high - low).where(high > low, torch.ones_like(low))
+        self.data = emulator.conditioning()
+        self.places = emulator.at(low + self.range * places.to(low))
+        mean, K = self.data.joint(self.places)  # S x m x Q (x Q)
+        S, m, q = mean.shape
+        away = mean - mean.mean(0)
+        C = torch.zeros(m, q, m, q).to(K)
+        for j in range(m):
+            C[j, :, j] = K.mean(0)[j]
+        flat = away.flatten(1)
+        C = C.reshape(m * q, m * q) + flat.mT @ flat / S
+        size, vectors = torch.linalg.eigh(C)
+        number = min(number, len(size))
+        size, vectors = size[-number:].flip(0).clamp_min(1e-300), vectors[:, -number:].flip(1)
+        # Components left out: the others are as much larger.
+        larger = (C.trace() / size.sum()).sqrt()
+        weights = (larger * vectors / size.sqrt()).reshape(m, q, number)
+        self.weights = weights  # m x Q x K
+        cross = self.places.cross(self.data.train) * self.data.observed.unsqueeze(-2)
+        solved = torch.cholesky_solve(cross.mT, self.data.chol)  # S x m x n x Q
+        self.of_runs = solved @ weights
+        self.of_means = torch.einsum("smq,mqk->sk", away, weights)  # S x K
+        noise = emulator.noise.variance(self.data.train.values, emulator.places(X, emulator.values))
+        self.detail = has_details * (noise.mean((0, -1)).expand(m) / number).sqrt()  # m
+        shape, generator = (num_inputs, _WAVES * m * number), torch.Generator().manual_seed(seed)
+        self.frequencies = 1e5 * standard_normal(shape, generator, X)
+        self.phases = 10 * standard_normal(shape[1:], generator, X)
+
+    def at(self, rows: Tensor) -> Tensor:
+        """Return the mean and the components at rows ``N x D``, ``N x m x (1 + K)``."""
+        at, emulator = self.emulator.at(rows, self.data.train.values), self.emulator
+        mean, cross = self.data.mean(at)  # S x m x N (x n)
+        components = (at.cross(self.places) @ self.weights - cross @ self.of_runs).mean(0)
+        center = mean.mean(0)
+        away = (mean - center).movedim(0, -1)  # m x N x S
+        components = components + away @ self.of_means / len(mean) + self._details(rows)
+        parts = torch.cat([center.unsqueeze(-1), components], -1)
+        return (parts * emulator.unit.unsqueeze(-1)).movedim(0, 1)
+
+    def _details(self, rows: Tensor) -> Tensor:
+        """Return ``m x N x K`` of the variance of the noise: independent at different inputs.
+
+        They are sums of waves too short to be seen, without derivatives.
+        """
+        d, m = self.num_inputs, len(self.detail)
+        x = ((rows.detach() - self.low) / self.range)[:, :d]
+        waves = (x @ self.frequencies + self.phases).cos().reshape(len(x), _WAVES, m, -1)
+        return self.detail[:, None, None] * waves.sum(1).movedim(0, 1) * (2 / _WAVES) ** 0.5
+
+
+def _distinct(rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Return rows that differ ``U x D``, and of each row ``N`` its number in them."""
+    generator = torch.Generator().manual_seed(0)
+    keys, place = (rows @ standard_normal(rows.shape[1:], generator, rows)).unique(
+        return_inverse=True
+    )
+    some = place.new_zeros(len(keys)).scatter_(0, place, torch.arange(len(rows)).to(place))
+    if torch.equal(rows[some][place], rows):
+        return rows[some], place
+    return rows.unique(dim=0, return_inverse=True)
+
+
+def _fitted(
+    runs_X: Any, runs_Y: Any, model_factory: Callable[[Any, Any], GP] | None, options: Any
+) -> GP:
+    """Return the fitted model of the runs, by default the one of two that predicts them better."""
+    factories = [model_factory] if model_factory else [_of_profile(p) for p in (RBF, MATERN52)]
+    fitted = []
+    for factory in factories:
+        emulator = factory(runs_X, runs_Y)
+        if not isinstance(emulator, GP):
+            raise TypeError(f"Expected model_factory to return a GP; found {emulator!r}.")
+        fit(emulator, **options)
+        fitted.append(emulator.eval().requires_grad_(False))
+    return max(fitted, key=lambda e: float(e.left_out().log_density(e.data.Y).nansum()))
+
+
+def _of_profile(profile: Any) -> Callable[[Any, Any], GP]:
+    return lambda X, Y: ZeroMeanGP(X, Y, covar_module=Stationary(profile))
+
+
+def _with_unknowns_last(runs_X: Any, names: list[str], physics: str) -> Any:
+    """Return runs whose last columns are the unknown parameters, if columns have names."""
+    columns = getattr(runs_X, "columns", None)
+    if columns is None or not names:
+        return runs_X
+    bare = {str(each).partition(" [")[0]: each for each in columns}  # "drag [1]" is drag
+    bare |= {each: each for each in columns}
+    if absent := [each for each in names if each not in bare]:
+        raise ValueError(
+            f"Expected columns of the names {', '.join(absent)} in the runs of {physics!r}, the "
+            f"unknown parameters; found {[*columns]}."
+        )
+    unknown = [bare[each] for each in names]
+    return runs_X[[*(each for each in columns if each not in unknown), *unknown]]
+
+
+def _missing_rows(Y: Any) -> Tensor:
+    """Return which rows of outputs are missing altogether."""
+    values = Y if isinstance(Y, Tensor) else torch.as_tensor(np.array(Y))
+    missing = values.isnan() if values.is_floating_point() else torch.zeros_like(values).bool()
+    return missing.reshape(len(missing), -1).all(-1)
+
+
+def _rows(values: Any, kept: Tensor) -> Any:
+    """Return some rows of a tensor, an array or a frame."""
+    chosen = kept if isinstance(values, Tensor) else kept.numpy()
+    return values.loc[chosen] if hasattr(values, "loc") else values[chosen]

@@ -1,0 +1,78 @@
+"""Models made by a structure, such as CKA, or by a function of the user's own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from copy import deepcopy
+from functools import partial
+from typing import Any
+
+from botorch.models.model import Model
+
+from gpadjust.core.model import GP
+from gpadjust.kinds.links import Linked, linked
+
+ModelFactory = Callable[..., Model]
+"""A callable ``(X, Y, **physics) -> model``: a structure, ``functools.partial`` of one with further
+arguments, or a function."""
+
+
+def with_options(factory: ModelFactory, options: Mapping[str, Any]) -> ModelFactory:
+    """Return a factory with further arguments, except those that it has already.
+
+    Args:
+        factory: Makes a model.
+        options: Arguments by name; None is left out. A ``link`` makes the structure
+            :func:`~gpadjust.kinds.links.linked`.
+
+    Raises:
+        TypeError: If there is a link, and the factory is not a structure or a partial of one.
+    """
+    own = factory.keywords if isinstance(factory, partial) else {}
+    further = {n: v for n, v in options.items() if n not in own and v is not None}
+    if not further:
+        return factory
+    args = factory.args if isinstance(factory, partial) else ()
+    make: Any = factory.func if isinstance(factory, partial) else factory
+    if "link" in further:
+        if not isinstance(make, type) or not issubclass(make, GP):
+            raise TypeError(
+                "Expected a structure such as CKA, or functools.partial of one, for a link; found "
+                f"{factory!r}. Use the link in the function: LinkedCKA(X, Y, link=...)."
+            )
+        make = make if issubclass(make, Linked) else linked(make)
+    return partial(make, *args, **own, **further)
+
+
+def make_model(
+    factory: ModelFactory, X: Any, Y: Any, *, kind: type[Model] = Model, **arguments: Any
+) -> Any:
+    """Return a new model of data.
+
+    Args:
+        factory: Makes it. The arguments of a ``functools.partial`` other than a physics (kernels, a
+            noise) are copied, so that each model has its own.
+        X: Inputs, ``n x d``.
+        Y: Targets, ``n x m``.
+        kind: The class that the model has to be of.
+        arguments: Further arguments, such as ``physics``; None is left out.
+
+    Raises:
+        TypeError: If ``factory`` is not callable, does not take the arguments, or makes something
+            else.
+    """
+    if not callable(factory):
+        raise TypeError(
+            "Expected a callable (X, Y, **physics) that makes a model, such as CKA or "
+            f"functools.partial(CKA, rho_mean=2.0); found {factory!r}."
+        )
+    if isinstance(factory, partial):
+        own = {n: v if n == "physics" else deepcopy(v) for n, v in factory.keywords.items()}
+        factory = partial(factory.func, *factory.args, **own)
+    model = factory(X, Y, **{name: v for name, v in arguments.items() if v is not None})
+    if not isinstance(model, kind):
+        raise TypeError(
+            f"Expected the model factory to make a {kind.__module__.partition('.')[0]} "
+            f"{kind.__name__}; found {type(model).__name__}."
+        )
+    return model

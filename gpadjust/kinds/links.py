@@ -1,0 +1,396 @@
+"""Links: outputs with bounds, which a model without bounds is made of."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from statistics import NormalDist
+from typing import Any, NamedTuple, Self
+
+import torch
+from botorch.models.transforms.outcome import OutcomeTransform
+from botorch.posteriors.transformed import TransformedPosterior
+from torch import Tensor
+
+from gpadjust.checks import marked_rows
+from gpadjust.core.gaussian import Marginals, Prediction
+from gpadjust.core.model import GP
+from gpadjust.core.posterior import MixturePosterior
+from gpadjust.core.stacked import StackedGP
+from gpadjust.core.structures import (
+    CKA,
+    RRA,
+    CalibratedPhysics,
+    PhysicsMeanGP,
+    ScaleGP,
+    ZeroMeanGP,
+)
+
+NAMED = {"log": (0.0, math.inf), "logit": (0.0, 1.0)}
+_LOW, _HIGH = (NormalDist().cdf(z) for z in (-1.0, 1.0))  # the ends of 68.27 %
+
+
+class Link(NamedTuple):
+    r"""The link :math:`g(y) = \log \frac{y - a}{b - y} - c` of an output between bounds a and b.
+
+    Without an upper bound it is :math:`\log(y - a) - c`. The location c of each output is the mean
+    of the targets' links, so that nothing depends on the unit of a positive output.
+    """
+
+    lower: float
+    upper: float
+    location: Tensor  # c, m
+
+    @classmethod
+    def of(cls, link: Any) -> Link:
+        """Return the link of a name or of two bounds, without a location."""
+        if isinstance(link, str) and link not in NAMED:
+            raise ValueError(
+                f"Unknown link {link!r}; expected {', '.join(map(repr, NAMED))} or two bounds."
+            )
+        bounds = NAMED[link] if isinstance(link, str) else link
+        types = [type(v) for v in bounds] if isinstance(bounds, tuple | list) else []
+        if len(types) != 2 or not {*types} <= {int, float}:
+            raise TypeError(f"Expected link as 'log', 'logit' or two bounds; found {link!r}.")
+        lower, upper = map(float, bounds)
+        if not (math.isfinite(lower) and lower < upper):
+            raise ValueError(
+                f"Expected a finite lower bound below the upper one; found {lower:g} and {upper:g}."
+                " Of an output with an upper bound alone, model its distance from that."
+            )
+        return cls(lower, upper, torch.zeros((), dtype=torch.float64))
+
+    @property
+    def formula(self) -> str:
+        """The link as a formula of y."""
+        above = f"y - {self.lower:g}" if self.lower else "y"
+        if math.isinf(self.upper):
+            return f"log({above})"
+        above = f"({above})" if self.lower else above
+        return f"log({above} / ({self.upper:g} - y))"
+
+    @property
+    def range(self) -> str:
+        """The values that it takes, in words."""
+        above = f"above {self.lower:g}"
+        return above if math.isinf(self.upper) else f"{above} and below {self.upper:g}"
+
+    def holds(self, y: Tensor) -> Tensor:
+        """Return which values are within the bounds."""
+        return (y > self.lower) & (y < self.upper)
+
+    def value(self, y: Tensor) -> Tensor:
+        """Return g of values ``... x m``: infinite at the bounds and beyond, NaN stays."""
+        above = (y - self.lower).clamp_min(0.0).log() - self.location
+        return above if math.isinf(self.upper) else above - (self.upper - y).clamp_min(0.0).log()
+
+    def inverse(self, z: Tensor) -> Tensor:
+        """Return y of values g, within the bounds however large or small these are."""
+        z = z + self.location
+        bounds = z.new_tensor([self.lower, self.upper])
+        least, most = bounds.nextafter(bounds.flip(0)).tolist()
+        if math.isinf(self.upper):
+            return (self.lower + z.exp()).clamp(least, most)
+        return (self.lower + (self.upper - self.lower) * z.sigmoid()).clamp(least, most)
+
+    def log_slope(self, y: Tensor) -> Tensor:
+        """Return the logarithm of the derivative of g."""
+        above = (y - self.lower).log()
+        if math.isinf(self.upper):
+            return -above
+        return math.log(self.upper - self.lower) - above - (self.upper - y).log()
+
+    def of_outputs(self, outputs: Sequence[int] | slice) -> Link:
+        """Return the link of some outputs."""
+        return self._replace(location=self.location[outputs])
+
+
+class LinkedMarginals(Marginals):
+    """Mixtures of distributions at points by themselves that are Gaussian after a link."""
+
+    link: Link
+
+    def __new__(cls, means: Tensor, variances: Tensor, link: Link) -> Self:
+        """Make one of means and variances of the components, ``... x S x q x m``, after a link."""
+        new = super().__new__(cls, means, variances)
+        new.link = link
+        return new
+
+    @property
+    def prediction(self) -> Prediction:
+        """The median, and the square of half the width of the central 68.27 %, ``... x q x m``.
+
+        Moments would be those of rare values: of a wide mixture they may be infinite, and the mean
+        beyond the ends of every interval.
+        """
+        sd = (self.quantile(_HIGH) - self.quantile(_LOW)) / 2
+        largest = torch.finfo(sd.dtype).max
+        return Prediction(self.quantile(0.5), sd.square().clamp_max(largest))
+
+    def quantile(self, level: float) -> Tensor:
+        """Return the quantiles ``... x q x m`` of a level."""
+        return self.link.inverse(Marginals(*self).quantile(level))
+
+    def probability(self, Y: Tensor) -> Tensor:
+        """Return the probability of values below ``Y``, ``... x q x m``."""
+        return Marginals(*self).probability(self.link.value(Y))
+
+    def log_density(self, Y: Tensor) -> Tensor:
+        """Return the log density at values ``Y``, ``... x q x m``; NaN where they are."""
+        outside = ~self.link.holds(Y) & ~Y.isnan()
+        density = Marginals(*self).log_density(self.link.value(Y)) + self.link.log_slope(Y)
+        return density.masked_fill(outside, -math.inf)
+
+
+class LinkedPosterior(TransformedPosterior):
+    """The joint posterior of outputs with a link, in the user's units.
+
+    Samples are exact; ``mean`` and ``variance`` are as of :class:`LinkedMarginals`.
+    """
+
+    def __init__(self, mixture: MixturePosterior, link: Link) -> None:
+        super().__init__(mixture, link.inverse)
+        self.mixture, self.link = mixture, link
+
+    @property
+    def marginals(self) -> LinkedMarginals:
+        """The distributions at each point by itself."""
+        return LinkedMarginals(*self.mixture.marginals, self.link)
+
+    @property
+    def mean(self) -> Tensor:
+        """The medians, ``... x q x m``."""
+        return self.marginals.quantile(0.5)
+
+    @property
+    def variance(self) -> Tensor:
+        """The squares of half the widths of the central 68.27 %, ``... x q x m``."""
+        return self.marginals.prediction.variance
+
+    @property
+    def distribution(self) -> Any:
+        """Absent: an AttributeError, as it is not Gaussian."""
+        raise AttributeError(
+            "The posterior of outputs with a link is not Gaussian; take samples (`rsample`), "
+            "`mean`, `variance` and `quantile`."
+        )
+
+    def quantile(self, value: Tensor) -> Tensor:
+        """Return quantiles ``... x q x m``; those of several levels are in front."""
+        quantiles = [self.marginals.quantile(level) for level in value.flatten().tolist()]
+        return torch.stack(quantiles) if value.numel() > 1 else quantiles[0]
+
+    def density(self, value: Tensor) -> Tensor:
+        """Return the density of each output at each point, at values ``... x q x m``."""
+        return self.marginals.log_density(value).exp()
+
+    def scalarized(self, weights: Tensor, offset: float = 0.0) -> TransformedPosterior:
+        """Return the posterior of one output times its weight, plus an offset."""
+        outputs = weights.nonzero().flatten().tolist()
+        mean, K = self.mixture.components
+        if weights.shape != mean.shape[-2:-1] or len(outputs) != 1:
+            raise ValueError(
+                f"Expected the weight of one of {mean.shape[-2]} outputs with a link; found "
+                f"{weights.tolist()}. Sum samples: objective=LinearMCObjective(weights)."
+            )
+        mixture, w = MixturePosterior(mean[..., outputs, :], K[..., outputs, :, :]), weights.sum()
+        own = LinkedPosterior(mixture, self.link.of_outputs(outputs))
+        return TransformedPosterior(
+            own,
+            lambda y: w * y + offset,
+            lambda mean, variance: w * mean + offset,
+            lambda mean, variance: w.square() * variance,
+        )
+
+
+class NotGaussian(OutcomeTransform):
+    """A sign to BoTorch's lists of models that posteriors are not Gaussian; it changes nothing."""
+
+    def forward(self, Y: Tensor, Yvar: Tensor | None = None, X: Tensor | None = None) -> Any:
+        """Return observations and variances as they are."""
+        return Y, Yvar
+
+
+class Linked(GP):
+    r"""A structure of outputs with bounds: it is one of :math:`g(y)`, with the physics g(f_p).
+
+    Data, predictions, intervals, samples and functions are in the user's units and within the
+    bounds. A logarithm makes rho an exponent and errors relative. Predictions are medians, with the
+    square of half the width of the central 68.27 % as variance, see :class:`LinkedMarginals`. Known
+    variances are those of g(y) by the delta method. ``term``, ``rho``, ``delta`` and the summary
+    are on the scale of g, and so are kernels and means that are given.
+
+    Args as of the structure, and:
+
+    Args:
+        link: ``"log"`` of positive outputs, ``"logit"`` of shares between 0 and 1, or two bounds,
+            of which the upper one may be infinite.
+
+    Raises:
+        TypeError: If the link is something else.
+        ValueError: If a bound is, or targets are not within the bounds.
+        PhysicsError: If the physics is not.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust.core import fit
+        >>> from gpadjust.kinds.links import LinkedCKA
+        >>> X = torch.linspace(0.1, 2, 8, dtype=torch.float64).unsqueeze(-1)
+        >>> share = 1 - (-X).exp()
+        >>> model = LinkedCKA(X, share, physics=lambda X: X / (1 + X), link="logit")
+        >>> result = fit(model)
+        >>> lower, upper = model.interval(torch.tensor([[0.0001], [9.0]]).double())
+        >>> bool((lower > 0).all() and (upper < 1).all())
+        True
+    """
+
+    outcome_transform = NotGaussian()
+
+    def __init__(
+        self, train_X: Any, train_Y: Any, train_Yvar: Any = None, *, link: Any = "log",
+        **options: Any,
+    ) -> None:  # fmt: skip
+        self.link = Link.of(link)
+        super().__init__(train_X, train_Y, train_Yvar, **options)
+        self.settings["link"] = link
+
+    # What the core asks for.
+
+    @property
+    def scale(self) -> str:  # type: ignore[override]
+        """The link as a formula, and the location that is subtracted."""
+        return f"{self.link.formula} - [{', '.join(f'{c:.6g}' for c in self.link.location)}]"
+
+    def read_scale(self, Y: Tensor) -> None:
+        """Keep the mean of the targets' links."""
+        self.link = self.link._replace(location=self.on_gaussian_scale(Y).nanmean(-2))
+
+    def holds(self, Y: Tensor) -> Tensor:
+        """Return which values are within the bounds, or NaN."""
+        return self.link.holds(Y) | Y.isnan()
+
+    def on_gaussian_scale(self, Y: Tensor) -> Tensor:
+        """Return g of targets or outputs; a ValueError if some are not within the bounds."""
+        outside = ~self.holds(Y)
+        if outside.any():
+            rows = marked_rows(outside.any(-1))
+            raise ValueError(
+                f"Expected targets {self.link.range}, as {self.link.formula} is modelled; found "
+                f"{float(Y[outside][0]):.6g} in {len(rows)} row(s), the first row {rows[0]}. "
+                "Correct them, make them NaN if they are missing, or give other bounds: "
+                "link=(lower, upper)."
+            )
+        return self.link.value(Y)
+
+    def off_gaussian_scale(self, Z: Tensor) -> Tensor:
+        """Return y of values of g."""
+        return self.link.inverse(Z)
+
+    def noise_in_units(self, Y: Tensor, Yvar: Tensor) -> Tensor:
+        """Return known variances of targets by the delta method, ``... x m x n``, in units."""
+        sd = super().noise_in_units(Y, Yvar).sqrt() * self.link.log_slope(Y).exp().mT
+        variances = sd.square()
+        variances = variances.where(~Y.isnan().mT, variances.nanmean(-1, keepdim=True))
+        return variances.nan_to_num(nan=1.0)
+
+    def usual_noise(self, Y: Tensor) -> Tensor | None:
+        """Return the mean of the known variances of g, as variances of observations."""
+        if self.data.Yvar is None or self.noise.known is None:
+            return super().usual_noise(Y)
+        variances = (self.noise.known.mean(-1, keepdim=True) * self.unit.square()).mT
+        return variances * (-2 * self.link.log_slope(Y)).exp()
+
+    def log_unit(self) -> Tensor:
+        """Return the log densities of the targets, ``m``, in the user's units less the model's."""
+        return super().log_unit() + self.link.log_slope(self.data.Y).nansum(-2)
+
+    def components(self, X: Any, observation_noise: bool | Tensor = False) -> tuple[Tensor, Tensor]:
+        """Return means and variances of each draw, ``... x S x q x m``, on the scale of g."""
+        return super().components(X, self._noise_of_g(X, observation_noise))
+
+    def mixture(
+        self, X: Any, outputs: list[int] | slice, observation_noise: bool | Tensor
+    ) -> MixturePosterior:
+        """Return the joint posterior of some outputs on the scale of g."""
+        return super().mixture(X, outputs, self._noise_of_g(X, observation_noise))
+
+    def _noise_of_g(self, X: Any, noise: bool | Tensor) -> bool | Tensor:
+        """Return given variances of observations at predictions by the delta method."""
+        if noise is True or noise is False:
+            return noise
+        variances = self.checked_noise(noise, self.data.new_inputs(X))
+        median = self.marginals_of(*super().components(X)).quantile(0.5)
+        return variances * (2 * self.link.log_slope(median)).exp()
+
+    def marginals_of(self, means: Tensor, variances: Tensor) -> LinkedMarginals:
+        """Return the distributions of components on the scale of g, ``... x S x q x m``."""
+        return LinkedMarginals(means, variances, self.link)
+
+    def posterior_of(self, mixture: MixturePosterior, outputs: Any) -> LinkedPosterior:
+        """Return the posterior of some outputs of a mixture on the scale of g."""
+        return LinkedPosterior(mixture, self.link.of_outputs(outputs))
+
+    def subset_output(self, idcs: list[int]) -> Self:
+        """Return the model of some outputs; a ValueError if there are none of these numbers."""
+        new = super().subset_output(idcs)
+        new.link = self.link.of_outputs(self.checked_outputs(idcs))
+        return new
+
+    def to(self, *args: Any, **options: Any) -> Self:
+        """Move the model to a device, with its data."""
+        super().to(*args, **options)
+        self.link = self.link._replace(location=self.link.location.to(self.u))
+        return self
+
+    def as_single_task_gp(self, draw: int | None = None) -> Any:
+        """Raise a TypeError, as BoTorch's SingleTaskGP has no such link."""
+        raise TypeError(
+            f"{type(self).__name__} is Gaussian in {self.link.formula}, not in y: give its "
+            "posterior, samples or functions to code that takes a SingleTaskGP."
+        )
+
+
+class LinkedCKA(Linked, CKA):
+    """:class:`~gpadjust.core.CKA` of outputs with bounds, see :class:`Linked`."""
+
+
+class LinkedRRA(Linked, RRA):
+    """:class:`~gpadjust.core.RRA` of outputs with bounds, see :class:`Linked`."""
+
+
+class LinkedPhysicsMeanGP(Linked, PhysicsMeanGP):
+    """:class:`~gpadjust.core.PhysicsMeanGP` of outputs with bounds, see :class:`Linked`."""
+
+
+class LinkedScaleGP(Linked, ScaleGP):
+    """:class:`~gpadjust.core.ScaleGP` of outputs with bounds, see :class:`Linked`."""
+
+
+class LinkedZeroMeanGP(Linked, ZeroMeanGP):
+    """:class:`~gpadjust.core.ZeroMeanGP` of outputs with bounds, see :class:`Linked`."""
+
+
+class LinkedCalibratedPhysics(Linked, CalibratedPhysics):
+    """:class:`~gpadjust.core.CalibratedPhysics` of outputs with bounds, see :class:`Linked`."""
+
+
+_LINKED: dict[Any, Any] = {each.__bases__[1]: each for each in Linked.__subclasses__()}
+
+
+def linked(structure: type[GP]) -> type[Linked]:
+    """Return the class of a structure with a link; :func:`save` needs one of a module.
+
+    Example:
+        >>> linked(CKA).__name__
+        'LinkedCKA'
+    """
+    if not isinstance(structure, type) or not issubclass(structure, GP):
+        raise TypeError(f"Expected a structure, such as CKA; found {structure!r}.")
+    if issubclass(structure, Linked):
+        return structure
+    made = type(f"Linked{structure.__name__}", (Linked, structure), {})
+    own: type[Linked] = _LINKED.setdefault(structure, made)
+    return own
+
+
+LinkedStackedGP = StackedGP  # a mixture has the link of its models

@@ -1,0 +1,203 @@
+"""Larger variances near left-out observations that were missed by more than predicted."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from copy import deepcopy
+from typing import Any, Self
+
+import torch
+from torch import Size, Tensor
+from torch.nn import Module
+
+from gpadjust.checks import check_kind
+from gpadjust.core.data import ArrayLike, Data
+from gpadjust.core.gaussian import DRAWS, Marginals
+from gpadjust.core.model import GP, Predictive
+from gpadjust.core.posterior import MixturePosterior
+from gpadjust.physics import Physics
+
+_EXPECTED = 1.0  # observations that err as predicted, besides those near a point
+_ROUNDING = 1e-6  # of the targets' spread
+
+
+class Widened(Predictive):
+    """A model whose variances of the function, not of the noise, are multiplied by a factor.
+
+    A subclass has ``factors``.
+    """
+
+    likelihood = None  # FantasizeMixin reads it
+
+    def __init__(self, model: GP) -> None:
+        super().__init__()
+        check_kind("model", model, GP, "a model of gpadjust.core, fitted")
+        self.model = model.eval()
+
+    @abstractmethod
+    def factors(self, X: Tensor) -> Tensor:
+        """Return the factors at inputs ``... x q x d``, ``... x q x m``."""
+
+    @property
+    def source(self) -> GP:
+        """The model whose variances are multiplied."""
+        return self.model
+
+    @property
+    def data(self) -> Data:
+        """The training data."""
+        return self.model.data
+
+    @property
+    def physics(self) -> list[Physics]:
+        """The physics of the model."""
+        return self.model.physics
+
+    @property
+    def num_outputs(self) -> int:
+        """``m``."""
+        return self.model.num_outputs
+
+    @property
+    def batch_shape(self) -> Size:
+        """The batch shape of the data: empty but for fantasies."""
+        return self.model.batch_shape
+
+    def components(
+        self, X: ArrayLike, observation_noise: bool | Tensor = False
+    ) -> tuple[Tensor, Tensor]:
+        """Return means and variances of each draw, ``... x S x q x m``."""
+        X = self.data.new_inputs(X)
+        mean, variance = self.source.components(X)
+        more = (self.factors(X) - 1).unsqueeze(DRAWS) * variance
+        if observation_noise is not False:
+            _, variance = self.source.components(X, observation_noise)
+        return mean, variance + more
+
+    def mixture(
+        self, X: ArrayLike, outputs: list[int] | slice, observation_noise: bool | Tensor
+    ) -> MixturePosterior:
+        """Return the joint posterior of some outputs."""
+        X = self.data.new_inputs(X)
+        mean, K = self.source.mixture(X, outputs, False).components
+        root = self.factors(X)[..., outputs].sqrt().mT.unsqueeze(-3)  # ... x 1 x m x q
+        more = K * (root.unsqueeze(-1) * root.unsqueeze(-2) - 1)
+        if observation_noise is not False:
+            _, K = self.source.mixture(X, outputs, observation_noise).components
+        return MixturePosterior(mean, K + more)
+
+    def marginals_of(self, means: Tensor, variances: Tensor) -> Marginals:
+        """Return the distributions of Gaussian components, as the model does."""
+        return self.model.marginals_of(means, variances)
+
+    def posterior_of(self, mixture: MixturePosterior, outputs: list[int] | slice) -> Any:
+        """Return the posterior of a mixture, as the model does."""
+        return self.model.posterior_of(mixture, outputs)
+
+    def condition_on_observations(
+        self, X: ArrayLike, Y: ArrayLike, noise: Tensor | None = None, **_: Any
+    ) -> Self:
+        """Return the model with further observations and the same factors."""
+        return self.of_model(self.model.condition_on_observations(X, Y, noise))
+
+    def of_model(self, model: GP) -> Self:
+        """Return another model with the same factors."""
+        return deepcopy(self, {id(self.model): model})
+
+    def sample_functions(
+        self, num_functions: int, seed: int | None = None, num_features: int = 1024
+    ) -> Module:
+        """Draw functions ``... x q x d`` to ``k x ... x q x m`` from the posterior."""
+        functions = self.source.sample_functions(num_functions, seed, num_features)
+        return WidenedFunctions(self, functions)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.model!r})"
+
+
+class WidenedFunctions(Module):
+    """Functions of a model, as much farther from the means of their draws as it is widened."""
+
+    def __init__(self, widened: Widened, functions: Any) -> None:
+        super().__init__()
+        self.functions, self.factors = functions, widened.factors
+
+    def forward(self, X: Tensor) -> Tensor:
+        """Return the values ``k x ... x q x m`` of all functions at ``... x q x d``."""
+        means = self.functions.model.components(X)[0].movedim(DRAWS, 0)
+        return self._farther(self.functions(X), means, self.factors(X))
+
+    def each(self, X: Tensor) -> Tensor:
+        """Return the values ``k x q x m`` of each function at points of its own, ``k x q x d``."""
+        means = self.functions.model.components(X)[0]  # k x k x q x m
+        means = means.diagonal(dim1=0, dim2=1).movedim(-1, 0)
+        return self._farther(self.functions.each(X), means, self.factors(X))
+
+    def _farther(self, values: Tensor, means: Tensor, factors: Tensor) -> Tensor:
+        model = self.functions.model
+        away = model.on_gaussian_scale(values) - means
+        Y: Tensor = model.off_gaussian_scale(means + factors.sqrt() * away)
+        return Y
+
+
+class LocalErrors(Widened):
+    r"""A fitted model with larger variances near left-out observations that it has missed.
+
+    Where a function has a kink or a jump, as by dry friction or an impact, a process with a
+    stationary kernel is too sure nearby. With :math:`z_i^2` the squared error of a left-out
+    observation over its predicted variance, variances at x are multiplied by
+
+    .. math:: \max\Big(1, \frac{a + \sum_i k(x, x_i) z_i^2}{a + \sum_i k(x, x_i)}\Big),
+
+    with an RBF kernel k of the shortest lengthscale of all terms, input by input, and a = 1.
+    Locally weighted conformal prediction (Lei et al. 2018) has such a scale, too, by a model of
+    residuals. There is no guarantee here: left-out observations had their say in hyper-parameters.
+
+    Args:
+        model: The fitted model; each of its kernels has a lengthscale for each input.
+
+    Attributes:
+        squares: :math:`z_i^2`, ``m x n``; 1 where an observation is missing.
+        points: The inputs of kernels, ``n x d``.
+        lengthscale: That of k, ``m x 1 x d``.
+
+    Example:
+        >>> from gpadjust.core import ZeroMeanGP
+        >>> X = torch.linspace(0, 1, 9, dtype=torch.float64).unsqueeze(-1)
+        >>> wider = LocalErrors(ZeroMeanGP(X, (X - 0.5).abs()))
+        >>> bool((wider.predict(X).variance >= wider.model.predict(X).variance).all())
+        True
+    """
+
+    @torch.no_grad()
+    def __init__(self, model: GP) -> None:
+        super().__init__(model)
+        Y, d = model.on_gaussian_scale(self.data.Y), self.data.X.shape[-1]
+        self.points = model.kernel_inputs(self.data.X)
+        scales = [v for name, v in model.values.items() if name.endswith(".kernel.lengthscale")]
+        has_kernels = sum(term.kernel is not None for term in model.terms)
+        if len(scales) < has_kernels or any(v.shape[-1] != d for v in scales):
+            raise ValueError(
+                f"Expected kernels with a lengthscale for each of {d} inputs, such as "
+                f"Stationary(MATERN52); found {[term.kernel for term in model.terms]}."
+            )
+        shortest = torch.stack(scales).amin(0).log().mean(0).exp()  # m x d
+        self.lengthscale = shortest.unsqueeze(-2)
+        mean, variance = Marginals(*model.left_out()).prediction
+        spread = _ROUNDING * (Y - Y.nanmean(-2, keepdim=True)).square().nanmean(-2).sqrt()
+        squares = (Y - mean).square() / variance.maximum(spread.square())
+        self.squares = squares.nan_to_num(nan=1.0, posinf=1.0).mT
+
+    def factors(self, X: Tensor) -> Tensor:
+        """Return the factors at inputs ``... x q x d``, ``... x q x m``."""
+        x = self.model.kernel_inputs(X).unsqueeze(-3) / self.lengthscale  # ... x m x q x d
+        away = x.unsqueeze(-2) - (self.points / self.lengthscale).unsqueeze(-3)
+        near = (-0.5 * away.square().sum(-1)).exp()  # ... x m x q x n
+        total = (near @ self.squares.unsqueeze(-1)).squeeze(-1)
+        return ((_EXPECTED + total) / (_EXPECTED + near.sum(-1))).clamp_min(1.0).mT
+
+    def subset_output(self, idcs: list[int]) -> Self:
+        """Return the model of some outputs; a ValueError if there are none of these numbers."""
+        new, numbers = self.of_model(self.model.subset_output(idcs)), self.checked_outputs(idcs)
+        new.squares, new.lengthscale = self.squares[numbers], self.lengthscale[numbers]
+        return new

@@ -1,0 +1,128 @@
+"""Noise that grows with the size of what is measured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gpadjust.core import GP, Noise
+from gpadjust.core.kernels import exponents
+from gpadjust.core.terms import Places, TermSum
+
+_FLOOR = 1e-3  # of the largest size, that a size is at least
+_NEAR = 0.5  # of the shortest lengthscale, within which sizes are alike
+_FAR = 1e-6  # weight of the mean of all sizes, which counts far from all points
+_STILL = 0.2  # change of the logarithm of a size that needs no other fit
+_ROUNDS = 4
+
+
+class RelativeNoise(Noise):
+    r"""Noise of the variance :math:`s_0 + s_1 g(x)^2`, both numbers learnt.
+
+    The size g is that of the physics (of several, of their sum with the prior means of the rhos),
+    over its root mean square at the training inputs. Of a model without physics it is that of the
+    posterior mean by rough fits: at the training inputs, and between them by a weighted mean of
+    its logarithms, with an RBF kernel of half the shortest lengthscale. The numbers have the names
+    ``noise.constant`` and ``noise.relative``.
+
+    Args:
+        sizes: What a fit without physics has learnt: training inputs ``m x n x d``, log sizes
+            ``m x n``, lengthscales ``m x 1 x d``, and root mean squares ``m x 1``.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust.core import CKA, fit
+        >>> X = torch.linspace(0, 1, 12, dtype=torch.float64).unsqueeze(-1)
+        >>> Y = (1 + 0.05 * torch.cos(99 * X)) * torch.exp(6 * X)
+        >>> model = CKA(X, Y, physics=lambda X: torch.exp(6 * X), noise=RelativeNoise())
+        >>> result = fit(model)
+        >>> _, relative = model.noise.standard_deviations(model)
+        >>> 0.02 < relative.median() < 0.1
+        tensor(True)
+    """
+
+    def __init__(self, sizes: Sequence[Tensor] | None = None) -> None:
+        super().__init__(("constant", "relative"))
+        self.sizes = None if sizes is None else tuple(sizes)
+        self.weights: list[tuple[int, Tensor]] = []  # of each physics in g, m x 1
+        self.size: Tensor | None = None if sizes is None else sizes[-1]  # of g where it is 1
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What builds it again."""
+        return {"sizes": self.sizes}
+
+    def of_terms(self, terms: TermSum) -> RelativeNoise:
+        """Return the noise with g by the prior mean of a model of these terms."""
+        new = RelativeNoise(self.sizes)
+        means = [(term.physics, term.mean) for term in terms.terms if term.physics is not None]
+        if means:
+            f_p = torch.stack([mean * terms.f[i] for i, mean in means]).sum(0)
+            size = f_p.square().mean(-1, keepdim=True).sqrt()
+            new.size = size.where(size > 0, torch.ones_like(size))
+            new.weights = [(i, mean / new.size) for i, mean in means]
+        return new
+
+    def shares(self, places: Places) -> Tensor:
+        """Return 1 and the square of g, ``... x S x m x n x 2``."""
+        squares = torch.ones_like(places.x[..., 0])
+        if self.weights:
+            squares = torch.stack([w * places.f[i] for i, w in self.weights]).sum(0).square()
+        elif self.sizes is not None:
+            points, logs, lengths, _ = self.sizes
+            middle = points.mean(-2, keepdim=True)
+            near = exponents((places.x - middle) / lengths, (points - middle) / lengths).exp()
+            known = (near @ logs.unsqueeze(-1)).squeeze(-1)
+            mean = logs.mean(-1, keepdim=True)
+            squares = (2 * (known + _FAR * mean) / (near.sum(-1) + _FAR)).exp()
+        return torch.stack([torch.ones_like(squares), squares], -1)
+
+    @torch.no_grad()
+    def learnt(self, model: Any, fitted: Callable[[Noise], Any]) -> RelativeNoise:
+        """Return the noise with the sizes of the posterior mean, if there is no physics."""
+        if type(model).on_gaussian_scale is not GP.on_gaussian_scale:
+            raise ValueError(
+                "Expected no link beside RelativeNoise: noise is then that of g(y), relative "
+                "already for a logarithm. Leave one of them out."
+            )
+        if self.weights:
+            return self
+        noise, x = RelativeNoise(), model.data.kernel_inputs(model.data.X)
+        ranges = (x.amax(-2) - x.amin(-2)).expand(model.num_outputs, -1)
+        for _ in range(_ROUNDS):
+            rough = fitted(noise)
+            mean, _ = rough.conditioning().mean(rough.at(model.data.X))
+            sizes = mean[0].abs().maximum(_FLOOR * mean[0].abs().amax(-1, keepdim=True))
+            size = sizes.square().mean(-1, keepdim=True).sqrt()
+            logs = (sizes / size).log()
+            values = rough.values.items()
+            lengths = [v[0].detach() for name, v in values if name.endswith("kernel.lengthscale")]
+            shortest = torch.stack(lengths or [ranges]).amin(0).unsqueeze(-2)
+            before = torch.zeros_like(logs) if noise.sizes is None else noise.sizes[1]
+            noise = RelativeNoise((x.expand(len(logs), -1, -1), logs, _NEAR * shortest, size))
+            if (logs - before).abs().amax() <= _STILL:
+                break
+        return noise
+
+    def standard_deviations(self, model: Any) -> tuple[Tensor, Tensor]:
+        """Return draws ``N x m`` of the constant one, in the user's units, and the relative one."""
+        values, unit = model.table.values(model.draws), model.unit.squeeze(-1)
+        constant, relative = (values[f"noise.{name}"].squeeze(-1).sqrt() for name in self.names)
+        return constant * unit, relative / (1.0 if self.size is None else self.size.squeeze(-1))
+
+    def of_outputs(self, outputs: Sequence[int]) -> RelativeNoise:
+        """Return the noise of some outputs."""
+        return self._changed(lambda v: v[[*outputs]])
+
+    def to(self, like: Tensor) -> RelativeNoise:
+        """Return the noise on the device of a tensor."""
+        return self._changed(lambda v: v.to(like))
+
+    def _changed(self, change: Callable[[Tensor], Tensor]) -> RelativeNoise:
+        new = RelativeNoise(None if self.sizes is None else [*map(change, self.sizes)])
+        new.weights = [(i, change(weight)) for i, weight in self.weights]
+        new.size = None if self.size is None else change(self.size)
+        return new

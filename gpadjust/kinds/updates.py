@@ -1,0 +1,280 @@
+"""Observations that come one after the other, at a constant cost."""
+
+from __future__ import annotations
+
+import math
+from copy import deepcopy
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+from gpadjust.checks import checked_number, checked_whole
+from gpadjust.core import GP, Fourier, MixturePosterior
+from gpadjust.core.data import ArrayLike
+from gpadjust.core.gaussian import Marginals
+from gpadjust.core.terms import WeightedSum
+from gpadjust.kinds.local_errors import Widened
+
+_EXPECTED = 10.0  # observations that err as predicted, besides those that came
+
+
+class Updated(Widened):
+    r"""A fitted model that takes observations; its unknown numbers stay as they are.
+
+    Variances follow recent errors: with :math:`z_i^2` the squared error over the predicted variance
+    of what came, :math:`\lambda = e^{-1 / \tau}` and ages k, they are multiplied by
+
+    .. math:: \max\Big(1, \frac{a + \sum_k \lambda^k z_k^2}{a + \sum_k \lambda^k}\Big), \quad a = 10.
+
+    Attributes:
+        recent: The two sums, ``m x 2``.
+    """
+
+    def __init__(self, model: GP, forget: float) -> None:
+        super().__init__(model)
+        self.forget = forget
+        self.recent = model.unit.new_zeros(model.num_outputs, 2)
+
+    def factors(self, X: Tensor) -> Tensor:
+        """Return the factors of all inputs, ``1 x m``."""
+        errors, number = self.recent.unbind(-1)
+        return ((_EXPECTED + errors) / (_EXPECTED + number)).clamp_min(1.0).unsqueeze(0)
+
+    def subset_output(self, idcs: list[int]) -> Self:
+        """Return the model of some outputs; a ValueError if there are none of these numbers."""
+        new = self.of_model(self.model.subset_output(idcs))
+        new.recent = self.recent[self.checked_outputs(idcs)]
+        return new
+
+    def judge(self, predicted: tuple[Tensor, Tensor], targets: Tensor) -> None:
+        """Take errors of means and variances ``S x m x k`` of what came, ``m x k``."""
+        mean, variance = Marginals(*(each.mT for each in predicted)).prediction
+        squares = (targets - mean.mT).square() / variance.mT
+        for z in squares.unbind(-1):
+            new = torch.stack([z.nan_to_num(nan=0.0), (~z.isnan()).to(z)], -1)
+            self.recent = math.exp(-1 / self.forget) * self.recent + new
+
+
+class Window(Updated):
+    """A model that keeps its last observations.
+
+    The unknown numbers and units are those of the fit. Its attribute ``model`` is the model of the
+    rows that are kept, for all else that one asks.
+
+    Args:
+        model: Any fitted model with an exact posterior, whose noise can do with other rows.
+        size: Number of rows. Default: as many as the model has.
+
+    Example:
+        >>> from gpadjust.core import ZeroMeanGP
+        >>> X = torch.linspace(0, 1, 9, dtype=torch.float64).unsqueeze(-1)
+        >>> window = Window(ZeroMeanGP(X, X.sin()), size=5).update(X[:1] + 1.1, X[:1].cos())
+        >>> len(window.data.X)
+        5
+    """
+
+    def __init__(self, model: GP, size: int | None = None) -> None:
+        self.size = len(model.data.X) if size is None else checked_whole("size", size, 2)
+        super().__init__(model, self.size)
+
+    @torch.no_grad()
+    def update(self, X: ArrayLike, Y: ArrayLike, noise: Tensor | None = None) -> Self:
+        """Take observations ``k x d`` and ``k x m``, the last of which is the newest.
+
+        Args:
+            X: Inputs, as the model's training inputs.
+            Y: Observations, a tensor or as them; NaN where one is missing.
+            noise: Their variances, of a model with known ones.
+
+        Raises:
+            ValueError: If the model refuses them; nothing has changed then.
+        """
+        more, old = _with_rows(self.model, X, Y, noise), self.model.conditioning()
+        late = slice(old.train.x.shape[-2], None)
+        new = more.subset_rows(torch.arange(max(0, len(more.data.X) - self.size), len(more.data.X)))
+        if new is None:
+            raise ValueError(f"Expected a noise that can do with other rows; found {more.noise}.")
+        given = more.conditioning()
+        mean, variance = old.marginals(given.train.of_rows(late))
+        self.judge((mean, variance + given.noise[..., late]), given.targets[0, ..., late])
+        self.model = new
+        return self
+
+
+class Kalman(Updated):
+    r"""A ridge regression adjustment whose weights take observations, of which it keeps none.
+
+    The posterior of the weights of the features, in units of their prior N(0, I), is known by its
+    precision :math:`\Lambda` and h, of the mean :math:`\Lambda^{-1} h`. An observation
+    :math:`y = \varphi^T \beta + \epsilon` adds to both; before, with
+    :math:`\lambda = e^{-1 / \tau}`, what was observed fades, the prior does not (stabilised
+    forgetting, Kulhavy and Zarrop 1993):
+
+    .. math:: \Lambda \leftarrow \lambda \Lambda + (1 - \lambda) I + \varphi \varphi^T / \sigma^2,
+        \quad h \leftarrow \lambda h + \varphi y / \sigma^2.
+
+    It is a Kalman filter in its information form, for each draw of the model. An observation of
+    :math:`k` steps ago counts as one with the noise :math:`\sigma^2 e^{k / \tau}`; no variance
+    grows beyond the prior's.
+
+    Args:
+        model: A fitted :class:`~gpadjust.RRA`, or another model whose kernels are ``Fourier``.
+        forget: :math:`\tau`, in observations; infinite for never.
+
+    Attributes:
+        model: The model without what came, and its unknown numbers.
+    """
+
+    def __init__(self, model: GP, forget: float = math.inf) -> None:
+        if forget != math.inf:
+            forget = checked_number("forget", forget, above=0.0)
+        super().__init__(model, forget)
+        kernels = [term.kernel for term in model.terms if term.kernel is not None]
+        if not all(isinstance(kernel, Fourier) for kernel in kernels):
+            raise TypeError(f"Expected an RRA; found kernels {kernels}. Take Window(model, size).")
+        self.weights = Weights.of_model(model)
+        # What comes is checked and read by a model of two rows: in a tuple, as it is no submodule.
+        self._few = (model.subset_rows(torch.arange(2)),)
+
+    @torch.no_grad()
+    def update(self, X: ArrayLike, Y: ArrayLike, noise: Tensor | None = None) -> Self:
+        """Take observations; arguments and errors as of :meth:`Window.update`."""
+        (few,) = self._few
+        if few is None:
+            raise ValueError(
+                f"Expected a noise that can do with other rows; found {self.model.noise}."
+            )
+        more, late = _with_rows(few, X, Y, noise).conditioning(), slice(2, None)
+        f, variances = more.train.of_rows(late), more.noise[..., late]
+        targets = more.targets[..., late]
+        mean, variance = self.weights.marginals(f)
+        self.judge((mean, variance + variances), targets[0])
+        self.weights = self.weights.updated(f, variances, targets - f.mean, self.forget)
+        return self
+
+    @property
+    def source(self) -> GP:
+        """The model with the posterior of the weights."""
+        return self.model.with_conditioning(self.weights)
+
+    def term(self, name: str, X: ArrayLike) -> MixturePosterior:
+        """Return the joint posterior of a term's process at ``X``, as of a GP."""
+        return self.source.term(name, X)
+
+    def condition_on_observations(
+        self, X: ArrayLike, Y: ArrayLike, noise: Tensor | None = None, **_: Any
+    ) -> Self:
+        """Return a copy that has taken observations ``k x d`` and ``k x m``."""
+        return deepcopy(self).update(X, Y, noise)
+
+    def subset_output(self, idcs: list[int]) -> Self:
+        """Return the model of some outputs; a ValueError if there are none of these numbers."""
+        new, (few,) = super().subset_output(idcs), self._few
+        new._few = (None if few is None else few.subset_output(idcs),)
+        new.weights = self.weights.of_outputs(new.model, self.checked_outputs(idcs))
+        return new
+
+    def sample_functions(self, *_: Any, **__: Any) -> Any:
+        """Raise an error, as functions are drawn given the rows of data."""
+        raise NotImplementedError(
+            "Functions of weights are not drawn; draw joint samples: kalman.posterior(X).rsample()."
+        )
+
+
+class Weights:
+    r"""The posterior of the weights of Fourier features, which conditions a model.
+
+    Args:
+        train: The function at the training inputs of the model.
+        precision: :math:`\Lambda`, ``S x m x p x p``.
+        pull: h, ``S x m x p``.
+    """
+
+    def __init__(self, train: WeightedSum, precision: Tensor, pull: Tensor) -> None:
+        self.train, self.precision, self.pull = train, precision, pull
+        self.alpha = pull  # a model asks whether it has a graph
+        chol = torch.linalg.cholesky(precision)
+        eye = torch.eye(chol.shape[-1]).to(chol).expand_as(chol)
+        self.root = torch.linalg.solve_triangular(chol, eye, upper=False).mT
+        self.mean = (self.root @ (self.root.mT @ pull.unsqueeze(-1))).squeeze(-1)
+
+    @classmethod
+    @torch.no_grad()
+    def of_model(cls, model: GP) -> Self:
+        """Return the weights given the data of a model."""
+        data = model.conditioning()
+        residual = data.targets - data.train.mean
+        lead = (*data.noise.shape[:-1], design(data.train).shape[-1])  # S x m x p
+        eye = torch.eye(lead[-1]).to(residual).expand(*lead, -1)
+        prior = cls(data.train, eye, residual.new_zeros(lead))
+        return prior.updated(data.train, data.noise, residual, math.inf)
+
+    def updated(self, f: WeightedSum, noise: Tensor, residual: Tensor, forget: float) -> Self:
+        """Return the weights given observations of a sum, too, the last of which is the newest.
+
+        Args:
+            f: The function at their inputs.
+            noise: Variances of their noise, ``S x m x k``.
+            residual: Targets less their prior mean, ``S x m x k``; NaN where one is missing.
+            forget: tau.
+        """
+        k, phi = residual.shape[-1], design(f)
+        left = torch.arange(k - 1, -1, -1).to(noise).div(-forget).exp()
+        weight = (left / noise).masked_fill(residual.isnan(), 0.0)
+        kept = math.exp(-k / forget)
+        weighted = (phi * weight.unsqueeze(-1)).mT
+        precision = kept * self.precision + weighted @ phi
+        precision.diagonal(dim1=-1, dim2=-2).add_(1 - kept)
+        pull = kept * self.pull + (weighted @ residual.nan_to_num().unsqueeze(-1)).squeeze(-1)
+        return type(self)(self.train, precision, pull)
+
+    def marginals(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
+        """Return means and variances at each point, ``... x S x m x q``."""
+        mean, root = self._moments(sought)
+        return mean, root.square().sum(-1)
+
+    def joint(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
+        """Return means and covariances, ``... x S x m x q x q``."""
+        mean, root = self._moments(sought)
+        return mean, root @ root.mT
+
+    def of_outputs(self, model: GP, outputs: list[int]) -> Self:
+        """Return the weights of some outputs, of the model of these."""
+        train = model.conditioning().train
+        return type(self)(train, self.precision[:, outputs], self.pull[:, outputs])
+
+    def _moments(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
+        """Return the mean of a sum, and a root ``... x q x p`` of its covariance."""
+        phi = design(sought)
+        return sought.mean + (phi @ self.mean.unsqueeze(-1)).squeeze(-1), phi @ self.root
+
+
+def design(f: WeightedSum) -> Tensor:
+    """Return the features of a sum, ``... x S x m x n x p``, for weights N(0, I)."""
+    parts = []
+    for term in f.terms:
+        phi = []
+        if term.kernel is not None:
+            generator = torch.Generator()  # not used: the features are the kernel's own
+            of_kernel = term.kernel.features(f.own(term), 0, generator)(f.x)
+            process = f.values.get(f"{term.name}.process")
+            phi.append(of_kernel if process is None else of_kernel * process.unsqueeze(-1))
+        if term.constant is not None:
+            sd = f.values[f"{term.name}.constant"].sqrt().unsqueeze(-1)
+            phi.append(sd * torch.ones_like(f.x[..., :1]))
+        w = f.weights.get(term.name, torch.zeros_like(f.x[..., 0]))
+        parts += phi if w is None else [each * w.unsqueeze(-1) for each in phi]
+    lead = torch.broadcast_shapes(*(each.shape[:-1] for each in parts))
+    return torch.cat([each.expand(*lead, each.shape[-1]) for each in parts], -1)
+
+
+def _with_rows(model: GP, X: ArrayLike, Y: ArrayLike, noise: Tensor | None) -> GP:
+    """Return a model with further rows ``k x d`` and ``k x m``, if it takes them."""
+    X = model.data.new_inputs(X)
+    if X.dim() != 2 or not len(X):
+        raise ValueError(f"Expected X of shape k x d, one row at least; found {tuple(X.shape)}.")
+    more = model.condition_on_observations(X, Y, noise)
+    if more.batch_shape:
+        raise ValueError(f"Expected Y of shape k x m; found a batch {tuple(more.batch_shape)}.")
+    return more

@@ -1,0 +1,231 @@
+"""Kernels of processes that are zero at places that the user names, where the formula is right."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from copy import copy
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gpadjust.checks import check_finite
+from gpadjust.core.data import Data, as_tensor, column_names
+from gpadjust.core.kernels import Features, Kernel, as_kernel
+from gpadjust.core.terms import Term
+from gpadjust.core.unknowns import LogNormal, Row, Values
+
+_ROUNDING = 1e-10  # of the variance at places, of which there are several
+
+
+class Vanishing(Kernel):
+    r"""The kernel of a process that is zero wherever some inputs have given values.
+
+    As the kernel of delta the formula is right there; as that of rho, rho is its mean there. With a
+    product :math:`k = k_S(x_S, x'_S) \, k_R(x_R, x'_R)` over the inputs S that the values V are of,
+    and all others R, it is that of :math:`g \sim GP(0, k)` given that :math:`g(x) = 0` for each x
+    with :math:`x_S \in V`, whatever :math:`x_R`:
+
+    .. math:: k_R(x_R, x'_R) \, [k_S(x_S, x'_S) - k_S(x_S, V) \, k_S(V, V)^{-1} k_S(V, x'_S)]
+
+    (conditioning, Rasmussen and Williams 2006, eq. 2.19). One input makes V hyperplanes, all inputs
+    points. Unknown parameters of the physics are then those that agree with the observations there,
+    and with a process that is smooth towards them.
+
+    Args:
+        where: Values of columns, by name or number: ``{"valve": 1.0}``, ``{"valve": [0.0, 1.0]}``
+            for either, ``{"valve": 1.0, "flow": 0.0}`` for both at once. Or points, ``p x d``, or a
+            frame with some of the columns. In the user's units; the numbers of categories' levels.
+        kernel: k, of this library or GPyTorch. Default: RBF.
+
+    Raises:
+        ValueError: If it is empty, not finite or of another shape. When a model is built, if it
+            names no column of the inputs, a transform of the inputs mixes columns, or k is not a
+            product over S and R.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust.core import PhysicsMeanGP
+        >>> from gpadjust.kinds.vanishing import Vanishing
+        >>> X = torch.rand(9, 2, dtype=torch.float64)
+        >>> Y = X[:, :1].sin() + X[:, :1] * X[:, 1:]
+        >>> right = Vanishing({1: 0.0})  # the second column
+        >>> model = PhysicsMeanGP(X, Y, physics=lambda X: X[:, 0].sin(), covar_module=right)
+        >>> model.delta(torch.tensor([[0.3, 0.0]], dtype=torch.float64)).variance.item() < 1e-12
+        True
+    """
+
+    has_constant = False
+
+    def __init__(self, where: Any, kernel: Any = None) -> None:
+        self.kernel: Any = kernel
+        names = column_names(where)
+        self.columns: list[str | int] | None = None if names is None else [*names]
+        if isinstance(where, Mapping):
+            self.columns = [*where]
+            each = [_numbers(values) for values in where.values()]
+            sizes = {len(values) for values in each} - {1}
+            if not each or len(sizes) > 1 or 0 in sizes:
+                raise ValueError(
+                    "Expected `where` with a number for each column, or as many numbers for each; "
+                    f"found {where!r}."
+                )
+            where = torch.stack([v.expand(max([1, *sizes])) for v in each], -1)
+        elif isinstance(where, list | tuple):
+            where = torch.tensor(where, dtype=torch.float64)
+        self.values = as_tensor(where, "where")
+        if self.values.dim() != 2 or not self.values.numel():
+            raise ValueError(
+                "Expected `where` as values of columns ({'valve': 1.0}) or as points p x d; found "
+                f"shape {tuple(self.values.shape)}."
+            )
+        check_finite("where", self.values)
+        self.places = self.values  # in the columns that kernels read; NaN in those that are free
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The arguments."""
+        points = self.values.tolist()
+        if self.columns is None:
+            return {"where": points, "kernel": self.kernel}
+        each = zip(self.columns, zip(*points, strict=True), strict=True)
+        return {"where": {name: [*values] for name, values in each}, "kernel": self.kernel}
+
+    def of_term(self, outputscale: LogNormal) -> Vanishing:
+        """Return the kernel whose k has the prior variance of a term, if it has none."""
+        new = copy(self)
+        new.kernel = as_kernel(self.kernel, outputscale)
+        return new
+
+    def of_data(self, data: Data) -> Vanishing:
+        """Return the kernel on the columns that kernels of a model read."""
+        new, places = copy(self), self._places(data.input_names)
+        free = places.isnan()
+        terms = getattr(data.transform, "terms", lambda terms: terms)
+        new.kernel = terms([Term("k", self.kernel)])[0].kernel.of_data(data)
+        ends = torch.stack([data.X.amin(-2), data.X.amax(-2)])
+        moved = ends.where(free.unsqueeze(-2), places.unsqueeze(-2).to(ends))  # p x 2 x d
+        read = data.kernel_inputs(moved)
+        if read.shape != moved.shape or not torch.equal(read[:, 0][~free], read[:, 1][~free]):
+            raise ValueError(
+                "Expected an input transform that treats each column by itself, as Normalize, with "
+                "Vanishing; found one that mixes columns, or makes others."
+            )
+        check_finite("where, after the transform,", read[:, 0][~free])
+        new.places = read[:, 0].masked_fill(free, torch.nan)
+        x = data.kernel_inputs(data.X[:40])
+        if free.any() and not new._is_product(torch.cat([x, x.where(free[0], read[0, 0])])):
+            raise ValueError(
+                "Expected a kernel that is a product over the inputs in `where` and all others, as "
+                f"RBF; found {self.kernel}. With values of all inputs any kernel will do."
+            )
+        return new
+
+    def rows(self, x: Tensor, num_outputs: int) -> list[Row]:
+        """Return the unknown parameters of k."""
+        rows: list[Row] = self.kernel.rows(x, num_outputs)
+        return rows
+
+    def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
+        """Return the covariances of inputs with others, or with themselves; NaN if impossible."""
+        left = self._along(own, x)
+        right = left if other is None else self._along(own, other)
+        zero = self._of(own, x, other, True) - left @ right.mT
+        if not self.places.isnan().any():
+            return zero
+        origin = torch.zeros_like(x[..., :1, :])
+        return zero * self._of(own, x, other, False) / self.kernel.covariance(own, origin)
+
+    def variance(self, own: Values, x: Tensor) -> Tensor:
+        """Return the prior variances, ``... x S x m x n``."""
+        k = self.kernel.variance
+        zero = k(own, self._part(x, True)) - self._along(own, x).square().sum(-1)
+        return zero.clamp_min(0.0) * k(own, self._part(x, False)) / k(own, torch.zeros_like(x))
+
+    def features(self, own: Values, number: int, generator: torch.Generator) -> Features:
+        r"""Return features of k, less what is known of them:
+
+        .. math:: \varphi(x) - \sum_{ij} k_S(x_S, V_i) [k_S(V, V)^{-1}]_{ij} \varphi(V_j, x_R).
+        """
+        free = self.kernel.features(own, number, generator)
+
+        def features(x: Tensor) -> Tensor:
+            places = self.places.to(x).reshape(-1, *[1] * (x.dim() - 1), x.shape[-1])
+            there = free(x.where(places.isnan(), places))  # p x ... x n x D
+            along = self._along(own, x).mT
+            weights = torch.linalg.solve_triangular(self._factor(own, x).mT, along, upper=True)
+            return free(x) - (weights.movedim(-2, 0).unsqueeze(-1) * there).sum(0)
+
+        return features
+
+    def _places(self, names: tuple[str, ...]) -> Tensor:
+        """Return the places in the user's units, ``p x d``; NaN in the columns that are free."""
+        d, numbers = len(names), []
+        columns = self.columns
+        if columns is None:
+            columns = [*range(self.values.shape[-1])]
+            if len(columns) != d:
+                raise ValueError(
+                    f"Expected `where` as points of {d} columns; found shape "
+                    f"{tuple(self.values.shape)}. Give values of some columns as a dictionary."
+                )
+        for each in columns:
+            if each not in names and not (isinstance(each, int) and -d <= each < d):
+                raise ValueError(
+                    f"Expected `where` to name columns of {', '.join(names)}, or numbers from 0 to "
+                    f"{d - 1}; found {each!r}."
+                )
+            numbers.append(each % d if isinstance(each, int) else names.index(each))
+        places = self.values.new_full((len(self.values), d), torch.nan)
+        places[:, numbers] = self.values
+        return places
+
+    def _part(self, x: Tensor, is_given: bool) -> Tensor:
+        """Return inputs with 0 in the columns R, or in S."""
+        return x.where((self.places[0].isfinite() == is_given).to(x.device), 0.0)
+
+    def _of(self, own: Values, x: Tensor, other: Tensor | None, is_given: bool) -> Tensor:
+        """Return k_S, or k_R, times the variance."""
+        other = None if other is None else self._part(other, is_given)
+        K: Tensor = self.kernel.covariance(own, self._part(x, is_given), other)
+        return K
+
+    def _along(self, own: Values, x: Tensor) -> Tensor:
+        """Return the covariances of x_S with what is zero, whitened: ``... x n x p``."""
+        cross = self._of(own, x, self._zeros(x), True)
+        return torch.linalg.solve_triangular(self._factor(own, x), cross.mT, upper=False).mT
+
+    def _factor(self, own: Values, x: Tensor) -> Tensor:
+        """Return the Cholesky factor of the covariance of what is zero; NaN if it has none."""
+        K = self._of(own, self._zeros(x), None, True)
+        rounding = _ROUNDING if K.shape[-1] > 1 else 0.0
+        K = K + rounding * torch.diag_embed(K.diagonal(dim1=-1, dim2=-2))
+        factor, failed = torch.linalg.cholesky_ex(K)
+        return factor.masked_fill(failed[..., None, None] > 0, torch.nan)
+
+    def _zeros(self, x: Tensor) -> Tensor:
+        """Return the places as inputs, ``1 x 1 x p x d``."""
+        return self.places.to(x).nan_to_num()[None, None]
+
+    def _is_product(self, x: Tensor) -> bool:
+        """Return whether k(x, x') k(0, 0) is k_S k_R, at the middle of the prior."""
+        own = {row.name: row.value(x.new_zeros(1)) for row in self.kernel.rows(x, 1)}
+        own = {name: value.unsqueeze(0) for name, value in own.items()}
+        x = x[None, None]
+        whole = self.kernel.covariance(own, x) * self.kernel.covariance(own, 0 * x)
+        parts = self._of(own, x, None, True) * self._of(own, x, None, False)
+        return torch.allclose(whole, parts, rtol=1e-8, atol=1e-12)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.kernel})"
+
+
+def _numbers(values: Any) -> Tensor:
+    """Return one or several numbers."""
+    try:
+        return torch.as_tensor(values, dtype=torch.float64).reshape(-1)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(
+            f"Expected a number for each column of `where`, or several; found {values!r}. Of a "
+            "category give the number of the level, from 0 in the order of the alphabet."
+        ) from error

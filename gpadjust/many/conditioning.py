@@ -1,0 +1,184 @@
+"""The posterior of weighted sums by their values at inducing points."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from gpadjust.core.data import appended
+from gpadjust.core.gaussian import Conditioning, factor
+from gpadjust.core.terms import WeightedSum
+from gpadjust.core.unknowns import standard_normal
+from gpadjust.many.bound import Sums, at_points, blocks
+
+
+class SparseConditioning(Conditioning):
+    r"""The posterior of weighted sums, given many observations of one, by inducing values u.
+
+    A basis E makes their prior white and the information of the rows diagonal,
+    :math:`E K E^T = I` and :math:`E K_{uf} W K_{fu} E^T = D`. With :math:`e = E k(Z, x)`, means are
+    :math:`\bar f + e^T (I + D)^{-1} E K_{uf} W r` and variances
+    :math:`k(x, x) - e^T D (I + D)^{-1} e`.
+
+    Args:
+        total: The sum that the inducing points stand for, at all rows.
+        points: The numbers of the rows that are inducing points, ``m x M``.
+        prior: The variances of the observed sum at all rows, ``S x m x n``.
+        noise: The variances of the noise.
+        rest: The variances of what is noise to the inducing values but a function to others.
+        targets: The observations, ``1 x m x n``; NaN where one is missing.
+    """
+
+    def __init__(
+        self, total: WeightedSum, points: Tensor, prior: Tensor, noise: Tensor, rest: Tensor,
+        targets: Tensor,
+    ) -> None:  # fmt: skip
+        self.total, self.prior, self.targets = total, prior, targets
+        self.num_rows, self.rest = targets.shape[-1], rest
+        shape = torch.broadcast_shapes(prior.shape, noise.shape, targets.shape)
+        self.noise, is_seen = noise.expand(shape), ~targets.isnan()
+        self.weight = (is_seen / (noise + rest)).expand(shape)
+        self.residual = ((targets - total.mean).nan_to_num() * is_seen).expand(shape)
+        self.chol, square, cross = Sums.of(total, points, self.residual, self.weight)
+        if not self.chol.isfinite().all():
+            raise ValueError(
+                "Expected numbers of kernels at which covariances of inducing values have a "
+                "Cholesky factor; found others. Fit the model anew, with fewer inducing points."
+            )
+        self.gain, vectors = torch.linalg.eigh(square)
+        self.gain = self.gain.clamp_min(0.0)
+        self.basis = torch.linalg.solve_triangular(self.chol.mT, vectors, upper=True).mT
+        self.white_mean = (vectors.mT @ cross.unsqueeze(-1)).squeeze(-1) / (1 + self.gain)
+        self.alpha = (self.basis.mT @ self.white_mean.unsqueeze(-1)).squeeze(-1)
+        self.inverse = (self.gain / (1 + self.gain)).sqrt().unsqueeze(-1) * self.basis
+        self.train = at_points(total, points)
+        self.observed = torch.ones_like(self.train.mean, dtype=torch.bool)
+
+    def evidence(self) -> Tensor:
+        """Return the lower bound of the log likelihood, ``S x m``; see :func:`~.bound`."""
+        sizes = (2 * math.pi / self.weight).log().masked_fill(self.weight == 0, 0.0).sum(-1)
+        seen = (self.weight * (self.residual.square() + self.prior - self.rest)).sum(-1)
+        by_points = (1 + self.gain).log() - self.gain - (1 + self.gain) * self.white_mean.square()
+        return -0.5 * (sizes + seen + by_points.sum(-1))
+
+    def inverse_factor(self) -> Tensor:
+        """Return what makes :math:`k(x, x) - |F k|^2` of covariances k with inducing values."""
+        return self.inverse
+
+    def white(self, cross: Tensor) -> Tensor:
+        """Return covariances ``... x q x M`` times the inverse factor."""
+        return cross @ self.inverse.mT
+
+    def update(self, prior: Tensor, generator: torch.Generator) -> Tensor:
+        """Return what gives functions from the prior inducing values from the posterior."""
+        noise = standard_normal(prior.shape, generator, prior)
+        white = (self.basis @ (prior - self.train.mean).unsqueeze(-1)).squeeze(-1)
+        away = self.white_mean + (1 + self.gain).rsqrt() * noise - white
+        return (self.basis.mT @ away.unsqueeze(-1)).squeeze(-1)
+
+    def at_rows(self, rows: slice) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the mean, the variance by the inducing values, and their prior's, at some rows."""
+        e = self.basis @ self.train.cross(self.total.of_rows(rows))
+        mean = self.total.mean[..., rows] + (self.white_mean.unsqueeze(-2) @ e).squeeze(-2)
+        known = e.square()
+        return mean, (known / (1 + self.gain).unsqueeze(-1)).sum(-2), known.sum(-2)
+
+    def leverage(self) -> tuple[Tensor, Tensor, Tensor]:
+        r"""Return means, conditional variances and leverages :math:`w h` at all rows."""
+        parts = [self.at_rows(rows) for rows in blocks(self.targets.shape[-1], self.chol)]
+        mean, own, known = (torch.cat(each, -1) for each in zip(*parts, strict=True))
+        return mean, (self.prior - known).clamp_min(0.0), own
+
+    def left_out(self) -> tuple[Tensor, Tensor]:
+        r"""Return means and variances of each observation given all others, noise included.
+
+        In the linear model of the inducing values a row has a variance h and a leverage
+        :math:`H = w h`; without it the residual is :math:`(y - m) / (1 - H)`, h is
+        :math:`h / (1 - H)`.
+        """
+        mean, unseen, own = self.leverage()
+        kept = (1 - self.weight * own).clamp_min(1e-9)
+        variance = unseen + own / kept + self.noise
+        return self.targets - (self.targets - mean) / kept, variance.masked_fill(
+            self.targets.isnan(), torch.nan
+        )
+
+
+class LaterConditioning(SparseConditioning):
+    r"""A posterior by inducing values, given further observations exactly.
+
+    The late rows are observations of a Gaussian process with the old posterior as its prior.
+
+    Args:
+        old: The old posterior.
+        late: The observed sum at the late rows, with all its terms.
+        noise: The variances of their noise.
+        targets: Their observations.
+    """
+
+    def __init__(
+        self, old: SparseConditioning, late: WeightedSum, noise: Tensor, targets: Tensor
+    ) -> None:
+        self.old, self.train = old, joined(old.train, late)
+        self.num_rows = old.num_rows + targets.shape[-1]
+        K, K21, seen = late.cross(late), late.cross(old.train), ~targets.isnan()
+        while seen.dim() > K.dim() - 1 and bool((seen == seen[0]).all()):
+            seen = seen[0]  # fantasies of the same points share a factor
+        K21 = K21 * seen.unsqueeze(-1)
+        B = old.white(K21)
+        noise = noise.expand(torch.broadcast_shapes(noise.shape, K.shape[:-1]))
+        self.root = factor(K - B @ B.mT, noise, seen)
+        lead, k = self.root.shape[:-2], self.root.shape[-1]
+        # The inverse factor [[F, 0], [-R^-1 B F, R^-1]].
+        upper = old.inverse_factor().expand(*lead, -1, -1)
+        right = torch.cat([-B @ upper, torch.eye(k).to(K).expand(*lead, k, k)], -1)
+        self.below = torch.linalg.solve_triangular(self.root, right, upper=False)
+        zero = upper.new_zeros(*upper.shape[:-1], k)
+        self.inverse = torch.cat([torch.cat([upper, zero], -1), self.below], -2)
+        self.chol = self.inverse  # for its size
+        self.noise, self.targets, self.seen, self.K21 = noise, targets, seen, K21
+        mean = late.mean + (K21 @ old.alpha.unsqueeze(-1)).squeeze(-1)
+        self.alpha = self.later(old.alpha, targets - mean)
+        self.observed = torch.ones(self.alpha.shape[-1], dtype=torch.bool, device=K.device)
+
+    def later(self, weights: Tensor, residual: Tensor) -> Tensor:
+        """Return weights ``... x M`` of the old rows, and of late ones for their residuals."""
+        residual = (residual.nan_to_num() * self.seen).unsqueeze(-1)
+        white = torch.linalg.solve_triangular(self.root, residual, upper=False)
+        added = (self.below.mT @ white).squeeze(-1)
+        lead = torch.broadcast_shapes(added.shape[:-1], weights.shape[:-1])
+        old = torch.nn.functional.pad(weights.expand(*lead, -1), (0, residual.shape[-2]))
+        return old + added
+
+    def update(self, prior: Tensor, generator: torch.Generator) -> Tensor:
+        """Return what makes functions from the prior meet the observations."""
+        M = self.K21.shape[-1]
+        old = self.old.update(prior[..., :M], generator)
+        value = prior[..., M:] + (self.K21 @ old.unsqueeze(-1)).squeeze(-1)
+        noise = self.noise.sqrt() * standard_normal(value.shape, generator, prior)
+        return self.later(old, self.targets - value - noise)
+
+    def left_out(self) -> tuple[Tensor, Tensor]:
+        """Refuse, as there is no formula for the first rows."""
+        raise NotImplementedError(
+            "Expected a model without observations since its fit; found "
+            f"{self.targets.shape[-1]}. Build it of all data and fit it: then there are left-out "
+            "predictions."
+        )
+
+
+def joined(old: WeightedSum, late: WeightedSum) -> WeightedSum:
+    """Return a sum at the places of two; terms that the old one has not have no weight there."""
+
+    def weight(total: WeightedSum, name: str) -> Tensor:
+        one = torch.ones_like(total.mean)
+        w = total.weights.get(name, torch.zeros_like(one))
+        return one if w is None else w
+
+    weights: dict[str, Tensor | None] = {
+        name: appended(weight(old, name), weight(late, name), -1) for name in late.weights
+    }
+    x, mean = appended(old.x, late.x), appended(old.mean, late.mean, -1)
+    return WeightedSum(late.terms, late.values, x, mean, weights)

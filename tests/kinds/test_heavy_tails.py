@@ -1,0 +1,218 @@
+"""Noise with heavy tails: outliers are found and hardly count, on top of any other noise."""
+
+import math
+
+import pytest
+import torch
+from torch.distributions import MultivariateNormal
+from torch.nn.functional import silu
+
+from gpadjust.core import CKA, RRA, ZeroMeanGP, fit, load, save
+from gpadjust.kinds.heavy_tails import HeavyTails
+from gpadjust.kinds.relative import RelativeNoise
+from gpadjust.physics import FunctionPhysics, Unknown
+
+X = torch.linspace(0, 1, 20, dtype=torch.float64).unsqueeze(-1)
+Z = torch.tensor([[0.22], [0.47], [0.81]], dtype=torch.float64)
+ROWS = [4, 13]
+
+
+def wave(X):
+    return torch.sin(5 * X[..., :1])
+
+
+def both(X):
+    return torch.cat([wave(X), wave(1 - X)], -1)
+
+
+def truth(X):
+    return wave(X) + 0.3 * X
+
+
+def clean():
+    draw = torch.Generator().manual_seed(1)
+    return truth(X) + 0.03 * torch.randn(20, 1, generator=draw, dtype=torch.float64)
+
+
+def gross(rows=ROWS, sizes=(0.6, -3.0)):
+    Y = clean()
+    Y[rows] += torch.tensor(sizes, dtype=torch.float64).unsqueeze(-1)
+    return Y
+
+
+def drawn(model, number=2):
+    draw = torch.Generator().manual_seed(0)
+    u = 0.4 * torch.randn(number, *model.u.shape[1:], generator=draw, dtype=torch.float64)
+    model.set_draws(model.table.with_choice(u, 0))
+    return model.eval()
+
+
+def rows_of(mask):
+    return mask.flatten().nonzero().flatten().tolist()
+
+
+CASES = {
+    "near and far": (gross(), ROWS, {}),
+    "huge": (gross([7], [3000.0]), [7], {}),
+    "at the end": (gross([19], [1.0]), [19], {}),
+    "neighbours": (gross([9, 10], [2.0, -2.0]), [9, 10], {}),
+    "known variances": (gross(), ROWS, {"train_Yvar": 0.03**2}),
+    "none": (clean(), [], {}),
+    "none, of known variances": (clean(), [], {"train_Yvar": 0.03**2}),
+}
+
+
+QUICK = ("near and far", "known variances", "none, of known variances")
+SLOW = [name for name in CASES if name not in QUICK]
+
+
+@pytest.mark.parametrize("name", [*QUICK, *(pytest.param(s, marks=pytest.mark.slow) for s in SLOW)])
+def test_outliers_are_found_and_hardly_count(name):
+    Y, rows, options = CASES[name]
+    model = CKA(X, Y, physics=wave, noise=HeavyTails(), **options)
+    fit(model, "map")
+    assert rows_of(model.noise.is_outlier) == rows
+    assert rows_of(model.noise.outliers(model) > 0.5) == rows
+    alone = torch.ones(20, dtype=torch.bool)
+    alone[rows] = False
+    without = CKA(X[alone], Y[alone], physics=wave, **options)
+    fit(without, "map")
+    assert (model.predict(Z).mean - without.predict(Z).mean).abs().max() < 0.01
+    assert ("outliers: rows" in model.summary()) == bool(rows)
+
+
+@pytest.mark.slow
+def test_draws_agree_and_the_density_of_an_outlier_is_that_of_the_tails():
+    model = CKA(X, gross(), physics=wave, noise=HeavyTails())
+    fit(model)
+    assert rows_of(model.noise.outliers(model) > 0.5) == ROWS
+    assert (model.predict(X).mean - truth(X)).abs().max() < 0.15
+    left_out = model.left_out()
+    r = (model.data.Y - left_out.prediction.mean)[13].abs().item()
+    tail = math.log(0.02 / (2 * r * math.log(1e3)))
+    assert left_out.log_density(model.data.Y)[13].item() == pytest.approx(tail, abs=0.1)
+
+
+def test_the_likelihood_is_the_dense_formula():
+    added = torch.rand(1, 20, dtype=torch.float64)
+    unknowns = {"rate": Unknown(5.0, sd=1.0)}
+    law = FunctionPhysics(lambda X, p: torch.sin(p.rate * X[:, 0]), unknowns=unknowns)
+    for base in (None, RelativeNoise()):
+        model = CKA(X, gross(), physics=law, noise=HeavyTails(base=base, added=added))
+        u = drawn(model, 1).u.detach()
+        prior = model(X) if model.train() else None
+        v = {name: value.item() for name, value in model.values.items() if "noise" in name}
+        noise = torch.full((20,), v.get("noise.variance", v.get("noise.constant")) + 1e-11)
+        if base is not None:
+            f = law(X, law.unknowns.at(model.values["physics.rate"])).flatten()
+            at_prior = law(X, law.unknowns.at(torch.zeros(1, 1).double())).square().mean()
+            noise = noise + (v["noise.relative"] + 1e-11) * f.square() / at_prior
+        noise = (noise + added[0]) * model.unit.square()[0]
+        law_of_Y = MultivariateNormal(prior.mean, prior.covariance_matrix + noise.diag())
+        expected = law_of_Y.log_prob(model.data.Y[:, 0]) + 20 * model.unit.log()
+        value, slope = model.log_likelihood(u)
+        torch.testing.assert_close(value, expected.detach(), rtol=1e-7, atol=1e-7)
+        step = 1e-5 * torch.eye(u.shape[-1]).double().unsqueeze(1)
+        up, down = (model.log_likelihood(u + s, False)[0] for s in (step, -step))
+        torch.testing.assert_close((up - down).mT / 2e-5, slope[:, 0], rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_outputs_have_outliers_of_their_own():
+    two = torch.cat([gross(), gross([2], [2.0]).flip(0)], -1)
+    two[7, 0] = torch.nan
+    model = CKA(X, two, physics=both, noise=HeavyTails())
+    fit(model, "map")
+    assert model.noise.outliers(model)[7, 0] == 0
+    assert [rows_of(mask) for mask in model.noise.is_outlier.mT] == [ROWS, [17]]
+    swapped = CKA(X, two[:, [1, 0]], physics=lambda X: both(X)[..., [1, 0]], noise=HeavyTails())
+    fit(swapped, "map")
+    torch.testing.assert_close(swapped.predict(Z).mean, model.predict(Z).mean[:, [1, 0]], **NEAR)
+    for part in (model.subset_output([1, 0]), model.subset_output([1])):
+        indices = [1, 0][: part.num_outputs]
+        torch.testing.assert_close(part.predict(Z, True).variance,
+                                   model.predict(Z, True).variance[:, indices])  # fmt: skip
+        mask = model.noise.outliers(model)[:, indices]
+        torch.testing.assert_close(part.noise.outliers(part), mask)
+
+
+NEAR = {"rtol": 1e-3, "atol": 1e-4}
+
+
+@pytest.mark.slow
+def test_outputs_may_share_unknown_numbers():
+    law = FunctionPhysics(
+        lambda X, p: both(X) * p.size[:, None], unknowns={"size": Unknown(1.0, sd=0.5)}
+    )
+    two = torch.cat([gross(), gross([2], [2.0]).flip(0)], -1)
+    model = CKA(X, two, physics=law, noise=HeavyTails())
+    fit(model, "map")
+    assert [rows_of(mask) for mask in model.noise.is_outlier.mT] == [ROWS, [17]]
+
+
+MODELS = {
+    "learnt": lambda added: CKA(X, gross(), physics=silu, noise=HeavyTails(0.1, None, added)),
+    "relative": lambda added: CKA(
+        X, gross(), physics=silu, noise=HeavyTails(base=RelativeNoise(), added=added)
+    ),
+    "known": lambda added: CKA(X, gross(), 0.03**2, physics=silu, noise=HeavyTails(added=added)),
+}
+
+
+@pytest.mark.parametrize("name", list(MODELS))
+def test_conditioning_subsets_and_files_keep_the_numbers(name, tmp_path):
+    added = torch.zeros(1, 20, dtype=torch.float64)
+    added[0, ROWS] = 1e5
+    model = drawn(MODELS[name](added))
+    noise = None if model.data.Yvar is None else torch.full((3, 1), 0.01).double()
+    later = model.condition_on_observations(Z, truth(Z) + 1, noise)
+    values = later.table.values(later.u)
+    variance = later.noise.variance(values, later.places(later.data.X, values), True)
+    variance = variance.expand(2, 1, 23)
+    plain = later.noise.base.variance(values, later.places(later.data.X, values), True)
+    torch.testing.assert_close((variance - plain)[..., :20], added.expand(2, 1, 20))
+    assert not (variance - plain)[..., 20:].any()
+    if noise is not None:
+        torch.testing.assert_close(later.noise.known[0, 20:] * model.unit.square(), noise.mT)
+    again = later.subset_rows(torch.arange(20))
+    torch.testing.assert_close(again.predict(Z).mean, model.predict(Z).mean)
+    for each in (model, later):
+        assert not save(each, tmp_path / "model.pt").missing
+        loaded = load(tmp_path / "model.pt", trusted=True)
+        torch.testing.assert_close(loaded.predict(Z, True), each.predict(Z, True))
+        assert torch.equal(loaded.noise.added, each.noise.added)
+        assert loaded.noise.share == each.noise.share
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("base", [None, RelativeNoise()])
+@pytest.mark.parametrize("kind", [ZeroMeanGP, RRA])
+def test_a_second_fit_is_the_first(kind, base):
+    options = {} if kind is ZeroMeanGP else {"physics": wave}
+    model = kind(X, gross() + 2, noise=HeavyTails(base=base), **options)
+    fit(model, "map")
+    first = model.predict(Z, True).variance
+    added = model.noise.added
+    assert {*ROWS} <= {*rows_of(model.noise.is_outlier)}
+    fit(model, "map")
+    assert torch.equal(model.predict(Z, True).variance, first)
+    assert torch.equal(model.noise.added, added)
+
+
+BAD = {
+    "share": (lambda: HeavyTails(share=0.6), ValueError, "below 0.5"),
+    "no share": (lambda: HeavyTails(share=0.0), ValueError, "above 0"),
+    "base": (lambda: HeavyTails(base=0.1), TypeError, "train_Yvar"),
+    "both": (
+        lambda: CKA(X, clean(), 0.1, physics=wave, noise=HeavyTails(base=RelativeNoise())),
+        ValueError,
+        "found both",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", list(BAD))
+def test_bad_input(name):
+    call, error, match = BAD[name]
+    with pytest.raises(error, match=match):
+        call()

@@ -1,0 +1,420 @@
+"""Outputs with bounds: a link, with the physics through it."""
+
+import math
+
+import pytest
+import torch
+from botorch.acquisition import (
+    LogExpectedImprovement,
+    qLogExpectedImprovement,
+    qLogNoisyExpectedImprovement,
+)
+from botorch.acquisition.objective import GenericMCObjective, ScalarizedPosteriorTransform
+from botorch.generation import MaxPosteriorSampling
+from botorch.models import ModelListGP, SingleTaskGP
+from botorch.sampling import SobolQMCNormalSampler
+from botorch.sampling.pathwise import draw_matheron_paths
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gpadjust.core import (
+    CKA,
+    GP,
+    KnownNoise,
+    PhysicsMeanGP,
+    StackedGP,
+    Stationary,
+    Term,
+    ZeroMeanGP,
+    fit,
+    load,
+    save,
+)  # fmt: skip
+from gpadjust.kinds.links import (
+    Link,
+    Linked,
+    LinkedCalibratedPhysics,
+    LinkedCKA,
+    LinkedMarginals,
+    LinkedPhysicsMeanGP,
+    LinkedRRA,
+    LinkedScaleGP,
+    LinkedZeroMeanGP,
+    linked,
+)
+from gpadjust.physics import FunctionPhysics, PhysicsError, Unknown
+
+X = torch.linspace(0.1, 1.0, 12, dtype=torch.float64).unsqueeze(-1)
+NEW = torch.tensor([[0.05], [0.5], [2.5]], dtype=torch.float64)
+NOISE = torch.randn(12, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+LEVELS = torch.tensor([0.025, 0.5, 0.975], dtype=torch.float64)
+
+
+def decades(X):
+    return (6 * X[:, :1]).exp()
+
+
+def share(X):
+    return X[:, :1] / (1 + X[:, :1])
+
+
+Y = 3 * decades(X) ** 1.1 * (0.05 * NOISE).exp()
+SHARES = (2 * share(X).logit() + 0.05 * NOISE).sigmoid()
+C = Y.log().mean()
+
+
+def drawn(model, number=4):
+    """Return the model with some draws."""
+    generator = torch.Generator().manual_seed(number)
+    shape = (number, *model.u.shape[1:])
+    model.set_draws(0.4 * torch.randn(shape, dtype=torch.float64, generator=generator))
+    return model
+
+
+@pytest.fixture
+def model():
+    return drawn(LinkedCKA(X, Y, physics=decades))
+
+
+@pytest.fixture
+def plain():
+    """The model of the logarithms, by hand."""
+    return drawn(CKA(X, Y.log() - C, physics=lambda X: decades(X).log() - C))
+
+
+@pytest.fixture
+def shares():
+    return drawn(LinkedCKA(X, SHARES, physics=share, link="logit"))
+
+
+def close(one, other, size=1e-10):
+    torch.testing.assert_close(one, other, rtol=size, atol=0.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [1.0, 1e-12, 1e12])
+def test_a_fit_is_that_of_the_logarithms_in_every_unit(factor):
+    model = LinkedCKA(X, factor * Y, physics=lambda X: factor * decades(X))
+    plain = CKA(X, Y.log() - C, physics=lambda X: decades(X).log() - C)
+    one, other = fit(model, num_draws=16), fit(plain, num_draws=16)
+    expected = factor * (plain.marginals(NEW, True).quantile(0.5) + C).exp()
+    close(model.predict(NEW, True).mean, expected, 1e-6)
+    evidence = other.log_evidence - (factor * Y).log().sum()
+    close(one.log_evidence, evidence, 1e-8)
+    assert one.probabilities.keys() == other.probabilities.keys()
+
+
+def test_it_is_the_model_of_the_logarithms(model, plain):
+    for noise in (False, True):
+        for own, other in zip(model.interval(NEW, 0.9, noise), plain.interval(NEW, 0.9, noise),
+                              strict=True):  # fmt: skip
+            close(own, (other + C).exp())
+    one, other = model.left_out(), plain.left_out()
+    close(one.log_density(Y), other.log_density(Y.log() - C) - Y.log())
+    close(one.probability(Y), other.probability(Y.log() - C))
+    close(model.log_unit(), plain.log_unit() - Y.log().sum())
+    close(model.delta(NEW).mean, plain.delta(NEW).mean)
+    functions = model.sample_functions(3, seed=0)(NEW)
+    close(functions, (plain.sample_functions(3, seed=0)(NEW) + C).exp())
+    later = model.condition_on_observations(NEW, decades(NEW))
+    expected = plain.condition_on_observations(NEW, decades(NEW).log() - C)
+    close(later.predict(X).mean, (expected.marginals(X).quantile(0.5) + C).exp())
+    some = torch.tensor([1, 5, 7])
+    close(
+        later.subset_rows(some).conditioning().alpha,
+        expected.subset_rows(some).conditioning().alpha,
+    )
+
+
+def test_one_draw_is_a_log_normal():
+    model = LinkedZeroMeanGP(X, Y)
+    mean, variance = (each[0] for each in model.components(NEW, True))
+    prediction, sd = model.predict(NEW, True), variance.sqrt()
+    close(prediction.mean, (mean + C).exp())
+    close(prediction.variance, (prediction.mean * sd.sinh()).square(), 1e-6)
+    y = torch.tensor([[2.0], [70.0], [1e5]], dtype=torch.float64)
+    law = torch.distributions.LogNormal(mean + C, sd)
+    marginals = model.marginals(NEW, True)
+    close(marginals.log_density(y), law.log_prob(y))
+    close(marginals.probability(y), law.cdf(y))
+    close(marginals.quantile(0.9), law.icdf(torch.tensor(0.9).double()), 1e-7)
+    outside = marginals.log_density(torch.tensor([[0.0], [-1.0], [math.nan]]).double()).flatten()
+    assert outside[:2].tolist() == [-math.inf] * 2
+    assert outside[2].isnan()
+
+
+def test_samples_have_the_quantiles_and_densities(shares):
+    posterior = shares.posterior(NEW[:2])
+    samples = posterior.rsample(torch.Size([4000]))
+    quantiles = posterior.quantile(LEVELS)
+    assert ((samples > 0) & (samples < 1)).all()
+    for level, ends in zip(LEVELS, quantiles, strict=True):
+        torch.testing.assert_close((samples < ends).double().mean(0), level.expand(2, 1),
+                                   rtol=0.0, atol=0.03)  # fmt: skip
+    torch.testing.assert_close(torch.stack(shares.interval(NEW[:2])), quantiles[[0, 2]])
+    close(posterior.mean, quantiles[1])
+    close(posterior.variance, shares.predict(NEW[:2]).variance)
+    y = torch.linspace(-12, 12, 4000, dtype=torch.float64).sigmoid().reshape(-1, 1, 1)
+    total = torch.trapezoid(posterior.density(y.expand(-1, 2, 1)), y, dim=0)
+    torch.testing.assert_close(total, torch.ones(2, 1).double(), rtol=1e-3, atol=0.0)
+    functions = shares.sample_functions(300, seed=0, num_features=128)(NEW[:2])
+    torch.testing.assert_close(functions.median(0).values, quantiles[1], rtol=0.1, atol=0.0)
+    with pytest.raises(AttributeError, match="not Gaussian; take samples"):
+        _ = posterior.distribution
+
+
+@given(
+    st.sampled_from([("log", 0.0, 1.0), ("log", 0.0, 1e-12), ("log", 0.0, 1e12),
+                     ("logit", -36.0, 1.0), ("logit", 36.0, 1.0), ((2.0, 2.001), 0.0, 1.0),
+                     ((-3.0, math.inf), -30.0, 1.0)]),
+    st.lists(st.floats(-9.0, 9.0), min_size=1, max_size=4),
+    st.floats(-6.0, 6.0),
+    st.floats(0.01, 0.999),
+)  # fmt: skip
+@settings(max_examples=40, deadline=None)
+def test_predictions_are_within_their_intervals_and_bounds(case, means, log_sd, level):
+    name, middle, size = case
+    link = Link.of(name)._replace(location=torch.tensor([middle + math.log(size)]).double())
+    means = torch.tensor(means, dtype=torch.float64).reshape(-1, 1, 1)
+    marginals = LinkedMarginals(means, torch.full_like(means, math.exp(2 * log_sd)), link)
+    mean, variance = marginals.prediction
+    lower, upper = (marginals.quantile(end) for end in ((1 - level) / 2, (1 + level) / 2))
+    assert lower <= mean <= upper
+    assert link.holds(torch.stack([lower, mean, upper])).all()
+    assert variance.isfinite()
+    assert (variance >= 0).all()
+    assert link.value(torch.stack([lower, mean, upper])).isfinite().all()
+
+
+@pytest.mark.parametrize("bounds", [(0.0, math.inf), (2.0, 5.0), (-1.0, math.inf)])
+def test_the_link_and_its_derivative(bounds):
+    link = Link.of(bounds)._replace(location=torch.tensor([0.3, -2.0]).double())
+    y = torch.tensor([[2.1, 3.0], [4.9, 4.0]], dtype=torch.float64, requires_grad=True)
+    close(link.inverse(link.value(y)), y)
+    (slope,) = torch.autograd.grad(link.value(y).sum(), y)
+    close(link.log_slope(y.detach()), slope.log())
+    close(link.of_outputs([1]).value(y[:, 1:]), link.value(y)[:, 1:])
+
+
+def test_gradients_of_mean_and_variance(model):
+    Z = NEW[:2].unsqueeze(1).clone().requires_grad_()
+    assert torch.autograd.gradcheck(lambda Z: model.posterior(Z).mean.log(), Z, atol=1e-4)
+    assert torch.autograd.gradcheck(lambda Z: model.posterior(Z).variance.log(), Z, atol=1e-4)
+
+
+def test_known_variances_by_the_delta_method():
+    variances = (0.05 * Y).square()
+    model = drawn(LinkedCKA(X, Y, variances, physics=decades))
+    known = model.noise.known * model.unit.square()
+    close(known, torch.full_like(known, 0.0025))
+    assert model.data.Yvar is not variances
+    own = 0.0025 * decades(NEW).square()
+    one = model.condition_on_observations(NEW, decades(NEW), own)
+    other = model.condition_on_observations(NEW, decades(NEW))  # with the mean of those known
+    close(one.predict(X).mean, other.predict(X).mean)
+    close(other.data.Yvar[-3:], own)
+    variance = model.components(NEW)[1]
+    median = model.predict(NEW).mean
+    close(model.components(NEW, 0.01 * median.square())[1], variance + 0.01)
+    with pytest.raises(ValueError, match=r"found -0\.05"):
+        model.condition_on_observations(NEW, -NEW)
+    fantasies = model.fantasize(NEW, SobolQMCNormalSampler(torch.Size([2]), seed=0))
+    assert fantasies.conditioning().chol.shape[:-2] == (4, 1)  # of all fantasies
+    given = model.condition_on_observations(
+        NEW, fantasies.data.Y[:, -3:], fantasies.data.Yvar[0, -3:]
+    )
+    close(given.predict(X).mean[0], fantasies.predict(X).mean[0], 1e-6)
+    missing = Y.clone()
+    missing[3] = math.nan
+    two = LinkedZeroMeanGP(X, torch.cat([missing, Y], -1), torch.cat([variances, variances], -1))
+    close(two.noise.known * two.unit.square(), torch.full((2, 12), 0.0025, dtype=torch.float64))
+
+
+def test_conditioning_is_a_model_of_all_data(shares):
+    later = shares.condition_on_observations(NEW, share(NEW))
+    both = LinkedCKA(
+        torch.cat([X, NEW]), torch.cat([SHARES, share(NEW)]), physics=share, link="logit"
+    )
+    both.link, both.unit = shares.link, shares.unit  # those of the first rows
+    assert (later.components(NEW)[1] < shares.components(NEW)[1]).all()
+    close(later.data.Y, both.data.Y)
+    close(later.on_gaussian_scale(later.data.Y), both.on_gaussian_scale(both.data.Y))
+    stepwise = shares
+    for i in range(3):
+        stepwise = stepwise.condition_on_observations(NEW[[i]], share(NEW[[i]]))
+    close(stepwise.predict(X).mean, later.predict(X).mean, 1e-8)
+
+
+def test_unknown_parameters_and_missing_observations():
+    law = FunctionPhysics(
+        lambda X, p: torch.stack([(p.a * X[:, 0]).exp() - 1, (-p.a * X[:, 0]).exp()], -1),
+        unknowns={"a": Unknown(3.0, sd=3.0)},  # a negative one is outside the bounds
+    )
+    seen = torch.cat([decades(X) - 1, 1 / decades(X)], -1)
+    seen[3, 1] = math.nan
+    model = LinkedCalibratedPhysics(X, seen * (0.01 * NOISE).exp(), physics=law)
+    u = model.u.detach().repeat(2, 1, 1)
+    u[1, :, -1] = -2.0
+    value, gradient = model.log_likelihood(u)
+    assert value[0].isfinite().all()
+    assert (value[1] == -math.inf).all()
+    assert gradient.isfinite().all()
+    result = fit(model, num_draws=32)
+    torch.testing.assert_close(model.physics_parameters.mean, torch.tensor([6.0]).double(),
+                               rtol=0.01, atol=0.0)  # fmt: skip
+    assert model.left_out().log_density(seen).isnan().sum() == 1
+    assert result.log_evidence.isfinite().all()
+    with pytest.raises(PhysicsError, match=r"(?s)returned -.*row 1: \[-1.0"):
+        model.predict(torch.tensor([[1.0], [-1.0]]).double())
+
+
+def test_outputs_have_locations_of_their_own():
+    both = torch.cat([Y, 1e-12 * Y.flip(0)], -1)
+    physics = FunctionPhysics(lambda X: torch.cat([decades(X), 1e-10 / decades(X)], -1))
+    model = drawn(LinkedCKA(X, both, physics=physics))
+    for j in (0, 1):
+        part = model.subset_output([j])
+        close(part.predict(NEW).mean, model.predict(NEW).mean[:, [j]])
+        close(model.posterior(NEW, [j]).mean, model.predict(NEW).mean[:, [j]])
+        transform = ScalarizedPosteriorTransform(torch.eye(2).double()[j] * -2.0, 1.0)
+        scalar = model.posterior(NEW, posterior_transform=transform)
+        close(scalar.mean, 1.0 - 2.0 * part.predict(NEW).mean)
+        assert scalar.rsample(torch.Size([4])).shape == (4, 3, 1)
+        assert part.condition_on_observations(NEW, decades(NEW)).predict(NEW).mean.isfinite().all()
+    with pytest.raises(ValueError, match=r"the weight of one of 2.*LinearMCObjective"):
+        model.posterior(
+            NEW, posterior_transform=ScalarizedPosteriorTransform(torch.ones(2).double())
+        )
+
+
+def test_botorch_takes_it(model):
+    Z, best = X[::3].unsqueeze(1), Y.max()
+    sampler = SobolQMCNormalSampler(torch.Size([32]), seed=0)
+    one = qLogExpectedImprovement(model, best, sampler)(Z)
+    assert one.shape == (4,)
+    assert one[-1] > one[0]
+    several = ModelListGP(model, SingleTaskGP(X, SHARES))
+    objective = GenericMCObjective(lambda Y, X=None: Y[..., 0])
+    sampler = SobolQMCNormalSampler(torch.Size([64]), seed=0)
+    other = qLogExpectedImprovement(several, best, objective=objective)(Z)
+    torch.testing.assert_close(other[-1], one[-1], rtol=0.0, atol=0.7)
+    later = several.condition_on_observations([NEW, NEW], torch.cat([decades(NEW), share(NEW)], -1))
+    close(later.models[0].data.Y[-3:], decades(NEW))
+    noisy = qLogNoisyExpectedImprovement(several, X, objective=objective, prune_baseline=True)
+    assert noisy(Z).isfinite().all()
+    analytic = LogExpectedImprovement(model, best)(Z)
+    assert analytic.argmax() == 3
+    assert MaxPosteriorSampling(model, replacement=False)(X, 2).shape == (2, 1)
+    values = draw_matheron_paths(model, torch.Size([5]))(X)
+    assert values.shape == (5, 12)
+    assert (values > 0).all()
+
+
+def test_mixtures_of_linked_models():
+    models = {
+        "mean": drawn(LinkedPhysicsMeanGP(X, Y, physics=decades)),
+        "none": drawn(LinkedZeroMeanGP(X, Y), 8),
+    }
+    stacked = StackedGP(models, [0.25, 0.75], 32)
+    levels = [stacked.interval(NEW)[0], stacked.predict(NEW).mean, stacked.interval(NEW)[1]]
+    close(torch.stack(levels), stacked.posterior(NEW).quantile(LEVELS))
+    probability = sum(w * m.marginals(NEW).probability(levels[1])
+                      for w, m in zip([0.25, 0.75], models.values(), strict=True))  # fmt: skip
+    close(probability, torch.full((3, 1), 0.5).double())
+    functions = stacked.sample_functions(200, seed=0, num_features=128)(NEW[:2])
+    torch.testing.assert_close(functions.median(0).values, levels[1][:2], rtol=0.1, atol=0.0)
+    density = [m.left_out().log_density(Y).sum() for m in models.values()]
+    chosen = StackedGP.by_left_out(models, 16).weights
+    assert max(chosen, key=chosen.get) == ("mean" if density[0] > density[1] else "none")
+    several = ModelListGP(stacked, SingleTaskGP(X, SHARES))
+    close(several.posterior(NEW).mean[:, :1], levels[1])
+    later = stacked.condition_on_observations(NEW, decades(NEW))
+    assert (later.components(NEW)[1].mean(0) < stacked.components(NEW)[1].mean(0)).all()
+    with pytest.raises(ValueError, match=r"one scale of y; found log\(y\).*, y"):
+        StackedGP({"one": models["none"], "other": ZeroMeanGP(X, Y)}, [0.5, 0.5])
+
+
+class Sine(GP):
+    """A structure of one's own."""
+
+    def __init__(self, train_X, train_Y, train_Yvar=None, *, gain=1.0, **options):
+        super().__init__(train_X, train_Y, train_Yvar, terms=[Term("f", Stationary(), gain)],
+                         settings={"gain": gain} | options, **options)  # fmt: skip
+
+
+class LinkedSine(Linked, Sine):
+    """It with a link."""
+
+
+@pytest.mark.parametrize(
+    ("made", "options"),
+    [
+        (LinkedCKA, {"physics": decades, "link": (-1.0, math.inf)}),
+        (LinkedRRA, {"physics": decades, "num_features": 16}),
+        (LinkedScaleGP, {"physics": decades}),
+        (LinkedZeroMeanGP, {"noise": KnownNoise(torch.ones(1, 12).double())}),
+        (LinkedSine, {"gain": 2.0, "link": (0.0, 1e9)}),
+    ],
+)
+def test_save_and_load(made, options, tmp_path):
+    model = drawn(made(X, Y, **options))
+    model = model.condition_on_observations(NEW, decades(NEW))
+    saved = save(model, tmp_path / "model.pt")
+    again = load(tmp_path / "model.pt", trusted=True, **{n: options[n] for n in saved.missing})
+    assert type(again) is made
+    close(again.predict(NEW).mean, model.predict(NEW).mean)
+    assert ", of log(" in again.summary().splitlines()[0]
+
+
+def test_structures_and_their_linked_classes():
+    assert linked(CKA) is LinkedCKA
+    assert linked(LinkedCKA) is LinkedCKA
+    assert linked(Sine) is linked(Sine)
+    own = drawn(linked(Sine)(X, Y, gain=2.0))
+    close(own.predict(NEW).mean, drawn(LinkedSine(X, Y, gain=2.0)).predict(NEW).mean)
+
+
+def test_rows_of_frames():
+    pd = pytest.importorskip("pandas")
+    frame = pd.DataFrame({"x": X[:, 0]})
+    model = LinkedPhysicsMeanGP(frame, pd.Series(Y[:, 0], name="rate"), physics=decades)
+    assert list(model.predict(frame[:2]).mean.columns) == ["rate"]
+
+
+BAD = {
+    "targets": ({"train_Y": Y - 10}, ValueError, "targets above 0.*found .* the first row 0"),
+    "shares": ({"link": "logit"}, ValueError, r"above 0 and below 1, as log\(y / \(1 - y\)\)"),
+    "name": ({"link": "logarithm"}, ValueError, "expected 'log', 'logit'"),
+    "a bound": ({"link": (1.0,)}, TypeError, "two bounds"),
+    "texts": ({"link": ("a", 1.0)}, TypeError, "two bounds"),
+    "none": ({"link": None}, TypeError, "two bounds"),
+    "order": ({"link": (1.0, 0.0)}, ValueError, "below the upper"),
+    "no lower": ({"link": (-math.inf, 0.0)}, ValueError, "finite lower.*distance"),
+    "physics": (
+        {"physics": lambda X: X - 0.5},
+        PhysicsError,
+        r"-0.4, which.*clamp.*row 0: \[0.1\]",
+    ),
+    "outputs": ({"train_Y": torch.cat([Y, Y], -1)}, ValueError, "2 outputs of physics.*found 1"),
+    "infinite": ({"train_Y": Y / 0}, ValueError, "infinity"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input(case):
+    changed, error, message = BAD[case]
+    options = {"train_Y": Y, "physics": decades} | changed
+    with pytest.raises(error, match=f"(?s){message}"):
+        LinkedPhysicsMeanGP(X, options.pop("train_Y"), **options)
+
+
+def test_bad_calls(model):
+    with pytest.raises(ValueError, match=r"targets above 0.*found -0\.05"):
+        model.condition_on_observations(NEW, -NEW)
+    with pytest.raises(ValueError, match="not negative or NaN"):
+        model.predict(NEW, torch.ones(4, 1).double())
+    with pytest.raises(TypeError, match=r"Gaussian in log\(y\)"):
+        model.as_single_task_gp()
+    with pytest.raises(TypeError, match="structure"):
+        linked(torch.nn.Linear)
+    assert isinstance(PhysicsMeanGP(X, Y, physics=decades).predict(NEW).mean, torch.Tensor)

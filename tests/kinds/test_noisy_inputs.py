@@ -1,0 +1,222 @@
+"""Inputs that were measured with noise."""
+
+import numpy as np
+import pytest
+import torch
+from torch.nn.functional import silu
+
+from gpadjust.core import CKA, GP, CalibratedPhysics, Term, ZeroMeanGP, fit, load, save
+from gpadjust.kinds.heavy_tails import HeavyTails
+from gpadjust.kinds.noisy_inputs import NoisyInputs
+from gpadjust.kinds.relative import RelativeNoise
+from gpadjust.physics import BlackBoxPhysics, FunctionPhysics, PhysicsError, Unknown
+
+SD = 0.05
+TEST = torch.linspace(0.05, 0.95, 41, dtype=torch.float64).unsqueeze(-1)
+
+
+def f_p(X):
+    return torch.sin(6 * X[..., :1])
+
+
+def truth(X):
+    return 1.2 * f_p(X) + X.square()
+
+
+def forrester(X):
+    return (6 * X - 2).square() * torch.sin(12 * X - 4)
+
+
+def case(seed=3, truth=truth, n=30):
+    draw = torch.Generator().manual_seed(seed)
+    true = torch.rand(n, 1, generator=draw, dtype=torch.float64)
+    noise = torch.randn(2, n, 1, generator=draw, dtype=torch.float64)
+    return true + SD * noise[0], truth(true) + 0.02 * noise[1]
+
+
+X, Y = case()
+
+
+def model_of(X, Y, variances, structure=CKA, **options):
+    base = options.pop("base", None)
+    noisy = NoisyInputs(X, variances, base)
+    return structure(noisy.X, Y, noise=noisy, **options)
+
+
+def test_true_inputs_vary_less_than_measured_ones():
+    noisy = NoisyInputs(X, SD**2)
+    total = noisy.X.var(0) + noisy.spread.square().mean(0)
+    torch.testing.assert_close(total, X.var(0) - SD**2)
+    some = torch.zeros_like(X)
+    some[:10] = SD**2
+    noisy = NoisyInputs(X, some)
+    assert torch.equal(noisy.X[10:], X[10:])
+    assert not noisy.spread[10:].any()
+
+
+def test_moments_are_those_of_the_function_at_the_true_inputs():
+    noisy = NoisyInputs(X, SD**2)
+    two = lambda X: torch.cat([f_p(X), X.exp()], -1)  # noqa: E731
+    model = GP(noisy.X, torch.cat([Y, Y], -1), terms=[Term("rho", mean=1.0, physics=0)],
+               physics=[two], noise=noisy)  # fmt: skip
+    learnt = noisy.learnt(model, model.with_noise)
+    draw = torch.Generator().manual_seed(0)
+    error = torch.randn(100_000, 30, 1, generator=draw, dtype=torch.float64)
+    values = two(noisy.X + noisy.spread * error) / model.unit[:, 0]
+    expected = (values.mean(0) - two(noisy.X) / model.unit[:, 0]).mT
+    torch.testing.assert_close(learnt.shift, expected, atol=5e-3, rtol=0.0)
+    torch.testing.assert_close(learnt.added, values.var(0).mT, rtol=0.04, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_it_is_nearer_than_what_ignores_it():
+    half = lambda X: 0.5 * forrester(X) + 10 * (X - 0.5) - 5  # noqa: E731
+    ratios = []
+    for seed in range(3):
+        X, Y = case(seed, forrester)
+        models = (CKA(X, Y, physics=half), model_of(X, Y, SD**2, physics=half))
+        off = []
+        for model in models:
+            fit(model, "map")
+            off.append((model.predict(TEST).mean - forrester(TEST)).square().mean().sqrt().log())
+        ratios.append(off[1] - off[0])
+    assert sum(ratios) / 3 < -0.2
+
+
+@pytest.mark.slow
+def test_an_unknown_parameter_is_nearer_to_the_truth():
+    draw = torch.Generator().manual_seed(0)
+    true = torch.rand(200, 1, generator=draw, dtype=torch.float64)
+    X = true + 0.1 * torch.randn(200, 1, generator=draw, dtype=torch.float64)
+    line = FunctionPhysics(lambda X, p: p.a * (X[:, 0] - 0.5), unknowns={"a": Unknown(1.0, sd=2.0)})
+    Y = 2 * (true - 0.5) + 0.02 * torch.randn(200, 1, generator=draw, dtype=torch.float64)
+    models = (
+        CalibratedPhysics(X, Y, physics=line),
+        model_of(X, Y, 0.01, CalibratedPhysics, physics=line),
+    )
+    for model in models:
+        fit(model, "map")
+    ignoring, noisy = (model.physics_parameters.mean.item() for model in models)
+    assert ignoring < 1.85  # by 12 %, as errors in variables have it
+    assert abs(noisy - 2) < 0.1
+
+
+def test_exact_inputs_change_nothing():
+    plain, model = CKA(X, Y, physics=f_p), model_of(X, Y, 0.0, physics=f_p)
+    for each in (plain, model):
+        fit(each, "map")
+    assert torch.equal(plain.predict(TEST).mean, model.predict(TEST).mean)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("structure", [CKA, ZeroMeanGP])
+def test_fits_conditioning_subsets_and_files(structure, tmp_path):
+    two = torch.cat([Y, 2 * Y.flip(0)], -1)
+    options = {} if structure is ZeroMeanGP else {"physics": lambda X: X.sin().expand(-1, 2)}
+    model = model_of(X, two, SD**2, structure, **options)
+    fit(model, "map")
+    assert (model.noise.added.amax(-1) > 10 * model.noise.added.amin(-1)).all()
+    first = model.predict(TEST, True)
+    fit(model, "map")
+    assert all(map(torch.equal, model.predict(TEST, True), first))
+    later = model.condition_on_observations(TEST[:1], 3 + truth(TEST[:1]).expand(-1, 2))
+    assert (later.predict(TEST[:1]).mean > model.predict(TEST[:1]).mean).all()
+    assert not later.noise.added[:, 30:].any()  # later inputs are exact
+    assert not later.noise.shift[:, 30:].any()
+    second = model.subset_output([1])
+    torch.testing.assert_close(second.predict(TEST, True).variance, first.variance[:, 1:])
+    fit(later, "map")
+    if structure is ZeroMeanGP:
+        for each in (model, later):
+            assert not save(each, tmp_path / "model.pt").missing
+            again = load(tmp_path / "model.pt")
+            torch.testing.assert_close(again.predict(TEST, True), each.predict(TEST, True))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("is_inner", [True, False])
+def test_outliers_of_noisy_inputs(is_inner, tmp_path):
+    off = Y.clone()
+    off[5] += 4.0
+    if is_inner:
+        noisy = NoisyInputs(X, SD**2)
+        X_hat, noise = noisy.X, HeavyTails(base=noisy)
+    else:
+        noise = NoisyInputs(X, SD**2, base=HeavyTails())
+        X_hat = noise.X
+    model = CKA(X_hat, off, physics=silu, noise=noise)
+    fit(model, "map")
+    assert model.noise.is_outlier.flatten().nonzero().tolist() == [[5]]
+    alone = torch.arange(30) != 5
+    without = model_of(X[alone], off[alone], SD**2, physics=silu)
+    fit(without, "map")
+    assert (model.predict(TEST).mean - without.predict(TEST).mean).abs().max() < 0.15
+    assert not save(model, tmp_path / "model.pt").missing
+    again = load(tmp_path / "model.pt", trusted=True)
+    torch.testing.assert_close(again.predict(TEST, True), model.predict(TEST, True))
+    first = model.predict(TEST).mean
+    fit(model, "map")
+    assert torch.equal(model.predict(TEST).mean, first)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{"train_Yvar": 0.02**2}, {"base": RelativeNoise()}])
+def test_other_noise_of_the_targets(options):
+    model = model_of(X, Y, SD**2, physics=f_p, **options)
+    fit(model, "map")
+    assert (model.predict(TEST).mean - truth(TEST)).square().mean().sqrt() < 0.15
+    added = (model.left_out().variances[0] > model.predict(model.data.X, True).variance).sum()
+    assert added > 20
+
+
+def test_a_black_box_that_cannot_be_asked_everywhere():
+    X = torch.linspace(0, 1, 12, dtype=torch.float64).unsqueeze(-1)
+
+    def root(X):
+        if (X < 0).any():
+            raise ValueError("no root")
+        return np.sqrt(X[:, :1])
+
+    model = model_of(X, X.sqrt() + 0.1, 1e-3, physics=BlackBoxPhysics(root))
+    fit(model, "map")
+    assert model.noise.added.argmax() <= 1  # where the root is steep
+    noisy = NoisyInputs(X, 1e-3)
+    never = BlackBoxPhysics(lambda X: np.where(np.isin(X, noisy.X), X, np.nan))
+    with pytest.raises(PhysicsError):
+        fit(CKA(noisy.X, X, physics=never, noise=noisy), "map")
+
+
+def test_frames_stay_frames():
+    pd = pytest.importorskip("pandas")
+    frame = pd.DataFrame(X.numpy(), columns=["length"], index=range(5, 35))
+    noisy = NoisyInputs(frame, pd.DataFrame({"length": np.full(30, SD**2)}))
+    assert list(noisy.X.columns) == ["length"]
+    assert list(noisy.X.index) == list(frame.index)
+    np.testing.assert_allclose(noisy.X, NoisyInputs(X, [SD**2]).X)
+    assert isinstance(NoisyInputs(X.numpy(), SD**2).X, np.ndarray)
+    assert CKA(noisy.X, Y, physics=f_p, noise=noisy).data.input_names == ("length",)
+
+
+BAD = {
+    "negative": (lambda: NoisyInputs(X, -1.0), ValueError, "Expected variances in variances"),
+    "shape": (lambda: NoisyInputs(X, [1e-3, 1e-3]), ValueError, "one number"),
+    "large": (lambda: NoisyInputs(X, 1.0), ValueError, "not standard deviations"),
+    "nan": (lambda: NoisyInputs(X, float("nan")), ValueError, "finite"),
+    "base": (lambda: NoisyInputs(X, 1e-3, base=0.1), TypeError, "train_Yvar"),
+    "float32": (lambda: NoisyInputs(X.float(), 1e-3), TypeError, "double"),
+    "rows": (
+        lambda: CKA(X[:9], Y[:9], physics=f_p, noise=NoisyInputs(X, 1e-3)), ValueError,
+        "30 measured",
+    ),
+    "measured": (
+        lambda: fit(CKA(X, Y, physics=f_p, noise=NoisyInputs(X, 1e-3)), "map"), ValueError,
+        "noisy.X",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", list(BAD))
+def test_bad_input(name):
+    call, error, match = BAD[name]
+    with pytest.raises(error, match=match):
+        call()

@@ -1,0 +1,146 @@
+"""Noise that grows with the size of what is measured."""
+
+import math
+
+import pytest
+import torch
+
+from gpadjust.core import CKA, GP, Term, ZeroMeanGP, fit, load, save
+from gpadjust.kinds.relative import RelativeNoise
+from gpadjust.physics import FunctionPhysics, Unknown
+
+X = torch.linspace(0.02, 1, 40, dtype=torch.float64).unsqueeze(-1)
+ENDS = torch.tensor([[0.05], [0.95]], dtype=torch.float64)
+
+
+def decades(X):
+    return torch.exp(6 * X[..., :1] - 4)
+
+
+def growing(relative=0.1, constant=0.02, seed=0):
+    draw = torch.Generator().manual_seed(seed)
+    f = decades(X) * (1 + 0.2 * X)
+    sd = (constant**2 + (relative * f).square()).sqrt()
+    return f + sd * torch.randn(40, 1, generator=draw, dtype=torch.float64)
+
+
+def drawn(model):
+    draw = torch.Generator().manual_seed(0)
+    u = 0.4 * torch.randn(2, *model.u.shape[1:], generator=draw, dtype=torch.float64)
+    model.set_draws(u)
+    return model.eval()
+
+
+def noise_at(model, Z):
+    """The variance of the noise that predictions add, ``q x m``."""
+    return model.predict(Z, observation_noise=True).variance - model.predict(Z).variance
+
+
+def test_both_numbers_are_found_in_the_user_s_units():
+    model = CKA(X, 100 * growing(), physics=lambda X: 70 * decades(X), noise=RelativeNoise())
+    fit(model)
+    constant, relative = model.noise.standard_deviations(model)
+    assert 1.0 < constant.median() < 4.0
+    assert 0.06 < 0.7 * relative.median() < 0.16 * 1.2  # of f_p, which is less than f
+    f = 70 * decades(ENDS)
+    few, each = model.values, model.unit.square()
+    expected = (few["noise.constant"][..., 0] + 1e-11) * each[0]
+    size = (70 * decades(X)).square().mean()
+    expected = expected + (few["noise.relative"][..., 0] + 1e-11) * f.mT.square() / size * each
+    torch.testing.assert_close(noise_at(model, ENDS)[:, 0], expected.detach().mean(0))
+    low, high = model.interval(ENDS, observation_noise=True)
+    widths = (high - low).flatten()
+    assert 8 < widths[1] / widths[0] < 100  # of noise of one size about 1
+
+
+def test_several_physics_count_by_their_prior_means():
+    two = {"a": decades, "b": lambda X: X}
+    model = drawn(CKA(X, growing(), physics=two, rho_mean=[2.0, -1.0], noise=RelativeNoise()))
+    g = 2 * decades(ENDS) - ENDS
+    size = (2 * decades(X) - X).square().mean()
+    v = {name: value[..., 0] + 1e-11 for name, value in model.values.items()}
+    variance = v["noise.constant"] + v["noise.relative"] * g.mT.square() / size
+    expected = variance.mean(0) * model.unit[0].square()
+    torch.testing.assert_close(noise_at(model, ENDS)[:, 0], expected.detach())
+
+
+def test_without_physics_sizes_are_those_of_the_posterior_mean(tmp_path):
+    model = ZeroMeanGP(
+        X, torch.cat([growing(), growing(seed=1).flip(0)], -1), noise=RelativeNoise()
+    )
+    torch.testing.assert_close(*noise_at(model, ENDS))  # of one size before a fit
+    fit(model, "map")
+    ratio = (noise_at(model, ENDS)[1] / noise_at(model, ENDS)[0]).sqrt()
+    assert ratio[0] > 8
+    assert 1 / ratio[1] > 8
+    logs, size = model.noise.sizes[1], model.noise.sizes[3]
+    away = (logs.exp() * size * model.unit).mT - model.predict(X).mean.abs()
+    assert away.abs().max() < 0.1 * model.predict(X).mean.max()
+    second = model.subset_output([1])
+    torch.testing.assert_close(noise_at(second, ENDS), noise_at(model, ENDS)[:, 1:])
+    first = noise_at(model, ENDS)
+    assert not save(model, tmp_path / "model.pt").missing
+    torch.testing.assert_close(noise_at(load(tmp_path / "model.pt"), ENDS), first)
+    fit(model, "map")
+    assert torch.equal(noise_at(model, ENDS), first)
+
+
+def test_unknown_parameters_outputs_conditioning_and_files(tmp_path):
+    law = FunctionPhysics(
+        lambda X, p: torch.cat([(p.rate * X[:, 0] - 4).exp()[:, None], X], -1),
+        unknowns={"rate": Unknown(5.0, sd=1.0)},
+    )
+    two = torch.cat([growing(), X + 0.1], -1)
+    model = drawn(CKA(X, two, physics=law, noise=RelativeNoise()))
+    u = model.u.detach()[:1]
+    step = 1e-5 * torch.eye(u.shape[-1]).double().unsqueeze(1)
+    up, down = (model.log_likelihood(u + s, False)[0] for s in (step, -step))
+    slope = model.log_likelihood(u)[1][0]
+    torch.testing.assert_close((up - down).mT / 2e-5, slope, rtol=1e-3, atol=1e-3)
+    second = model.subset_output([1])
+    torch.testing.assert_close(noise_at(second, ENDS), noise_at(model, ENDS)[:, 1:])
+    later = model.condition_on_observations(ENDS, two[:2])
+    torch.testing.assert_close(noise_at(later, ENDS), noise_at(model, ENDS))
+    with pytest.warns(UserWarning, match="physics"):
+        save(later, tmp_path / "model.pt")
+    loaded = load(tmp_path / "model.pt", physics=law)
+    torch.testing.assert_close(loaded.predict(ENDS, True), later.predict(ENDS, True))
+
+
+@pytest.mark.slow
+def test_unknown_parameters_are_found():
+    law = FunctionPhysics(
+        lambda X, p: (p.rate * X[:, 0] - 4).exp(), unknowns={"rate": Unknown(5.0, sd=1.0)}
+    )
+    model = CKA(X, growing(0.05, 1e-3) / (1 + 0.2 * X), physics=law, noise=RelativeNoise())
+    fit(model)
+    low, high = model.physics_parameters.interval()
+    assert low[0] < 6 < high[0]
+    _, relative = model.noise.standard_deviations(model)
+    assert math.isclose(relative.median(), 0.05, rel_tol=0.5)
+
+
+class Logarithm(GP):
+    def on_gaussian_scale(self, Y):
+        return Y.log()
+
+
+BAD = {
+    "known variances": (
+        lambda: CKA(X, growing(), 0.1, physics=decades, noise=RelativeNoise()), "found both",
+    ),
+    "a link": (
+        lambda: fit(Logarithm(
+            X, decades(X), terms=[Term("rho", mean=1.0, physics=0)],
+            physics=[lambda X: 2 + decades(X)], noise=RelativeNoise(),
+        )),
+        "no link",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", list(BAD))
+def test_bad_input(name):
+    call, match = BAD[name]
+    with pytest.raises(ValueError, match=match):
+        call()

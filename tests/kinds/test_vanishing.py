@@ -1,0 +1,199 @@
+"""A formula that is right somewhere: processes that are zero there."""
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from botorch.models.transforms import Normalize
+from gpytorch.kernels import MaternKernel, RBFKernel, ScaleKernel
+
+from gpadjust.core import CKA, MATERN52, PhysicsMeanGP, ScaleGP, Stationary, fit, load, save
+from gpadjust.kinds.categories import Categories
+from gpadjust.kinds.vanishing import Vanishing
+from gpadjust.physics import FormulaPhysics, FunctionPhysics, Unknown
+from tests.systems import normal, refused, uniform
+
+OPEN = Vanishing({"valve": 1.0})
+X = uniform(16, 2, low=0.2)
+Y = 2 * X[:, 1:] ** 2 + 0.5 * (1 / X[:, :1] - 1) * X[:, 1:] ** 2 + 0.01 * normal(16, 1, seed=3)
+FRAME = pd.DataFrame(X.numpy(), columns=["valve", "flow"])
+AT_OPEN = torch.cat([torch.ones(7, 1).double(), uniform(7, 1)], -1)
+PIPE = FunctionPhysics(
+    lambda X, p: p.friction * X[:, 1] ** 2, unknowns={"friction": Unknown(1.0, factor=2.0)}
+)
+SQUARE = FormulaPhysics("flow**2", ["valve", "flow"])
+
+
+def drawn(model, number=2):
+    """Hold random coordinates."""
+    model.set_draws(0.4 * normal(number, *model.u.shape[1:], seed=3))
+    return model.eval()
+
+
+def same(actual, expected, tolerance=1e-8):
+    torch.testing.assert_close(actual, expected, rtol=tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize("where", [{0: 1.0}, {"x1": [0.5, 1.0]}, [[0.5, 0.3], [1.0, 0.4]]])
+def test_the_covariance_is_that_of_a_process_that_was_seen_to_be_zero(where):
+    """Conditioning on zeros in dense algebra, of hyperplanes at the other inputs of the points."""
+    kernel = Vanishing(where)
+    model = drawn(PhysicsMeanGP(X, Y, physics=SQUARE, covar_module=kernel, constants=False), 1)
+    Z = uniform(5, 2, high=1.5, seed=5)
+    places = kernel.values
+    if places.shape[-1] == 1:
+        rest = torch.cat([X, Z])[:, 1]
+        places = torch.stack([places.repeat(1, len(rest)).flatten(), rest.repeat(len(places))], -1)
+
+    def k(A, B):
+        away = (A[:, None] - B) / model.values["delta.kernel.lengthscale"][0, 0]
+        return model.values["delta.kernel.outputscale"] * (-away.square().sum(-1) / 2).exp()
+
+    inverse = torch.linalg.pinv(k(places, places)[0], rtol=1e-12)
+    expected = k(X, Z)[0] - k(X, places)[0] @ inverse @ k(places, Z)[0]
+    x, z = model.at(X), model.at(Z)
+    same(x.cross(z)[0, 0], expected, 1e-6)
+    assert k(X, Z)[0].sub(expected).abs().max() > 1e-3
+    same(x.variance(), x.cross(x).diagonal(dim1=-1, dim2=-2))
+    assert torch.linalg.eigvalsh(x.cross(x)).min() > -1e-9
+
+
+@pytest.mark.parametrize("kernel", [None, Stationary(MATERN52)])
+def test_gradients_and_features(kernel):
+    where = {0: 1.0} if kernel is None else [[1.0, 0.4]]
+    options = {"physics": SQUARE, "delta_covar_module": Vanishing(where, kernel), "nested": False}
+    model = drawn(CKA(X, Y, **options))
+    u = model.u.detach()
+    _, gradient = model.log_likelihood(u)
+    for i in range(u.shape[-1]):
+        step = torch.zeros_like(u)
+        step[..., i] = 1e-5
+        high, low = (model.log_likelihood(u + sign * step)[0] for sign in (1, -1))
+        torch.testing.assert_close(gradient[..., i], (high - low) / 2e-5, rtol=1e-5, atol=1e-5)
+    own = model.at(X).own(model.terms[1])
+    phi = model.terms[1].kernel.features(own, 20000, torch.Generator().manual_seed(0))
+    phi = phi(X[None, None])
+    expected = model.terms[1].kernel.covariance(own, X[None, None])
+    assert (phi @ phi.mT - expected).abs().max() < 0.05 * own["outputscale"].max()
+    there = torch.tensor([[1.0, 0.4]]).double()
+    assert model.terms[1].kernel.features(own, 64, torch.Generator())(there).abs().max() < 1e-7
+
+
+def test_delta_and_rho_are_right_there():
+    both = CKA(FRAME, Y, physics=SQUARE, rho_covar_module=OPEN, delta_covar_module=OPEN)
+    scale = ScaleGP(FRAME, Y, physics=SQUARE, covar_module=OPEN)
+    for model in (drawn(both), drawn(scale)):
+        mean, variance = model.predict(AT_OPEN)
+        same(mean, AT_OPEN[:, 1:] ** 2, 1e-7)
+        assert variance.max() < 1e-9
+        rho = model.rho(AT_OPEN)
+        same(rho.mean, torch.ones(7, 1).double())
+        assert rho.variance.max() < 1e-9
+        assert model.rho(AT_OPEN - torch.tensor([0.5, 0.0])).variance.min() > 1e-6
+    for center in (True, 0.0):  # rho alone may be another factor
+        model = CKA(FRAME, Y, physics=SQUARE, delta_covar_module=OPEN, center=center)
+        delta = model.delta(AT_OPEN)
+        assert torch.cat([delta.mean, delta.variance]).abs().max() < 1e-9
+        assert (model.predict(AT_OPEN).mean / AT_OPEN[:, 1:] ** 2 - 1).abs().min() > 0.05
+    # It is the kernel of the term that it is in.
+    names = ["rho.kernel.outputscale", "delta.kernel.outputscale"]
+    plain = CKA(FRAME, Y, physics=SQUARE)
+    for name in names:
+        same(both.table.values(0 * both.u[:1])[name], plain.table.values(0 * plain.u)[name])
+
+
+@pytest.mark.slow
+def test_unknown_parameters_functions_and_files(tmp_path):
+    model = PhysicsMeanGP(FRAME, Y, physics=PIPE, covar_module=OPEN)
+    fit(model, num_draws=16)
+    lower, upper = model.physics_parameters.interval()
+    assert lower < 2 < upper
+    assert upper - lower < 0.8
+    assert model.delta(AT_OPEN).variance.max() < 1e-9
+    Z = uniform(5, 2, low=0.2, seed=5)
+    values = model.sample_functions(1000, seed=0)(Z)
+    mean, variance = model.predict(Z)
+    assert (values.mean(0) - mean).abs().max() < 0.2 * variance.max().sqrt()
+    torch.testing.assert_close(values.std(0), variance.sqrt(), rtol=0.2, atol=0)
+    more = model.condition_on_observations(AT_OPEN[:2], 2 * AT_OPEN[:2, 1:] ** 2)
+    assert more.delta(AT_OPEN).variance.max() < 1e-9
+    assert model.left_out().means.isfinite().all()
+    known = PhysicsMeanGP(FRAME, Y, physics=SQUARE, covar_module=OPEN)
+    saved = save(known, tmp_path / "model.pt")
+    assert saved.missing == ()
+    again = load(saved.path)
+    same(again.predict(Z).mean, known.predict(Z).mean)
+    assert again.delta(AT_OPEN).variance.max() < 1e-9
+
+
+def test_transforms_categories_and_what_has_no_covariance():
+    wide = FRAME * [10.0, 1.0]
+    where = Vanishing({"valve": 10.0})
+    options = {"physics": SQUARE, "covar_module": where}
+    for transform in (None, Normalize(2)):
+        model = PhysicsMeanGP(wide, Y, **options, input_transform=transform)
+        there = AT_OPEN * torch.tensor([10.0, 1.0])
+        assert model.delta(there).variance.max() < 1e-9
+        assert model.delta(there - 1).variance.min() > 1e-6
+    metals = FRAME.assign(metal=["brass", "steel", "iron", "steel"] * 4)
+    physics = {"physics": lambda X: X[:, 1] ** 2, "input_transform": Categories()}
+    for where, right in (({"valve": 1.0}, {"valve": 1.0}), ({"metal": 2}, {"metal": "steel"})):
+        kernel = Vanishing(where)
+        model = PhysicsMeanGP(metals, Y, **physics, covar_module=kernel)
+        assert model.delta(metals.assign(**right)).variance.max() < 1e-9
+        assert model.delta(metals).variance.max() > 1e-5
+    model = PhysicsMeanGP(X, Y, physics=SQUARE, covar_module=Vanishing({0: 1.0}))
+    values = {n.removeprefix("delta.kernel."): v for n, v in model.values.items()}
+    values["outputscale"] = values["outputscale"] * torch.nan
+    assert model.terms[1].kernel.covariance(values, X[None, None]).isnan().all()
+    u = torch.cat([model.u.detach(), model.u.detach() + 1e4])
+    value, gradient = model.log_likelihood(u)
+    assert value.isfinite().tolist() == [[True], [False]]
+    assert gradient.isfinite().all()
+
+
+def test_places():
+    names = ("valve", "flow")
+    for where, expected in [
+        ({"flow": [0.0, 1.0]}, [[None, 0.0], [None, 1.0]]),
+        ({1: 0.0, "valve": 2}, [[2.0, 0.0]]),
+        ({-1: 3}, [[None, 3.0]]),
+        (np.array([[1.0, 2.0]]), [[1.0, 2.0]]),
+        ([[1.0, 2.0]], [[1.0, 2.0]]),
+        (pd.DataFrame({"flow": [4.0]}), [[None, 4.0]]),
+    ]:
+        model = PhysicsMeanGP(FRAME, Y, physics=SQUARE, covar_module=Vanishing(where))
+        found = model.terms[1].kernel.places.tolist()
+        assert [[None if v != v else v for v in row] for row in found] == expected
+        again = Vanishing(**Vanishing(where).settings)
+        assert torch.equal(again.values, Vanishing(where).values)
+        assert model.data.input_names == names
+
+
+class Turned(Normalize):
+    def transform(self, X):
+        return X @ torch.tensor([[0.6, 0.8], [-0.8, 0.6]]).to(X)
+
+
+def test_bad_places_kernels_and_transforms():
+    for where, says in (
+        ({}, "number for each column"),
+        ({"valve": [0.0, 1.0], "flow": [1.0, 2.0, 3.0]}, "as many numbers for each"),
+        ({"valve": float("nan")}, "finite"),
+        (np.zeros(3), r"points p x d.*\(3,\)"),
+        ({"metal": "steel"}, "category.*level"),
+    ):
+        refused(ValueError, says, Vanishing, where)
+    for where, options, says in (
+        ({"vane": 1.0}, {}, "columns of valve, flow.*'vane'"),
+        ({2: 1.0}, {}, "numbers from 0 to 1; found 2"),
+        (np.zeros((1, 3)), {}, "points of 2 columns"),
+        ({0: 1.0}, {"kernel": Stationary(MATERN52)}, "a product over the inputs"),
+        ({0: 1.0}, {"kernel": ScaleKernel(MaternKernel())}, "a product over the inputs"),
+        ({0: 1.0}, {"input_transform": Turned(2)}, "mixes columns"),
+    ):
+        transform = options.pop("input_transform", None)
+        kernels = {"covar_module": Vanishing(where, **options), "input_transform": transform}
+        refused(ValueError, says, PhysicsMeanGP, FRAME, Y, physics=SQUARE, **kernels)
+    of_gpytorch = ScaleKernel(RBFKernel(active_dims=[0]) * MaternKernel(active_dims=[1]))
+    PhysicsMeanGP(X, Y, physics=SQUARE, covar_module=Vanishing({0: 1.0}, of_gpytorch))
