@@ -205,7 +205,7 @@ class Collection(Measurements):
         self.close()
 
     def __repr__(self) -> str:
-        """The state of the collection in a line."""
+        """Return the state of the collection in a line."""
         m = "unknown" if self.num_outputs is None else self.num_outputs
         left = "" if self.keep is None else f", {len(self.left_out)} left out"
         return (
@@ -215,7 +215,7 @@ class Collection(Measurements):
         )
 
     def __getstate__(self) -> dict[str, Any]:
-        """The state of a copy or a pickle, whose log is its own and not held."""
+        """Return the state of a copy or a pickle, whose log is its own and not held."""
         return {**self.__dict__, "log": copy(self.log)}
 
     @property
@@ -238,7 +238,7 @@ class Collection(Measurements):
         return self._model
 
     def ask(self, q: int | None = None) -> Tensor:
-        """Say where to measure next.
+        """Choose the points to measure next.
 
         Args:
             q: Number of points. Default: ``batch_size``.
@@ -294,7 +294,7 @@ class Collection(Measurements):
         self._enter([measurement(x, y) for x, y in zip(X.tolist(), Y.tolist(), strict=True)])
 
     def fail(self, X: Tensor, reason: str | Exception) -> None:
-        """Take it that measurements failed. Their points are not asked for again.
+        """Record that measurements failed. Their points are not asked for again.
 
         Args:
             X: The points, ``n x d``.
@@ -308,7 +308,7 @@ class Collection(Measurements):
         self._enter([{"x": x, "failed": message} for x in X.tolist()])
 
     def withdraw(self, X: Tensor | None = None) -> None:
-        """Take it that points asked for will not be measured, but may be asked for again.
+        """Withdraw pending points, which will not be measured, but may be asked for again.
 
         Args:
             X: The points, ``n x d``. Default: all that are pending.
@@ -385,7 +385,7 @@ class Collection(Measurements):
             self.log.close()
 
     def _design(self, q: int) -> Tensor | None:
-        """The next points that need no model, ``q x d``, or None if a model is to choose."""
+        """Return the next points that need no model, ``q x d``, or None if a model is to choose."""
         known = torch.cat([self.X, self.failed_X, self._asked])
         first = self._first_points[~among(self._first_points, known)]
         if not len(first) and len(self.X) >= self._initial and self.num_observed >= 2:
@@ -405,7 +405,7 @@ class Collection(Measurements):
         return torch.cat([first, sobol_points(self.bounds, q, known, self.seed)])[:q]
 
     def _acquisition_function(self, q: int) -> AcquisitionFunction:
-        """The user's acquisition function of the model."""
+        """Return the user's acquisition function of the model."""
         function = self.acquisition(self.model)
         if not isinstance(function, AcquisitionFunction):
             raise TypeError(
@@ -479,7 +479,7 @@ class Collection(Measurements):
         return None
 
     def _place(self) -> str:
-        """The place of the log."""
+        """Return the place of the log."""
         return "no log was kept" if self.log is None else f"the log is at {self.log.path}"
 
 

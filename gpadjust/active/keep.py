@@ -34,7 +34,7 @@ class Keep:
 
     @torch.no_grad()
     def probabilities(self, model: Any, X: Tensor) -> Tensor:
-        """Probabilities ``n`` by a model, noise included, of points ``n x d``, each by itself."""
+        """Return probabilities ``n`` by a model, noise included, of each of ``n x d`` points."""
         found = []
         for some in X.split(_AT_ONCE):
             posterior = model.posterior(some.unsqueeze(-2), observation_noise=True)
@@ -98,7 +98,7 @@ class Keep:
         return torch.cat(taken), torch.cat([bounds[:0], *left_out])
 
     def _candidates(self, bounds: Tensor, known: Tensor) -> Tensor:
-        """Random points ``n x d`` in the bounds, half of them near those known."""
+        """Return random points ``n x d`` in the bounds, half of them near those known."""
         seed = int(torch.randint(2**31, (1,)))
         everywhere = draw_sobol_samples(bounds, n=_CANDIDATES, q=1, seed=seed).squeeze(-2)
         near = known[torch.randint(len(known), (_CANDIDATES,))]

@@ -144,7 +144,7 @@ class MeasurementLog:
             self._lock = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """The state of a copy or a pickle, which does not hold the file."""
+        """Return the state of a copy or a pickle, which does not hold the file."""
         return {**self.__dict__, "_torn": False, "_lock": None}
 
     def _hold(self) -> None:

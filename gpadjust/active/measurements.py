@@ -114,13 +114,13 @@ class Measurements:
         return point
 
     def _points(self, rows: list[list[float]]) -> Tensor:
-        """The points of a record, ``n x d``."""
+        """Return the points of a record, ``n x d``."""
         d = self.X.shape[-1]
         return checked_points("X", rows, d) if rows else self.X.new_zeros(0, d)
 
 
 def refusal(X: Tensor, result: Any, error: Exception) -> Record:
-    """The record of what an oracle returned for points ``q x d`` and is refused.
+    """Return the record of a refused result of an oracle for points ``q x d``.
 
     Example:
         >>> refusal(torch.zeros(1, 1), {"Y": torch.tensor([1.5, math.nan])}, ValueError("no"))
@@ -138,7 +138,7 @@ def refusal(X: Tensor, result: Any, error: Exception) -> Record:
 
 
 def measurement(x: list[float], y: list[float]) -> Record:
-    """The record of what was measured at a point; one that failed if no value is finite.
+    """Return the record of a measurement, a failed one if no value is finite.
 
     Example:
         >>> measurement([0.5], [1.25, float("nan")])

@@ -19,7 +19,7 @@ _OTHERS = 256  # points among which the best is taken in its place
 
 
 def sobol_points(bounds: Tensor, q: int, known: Tensor, seed: int) -> Tensor:
-    """The next points of a scrambled Sobol sequence that are not known yet.
+    """Return the next points of a scrambled Sobol sequence that are not known yet.
 
     Args:
         bounds: Bounds of the inputs, ``2 x d``.
@@ -42,7 +42,7 @@ def among(points: Tensor, others: Tensor) -> Tensor:
 
 
 def distances(points: Tensor, others: Tensor, bounds: Tensor) -> Tensor:
-    """Distances of ``n x d`` points from others, the largest over the inputs: ``n x k``.
+    """Return distances of ``n x d`` points from others, the largest over the inputs: ``n x k``.
 
     They are in units of the bounds' widths.
     """
@@ -112,7 +112,7 @@ def _near(points: Tensor, others: Tensor, bounds: Tensor) -> Tensor:
 def _elsewhere(
     acquisition: AcquisitionFunction, points: Tensor, i: int, away: Tensor, bounds: Tensor
 ) -> Tensor:
-    """The best place for the i-th of the points, among random ones that are near none of others."""
+    """Return the best place for the i-th point among random ones that are not near others."""
     seed = int(torch.randint(2**31, (1,)))
     drawn = draw_sobol_samples(bounds, n=_OTHERS, q=1, seed=seed).squeeze(-2)
     drawn = drawn[~_near(drawn, away, bounds)]

@@ -106,15 +106,22 @@ class Paths(SamplePath):
         """Do nothing, as the draws of a model are no batch."""
 
     def forward(self, X: Tensor, **_: Any) -> Tensor:
-        """Return the values at ``... x q x d``; dimensions of samples in front of X are its own."""
+        """Return the values at ``... x q x d``.
+
+        Dimensions of samples in X, in front or next to the points, are points of each function.
+        """
         k, m = self.functions.number, self.functions.model.num_outputs
         if m > 1 and X.dim() > 2 and X.shape[-3] == 1:  # the place of outputs
             X = X.squeeze(-3)
-        lead = len(self.sample_shape)
-        if k > 1 and X.shape[:lead] == self.sample_shape and X.dim() > lead + 1:
+        lead, batch = len(self.sample_shape), X.dim() - 2
+        own = [*range(batch - lead, batch)]
+        is_inner = batch > lead and X.shape[batch - lead : batch] == self.sample_shape
+        X = X.movedim(own, [*range(lead)]) if is_inner else X
+        if X.shape[:lead] == self.sample_shape and batch >= lead:
             values = self.functions.each(X.reshape(k, -1, X.shape[-1]))
             values = values.unflatten(1, X.shape[lead:-1])
         else:
             values = self.functions(X)
         values = values.reshape(*self.sample_shape, *values.shape[1:])
+        values = values.movedim([*range(lead)], own) if is_inner else values
         return values.squeeze(-1) if values.shape[-1] == 1 else values.mT

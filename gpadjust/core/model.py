@@ -323,7 +323,7 @@ class GP(gpytorch.models.GP, Predictive):
         self, train: WeightedSum, residual: Tensor, noise: Tensor, observed: Tensor,
         with_gradient: bool,
     ) -> Evidence:  # fmt: skip
-        """Return the log likelihood of residuals ``S x m x n`` of a sum; a subclass may bound it."""
+        """Return the log likelihood of residuals ``S x m x n``; a subclass may bound it."""
         return evidence(train, residual, noise, observed, with_gradient)
 
     def conditioned(
@@ -828,8 +828,8 @@ class GP(gpytorch.models.GP, Predictive):
         return f"{type(self).__name__}({n} points, {d} inputs, {m} outputs, {len(self.u)} draws)"
 
 
-@DrawMatheronPaths.register(GP)  # type: ignore[untyped-decorator]
-def _draw_matheron_paths(model: GP, *, sample_shape: Size, **_: Any) -> Paths:
+@DrawMatheronPaths.register(Predictive)  # type: ignore[untyped-decorator]
+def _draw_matheron_paths(model: Any, *, sample_shape: Size, **_: Any) -> Paths:
     """Draw functions for BoTorch's ``draw_matheron_paths``, by the model's own features."""
     functions = model.sample_functions(max(1, sample_shape.numel()))
     return Paths(functions, sample_shape)

@@ -63,8 +63,8 @@ def save(model: GP | StackedGP, path: str | Path) -> Saved:
     ``path`` is replaced.
 
     Args:
-        model: The model, or a mixture of several. A class of one's own takes train_X, train_Y and train_Yvar first, and
-            its ``settings`` are all its other arguments but ``physics``.
+        model: The model, or a mixture of several. A class of one's own takes train_X, train_Y and
+            train_Yvar first, and its ``settings`` are all its other arguments but ``physics``.
         path: The file.
 
     Warns:
@@ -247,11 +247,11 @@ def _stack(content: dict[str, Any], objects: dict[str, Any], trusted: bool) -> S
     _check_objects(content, objects)
     models = {}
     for name, each in content["models"].items():
-        own = {n: v for n, v in objects.items() if n in each["missing"] or n == "physics"}
-        choices = [own.pop("physics", None)] if each["physics"] else []
-        if isinstance(choices[0] if choices else None, dict) and not each["physics_names"]:
-            choices = [*choices[0].values()]
-        models[name] = _first_that_fits(each, own, choices, trusted)
+        own = {n: v for n, v in objects.items() if n in each["missing"] and n != "physics"}
+        physics = [objects["physics"]] if each["physics"] and "physics" in objects else []
+        if physics and isinstance(physics[0], dict) and not each["physics_names"]:
+            physics = [*physics[0].values()]
+        models[name] = _first_that_fits(each, own, physics, trusted)
     return _class_of(content, StackedGP)(models, content["weights"], content["num_components"])
 
 

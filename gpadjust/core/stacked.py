@@ -180,8 +180,9 @@ class StackedFunctions(Module):
 
     def __init__(self, model: StackedGP, number: int, num_features: int, seed: int) -> None:
         super().__init__()
+        self.model, self.number = model, checked_whole("num_functions", number, 1)
         order = torch.randperm(len(model.picks), generator=torch.Generator().manual_seed(seed))
-        order = order[torch.arange(checked_whole("num_functions", number, 1)) % len(order)]
+        order = order[torch.arange(number) % len(order)]
         self.owners, picks = model.owners[order], model.picks[order]  # k x m
         outputs = [[j] for j in range(model.num_outputs)]
         if (picks == picks[:, :1]).all():  # models as wholes

@@ -132,7 +132,7 @@ class Table:
         return values
 
     def with_values(self, u: Tensor, values: Values) -> Tensor:
-        """Return coordinates ``S x B x P`` of which some make numbers of the outputs these values."""
+        """Return coordinates ``S x B x P`` by which numbers of outputs have these values."""
         parts = []
         for row, part in zip(self.own, self._own(u).split(self._sizes[0], -1), strict=True):
             is_given = row.name in values

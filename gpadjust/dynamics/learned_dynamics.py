@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gpadjust.checks import check_switch, checked_whole
 from gpadjust.core import CKA, GP, FitResult, Prediction
+from gpadjust.core.model import Predictive
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.joint_errors import error_correlation
 from gpadjust.dynamics.learning import (
@@ -27,7 +28,7 @@ from gpadjust.kinds.factory import ModelFactory
 from gpadjust.states import StateSpec
 
 _NUM_FEATURES = 1024  # by default
-_MEAN_ROWS = 256  # kernel rows of a mean: transitions times draws
+_MEAN_ROWS = 200  # kernel rows of a mean: transitions times draws
 
 
 class LearnedDynamics(Dynamics):
@@ -250,10 +251,16 @@ class LearnedDynamics(Dynamics):
             number = min(len(model.u), max(2, _MEAN_ROWS // self.num_transitions))
             rows = ((torch.arange(number) + 0.5) * len(model.u) / number).long()
             self._means = model, model.subset_draws(rows)
-        _, few = self._means
+        few, posterior = self._means[1], self._means[1].conditioning()
+        has_scale = type(few).marginals_of is not Predictive.marginals_of  # as of a link
 
         def mean(inputs: Tensor) -> Tensor:
-            values = few.predict(inputs.flatten(0, -2)).mean
+            X = inputs.flatten(0, -2)
+            if has_scale:
+                values = few.predict(X).mean
+            else:  # without variances, which cost most
+                means, _ = posterior.mean(few.at(X, posterior.train.values))
+                values = (means.mean(-3) * few.unit).mT
             return values.unflatten(0, inputs.shape[:-1])
 
         def step(states: Tensor, actions: Tensor) -> Tensor:

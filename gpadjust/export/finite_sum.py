@@ -233,12 +233,13 @@ def _of_waves(conditioning: Conditioning) -> tuple[Tensor, Tensor]:
 
     .. math:: L L^T = I + \Phi^T N^{-1} \Phi, \quad w = \Phi^T \alpha.
     """
-    f, columns = conditioning.train, []
+    f, columns = conditioning.train, list[Tensor]()
     for term in f.terms:
         if term.kernel is None:
             continue
+        kernel: Any = term.kernel
         own, weight = f.own(term), f.weights[term.name]
-        angle = (f.x / own["lengthscale"].unsqueeze(-2)) @ term.kernel.frequencies
+        angle = (f.x / own["lengthscale"].unsqueeze(-2)) @ kernel.frequencies
         process = own["outputscale"] * f.values.get(f"{term.name}.process", 1.0)
         size = (process / angle.shape[-1]).sqrt().unsqueeze(-1)
         waves = [size * angle.cos(), size * angle.sin()]

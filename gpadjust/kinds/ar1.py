@@ -43,7 +43,7 @@ class AR1(GP):
         ValueError: If neither ``physics`` with ``bounds`` nor ``low_X`` with its values is given.
     """
 
-    low: Data | None = None  # not before units of the high level are known
+    low: Any = None  # the data of the low level; not before units of the high one are known
 
     def __init__(
         self, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike = None, *,
@@ -51,7 +51,8 @@ class AR1(GP):
         low_Y: ArrayLike = None, low_covar_module: Any = None, delta_covar_module: Any = None,
         input_transform: Any = None, seed: int = 0,
     ) -> None:  # fmt: skip
-        if low_Y is None and physics is None or low_X is None and (bounds is None or physics is None):
+        has_inputs = low_X is not None or (physics is not None and bounds is not None)
+        if not has_inputs or (physics is None and low_Y is None):
             raise ValueError(
                 "Expected a low level: physics with bounds (2 x d) or low_X, or low_X with low_Y."
             )
@@ -82,10 +83,10 @@ class AR1(GP):
                 "delta_covar_module": delta_covar_module, "input_transform": input_transform,
             },
         )  # fmt: skip
-        if low.X.shape[-1] != self.data.X.shape[-1] or low.Y.shape[-1] != self.num_outputs:
+        if low.Y.shape[-1] != self.num_outputs:
             raise ValueError(
-                f"Expected a low level of {self.data.X.shape[-1]} inputs and {self.num_outputs} "
-                f"outputs, as the high one; found {low.X.shape[-1]} and {low.Y.shape[-1]}."
+                f"Expected a low level of {self.num_outputs} outputs, as the high one; found "
+                f"{low.Y.shape[-1]}."
             )
         self.low = low
 
@@ -123,7 +124,7 @@ class AR1(GP):
     def subset_output(self, idcs: list[int]) -> Self:
         """Return the model of some outputs; a ValueError if there are none of these numbers."""
         new = super().subset_output(idcs)
-        new.low = self._low.of_outputs(self.checked_outputs(idcs))
+        new.low = self.low.of_outputs(self.checked_outputs(idcs))
         return new
 
     def as_single_task_gp(self, draw: int | None = None) -> Any:
@@ -155,6 +156,11 @@ class AtLevels(Kernel):
 
     def of_data(self, data: Data) -> AtLevels:
         """Return the kernel of transformed inputs, and with names."""
+        if self.low_x.shape[-1] != data.X.shape[-1]:
+            raise ValueError(
+                f"Expected a low level of {data.X.shape[-1]} inputs, as the high one; found "
+                f"{self.low_x.shape[-1]}."
+            )
         return AtLevels(self.kernel.of_data(data), data.kernel_inputs(self.low_x), self.has_rho)
 
     def rows(self, x: Tensor, num_outputs: int) -> list[Row]:

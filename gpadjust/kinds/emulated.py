@@ -239,6 +239,11 @@ def _fitted(
         emulator = factory(runs_X, runs_Y)
         if not isinstance(emulator, GP):
             raise TypeError(f"Expected model_factory to return a GP; found {emulator!r}.")
+        if type(emulator).on_gaussian_scale is not GP.on_gaussian_scale:
+            raise ValueError(
+                f"Expected an emulator without a link; found a {type(emulator).__name__}. Emulate "
+                "log(Y), say, and take its exponential as a physics."
+            )
         fit(emulator, **options)
         fitted.append(emulator.eval().requires_grad_(False))
     return max(fitted, key=lambda e: float(e.left_out().log_density(e.data.Y).nansum()))

@@ -16,7 +16,6 @@ from gpadjust.checks import marked_rows
 from gpadjust.core.gaussian import Marginals, Prediction
 from gpadjust.core.model import GP
 from gpadjust.core.posterior import MixturePosterior
-from gpadjust.core.stacked import StackedGP
 from gpadjust.core.structures import (
     CKA,
     RRA,
@@ -391,6 +390,3 @@ def linked(structure: type[GP]) -> type[Linked]:
     made = type(f"Linked{structure.__name__}", (Linked, structure), {})
     own: type[Linked] = _LINKED.setdefault(structure, made)
     return own
-
-
-LinkedStackedGP = StackedGP  # a mixture has the link of its models

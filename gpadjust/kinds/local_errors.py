@@ -22,7 +22,7 @@ _ROUNDING = 1e-6  # of the targets' spread
 
 
 class Widened(Predictive):
-    """A model whose variances of the function, not of the noise, are multiplied by a factor.
+    """A model whose variances are multiplied by a factor, but for known ones of noise.
 
     A subclass has ``factors``.
     """
@@ -67,10 +67,10 @@ class Widened(Predictive):
         self, X: ArrayLike, observation_noise: bool | Tensor = False
     ) -> tuple[Tensor, Tensor]:
         """Return means and variances of each draw, ``... x S x q x m``."""
-        X = self.data.new_inputs(X)
-        mean, variance = self.source.components(X)
+        X, is_learnt = self.data.new_inputs(X), self._is_learnt(observation_noise)
+        mean, variance = self.source.components(X, is_learnt)
         more = (self.factors(X) - 1).unsqueeze(DRAWS) * variance
-        if observation_noise is not False:
+        if observation_noise is not is_learnt:
             _, variance = self.source.components(X, observation_noise)
         return mean, variance + more
 
@@ -78,13 +78,17 @@ class Widened(Predictive):
         self, X: ArrayLike, outputs: list[int] | slice, observation_noise: bool | Tensor
     ) -> MixturePosterior:
         """Return the joint posterior of some outputs."""
-        X = self.data.new_inputs(X)
-        mean, K = self.source.mixture(X, outputs, False).components
+        X, is_learnt = self.data.new_inputs(X), self._is_learnt(observation_noise)
+        mean, K = self.source.mixture(X, outputs, is_learnt).components
         root = self.factors(X)[..., outputs].sqrt().mT.unsqueeze(-3)  # ... x 1 x m x q
         more = K * (root.unsqueeze(-1) * root.unsqueeze(-2) - 1)
-        if observation_noise is not False:
+        if observation_noise is not is_learnt:
             _, K = self.source.mixture(X, outputs, observation_noise).components
         return MixturePosterior(mean, K + more)
+
+    def _is_learnt(self, observation_noise: bool | Tensor) -> bool:
+        """Return whether variances include learnt ones of the noise, which are multiplied, too."""
+        return observation_noise is True and self.model.noise.known is None
 
     def marginals_of(self, means: Tensor, variances: Tensor) -> Marginals:
         """Return the distributions of Gaussian components, as the model does."""

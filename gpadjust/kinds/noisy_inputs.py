@@ -11,7 +11,6 @@ from torch.nn.functional import pad
 
 from gpadjust.core import Noise
 from gpadjust.core.data import ArrayLike, as_given, as_tensor, names_of, variances_of
-from gpadjust.core.unknowns import Row
 from gpadjust.kinds.heavy_tails import RowNoise
 from gpadjust.physics import PhysicsError
 
@@ -89,22 +88,14 @@ class NoisyInputs(RowNoise):
         X, S = self.inputs
         return super().settings | {"train_X": X, "variances": S, "moved": self.moved}
 
-    def rows(self, Y: Tensor) -> list[Row]:
-        """Return the unknown variances, for targets of all measured inputs."""
-        if len(Y) != len(self.points):
-            raise ValueError(
-                f"Expected targets of the {len(self.points)} measured inputs; found {len(Y)}."
-            )
-        return super().rows(Y)
-
     @torch.no_grad()
     def refined(self, model: Any, fitted: Callable[[Noise], Any]) -> NoisyInputs:
         """Return the noise with the moments of the function over the errors of its inputs."""
         n, X = len(self.points), model.data.X
         if not torch.equal(X[:n], self.points.to(X)):
             raise ValueError(
-                "Expected a model of the attribute X of NoisyInputs; found other inputs, such as "
-                "the measured ones. Build it with CKA(noisy.X, Y, physics=f_p, noise=noisy)."
+                f"Expected a model of the {n} inputs NoisyInputs.X; found others, such as the "
+                "measured ones. Build it with CKA(noisy.X, Y, physics=f_p, noise=noisy)."
             )
         spread = pad(self.spread.to(X), (0, 0, 0, len(X) - n))
         rough = fitted(self)
@@ -116,9 +107,9 @@ class NoisyInputs(RowNoise):
             rough = fitted(self.having(self.base, variance, mean))
             mean, variance = _moments(_posterior_mean(rough), X, spread)
             noise = rough.conditioning().noise[0] - before[0]
-            off = (variance - before[0]).abs() / (before[0] + noise)
+            off = (variance - before[0]).abs() / (before[0] + noise)  # 0 / 0 of exact rows
             away = (mean - before[1]).abs() / (variance + noise).sqrt()
-            if off.mean() <= _SETTLED[0] and away.max() <= _SETTLED[1]:
+            if off.nanmean() <= _SETTLED[0] and away.nan_to_num().max() <= _SETTLED[1]:
                 break
         return self.having(self.base, variance, mean)
 

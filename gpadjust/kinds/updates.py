@@ -25,15 +25,17 @@ class Updated(Widened):
     Variances follow recent errors: with :math:`z_i^2` the squared error over the predicted variance
     of what came, :math:`\lambda = e^{-1 / \tau}` and ages k, they are multiplied by
 
-    .. math:: \max\Big(1, \frac{a + \sum_k \lambda^k z_k^2}{a + \sum_k \lambda^k}\Big), \quad a = 10.
+    .. math:: \max\Big(1, \frac{a + \sum_k \lambda^k z_k^2}{a + \sum_k \lambda^k}\Big), \quad
+        a = 10.
 
     Attributes:
         recent: The two sums, ``m x 2``.
     """
 
-    def __init__(self, model: GP, forget: float) -> None:
+    forget: float = math.inf  # tau
+
+    def __init__(self, model: GP) -> None:
         super().__init__(model)
-        self.forget = forget
         self.recent = model.unit.new_zeros(model.num_outputs, 2)
 
     def factors(self, X: Tensor) -> Tensor:
@@ -75,8 +77,9 @@ class Window(Updated):
     """
 
     def __init__(self, model: GP, size: int | None = None) -> None:
+        super().__init__(model)
         self.size = len(model.data.X) if size is None else checked_whole("size", size, 2)
-        super().__init__(model, self.size)
+        self.forget = self.size
 
     @torch.no_grad()
     def update(self, X: ArrayLike, Y: ArrayLike, noise: Tensor | None = None) -> Self:
@@ -127,9 +130,8 @@ class Kalman(Updated):
     """
 
     def __init__(self, model: GP, forget: float = math.inf) -> None:
-        if forget != math.inf:
-            forget = checked_number("forget", forget, above=0.0)
-        super().__init__(model, forget)
+        super().__init__(model)
+        self.forget = forget if forget == math.inf else checked_number("forget", forget, above=0)
         kernels = [term.kernel for term in model.terms if term.kernel is not None]
         if not all(isinstance(kernel, Fourier) for kernel in kernels):
             raise TypeError(f"Expected an RRA; found kernels {kernels}. Take Window(model, size).")

@@ -9,8 +9,8 @@ from scipy.special import chdtri
 from torch import Tensor
 
 from gpadjust.core.gaussian import log_likelihood
+from gpadjust.core.kernels import Kernel
 from gpadjust.core.sample import maximise
-from gpadjust.core.terms import Term
 from gpadjust.core.unknowns import Table, Values
 from gpadjust.many.conditioning import SparseConditioning
 
@@ -22,20 +22,20 @@ _CHANCE = 1e-3  # of finding a rest where there is none, at most
 
 @torch.no_grad()
 def rest_of(
-    posterior: SparseConditioning, rest: Term, table: Table, begin: Values,
+    posterior: SparseConditioning, kernel: Kernel, table: Table, begin: Values,
     noise: Callable[[Values], Tensor], seed: int,
 ) -> tuple[Values, Tensor]:  # fmt: skip
     r"""Return numbers of the rest and of the noise, and in which outputs there is a rest, ``m``.
 
     Few inducing points leave a function of x in the residuals, which is noise to a sparse model.
     Close rows share it, but not the noise. The residuals of groups of neighbours are
-    :math:`N(0, k + \sigma^2 I)`, k the kernel of the rest. It is kept if a test of likelihoods
+    :math:`N(0, k + \sigma^2 I)`, with the kernel k. It is kept if a test of likelihoods
     finds it (Wilks 1938), with a chance of a thousandth where there is none: over distances that
     contain next to no neighbours it looks as noise does, and must not take its place.
 
     Args:
         posterior: The posterior without rest.
-        rest: The term.
+        kernel: k, of the term ``rest``.
         table: The table of their unknown numbers.
         begin: The numbers of the noise that contains the rest.
         noise: Returns the variances of the noise, ``S x m x n`` (or 1), by its numbers.
@@ -56,19 +56,19 @@ def rest_of(
         """Return ``G x S x m x k`` of values ``S x m x n`` (or 1)."""
         return v.expand(*v.shape[:-1], n)[..., nearest].movedim(-2, 0)
 
-    mean, _, own = posterior.leverage()
+    mean, unseen, own = posterior.leverage()
     kept = (1 - posterior.weight * own).clamp_min(1e-3)  # of the noise is in the residuals
-    residual = of_groups((posterior.targets - mean) / kept.sqrt())
+    residual = (posterior.targets - mean) / kept.sqrt()
+    size = residual.square().nanmean(-1)[0].unsqueeze(-1).clamp_min(1e-300)  # m x 1
+    residual = of_groups(residual)
     observed, residual = ~residual.isnan(), residual.nan_to_num()
-    size = (residual.square().sum((0, -1)) / observed.sum((0, -1)))[0].unsqueeze(-1)  # m x 1
-    size = size.nan_to_num().clamp_min(1e-300)
 
     def likelihood(has_rest: bool) -> Callable[..., tuple[Tensor, Tensor]]:
         def log_density(u: Tensor, with_gradient: bool = True) -> tuple[Tensor, Tensor]:
             leaf = u.detach().requires_grad_()
             with torch.enable_grad():
                 values = table.values(leaf)
-                K = rest.kernel.covariance(_of_kernel(rest, values), groups)
+                K = kernel.covariance(_of_kernel(values), groups)
                 K = K if has_rest else 0 * K
                 variance = of_groups(noise(values)).expand(K.shape[:-1])
             found = log_likelihood(residual.expand(K.shape[:-1]), K, variance, observed)
@@ -95,14 +95,12 @@ def rest_of(
     gain = 2 * (density.amax(0) - alone[0])
     values = table.values(best)
     number = sum(r.location.shape[-1] for r in table.own if r.name not in begin)
-    # Groups that are narrow beside the lengthscales do not show the variance, but residuals do.
-    most = (size - of_groups(noise(values)).mean((0, -1))[0].unsqueeze(-1)).clamp_min(1e-9 * size)
-    scale = values.get("rest.kernel.outputscale")
-    if scale is not None:
-        values["rest.kernel.outputscale"] = scale.minimum(most)
+    # Groups show the noise; its variance and those that are predicted make up the residuals'.
+    other = (unseen + noise(values)).mean(-1, keepdim=True)
+    values["rest.kernel.outputscale"] = (size - other).maximum(1e-9 * size)
     return values, gain > chdtri(number, _CHANCE)
 
 
-def _of_kernel(rest: Term, values: Values) -> Values:
-    start = f"{rest.name}.kernel."
+def _of_kernel(values: Values) -> Values:
+    start = "rest.kernel."
     return {n.removeprefix(start): v for n, v in values.items() if n.startswith(start)}

@@ -21,8 +21,9 @@ from gpadjust.many.bound import at_points, bound, part_of
 from gpadjust.many.conditioning import LaterConditioning, SparseConditioning
 from gpadjust.many.rest import rest_of
 
-_FEW, _SEARCHED, _REFINED = 100, 1000, 20_000  # rows of which hyper-parameters are learnt
-_ROUNDS, _ITERATIONS = 2, 15  # of inducing points and hyper-parameters by turns
+_FEW, _SEARCHED = 100, 500  # rows of exact models
+_ROUNDS = ((5_000, 2), (20_000, 1))  # rows of the bound, of a share of the inducing points
+_ITERATIONS = 15  # of each round
 _CANDIDATES = 4  # rows for each inducing point
 _AT_ONCE = 4096  # predictions
 _REST = "rest"
@@ -120,9 +121,8 @@ class VariationalCKA(CKA):
             old = self.conditioned(train.of_rows(slice(n)), noise[..., :n], targets[..., :n])
         if old is not None:
             late = slice(old.num_rows, None)
-            return LaterConditioning(
-                old, train.of_rows(late), noise[..., late], targets[..., late]
-            )
+            late_noise, late_targets = noise[..., late], targets[..., late]
+            return LaterConditioning(old, train.of_rows(late), late_noise, late_targets)
         total, rest = (part_of(train, _REST, is_in) for is_in in (False, True))
         return SparseConditioning(
             total, self.inducing, train.variance(), noise, rest.variance(), targets
@@ -172,28 +172,30 @@ class VariationalCKA(CKA):
                 f"VariationalCKA; found {num_draws}. CKA draws them, of some thousand rows."
             )
         order, whole = self._order(seed), self.subset_draws(torch.zeros(1, dtype=torch.long))
-        few, some, refined = (whole.subset_rows(order[:n]) for n in (_FEW, _SEARCHED, _REFINED))
+        few, some = (whole.subset_rows(order[:n]) for n in (_FEW, _SEARCHED))
         u = maximise(some.log_likelihood, modes(few, 0, seed)[:1])
-        for _ in range(_ROUNDS):
-            refined.inducing = refined.points(u)
+        for n, share in _ROUNDS:
+            refined = whole.subset_rows(order[:n])
+            refined.inducing = refined.points(u, max(1, self.num_inducing // share))
             u = maximise(refined.log_likelihood, u, most=_ITERATIONS)
-        whole.inducing = order[refined.points(u)]
+        whole.inducing = order[refined.points(u, self.num_inducing)]
         whole.set_draws(u)
-        value, u = whole.conditioning().evidence(), whole._with_rest(seed)
+        posterior = whole.conditioning()
+        assert isinstance(posterior, SparseConditioning)
+        u = whole._with_rest(posterior, seed)
         self.inducing = whole.inducing
         self.set_draws(u)
         self._cached = whole._cached  # of the same draw, if there is no rest
         units = self.log_unit()
-        total = value[0] + units
+        total = posterior.evidence()[0] + units
         return FitResult("map", total if self.table.problems > 1 else total.sum(0, keepdim=True))
 
     @torch.no_grad()
-    def points(self, u: Tensor) -> Tensor:
+    def points(self, u: Tensor, M: int) -> Tensor:
         """Return row numbers ``m x M`` of most prior variance, at coordinates ``1 x B x P``.
 
         They are pivots of the Cholesky factor of the covariance of the first rows.
         """
-        M = self.num_inducing
         first, values = slice(_CANDIDATES * M), self.table.values(u)
         total = part_of(self.at(self.data.X, values), _REST, False).of_rows(first)
         left, is_free = total.variance()[0], ~self.data.Y[first].isnan().mT
@@ -211,23 +213,25 @@ class VariationalCKA(CKA):
             picks.append(pick)
         return torch.stack(picks, -1)
 
-    def _with_rest(self, seed: int) -> Tensor:
+    def _with_rest(self, posterior: SparseConditioning, seed: int) -> Tensor:
         """Return coordinates with the sizes of rest and noise in the residuals."""
-        values, posterior = self.values, self.conditioning()
+        values = self.values
         rows = [row for row in self.table.own if row.name.startswith((f"{_REST}.", "noise."))]
         begin = {row.name: values[row.name] for row in rows if row.name.startswith("noise.")}
-        places, (rest,) = self.places(self.data.X, values), self.terms[-1:]
+        places, kernel = self.places(self.data.X, values), self.terms[-1].kernel
+        assert kernel is not None
 
         def noise(numbers: Values) -> Tensor:
             return self.noise.variance(numbers, places, True)
 
         table = Table(rows, self.num_outputs)
-        found, has_rest = rest_of(posterior, rest, table, begin, noise, seed)
+        found, has_rest = rest_of(posterior, kernel, table, begin, noise, seed)
         u, chosen = self.u.detach(), has_rest.unsqueeze(-1)
         # An output without a rest keeps the noise of the bound, which counts what was fitted to it.
         found = {name: torch.where(chosen, v, values[name]) for name, v in found.items()}
         kinds = [self.table.values(self.table.with_choice(u, k))["choice"] for k in range(2)]
-        return self.table.with_values(u, found | {"choice": torch.where(chosen, *kinds[::-1])})
+        found["choice"] = torch.where(chosen, kinds[1], kinds[0])
+        return self.table.with_values(u, found)
 
     def _order(self, seed: int) -> Tensor:
         """Return row numbers in a random order that begins with as many targets of each output."""
@@ -239,11 +243,11 @@ class VariationalCKA(CKA):
 
     # Other rows and outputs.
 
-    def subset_rows(self, rows: Tensor) -> Self | None:
+    def subset_rows(self, rows: Tensor) -> Self:
         """Return an exact model of some observations in the same units."""
         new = super().subset_rows(rows)
-        if new is not None:
-            new.inducing = None
+        assert new is not None  # noises that cannot do with fewer rows are refused
+        new.inducing = None
         return new
 
     def subset_draws(self, rows: Tensor) -> Self:

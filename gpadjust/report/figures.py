@@ -26,7 +26,7 @@ from gpadjust.validation.plots.drawing import (
     band,
     column,
     labels,
-    mean_and_half_width,
+    mean_and_ends,
     tidy,
 )
 from gpadjust.validation.plots.predictions import plot_pit
@@ -153,8 +153,7 @@ def _slice(subject: Subject, i: int, number_of_points: int) -> Tensor:
 def _prediction(subject: Subject, output: int, i: int, ax: Any) -> None:
     X = _slice(subject, i, _POINTS)
     x = X[:, i]
-    mean, half = mean_and_half_width(subject.model.predict(X), output, 0.95)
-    band(ax, x, mean, half, 0.95)
+    band(ax, x, *mean_and_ends(subject.model.marginals(X), output, 0.95), 0.95)
     curves = subject.physics_at(X, output)
     for k, (name, values) in enumerate(curves.items()):
         ax.plot(x, values, color=GREY, ls=_STYLES[k % 3], lw=1.2, label=name)

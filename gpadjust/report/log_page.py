@@ -207,7 +207,8 @@ def _states(found: Identification, origin: LogOrigin) -> list[Markup]:
         figure = Figure(figsize=_SIZE, layout="constrained")
         ax = figure.subplots()
         path = going_on(record.states[:, i], i in spec.angle_columns)
-        band(ax, record.times, path, quantile(0.95) * sd[:, i], 0.95)
+        half = quantile(0.95) * sd[:, i]
+        band(ax, record.times, path, path - half, path + half, 0.95)
         ax.set(xlabel=called["time"], ylabel=called[state])
         tidy(ax)
         what = "hidden" if state in found.hidden else "smoothed"

@@ -46,9 +46,7 @@ def complaint(physics: Physics, data: Data) -> str:
 def _of_output(X: Tensor, y: Tensor, f: Tensor) -> str:
     """Return the fault of f_p for the ``n`` observations of an output."""
     sd = float(y.std())
-    if sd <= _ROUNDING * _rms(y):
-        return ""
-    cause = _cause(X, y, f)
+    cause = _cause(X, y, f) if sd > _ROUNDING * _rms(y) else ""
     if cause and _is_standardised(y.unsqueeze(-1)):
         cause += " The targets were standardised; f_p has to return what they are in."
     return cause and (
@@ -70,10 +68,8 @@ def _cause(X: Tensor, y: Tensor, f: Tensor) -> str:
     if rmse <= _NEAR * size:
         return ""
     factor, by_factor = _factor(y, f, r)
-    is_off, is_opposite = (
-        rmse > _FAR * sd,
-        r < -_FOLLOWS and r**2 * (n - 2) > _SHOWN**2 * (1 - r**2),
-    )
+    is_off = rmse > _FAR * sd
+    is_opposite = r < -_FOLLOWS and r**2 * (n - 2) > _SHOWN**2 * (1 - r**2)
     is_worse = n >= _MANY and rmse > _WORSE * sd and r < -_SURELY
     if is_opposite and (is_off or is_worse) and _rms(f + y) < (1.0 if is_off else _LIKE) * rmse:
         large = f", and {_times(factor)}" if abs(factor) > _FACTOR else ""
@@ -84,9 +80,8 @@ def _cause(X: Tensor, y: Tensor, f: Tensor) -> str:
     offset = float((f - y).mean())
     by_offset = _rms(f - y - offset)
     if rmse > _APART * sd and by_offset < _EXPLAINS * rmse and by_offset <= by_factor:
-        return (
-            f"f_p is about {_number(abs(offset))} {'above' if offset > 0 else 'below'} the targets."
-        )
+        where = "above" if offset > 0 else "below"
+        return f"f_p is about {_number(abs(offset))} {where} the targets."
     if factor > 0 and not 1 / _FACTOR < factor < _FACTOR:
         return f"f_p is {_times(factor)}; are its units those of the targets?"
     return ""

@@ -114,13 +114,9 @@ def pit(mean: Tensor, variance: Tensor, y: Tensor, *, mixture_dim: int | None = 
 
 
 def coverage(
-    mean: Tensor,
-    variance: Tensor,
-    y: Tensor,
-    level: float = 0.95,
-    *,
+    mean: Tensor, variance: Tensor, y: Tensor, level: float = 0.95, *,
     mixture_dim: int | None = None,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     """Share of the points that lie within the central interval of a given level.
 
     Arguments and errors are those of :func:`nlpd`, and the nominal coverage ``level``, a number
@@ -249,20 +245,18 @@ class Scores:
 
     def __iter__(self) -> Iterator[Scores]:
         """The scores of each part of the batch; an IndexError if there is none."""
-        whole = self[:]  # refused now: an error of the first part would end a loop in silence
+        whole = self[:]  # an IndexError of the first part would end a loop in silence
         return (whole[i] for i in range(len(whole.rmse)))
 
 
 def score(posterior: Posterior, Y: Tensor, level: float = 0.95) -> Scores:
     """Judge a posterior by what was observed.
 
-    Ask the model for the posterior of *observations*, ``observation_noise=True``, if ``Y`` is
-    noisy.
+    Of noisy ``Y`` take the posterior of *observations*, ``observation_noise=True``.
 
     Args:
-        posterior: That of a model of this library, which is judged as the mixture that it is (with
-            a link ``crps`` is by the prediction and its variance), or any of BoTorch that is
-            Gaussian at each point, or a ``GaussianMixturePosterior``.
+        posterior: That of a model of this library (with a link ``crps`` is by the prediction and
+            its variance), or one of BoTorch that is Gaussian at each point or a mixture.
         Y: Observations, ``... x n x m``, NaN where there is none.
         level: Nominal coverage, between 0 and 1.
 
@@ -292,7 +286,6 @@ def score(posterior: Posterior, Y: Tensor, level: float = 0.95) -> Scores:
             f"Expected a posterior, with a mean and a variance, got {type(posterior).__name__}; "
             "that of a model is `model.posterior(X, observation_noise=True)`."
         )
-    _components(Y, dim, mean=mean, variance=variance)
     return Scores.of(mean, variance, Y, level=level, mixture_dim=dim)
 
 
@@ -355,8 +348,8 @@ def _components(y: Tensor, mixture_dim: int | None, **predicted: Tensor) -> list
     if mixture_dim is not None:
         if mixture_dim not in range(-len(shape), len(shape)):
             raise ValueError(
-                f"There is no dimension {mixture_dim} in means of shape {tuple(shape)}; pass "
-                "mixture_dim=None for a prediction that is not a mixture."
+                f"There is no dimension {mixture_dim} in means of shape {tuple(shape)}; of a "
+                "prediction that is not a mixture mixture_dim is None."
             )
         del shape[mixture_dim]
     shapes = [tuple(values.shape) for values in predicted.values()]

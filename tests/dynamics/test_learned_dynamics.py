@@ -145,9 +145,8 @@ def test_a_model_of_the_user(cart_pole_system):
     two_waves = partial(WavyCKA, waves=2, center=0.0)
 
     def dynamics(model=two_waves):
-        return LearnedDynamics(
-            system.spec, system.crude, model=model, fit_options={"method": "map"}
-        )
+        options = {"model": model, "fit_options": {"method": "map"}}
+        return LearnedDynamics(system.spec, system.crude, **options)
 
     one, other = dynamics(), dynamics()
     one.update(*system.trial(0, 10))

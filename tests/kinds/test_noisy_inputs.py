@@ -205,8 +205,8 @@ BAD = {
     "base": (lambda: NoisyInputs(X, 1e-3, base=0.1), TypeError, "train_Yvar"),
     "float32": (lambda: NoisyInputs(X.float(), 1e-3), TypeError, "double"),
     "rows": (
-        lambda: CKA(X[:9], Y[:9], physics=f_p, noise=NoisyInputs(X, 1e-3)), ValueError,
-        "30 measured",
+        lambda: fit(CKA(X[:9], Y[:9], physics=f_p, noise=NoisyInputs(X, 1e-3))), ValueError,
+        "30 inputs",
     ),
     "measured": (
         lambda: fit(CKA(X, Y, physics=f_p, noise=NoisyInputs(X, 1e-3)), "map"), ValueError,

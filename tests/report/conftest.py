@@ -6,8 +6,8 @@ from html.parser import HTMLParser
 import pytest
 import torch
 
-from gpadjust import compare
 from gpadjust.report.markup import Markup
+from gpadjust.validation import compare
 
 VOID = {"meta", "img", "br"}
 
@@ -95,4 +95,4 @@ def comparison():
     X = torch.linspace(0, 1, 10, dtype=torch.float64).unsqueeze(-1)
     Y = 2 * f_p(X) + X + 0.1 * torch.randn(10, 1, generator=generator, dtype=torch.float64)
     structures = ["zero mean", "physics mean", "CKA"]
-    return compare(X, Y, f_p, structures=structures, num_starts=1, num_screened=8)
+    return compare(X, Y, f_p, structures=structures)

@@ -10,8 +10,10 @@ import pytest
 import torch
 
 import gpadjust.report
-from gpadjust import Unknown, load
 from gpadjust.__main__ import main
+from gpadjust.core import load
+from gpadjust.kinds.categories import levels_of
+from gpadjust.physics import Unknown
 from gpadjust.report.given_physics import unknown_of
 
 MODULE = """
@@ -139,7 +141,6 @@ BAD_OPTIONS = {
     ("--out", "taken.html"): "'taken.pt' is a folder, where the model's file would be",
     ("--physics", "hill:wave"): "Expected different --physics, found hill:wave more than once",
     ("--inputs", "time,head"): "as inputs and outputs, got 'head \\[m\\]' more than once",
-    ("--inputs", "time,note"): "names, say so by --categories note, or by --batches note",
     ("--units", "head"): "Expected --units such as a=1,b=2, found 'head'",
     ("--units", "tail=m"): "--units names 'tail', which is none of 'time', 'head'",
     ("--noise", "much"): "standard deviation in the output's unit, such as 0.1, found 'much'",
@@ -206,9 +207,10 @@ def test_a_german_table_with_units_and_noise(folder, read, undrawn):
     options = ["--delimiter", ";", "--decimal", ",", "--units", "time=ms,head=Pa", "--noise", "0.5"]
     assert main([*COMMAND, "--physics", "hill:wave", *options, "--out", "new.htm"]) == 0
     model = load("new.pt", trusted=True)
-    assert (model.input_names, model.output_names) == (("time [ms]",), ("head [Pa]",))
-    assert model.data()["train_Y"].flatten().tolist() == pytest.approx([y for _, y in ROWS])
-    assert model.data()["train_Yvar"].flatten().tolist() == pytest.approx([0.25] * 9)
+    data = model.data
+    assert (data.input_names, data.output_names) == (("time [ms]",), ("head [Pa]",))
+    assert data.Y.flatten().tolist() == pytest.approx([y for _, y in ROWS])
+    assert data.Yvar.flatten().tolist() == pytest.approx([0.25] * 9)
     assert "Pa" in read(folder / "new.htm").text
 
 
@@ -235,7 +237,7 @@ def test_kinds_of_data(folder, read, undrawn):
         assert words in text
     model = load(folder / "report.pt", physics=lambda X: 4 + X[:, :1].sin())
     assert model.link is not None
-    assert model.levels == {1: ("lent", "new", "old")}
+    assert levels_of(model) == {1: ("lent", "new", "old")}
     kinds = "--noise relative --categories rig"
     assert main(["report", "data.csv", "--fit", "map", *options, *kinds.split()]) == 0
     text = read(folder / "report.html").text
@@ -274,7 +276,7 @@ def test_a_formula_names_its_inputs_and_is_in_the_file(folder, read, capsys, und
     names = {}
     exec(code, names)
     assert abs(names["mean"] - 2 * (6 * names["X"]).sin() - names["X"]) < 0.2
-    assert names["model"].input_transform.physics.unknowns == {"a": unknown_of("a=1 +- 50 %")[1]}
+    assert names["model"].physics[0].unknowns == {"a": unknown_of("a=1 +- 50 %")[1]}
 
 
 BAD_FORMULAS = {
@@ -298,16 +300,32 @@ def test_formulas_that_are_none_or_fail(folder, capsys):
 def test_groups_are_inputs_beside_those_of_a_formula(folder, capsys, undrawn):
     rows = [f"{x},R{i % 2},{y}" for i, (x, y) in enumerate(ROWS)]
     (folder / "data.csv").write_text("\n".join(["time [s],rig,head [m]", *rows, ""]))
-    assert "by --batches rig" in _fails(capsys, "--inputs", "time,rig")
     assert main(["report", "data.csv", "--fit", "map", *FORMULA, "--batches", "rig"]) == 0
-    assert load("report.pt").input_names == ("time [s]", "rig")
+    model = load("report.pt")
+    assert model.data.input_names == ("time [s]", "rig")
+    assert model.data.transform.batches == [1]
+
+
+def test_texts_are_categories(folder, capsys, undrawn):
+    rows = [f"{x},R{i % 2},{y}" for i, (x, y) in enumerate(ROWS)]
+    (folder / "data.csv").write_text("\n".join(["time [s],rig,head [m]", *rows, ""]))
+    given = ["--inputs", "time,rig", "--physics", "hill:wave"]
+    assert main(["report", "data.csv", "--outputs", "head", "--fit", "map", *given]) == 0
+    assert "The physics reads rig as a number: 0 is R0 and 1 is R1." in capsys.readouterr().err
+    model = load("report.pt", trusted=True)
+    assert levels_of(model) == {1: ("R0", "R1")}
+    assert model.data.transform.batches == []
+    rows = [f"{x},id{i},{y}" for i, (x, y) in enumerate(ROWS)]
+    (folder / "data.csv").write_text("\n".join(["time [s],rig,head [m]", *rows, ""]))
+    assert "column 2 ('rig'): expected a number" in _fails(capsys, *given[:2])
 
 
 def test_several_formulas_have_short_names(folder, read, undrawn):
     given = [*FORMULA, "--physics", "cos(time)"]
     assert main(["report", "data.csv", "--fit", "map", *given]) == 0
     assert "formula 1" in read(folder / "report.html").text
-    assert load("report.pt").input_transform.physics.names == ("formula 1", "formula 2")
+    names = [term.name for term in load("report.pt").terms if term.physics is not None]
+    assert names == ["rho_formula 1", "rho_formula 2"]
 
 
 @pytest.mark.slow
@@ -318,7 +336,7 @@ def test_a_workbook_is_as_a_csv_file(folder, read, capsys, undrawn):
     book.save(folder / "data.xlsx")
     assert main(["report", "data.xlsx", "--fit", "map", *FORMULA]) == 0
     model = load("report.pt")
-    assert model.data()["train_Y"].flatten().tolist() == [y for _, y in ROWS]
+    assert model.data.Y.flatten().tolist() == [y for _, y in ROWS]
     book.create_sheet("other")
     book.save(folder / "data.xlsx")
     capsys.readouterr()
@@ -346,7 +364,7 @@ def test_of_many_rows_some_are_drawn(folder, read, capsys, undrawn):
     told = "Of 100,000 rows 12 were taken, drawn at random by --seed"
     assert told in capsys.readouterr().err
     assert told in read(folder / "report.html").text
-    X = load("report.pt").data()["train_X"]
+    X = load("report.pt").data.X
     assert len(X) == 12
     assert X.std() > 0.1
     with pytest.raises(SystemExit):

@@ -9,22 +9,14 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from gpadjust import (
-    AR1,
-    CKA,
-    RRA,
-    CalibratedPhysics,
-    FunctionPhysics,
-    ScaleGP,
-    StackedGP,
-    Unknown,
-    compare,
-    fit,
-    load,
-)
+from gpadjust.core import CKA, RRA, CalibratedPhysics, ScaleGP, StackedGP, fit, load
+from gpadjust.kinds.ar1 import AR1
+from gpadjust.kinds.categories import Categories
+from gpadjust.kinds.heavy_tails import HeavyTails
+from gpadjust.physics import FunctionPhysics, Unknown
 from gpadjust.report import report
+from gpadjust.validation import compare
 
-QUICK = {"num_starts": 1, "num_screened": 8}
 NASTY = ("<script>alert('1')</script>", '"><img src="https://x.y/z">', "$\\frac$ & 水 \n 5 €")
 
 
@@ -42,8 +34,8 @@ def physics(m):
 def named(d, m):
     X, Y = problem(d, m)
     model = CKA(X, Y, physics=physics(m))
-    model.input_names, model.output_names = NASTY[:d], NASTY[-m:]
-    fit(model, "map", **QUICK)
+    model.data = model.data._replace(input_names=NASTY[:d], output_names=NASTY[-m:])
+    fit(model, "map")
     return model
 
 
@@ -65,20 +57,21 @@ def test_names_are_shown_as_they_are(tmp_path, read, monkeypatch):
 def test_any_names_make_a_page(tmp_path, read, monkeypatch, first, second):
     monkeypatch.chdir(tmp_path)
     model = named(2, 1)
-    model.input_names, model.output_names = (first, second), (first,)
+    names = {"input_names": (first, second), "output_names": (first,)}
+    model.data = model.data._replace(**names)
     page = read(report(model, "report.html", title=second))
     assert page.needs_nothing_else()
     (code,) = [text for text in page.codes if "load(" in text]
     names = {"f_p": physics(1)}
     exec(code, names)
-    assert names["model"].input_names == (first, second)
+    assert names["model"].data.input_names == (first, second)
 
 
 @pytest.mark.slow
 def test_several_outputs_some_of_them_missing_and_two_inputs(tmp_path, read):
     X, Y = problem(2, 2)
     Y[3, 0] = Y[5, 1] = math.nan
-    comparison = compare(X, Y, physics(2), **QUICK)
+    comparison = compare(X, Y, physics(2))
     page = read(report(comparison, tmp_path / "report.html"))
     assert page.needs_nothing_else()
     assert [row[-1] for row in page.tables["Columns"][1:]] == ["0", "0", "1", "1"]
@@ -111,7 +104,7 @@ def test_unknown_parameters(tmp_path, read):
 def test_a_physics_that_fails_away_from_the_data(tmp_path, read):
     X = torch.tensor([[0.0], [0.1], [0.2], [0.8], [0.9], [1.0]], dtype=torch.float64)
     model = CKA(X, X.sin(), physics=lambda X: torch.where((X - 0.5).abs() < 0.1, torch.nan, X))
-    fit(model, "map", **QUICK)
+    fit(model, "map")
     page = read(report(model, tmp_path / "report.html"))
     assert "No figure: Physics '<lambda>' returned NaN or inf" in page.text
     assert "Coverage of left-out intervals" in page.tables
@@ -127,9 +120,9 @@ def test_other_models(tmp_path, read, kind):
         "ScaleGP": lambda: ScaleGP(X, Y, physics=physics(1)),
     }
     model = makes.get(kind, lambda: CKA(X, Y, physics=physics(1)))()
-    fit(model, None if kind == "several samples" else "map", **QUICK)
+    fit(model, "bayes" if kind == "several samples" else "map")
     if kind == "StackedGP":
-        model = StackedGP({"CKA": model}, [[1.0]])
+        model = StackedGP({"CKA": model}, [1.0])
     page = read(report(model, tmp_path / "report.html"))
     assert page.needs_nothing_else()
     assert "Not asked" in page.text
@@ -167,8 +160,7 @@ def test_errors_and_coverage_are_without_outliers(tmp_path, read):
     f_p = physics(1)
     Y = f_p(X) + 0.3 * X + 0.03 * noise
     Y[5] += 20
-    told = {"likelihood": "heavy-tailed", "structures": ["CKA"], **QUICK}
-    comparison = compare(X, Y, f_p, **told)
+    comparison = compare(X, Y, f_p, noise=HeavyTails(), structures=["CKA"])
     others = torch.arange(20) != 5
     alone = (Y - f_p(X))[others].square().mean().sqrt()
     errors = comparison.errors()["y"]
@@ -190,10 +182,10 @@ def test_categories_have_their_names(tmp_path, read):
     pandas = pytest.importorskip("pandas")
     x = torch.linspace(0, 1, 12, dtype=torch.float64)
     frame = pandas.DataFrame({"x": x, "rig": ["R1", "R2", "R3"] * 4})
-    model = CKA(
-        frame, (x + 0.1 * (3 * x).sin()).unsqueeze(-1), physics=lambda X: X[:, :1], batch="rig"
-    )
-    fit(model, "map", **QUICK)
+    rigs = Categories((), batches=["rig"])
+    Y = (x + 0.1 * (3 * x).sin()).unsqueeze(-1)
+    model = CKA(frame, Y, physics=lambda X: X[:, :1], input_transform=rigs)
+    fit(model, "map")
     page = read(report(model, tmp_path / "report.html"))
     assert "rig = R2" in page.text
     assert "offsets of rig" in page.text

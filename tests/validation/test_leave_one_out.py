@@ -95,6 +95,7 @@ def test_with_a_link_it_is_of_the_users_numbers(data):
     torch.testing.assert_close(loo.log_density, plain.log_density - Y.log())
 
 
+@pytest.mark.slow
 def test_outliers_are_left_out_of_scores():
     X = torch.linspace(0, 1, 12, dtype=torch.float64).unsqueeze(-1)
     Y = 2 * torch.sin(6 * X) + 0.01 * torch.cos(99 * X)

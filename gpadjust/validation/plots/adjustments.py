@@ -20,7 +20,7 @@ from gpadjust.validation.plots.drawing import (
     band,
     column,
     labels,
-    mean_and_half_width,
+    mean_and_ends,
     quantile,
     tidy,
 )
@@ -85,9 +85,9 @@ def plot_adjustment(
         X = on_levels(model, X)
         for ax, name in zip(axes[:, i], names, strict=True):
             with torch.no_grad():
-                mean, half = mean_and_half_width(model.term(name, X), output, level)
+                drawn = mean_and_ends(model.term(name, X), output, level)
             ax.axhline(unadjusted(model, name), color=GREY, lw=1, ls="--")
-            band(ax, x, mean, half, level)
+            band(ax, x, *drawn, level)
             bottom = ax.get_xaxis_transform()
             ax.plot(train_X[:, i], torch.zeros(len(train_X)), "|", color=RED, transform=bottom)
             ax.set_xlim(*bounds[:, i].tolist())

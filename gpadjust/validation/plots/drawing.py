@@ -9,11 +9,13 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+import torch
 from matplotlib.axes import Axes
 from matplotlib.mathtext import MathTextParser
 from torch import Tensor
 
 from gpadjust.checks import check_level, checked_whole
+from gpadjust.core.gaussian import Marginals
 from gpadjust.core.model import Predictive
 
 BLUE, RED, GREY = "#0072B2", "#D55E00", "0.45"  # told apart by the colour-blind, too
@@ -27,10 +29,17 @@ def quantile(level: float) -> float:
     return NormalDist().inv_cdf((1 + level) / 2)
 
 
-def mean_and_half_width(prediction: Any, output: int, level: float) -> tuple[Tensor, Tensor]:
-    """Return mean and half the width of the interval of one output, ``n`` each."""
-    sd = column(prediction.variance.sqrt(), output)
-    return column(prediction.mean, output), quantile(level) * sd
+def mean_and_ends(prediction: Any, output: int, level: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the mean and the ends of the interval of one output of a posterior, ``n`` each."""
+    z, marginals = quantile(level), getattr(prediction, "marginals", prediction)
+    if isinstance(marginals, Marginals):
+        ends = [marginals.quantile((1 + sign * level) / 2) for sign in (-1, 1)]
+        mean = marginals.prediction.mean
+    else:
+        mean, half = prediction.mean, z * prediction.variance.sqrt()
+        ends = [mean - half, mean + half]
+    low, high = (column(end, output) for end in ends)
+    return column(mean, output), low, high
 
 
 def column(values: Tensor, output: int) -> Tensor:
@@ -95,20 +104,22 @@ def given_axes(axes: Any, shape: tuple[int, ...]) -> Any:
     return axes.reshape(shape)
 
 
-def band(ax: Axes, x: Tensor, mean: Tensor, half: Tensor, level: float) -> None:
+def band(ax: Axes, x: Tensor, mean: Tensor, low: Tensor, high: Tensor, level: float) -> None:
     """Draw a mean and its interval, ``n`` each."""
-    ax.fill_between(x, mean - half, mean + half, **BAND, label=f"{100 * level:g} %")
+    ax.fill_between(x, low, high, **BAND, label=f"{100 * level:g} %")
     ax.plot(x, mean, color=BLUE, lw=1.8, label="mean")
 
 
 def against_truth(
-    ax: Axes, truth: Tensor, mean: Tensor, half: Tensor, level: float, xlabel: str, ylabel: str
+    ax: Axes, truth: Tensor, mean: Tensor, ends: Any, level: float, xlabel: str, ylabel: str
 ) -> None:
-    """Draw predictions with intervals against what is true."""
-    ends = [min(truth.min(), mean.min()), max(truth.max(), mean.max())]
-    ax.plot(ends, ends, color=GREY, lw=1, ls="--")
-    label = f"mean, {100 * level:g} %"
-    ax.errorbar(truth, mean, half, color=BLUE, **DOTS, elinewidth=1, alpha=0.85, label=label)
+    """Draw predictions with the ends of their intervals against what is true."""
+    low, high = ends
+    diagonal = [min(truth.min(), mean.min()), max(truth.max(), mean.max())]
+    ax.plot(diagonal, diagonal, color=GREY, lw=1, ls="--")
+    label, errors = f"mean, {100 * level:g} %", torch.stack([mean - low, high - mean])
+    errors = errors.clamp_min(0.0)
+    ax.errorbar(truth, mean, errors, color=BLUE, **DOTS, elinewidth=1, alpha=0.85, label=label)
     ax.set(xlabel=xlabel, ylabel=ylabel)
     ax.legend(frameon=False, loc="upper left")
     tidy(ax)

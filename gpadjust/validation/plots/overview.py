@@ -18,7 +18,7 @@ from gpadjust.validation.plots.drawing import (
     band,
     column,
     labels,
-    mean_and_half_width,
+    mean_and_ends,
     quantile,
     tidy,
 )
@@ -67,9 +67,9 @@ def plot_model(
         X[:, i] = x = torch.linspace(bounds[0, i], bounds[1, i], num_points, dtype=base.dtype)
         X = on_levels(model, X)
         with torch.no_grad():
-            mean, half = mean_and_half_width(model.predict(X), output, level)
+            drawn = mean_and_ends(model.marginals(X), output, level)
             draw_physics(ax, model, X, x, output)
-        band(ax, x, mean, half, level)
+        band(ax, x, *drawn, level)
         if d == 1:
             ax.plot(train_X[:, 0], y[~y.isnan()], color=RED, **DOTS, label="data")
         else:

@@ -25,7 +25,7 @@ from gpadjust.validation.plots.drawing import (
     column,
     labels,
     legend,
-    mean_and_half_width,
+    mean_and_ends,
     observed,
     quantile,
     tidy,
@@ -77,7 +77,7 @@ def plot_prediction(
         )
     with torch.no_grad():
         posterior = model.posterior(X, observation_noise=observation_noise)
-    mean, half = mean_and_half_width(posterior, output, level)
+    drawn = mean_and_ends(posterior, output, level)
     label = labels(model, "output", posterior.mean.shape[-1])[output]
     if Y is not None and Y.shape[-1] != posterior.mean.shape[-1]:
         raise ValueError(
@@ -90,12 +90,13 @@ def plot_prediction(
     ax = axes_of(ax, 1, 1)[0, 0]
     if X.shape[-1] > 1:
         of = "" if label == "y" else f" {label}"
-        seen_values = (truth[seen], mean[seen], half[seen])
-        against_truth(ax, *seen_values, level, f"true{of}", f"predicted{of}")
+        mean, *ends = (each[seen] for each in drawn)
+        against_truth(ax, truth[seen], mean, ends, level, f"true{of}", f"predicted{of}")
         return ax
     order = X[:, 0].argsort()
     x = X[order, 0].detach()
-    band(ax, x, mean[order], half[order], level)
+    mean, low, high = (each[order] for each in drawn)
+    band(ax, x, mean, low, high, level)
     draw_physics(ax, model, X[order], x, output)
     if Y is not None:
         order = order[seen[order]]
@@ -148,7 +149,8 @@ def plot_leave_one_out(
     label = labels(loo, "output", loo.Y.shape[-1])[output]
     axes = axes_of(axes, 1, 2)[0]
     of = "" if label == "y" else f" {label}"
-    against_truth(axes[0], Y, mean, z * sd, level, f"observed{of}", "predicted without it")
+    ends = (mean - z * sd, mean + z * sd)
+    against_truth(axes[0], Y, mean, ends, level, f"observed{of}", "predicted without it")
     axes[1].axhspan(-z, z, **BAND, label=f"{100 * level:g} %")
     axes[1].axhline(0, color=GREY, lw=1, ls="--")
     axes[1].plot(mean, residuals, color=BLUE, **DOTS)

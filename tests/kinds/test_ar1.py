@@ -1,0 +1,203 @@
+"""AR1 as joint co-kriging of two levels."""
+
+import pytest
+import torch
+from botorch.models.transforms import Normalize
+
+from gpadjust.core import MATERN52, Stationary, fit, load, save
+from gpadjust.kinds.ar1 import AR1
+from gpadjust.physics import FunctionPhysics, Unknown
+from tests.systems import crude, line, refused, uniform
+
+X, LOW_X, Z = (uniform(n, 2, high=2.0, seed=n) for n in (7, 11, 5))
+LOW_Y = crude(LOW_X)
+Y = 1.7 * crude(X) + X.sum(-1, keepdim=True).sin()
+BOUNDS = torch.tensor([[-3.0, 1.0], [-2.0, 5.0]], dtype=torch.float64)
+
+
+def drawn(model, number=2, seed=0):
+    draw = torch.Generator().manual_seed(seed)
+    model.set_draws(0.4 * torch.randn(number, *model.u.shape[1:], generator=draw).double())
+    return model.eval()
+
+
+class Dense:
+    """The joint Gaussian of both levels in plain linear algebra, of an output at a draw."""
+
+    def __init__(self, model, s, j, noise=None):
+        values = {name: v[s, j].detach() for name, v in model.values.items()}
+        unit, self.rho = model.unit[j].item(), model.rho_constant[s, j].detach()
+        low_unit = (values["low.kernel.rho"] * unit / self.rho).item()
+
+        def kernel(name, unit):
+            own = {k.removeprefix(f"{name}.kernel."): v for k, v in values.items()}
+
+            def k(A, B):
+                away = (A[:, None] - B[None]) / own["lengthscale"]
+                e = (-0.5 * away.square().sum(-1)).exp()
+                return unit**2 * (own["outputscale"] * e + own["constant"])
+
+            return k
+
+        self.k1, self.k2 = kernel("low", low_unit), kernel("delta", unit)
+        low = 1e-6 if noise is not None else values["noise.low"] + 1e-11
+        high = noise if noise is not None else (values["noise.high"] + 1e-11) * unit**2
+        self.high_noise = high * torch.ones(len(model.data.X)).double()
+        self.noise = torch.cat([low * low_unit**2 * torch.ones(11).double(), self.high_noise])
+        self.y = torch.cat([LOW_Y[:, j], model.data.Y[:, j]])
+        self.X = model.data.X
+
+    def covariance(self, A, B):
+        """Of levels 0 and then 1, given as pairs of inputs."""
+        (a0, a1), (b0, b1) = A, B
+        rho = self.rho
+        high = rho**2 * self.k1(a1, b1) + self.k2(a1, b1)
+        upper = torch.cat([self.k1(a0, b0), rho * self.k1(a0, b1)], 1)
+        return torch.cat([upper, torch.cat([rho * self.k1(a1, b0), high], 1)])
+
+    def posterior(self, Z, rows=slice(None)):
+        data, at = (LOW_X, self.X), (LOW_X[:0], Z)
+        K = self.covariance(data, data) + self.noise.diag()
+        K, y = K[rows][:, rows], self.y[rows]
+        cross = self.covariance(at, data)[:, rows]
+        mean = cross @ torch.linalg.solve(K, y)
+        return mean, self.covariance(at, at) - cross @ torch.linalg.solve(K, cross.mT)
+
+    def log_likelihood(self):
+        data = (LOW_X, self.X)
+        K = self.covariance(data, data) + self.noise.diag()
+        return torch.distributions.MultivariateNormal(torch.zeros(len(K)).double(), K).log_prob(
+            self.y
+        )
+
+
+@pytest.mark.parametrize("Yvar", [None, 0.02])
+def test_joint_co_kriging(Yvar, close):
+    model = drawn(AR1(X, Y, Yvar, low_X=LOW_X, low_Y=LOW_Y))
+    parts = [[Dense(model, s, j, Yvar) for j in range(2)] for s in range(2)]
+    means, K = model.posterior(Z).components
+    noisy, left_out = model.marginals(Z, observation_noise=True), model.left_out()
+    assert left_out.means.shape == (2, 7, 2)
+    ratio = model.log_likelihood(model.u.detach())[0]
+    for s in range(2):
+        for j, part in enumerate(parts[s]):
+            mean, covariance = part.posterior(Z)
+            close(means[s, j], mean, 1e-6)
+            close(K[s, j], covariance, 1e-6)
+            expected = covariance.diagonal() + part.high_noise[0]
+            close(noisy.variances[s, :, j], expected, 1e-6)
+            rows = torch.arange(18) != 13  # without the third observation of the high level
+            mean, covariance = part.posterior(X[[2]], rows)
+            close(left_out.means[s, 2, [j]], mean, 1e-6)
+            close(left_out.variances[s, 2, [j]], covariance[0] + part.high_noise[2], 1e-6)
+    own = torch.tensor([[p.log_likelihood() for p in row] for row in parts])
+    close((ratio[1] - ratio[0]).squeeze(), own[1] - own[0], 1e-6)  # but for the units
+
+
+def test_recursive_co_kriging_on_nested_designs_without_noise(close):
+    """The recursion of Le Gratiet and Garnier (2014) is the joint model then."""
+    model = AR1(LOW_X[:6], 1.7 * LOW_Y[:6] + LOW_X[:6].sin(), 1e-12, low_X=LOW_X, low_Y=LOW_Y)
+    values = {row.name: 0.0 for row in model.table.own}
+    values |= {f"{name}.kernel.lengthscale": -1.0 for name in ("low", "delta")}  # 0.5
+    u = torch.cat([torch.full_like(r.location, values[r.name]) for r in model.table.own], -1)
+    model.set_draws(u.reshape(model.u.shape))
+    part = Dense(model.eval(), 0, 0, 1e-12)
+    k1, k2, rho, y1, x2 = part.k1, part.k2, part.rho, LOW_Y[:, 0], LOW_X[:6]
+    exact = part.noise[:11].diag()
+    first = k1(Z, LOW_X) @ torch.linalg.solve(k1(LOW_X, LOW_X) + exact, y1)
+    bias = k2(Z, x2) @ torch.linalg.solve(k2(x2, x2), model.data.Y[:, 0] - rho * y1[:6])
+    close(model.predict(Z).mean[:, 0], rho * first + bias, 1e-4)
+
+
+def test_gradients_rows_conditioning_outputs_and_functions_are_of_both_levels(close):
+    model = drawn(AR1(X, Y, low_X=LOW_X, low_Y=LOW_Y))
+    u = model.u.detach()
+    _, slope = model.log_likelihood(u)
+    for i in range(u.shape[-1]):
+        step = torch.zeros_like(u)
+        step[..., i] = 1e-5
+        up, down = (model.log_likelihood(u + sign * step, False)[0] for sign in (1, -1))
+        torch.testing.assert_close((up - down) / 2e-5, slope[..., i], rtol=1e-4, atol=1e-3)
+    more = model.condition_on_observations(Z, crude(Z))
+    both = AR1(torch.cat([X, Z]), torch.cat([Y, crude(Z)]), low_X=LOW_X, low_Y=LOW_Y)
+    few = more.subset_rows(torch.arange(7))
+    close(few.predict(Z).mean, model.predict(Z).mean)
+    assert more.left_out().means.shape[-2] == len(both.data.X) == 12
+    close(model.subset_output([1]).predict(Z).mean, model.predict(Z).mean[:, 1:])
+    functions = model.sample_functions(4000, seed=0, num_features=256)(Z[:2])
+    sd = model.predict(Z[:2]).variance.sqrt()
+    assert ((functions.mean(0) - model.predict(Z[:2]).mean).abs() < 0.1 * sd + 1e-3).all()
+    torch.testing.assert_close(functions.std(0), sd, rtol=0.15, atol=1e-3)
+
+
+def test_low_values_may_be_missing_or_the_physics_and_files_hold_both_levels(tmp_path):
+    given = AR1(X, Y, low_X=LOW_X, low_Y=LOW_Y).eval()
+    computed = AR1(X, Y, low_X=LOW_X, physics=crude).eval()
+    torch.testing.assert_close(given.predict(Z).mean, computed.predict(Z).mean)
+    missing = LOW_Y.clone()
+    missing[0, 1] = torch.nan
+    two = AR1(X, Y, low_X=LOW_X, low_Y=missing).eval()
+    kernel = {"low_covar_module": Stationary(MATERN52), "input_transform": Normalize(2)}
+    one = AR1(X, Y[:, 1:], low_X=LOW_X[1:], low_Y=LOW_Y[1:, 1:]).eval()
+    for name, v in one.values.items():
+        same = two.values[name][:, 1:]
+        assert name.endswith("lengthscale") or torch.equal(v, same)
+    torch.testing.assert_close(two.targets()[1, 1:], one.targets()[0])
+    model = drawn(AR1(X, Y, low_X=LOW_X, low_Y=LOW_Y, delta_covar_module=Stationary(MATERN52)))
+    save(model, tmp_path / "model.pt")
+    again = load(tmp_path / "model.pt", delta_covar_module=Stationary(MATERN52))
+    torch.testing.assert_close(again.predict(Z).mean, model.predict(Z).mean)
+    assert drawn(AR1(X, Y, low_X=LOW_X, low_Y=LOW_Y, **kernel)).predict(Z).mean.isfinite().all()
+
+
+def test_samples_lie_within_the_bounds_and_the_seed_makes_them():
+    rows = []
+
+    def physics(X):
+        rows.append(X)
+        return crude(X)
+
+    low = [AR1(X, Y, physics=physics, bounds=BOUNDS, num_low=33, seed=s).low.X for s in (1, 1, 2)]
+    assert torch.equal(low[0], low[1])
+    assert not torch.equal(low[0], low[2])
+    assert len(low[0]) == 33 == len(rows[0])
+    assert ((low[0] >= BOUNDS[0]) & (low[0] <= BOUNDS[1])).all()
+    assert (low[0].amax(0) - low[0].amin(0) > 0.8 * (BOUNDS[1] - BOUNDS[0])).all()
+
+
+@pytest.mark.parametrize("units", [(1e-12, 1e-12), (1e12, 1e12), (1e-6, 1e6)])
+def test_units_of_any_size(units):
+    low, high = units
+    plain = drawn(AR1(X, Y, low_X=LOW_X, low_Y=LOW_Y))
+    model = drawn(AR1(X, high * Y, low_X=LOW_X, low_Y=low * LOW_Y))
+    torch.testing.assert_close(model.predict(Z).mean / high, plain.predict(Z).mean)
+    torch.testing.assert_close(model.rho_constant * low / high, plain.rho_constant)
+
+
+@pytest.mark.slow
+def test_a_function_and_a_cheap_version_of_it():
+    """Of Forrester et al. (2007): the function, and half of it with a line."""
+
+    def high(X):
+        return (6 * X - 2).square() * (12 * X - 4).sin()
+
+    X, Z = line(6, 0.05, 0.95), line(50)
+    model = AR1(X, high(X), physics=lambda X: 0.5 * high(X) + 10 * X - 10, bounds=[[0.0], [1.0]])
+    fit(model)
+    assert (model.predict(Z).mean - high(Z)).square().mean().sqrt() < 0.2 * high(Z).std()
+    lower, upper = model.interval(Z)
+    assert ((lower <= high(Z)) & (high(Z) <= upper)).double().mean() > 0.9
+
+
+@pytest.mark.parametrize("options, words", [
+    ({}, "low level"),
+    ({"physics": crude}, "bounds"),
+    ({"low_Y": LOW_Y}, "low_X"),
+    ({"physics": crude, "bounds": BOUNDS.flip(0)}, "below"),
+    ({"low_X": LOW_X[:, :1], "low_Y": LOW_Y}, "2 inputs"),
+    ({"low_X": LOW_X, "low_Y": LOW_Y[:, :1]}, "2 outputs"),
+    ({"low_X": LOW_X, "physics": FunctionPhysics(
+        lambda X, p: crude(X), unknowns={"w": Unknown(1.0, sd=1.0)})}, "CKA"),
+])  # fmt: skip
+def test_bad_input(options, words):
+    refused(ValueError, words, AR1, X, Y, **options)

@@ -1,0 +1,205 @@
+"""A physics that is known by its runs."""
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from gpadjust.core import CKA, CalibratedPhysics, PhysicsMeanGP, ZeroMeanGP, fit, load, save
+from gpadjust.kinds.emulated import EmulatedPhysics
+from gpadjust.kinds.links import LinkedCKA
+from gpadjust.physics import FunctionPhysics, Unknown
+from tests.systems import line, refused, uniform
+
+MAP = {"method": "map"}
+W = {"w": Unknown(2.0, bounds=(1.0, 3.0))}
+FAR = torch.tensor([[1.9], [2.2]], dtype=torch.float64)
+
+
+def wave(X):
+    return torch.sin(3 * X[:, :1]) * X[:, :1]
+
+
+def truth(X):
+    return 1.3 * wave(X) + 0.3 * X
+
+
+def simulated(x, w):
+    return torch.sin(w * x) * x + 0.2 * w
+
+
+@pytest.fixture(scope="module")
+def crude():
+    """Runs in the left half, so that little is known in the right one."""
+    runs = 1.2 * line(9)
+    return EmulatedPhysics(runs, wave(runs), name="crude")
+
+
+def functions(physics, X, number=4000, seed=0):
+    """Outputs ``number x n x m`` of functions drawn by the prior."""
+    draw = torch.Generator().manual_seed(seed)
+    z = torch.randn(number, len(physics.unknowns), generator=draw, dtype=torch.float64)
+    return physics(X, z)
+
+
+def test_functions_have_the_mean_and_covariance_of_the_emulator(crude):
+    X = torch.tensor([[0.1], [1.0], [1.25], [1.5]], dtype=torch.float64)
+    torch.testing.assert_close(crude(X), crude.emulator.predict(X).mean)
+    values = functions(crude, X)[..., 0]
+    posterior = crude.emulator.posterior(X)
+    sd = posterior.variance[:, 0].sqrt()
+    assert ((values.mean(0) - posterior.mean[:, 0]).abs() < 0.1 * sd).all()
+    expected = posterior.distribution.covariance_matrix
+    size = expected.diagonal().sqrt()
+    found = values.T.cov()
+    assert ((found - expected).abs() < 0.25 * size * size.unsqueeze(-1)).all()
+
+
+def test_several_outputs_have_errors_of_their_own_size():
+    runs = 1.2 * line(9)
+    both = torch.cat([wave(runs), 100 * runs.cos()], -1)
+    physics = EmulatedPhysics(runs, both, fit_options=MAP, num_components=12)
+    values = functions(physics, FAR[:1] - 0.4)[:, 0]
+    sd = physics.emulator.predict(FAR[:1] - 0.4).variance[0].sqrt()
+    torch.testing.assert_close(values.std(0), sd, rtol=0.3, atol=0.0)
+    assert abs(values.T.corrcoef()[0, 1]) < 0.2
+
+
+def test_gradients_are_those_of_the_function(crude):
+    z = functions(crude, FAR[:1], 3)[:0]
+    z = torch.randn(3, 8, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    plain = EmulatedPhysics(1.2 * line(9), wave(1.2 * line(9)), fit_options=MAP, is_random=True)
+    X = (1.0 + line(4)).requires_grad_()
+    assert torch.autograd.gradcheck(lambda X: plain(X, z), X)
+    z.requires_grad_()
+    assert torch.autograd.gradcheck(lambda z: plain(X.detach(), z), z)
+
+
+@pytest.mark.slow
+def test_intervals_are_wide_where_there_are_no_runs_and_measurements_correct_the_emulator(crude):
+    near = 1.2 * line(6)
+    model = CKA(near, truth(near), physics=crude)
+    fit(model)
+    certain = CKA(near, truth(near), physics=lambda X: crude.emulator.predict(X).mean)
+    fit(certain)
+    wide, narrow = (m.predict(FAR).variance.sqrt() for m in (model, certain))
+    own = crude.emulator.predict(FAR).variance.sqrt()
+    assert (wide > 0.3 * own).all()
+    assert (wide > 1.2 * narrow).all()
+    X = 2.4 * line(9)
+    corrected = PhysicsMeanGP(X, wave(X), physics=crude)
+    fit(corrected)
+    # What was measured is known of the simulator, too.
+    z = torch.stack([corrected.physics_parameters[f"emulator_{k + 1}"] for k in range(8)], -1)
+    away = (crude(X[5:], z) - wave(X[5:])).square().mean().sqrt()
+    before = (functions(crude, X[5:]) - wave(X[5:])).square().mean().sqrt()
+    assert away < 0.5 * before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [8, 60])
+def test_with_dense_runs_results_are_those_of_the_simulator(n):
+    """By draws from the prior, and from Laplace's approximation."""
+    runs, X = 1.5 * line(40), 1.2 * line(n) + 0.1
+    noise = 0.02 * torch.randn(n, 1, generator=torch.Generator().manual_seed(0)).double()
+    known = EmulatedPhysics(runs, wave(runs), num_components=2)
+    Z = 1.4 * line(9)
+    emulated, exact = (PhysicsMeanGP(X, wave(X) + 0.1 * X + noise, physics=p) for p in (known, wave))
+    for model in (emulated, exact):
+        fit(model)
+    a, b = emulated.predict(Z), exact.predict(Z)
+    assert ((a.mean - b.mean).abs() < 0.5 * b.variance.sqrt()).all()
+    torch.testing.assert_close(a.variance.sqrt(), b.variance.sqrt(), rtol=0.4, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_unknown_parameters_are_inputs_of_the_runs():
+    runs = torch.quasirandom.SobolEngine(2, scramble=True, seed=1).draw(40).double()
+    runs = runs * torch.tensor([3.0, 2.0]) + torch.tensor([0.0, 1.0])
+    emulated = EmulatedPhysics(runs, simulated(*runs.split(1, -1)), unknowns=W, fit_options=MAP)
+    exact = FunctionPhysics(lambda X, p: simulated(X[:, 0], p.w), unknowns=W)
+    X = 0.1 + 2.8 * line(12)
+    noise = 0.02 * torch.randn(X.shape, generator=torch.Generator().manual_seed(0)).double()
+    draws = []
+    for physics in (emulated, exact):
+        model = CalibratedPhysics(X, simulated(X, 1.6) + noise, physics=physics)
+        fit(model)
+        draws.append(model.physics_parameters["w"].flatten())
+    one, two = draws
+    assert abs(one.mean() - two.mean()) < 2 * one.std()
+    assert 0.7 < one.std() / two.std() < 5
+    assert abs(one.mean() - 1.6) < 0.05
+
+
+def test_columns_of_a_frame_are_unknown_parameters_by_their_names():
+    runs = pd.DataFrame({"w": 1 + 2 * np.linspace(0, 1, 9), "x": 3 * np.linspace(0, 1, 9) ** 2})
+    Y = np.sin(runs.w * runs.x).to_frame("y")
+    Y.iloc[3, 0] = np.nan  # a run that failed
+    options = {"unknowns": W, "fit_options": MAP, "num_components": 1}
+    physics = EmulatedPhysics(runs, Y, **options)
+    x, p = torch.tensor([[3.0]]).double(), torch.tensor([3.0, 0.0]).double()
+    assert len(physics.emulator.data.X) == 8
+    assert physics.emulator.data.input_names == ("x", "w")
+    assert abs(physics(x, p) - np.sin(9)) < 0.1
+    with_units = runs.rename(columns={"w": "w [1/s]", "x": "x [s]"})
+    torch.testing.assert_close(EmulatedPhysics(with_units, Y, **options)(x, p), physics(x, p))
+
+
+def test_names_of_inputs_are_to_be_in_order():
+    X = pd.DataFrame(uniform(6, 2).numpy(), columns=["a", "b"])
+    physics = EmulatedPhysics(X, X[["a"]], fit_options=MAP, num_components=1)
+    refused(ValueError, "in this order", CKA, X[["b", "a"]], X[["a"]], physics=physics)
+    turned = EmulatedPhysics(X, X[["a"]], inputs=[1, 0], fit_options=MAP, num_components=1)
+    model = CKA(X[["b", "a"]], X[["a"]], physics=turned)
+    assert abs(turned(model.data.X) - model.data.Y).max() < 0.1
+
+
+def test_fine_detail_is_an_error_of_a_certain_simulator():
+    runs, X = 4 * line(60), 4 * line(5) + 0.01
+    ripples = runs.sin() + 0.1 * torch.sin(397 * runs)
+    sd = []
+    for is_random in (False, True):
+        physics = EmulatedPhysics(runs, ripples, is_random=is_random, fit_options=MAP)
+        values = functions(physics, X)[..., 0]
+        sd.append(values.std(0))
+    more = (sd[0].square() - sd[1].square()).sqrt()
+    assert ((more > 0.03) & (more < 0.15)).all()
+
+
+def test_a_model_may_be_saved_and_its_physics_is_given_again(crude, tmp_path):
+    X = 2.4 * line(7)
+    model = PhysicsMeanGP(X, truth(X), physics=crude)
+    model.set_draws(0.3 * torch.randn(3, *model.u.shape[1:]).double())
+    with pytest.warns(UserWarning, match="Pass it again"):
+        save(model, tmp_path / "model.pt")
+    again = load(tmp_path / "model.pt", physics=crude)
+    torch.testing.assert_close(again.predict(FAR).mean, model.predict(FAR).mean)
+    more = model.condition_on_observations(FAR, truth(FAR))
+    assert (more.predict(FAR).variance < model.predict(FAR).variance).all()
+
+
+@pytest.mark.parametrize("call, error, words", [
+    (lambda X: EmulatedPhysics(X, X, inputs=[0, 1]), ValueError, "inputs as the numbers of 1"),
+    (lambda X: EmulatedPhysics(pd.DataFrame({"x": [0.0, 1.0]}), np.zeros(2), unknowns=W),
+     ValueError, "names w"),
+    (lambda X: EmulatedPhysics(X, X, unknowns=W), ValueError, "and then 1 unknown"),
+    (lambda X: EmulatedPhysics(X, X, unknowns={"emulator_1": W["w"]}), ValueError, "other names"),
+    (lambda X: EmulatedPhysics(X, X, num_components=0), ValueError, "num_components"),
+    (lambda X: EmulatedPhysics(X, X, model_factory=lambda X, Y: X), TypeError, "return a GP"),
+    (lambda X: EmulatedPhysics(X, X + 1, fit_options=MAP, model_factory=lambda X, Y: LinkedCKA(
+        X, Y, physics=torch.exp, link="log")), ValueError, "without a link"),
+    (lambda X: EmulatedPhysics(X, X.sin(), fit_options=MAP)(torch.zeros(3, 2).double()),
+     ValueError, r"inputs=\[...\]"),
+])  # fmt: skip
+def test_bad_input(call, error, words):
+    refused(error, words, call, line(5))
+
+
+def test_any_model_may_be_the_emulator():
+    X = line(6)
+    physics = EmulatedPhysics(
+        X, X.exp(), fit_options=MAP, num_components=2,
+        model_factory=lambda X, Y: CKA(X, Y, physics=lambda X: 1 + X),
+    )  # fmt: skip
+    assert isinstance(physics.emulator, CKA) and not isinstance(physics.emulator, ZeroMeanGP)
+    assert abs(physics(line(9)) - line(9).exp()).max() < 0.01

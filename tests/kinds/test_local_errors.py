@@ -1,0 +1,127 @@
+"""Variances near what was missed when it was left out."""
+
+import pytest
+import torch
+
+from gpadjust.core import CKA, GP, RRA, OfGPyTorch, Term, ZeroMeanGP, fit
+from gpadjust.kinds.links import LinkedCKA
+from gpadjust.kinds.local_errors import LocalErrors
+from tests.systems import line, refused, uniform
+
+KINK = 0.6
+
+
+def truth(X):
+    """Two outputs: one with a kink and another without."""
+    kinked = 2 * X[:, :1].sin() + 3 * (X[:, :1] - KINK).clamp_min(0.0) * (1 + X[:, 1:])
+    return torch.cat([kinked, 2 * X[:, :1].sin() + X[:, 1:].square()], dim=-1)
+
+
+def physics(X):
+    return X[..., :1].sin().expand(*X.shape[:-1], 2)
+
+
+@pytest.fixture(scope="module")
+def wider():
+    X = uniform(60, 2, seed=4)
+    model = CKA(X, truth(X), physics=physics)
+    fit(model)
+    return LocalErrors(model)
+
+
+@pytest.fixture(scope="module")
+def Z():
+    return uniform(400, 2, seed=5)
+
+
+def test_the_formula():
+    X = line(5)
+    model = ZeroMeanGP(X, (X - 0.5).abs()).eval()
+    errors = LocalErrors(model)
+    mean, variance = model.left_out().prediction
+    expected = ((model.data.Y - mean).square() / variance).mT
+    torch.testing.assert_close(errors.squares, expected)
+    errors.squares = torch.tensor([[9.0, 0.0, 1.0, 1.0, 0.5]]).double()
+    x = torch.tensor([[0.0], [0.5], [100.0]], dtype=torch.float64)
+    length = model.values["f.kernel.lengthscale"].item()
+    near = (-0.5 * ((x - X.mT) / length).square()).exp()
+    ratio = (1 + near @ errors.squares[0]) / (1 + near.sum(-1))
+    torch.testing.assert_close(errors.factors(x)[:, 0], ratio.clamp_min(1.0))
+    assert errors.factors(x)[0, 0] > 1.2
+    assert errors.factors(x)[2, 0] == 1
+
+
+@pytest.mark.slow
+def test_intervals_cover_a_kink_and_others_are_not_wider(wider, Z):
+    Y, covered, width = truth(Z), {}, {}
+    for name, model in (("wider", wider), ("plain", wider.model)):
+        low, high = model.interval(Z, observation_noise=True)
+        covered[name], width[name] = ((low <= Y) & (high >= Y)).double(), high - low
+    near = (Z[:, 0] - KINK).abs() < 0.1
+    assert covered["wider"][near, 0].mean() > covered["plain"][near, 0].mean() + 0.05
+    assert covered["wider"][:, 0].mean() > 0.9
+    ratio = width["wider"] / width["plain"]
+    assert ratio[near, 0].mean() > 1.2
+    assert ratio[:, 1].mean() < 1.1
+
+
+@pytest.mark.slow
+def test_predictions_posteriors_gradients_functions_and_noise_agree(wider, Z):
+    X, plain = Z[:12], wider.model
+    factors = wider.factors(X)
+    assert factors.max() > 1.3
+    own, other = wider.marginals(X), plain.marginals(X)
+    assert torch.equal(own.means, other.means)
+    torch.testing.assert_close(own.variances, other.variances * factors)
+    for noise in (False, True, torch.full((12, 2), 0.5).double()):
+        predicted, posterior = wider.predict(X, noise), wider.posterior(X, observation_noise=noise)
+        torch.testing.assert_close(posterior.mean, predicted.mean)
+        torch.testing.assert_close(posterior.variance, predicted.variance)
+    own, other = wider.marginals(X, True), plain.marginals(X, True)  # learnt noise grows, too
+    torch.testing.assert_close(own.variances, other.variances * factors)
+    given = wider.predict(X, noise).variance - wider.predict(X).variance
+    torch.testing.assert_close(given, noise)
+    x = Z[:3].clone().requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: wider.predict(x).variance, x, rtol=1e-3)
+    part = wider.subset_output([1])
+    torch.testing.assert_close(part.predict(X).variance, wider.predict(X).variance[:, 1:])
+    more = wider.condition_on_observations(Z[:2], truth(Z[:2]))
+    assert torch.equal(more.factors(X), factors)
+    less = more.predict(Z[:2]).variance / wider.predict(Z[:2]).variance
+    assert (less[:, 0] < 1).all()
+    functions = wider.sample_functions(8, seed=0, num_features=64)
+    plain_functions = plain.sample_functions(8, seed=0, num_features=64)
+    means = plain_functions.model.components(X)[0].movedim(-3, 0)
+    expected = means + factors.sqrt() * (plain_functions(X) - means)
+    torch.testing.assert_close(functions(X), expected)
+    torch.testing.assert_close(functions.each(X.expand(8, -1, -1)), expected)
+
+
+def test_links_keep_their_bounds():
+    X = line(9)
+    wider = LocalErrors(LinkedCKA(X, (X - 0.5).abs() + 0.01, physics=torch.ones_like, link="log"))
+    low, high = wider.interval(line(20))
+    assert (low > 0).all()
+    assert (high.log() - low.log() >= (1 - 1e-9) * _width(wider.model, line(20))).all()
+    assert (wider.sample_functions(3, 0, 64)(X) > 0).all()
+
+
+def _width(model, Z):
+    low, high = model.interval(Z)
+    return high.log() - low.log()
+
+
+@pytest.mark.parametrize("call, error, words", [
+    (lambda X: LocalErrors("model"), TypeError, "model"),
+    (lambda X: LocalErrors(GP(X, X, terms=[Term("f", OfGPyTorch(_linear()))])), ValueError,
+     "lengthscale"),
+    (lambda X: LocalErrors(RRA(X, X, physics=torch.sin)).predict(X.repeat(1, 2)), ValueError, "X"),
+])  # fmt: skip
+def test_bad_input(call, error, words):
+    refused(error, words, call, line(5))
+
+
+def _linear():
+    from gpytorch.kernels import LinearKernel
+
+    return LinearKernel()

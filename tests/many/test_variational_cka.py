@@ -1,0 +1,379 @@
+"""VariationalCKA: the exact model in the limit, later rows, copies and files, fits, bad input."""
+
+import copy
+import pickle
+from functools import cache, partial
+
+import pytest
+import torch
+from botorch.acquisition import UpperConfidenceBound
+from botorch.acquisition.knowledge_gradient import qKnowledgeGradient
+from botorch.acquisition.logei import qLogNoisyExpectedImprovement
+from botorch.acquisition.thompson_sampling import PathwiseThompsonSampling
+from botorch.models import ModelListGP
+from botorch.models.transforms import Normalize
+from botorch.optim import optimize_acqf
+
+from gpadjust.core import StackedGP, fit, load, save
+from gpadjust.kinds.categories import Categories
+from gpadjust.kinds.heavy_tails import HeavyTails
+from gpadjust.kinds.links import Linked
+from gpadjust.many import VariationalCKA
+from gpadjust.physics import FunctionPhysics, Unknown
+from tests.many.numbers import at_random, exact_of, physics_of, problem, truth
+from tests.systems import line, normal, refused, same, uniform, wave, waves
+
+
+def make(X, Y, *args, num_inducing=10, **options):
+    options = {"physics": physics_of(Y.shape[-1])} | options
+    return VariationalCKA(X, Y, *args, num_inducing=num_inducing, **options)
+
+
+@pytest.fixture
+def model(num_outputs):
+    """A model at random numbers with some missing targets."""
+    X, Y = problem(60, num_outputs)
+    if num_outputs > 1:
+        Y[::4, 0] = torch.nan
+    return at_random(make(X, Y))
+
+
+def with_rest(model, variance=0.3, length=0.2):
+    """The model with a rest, in units of its targets."""
+    shape = (model.num_outputs, 1)
+    numbers = {"lengthscale": length, "outputscale": variance}
+    numbers = {f"rest.kernel.{n}": torch.full(shape, v).double() for n, v in numbers.items()}
+    u = model.table.with_choice(model.u.detach(), 1)
+    model.set_draws(model.table.with_values(u, numbers))
+    return model
+
+
+def points_everywhere(model):
+    model.inducing = torch.arange(len(model.data.Y)).expand(model.num_outputs, -1).clone()
+    model.set_draws(model.u.detach())
+    return model
+
+
+def test_points_at_all_rows_make_the_exact_model(model, close):
+    model, exact, Z = points_everywhere(model), exact_of(model), line(9, -0.2, 1.2)
+    for name in ("posterior", "rho", "delta"):
+        ours, theirs = getattr(model, name)(Z), getattr(exact, name)(Z)
+        close(ours.mean, theirs.mean, 1e-4)
+        close(ours.distribution.covariance_matrix, theirs.distribution.covariance_matrix, 1e-4)
+    for ours, theirs in zip(
+        model.interval(Z, 0.8, True), exact.interval(Z, 0.8, True), strict=True
+    ):
+        close(ours, theirs, 1e-4)
+    for ours, theirs in zip(model.left_out(), exact.left_out(), strict=True):
+        close(ours.nan_to_num(), theirs.nan_to_num(), 1e-3)
+
+
+@pytest.mark.parametrize("has_rest", [False, True], ids=["", "rest"])
+def test_left_out_is_the_model_without_the_row(model, close, has_rest):
+    model = with_rest(model) if has_rest else model
+    prediction = model.left_out().prediction
+    Y, fresh = model.data.Y.clone(), copy.deepcopy(model)
+    for row in (0, 7, 33):
+        others = Y.clone()
+        others[row] = torch.nan
+        fresh.data = model.data._replace(Y=others)
+        fresh.to(torch.float64)  # forgets the posterior
+        mean, variance = fresh.predict(model.data.X[[row]], observation_noise=True)
+        seen = ~Y[row].isnan()
+        close(prediction.mean[row, seen], mean[0, seen], 1e-6)
+        close(prediction.variance[row, seen], variance[0, seen], 1e-6)
+        assert prediction.mean[row, ~seen].isnan().all()
+
+
+@pytest.mark.parametrize("has_rest", [False, True], ids=["", "rest"])
+def test_all_that_predicts_agrees(model, close, has_rest):
+    Z = line(5)
+    if has_rest:  # the inducing values take it for noise, so that they know less
+        before = model.predict(Z).variance
+        added = with_rest(model).predict(Z).variance - before
+        assert (added > 0.3 * model.unit.mT.square()).all()
+    mean, variance = model.predict(Z)
+    posterior = model.posterior(Z)
+    close(posterior.mean, mean)
+    close(posterior.variance, variance, 1e-6)
+    f_p = physics_of(model.num_outputs)(Z)
+    close(model.rho(Z).mean * f_p + model.delta(Z).mean, mean)
+    assert (model.delta(Z).variance >= model.term("delta", Z).variance).all()
+    draws = torch.cat([model.sample_functions(500, seed, 512)(Z).detach() for seed in range(4)])
+    sd = variance.sqrt().detach()
+    assert ((draws.mean(0) - mean).abs() < 5 * sd / 2000**0.5).all()
+    torch.testing.assert_close(draws.std(0), sd, rtol=0.15, atol=0)
+    many = line(5000)
+    close(model.predict(many).variance[2500:], model.predict(many[2500:]).variance)
+
+
+@pytest.mark.parametrize("has_rest", [False, True], ids=["", "rest"])
+def test_later_rows_are_observed_exactly(model, close, has_rest):
+    m = model.num_outputs
+    model = with_rest(model) if has_rest else points_everywhere(model)
+    X, Y, Z = line(4, 1.3, 1.6), 2 * physics_of(m)(line(4, 1.3, 1.6)), line(6, 1.2, 1.7)
+    Y[1, 0] = torch.nan if m > 1 else 0.0
+    later = model.condition_on_observations(X, Y)
+    posterior = model.posterior(torch.cat([X, Z]))
+    mean, K = posterior.mean, posterior.components[1][0]
+    noise = (model.noise.variance(model.values, None) * model.unit.square())[0].detach()
+    for j in range(m):  # the posterior of the first rows is the prior of the late ones
+        seen = torch.arange(4)[~Y[:, j].isnan()]
+        S = K[j][seen][:, seen] + noise[j] * torch.eye(len(seen)).double()
+        gain = torch.linalg.solve(S, K[j][4:][:, seen].mT).mT
+        expected = mean[4:, j] + gain @ (Y[seen, j] - mean[seen, j])
+        close(later.predict(Z).mean[:, j], expected, 1e-5)
+        variance = (K[j][4:, 4:] - gain @ K[j][seen][:, 4:]).diagonal()
+        close(later.predict(Z).variance[:, j], variance, 1e-5)
+    by_two = model.condition_on_observations(X[:2], Y[:2]).condition_on_observations(X[2:], Y[2:])
+    close(by_two.predict(Z).variance, later.predict(Z).variance, 1e-5)
+    close(by_two.to(torch.float64).predict(Z).mean, later.predict(Z).mean, 1e-5)  # made again
+    if not has_rest:
+        exact = exact_of(model).condition_on_observations(X, Y)
+        close(later.predict(Z).mean, exact.predict(Z).mean, 1e-4)
+    draws = later.sample_functions(2000, 0, 512)(Z).detach()
+    torch.testing.assert_close(draws.std(0), later.predict(Z).variance.sqrt(), rtol=0.2, atol=0)
+    fantasies = model.condition_on_observations(X, torch.stack([Y, Y + 1, Y - 1]))
+    close(fantasies.predict(Z).mean[0], later.predict(Z).mean, 1e-6)
+    refused(NotImplementedError, "Build it of all data", later.left_out)
+
+
+def test_shapes_and_gradients(model, close, gradient_is_right):
+    m, X = model.num_outputs, problem(24)[0].reshape(2, 3, 4, 1)
+    posterior = model.posterior(X)
+    assert posterior.rsample(torch.Size([5])).shape == (5, 2, 3, 4, m)
+    close(posterior.mean[1, 2], model.posterior(X[1, 2]).mean)
+    last = model.posterior(X, output_indices=[m - 1])
+    close(last.mean, posterior.mean[..., -1:])
+    gradient_is_right(lambda X: model.predict(X).mean.sum(), X[0, 0])
+    gradient_is_right(lambda X: model.posterior(X).variance.sum(), X[0, 0])
+
+
+def test_botorch():
+    X, Y = problem(60)
+    model = at_random(make(X, Y))
+    options = {"num_restarts": 1, "raw_samples": 4, "options": {"maxiter": 3}}
+    functions = (
+        UpperConfidenceBound(model, 0.2),
+        qLogNoisyExpectedImprovement(model, X[:10]),
+        qKnowledgeGradient(model, num_fantasies=2),
+    )
+    for acquisition in functions:
+        best, _ = optimize_acqf(acquisition, torch.tensor([[0.0], [1.0]]).double(), q=1, **options)
+        assert best.isfinite().all()
+    value = PathwiseThompsonSampling(model)(torch.tensor([0.28, 0.75]).double().reshape(2, 1, 1))
+    assert value[0] > value[1]
+    both = ModelListGP(model, exact_of(model))
+    assert both.posterior(X[:3]).mean.shape == (3, 2)
+    names = {"many": model, "exact": exact_of(model)}
+    assert StackedGP.by_left_out(names, 8).predict(X[:3]).mean.isfinite().all()
+
+
+def test_copies_states_and_outputs(model, close):
+    Z, before = line(5), with_rest(model).predict(line(5), True)
+    fresh = make(*model.data[:2])
+    fresh.inducing = 0 * fresh.inducing
+    fresh.load_state_dict(model.state_dict())
+    copies = [copy.deepcopy(model), pickle.loads(pickle.dumps(model)), fresh, model.to("cpu")]
+    for each in copies:
+        same(each.predict(Z, True), before, rtol=1e-10, atol=0)
+        assert each.summary() == model.summary()
+    assert "varies in 0 of 1 draws" in make(*problem(10)).summary()
+    for kept in ([0], [-1], [model.num_outputs - 1, 0][: model.num_outputs]):
+        part = model.subset_output(kept)
+        same(part.predict(Z, True), [each[:, kept] for each in before], rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("later", [False, True], ids=["", "conditioned"])
+def test_files(tmp_path, later):
+    X, Y = problem(60, 2)
+    model = with_rest(at_random(make(5 * X, Y, 0.01, input_transform=Normalize(1), center=0.5)))
+    model.inducing = model.inducing.flip(-1)[:, 1:]
+    options = {"input_transform": Normalize(1), "physics": waves}
+    if later:
+        model = model.condition_on_observations(X[:2] + 6, Y[:2])
+    save(model, tmp_path / "model.pt")
+    again = load(tmp_path / "model.pt", **options)
+    same(again.predict(line(5), True), model.predict(line(5), True), rtol=1e-8, atol=1e-10)
+    assert torch.equal(again.inducing, model.inducing)
+    assert again.summary() == model.summary()
+
+
+def test_inducing_points_are_pivots():
+    X, Y = problem(100, 2)
+    Y[:50, 1] = torch.nan
+    model = at_random(make(X, Y))
+    points = model.points(model.u.detach(), 8)
+    assert points.shape == (2, 8)
+    assert all(len(set(each.tolist())) == 8 for each in points)
+    assert not Y[points[1], 1].isnan().any()
+    f = model.at(X)
+    f.weights.pop("rest")
+    K = f.cross(f)[0, 0].detach()
+
+    def left(rows):
+        k = K[rows]
+        return (
+            K.diagonal() - (k * torch.linalg.pinv(k[:, rows], hermitian=True).mm(k)).sum(0)
+        ).sum()
+
+    first = points[0]
+    assert first[0] == K[:32].diagonal().argmax()
+    some = [left(torch.randperm(32)[:8]) for _ in range(20)]
+    assert left(first) < min(some)
+
+
+def test_noise_is_no_function_and_a_function_is_found():
+    X = line(400)
+    for seed in range(3):
+        Y = torch.cat([0.1 * normal(400, 1, seed=seed), 0.1 * normal(400, 1, seed=seed + 9)], -1)
+        Y[:, 1:] += 0.3 * (40 * X).sin()
+        Y[::5, 1] = torch.nan
+        model = make(X, Y, physics=lambda X: 0 * waves(X) + 0.1, num_inducing=3)
+        u = model._with_rest(model.conditioning(), seed)
+        values = model.table.values(u)
+        assert model.table.chosen(values).tolist() == [[0, 1]]
+        model.set_draws(u)
+        noise = model.noise.variance(model.values, None)[0, :, 0].sqrt() * model.unit[:, 0]
+        assert noise[1].item() == pytest.approx(0.1, rel=0.2)
+        lower, upper = model.interval(X)
+        inside = ((lower < 0.3 * (40 * X).sin()) & (upper > 0.3 * (40 * X).sin())).double().mean(0)
+        assert inside[1] > 0.9
+
+
+@cache
+def fitted_once(fine):
+    X, Y = problem(400, fine=fine)
+    model = make(X, Y, num_inducing=6 if fine else 12)
+    return model, fit(model)
+
+
+def test_a_fit_meets_the_exact_one():
+    model, result = fitted_once(0.0)
+    X, Y, f = *model.data[:2], truth(model.data.X)[..., :1]
+    assert result.method == "map"
+    assert result.converged
+    assert model.is_fitted
+    noise = model.noise.variance(model.values, None).sqrt().squeeze() * model.unit.squeeze()
+    assert noise.item() == pytest.approx(0.1, rel=0.1)
+    lower, upper = model.interval(X)
+    assert ((lower < f) & (f < upper)).double().mean() > 0.85
+    exact = exact_of(model)
+    assert 0 <= exact.log_likelihood(exact.u)[0] + exact.log_unit() - result.log_evidence < 1.0
+    fit(exact, "map")
+    torch.testing.assert_close(model.predict(X).mean, exact.predict(X).mean, rtol=0, atol=0.02)
+    assert len(model.subset_rows(torch.arange(30)).conditioning().alpha[0, 0]) == 30
+
+
+def test_what_few_points_cannot_show_is_in_the_intervals():
+    model, _ = fitted_once(0.5)
+    X, f = line(300), truth(line(300), 0.5)[..., :1]
+
+    def coverage(model):
+        lower, upper = model.interval(X)
+        return ((lower < f) & (f < upper)).double().mean()
+
+    assert 0.88 < coverage(model) < 0.995
+    without = copy.deepcopy(model)
+    without.set_draws(model.table.with_choice(model.u.detach(), 0))
+    assert coverage(without) < 0.6
+    left_out = model.left_out()
+    inside = (left_out.quantile(0.025) < model.data.Y) & (left_out.quantile(0.975) > model.data.Y)
+    assert 0.88 < inside.double().mean() < 0.995
+
+
+@pytest.mark.slow
+def test_unknown_parameters_and_several_physics(close):
+    X, Y = problem(120)
+    law = FunctionPhysics(
+        lambda X, p: (p.w * X[..., 0]).sin().unsqueeze(-1), unknowns={"w": Unknown(5.0, sd=1.0)}
+    )
+    model = make(X, Y, physics=law)
+    fit(model)
+    assert float(model.physics_parameters["w"][0]) == pytest.approx(6.0, abs=0.2)
+    f = truth(X)[..., :1]
+    assert (model.predict(X).mean - f).std() < 0.05
+    model = make(X, Y, physics={"a": wave, "b": lambda X: X.square()})
+    fit(model)
+    assert (model.predict(X).mean - f).std() < 0.05
+    parts = model.term("rho_a", X).mean * wave(X) + model.term("rho_b", X).mean * X.square()
+    close(parts + model.delta(X).mean, model.predict(X).mean, 1e-6)
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_an_error_leaves_the_model_as_it_was(monkeypatch, error):
+    model = at_random(make(*problem(100)))
+    before, prediction = copy.deepcopy(model.state_dict()), model.predict(line(4))
+
+    def fail(*args):
+        raise error
+
+    monkeypatch.setattr("gpadjust.many.variational_cka.rest_of", fail)
+    with pytest.raises(error):
+        fit(model, seed=1)
+    for name, tensor in model.state_dict().items():
+        assert torch.equal(tensor, before[name])
+    assert all(map(torch.equal, model.predict(line(4)), prediction))
+
+
+@pytest.mark.parametrize("case", ["repeated", "constant", "all the same", "few rows"])
+def test_inputs_that_repeat_or_rest(case):
+    X, Y = problem(60)
+    inputs = {
+        "repeated": torch.cat([X[:30], X[:30]]),
+        "constant": torch.cat([X, torch.ones_like(X)], dim=-1),
+        "all the same": torch.full_like(X, 0.3),
+        "few rows": X[:4],
+    }[case]
+    Y = torch.cat([Y[:30], Y[:30] + 0.1]) if case == "repeated" else Y[: len(inputs)]
+    model = make(inputs, Y)
+    assert fit(model).log_evidence.isfinite().all()
+    error = (model.predict(inputs).mean - Y).std()
+    assert error < (2.0 if case == "all the same" else 0.2)
+
+
+class LinkedMany(Linked, VariationalCKA):
+    """A model with a link."""
+
+
+def test_links_and_categories():
+    X, Y = problem(80)
+    model = LinkedMany(X, Y.exp(), physics=lambda X: wave(X).exp(), link="log", num_inducing=12)
+    fit(model)
+    lower, upper = model.interval(line(50))
+    assert (lower > 0).all()
+    f = truth(line(50))[..., :1].exp()
+    assert ((lower < f) & (f < upper)).double().mean() > 0.8
+    assert ((model.predict(line(50)).mean / f).log().std()) < 0.1
+    assert model.left_out().prediction.mean.isfinite().all()
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame({"x": X[:, 0], "material": ["iron", "tin"] * 40})
+    Y = Y + torch.tensor([[0.0], [1.0]]).repeat(40, 1)
+    model = VariationalCKA(
+        frame, Y, physics=wave, input_transform=Categories(["material"]), num_inducing=20
+    )
+    fit(model)
+    assert (torch.as_tensor(model.predict(frame).mean.to_numpy()) - Y).std() < 0.15
+
+
+X, Y = problem(10)
+BAD = {
+    "float32": (TypeError, "float64", partial(make, X.float(), Y.float())),
+    "shapes": (ValueError, "row of targets", partial(make, X, Y[:4])),
+    "a batch": (ValueError, "two dimensions", partial(make, X.expand(2, -1, -1), Y)),
+    "no points": (ValueError, "num_inducing", partial(make, X, Y, num_inducing=0)),
+    "half points": (TypeError, "num_inducing", partial(make, X, Y, num_inducing=2.5)),
+    "outliers": (ValueError, "CKA takes it", partial(make, X, Y, noise=HeavyTails())),
+    "nested": (TypeError, "nested", partial(make, X, Y, nested=True)),
+    "draws": (ValueError, "num_draws=None", lambda: fit(make(X, Y), num_draws=8)),
+    "a method": (ValueError, "Unknown method", lambda: fit(make(X, Y), "vi")),
+    "a bridge": (NotImplementedError, "subset_rows", lambda: make(X, Y).as_single_task_gp()),
+    "columns": (ValueError, "q x 1", lambda: make(X, Y).predict(uniform(2, 3))),
+    "a term": (ValueError, "Unknown term 'season'", lambda: make(X, Y).term("season", X)),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_is_refused(case):
+    error, words, call = BAD[case]
+    refused(error, words, call)
