@@ -523,6 +523,7 @@ class GP(gpytorch.models.GP, Predictive):
     def left_out_at(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Return means and variances of left-out targets at coordinates ``S x B x P``."""
         mean, variance = self.conditioned(*self._observed(self.table.values(u))).left_out()
+        mean = mean + self.noise.shift
         return (mean * self.unit).mT, (variance * self.unit.square()).mT
 
     def components(

@@ -65,7 +65,7 @@ class WeightedSum:
     mean: Tensor  # ... x S x m x n
     weights: dict[str, Tensor | None] = field(default_factory=dict)  # w_t; None for 1
 
-    def of_rows(self, rows: slice) -> WeightedSum:
+    def of_rows(self, rows: slice | Tensor) -> WeightedSum:
         """Return the sum at some of its places."""
         weights = {name: None if w is None else w[..., rows] for name, w in self.weights.items()}
         x, mean = self.x[..., rows, :], self.mean[..., rows]

@@ -114,26 +114,18 @@ class AR1(GP):
 
     def left_out(self) -> Marginals:
         """Return the distribution of each target of the high level given all others."""
-        return Marginals(*(each[..., self._num_low :, :] for each in super().left_out()))
+        return Marginals(*(each[..., len(self.low.X) :, :] for each in super().left_out()))
 
     def left_out_at(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Return means and variances of targets of the high level, left out, at coordinates."""
         mean, variance = super().left_out_at(u)
-        return mean[..., self._num_low :, :], variance[..., self._num_low :, :]
+        return mean[..., len(self.low.X) :, :], variance[..., len(self.low.X) :, :]
 
     def subset_output(self, idcs: list[int]) -> Self:
         """Return the model of some outputs; a ValueError if there are none of these numbers."""
         new = super().subset_output(idcs)
         new.low = self.low.of_outputs(self.checked_outputs(idcs))
         return new
-
-    def as_single_task_gp(self, draw: int | None = None) -> Any:
-        """Raise a ValueError, as such a model has no rows of a low level."""
-        raise ValueError("Expected a model of one level; AR1 has rows of two. Take posterior.")
-
-    @property
-    def _num_low(self) -> int:
-        return 0 if self.low is None else len(self.low.X)
 
     def _low_unit(self) -> Tensor:
         """Return the unit of each output of the low level, ``m x 1``."""
@@ -181,11 +173,6 @@ class AtLevels(Kernel):
         left, right = (self.basis(own, each) for each in (x, x if other is None else other))
         return left.unsqueeze(-1) * k * right.unsqueeze(-2)
 
-    def variance(self, own: Values, x: Tensor) -> Tensor:
-        """Return the prior variances, ``... x S x m x n``."""
-        k = self.kernel.variance(own, x[..., :-1]) + own["constant"]
-        return self.basis(own, x).square() * k
-
     def with_pull_back(self, own: Values, x: Tensor) -> tuple[Tensor, PullBack]:
         """Return the covariance, and what gives derivatives by the numbers."""
         k, back = self.kernel.with_pull_back(own, x[..., :-1])
@@ -211,9 +198,6 @@ class AtLevels(Kernel):
             return torch.cat([phi, one], -1) * b
 
         return features
-
-    def __repr__(self) -> str:
-        return f"{'rho^level' if self.has_rho else 'level'} x {self.kernel}"
 
 
 class LevelNoise(Noise):

@@ -13,6 +13,7 @@ from torch.quasirandom import SobolEngine
 from gpadjust.checks import checked_whole
 from gpadjust.core import MATERN52, RBF, Stationary, ZeroMeanGP, fit
 from gpadjust.core.model import GP
+from gpadjust.core.terms import WeightedSum
 from gpadjust.core.unknowns import standard_normal
 from gpadjust.physics import Physics, Unknown
 from gpadjust.physics.unknown import ParameterValues
@@ -202,9 +203,21 @@ class _Components:
         components = (at.cross(self.places) @ self.weights - cross @ self.of_runs).mean(0)
         center = mean.mean(0)
         away = (mean - center).movedim(0, -1)  # m x N x S
-        components = components + away @ self.of_means / len(mean) + self._details(rows)
+        components = components + away @ self.of_means / len(mean)
+        outside = ((rows < self.low) | (rows > self.low + self.range)).any(-1)
+        if outside.any():  # where no place is, they have the variance by the emulator
+            wider = torch.ones_like(center)
+            wider[:, outside] = self._ratio(at.of_rows(outside), components[:, outside])
+            components = components * wider.unsqueeze(-1)
+        components = components + self._details(rows)
         parts = torch.cat([center.unsqueeze(-1), components], -1)
         return (parts * emulator.unit.unsqueeze(-1)).movedim(0, 1)
+
+    def _ratio(self, at: WeightedSum, components: Tensor) -> Tensor:
+        """Return the emulator's standard deviations over those of components ``m x N x K``."""
+        mean, variance = self.data.marginals(at)
+        total = variance.mean(0) + mean.var(0, correction=0)
+        return (total / components.square().sum(-1).clamp_min(1e-30)).sqrt()
 
     def _details(self, rows: Tensor) -> Tensor:
         """Return ``m x N x K`` of the variance of the noise: independent at different inputs.

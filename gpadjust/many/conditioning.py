@@ -126,7 +126,7 @@ class LaterConditioning(SparseConditioning):
         K, K21, seen = late.cross(late), late.cross(old.train), ~targets.isnan()
         while seen.dim() > K.dim() - 1 and bool((seen == seen[0]).all()):
             seen = seen[0]  # fantasies of the same points share a factor
-        K21 = K21 * seen.unsqueeze(-1)
+        K21 = K21 * seen.unsqueeze(-1) * old.observed.unsqueeze(-2)
         B = old.white(K21)
         noise = noise.expand(torch.broadcast_shapes(noise.shape, K.shape[:-1]))
         self.root = factor(K - B @ B.mT, noise, seen)
@@ -141,7 +141,7 @@ class LaterConditioning(SparseConditioning):
         self.noise, self.targets, self.seen, self.K21 = noise, targets, seen, K21
         mean = late.mean + (K21 @ old.alpha.unsqueeze(-1)).squeeze(-1)
         self.alpha = self.later(old.alpha, targets - mean)
-        self.observed = torch.ones(self.alpha.shape[-1], dtype=torch.bool, device=K.device)
+        self.observed = appended(old.observed, seen, -1)
 
     def later(self, weights: Tensor, residual: Tensor) -> Tensor:
         """Return weights ``... x M`` of the old rows, and of late ones for their residuals."""

@@ -198,18 +198,19 @@ class VariationalCKA(CKA):
         """
         first, values = slice(_CANDIDATES * M), self.table.values(u)
         total = part_of(self.at(self.data.X, values), _REST, False).of_rows(first)
-        left, is_free = total.variance()[0], ~self.data.Y[first].isnan().mT
-        m, n = is_free.shape
+        left, is_seen = total.variance()[0], ~self.data.Y[first].isnan().mT
+        m, n = is_seen.shape
+        order = torch.where(is_seen, 0.0, -2 * left.amax())  # points of missing targets come last
         outputs, least = torch.arange(m, device=left.device), 1e-12 * left.amax(-1)
         factor, picks = left.new_zeros(m, min(M, n), n), []
         for i in range(min(M, n)):
-            pick = left.masked_fill(~is_free, -torch.inf).argmax(-1)
+            pick = (left + order).argmax(-1)
             row = at_points(total, pick.unsqueeze(-1)).cross(total)[0, :, 0]
             row = row - (factor[outputs, :i, pick].unsqueeze(-2) @ factor[:, :i]).squeeze(-2)
             pivot = left[outputs, pick].maximum(least).sqrt().unsqueeze(-1)
             factor[:, i] = row / pivot
             left = left - factor[:, i].square()
-            is_free[outputs, pick] = False
+            order[outputs, pick] = -torch.inf
             picks.append(pick)
         return torch.stack(picks, -1)
 

@@ -11,7 +11,7 @@ from botorch.models import ModelListGP, SingleTaskGP
 from botorch.models.transforms.outcome import Standardize
 from torch import Tensor
 
-from gpadjust.core import StackedGP
+from gpadjust.core import GP, StackedGP
 from gpadjust.core.gaussian import DRAWS, Marginals
 from gpadjust.validation.scores import Scores, central_share
 
@@ -110,7 +110,7 @@ def leave_one_out(model: Any) -> LeaveOneOut:
         return _side_by_side([leave_one_out(part) for part in model.models])
     if isinstance(model, SingleTaskGP):
         return _of_botorch(model)
-    if not isinstance(model, StackedGP) and not hasattr(model, "left_out"):
+    if not isinstance(model, StackedGP) and not isinstance(model, GP):
         raise TypeError(
             "Expected a model of this library, a SingleTaskGP, or a ModelListGP of such; found "
             f"{type(model).__name__}. Of a model without leave-one-out predictions hold some "
@@ -129,7 +129,7 @@ def _left_out(model: Any) -> Marginals:
     """Return the predictions of left-out observations, by components of equal weights."""
     if isinstance(model, StackedGP):
         return model.marginals_of(*_mixed(model, [_left_out(each) for each in model.models]))
-    means, variances = model.left_out()[:2]
+    means, variances = model.left_out_at(model.draws)
     y = model.on_gaussian_scale(model.data.Y)
     spread = (y - y.nanmean(-2, keepdim=True)).square().nanmean(-2, keepdim=True)
     variances = variances.maximum(ROUNDING**2 * spread)

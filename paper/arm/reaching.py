@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gpadjust.control import PolicySearch, PolicySearchAgent, mlp_policy
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
-from gpadjust.inference import ParameterWarning, SamplingWarning
+from gpadjust.core import SamplingWarning
 from gpadjust.physics import as_physics
 from gpadjust.states import StateSpec
 from gpadjust.systems import System
@@ -46,8 +46,7 @@ _SYSTEMS, _LABELS = Reaching.axes["system"], Reaching.axes["learner"]
 
 def run(experiment: Reaching, system: str, learner: str, seed: int) -> Run:
     """Make the trials; return the hand's errors after each, and times."""
-    for category in (SamplingWarning, ParameterWarning):
-        warnings.simplefilter("ignore", category)
+    warnings.simplefilter("ignore", SamplingWarning)
     warnings.filterwarnings("ignore", message="A step of the last real episode")
     warnings.filterwarnings("ignore", message=".* of the episodes of the policy left the bounds")
     settings = experiment.settings_of(system, learner)

@@ -26,7 +26,7 @@ from gpadjust.control import (
     PolicySearchAgent,
 )
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
-from gpadjust.inference import ParameterWarning, SamplingWarning
+from gpadjust.core import SamplingWarning
 from gpadjust.physics import Unknown
 from gpadjust.systems import NoisySensors, System, cart_pole
 from gpadjust.systems.swing_up import (
@@ -64,8 +64,7 @@ _LEARNERS, _SYSTEMS = Planning.axes["learner"], Planning.axes["system"]
 
 def run(experiment: Planning, system: str, learner: str, seed: int) -> Run:
     """Make the trials; return cost and times of each."""
-    for category in (SamplingWarning, ParameterWarning):
-        warnings.simplefilter("ignore", category)
+    warnings.simplefilter("ignore", SamplingWarning)
     warnings.filterwarnings("ignore", message="A step of the last real episode")
     settings = experiment.settings_of(system)
     agent = make_agent(experiment, system, learner, seed)

@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 from botorch.exceptions.warnings import OptimizationWarning
 from filelock import FileLock
 
-from gpadjust.inference import SamplingWarning
+from gpadjust.core import SamplingWarning
 from paper.common.experiment import Case, Run
 
 _Fitted = TypeVar("_Fitted")

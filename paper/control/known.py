@@ -14,7 +14,7 @@ import pandas as pd
 from gpadjust.control import CrossEntropy, MPCAgent, Planner
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.dynamics.learning import DynamicsFitOptions
-from gpadjust.inference import ParameterWarning, SamplingWarning
+from gpadjust.core import SamplingWarning
 from gpadjust.physics import as_physics
 from gpadjust.systems import System
 from paper.common.experiment import Run, Table
@@ -33,8 +33,7 @@ _RATIOS = ("phymean", "fitted", "gp", "ensemble")  # to which CKA is compared
 
 def run(experiment: Known, system: str, learner: str, seed: int) -> Run:
     """Make the trials; return cost and times of each."""
-    for category in (SamplingWarning, ParameterWarning):
-        warnings.simplefilter("ignore", category)
+    warnings.simplefilter("ignore", SamplingWarning)
     warnings.filterwarnings("ignore", message="A step of the last real episode")
     warnings.filterwarnings("ignore", message=".*WARN.*")  # Gymnasium's on spaces
     agent, known = make_agent(experiment.settings, system, learner, seed)

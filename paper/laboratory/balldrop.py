@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from gpadjust import CKA, CalibratedPhysics, EmulatedPhysics, PhysicsMeanGP, Unknown, fit
-from gpadjust.inference import ParameterWarning, SamplingWarning
+from gpadjust.core import SamplingWarning
 from gpadjust.physics import FunctionPhysics, ParameterValues
 from paper.common.experiment import Run, Table
 from paper.common.figures import panels, save
@@ -69,7 +69,6 @@ def formula(X: Tensor, p: ParameterValues) -> Tensor:
 def run(experiment: Balldrop, physics: str, left: str, model: str, seed: int) -> Run:
     """Fit a model to the drop times of the other balls, and predict those of one."""
     warnings.simplefilter("ignore", SamplingWarning)
-    warnings.simplefilter("ignore", ParameterWarning)
     field, seconds = pd.read_csv(DATA / "field.csv"), 0.0
     f_p: EmulatedPhysics | FunctionPhysics = FunctionPhysics(formula, unknowns=_UNKNOWNS)
     if physics == "runs":

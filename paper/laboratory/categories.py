@@ -21,8 +21,7 @@ from botorch.models.transforms.input import InputTransform
 from torch import Tensor
 
 from gpadjust import CKA, fit
-from gpadjust.inference import SamplingWarning
-from gpadjust.models import TermsGP
+from gpadjust.core import GP, SamplingWarning
 from paper.common.experiment import Run, Table
 from paper.common.figures import panels, save
 from paper.common.tables import markdown, number
@@ -91,7 +90,7 @@ def of_number(X: Tensor) -> Tensor:
     return 20 * X[:, 1].square() - 4 * _CONSTANTS.mean() * X[:, 0].square()
 
 
-def models_of(name: str, case: Case) -> list[tuple[TermsGP, Callable[[Tensor], Tensor], Any]]:
+def models_of(name: str, case: Case) -> list[tuple[GP, Callable[[Tensor], Tensor], Any]]:
     """Models of a name before their fits, the columns they read, and the material each is of."""
     X, Y = case.X, case.Y
     if name == "ignored":

@@ -16,7 +16,7 @@ from botorch.exceptions.warnings import OptimizationWarning
 from scipy.stats import gmean
 
 from gpadjust import CKA, EmulatedPhysics, FunctionPhysics, PhysicsWarning, fit
-from gpadjust.inference import SamplingWarning
+from gpadjust.core import SamplingWarning
 from gpadjust.physics import Physics
 from gpadjust.validation import rmse
 from paper.common.experiment import Run, Table

@@ -20,8 +20,8 @@ import torch
 from torch import Tensor
 
 from gpadjust import CKA, ZeroMeanGP, fit
-from gpadjust.inference import SamplingWarning
-from gpadjust.models import Logit, TermsGP
+from gpadjust.core import SamplingWarning
+from gpadjust.models import Logit, GP
 from paper.common.experiment import Run, Table
 from paper.common.figures import panels, save
 from paper.common.tables import markdown, number
@@ -119,7 +119,7 @@ def data_of(problem: Problem, seed: int) -> tuple[Tensor, Tensor, Tensor, Tensor
     return X, link.inverse(link.value(system(X)) + noise), test, system(test)
 
 
-def model_of(name: str, problem: Problem, X: Tensor, Y: Tensor) -> TermsGP:
+def model_of(name: str, problem: Problem, X: Tensor, Y: Tensor) -> GP:
     """The model of a name, before its fit."""
     if name == "gp":
         return ZeroMeanGP(X, Y, outcome_transform=problem.link)

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from gpadjust import CKA, CalibratedPhysics, fit
-from gpadjust.inference import ParameterWarning, SamplingWarning
+from gpadjust.core import SamplingWarning
 from gpadjust.physics import FunctionPhysics, Unknown
 from gpadjust.validation import rmse
 from paper.common.experiment import Run, Table
@@ -109,7 +109,6 @@ def case_of(experiment: Noisyinputs, problem: str, seed: int) -> Case:
 def run(experiment: Noisyinputs, problem: str, model: str, seed: int) -> Run:
     """Fit a model to a case; return its errors, and the parameter if there is one."""
     warnings.simplefilter("ignore", SamplingWarning)
-    warnings.simplefilter("ignore", ParameterWarning)
     case, known = case_of(experiment, problem, seed), PROBLEMS[problem]
     options: dict[str, Any] = {"train_Xvar": case.Xvar} if model == "noisy" else {}
     begin = time.perf_counter()

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from gpadjust import CKA, fit
-from gpadjust.inference import SamplingWarning
+from gpadjust.core import SamplingWarning
 from paper.common.experiment import Run, Table
 from paper.common.figures import panels, save
 from paper.common.tables import groups, markdown, number

@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 
 from gpadjust import CKA, ZeroMeanGP, fit
-from gpadjust.inference import SamplingWarning
-from gpadjust.models import TermsGP
+from gpadjust.core import GP, SamplingWarning
 from paper.common.experiment import Run, Table
 from paper.common.figures import panels, save
 from paper.common.tables import markdown, number
@@ -60,7 +59,7 @@ def data(problem: str, seed: int, n: int) -> tuple[Tensor, Tensor, Tensor, Tenso
     return X, noisy[0], test, values[1], noisy[1]
 
 
-def model_of(structure: str, noise: str, X: Tensor, Y: Tensor, problem: str) -> TermsGP:
+def model_of(structure: str, noise: str, X: Tensor, Y: Tensor, problem: str) -> GP:
     """A model before its fit."""
     likelihood = None if noise == "default" else noise
     if structure == "CKA":

@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 
 from gpadjust import CalibratedPhysics, PhysicsMeanGP, fit
-from gpadjust.inference import ParameterWarning, SamplingWarning
-from gpadjust.models import TermsGP, orthogonal_rbf, vanishing_rbf
+from gpadjust.core import SamplingWarning
+from gpadjust.models import GP, orthogonal_rbf, vanishing_rbf
 from gpadjust.physics import FunctionPhysics, Unknown
 from gpadjust.validation import rmse
 from paper.common.experiment import Run, Table
@@ -89,7 +89,7 @@ PROBLEMS: Mapping[str, Callable[[np.random.Generator], Case]] = {
 }
 
 
-def model_of(name: str, case: Case) -> TermsGP:
+def model_of(name: str, case: Case) -> GP:
     """The model of a name, before its fit."""
     if name == "physics":
         return CalibratedPhysics(case.X, case.Y, physics=case.physics)
@@ -100,7 +100,6 @@ def model_of(name: str, case: Case) -> TermsGP:
 def run(experiment: Vanishing, problem: str, model: str, seed: int) -> Run:
     """Fit a model to a case; return the interval of the parameter, beside its true value."""
     warnings.simplefilter("ignore", SamplingWarning)
-    warnings.simplefilter("ignore", ParameterWarning)
     case = PROBLEMS[problem](np.random.default_rng(seed))
     fitted = model_of(model, case)
     begin = time.perf_counter()

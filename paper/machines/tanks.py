@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.dynamics import Dynamics, FreeRun, LearnedDynamics, PhysicsDynamics, StateSpec
-from gpadjust.inference import SamplingWarning
+from gpadjust.core import SamplingWarning
 from gpadjust.physics import Physics
 from gpadjust.records import SmoothingWarning, smooth
 from paper.common.experiment import Run, Table

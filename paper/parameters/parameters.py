@@ -15,8 +15,8 @@ from torch import Size, Tensor
 
 from gpadjust import CKA, CalibratedPhysics, PhysicsMeanGP, fit
 from gpadjust.gp import PhysicsScaledKernel
-from gpadjust.inference import ParameterWarning, SamplingWarning
-from gpadjust.models import TermsGP, orthogonal_rbf
+from gpadjust.core import SamplingWarning
+from gpadjust.models import GP, orthogonal_rbf
 from gpadjust.models.parameters import scaled_rbf
 from gpadjust.validation import rmse
 from paper.common.experiment import Run, Table
@@ -30,7 +30,7 @@ def growing(num_inputs: int, batch_shape: Size) -> Kernel:
     return PhysicsScaledKernel(scaled_rbf(num_inputs, batch_shape), lambda X: X[..., :1] ** 3)
 
 
-MODELS: Mapping[str, Callable[..., TermsGP]] = {
+MODELS: Mapping[str, Callable[..., GP]] = {
     "physics": CalibratedPhysics,
     "free": PhysicsMeanGP,
     "orthogonal": partial(PhysicsMeanGP, covar_module=orthogonal_rbf),
@@ -42,7 +42,6 @@ MODELS: Mapping[str, Callable[..., TermsGP]] = {
 def run(experiment: Parameters, problem: str, model: str, seed: int) -> Run:
     """Fit a model to a case; return ends of intervals, beside what they are to hold."""
     warnings.simplefilter("ignore", SamplingWarning)
-    warnings.simplefilter("ignore", ParameterWarning)
     known = textbook_case(problem, seed)
     fitted: Any = MODELS[model](known.X, known.Y, physics=known.physics)
     begin = time.perf_counter()

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from gpadjust import CKA, FunctionPhysics, PhysicsMeanGP, Unknown, ZeroMeanGP
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics, StateSpec
-from gpadjust.inference import ParameterWarning, SamplingWarning
+from gpadjust.core import SamplingWarning
 from gpadjust.physics import ParameterValues
 from gpadjust.records import Record, Records, SmoothedRecords, SmoothingWarning, smooth
 from paper.common.experiment import Run, Table
@@ -152,8 +152,7 @@ def smoothed(name: str, half: bool, held: bool, settings: EmpsSettings) -> Smoot
 
 def run(experiment: Emps, learner: str, seed: int) -> Run:
     """Learn from the estimation record, simulate the validation record; the same of its halves."""
-    for category in (SamplingWarning, ParameterWarning):
-        warnings.simplefilter("ignore", category)
+    warnings.simplefilter("ignore", SamplingWarning)
     settings = experiment.settings
     estimation, validation = (measured(n, settings) for n in ("estimation", "validation"))
     begin = time.perf_counter()

@@ -31,7 +31,7 @@ from torch import Tensor
 
 from gpadjust import CKA, PhysicsMeanGP, ZeroMeanGP
 from gpadjust.dynamics import FreeRun, LearnedDynamics, PhysicsDynamics
-from gpadjust.inference import ParameterWarning, SamplingWarning
+from gpadjust.core import SamplingWarning
 from gpadjust.records import SmoothedRecords, SmoothingWarning, smooth
 from paper.common.experiment import Run, Table
 from paper.common.figures import one_legend, panels, save
@@ -115,8 +115,7 @@ def chosen(record: str, settings: FreerunsSettings) -> tuple[Candidate, dict[str
 
 def run(experiment: Freeruns, record: str, learner: str, seed: int) -> Run:
     """Choose by the folds, learn from the training part, and follow the rest."""
-    for category in (SamplingWarning, ParameterWarning):
-        warnings.simplefilter("ignore", category)
+    warnings.simplefilter("ignore", SamplingWarning)
     settings, system = experiment.settings, SYSTEMS[record]
     begin = time.perf_counter()
     end = len(system.column(system.output))

@@ -32,7 +32,7 @@ from torch import Size, Tensor
 
 from gpadjust import CKA, CalibratedPhysics, PhysicsMeanGP, Unknown, ZeroMeanGP, fit
 from gpadjust.inference.warm_start import warm_start
-from gpadjust.models import TermsGP
+from gpadjust.models import GP
 from gpadjust.physics import FunctionPhysics, ParameterValues
 from paper.common.experiment import Run, Table
 from paper.common.figures import save
@@ -82,7 +82,7 @@ _SHELL = {**_DROP, "valence": Unknown(0.0, sd=1.0), "promiscuity": Unknown(0.0, 
 
 # The formula alone, whose noise is learnt (known noise is far less than what it lacks), and the
 # seconds of its fit: the last one, which the trees of the same case need, too.
-_ALONE: dict[tuple[object, ...], tuple[TermsGP, float]] = {}
+_ALONE: dict[tuple[object, ...], tuple[GP, float]] = {}
 
 
 def nuclides(stride: int = 1) -> pd.DataFrame:
@@ -113,9 +113,9 @@ def matern(d: int, batch: Size) -> ScaleKernel:
     return ScaleKernel(MaternKernel(2.5, ard_num_dims=d, batch_shape=batch), batch_shape=batch)
 
 
-def build(model: str, physics: FunctionPhysics) -> Callable[..., TermsGP]:
+def build(model: str, physics: FunctionPhysics) -> Callable[..., GP]:
     """What makes a model of inputs, energies and variances."""
-    makers: dict[str, Callable[..., TermsGP]] = {
+    makers: dict[str, Callable[..., GP]] = {
         "cka": lambda X, Y, V: CKA(
             X, Y, V, physics=physics, rho_covar_module=matern, delta_covar_module=matern
         ),
@@ -126,8 +126,8 @@ def build(model: str, physics: FunctionPhysics) -> Callable[..., TermsGP]:
 
 
 def fitted(
-    make: Callable[..., TermsGP], data: Sequence[Tensor], settings: MassesSettings, seed: int
-) -> TermsGP:
+    make: Callable[..., GP], data: Sequence[Tensor], settings: MassesSettings, seed: int
+) -> GP:
     """A model of all rows; the search for its hyper-parameters is made on some of them."""
     some = _some(len(data[0]), settings, seed)
     rough, model = make(*(each[some] for each in data)), make(*data)
@@ -167,7 +167,7 @@ def run(experiment: Masses, task: str, physics: str, model: str, seed: int) -> R
             _ALONE[key] = alone, time.perf_counter() - begin
         else:
             earlier = _ALONE[key][1]
-        made: TermsGP = _ALONE[key][0]
+        made: GP = _ALONE[key][0]
     else:
         made = fitted(build(model, law), (X, Y, V), settings, seed)
     test_X, test_Y, test_V = _tensors(test)
@@ -212,7 +212,7 @@ def _tensors(table: pd.DataFrame) -> tuple[Tensor, Tensor, Tensor]:
     return X, Y, sd.square()
 
 
-def _values(model: TermsGP) -> dict[str, float]:
+def _values(model: GP) -> dict[str, float]:
     return {name: draws.mean().item() for name, draws in model.physics_parameters.items()}
 
 

@@ -21,7 +21,7 @@ from botorch.exceptions.warnings import OptimizationWarning
 from torch import Tensor
 
 from gpadjust import CKA, CalibratedPhysics, PhysicsMeanGP, ZeroMeanGP, fit
-from gpadjust.inference import ParameterWarning, SamplingWarning
+from gpadjust.core import SamplingWarning
 from gpadjust.physics import Physics, PhysicsWarning
 from gpadjust.validation import score
 from paper.common.experiment import Run, Table

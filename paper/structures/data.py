@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gpadjust.models import TermsGP
+from gpadjust.models import GP
 from gpadjust.physics import Physics
 from gpadjust.validation import score
 from paper.structures.functions import PAIRS, observations
@@ -36,7 +36,7 @@ class Data(NamedTuple):
     noise: Tensor
 
 
-def scored(model: TermsGP, data: Data, seed: int) -> dict[str, Tensor]:
+def scored(model: GP, data: Data, seed: int) -> dict[str, Tensor]:
     """Errors of the mean against the truth; density and coverage of new observations; ``m`` each.
 
     Args:

@@ -14,7 +14,7 @@ from torch import Tensor
 from gpadjust import fit
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.inference import SampleResult
-from gpadjust.models import TermsGP
+from gpadjust.models import GP
 from paper.common.experiment import Run, Table
 from paper.common.learners import LEARNERS
 from paper.common.runs import timed
@@ -43,7 +43,7 @@ def run(
     return _of_function(of_pair(problem, size, noise, settings.num_test, seed), model, seed)
 
 
-def _make(name: str) -> Callable[..., TermsGP]:
+def _make(name: str) -> Callable[..., GP]:
     return LEARNERS["phymean" if name == "phy" else name].make
 
 
@@ -55,7 +55,7 @@ def _of_function(data: Data, name: str, seed: int) -> Run:
     return {"N": len(data.X), **_scores(*parts), "effective_size": sizes, **found}
 
 
-def _fitted(data: Data, name: str) -> tuple[TermsGP, list[float]]:
+def _fitted(data: Data, name: str) -> tuple[GP, list[float]]:
     model = _make(name)(data.X, data.Y, physics=data.physics)
     return model, _sizes(fit(model))
 

@@ -121,7 +121,9 @@ def test_cross_validation_leaves_each_trial_out(fit_options):
         for i, name in enumerate(sorted(by_arm)):
             m = mean[i].item() * units.Ystd["output"] + units.Ymean["output"]
             index = by_arm[name].metric_signatures.index("output")
-            assert by_arm[name].means[index] == pytest.approx(m, rel=1e-2, abs=0.2)
+            # Without a trial, units of targets and ranges of inputs are a bit different.
+            sd = units.Ystd["output"]
+            assert by_arm[name].means[index] == pytest.approx(m, abs=0.25 * sd)
     assert all(math.isfinite(r.predicted.means[0]) for r in results)
 
 

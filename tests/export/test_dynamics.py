@@ -16,7 +16,6 @@ from tests.export.apart import apart
 from tests.export.conftest import called, compiled
 from tests.systems import normal, uniform
 
-
 SPEC = StateSpec(
     ["goal", "angle", "x", "rate", "speed", "last"],
     ["force"],

@@ -189,7 +189,7 @@ def test_a_function_and_a_cheap_version_of_it():
     assert ((lower <= high(Z)) & (high(Z) <= upper)).double().mean() > 0.9
 
 
-@pytest.mark.parametrize("options, words", [
+@pytest.mark.parametrize(("options", "words"), [
     ({}, "low level"),
     ({"physics": crude}, "bounds"),
     ({"low_Y": LOW_Y}, "low_X"),

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 import torch
 
-from gpadjust.core import CKA, CalibratedPhysics, PhysicsMeanGP, ZeroMeanGP, fit, load, save
+from gpadjust.core import CKA, CalibratedPhysics, PhysicsMeanGP, fit, load, save
 from gpadjust.kinds.emulated import EmulatedPhysics
 from gpadjust.kinds.links import LinkedCKA
 from gpadjust.physics import FunctionPhysics, Unknown
@@ -32,7 +32,7 @@ def simulated(x, w):
 def crude():
     """Runs in the left half, so that little is known in the right one."""
     runs = 1.2 * line(9)
-    return EmulatedPhysics(runs, wave(runs), name="crude")
+    return EmulatedPhysics(runs, wave(runs), fit_options={"num_draws": 16}, name="crude")
 
 
 def functions(physics, X, number=4000, seed=0):
@@ -42,34 +42,33 @@ def functions(physics, X, number=4000, seed=0):
     return physics(X, z)
 
 
-def test_functions_have_the_mean_and_covariance_of_the_emulator(crude):
-    X = torch.tensor([[0.1], [1.0], [1.25], [1.5]], dtype=torch.float64)
-    torch.testing.assert_close(crude(X), crude.emulator.predict(X).mean)
-    values = functions(crude, X)[..., 0]
-    posterior = crude.emulator.posterior(X)
+def test_functions_have_the_mean_and_covariance_of_the_emulator():
+    """Between runs and beyond them."""
+    runs, X = 1.2 * line(6), torch.tensor([[0.1], [0.6], [1.1], [1.5], [2.4]], dtype=torch.float64)
+    physics = EmulatedPhysics(runs, wave(runs), is_random=True, fit_options=MAP)
+    torch.testing.assert_close(physics(X), physics.emulator.predict(X).mean)
+    values, posterior = functions(physics, X)[..., 0], physics.emulator.posterior(X)
     sd = posterior.variance[:, 0].sqrt()
     assert ((values.mean(0) - posterior.mean[:, 0]).abs() < 0.1 * sd).all()
     expected = posterior.distribution.covariance_matrix
-    size = expected.diagonal().sqrt()
-    found = values.T.cov()
-    assert ((found - expected).abs() < 0.25 * size * size.unsqueeze(-1)).all()
+    assert ((values.T.cov() - expected).abs()[:3, :3] < 0.1 * sd[:3] * sd[:3, None]).all()
+    torch.testing.assert_close(values.std(0), sd, rtol=0.1, atol=0.0)
 
 
 def test_several_outputs_have_errors_of_their_own_size():
-    runs = 1.2 * line(9)
+    runs = 1.2 * line(6)
     both = torch.cat([wave(runs), 100 * runs.cos()], -1)
-    physics = EmulatedPhysics(runs, both, fit_options=MAP, num_components=12)
-    values = functions(physics, FAR[:1] - 0.4)[:, 0]
-    sd = physics.emulator.predict(FAR[:1] - 0.4).variance[0].sqrt()
-    torch.testing.assert_close(values.std(0), sd, rtol=0.3, atol=0.0)
+    physics = EmulatedPhysics(runs, both, is_random=True, fit_options=MAP, num_components=12)
+    values = functions(physics, FAR[:1])[:, 0]
+    sd = physics.emulator.predict(FAR[:1]).variance[0].sqrt()
+    torch.testing.assert_close(values.std(0), sd, rtol=0.1, atol=0.0)
     assert abs(values.T.corrcoef()[0, 1]) < 0.2
 
 
-def test_gradients_are_those_of_the_function(crude):
-    z = functions(crude, FAR[:1], 3)[:0]
+def test_gradients_are_those_of_the_function():
     z = torch.randn(3, 8, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     plain = EmulatedPhysics(1.2 * line(9), wave(1.2 * line(9)), fit_options=MAP, is_random=True)
-    X = (1.0 + line(4)).requires_grad_()
+    X = (1.05 + line(4)).requires_grad_()
     assert torch.autograd.gradcheck(lambda X: plain(X, z), X)
     z.requires_grad_()
     assert torch.autograd.gradcheck(lambda z: plain(X.detach(), z), z)
@@ -104,7 +103,9 @@ def test_with_dense_runs_results_are_those_of_the_simulator(n):
     noise = 0.02 * torch.randn(n, 1, generator=torch.Generator().manual_seed(0)).double()
     known = EmulatedPhysics(runs, wave(runs), num_components=2)
     Z = 1.4 * line(9)
-    emulated, exact = (PhysicsMeanGP(X, wave(X) + 0.1 * X + noise, physics=p) for p in (known, wave))
+    emulated, exact = (
+        PhysicsMeanGP(X, wave(X) + 0.1 * X + noise, physics=p) for p in (known, wave)
+    )
     for model in (emulated, exact):
         fit(model)
     a, b = emulated.predict(Z), exact.predict(Z)
@@ -174,11 +175,9 @@ def test_a_model_may_be_saved_and_its_physics_is_given_again(crude, tmp_path):
         save(model, tmp_path / "model.pt")
     again = load(tmp_path / "model.pt", physics=crude)
     torch.testing.assert_close(again.predict(FAR).mean, model.predict(FAR).mean)
-    more = model.condition_on_observations(FAR, truth(FAR))
-    assert (more.predict(FAR).variance < model.predict(FAR).variance).all()
 
 
-@pytest.mark.parametrize("call, error, words", [
+@pytest.mark.parametrize(("call", "error", "words"), [
     (lambda X: EmulatedPhysics(X, X, inputs=[0, 1]), ValueError, "inputs as the numbers of 1"),
     (lambda X: EmulatedPhysics(pd.DataFrame({"x": [0.0, 1.0]}), np.zeros(2), unknowns=W),
      ValueError, "names w"),
@@ -201,5 +200,5 @@ def test_any_model_may_be_the_emulator():
         X, X.exp(), fit_options=MAP, num_components=2,
         model_factory=lambda X, Y: CKA(X, Y, physics=lambda X: 1 + X),
     )  # fmt: skip
-    assert isinstance(physics.emulator, CKA) and not isinstance(physics.emulator, ZeroMeanGP)
+    assert isinstance(physics.emulator, CKA)
     assert abs(physics(line(9)) - line(9).exp()).max() < 0.01

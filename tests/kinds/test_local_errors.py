@@ -111,7 +111,7 @@ def _width(model, Z):
     return high.log() - low.log()
 
 
-@pytest.mark.parametrize("call, error, words", [
+@pytest.mark.parametrize(("call", "error", "words"), [
     (lambda X: LocalErrors("model"), TypeError, "model"),
     (lambda X: LocalErrors(GP(X, X, terms=[Term("f", OfGPyTorch(_linear()))])), ValueError,
      "lengthscale"),

@@ -64,6 +64,7 @@ def test_several_physics_count_by_their_prior_means():
     torch.testing.assert_close(noise_at(model, ENDS)[:, 0], expected.detach())
 
 
+@pytest.mark.slow
 def test_without_physics_sizes_are_those_of_the_posterior_mean(tmp_path):
     model = ZeroMeanGP(
         X, torch.cat([growing(), growing(seed=1).flip(0)], -1), noise=RelativeNoise()

@@ -171,7 +171,7 @@ def test_links_and_categories_are_looked_at_and_nothing_changes_by_bad_numbers()
     refused(ValueError, "rig", window.update, unknown, NEW_Y)
 
 
-@pytest.mark.parametrize("call, error, words", [
+@pytest.mark.parametrize(("call", "error", "words"), [
     (lambda: Kalman(CKA(X, Y, physics=wave)), TypeError, "Window"),
     (lambda: Kalman(rra(), forget=0), ValueError, "forget"),
     (lambda: Window(rra(), 1), ValueError, "size"),

@@ -10,7 +10,7 @@ def problem(n, num_outputs=1, seed=0, fine=0.0, noise=0.1):
     """Inputs, and noisy observations of a function with a bias that is fine or not."""
     X = uniform(n, 1, seed=seed)
     f = truth(X, fine)[..., :num_outputs]
-    return X, f + noise * normal(n, num_outputs, seed=seed)
+    return X, f + noise * normal(n, num_outputs, seed=seed + 1)
 
 
 def truth(X, fine=0.0):

@@ -1,0 +1,70 @@
+"""A ridge regression adjustment as a Pyro model, for NUTS, SVI or any guide."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gpadjust.checks import checked_whole
+from gpadjust.core.data import ArrayLike, as_tensor
+from gpadjust.core.model import GP
+from gpadjust.kinds.updates import design
+
+
+def pyro_model(
+    model: GP, X: ArrayLike = None, Y: ArrayLike = None, *, draw: int = 0
+) -> tuple[Tensor, Tensor]:
+    r"""Sample a model on Fourier features as a Bayesian linear regression in Pyro.
+
+    With the features :math:`\varphi` of rho and delta, and their constants, it is
+
+    .. math:: y = f_p(x) + \varphi(x)^T \beta + \epsilon, \quad \beta \sim N(0, I).
+
+    Its sample sites are ``"weights"``, ``m x p``, and ``"Y"``, ``m x n``. Lengthscales, variances
+    and unknown parameters of the physics are those of a draw of the model. The posterior of the
+    weights is normal, ``Weights.of_model(model)`` of :mod:`gpadjust.kinds.updates`.
+
+    Args:
+        model: An :class:`~gpadjust.core.RRA`, or another model whose kernels are ``Fourier``.
+        X: Inputs, ``n x d``. Default: the training inputs, with the training targets.
+        Y: Observations, ``n x m``; None to sample them.
+        draw: The number of the draw.
+
+    Returns:
+        The weights, and the function ``n x m``, in the user's units (of a link on its scale).
+
+    Raises:
+        ImportError: Without Pyro, ``pip install "gpadjust[pyro]"``.
+        ValueError: If there is no such draw, or ``Y`` without ``X``.
+    """
+    try:
+        import pyro  # here alone, as it takes a second
+        import pyro.distributions as dist
+    except ImportError as error:
+        raise ImportError('pyro_model needs Pyro; run `pip install "gpadjust[pyro]"`.') from error
+    if X is None and Y is not None:
+        raise ValueError("Expected X with Y, the inputs that it belongs to.")
+    if checked_whole("draw", draw, 0) >= len(model.u):
+        raise ValueError(f"Expected draw below {len(model.u)}, the number of draws; found {draw}.")
+    one = model.subset_draws(torch.tensor([draw]))
+    is_training = X is None
+    X = model.data.X if is_training else model.data.new_inputs(X)
+    targets: Any = model.data.Y if is_training else None
+    targets = as_tensor(Y, "Y") if Y is not None else targets
+    with torch.no_grad():
+        values = one.values
+        f, unit = one.at(X, values), one.unit
+        phi = design(f)[0] * unit.unsqueeze(-1)  # m x n x p
+        noise = one.noise.variance(values, one.places(X, values), is_training)[0]
+        sd = (noise.sqrt() * unit).expand(phi.shape[:-1])
+        mean = f.mean[0] * unit
+        obs = None if targets is None else model.on_gaussian_scale(targets).mT
+    zero = torch.zeros_like(phi[:, 0])
+    weights = pyro.sample("weights", dist.Normal(zero, torch.ones_like(zero)).to_event(2))
+    function = mean + (phi @ weights.unsqueeze(-1)).squeeze(-1)
+    seen = torch.ones_like(function, dtype=torch.bool) if obs is None else ~obs.isnan()
+    observed = dist.Normal(function, sd).mask(seen).to_event(2)
+    pyro.sample("Y", observed, obs=None if obs is None else obs.nan_to_num())
+    return weights, function.mT
