@@ -239,8 +239,15 @@ class Fourier(Stationary):
         self, num_inputs: int, num_features: int, seed: int = 0, outputscale: LogNormal = DELTA
     ) -> None:
         super().__init__(RBF, outputscale)
+        self.seed = seed
         generator = torch.Generator().manual_seed(seed)
         self.frequencies = _normal((num_inputs, num_features // 2), generator)
+
+    def of_data(self, data: Any) -> Fourier:
+        """Return the kernel of as many inputs as an input transform makes."""
+        d, half = data.kernel_inputs(data.X[:1]).shape[-1], self.frequencies.shape[-1]
+        is_right = d == len(self.frequencies)
+        return self if is_right else type(self)(d, 2 * half, self.seed, self.outputscale)
 
     def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
         """Return the inner products of the features."""

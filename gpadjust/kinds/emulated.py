@@ -20,6 +20,7 @@ from gpadjust.physics.unknown import ParameterValues
 
 _PLACES = 128  # at which errors are told apart
 _WAVES = 8  # whose sum is noise
+_FEW = 200_000  # numbers of factors, with which a variance is quick
 
 
 class EmulatedPhysics(Physics):
@@ -170,6 +171,8 @@ class _Components:
         places = SobolEngine(len(low), seed=seed, scramble=True).draw(_PLACES, dtype=low.dtype)
         self.low, self.range = low, (high - low).where(high > low, torch.ones_like(low))
         self.data = emulator.conditioning()
+        has_parameters = X.shape[-1] > num_inputs  # of which rows of each draw are others
+        self.is_quick = not has_parameters or self.data.chol.numel() < _FEW
         self.places = emulator.at(low + self.range * places.to(low))
         mean, K = self.data.joint(self.places)  # S x m x Q (x Q)
         S, m, q = mean.shape
@@ -204,10 +207,11 @@ class _Components:
         center = mean.mean(0)
         away = (mean - center).movedim(0, -1)  # m x N x S
         components = components + away @ self.of_means / len(mean)
-        outside = ((rows < self.low) | (rows > self.low + self.range)).any(-1)
-        if outside.any():  # where no place is, they have the variance by the emulator
+        # Where no place is near they have the emulator's variance; with many rows beyond runs only.
+        sought = ((rows < self.low) | (rows > self.low + self.range)).any(-1) | self.is_quick
+        if sought.any():
             wider = torch.ones_like(center)
-            wider[:, outside] = self._ratio(at.of_rows(outside), components[:, outside])
+            wider[:, sought] = self._ratio(at.of_rows(sought), components[:, sought])
             components = components * wider.unsqueeze(-1)
         components = components + self._details(rows)
         parts = torch.cat([center.unsqueeze(-1), components], -1)

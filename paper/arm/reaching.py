@@ -16,8 +16,8 @@ from stable_baselines3.common.noise import NormalActionNoise
 from torch import Tensor
 
 from gpadjust.control import PolicySearch, PolicySearchAgent, mlp_policy
-from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.core import SamplingWarning
+from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.physics import as_physics
 from gpadjust.states import StateSpec
 from gpadjust.systems import System

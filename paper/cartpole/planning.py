@@ -25,8 +25,8 @@ from gpadjust.control import (
     PolicySearch,
     PolicySearchAgent,
 )
-from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.core import SamplingWarning
+from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.physics import Unknown
 from gpadjust.systems import NoisySensors, System, cart_pole
 from gpadjust.systems.swing_up import (

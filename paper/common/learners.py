@@ -16,7 +16,7 @@ class Learner:
     Args:
         label: Its name in tables and figures.
         color: Its color in figures.
-        model: A class of :mod:`gpadjust.models`, or ``"module:class"``; None of a learner whose
+        model: A class of :mod:`gpadjust`, or ``"module:class"``; None of a learner whose
             model a chapter makes.
         options: Of that class.
         adjusts: Whether the model is given f_p.
@@ -33,7 +33,7 @@ class Learner:
         """Its model factory, of inputs, targets and ``physics``; imports the library."""
         if self.model is None:
             raise ValueError(f"{self.label}: the chapter makes its model")
-        kind = resolve_name(self.model if ":" in self.model else f"gpadjust.models:{self.model}")
+        kind = resolve_name(self.model if ":" in self.model else f"gpadjust:{self.model}")
         if self.adjusts:
             return partial(kind, **self.options) if self.options else kind
 
@@ -44,8 +44,8 @@ class Learner:
         return without_physics
 
 
-LITERAL: Mapping[str, Any] = {"center": 0.0}
-"""Of the model as it is printed in the paper: rho is about 0, not about 1."""
+LITERAL: Mapping[str, Any] = {"center": 0.0, "constants": False}
+"""Of the model as it is printed in the paper: its kernels contain no constants."""
 
 LEARNERS = {
     # With f_p and data.
@@ -53,7 +53,7 @@ LEARNERS = {
     "literal": Learner("CKA, center 0", "tab:blue", "CKA", LITERAL),
     "rra": Learner("RRA", "tab:green", "RRA"),
     "phymean": Learner("physics mean", "tab:purple", "PhysicsMeanGP"),
-    "bias": Learner("GP-bias", "tab:pink", "BiasGP"),
+    "bias": Learner("GP-bias", "tab:pink", "PhysicsMeanGP"),
     "scale": Learner("GP-scale", "tab:olive", "ScaleGP"),
     "ar1": Learner("AR1", "tab:brown", "AR1"),
     "fitted": Learner("f_p, parameters fitted", "tab:brown"),

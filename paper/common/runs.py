@@ -16,7 +16,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeVar
 
-from botorch.exceptions.warnings import OptimizationWarning
 from filelock import FileLock
 
 from gpadjust.core import SamplingWarning
@@ -153,7 +152,7 @@ def timed(fitted: Callable[[], _Fitted], clock: Callable[[], float]) -> tuple[_F
     """The result of a fit; its ``"seconds"`` and whether it ``"warned"`` of samples, for a run.
 
     Args:
-        fitted: Fits; optimisations that stopped early are shown by scores, other warnings shown.
+        fitted: Fits; warnings of other kinds are shown.
         clock: Of the seconds.
     """
     with warnings.catch_warnings(record=True) as caught:
@@ -162,7 +161,7 @@ def timed(fitted: Callable[[], _Fitted], clock: Callable[[], float]) -> tuple[_F
         result = fitted()
         seconds = clock() - start
     for each in caught:
-        if not issubclass(each.category, OptimizationWarning | SamplingWarning):
+        if not issubclass(each.category, SamplingWarning):
             warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
     warned = any(issubclass(each.category, SamplingWarning) for each in caught)
     return result, {"seconds": seconds, "warned": warned}

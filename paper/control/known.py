@@ -12,9 +12,8 @@ from typing import Any
 import pandas as pd
 
 from gpadjust.control import CrossEntropy, MPCAgent, Planner
-from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
-from gpadjust.dynamics.learning import DynamicsFitOptions
 from gpadjust.core import SamplingWarning
+from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.physics import as_physics
 from gpadjust.systems import System
 from paper.common.experiment import Run, Table
@@ -84,8 +83,8 @@ def dynamics(settings: KnownSettings, known: System, learner: str) -> Dynamics:
         return NetworkDynamics(known.spec, given, number=number, steps=steps)
     made = LEARNERS[learner]
     given = physics if made.adjusts else None
-    fit: DynamicsFitOptions = {"method": settings.fit}
-    return LearnedDynamics(known.spec, given, model=made.make, fit_options=fit)
+    fit_options = {"method": settings.fit}
+    return LearnedDynamics(known.spec, given, model=made.make, fit_options=fit_options)
 
 
 def tables(runs: Sequence[Run], experiment: Known) -> dict[str, Table]:

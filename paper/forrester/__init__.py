@@ -1,4 +1,4 @@
-"""Forrester's function: eight models, eight observations, a hundred runs (the paper's sec. 3.1)."""
+"""Forrester's function: seven models, eight observations, a hundred runs (the paper's sec. 3.1)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Settings:
 
 @dataclass(frozen=True, kw_only=True)
 class Forrester(Experiment):
-    """Eight models learn Forrester's function (figure 1), by two protocols of training."""
+    """Seven models learn Forrester's function (figure 1), by two protocols of training."""
 
     runs: int = 100
     """data sets; the number is the seed"""

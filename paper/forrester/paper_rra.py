@@ -8,19 +8,9 @@ import torch
 from torch import Tensor
 
 from gpadjust import RRA
-from gpadjust.models.rra import WeightConditioning, regression
-from gpadjust.models.training_data import ArrayLike
-from gpadjust.physics import Physics
-
-
-class PaperConditioning(WeightConditioning):
-    """Weight conditioning with the covariance of the paper."""
-
-    def regress(self) -> tuple[Tensor, Tensor]:
-        """The paper's mean and root of the covariance of weights."""
-        design = self.kernel.at(self.train_inputs[0]).features(self.features)
-        _, root = regression(design, self.targets, torch.ones_like(design[..., 0]))
-        return super().regress()[0], root
+from gpadjust.core.gaussian import Conditioning
+from gpadjust.core.terms import WeightedSum
+from gpadjust.core.unknowns import Table
 
 
 class PaperRRA(RRA):
@@ -32,27 +22,56 @@ class PaperRRA(RRA):
     .. math:: \hat\beta = (\Phi^T\Phi + \lambda I)^{-1}\Phi^T y, \quad
         \mathrm{Cov}(\beta) = (\Phi^T\Phi + I)^{-1},
 
-    which is no posterior's unless :math:`\lambda = 1`, so that it cannot be fully Bayesian. The
-    arguments are those of :class:`~gpadjust.RRA`, without prior means, and always in the user's
-    units.
+    which is no posterior's unless :math:`\lambda = 1`, so that it is for ``fit(model, "map")``
+    alone. Args as of :class:`~gpadjust.RRA`, without prior means, center and constants.
     """
 
-    conditioning_class = PaperConditioning
-    not_sampled = (
-        "PaperRRA cannot be fully Bayesian: its covariance is not that of a posterior. Take RRA, "
-        "or fit it by method 'map'."
-    )
+    def __init__(self, train_X: Any, train_Y: Any, train_Yvar: Any = None, **options: Any) -> None:
+        own: dict[str, Any] = {"rho_mean": 0.0, "center": 0.0, "constants": False}
+        super().__init__(train_X, train_Y, train_Yvar, **own, **options)
+        known: dict[str, Any] = {
+            "rho.kernel.outputscale": 0.0,
+            "delta.kernel.outputscale": -2 * self.unit.log(),
+        }
+        rows = [
+            row._replace(location=0 * row.location + known[row.name], scale=0.0)
+            if row.name in known
+            else row
+            for row in self.table.own
+        ]
+        self.table = Table(rows, self.num_outputs)
 
-    def __init__(
-        self,
-        train_X: ArrayLike,
-        train_Y: ArrayLike,
-        train_Yvar: ArrayLike = None,
-        *,
-        physics: Physics | Any,
-        **options: Any,
-    ) -> None:
-        own: dict[str, Any] = {"rho_mean": 0.0, "center": 0.0, "outcome_transform": None}
-        super().__init__(train_X, train_Y, train_Yvar, physics=physics, **{**own, **options})
-        for term in self.covar_module.terms:
-            term.kernel.raw_outputscale.requires_grad_(False).zero_()  # an outputscale of 1
+    def conditioned(
+        self, train: WeightedSum, noise: Tensor, targets: Tensor, old: Any = None
+    ) -> PaperConditioning:
+        """Return the paper's mean and covariance given observations of a sum."""
+        found = PaperConditioning(train, noise, targets, old)
+        one = self.unit.square().reciprocal()
+        found.wide = Conditioning(train, one, targets, None if old is None else old.wide)
+        return found
+
+    def fit_itself(self, method: str, num_draws: int | None, seed: int) -> None:
+        """Raise a ValueError unless the method is ``"map"``."""
+        if method != "map":
+            raise ValueError(
+                "Expected method 'map', as the covariance of PaperRRA is not that of a posterior; "
+                f"found {method!r}. Take RRA."
+            )
+
+
+class PaperConditioning(Conditioning):
+    """A posterior with the covariance of another one, whose noise has the variance 1."""
+
+    wide: Conditioning
+
+    def marginals(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
+        """Return means and variances at each point."""
+        return self.mean(sought)[0], self.wide.marginals(sought)[1]
+
+    def joint(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
+        """Return means and covariances."""
+        return self.mean(sought)[0], self.wide.joint(sought)[1]
+
+    def update(self, prior: Tensor, generator: torch.Generator) -> Tensor:
+        """Return what makes functions from the prior ones of this posterior."""
+        return self.wide.update(prior, generator) + self.alpha - self.wide.alpha

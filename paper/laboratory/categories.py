@@ -22,6 +22,7 @@ from torch import Tensor
 
 from gpadjust import CKA, fit
 from gpadjust.core import GP, SamplingWarning
+from gpadjust.kinds import Categories as Columns
 from paper.common.experiment import Run, Table
 from paper.common.figures import panels, save
 from paper.common.tables import markdown, number
@@ -106,10 +107,9 @@ def models_of(name: str, case: Case) -> list[tuple[GP, Callable[[Tensor], Tensor
             model = CKA(X[own, :2], Y[own], physics=of_material)
             found.append((model, lambda X: X[:, :2], float(k)))
         return found
-    options: dict[str, Any] = {"numbers": {}, "onehot": {"input_transform": _OneHot()}}.get(
-        name, {"categorical": [2], "batch": [3]}
-    )
-    return [(CKA(X, Y, physics=head, **options), lambda X: X, None)]
+    transforms = {"onehot": _OneHot(), "ours": Columns([2], batches=[3])}
+    model = CKA(X, Y, physics=head, input_transform=transforms.get(name))
+    return [(model, lambda X: X, None)]
 
 
 @torch.no_grad()

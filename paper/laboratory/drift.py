@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from gpadjust import CKA, RRA, fit
+from gpadjust.kinds import Kalman, Window
 from paper.common.experiment import Run, Table
 from paper.common.figures import panels, save
 from paper.common.tables import markdown, number
@@ -35,13 +36,17 @@ def run(experiment: Drift, model: str, seed: int) -> Run:
         start = max(0, end - (settings.refit_window if model == "refit" else end))
         rows = slice(start, end)
         if model in ("rra", "steady"):
-            return RRA(X[rows], Y[rows], physics=catalogue, num_features=settings.num_features)
-        return CKA(X[rows], Y[rows], physics=catalogue)
+            rra = RRA(X[rows], Y[rows], physics=catalogue, num_features=settings.num_features)
+            fit(rra, settings.method)
+            return Kalman(rra, settings.forget)
+        cka = CKA(X[rows], Y[rows], physics=catalogue)
+        fit(cka, settings.method)
+        if model == "never":
+            return cka
+        return Window(cka, settings.refit_window if model == "refit" else settings.window)
 
     begin = time.perf_counter()
     adjusted = built(first)
-    fit(adjusted, settings.method)
-    forget = {"cka": settings.window, "refit": settings.refit_window}.get(model, settings.forget)
     means, held = [], []
     if model == "never":
         mean, _ = adjusted.predict(X[first:])
@@ -52,11 +57,10 @@ def run(experiment: Drift, model: str, seed: int) -> Run:
         x, y = X[i : i + 1], Y[i : i + 1]
         if model == "refit" and (i - first) % settings.refit_every == 0 and i > first:
             adjusted = built(i)
-            fit(adjusted, settings.method, num_starts=4, num_screened=64)
         means.append(adjusted.predict(x).mean.item())
         low, high = adjusted.interval(x, observation_noise=True)
         held.append(bool(low <= y <= high))
-        adjusted.update(x, y, forget=forget)
+        adjusted.update(x, y)
     errors = torch.tensor(means, dtype=torch.float64) - pump.truth[first:].flatten()
     week = errors.square().split(84)
     return {

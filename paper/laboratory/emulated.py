@@ -12,7 +12,6 @@ from collections.abc import Sequence
 
 import pandas as pd
 import torch
-from botorch.exceptions.warnings import OptimizationWarning
 from scipy.stats import gmean
 
 from gpadjust import CKA, EmulatedPhysics, FunctionPhysics, PhysicsWarning, fit
@@ -27,7 +26,7 @@ from paper.structures.functions import PAIRS, low_inputs, observations
 
 def run(experiment: Emulated, name: str, model: str, seed: int) -> Run:
     """Adjust the low level to data of the high one; score it against the truth."""
-    for category in (OptimizationWarning, SamplingWarning, PhysicsWarning):
+    for category in (SamplingWarning, PhysicsWarning):
         warnings.simplefilter("ignore", category)
     settings, found = experiment.settings, PAIRS[name]
     X, Y = observations(found, settings.per_input * found.d, seed)

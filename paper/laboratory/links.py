@@ -19,9 +19,10 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from gpadjust import CKA, ZeroMeanGP, fit
-from gpadjust.core import SamplingWarning
-from gpadjust.models import Logit, GP
+from gpadjust import CKA, fit
+from gpadjust.core import GP, SamplingWarning
+from gpadjust.kinds import LinkedCKA, LinkedZeroMeanGP
+from gpadjust.kinds.links import Link
 from paper.common.experiment import Run, Table
 from paper.common.figures import panels, save
 from paper.common.tables import markdown, number
@@ -114,7 +115,7 @@ def data_of(problem: Problem, seed: int) -> tuple[Tensor, Tensor, Tensor, Tensor
         torch.from_numpy(draw.uniform(low, high, (n, len(low)))) for n in (problem.number, _TEST)
     )
     system = problem.system(X, draw)
-    link: Logit = Logit.of(problem.link)  # type: ignore[assignment]
+    link = Link.of(problem.link)
     noise = problem.noise * torch.from_numpy(draw.normal(size=(problem.number, 1)))
     return X, link.inverse(link.value(system(X)) + noise), test, system(test)
 
@@ -122,9 +123,9 @@ def data_of(problem: Problem, seed: int) -> tuple[Tensor, Tensor, Tensor, Tensor
 def model_of(name: str, problem: Problem, X: Tensor, Y: Tensor) -> GP:
     """The model of a name, before its fit."""
     if name == "gp":
-        return ZeroMeanGP(X, Y, outcome_transform=problem.link)
+        return LinkedZeroMeanGP(X, Y, link=problem.link)
     if name == "linked":
-        return CKA(X, Y, physics=problem.physics, outcome_transform=problem.link)
+        return LinkedCKA(X, Y, physics=problem.physics, link=problem.link)
     return CKA(X, Y, physics=problem.physics)
 
 
@@ -137,7 +138,7 @@ def run(experiment: Links, problem: str, model: str, seed: int) -> Run:
     begin = time.perf_counter()
     fit(fitted)
     seconds = time.perf_counter() - begin
-    link: Logit = Logit.of(of.link)  # type: ignore[assignment]
+    link = Link.of(of.link)
     with torch.no_grad():
         lower, upper = fitted.interval(test)
         ends = fitted.interval(test, observation_noise=True)

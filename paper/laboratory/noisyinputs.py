@@ -19,6 +19,7 @@ from torch import Tensor
 
 from gpadjust import CKA, CalibratedPhysics, fit
 from gpadjust.core import SamplingWarning
+from gpadjust.kinds import NoisyInputs
 from gpadjust.physics import FunctionPhysics, Unknown
 from gpadjust.validation import rmse
 from paper.common.experiment import Run, Table
@@ -106,16 +107,22 @@ def case_of(experiment: Noisyinputs, problem: str, seed: int) -> Case:
     return Case(X, Y, [settings.input_noise**2] * d, test, truth(test))
 
 
+def _inputs(model: str, case: Case) -> tuple[Tensor, NoisyInputs | None]:
+    """The training inputs of a model, and its noise."""
+    noise = NoisyInputs(case.X, case.Xvar) if model == "noisy" else None
+    return (case.X if noise is None else noise.X), noise
+
+
 def run(experiment: Noisyinputs, problem: str, model: str, seed: int) -> Run:
     """Fit a model to a case; return its errors, and the parameter if there is one."""
     warnings.simplefilter("ignore", SamplingWarning)
     case, known = case_of(experiment, problem, seed), PROBLEMS[problem]
-    options: dict[str, Any] = {"train_Xvar": case.Xvar} if model == "noisy" else {}
     begin = time.perf_counter()
+    X, noise = _inputs(model, case)
     if known.parameter is None:
-        fitted: Any = CKA(case.X, case.Y, physics=known.physics, **options)
+        fitted: Any = CKA(X, case.Y, physics=known.physics, noise=noise)
     else:
-        fitted = CalibratedPhysics(case.X, case.Y, physics=known.physics(), **options)
+        fitted = CalibratedPhysics(X, case.Y, physics=known.physics(), noise=noise)
     fit(fitted)
     seconds = time.perf_counter() - begin
     mean, (lower, upper) = fitted.predict(case.test).mean, fitted.interval(case.test)
@@ -201,8 +208,8 @@ def draw(runs: Sequence[Run], experiment: Noisyinputs) -> list[Path]:
         ax.plot(line, known.truth(line), color="0.1", lw=1, ls="--", label="truth")
         ax.plot(line, known.physics(line), color="0.7", lw=1, label="$f_p$")
         for model, label in experiment.axes["model"].items():
-            options: dict[str, Any] = {"train_Xvar": case.Xvar} if model == "noisy" else {}
-            fitted = CKA(case.X, case.Y, physics=known.physics, **options)
+            X, noise = _inputs(model, case)
+            fitted = CKA(X, case.Y, physics=known.physics, noise=noise)
             fit(fitted)
             lower, upper = (end[:, 0] for end in fitted.interval(line))
             ax.plot(line, fitted.predict(line).mean, color=_COLORS[model], lw=1.5, label=label)

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from gpadjust import CKA, fit
 from gpadjust.core import SamplingWarning
+from gpadjust.kinds import HeavyTails
 from paper.common.experiment import Run, Table
 from paper.common.figures import panels, save
 from paper.common.tables import groups, markdown, number
@@ -90,9 +91,9 @@ def run(experiment: Outliers, problem: str, observations: int, seed: int) -> Run
     case, found = case_of(problem, observations, seed), Run()
     for data in ("clean", "dirty"):
         for noise in ("gaussian", "heavy"):
-            likelihood = None if noise == "gaussian" else "heavy-tailed"
+            own_noise = HeavyTails() if noise == "heavy" else None
             Y = getattr(case, data)
-            model = CKA(case.X, Y, physics=PROBLEMS[problem].physics, likelihood=likelihood)
+            model = CKA(case.X, Y, physics=PROBLEMS[problem].physics, noise=own_noise)
             begin = time.perf_counter()
             fit(model)
             seconds = time.perf_counter() - begin
@@ -102,8 +103,8 @@ def run(experiment: Outliers, problem: str, observations: int, seed: int) -> Run
             held = (low <= case.truth) & (case.truth <= high)
             own = {"rmse": error.square().mean().sqrt().item(), "seconds": seconds}
             own["coverage"] = held.double().mean().item()
-            if likelihood:
-                told = (model.outliers() > 0.5).flatten().nonzero().flatten().tolist()
+            if isinstance(model.noise, HeavyTails):
+                told = (model.noise.outliers(model) > 0.5).flatten().nonzero().flatten().tolist()
                 own["found"] = len({*told} & {*case.rows}) if data == "dirty" else 0
                 own["wrong"] = len({*told} - ({*case.rows} if data == "dirty" else set()))
             found[f"{noise}_{data}"] = own
@@ -172,10 +173,8 @@ def draw(runs: Sequence[Run], experiment: Outliers) -> list[Path]:
     case = case_of("wave", 20, experiment.seed)
     grid = torch.linspace(0, 1, 201, dtype=torch.float64).unsqueeze(-1)
     figure, axes = panels(["Gaussian noise", "heavy tails"], 2, (4.6, 3.4))
-    for ax, (likelihood, color) in zip(
-        axes, ((None, "0.45"), ("heavy-tailed", "#D55E00")), strict=True
-    ):
-        model = CKA(case.X, case.dirty, physics=PROBLEMS["wave"].physics, likelihood=likelihood)
+    for ax, noise, color in zip(axes, (None, HeavyTails()), ("0.45", "#D55E00"), strict=True):
+        model = CKA(case.X, case.dirty, physics=PROBLEMS["wave"].physics, noise=noise)
         fit(model)
         with torch.no_grad():
             low, high = (each.flatten() for each in model.interval(grid))
@@ -183,8 +182,8 @@ def draw(runs: Sequence[Run], experiment: Outliers) -> list[Path]:
         ax.fill_between(x, low, high, color=color, alpha=0.3, label="95 % interval")
         ax.plot(x, PROBLEMS["wave"].truth(grid).flatten(), color="0.2", lw=1, label="truth")
         ax.plot(case.X[:, 0], case.dirty[:, 0], ".", color="0.2", label="observations")
-        if likelihood:
-            told = (model.outliers() > 0.5).flatten()
+        if isinstance(model.noise, HeavyTails):
+            told = (model.noise.outliers(model) > 0.5).flatten()
             ax.plot(
                 case.X[told, 0], case.dirty[told, 0], "o", mfc="none", color=color, label="outliers"
             )

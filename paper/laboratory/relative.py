@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gpadjust import CKA, ZeroMeanGP, fit
 from gpadjust.core import GP, SamplingWarning
+from gpadjust.kinds import RelativeNoise
 from paper.common.experiment import Run, Table
 from paper.common.figures import panels, save
 from paper.common.tables import markdown, number
@@ -59,12 +60,12 @@ def data(problem: str, seed: int, n: int) -> tuple[Tensor, Tensor, Tensor, Tenso
     return X, noisy[0], test, values[1], noisy[1]
 
 
-def model_of(structure: str, noise: str, X: Tensor, Y: Tensor, problem: str) -> GP:
+def model_of(structure: str, kind: str, X: Tensor, Y: Tensor, problem: str) -> GP:
     """A model before its fit."""
-    likelihood = None if noise == "default" else noise
+    noise = RelativeNoise() if kind == "relative" else None
     if structure == "CKA":
-        return CKA(X, Y, physics=PROBLEMS[problem].physics, likelihood=likelihood)
-    return ZeroMeanGP(X, Y, likelihood=likelihood)
+        return CKA(X, Y, physics=PROBLEMS[problem].physics, noise=noise)
+    return ZeroMeanGP(X, Y, noise=noise)
 
 
 def run(experiment: Relative, problem: str, structure: str, noise: str, seed: int) -> Run:

@@ -21,8 +21,9 @@ import torch
 from torch import Tensor
 
 from gpadjust import CalibratedPhysics, PhysicsMeanGP, fit
-from gpadjust.core import SamplingWarning
-from gpadjust.models import GP, orthogonal_rbf, vanishing_rbf
+from gpadjust.core import GP, SamplingWarning
+from gpadjust.kinds import Orthogonal
+from gpadjust.kinds import Vanishing as VanishingKernel
 from gpadjust.physics import FunctionPhysics, Unknown
 from gpadjust.validation import rmse
 from paper.common.experiment import Run, Table
@@ -93,7 +94,7 @@ def model_of(name: str, case: Case) -> GP:
     """The model of a name, before its fit."""
     if name == "physics":
         return CalibratedPhysics(case.X, case.Y, physics=case.physics)
-    kernels = {"orthogonal": orthogonal_rbf, "vanishing": vanishing_rbf(case.where)}
+    kernels = {"orthogonal": Orthogonal(case.physics), "vanishing": VanishingKernel(case.where)}
     return PhysicsMeanGP(case.X, case.Y, physics=case.physics, covar_module=kernels.get(name))
 
 

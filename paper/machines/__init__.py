@@ -52,9 +52,6 @@ REAL_LEARNERS = {
     "rra-identified": _of("rra", "RRA, identified", "yellowgreen", "identified"),
     "calibrated": _of("calibrated", "calibrated f_p", "tab:olive", "unknown"),
     "calibrated-delta": _of("phymean", "calibrated f_p + delta", "deepskyblue", "unknown"),
-    "calibrated-orthogonal": RealLearner(
-        "calibrated f_p + orthogonal delta", "teal", "PhysicsMeanGP", physics="unknown"
-    ),
     "calibrated-cka": _of("cka", "calibrated CKA", "blue", "unknown"),
     "stretches-delta": _of(
         "phymean", "calibrated f_p + delta, of stretches", "slategray", "unknown", "stretches"

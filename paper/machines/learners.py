@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any, NamedTuple
 
 from torch import Tensor
 
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
-from gpadjust.models import PhysicsParameters, orthogonal_rbf
+from gpadjust.physics.parameters import PhysicsParameters
 from gpadjust.records import Records, smooth
 from paper.machines import REAL_LEARNERS, UNTRAINED
 from paper.machines.networks import NetworkDynamics
@@ -50,9 +49,8 @@ def train(name: str, machine: Machine, data: Any, seed: int) -> Trained:
         dynamics.update(*data)
     if found is not None:
         return Trained(dynamics, found.noise, found.physics_parameters)
-    if isinstance(dynamics, LearnedDynamics) and dynamics.model.has_unknowns:
-        return Trained(dynamics, parameters=dynamics.model.physics_parameters)
-    return Trained(dynamics)
+    learnt = dynamics.model.physics_parameters if isinstance(dynamics, LearnedDynamics) else None
+    return Trained(dynamics, parameters=learnt or None)
 
 
 def _dynamics(name: str, machine: Machine, data: Any, seed: int) -> Dynamics:
@@ -71,5 +69,4 @@ def _dynamics(name: str, machine: Machine, data: Any, seed: int) -> Dynamics:
         return PhysicsDynamics(machine.spec, physics)
     if known.model == "network":
         return NetworkDynamics(machine.spec, physics, seed=seed)
-    options = {"covar_module": orthogonal_rbf} if "orthogonal" in name else {}
-    return LearnedDynamics(machine.spec, physics, model=partial(known.make, **options))
+    return LearnedDynamics(machine.spec, physics, model=known.make)

@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from gpadjust.core import Prediction
 from gpadjust.dynamics import Dynamics, PhysicsDynamics, Trajectories, TransitionFunctions
-from gpadjust.models import Prediction
 from gpadjust.physics import Physics
 from gpadjust.states import StateSpec
 

@@ -13,8 +13,8 @@ import pandas as pd
 import torch
 from matplotlib.axes import Axes
 
-from gpadjust.dynamics import Dynamics, FreeRun, Windows
 from gpadjust.core import SamplingWarning
+from gpadjust.dynamics import Dynamics, FreeRun, Windows
 from paper.common.experiment import Run, Table
 from paper.common.figures import one_legend, panels, save
 from paper.common.tables import Cell, across, groups, number, table

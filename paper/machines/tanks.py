@@ -15,8 +15,8 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from gpadjust.dynamics import Dynamics, FreeRun, LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.core import SamplingWarning
+from gpadjust.dynamics import Dynamics, FreeRun, LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.physics import Physics
 from gpadjust.records import SmoothingWarning, smooth
 from paper.common.experiment import Run, Table

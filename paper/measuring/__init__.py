@@ -29,12 +29,6 @@ class Settings:
     """of that optimisation"""
     maxiter: int = 20
     """of that optimisation"""
-    num_screened: int = 64
-    """starts of a fit, beside the hyper-parameters of the last one"""
-    num_starts: int = 4
-    """of these, how many are optimised"""
-    max_iterations: int = 100
-    """of a fit"""
 
     def counts(self) -> range:
         """The numbers of measurements that there is a score of."""
@@ -49,9 +43,6 @@ _FOUR_OUTPUTS = Settings(  # more to compute at every step
     raw_samples=16,
     num_restarts=1,
     maxiter=8,
-    num_screened=16,
-    num_starts=2,
-    max_iterations=30,
 )
 
 

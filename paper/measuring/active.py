@@ -21,7 +21,6 @@ from torch import Tensor
 from gpadjust import fit
 from gpadjust.active import collect, qAdjustmentInformationGain
 from gpadjust.active.information_gain import About
-from gpadjust.active.warm_refit import refit
 from gpadjust.validation import coverage, rmse
 from paper.common.experiment import Run, Table
 from paper.common.tables import markdown, settings_table
@@ -57,8 +56,7 @@ def integrated_variance(model: Any, points: Tensor) -> AcquisitionFunction:
     """
     if model.num_outputs == 1:
         return qNegIntegratedPosteriorVariance(model, mc_points=points)
-    measured, _ = model.outcome_transform.untransform(model.train_targets.mT)
-    in_units = ScalarizedPosteriorTransform(1 / measured.std(0))
+    in_units = ScalarizedPosteriorTransform(1 / model.data.Y.std(0))
     return qNegIntegratedPosteriorVariance(model, mc_points=points, posterior_transform=in_units)
 
 
@@ -129,7 +127,7 @@ def measured(system: Problem, chooser: Chooser, kind: str, settings: Settings, s
         lambda model: acquisition(model, points),
         budget,
         initial=first,
-        fit=partial(fitted, settings),
+        fit=partial(fit, method="map"),
         optimizer_options={
             "raw_samples": settings.raw_samples,
             "num_restarts": settings.num_restarts,
@@ -154,11 +152,10 @@ def scored(system: Problem, kind: str, settings: Settings, X: Tensor) -> dict[st
         (the root mean square over the outputs), and the coverage of the central 95 % interval.
     """
     Y, (test_X, test_Y) = system.truth(X), system.test_points(settings.num_test)
-    model = None
     scores: dict[str, list[Any]] = {"measurements": [], "nrmse": [], "coverage": []}
     for n in settings.counts():
-        previous, model = model, system.model(X[:n], Y[:n], kind)
-        refit(model, previous, partial(fitted, settings))
+        model = system.model(X[:n], Y[:n], kind)
+        fit(model, "map")
         with torch.no_grad():
             mean, variance = model.predict(test_X, observation_noise=True)
         scores["measurements"].append(n)
@@ -170,17 +167,6 @@ def scored(system: Problem, kind: str, settings: Settings, X: Tensor) -> dict[st
 def relative_error(mean: Tensor, truth: Tensor) -> float:
     """The root mean square over the outputs, each in units of the truth's standard deviation."""
     return (rmse(mean, truth) / truth.std(0)).square().mean().sqrt().item()
-
-
-def fitted(settings: Settings, model: Any) -> None:
-    """Fit a model from the hyper-parameters that it has and others."""
-    fit(
-        model,
-        "map",
-        num_screened=settings.num_screened,
-        num_starts=settings.num_starts,
-        max_iterations=settings.max_iterations,
-    )
 
 
 @contextmanager

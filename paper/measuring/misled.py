@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from botorch.acquisition import qLogExpectedImprovement
@@ -19,7 +19,8 @@ from torch import Tensor
 from torch.quasirandom import SobolEngine
 
 from gpadjust import fit
-from gpadjust.models.sampled_functions import seeded
+from gpadjust.checks import seeded
+from gpadjust.validation.advice import relevance_of
 from paper.common.experiment import Run, Table
 from paper.common.learners import LEARNERS
 from paper.common.tables import Cell, frame, groups, number, of, table
@@ -165,10 +166,9 @@ def _fitted(method: str, X: Tensor, Y: Tensor, problem: Problem) -> tuple[Model,
         return problem.physics(X).unsqueeze(-1)
 
     name = {"zero": "gp", "physics-mean": "phymean"}.get(method, method)
-    model: Model = LEARNERS[name].make(X, Y, physics=physics)
-    result = fit(model)
-    weight = getattr(result, "relevance", None)
-    return model, None if weight is None else float(weight)
+    model: Any = LEARNERS[name].make(X, Y, physics=physics)
+    relevance = relevance_of(model, fit(model))
+    return model, relevance[0] if relevance else None
 
 
 def tables(runs: Sequence[Run], experiment: Misled) -> dict[str, Table]:

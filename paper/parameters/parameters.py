@@ -5,19 +5,16 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import pandas as pd
 import torch
-from gpytorch.kernels import Kernel
-from torch import Size, Tensor
+from torch import Tensor
 
 from gpadjust import CKA, CalibratedPhysics, PhysicsMeanGP, fit
-from gpadjust.gp import PhysicsScaledKernel
-from gpadjust.core import SamplingWarning
-from gpadjust.models import GP, orthogonal_rbf
-from gpadjust.models.parameters import scaled_rbf
+from gpadjust.core import GP, SamplingWarning, Stationary, Term
+from gpadjust.kinds import Orthogonal
+from gpadjust.physics import Physics
 from gpadjust.validation import rmse
 from paper.common.experiment import Run, Table
 from paper.common.tables import markdown, number
@@ -25,17 +22,23 @@ from paper.parameters import Parameters
 from paper.parameters.laws import textbook_case
 
 
-def growing(num_inputs: int, batch_shape: Size) -> Kernel:
-    """The kernel of a discrepancy that vanishes at 0 and grows as the input cubed."""
-    return PhysicsScaledKernel(scaled_rbf(num_inputs, batch_shape), lambda X: X[..., :1] ** 3)
+def growing(X: Tensor, Y: Tensor, physics: Physics) -> GP:
+    """Make a model of a discrepancy that vanishes at 0 and grows as the input cubed."""
+    terms = [Term("rho", mean=1.0, physics=0), Term("growing", Stationary(), physics=1)]
+    return GP(X, Y, terms=terms, physics=[physics, lambda X: X[..., :1] ** 3])
+
+
+def orthogonal(X: Tensor, Y: Tensor, physics: Physics) -> GP:
+    """Make a model of a discrepancy that is orthogonal to what parameters change (Plumlee)."""
+    return PhysicsMeanGP(X, Y, physics=physics, covar_module=Orthogonal(physics))
 
 
 MODELS: Mapping[str, Callable[..., GP]] = {
     "physics": CalibratedPhysics,
     "free": PhysicsMeanGP,
-    "orthogonal": partial(PhysicsMeanGP, covar_module=orthogonal_rbf),
+    "orthogonal": orthogonal,
     "cka": CKA,
-    "vanishing": partial(PhysicsMeanGP, covar_module=growing),
+    "vanishing": growing,
 }
 
 

@@ -218,8 +218,6 @@ class MassesSettings:
     """seed of the ten folds"""
     num_rows: int = 600
     """random rows for the search for hyper-parameters, and for f_p alone"""
-    max_iterations: int = 1
-    """iterations of L-BFGS with all rows, from what that search found"""
     stride: int = 1
     """every how many-th element is taken"""
 

@@ -25,8 +25,8 @@ import torch
 from torch import Tensor
 
 from gpadjust import CKA, FunctionPhysics, PhysicsMeanGP, Unknown, ZeroMeanGP
-from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.core import SamplingWarning
+from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.physics import ParameterValues
 from gpadjust.records import Record, Records, SmoothedRecords, SmoothingWarning, smooth
 from paper.common.experiment import Run, Table

@@ -30,8 +30,8 @@ import torch
 from torch import Tensor
 
 from gpadjust import CKA, PhysicsMeanGP, ZeroMeanGP
-from gpadjust.dynamics import FreeRun, LearnedDynamics, PhysicsDynamics
 from gpadjust.core import SamplingWarning
+from gpadjust.dynamics import FreeRun, LearnedDynamics, PhysicsDynamics
 from gpadjust.records import SmoothedRecords, SmoothingWarning, smooth
 from paper.common.experiment import Run, Table
 from paper.common.figures import one_legend, panels, save

@@ -18,7 +18,6 @@ iterations a fit needs. The ends of chains were looked at in no way.
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,13 +25,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from botorch.exceptions.warnings import OptimizationWarning
-from gpytorch.kernels import MaternKernel, ScaleKernel
-from torch import Size, Tensor
+from torch import Tensor
 
 from gpadjust import CKA, CalibratedPhysics, PhysicsMeanGP, Unknown, ZeroMeanGP, fit
-from gpadjust.inference.warm_start import warm_start
-from gpadjust.models import GP
+from gpadjust.core import GP, MATERN52, Stationary
+from gpadjust.core.kernels import RHO
 from gpadjust.physics import FunctionPhysics, ParameterValues
 from paper.common.experiment import Run, Table
 from paper.common.figures import save
@@ -108,16 +105,12 @@ def left_out(table: pd.DataFrame, task: str, split: int, seed: int) -> np.ndarra
     return np.asarray(ends & (chains.transform("size") > 2 * k))
 
 
-def matern(d: int, batch: Size) -> ScaleKernel:
-    """A Matern kernel with nu = 5/2: shells close with kinks."""
-    return ScaleKernel(MaternKernel(2.5, ard_num_dims=d, batch_shape=batch), batch_shape=batch)
-
-
 def build(model: str, physics: FunctionPhysics) -> Callable[..., GP]:
-    """What makes a model of inputs, energies and variances."""
+    """What makes a model of inputs, energies and variances; shells close with kinks."""
+    of_rho, matern = Stationary(MATERN52, RHO), Stationary(MATERN52)
     makers: dict[str, Callable[..., GP]] = {
         "cka": lambda X, Y, V: CKA(
-            X, Y, V, physics=physics, rho_covar_module=matern, delta_covar_module=matern
+            X, Y, V, physics=physics, rho_covar_module=of_rho, delta_covar_module=matern
         ),
         "mean": lambda X, Y, V: PhysicsMeanGP(X, Y, V, physics=physics, covar_module=matern),
         "gp": lambda X, Y, V: ZeroMeanGP(X, Y, V, covar_module=matern),
@@ -128,12 +121,11 @@ def build(model: str, physics: FunctionPhysics) -> Callable[..., GP]:
 def fitted(
     make: Callable[..., GP], data: Sequence[Tensor], settings: MassesSettings, seed: int
 ) -> GP:
-    """A model of all rows; the search for its hyper-parameters is made on some of them."""
-    some = _some(len(data[0]), settings, seed)
-    rough, model = make(*(each[some] for each in data)), make(*data)
-    fit(rough, "map", seed=seed)
-    warm_start(model, rough)
-    fit(model, "map", num_screened=0, max_iterations=settings.max_iterations)
+    """A model of all rows, whose hyper-parameters are those of some of them."""
+    model = make(*data)
+    some: Any = model.subset_rows(torch.from_numpy(_some(len(data[0]), settings, seed)))
+    fit(some, "map", seed=seed)
+    model.set_draws(some.draws)
     return model
 
 
@@ -144,7 +136,6 @@ def _some(number_of_rows: int, settings: MassesSettings, seed: int) -> np.ndarra
 
 def run(experiment: Masses, task: str, physics: str, model: str, seed: int) -> Run:
     """Fit one model to the nuclides that a task does not leave out, and predict the others."""
-    warnings.simplefilter("ignore", OptimizationWarning)  # a few iterations, on purpose
     settings, table = experiment.settings, nuclides(experiment.settings.stride)
     known = table[table.measured == 1].reset_index(drop=True)
     if task == "unmeasured":

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gpadjust.models import GP
+from gpadjust.core import GP
 from gpadjust.physics import Physics
 from gpadjust.validation import score
 from paper.structures.functions import PAIRS, observations

@@ -12,9 +12,8 @@ import pandas as pd
 from torch import Tensor
 
 from gpadjust import fit
+from gpadjust.core import GP, FitResult
 from gpadjust.dynamics import LearnedDynamics
-from gpadjust.inference import SampleResult
-from gpadjust.models import GP
 from paper.common.experiment import Run, Table
 from paper.common.learners import LEARNERS
 from paper.common.runs import timed
@@ -49,15 +48,15 @@ def _make(name: str) -> Callable[..., GP]:
 
 def _of_function(data: Data, name: str, seed: int) -> Run:
     """Scores of each output, as those of calibration."""
-    (model, sizes), found = timed(lambda: _fitted(data, name), time.perf_counter)
+    (model, result), found = timed(lambda: _fitted(data, name), time.perf_counter)
     scores = scored(model, data, seed)
     parts = (scores[score] for score in ("nrmse", "nlpd", "coverage"))
-    return {"N": len(data.X), **_scores(*parts), "effective_size": sizes, **found}
+    return {"N": len(data.X), **_scores(*parts), "effective": result.effective, **found}
 
 
-def _fitted(data: Data, name: str) -> tuple[GP, list[float]]:
+def _fitted(data: Data, name: str) -> tuple[GP, FitResult]:
     model = _make(name)(data.X, data.Y, physics=data.physics)
-    return model, _sizes(fit(model))
+    return model, fit(model)
 
 
 def _of_system(data: System, name: str) -> Run:
@@ -76,7 +75,7 @@ def _of_system(data: System, name: str) -> Run:
     return {
         "N": len(data.train.states),
         **_scores(scores.rmse / sd, scores.nlpd - sd.log(), scores.coverage),
-        "effective_size": _sizes(dynamics.fit_result),
+        "effective": dynamics.fit_result.effective if dynamics.fit_result else None,
         **found,
     }
 
@@ -90,11 +89,6 @@ def _scores(nrmse: Tensor, nlpd: Tensor, coverage: Tensor) -> Run:
         "coverage": coverage.mean().item(),
         "each": each,
     }
-
-
-def _sizes(result: Any) -> list[float]:
-    """The effective sample size of the draws of each output."""
-    return result.effective_size.reshape(-1).tolist() if isinstance(result, SampleResult) else []
 
 
 @cache

@@ -124,9 +124,9 @@ def test_gradients_rows_conditioning_outputs_and_functions_are_of_both_levels(cl
     close(few.predict(Z).mean, model.predict(Z).mean)
     assert more.left_out().means.shape[-2] == len(both.data.X) == 12
     close(model.subset_output([1]).predict(Z).mean, model.predict(Z).mean[:, 1:])
-    functions = model.sample_functions(4000, seed=0, num_features=256)(Z[:2])
+    functions = model.sample_functions(800, seed=0, num_features=128)(Z[:2])
     sd = model.predict(Z[:2]).variance.sqrt()
-    assert ((functions.mean(0) - model.predict(Z[:2]).mean).abs() < 0.1 * sd + 1e-3).all()
+    assert ((functions.mean(0) - model.predict(Z[:2]).mean).abs() < 0.15 * sd + 1e-3).all()
     torch.testing.assert_close(functions.std(0), sd, rtol=0.15, atol=1e-3)
 
 

@@ -34,9 +34,6 @@ TINY = Settings(
     raw_samples=4,
     num_restarts=1,
     maxiter=2,
-    num_screened=4,
-    num_starts=1,
-    max_iterations=5,
 )
 
 
