@@ -7,6 +7,7 @@ import matplotlib.pyplot as plt
 import torch
 
 from gpadjust import CKA, fit
+from gpadjust.kinds import HeavyTails
 
 
 def catalogue(X):
@@ -20,7 +21,7 @@ noise = 0.15 * torch.randn(16, 1, generator=generator, dtype=torch.float64)
 head = 0.95 * catalogue(flow) - 0.02 * flow**2 + noise
 head[[4, 11]] += torch.tensor([[6.0], [-5.0]])  # air in the gauge
 
-model = CKA(flow, head, physics=catalogue, likelihood="heavy-tailed")
+model = CKA(flow, head, physics=catalogue, noise=HeavyTails())
 fit(model)
 points = torch.linspace(0, 11, 111, dtype=torch.float64).unsqueeze(-1)
 mean = model.predict(points).mean

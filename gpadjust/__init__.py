@@ -11,7 +11,6 @@ The usual way::
     mean, variance = model.predict(X)            # of a measurement: observation_noise=True
     lower, upper = model.interval(X, level=0.95)
     rho, delta = model.rho(X), model.delta(X)    # where and how is f_p wrong?
-    model.plot()                                 # all of it, along each input
     print(compare(X, Y, f_p))                    # does f_p help, and which model is best?
     save(model, "model.pt")
     model = load("model.pt", physics=f_p)        # or trusted=True: imported by its name
@@ -26,11 +25,12 @@ Other models, with the same calls::
     VariationalCKA(X, Y, physics=f_p)            # up to 100,000 rows
     AR1(X, Y, physics=f_p, bounds=[[0], [1]])    # a constant rho; f_p known through samples
 
-Other data, for each of these::
+Other data, for each of these; names of gpadjust.kinds::
 
-    CKA(X, Y, 0.1**2, physics=f_p)                     # noise of a known variance
-    CKA(X, Y, physics=f_p, likelihood="heavy-tailed")  # outliers; "relative": errors in per cent
-    CKA(X, Y, physics=f_p, outcome_transform="log")    # positive outputs
+    CKA(X, Y, 0.1**2, physics=f_p)               # noise of a known variance
+    CKA(X, Y, physics=f_p, noise=HeavyTails())   # outliers; RelativeNoise(): errors in per cent
+    LinkedCKA(X, Y, physics=f_p, link="log")     # positive outputs; (0, 1): between bounds
+    CKA(frame, Y, physics=f_p, input_transform=Categories())   # columns of text
 
 Other physics, with unknown parameters or without::
 
@@ -43,6 +43,7 @@ Other physics, with unknown parameters or without::
 Beyond the models::
 
     from gpadjust.validation import leave_one_out, trust   # do the intervals hold what they say?
+    from gpadjust.validation.plots import plot_model       # predictions, rho and delta
     from gpadjust.report import report                     # a page to show
     from gpadjust.active import collect                    # the next point to measure
     from gpadjust.records import Records, smooth           # log files of machines

@@ -13,7 +13,7 @@ from gpadjust.core.gaussian import Evidence, add_noise
 from gpadjust.core.terms import WeightedSum
 
 _NUGGET = 1e-8  # of inducing values, in their mean variance: sums over rows divide errors by it
-_AT_ONCE = 2**22  # covariances of inducing values with rows that are in memory
+_AT_ONCE = 2**20  # covariances of inducing values with rows that are in memory
 
 
 def at_points(total: WeightedSum, points: Tensor) -> WeightedSum:

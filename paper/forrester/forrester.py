@@ -147,7 +147,7 @@ def _by_gpytorch(name: str, reading: str, X: Tensor, Y: Tensor, settings: Settin
     one, other = (ScaleKernel(RBFKernel()) for _ in range(2))
     if name == "RRA":
         one, other = (RFFKernel(64, num_dims=1) for _ in range(2))
-        printed = closed_form(reading, X, Y, (1.0, 1.0), settings.noise)
+        printed: Any = closed_form(reading, X, Y, (1.0, 1.0), settings.noise)
         for kernel, term in zip((one, other), printed.terms, strict=True):
             kernel.randn_weights = term.kernel.frequencies
     physics, variances = CRUDE[reading], torch.full_like(Y, settings.noise)

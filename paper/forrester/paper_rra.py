@@ -29,17 +29,11 @@ class PaperRRA(RRA):
     def __init__(self, train_X: Any, train_Y: Any, train_Yvar: Any = None, **options: Any) -> None:
         own: dict[str, Any] = {"rho_mean": 0.0, "center": 0.0, "constants": False}
         super().__init__(train_X, train_Y, train_Yvar, **own, **options)
-        known: dict[str, Any] = {
-            "rho.kernel.outputscale": 0.0,
-            "delta.kernel.outputscale": -2 * self.unit.log(),
-        }
-        rows = [
-            row._replace(location=0 * row.location + known[row.name], scale=0.0)
-            if row.name in known
-            else row
-            for row in self.table.own
-        ]
-        self.table = Table(rows, self.num_outputs)
+        logs = {"rho.kernel.outputscale": 0 * self.unit.log()}
+        logs["delta.kernel.outputscale"] = -2 * self.unit.log()
+        rows = {row.name: row for row in self.table.own}
+        rows |= {n: rows[n]._replace(location=log, scale=0.0) for n, log in logs.items()}
+        self.table = Table([*rows.values()], self.num_outputs)
 
     def conditioned(
         self, train: WeightedSum, noise: Tensor, targets: Tensor, old: Any = None

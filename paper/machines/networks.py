@@ -110,7 +110,7 @@ class NetworkDynamics(Dynamics):
         self._noise = error * self._scale.square()
         self._networks = networks.requires_grad_(False)
 
-    def predict(self, states: Tensor, actions: Tensor) -> Prediction[Tensor]:
+    def predict(self, states: Tensor, actions: Tensor) -> Prediction:
         """The mean over the networks; the variance over them, and that of the noise."""
         each = self._of_all(states, actions)
         return Prediction(each.mean(0), each.var(0) + self.noise_variance(states, actions))

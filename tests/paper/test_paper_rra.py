@@ -20,7 +20,7 @@ def test_closed_form(data, close, uniform, known_noise):
     plain, noisy = model.posterior(Z), model.posterior(Z, observation_noise=True)
     with torch.no_grad():
         joint = model.mixture(Z, slice(None), False).components[1]
-    functions = model.sample_functions(4000, seed=0)(Z)
+    functions = model.sample_functions(1000, seed=0)(Z)
     for j in range(2):
 
         def phi(X, j=j):
@@ -40,8 +40,8 @@ def test_closed_form(data, close, uniform, known_noise):
         close(joint[0, j], covariance, 1e-6)
         close(plain.variance[:, j], covariance.diagonal(), 1e-6)
         close(noisy.variance[:, j], covariance.diagonal() + ridge, 1e-6)
-        close(functions[..., j].mean(0), mean, 0.02)
-        close(functions[..., j].mT.cov(), covariance, 0.1)
+        close(functions[..., j].mean(0), mean, 0.05)
+        close(functions[..., j].mT.cov(), covariance, 0.2)
 
 
 def test_it_falls_to_zero_far_away_and_is_fitted_to_the_most_likely_numbers_alone(data):

@@ -1,5 +1,0 @@
-"""Simulators that are known by their runs."""
-
-from gpadjust.emulation.emulated_physics import EmulatedPhysics
-
-__all__ = ["EmulatedPhysics"]
