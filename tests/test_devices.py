@@ -6,48 +6,47 @@ from pathlib import Path
 import gpadjust
 
 ROOT = Path(gpadjust.__file__).parent
-ROOMS = ("physics", "gp", "models", "inference")
+ROOMS = ("physics", "core", "kinds", "many")
 FACTORIES = {
     *("arange", "empty", "eye", "full", "linspace", "ones", "rand", "randint", "randn", "randperm"),
     *("scalar_tensor", "tensor", "zeros"),
 }
 # Functions that may make tensors on the CPU, by why.
 ALLOWED = {
-    "numbers of rows or samples, which index tensors of any device": {
+    "numbers of rows or draws, which index tensors of any device": {
+        "core/fitting.py _pooled",
+        "core/fitting.py _starts",
+        "core/fitting.py modes",
+        "core/functions.py __init__",
+        "core/saving.py _built_with",
+        "core/saving.py _content",
+        "core/stacked.py __init__",
+        "core/stacked.py components",
+        "core/stacked.py mixture",
+        "core/summary.py _of_term",
+        "kinds/categories.py __init__",
+        "kinds/pyro_model.py pyro_model",
+        "kinds/updates.py __init__",
+        "kinds/updates.py update",
+        "many/rest.py rest_of",
+        "many/variational_cka.py fit_itself",
         "physics/base.py forward",
         "physics/error.py relocate",
         "physics/memo.py recall",
-        "inference/optimise.py _optima_of_some",
-        "inference/optimise.py maximise",
-        "inference/parameter_draws.py draw_parameters",
-        "models/stacked.py __init__",
-        "models/stacked.py _components",
-        "models/stacked.py draw_functions",
-        "models/terms_model.py draw_functions",
-        "models/terms_model.py mean_functions",
     },
     "drawn on the CPU, so that a seed says the same everywhere, and moved": {
-        "inference/least_squares.py spread_normal",
-        "inference/parameter_draws.py _moved",
-        "models/rra.py fourier_kernel",
-        "models/sampled_functions.py by_matheron",
+        "core/kernels.py _normal",
+        "core/model.py sample_functions",
+        "core/stacked.py sample_functions",
     },
-    "numbers that become Python's, a file's, or are moved by their callers": {
-        "models/posteriors.py mixture_quantile",
-        "models/saving.py content_of",
-        "inference/fitting.py _refine_noise",
-        "models/vanishing.py __init__",
-        "models/training_data.py standardize",
+    "numbers that become Python's, a file's, or are moved where they are used": {
+        "core/stacked.py _shares",
+        "core/unknowns.py __init__",
+        "kinds/links.py of",
+        "kinds/vanishing.py __init__",
         "physics/black_box.py _slope",
         "physics/unknown.py _cdf",
         "physics/unknown.py guess",
-    },
-    "parameters and buffers, which move with their model": {
-        "gp/categories.py untransform",
-        "gp/noise.py __init__",
-        "gp/orthogonal_kernel.py __init__",
-        "models/links.py __init__",
-        "models/local_errors.py __init__",
     },
 }
 

@@ -187,8 +187,8 @@ def variances_of(values: ArrayLike, Y: Tensor, name: str = "train_Yvar") -> Tens
     variances, m = as_tensor(values, name), Y.shape[-1]
     if variances.shape != Y.shape and variances.shape not in ((), (1,), (m,)):
         raise ValueError(
-            f"Expected {name} (known variances) as one number, {m} (one for each column), or of the "
-            f"data's shape {tuple(Y.shape)}; found {tuple(variances.shape)}."
+            f"Expected {name} (known variances) as one number, {m} (one for each column), or of "
+            f"the data's shape {tuple(Y.shape)}; found {tuple(variances.shape)}."
         )
     variances = variances.expand(Y.shape).masked_fill(Y.isnan(), torch.nan)
     variances = variances.where(~Y.isnan(), variances.nanmean(-2, keepdim=True))

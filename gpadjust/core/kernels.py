@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from copy import deepcopy
+from copy import copy, deepcopy
 from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
@@ -146,10 +146,19 @@ class Stationary(Kernel):
     Args:
         profile: k.
         outputscale: The prior of s, in squared units of the targets (of a scaling without unit).
+            Default: that of the term.
     """
 
-    def __init__(self, profile: Profile = RBF, outputscale: LogNormal = DELTA) -> None:
-        self.profile, self.outputscale = profile, outputscale
+    def __init__(self, profile: Profile = RBF, outputscale: LogNormal | None = None) -> None:
+        self.profile, self.outputscale = profile, outputscale or DELTA
+        self.is_given = outputscale is not None
+
+    def of_term(self, outputscale: LogNormal) -> Stationary:
+        """Return the kernel with the prior variance of a term, if it was given none."""
+        new = self if self.is_given else copy(self)
+        if not self.is_given:
+            new.outputscale = outputscale
+        return new
 
     def rows(self, x: Tensor, num_outputs: int) -> list[Row]:
         """Return lengthscales like d times the ranges of the inputs, and the outputscale."""

@@ -728,7 +728,8 @@ class GP(gpytorch.models.GP, Predictive):
         super().to(*args, **options)
         Yvar = None if self.data.Yvar is None else self.data.Yvar.to(self.u)
         X, Y = self.data.X.to(self.u), self.data.Y.to(self.u)
-        self.data = self.data._replace(X=X, Y=Y, Yvar=Yvar)
+        transform = None if self.data.transform is None else self.data.transform.to(self.u)
+        self.data = self.data._replace(X=X, Y=Y, Yvar=Yvar, transform=transform)
         self.unit, self._draws = self.unit.to(self.u), self._draws.to(self.u)
         self._f_train = [f.to(self.u) for f in self._f_train]
         self.term_sum = TermSum(self.terms, [f.to(self.u) for f in self.term_sum.f], self.unit)

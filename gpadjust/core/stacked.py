@@ -142,6 +142,12 @@ class StackedGP(Predictive):
         """Return the mixture of the conditioned models; the weights stay as they are."""
         return self._of([each.condition_on_observations(X, Y, noise) for each in self.models])
 
+    def to(self, *args: Any, **options: Any) -> Self:
+        """Move the models to a device, with their data."""
+        for model in self.models:  # a module's own moves parameters alone
+            model.to(*args, **options)
+        return self
+
     def subset_output(self, idcs: list[int]) -> Self:
         """Return the mixture of some outputs; a ValueError if there are none of these numbers."""
         new = self._of([each.subset_output(idcs) for each in self.models])
@@ -231,7 +237,7 @@ def _shares(models: Mapping[str, GP], weights: Any) -> Tensor:
     if isinstance(weights, Mapping) and weights.keys() == models.keys():
         weights = [weights[name] for name in models]
     try:
-        shares = torch.stack([torch.as_tensor(w, dtype=torch.float64) for w in weights])
+        shares = torch.stack([torch.as_tensor(w).double().cpu() for w in weights])
     except (TypeError, ValueError, RuntimeError):
         shares = torch.zeros(0)
     shares = shares.detach().unsqueeze(-1) if shares.dim() == 1 else shares.detach()

@@ -210,5 +210,5 @@ class Table:
         # The middle of the choice's interval of |u|, by probability.
         ends = [0.5, *torch.special.ndtr(self._ends).tolist(), 1.0]
         middle = NormalDist().inv_cdf((ends[number] + ends[number + 1]) / 2) if number else 0.0
-        columns = torch.arange(self._width - 1, self._own_size, self._width)
-        return u.index_fill(-1, columns.to(u.device), middle)
+        columns = torch.arange(self._width - 1, self._own_size, self._width, device=u.device)
+        return u.index_fill(-1, columns, middle)

@@ -153,7 +153,8 @@ class AtLevels(Kernel):
                 f"Expected a low level of {data.X.shape[-1]} inputs, as the high one; found "
                 f"{self.low_x.shape[-1]}."
             )
-        return AtLevels(self.kernel.of_data(data), data.kernel_inputs(self.low_x), self.has_rho)
+        low_x = data.kernel_inputs(self.low_x.to(data.X))
+        return AtLevels(self.kernel.of_data(data), low_x, self.has_rho)
 
     def rows(self, x: Tensor, num_outputs: int) -> list[Row]:
         """Return the numbers of k, kappa and rho."""

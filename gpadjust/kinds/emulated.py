@@ -19,8 +19,6 @@ from gpadjust.physics import Physics, Unknown
 from gpadjust.physics.unknown import ParameterValues
 
 _PLACES = 128  # at which errors are told apart
-_WAVES = 8  # whose sum is noise
-_FEW = 200_000  # numbers of factors, with which a variance is quick
 
 
 class EmulatedPhysics(Physics):
@@ -47,8 +45,6 @@ class EmulatedPhysics(Physics):
         inputs: The columns of the data that are the first ``d`` inputs of the runs, in their order.
             Default: all.
         unknowns: The unknown parameters by name.
-        is_random: Whether the simulator is random, and f_p its mean. Otherwise what the emulator
-            takes for noise of the runs is their finest detail, which is unknown between them.
         model_factory: Makes the emulator of ``X`` and ``Y``. Default: ``ZeroMeanGP`` with an RBF
             kernel or a Matern one (5/2), whichever predicts runs that are left out with the higher
             density. ``functools.partial(CKA, physics=...)`` of a formula needs fewer runs.
@@ -77,7 +73,7 @@ class EmulatedPhysics(Physics):
 
     def __init__(
         self, runs_X: Any, runs_Y: Any, *, inputs: Sequence[int] | None = None,
-        unknowns: Mapping[str, Unknown] | None = None, is_random: bool = False,
+        unknowns: Mapping[str, Unknown] | None = None,
         model_factory: Callable[[Any, Any], GP] | None = None,
         fit_options: Mapping[str, Any] | None = None, num_components: int = 8, seed: int = 0,
         name: str | None = None,
@@ -107,7 +103,7 @@ class EmulatedPhysics(Physics):
         self.num_outputs = emulator.num_outputs
         # In a tuple, no submodule: it is no part of a model that a fit changes or a copy copies.
         self._emulator = (emulator,)
-        self._components = _Components(emulator, number, seed, self.num_inputs, not is_random)
+        self._components = _Components(emulator, number, seed)
         self._kept: tuple[Tensor, Tensor] | None = None  # the components at the last rows
 
     @property
@@ -162,18 +158,15 @@ class _Components:
     """
 
     @torch.no_grad()
-    def __init__(
-        self, emulator: GP, number: int, seed: int, num_inputs: int, has_details: bool
-    ) -> None:
+    def __init__(self, emulator: GP, number: int, seed: int) -> None:
         X = emulator.data.X
-        self.emulator, self.num_inputs = emulator, num_inputs
+        self.emulator = emulator
         low, high = X.amin(0), X.amax(0)
-        places = SobolEngine(len(low), seed=seed, scramble=True).draw(_PLACES, dtype=low.dtype)
+        unit = SobolEngine(len(low), seed=seed, scramble=True).draw(2 * _PLACES, dtype=low.dtype)
         self.low, self.range = low, (high - low).where(high > low, torch.ones_like(low))
+        places, others = (low + self.range * unit.to(low)).chunk(2)
         self.data = emulator.conditioning()
-        has_parameters = X.shape[-1] > num_inputs  # of which rows of each draw are others
-        self.is_quick = not has_parameters or self.data.chol.numel() < _FEW
-        self.places = emulator.at(low + self.range * places.to(low))
+        self.places = emulator.at(places)
         mean, K = self.data.joint(self.places)  # S x m x Q (x Q)
         S, m, q = mean.shape
         away = mean - mean.mean(0)
@@ -185,53 +178,42 @@ class _Components:
         size, vectors = torch.linalg.eigh(C)
         number = min(number, len(size))
         size, vectors = size[-number:].flip(0).clamp_min(1e-300), vectors[:, -number:].flip(1)
-        # Components left out: the others are as much larger.
-        larger = (C.trace() / size.sum()).sqrt()
-        weights = (larger * vectors / size.sqrt()).reshape(m, q, number)
-        self.weights = weights  # m x Q x K
+        weights = (vectors / size.sqrt()).reshape(m, q, number)
         cross = self.places.cross(self.data.train) * self.data.observed.unsqueeze(-2)
         solved = torch.cholesky_solve(cross.mT, self.data.chol)  # S x m x n x Q
-        self.of_runs = solved @ weights
-        self.of_means = torch.einsum("smq,mqk->sk", away, weights)  # S x K
-        noise = emulator.noise.variance(self.data.train.values, emulator.places(X, emulator.values))
-        self.detail = has_details * (noise.mean((0, -1)).expand(m) / number).sqrt()  # m
-        shape, generator = (num_inputs, _WAVES * m * number), torch.Generator().manual_seed(seed)
-        self.frequencies = 1e5 * standard_normal(shape, generator, X)
-        self.phases = 10 * standard_normal(shape[1:], generator, X)
+        of_means = torch.einsum("smq,mqk->sk", away, weights)
+        self.weights = [weights, solved @ weights, of_means]  # m x Q x K, S x m x n x K, S x K
+        # For components that are left out, and between places, all are as much larger.
+        at = emulator.at(others)
+        larger = self._variance(at).sum() / self._at(at)[1].square().sum().clamp_min(1e-300)
+        self.weights = [larger.sqrt() * each for each in self.weights]
 
     def at(self, rows: Tensor) -> Tensor:
         """Return the mean and the components at rows ``N x D``, ``N x m x (1 + K)``."""
-        at, emulator = self.emulator.at(rows, self.data.train.values), self.emulator
-        mean, cross = self.data.mean(at)  # S x m x N (x n)
-        components = (at.cross(self.places) @ self.weights - cross @ self.of_runs).mean(0)
-        center = mean.mean(0)
-        away = (mean - center).movedim(0, -1)  # m x N x S
-        components = components + away @ self.of_means / len(mean)
-        # Where no place is near they have the emulator's variance; with many rows beyond runs only.
-        sought = ((rows < self.low) | (rows > self.low + self.range)).any(-1) | self.is_quick
-        if sought.any():
+        at = self.emulator.at(rows, self.data.train.values)
+        center, components = self._at(at)
+        # Beyond the runs, where no place is, they have the emulator's variance.
+        beyond = ((rows < self.low) | (rows > self.low + self.range)).any(-1)
+        if beyond.any():
+            size = components[:, beyond].square().sum(-1).clamp_min(1e-30)
             wider = torch.ones_like(center)
-            wider[:, sought] = self._ratio(at.of_rows(sought), components[:, sought])
+            wider[:, beyond] = (self._variance(at.of_rows(beyond)) / size).sqrt()
             components = components * wider.unsqueeze(-1)
-        components = components + self._details(rows)
         parts = torch.cat([center.unsqueeze(-1), components], -1)
-        return (parts * emulator.unit.unsqueeze(-1)).movedim(0, 1)
+        return (parts * self.emulator.unit.unsqueeze(-1)).movedim(0, 1)
 
-    def _ratio(self, at: WeightedSum, components: Tensor) -> Tensor:
-        """Return the emulator's standard deviations over those of components ``m x N x K``."""
+    def _at(self, at: WeightedSum) -> tuple[Tensor, Tensor]:
+        """Return the mean ``m x N`` and the components ``m x N x K``."""
+        of_places, of_runs, of_means = self.weights
+        mean, cross = self.data.mean(at)  # S x m x N (x n)
+        components = (at.cross(self.places) @ of_places - cross @ of_runs).mean(0)
+        away = (mean - mean.mean(0)).movedim(0, -1)  # m x N x S
+        return mean.mean(0), components + away @ of_means / len(mean)
+
+    def _variance(self, at: WeightedSum) -> Tensor:
+        """Return the variance by the emulator, ``m x N``."""
         mean, variance = self.data.marginals(at)
-        total = variance.mean(0) + mean.var(0, correction=0)
-        return (total / components.square().sum(-1).clamp_min(1e-30)).sqrt()
-
-    def _details(self, rows: Tensor) -> Tensor:
-        """Return ``m x N x K`` of the variance of the noise: independent at different inputs.
-
-        They are sums of waves too short to be seen, without derivatives.
-        """
-        d, m = self.num_inputs, len(self.detail)
-        x = ((rows.detach() - self.low) / self.range)[:, :d]
-        waves = (x @ self.frequencies + self.phases).cos().reshape(len(x), _WAVES, m, -1)
-        return self.detail[:, None, None] * waves.sum(1).movedim(0, 1) * (2 / _WAVES) ** 0.5
+        return variance.mean(0) + mean.var(0, correction=0)
 
 
 def _distinct(rows: Tensor) -> tuple[Tensor, Tensor]:

@@ -99,12 +99,12 @@ class Vanishing(Kernel):
 
     def of_data(self, data: Data) -> Vanishing:
         """Return the kernel on the columns that kernels of a model read."""
-        new, places = copy(self), self._places(data.input_names)
+        new, places = copy(self), self._places(data.input_names).to(data.X)
         free = places.isnan()
         terms = getattr(data.transform, "terms", lambda terms: terms)
         new.kernel = terms([Term("k", self.kernel)])[0].kernel.of_data(data)
         ends = torch.stack([data.X.amin(-2), data.X.amax(-2)])
-        moved = ends.where(free.unsqueeze(-2), places.unsqueeze(-2).to(ends))  # p x 2 x d
+        moved = ends.where(free.unsqueeze(-2), places.unsqueeze(-2))  # p x 2 x d
         read = data.kernel_inputs(moved)
         if read.shape != moved.shape or not torch.equal(read[:, 0][~free], read[:, 1][~free]):
             raise ValueError(

@@ -44,7 +44,7 @@ def rest_of(
     x, n, m = posterior.total.x[0, 0], posterior.num_rows, table.num_outputs
     k = min(_NEIGHBOURS, n // 4)
     if k < _LEAST:
-        return {}, torch.zeros(m, dtype=torch.bool)
+        return {}, x.new_zeros(m, dtype=torch.bool)
     spread = x.std(0)
     spread = spread.where(spread > 0, torch.ones_like(spread))
     generator = torch.Generator().manual_seed(seed)

@@ -144,8 +144,11 @@ class Control(Experiment):
     def describe(self, *kind: Any) -> dict[str, Any]:
         """The settings of the learner, and the task with its dynamics, if it has a model."""
         name, settings = kind[0], asdict(self.settings_of(kind[0]))
-        model_free = self.known[name].kind == "none"
-        return settings if model_free else {**settings, "task": self.setup(name, 0).task.describe()}
+        if self.known[name].kind == "none":
+            return settings
+        task = self.setup(name, 0).task.describe()
+        task.pop("dynamics.model_options", None)  # beside the task, number by number
+        return {**settings, "task": task, "options": dict(self.known[name].options)}
 
     def run(self, *case: Any) -> dict[str, Any]:
         """Learn, or go on with it."""

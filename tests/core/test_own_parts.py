@@ -232,3 +232,12 @@ def test_a_right_law_with_unknown_parameters_may_be_right_as_it_is():
         if nested:
             assert [*result.probabilities][1] == "as it is"
     assert spread[0] < 0.7 * spread[1]
+
+
+def test_a_kernel_takes_the_prior_variance_of_its_term(data):
+    X, Y, *_ = data
+    models = [CKA(X, Y, physics=lambda X: X[:, :1], rho_covar_module=k, delta_covar_module=k)
+              for k in (None, Stationary())]  # fmt: skip
+    for name in ("rho.kernel.outputscale", "delta.kernel.outputscale"):
+        assert torch.equal(models[0].values[name], models[1].values[name])
+    assert models[1].values["rho.kernel.outputscale"] < models[1].values["delta.kernel.outputscale"]

@@ -12,7 +12,7 @@ import torch
 from gpadjust.core import CKA, GP, Noise, Stationary, Term, fit
 
 PAGE = Path(__file__).parents[2] / "docs" / "extending.md"
-START = "\n## Something new in the core\n"
+START = "\n## In a model\n"
 
 
 def recipe(heading):

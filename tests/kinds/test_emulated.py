@@ -45,7 +45,7 @@ def functions(physics, X, number=4000, seed=0):
 def test_functions_have_the_mean_and_covariance_of_the_emulator():
     """Between runs and beyond them."""
     runs, X = 1.2 * line(6), torch.tensor([[0.1], [0.6], [1.1], [1.5], [2.4]], dtype=torch.float64)
-    physics = EmulatedPhysics(runs, wave(runs), is_random=True, fit_options=MAP)
+    physics = EmulatedPhysics(runs, wave(runs), fit_options=MAP)
     torch.testing.assert_close(physics(X), physics.emulator.predict(X).mean)
     values, posterior = functions(physics, X)[..., 0], physics.emulator.posterior(X)
     sd = posterior.variance[:, 0].sqrt()
@@ -58,7 +58,7 @@ def test_functions_have_the_mean_and_covariance_of_the_emulator():
 def test_several_outputs_have_errors_of_their_own_size():
     runs = 1.2 * line(6)
     both = torch.cat([wave(runs), 100 * runs.cos()], -1)
-    physics = EmulatedPhysics(runs, both, is_random=True, fit_options=MAP, num_components=12)
+    physics = EmulatedPhysics(runs, both, fit_options=MAP, num_components=12)
     values = functions(physics, FAR[:1])[:, 0]
     sd = physics.emulator.predict(FAR[:1]).variance[0].sqrt()
     torch.testing.assert_close(values.std(0), sd, rtol=0.1, atol=0.0)
@@ -67,7 +67,7 @@ def test_several_outputs_have_errors_of_their_own_size():
 
 def test_gradients_are_those_of_the_function():
     z = torch.randn(3, 8, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    plain = EmulatedPhysics(1.2 * line(9), wave(1.2 * line(9)), fit_options=MAP, is_random=True)
+    plain = EmulatedPhysics(1.2 * line(9), wave(1.2 * line(9)), fit_options=MAP)
     X = (1.05 + line(4)).requires_grad_()
     assert torch.autograd.gradcheck(lambda X: plain(X, z), X)
     z.requires_grad_()
@@ -153,18 +153,6 @@ def test_names_of_inputs_are_to_be_in_order():
     turned = EmulatedPhysics(X, X[["a"]], inputs=[1, 0], fit_options=MAP, num_components=1)
     model = CKA(X[["b", "a"]], X[["a"]], physics=turned)
     assert abs(turned(model.data.X) - model.data.Y).max() < 0.1
-
-
-def test_fine_detail_is_an_error_of_a_certain_simulator():
-    runs, X = 4 * line(60), 4 * line(5) + 0.01
-    ripples = runs.sin() + 0.1 * torch.sin(397 * runs)
-    sd = []
-    for is_random in (False, True):
-        physics = EmulatedPhysics(runs, ripples, is_random=is_random, fit_options=MAP)
-        values = functions(physics, X)[..., 0]
-        sd.append(values.std(0))
-    more = (sd[0].square() - sd[1].square()).sqrt()
-    assert ((more > 0.03) & (more < 0.15)).all()
 
 
 def test_a_model_may_be_saved_and_its_physics_is_given_again(crude, tmp_path):
