@@ -16,7 +16,7 @@ from sklearn.model_selection import GridSearchCV
 from gpadjust import CKA, compare, fit, load, save
 from gpadjust.active import collect
 from gpadjust.dynamics import LearnedDynamics, StateSpec
-from gpadjust.kinds import Categories, HeavyTails, Linked, RelativeNoise, with_options
+from gpadjust.kinds import Categories, HeavyTails, RelativeNoise, with_options
 from gpadjust.report import report
 from gpadjust.report.markup import Markup
 from gpadjust.sklearn import CKARegressor
@@ -138,8 +138,9 @@ def test_collection(tmp_path):
 
 
 @pytest.mark.slow
-def test_dynamics(kind):
-    options, has = kind
+@pytest.mark.parametrize("name", [name for name in KINDS if name not in ("categories", "batches")])
+def test_dynamics(name):
+    options, has = KINDS[name]
     spec = StateSpec(["x"], ["v"])
 
     def build():

@@ -12,6 +12,7 @@ from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from packaging.requirements import Requirement
@@ -19,6 +20,7 @@ from packaging.utils import canonicalize_name
 
 import gpadjust
 from gpadjust import RRA
+from gpadjust.kinds import pyro_model
 from tests.systems import line
 
 ROOT = Path(__file__).parents[1]
@@ -79,13 +81,13 @@ def test_the_core_brings_no_more_than_botorch():
     python(
         f"import sys\nsys.modules.update(dict.fromkeys({absent}))\n{lines}\n"
         "from gpadjust import active, compare, dynamics, records\n"
-        "compare(train_X, train_Y, f_p, structures=['CKA'], num_starts=1)\n"
+        "compare(train_X, train_Y, f_p, structures=['CKA'])\n"
     )
 
 
 NEEDED = {
     "torchdiffeq": ("ode", lambda: gpadjust.ODEPhysics(lambda s, a: -s, step=0.1, state_dim=1)),
-    "pyro": ("pyro", lambda: RRA(line(5), line(5), physics=torch.sin).pyro_model()),
+    "pyro": ("pyro", lambda: pyro_model(RRA(line(5), line(5), physics=torch.sin))),
 }
 
 
@@ -111,7 +113,9 @@ def test_each_line_of_the_cheat_sheet_runs(tmp_path, monkeypatch):
     X = line(6)
     names = {name: getattr(gpadjust, name) for name in gpadjust.__all__}
     names |= {"X": X, "Y": 2 * f_p(X) + 0.1 * X.sin(), "f_p": f_p, "g_p": torch.exp}
-    names |= {"simulator": np.sin, "rate": rate}
+    names |= {name: getattr(gpadjust.kinds, name) for name in gpadjust.kinds.__all__}
+    frame = pd.DataFrame({"x": X[:, 0], "rig": ["old", "new"] * 3})
+    names |= {"simulator": np.sin, "rate": rate, "frame": frame}
     calls = re.findall(r"^ {4}(.+)", inspect.getdoc(gpadjust), flags=re.MULTILINE)
     assert len(calls) > 25
     for call in calls:
@@ -129,7 +133,7 @@ def test_every_name_is_there_and_brings_nothing_optional():
         "for name in gpadjust.__all__:\n"
         "    assert globals()[name] is getattr(gpadjust, name), name\n"
         "    assert name in dir(gpadjust), name\n"
-        "assert gpadjust.models.CKA is CKA and gpadjust.dynamics.LearnedDynamics\n"
+        "assert gpadjust.core.CKA is CKA and gpadjust.dynamics.LearnedDynamics\n"
         "print(gpadjust.__version__)"
     )
     assert python(code).strip() == gpadjust.__version__

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import gpytorch
 import torch
@@ -46,9 +46,6 @@ from gpadjust.core.views import (
 )
 from gpadjust.physics import Physics, PhysicsError, Unknown, as_physics
 from gpadjust.physics.parameters import PhysicsParameters
-
-if TYPE_CHECKING:
-    from gpadjust.core.fitting import FitResult
 
 Slopes = dict[str, list[Tensor]]
 """Derivatives of each physics by the coordinate of each unknown parameter, ``S x m x n``."""
@@ -332,8 +329,8 @@ class GP(gpytorch.models.GP, Predictive):
         """Return the posterior given observations of a sum, of which the first ones made an old."""
         return Conditioning(train, noise, targets, old)
 
-    def fit_itself(self, method: str, num_draws: int | None, seed: int) -> FitResult | None:
-        """Return None; a subclass that is not fitted by draws fits itself, for :func:`fit`."""
+    def fit_itself(self, method: str, num_draws: int | None, seed: int) -> Any:
+        """Return None; a subclass that is not fitted by draws fits itself, and its FitResult."""
         return None
 
     def _by_physics(

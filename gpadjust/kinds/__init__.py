@@ -17,7 +17,6 @@ from gpadjust.kinds.links import (
 )
 from gpadjust.kinds.local_errors import LocalErrors
 from gpadjust.kinds.noisy_inputs import NoisyInputs
-from gpadjust.kinds.orthogonal import Orthogonal
 from gpadjust.kinds.pyro_model import pyro_model
 from gpadjust.kinds.relative import RelativeNoise
 from gpadjust.kinds.updates import Kalman, Window
@@ -26,7 +25,7 @@ from gpadjust.kinds.vanishing import Vanishing
 __all__ = [
     "AR1", "Categories", "EmulatedPhysics", "HeavyTails", "Kalman", "Linked", "LinkedCKA",
     "LinkedCalibratedPhysics", "LinkedPhysicsMeanGP", "LinkedRRA", "LinkedScaleGP",
-    "LinkedZeroMeanGP", "LocalErrors", "ModelFactory", "NoisyInputs", "Orthogonal",
+    "LinkedZeroMeanGP", "LocalErrors", "ModelFactory", "NoisyInputs",
     "RelativeNoise", "Vanishing", "Window", "levels_of", "linked", "make_model", "on_levels",
     "pyro_model", "with_options",
 ]  # fmt: skip

@@ -22,12 +22,12 @@ from torch import Tensor
 
 from gpadjust import CalibratedPhysics, PhysicsMeanGP, fit
 from gpadjust.core import GP, SamplingWarning
-from gpadjust.kinds import Orthogonal
 from gpadjust.kinds import Vanishing as VanishingKernel
 from gpadjust.physics import FunctionPhysics, Unknown
 from gpadjust.validation import rmse
 from paper.common.experiment import Run, Table
 from paper.common.figures import panels, save
+from paper.common.orthogonal import Orthogonal
 from paper.common.tables import markdown, number
 from paper.laboratory import Vanishing
 

@@ -13,10 +13,10 @@ from torch import Tensor
 
 from gpadjust import CKA, CalibratedPhysics, PhysicsMeanGP, fit
 from gpadjust.core import GP, SamplingWarning, Stationary, Term
-from gpadjust.kinds import Orthogonal
 from gpadjust.physics import Physics
 from gpadjust.validation import rmse
 from paper.common.experiment import Run, Table
+from paper.common.orthogonal import Orthogonal
 from paper.common.tables import markdown, number
 from paper.parameters import Parameters
 from paper.parameters.laws import textbook_case

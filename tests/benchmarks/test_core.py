@@ -4,10 +4,10 @@ import time
 
 import pytest
 import torch
+from gpadjust.inference.targets import LogLikelihood
 
 import gpadjust
 from gpadjust import core
-from gpadjust.inference.targets import LogLikelihood
 
 
 def wavy(X):

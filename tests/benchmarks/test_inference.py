@@ -9,10 +9,10 @@ import torch
 from botorch.fit import fit_gpytorch_mll
 from botorch.models import SingleTaskGP
 from botorch.optim.closures import get_loss_closure_with_grads
+from gpadjust.inference.targets import LogLikelihood
 from gpytorch.mlls import ExactMarginalLogLikelihood
 
 from gpadjust import CKA, fit
-from gpadjust.inference.targets import LogLikelihood
 
 
 def crude(X):

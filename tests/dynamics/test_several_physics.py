@@ -45,7 +45,7 @@ def test_targets_are_those_of_each_part(cart_pole_system, make, still):
 
 def test_the_better_physics_gets_the_weight(cart_pole_system, make, still):
     system = cart_pole_system
-    dynamics = make("PhysicsMean", system.spec, {"still": still, "truth": system.truth})
+    dynamics = make("CKA", system.spec, {"still": still, "truth": system.truth})
     dynamics.update(*system.trial(0))
     states, actions, next_states = system.trial(1)
     torch.testing.assert_close(

@@ -43,7 +43,7 @@ class Orthogonal(Kernel):
     Example:
         >>> import torch
         >>> from gpadjust.core import PhysicsMeanGP
-        >>> from gpadjust.kinds.orthogonal import Orthogonal
+        >>> from paper.common.orthogonal import Orthogonal
         >>> from gpadjust.physics import FunctionPhysics, Unknown
         >>> line = FunctionPhysics(lambda X, p: p.a * X[:, 0], unknowns={"a": Unknown(1.0, sd=5.0)})
         >>> X = torch.linspace(0, 1, 17, dtype=torch.float64).unsqueeze(-1)

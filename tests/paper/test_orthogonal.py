@@ -5,8 +5,8 @@ import torch
 
 from gpadjust.core import CKA, MATERN52, PhysicsMeanGP, Stationary
 from gpadjust.kinds.categories import Categories
-from gpadjust.kinds.orthogonal import Orthogonal
 from gpadjust.physics import FunctionPhysics, Unknown
+from paper.common.orthogonal import Orthogonal
 from tests.systems import normal, refused, uniform
 
 LAW = FunctionPhysics(
