@@ -118,6 +118,8 @@ class Conditioning:
     """
 
     chol: Tensor
+    is_noisy = True
+    """Whether predictions are products with the inverse factor."""
 
     def __init__(
         self, train: WeightedSum, noise: Tensor, targets: Tensor, old: Conditioning | None = None
@@ -139,7 +141,7 @@ class Conditioning:
         else:
             self.chol, self._inverse = self._appended(old, late.cross(old.train), K)
         pivots = self.chol.diagonal(dim1=-1, dim2=-2).square()
-        self._is_noisy = bool(pivots.min() > _NOISY * pivots.max())
+        self.is_noisy = bool(pivots.min() > _NOISY * pivots.max())
         self.alpha = self.solve((targets - train.mean).nan_to_num() * observed)
 
     def _appended(
@@ -164,7 +166,7 @@ class Conditioning:
         L2 = factor(K22 - B @ B.mT, late_noise, seen)
         L2 = L2.expand(*lead, *L2.shape[-2:])
         chol = _lower(old.chol.expand(*lead, n, n), B, L2)
-        if not old._is_noisy:
+        if not old.is_noisy:
             return chol, None
         inverse1, inverse2 = old.inverse_factor(), _inverse(L2)
         inverse1 = inverse1.expand(*lead, n, n)
@@ -187,7 +189,7 @@ class Conditioning:
 
     def white(self, cross: Tensor) -> Tensor:
         """Return :math:`k L^{-T}`: a product, or without noise a solve, which is exacter."""
-        if self._is_noisy:
+        if self.is_noisy:
             return cross @ self.inverse_factor().mT
         return torch.linalg.solve_triangular(self.chol, cross.mT, upper=False).mT
 

@@ -110,7 +110,10 @@ class Predictive(Model, FantasizeMixin):
         observation_noise: bool | Tensor = False,
         posterior_transform: PosteriorTransform | None = None,
     ) -> Any:
-        """Return the joint posterior at ``X``, ``... x q x d``, as BoTorch asks for it."""
+        """Return the joint posterior at ``X`` as BoTorch asks for it.
+
+        Its mean is ``... x q x m``, for ``X`` of ``... x q x d``.
+        """
         self.eval()
         is_part = output_indices is not None
         outputs = self.checked_outputs(output_indices) if is_part else slice(None)
@@ -578,7 +581,9 @@ class GP(gpytorch.models.GP, Predictive):
     def sample_functions(
         self, num_functions: int, seed: int | None = None, num_features: int = 1024
     ) -> Functions:
-        """Draw functions ``... x q x d`` to ``k x ... x q x m`` from the posterior.
+        """Draw functions from the posterior.
+
+        They take ``... x q x d`` to ``k x ... x q x m``.
 
         Args:
             num_functions: Number ``k`` of functions, spread over the draws.

@@ -323,6 +323,9 @@ def _model(content: dict[str, Any], objects: dict[str, Any], trusted: bool) -> G
     u = model.u
     model.set_draws(content["draws"].double())
     model.u = u
+    buffers = dict(model.named_buffers(recurse=False))
+    if buffers.keys() != content["buffers"].keys():
+        raise ValueError(f"expected tensors {[*buffers]}; found {[*content['buffers']]}.")
     for name, value in content["buffers"].items():
         setattr(model, name, value)
     model.data = model.data._replace(input_names=inputs, output_names=outputs)

@@ -300,7 +300,7 @@ def levels_of(model: Any) -> Levels:
 
 
 def on_levels(model: Any, X: Tensor) -> Tensor:
-    """Return inputs ``... x d`` with the nearest level in columns of categories and batches."""
+    """Return inputs with the nearest level in columns of categories and batches."""
     X = X.clone()
     for i, own in levels_of(model).items():
         levels = X.new_tensor(numbers_of(own))

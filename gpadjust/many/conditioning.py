@@ -67,10 +67,6 @@ class SparseConditioning(Conditioning):
         """Return what makes :math:`k(x, x) - |F k|^2` of covariances k with inducing values."""
         return self.inverse
 
-    def white(self, cross: Tensor) -> Tensor:
-        """Return covariances ``... x q x M`` times the inverse factor."""
-        return cross @ self.inverse.mT
-
     def update(self, prior: Tensor, generator: torch.Generator) -> Tensor:
         """Return what gives functions from the prior inducing values from the posterior."""
         noise = standard_normal(prior.shape, generator, prior)
@@ -106,7 +102,7 @@ class SparseConditioning(Conditioning):
         )
 
 
-class LaterConditioning(SparseConditioning):
+class LaterConditioning(Conditioning):
     r"""A posterior by inducing values, given further observations exactly.
 
     The late rows are observations of a Gaussian process with the old posterior as its prior.
@@ -119,7 +115,11 @@ class LaterConditioning(SparseConditioning):
     """
 
     def __init__(
-        self, old: SparseConditioning, late: WeightedSum, noise: Tensor, targets: Tensor
+        self,
+        old: SparseConditioning | LaterConditioning,
+        late: WeightedSum,
+        noise: Tensor,
+        targets: Tensor,
     ) -> None:
         self.old, self.train = old, joined(old.train, late)
         self.num_rows = old.num_rows + targets.shape[-1]
@@ -142,6 +142,10 @@ class LaterConditioning(SparseConditioning):
         mean = late.mean + (K21 @ old.alpha.unsqueeze(-1)).squeeze(-1)
         self.alpha = self.later(old.alpha, targets - mean)
         self.observed = appended(old.observed, seen, -1)
+
+    def inverse_factor(self) -> Tensor:
+        """Return what makes :math:`k(x, x) - |F k|^2` of covariances k with all that is known."""
+        return self.inverse
 
     def later(self, weights: Tensor, residual: Tensor) -> Tensor:
         """Return weights ``... x M`` of the old rows, and of late ones for their residuals."""

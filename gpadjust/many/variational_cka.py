@@ -22,8 +22,8 @@ from gpadjust.many.conditioning import LaterConditioning, SparseConditioning
 from gpadjust.many.rest import rest_of
 
 _FEW, _SEARCHED = 100, 500  # rows of exact models
-_ROUNDS = ((5_000, 2), (20_000, 1))  # rows of the bound, of a share of the inducing points
-_ITERATIONS = 15  # of each round
+# Rows of the bound, their inducing points as a share of all, and iterations.
+_ROUNDS = ((5_000, 0.5, 15), (20_000, 1.0, 15))
 _CANDIDATES = 4  # rows for each inducing point
 _AT_ONCE = 4096  # predictions
 _REST = "rest"
@@ -174,10 +174,10 @@ class VariationalCKA(CKA):
         order, whole = self._order(seed), self.subset_draws(torch.zeros(1, dtype=torch.long))
         few, some = (whole.subset_rows(order[:n]) for n in (_FEW, _SEARCHED))
         u = maximise(some.log_likelihood, modes(few, 0, seed)[:1])
-        for n, share in _ROUNDS:
+        for n, share, iterations in _ROUNDS:
             refined = whole.subset_rows(order[:n])
-            refined.inducing = refined.points(u, max(1, self.num_inducing // share))
-            u = maximise(refined.log_likelihood, u, most=_ITERATIONS)
+            refined.inducing = refined.points(u, max(1, int(share * self.num_inducing)))
+            u = maximise(refined.log_likelihood, u, most=iterations)
         whole.inducing = order[refined.points(u, self.num_inducing)]
         whole.set_draws(u)
         posterior = whole.conditioning()

@@ -186,6 +186,8 @@ def parse(formula: str) -> list[ast.expr]:
                 raise ValueError(f"{told}: {wrong}. {_GRAMMAR}")
     except (SyntaxError, UnicodeError) as error:
         what = getattr(error, "msg", "not a text")
+        taken = [word for word in re.findall(r"\w+", str(formula)) if iskeyword(word)]
+        what += f"; of a column {taken[0]} write {taken[0]}_" if taken else ""
         raise ValueError(f"{told}: {what}. {_SIGNS} {_GRAMMAR}") from error
     except (RecursionError, MemoryError) as error:
         raise ValueError(f"{told}: it is nested too deeply.") from error
