@@ -85,7 +85,7 @@ def test_the_examples_run(capsys, tmp_path, monkeypatch):
     loaded = {}
     with pytest.warns(UserWarning, match="other programs cannot import it"):
         exec(held, loaded)
-    assert "noise: sd" in capsys.readouterr().out
+    assert "noise: standard deviation" in capsys.readouterr().out
     assert (loaded["lower"] <= loaded["train_Y"]).all()
     torch.testing.assert_close(loaded["model"].predict(names["test_X"]).mean, before)
     exec(second, names)
@@ -110,7 +110,7 @@ def abilities(name):
     else:
         model = made(unknown if name == "CalibratedPhysics" else torch.sin)
     tries = [
-        lambda: gpadjust.fit(model).draws,
+        lambda: gpadjust.fit(model).num_draws,
         lambda: model.rho(X),
         lambda: model.delta(X),
         lambda: made({"sine": torch.sin, "line": torch.abs if name == "AR1" else unknown}),

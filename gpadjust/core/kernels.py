@@ -375,7 +375,8 @@ class OfGPyTorch(Kernel):
         for i, j in product(*map(range, lead)):
             one = {name: value[i, j] for name, value in own.items()}
             points = (x[..., i, j, :, :], other[..., i, j, :, :])
-            parts.append(self._dense(self.kernel, one, *points))
+            kernel = deepcopy(self.kernel)  # some keep what they have computed
+            parts.append(self._dense(kernel, one, *points))
         return torch.stack(parts, -3).unflatten(-3, lead)
 
     def _is_the_same_as_a_batch(self, own: Values, x: Tensor, lead: torch.Size) -> bool:

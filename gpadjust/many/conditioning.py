@@ -122,7 +122,7 @@ class LaterConditioning(Conditioning):
         targets: Tensor,
     ) -> None:
         self.old, self.train = old, joined(old.train, late)
-        self.num_rows = old.num_rows + targets.shape[-1]
+        self.num_rows: int = old.num_rows + targets.shape[-1]
         K, K21, seen = late.cross(late), late.cross(old.train), ~targets.isnan()
         while seen.dim() > K.dim() - 1 and bool((seen == seen[0]).all()):
             seen = seen[0]  # fantasies of the same points share a factor

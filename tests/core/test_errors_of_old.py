@@ -40,7 +40,6 @@ def test_a_second_fit_is_the_first(make):
 
 def test_a_term_that_a_model_has_not():
     refused(ValueError, "Unknown term 'rho'; expected one of f", ZeroMeanGP(X, Y).rho, X)
-    refused(ValueError, "Unknown term 'rho'", PhysicsMeanGP(X, Y, physics=wave).rho, X)
 
 
 def test_beyond_the_data_a_link_predicts_within_its_interval():
