@@ -33,7 +33,7 @@ CSV_TO_FREE_RUN = 35  # files that a log passes on the way to a judged free run
 TRIAL, ITERATION = 47, 46  # that a planned trial and an iteration of Dyna pass, fits included
 OF_CONTROL, OF_CONTROL_AND_RL = 14, 13  # of these
 FILES, CLASSES, FUNCTIONS = 12, 16, 125  # that the ten lines of the README pass; fewer are better
-CORE_LINES = 4530
+CORE_LINES = 4560
 REPORT, WITH_A_REPORT = 16, 25  # of report and validation, and of what is below, by a point fit
 
 
@@ -144,7 +144,8 @@ def is_private(name):
 
 def test_no_private_name_of_another_library_is_read():
     """Rooms that extend Stable-Baselines3 and Ax are apart."""
-    read, own = {}, {"_replace", "_fields", "_make"}  # of named tuples, which are documented
+    own = {"_replace", "_fields", "_asdict", "_make"}  # of named tuples, which are documented
+    read = {}
     for path in ROOT.glob("**/*.py"):
         used, defined = private_and_own(parsed(path))
         own |= defined

@@ -50,11 +50,6 @@ def f_p(X):
     return 3 + X[:, :1].sin()
 
 
-@pytest.fixture(params=[pytest.param(kind, id=name) for name, kind in KINDS.items()])
-def kind(request):
-    return request.param
-
-
 @pytest.fixture
 def data():
     """A time and one of three rigs."""
@@ -64,9 +59,10 @@ def data():
 
 
 @pytest.mark.slow
-def test_compare_and_its_page(kind, data, tmp_path, monkeypatch):
+@pytest.mark.parametrize("name", KINDS)
+def test_compare_and_its_page(name, data, tmp_path, monkeypatch):
     monkeypatch.setattr("gpadjust.report.sections.drawn", lambda draw: Markup())
-    options, has = kind
+    options, has = KINDS[name]
     found = compare(*data, f_p, structures=["physics mean", "CKA"], **options)
     assert len(found.models) == 2
     assert all(map(has, found.models.values()))
@@ -86,20 +82,6 @@ def test_known_variances(data):
     variances = 0.02**2 * torch.ones_like(data[1])
     found = compare(*data, f_p, variances, structures=["CKA"])
     assert torch.equal(found.models["CKA"].data.Yvar, variances)
-
-
-@pytest.mark.slow
-def test_regressor(data):
-    options, has = KINDS["relative noise and outliers"]
-    X, y = data[0].numpy(), data[1].numpy()[:, 0]
-    regressor = CKARegressor(
-        lambda X: 3 + np.sin(X[:, 0]), model_options=options, fit_method="map", random_state=0
-    )
-    search = GridSearchCV(regressor, {"model_options": [options]}, cv=2).fit(X, y)
-    assert has(search.best_estimator_.model_)
-    fitted = clone(regressor).fit(X, y)
-    assert has(fitted.model_)
-    assert np.abs(fitted.predict(X) - y).max() < 0.2
 
 
 @pytest.mark.slow

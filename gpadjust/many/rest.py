@@ -16,7 +16,7 @@ from gpadjust.many.conditioning import SparseConditioning
 
 _GROUPS, _NEIGHBOURS = 64, 128  # places where neighbours are compared
 _LEAST = 8  # neighbours that show anything
-_LENGTHS = (0.5, 2.0)  # where searches begin, in standard deviations of the inputs
+_STARTS = (-1.0, -2.0)  # of searches, coordinates of lengthscales: shorter than the usual ones
 _CHANCE = 1e-3  # of finding a rest where there is none, at most
 
 
@@ -81,11 +81,11 @@ def rest_of(
         return log_density
 
     begins = []
-    for length in _LENGTHS:
+    for start in _STARTS:
         values = {name: 0.7 * value for name, value in begin.items()}
         values["rest.kernel.outputscale"] = 0.3 * size
-        values["rest.kernel.lengthscale"] = (length * spread).expand(m, -1)
-        begins.append(table.with_values(size.new_zeros(1, table.problems, table.size), values))
+        u = size.new_full((1, table.problems, table.size), start)
+        begins.append(table.with_values(u, values))
     with_rest, without = likelihood(True), likelihood(False)
     ends = maximise(with_rest, torch.cat(begins))
     density = with_rest(ends, False)[0]
@@ -97,7 +97,8 @@ def rest_of(
     number = sum(r.location.shape[-1] for r in table.own if r.name not in begin)
     # Groups show the noise; its variance and those that are predicted make up the residuals'.
     other = (unseen + noise(values)).mean(-1, keepdim=True)
-    values["rest.kernel.outputscale"] = (size - other).maximum(1e-9 * size)
+    if "rest.kernel.outputscale" in values:
+        values["rest.kernel.outputscale"] = (size - other).maximum(1e-9 * size)
     return values, gain > chdtri(number, _CHANCE)
 
 

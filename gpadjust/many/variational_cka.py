@@ -219,7 +219,8 @@ class VariationalCKA(CKA):
         values = self.values
         rows = [row for row in self.table.own if row.name.startswith((f"{_REST}.", "noise."))]
         begin = {row.name: values[row.name] for row in rows if row.name.startswith("noise.")}
-        places, kernel = self.places(self.data.X, values), self.terms[-1].kernel
+        places = self.places(self.data.X, values)
+        (kernel,) = (term.kernel for term in self.terms if term.name == _REST)
         assert kernel is not None
 
         def noise(numbers: Values) -> Tensor:

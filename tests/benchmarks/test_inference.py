@@ -1,4 +1,4 @@
-"""Time of a likelihood step, a fit and full Bayes beside others; run with `--benchmark-only`."""
+"""Time of a likelihood step and of fits beside others; run with `--benchmark-only`."""
 
 import contextlib
 import io
@@ -9,61 +9,62 @@ import torch
 from botorch.fit import fit_gpytorch_mll
 from botorch.models import SingleTaskGP
 from botorch.optim.closures import get_loss_closure_with_grads
-from gpadjust.inference.targets import LogLikelihood
 from gpytorch.mlls import ExactMarginalLogLikelihood
 
 from gpadjust import CKA, fit
 
 
-def crude(X):
-    return torch.stack(
-        [(3 * X[:, 0]).sin() + X[:, 1], X[:, 2] * X[:, 3], X.sum(-1), (4 * X[:, 4]).cos()], -1
-    )
-
-
-@pytest.mark.parametrize("other", ["BoTorch's step", "Cholesky and inverse"])
-def test_step(benchmark, record_ratio, uniform, other):
-    X = uniform(500, 6)
-    Y = (1 + 0.3 * X[:, :1]) * crude(X) + X[:, :4].square()
-    model = CKA(X, Y + 0.01 * torch.randn(500, 4, dtype=torch.float64), physics=crude)
-    objective = LogLikelihood(model)
-    point = objective.parameters.current()
-    with torch.no_grad():
-        _, covariance, *_ = objective.distribution(objective.parameters.unflatten(point))
-    mll = ExactMarginalLogLikelihood(model.likelihood, model)
-    step = get_loss_closure_with_grads(
-        mll, {name: p for name, p in mll.named_parameters() if p.requires_grad}
-    )
-    others = {
-        "BoTorch's step": step,
-        "Cholesky and inverse": lambda: torch.cholesky_inverse(torch.linalg.cholesky(covariance)),
-    }
-
-    def ours():
-        return objective.value_and_gradient(point)
-
-    ours(), others[other]()
-    benchmark.group = "likelihood and gradient, n = 500, 4 outputs, 6 inputs"
-    record_ratio(f"our step / {other}", ours, others[other], rounds=15)
-
-
 def low(X):
-    return (3 * X[..., :1]).sin() + X[..., 1:]
+    return (3 * X[..., :1]).sin() + X[..., 1:2]
 
 
 def high(X):
-    return (1 + 0.3 * X[..., :1]) * low(X) + X[..., 1:].square()
+    return (1 + 0.3 * X[..., :1]) * low(X) + X[..., 1:2].square()
+
+
+def of_botorch(X, Y):
+    model = SingleTaskGP(X, Y)
+    return model, ExactMarginalLogLikelihood(model.likelihood, model)
+
+
+def data(uniform, n):
+    X = uniform(n, 2)
+    return X, high(X) + 0.01 * torch.randn(n, 1, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("n", [50, 500])
+def test_step(benchmark, record_ratio, uniform, n):
+    X, Y = data(uniform, n)
+    model = CKA(X, Y, physics=low, nested=False)
+    u = 0.1 * torch.randn(1, *model.u.shape[1:], dtype=torch.float64)
+    single, mll = of_botorch(X, Y)
+    theirs = get_loss_closure_with_grads(mll, dict(single.named_parameters()))
+    benchmark.group = f"likelihood and gradient, n = {n}"
+    record_ratio(
+        "our step / BoTorch's of a SingleTaskGP", lambda: model.log_likelihood(u), theirs, 15
+    )
+
+
+@pytest.mark.parametrize("method", ["map", "bayes"])
+@pytest.mark.parametrize("n", [12, 50, 200, 500])
+def test_fit(benchmark, record_ratio, uniform, n, method):
+    X, Y = data(uniform, n)
+
+    def ours():
+        fit(CKA(X, Y, physics=low), method)
+
+    def theirs():
+        fit_gpytorch_mll(of_botorch(X, Y)[1])
+
+    benchmark.group = f"fit beside fit_gpytorch_mll, n = {n}"
+    record_ratio(f"fit(CKA, {method!r}) / BoTorch's of a SingleTaskGP", ours, theirs, 3)
 
 
 @pytest.mark.parametrize("n", [8, 50, 200])
 def test_fit_beside_mfk(benchmark, record_ratio, uniform, n):
     mfk = pytest.importorskip("smt.applications").MFK
-    X_low = uniform(2 * n, 2)
+    X_low, noise = uniform(2 * n, 2), 0.01 * torch.randn(n, 1, dtype=torch.float64)
     X = X_low[:n]
-    noise = 0.01 * torch.randn(n, 1, dtype=torch.float64)
-
-    def ours():
-        fit(CKA(X, high(X) + noise, physics=low), "map")
 
     def theirs():
         with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
@@ -73,49 +74,6 @@ def test_fit_beside_mfk(benchmark, record_ratio, uniform, n):
             model.set_training_values(X.numpy(), (high(X) + noise).numpy())
             model.train()
 
-    ours()
     benchmark.group = f"fit, n = {n}"
-    record_ratio("fit of CKA / SMT's MFK", ours, theirs, rounds=3 if n < 50 else 1)
-
-
-@pytest.mark.parametrize("n", [8, 20, 50])
-def test_full_bayes(benchmark, record_ratio, uniform, n):
-    X = uniform(n, 2)
-    Y = high(X) + 0.01 * torch.randn(n, 1, dtype=torch.float64)
-
-    def build_and(method):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            fit(CKA(X, Y, physics=low), method)
-
-    build_and("map")
-    benchmark.group = f"full Bayes, n = {n}"
-    record_ratio(
-        'fit(model, "bayes") / fit(model, "map")',
-        lambda: build_and("bayes"),
-        lambda: build_and("map"),
-        rounds=3,
-    )
-
-
-def several(X, m):
-    columns = [low(X)[:, 0], X.prod(-1), X.sum(-1), (4 * X[:, 1]).cos()]
-    return torch.stack(columns[:m], dim=-1)
-
-
-@pytest.mark.parametrize(("n", "m"), [(50, 1), (200, 1), (500, 1), (1000, 1), (2000, 1), (500, 4)])
-def test_fit(benchmark, record_ratio, uniform, n, m):
-    """At most 2.0 for n from 200 on, without loss: see tests/inference."""
-    X = uniform(n, 2)
-    noise = 0.01 * torch.randn(n, m, dtype=torch.float64)
-    Y = (1 + 0.3 * X[:, :1]) * several(X, m) + X[:, 1:].square() + noise
-
-    def ours():
-        fit(CKA(X, Y, physics=lambda X: several(X, m)), "map")
-
-    def theirs():
-        model = SingleTaskGP(X, Y)
-        fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
-
-    benchmark.group = f"fit beside fit_gpytorch_mll, n = {n}, {m} output(s)"
-    record_ratio("fit of CKA / BoTorch's of a SingleTaskGP", ours, theirs, 3 if n < 1000 else 1)
+    ours = CKA(X, high(X) + noise, physics=low)
+    record_ratio("fit of CKA / SMT's MFK", lambda: fit(ours), theirs, 3 if n < 50 else 1)

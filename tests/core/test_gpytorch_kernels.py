@@ -1,5 +1,7 @@
 """Every kernel of GPyTorch is that of rho or delta, with its priors."""
 
+from copy import deepcopy
+
 import gpytorch.kernels as kernels
 import pytest
 import torch
@@ -88,8 +90,8 @@ def test_covariance_and_gradient(data, name):
     own = model.at(X).own(term)
     with torch.no_grad():
         K = term.kernel.covariance(own, X.expand(1, 1, 9, 2)).squeeze()
-        kernel = term.kernel.kernel
-        for key, (raw, constraint) in term.kernel._raw_parameters.items():
+        kernel = deepcopy(term.kernel.kernel)
+        for key, raw, constraint in kernel.named_parameters_and_constraints():
             value = own[key].reshape(raw.shape)
             raw.copy_(value if constraint is None else constraint.inverse_transform(value))
         torch.testing.assert_close(K, kernel(X).to_dense(), rtol=1e-8, atol=1e-10)

@@ -63,7 +63,7 @@ def test_conditioning_is_the_exact_posterior(cart_pole_system, make):
 @pytest.mark.slow
 def test_refits_are_quiet_and_leave_the_generator_alone(cart_pole_system, make):
     system = cart_pole_system
-    dynamics = make("CKA", system.spec, system.crude)
+    dynamics = make("CKA", system.spec, system.crude, fit_options=None)
     state = torch.get_rng_state()
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -12,7 +12,7 @@ pytestmark = pytest.mark.filterwarnings(
     "ignore:f_p is nearly zero", "ignore::gpadjust.core.SamplingWarning"
 )
 POINT_FIT = {"method": "map"}
-SEVERAL = ["PhysicsMean", "Scale", "CKA", "RRA"]
+SEVERAL = ["PhysicsMean", "CKA", "RRA"]
 
 
 @pytest.fixture

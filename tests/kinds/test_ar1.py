@@ -123,6 +123,8 @@ def test_gradients_rows_conditioning_outputs_and_functions_are_of_both_levels(cl
     few = more.subset_rows(torch.arange(7))
     close(few.predict(Z).mean, model.predict(Z).mean)
     assert more.left_out().means.shape[-2] == len(both.data.X) == 12
+    for left_out, at in zip(model.left_out(), model.left_out_at(u), strict=True):
+        close(left_out, at)
     close(model.subset_output([1]).predict(Z).mean, model.predict(Z).mean[:, 1:])
     functions = model.sample_functions(800, seed=0, num_features=128)(Z[:2])
     sd = model.predict(Z[:2]).variance.sqrt()

@@ -88,6 +88,16 @@ def test_the_covariance_is_exchangeable(profile):
         torch.testing.assert_close(gradient[..., i], (high - low) / 2e-5, rtol=1e-5, atol=1e-5)
 
 
+def test_levels_by_random_features_are_as_far_apart():
+    """As many features come near the RBF kernel, of which they are samples."""
+    options = {"physics": head, "input_transform": Categories([1])}
+    models = RRA(X, Y, num_features=20_000, **options), CKA(X, Y, **options)
+    one = torch.ones(1, 1, 3, dtype=torch.float64)
+    own = {"lengthscale": 0.5 * one, "outputscale": one[..., :1]}
+    rough, exact = (m.terms[0].kernel.covariance(own, X[None, None, :6]) for m in models)
+    torch.testing.assert_close(rough, exact, rtol=0, atol=0.04)
+
+
 def test_names_of_levels_do_not_matter():
     order = torch.tensor([2.0, 0.0, 1.0]).double()
     other = X.clone()

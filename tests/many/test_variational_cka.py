@@ -355,11 +355,10 @@ def test_links_and_categories():
     pandas = pytest.importorskip("pandas")
     frame = pandas.DataFrame({"x": X[:, 0], "material": ["iron", "tin"] * 40})
     Y = Y + torch.tensor([[0.0], [1.0]]).repeat(40, 1)
-    model = VariationalCKA(
-        frame, Y, physics=wave, input_transform=Categories(["material"]), num_inducing=20
-    )
-    fit(model)
-    assert (model.predict(frame).mean.to_numpy() - Y.numpy()).std() < 0.15
+    for transform in (Categories(["material"]), Categories([], batches=["material"])):
+        model = VariationalCKA(frame, Y, physics=wave, input_transform=transform, num_inducing=20)
+        fit(model)
+        assert (model.predict(frame).mean.to_numpy() - Y.numpy()).std() < 0.15
 
 
 X, Y = problem(10)

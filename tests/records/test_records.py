@@ -390,7 +390,7 @@ REFUSED = [
     ({"states": column(0, math.inf, 0)}, ValueError, "row 1: .*inf in column 0 of states; put N"),
     ({"actions": column(0, 0, math.nan)}, ValueError, "row 2: .*nan in column 0 of actions"),
     ({"actions": column(0, 0)}, ValueError, "3 of times, 3 of states, 2 of actions"),
-    ({"states": np.array([["a"], ["b"], ["c"]])}, TypeError, "hold numbers only"),
+    ({"states": np.array([["a"], ["b"], ["c"]])}, TypeError, "contain numbers only"),
     ({"segments": [1, 1]}, ValueError, "3 of actions, 2 of segments"),
     ({"segments": [1, math.nan, 1]}, ValueError, "row 1: expected a label .*found nan"),
     ({"segments": [1, 2, 1]}, ValueError, "two rows or more of a segment, .* found 3 in all"),

@@ -136,7 +136,7 @@ def test_another_friction_law_at_forces_that_were_not_learnt_from():
 def test_parameters_vary_more_beyond_the_actions_but_no_more_than_half_of_the_prior(beyond, factor):
     """By halves of the range beyond it; 5 times 0.1 is half of the prior's."""
     learnt, actions = (
-        PhysicsParameters(spring().unknowns, torch.tensor([[4.0, 0.3]]).double()),
+        PhysicsParameters(spring().unknowns, torch.tensor([[4.0], [0.3]]).double()),
         (torch.tensor([[-1.0], [1.0]]).double()),
     )
     vary = varying_parameters(spring(), SPEC, learnt, actions, torch.tensor([0.1, 0.0]).double())
