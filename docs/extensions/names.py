@@ -17,7 +17,7 @@ from sphinx.util import inspect
 from sphinx.util.logging import getLogger
 
 REFERENCE = Path(__file__).parents[1] / "reference"
-PAGES = {page.stem for page in REFERENCE.glob("*.rst")} - {"index", "bases"}
+PAGES = {page.stem for page in REFERENCE.glob("*.rst")} - {"index"}
 ROOMS = [import_module(f"gpadjust.{name}") for name in (*sorted(PAGES), "validation.plots")]
 ENTRIES = {id(getattr(room, n)): f"{room.__name__}.{n}" for room in ROOMS for n in room.__all__}
 SOURCES = [ModuleAnalyzer.for_module(n) for n in list(sys.modules) if n.startswith("gpadjust.")]

@@ -4,9 +4,10 @@ Read it in this order: ``unknowns``, ``kernels``, ``terms``, ``noise``, ``gaussi
 ``fitting``, ``model``, ``structures``.
 """
 
+from gpadjust.core.data import Data
 from gpadjust.core.fitting import FitResult, SamplingWarning, fit
 from gpadjust.core.functions import Functions
-from gpadjust.core.gaussian import Prediction
+from gpadjust.core.gaussian import Marginals, Prediction
 from gpadjust.core.kernels import (
     MATERN12,
     MATERN32,
@@ -18,7 +19,7 @@ from gpadjust.core.kernels import (
     Profile,
     Stationary,
 )
-from gpadjust.core.model import GP
+from gpadjust.core.model import GP, Predictive
 from gpadjust.core.noise import KnownNoise, Noise
 from gpadjust.core.posterior import MixturePosterior
 from gpadjust.core.saving import load, save
@@ -36,7 +37,8 @@ from gpadjust.core.unknowns import Choice, LogNormal, Row
 
 __all__ = [
     "CKA", "GP", "MATERN12", "MATERN32", "MATERN52", "RBF", "RRA", "CalibratedPhysics", "Choice",
-    "FitResult", "Fourier", "Functions", "Kernel", "KnownNoise", "LogNormal", "MixturePosterior",
-    "Noise", "OfGPyTorch", "PhysicsMeanGP", "Prediction", "Profile", "Row", "SamplingWarning",
-    "ScaleGP", "StackedGP", "Stationary", "Term", "ZeroMeanGP", "fit", "load", "save",
+    "Data", "FitResult", "Fourier", "Functions", "Kernel", "KnownNoise", "LogNormal", "Marginals",
+    "MixturePosterior", "Noise", "OfGPyTorch", "PhysicsMeanGP", "Prediction", "Predictive",
+    "Profile", "Row", "SamplingWarning", "ScaleGP", "StackedGP", "Stationary", "Term",
+    "ZeroMeanGP", "fit", "load", "save",
 ]  # fmt: skip

@@ -24,7 +24,7 @@ def pyro_model(
 
     Its sample sites are ``"weights"``, ``m x p``, and ``"Y"``, ``m x n``. Lengthscales, variances
     and unknown parameters of the physics are those of a draw of the model. The posterior of the
-    weights is normal, ``Weights.of_model(model)`` of :mod:`gpadjust.kinds.updates`.
+    weights is normal, ``Weights.of_model(model)`` of ``gpadjust.kinds.updates``.
 
     Args:
         model: An :class:`~gpadjust.core.RRA`, or another model whose kernels are ``Fourier``.

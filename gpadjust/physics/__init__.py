@@ -6,6 +6,7 @@ from gpadjust.physics.error import PhysicsError
 from gpadjust.physics.formula import FormulaPhysics
 from gpadjust.physics.function import FunctionPhysics, JoinedPhysics, as_physics
 from gpadjust.physics.ode import ODEPhysics
+from gpadjust.physics.parameters import PhysicsParameters
 from gpadjust.physics.subprocess_physics import SubprocessPhysics
 from gpadjust.physics.unknown import ParameterValues, Unknown
 from gpadjust.physics.warning import PhysicsWarning
@@ -19,6 +20,7 @@ __all__ = [
     "ParameterValues",
     "Physics",
     "PhysicsError",
+    "PhysicsParameters",
     "PhysicsWarning",
     "SubprocessPhysics",
     "Unknown",

@@ -119,7 +119,7 @@ def test_the_ends_of_the_interval_are_draws_at_any_level():
 @pytest.mark.slow
 def test_one_step_is_that_of_the_predictions(cart_pole_system, make):
     system = cart_pole_system
-    dynamics = make("CKA", system.spec, system.crude)
+    dynamics = make("CKA", system.spec, system.crude, fit_options=None)
     dynamics.update(*system.trial(0))
     states, actions, following = system.trial(1)
     one = dynamics.score(states, actions, following)

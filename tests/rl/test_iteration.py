@@ -222,13 +222,8 @@ def test_a_trivial_task_is_improved(point_agent, algorithm):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:The draws of")  # there are 16
 def test_cart_pole(cart_pole):
-    dynamics = LearnedDynamics(
-        CART_POLE_SPEC,
-        swing_up(0).physics,
-        fit_options={"num_draws": 8},
-    )
+    dynamics = LearnedDynamics(CART_POLE_SPEC, swing_up(0).physics)
     agent = DynaSAC(
         "MlpPolicy",
         cart_pole(),
