@@ -22,6 +22,7 @@ from gpadjust.core.sample import (
     maximise,
     sample,
 )
+from gpadjust.core.threads import threads_for
 from gpadjust.core.unknowns import standard_normal
 
 if TYPE_CHECKING:
@@ -122,8 +123,23 @@ def fit(
     if model.data.Y.dim() > 2:
         batch = tuple(model.batch_shape)
         raise ValueError(f"Expected a model of one data set; found fantasies, a batch {batch}.")
-    if (itself := model.fit_itself(method, num_draws, seed)) is not None:
-        return itself
+    with threads_for(len(model.data.Y)):
+        result: FitResult | None = model.fit_itself(method, num_draws, seed)
+        if result is None:
+            result = _fitted(model, method, num_draws, seed)
+    if not result.converged:
+        warnings.warn(
+            f"Predictions depend on the seed: another one would move them by {result.error:.2f} of "
+            "their standard deviation. Draw more: "
+            f"fit(model, num_draws={4 * len(model.draws)}).",
+            SamplingWarning,
+            stacklevel=2,
+        )
+    return result
+
+
+def _fitted(model: GP, method: str, num_draws: int | None, seed: int) -> FitResult:
+    """Let a model hold draws, or the most likely coordinates."""
     model.noise = model.noise.learnt(model, partial(_roughly_fitted, model, seed))
     if method == "map":
         model.set_draws(modes(model, 0, seed, is_precise=True)[:1])
@@ -136,18 +152,10 @@ def fit(
     error = _error(model, sampled, weights, number) * math.sqrt(number / kept)
     choices = zip(model.table.choices, shares.expand(-1, len(model.unit)).tolist(), strict=False)
     effective = min(float(draws.effective.min()) for draws in sampled.values())
-    result = FitResult(
+    return FitResult(
         method, _evidence(model, sampled), {choice.text: p for choice, p in choices},
         effective, error, len(model.u),
     )  # fmt: skip
-    if error > _MOVED:
-        warnings.warn(
-            f"Predictions depend on the seed: another one would move them by {error:.2f} of their "
-            f"standard deviation. Draw more: fit(model, num_draws={4 * number}).",
-            SamplingWarning,
-            stacklevel=2,
-        )
-    return result
 
 
 def _roughly_fitted(model: GP, seed: int, noise: Noise) -> GP:
