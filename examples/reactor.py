@@ -36,7 +36,7 @@ X = draw_sobol_samples(bounds, n=4, q=1, seed=0).squeeze(1)
 Y = measure(X)
 for _ in range(6):
     model = CKA(X, Y, physics=worth)
-    fit(model, "map")
+    fit(model)
     acquisition = qLogNoisyExpectedImprovement(model, X)
     new, _ = optimize_acqf(acquisition, bounds, q=1, num_restarts=4, raw_samples=64)
     X, Y = torch.cat([X, new]), torch.cat([Y, measure(new)])

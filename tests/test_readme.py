@@ -83,7 +83,7 @@ def test_the_examples_run(capsys, tmp_path, monkeypatch):
     assert (names["rho"].mean - 2).abs().max() < 0.5
     before = names["mean"]
     loaded = {}
-    with pytest.warns(UserWarning, match="other programs cannot import it"):
+    with pytest.warns(UserWarning, match="Other programs cannot import the physics"):
         exec(held, loaded)
     assert "noise: standard deviation" in capsys.readouterr().out
     assert (loaded["lower"] <= loaded["train_Y"]).all()
@@ -147,7 +147,7 @@ def test_measuring(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 # Few draws of parameters count, as there is no noise at all.
-@pytest.mark.filterwarnings("ignore:The draws of")
+@pytest.mark.filterwarnings("ignore::gpadjust.core.SamplingWarning")
 def test_the_log_of_a_pendulum_tells_its_parameters(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     law, data, log, hidden, one_call = blocks("docs/guide/records.md")

@@ -127,7 +127,7 @@ def fit(
         result: FitResult | None = model.fit_itself(method, num_draws, seed)
         if result is None:
             result = _fitted(model, method, num_draws, seed)
-    if not result.converged:
+    if result.error > _MOVED:
         warnings.warn(
             f"Predictions depend on the seed: another one would move them by {result.error:.2f} of "
             "their standard deviation. Draw more: "

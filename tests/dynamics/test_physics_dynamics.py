@@ -63,7 +63,6 @@ def test_states_that_are_not_as_declared_are_named():
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:The draws of")
 @pytest.mark.parametrize("learnt", [False, True])
 def test_a_physics_of_differences_is_warned_of(learnt):
     def change(X):

@@ -188,7 +188,6 @@ def test_td3_goes_on(point_agent, point_env, point_task, assert_same, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:The draws of")
 @pytest.mark.parametrize("sampling", ["step", "trajectory"])
 def test_cart_pole_of_co_kriging(sampling, cart_pole, assert_same, tmp_path):
     path = tmp_path / "run.ckpt"
