@@ -14,16 +14,16 @@ from threadpoolctl import ThreadpoolController
 _limiting = Lock()  # held by the thread that limits those of other libraries
 _setting = Lock()  # held by the thread that sets PyTorch's number of threads
 _controller = cache(ThreadpoolController)  # it lists the process's libraries, once
-_SMALL = 600  # points of a covariance, up to which a second thread costs more than it brings
+_SMALL = 600  # points of a covariance, up to which two threads took longer than one
 
 
 @contextmanager
 def threads_for(num_points: int) -> Iterator[None]:
     """Compute a small problem with one thread; the user's settings hold again after.
 
-    On a busy machine, threads that wait for each other at every small product can make a fit take a
-    hundred times as long. PyTorch is limited in the calling thread alone, NumPy's and SciPy's
-    libraries in the process, by the first thread that asks; in about 0.2 ms.
+    Threads that wait for each other at every small product make a fit take longer, most of all on a
+    busy machine. PyTorch is limited in the calling thread alone, NumPy's and SciPy's libraries in
+    the process, by the first thread that asks.
 
     Example:
         >>> with threads_for(12):
