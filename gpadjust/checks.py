@@ -105,7 +105,7 @@ def check_kind(name: str, value: Any, kind: Any, expected: str) -> None:
         raise TypeError(f"{name} must be {expected}; found {value!r}.")
 
 
-def check_choice(name: str, value: Any, known: Sequence[str]) -> None:
+def check_choice(name: str, value: Any, known: Sequence[Any]) -> None:
     """Raise a ValueError unless an option is one of these words."""
     if value not in known:
         raise ValueError(f"Unknown {name} {value!r}; use {' or '.join(map(repr, known))}.")

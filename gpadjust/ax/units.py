@@ -28,8 +28,7 @@ from ax.adapter.transforms.winsorize import Winsorize
 from torch import Tensor
 
 from gpadjust.ax.parameter_physics import ParameterPhysics
-from gpadjust.physics import Physics, PhysicsError
-from gpadjust.physics.unknown import ParameterValues
+from gpadjust.physics import ParameterValues, Physics, PhysicsError
 
 Columns = dict[str, Tensor]
 Step = Callable[[Columns], None]

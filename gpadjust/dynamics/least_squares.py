@@ -51,7 +51,7 @@ def most_likely(
     freedom = whole.count.sum() / (whole.count.sum() - len(unknowns)).clamp_min(1)
     noise = torch.zeros(spec.state_dim, dtype=torch.float64)
     noise[spec.moving] = errors.square().sum(-1) / whole.count.clamp_min(1) * freedom
-    _warn_of_parameters(unknowns.names, precision, point)
+    _warn_of_parameters(tuple(unknowns), precision, point)
     return point, precision, noise
 
 

@@ -178,12 +178,12 @@ def varying_parameters(
         TypeError: If ``variation`` is no number or numbers.
         ValueError: If it is not one of 0 or more, or one for each parameter.
     """
-    unknowns, moving, p = physics.unknowns, spec.moving, len(physics.unknowns.names)
+    unknowns, moving, p = physics.unknowns, spec.moving, len(physics.unknowns)
     sd = checked_tensor("variation", variation)
     if sd.shape not in ((), (p,)) or not (sd.isfinite() & (sd >= 0)).all():
         raise ValueError(
             f"Expected variation as one number of 0 or more, or one for each of "
-            f"{', '.join(unknowns.names)}, got {sd.tolist()}."
+            f"{', '.join(unknowns)}, got {sd.tolist()}."
         )
     sd = sd.expand(p)
     center = unknowns.coordinates(learnt.draws).clamp(-_END, _END).mean(0)

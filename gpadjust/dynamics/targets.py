@@ -13,7 +13,7 @@ from torch import Tensor
 from gpadjust.checks import check_choice, checked_number
 from gpadjust.dynamics.trajectories import Trajectories
 from gpadjust.physics import ODEPhysics, ParameterValues, Physics, PhysicsError, as_physics
-from gpadjust.physics.memo import RowMemo, row_keys
+from gpadjust.physics.black_box import RowMemo, row_keys
 from gpadjust.states import StateSpec
 from gpadjust.states.state_spec import side_by_side
 

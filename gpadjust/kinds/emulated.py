@@ -15,8 +15,7 @@ from gpadjust.core import MATERN52, RBF, Stationary, ZeroMeanGP, fit
 from gpadjust.core.model import GP
 from gpadjust.core.terms import WeightedSum
 from gpadjust.core.unknowns import standard_normal
-from gpadjust.physics import Physics, Unknown
-from gpadjust.physics.unknown import ParameterValues
+from gpadjust.physics import ParameterValues, Physics, Unknown
 
 _PLACES = 128  # at which errors are told apart
 

@@ -2,20 +2,18 @@
 
 from gpadjust.physics.base import Physics
 from gpadjust.physics.black_box import BlackBoxPhysics
-from gpadjust.physics.error import PhysicsError
+from gpadjust.physics.error import PhysicsError, PhysicsWarning
 from gpadjust.physics.formula import FormulaPhysics
-from gpadjust.physics.function import FunctionPhysics, JoinedPhysics, as_physics
+from gpadjust.physics.function import FunctionPhysics, as_physics
 from gpadjust.physics.ode import ODEPhysics
-from gpadjust.physics.parameters import PhysicsParameters
+from gpadjust.physics.parameters import ParameterValues, PhysicsParameters
 from gpadjust.physics.subprocess_physics import SubprocessPhysics
-from gpadjust.physics.unknown import ParameterValues, Unknown
-from gpadjust.physics.warning import PhysicsWarning
+from gpadjust.physics.unknown import Unknown
 
 __all__ = [
     "BlackBoxPhysics",
     "FormulaPhysics",
     "FunctionPhysics",
-    "JoinedPhysics",
     "ODEPhysics",
     "ParameterValues",
     "Physics",

@@ -9,21 +9,28 @@ from copy import deepcopy
 from operator import index
 from typing import Any, Self
 
+import numpy as np
 import torch
-from torch import Size, Tensor
+from torch import Tensor
+from torch.nn.functional import pad
 
 from gpadjust.physics.error import PhysicsError, described
-from gpadjust.physics.gradient import central_difference
-from gpadjust.physics.unknown import ParameterValues, Unknown, Unknowns
+from gpadjust.physics.parameters import ParameterValues
+from gpadjust.physics.unknown import Unknown, Unknowns
 
-_NONE = Unknowns(None)
+# By a part of an error's message, the way out.
+_HINTS = {
+    "positional argument": " It is called with rows N x d and, if it has unknown parameters, named "
+    "as unknowns={'mass': Unknown(...)}, with their values p, such as p.mass, one for each row.",
+    "Can't call numpy()": " Wrap NumPy code as BlackBoxPhysics(function).",
+}
 
 
 class Physics(torch.nn.Module, ABC):
     r"""The crude model :math:`f_p : \mathbb{R}^d \to \mathbb{R}^m` of a system.
 
-    A subclass says in ``evaluate`` what the outputs of some rows are; calling the physics adds
-    batch shapes, the choice of columns, and checks. It must be deterministic.
+    A subclass computes the outputs of some rows in ``evaluate``; calling the physics adds batch
+    shapes, the choice of columns, and checks. It must be deterministic.
 
     A model learns the ``unknowns`` by :func:`gpadjust.fit`; other fits leave them at the guesses. A
     deep copy of a physics without parameters and buffers is the physics itself, so that a
@@ -38,11 +45,9 @@ class Physics(torch.nn.Module, ABC):
     Attributes:
         num_outputs: ``m``; None until the first call if it is not known before.
         unknowns: The unknown parameters, ``p`` of them.
-        is_emulated: Whether its outputs are estimates, whose errors have a kernel
-            (``error_kernel``), as of :class:`~gpadjust.EmulatedPhysics`.
 
     Raises:
-        TypeError: If ``inputs`` are no whole numbers.
+        TypeError: If ``inputs`` are not whole numbers.
         ValueError: If ``inputs`` is empty.
 
     Example:
@@ -55,8 +60,6 @@ class Physics(torch.nn.Module, ABC):
                 [-2.0000]])
     """
 
-    is_emulated = False
-
     def __init__(
         self,
         *,
@@ -65,26 +68,22 @@ class Physics(torch.nn.Module, ABC):
         name: str | None = None,
     ) -> None:
         super().__init__()
-        self.unknowns = _NONE if unknowns is None else Unknowns(unknowns)
-        self._p = len(unknowns or ())
-        self.inputs: tuple[int, ...] | None = None
-        if inputs is not None:
-            try:
-                self.inputs = tuple(map(index, inputs))
-            except TypeError:
-                raise TypeError(
-                    "inputs must be a sequence of column numbers, such as [0, 2]; found "
-                    f"{inputs!r}."
-                ) from None
-            if not self.inputs:
-                raise ValueError("inputs is empty; name at least one column of X, or None for all.")
+        self.unknowns = Unknowns(unknowns)
         self.name = type(self).__name__ if name is None else name
         self.num_outputs: int | None = None
-        self._warned: set[str] = set()
+        self._has_warned = False
+        try:
+            self.inputs = None if inputs is None else tuple(map(index, inputs))
+        except TypeError:
+            raise TypeError(
+                f"inputs must be a sequence of column numbers, such as [0, 2]; found {inputs!r}."
+            ) from None
+        if self.inputs == ():
+            raise ValueError("inputs is empty; name at least one column of X, or None for all.")
 
     @abstractmethod
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """The outputs of some rows, without checks.
+        """Return the outputs of some rows, without checks.
 
         Args:
             X: ``N x d``, the columns ``inputs`` only, ``N >= 1``.
@@ -96,7 +95,7 @@ class Physics(torch.nn.Module, ABC):
         """
 
     def forward(self, X: Tensor, parameters: Tensor | None = None) -> Tensor:
-        """The outputs of the physics.
+        """Return the outputs of the physics.
 
         Args:
             X: ``batch_shape x n x d``, floating point.
@@ -112,52 +111,105 @@ class Physics(torch.nn.Module, ABC):
             ValueError: If X lacks a dimension or column, or parameters are of another shape.
             PhysicsError: If the physics fails, or returns something else than finite outputs.
         """
-        columns, shape = self.read(X), X.shape[:-1]
+        columns = self.read(X)
         # Of the copies of an expanded leaf, each has a gradient of its own.
         for dim in range(0 if X.requires_grad and X.is_leaf else X.dim() - 1):
-            if shape[dim] > 1 and X.stride(dim) == 0:
-                columns = columns.narrow(dim, 0, 1)
-        if self._p or parameters is not None:
-            values = self._checked_parameters(parameters, X)
-            shape = Size((*torch.broadcast_shapes(X.shape[:-2], values.shape[:-1]), X.shape[-2]))
-            columns = _beside(columns, values)
-        rows = columns.reshape(-1, columns.shape[-1])
+            if X.stride(dim) == 0:
+                columns = columns.narrow(dim, 0, min(1, X.shape[dim]))
+        if self.unknowns or parameters is not None:
+            columns = self._with_parameters(columns, parameters)
+        shape = np.broadcast_shapes(X.shape[:-1], columns.shape[:-1])
+        rows = columns.flatten(0, -2)
         try:
             Y = self.of_rows(rows)
         except PhysicsError as error:
-            if error.inputs is None:
-                numbers = torch.arange(len(rows)).reshape(columns.shape[:-1])
-                origin = numbers.expand(shape).flatten()
-                error.relocate(origin)
-                error.inputs = rows.detach()[origin[list(error.rows)]]
+            if error.inputs is None:  # those of a physics that is called by this one are set
+                number = torch.arange(len(rows)).reshape(columns.shape[:-1]).expand(shape).flatten()
+                failed = {*error.rows}
+                error.rows = tuple(i for i, row in enumerate(number.tolist()) if row in failed)
+                error.inputs = rows.detach()[number[[*error.rows]]]
             raise
-        m = Y.shape[-1]
-        return Y.reshape(*columns.shape[:-1], m).expand(*shape, m)
+        is_cut = rows.requires_grad and torch.is_grad_enabled() and not Y.requires_grad
+        if is_cut and len(Y) and not self._has_warned:
+            self._has_warned = True
+            warnings.warn(
+                f"No gradient flows through physics {self.name!r}: X requires grad, its outputs do "
+                "not. Use BlackBoxPhysics(function, gradient='finite-difference'), or optimise "
+                "acquisition functions with optimize_acqf(..., options={'with_grad': False}); "
+                "ignore this if the outputs do not depend on X.",
+                UserWarning,
+                stacklevel=2,
+            )
+        return Y.reshape(*columns.shape[:-1], Y.shape[-1]).expand(*shape, -1)
 
     def or_nan(self, X: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Return the outputs without gradient, NaN in rows at which the physics fails.
 
+        Args:
+            X: ``batch_shape x n x d``, floating point.
+            parameters: As of :meth:`forward`.
+
         Raises:
-            PhysicsError: If it does not say where it fails, or fails everywhere before its number
-                of outputs is known.
+            PhysicsError: If it does not contain the rows that failed, or if all do before the
+                number of outputs is known.
         """
         with torch.no_grad():
-            columns = _beside(self.read(X), self._checked_parameters(parameters, X))
-            blocks = columns.reshape(1, -1, columns.shape[-1])
-            found = [self._where_it_works(blocks[0])]
-            if isinstance(found[0], PhysicsError):
-                # A function of all rows may raise an error for what some parameters do to it.
+            columns = self._with_parameters(self.read(X), parameters)
+            blocks = columns.flatten(0, -2).unsqueeze(0)
+            results = [self._where_it_works(blocks[0])]
+            if isinstance(results[0], PhysicsError):
+                # A function of all rows may raise an error because of some parameters.
                 blocks = columns.reshape(-1, *columns.shape[-2:])
-                found = [self._where_it_works(block) for block in blocks]
-            errors = [Y for Y in found if isinstance(Y, PhysicsError)]
+                results = [self._where_it_works(block) for block in blocks]
             if self.num_outputs is None:
-                raise errors[0]
+                raise next(each for each in results if isinstance(each, PhysicsError))
             failed = columns.new_full((blocks.shape[1], self.num_outputs), torch.nan)
-            values = [failed if isinstance(Y, PhysicsError) else Y for Y in found]
-        return torch.cat(values).reshape(*columns.shape[:-1], self.num_outputs)
+            Y = torch.cat([failed if isinstance(each, PhysicsError) else each for each in results])
+            Y = Y.where(Y.isfinite().all(-1, keepdim=True), torch.nan)
+        return Y.reshape(*columns.shape[:-1], self.num_outputs)
+
+    def jacobian(self, rows: Tensor, step: float | None = None) -> Tensor:
+        r"""Return the Jacobian by central differences in X, in one call of the physics.
+
+        .. math:: \frac{\partial f_k}{\partial x_j} \approx
+            \frac{f_k(x + h_j e_j) - f_k(x - h_j e_j)}{2 h_j}
+
+        Args:
+            rows: ``N x (d + p)``, columns of X and parameters.
+            step: :math:`h`, in the columns' units. Default:
+                :math:`\epsilon^{1/3} \max(1, |x|)`.
+
+        Returns:
+            ``N x m x (d + p)``, zero by the parameters.
+
+        Raises:
+            PhysicsError: If the physics fails; it names the rows around which it does.
+        """
+        p = len(self.unknowns)
+        X = rows[:, : rows.shape[1] - p]
+        n, d = X.shape
+        h = torch.finfo(X.dtype).eps ** (1 / 3) * X.abs().clamp(min=1.0)
+        h = h if step is None else torch.full_like(X, step)
+        moves = pad(torch.diag_embed(h), (0, p))
+        sides = torch.stack([rows.unsqueeze(1) + moves, rows.unsqueeze(1) - moves])  # 2 x n x d x .
+        try:
+            Y = self.fresh_rows(sides.flatten(0, 2))
+        except PhysicsError as error:
+            if error.inputs is None:
+                error.rows = tuple(sorted({i // d % n for i in error.rows}))
+                error.inputs = rows[[*error.rows]]
+            error.add_note(
+                "This was in the finite differences around these rows. Make their step smaller, or "
+                "choose another gradient."
+            )
+            raise
+        upper, lower = Y.unflatten(0, sides.shape[:3])
+        # The distance that rounding left, not 2 h.
+        width = (sides[0] - sides[1]).diagonal(dim1=-2, dim2=-1)
+        return pad(((upper - lower) / width.unsqueeze(-1)).mT, (0, p))
 
     def read(self, X: Tensor) -> Tensor:
-        """The columns of ``X`` (``... x n x d``) that the physics reads, checked."""
+        """Return the columns of ``X`` (``... x n x d``) that the physics reads, checked."""
         if not torch.is_tensor(X) or not X.is_floating_point():
             found = X.dtype if torch.is_tensor(X) else type(X).__name__
             raise TypeError(
@@ -176,8 +228,7 @@ class Physics(torch.nn.Module, ABC):
         if absent:
             raise ValueError(
                 f"Physics {self.name!r} reads the columns inputs={self.inputs}, but X of shape "
-                f"{tuple(X.shape)} has {d} column(s), no column {absent}. Pass all, or correct "
-                "inputs."
+                f"{tuple(X.shape)} has no column {absent}. Pass all, or correct inputs."
             )
         return X[..., list(self.inputs)]
 
@@ -185,88 +236,63 @@ class Physics(torch.nn.Module, ABC):
         """Raise a ValueError if the physics names its columns, and data have them otherwise."""
 
     def read_rows(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """Rows for :meth:`of_rows`, of rows ``N x d`` and parameters of several physics."""
+        """Return rows for :meth:`of_rows`, of rows ``N x d`` and parameters, others' too."""
         own = [parameters[0][name].unsqueeze(-1) for name in self.unknowns]
         return torch.cat([self.read(X), *own], dim=-1)
 
-    def in_user_units(self, values: Tensor) -> Tensor:
-        """Values of this physics, or targets beside them, in the units that the user knows."""
-        return values
-
     def of_rows(self, rows: Tensor) -> Tensor:
-        """The outputs ``N x m`` of rows ``N x (d + p)``, the columns it reads and its parameters.
+        """Return the outputs ``N x m`` of rows ``N x (d + p)``: columns and parameters.
 
-        They have a graph as far as the rows or the parameters of the module ask for one. The rows
-        that an error names are these.
+        The rows that an error names are these. Subclasses with a memory use it here.
         """
-        if len(rows) == 0:
-            if self.num_outputs is None:
-                raise PhysicsError(
-                    f"Physics {self.name!r} was given no rows before its number of outputs was "
-                    "known; call it on at least one row first."
-                )
-            return rows.new_empty(0, self.num_outputs)
-        Y = Physics.fresh_rows(self, rows)  # not a subclass's, which may leave evaluate out
-        if not torch.is_grad_enabled():
-            return Y
-        if rows.requires_grad and not Y.requires_grad:
-            self._warn_once(
-                f"No gradient flows through physics {self.name!r}: X requires grad, its outputs "
-                "do not. Wrap the function as BlackBoxPhysics(function) for finite differences; "
-                "ignore this if the outputs do not depend on X."
+        if len(rows):
+            return Physics.fresh_rows(self, rows)  # not a subclass's, which may skip evaluate
+        if self.num_outputs is None:
+            raise PhysicsError(
+                f"Physics {self.name!r} was given no rows before its number of outputs was known; "
+                "call it on at least one row first."
             )
-        learns = any(p.requires_grad for p in self.parameters())
-        if learns or not Y.requires_grad or rows.requires_grad:
-            return Y
-        self._warn_once(
-            f"Physics {self.name!r} depends on a tensor that requires grad but is not one of "
-            "its parameters; it is taken as a constant. To learn it, make it a parameter of a "
-            "torch.nn.Module and pass that module; else call requires_grad_(False) on it."
-        )
-        return Y.detach()
+        return rows.new_empty(0, self.num_outputs)
 
     def fresh_rows(self, rows: Tensor) -> Tensor:
         """Return :meth:`of_rows` without the memory, checked, in the dtype of the rows."""
+        n = len(rows)
         try:
-            Y = self.evaluate(*(self._arguments(rows) if self._p else (rows,)))
+            Y = self.evaluate(*(self._arguments(rows) if self.unknowns else (rows,)))
         except PhysicsError as error:
             if error.partial is not None:
-                error.partial = self._shaped(error.partial, len(rows)).to(rows)
+                error.partial = self._shaped(error.partial, n).to(rows)
             raise
         except Exception as error:
+            hint = "".join(hint for part, hint in _HINTS.items() if part in str(error))
             raise PhysicsError(
-                f"Physics {self.name!r} raised {described(error)}."
-                f"{self._arguments_hint(error)} The call was for {len(rows)} row(s):",
-                range(len(rows)),
+                f"Physics {self.name!r} raised {described(error)}.{hint} The call was for {n} "
+                "row(s):",
+                range(n),
             ) from error
-        Y = self._shaped(Y, len(rows)).to(rows)
+        Y = self._shaped(Y, n).to(rows)
         # A finite sum has finite terms only, and is the faster look.
         if not Y.detach().sum().isfinite():
             bad = (~Y.isfinite().all(-1)).nonzero().flatten().tolist()
             if bad:
                 raise PhysicsError(
-                    f"Physics {self.name!r} returned NaN or inf in {len(bad)} of {len(rows)} "
-                    "row(s), expected finite numbers. Correct it, or exclude such inputs:",
+                    f"Physics {self.name!r} returned NaN or inf in {len(bad)} of {n} row(s), "
+                    "expected finite numbers. Correct it, or exclude such inputs:",
                     bad,
                     partial=Y.detach(),
                 )
         return Y
 
-    def _arguments(self, rows: Tensor) -> tuple[Tensor, *tuple[ParameterValues, ...]]:
-        """The arguments of :meth:`evaluate`, of rows ``N x (d + p)``."""
-        d = rows.shape[-1] - self._p
-        return (rows[:, :d], self.unknowns.named(rows[:, d:])) if self._p else (rows,)
-
     def forget(self) -> None:
         """Empty the memory of evaluated rows, if there is one."""
 
     def extra_repr(self) -> str:
-        """The settings that ``repr`` shows."""
-        told = f"name={self.name!r}, inputs={self.inputs}, num_outputs={self.num_outputs}"
-        return f"{told}, unknowns={dict(self.unknowns)!r}" if self.unknowns else told
+        """Return the settings that ``repr`` shows."""
+        text = f"name={self.name!r}, inputs={self.inputs}, num_outputs={self.num_outputs}"
+        return f"{text}, unknowns={dict(self.unknowns)!r}" if self.unknowns else text
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        """The physics itself if it has no parameters and buffers, else a copy."""
+        """Return the physics itself if it has no parameters and buffers, else a copy."""
         if not [*self.parameters(), *self.buffers()]:
             return self
         copy = type(self).__new__(type(self))
@@ -274,79 +300,57 @@ class Physics(torch.nn.Module, ABC):
         copy.__dict__.update(deepcopy(self.__dict__, memo))
         return copy
 
-    def _checked_parameters(self, parameters: Tensor | None, X: Tensor) -> Tensor:
-        names = self.unknowns.names
-        if parameters is None:
-            return self.unknowns.guess.to(X)
-        if not torch.is_tensor(parameters) or parameters.shape[-1:] != (len(names),) or not names:
-            found = tuple(parameters.shape) if torch.is_tensor(parameters) else repr(parameters)
+    def _arguments(self, rows: Tensor) -> tuple[Tensor, *tuple[ParameterValues, ...]]:
+        """Return the arguments of :meth:`evaluate`, of rows ``N x (d + p)``."""
+        d = rows.shape[-1] - len(self.unknowns)
+        values = ParameterValues(self.unknowns, rows[:, d:])
+        return (rows[:, :d], values) if self.unknowns else (rows,)
+
+    def _with_parameters(self, columns: Tensor, parameters: Tensor | None) -> Tensor:
+        """Return ``... x n x (d + p)``, with parameters ``... x p`` at the end of each row."""
+        p = len(self.unknowns)
+        values = self.unknowns.guess if parameters is None else parameters
+        if not torch.is_tensor(values) or values.shape[-1:] != (p,) or (not p and values.numel()):
+            found = tuple(values.shape) if torch.is_tensor(values) else repr(values)
             raise ValueError(
-                f"Physics {self.name!r} has {len(names)} unknown parameter(s)"
-                f"{': ' * bool(names)}{', '.join(names)}; expected parameters of shape ... x "
-                f"{len(names)}, found {found}."
+                f"Physics {self.name!r} has {p} unknown parameter(s) {', '.join(self.unknowns)}; "
+                f"expected parameters of shape ... x {p}, found {found}."
             )
-        return parameters.to(X)
+        batch = np.broadcast_shapes(columns.shape[:-2], values.shape[:-1])
+        columns = columns.expand(*batch, *columns.shape[-2:])
+        values = values.to(columns).unsqueeze(-2).expand(*columns.shape[:-1], p)
+        return torch.cat([columns, values], dim=-1)
 
     def _where_it_works(self, rows: Tensor) -> Tensor | PhysicsError:
-        """Return ``N x m`` outputs, NaN where the physics fails, or its error if all rows fail."""
-        working = torch.ones(len(rows), dtype=torch.bool, device=rows.device)
-        while True:
-            try:
-                Y = self.fresh_rows(rows[working])
-            except PhysicsError as error:
-                if error.partial is None:
-                    if not error.rows:
-                        raise
-                    working[working.nonzero().flatten()[list(error.rows)]] = False
-                    if not working.any():
-                        return error
-                    continue
-                Y = error.partial
-            values = Y.new_full((len(rows), Y.shape[-1]), torch.nan)
-            values[working] = Y.where(Y.isfinite().all(-1, keepdim=True), torch.nan)
-            return values
-
-    def jacobian(
-        self, rows: Tensor, step: Tensor | None = None, with_values: bool = False
-    ) -> tuple[Tensor, Tensor]:
-        """Outputs and their Jacobian by differences in X, zero for parameters, in a single call.
-
-        Returns:
-            ``N x m``, or nothing (``0 x m``) if values are not asked for, and ``N x m x (d + p)``.
-        """
-        d, also, kept = rows.shape[1] - self._p, rows if with_values else rows[:0], []
-        parameters = rows[:, d:].repeat_interleave(d, dim=0).repeat(2, 1)
-
-        def moved(X: Tensor) -> Tensor:
-            Y = self.fresh_rows(torch.cat([also, torch.cat([X, parameters], dim=-1)]))
-            kept.append(Y[: len(also)])
-            return Y[len(also) :]
-
-        slope = central_difference(moved, rows[:, :d], step)
-        return kept[0], torch.nn.functional.pad(slope, (0, self._p))
-
-    def _arguments_hint(self, error: Exception) -> str:
-        """Return a hint for a function that was called with a wrong number of arguments."""
-        if not isinstance(error, TypeError) or "positional argument" not in str(error):
-            return ""
-        if self._p:
-            return (
-                " The values of its unknown parameters, p, are its last argument: p."
-                f"{self.unknowns.names[0]} is one for each row."
-            )
-        return " Parameters that are to be learnt are named as unknowns={'mass': Unknown(...)}."
+        """Return ``N x m`` outputs, not finite where the physics fails, or an error of all rows."""
+        try:
+            return self.fresh_rows(rows)
+        except PhysicsError as error:
+            if error.partial is not None:
+                return error.partial
+            if not error.rows:
+                raise
+            works = torch.ones(len(rows), dtype=torch.bool, device=rows.device)
+            works[[*error.rows]] = False
+            results = self._where_it_works(rows[works]) if works.any() else error
+        if isinstance(results, PhysicsError):
+            return results
+        Y = results.new_full((len(rows), results.shape[1]), torch.nan)
+        Y[works] = results
+        return Y
 
     def _shaped(self, Y: Tensor, n: int) -> Tensor:
-        """Outputs as ``n x m``, if they are that or ``n``."""
-        expected = f"a real tensor of shape ({n}, m) or ({n},), one row per row of X"
-        if not torch.is_tensor(Y) or Y.is_complex():
-            found = Y.dtype if torch.is_tensor(Y) else type(Y).__name__
-            raise PhysicsError(f"Physics {self.name!r} returned {found}, expected {expected}.")
-        if Y.dim() not in (1, 2) or len(Y) != n or Y.shape[-1] == 0:
+        """Return outputs as ``n x m``; a PhysicsError unless they are that or ``n``."""
+        is_real = torch.is_tensor(Y) and not Y.is_complex()
+        if not is_real or Y.dim() not in (1, 2) or len(Y) != n or Y.shape[-1] == 0:
+            found: object = type(Y).__name__
+            if torch.is_tensor(Y):
+                found = f"shape {tuple(Y.shape)}" if is_real else Y.dtype
             raise PhysicsError(
-                f"Physics {self.name!r} returned shape {tuple(Y.shape)}, expected {expected}. For "
-                "a constant return X.new_full((X.shape[0],), value); for a function of a single "
-                "row take BlackBoxPhysics(function, batched=False)."
+                f"Physics {self.name!r} returned {found}, expected a real tensor of shape ({n}, m) "
+                f"or ({n},), one row per row of X. For a constant return X.new_full((len(X),), "
+                "value); for NumPy code take BlackBoxPhysics(function), for a function of a single "
+                "row BlackBoxPhysics(function, batched=False)."
             )
         Y = Y.unsqueeze(-1) if Y.dim() == 1 else Y
         if self.num_outputs is None:
@@ -358,15 +362,9 @@ class Physics(torch.nn.Module, ABC):
             )
         return Y
 
-    def _warn_once(self, message: str) -> None:
-        if message not in self._warned:
-            self._warned.add(message)
-            warnings.warn(message, UserWarning, stacklevel=2)
 
-
-def _beside(columns: Tensor, values: Tensor) -> Tensor:
-    """Rows ``... x n x d`` and, at the end of each, values ``... x p``."""
-    batch = torch.broadcast_shapes(columns.shape[:-2], values.shape[:-1])
-    rows = columns.expand(*batch, *columns.shape[-2:])
-    values = values.unsqueeze(-2).expand(*rows.shape[:-1], values.shape[-1])
-    return torch.cat([rows, values], dim=-1)
+def name_of(function: Any, name: str | None, argument: str = "function") -> str:
+    """Return a name, by default a function's; a TypeError unless the function is callable."""
+    if not callable(function):
+        raise TypeError(f"{argument} must be callable; found {type(function).__name__}.")
+    return name or str(getattr(function, "__name__", type(function).__name__))

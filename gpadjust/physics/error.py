@@ -1,10 +1,9 @@
-"""The error of a physics that cannot be evaluated."""
+"""The error of a physics that cannot be evaluated, and the warning of one that is obviously off."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
-import torch
 from torch import Tensor
 
 _SHOWN = 5
@@ -17,8 +16,7 @@ class PhysicsError(RuntimeError):
     Args:
         message: What was found, what was expected, and the way out.
         rows: The failing rows, as indices into the rows that were asked for.
-        partial: ``N x m`` outputs when only some rows failed, not finite in those; the others are
-            remembered.
+        partial: ``N x m`` outputs when only some rows failed, NaN in those.
 
     Attributes:
         rows: Indices of the failing rows, counted over the flattened leading dimensions of X;
@@ -27,10 +25,7 @@ class PhysicsError(RuntimeError):
             has any; or None if unknown.
 
     Example:
-        >>> error = PhysicsError("physics 'pendulum' returned NaN.", rows=[7])
-        >>> error.rows
-        (7,)
-        >>> print(error)
+        >>> print(PhysicsError("physics 'pendulum' returned NaN.", rows=[7]))
         physics 'pendulum' returned NaN.
           row 7
     """
@@ -43,11 +38,6 @@ class PhysicsError(RuntimeError):
         self.inputs: Tensor | None = None
         self.partial = partial
 
-    def relocate(self, origin: Tensor) -> None:
-        """Restates ``rows`` as positions in a list whose entry ``i`` is row ``origin[i]`` or -1."""
-        failed = torch.isin(origin, torch.tensor(self.rows, dtype=origin.dtype))
-        self.rows = tuple(failed.nonzero().flatten().tolist())
-
     def __str__(self) -> str:
         lines = [str(self.args[0])]
         for position, row in enumerate(self.rows[:_SHOWN]):
@@ -58,9 +48,26 @@ class PhysicsError(RuntimeError):
         return "\n".join(lines)
 
 
+class PhysicsWarning(UserWarning):
+    """A physics is obviously off at the training inputs, and it shows why.
+
+    ``gpadjust.validation.compare``, the report and ``CKARegressor`` give it by at least five
+    observations of an output: a factor, as of other units; the opposite sign; an offset; inputs, or
+    targets, that were scaled beforehand, while f_p reads and returns raw units. A physics with
+    unknown parameters is not judged: its first values are guesses. A fit of unknown parameters of
+    dynamics warns where the transitions do not determine one.
+
+    Example:
+        >>> import pytest, torch
+        >>> from gpadjust.validation import compare
+        >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+        >>> with pytest.warns(PhysicsWarning, match="f_p is about 1,000 times too large"):
+        ...     table = compare(X, torch.sin(6 * X), physics=lambda X: 1000 * torch.sin(6 * X))
+    """
+
+
 def described(error: Exception) -> str:
-    """The type and message of an error, and the end of what a subprocess wrote to stderr."""
-    written = getattr(error, "stderr", None)
-    text = written.decode(errors="replace") if isinstance(written, bytes) else str(written or "")
-    said = f"; it wrote: {text.strip()[-_LONGEST:]}" if text.strip() else ""
-    return f"{type(error).__name__}: {str(error).rstrip('.')}{said}"
+    """Return the type and message of an error, and the end of a subprocess's stderr."""
+    written = str(getattr(error, "stderr", None) or "").strip()
+    tail = f"; it wrote: {written[-_LONGEST:]}" if written else ""
+    return f"{type(error).__name__}: {str(error).rstrip('.')}{tail}"

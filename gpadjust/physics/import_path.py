@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
+from dataclasses import asdict
 from importlib import import_module
 from operator import attrgetter
 from typing import Any
@@ -20,27 +21,29 @@ _FORMULA = "formula:"
 
 
 def import_path(physics: Physics | Callable[[Tensor], Tensor]) -> str | None:
-    """The path of a physics, for ``physics_from_path``.
+    """Return the path of a physics, for ``physics_from_path``.
 
     A ``FunctionPhysics`` without a path of its own has that of its function if it was made of this
     alone. Objects have a path if they are attributes of the module of their class or callables.
 
     Returns:
-        ``"package.module:qualname"``; of a ``FormulaPhysics`` ``"formula:"`` and what it was made
-        of; None for what has no name in a module, as lambdas and functions inside of functions. A
-        path in ``__main__`` holds for the same script only.
+        ``"package.module:qualname"``; of a ``FormulaPhysics`` ``"formula:"`` and its arguments;
+        None for what has no name in a module, as lambdas and functions inside of functions. A path
+        in ``__main__`` is valid for the same script only.
 
     Example:
         >>> import_path(physics_from_path), import_path(lambda X: X)
         ('gpadjust.physics.import_path:physics_from_path', None)
     """
     if type(physics) is FormulaPhysics:
-        return f"{_FORMULA}{json.dumps(physics.made_of)}"
+        unknowns = {name: asdict(unknown) for name, unknown in physics.unknowns.items()}
+        settings = {"formula": physics.formula, "columns": physics.columns, "name": physics.name}
+        return f"{_FORMULA}{json.dumps({**settings, 'unknowns': unknowns})}"
     path = _path_of(physics)
-    if path or type(physics) is not FunctionPhysics:
-        return path
-    is_plain = physics.inputs is None and not physics.unknowns
-    return _path_of(physics.function) if is_plain else None
+    if path is None and type(physics) is FunctionPhysics:
+        is_plain = physics.inputs is None and not physics.unknowns
+        return _path_of(physics.function) if is_plain else None
+    return path
 
 
 def is_formula(path: str) -> bool:
@@ -49,23 +52,30 @@ def is_formula(path: str) -> bool:
 
 
 def physics_from_path(path: str) -> Physics:
-    """Imports the physics that a path of ``import_path`` names.
+    """Import the physics that a path of ``import_path`` names.
 
     Importing a module runs its code, so take paths from files that you trust only. A formula is
     read and runs nothing.
 
     Args:
-        path: As ``import_path`` returns it; a ValueError if it has another form, cannot be
-            imported, or names something else.
+        path: As ``import_path`` returns it.
+
+    Raises:
+        ValueError: If the path has another form, cannot be imported, or names something else.
 
     Example:
         >>> physics_from_path("torch:sin").name
         'sin'
     """
     if is_formula(path):
-        return _formula(path.removeprefix(_FORMULA))
-    module, colon, name = path.partition(":")
-    if not (module and colon and name):
+        try:
+            settings = json.loads(path.removeprefix(_FORMULA))
+            unknowns = {name: Unknown(**own) for name, own in settings["unknowns"].items()}
+            return FormulaPhysics(**{**settings, "unknowns": unknowns})
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"Found {path!r} as a formula, which is damaged: {error}") from error
+    module, _, name = path.partition(":")
+    if not module or not name:
         raise ValueError(
             f"Found {path!r} as the path of a physics, expected 'package.module:qualname'."
         )
@@ -82,34 +92,21 @@ def physics_from_path(path: str) -> Physics:
         raise ValueError(f"The path {path!r} does not name a physics: {error}") from error
 
 
-def _formula(text: str) -> FormulaPhysics:
-    """The physics of what :attr:`FormulaPhysics.made_of` says."""
-    try:
-        given = json.loads(text)
-        unknowns = {name: Unknown(**own) for name, own in given["unknowns"].items()}
-        own = {"unknowns": unknowns, "name": given["name"]}
-        return FormulaPhysics(given["formula"], given["columns"], **own)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"Found {text!r} as a formula, which is damaged: {error}") from error
-
-
 def _path_of(thing: Any) -> str | None:
+    """Return the name of a thing in the module of its class, or of a callable that it contains."""
     owners = [thing]
     if isinstance(thing, Physics):
-        for part in thing.modules():
-            owners += [part, *filter(callable, vars(part).values())]
+        owners += filter(callable, vars(thing).values())
+        owners += thing.modules()
     for owner in owners:
         module = sys.modules.get(getattr(owner, "__module__", None) or "")
         # Only functions and classes know their names.
         own = getattr(thing, "__qualname__", None)
         for name in [own] if own else getattr(module, "__dict__", ()):
-            if _attribute(module, name) is thing:
+            try:
+                found = attrgetter(name)(module)
+            except AttributeError:
+                continue
+            if found is thing:
                 return f"{owner.__module__}:{name}"
     return None
-
-
-def _attribute(module: Any, name: str) -> Any:
-    try:
-        return attrgetter(name)(module)
-    except AttributeError:
-        return None

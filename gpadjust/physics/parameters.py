@@ -1,8 +1,9 @@
-"""Draws of the unknown parameters of a physics."""
+"""Values of the unknown parameters of a physics, and their posterior."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,7 +12,31 @@ from gpadjust.checks import check_level
 from gpadjust.physics.unknown import Unknown
 
 
-class PhysicsParameters(dict[str, Tensor]):
+class ParameterValues(dict[str, Any]):
+    """Values of parameters by their names, as items or attributes: ``p["mass"]``, ``p.mass``.
+
+    Args:
+        names: The names, ``p`` of them.
+        rows: A tensor or array of values, ``N x p``, or ``p`` of a single row. Each name then has
+            ``N``, or a number.
+    """
+
+    def __init__(self, names: Iterable[str], rows: Any) -> None:
+        super().__init__((name, rows[..., i]) for i, name in enumerate(names))
+        self.rows = rows
+
+    def __missing__(self, name: str) -> Any:
+        names = ", ".join(self) or "none"
+        raise KeyError(f"Unknown parameter {name!r}; expected one of {names}.")
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return self[name]
+        except KeyError as error:
+            raise AttributeError(error.args[0]) from None
+
+
+class PhysicsParameters(ParameterValues):
     """The posterior of the unknown parameters of a physics, as draws.
 
     It maps names to their draws, ``K`` each: one, the value itself, after a point fit (``"map"``)
@@ -20,6 +45,9 @@ class PhysicsParameters(dict[str, Tensor]):
     Args:
         unknowns: The parameters.
         draws: Draws of each, ``K``, in their units.
+
+    Attributes:
+        draws: All draws, ``K x p``.
 
     Example:
         >>> import torch
@@ -35,17 +63,9 @@ class PhysicsParameters(dict[str, Tensor]):
     """
 
     def __init__(self, unknowns: Mapping[str, Unknown], draws: Sequence[Tensor]) -> None:
-        super().__init__(zip(unknowns, draws, strict=True))
+        self.draws = torch.stack([*draws], -1) if unknowns else torch.empty(1, 0)
         self.unknowns = unknowns
-
-    @property
-    def draws(self) -> Tensor:
-        """All draws, ``K x p``."""
-        return torch.stack([*self.values()], -1)
-
-    def __missing__(self, name: str) -> Tensor:
-        names = ", ".join(self) or "none"
-        raise KeyError(f"Unknown parameter {name!r}; expected one of {names}.")
+        super().__init__(unknowns, self.draws)
 
     @property
     def mean(self) -> Tensor:
@@ -58,7 +78,7 @@ class PhysicsParameters(dict[str, Tensor]):
         return self.draws.std(0, correction=0)
 
     def interval(self, level: float = 0.95) -> tuple[Tensor, Tensor]:
-        """Lower and upper ends of the central intervals of probability ``level``, ``p`` each."""
+        """Return both ends of the central intervals of probability ``level``, ``p`` each."""
         check_level(level)
         ends = torch.tensor([(1 - level) / 2, (1 + level) / 2]).to(self.draws)
         low, high = self.draws.quantile(ends, dim=0)
@@ -70,8 +90,5 @@ class PhysicsParameters(dict[str, Tensor]):
         for i, (name, unknown) in enumerate(self.unknowns.items()):
             interval = f"{low[i]:.4g} to {high[i]:.4g}" if low[i] < high[i] else "-"  # a point fit
             rows.append((name, f"{self.mean[i]:.4g}", interval, unknown.prior_text, unknown.unit))
-        padded = (
-            [cell.ljust(max(map(len, column))) for cell in column]
-            for column in zip(*rows, strict=True)
-        )
-        return "\n".join("  ".join(row).rstrip() for row in zip(*padded, strict=True))
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        return "\n".join("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)

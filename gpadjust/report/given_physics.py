@@ -24,8 +24,8 @@ from gpadjust.physics import (
     PhysicsError,
     Unknown,
 )
-from gpadjust.physics.array_physics import array_physics
 from gpadjust.physics.formula import names_in, symbol
+from gpadjust.physics.function import array_physics
 from gpadjust.report.inputs import TableData, meant
 from gpadjust.report.markup import plural
 

@@ -218,17 +218,16 @@ def _physics(
     formula, is_rate = _formula(texts, states)
     if absent := [name for name in unknowns if name not in names_in(formula)]:
         raise ValueError(f"--unknown names {absent[0]!r}, which is in no equation.")
-    physics: Physics
-    if is_rate:
-        physics = ODEPhysics.of_formula(formula, states, actions, step, unknowns=unknowns)
-        name, names = "ODEPhysics", f"{[*states]}, {[*actions]}, step={step!r}"
-    else:
-        physics = FormulaPhysics(formula, [*states, *actions], unknowns=unknowns)
-        name, names = "FormulaPhysics", f"{[*states, *actions]}"
-    maker = f"{name}.of_formula" if is_rate else name
+    columns = [*states, *actions]
+    physics: Physics = FormulaPhysics(formula, columns, unknowns=unknowns)
     priors = "".join(f"        {name!r}: {own!r},\n" for name, own in unknowns.items())
-    made = f"{maker}(\n    {formula!r},\n    {names},\n    unknowns={{\n{priors}    }},\n)"
-    return physics, (f"from gpadjust import {name}, Unknown", made)
+    own = f"{formula!r},\n    {columns},\n    unknowns={{\n{priors}    }},\n"
+    made = f"FormulaPhysics(\n    {own})"
+    if not is_rate:
+        return physics, ("from gpadjust import FormulaPhysics, Unknown", made)
+    physics = ODEPhysics(physics, step, len(states))
+    made = f"ODEPhysics({made}, step={step!r}, state_dim={len(states)})"
+    return physics, ("from gpadjust import FormulaPhysics, ODEPhysics, Unknown", made)
 
 
 def _formula(texts: Sequence[str], states: Sequence[str]) -> tuple[str, bool]:

@@ -32,7 +32,7 @@ from gpadjust.kinds.categories import Categories
 from gpadjust.kinds.factory import ModelFactory, make_model, with_options
 from gpadjust.many import VariationalCKA
 from gpadjust.physics import PhysicsWarning
-from gpadjust.physics.array_physics import array_physics
+from gpadjust.physics.function import array_physics
 from gpadjust.physics.parameters import PhysicsParameters
 from gpadjust.validation.plausibility import complaint
 

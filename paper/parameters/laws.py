@@ -76,7 +76,7 @@ class Case:
 
         start = unknowns.guess.numpy()
         found = least_squares(errors, start, x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12)
-        return dict(zip(unknowns.names, found.x.tolist(), strict=True))
+        return dict(zip(unknowns, found.x.tolist(), strict=True))
 
 
 def case(name: str, seed: int) -> Case:

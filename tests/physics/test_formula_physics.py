@@ -47,18 +47,18 @@ def test_several_outputs_and_gradients():
 WRONG = {
     "": "Expected a formula such as",
     "a ** (": "never closed",
-    "a^2": "\\^ is no power, expected \\*\\*",
-    "sinn(a)": "sinn is no function of formulas, is it sin",
-    "max(a)": "max takes 2 values, found 1",
-    "a < b < 2": "a comparison is of two values",
-    "a == b": "a comparison is of two values",
-    "c * a": "'c', which is none of its names: a, b",
-    "aa * bb": "Is it 'a'",
-    "True": "True is no number",
-    "'a'": "no number",
-    "2j": "no number",
+    "a^2": "'a \\^ 2' is not a part of a formula.*\\^ is not a power",
+    "sinn(a)": r"'sinn\(a\)' is not a part of a formula.*functions sin of 1",
+    "max(a)": r"'max\(a\)' is not a part of a formula.*max of 2",
+    "a < b < 2": "'a < b < 2' is not a part of a formula.*comparisons of two values",
+    "a == b": "'a == b' is not a part",
+    "c * a": "has 'c'; expected one of its names: a, b",
+    "True": "'True' is not a part",
+    "'a'": "is not a part",
+    "2j": "'2j' is not a part",
+    "1e999": "inf is too large",
     "(" * 300 + "a" + ")" * 300: "too many nested|nested too deeply",
-    "a + " * 900 + "a": "at most 2000 characters",
+    "a + " * 900 + "a": "more than 2000 characters",
     "a+" * 900 + "a": "nested too deeply",
     "-" * 900 + "a": "nested too deeply",
     "\ud800": "Expected a formula such as",
@@ -89,7 +89,7 @@ def test_names_and_columns():
     names = ["air flow [m3/h]", "E", "2nd", "dT/dt", "lambda [W/mK]", "\u00b5"]
     assert [*map(symbol, names)] == ["air_flow", "E", "_2nd", "dT_dt", "lambda_", "\u03bc"]
     assert FormulaPhysics("\u00b5", ["\u00b5 [m]"])(X[:, :1])[0] == 1
-    refused(ValueError, "other names than 'pi'", FormulaPhysics, "pi", ["pi"])
+    refused(ValueError, "and none 'pi'", FormulaPhysics, "pi", ["pi"])
     refused(ValueError, "found 'a' more than once", FormulaPhysics, "a", ["a", "a [m]"])
     with pytest.raises(ValueError, match="found 'a' more than once"):
         FormulaPhysics("a", ["a"], unknowns={"a": Unknown(1.0, sd=1.0)})
@@ -107,7 +107,7 @@ def test_a_formula_can_be_made_of_its_text_and_is_saved(tmp_path):
     unknowns = {"c": Unknown(2.0, sd=0.5, bounds=(0.0, math.inf), unit="m")}
     physics = FormulaPhysics("c * a + b", ["a", "b"], unknowns=unknowns, name="my law")
     again = physics_from_path(import_path(physics))
-    assert again.made_of == physics.made_of
+    assert (again.formula, again.columns, again.name) == ("c * a + b", ("a", "b"), "my law")
     assert again.unknowns == physics.unknowns
     assert torch.equal(again(X), physics(X))
     for damaged in ("formula:", "formula:{}", import_path(physics).replace("c *", "d *")):

@@ -10,11 +10,10 @@ from gpadjust import CalibratedPhysics
 from gpadjust.physics import (
     BlackBoxPhysics,
     FunctionPhysics,
-    JoinedPhysics,
     PhysicsError,
     as_physics,
 )
-from gpadjust.physics.array_physics import array_physics
+from gpadjust.physics.function import array_physics
 from tests.systems import refused
 
 
@@ -51,22 +50,19 @@ def test_missing_gradient_warns_once(points):
         FunctionPhysics(smooth)(points(3, 2))
 
 
-def double(X):
-    return 2 * X
-
-
 def test_as_physics(points):
     X, physics = points(3, 2), BlackBoxPhysics(np.sin)
     assert as_physics(physics) is physics
-    assert as_physics([physics]) is physics
     assert isinstance(as_physics(torch.sin), FunctionPhysics)
     assert torch.equal(as_physics(torch.sin)(X), X.sin())
     assert list(as_physics(torch.nn.Linear(2, 1)).parameters())
-    for several in ([torch.sin, double], (torch.sin, double), {"a": torch.sin, "b": double}):
-        assert torch.equal(as_physics(several)(X), torch.cat([X.sin(), 2 * X], -1))
     refused(TypeError, "callable; found float", FunctionPhysics, 1.0)
-    refused(ValueError, "no physics to join", as_physics, [])
-    for thing, found in ((3.0, "a float"), (None, "a NoneType"), (torch.nn.Tanh, "the class Tanh")):
+    for thing, found in (
+        (3.0, "a float"),
+        ([torch.sin], "a list"),
+        (None, "a NoneType"),
+        (torch.nn.Tanh, "the class Tanh"),
+    ):
         says = f"found {found}.*torch function.*ODEPhysics.*BlackBoxPhysics"
         refused(TypeError, says, as_physics, thing)
 
@@ -102,12 +98,7 @@ def test_functions_are_told_apart():
     assert array_physics(physics, X) is physics
 
 
-def test_several_and_one_row():
-    joined = array_physics({"coarse": np.sin, "fine": torch.cos}, X)
-    assert isinstance(joined, JoinedPhysics)
-    assert joined.names == ("coarse", "fine")
-    torch.testing.assert_close(joined(TENSOR), torch.cat([TENSOR.sin(), TENSOR.cos()], dim=1))
-    assert array_physics([np.sin, torch.cos], X).names == ("sin", "cos")
+def test_a_function_is_called_with_a_copy_of_one_row():
     asked = []
 
     def writes(X):

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from gpadjust.physics import BlackBoxPhysics, FunctionPhysics, JoinedPhysics, Physics, as_physics
+from gpadjust.physics import BlackBoxPhysics, FunctionPhysics, Physics, as_physics
 from gpadjust.physics.import_path import import_path, physics_from_path
 from tests.systems import refused
 
 SOURCE = """
 import torch
-from gpadjust.physics import BlackBoxPhysics, FunctionPhysics, JoinedPhysics, Physics
+from gpadjust.physics import BlackBoxPhysics, FunctionPhysics, Physics
 
 def double(X):
     return 2 * X
@@ -39,7 +39,6 @@ drag = Drag()
 net = Net()
 mill = BlackBoxPhysics(double)
 ghost = FunctionPhysics(lambda X: X)
-pair = JoinedPhysics([double, drag])
 number = 3
 """
 
@@ -55,7 +54,7 @@ def plant():
 
 
 def test_what_a_module_names_comes_back(plant):
-    for name in ("double", "Formula.triple", "drag", "net", "mill", "ghost", "pair"):
+    for name in ("double", "Formula.triple", "drag", "net", "mill", "ghost"):
         thing = attrgetter(name)(plant)
         assert import_path(thing) == f"plant:{name}"
         loaded, X = physics_from_path(f"plant:{name}"), torch.ones(2, 2)
@@ -71,7 +70,6 @@ def test_what_has_no_name(plant):
         plant.local(),
         FunctionPhysics(plant.double, inputs=[0]),
         BlackBoxPhysics(plant.double),
-        JoinedPhysics([plant.double, plant.drag]),
         plant.Drag(),
         plant.Drag().evaluate,
         np.vectorize(abs),

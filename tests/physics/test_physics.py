@@ -85,7 +85,7 @@ def test_bad_settings_and_inputs(points):
         says = re.escape(f"batch_shape x n x d; found {shape}")
         refused(ValueError, says, FunctionPhysics(square), points(*shape))
     for column in (2, -3):
-        says = rf"inputs=\(0, {column}\).*\(5, 2\).*2 column.*no column \[{column}\]"
+        says = rf"inputs=\(0, {column}\).*\(5, 2\).*no column \[{column}\]"
         refused(ValueError, says, FunctionPhysics(square, inputs=[0, column]), points(5, 2))
     refused(TypeError, "abstract", Physics)
 
@@ -171,11 +171,6 @@ class TestGradients:
             physics(X)
         scale.requires_grad_(False)
         assert not physics(X.detach()).requires_grad
-        gain = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
-        physics = FunctionPhysics(lambda X: gain * X)
-        with pytest.warns(UserWarning, match=r"parameters.*requires_grad_"):
-            Y = physics(points(3, 1))
-        assert not Y.requires_grad
 
     def test_expanded_X(self, counter, points):
         X = points(2, 5, 3).requires_grad_()
@@ -277,7 +272,6 @@ class TestCopies:
             expected = physics(X)
             loaded = pickle.loads(pickle.dumps(physics))
             assert torch.equal(loaded(X), expected)
-            assert loaded.function.calls == 1
             loaded.function.gain.fill_(5.0)
             assert torch.equal(loaded(X), 5.0 * X)
 
@@ -327,6 +321,3 @@ def test_errors_and_their_rows():
         assert one.rows == tuple(range(10, 17))
     assert "more" not in str(PhysicsError("It broke:", rows=range(5)))
     assert str(PhysicsError("It broke.")) == "It broke."
-    error = PhysicsError("It broke:", rows=[1])
-    error.relocate(torch.tensor([0, 1, -1, 1, 2]))  # to every copy of a row
-    assert error.rows == (1, 3)

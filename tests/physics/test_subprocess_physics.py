@@ -71,10 +71,12 @@ def test_failures_and_bad_input(law):
         SubprocessPhysics([sys.executable, "-c", "print('done')"])(line(1))
     refused(TypeError, r"shlex\.split", SubprocessPhysics, "prog {T}")
     refused(ValueError, "no name of an input", SubprocessPhysics, ["prog", "{T}"])
-    refused(ValueError, "is no template", SubprocessPhysics, ["prog", "{"])
+    refused(ValueError, "are no templates", SubprocessPhysics, ["prog", "{"])
     with pytest.raises(ValueError, match="no placeholder of the unknown parameter k"):
         SubprocessPhysics(["prog"], unknowns={"k": Unknown(4.0, sd=1.0)})
-    refused(ValueError, "positive number of seconds", SubprocessPhysics, ["prog"], timeout=0)
+    refused(
+        ValueError, "timeout must be finite and above 0", SubprocessPhysics, ["prog"], timeout=0
+    )
     with pytest.raises(PhysicsError, match="names has 1 entries"):
         SubprocessPhysics(["prog", "{T}"], names=["T"])(torch.zeros(1, 2).double())
 

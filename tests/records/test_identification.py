@@ -6,7 +6,7 @@ from functools import partial
 import pytest
 import torch
 
-from gpadjust.physics import FunctionPhysics, ODEPhysics, Unknown
+from gpadjust.physics import FormulaPhysics, FunctionPhysics, ODEPhysics, Unknown
 from gpadjust.records import Record, Records, identify
 from gpadjust.records.identification import _of_jumps
 from gpadjust.states import StateSpec
@@ -21,7 +21,7 @@ def spring(prior=None):
     """A mass on a spring; with a prior its stiffness is unknown."""
     unknowns = {} if prior is None else {"k": prior}
     formula = "v, u - k * x" if unknowns else f"v, u - {TRUE} * x"
-    return ODEPhysics.of_formula(formula, ["x", "v"], ["u"], STEP, unknowns=unknowns)
+    return ODEPhysics(FormulaPhysics(formula, ["x", "v", "u"], unknowns=unknowns), STEP, 2)
 
 
 def oscillation(rows, noise=0.02, seed=0, known=("x",)):
@@ -145,9 +145,9 @@ def test_bad_arguments():
 def test_actions_that_vary_within_a_step_and_angles_that_jump_are_said():
     record = oscillation(121)
     records = Records(record, StateSpec(["x", "v"], ["u"], step=2 * STEP))
-    physics = ODEPhysics.of_formula(
-        "v, u - k * x", ["x", "v"], ["u"], 2 * STEP, unknowns={"k": Unknown(1.5, factor=1.5)}
-    )
+    unknowns = {"k": Unknown(1.5, factor=1.5)}
+    rates = FormulaPhysics("v, u - k * x", ["x", "v", "u"], unknowns=unknowns)
+    physics = ODEPhysics(rates, 2 * STEP, 2)
     (told, *_) = quickly(records, physics).advice
     assert "The actions vary within a step of 2 samples, over which they are averaged" in told
     held = Record(record.times, record.states, record.actions[::2].repeat_interleave(2, 0)[:121])

@@ -117,7 +117,7 @@ def test_without_actions_there_is_the_time_and_next_values_are_equations_too(fol
     assert main(["identify", "cooling.csv", *given, "--unknown", "q = 0.5 .. 1"]) == 0
     text = (folder / "identify.html").read_text()
     assert "0.9 to 0.9" in text
-    assert "FormulaPhysics.of_formula" not in text
+    assert "ODEPhysics" not in text
 
 
 @pytest.mark.slow
