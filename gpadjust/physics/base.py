@@ -18,6 +18,7 @@ from gpadjust.physics.error import PhysicsError, described
 from gpadjust.physics.parameters import ParameterValues
 from gpadjust.physics.unknown import Unknown, Unknowns
 
+_NONE = Unknowns({})
 # By a part of an error's message, the way out.
 _HINTS = {
     "positional argument": " It is called with rows N x d and, if it has unknown parameters, named "
@@ -68,7 +69,7 @@ class Physics(torch.nn.Module, ABC):
         name: str | None = None,
     ) -> None:
         super().__init__()
-        self.unknowns = Unknowns(unknowns)
+        self.unknowns = _NONE if unknowns is None else Unknowns(unknowns)
         self.name = type(self).__name__ if name is None else name
         self.num_outputs: int | None = None
         self._has_warned = False

@@ -147,8 +147,7 @@ class Unknowns(dict[str, Unknown]):
         ValueError: If a name cannot be an attribute.
     """
 
-    def __init__(self, unknowns: Mapping[str, Unknown] | None) -> None:
-        unknowns = {} if unknowns is None else unknowns
+    def __init__(self, unknowns: Mapping[str, Unknown]) -> None:
         is_mapping = isinstance(unknowns, Mapping)
         if not is_mapping or not all(isinstance(u, Unknown) for u in unknowns.values()):
             raise TypeError(
