@@ -44,7 +44,7 @@ class Link(NamedTuple):
     @classmethod
     def of(cls, link: Any) -> Link:
         """Return the link of a name or of two bounds, without a location."""
-        bounds = NAMED.get(link) if isinstance(link, str) else link
+        bounds: Any = NAMED.get(link) if isinstance(link, str) else link
         types = [type(v) for v in bounds] if isinstance(bounds, tuple | list) else []
         if len(types) != 2 or not {*types} <= {int, float}:
             raise TypeError(f"Expected link as 'log', 'logit' or two bounds; found {link!r}.")
@@ -311,7 +311,7 @@ class Linked(GP):
 
 
 @cache
-def linked(structure: type[GP]) -> type[Linked]:
+def linked(structure: Any) -> type[Linked]:
     """Return the class of a structure with a link; :func:`save` needs one of a module.
 
     Example:

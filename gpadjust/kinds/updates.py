@@ -227,23 +227,19 @@ class Weights:
 
     def marginals(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Return means and variances at each point, ``... x S x m x q``."""
-        mean, root = self._moments(sought)
-        return mean, root.square().sum(-1)
+        phi = design(sought)
+        mean = sought.mean + (phi @ self.mean.unsqueeze(-1)).squeeze(-1)
+        return mean, (phi @ self.root).square().sum(-1)
 
     def joint(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Return means and covariances, ``... x S x m x q x q``."""
-        mean, root = self._moments(sought)
-        return mean, root @ root.mT
+        root = design(sought) @ self.root
+        return self.marginals(sought)[0], root @ root.mT
 
     def of_outputs(self, model: GP, outputs: list[int]) -> Self:
         """Return the weights of some outputs, of the model of these."""
         train = model.conditioning().train
         return type(self)(train, self.precision[:, outputs], self.pull[:, outputs])
-
-    def _moments(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
-        """Return the mean of a sum, and a root ``... x q x p`` of its covariance."""
-        phi = design(sought)
-        return sought.mean + (phi @ self.mean.unsqueeze(-1)).squeeze(-1), phi @ self.root
 
 
 def design(f: WeightedSum) -> Tensor:
