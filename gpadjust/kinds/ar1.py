@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gpadjust.checks import checked_bounds, checked_whole
 from gpadjust.core import GP, KnownNoise, Noise, Row, Term
-from gpadjust.core.data import ArrayLike, Data, appended, as_tensor, unit_of
+from gpadjust.core.data import ArrayLike, Data, appended, as_tensor, names_of, unit_of
 from gpadjust.core.gaussian import Marginals
 from gpadjust.core.kernels import Features, Kernel, PullBack, as_kernel
 from gpadjust.core.structures import DELTA_CONSTANT
@@ -71,7 +71,7 @@ class AR1(GP):
             with torch.no_grad():
                 low_Y = f_p(as_tensor(low_X, "low_X"))
         low = Data.of(low_X, low_Y, None, None)
-        sizes = [as_tensor(each, "data").shape[1:].numel() for each in (train_X, train_Y)]
+        sizes = [len(names_of(train_X, "x")), len(names_of(train_Y, "y"))]
         if sizes != [low.X.shape[-1], low.Y.shape[-1]]:
             raise ValueError(
                 f"Expected a low level of {sizes[0]} inputs and {sizes[1]} outputs, as the high "
