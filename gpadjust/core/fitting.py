@@ -28,7 +28,7 @@ from gpadjust.core.unknowns import standard_normal
 if TYPE_CHECKING:
     from gpadjust.core.model import GP
 
-_SMALL, _MEDIUM = 40, 150  # points: up to these draws begin with the prior, and are moved
+_SMALL, _MEDIUM = 40, 100  # points: up to these draws begin with the prior, and are moved
 _ENTRIES = 150_000  # of covariances that are computed at once, which caches hold
 _SELDOM = 1e-3  # a nested model of less probability at its mode is not drawn from
 _SEARCHES = 4  # for the mode
@@ -90,7 +90,7 @@ def fit(
     """Fit a model to its data, from the prior: what it held before has no influence.
 
     ``"bayes"`` draws all unknown numbers from their posterior: by sequential Monte Carlo from the
-    prior up to 40 points, from Laplace's approximation beyond; beyond 150 points its draws are
+    prior up to 40 points, from Laplace's approximation beyond; beyond 100 points its draws are
     weighted once and not moved. Nested models are drawn from apart and pooled by their posterior
     probabilities. ``"map"`` brings the numbers of the whole model to their most likely values.
 
@@ -215,21 +215,35 @@ def _sampled(model: GP, number: int, seed: int) -> dict[int, Draws]:
 def _starts(model: GP, seed: int) -> dict[int, Normal]:
     """Return Laplace's approximation of each nested model that is likely enough.
 
-    Modes are searched by some of the rows first. A nested model that is unlikely by these is left
-    out: that its odds recover has a probability of the odds at most (Ville's inequality).
+    Modes are searched by some of the rows first, then from there by four times as many, up to all.
+    A nested model that is unlikely by some of them is left out: that its odds recover has a
+    probability of the odds at most (Ville's inequality).
     """
-    n, choices = len(model.data.Y), [*range(len(model.table.log_prior))]
-    generator = torch.Generator().manual_seed(seed)
-    rows = torch.randperm(n, generator=generator)[:_SMALL].sort().values
-    some = model.subset_rows(rows) if n > 2 * _SMALL else None
-    ends = {k: modes(some or model, k, seed) for k in choices}
-    if some is not None:
-        evidence = {k: around_mode(_target(some, k), several[0])[1] for k, several in ends.items()}
-        choices = _likely(model, evidence)
-        ends = {k: _sorted(model, k, maximise(_target(model, k), ends[k])) for k in choices}
-    starts = {k: around_mode(_target(model, k), ends[k][0]) for k in choices}
-    likely = _likely(model, {k: evidence for k, (_, evidence) in starts.items()})
+    ends: dict[int, Tensor] = {}
+    likely = [*range(len(model.table.log_prior))]
+    for part in _parts(model, seed):
+        for k in likely:
+            is_first = k not in ends
+            ends[k] = (
+                modes(part, k, seed)
+                if is_first
+                else _sorted(part, k, maximise(_target(part, k), ends[k]))
+            )
+        starts = {k: around_mode(_target(part, k), ends[k][0]) for k in likely}
+        likely = _likely(model, {k: evidence for k, (_, evidence) in starts.items()})
     return {k: starts[k][0] for k in likely}
+
+
+def _parts(model: GP, seed: int) -> list[GP]:
+    """Return models of 40 rows, 160 and so on, as far as the noise has fewer, and the whole."""
+    n, size = len(model.data.Y), _SMALL
+    parts: list[GP] = []
+    order = torch.randperm(n, generator=torch.Generator().manual_seed(seed))
+    while 2 * size < n:
+        part = model.subset_rows(order[:size].sort().values)
+        parts += [] if part is None else [part]
+        size *= 4
+    return [*parts, model]
 
 
 def modes(model: GP, choice: int, seed: int, is_precise: bool = False) -> Tensor:

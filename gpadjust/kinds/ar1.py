@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gpadjust.checks import checked_bounds, checked_whole
 from gpadjust.core import GP, KnownNoise, Noise, Row, Term
-from gpadjust.core.data import ArrayLike, Data, appended, as_tensor, unit_of
+from gpadjust.core.data import ArrayLike, Data, appended, as_tensor, names_of, unit_of
 from gpadjust.core.gaussian import Marginals
 from gpadjust.core.kernels import Features, Kernel, PullBack, as_kernel
 from gpadjust.core.structures import DELTA_CONSTANT
@@ -71,6 +71,12 @@ class AR1(GP):
             with torch.no_grad():
                 low_Y = f_p(as_tensor(low_X, "low_X"))
         low = Data.of(low_X, low_Y, None, None)
+        sizes = [len(names_of(train_X, "x")), len(names_of(train_Y, "y"))]
+        if sizes != [low.X.shape[-1], low.Y.shape[-1]]:
+            raise ValueError(
+                f"Expected a low level of {sizes[0]} inputs and {sizes[1]} outputs, as the high "
+                f"one; found {low.X.shape[-1]} and {low.Y.shape[-1]}."
+            )
         terms = [
             Term("low", AtLevels(as_kernel(low_covar_module), low.X, has_rho=True)),
             Term("delta", AtLevels(as_kernel(delta_covar_module), low.X)),
@@ -83,11 +89,6 @@ class AR1(GP):
                 "delta_covar_module": delta_covar_module, "input_transform": input_transform,
             },
         )  # fmt: skip
-        if low.Y.shape[-1] != self.num_outputs:
-            raise ValueError(
-                f"Expected a low level of {self.num_outputs} outputs, as the high one; found "
-                f"{low.Y.shape[-1]}."
-            )
         self.low = low
 
     @property
@@ -148,11 +149,6 @@ class AtLevels(Kernel):
 
     def of_data(self, data: Data) -> AtLevels:
         """Return the kernel of transformed inputs, and with names."""
-        if self.low_x.shape[-1] != data.X.shape[-1]:
-            raise ValueError(
-                f"Expected a low level of {data.X.shape[-1]} inputs, as the high one; found "
-                f"{self.low_x.shape[-1]}."
-            )
         low_x = data.kernel_inputs(self.low_x.to(data.X))
         return AtLevels(self.kernel.of_data(data), low_x, self.has_rho)
 

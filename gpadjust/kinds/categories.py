@@ -229,23 +229,22 @@ class Exchangeable(Kernel):
 class Offset(Kernel):
     r"""Independent offsets of equal variance s, one for each value: :math:`s \, 1\{x_c = x'_c\}`.
 
-    The column c has a name or number; s has a prior, in squared units of the targets.
+    The column c has a number; s has a prior, in squared units of the targets.
     """
 
-    def __init__(self, column: str | int, outputscale: LogNormal = DELTA) -> None:
+    def __init__(self, column: int, outputscale: LogNormal = DELTA) -> None:
         self.column, self.outputscale = column, outputscale
         self.values: list[float] = []
 
     def of_data(self, data: Data) -> Offset:
         """Return the kernel for a model's data, of which it knows the values."""
-        new, names = copy(self), [*data.input_names]
-        new.column = names.index(self.column) if isinstance(self.column, str) else self.column
-        new.values = new.of(data.kernel_inputs(data.X)).unique().tolist()
+        new = copy(self)
+        new.values = self.of(data.kernel_inputs(data.X)).unique().tolist()
         return new
 
     def of(self, x: Tensor) -> Tensor:
         """Return the values of inputs, ``... x n x 1``."""
-        return x[..., [int(self.column)]]
+        return x[..., [self.column]]
 
     def rows(self, x: Tensor, num_outputs: int) -> list[Row]:
         """Return the row of s."""
@@ -273,14 +272,12 @@ class Offset(Kernel):
 def levels_of_texts(frame: Any, asked: Sequence[int]) -> Levels:
     """Return the sorted levels of the columns of a frame that are texts or categories."""
     found: Levels = {}
-    array = frame.to_numpy() if hasattr(frame, "columns") else np.zeros((0, 0))
     dtypes = [*getattr(frame, "dtypes", ())]
-    for i in range(array.shape[-1]):
+    for i, column in enumerate(frame.to_numpy().T if hasattr(frame, "columns") else ()):
         categories = getattr(dtypes[i], "categories", None) if dtypes else None
-        texts = {value for value in array[:, i] if isinstance(value, str)}
-        is_plain = len(texts) <= max(4, _IDS * len(array)) and not any(
-            map(_NUMBER.fullmatch, texts)
-        )
+        texts = {value for value in column if isinstance(value, str)}
+        has_number = any(map(_NUMBER.fullmatch, texts))
+        is_plain = len(texts) <= max(4, _IDS * len(column)) and not has_number
         if isinstance(categories, Iterable):
             found[i] = tuple(v if isinstance(v, str) else float(v) for v in categories)
         elif texts and (is_plain or i in asked):

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.quasirandom import SobolEngine
@@ -14,7 +14,6 @@ from gpadjust.checks import checked_whole
 from gpadjust.core import MATERN52, RBF, Stationary, ZeroMeanGP, fit
 from gpadjust.core.model import GP
 from gpadjust.core.terms import WeightedSum
-from gpadjust.core.unknowns import standard_normal
 from gpadjust.physics import ParameterValues, Physics, Unknown
 
 _PLACES = 128  # at which errors are told apart
@@ -39,8 +38,7 @@ class EmulatedPhysics(Physics):
         runs_X: Inputs of the runs, ``N x (d + p)``: those that the data have, and then values of
             the unknown parameters; in a frame these are the columns of their names, with or
             without a unit, as ``"drag [1]"``.
-        runs_Y: Outputs of the runs, ``N x m``; NaN where one is missing, a row of NaN is a run
-            that failed.
+        runs_Y: Outputs of the runs, ``N x m``; NaN where one is missing.
         inputs: The columns of the data that are the first ``d`` inputs of the runs, in their order.
             Default: all.
         unknowns: The unknown parameters by name.
@@ -49,7 +47,6 @@ class EmulatedPhysics(Physics):
             density. ``functools.partial(CKA, physics=...)`` of a formula needs fewer runs.
         fit_options: Options of its :func:`~gpadjust.fit`, such as ``{"method": "map"}``.
         num_components: Number ``K`` of components; they have the variance of those left out, too.
-        seed: Seed of the places at which components are computed.
         name: The name in messages. Default: the class's.
 
     Attributes:
@@ -74,7 +71,7 @@ class EmulatedPhysics(Physics):
         self, runs_X: Any, runs_Y: Any, *, inputs: Sequence[int] | None = None,
         unknowns: Mapping[str, Unknown] | None = None,
         model_factory: Callable[[Any, Any], GP] | None = None,
-        fit_options: Mapping[str, Any] | None = None, num_components: int = 8, seed: int = 0,
+        fit_options: Mapping[str, Any] | None = None, num_components: int = 8,
         name: str | None = None,
     ) -> None:  # fmt: skip
         own, number = dict(unknowns or {}), checked_whole("num_components", num_components, 1)
@@ -83,26 +80,17 @@ class EmulatedPhysics(Physics):
             raise ValueError(f"Expected other names than {sorted(taken)}, of the emulator's error.")
         super().__init__(unknowns=own | further, inputs=inputs, name=name)
         runs_X = _with_unknowns_last(runs_X, [*own], self.name)
-        failed = _missing_rows(runs_Y)
-        if failed.any():
-            runs_X, runs_Y = (_rows(each, ~failed) for each in (runs_X, runs_Y))
-        shape = tuple(runs_X.shape)
-        if len(shape) != 2 or shape[-1] <= len(own):
+        self.num_inputs = runs_X.shape[-1] - len(own)
+        if self.num_inputs < 1:
             raise ValueError(
                 f"Expected runs N x (d + {len(own)}): inputs that the data have, and then "
-                f"{len(own)} unknown parameter(s); found shape {shape}."
-            )
-        self.num_inputs = shape[-1] - len(own)
-        if self.inputs is not None and len(self.inputs) != self.num_inputs:
-            raise ValueError(
-                f"Expected inputs as the numbers of {self.num_inputs} columns of the data, which "
-                f"the runs have besides unknown parameters; found {self.inputs}."
+                f"{len(own)} unknown parameter(s); found shape {tuple(runs_X.shape)}."
             )
         emulator = _fitted(runs_X, runs_Y, model_factory, dict(fit_options or {}))
         self.num_outputs = emulator.num_outputs
         # In a tuple, no submodule: it is no part of a model that a fit changes or a copy copies.
         self._emulator = (emulator,)
-        self._components = _Components(emulator, number, seed)
+        self._components = _Components(emulator, number)
         self._kept: tuple[Tensor, Tensor] | None = None  # the components at the last rows
 
     @property
@@ -138,7 +126,7 @@ class EmulatedPhysics(Physics):
         rows, z = torch.cat([X, values[:, :p]], -1).double(), values[:, p:]
         if rows.requires_grad and torch.is_grad_enabled():
             return self._sum(self._components.at(rows), z)
-        rows, place = _distinct(rows)
+        rows, place = rows.unique(dim=0, return_inverse=True)
         if self._kept is None or not torch.equal(self._kept[0], rows):
             self._kept = (rows, self._components.at(rows))
         return self._sum(self._kept[1][place], z)
@@ -157,11 +145,11 @@ class _Components:
     """
 
     @torch.no_grad()
-    def __init__(self, emulator: GP, number: int, seed: int) -> None:
+    def __init__(self, emulator: GP, number: int) -> None:
         X = emulator.data.X
         self.emulator = emulator
         low, high = X.amin(0), X.amax(0)
-        unit = SobolEngine(len(low), seed=seed, scramble=True).draw(2 * _PLACES, dtype=low.dtype)
+        unit = SobolEngine(len(low), seed=0, scramble=True).draw(2 * _PLACES, dtype=low.dtype)
         self.low, self.range = low, (high - low).where(high > low, torch.ones_like(low))
         places, others = (low + self.range * unit.to(low)).chunk(2)
         self.data = emulator.conditioning()
@@ -215,25 +203,14 @@ class _Components:
         return variance.mean(0) + mean.var(0, correction=0)
 
 
-def _distinct(rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Return rows that differ ``U x D``, and of each row ``N`` its number in them."""
-    generator = torch.Generator().manual_seed(0)
-    keys, place = (rows @ standard_normal(rows.shape[1:], generator, rows)).unique(
-        return_inverse=True
-    )
-    some = place.new_zeros(len(keys)).scatter_(0, place, torch.arange(len(rows)).to(place))
-    if torch.equal(rows[some][place], rows):
-        return rows[some], place
-    return rows.unique(dim=0, return_inverse=True)
-
-
 def _fitted(
     runs_X: Any, runs_Y: Any, model_factory: Callable[[Any, Any], GP] | None, options: Any
 ) -> GP:
     """Return the fitted model of the runs, by default the one of two that predicts them better."""
-    factories = [model_factory] if model_factory else [_of_profile(p) for p in (RBF, MATERN52)]
+    kernels = [Stationary(profile) for profile in (RBF, MATERN52)]
+    factories = [partial(ZeroMeanGP, covar_module=kernel) for kernel in kernels]
     fitted = []
-    for factory in factories:
+    for factory in [model_factory] if model_factory else factories:
         emulator = factory(runs_X, runs_Y)
         if not isinstance(emulator, GP):
             raise TypeError(f"Expected model_factory to return a GP; found {emulator!r}.")
@@ -247,34 +224,17 @@ def _fitted(
     return max(fitted, key=lambda e: float(e.left_out().log_density(e.data.Y).nansum()))
 
 
-def _of_profile(profile: Any) -> Callable[[Any, Any], GP]:
-    return lambda X, Y: ZeroMeanGP(X, Y, covar_module=Stationary(profile))
-
-
 def _with_unknowns_last(runs_X: Any, names: list[str], physics: str) -> Any:
     """Return runs whose last columns are the unknown parameters, if columns have names."""
-    columns = getattr(runs_X, "columns", None)
-    if columns is None or not names:
+    columns = [*getattr(runs_X, "columns", ())]
+    if not columns:
         return runs_X
-    bare = {str(each).partition(" [")[0]: each for each in columns}  # "drag [1]" is drag
-    bare |= {each: each for each in columns}
-    if absent := [each for each in names if each not in bare]:
+    own = {str(each).partition(" [")[0]: each for each in columns}  # "drag [1]" is drag
+    own |= {each: each for each in columns}
+    if absent := [name for name in names if name not in own]:
         raise ValueError(
             f"Expected columns of the names {', '.join(absent)} in the runs of {physics!r}, the "
-            f"unknown parameters; found {[*columns]}."
+            f"unknown parameters; found {columns}."
         )
-    unknown = [bare[each] for each in names]
-    return runs_X[[*(each for each in columns if each not in unknown), *unknown]]
-
-
-def _missing_rows(Y: Any) -> Tensor:
-    """Return which rows of outputs are missing altogether."""
-    values = Y if isinstance(Y, Tensor) else torch.as_tensor(np.array(Y))
-    missing = values.isnan() if values.is_floating_point() else torch.zeros_like(values).bool()
-    return missing.reshape(len(missing), -1).all(-1)
-
-
-def _rows(values: Any, kept: Tensor) -> Any:
-    """Return some rows of a tensor, an array or a frame."""
-    chosen = kept if isinstance(values, Tensor) else kept.numpy()
-    return values.loc[chosen] if hasattr(values, "loc") else values[chosen]
+    last = [own[name] for name in names]
+    return runs_X[[each for each in columns if each not in last] + last]

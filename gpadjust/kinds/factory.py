@@ -10,7 +10,7 @@ from typing import Any
 from botorch.models.model import Model
 
 from gpadjust.core.model import GP
-from gpadjust.kinds.links import Linked, linked
+from gpadjust.kinds.links import linked
 
 ModelFactory = Callable[..., Model]
 """A callable ``(X, Y, **physics) -> model``: a structure, ``functools.partial`` of one with further
@@ -30,18 +30,17 @@ def with_options(factory: ModelFactory, options: Mapping[str, Any]) -> ModelFact
     """
     own = factory.keywords if isinstance(factory, partial) else {}
     further = {n: v for n, v in options.items() if n not in own and v is not None}
-    if not further:
-        return factory
-    args = factory.args if isinstance(factory, partial) else ()
-    make: Any = factory.func if isinstance(factory, partial) else factory
     if "link" in further:
-        if not isinstance(make, type) or not issubclass(make, GP):
+        make: Any = factory.func if isinstance(factory, partial) else factory
+        is_structure = isinstance(make, type) and issubclass(make, GP)
+        if not is_structure:
             raise TypeError(
                 "Expected a structure such as CKA, or functools.partial of one, for a link; found "
                 f"{factory!r}. Use the link in the function: LinkedCKA(X, Y, link=...)."
             )
-        make = make if issubclass(make, Linked) else linked(make)
-    return partial(make, *args, **own, **further)
+        args = factory.args if isinstance(factory, partial) else ()
+        factory = partial(linked(make), *args, **own)
+    return partial(factory, **further) if further else factory
 
 
 def make_model(

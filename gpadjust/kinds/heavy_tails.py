@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from copy import copy
 from typing import Any, NamedTuple, Self
@@ -14,7 +15,7 @@ from torch.nn.functional import pad
 from gpadjust.checks import checked_number
 from gpadjust.core import KnownNoise, Noise
 from gpadjust.core.terms import Places, TermSum
-from gpadjust.core.unknowns import Row, Values
+from gpadjust.core.unknowns import Values
 
 _SIZES = math.log(1e3)  # range of the logarithm of an outlier's standard deviation
 _NEAR = 3.0  # standard deviations, nearer than which outliers are no more likely than there
@@ -70,9 +71,9 @@ class RowNoise(Noise):
         base = base.learnt(model, lambda b: fitted(noise.having(b, noise.added, noise.moved)))
         return self.having(base, zeros, zeros).refined(model, fitted)
 
+    @abstractmethod
     def refined(self, model: Any, fitted: Callable[[Noise], Any]) -> Self:
         """Return the noise with numbers of rows, by rough fits that begin with none."""
-        return self
 
     @property
     def has_shares(self) -> bool:
@@ -83,10 +84,6 @@ class RowNoise(Noise):
     def is_outlier(self) -> Tensor | None:
         """Mask ``n x m`` of the outliers of the base."""
         return self.base.is_outlier
-
-    def rows(self, Y: Tensor) -> list[Row]:
-        """Return the unknown variances of the base."""
-        return self.base.rows(Y)
 
     def shares(self, places: Places) -> Tensor | None:
         """Return the shares of the base."""
@@ -190,7 +187,7 @@ class HeavyTails(RowNoise):
         return odds.sigmoid().mT.masked_fill(model.data.Y.isnan(), 0.0)
 
     @torch.no_grad()
-    def refined(self, model: Any, fitted: Callable[[Noise], Any]) -> HeavyTails:
+    def refined(self, model: Any, fitted: Callable[[Noise], Any]) -> Self:
         """Return the noise with the likeliest outliers that a greedy search finds."""
         noise, densities, tried = self, [], []
         while True:

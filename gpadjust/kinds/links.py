@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cache
 from statistics import NormalDist
 from typing import Any, NamedTuple, Self
 
@@ -43,11 +44,7 @@ class Link(NamedTuple):
     @classmethod
     def of(cls, link: Any) -> Link:
         """Return the link of a name or of two bounds, without a location."""
-        if isinstance(link, str) and link not in NAMED:
-            raise ValueError(
-                f"Unknown link {link!r}; expected {', '.join(map(repr, NAMED))} or two bounds."
-            )
-        bounds = NAMED[link] if isinstance(link, str) else link
+        bounds: Any = NAMED.get(link) if isinstance(link, str) else link
         types = [type(v) for v in bounds] if isinstance(bounds, tuple | list) else []
         if len(types) != 2 or not {*types} <= {int, float}:
             raise TypeError(f"Expected link as 'log', 'logit' or two bounds; found {link!r}.")
@@ -68,36 +65,36 @@ class Link(NamedTuple):
         above = f"({above})" if self.lower else above
         return f"log({above} / ({self.upper:g} - y))"
 
-    @property
-    def range(self) -> str:
-        """The values that it takes, in words."""
-        above = f"above {self.lower:g}"
-        return above if math.isinf(self.upper) else f"{above} and below {self.upper:g}"
-
     def holds(self, y: Tensor) -> Tensor:
         """Return which values are within the bounds."""
         return (y > self.lower) & (y < self.upper)
 
+    def logs(self, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Return log(y - a) and log(b - y), minus infinity beyond a bound; 0 without the upper."""
+        above = (y - self.lower).clamp_min(0.0).log()
+        if math.isinf(self.upper):
+            return above, torch.zeros_like(y)
+        return above, (self.upper - y).clamp_min(0.0).log()
+
     def value(self, y: Tensor) -> Tensor:
         """Return g of values ``... x m``: infinite at the bounds and beyond, NaN stays."""
-        above = (y - self.lower).clamp_min(0.0).log() - self.location
-        return above if math.isinf(self.upper) else above - (self.upper - y).clamp_min(0.0).log()
-
-    def inverse(self, z: Tensor) -> Tensor:
-        """Return y of values g, within the bounds however large or small these are."""
-        z = z + self.location
-        bounds = z.new_tensor([self.lower, self.upper])
-        least, most = bounds.nextafter(bounds.flip(0)).tolist()
-        if math.isinf(self.upper):
-            return (self.lower + z.exp()).clamp(least, most)
-        return (self.lower + (self.upper - self.lower) * z.sigmoid()).clamp(least, most)
+        above, below = self.logs(y)
+        return above - below - self.location.to(y)
 
     def log_slope(self, y: Tensor) -> Tensor:
         """Return the logarithm of the derivative of g."""
-        above = (y - self.lower).log()
-        if math.isinf(self.upper):
-            return -above
-        return math.log(self.upper - self.lower) - above - (self.upper - y).log()
+        above, below = self.logs(y)
+        size = 0.0 if math.isinf(self.upper) else math.log(self.upper - self.lower)
+        return size - above - below  # dg / dy = 1 / (y - a), or (b - a) / ((y - a) (b - y))
+
+    def inverse(self, z: Tensor) -> Tensor:
+        """Return y of values g, within the bounds however large or small these are."""
+        z = z + self.location.to(z)
+        bounds = z.new_tensor([self.lower, self.upper])
+        least, most = bounds.nextafter(bounds.flip(0)).tolist()
+        is_open = math.isinf(self.upper)
+        above = z.exp() if is_open else (self.upper - self.lower) * z.sigmoid()
+        return (self.lower + above).clamp(least, most)
 
     def of_outputs(self, outputs: Sequence[int] | slice) -> Link:
         """Return the link of some outputs."""
@@ -148,31 +145,13 @@ class LinkedPosterior(TransformedPosterior):
     """
 
     def __init__(self, mixture: MixturePosterior, link: Link) -> None:
-        super().__init__(mixture, link.inverse)
         self.mixture, self.link = mixture, link
-
-    @property
-    def marginals(self) -> LinkedMarginals:
-        """The distributions at each point by itself."""
-        return LinkedMarginals(*self.mixture.marginals, self.link)
-
-    @property
-    def mean(self) -> Tensor:
-        """The medians, ``... x q x m``."""
-        return self.marginals.quantile(0.5)
-
-    @property
-    def variance(self) -> Tensor:
-        """The squares of half the widths of the central 68.27 %, ``... x q x m``."""
-        return self.marginals.prediction.variance
-
-    @property
-    def distribution(self) -> Any:
-        """Absent: an AttributeError, as it is not Gaussian."""
-        raise AttributeError(
-            "The posterior of outputs with a link is not Gaussian; take samples (`rsample`), "
-            "`mean`, `variance` and `quantile`."
-        )
+        self.marginals = LinkedMarginals(*mixture.marginals, link)
+        super().__init__(
+            mixture, link.inverse,
+            lambda *_: self.marginals.quantile(0.5),
+            lambda *_: self.marginals.prediction.variance,
+        )  # fmt: skip
 
     def quantile(self, value: Tensor) -> Tensor:
         """Return quantiles ``... x q x m``; those of several levels are in front."""
@@ -195,11 +174,9 @@ class LinkedPosterior(TransformedPosterior):
         mixture, w = MixturePosterior(mean[..., outputs, :], K[..., outputs, :, :]), weights.sum()
         own = LinkedPosterior(mixture, self.link.of_outputs(outputs))
         return TransformedPosterior(
-            own,
-            lambda y: w * y + offset,
-            lambda mean, variance: w * mean + offset,
-            lambda mean, variance: w.square() * variance,
-        )
+            own, lambda y: w * y + offset,
+            lambda mean, _: w * mean + offset, lambda _, variance: w.square() * variance,
+        )  # fmt: skip
 
 
 class NotGaussian(OutcomeTransform):
@@ -272,12 +249,13 @@ class Linked(GP):
         """Return g of targets or outputs; a ValueError if some are not within the bounds."""
         outside = ~self.holds(Y)
         if outside.any():
-            rows = marked_rows(outside.any(-1))
+            rows, b = marked_rows(outside.any(-1)), self.link.upper
+            upper = "" if math.isinf(b) else f" and below {b:g}"
             raise ValueError(
-                f"Expected targets {self.link.range}, as {self.link.formula} is modelled; found "
-                f"{float(Y[outside][0]):.6g} in {len(rows)} row(s), the first row {rows[0]}. "
-                "Correct them, make them NaN if they are missing, or give other bounds: "
-                "link=(lower, upper)."
+                f"Expected targets above {self.link.lower:g}{upper}, as {self.link.formula} is "
+                f"modelled; found {float(Y[outside][0]):.6g} in {len(rows)} row(s), the first row "
+                f"{rows[0]}. Correct them, make them NaN if they are missing, or give other "
+                "bounds: link=(lower, upper)."
             )
         return self.link.value(Y)
 
@@ -287,10 +265,9 @@ class Linked(GP):
 
     def noise_in_units(self, Y: Tensor, Yvar: Tensor) -> Tensor:
         """Return known variances of targets by the delta method, ``... x m x n``, in units."""
-        sd = super().noise_in_units(Y, Yvar).sqrt() * self.link.log_slope(Y).exp().mT
-        variances = sd.square()
-        variances = variances.where(~Y.isnan().mT, variances.nanmean(-1, keepdim=True))
-        return variances.nan_to_num(nan=1.0)
+        variances = super().noise_in_units(Y, Yvar) * (2 * self.link.log_slope(Y)).exp().mT
+        mean = variances.nanmean(-1, keepdim=True)
+        return variances.where(~variances.isnan(), mean).nan_to_num(nan=1.0)
 
     def usual_noise(self, Y: Tensor) -> Tensor | None:
         """Return the mean of the known variances of g, as variances of observations."""
@@ -335,12 +312,6 @@ class Linked(GP):
         new.link = self.link.of_outputs(self.checked_outputs(idcs))
         return new
 
-    def to(self, *args: Any, **options: Any) -> Self:
-        """Move the model to a device, with its data."""
-        super().to(*args, **options)
-        self.link = self.link._replace(location=self.link.location.to(self.u))
-        return self
-
     def as_single_task_gp(self, draw: int | None = None) -> Any:
         """Raise a TypeError, as BoTorch's SingleTaskGP has no such link."""
         raise TypeError(
@@ -349,34 +320,8 @@ class Linked(GP):
         )
 
 
-class LinkedCKA(Linked, CKA):
-    """:class:`~gpadjust.core.CKA` of outputs with bounds, see :class:`Linked`."""
-
-
-class LinkedRRA(Linked, RRA):
-    """:class:`~gpadjust.core.RRA` of outputs with bounds, see :class:`Linked`."""
-
-
-class LinkedPhysicsMeanGP(Linked, PhysicsMeanGP):
-    """:class:`~gpadjust.core.PhysicsMeanGP` of outputs with bounds, see :class:`Linked`."""
-
-
-class LinkedScaleGP(Linked, ScaleGP):
-    """:class:`~gpadjust.core.ScaleGP` of outputs with bounds, see :class:`Linked`."""
-
-
-class LinkedZeroMeanGP(Linked, ZeroMeanGP):
-    """:class:`~gpadjust.core.ZeroMeanGP` of outputs with bounds, see :class:`Linked`."""
-
-
-class LinkedCalibratedPhysics(Linked, CalibratedPhysics):
-    """:class:`~gpadjust.core.CalibratedPhysics` of outputs with bounds, see :class:`Linked`."""
-
-
-_LINKED: dict[Any, Any] = {each.__bases__[1]: each for each in Linked.__subclasses__()}
-
-
-def linked(structure: type[GP]) -> type[Linked]:
+@cache
+def linked(structure: Any) -> type[Linked]:
     """Return the class of a structure with a link; :func:`save` needs one of a module.
 
     Example:
@@ -387,6 +332,17 @@ def linked(structure: type[GP]) -> type[Linked]:
         raise TypeError(f"Expected a structure, such as CKA; found {structure!r}.")
     if issubclass(structure, Linked):
         return structure
-    made = type(f"Linked{structure.__name__}", (Linked, structure), {})
-    own: type[Linked] = _LINKED.setdefault(structure, made)
-    return own
+    name = structure.__name__
+    text = f":class:`~gpadjust.core.{name}` of outputs with bounds, see :class:`Linked`."
+    made: Any = type(
+        f"Linked{name}", (Linked, structure), {"__doc__": text, "__module__": __name__}
+    )
+    return made
+
+
+LinkedCKA = linked(CKA)
+LinkedRRA = linked(RRA)
+LinkedPhysicsMeanGP = linked(PhysicsMeanGP)
+LinkedScaleGP = linked(ScaleGP)
+LinkedZeroMeanGP = linked(ZeroMeanGP)
+LinkedCalibratedPhysics = linked(CalibratedPhysics)

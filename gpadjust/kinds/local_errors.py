@@ -39,11 +39,6 @@ class Widened(Predictive):
         """Return the factors at inputs ``... x q x d``, ``... x q x m``."""
 
     @property
-    def source(self) -> GP:
-        """The model whose variances are multiplied."""
-        return self.model
-
-    @property
     def data(self) -> Data:
         """The training data."""
         return self.model.data
@@ -67,28 +62,25 @@ class Widened(Predictive):
         self, X: ArrayLike, observation_noise: bool | Tensor = False
     ) -> tuple[Tensor, Tensor]:
         """Return means and variances of each draw, ``... x S x q x m``."""
-        X, is_learnt = self.data.new_inputs(X), self._is_learnt(observation_noise)
-        mean, variance = self.source.components(X, is_learnt)
-        more = (self.factors(X) - 1).unsqueeze(DRAWS) * variance
-        if observation_noise is not is_learnt:
-            _, variance = self.source.components(X, observation_noise)
-        return mean, variance + more
+        mean, variance = self.model.components(X, observation_noise)
+        own = variance if self._is_own(observation_noise) else self.model.components(X)[1]
+        factors = self.factors(self.data.new_inputs(X))
+        return mean, variance + (factors - 1).unsqueeze(DRAWS) * own
 
     def mixture(
         self, X: ArrayLike, outputs: list[int] | slice, observation_noise: bool | Tensor
     ) -> MixturePosterior:
         """Return the joint posterior of some outputs."""
-        X, is_learnt = self.data.new_inputs(X), self._is_learnt(observation_noise)
-        mean, K = self.source.mixture(X, outputs, is_learnt).components
-        root = self.factors(X)[..., outputs].sqrt().mT.unsqueeze(-3)  # ... x 1 x m x q
-        more = K * (root.unsqueeze(-1) * root.unsqueeze(-2) - 1)
-        if observation_noise is not is_learnt:
-            _, K = self.source.mixture(X, outputs, observation_noise).components
-        return MixturePosterior(mean, K + more)
+        mean, K = self.model.mixture(X, outputs, observation_noise).components
+        is_own = self._is_own(observation_noise)
+        own = K if is_own else self.model.mixture(X, outputs, False).components[1]
+        root = self.factors(self.data.new_inputs(X))[..., outputs].sqrt().mT.unsqueeze(-3)
+        return MixturePosterior(mean, K + own * (root.unsqueeze(-1) * root.unsqueeze(-2) - 1))
 
-    def _is_learnt(self, observation_noise: bool | Tensor) -> bool:
-        """Return whether variances include learnt ones of the noise, which are multiplied, too."""
-        return observation_noise is True and self.model.noise.known is None
+    def _is_own(self, observation_noise: bool | Tensor) -> bool:
+        """Return whether variances are the function's alone, or with a noise that is learnt."""
+        is_learnt = observation_noise is True and self.model.noise.known is None
+        return observation_noise is False or is_learnt
 
     def marginals_of(self, means: Tensor, variances: Tensor) -> Marginals:
         """Return the distributions of Gaussian components, as the model does."""
@@ -112,7 +104,7 @@ class Widened(Predictive):
         self, num_functions: int, seed: int | None = None, num_features: int = 1024
     ) -> Module:
         """Draw functions ``... x q x d`` to ``k x ... x q x m`` from the posterior."""
-        functions = self.source.sample_functions(num_functions, seed, num_features)
+        functions = self.model.sample_functions(num_functions, seed, num_features)
         return WidenedFunctions(self, functions)
 
     def __repr__(self) -> str:

@@ -95,9 +95,7 @@ class Window(Updated):
         """
         more, old = _with_rows(self.model, X, Y, noise), self.model.conditioning()
         late = slice(old.train.x.shape[-2], None)
-        new = more.subset_rows(torch.arange(max(0, len(more.data.X) - self.size), len(more.data.X)))
-        if new is None:
-            raise ValueError(f"Expected a noise that can do with other rows; found {more.noise}.")
+        new = _of_rows(more, torch.arange(len(more.data.X))[-self.size :])
         given = more.conditioning()
         mean, variance = old.marginals(given.train.of_rows(late))
         self.judge((mean, variance + given.noise[..., late]), given.targets[0, ..., late])
@@ -126,7 +124,7 @@ class Kalman(Updated):
         forget: :math:`\tau`, in observations; infinite for never.
 
     Attributes:
-        model: The model without what came, and its unknown numbers.
+        model: The model with the posterior of the weights, of the same data.
     """
 
     def __init__(self, model: GP, forget: float = math.inf) -> None:
@@ -135,34 +133,30 @@ class Kalman(Updated):
         kernels = [term.kernel for term in model.terms if term.kernel is not None]
         if not all(isinstance(kernel, Fourier) for kernel in kernels):
             raise TypeError(f"Expected an RRA; found kernels {kernels}. Take Window(model, size).")
-        self.weights = Weights.of_model(model)
-        # What comes is checked and read by a model of two rows: in a tuple, as it is no submodule.
-        self._few = (model.subset_rows(torch.arange(2)),)
+        self.model = model.with_conditioning(Weights.of_model(model)).eval()
+
+    @property
+    def weights(self) -> Weights:
+        """The posterior of the weights."""
+        weights: Any = self.model.conditioning()
+        return weights
 
     @torch.no_grad()
     def update(self, X: ArrayLike, Y: ArrayLike, noise: Tensor | None = None) -> Self:
         """Take observations; arguments and errors as of :meth:`Window.update`."""
-        (few,) = self._few
-        if few is None:
-            raise ValueError(
-                f"Expected a noise that can do with other rows; found {self.model.noise}."
-            )
-        more, late = _with_rows(few, X, Y, noise).conditioning(), slice(2, None)
+        few, late = _of_rows(self.model, torch.arange(2)), slice(2, None)  # they check and read
+        more, weights = _with_rows(few, X, Y, noise).conditioning(), self.weights
         f, variances = more.train.of_rows(late), more.noise[..., late]
         targets = more.targets[..., late]
-        mean, variance = self.weights.marginals(f)
+        mean, variance = weights.marginals(f)
         self.judge((mean, variance + variances), targets[0])
-        self.weights = self.weights.updated(f, variances, targets - f.mean, self.forget)
+        weights = weights.updated(f, variances, targets - f.mean, self.forget)
+        self.model = self.model.with_conditioning(weights)
         return self
-
-    @property
-    def source(self) -> GP:
-        """The model with the posterior of the weights."""
-        return self.model.with_conditioning(self.weights)
 
     def term(self, name: str, X: ArrayLike) -> MixturePosterior:
         """Return the joint posterior of a term's process at ``X``, as of a GP."""
-        return self.source.term(name, X)
+        return self.model.term(name, X)
 
     def condition_on_observations(
         self, X: ArrayLike, Y: ArrayLike, noise: Tensor | None = None, **_: Any
@@ -172,9 +166,9 @@ class Kalman(Updated):
 
     def subset_output(self, idcs: list[int]) -> Self:
         """Return the model of some outputs; a ValueError if there are none of these numbers."""
-        new, (few,) = super().subset_output(idcs), self._few
-        new._few = (None if few is None else few.subset_output(idcs),)
-        new.weights = self.weights.of_outputs(new.model, self.checked_outputs(idcs))
+        new = super().subset_output(idcs)
+        weights = self.weights.of_outputs(new.model, self.checked_outputs(idcs))
+        new.model = new.model.with_conditioning(weights)
         return new
 
     def sample_functions(self, *_: Any, **__: Any) -> Any:
@@ -233,23 +227,19 @@ class Weights:
 
     def marginals(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Return means and variances at each point, ``... x S x m x q``."""
-        mean, root = self._moments(sought)
-        return mean, root.square().sum(-1)
+        phi = design(sought)
+        mean = sought.mean + (phi @ self.mean.unsqueeze(-1)).squeeze(-1)
+        return mean, (phi @ self.root).square().sum(-1)
 
     def joint(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Return means and covariances, ``... x S x m x q x q``."""
-        mean, root = self._moments(sought)
-        return mean, root @ root.mT
+        root = design(sought) @ self.root
+        return self.marginals(sought)[0], root @ root.mT
 
     def of_outputs(self, model: GP, outputs: list[int]) -> Self:
         """Return the weights of some outputs, of the model of these."""
         train = model.conditioning().train
         return type(self)(train, self.precision[:, outputs], self.pull[:, outputs])
-
-    def _moments(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
-        """Return the mean of a sum, and a root ``... x q x p`` of its covariance."""
-        phi = design(sought)
-        return sought.mean + (phi @ self.mean.unsqueeze(-1)).squeeze(-1), phi @ self.root
 
 
 def design(f: WeightedSum) -> Tensor:
@@ -269,6 +259,14 @@ def design(f: WeightedSum) -> Tensor:
         parts += phi if w is None else [each * w.unsqueeze(-1) for each in phi]
     lead = torch.broadcast_shapes(*(each.shape[:-1] for each in parts))
     return torch.cat([each.expand(*lead, each.shape[-1]) for each in parts], -1)
+
+
+def _of_rows(model: GP, rows: Tensor) -> GP:
+    """Return the model of some rows, if its noise can do with them."""
+    new = model.subset_rows(rows)
+    if new is None:
+        raise ValueError(f"Expected a noise that can do with other rows; found {model.noise}.")
+    return new
 
 
 def _with_rows(model: GP, X: ArrayLike, Y: ArrayLike, noise: Tensor | None) -> GP:

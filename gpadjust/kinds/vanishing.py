@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.checks import check_finite
-from gpadjust.core.data import Data, as_tensor, column_names
+from gpadjust.core.data import Data, as_tensor
 from gpadjust.core.kernels import Features, Kernel, as_kernel
 from gpadjust.core.terms import Term
 from gpadjust.core.unknowns import LogNormal, Row, Values
@@ -59,18 +59,19 @@ class Vanishing(Kernel):
 
     def __init__(self, where: Any, kernel: Any = None) -> None:
         self.kernel: Any = kernel
-        names = column_names(where)
-        self.columns: list[str | int] | None = None if names is None else [*names]
+        if hasattr(where, "columns"):
+            where = {name: where[name].to_list() for name in where.columns}
+        self.columns: list[str | int] | None = [*where] if isinstance(where, Mapping) else None
         if isinstance(where, Mapping):
-            self.columns = [*where]
-            each = [_numbers(values) for values in where.values()]
-            sizes = {len(values) for values in each} - {1}
-            if not each or len(sizes) > 1 or 0 in sizes:
+            try:
+                each = [torch.as_tensor(v, dtype=torch.float64).reshape(-1) for v in where.values()]
+                where = torch.stack(torch.broadcast_tensors(*each), -1)
+            except (TypeError, ValueError, RuntimeError) as error:
                 raise ValueError(
-                    "Expected `where` with a number for each column, or as many numbers for each; "
-                    f"found {where!r}."
-                )
-            where = torch.stack([v.expand(max([1, *sizes])) for v in each], -1)
+                    "Expected `where` with a number for each column, or as many numbers for each "
+                    "(for a category the number of its level, from 0 in the order of the "
+                    f"alphabet); found {where!r}."
+                ) from error
         elif isinstance(where, list | tuple):
             where = torch.tensor(where, dtype=torch.float64)
         self.values = as_tensor(where, "where")
@@ -160,16 +161,14 @@ class Vanishing(Kernel):
 
     def _places(self, names: tuple[str, ...]) -> Tensor:
         """Return the places in the user's units, ``p x d``; NaN in the columns that are free."""
-        d, numbers = len(names), []
-        columns = self.columns
-        if columns is None:
-            columns = [*range(self.values.shape[-1])]
-            if len(columns) != d:
-                raise ValueError(
-                    f"Expected `where` as points of {d} columns; found shape "
-                    f"{tuple(self.values.shape)}. Give values of some columns as a dictionary."
-                )
-        for each in columns:
+        d, columns = len(names), self.columns
+        if columns is None and self.values.shape[-1] != d:
+            raise ValueError(
+                f"Expected `where` as points of {d} columns; found shape "
+                f"{tuple(self.values.shape)}. Give values of some columns as a dictionary."
+            )
+        numbers = []
+        for each in range(d) if columns is None else columns:
             if each not in names and not (isinstance(each, int) and -d <= each < d):
                 raise ValueError(
                     f"Expected `where` to name columns of {', '.join(names)}, or numbers from 0 to "
@@ -218,14 +217,3 @@ class Vanishing(Kernel):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.kernel})"
-
-
-def _numbers(values: Any) -> Tensor:
-    """Return one or several numbers."""
-    try:
-        return torch.as_tensor(values, dtype=torch.float64).reshape(-1)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(
-            f"Expected a number for each column of `where`, or several; found {values!r}. Of a "
-            "category give the number of the level, from 0 in the order of the alphabet."
-        ) from error

@@ -197,7 +197,7 @@ def test_a_function_and_a_cheap_version_of_it():
     ({"low_Y": LOW_Y}, "low_X"),
     ({"physics": crude, "bounds": BOUNDS.flip(0)}, "below"),
     ({"low_X": LOW_X[:, :1], "low_Y": LOW_Y}, "2 inputs"),
-    ({"low_X": LOW_X, "low_Y": LOW_Y[:, :1]}, "2 outputs"),
+    ({"low_X": LOW_X, "low_Y": LOW_Y[:, :1]}, "and 2 outputs"),
     ({"low_X": LOW_X, "physics": FunctionPhysics(
         lambda X, p: crude(X), unknowns={"w": Unknown(1.0, sd=1.0)})}, "CKA"),
 ])  # fmt: skip
