@@ -22,11 +22,9 @@ def check_exogenous(name: str, change: Tensor, rounding: Tensor) -> None:
 
 
 def check_lags(
-    previous: Mapping[str, str],
-    states: Sequence[str],
-    actions: Sequence[str],
+    previous: Mapping[str, str], states: Sequence[str], actions: Sequence[str],
     angles: Sequence[str],
-) -> None:
+) -> None:  # fmt: skip
     """Raise an error unless what each state holds is another state's or an action's earlier value.
 
     A state is an angle if what it holds is one, and only then.
@@ -66,15 +64,7 @@ def check_reads(reads: Sequence[str], states: Sequence[str], actions: Sequence[s
 
 
 def check_previous(name: str, held: str, found: Tensor, before: Tensor, off: Tensor) -> None:
-    """Raise an error for the first row in which a state is off what it is said to hold.
-
-    Args:
-        name: The state's name.
-        held: What it holds, in words.
-        found: Its values after a step, ``N``.
-        before: What they should be, ``N``.
-        off: Where they are not, ``N`` booleans.
-    """
+    """Raise an error for the first row ``off`` where a state is ``found``, not what was before."""
     wrong = off.nonzero()
     if len(wrong):
         row = int(wrong[0])
@@ -86,22 +76,13 @@ def check_previous(name: str, held: str, found: Tensor, before: Tensor, off: Ten
 
 
 def check_integrated(
-    name: str,
-    velocity: str,
-    step: float,
-    velocities: tuple[Tensor, Tensor],
-    discrepancy: Tensor,
+    name: str, velocity: str, step: float, velocities: tuple[Tensor, Tensor], discrepancy: Tensor,
     rounding: Tensor,
-) -> None:
+) -> None:  # fmt: skip
     """Raise an error if an integrated state follows its velocity at another rate; warn of noise.
 
-    Args:
-        name: The state's name.
-        velocity: The name of its velocity.
-        step: The time step.
-        velocities: At the start and at the end of each step, ``N`` each.
-        discrepancy: ``N`` differences between the change of the state and the trapezoid's.
-        rounding: Bounds of the error that single precision makes in ``discrepancy``.
+    Of ``N`` steps the discrepancy is the change of the state less the trapezoid's, of velocities at
+    the start and at the end; its error is within the rounding of single precision.
     """
     before, after = velocities
     trapezoid = step * (before + after) / 2

@@ -140,10 +140,7 @@ class StateSpec:
 
     @property
     def moving(self) -> list[int]:
-        """The states that the physics says the next values of.
-
-        They are those neither exogenous nor previous values.
-        """
+        """The states that the physics moves, neither exogenous nor previous values."""
         still = (*self.exogenous, *self.previous)
         return [i for i, name in enumerate(self.states) if name not in still]
 
@@ -171,9 +168,9 @@ class StateSpec:
 
     @property
     def model_columns(self) -> list[int]:
-        """The columns that models read: moving states, actions, previous values.
+        """The columns that models read, of states and actions side by side.
 
-        Then those that the physics reads beside them, all of states and actions side by side.
+        They are moving states, actions, previous values, and what else the physics reads.
         """
         read = [*self.moving, *range(self.state_dim, self.state_dim + self.action_dim)]
         read += self.previous_columns
@@ -207,14 +204,11 @@ class StateSpec:
         return torch.stack(columns, dim=-1)
 
     def check_observations(self, observations: Tensor) -> None:
-        """Check that sine and cosine of each angle are where they should be.
-
-        Args:
-            observations: ``... x observation_dim``; sensors may be noisy.
+        """Check observations ``... x observation_dim`` of sensors, which may be noisy.
 
         Raises:
-            ValueError: If there are more or less, or the two entries of an angle are far from the
-                unit circle.
+            ValueError: If there are more or fewer entries, or the sine and cosine of an angle are
+                far from the unit circle.
         """
         try:
             check_columns("observations", observations, self.observation_dim)
@@ -251,9 +245,8 @@ class StateSpec:
     ) -> None:
         r"""Check what is declared against transitions of the system.
 
-        An exogenous state may change by no more than the rounding of single precision.
-
-        An integrated one must follow its velocity as :math:`q' - q = b\, h (v + v') / 2` with
+        An exogenous state may change by no more than the rounding of single precision. An
+        integrated one must follow its velocity as :math:`q' - q = b\, h (v + v') / 2` with
         :math:`b = 1`. With the way :math:`w = \sum h (|v| + |v'|) / 2`, or :math:`\sum |q' - q|`
         where that is more,
 
@@ -264,11 +257,9 @@ class StateSpec:
           another state's velocity do, or of noisy sensors while nothing moves.
 
         The trapezoid itself errs by :math:`h^3 |\ddot v| / 12` a step: of an oscillation by less
-        than a tenth if it is sampled six times a period or more. Discrepancies in angles are taken
-        the shortest way round.
-
-        A previous action must be the action to a thousandth of the largest of that action; a
-        previous state must be that state to the rounding of single precision.
+        than a tenth if it is sampled six times a period or more. A previous action must be the
+        action to a thousandth of the largest of that action; a previous state must be that state to
+        the rounding of single precision.
 
         Args:
             states: ``N x state_dim``.
@@ -277,8 +268,8 @@ class StateSpec:
             actions: ``N x action_dim``; may be left out if no state is a previous action.
 
         Raises:
-            ValueError: If a state is not what it is said to be. It is named, with what was found.
-                If there are previous actions, but no ``actions``.
+            ValueError: If a state, which is named, is not what it is said to be, or there are
+                previous actions, but no ``actions``.
 
         Warns:
             UserWarning: If an integrated state is far from what its velocity says.
@@ -333,17 +324,10 @@ class StateSpec:
             check_previous(name, held, found, before, gap[..., i] > tolerance)
 
     def remember(self, next_states: Tensor, states: Tensor, actions: Tensor) -> Tensor:
-        """Let next states hold what these states and actions are as the previous ones, in place.
-
-        Args:
-            next_states: ``... x state_dim``, in memory of their own.
-            states: ``... x state_dim``.
-            actions: ``... x action_dim``.
-        """
+        """Write states and actions, ``... x dim``, into the next states as previous ones."""
         for name, other in self.previous.items():
-            names, values = (
-                (self.states, states) if other in self.states else (self.actions, actions)
-            )
+            is_state = other in self.states
+            names, values = (self.states, states) if is_state else (self.actions, actions)
             next_states[..., self.states.index(name)] = values[..., names.index(other)]
         return next_states
 
