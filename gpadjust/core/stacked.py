@@ -1,12 +1,12 @@
-"""A mixture of several models of the same targets, as one model."""
+"""Models made of fitted ones of the same data, such as the mixture of several."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from copy import deepcopy
 from typing import Any, Self
 
 import torch
-from botorch.models.model import Model
 from torch import Size, Tensor
 from torch.nn import Module, ModuleList
 from torch.quasirandom import SobolEngine
@@ -20,7 +20,70 @@ from gpadjust.core.posterior import MixturePosterior
 _ROUNDS = 1000  # of the search for weights
 
 
-class StackedGP(Predictive):
+class Wrapper(Predictive):
+    """A model made of fitted models of the same data, the first of which has data and scale.
+
+    A subclass has ``components`` and ``mixture``.
+    """
+
+    likelihood = None  # FantasizeMixin reads it
+
+    def __init__(self, models: Iterable[GP]) -> None:
+        super().__init__()
+        self.models: Any = ModuleList(models)
+
+    @property
+    def data(self) -> Data:
+        """The training data."""
+        return self.models[0].data
+
+    @property
+    def num_outputs(self) -> int:
+        """``m``."""
+        return self.models[0].num_outputs
+
+    @property
+    def batch_shape(self) -> Size:
+        """The batch shape of the data: empty but for fantasies."""
+        return self.models[0].batch_shape
+
+    @property
+    def outcome_transform(self) -> Any:
+        """The sign of the models' posteriors for BoTorch's lists of models, if they have one."""
+        return self.models[0].outcome_transform
+
+    def marginals_of(self, means: Tensor, variances: Tensor) -> Marginals:
+        """Return the distributions of Gaussian components, as the models do."""
+        marginals: Marginals = self.models[0].marginals_of(means, variances)
+        return marginals
+
+    def posterior_of(self, mixture: MixturePosterior, outputs: list[int] | slice) -> Any:
+        """Return the posterior of a mixture where the models are Gaussian, as they do."""
+        return self.models[0].posterior_of(mixture, outputs)
+
+    def condition_on_observations(
+        self, X: ArrayLike, Y: ArrayLike, noise: Tensor | None = None, **_: Any
+    ) -> Self:
+        """Return the same of the models with further observations."""
+        return self.of_models([m.condition_on_observations(X, Y, noise) for m in self.models])
+
+    def subset_output(self, idcs: list[int]) -> Self:
+        """Return the same of some outputs; a ValueError if there are none of these numbers."""
+        return self.of_models([each.subset_output(idcs) for each in self.models])
+
+    def of_models(self, models: Iterable[GP]) -> Self:
+        """Return the same of other models with as many draws."""
+        return deepcopy(self, {id(self.models): ModuleList(models)}).eval()
+
+    def to(self, *args: Any, **options: Any) -> Self:
+        """Move the models to a device, with their data."""
+        super().to(*args, **options)
+        for model in self.models:  # a module's own moves parameters alone
+            model.to(*args, **options)
+        return self
+
+
+class StackedGP(Wrapper):
     r"""The mixture of several models, :math:`p(f(x)) = \sum_k w_k \, p_k(f(x))` (Yao et al. 2018).
 
     Its components are draws of each model in proportion to the weight. By a weight of each model
@@ -40,17 +103,15 @@ class StackedGP(Predictive):
         torch.Size([8, 1])
     """
 
-    likelihood = None  # FantasizeMixin reads it
-
     def __init__(self, models: Mapping[str, GP], weights: Any, num_components: int = 64) -> None:
-        super().__init__()
         _check_models(models)
         shares, S = _shares(models, weights), checked_whole("num_components", num_components, 1)
         heights = ((torch.arange(S) + 0.5) / S).to(shares).repeat(shares.shape[-1], 1)
         owners = torch.searchsorted(shares.cumsum(0).mT.contiguous(), heights).mT
         used, owners = owners.clamp_max(len(shares) - 1).unique(return_inverse=True)
-        self.names = [[*models][i] for i in used]
-        self.models: Any = ModuleList(models[name] for name in self.names)
+        names = [[*models][i] for i in used]
+        super().__init__(models[name] for name in names)
+        self.names = names
         picks, start = torch.zeros_like(owners), 0
         for i, name in enumerate(self.names):
             mine, draws = owners == i, len(models[name].u)
@@ -86,35 +147,6 @@ class StackedGP(Predictive):
         """The weights of each model that has any after rounding, one for each output."""
         return {n: (self.owners == i).double().mean(0).tolist() for i, n in enumerate(self.names)}
 
-    @property
-    def data(self) -> Data:
-        """The training data."""
-        return self.models[0].data
-
-    @property
-    def num_outputs(self) -> int:
-        """``m``."""
-        return self.models[0].num_outputs
-
-    @property
-    def outcome_transform(self) -> Any:
-        """The sign of the models' posteriors for BoTorch's lists of models, if they have one."""
-        return self.models[0].outcome_transform
-
-    def marginals_of(self, means: Tensor, variances: Tensor) -> Marginals:
-        """Return the distributions of Gaussian components, as the models do."""
-        marginals: Marginals = self.models[0].marginals_of(means, variances)
-        return marginals
-
-    def posterior_of(self, mixture: MixturePosterior, outputs: list[int] | slice) -> Any:
-        """Return the posterior of a mixture where the models are Gaussian, as they do."""
-        return self.models[0].posterior_of(mixture, outputs)
-
-    @property
-    def batch_shape(self) -> Size:
-        """The batch shape of the data: empty but for fantasies."""
-        return self.models[0].batch_shape
-
     def components(
         self, X: ArrayLike, observation_noise: bool | Tensor = False
     ) -> tuple[Tensor, Tensor]:
@@ -136,31 +168,11 @@ class StackedGP(Predictive):
         picks, columns = self.picks[:, outputs], torch.arange(self.num_outputs)[outputs]
         return MixturePosterior(mean[..., picks, columns, :], K[..., picks, columns, :, :])
 
-    def condition_on_observations(
-        self, X: ArrayLike, Y: ArrayLike, noise: Tensor | None = None, **_: Any
-    ) -> Self:
-        """Return the mixture of the conditioned models; the weights stay as they are."""
-        return self._of([each.condition_on_observations(X, Y, noise) for each in self.models])
-
-    def to(self, *args: Any, **options: Any) -> Self:
-        """Move the models to a device, with their data."""
-        for model in self.models:  # a module's own moves parameters alone
-            model.to(*args, **options)
-        return self
-
     def subset_output(self, idcs: list[int]) -> Self:
         """Return the mixture of some outputs; a ValueError if there are none of these numbers."""
-        new = self._of([each.subset_output(idcs) for each in self.models])
+        new = super().subset_output(idcs)
         new.owners, new.picks = self.owners[:, idcs], self.picks[:, idcs]
         return new
-
-    def _of(self, models: list[GP]) -> Self:
-        """Return the mixture of other models with as many draws."""
-        new = type(self).__new__(type(self))
-        Model.__init__(new)
-        new.names, new.models = self.names, ModuleList(models)
-        new.owners, new.picks = self.owners, self.picks
-        return new.eval()
 
     def sample_functions(
         self, num_functions: int, seed: int | None = None, num_features: int = 1024

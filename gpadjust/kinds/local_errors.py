@@ -3,60 +3,44 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from copy import deepcopy
 from typing import Any, Self
 
 import torch
-from torch import Size, Tensor
+from torch import Tensor
 from torch.nn import Module
 
 from gpadjust.checks import check_kind
-from gpadjust.core.data import ArrayLike, Data
+from gpadjust.core.data import ArrayLike
 from gpadjust.core.gaussian import DRAWS, Marginals
-from gpadjust.core.model import GP, Predictive
+from gpadjust.core.model import GP
 from gpadjust.core.posterior import MixturePosterior
-from gpadjust.physics import Physics
+from gpadjust.core.stacked import Wrapper
 
 _EXPECTED = 1.0  # observations that err as predicted, besides those near a point
 _ROUNDING = 1e-6  # of the targets' spread
 
 
-class Widened(Predictive):
+class Widened(Wrapper):
     """A model whose variances are multiplied by a factor, but for known ones of noise.
 
-    A subclass has ``factors``.
+    A subclass has ``factors``, made of buffers of the names ``of_outputs``, ``m x ...``.
     """
 
-    likelihood = None  # FantasizeMixin reads it
+    of_outputs: tuple[str, ...]
 
     def __init__(self, model: GP) -> None:
-        super().__init__()
         check_kind("model", model, GP, "a model of gpadjust.core, fitted")
-        self.model = model.eval()
+        super().__init__([model.eval()])
 
     @abstractmethod
     def factors(self, X: Tensor) -> Tensor:
         """Return the factors at inputs ``... x q x d``, ``... x q x m``."""
 
     @property
-    def data(self) -> Data:
-        """The training data."""
-        return self.model.data
-
-    @property
-    def physics(self) -> list[Physics]:
-        """The physics of the model."""
-        return self.model.physics
-
-    @property
-    def num_outputs(self) -> int:
-        """``m``."""
-        return self.model.num_outputs
-
-    @property
-    def batch_shape(self) -> Size:
-        """The batch shape of the data: empty but for fantasies."""
-        return self.model.batch_shape
+    def model(self) -> GP:
+        """The model."""
+        model: GP = self.models[0]
+        return model
 
     def components(
         self, X: ArrayLike, observation_noise: bool | Tensor = False
@@ -82,23 +66,12 @@ class Widened(Predictive):
         is_learnt = observation_noise is True and self.model.noise.known is None
         return observation_noise is False or is_learnt
 
-    def marginals_of(self, means: Tensor, variances: Tensor) -> Marginals:
-        """Return the distributions of Gaussian components, as the model does."""
-        return self.model.marginals_of(means, variances)
-
-    def posterior_of(self, mixture: MixturePosterior, outputs: list[int] | slice) -> Any:
-        """Return the posterior of a mixture, as the model does."""
-        return self.model.posterior_of(mixture, outputs)
-
-    def condition_on_observations(
-        self, X: ArrayLike, Y: ArrayLike, noise: Tensor | None = None, **_: Any
-    ) -> Self:
-        """Return the model with further observations and the same factors."""
-        return self.of_model(self.model.condition_on_observations(X, Y, noise))
-
-    def of_model(self, model: GP) -> Self:
-        """Return another model with the same factors."""
-        return deepcopy(self, {id(self.model): model})
+    def subset_output(self, idcs: list[int]) -> Self:
+        """Return the model of some outputs; a ValueError if there are none of these numbers."""
+        new = super().subset_output(idcs)
+        for name in self.of_outputs:
+            setattr(new, name, getattr(self, name)[idcs])
+        return new
 
     def sample_functions(
         self, num_functions: int, seed: int | None = None, num_features: int = 1024
@@ -165,11 +138,16 @@ class LocalErrors(Widened):
         True
     """
 
+    of_outputs = ("squares", "lengthscale")
+    squares: Tensor
+    lengthscale: Tensor
+    points: Tensor
+
     @torch.no_grad()
     def __init__(self, model: GP) -> None:
         super().__init__(model)
         Y, d = model.on_gaussian_scale(self.data.Y), self.data.X.shape[-1]
-        self.points = model.kernel_inputs(self.data.X)
+        self.register_buffer("points", model.kernel_inputs(self.data.X))
         scales = [v for name, v in model.values.items() if name.endswith(".kernel.lengthscale")]
         has_kernels = sum(term.kernel is not None for term in model.terms)
         if len(scales) < has_kernels or any(v.shape[-1] != d for v in scales):
@@ -178,11 +156,11 @@ class LocalErrors(Widened):
                 f"Stationary(MATERN52); found {[term.kernel for term in model.terms]}."
             )
         shortest = torch.stack(scales).amin(0).log().mean(0).exp()  # m x d
-        self.lengthscale = shortest.unsqueeze(-2)
+        self.register_buffer("lengthscale", shortest.unsqueeze(-2))
         mean, variance = Marginals(*model.left_out()).prediction
         spread = _ROUNDING * (Y - Y.nanmean(-2, keepdim=True)).square().nanmean(-2).sqrt()
         squares = (Y - mean).square() / variance.maximum(spread.square())
-        self.squares = squares.nan_to_num(nan=1.0, posinf=1.0).mT
+        self.register_buffer("squares", squares.nan_to_num(nan=1.0, posinf=1.0).mT)
 
     def factors(self, X: Tensor) -> Tensor:
         """Return the factors at inputs ``... x q x d``, ``... x q x m``."""
@@ -191,9 +169,3 @@ class LocalErrors(Widened):
         near = (-0.5 * away.square().sum(-1)).exp()  # ... x m x q x n
         total = (near @ self.squares.unsqueeze(-1)).squeeze(-1)
         return ((_EXPECTED + total) / (_EXPECTED + near.sum(-1))).clamp_min(1.0).mT
-
-    def subset_output(self, idcs: list[int]) -> Self:
-        """Return the model of some outputs; a ValueError if there are none of these numbers."""
-        new, numbers = self.of_model(self.model.subset_output(idcs)), self.checked_outputs(idcs)
-        new.squares, new.lengthscale = self.squares[numbers], self.lengthscale[numbers]
-        return new

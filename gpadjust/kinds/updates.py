@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from copy import deepcopy
 from typing import Any, Self
 
@@ -32,30 +33,54 @@ class Updated(Widened):
         recent: The two sums, ``m x 2``.
     """
 
+    of_outputs = ("recent",)
+    recent: Tensor
     forget: float = math.inf  # tau
 
     def __init__(self, model: GP) -> None:
         super().__init__(model)
-        self.recent = model.unit.new_zeros(model.num_outputs, 2)
+        self.register_buffer("recent", model.unit.new_zeros(model.num_outputs, 2))
 
     def factors(self, X: Tensor) -> Tensor:
         """Return the factors of all inputs, ``1 x m``."""
         errors, number = self.recent.unbind(-1)
         return ((_EXPECTED + errors) / (_EXPECTED + number)).clamp_min(1.0).unsqueeze(0)
 
-    def subset_output(self, idcs: list[int]) -> Self:
-        """Return the model of some outputs; a ValueError if there are none of these numbers."""
-        new = self.of_model(self.model.subset_output(idcs))
-        new.recent = self.recent[self.checked_outputs(idcs)]
-        return new
+    @torch.no_grad()
+    def update(self, X: ArrayLike, Y: ArrayLike, noise: Tensor | None = None) -> Self:
+        """Take observations ``k x d`` and ``k x m``, the last of which is the newest.
 
-    def judge(self, predicted: tuple[Tensor, Tensor], targets: Tensor) -> None:
-        """Take errors of means and variances ``S x m x k`` of what came, ``m x k``."""
-        mean, variance = Marginals(*(each.mT for each in predicted)).prediction
-        squares = (targets - mean.mT).square() / variance.mT
-        for z in squares.unbind(-1):
-            new = torch.stack([z.nan_to_num(nan=0.0), (~z.isnan()).to(z)], -1)
-            self.recent = math.exp(-1 / self.forget) * self.recent + new
+        Args:
+            X: Inputs, as the model's training inputs.
+            Y: Observations, a tensor or as them; NaN where one is missing.
+            noise: Their variances, of a model with known ones.
+
+        Raises:
+            ValueError: If the model refuses them; nothing has changed then.
+        """
+        X = self.data.new_inputs(X)
+        if X.dim() != 2 or not len(X):
+            raise ValueError(
+                f"Expected X of shape k x d, one row at least; found {tuple(X.shape)}."
+            )
+        more = self.models[-1].condition_on_observations(X, Y, noise)
+        if more.batch_shape:
+            raise ValueError(f"Expected Y of shape k x m; found a batch {tuple(more.batch_shape)}.")
+        late, given = slice(-len(X), None), more.conditioning()
+        f, variances = given.train.of_rows(late), given.noise[..., late]
+        targets = given.targets[0, ..., late]
+        new = self._updated(more, f, variances, targets)
+        means, own = self.model.conditioning().marginals(f)
+        mean, variance = Marginals(means.mT, (own + variances).mT).prediction
+        for z in ((targets - mean.mT).square() / variance.mT).unbind(-1):
+            last = torch.stack([z.nan_to_num(nan=0.0), (~z.isnan()).to(z)], -1)
+            self.recent = math.exp(-1 / self.forget) * self.recent + last
+        self.models[0] = new
+        return self
+
+    @abstractmethod
+    def _updated(self, more: GP, f: WeightedSum, noise: Tensor, targets: Tensor) -> GP:
+        """Return the model with the last rows of another, where it has a function, and targets."""
 
 
 class Window(Updated):
@@ -81,26 +106,8 @@ class Window(Updated):
         self.size = len(model.data.X) if size is None else checked_whole("size", size, 2)
         self.forget = self.size
 
-    @torch.no_grad()
-    def update(self, X: ArrayLike, Y: ArrayLike, noise: Tensor | None = None) -> Self:
-        """Take observations ``k x d`` and ``k x m``, the last of which is the newest.
-
-        Args:
-            X: Inputs, as the model's training inputs.
-            Y: Observations, a tensor or as them; NaN where one is missing.
-            noise: Their variances, of a model with known ones.
-
-        Raises:
-            ValueError: If the model refuses them; nothing has changed then.
-        """
-        more, old = _with_rows(self.model, X, Y, noise), self.model.conditioning()
-        late = slice(old.train.x.shape[-2], None)
-        new = _of_rows(more, torch.arange(len(more.data.X))[-self.size :])
-        given = more.conditioning()
-        mean, variance = old.marginals(given.train.of_rows(late))
-        self.judge((mean, variance + given.noise[..., late]), given.targets[0, ..., late])
-        self.model = new
-        return self
+    def _updated(self, more: GP, f: WeightedSum, noise: Tensor, targets: Tensor) -> GP:
+        return _of_rows(more, torch.arange(len(more.data.X))[-self.size :])
 
 
 class Kalman(Updated):
@@ -133,26 +140,14 @@ class Kalman(Updated):
         kernels = [term.kernel for term in model.terms if term.kernel is not None]
         if not all(isinstance(kernel, Fourier) for kernel in kernels):
             raise TypeError(f"Expected an RRA; found kernels {kernels}. Take Window(model, size).")
-        self.model = model.with_conditioning(Weights.of_model(model)).eval()
+        self.models[0] = model.with_conditioning(Weights.of_model(model)).eval()
+        self.models.append(_of_rows(model, torch.arange(2)))  # it checks and reads observations
 
     @property
     def weights(self) -> Weights:
         """The posterior of the weights."""
         weights: Any = self.model.conditioning()
         return weights
-
-    @torch.no_grad()
-    def update(self, X: ArrayLike, Y: ArrayLike, noise: Tensor | None = None) -> Self:
-        """Take observations; arguments and errors as of :meth:`Window.update`."""
-        few, late = _of_rows(self.model, torch.arange(2)), slice(2, None)  # they check and read
-        more, weights = _with_rows(few, X, Y, noise).conditioning(), self.weights
-        f, variances = more.train.of_rows(late), more.noise[..., late]
-        targets = more.targets[..., late]
-        mean, variance = weights.marginals(f)
-        self.judge((mean, variance + variances), targets[0])
-        weights = weights.updated(f, variances, targets - f.mean, self.forget)
-        self.model = self.model.with_conditioning(weights)
-        return self
 
     def term(self, name: str, X: ArrayLike) -> MixturePosterior:
         """Return the joint posterior of a term's process at ``X``, as of a GP."""
@@ -167,15 +162,25 @@ class Kalman(Updated):
     def subset_output(self, idcs: list[int]) -> Self:
         """Return the model of some outputs; a ValueError if there are none of these numbers."""
         new = super().subset_output(idcs)
-        weights = self.weights.of_outputs(new.model, self.checked_outputs(idcs))
-        new.model = new.model.with_conditioning(weights)
+        new.models[0] = self.weights.given_to(new.model, idcs)
         return new
+
+    def to(self, *args: Any, **options: Any) -> Self:
+        """Move the model to a device, with its weights."""
+        weights = self.weights
+        super().to(*args, **options)
+        self.models[0] = weights.given_to(self.model)
+        return self
 
     def sample_functions(self, *_: Any, **__: Any) -> Any:
         """Raise an error, as functions are drawn given the rows of data."""
         raise NotImplementedError(
             "Functions of weights are not drawn; draw joint samples: kalman.posterior(X).rsample()."
         )
+
+    def _updated(self, more: GP, f: WeightedSum, noise: Tensor, targets: Tensor) -> GP:
+        weights = self.weights.updated(f, noise, targets - f.mean, self.forget)
+        return self.model.with_conditioning(weights)
 
 
 class Weights:
@@ -236,10 +241,11 @@ class Weights:
         root = design(sought) @ self.root
         return self.marginals(sought)[0], root @ root.mT
 
-    def of_outputs(self, model: GP, outputs: list[int]) -> Self:
-        """Return the weights of some outputs, of the model of these."""
-        train = model.conditioning().train
-        return type(self)(train, self.precision[:, outputs], self.pull[:, outputs])
+    @torch.no_grad()
+    def given_to(self, model: GP, outputs: Any = slice(None)) -> GP:
+        """Return a model of some outputs, or on another device, with these weights."""
+        parts = (each[:, outputs].to(model.u) for each in (self.precision, self.pull))
+        return model.with_conditioning(Weights(model.at(model.data.X), *parts))
 
 
 def design(f: WeightedSum) -> Tensor:
@@ -267,14 +273,3 @@ def _of_rows(model: GP, rows: Tensor) -> GP:
     if new is None:
         raise ValueError(f"Expected a noise that can do with other rows; found {model.noise}.")
     return new
-
-
-def _with_rows(model: GP, X: ArrayLike, Y: ArrayLike, noise: Tensor | None) -> GP:
-    """Return a model with further rows ``k x d`` and ``k x m``, if it takes them."""
-    X = model.data.new_inputs(X)
-    if X.dim() != 2 or not len(X):
-        raise ValueError(f"Expected X of shape k x d, one row at least; found {tuple(X.shape)}.")
-    more = model.condition_on_observations(X, Y, noise)
-    if more.batch_shape:
-        raise ValueError(f"Expected Y of shape k x m; found a batch {tuple(more.batch_shape)}.")
-    return more

@@ -106,6 +106,11 @@ def test_links_keep_their_bounds():
     assert (wider.sample_functions(3, 0, 64)(X) > 0).all()
 
 
+def test_another_device_has_the_data_and_factors_too():
+    wider = LocalErrors(ZeroMeanGP(line(5), line(5))).to("meta")
+    assert all(each.is_meta for each in (wider.data.X, wider.points, wider.squares))
+
+
 def _width(model, Z):
     low, high = model.interval(Z)
     return high.log() - low.log()
