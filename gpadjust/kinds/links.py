@@ -280,23 +280,12 @@ class Linked(GP):
         """Return the log densities of the targets, ``m``, in the user's units less the model's."""
         return super().log_unit() + self.link.log_slope(self.data.Y).nansum(-2)
 
-    def components(self, X: Any, observation_noise: bool | Tensor = False) -> tuple[Tensor, Tensor]:
-        """Return means and variances of each draw, ``... x S x q x m``, on the scale of g."""
-        return super().components(X, self._noise_of_g(X, observation_noise))
-
-    def mixture(
-        self, X: Any, outputs: list[int] | slice, observation_noise: bool | Tensor
-    ) -> MixturePosterior:
-        """Return the joint posterior of some outputs on the scale of g."""
-        return super().mixture(X, outputs, self._noise_of_g(X, observation_noise))
-
-    def _noise_of_g(self, X: Any, noise: bool | Tensor) -> bool | Tensor:
-        """Return given variances of observations at predictions by the delta method."""
-        if noise is True or noise is False:
-            return noise
-        variances = self.checked_noise(noise, self.data.new_inputs(X))
-        median = self.marginals_of(*super().components(X)).quantile(0.5)
-        return variances * (2 * self.link.log_slope(median)).exp()
+    def _noise_at(self, X: Tensor, asked: bool | Tensor) -> Tensor:
+        """Return variances of g, given ones by the delta method at predictions."""
+        if asked is True:
+            return super()._noise_at(X, asked)
+        variances = self.checked_noise(asked, X)
+        return self.noise_in_units(self.marginals(X).quantile(0.5), variances).unsqueeze(-3)
 
     def marginals_of(self, means: Tensor, variances: Tensor) -> LinkedMarginals:
         """Return the distributions of components on the scale of g, ``... x S x q x m``."""

@@ -183,8 +183,8 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/kinds/links.py",
-        "return variances * (2 * self.link.log_slope(median)).exp()",
-        "return variances * self.link.log_slope(median).exp()",
+        "return self.noise_in_units(self.marginals(X).quantile(0.5), variances).unsqueeze(-3)",
+        "return super()._noise_at(X, variances)",
         "Given noise at predictions is not carried over the link as a variance.",
     ),
     Fault(
