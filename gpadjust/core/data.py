@@ -214,6 +214,19 @@ def names_of(values: ArrayLike, letter: str) -> tuple[str, ...]:
     return (letter,) if number == 1 else tuple(f"{letter}{i + 1}" for i in range(number))
 
 
+def columns_of(names: Sequence[str], asked: Any, what: str) -> list[int]:
+    """Return the numbers of columns that are asked for, one or several, by name or number."""
+    numbers: dict[Any, int] = {name: i for i, name in enumerate(names)}
+    numbers |= {i: i % len(names) for i in range(-len(names), len(names))}
+    several = [asked] if isinstance(asked, str | int) else [*asked]
+    if unknown := [each for each in several if each not in numbers]:
+        raise ValueError(
+            f"Expected {what} by names or numbers of the inputs {', '.join(names)}; found "
+            f"{unknown[0]!r}."
+        )
+    return [numbers[each] for each in several]
+
+
 def column_names(values: ArrayLike) -> tuple[str, ...] | None:
     """Return the names of a frame's columns or of a Series, or None."""
     if hasattr(values, "columns"):

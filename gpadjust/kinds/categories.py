@@ -14,7 +14,7 @@ import torch
 from botorch.models.transforms.input import InputTransform
 from torch import Tensor
 
-from gpadjust.core.data import ArrayLike, Data, names_of
+from gpadjust.core.data import ArrayLike, Data, columns_of, names_of
 from gpadjust.core.kernels import DELTA, Features, Fourier, Kernel, PullBack, Stationary
 from gpadjust.core.terms import Term
 from gpadjust.core.unknowns import LogNormal, Row, Values
@@ -126,7 +126,8 @@ class Categories(InputTransform):
     def _learn(self, X: ArrayLike) -> None:
         """Learn columns and levels of texts; levels that are numbers are empty until transform."""
         self.names, asked = names_of(X, "x"), self.asked
-        columns, self.batches, declared = (self._columns(name) for name in asked)
+        each = (columns_of(self.names, () if v is None else v, name) for name, v in asked.items())
+        columns, self.batches, declared = each
         texts = levels_of_texts(X, [*columns, *self.batches])
         columns = [*texts] if asked["columns"] is None else columns
         texts |= zip(declared, map(tuple, asked["levels"].values()), strict=True)
@@ -134,19 +135,6 @@ class Categories(InputTransform):
         for i, own in self.levels.items():
             if len({*own}) < len(own) or len({isinstance(level, str) for level in own}) > 1:
                 raise ValueError(f"Expected different levels of {self.names[i]}; found {own}.")
-
-    def _columns(self, argument: str) -> list[int]:
-        """Return the numbers of the columns that an argument names."""
-        names, asked = [*self.names], self.asked[argument]
-        columns: dict[Any, int] = dict(zip(names, range(len(names)), strict=True))
-        columns |= {i: i % len(names) for i in range(-len(names), len(names))}
-        several = [asked] if isinstance(asked, str | int) else [*(asked or ())]
-        if unknown := [each for each in several if each not in columns]:
-            raise ValueError(
-                f"Expected {argument} by names or numbers of the inputs {', '.join(names)}; found "
-                f"{unknown[0]!r}."
-            )
-        return [columns[each] for each in several]
 
     def _unknown(self, i: int, value: str | float) -> ValueError:
         levels = self.levels[i] if isinstance(value, str) else numbers_of(self.levels[i])
@@ -239,12 +227,8 @@ class Offset(Kernel):
     def of_data(self, data: Data) -> Offset:
         """Return the kernel for a model's data, of which it knows the values."""
         new = copy(self)
-        new.values = self.of(data.kernel_inputs(data.X)).unique().tolist()
+        new.values = data.kernel_inputs(data.X)[..., self.column].unique().tolist()
         return new
-
-    def of(self, x: Tensor) -> Tensor:
-        """Return the values of inputs, ``... x n x 1``."""
-        return x[..., [self.column]]
 
     def rows(self, x: Tensor, num_outputs: int) -> list[Row]:
         """Return the row of s."""
@@ -253,7 +237,8 @@ class Offset(Kernel):
 
     def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
         """Return s where values are the same."""
-        same = self.of(x) == self.of(x if other is None else other).mT
+        column = (x if other is None else other)[..., self.column]
+        same = x[..., self.column].unsqueeze(-1) == column.unsqueeze(-2)
         return own["outputscale"].unsqueeze(-1) * same
 
     def features(self, own: Values, number: int, generator: torch.Generator) -> Features:
@@ -261,7 +246,7 @@ class Offset(Kernel):
         size = own["outputscale"].sqrt().unsqueeze(-1)
 
         def features(x: Tensor) -> Tensor:
-            c, slots = self.of(x), torch.arange(number).to(x)
+            c, slots = x[..., [self.column]], torch.arange(number).to(x)
             known = c == c.new_tensor(self.values)
             slot = torch.floor(number * torch.remainder(c * (math.sqrt(5) - 1) / 2, 1.0))
             return size * torch.cat([known, (slot == slots) & ~known.any(-1, keepdim=True)], -1)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.checks import check_finite
-from gpadjust.core.data import Data, as_tensor
+from gpadjust.core.data import Data, as_tensor, columns_of
 from gpadjust.core.kernels import Features, Kernel, as_kernel
 from gpadjust.core.terms import Term
 from gpadjust.core.unknowns import LogNormal, Row, Values
@@ -61,36 +61,35 @@ class Vanishing(Kernel):
         self.kernel: Any = kernel
         if hasattr(where, "columns"):
             where = {name: where[name].to_list() for name in where.columns}
-        self.columns: list[str | int] | None = [*where] if isinstance(where, Mapping) else None
-        if isinstance(where, Mapping):
-            try:
-                each = [torch.as_tensor(v, dtype=torch.float64).reshape(-1) for v in where.values()]
-                where = torch.stack(torch.broadcast_tensors(*each), -1)
-            except (TypeError, ValueError, RuntimeError) as error:
+        self.is_points = not isinstance(where, Mapping)
+        if self.is_points:
+            is_list = isinstance(where, list | tuple)
+            points = as_tensor(torch.tensor(where).double() if is_list else where, "where")
+            if points.dim() != 2:
                 raise ValueError(
-                    "Expected `where` with a number for each column, or as many numbers for each "
-                    "(for a category the number of its level, from 0 in the order of the "
-                    f"alphabet); found {where!r}."
-                ) from error
-        elif isinstance(where, list | tuple):
-            where = torch.tensor(where, dtype=torch.float64)
-        self.values = as_tensor(where, "where")
-        if self.values.dim() != 2 or not self.values.numel():
+                    "Expected `where` as values of columns ({'valve': 1.0}) or as points p x d; "
+                    f"found shape {tuple(points.shape)}."
+                )
+            where = dict(enumerate(points.mT))
+        try:
+            each = [torch.as_tensor(v, dtype=torch.float64).reshape(-1) for v in where.values()]
+            self.values = torch.stack(torch.broadcast_tensors(*each), -1)
+            self.values[0]  # an error if there is none
+        except (TypeError, ValueError, RuntimeError, IndexError) as error:
             raise ValueError(
-                "Expected `where` as values of columns ({'valve': 1.0}) or as points p x d; found "
-                f"shape {tuple(self.values.shape)}."
-            )
+                "Expected `where` with a number for each column, or as many numbers for each (for "
+                "a category the number of its level, from 0 in the order of the alphabet); found "
+                f"{where!r}."
+            ) from error
+        self.columns: list[str | int] = [*where]
         check_finite("where", self.values)
         self.places = self.values  # in the columns that kernels read; NaN in those that are free
 
     @property
     def settings(self) -> dict[str, Any]:
         """The arguments."""
-        points = self.values.tolist()
-        if self.columns is None:
-            return {"where": points, "kernel": self.kernel}
-        each = zip(self.columns, zip(*points, strict=True), strict=True)
-        return {"where": {name: [*values] for name, values in each}, "kernel": self.kernel}
+        where = dict(zip(self.columns, self.values.mT.tolist(), strict=True))
+        return {"where": self.values.tolist() if self.is_points else where, "kernel": self.kernel}
 
     def of_term(self, outputscale: LogNormal) -> Vanishing:
         """Return the kernel whose k has the prior variance of a term, if it has none."""
@@ -100,7 +99,14 @@ class Vanishing(Kernel):
 
     def of_data(self, data: Data) -> Vanishing:
         """Return the kernel on the columns that kernels of a model read."""
-        new, places = copy(self), self._places(data.input_names).to(data.X)
+        new, d, found = copy(self), data.X.shape[-1], len(self.columns)
+        if self.is_points and found != d:
+            raise ValueError(
+                f"Expected `where` as points of {d} columns; found {found}. Give values of some "
+                "columns as a dictionary."
+            )
+        places = data.X.new_full((len(self.values), d), torch.nan)
+        places[:, columns_of(data.input_names, self.columns, "`where`")] = self.values.to(places)
         free = places.isnan()
         terms = getattr(data.transform, "terms", lambda terms: terms)
         new.kernel = terms([Term("k", self.kernel)])[0].kernel.of_data(data)
@@ -129,8 +135,8 @@ class Vanishing(Kernel):
 
     def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
         """Return the covariances of inputs with others, or with themselves; NaN if impossible."""
-        left = self._along(own, x)
-        right = left if other is None else self._along(own, other)
+        left = self._along(own, x)[0]
+        right = left if other is None else self._along(own, other)[0]
         zero = self._of(own, x, other, True) - left @ right.mT
         if not self.places.isnan().any():
             return zero
@@ -140,7 +146,7 @@ class Vanishing(Kernel):
     def variance(self, own: Values, x: Tensor) -> Tensor:
         """Return the prior variances, ``... x S x m x n``."""
         k = self.kernel.variance
-        zero = k(own, self._part(x, True)) - self._along(own, x).square().sum(-1)
+        zero = k(own, self._part(x, True)) - self._along(own, x)[0].square().sum(-1)
         return zero.clamp_min(0.0) * k(own, self._part(x, False)) / k(own, torch.zeros_like(x))
 
     def features(self, own: Values, number: int, generator: torch.Generator) -> Features:
@@ -153,31 +159,11 @@ class Vanishing(Kernel):
         def features(x: Tensor) -> Tensor:
             places = self.places.to(x).reshape(-1, *[1] * (x.dim() - 1), x.shape[-1])
             there = free(x.where(places.isnan(), places))  # p x ... x n x D
-            along = self._along(own, x).mT
-            weights = torch.linalg.solve_triangular(self._factor(own, x).mT, along, upper=True)
+            along, root = self._along(own, x)
+            weights = torch.linalg.solve_triangular(root.mT, along.mT, upper=True)
             return free(x) - (weights.movedim(-2, 0).unsqueeze(-1) * there).sum(0)
 
         return features
-
-    def _places(self, names: tuple[str, ...]) -> Tensor:
-        """Return the places in the user's units, ``p x d``; NaN in the columns that are free."""
-        d, columns = len(names), self.columns
-        if columns is None and self.values.shape[-1] != d:
-            raise ValueError(
-                f"Expected `where` as points of {d} columns; found shape "
-                f"{tuple(self.values.shape)}. Give values of some columns as a dictionary."
-            )
-        numbers = []
-        for each in range(d) if columns is None else columns:
-            if each not in names and not (isinstance(each, int) and -d <= each < d):
-                raise ValueError(
-                    f"Expected `where` to name columns of {', '.join(names)}, or numbers from 0 to "
-                    f"{d - 1}; found {each!r}."
-                )
-            numbers.append(each % d if isinstance(each, int) else names.index(each))
-        places = self.values.new_full((len(self.values), d), torch.nan)
-        places[:, numbers] = self.values
-        return places
 
     def _part(self, x: Tensor, is_given: bool) -> Tensor:
         """Return inputs with 0 in the columns R, or in S."""
@@ -189,22 +175,19 @@ class Vanishing(Kernel):
         K: Tensor = self.kernel.covariance(own, self._part(x, is_given), other)
         return K
 
-    def _along(self, own: Values, x: Tensor) -> Tensor:
-        """Return the covariances of x_S with what is zero, whitened: ``... x n x p``."""
-        cross = self._of(own, x, self._zeros(x), True)
-        return torch.linalg.solve_triangular(self._factor(own, x), cross.mT, upper=False).mT
+    def _along(self, own: Values, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the covariances of x_S with what is zero, whitened: ``... x n x p``.
 
-    def _factor(self, own: Values, x: Tensor) -> Tensor:
-        """Return the Cholesky factor of the covariance of what is zero; NaN if it has none."""
-        K = self._of(own, self._zeros(x), None, True)
+        And the root that whitens, the Cholesky factor of what is zero; NaN if it has none.
+        """
+        zeros = self.places.to(x).nan_to_num()[None, None]
+        K = self._of(own, zeros, None, True)
         rounding = _ROUNDING if K.shape[-1] > 1 else 0.0
         K = K + rounding * torch.diag_embed(K.diagonal(dim1=-1, dim2=-2))
-        factor, failed = torch.linalg.cholesky_ex(K)
-        return factor.masked_fill(failed[..., None, None] > 0, torch.nan)
-
-    def _zeros(self, x: Tensor) -> Tensor:
-        """Return the places as inputs, ``1 x 1 x p x d``."""
-        return self.places.to(x).nan_to_num()[None, None]
+        root, failed = torch.linalg.cholesky_ex(K)
+        root = root.masked_fill(failed[..., None, None] > 0, torch.nan)
+        cross = self._of(own, x, zeros, True)
+        return torch.linalg.solve_triangular(root, cross.mT, upper=False).mT, root
 
     def _is_product(self, x: Tensor) -> bool:
         """Return whether k(x, x') k(0, 0) is k_S k_R, at the middle of the prior."""

@@ -178,6 +178,8 @@ class Turned(Normalize):
 def test_bad_places_kernels_and_transforms():
     for where, says in (
         ({}, "number for each column"),
+        ({"valve": []}, "number for each column"),
+        (np.zeros((0, 2)), "number for each column"),
         ({"valve": [0.0, 1.0], "flow": [1.0, 2.0, 3.0]}, "as many numbers for each"),
         ({"valve": float("nan")}, "finite"),
         (np.zeros(3), r"points p x d.*\(3,\)"),
@@ -185,8 +187,8 @@ def test_bad_places_kernels_and_transforms():
     ):
         refused(ValueError, says, Vanishing, where)
     for where, options, says in (
-        ({"vane": 1.0}, {}, "columns of valve, flow.*'vane'"),
-        ({2: 1.0}, {}, "numbers from 0 to 1; found 2"),
+        ({"vane": 1.0}, {}, "`where` by names or numbers of the inputs valve, flow; found 'vane'"),
+        ({2: 1.0}, {}, "numbers of the inputs valve, flow; found 2"),
         (np.zeros((1, 3)), {}, "points of 2 columns"),
         ({0: 1.0}, {"kernel": Stationary(MATERN52)}, "a product over the inputs"),
         ({0: 1.0}, {"kernel": ScaleKernel(MaternKernel())}, "a product over the inputs"),

@@ -219,7 +219,7 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/kinds/vanishing.py",
-        "zero = k(own, self._part(x, True)) - self._along(own, x).square().sum(-1)",
+        "zero = k(own, self._part(x, True)) - self._along(own, x)[0].square().sum(-1)",
         "zero = k(own, self._part(x, True))",
         "Marginal prior variances are not zero where the function is.",
     ),
