@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from copy import copy
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -141,9 +142,11 @@ class KnownNoise(Noise):
         super().__init__(())
         self.known: Tensor = variances
 
-    def of_variances(self, variances: Tensor) -> KnownNoise:
+    def of_variances(self, variances: Tensor) -> Self:
         """Return the noise of the same kind with other variances."""
-        return KnownNoise(variances)
+        new = copy(self)
+        new.known = variances
+        return new
 
     def variance(self, values: Values, places: Places, is_training: bool = False) -> Tensor:
         """Return the known variances; at other places their mean in each output."""
@@ -154,20 +157,20 @@ class KnownNoise(Noise):
         """Return nothing, as nothing is learnt."""
         return {}
 
-    def appended(self, variances: Tensor | None, num_points: int) -> KnownNoise:
+    def appended(self, variances: Tensor | None, num_points: int) -> Self:
         """Return the noise of further rows, too: of given variances or the mean of those known."""
         if variances is None:
             variances = self.known.mean(-1, keepdim=True).expand(*self.known.shape[:-1], num_points)
         return self.of_variances(appended(self.known, variances, -1))
 
-    def to(self, like: Tensor) -> KnownNoise:
+    def to(self, like: Tensor) -> Self:
         """Return the noise on the device of a tensor."""
         return self.of_variances(self.known.to(like))
 
-    def of_rows(self, rows: Tensor) -> KnownNoise:
+    def of_rows(self, rows: Tensor) -> Self:
         """Return the noise of some observations."""
         return self.of_variances(self.known[..., rows])
 
-    def of_outputs(self, outputs: Sequence[int]) -> KnownNoise:
+    def of_outputs(self, outputs: Sequence[int]) -> Self:
         """Return the noise of some outputs."""
         return self.of_variances(self.known[..., list(outputs), :])

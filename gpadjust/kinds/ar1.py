@@ -213,10 +213,6 @@ class LevelNoise(Noise):
 class KnownAtHigh(KnownNoise):
     """Known variances of the high level, and a low one next to exact."""
 
-    def of_variances(self, variances: Tensor) -> KnownNoise:
-        """Return the noise with other variances."""
-        return KnownAtHigh(variances)
-
     def variance(self, values: Values, places: Places, is_training: bool = False) -> Tensor:
         """Return the variances, of both levels at the training inputs."""
         variances = super().variance(values, places, is_training)

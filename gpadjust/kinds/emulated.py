@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
-from gpadjust.checks import checked_whole
+from gpadjust.checks import check_kind, checked_whole
 from gpadjust.core import MATERN52, RBF, Stationary, ZeroMeanGP, fit
 from gpadjust.core.model import GP
+from gpadjust.core.posterior import MixturePosterior
 from gpadjust.core.terms import WeightedSum
 from gpadjust.physics import ParameterValues, Physics, Unknown
 
@@ -125,14 +126,12 @@ class EmulatedPhysics(Physics):
         values = parameters[0].rows
         rows, z = torch.cat([X, values[:, :p]], -1).double(), values[:, p:]
         if rows.requires_grad and torch.is_grad_enabled():
-            return self._sum(self._components.at(rows), z)
-        rows, place = rows.unique(dim=0, return_inverse=True)
-        if self._kept is None or not torch.equal(self._kept[0], rows):
-            self._kept = (rows, self._components.at(rows))
-        return self._sum(self._kept[1][place], z)
-
-    def _sum(self, parts: Tensor, z: Tensor) -> Tensor:
-        """Return ``m + sum_k z_k v_k``, of ``N x m x (1 + K)``."""
+            parts = self._components.at(rows)
+        else:
+            rows, place = rows.unique(dim=0, return_inverse=True)
+            if self._kept is None or not torch.equal(self._kept[0], rows):
+                self._kept = (rows, self._components.at(rows))
+            parts = self._kept[1][place]
         return parts[..., 0] + (parts[..., 1:] @ z.to(parts).unsqueeze(-1)).squeeze(-1)
 
 
@@ -155,20 +154,14 @@ class _Components:
         self.data = emulator.conditioning()
         self.places = emulator.at(places)
         mean, K = self.data.joint(self.places)  # S x m x Q (x Q)
-        S, m, q = mean.shape
-        away = mean - mean.mean(0)
-        C = torch.zeros(m, q, m, q).to(K)
-        for j in range(m):
-            C[j, :, j] = K.mean(0)[j]
-        flat = away.flatten(1)
-        C = C.reshape(m * q, m * q) + flat.mT @ flat / S
+        C = MixturePosterior(mean, K).distribution.covariance_matrix
         size, vectors = torch.linalg.eigh(C)
         number = min(number, len(size))
         size, vectors = size[-number:].flip(0).clamp_min(1e-300), vectors[:, -number:].flip(1)
-        weights = (vectors / size.sqrt()).reshape(m, q, number)
+        weights = (vectors / size.sqrt()).reshape(*mean.shape[1:], number)
         cross = self.places.cross(self.data.train) * self.data.observed.unsqueeze(-2)
         solved = torch.cholesky_solve(cross.mT, self.data.chol)  # S x m x n x Q
-        of_means = torch.einsum("smq,mqk->sk", away, weights)
+        of_means = torch.einsum("smq,mqk->sk", mean - mean.mean(0), weights)
         self.weights = [weights, solved @ weights, of_means]  # m x Q x K, S x m x n x K, S x K
         # For components that are left out, and between places, all are as much larger.
         at = emulator.at(others)
@@ -212,8 +205,7 @@ def _fitted(
     fitted = []
     for factory in [model_factory] if model_factory else factories:
         emulator = factory(runs_X, runs_Y)
-        if not isinstance(emulator, GP):
-            raise TypeError(f"Expected model_factory to return a GP; found {emulator!r}.")
+        check_kind("model_factory's model", emulator, GP, "a GP")
         if type(emulator).on_gaussian_scale is not GP.on_gaussian_scale:
             raise ValueError(
                 f"Expected an emulator without a link; found a {type(emulator).__name__}. Emulate "

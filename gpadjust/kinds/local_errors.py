@@ -7,7 +7,6 @@ from typing import Any, Self
 
 import torch
 from torch import Tensor
-from torch.nn import Module
 
 from gpadjust.checks import check_kind
 from gpadjust.core.data import ArrayLike
@@ -73,40 +72,15 @@ class Widened(Wrapper):
             setattr(new, name, getattr(self, name)[idcs])
         return new
 
-    def sample_functions(
-        self, num_functions: int, seed: int | None = None, num_features: int = 1024
-    ) -> Module:
-        """Draw functions ``... x q x d`` to ``k x ... x q x m`` from the posterior."""
-        functions = self.model.sample_functions(num_functions, seed, num_features)
-        return WidenedFunctions(self, functions)
+    def sample_functions(self, *_: Any, **__: Any) -> Any:
+        """Raise an error, as functions are those of a GP."""
+        raise NotImplementedError(
+            f"A {type(self).__name__} draws no functions; draw joint samples, "
+            "posterior(X).rsample(), or functions of its attribute model, without the factors."
+        )
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.model!r})"
-
-
-class WidenedFunctions(Module):
-    """Functions of a model, as much farther from the means of their draws as it is widened."""
-
-    def __init__(self, widened: Widened, functions: Any) -> None:
-        super().__init__()
-        self.functions, self.factors = functions, widened.factors
-
-    def forward(self, X: Tensor) -> Tensor:
-        """Return the values ``k x ... x q x m`` of all functions at ``... x q x d``."""
-        means = self.functions.model.components(X)[0].movedim(DRAWS, 0)
-        return self._farther(self.functions(X), means, self.factors(X))
-
-    def each(self, X: Tensor) -> Tensor:
-        """Return the values ``k x q x m`` of each function at points of its own, ``k x q x d``."""
-        means = self.functions.model.components(X)[0]  # k x k x q x m
-        means = means.diagonal(dim1=0, dim2=1).movedim(-1, 0)
-        return self._farther(self.functions.each(X), means, self.factors(X))
-
-    def _farther(self, values: Tensor, means: Tensor, factors: Tensor) -> Tensor:
-        model = self.functions.model
-        away = model.on_gaussian_scale(values) - means
-        Y: Tensor = model.off_gaussian_scale(means + factors.sqrt() * away)
-        return Y
 
 
 class LocalErrors(Widened):

@@ -172,12 +172,6 @@ class Kalman(Updated):
         self.models[0] = weights.given_to(self.model)
         return self
 
-    def sample_functions(self, *_: Any, **__: Any) -> Any:
-        """Raise an error, as functions are drawn given the rows of data."""
-        raise NotImplementedError(
-            "Functions of weights are not drawn; draw joint samples: kalman.posterior(X).rsample()."
-        )
-
     def _updated(self, more: GP, f: WeightedSum, noise: Tensor, targets: Tensor) -> GP:
         weights = self.weights.updated(f, noise, targets - f.mean, self.forget)
         return self.model.with_conditioning(weights)

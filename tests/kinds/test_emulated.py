@@ -171,7 +171,7 @@ def test_a_model_may_be_saved_and_its_physics_is_given_again(crude, tmp_path):
     (lambda X: EmulatedPhysics(X, X, unknowns=W), ValueError, "and then 1 unknown"),
     (lambda X: EmulatedPhysics(X, X, unknowns={"emulator_1": W["w"]}), ValueError, "other names"),
     (lambda X: EmulatedPhysics(X, X, num_components=0), ValueError, "num_components"),
-    (lambda X: EmulatedPhysics(X, X, model_factory=lambda X, Y: X), TypeError, "return a GP"),
+    (lambda X: EmulatedPhysics(X, X, model_factory=lambda X, Y: X), TypeError, "must be a GP"),
     (lambda X: EmulatedPhysics(X, X + 1, fit_options=MAP, model_factory=lambda X, Y: LinkedCKA(
         X, Y, physics=torch.exp, link="log")), ValueError, "without a link"),
     (lambda X: EmulatedPhysics(X, X.sin(), fit_options=MAP)(torch.zeros(3, 2).double()),

@@ -66,7 +66,7 @@ def test_intervals_cover_a_kink_and_others_are_not_wider(wider, Z):
 
 
 @pytest.mark.slow
-def test_predictions_posteriors_gradients_functions_and_noise_agree(wider, Z):
+def test_predictions_posteriors_gradients_and_noise_agree(wider, Z):
     X, plain = Z[:12], wider.model
     factors = wider.factors(X)
     assert factors.max() > 1.3
@@ -89,12 +89,7 @@ def test_predictions_posteriors_gradients_functions_and_noise_agree(wider, Z):
     assert torch.equal(more.factors(X), factors)
     less = more.predict(Z[:2]).variance / wider.predict(Z[:2]).variance
     assert (less[:, 0] < 1).all()
-    functions = wider.sample_functions(8, seed=0, num_features=64)
-    plain_functions = plain.sample_functions(8, seed=0, num_features=64)
-    means = plain_functions.model.components(X)[0].movedim(-3, 0)
-    expected = means + factors.sqrt() * (plain_functions(X) - means)
-    torch.testing.assert_close(functions(X), expected)
-    torch.testing.assert_close(functions.each(X.expand(8, -1, -1)), expected)
+    refused(NotImplementedError, "attribute model", wider.sample_functions, 8)
 
 
 def test_links_keep_their_bounds():
@@ -103,7 +98,7 @@ def test_links_keep_their_bounds():
     low, high = wider.interval(line(20))
     assert (low > 0).all()
     assert (high.log() - low.log() >= (1 - 1e-9) * _width(wider.model, line(20))).all()
-    assert (wider.sample_functions(3, 0, 64)(X) > 0).all()
+    assert (wider.posterior(X).rsample(torch.Size([3])) > 0).all()
 
 
 def test_another_device_has_the_data_and_factors_too():
