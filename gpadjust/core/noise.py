@@ -88,7 +88,7 @@ class Noise:
         """Return derivatives by v, of derivatives by the training variances ``S x m x n``."""
         shares = self.shares(places)
         if shares is None:
-            return {f"noise.{self.names[0]}": by.sum(-1, keepdim=True)}
+            return {f"noise.{name}": by.sum(-1, keepdim=True) for name in self.names}
         slopes = (by.unsqueeze(-1) * shares).sum(-2).split(1, -1)
         return {f"noise.{name}": slope for name, slope in zip(self.names, slopes, strict=True)}
 
@@ -152,10 +152,6 @@ class KnownNoise(Noise):
         """Return the known variances; at other places their mean in each output."""
         known = self.known.unsqueeze(-3)  # ... x 1 x m x n
         return known if is_training else known.mean(-1, keepdim=True)
-
-    def pull_back(self, values: Values, places: Places, by: Tensor) -> Values:
-        """Return nothing, as nothing is learnt."""
-        return {}
 
     def appended(self, variances: Tensor | None, num_points: int) -> Self:
         """Return the noise of further rows, too: of given variances or the mean of those known."""

@@ -203,7 +203,13 @@ class HeavyTails(RowNoise):
             densities.append(density.expand(len(outlying)))
             tried.append(outlying * found.spread[0])
             best, sets = torch.stack(densities).argmax(0), torch.stack(tried) > 0
-            following = found.next_outliers(outlying)
+            # Outliers that remain, and the rows that are farthest off: one, or a fourth of those
+            # that are likely, as neighbours of an outlier may seem so, too.
+            is_likely, z = (found.tails > found.normal)[0], found.z[0].masked_fill(outlying, 0.0)
+            is_suspect = z > _SUSPECT * math.sqrt(2 * math.log(z.shape[-1]))
+            number = 1 + (is_likely & is_suspect).sum(-1, keepdim=True) // 4
+            is_first = z.argsort(-1, descending=True).argsort(-1) < number
+            following = (outlying & is_likely) | (is_suspect & is_first)
             is_done = (sets == following).all(-1).any(0) | (len(tried) - best > _PATIENCE)
             is_done |= following.sum(-1) > _MOST * following.shape[-1]
             if is_done.all():
@@ -237,15 +243,6 @@ class _LeftOut(NamedTuple):
     in_fit: Tensor  # and with the variance that it has in the fit
     z: Tensor  # residual in standard deviations
     spread: Tensor  # variance of an outlier of the density by the tails
-
-    def next_outliers(self, outlying: Tensor) -> Tensor:
-        """Return the outliers that remain, and the rows that are farthest off, ``m x n``."""
-        is_likely, z = (self.tails > self.normal)[0], self.z[0].masked_fill(outlying, 0.0)
-        is_suspect = z > _SUSPECT * math.sqrt(2 * math.log(z.shape[-1]))
-        # One, or a fourth of those that are likely: neighbours of an outlier may seem so, too.
-        number = 1 + (is_likely & is_suspect).sum(-1, keepdim=True) // 4
-        is_first = z.argsort(-1, descending=True).argsort(-1) < number
-        return (outlying & is_likely) | (is_suspect & is_first)
 
 
 def _log_normal(residual: Tensor, variance: Tensor) -> Tensor:

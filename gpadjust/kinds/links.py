@@ -71,10 +71,8 @@ class Link(NamedTuple):
 
     def logs(self, y: Tensor) -> tuple[Tensor, Tensor]:
         """Return log(y - a) and log(b - y), minus infinity beyond a bound; 0 without the upper."""
-        above = (y - self.lower).clamp_min(0.0).log()
-        if math.isinf(self.upper):
-            return above, torch.zeros_like(y)
-        return above, (self.upper - y).clamp_min(0.0).log()
+        above, below = (v.clamp_min(0.0).log() for v in (y - self.lower, self.upper - y))
+        return above, torch.zeros_like(y) if math.isinf(self.upper) else below
 
     def value(self, y: Tensor) -> Tensor:
         """Return g of values ``... x m``: infinite at the bounds and beyond, NaN stays."""
@@ -230,8 +228,6 @@ class Linked(GP):
         super().__init__(train_X, train_Y, train_Yvar, **options)
         self.settings["link"] = link
 
-    # What the core asks for.
-
     @property
     def scale(self) -> str:  # type: ignore[override]
         """The link as a formula, and the location that is subtracted."""
@@ -249,13 +245,12 @@ class Linked(GP):
         """Return g of targets or outputs; a ValueError if some are not within the bounds."""
         outside = ~self.holds(Y)
         if outside.any():
-            rows, b = marked_rows(outside.any(-1)), self.link.upper
-            upper = "" if math.isinf(b) else f" and below {b:g}"
+            rows = marked_rows(outside.any(-1))
             raise ValueError(
-                f"Expected targets above {self.link.lower:g}{upper}, as {self.link.formula} is "
-                f"modelled; found {float(Y[outside][0]):.6g} in {len(rows)} row(s), the first row "
-                f"{rows[0]}. Correct them, make them NaN if they are missing, or give other "
-                "bounds: link=(lower, upper)."
+                f"Expected targets above {self.link.lower:g} and below {self.link.upper:g}, as "
+                f"{self.link.formula} is modelled; found {float(Y[outside][0]):.6g} in "
+                f"{len(rows)} row(s), the first row {rows[0]}. Correct them, make them NaN if they "
+                "are missing, or give other bounds: link=(lower, upper)."
             )
         return self.link.value(Y)
 
@@ -271,8 +266,8 @@ class Linked(GP):
 
     def usual_noise(self, Y: Tensor) -> Tensor | None:
         """Return the mean of the known variances of g, as variances of observations."""
-        if self.data.Yvar is None or self.noise.known is None:
-            return super().usual_noise(Y)
+        if self.noise.known is None:
+            return None
         variances = (self.noise.known.mean(-1, keepdim=True) * self.unit.square()).mT
         return variances * (-2 * self.link.log_slope(Y)).exp()
 
