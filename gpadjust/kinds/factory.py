@@ -28,19 +28,18 @@ def with_options(factory: ModelFactory, options: Mapping[str, Any]) -> ModelFact
     Raises:
         TypeError: If there is a link, and the factory is not a structure or a partial of one.
     """
-    own = factory.keywords if isinstance(factory, partial) else {}
-    further = {n: v for n, v in options.items() if n not in own and v is not None}
+    own = factory if isinstance(factory, partial) else partial(factory)
+    further = {n: v for n, v in options.items() if n not in own.keywords and v is not None}
+    make: Any = own.func
     if "link" in further:
-        make: Any = factory.func if isinstance(factory, partial) else factory
         is_structure = isinstance(make, type) and issubclass(make, GP)
         if not is_structure:
             raise TypeError(
                 "Expected a structure such as CKA, or functools.partial of one, for a link; found "
                 f"{factory!r}. Use the link in the function: LinkedCKA(X, Y, link=...)."
             )
-        args = factory.args if isinstance(factory, partial) else ()
-        factory = partial(linked(make), *args, **own)
-    return partial(factory, **further) if further else factory
+        make = linked(make)
+    return partial(make, *own.args, **own.keywords, **further) if further else factory
 
 
 def make_model(

@@ -97,26 +97,25 @@ class NoisyInputs(RowNoise):
                 f"Expected a model of the {n} inputs NoisyInputs.X; found others, such as the "
                 "measured ones. Build it with CKA(noisy.X, Y, physics=f_p, noise=noisy)."
             )
+
+        def posterior_mean(X: Tensor) -> Tensor:
+            return rough.conditioning().mean(rough.at(X))[0][0]
+
         spread = pad(self.spread.to(X), (0, 0, 0, len(X) - n))
         rough = fitted(self)
         mean, variance = _moments(lambda X: rough.at(X).mean[0], X, spread)
         if not variance.any():  # a prior mean without slope
-            mean, variance = _moments(_posterior_mean(rough), X, spread)
+            mean, variance = _moments(posterior_mean, X, spread)
         for _ in range(_ROUNDS if variance.any() else 0):
             before = torch.stack([variance, mean])
             rough = fitted(self.having(self.base, variance, mean))
-            mean, variance = _moments(_posterior_mean(rough), X, spread)
+            mean, variance = _moments(posterior_mean, X, spread)
             noise = rough.conditioning().noise[0] - before[0]
             off = (variance - before[0]).abs() / (before[0] + noise)  # 0 / 0 of exact rows
             away = (mean - before[1]).abs() / (variance + noise).sqrt()
             if off.nanmean() <= _SETTLED[0] and away.nan_to_num().max() <= _SETTLED[1]:
                 break
         return self.having(self.base, variance, mean)
-
-
-def _posterior_mean(model: Any) -> Function:
-    """Return the posterior mean of a model of one draw, ``n x d`` to ``m x n``."""
-    return lambda X: model.conditioning().mean(model.at(X))[0][0]
 
 
 def _moments(function: Function, X: Tensor, spread: Tensor) -> tuple[Tensor, Tensor]:
@@ -126,20 +125,14 @@ def _moments(function: Function, X: Tensor, spread: Tensor) -> tuple[Tensor, Ten
     for j in spread.any(0).nonzero().flatten().tolist():
         step = torch.zeros_like(X)
         step[:, j] = spread[:, j]
-        width, up, down = _differences(function, X, step, here)
+        for width in _SPREAD:  # smaller where f_p fails
+            try:
+                up, down = (function(X + sign * width * step) - here for sign in (1, -1))
+                break
+            except PhysicsError:
+                if width == _SPREAD[-1]:
+                    raise
         mean = mean + (up + down) / (2 * width**2)
         variance = variance + (up - down).square() / (4 * width**2)
         variance = variance + (up + down).square() / (2 * width**4)
     return mean, variance
-
-
-def _differences(
-    function: Function, X: Tensor, step: Tensor, here: Tensor
-) -> tuple[float, Tensor, Tensor]:
-    """Return how many steps up and down, fewer where f_p fails, and the differences."""
-    for width in _SPREAD:
-        try:
-            return width, function(X + width * step) - here, function(X - width * step) - here
-        except PhysicsError as error:
-            failure = error
-    raise failure

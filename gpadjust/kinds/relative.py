@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from typing import Any
 
 import torch
@@ -47,8 +48,8 @@ class RelativeNoise(Noise):
     def __init__(self, sizes: Sequence[Tensor] | None = None) -> None:
         super().__init__(("constant", "relative"))
         self.sizes = None if sizes is None else tuple(sizes)
-        self.weights: list[tuple[int, Tensor]] = []  # of each physics in g, m x 1
-        self.size: Tensor | None = None if sizes is None else sizes[-1]  # of g where it is 1
+        self.means: list[tuple[int, float]] = []  # of each physics in g, times the size
+        self.size: Tensor | float = 1.0 if sizes is None else sizes[-1]  # of g where it is 1
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -58,19 +59,19 @@ class RelativeNoise(Noise):
     def of_terms(self, terms: TermSum) -> RelativeNoise:
         """Return the noise with g by the prior mean of a model of these terms."""
         new = RelativeNoise(self.sizes)
-        means = [(term.physics, term.mean) for term in terms.terms if term.physics is not None]
-        if means:
-            f_p = torch.stack([mean * terms.f[i] for i, mean in means]).sum(0)
+        new.means = [(t.physics, t.mean) for t in terms.terms if t.physics is not None]
+        if new.means:
+            f_p = torch.stack([mean * terms.f[i] for i, mean in new.means]).sum(0)
             size = f_p.square().mean(-1, keepdim=True).sqrt()
             new.size = size.where(size > 0, torch.ones_like(size))
-            new.weights = [(i, mean / new.size) for i, mean in means]
         return new
 
     def shares(self, places: Places) -> Tensor:
         """Return 1 and the square of g, ``... x S x m x n x 2``."""
         squares = torch.ones_like(places.x[..., 0])
-        if self.weights:
-            squares = torch.stack([w * places.f[i] for i, w in self.weights]).sum(0).square()
+        if self.means:
+            f_p = torch.stack([mean / self.size * places.f[i] for i, mean in self.means])
+            squares = f_p.sum(0).square()
         elif self.sizes is not None:
             points, logs, lengths, _ = self.sizes
             middle = points.mean(-2, keepdim=True)
@@ -88,7 +89,7 @@ class RelativeNoise(Noise):
                 "Expected no link beside RelativeNoise: noise is then that of g(y), relative "
                 "already for a logarithm. Leave one of them out."
             )
-        if self.weights:
+        if self.means:
             return self
         noise, x = RelativeNoise(), model.data.kernel_inputs(model.data.X)
         ranges = (x.amax(-2) - x.amin(-2)).expand(model.num_outputs, -1)
@@ -111,7 +112,7 @@ class RelativeNoise(Noise):
         """Return draws ``N x m`` of the constant one, in the user's units, and the relative one."""
         values, unit = model.table.values(model.draws), model.unit.squeeze(-1)
         constant, relative = (values[f"noise.{name}"].squeeze(-1).sqrt() for name in self.names)
-        return constant * unit, relative / (1.0 if self.size is None else self.size.squeeze(-1))
+        return constant * unit, relative / torch.as_tensor(self.size).squeeze(-1)
 
     def of_outputs(self, outputs: Sequence[int]) -> RelativeNoise:
         """Return the noise of some outputs."""
@@ -122,7 +123,7 @@ class RelativeNoise(Noise):
         return self._changed(lambda v: v.to(like))
 
     def _changed(self, change: Callable[[Tensor], Tensor]) -> RelativeNoise:
-        new = RelativeNoise(None if self.sizes is None else [*map(change, self.sizes)])
-        new.weights = [(i, change(weight)) for i, weight in self.weights]
-        new.size = None if self.size is None else change(self.size)
+        new = copy(self)
+        new.sizes = None if self.sizes is None else tuple(map(change, self.sizes))
+        new.size = self.size if isinstance(self.size, float) else change(self.size)
         return new

@@ -244,19 +244,16 @@ class Weights:
 
 def design(f: WeightedSum) -> Tensor:
     """Return the features of a sum, ``... x S x m x n x p``, for weights N(0, I)."""
-    parts = []
+    parts, one = [], torch.ones_like(f.x[..., :1])
     for term in f.terms:
-        phi = []
+        w = f.weights.get(term.name, torch.zeros_like(one[..., 0]))
+        b = one if w is None else w.unsqueeze(-1)
         if term.kernel is not None:
             generator = torch.Generator()  # not used: the features are the kernel's own
-            of_kernel = term.kernel.features(f.own(term), 0, generator)(f.x)
-            process = f.values.get(f"{term.name}.process")
-            phi.append(of_kernel if process is None else of_kernel * process.unsqueeze(-1))
+            process = f.values.get(f"{term.name}.process", one[..., 0]).unsqueeze(-1)
+            parts.append(term.kernel.features(f.own(term), 0, generator)(f.x) * process * b)
         if term.constant is not None:
-            sd = f.values[f"{term.name}.constant"].sqrt().unsqueeze(-1)
-            phi.append(sd * torch.ones_like(f.x[..., :1]))
-        w = f.weights.get(term.name, torch.zeros_like(f.x[..., 0]))
-        parts += phi if w is None else [each * w.unsqueeze(-1) for each in phi]
+            parts.append(f.values[f"{term.name}.constant"].sqrt().unsqueeze(-1) * b)
     lead = torch.broadcast_shapes(*(each.shape[:-1] for each in parts))
     return torch.cat([each.expand(*lead, each.shape[-1]) for each in parts], -1)
 
