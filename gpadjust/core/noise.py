@@ -30,7 +30,10 @@ class Noise:
         priors: The priors of v, in squared units of the targets (times those of 1 / h).
     """
 
+    of_targets: tuple[str, ...] = ("known", "shift")
+    """Attributes with a number of each training target, ``... x m x n``."""
     known: Tensor | None = None
+    """Known variances of the training targets, ``... x m x n``, in their unit squared."""
     shift: Tensor | float = 0.0
     """What the noise adds to the training targets in the mean, ``m x n``, in their unit."""
 
@@ -116,17 +119,27 @@ class Noise:
             f"Expected train_Yvar or a noise that learns variances; found both, {self}."
         )
 
-    def of_outputs(self, outputs: Sequence[int]) -> Noise:
+    def of_outputs(self, outputs: Sequence[int]) -> Self:
         """Return the noise of some outputs."""
-        return self
+        return self.mapped(lambda v: v[..., [*outputs], :], "of_outputs", outputs)
 
-    def to(self, like: Tensor) -> Noise:
+    def to(self, like: Tensor) -> Self:
         """Return the noise on the device of a tensor."""
-        return self
+        return self.mapped(lambda v: v.to(like), "to", like)
 
-    def of_rows(self, rows: Tensor) -> Noise | None:
+    def of_rows(self, rows: Tensor) -> Self | None:
         """Return the noise of some observations, or None if it cannot do with fewer."""
-        return self
+        return self.mapped(lambda v: v[..., rows], "of_rows", rows)
+
+    def mapped(self, change: Callable[[Tensor], Tensor], method: str, *arguments: Any) -> Self:
+        """Return the noise with other numbers of targets; a method does it to a noise within."""
+        new = copy(self)
+        for name, value in vars(self).items():
+            if isinstance(value, Noise):
+                setattr(new, name, getattr(value, method)(*arguments))
+            elif name in self.of_targets and isinstance(value, Tensor):
+                setattr(new, name, change(value))
+        return new
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({', '.join(self.names)})"
@@ -142,12 +155,6 @@ class KnownNoise(Noise):
         super().__init__(())
         self.known: Tensor = variances
 
-    def of_variances(self, variances: Tensor) -> Self:
-        """Return the noise of the same kind with other variances."""
-        new = copy(self)
-        new.known = variances
-        return new
-
     def variance(self, values: Values, places: Places, is_training: bool = False) -> Tensor:
         """Return the known variances; at other places their mean in each output."""
         known = self.known.unsqueeze(-3)  # ... x 1 x m x n
@@ -157,16 +164,6 @@ class KnownNoise(Noise):
         """Return the noise of further rows, too: of given variances or the mean of those known."""
         if variances is None:
             variances = self.known.mean(-1, keepdim=True).expand(*self.known.shape[:-1], num_points)
-        return self.of_variances(appended(self.known, variances, -1))
-
-    def to(self, like: Tensor) -> Self:
-        """Return the noise on the device of a tensor."""
-        return self.of_variances(self.known.to(like))
-
-    def of_rows(self, rows: Tensor) -> Self:
-        """Return the noise of some observations."""
-        return self.of_variances(self.known[..., rows])
-
-    def of_outputs(self, outputs: Sequence[int]) -> Self:
-        """Return the noise of some outputs."""
-        return self.of_variances(self.known[..., list(outputs), :])
+        new = copy(self)
+        new.known = appended(self.known, variances, -1)
+        return new

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from copy import copy
 from typing import Any, NamedTuple, Self
 
@@ -33,6 +33,8 @@ class RowNoise(Noise):
             squared.
         moved: What is added to their means, ``m x n``, in their unit.
     """
+
+    of_targets = ("added", "moved")
 
     def __init__(
         self, base: Noise | None = None, added: Tensor | float = 0.0, moved: Tensor | float = 0.0
@@ -110,25 +112,12 @@ class RowNoise(Noise):
 
     def appended(self, variances: Tensor | None, num_points: int) -> Self:
         """Return the noise of further rows, too."""
-        base = self.base.appended(variances, num_points)
-        return self._changed(base, lambda v: pad(v, (0, num_points)))
+        return self.mapped(lambda v: pad(v, (0, num_points)), "appended", variances, num_points)
 
-    def of_outputs(self, outputs: Sequence[int]) -> Self:
-        """Return the noise of some outputs."""
-        return self._changed(self.base.of_outputs(outputs), lambda v: v[[*outputs]])
-
-    def of_rows(self, rows: Tensor) -> Self | None:
-        """Return the noise of some observations."""
-        base = self.base.of_rows(rows)
-        return None if base is None else self._changed(base, lambda v: v[..., rows])
-
-    def to(self, like: Tensor) -> Self:
-        """Return the noise on the device of a tensor."""
-        return self._changed(self.base.to(like), lambda v: v.to(like))
-
-    def _changed(self, base: Noise, change: Callable[[Tensor], Tensor]) -> Self:
-        numbers = (self.added, self.moved)
-        return self.having(base, *(change(v) if isinstance(v, Tensor) else v for v in numbers))
+    def mapped(self, change: Callable[[Tensor], Tensor], method: str, *arguments: Any) -> Any:
+        """Return the noise with other numbers of rows and another base; None if that is None."""
+        new = super().mapped(change, method, *arguments)
+        return None if new.base is None else self.having(new.base, new.added, new.moved)
 
 
 class HeavyTails(RowNoise):

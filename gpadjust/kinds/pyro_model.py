@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
@@ -51,8 +49,6 @@ def pyro_model(
     one = model.subset_draws(torch.tensor([draw]))
     is_training = X is None
     X = model.data.X if is_training else model.data.new_inputs(X)
-    targets: Any = model.data.Y if is_training else None
-    targets = as_tensor(Y, "Y") if Y is not None else targets
     with torch.no_grad():
         values = one.values
         f, unit = one.at(X, values), one.unit
@@ -60,7 +56,9 @@ def pyro_model(
         noise = one.noise.variance(values, one.places(X, values), is_training)[0]
         sd = (noise.sqrt() * unit).expand(phi.shape[:-1])
         mean = f.mean[0] * unit
-        obs = None if targets is None else model.on_gaussian_scale(targets).mT
+        obs = one.targets() * unit if is_training else None
+        if Y is not None:
+            obs = model.on_gaussian_scale(as_tensor(Y, "Y")).mT
     zero = torch.zeros_like(phi[:, 0])
     weights = pyro.sample("weights", dist.Normal(zero, torch.ones_like(zero)).to_event(2))
     function = mean + (phi @ weights.unsqueeze(-1)).squeeze(-1)

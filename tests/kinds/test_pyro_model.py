@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from gpadjust.core import RRA, fit
+from gpadjust.kinds.noisy_inputs import NoisyInputs
 from gpadjust.kinds.pyro_model import pyro_model
 from gpadjust.kinds.updates import Weights
 from tests.systems import line, wave
@@ -60,3 +61,10 @@ def test_bad_input(model):
     for options, words in (({"Y": model.data.Y}, "Expected X"), ({"draw": 1}, "draw")):
         with pytest.raises(ValueError, match=words):
             pyro_model(model, **options)
+
+
+def test_what_noise_adds_to_the_targets_in_the_mean_is_no_observation():
+    noisy = NoisyInputs(line(9), 1e-4, moved=torch.full((1, 9), 0.5).double())
+    model = RRA(noisy.X, wave(line(9)), physics=wave, num_features=6, noise=noisy)
+    observed = pyro.poutine.trace(pyro_model).get_trace(model).nodes["Y"]["value"]
+    torch.testing.assert_close(observed, model.data.Y.mT - 0.5 * model.unit)

@@ -93,7 +93,7 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/core/noise.py",
-        "return self.of_variances(self.known[..., list(outputs), :])",
+        'return self.mapped(lambda v: v[..., [*outputs], :], "of_outputs", outputs)',
         "return self",
         "Of a subset of outputs the noise of the others remains.",
     ),
@@ -189,8 +189,8 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/kinds/heavy_tails.py",
-        "return self._changed(base, lambda v: pad(v, (0, num_points)))",
-        "return self._changed(base, lambda v: pad(v, (num_points, 0)))",
+        "pad(v, (0, num_points))",
+        "pad(v, (num_points, 0))",
         "After conditioning other rows are the outliers.",
     ),
     Fault(
