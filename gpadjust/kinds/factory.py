@@ -18,12 +18,9 @@ arguments, or a function."""
 
 
 def with_options(factory: ModelFactory, options: Mapping[str, Any]) -> ModelFactory:
-    """Return a factory with further arguments, except those that it has already.
+    """Return a factory with further arguments by name, except None and those that it has already.
 
-    Args:
-        factory: Makes a model.
-        options: Arguments by name; None is left out. A ``link`` makes the structure
-            :func:`~gpadjust.kinds.links.linked`.
+    A ``link`` makes the structure :func:`~gpadjust.kinds.links.linked`.
 
     Raises:
         TypeError: If there is a link, and the factory is not a structure or a partial of one.
@@ -45,19 +42,14 @@ def with_options(factory: ModelFactory, options: Mapping[str, Any]) -> ModelFact
 def make_model(
     factory: ModelFactory, X: Any, Y: Any, *, kind: type[Model] = Model, **arguments: Any
 ) -> Any:
-    """Return a new model of data.
+    """Return a new model of inputs ``n x d`` and targets ``n x m``, made by a factory.
 
-    Args:
-        factory: Makes it. The arguments of a ``functools.partial`` other than a physics (kernels, a
-            noise) are copied, so that each model has its own.
-        X: Inputs, ``n x d``.
-        Y: Targets, ``n x m``.
-        kind: The class that the model has to be of.
-        arguments: Further arguments, such as ``physics``; None is left out.
+    Further arguments, such as ``physics``, are left out if they are None. Those of a
+    ``functools.partial`` other than a physics (kernels, a noise) are copied for each model.
 
     Raises:
-        TypeError: If ``factory`` is not callable, does not take the arguments, or makes something
-            else.
+        TypeError: If the factory is not callable, does not take the arguments, or makes something
+            else than a ``kind``.
     """
     if not callable(factory):
         raise TypeError(

@@ -7,6 +7,7 @@ from typing import Any, Self
 
 import torch
 from torch import Tensor
+from torch.nn import Buffer
 
 from gpadjust.checks import check_kind
 from gpadjust.core.data import ArrayLike
@@ -22,10 +23,10 @@ _ROUNDING = 1e-6  # of the targets' spread
 class Widened(Wrapper):
     """A model whose variances are multiplied by a factor, but for known ones of noise.
 
-    A subclass has ``factors``, made of buffers of the names ``of_outputs``, ``m x ...``.
+    A subclass has ``factors``, and the names of its buffers that are numbers of each output.
     """
 
-    of_outputs: tuple[str, ...]
+    numbers: tuple[str, ...]
 
     def __init__(self, model: GP) -> None:
         check_kind("model", model, GP, "a model of gpadjust.core, fitted")
@@ -68,7 +69,7 @@ class Widened(Wrapper):
     def subset_output(self, idcs: list[int]) -> Self:
         """Return the model of some outputs; a ValueError if there are none of these numbers."""
         new = super().subset_output(idcs)
-        for name in self.of_outputs:
+        for name in self.numbers:
             setattr(new, name, getattr(self, name)[idcs])
         return new
 
@@ -112,16 +113,13 @@ class LocalErrors(Widened):
         True
     """
 
-    of_outputs = ("squares", "lengthscale")
-    squares: Tensor
-    lengthscale: Tensor
-    points: Tensor
+    numbers = ("squares", "lengthscale")
 
     @torch.no_grad()
     def __init__(self, model: GP) -> None:
         super().__init__(model)
         Y, d = model.on_gaussian_scale(self.data.Y), self.data.X.shape[-1]
-        self.register_buffer("points", model.kernel_inputs(self.data.X))
+        self.points = Buffer(model.kernel_inputs(self.data.X))
         scales = [v for name, v in model.values.items() if name.endswith(".kernel.lengthscale")]
         has_kernels = sum(term.kernel is not None for term in model.terms)
         if len(scales) < has_kernels or any(v.shape[-1] != d for v in scales):
@@ -130,11 +128,11 @@ class LocalErrors(Widened):
                 f"Stationary(MATERN52); found {[term.kernel for term in model.terms]}."
             )
         shortest = torch.stack(scales).amin(0).log().mean(0).exp()  # m x d
-        self.register_buffer("lengthscale", shortest.unsqueeze(-2))
+        self.lengthscale = Buffer(shortest.unsqueeze(-2))
         mean, variance = Marginals(*model.left_out()).prediction
         spread = _ROUNDING * (Y - Y.nanmean(-2, keepdim=True)).square().nanmean(-2).sqrt()
         squares = (Y - mean).square() / variance.maximum(spread.square())
-        self.register_buffer("squares", squares.nan_to_num(nan=1.0, posinf=1.0).mT)
+        self.squares = Buffer(squares.nan_to_num(nan=1.0, posinf=1.0).mT)
 
     def factors(self, X: Tensor) -> Tensor:
         """Return the factors at inputs ``... x q x d``, ``... x q x m``."""

@@ -9,6 +9,7 @@ from typing import Any, Self
 
 import torch
 from torch import Tensor
+from torch.nn import Buffer
 
 from gpadjust.checks import checked_number, checked_whole
 from gpadjust.core import GP, Fourier, MixturePosterior
@@ -33,13 +34,12 @@ class Updated(Widened):
         recent: The two sums, ``m x 2``.
     """
 
-    of_outputs = ("recent",)
-    recent: Tensor
+    numbers = ("recent",)
     forget: float = math.inf  # tau
 
     def __init__(self, model: GP) -> None:
         super().__init__(model)
-        self.register_buffer("recent", model.unit.new_zeros(model.num_outputs, 2))
+        self.recent: Tensor = Buffer(model.unit.new_zeros(model.num_outputs, 2))
 
     def factors(self, X: Tensor) -> Tensor:
         """Return the factors of all inputs, ``1 x m``."""
@@ -60,9 +60,7 @@ class Updated(Widened):
         """
         X = self.data.new_inputs(X)
         if X.dim() != 2 or not len(X):
-            raise ValueError(
-                f"Expected X of shape k x d, one row at least; found {tuple(X.shape)}."
-            )
+            raise ValueError(f"Expected X of one row at least, k x d; found {tuple(X.shape)}.")
         more = self.models[-1].condition_on_observations(X, Y, noise)
         if more.batch_shape:
             raise ValueError(f"Expected Y of shape k x m; found a batch {tuple(more.batch_shape)}.")
