@@ -53,9 +53,9 @@ class Noise:
         """Mask ``n x m`` of the training targets that hardly count; None if none is searched."""
         return None
 
-    def of_terms(self, terms: TermSum) -> Noise:
-        """Return the noise for a model of these terms; itself by default."""
-        return self
+    def of_terms(self, terms: TermSum) -> Self:
+        """Return the noise for a model of these terms."""
+        return self.mapped(lambda v: v, "of_terms", terms)
 
     def shares(self, places: Places) -> Tensor | None:
         """Return h, which broadcasts with ``... x S x m x n x K``; None for a single share of 1."""

@@ -17,7 +17,7 @@ from torch import Tensor
 from gpadjust.core.data import ArrayLike, Data, columns_of, names_of
 from gpadjust.core.kernels import DELTA, Features, Fourier, Kernel, PullBack, Stationary
 from gpadjust.core.terms import Term
-from gpadjust.core.unknowns import LogNormal, Row, Values
+from gpadjust.core.unknowns import Row, Values
 
 Levels = dict[int, tuple[str | float, ...]]
 
@@ -217,11 +217,11 @@ class Exchangeable(Kernel):
 class Offset(Kernel):
     r"""Independent offsets of equal variance s, one for each value: :math:`s \, 1\{x_c = x'_c\}`.
 
-    The column c has a number; s has a prior, in squared units of the targets.
+    The column c has a number; s has the prior of a process in squared units of the targets.
     """
 
-    def __init__(self, column: int, outputscale: LogNormal = DELTA) -> None:
-        self.column, self.outputscale = column, outputscale
+    def __init__(self, column: int) -> None:
+        self.column = column
         self.values: list[float] = []
 
     def of_data(self, data: Data) -> Offset:
@@ -232,8 +232,8 @@ class Offset(Kernel):
 
     def rows(self, x: Tensor, num_outputs: int) -> list[Row]:
         """Return the row of s."""
-        median = x.new_full((num_outputs, 1), self.outputscale.median)
-        return [Row.positive("outputscale", median, self.outputscale.factor)]
+        median = x.new_full((num_outputs, 1), DELTA.median)
+        return [Row.positive("outputscale", median, DELTA.factor)]
 
     def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
         """Return s where values are the same."""

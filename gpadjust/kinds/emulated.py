@@ -29,11 +29,10 @@ class EmulatedPhysics(Physics):
     .. math:: f_p(x) = m(x) + \sum_{k=1}^K z_k v_k(x), \quad z_k \sim N(0, 1),
 
     with its mean m and the principal components v of its errors. The z are further unknown
-    parameters ``emulator_1`` and so on, so that each draw of a model contains one function, and
-    intervals are wide where there are no runs; measurements correct the emulator, too. Where they
-    are 0, as before a fit, f_p is the mean. With unknown parameters that are inputs of the runs,
-    ``CKA`` and ``PhysicsMeanGP`` are the calibration of Kennedy and O'Hagan (2001), with the
-    emulator fitted to the runs alone.
+    parameters ``emulator_1`` and so on, 0 before a fit, so that each draw of a model contains one
+    function, intervals are wide where there are no runs, and measurements correct the emulator,
+    too. With unknown parameters that are inputs of the runs, ``CKA`` and ``PhysicsMeanGP`` are the
+    calibration of Kennedy and O'Hagan (2001), with the emulator fitted to the runs alone.
 
     Args:
         runs_X: Inputs of the runs, ``N x (d + p)``: those that the data have, and then values of

@@ -66,8 +66,8 @@ class Link(NamedTuple):
         return f"log({above} / ({self.upper:g} - y))"
 
     def holds(self, y: Tensor) -> Tensor:
-        """Return which values are within the bounds."""
-        return (y > self.lower) & (y < self.upper)
+        """Return which values are within the bounds, or NaN."""
+        return ~((y <= self.lower) | (y >= self.upper))
 
     def logs(self, y: Tensor) -> tuple[Tensor, Tensor]:
         """Return log(y - a) and log(b - y), minus infinity beyond a bound; 0 without the upper."""
@@ -131,9 +131,8 @@ class LinkedMarginals(Marginals):
 
     def log_density(self, Y: Tensor) -> Tensor:
         """Return the log density at values ``Y``, ``... x q x m``; NaN where they are."""
-        outside = ~self.link.holds(Y) & ~Y.isnan()
         density = Marginals(*self).log_density(self.link.value(Y)) + self.link.log_slope(Y)
-        return density.masked_fill(outside, -math.inf)
+        return density.masked_fill(~self.link.holds(Y), -math.inf)
 
 
 class LinkedPosterior(TransformedPosterior):
@@ -239,7 +238,7 @@ class Linked(GP):
 
     def holds(self, Y: Tensor) -> Tensor:
         """Return which values are within the bounds, or NaN."""
-        return self.link.holds(Y) | Y.isnan()
+        return self.link.holds(Y)
 
     def on_gaussian_scale(self, Y: Tensor) -> Tensor:
         """Return g of targets or outputs; a ValueError if some are not within the bounds."""
