@@ -136,12 +136,8 @@ class AR1(GP):
 class AtLevels(Kernel):
     r"""The kernel :math:`b(l) \, (k(x, x') + \kappa) \, b(l')` of levels l, the last input.
 
-    b is :math:`\rho^l`, with a normal prior of rho in units of both levels, or l.
-
-    Args:
-        kernel: k.
-        low_x: Inputs of the low level, which lengthscales are to fit, too.
-        has_rho: Whether b is :math:`\rho^l`.
+    b is :math:`\rho^l`, with a normal prior of rho in units of both levels, or l. Lengthscales are
+    to fit the inputs of the low level, too.
     """
 
     def __init__(self, kernel: Kernel, low_x: Tensor, has_rho: bool = False) -> None:

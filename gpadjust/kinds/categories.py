@@ -149,12 +149,8 @@ class Categories(InputTransform):
 class Exchangeable(Kernel):
     r"""A stationary kernel of which the levels of a category are at distance 1 from each other.
 
-    It reads :math:`1 / \sqrt 2` or 0 for each level; these columns have one lengthscale.
-
-    Args:
-        kernel: The kernel.
-        columns: The names of the columns that it reads, by their numbers.
-        levels: The numbers of the levels of those that are categories.
+    It reads :math:`1 / \sqrt 2` or 0 for each level; these columns have one lengthscale. The names
+    of the columns that it reads, and the numbers of levels of categories, are by their numbers.
     """
 
     def __init__(

@@ -178,10 +178,8 @@ class Kalman(Updated):
 class Weights:
     r"""The posterior of the weights of Fourier features, which conditions a model.
 
-    Args:
-        train: The function at the training inputs of the model.
-        precision: :math:`\Lambda`, ``S x m x p x p``.
-        pull: h, ``S x m x p``.
+    It has the function at the training inputs of the model, the precision :math:`\Lambda`,
+    ``S x m x p x p``, and the pull h, ``S x m x p``.
     """
 
     def __init__(self, train: WeightedSum, precision: Tensor, pull: Tensor) -> None:
@@ -206,11 +204,8 @@ class Weights:
     def updated(self, f: WeightedSum, noise: Tensor, residual: Tensor, forget: float) -> Self:
         """Return the weights given observations of a sum, too, the last of which is the newest.
 
-        Args:
-            f: The function at their inputs.
-            noise: Variances of their noise, ``S x m x k``.
-            residual: Targets less their prior mean, ``S x m x k``; NaN where one is missing.
-            forget: tau.
+        Variances of their noise are ``S x m x k``, and so are residuals, targets less their prior
+        mean; NaN where one is missing.
         """
         k, phi = residual.shape[-1], design(f)
         left = torch.arange(k - 1, -1, -1).to(noise).div(-forget).exp()
