@@ -54,8 +54,8 @@ class Noise:
         return None
 
     def of_terms(self, terms: TermSum) -> Self:
-        """Return the noise for a model of these terms."""
-        return self.mapped(lambda v: v, "of_terms", terms)
+        """Return the noise for a model of these terms; itself by default."""
+        return self
 
     def shares(self, places: Places) -> Tensor | None:
         """Return h, which broadcasts with ``... x S x m x n x K``; None for a single share of 1."""

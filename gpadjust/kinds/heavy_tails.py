@@ -14,7 +14,7 @@ from torch.nn.functional import pad
 
 from gpadjust.checks import checked_number
 from gpadjust.core import KnownNoise, Noise
-from gpadjust.core.terms import Places
+from gpadjust.core.terms import Places, TermSum
 from gpadjust.core.unknowns import Values
 
 _SIZES = math.log(1e3)  # range of the logarithm of an outlier's standard deviation
@@ -99,6 +99,10 @@ class RowNoise(Noise):
     def pull_back(self, values: Values, places: Places, by: Tensor) -> Values:
         """Return the derivatives by the numbers of the base."""
         return self.base.pull_back(values, places, by)
+
+    def of_terms(self, terms: TermSum) -> Self:
+        """Return the noise for a model of these terms."""
+        return self.mapped(lambda v: v, "of_terms", terms)
 
     def with_known(self, known: KnownNoise) -> Self:
         """Return the noise with known variances in place of a learnt one."""
