@@ -138,8 +138,16 @@ class Kalman(Updated):
         kernels = [term.kernel for term in model.terms if term.kernel is not None]
         if not all(isinstance(kernel, Fourier) for kernel in kernels):
             raise TypeError(f"Expected an RRA; found kernels {kernels}. Take Window(model, size).")
-        self.models[0] = model.with_conditioning(Weights.of_model(model)).eval()
+        self._weights = Weights.of_model(model)
         self.models.append(_of_rows(model, torch.arange(2)))  # it checks and reads observations
+
+    @property
+    def model(self) -> GP:
+        """The model with the posterior of the weights, which it loses when it moves to a device."""
+        if not isinstance(self.models[0].conditioning(), Weights):
+            self._weights = self._weights.of(self.models[0])
+            self.models[0] = self.models[0].with_conditioning(self._weights)
+        return super().model
 
     @property
     def weights(self) -> Weights:
@@ -160,19 +168,12 @@ class Kalman(Updated):
     def subset_output(self, idcs: list[int]) -> Self:
         """Return the model of some outputs; a ValueError if there are none of these numbers."""
         new = super().subset_output(idcs)
-        new.models[0] = self.weights.given_to(new.model, idcs)
+        new._weights = self.weights.of(new.models[0], idcs)
         return new
 
-    def to(self, *args: Any, **options: Any) -> Self:
-        """Move the model to a device, with its weights."""
-        weights = self.weights
-        super().to(*args, **options)
-        self.models[0] = weights.given_to(self.model)
-        return self
-
     def _updated(self, more: GP, f: WeightedSum, noise: Tensor, targets: Tensor) -> GP:
-        weights = self.weights.updated(f, noise, targets - f.mean, self.forget)
-        return self.model.with_conditioning(weights)
+        self._weights = self.weights.updated(f, noise, targets - f.mean, self.forget)
+        return self.model.with_conditioning(self._weights)
 
 
 class Weights:
@@ -229,10 +230,10 @@ class Weights:
         return self.marginals(sought)[0], root @ root.mT
 
     @torch.no_grad()
-    def given_to(self, model: GP, outputs: Any = slice(None)) -> GP:
-        """Return a model of some outputs, or on another device, with these weights."""
+    def of(self, model: GP, outputs: Any = slice(None)) -> Self:
+        """Return the weights of a model on another device, or of some outputs."""
         parts = (each[:, outputs].to(model.u) for each in (self.precision, self.pull))
-        return model.with_conditioning(Weights(model.at(model.data.X), *parts))
+        return type(self)(model.at(model.data.X), *parts)
 
 
 def design(f: WeightedSum) -> Tensor:

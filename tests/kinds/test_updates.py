@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 import torch
 
-from gpadjust.core import CKA, GP, RRA, Fourier, PhysicsMeanGP, Term, fit
+from gpadjust.core import CKA, RRA, PhysicsMeanGP, fit
 from gpadjust.kinds.categories import Categories
 from gpadjust.kinds.links import LinkedCKA
 from gpadjust.kinds.updates import Kalman, Window, design
@@ -156,12 +156,11 @@ def test_variances_follow_recent_errors():
 def test_another_device_has_weights_and_errors_too():
     kalman = Kalman(rra()).update(NEW_X, NEW_Y)
     before = kalman.predict(AT)
-    for pair in zip(kalman.to("cpu").predict(AT), before, strict=True):
-        torch.testing.assert_close(*pair)
-    kalman = Kalman(GP(X, Y, terms=[Term("f", Fourier(1, 20))])).to("meta")
-    _, weights = kalman.model._cached
-    tensors = (kalman.data.X, kalman.recent, weights.precision, weights.train.x)
-    assert all(each.is_meta for each in tensors)
+    for moved in (kalman.to("cpu"), kalman.model.to("cpu") and kalman):
+        for pair in zip(moved.predict(AT), before, strict=True):
+            torch.testing.assert_close(*pair)
+    assert kalman.to("meta").data.X.is_meta
+    assert kalman.recent.is_meta
 
 
 def test_links_and_categories_are_looked_at_and_nothing_changes_by_bad_numbers():
