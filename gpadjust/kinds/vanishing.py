@@ -63,8 +63,9 @@ class Vanishing(Kernel):
             where = {name: where[name].to_list() for name in where.columns}
         self.is_points = not isinstance(where, Mapping)
         if self.is_points:
-            is_list = isinstance(where, list | tuple)
-            points = as_tensor(torch.tensor(where).double() if is_list else where, "where")
+            if isinstance(where, list | tuple):
+                where = torch.tensor(where, dtype=torch.float64)
+            points = as_tensor(where, "where")
             if points.dim() != 2:
                 raise ValueError(
                     "Expected `where` as values of columns ({'valve': 1.0}) or as points p x d; "

@@ -159,7 +159,7 @@ def test_places():
         ({1: 0.0, "valve": 2}, [[2.0, 0.0]]),
         ({-1: 3}, [[None, 3.0]]),
         (np.array([[1.0, 2.0]]), [[1.0, 2.0]]),
-        ([[1.0, 2.0]], [[1.0, 2.0]]),
+        ([[1.0, 2.1]], [[1.0, 2.1]]),
         (pd.DataFrame({"flow": [4.0]}), [[None, 4.0]]),
     ]:
         model = PhysicsMeanGP(FRAME, Y, physics=SQUARE, covar_module=Vanishing(where))
