@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from gpadjust.core.model import GP
 
 _SMALL, _MEDIUM = 40, 100  # points: up to these draws begin with the prior, and are moved
-_ENTRIES = 150_000  # of covariances that are computed at once, which caches hold
 _SELDOM = 1e-3  # a nested model of less probability at its mode is not drawn from
 _SEARCHES = 4  # for the mode
 _NEAR, _LESS_LIKELY = 0.3, 5.0  # coordinates of one end; log density of one that is left out
@@ -98,7 +97,8 @@ def fit(
         model: The model.
         method: ``"bayes"`` or ``"map"``.
         num_draws: Number of draws, a multiple of 4; predictions average over every fourth.
-            Default: 80, 32 or 16 and 16, 8 or 4 of them; 256 if outputs share unknown numbers.
+            Default: 80, 32 or 16 and 16, 8 or 4 of them; 256, 128 or 64 if outputs share unknown
+            numbers, as parameters of a physics.
         seed: Seed.
 
     Warns:
@@ -171,20 +171,15 @@ def _default_numbers(model: GP) -> tuple[int, int]:
     if n <= _SMALL:
         return 256 if is_shared else 80, 16
     if n <= _MEDIUM:
-        return 256 if is_shared else 32, 8
-    return 16, 4
+        return 128 if is_shared else 32, 8
+    return 64 if is_shared else 16, 4
 
 
 def _target(model: GP, choice: int) -> LogLikelihood:
-    """Return the log likelihood of a nested model, of so many draws at once as caches hold."""
-    m, n = model.targets().shape
-    size = max(1, _ENTRIES // (n * n * m))
+    """Return the log likelihood of a nested model."""
 
     def log_likelihood(u: Tensor, with_gradient: bool = True) -> tuple[Tensor, Tensor]:
-        rows = model.table.with_choice(u, choice).split(size)
-        parts = [model.log_likelihood(part, with_gradient) for part in rows]
-        value, slope = (torch.cat(each) for each in zip(*parts, strict=True))
-        return value, slope
+        return model.log_likelihood(model.table.with_choice(u, choice), with_gradient)
 
     return log_likelihood
 
@@ -220,14 +215,15 @@ def _starts(model: GP, seed: int) -> dict[int, Normal]:
     probability of the odds at most (Ville's inequality).
     """
     ends: dict[int, Tensor] = {}
+    is_precise = bool(model.table.shared)  # parameters of a physics may be known to many digits
     likely = [*range(len(model.table.log_prior))]
     for part in _parts(model, seed):
         for k in likely:
             is_first = k not in ends
             ends[k] = (
-                modes(part, k, seed)
+                modes(part, k, seed, is_precise)
                 if is_first
-                else _sorted(part, k, maximise(_target(part, k), ends[k]))
+                else _sorted(part, k, maximise(_target(part, k), ends[k], is_precise))
             )
         starts = {k: around_mode(_target(part, k), ends[k][0]) for k in likely}
         likely = _likely(model, {k: evidence for k, (_, evidence) in starts.items()})

@@ -50,6 +50,7 @@ from gpadjust.physics.parameters import PhysicsParameters
 Slopes = dict[str, list[Tensor]]
 """Derivatives of each physics by the coordinate of each unknown parameter, ``S x m x n``."""
 
+_ENTRIES = 150_000  # of covariances that are computed at once, which caches hold
 _STEP = 1e-4  # of differences by parameters of a physics, in coordinates
 
 
@@ -295,11 +296,26 @@ class GP(gpytorch.models.GP, Predictive):
         It is in units of the targets, minus infinity where it or f_p is not finite. The gradient is
         zero if it is not asked for.
         """
+        f: list[Tensor] = []
+        slopes: Slopes = {}
+        if self._unknowns:  # f_p is asked once, at all draws
+            f, slopes = self._physics_with_slopes(self.table.values(u), with_gradient)
+        m, n = self.targets().shape[-2:]
+        parts = []
+        for rows in torch.arange(len(u)).split(max(1, _ENTRIES // (n * n * m))):
+            own = {name: [each[rows] for each in by_f] for name, by_f in slopes.items()}
+            part = self._log_likelihood(u[rows], [each[rows] for each in f], own, with_gradient)
+            parts.append(part)
+        value, gradient = (torch.cat(each) for each in zip(*parts, strict=True))
+        return value, gradient
+
+    def _log_likelihood(
+        self, u: Tensor, f: list[Tensor], f_slopes: Slopes, with_gradient: bool
+    ) -> tuple[Tensor, Tensor]:
+        """Return the same of few draws, with f_p and its derivatives if it has parameters."""
         values, y = self.table.values(u), self.targets()
-        f_slopes: Slopes = {}
         places = self.places(self.data.X, values, with_physics=not self._unknowns)
         if self._unknowns:
-            f, f_slopes = self._physics_with_slopes(values, with_gradient)
             places = places._replace(f=f)
         total = self.term_sum.at(values, places)
         noise = self.noise.variance(values, places, True)

@@ -23,7 +23,8 @@ GROUPS = 2  # of draws that are resampled apart, so that their difference shows 
 _LEAPS, _ACCEPTED, _LAST_MOVES, _MOVES, _FAR = 3, 0.8, 4, 3, 60.0
 _SEARCHES, _GAIN = 3, 0.01  # of searches, and of log density, below which there are no more
 _SHARE = 0.5  # of draws that count after each step of the power
-_WIDER = 1.5  # than Laplace's approximation
+_WIDER = 1.2  # than Laplace's approximation
+_STEP, _PASSES = 0.1, 3  # of differences, in coordinates; passes, each with steps by the last
 
 
 class Normal(NamedTuple):
@@ -108,7 +109,8 @@ def sample(
                 return None
         is_done = bool((power >= 1).all()) or not with_moves
         # Resample, and move.
-        root, rows = _root(u, weights), _resampled(halves, number // GROUPS, generator)
+        root = _root(u, weights, None if start is None else start.root / _WIDER)
+        rows = _resampled(halves, number // GROUPS, generator)
         u, value, slope = u[rows, problems], value[rows, problems], slope[rows, problems]
         if is_first and with_moves:
             value, slope = ratio(u)
@@ -188,14 +190,18 @@ def _resampled(logs: Tensor, number: int, generator: torch.Generator) -> Tensor:
     return (rows + shift).reshape(-1, problems)
 
 
-def _root(u: Tensor, weights: Tensor) -> Tensor:
-    """Return a root of the draws' covariances, shrunk to their diagonals as far as they are few."""
+def _root(u: Tensor, weights: Tensor, expected: Tensor | None) -> Tensor:
+    """Return a root of the draws' covariances.
+
+    As far as draws are few it is that of an expected root ``B x P x P``, or of their diagonals.
+    """
     away = u - (weights.unsqueeze(-1) * u).sum(0)
     covariance = torch.einsum("nb,nbi,nbj->bij", weights, away, away)
     size = weights.square().sum(0).reciprocal()
     share = (size / (size + u.shape[-1]))[:, None, None]
-    diagonal = torch.diag_embed(covariance.diagonal(dim1=-1, dim2=-2).clamp_min(1e-12))
-    root: Tensor = torch.linalg.cholesky(share * covariance + (1 - share) * diagonal)
+    diagonal = covariance.diagonal(dim1=-1, dim2=-2).clamp_min(1e-12)
+    few = torch.diag_embed(diagonal) if expected is None else expected @ expected.mT
+    root: Tensor = torch.linalg.cholesky(share * covariance + (1 - share) * few)
     return root
 
 
@@ -234,17 +240,19 @@ def around_mode(log_likelihood: LogLikelihood, mode: Tensor) -> tuple[Normal, Te
     """Return Laplace's approximation at a mode ``B x P``, made wider, and the log evidence by it.
 
     The Hessian is that of central differences of the gradient, along the coordinates that have any
-    influence.
+    influence. Their steps are a tenth of the prior's range, or of the posterior's if that is less.
     """
     p, here = mode.shape[-1], mode.unsqueeze(0)
     _, at_random = log_likelihood(here + 0.1)
     moved = (at_random[0] != 0).any(0).nonzero().flatten()
-    step = 0.1 * torch.eye(p)[moved].to(mode).unsqueeze(1)
-    value, slope = log_likelihood(torch.cat([here, mode + step, mode - step]))
-    up, down = slope[1:].chunk(2)
-    rows = -(up - down).movedim(0, -2) / 0.2
     hessian = mode.new_zeros(len(mode), p, p)
-    hessian[:, moved.unsqueeze(-1), moved] = rows.nan_to_num()[..., moved]
+    for _ in range(_PASSES):
+        step = _STEP * (1 + hessian.diagonal(dim1=-1, dim2=-2).clamp_min(0.0)).rsqrt()  # B x P
+        moves = torch.diag_embed(step)[:, moved].movedim(0, 1)
+        value, slope = log_likelihood(torch.cat([here, mode + moves, mode - moves]))
+        up, down = slope[1:].chunk(2)
+        rows = (down - up).movedim(0, -2) / (2 * step[:, moved].unsqueeze(-1))
+        hessian[:, moved.unsqueeze(-1), moved] = rows.nan_to_num()[..., moved]
     values, vectors = torch.linalg.eigh(0.5 * (hessian + hessian.mT))
     precision = 1 + values.clamp_min(0.0)
     root = vectors * (_WIDER * precision.rsqrt()).unsqueeze(-2)

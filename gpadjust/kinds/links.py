@@ -244,12 +244,13 @@ class Linked(GP):
         """Return g of targets or outputs; a ValueError if some are not within the bounds."""
         outside = ~self.holds(Y)
         if outside.any():
-            rows = marked_rows(outside.any(-1))
+            rows, b = marked_rows(outside.any(-1)), self.link.upper
+            upper = "" if math.isinf(b) else f" and below {b:g}"
             raise ValueError(
-                f"Expected targets above {self.link.lower:g} and below {self.link.upper:g}, as "
-                f"{self.link.formula} is modelled; found {float(Y[outside][0]):.6g} in "
-                f"{len(rows)} row(s), the first row {rows[0]}. Correct them, make them NaN if they "
-                "are missing, or give other bounds: link=(lower, upper)."
+                f"Expected targets above {self.link.lower:g}{upper}, as {self.link.formula} is "
+                f"modelled; found {float(Y[outside][0]):.6g} in {len(rows)} row(s), the first row "
+                f"{rows[0]}. Correct them, make them NaN if they are missing, or give other "
+                "bounds: link=(lower, upper)."
             )
         return self.link.value(Y)
 
