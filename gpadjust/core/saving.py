@@ -154,8 +154,6 @@ def _content(model: GP) -> dict[str, Any]:
     missing = [name for name, value in settings.items() if not _is_plain(value)]
     scalings = [term.name for term in model.terms if term.physics is not None]
     is_mapping = type(model) is not GP and all(each.startswith("rho_") for each in scalings)
-    tensors = {"X": data.X, "Y": data.Y, "Yvar": data.Yvar, "u": model.u, "draws": model.draws}
-    tensors |= dict(model.named_buffers(recurse=False))
     return {
         "class": _path_of(type(model)),
         "settings": {name: value for name, value in settings.items() if name not in missing},
@@ -165,7 +163,12 @@ def _content(model: GP) -> dict[str, Any]:
         "rows_of_fit": n,
         "names": [list(data.input_names), list(data.output_names)],
         "built_with": _built_with(model, n),
-        **{name: v if v is None else v.detach().cpu().clone() for name, v in tensors.items()},
+        "X": data.X,
+        "Y": data.Y,
+        "Yvar": data.Yvar,
+        "u": model.u.detach(),
+        "draws": model.draws,
+        "buffers": dict(model.named_buffers(recurse=False)),
     }
 
 
@@ -221,14 +224,13 @@ def _built_with(model: GP, n: int) -> dict[str, Tensor]:
     total = model.term_sum.at(values, places)
     noise = model.noise.of_rows(torch.arange(n)) or model.noise
     numbers = {f"physics {i + 1}": f * model.unit for i, f in enumerate(places.f)}
-    numbers |= {"mean": total.mean * model.unit}
-    numbers |= {"noise": noise.variance(values, places, True)[..., :n] * model.unit.square()}
+    numbers["mean"] = total.mean * model.unit
+    numbers["noise"] = noise.variance(values, places, True)[..., :n] * model.unit.square()
     for row in (*model.table.own, *model.table.shared):
         numbers[f"prior of {row.name}"] = torch.stack([row.location, row.location + row.scale])
     for choice in model.table.choices:
         numbers[f"choice {choice.text} {choice.zeros}"] = torch.tensor(choice.probability)
-    numbers["kernel"] = total.cross(total.of_rows(slice(_COMPARED))).sum(-1)
-    return {name: value.detach().cpu().clone() for name, value in numbers.items()}
+    return numbers | {"kernel": total.cross(total.of_rows(slice(_COMPARED))).sum(-1)}
 
 
 def _loaded(content: dict[str, Any], objects: dict[str, Any], trusted: bool) -> Any:
@@ -291,7 +293,7 @@ def _model(content: dict[str, Any], objects: dict[str, Any], trusted: bool) -> G
     model.set_draws(content["draws"])
     model.u = u
     for name, _ in [*model.named_buffers(recurse=False)]:
-        setattr(model, name, content[name])
+        setattr(model, name, content["buffers"][name])
     model.data = model.data._replace(input_names=inputs, output_names=outputs)
     if n < len(Y):
         model = model.condition_on_observations(X[n:], Y[n:], None if Yvar is None else Yvar[n:])

@@ -151,8 +151,7 @@ class WeightedSum:
             process = self.values.get(f"{term.name}.process")
             if process is not None and not process.any():
                 term = term._replace(kernel=None)
-            varies = term.kernel is not None or term.constant is not None
-            if term.name in self.weights and varies:
+            if term.name in self.weights and term.varies:
                 parts.append((term, self.weights[term.name]))
         return parts
 
