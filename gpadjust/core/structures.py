@@ -14,8 +14,6 @@ from gpadjust.core.unknowns import Choice, LogNormal
 RHO_CONSTANT = LogNormal(0.01, 100.0)  # prior variance of an unknown constant in a scaling
 DELTA_CONSTANT = LogNormal(0.3, 1000.0)  # that in delta, in squared units of the targets
 
-CORRECTED, AS_IT_IS, OF_NO_USE = (0.45, 0.35, 0.2)  # prior probabilities
-
 
 class CKA(GP):
     r"""Co-kriging adjustment of a physics model (Wannawas and Faisal 2023, section 2.1).
@@ -217,21 +215,20 @@ def _delta(kernel: Any, constants: bool) -> Term:
 
 
 def _nested(rho: str, extra_terms: Sequence[Term], physics: Any) -> list[Choice]:
-    """Return the nested models.
+    """Return the nested models and their prior probabilities.
 
     A physics with unknown parameters may also be right as it is, which tells these much more of
     them than a physics up to a factor and an offset does.
     """
+    constants = [f"{rho}.constant", "delta.constant"]
     processes = [f"{name}.process" for name in (rho, "delta", *(t.name for t in extra_terms))]
     processes += [f"{t.name}.constant" for t in extra_terms if t.constant is not None]
-    constants = [f"{rho}.constant", "delta.constant"]
-    has_unknowns = bool(getattr(physics, "unknowns", None))
-    up_to = AS_IT_IS / 2 if has_unknowns else AS_IT_IS
     choices = [
-        Choice("your formula corrected", CORRECTED),
-        Choice("as it is up to a factor and an offset", up_to, tuple(processes)),
-        Choice("of no use", OF_NO_USE, (f"{rho}.mean", f"{rho}.constant", f"{rho}.process")),
+        Choice("your formula corrected", 0.45),
+        Choice("as it is", 0.175, (*processes, *constants)),
+        Choice("as it is up to a factor and an offset", 0.175, tuple(processes)),
+        Choice("of no use", 0.2, (f"{rho}.mean", f"{rho}.constant", f"{rho}.process")),
     ]
-    if has_unknowns:
-        choices.insert(1, Choice("as it is", AS_IT_IS - up_to, (*processes, *constants)))
+    if not getattr(physics, "unknowns", None):
+        choices[1:3] = [choices[2]._replace(probability=0.35)]
     return choices
