@@ -281,7 +281,7 @@ def _model(content: dict[str, Any], objects: dict[str, Any], trusted: bool) -> G
         model: GP = _class_of(content["class"], GP)(*data, **settings)
     found, saved = _built_with(model, n), content["built_with"]
     for name in [*found, *saved]:
-        ours, theirs = (numbers.get(name, torch.zeros(0)) for numbers in (found, saved))
+        ours, theirs = (numbers.get(name, X.new_zeros(0)) for numbers in (found, saved))
         same = ours.shape == theirs.shape
         if not same or not torch.allclose(theirs, ours, 1e-6, 1e-9 * float(ours.abs().max())):
             raise ValueError(

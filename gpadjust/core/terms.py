@@ -110,20 +110,19 @@ class WeightedSum:
         """
         total, steps = self.x.new_zeros(self.x.shape[-2], self.x.shape[-2]), []
         for term, w in self._parts():
-            K, back = None, None
+            column, row, K, back = w.unsqueeze(-1), w.unsqueeze(-2), None, None
             if term.kernel is not None:
                 K, back = term.kernel.with_pull_back(self.own(term), self.x)
                 K = self._process(term, K)
-                total = _scaled(K, w).add_(total)
+                total = (K * column).mul_(row).add_(total)
             if term.constant is not None:  # kappa w_i w_j
-                left = (self._constant(term) * w).unsqueeze(-1)
-                total = torch.addcmul(total, left, w.unsqueeze(-2))
-            steps.append((term, w, K, back))
+                total = torch.addcmul(total, self._constant(term).unsqueeze(-1) * column, row)
+            steps.append((term, column, row, K, back))
 
         def pull_back(D: Tensor) -> Values:
             by: Values = {}
-            for term, w, K, back in steps:
-                by_k = _scaled(D, w)
+            for term, column, row, K, back in steps:
+                by_k = (D * column).mul_(row)
                 if back is not None:
                     by_own = back(self._process(term, by_k))
                     by |= {f"{term.name}.kernel.{n}": slope for n, slope in by_own.items()}
@@ -131,7 +130,6 @@ class WeightedSum:
                     by[f"{term.name}.constant"] = by_k.sum((-1, -2)).unsqueeze(-1)
                 if term.physics is not None:
                     # Of w_i (K_ij + kappa) w_j it is 2 sum_j D_ij (K_ij + kappa) w_j.
-                    column = w.unsqueeze(-1)
                     by_w = self._constant(term) * (D @ column).squeeze(-1)
                     by_w = by_w if K is None else by_w + ((D * K) @ column).squeeze(-1)
                     by[f"{term.name}.weight"] = 2 * by_w
@@ -146,7 +144,7 @@ class WeightedSum:
             process = self.values.get(f"{term.name}.process")
             if process is not None and not process.any():
                 term = term._replace(kernel=None)
-            if term.name in self.weights and term.varies:
+            if term.name in self.weights and (term.kernel, term.constant) != (None, None):
                 parts.append((term, self.weights[term.name]))
         return parts
 
@@ -160,11 +158,6 @@ class WeightedSum:
         if term.constant is None:
             return torch.zeros_like(self.x[..., :1, 0])
         return self.values[f"{term.name}.constant"]
-
-
-def _scaled(K: Tensor, w: Tensor) -> Tensor:
-    """Return ``w_i K_ij w_j``."""
-    return (K * w.unsqueeze(-1)).mul_(w.unsqueeze(-2))
 
 
 class TermSum:
@@ -211,9 +204,8 @@ class TermSum:
         """Return c, ``S x m x 1``: normal around the mean of f_p, by three standard deviations."""
         if term.has_center is not True:
             return term.has_center / self.unit
-        coordinate = values[f"{term.name}.center"]
         i = term.physics or 0
-        return self.middle[i] + self.spread[i] * coordinate
+        return self.middle[i] + self.spread[i] * values[f"{term.name}.center"]
 
     def mean_of(self, term: Term, values: Values) -> Tensor | float:
         """Return the prior mean of a term's process, which is zero in some nested models."""
