@@ -82,7 +82,8 @@ def save(model: GP | StackedGP, path: str | Path) -> Saved:
         models = dict(zip(model.names, model.models, strict=True))
         is_whole = bool((model.picks == model.picks[:, :1]).all())
         weights = {name: own[0] if is_whole else own for name, own in model.weights.items()}
-        mixture = {"weights": weights, "num_components": len(model.picks)}
+        mixture = {"class": _path_of(type(model)), "weights": weights}
+        mixture["num_components"] = len(model.picks)
     contents = {name: _content(each) for name, each in models.items()}
     missing, physics = (
         [*dict.fromkeys(name for each in contents.values() for name in each[key])]
@@ -163,8 +164,8 @@ def _content(model: GP) -> dict[str, Any]:
         "rows_of_fit": n,
         "names": [list(data.input_names), list(data.output_names)],
         "built_with": _built_with(model, n),
-        "X": data.X,
-        "Y": data.Y,
+        "X": data.X.detach(),
+        "Y": data.Y.detach(),
         "Yvar": data.Yvar,
         "u": model.u.detach(),
         "draws": model.draws,
@@ -245,10 +246,11 @@ def _loaded(content: dict[str, Any], objects: dict[str, Any], trusted: bool) -> 
             f"expected what the file could not hold, load(path, {_call(missing)}), and nothing "
             f"else but its physics; found load(path, {_call(objects)})."
         )
-    if content["mixture"] is None:
+    own = content["mixture"]
+    if own is None:
         return _model(contents[""], objects, trusted)
     models = {name: _of_mixture(each, objects, trusted) for name, each in contents.items()}
-    return StackedGP(models, **content["mixture"])
+    return _class_of(own["class"], StackedGP)(models, own["weights"], own["num_components"])
 
 
 def _of_mixture(content: dict[str, Any], objects: dict[str, Any], trusted: bool) -> GP:
