@@ -77,7 +77,7 @@ def save(model: GP | StackedGP, path: str | Path) -> Saved:
     if path.is_dir() or not path.parent.is_dir():
         raise ValueError(f"Expected path as a file in a folder that exists; found {str(path)!r}.")
     models: Any = {"": model}
-    mixture = None
+    mixture: dict[str, Any] | None = None
     if isinstance(model, StackedGP):
         models = dict(zip(model.names, model.models, strict=True))
         is_whole = bool((model.picks == model.picks[:, :1]).all())
