@@ -168,9 +168,10 @@ class Table:
         for row in (*self.own, *self.shared):
             if row.log_density is not None:
                 theta = values[row.name]
-                log_slope = (row.slope(theta) * torch.ones_like(theta)).log()
-                log_normal = -0.5 * (row.coordinate(theta).square() + math.log(2 * math.pi))
-                part = row.log_density(theta) + (log_slope - log_normal).sum(-1)
+                size = theta.log() if row.is_positive else torch.zeros_like(theta)
+                z = ((size if row.is_positive else theta) - row.location) / row.scale
+                size = size + math.log(row.scale) + 0.5 * z.square() + 0.5 * math.log(2 * math.pi)
+                part = row.log_density(theta) + size.sum(-1)
                 part = part.reshape(len(u), -1)  # S x m, or S x 1 of a shared row
                 total = total + (part if self.problems > 1 else part.sum(-1, keepdim=True))
         return total
