@@ -114,7 +114,7 @@ class WeightedSum:
             if term.kernel is not None:
                 K, back = term.kernel.with_pull_back(self.own(term), self.x)
                 K = self._process(term, K)
-                total = (K * column).mul_(row).add_(total)
+                total = total + (K * column).mul_(row)
             if term.constant is not None:  # kappa w_i w_j
                 total = torch.addcmul(total, self._constant(term).unsqueeze(-1) * column, row)
             steps.append((term, column, row, K, back))
