@@ -90,8 +90,7 @@ class Functions(torch.nn.Module):
             if term.constant is not None:
                 sd = f.values[f"{term.name}.constant"].sqrt()
                 value = value + sd * self.weights[f"{term.name}.constant"]
-            weight = f.weights[term.name]
-            total = total + (value if weight is None else weight * value)
+            total = total + f.weights[term.name] * value
         return total
 
 

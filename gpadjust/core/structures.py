@@ -14,8 +14,6 @@ from gpadjust.core.unknowns import Choice, LogNormal
 RHO_CONSTANT = LogNormal(0.01, 100.0)  # prior variance of an unknown constant in a scaling
 DELTA_CONSTANT = LogNormal(0.3, 1000.0)  # that in delta, in squared units of the targets
 
-CORRECTED, AS_IT_IS, OF_NO_USE = (0.45, 0.35, 0.2)  # prior probabilities
-
 
 class CKA(GP):
     r"""Co-kriging adjustment of a physics model (Wannawas and Faisal 2023, section 2.1).
@@ -67,28 +65,25 @@ class CKA(GP):
     ) -> None:  # fmt: skip
         if not isinstance(center, bool | int | float):
             raise TypeError(f"Expected center as True, False or a number; found {center!r}.")
-        settings = {
+        settings = options | {
             "rho_covar_module": rho_covar_module, "delta_covar_module": delta_covar_module,
             "rho_mean": rho_mean, "delta_mean": delta_mean, "center": center,
-            "constants": constants, "nested": nested,
+            "constants": constants, "nested": nested, "extra_terms": [*extra_terms],
         }  # fmt: skip
-        if extra_terms:
-            settings["extra_terms"] = extra_terms
         rhos, functions = _scalings(physics, rho_mean)
         kernel, constant = as_kernel(rho_covar_module, RHO), RHO_CONSTANT if constants else None
-        delta = _delta(delta_covar_module, delta_mean, constants)
-        has_both = kernel.has_constant and as_kernel(delta.kernel).has_constant
-        if center is True and kernel.has_constant and not has_both:
+        delta = _delta(delta_covar_module, constants)._replace(mean=delta_mean)
+        delta_has_constant = as_kernel(delta.kernel).has_constant
+        if center is True and kernel.has_constant and not delta_has_constant:
             center = 0.0  # another one would add a constant to delta
         rhos = [rho._replace(kernel=kernel, constant=constant, has_center=center) for rho in rhos]
-        choices: tuple[Choice, ...] = () if isinstance(nested, bool) else tuple(nested)
-        if nested is True and constants and has_both and len(rhos) == 1:
-            has_unknowns = bool(getattr(functions[0], "unknowns", None))
-            choices = _nested(rhos[0].name, extra_terms, has_unknowns)
+        choices = [] if isinstance(nested, bool) else [*nested]
+        has_both = constants and kernel.has_constant and delta_has_constant
+        if nested is True and has_both and len(rhos) == 1:
+            choices = _nested(rhos[0].name, extra_terms, functions[0])
         super().__init__(
-            train_X, train_Y, train_Yvar, terms=[*rhos, delta, *extra_terms],
-            physics=functions, choices=choices,
-            settings=settings | options, **options,
+            train_X, train_Y, train_Yvar, terms=[*rhos, delta, *extra_terms], physics=functions,
+            choices=choices, settings=settings, **options,
         )  # fmt: skip
 
 
@@ -133,11 +128,11 @@ class PhysicsMeanGP(GP):
         self, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike = None, *,
         physics: Any, covar_module: Any = None, constants: bool = True, **options: Any,
     ) -> None:  # fmt: skip
+        settings = options | {"covar_module": covar_module, "constants": constants}
         rhos, functions = _scalings(physics)
         super().__init__(
-            train_X, train_Y, train_Yvar, terms=[*rhos, _delta(covar_module, 0.0, constants)],
-            physics=functions,
-            settings={"covar_module": covar_module, "constants": constants} | options, **options,
+            train_X, train_Y, train_Yvar, terms=[*rhos, _delta(covar_module, constants)],
+            physics=functions, settings=settings, **options,
         )  # fmt: skip
 
 
@@ -152,11 +147,12 @@ class ScaleGP(GP):
         self, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike = None, *,
         physics: Any, covar_module: Any = None, constants: bool = True, **options: Any,
     ) -> None:  # fmt: skip
+        settings = options | {"covar_module": covar_module, "constants": constants}
         constant = RHO_CONSTANT if constants else None
         rho = Term("rho", as_kernel(covar_module, LogNormal(0.01, 100.0)), 1.0, constant, 0)
         super().__init__(
-            train_X, train_Y, train_Yvar, terms=[rho], physics=[physics],
-            settings={"covar_module": covar_module, "constants": constants} | options, **options,
+            train_X, train_Y, train_Yvar, terms=[rho], physics=[physics], settings=settings,
+            **options,
         )  # fmt: skip
 
 
@@ -171,11 +167,9 @@ class ZeroMeanGP(GP):
         self, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike = None, *,
         covar_module: Any = None, constants: bool = True, **options: Any,
     ) -> None:  # fmt: skip
-        super().__init__(
-            train_X, train_Y, train_Yvar,
-            terms=[_delta(covar_module, 0.0, constants)._replace(name="f")],
-            settings={"covar_module": covar_module, "constants": constants} | options, **options,
-        )  # fmt: skip
+        settings = options | {"covar_module": covar_module, "constants": constants}
+        f = _delta(covar_module, constants)._replace(name="f")
+        super().__init__(train_X, train_Y, train_Yvar, terms=[f], settings=settings, **options)
 
 
 class CalibratedPhysics(GP):
@@ -200,49 +194,41 @@ class CalibratedPhysics(GP):
             )
 
 
-def _scalings(
-    physics: Any, means: float | Sequence[float] | None = None
-) -> tuple[list[Term], list[Any]]:
+def _scalings(physics: Any, means: Any = None) -> tuple[list[Term], list[Any]]:
     """Return a scaling of each physics by its prior mean, and the physics."""
-    names, functions = ["rho"], [physics]
-    if isinstance(physics, list | tuple):
-        functions = [*physics]
-        names = [f"rho{i + 1}" for i in range(len(functions))] if len(functions) > 1 else names
-    elif isinstance(physics, Mapping):
-        functions = [*physics.values()]
-        names = [f"rho_{name}" for name in physics]
+    functions = [*physics] if isinstance(physics, list | tuple) else [physics]
+    names = [f"rho{i + 1}" for i in range(len(functions))] if len(functions) > 1 else ["rho"]
+    if isinstance(physics, Mapping):
+        names, functions = [f"rho_{name}" for name in physics], [*physics.values()]
     number = len(functions)
     if not number:
         raise ValueError("Expected at least one physics; found none. Without, take ZeroMeanGP.")
-    if means is None:
-        means = 1.0 / number
-    means = [float(means)] * number if isinstance(means, int | float) else [*map(float, means)]
+    means = 1.0 / number if means is None else means
+    means = [means] * number if isinstance(means, int | float) else [*means]
     if len(means) != number:
         raise ValueError(f"Expected rho_mean for each of {number} physics; found {means}.")
-    pairs = enumerate(zip(names, means, strict=True))
-    return [Term(name, mean=mean, physics=i) for i, (name, mean) in pairs], functions
+    return [Term(names[i], mean=float(means[i]), physics=i) for i in range(number)], functions
 
 
-def _delta(kernel: Any, mean: float, constants: bool) -> Term:
-    constant = DELTA_CONSTANT if constants else None
-    return Term("delta", as_kernel(kernel, DELTA), mean, constant)
+def _delta(kernel: Any, constants: bool) -> Term:
+    return Term("delta", as_kernel(kernel, DELTA), constant=DELTA_CONSTANT if constants else None)
 
 
-def _nested(rho: str, extra_terms: Sequence[Term], has_unknowns: bool) -> tuple[Choice, ...]:
-    """Return the nested models.
+def _nested(rho: str, extra_terms: Sequence[Term], physics: Any) -> list[Choice]:
+    """Return the nested models and their prior probabilities.
 
     A physics with unknown parameters may also be right as it is, which tells these much more of
     them than a physics up to a factor and an offset does.
     """
-    processes = [f"{rho}.process", "delta.process", *(f"{t.name}.process" for t in extra_terms)]
-    processes += [f"{t.name}.constant" for t in extra_terms if t.constant is not None]
     constants = [f"{rho}.constant", "delta.constant"]
-    up_to = AS_IT_IS / 2 if has_unknowns else AS_IT_IS
+    processes = [f"{name}.process" for name in (rho, "delta", *(t.name for t in extra_terms))]
+    processes += [f"{t.name}.constant" for t in extra_terms if t.constant is not None]
     choices = [
-        Choice("your formula corrected", CORRECTED),
-        Choice("as it is up to a factor and an offset", up_to, tuple(processes)),
-        Choice("of no use", OF_NO_USE, (f"{rho}.mean", f"{rho}.constant", f"{rho}.process")),
+        Choice("your formula corrected", 0.45),
+        Choice("as it is", 0.175, (*processes, *constants)),
+        Choice("as it is up to a factor and an offset", 0.175, tuple(processes)),
+        Choice("of no use", 0.2, (f"{rho}.mean", f"{rho}.constant", f"{rho}.process")),
     ]
-    if has_unknowns:
-        choices.insert(1, Choice("as it is", AS_IT_IS - up_to, (*processes, *constants)))
-    return tuple(choices)
+    if not getattr(physics, "unknowns", None):
+        choices[1:3] = [choices[2]._replace(probability=0.35)]
+    return choices

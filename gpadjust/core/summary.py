@@ -2,66 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from textwrap import indent
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from gpadjust.core.noise import KnownNoise, Noise
 from gpadjust.core.terms import Term
 from gpadjust.core.unknowns import Values
+
+_SD = "standard deviation"
 
 
 @torch.no_grad()
 def summary(model: Any) -> str:
     """Return the unknown numbers of a model, medians of its draws and ranges of 95 % of them."""
     values, X = model.table.values(model.draws), model.data.X
-    reads_physics = type(model.noise) not in (Noise, KnownNoise)
-    variance = model.noise.variance(values, model.places(X, values, reads_physics), True)
-    lines = [_title(model), *_of_physics(model)]
+    variance = model.noise.variance(values, model.places(X, values, model.noise.has_shares), True)
+    n, d = X.shape[-2:]
+    counts = {"point": n, "input": d, "output": model.num_outputs, "draw": len(model.draws)}
+    parts = [f"{n} {noun}" + "s" * (n != 1) for noun, n in counts.items()]
+    parts += [] if model.is_fitted else ["not fitted"]
+    parts += [f"of {model.scale}"] if model.scale else []
+    lines = [f"{type(model).__name__}: {', '.join(parts)}"]
+    if model.physics_parameters:
+        lines += ["parameters of the physics:", indent(repr(model.physics_parameters), "  ")]
     for j, name in enumerate(model.data.output_names):
         own = {key: v[:, j] if v.dim() == 3 else v for key, v in values.items()}
-        lines += [f"{name}:", *_choices(model, values, j)]
+        lines.append(f"{name}:")
+        if model.table.choices and len(model.draws) > 1:
+            shares = model.table.chosen(values)[:, j].bincount(minlength=len(model.table.choices))
+            shares = shares.double() / len(model.draws)
+            pairs = zip(model.table.choices, shares.tolist(), strict=True)
+            lines.append(f"  probabilities: {', '.join(f'{c.text} {p:.0%}' for c, p in pairs)}")
         for term in model.terms:
             lines += _of_term(model, term, own, j)
         lines += _of_noise(model, variance[..., j, :].sqrt() * model.unit[j], j)
     return "\n".join(lines)
 
 
-def _title(model: Any) -> str:
-    """Return the class, the sizes of the data, and the number of draws."""
-    n, d = model.data.X.shape[-2:]
-    counts = {"point": n, "input": d, "output": model.num_outputs, "draw": len(model.draws)}
-    parts = [f"{n} {noun}" + "s" * (n != 1) for noun, n in counts.items()]
-    parts += [] if model.draws.any() else ["not fitted"]
-    parts += [f"of {model.scale}"] if model.scale else []
-    return f"{type(model).__name__}: {', '.join(parts)}"
-
-
-def _of_physics(model: Any) -> list[str]:
-    """Return the unknown parameters of the physics, and their priors."""
-    unknowns = {name: unknown for each in model.physics for name, unknown in each.unknowns.items()}
-    lines = ["parameters of the physics:"] if unknowns else []
-    for name, draws in model.physics_parameters.items():
-        unknown = unknowns[name]
-        unit = f" {unknown.unit}" if unknown.unit else ""
-        lines.append(f"  {name}: {_text(draws)}{unit} (prior {unknown.prior_text}{unit})")
-    return lines
-
-
-def _choices(model: Any, values: Values, j: int) -> list[str]:
-    """Return the probabilities of nested models of an output, their shares of the draws."""
-    choices = model.table.choices
-    if not choices or len(model.draws) < 2:
-        return []
-    chosen = model.table.chosen(values)[:, j].tolist()
-    shares = [f"{c.text} {chosen.count(k) / len(chosen):.0%}" for k, c in enumerate(choices)]
-    return [f"  probabilities: {', '.join(shares)}"]
-
-
 def _of_term(model: Any, term: Term, values: Values, j: int) -> list[str]:
-    """Return the numbers of a term of an output, at the draws that contain them."""
+    """Return the numbers of a term of an output, ``N x k``, at the draws that contain them."""
     unit = float(model.unit[j]) if term.physics is None else 1.0  # a scaling has none
     everywhere = torch.ones(len(model.draws), 1)
     kept = values.get(f"{term.name}.process", everywhere).squeeze(-1) != 0
@@ -69,40 +50,36 @@ def _of_term(model: Any, term: Term, values: Values, j: int) -> list[str]:
     if term.kernel is not None and not kept.all():
         head += f", varies in {int(kept.sum())} of {len(kept)} draws"
     lines, start = [head], f"{term.name}.kernel."
-    for name in values if kept.any() else ():
-        if name.startswith(start):
-            names = getattr(term.kernel, "input_names", None)
-            own = values[name][kept]
-            lines += _of_kernel(model, name.removeprefix(start), own, unit, names)
+    for key in values if kept.any() else ():
+        if key.startswith(start):
+            numbers, name = values[key][kept], key.removeprefix(start).replace("raw_", "")
+            if name.endswith("outputscale"):
+                numbers, name = numbers.sqrt() * unit, name.replace("outputscale", _SD)
+            labels = _labels(model, term, name, numbers.shape[-1])
+            pairs = zip(labels, numbers.unbind(-1), strict=True)
+            lines += [f"    {name}{label}: {_text(each)}" for label, each in pairs]
     constant = values.get(f"{term.name}.constant", torch.zeros(1))
     if constant.any():
-        lines.append(f"    standard deviation of the constant: {_sd(constant[constant > 0], unit)}")
+        lines.append(f"    {_SD} of the constant: {_text(constant[constant > 0].sqrt() * unit)}")
     if f"{term.name}.center" in values:
         c = model.term_sum.center(term, model.table.values(model.draws))
         lines.append(f"    center: {_text(c[:, j] * model.unit[j])}")
     return lines
 
 
-def _of_kernel(
-    model: Any, name: str, numbers: Tensor, unit: float, names: Sequence[str] | None
-) -> list[str]:
-    """Return some numbers ``N x k`` of a kernel."""
-    name = name.replace("raw_", "")
-    if name.endswith("outputscale"):
-        return [f"    {name.replace('outputscale', 'standard deviation')}: {_sd(numbers, unit)}"]
-    columns = [""] if numbers.shape[-1] == 1 else [f" {i + 1}" for i in range(numbers.shape[-1])]
-    after = ""
-    if name.endswith("lengthscale"):
-        if names is None:
-            names, transform = model.data.input_names, model.data.transform
-            if hasattr(transform, "column_names"):
-                names = transform.column_names(names)
-            elif transform is not None:
-                after = " after the transform"
-        if len(columns) == len(names):
-            columns = [f" of {each}" for each in names]
-    pairs = zip(columns, numbers.unbind(-1), strict=True)
-    return [f"    {name}{column}{after}: {_text(each)}" for column, each in pairs]
+def _labels(model: Any, term: Term, name: str, number: int) -> list[str]:
+    """Return labels of a kernel's numbers: the inputs, if it has a lengthscale of each."""
+    labels = [""] if number == 1 else [f" {i + 1}" for i in range(number)]
+    if not name.endswith("lengthscale"):
+        return labels
+    names, transform = getattr(term.kernel, "input_names", None), model.data.transform
+    after = "" if transform is None or names is not None else " after the transform"
+    if names is None:
+        names = model.data.input_names
+        if hasattr(transform, "column_names"):
+            names, after = transform.column_names(names), ""
+    labels = [f" of {each}" for each in names] if number == len(names) else labels
+    return [label + after for label in labels]
 
 
 def _of_noise(model: Any, sd: Tensor, j: int) -> list[str]:
@@ -112,16 +89,11 @@ def _of_noise(model: Any, sd: Tensor, j: int) -> list[str]:
         rows = mask[:, j].nonzero().flatten().tolist()
         lines = [f"  outliers: rows {', '.join(map(str, rows))}"]
         sd = sd[..., ~mask[:, j]]
-    mean = sd.square().mean(-1).sqrt()
     ends = sd.reshape(-1, sd.shape[-1]).median(0).values
     low, high = (f"{float(end):.3g}" for end in (ends.min(), ends.max()))
-    text = f"  noise: standard deviation {_text(mean)}"
+    text = f"  noise: {_SD} {_text(sd.square().mean(-1).sqrt())}"
     text = text if low == high else f"{text}, from {low} to {high} at the training inputs"
     return [text, *lines]
-
-
-def _sd(variances: Tensor, unit: float) -> str:
-    return _text(variances.sqrt() * unit)
 
 
 def _text(values: Tensor) -> str:

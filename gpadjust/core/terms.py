@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -63,11 +63,11 @@ class WeightedSum:
     values: Values
     x: Tensor
     mean: Tensor  # ... x S x m x n
-    weights: dict[str, Tensor | None] = field(default_factory=dict)  # w_t; None for 1
+    weights: dict[str, Tensor | Any]  # tensors w_t, shaped as the mean, of the terms in the sum
 
     def of_rows(self, rows: slice | Tensor) -> WeightedSum:
         """Return the sum at some of its places."""
-        weights = {name: None if w is None else w[..., rows] for name, w in self.weights.items()}
+        weights = {name: w[..., rows] for name, w in self.weights.items()}
         x, mean = self.x[..., rows, :], self.mean[..., rows]
         return WeightedSum(self.terms, self.values, x, mean, weights)
 
@@ -84,7 +84,7 @@ class WeightedSum:
             if term.kernel is not None:
                 variance = term.kernel.variance(self.own(term), self.x)
                 k = k + self._process(term, variance.unsqueeze(-1)).squeeze(-1)
-            total = total + (k if weight is None else k * weight.square())
+            total = total + k * weight.square()
         return total
 
     def cross(self, other: WeightedSum) -> Tensor:
@@ -96,47 +96,40 @@ class WeightedSum:
         for term, weight in self._parts():
             if term.name not in other.weights:
                 continue
-            other_weight = other.weights[term.name]
             k = self._constant(term).unsqueeze(-1)
             if term.kernel is not None:
                 point = None if other is self else other.x
                 k = k + self._process(term, term.kernel.covariance(self.own(term), self.x, point))
-            if weight is not None:
-                k = k * weight.unsqueeze(-1)
-            if other_weight is not None:
-                k = k * other_weight.unsqueeze(-2)
-            total = total + k
+            total = total + k * weight.unsqueeze(-1) * other.weights[term.name].unsqueeze(-2)
         return total
 
     def with_pull_back(self) -> tuple[Tensor, PullBack]:
         """Return the covariance, and what gives derivatives by all parameters.
 
-        Derivatives by the weights have the names ``"<term>.weight"``.
+        Derivatives by the weights of physics have the names ``"<term>.weight"``.
         """
         total, steps = self.x.new_zeros(self.x.shape[-2], self.x.shape[-2]), []
         for term, w in self._parts():
-            K, back = None, None
-            one = torch.ones_like(self.x[..., 0]) if w is None else w
+            column, row, K, back = w.unsqueeze(-1), w.unsqueeze(-2), None, None
             if term.kernel is not None:
                 K, back = term.kernel.with_pull_back(self.own(term), self.x)
                 K = self._process(term, K)
-                total = total + K if w is None else _scaled(K, w).add_(total)
+                total = total + (K * column).mul_(row)
             if term.constant is not None:  # kappa w_i w_j
-                left = (self._constant(term) * one).unsqueeze(-1)
-                total = torch.addcmul(total, left, one.unsqueeze(-2))
-            steps.append((term, w, K, back))
+                total = torch.addcmul(total, self._constant(term).unsqueeze(-1) * column, row)
+            steps.append((term, column, row, K, back))
 
         def pull_back(D: Tensor) -> Values:
             by: Values = {}
-            for term, w, K, back in steps:
-                by_k = _scaled(D, w)
+            for term, column, row, K, back in steps:
+                by_k = (D * column).mul_(row)
                 if back is not None:
                     by_own = back(self._process(term, by_k))
                     by |= {f"{term.name}.kernel.{n}": slope for n, slope in by_own.items()}
                 if term.constant is not None:
                     by[f"{term.name}.constant"] = by_k.sum((-1, -2)).unsqueeze(-1)
-                if w is not None:  # of w_i (K_ij + kappa) w_j it is 2 sum_j D_ij (K_ij + kappa) w_j
-                    column = w.unsqueeze(-1)
+                if term.physics is not None:
+                    # Of w_i (K_ij + kappa) w_j it is 2 sum_j D_ij (K_ij + kappa) w_j.
                     by_w = self._constant(term) * (D @ column).squeeze(-1)
                     by_w = by_w if K is None else by_w + ((D * K) @ column).squeeze(-1)
                     by[f"{term.name}.weight"] = 2 * by_w
@@ -144,15 +137,14 @@ class WeightedSum:
 
         return total, pull_back
 
-    def _parts(self) -> list[tuple[Term, Tensor | None]]:
+    def _parts(self) -> list[tuple[Term, Tensor]]:
         """Return the terms that vary and have a weight, without processes that no draw contains."""
         parts = []
         for term in self.terms:
             process = self.values.get(f"{term.name}.process")
             if process is not None and not process.any():
                 term = term._replace(kernel=None)
-            varies = term.kernel is not None or term.constant is not None
-            if term.name in self.weights and varies:
+            if term.name in self.weights and (term.kernel, term.constant) != (None, None):
                 parts.append((term, self.weights[term.name]))
         return parts
 
@@ -166,11 +158,6 @@ class WeightedSum:
         if term.constant is None:
             return torch.zeros_like(self.x[..., :1, 0])
         return self.values[f"{term.name}.constant"]
-
-
-def _scaled(K: Tensor, w: Tensor | None) -> Tensor:
-    """Return ``w_i K_ij w_j``."""
-    return K if w is None else (K * w.unsqueeze(-1)).mul_(w.unsqueeze(-2))
 
 
 class TermSum:
@@ -217,9 +204,8 @@ class TermSum:
         """Return c, ``S x m x 1``: normal around the mean of f_p, by three standard deviations."""
         if term.has_center is not True:
             return term.has_center / self.unit
-        coordinate = values[f"{term.name}.center"]
         i = term.physics or 0
-        return self.middle[i] + self.spread[i] * coordinate
+        return self.middle[i] + self.spread[i] * values[f"{term.name}.center"]
 
     def mean_of(self, term: Term, values: Values) -> Tensor | float:
         """Return the prior mean of a term's process, which is zero in some nested models."""
@@ -237,11 +223,11 @@ class TermSum:
 
     def at(self, values: Values, places: Places) -> WeightedSum:
         r"""Return the function itself, :math:`\sum_t b_t g_t`."""
-        weights: dict[str, Tensor | None] = {}
+        weights = {}
         for term in self.terms:
-            b = None if term.physics is None else places.f[term.physics]
-            if b is not None and term.has_center:
-                b = b - self.center(term, values)
+            b = torch.ones_like(places.x[..., 0])
+            if term.physics is not None:
+                b = places.f[term.physics] - self.center(term, values)
             weights[term.name] = b
         return WeightedSum(self.terms, values, places.x, self.mean(values, places), weights)
 
@@ -254,7 +240,7 @@ class TermSum:
         """
         term = next(t for t in self.terms if t.name == name)
         one = torch.ones_like(places.x[..., 0])
-        weights: dict[str, Tensor | None] = {name: None}
+        weights = {name: one}
         plain = [t.name for t in self.terms if t.physics is None]
         if name == ("delta" if "delta" in plain else next(iter(plain), None)):
             centered = [t for t in self.terms if t.has_center]

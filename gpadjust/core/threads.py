@@ -30,30 +30,20 @@ def threads_for(num_points: int) -> Iterator[None]:
         ...     torch.get_num_threads()
         1
     """
-    if num_points > _SMALL:
-        yield
-        return
-    with _setting:
-        # The first call in a thread sets its number, which the limits below put back, too.
-        before = torch.get_num_threads()
     with ExitStack() as stack:
-        if _limiting.acquire(blocking=False):
-            stack.callback(_limiting.release)
-            stack.enter_context(_controller().limit(limits=1, user_api="blas"))
-        stack.callback(_set_own_threads, before)
-        _set_own_threads(1)
+        if num_points <= _SMALL:
+            stack.callback(_set_own_threads, _set_own_threads(1))
+            if _limiting.acquire(blocking=False):
+                stack.callback(_limiting.release)
+                stack.enter_context(_controller().limit(limits=1, user_api="blas"))
         yield
 
 
-def _set_own_threads(number: int) -> None:
-    """Set the number of threads that PyTorch uses in the calling thread alone."""
+def _set_own_threads(number: int) -> int:
+    """Set the number of threads that PyTorch uses in the calling thread alone; return the last."""
     # PyTorch's own call also sets what new threads begin with; another thread sets that back.
-    with _setting:
-        if torch.get_num_threads() == number:
-            return
-        with ThreadPoolExecutor(1) as another:
-            common = another.submit(torch.get_num_threads).result()
-            try:
-                torch.set_num_threads(number)
-            finally:
-                another.submit(torch.set_num_threads, common)
+    with _setting, ThreadPoolExecutor(1) as another:
+        before, common = torch.get_num_threads(), another.submit(torch.get_num_threads).result()
+        torch.set_num_threads(number)
+        another.submit(torch.set_num_threads, common)
+    return before

@@ -164,16 +164,16 @@ class Table:
         Of :math:`\theta(u)` it is
         :math:`\log p(\theta) + \log |d\theta / du| - \log N(u | 0, 1)`.
         """
-        others = [row for row in (*self.own, *self.shared) if row.log_density is not None]
         values, total = self.values(u), u.new_zeros(len(u), self.problems)
-        for row in others:
-            theta = values[row.name]
-            size = theta.log() if row.is_positive else torch.zeros_like(theta)
-            z = ((size if row.is_positive else theta) - row.location) / row.scale
-            size = size + math.log(row.scale) + 0.5 * z.square() + 0.5 * math.log(2 * math.pi)
-            part = row.log_density(theta) + size.sum(-1)  # type: ignore[misc]
-            part = part.unsqueeze(-1) if row.is_shared else part  # S x 1 or S x m
-            total = total + (part if part.shape[-1] == self.problems else part.sum(-1, True))
+        for row in (*self.own, *self.shared):
+            if row.log_density is not None:
+                theta = values[row.name]
+                size = theta.log() if row.is_positive else torch.zeros_like(theta)
+                z = ((size if row.is_positive else theta) - row.location) / row.scale
+                size = size + math.log(row.scale) + 0.5 * z.square() + 0.5 * math.log(2 * math.pi)
+                part = row.log_density(theta) + size.sum(-1)
+                part = part.reshape(len(u), -1)  # S x m, or S x 1 of a shared row
+                total = total + (part if self.problems > 1 else part.sum(-1, keepdim=True))
         return total
 
     def of_outputs(self, outputs: Sequence[int]) -> Table:

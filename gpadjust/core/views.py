@@ -34,41 +34,37 @@ def _of_all(values: Tensor, model: Any, dim: int) -> Tensor:
     return squeezed(values.expand(torch.broadcast_shapes(values.shape, shape)), dim)
 
 
-class MeanView(Mean):
-    """The prior mean of a model, f_p for an adjustment."""
+class _View:
+    """What reads a model, which is no part of it."""
 
-    def __init__(self, model: Any) -> None:
-        super().__init__()
-        self.owner = [model]  # in a list, as it is no part of the view
+    model: Any
+
+    def __init__(self, model: Any, **options: Any) -> None:
+        super().__init__(**options)
+        object.__setattr__(self, "model", model)  # a module would register it
+
+
+class MeanView(_View, Mean):
+    """The prior mean of a model, f_p for an adjustment."""
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the mean at ``... x n x d``."""
-        (model,) = self.owner
-        return _of_all(model.at(x).mean * model.unit, model, -2)
+        return _of_all(self.model.at(x).mean * self.model.unit, self.model, -2)
 
 
-class TermView(Kernel):
+class TermView(_View, Kernel):
     """The kernel of a term, scaled by its basis on both sides: diag(b) (k + kappa) diag(b)."""
 
     def __init__(self, model: Any, name: str) -> None:
-        super().__init__()
-        self.owner, self.name = [model], name
-
-    @property
-    def batch_shape(self) -> torch.Size:
-        """``(S) x (m)``."""
-        (model,) = self.owner
-        return torch.Size([size for size in model.num_draws_and_outputs if size > 1])
-
-    @batch_shape.setter
-    def batch_shape(self, shape: torch.Size) -> None:
-        """Ignore what GPyTorch sets, as the shape is the model's."""
+        lead = torch.Size([size for size in model.num_draws_and_outputs if size > 1])
+        super().__init__(model, batch_shape=lead)
+        self.name = name
 
     def forward(
         self, x1: Tensor, x2: Tensor, diag: bool = False, last_dim_is_batch: bool = False, **_: Any
     ) -> Tensor:
         """Return covariances ``... x n x n'``, or variances ``... x n``."""
-        (model,) = self.owner
+        model = self.model
         one = model.at(x1)
         one.weights = {self.name: one.weights[self.name]}
         if diag:
@@ -82,18 +78,13 @@ def kernel_view(model: Any) -> AdditiveKernel:
     return AdditiveKernel(*(TermView(model, t.name) for t in model.terms if t.varies))
 
 
-class NoiseView(NoiseModule):
+class NoiseView(_View, NoiseModule):
     """The noise of a model's observations."""
-
-    def __init__(self, model: Any) -> None:
-        super().__init__()
-        self.owner = [model]
 
     @property
     def noise(self) -> Tensor:
         """The variances at the training inputs, ``(S) x (m) x n``."""
-        (model,) = self.owner
-        return _of_all(self._variance(model, model.data.X, True), model, -2)
+        return _of_all(self._variance(self.model.data.X, True), self.model, -2)
 
     def forward(
         self, *params: Any, shape: Any = None, noise: Tensor | None = None, **_: Any
@@ -104,18 +95,17 @@ class NoiseView(NoiseModule):
         """
         if noise is not None:
             return DiagLinearOperator(noise)
-        (model,) = self.owner
-        if model.training and shape is not None and shape[-1] == len(model.data.Y):
-            variance = self._variance(model, model.data.X, True)
+        X = self.model.data.X
+        if self.model.training and shape is not None and shape[-1] == len(X):
+            variance = self._variance(X, True)
         elif params and isinstance(params[0], Tensor):
-            variance = self._variance(model, params[0], False)
+            variance = self._variance(params[0], False)
         else:
-            variance = self._variance(model, model.data.X, False).mean(-1, keepdim=True)
-        return DiagLinearOperator(_of_all(variance, model, -2).expand(shape))
+            variance = self._variance(X, False).mean(-1, keepdim=True)
+        return DiagLinearOperator(_of_all(variance, self.model, -2).expand(shape))
 
-    @staticmethod
-    def _variance(model: Any, X: Tensor, is_training: bool) -> Tensor:
-        values = model.values
+    def _variance(self, X: Tensor, is_training: bool) -> Tensor:
+        model, values = self.model, self.model.values
         v = model.noise.variance(values, model.places(X, values), is_training)
         if is_training:
             v = v + _MISSING * model.data.Y.isnan().mT
@@ -129,13 +119,9 @@ def likelihood_view(model: Any) -> GaussianLikelihood:
     return likelihood
 
 
-class OtherPriors(AddedLossTerm):
+class OtherPriors(_View, AddedLossTerm):
     """What priors of GPyTorch's kernels add to the density of coordinates."""
-
-    def __init__(self, model: Any) -> None:
-        self.owner = [model]
 
     def loss(self, *params: Any) -> Tensor:
         """Return the log density, of each output."""
-        (model,) = self.owner
-        return model.table.log_prior_ratio(model.u).squeeze()
+        return self.model.table.log_prior_ratio(self.model.u).squeeze()

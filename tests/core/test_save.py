@@ -144,7 +144,7 @@ def test_a_model_comes_back(name, conditioned, path):
     model.data = model.data._replace(input_names=("left [m]", "right [m]"))
     saved = save(model, path)
     assert set(saved.missing) == set(objects)
-    assert torch.load(path, weights_only=True)["missing"] == list(saved.missing)
+    assert torch.load(path, weights_only=True)["models"][""]["missing"] == list(saved.missing)
     same(load(path, trusted=True, **dict(objects)), model)
 
 
@@ -182,11 +182,12 @@ def test_formulas_need_no_trust(path):
 def altered(path, **changes):
     """Write a file of a CKA with changes of its content, at which None deletes."""
     save(drawn(CKA(X, Y, physics=relu)), path)
-    content = torch.load(path, weights_only=True)
+    file = torch.load(path, weights_only=True)
+    content = file if "format" in changes else file["models"][""]
     content |= changes
-    content = {n: value for n, value in content.items() if n not in changes or value is not None}
-    torch.save(content, path)
-    return content
+    for name in [name for name, value in changes.items() if value is None]:
+        del content[name]
+    torch.save(file, path)
 
 
 def bad(tensor):
@@ -205,19 +206,21 @@ BAD_FILES = {
     "infinite Y": ({"Y": Y / 0}, "finite"),
     "moved X": ({"X": X + 0.1}, "another physics 1"),
     "longer Y": ({"Y": torch.cat([Y, Y])}, "one length"),
-    "rows": ({"rows_of_fit": 1}, "one length"),
+    "longer X": ({"X": torch.cat([X, X])}, "one length"),
+    "rows": ({"rows_of_fit": 1}, "at least 2 points"),
     "fewer rows": ({"rows_of_fit": 6}, "another physics 1"),
-    "no such rows": ({"rows_of_fit": True}, "one length"),
-    "names": ({"names": [["a"], ["b", "c"]]}, "a name of each"),
+    "no such rows": ({"rows_of_fit": True}, "at least 2 points"),
+    "fewer names": ({"names": [["a"], ["b", "c"]]}, "a name of each"),
+    "more names": ({"names": [["x1", "x2"], ["a", "b", "c"]]}, "a name of each"),
     "a later format": ({"format": 99}, "expected format"),
-    "no checks": ({"built_with": {}}, "other kernels"),
+    "no checks": ({"built_with": {}}, "another physics 1"),
     "no check": ({"built_with": None}, "damaged"),
     "NaN check": ({"built_with": CHECKS | {"mean": bad(CHECKS["mean"])}}, "another mean"),
     "another class": ({"class": "gpadjust.core.structures:RRA"}, "kernels|damaged|another"),
     "no model": ({"class": "builtins:dict"}, "import its module first"),
     "not imported": ({"class": "antigravity:GP"}, "import its module first"),
-    "other settings": ({"settings": {"nested": False}}, "other kernels"),
-    "other priors": ({"settings": {"rho_mean": 0.5}}, "another unit"),
+    "other settings": ({"settings": {"nested": False}}, "another prior of choice"),
+    "other priors": ({"settings": {"rho_mean": 0.5}}, "another mean"),
     "unknown settings": ({"settings": {"gain": 2.0}}, "wrong one"),
     "a path of code": ({"physics": ["antigravity:geohash"]}, "is the code antigravity"),
     "a bad formula": ({"physics": ["formula:{}"]}, "formula"),
@@ -239,7 +242,7 @@ def test_a_file_of_code_is_not_executed(path):
         def __reduce__(self):
             return os.mkdir, (str(path) + ".bomb",)
 
-    for content in ({"format": 4, "class": Bomb()}, [1], "text", {}):
+    for content in ({"format": 5, "models": Bomb()}, [1], "text", {}):
         torch.save(content, path)
         with pytest.raises(ValueError, match=r"Expected .* as a model"):
             load(path)
@@ -254,7 +257,7 @@ def test_a_file_of_code_is_not_executed(path):
     [
         ("CKA", {}, "is the code torch.nn.functional:silu"),
         ("CKA", {"physics": relu}, "another physics 1"),
-        ("CKA", {"physics": [silu, silu]}, "kernels"),
+        ("CKA", {"physics": [silu, silu]}, "another physics 2"),
         ("CKA", {"physics": silu, "terms": 1}, "nothing else"),
         ("kernel", {"physics": silu}, r"load\(path, delta_covar_module=\.\.\., noise"),
         (
@@ -262,7 +265,7 @@ def test_a_file_of_code_is_not_executed(path):
             {"delta_covar_module": Stationary(MATERN32), "noise": Noise()},
             "another kernel",
         ),
-        ("kernel", {"delta_covar_module": Stationary(RBF), "noise": Relative()}, "other kernels"),
+        ("kernel", {"delta_covar_module": Stationary(RBF), "noise": Relative()}, "another noise"),
         ("kernel", {"delta_covar_module": Stationary(RBF), "noise": 3}, "wrong one"),
     ],
 )
