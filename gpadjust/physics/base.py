@@ -5,26 +5,24 @@ from __future__ import annotations
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from copy import deepcopy
-from operator import index
+from copy import copy, deepcopy
 from typing import Any, Self
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
+from gpadjust.checks import checked_whole
 from gpadjust.physics.error import PhysicsError, described
 from gpadjust.physics.parameters import ParameterValues
 from gpadjust.physics.unknown import Unknown, Unknowns
 
 _NONE = Unknowns({})
-# By a part of an error's message, the way out.
-_HINTS = {
-    "positional argument": " It is called with rows N x d and, if it has unknown parameters, named "
-    "as unknowns={'mass': Unknown(...)}, with their values p, such as p.mass, one for each row.",
-    "Can't call numpy()": " Wrap NumPy code as BlackBoxPhysics(function).",
-}
+_CALL = (
+    " It is called with a tensor of rows N x d and, if it has unknown parameters, named as "
+    "unknowns={'mass': Unknown(...)}, with their values p, such as p.mass, one for each row. Wrap "
+    "NumPy code as BlackBoxPhysics(function)."
+)
 
 
 class Physics(torch.nn.Module, ABC):
@@ -38,10 +36,11 @@ class Physics(torch.nn.Module, ABC):
     simulator's handle outlives the copies that GP libraries make of their models.
 
     Args:
-        unknowns: The unknown parameters by name, such as ``{"mass": Unknown(1.0, factor=1.5)}``.
+        unknowns: The unknown parameters by name, such as ``{"mass": Unknown(1.0, factor=1.5)}``. A
+            function has their values as its last argument, ``p.mass`` or ``p["mass"]``.
         inputs: The columns of X that the physics reads, in its order; negative ones count from
             the end. Default: all.
-        name: The name in messages. Default: the class's.
+        name: The name in messages. Default: that of the function, or of the class.
 
     Attributes:
         num_outputs: ``m``; None until the first call if it is not known before.
@@ -70,24 +69,19 @@ class Physics(torch.nn.Module, ABC):
     ) -> None:
         super().__init__()
         self.unknowns = _NONE if unknowns is None else Unknowns(unknowns)
-        self.name = type(self).__name__ if name is None else name
-        self.num_outputs: int | None = None
-        self._has_warned = False
-        try:
-            self.inputs = None if inputs is None else tuple(map(index, inputs))
-        except TypeError:
-            raise TypeError(
-                f"inputs must be a sequence of column numbers, such as [0, 2]; found {inputs!r}."
-            ) from None
+        self.inputs = None if inputs is None else tuple(checked_whole("inputs", i) for i in inputs)
         if self.inputs == ():
             raise ValueError("inputs is empty; name at least one column of X, or None for all.")
+        self.name = name or type(self).__name__
+        self.num_outputs: int | None = None
+        self._has_warned = False
 
     @abstractmethod
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """Return the outputs of some rows, without checks.
 
         Args:
-            X: ``N x d``, the columns ``inputs`` only, ``N >= 1``.
+            X: ``N x d``, the columns ``inputs`` only.
             parameters: One argument if there are unknown parameters, their values by name, ``N``
                 each: ``p.mass`` or ``p["mass"]``. None otherwise.
 
@@ -135,9 +129,9 @@ class Physics(torch.nn.Module, ABC):
             self._has_warned = True
             warnings.warn(
                 f"No gradient flows through physics {self.name!r}: X requires grad, its outputs do "
-                "not. Use BlackBoxPhysics(function, gradient='finite-difference'), or optimise "
-                "acquisition functions with optimize_acqf(..., options={'with_grad': False}); "
-                "ignore this if the outputs do not depend on X.",
+                "not. Use BlackBoxPhysics(function, gradient='finite-difference'), or "
+                "optimize_acqf(..., options={'with_grad': False}); ignore this if the outputs do "
+                "not depend on X.",
                 UserWarning,
                 stacklevel=2,
             )
@@ -146,92 +140,41 @@ class Physics(torch.nn.Module, ABC):
     def or_nan(self, X: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Return the outputs without gradient, NaN in rows at which the physics fails.
 
+        If its error has no ``partial`` result, all rows of the same ``parameters`` are NaN.
+
         Args:
             X: ``batch_shape x n x d``, floating point.
             parameters: As of :meth:`forward`.
 
         Raises:
-            PhysicsError: If it does not contain the rows that failed, or if all do before the
-                number of outputs is known.
+            PhysicsError: If it fails for all rows before the number of outputs is known, or is not
+                one of some rows.
         """
+        columns = self._with_parameters(self.read(X), parameters)
         with torch.no_grad():
-            columns = self._with_parameters(self.read(X), parameters)
-            blocks = columns.flatten(0, -2).unsqueeze(0)
-            results = [self._where_it_works(blocks[0])]
-            if isinstance(results[0], PhysicsError):
-                # A function of all rows may raise an error because of some parameters.
-                blocks = columns.reshape(-1, *columns.shape[-2:])
-                results = [self._where_it_works(block) for block in blocks]
-            if self.num_outputs is None:
-                raise next(each for each in results if isinstance(each, PhysicsError))
-            failed = columns.new_full((blocks.shape[1], self.num_outputs), torch.nan)
-            Y = torch.cat([failed if isinstance(each, PhysicsError) else each for each in results])
-            Y = Y.where(Y.isfinite().all(-1, keepdim=True), torch.nan)
-        return Y.reshape(*columns.shape[:-1], self.num_outputs)
-
-    def jacobian(self, rows: Tensor, step: float | None = None) -> Tensor:
-        r"""Return the Jacobian by central differences in X, in one call of the physics.
-
-        .. math:: \frac{\partial f_k}{\partial x_j} \approx
-            \frac{f_k(x + h_j e_j) - f_k(x - h_j e_j)}{2 h_j}
-
-        Args:
-            rows: ``N x (d + p)``, columns of X and parameters.
-            step: :math:`h`, in the columns' units. Default:
-                :math:`\epsilon^{1/3} \max(1, |x|)`.
-
-        Returns:
-            ``N x m x (d + p)``, zero by the parameters.
-
-        Raises:
-            PhysicsError: If the physics fails; it names the rows around which it does.
-        """
-        p = len(self.unknowns)
-        X = rows[:, : rows.shape[1] - p]
-        n, d = X.shape
-        h = torch.finfo(X.dtype).eps ** (1 / 3) * X.abs().clamp(min=1.0)
-        h = h if step is None else torch.full_like(X, step)
-        moves = pad(torch.diag_embed(h), (0, p))
-        sides = torch.stack([rows.unsqueeze(1) + moves, rows.unsqueeze(1) - moves])  # 2 x n x d x .
-        try:
-            Y = self.fresh_rows(sides.flatten(0, 2))
-        except PhysicsError as error:
-            if error.inputs is None:
-                error.rows = tuple(sorted({i // d % n for i in error.rows}))
-                error.inputs = rows[[*error.rows]]
-            error.add_note(
-                "This was in the finite differences around these rows. Make their step smaller, or "
-                "choose another gradient."
-            )
-            raise
-        upper, lower = Y.unflatten(0, sides.shape[:3])
-        # The distance that rounding left, not 2 h.
-        width = (sides[0] - sides[1]).diagonal(dim1=-2, dim2=-1)
-        return pad(((upper - lower) / width.unsqueeze(-1)).mT, (0, p))
+            Y = self._or_nan(columns)
+        Y = Y.where(Y.isfinite().all(-1, keepdim=True), torch.nan)
+        return Y.reshape(*columns.shape[:-1], Y.shape[-1])
 
     def read(self, X: Tensor) -> Tensor:
         """Return the columns of ``X`` (``... x n x d``) that the physics reads, checked."""
-        if not torch.is_tensor(X) or not X.is_floating_point():
-            found = X.dtype if torch.is_tensor(X) else type(X).__name__
-            raise TypeError(
-                f"Physics {self.name!r} takes a floating-point tensor X; found {found}. Convert "
-                "with torch.as_tensor(X, dtype=torch.float64)."
-            )
-        if X.dim() < 2 or X.shape[-1] == 0:
-            raise ValueError(
-                f"Physics {self.name!r} takes X of shape batch_shape x n x d; found "
-                f"{tuple(X.shape)}. For a single point use X.unsqueeze(0)."
+        is_floating = torch.is_tensor(X) and X.is_floating_point()
+        if not is_floating or X.dim() < 2 or X.shape[-1] == 0:
+            found = f"{X.dtype}, {tuple(X.shape)}" if torch.is_tensor(X) else type(X).__name__
+            raise (ValueError if is_floating else TypeError)(
+                f"Physics {self.name!r} takes a floating-point tensor X of shape batch_shape x n x "
+                f"d; found {found}. Convert with torch.as_tensor(X, dtype=torch.float64); a single "
+                "point is X.unsqueeze(0)."
             )
         if self.inputs is None:
             return X
-        d = X.shape[-1]
-        absent = [i for i in self.inputs if not -d <= i < d]
-        if absent:
+        try:
+            return X[..., list(self.inputs)]
+        except IndexError:
             raise ValueError(
-                f"Physics {self.name!r} reads the columns inputs={self.inputs}, but X of shape "
-                f"{tuple(X.shape)} has no column {absent}. Pass all, or correct inputs."
-            )
-        return X[..., list(self.inputs)]
+                f"Physics {self.name!r} reads the columns inputs={self.inputs}, but X has the "
+                f"shape {tuple(X.shape)}. Pass all columns, or correct inputs."
+            ) from None
 
     def check_names(self, names: Sequence[str]) -> None:
         """Raise a ValueError if the physics names its columns, and data have them otherwise."""
@@ -246,13 +189,8 @@ class Physics(torch.nn.Module, ABC):
 
         The rows that an error names are these. Subclasses with a memory use it here.
         """
-        if len(rows):
+        if len(rows) or self.num_outputs is None:
             return Physics.fresh_rows(self, rows)  # not a subclass's, which may skip evaluate
-        if self.num_outputs is None:
-            raise PhysicsError(
-                f"Physics {self.name!r} was given no rows before its number of outputs was known; "
-                "call it on at least one row first."
-            )
         return rows.new_empty(0, self.num_outputs)
 
     def fresh_rows(self, rows: Tensor) -> Tensor:
@@ -262,26 +200,24 @@ class Physics(torch.nn.Module, ABC):
             Y = self.evaluate(*(self._arguments(rows) if self.unknowns else (rows,)))
         except PhysicsError as error:
             if error.partial is not None:
-                error.partial = self._shaped(error.partial, n).to(rows)
+                error.partial = self._shaped(error.partial, rows)
             raise
         except Exception as error:
-            hint = "".join(hint for part, hint in _HINTS.items() if part in str(error))
+            is_call = "positional argument" in str(error) or "Can't call numpy()" in str(error)
             raise PhysicsError(
-                f"Physics {self.name!r} raised {described(error)}.{hint} The call was for {n} "
-                "row(s):",
+                f"Physics {self.name!r} raised {described(error)}.{_CALL if is_call else ''} The "
+                f"call was for {n} row(s):",
                 range(n),
             ) from error
-        Y = self._shaped(Y, n).to(rows)
-        # A finite sum has finite terms only, and is the faster look.
-        if not Y.detach().sum().isfinite():
-            bad = (~Y.isfinite().all(-1)).nonzero().flatten().tolist()
-            if bad:
-                raise PhysicsError(
-                    f"Physics {self.name!r} returned NaN or inf in {len(bad)} of {n} row(s), "
-                    "expected finite numbers. Correct it, or exclude such inputs:",
-                    bad,
-                    partial=Y.detach(),
-                )
+        Y = self._shaped(Y, rows)
+        bad = (~Y.isfinite().all(-1)).nonzero().flatten().tolist()
+        if bad:
+            raise PhysicsError(
+                f"Physics {self.name!r} returned NaN or inf in {len(bad)} of {n} row(s), expected "
+                "finite numbers. Correct it, or exclude such inputs:",
+                bad,
+                partial=Y.detach(),
+            )
         return Y
 
     def forget(self) -> None:
@@ -296,10 +232,9 @@ class Physics(torch.nn.Module, ABC):
         """Return the physics itself if it has no parameters and buffers, else a copy."""
         if not [*self.parameters(), *self.buffers()]:
             return self
-        copy = type(self).__new__(type(self))
-        memo[id(self)] = copy
-        copy.__dict__.update(deepcopy(self.__dict__, memo))
-        return copy
+        memo[id(self)] = made = copy(self)
+        made.__dict__.update(deepcopy(self.__dict__, memo))
+        return made
 
     def _arguments(self, rows: Tensor) -> tuple[Tensor, *tuple[ParameterValues, ...]]:
         """Return the arguments of :meth:`evaluate`, of rows ``N x (d + p)``."""
@@ -310,58 +245,49 @@ class Physics(torch.nn.Module, ABC):
     def _with_parameters(self, columns: Tensor, parameters: Tensor | None) -> Tensor:
         """Return ``... x n x (d + p)``, with parameters ``... x p`` at the end of each row."""
         p = len(self.unknowns)
-        values = self.unknowns.guess if parameters is None else parameters
-        if not torch.is_tensor(values) or values.shape[-1:] != (p,) or (not p and values.numel()):
-            found = tuple(values.shape) if torch.is_tensor(values) else repr(values)
+        values = torch.as_tensor(self.unknowns.guess if parameters is None else parameters)
+        if values.shape[-1:] != (p,):
             raise ValueError(
                 f"Physics {self.name!r} has {p} unknown parameter(s) {', '.join(self.unknowns)}; "
-                f"expected parameters of shape ... x {p}, found {found}."
+                f"expected parameters of shape ... x {p}, found {tuple(values.shape)}."
             )
         batch = np.broadcast_shapes(columns.shape[:-2], values.shape[:-1])
         columns = columns.expand(*batch, *columns.shape[-2:])
         values = values.to(columns).unsqueeze(-2).expand(*columns.shape[:-1], p)
         return torch.cat([columns, values], dim=-1)
 
-    def _where_it_works(self, rows: Tensor) -> Tensor | PhysicsError:
-        """Return ``N x m`` outputs, not finite where the physics fails, or an error of all rows."""
+    def _or_nan(self, columns: Tensor) -> Tensor:
+        """Return ``N x m`` outputs of ``... x n x (d + p)``, not finite where the physics fails."""
+        rows = columns.flatten(0, -2)
         try:
             return self.fresh_rows(rows)
         except PhysicsError as error:
             if error.partial is not None:
                 return error.partial
-            if not error.rows:
+            if not error.rows or self.num_outputs is None:
                 raise
-            works = torch.ones(len(rows), dtype=torch.bool, device=rows.device)
-            works[[*error.rows]] = False
-            results = self._where_it_works(rows[works]) if works.any() else error
-        if isinstance(results, PhysicsError):
-            return results
-        Y = results.new_full((len(rows), results.shape[1]), torch.nan)
-        Y[works] = results
-        return Y
+        if columns.dim() == 2:
+            return rows.new_full((len(rows), self.num_outputs), torch.nan)
+        return torch.cat([self._or_nan(one) for one in columns.flatten(0, -3)])
 
-    def _shaped(self, Y: Tensor, n: int) -> Tensor:
-        """Return outputs as ``n x m``; a PhysicsError unless they are that or ``n``."""
+    def _shaped(self, Y: Tensor, rows: Tensor) -> Tensor:
+        """Return outputs as ``N x m`` in the dtype of the rows, or raise a PhysicsError."""
+        n, m = len(rows), self.num_outputs
         is_real = torch.is_tensor(Y) and not Y.is_complex()
-        if not is_real or Y.dim() not in (1, 2) or len(Y) != n or Y.shape[-1] == 0:
-            found: object = type(Y).__name__
-            if torch.is_tensor(Y):
-                found = f"shape {tuple(Y.shape)}" if is_real else Y.dtype
+        if is_real and Y.dim() == 1:
+            Y = Y.unsqueeze(-1)
+        is_table = is_real and Y.dim() == 2 and len(Y) == n and Y.shape[1] > 0
+        if not is_table or m not in (None, Y.shape[1]):
+            found = f"{Y.dtype}, {tuple(Y.shape)}" if torch.is_tensor(Y) else type(Y).__name__
+            expected = f"({n}, m) or ({n},)" if m is None else f"({n}, {m}), as before"
             raise PhysicsError(
-                f"Physics {self.name!r} returned {found}, expected a real tensor of shape ({n}, m) "
-                f"or ({n},), one row per row of X. For a constant return X.new_full((len(X),), "
+                f"Physics {self.name!r} returned {found}, expected a real tensor of shape "
+                f"{expected}, one row per row of X. For a constant return X.new_full((len(X),), "
                 "value); for NumPy code take BlackBoxPhysics(function), for a function of a single "
                 "row BlackBoxPhysics(function, batched=False)."
             )
-        Y = Y.unsqueeze(-1) if Y.dim() == 1 else Y
-        if self.num_outputs is None:
-            self.num_outputs = Y.shape[1]
-        if self.num_outputs != Y.shape[1]:
-            raise PhysicsError(
-                f"Physics {self.name!r} returned {Y.shape[1]} output(s), expected "
-                f"{self.num_outputs} as before; the number must not depend on the rows."
-            )
-        return Y
+        self.num_outputs = Y.shape[1]
+        return Y.to(rows)
 
 
 def name_of(function: Any, name: str | None, argument: str = "function") -> str:

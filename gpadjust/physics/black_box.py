@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Callable, Mapping, Sequence
 from threading import Lock
 from typing import Any, Literal, cast
@@ -11,15 +10,17 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
+from torch.nn.functional import pad
 
-from gpadjust.checks import check_choice, checked_number, checked_whole, real_array
+from gpadjust.checks import check_choice, checked_number, real_array
 from gpadjust.physics.base import Physics, name_of
 from gpadjust.physics.error import PhysicsError, described
 from gpadjust.physics.parameters import ParameterValues
 from gpadjust.physics.unknown import Unknown
 
+_REMEMBERED = 100_000  # rows
+
 NumpyFunction = Callable[..., ArrayLike]
-Array = NDArray[np.float64]
 
 
 class BlackBoxPhysics(Physics):
@@ -36,19 +37,15 @@ class BlackBoxPhysics(Physics):
 
     Args:
         function: Maps a float64 array of rows ``N x d`` to ``N x m``, or ``N`` if ``m`` is 1; with
-            ``batched=False``, one row ``(d,)`` to ``(m,)`` or a scalar.
-        unknowns: Unknown parameters by name; their values are then the function's second argument,
-            ``p.mass`` or ``p["mass"]``, ``N`` each, or with ``batched=False`` a number. They are
-            learnt by finite differences.
+            ``batched=False``, one row ``(d,)``, and a number for each unknown parameter, to
+            ``(m,)`` or a scalar.
         batched: Whether the function takes all rows at once.
         gradient: ``"finite-difference"``: central differences give the gradient in X, by ``2 d``
-            evaluations per row in the backward pass, which the memo does not keep. Second
-            derivatives are not available. None: the outputs are constants to autograd.
+            evaluations per row in the backward pass, which are not remembered. Second derivatives
+            are not available. None: the outputs are constants to autograd.
         fd_step: The step of the finite differences in the units of X. Default:
             ``eps^(1/3) max(1, |x|)``.
-        inputs: The columns of X that the function reads. Default: all.
-        memo: The most rows to remember.
-        name: The name in messages. Default: the function's.
+        unknowns, inputs, name: As of :class:`Physics`.
 
     Raises:
         TypeError: If ``function`` is not callable, or a setting is not a number.
@@ -71,19 +68,18 @@ class BlackBoxPhysics(Physics):
         gradient: Literal["finite-difference"] | None = "finite-difference",
         fd_step: float | None = None,
         inputs: Sequence[int] | None = None,
-        memo: int = 100_000,
         name: str | None = None,
     ) -> None:
         super().__init__(unknowns=unknowns, inputs=inputs, name=name_of(function, name))
         check_choice("gradient", gradient, ("finite-difference", None))
         if fd_step is not None:
             checked_number("fd_step", fd_step, above=0)
-        self._memo = RowMemo(checked_whole("memo", memo, 0))
-        self._remembered_for: list[Any] = []
         self.function = function
         self.batched = batched
         self.gradient = gradient
         self.fd_step = fd_step
+        self._remembered_for: list[Any] = []
+        self.forget()
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """Return the function's outputs, as :meth:`Physics.evaluate`.
@@ -91,43 +87,50 @@ class BlackBoxPhysics(Physics):
         Raises:
             PhysicsError: If single rows fail. It contains the outputs of the others.
         """
-        x, *more = self._arrays(X, *parameters)
+
+        def arguments(x: NDArray[np.float64], *values: NDArray[np.float64]) -> list[Any]:
+            return [x, *(ParameterValues(self.unknowns, each) for each in values)]
+
+        tensors = [X, *(each.rows for each in parameters)]
+        # Copies, to which a simulator may write.
+        arrays = [tensor.detach().cpu().double().numpy().copy() for tensor in tensors]
         if self.batched:
-            return torch.from_numpy(real_array(self.function(x, *more))).to(X.device)
+            return torch.from_numpy(real_array(self.function(*arguments(*arrays))))
         from joblib import Parallel, delayed  # slow to import
 
-        rows = ([x[i], *(ParameterValues(p, p.rows[i]) for p in more)] for i in range(len(x)))
-        results = Parallel()(delayed(_call_row)(self.function, *row) for row in rows)
-        outputs = [y for y in results if not isinstance(y, Exception)]
-        Y = np.full((len(x), len(outputs[0]) if outputs else 1), np.nan)
+        rows = zip(*arrays, strict=True)
+        results = Parallel()(delayed(_call_row)(self.function, *arguments(*row)) for row in rows)
+        m = next((len(y) for y in results if not isinstance(y, Exception)), 1)
+        Y = np.full((len(X), m), np.nan)
         errors: dict[int, Exception] = {}
         for i, y in enumerate(results):
             if isinstance(y, Exception):
                 errors[i] = y
-            elif len(y) != Y.shape[1]:
-                errors[i] = ValueError(f"found {len(y)} output(s), expected {Y.shape[1]} as before")
+            elif len(y) != m:
+                errors[i] = PhysicsError(f"found {len(y)} output(s), expected {m} as before")
             else:
                 Y[i] = y
         if errors:
             first = next(iter(errors.values()))
             raise PhysicsError(
-                f"Physics {self.name!r} raised {described(first)}, in the first of {len(errors)} "
-                f"failed row(s) of {len(x)}. Correct it, or exclude such inputs:",
+                f"Physics {self.name!r} raised {first}, in the first of {len(errors)} failed "
+                f"row(s) of {len(X)}. Correct it, or exclude such inputs:",
                 errors,
-                partial=torch.from_numpy(Y) if outputs else None,
-            ) from first
-        return torch.from_numpy(Y).to(X.device)
+                partial=torch.from_numpy(Y) if len(errors) < len(X) else None,
+            ) from first.__cause__
+        return torch.from_numpy(Y)
 
     def of_rows(self, rows: Tensor) -> Tensor:
         """Return the outputs of rows from the memory, with the gradient that was chosen."""
+        Y = self._recall(rows.detach())
         if self.gradient is None or not (torch.is_grad_enabled() and rows.requires_grad):
-            return self._recall(rows.detach())
-        return ExternalCall.apply(rows, self._recall, self._slope)
+            return Y
+        return FiniteDifferences.apply(rows.double(), Y.double(), self, self.fd_step).to(rows)
 
     def forget(self) -> None:
         """Empty the memory; call it after a change that the physics cannot see."""
         # A new memo: what other threads are evaluating right now ends in the old one.
-        self._memo = RowMemo(self._memo.capacity)
+        self._memo = RowMemo(_REMEMBERED)
 
     def _recall(self, rows: Tensor) -> Tensor:
         """Return ``N x m`` outputs, from the memory where it has them."""
@@ -139,18 +142,6 @@ class BlackBoxPhysics(Physics):
             self.forget()
         return self._memo.recall(rows, super().of_rows)
 
-    def _slope(self, rows: Tensor) -> Tensor:
-        """Return the Jacobian, ``N x m x (d + p)``."""
-        return self.jacobian(rows.double().cpu(), self.fd_step).to(rows)
-
-    def _arrays(self, X: Tensor, *parameters: ParameterValues) -> list[Any]:
-        """Return rows and parameters as arrays, copies to which a simulator may write."""
-        x, *values = (
-            tensor.detach().cpu().double().numpy().copy()
-            for tensor in (X, *(p.rows for p in parameters))
-        )
-        return [x, *(ParameterValues(self.unknowns, rows) for rows in values)]
-
 
 class RowMemo:
     """A dictionary of at most ``capacity`` input rows to output rows, which threads may share.
@@ -160,15 +151,8 @@ class RowMemo:
 
     Example:
         >>> memo = RowMemo(capacity=100)
-        >>> def square(X):
-        ...     print(f"{len(X)} new row(s)")
-        ...     return X**2
-        >>> memo.recall(torch.tensor([[2.0], [2.0]]), square)
-        1 new row(s)
-        tensor([[4.],
-                [4.]])
-        >>> memo.recall(torch.tensor([[2.0]]), square)
-        tensor([[4.]])
+        >>> memo.recall(torch.tensor([[2.0], [2.0]]), torch.square).flatten(), len(memo)
+        (tensor([4., 4.]), 1)
     """
 
     def __init__(self, capacity: int) -> None:
@@ -195,26 +179,25 @@ class RowMemo:
             learn: Whether new values are remembered.
         """
         keys, known = row_keys(rows), self._rows  # to which other threads only add
-        places: dict[bytes, int] = {}
-        for i, key in enumerate(keys):
-            if key not in known:
-                places.setdefault(key, i)
-        if not keys or not places:
-            return torch.stack([known[key] for key in keys]).to(rows) if keys else evaluate(rows)
+        places = {key: i for i, key in enumerate(keys) if key not in known}
         new = [*places]
-        try:
-            values = evaluate(rows[[*places.values()]])
-        except PhysicsError as error:
-            if error.partial is not None and learn:
-                good = error.partial.isfinite().all(-1)
-                self.store([new[i] for i in good.nonzero()], error.partial[good])
-            error.partial = None
-            if error.inputs is None:
-                failed = {new[i] for i in error.rows}
-                error.rows = tuple(i for i, key in enumerate(keys) if key in failed)
-            raise
-        if learn:
-            self.store(new, values)
+        values = rows[:0]
+        if new or not keys:
+            try:
+                values = evaluate(rows[[*places.values()]])
+            except PhysicsError as error:
+                if error.partial is not None and learn:
+                    good = error.partial.isfinite().all(-1)
+                    self.store([new[i] for i in good.nonzero()], error.partial[good])
+                error.partial = None
+                if error.inputs is None:
+                    failed = {new[i] for i in error.rows}
+                    error.rows = tuple(i for i, key in enumerate(keys) if key in failed)
+                raise
+            if learn:
+                self.store(new, values)
+        if not keys:
+            return values
         found = dict(zip(new, values, strict=True))
         return torch.stack([found[k] if k in found else known[k] for k in keys]).to(rows)
 
@@ -235,50 +218,70 @@ def row_keys(rows: Tensor) -> list[bytes]:
     return cast(list[bytes], table.view(row_bytes).ravel().tolist())
 
 
-class ExternalCall(torch.autograd.Function):
-    """A function of rows whose Jacobian is computed elsewhere, when the backward pass needs it.
+class FiniteDifferences(torch.autograd.Function):
+    r"""Outputs of a physics, with the gradient in X by central differences in the backward pass.
 
-    Call ``ExternalCall.apply(X, value, jacobian)``: X is ``N x d``, ``value(X)`` is ``N x m`` and
-    ``jacobian(X)`` is ``N x m x d``. A second derivative raises a ``NotImplementedError``.
+    .. math:: \frac{\partial f_k}{\partial x_j} \approx
+        \frac{f_k(x + h_j e_j) - f_k(x - h_j e_j)}{2 h_j}
 
-    Example:
-        >>> X = torch.tensor([[3.0]], requires_grad=True)
-        >>> Y = ExternalCall.apply(X, lambda X: X**2, lambda X: 2 * X.unsqueeze(-1))
-        >>> torch.autograd.grad(Y.sum(), X)
-        (tensor([[6.]]),)
+    Call ``FiniteDifferences.apply(rows, Y, physics, step)``: rows are ``N x (d + p)``, columns of X
+    and parameters, by which the gradient is 0; Y is ``N x m``; the step :math:`h` is in the
+    columns' units, by default ``eps^(1/3) max(1, |x|)``. An error names the rows around which the
+    physics fails. A second derivative raises a ``NotImplementedError``.
     """
 
     @staticmethod
     def forward(
-        ctx: Any, X: Tensor, value: Callable[[Tensor], Tensor], jacobian: Callable[[Tensor], Tensor]
+        ctx: Any, rows: Tensor, Y: Tensor, physics: Physics, step: float | None = None
     ) -> Tensor:
-        """Return the values, ``N x m``."""
-        ctx.save_for_backward(X)
-        ctx.jacobian = jacobian
-        return value(X.detach())
+        """Return the outputs."""
+        ctx.save_for_backward(rows)
+        ctx.physics, ctx.step = physics, step
+        return Y.clone()
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
-        """Return the gradient in X, ``N x d``."""
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
+        """Return the gradient in the rows, by one call of the physics."""
         if torch.is_grad_enabled():  # by create_graph=True
             raise NotImplementedError(
                 "A physics by finite differences has first derivatives only; for second ones write "
                 "it in torch, as FunctionPhysics."
             )
-        (X,) = ctx.saved_tensors
-        return torch.einsum("nm,nmd->nd", grad, ctx.jacobian(X)), None, None
+        (rows,) = ctx.saved_tensors
+        p = len(ctx.physics.unknowns)
+        X = rows[:, : rows.shape[1] - p]
+        n, d = X.shape
+        h = torch.finfo(X.dtype).eps ** (1 / 3) * X.abs().clamp(min=1.0)
+        h = h if ctx.step is None else torch.full_like(X, ctx.step)
+        moves = pad(torch.diag_embed(h), (0, p))
+        sides = rows.unsqueeze(1) + torch.stack([moves, -moves])  # 2 x n x d x (d + p)
+        try:
+            Y = ctx.physics.fresh_rows(sides.flatten(0, 2))
+        except PhysicsError as error:
+            if error.inputs is None:
+                error.rows = tuple(sorted({i // d % n for i in error.rows}))
+                error.inputs = rows[[*error.rows]]
+            error.add_note(
+                "This was in the finite differences around these rows. Make their step smaller, or "
+                "choose another gradient."
+            )
+            raise
+        upper, lower = Y.unflatten(0, sides.shape[:3])
+        # The distance that rounding left, not 2 h.
+        width = (sides[0] - sides[1]).diagonal(dim1=-2, dim2=-1)
+        slopes = (upper - lower) / width.unsqueeze(-1)  # n x d x m
+        gradient = torch.einsum("nm,ndm->nd", grad, slopes)
+        return pad(gradient, (0, p)), None, None, None
 
 
-def _call_row(function: NumpyFunction, *row: Any) -> Array | Exception:
+def _call_row(function: NumpyFunction, *row: Any) -> NDArray[np.float64] | PhysicsError:
     """Return a function's outputs ``(m,)`` at a row, or the exception that it raises."""
     try:
         y = np.atleast_1d(real_array(function(*row)))
-        if y.ndim > 1:
+        if y.ndim > 1 or not len(y):
             raise ValueError(f"expected a scalar or outputs of shape (m,), found {y.shape}")
         return y
     except Exception as error:
-        try:  # one that does not survive a pickle would break the pool, and lose the other rows
-            pickle.loads(pickle.dumps(error))
-        except Exception:
-            return RuntimeError(f"{type(error).__name__}: {error}")
-        return error
+        failure = PhysicsError(described(error))  # which survives a pickle, unlike some others
+        failure.__cause__ = error
+        return failure

@@ -15,12 +15,10 @@ class PhysicsError(RuntimeError):
 
     Args:
         message: What was found, what was expected, and the way out.
-        rows: The failing rows, as indices into the rows that were asked for.
+        rows: The failing rows, counted over the flattened leading dimensions of X; none if unknown.
         partial: ``N x m`` outputs when only some rows failed, NaN in those.
 
     Attributes:
-        rows: Indices of the failing rows, counted over the flattened leading dimensions of X;
-            empty if unknown.
         inputs: ``len(rows) x d`` inputs of those rows, and then unknown parameters, if the physics
             has any; or None if unknown.
 
@@ -56,13 +54,6 @@ class PhysicsWarning(UserWarning):
     targets, that were scaled beforehand, while f_p reads and returns raw units. A physics with
     unknown parameters is not judged: its first values are guesses. A fit of unknown parameters of
     dynamics warns where the transitions do not determine one.
-
-    Example:
-        >>> import pytest, torch
-        >>> from gpadjust.validation import compare
-        >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
-        >>> with pytest.warns(PhysicsWarning, match="f_p is about 1,000 times too large"):
-        ...     table = compare(X, torch.sin(6 * X), physics=lambda X: 1000 * torch.sin(6 * X))
     """
 
 

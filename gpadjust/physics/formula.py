@@ -8,20 +8,18 @@ import operator
 import re
 from collections.abc import Callable, Mapping, Sequence
 from keyword import iskeyword
-from typing import Any
 from unicodedata import normalize
 
 import torch
 from torch import Tensor
 
+from gpadjust.checks import check_kind
 from gpadjust.physics.base import Physics
 from gpadjust.physics.parameters import ParameterValues
 from gpadjust.physics.unknown import Unknown
 
 _LONGEST = 2000  # characters
-_LARGEST = 1e300  # number
-_DEEPEST = 100
-_OPERATORS: dict[type[ast.AST], Callable[..., Any]] = {
+_OPERATORS: dict[type[ast.AST], Callable[..., Tensor]] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
     ast.Mult: operator.mul,
@@ -34,22 +32,19 @@ _OPERATORS: dict[type[ast.AST], Callable[..., Any]] = {
     ast.Gt: operator.gt,
     ast.GtE: operator.ge,
 }
-_OF_ONE = "sin cos tan asin acos atan sinh cosh tanh exp log log10 sqrt abs sign"
-# Each with its number of arguments.
-_FUNCTIONS: dict[str, tuple[Callable[..., Tensor], int]] = {
-    **{name: (getattr(torch, name), 1) for name in _OF_ONE.split()},
-    "ln": (torch.log, 1),
-    "atan2": (torch.atan2, 2),
-    "min": (torch.minimum, 2),
-    "max": (torch.maximum, 2),
-    "where": (lambda c, x, y: torch.where(c != 0, x, y), 3),
+_OF_TORCH = "sin cos tan asin acos atan atan2 sinh cosh tanh exp log log10 sqrt abs sign"
+_FUNCTIONS: dict[str, Callable[..., Tensor]] = {
+    **{name: getattr(torch, name) for name in _OF_TORCH.split()},
+    "ln": torch.log,
+    "min": torch.minimum,
+    "max": torch.maximum,
+    "where": lambda c, x, y: torch.where(c != 0, x, y),
 }
 _GRAMMAR = (
-    "Formulas have numbers, names, + - * / and ** (^ is not a power), brackets, comparisons of two "
-    "values such as a < b, and the functions "
-    f"{', '.join(f'{name} of {count}' for name, (_, count) in _FUNCTIONS.items())}. "
-    "pi is a number. Commas part the outputs. There are no units, no = and no names with blanks: "
-    "water flow is water_flow, and lambda, which Python reserves, is lambda_."
+    "Formulas have numbers, names, pi, + - * / and ** (^ is not a power), brackets, comparisons of "
+    f"two values such as a < b, and the functions {', '.join(_FUNCTIONS)}; min and max are of two, "
+    "and where(a < b, x, y) of three. Commas part the outputs. There are no units, no = and no "
+    "names with blanks: water flow is water_flow, and lambda, which Python reserves, is lambda_."
 )
 
 
@@ -68,11 +63,9 @@ class FormulaPhysics(Physics):
         columns: The names of the columns of X, ``d`` of them. Names lose their unit, and characters
             that names cannot have become ``_``: "air flow [m3/h]" is ``air_flow``, and "lambda" is
             ``lambda_``.
-        unknowns: Unknown parameters by name.
-        name: The name in messages. Default: the formula.
+        unknowns, name: As of :class:`Physics`.
 
     Attributes:
-        formula: The text.
         columns: The names of columns that the formula may use.
 
     Raises:
@@ -95,19 +88,20 @@ class FormulaPhysics(Physics):
         unknowns: Mapping[str, Unknown] | None = None,
         name: str | None = None,
     ) -> None:
-        if not isinstance(formula, str):
-            raise TypeError(f"Expected a formula as a text, found {formula!r}.")
+        check_kind("formula", formula, str, "a text")
         super().__init__(unknowns=unknowns, name=name or " ".join(formula.split()))
         self.formula = formula
         self.columns = tuple(map(symbol, columns))
         known = [*self.columns, *self.unknowns, "pi"]
-        if again := [name for name in known if known.count(name) > 1]:
+        again = [name for name in known if known.count(name) > 1]
+        if again:
             raise ValueError(
                 "Expected different names of columns and unknown parameters, and none 'pi'; found "
                 f"{again[0]!r} more than once."
             )
         self._outputs = parse(formula)
-        if absent := sorted(names_in(formula) - {*known}):
+        absent = sorted(_names(self._outputs) - {*known})
+        if absent:
             raise ValueError(
                 f"The formula {formula!r} has {absent[0]!r}; expected one of its names: "
                 f"{', '.join(known)}. Give its value as a number, or name it as an unknown "
@@ -164,18 +158,14 @@ def parse(formula: str) -> list[ast.expr]:
         if len(formula) > _LONGEST:
             raise ValueError(f"it has more than {_LONGEST} characters")
         tree = ast.parse(formula.strip(), mode="eval").body
-        outputs = tree.elts if isinstance(tree, ast.Tuple) else [tree]
-        if not outputs:
-            raise ValueError("it has no outputs")
+        outputs = tree.elts if isinstance(tree, ast.Tuple) and tree.elts else [tree]
         one = torch.ones(())
         for output in outputs:
             _value(output, dict.fromkeys(_names(outputs), one), one)
-    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-        is_deep = isinstance(error, RecursionError | MemoryError)
-        why = "it is nested too deeply" if is_deep else getattr(error, "msg", str(error))
+    except Exception as error:  # of reading, or of the trial
         raise ValueError(
             f"Expected a formula such as 'force * length**3 / (3 * E * I)', found {formula!r}: "
-            f"{why}. {_GRAMMAR}"
+            f"{getattr(error, 'msg', error)}. {_GRAMMAR}"
         ) from error
     return outputs
 
@@ -187,34 +177,24 @@ def _names(outputs: Sequence[ast.expr]) -> set[str]:
     return {node.id for node in nodes if isinstance(node, ast.Name) and node not in functions}
 
 
-def _value(node: ast.expr, values: Mapping[str, Tensor], like: Tensor, depth: int = 0) -> Tensor:
-    """Return the value of a part of a formula, ``N`` or one number, in the dtype of ``like``.
-
-    Raises:
-        ValueError: If formulas do not have such a part.
-        RecursionError: If it is nested too deeply.
-    """
-    if depth > _DEEPEST:
-        raise RecursionError
-    function: Callable[..., Tensor]
+def _value(node: ast.expr, values: Mapping[str, Tensor], like: Tensor) -> Tensor:
+    """Return the value of a part of a formula, ``N`` or one number, in the dtype of ``like``."""
+    function: Callable[..., Tensor] | None = None
     match node:
         case ast.Name(id=name):
             return values[name]
         case ast.Constant(value=int() | float() as value) if type(value) is not bool:
-            if abs(value) <= _LARGEST:
-                return like.new_tensor(value)
-            raise ValueError(f"{value} is too large")
-        case ast.UnaryOp(op=op, operand=operand) if type(op) in _OPERATORS:
-            function, parts = _OPERATORS[type(op)], [operand]
-        case ast.BinOp(op=op, left=left, right=right) if type(op) in _OPERATORS:
-            function, parts = _OPERATORS[type(op)], [left, right]
-        case ast.Compare(left=left, ops=[op], comparators=[right]) if type(op) in _OPERATORS:
-            function, parts = _OPERATORS[type(op)], [left, right]
-        case ast.Call(func=ast.Name(id=name), args=parts, keywords=[]) if (
-            name in _FUNCTIONS and len(parts) == _FUNCTIONS[name][1]
+            return like.new_tensor(float(value))
+        case ast.UnaryOp(op=op, operand=operand):
+            function, parts = _OPERATORS.get(type(op)), [operand]
+        case (
+            ast.BinOp(op=op, left=left, right=right)
+            | ast.Compare(ops=[op], left=left, comparators=[right])
         ):
-            function = _FUNCTIONS[name][0]
-        case _:
-            raise ValueError(f"{ast.unparse(node)!r} is not a part of a formula")
+            function, parts = _OPERATORS.get(type(op)), [left, right]
+        case ast.Call(func=ast.Name(id=name), args=parts, keywords=[]):
+            function = _FUNCTIONS.get(name)
+    if function is None:
+        raise ValueError(f"{ast.unparse(node)!r} is not a part of a formula")
     # A comparison is one or zero.
-    return function(*(_value(part, values, like, depth + 1) for part in parts)).to(like)
+    return function(*(_value(part, values, like) for part in parts)).to(like)

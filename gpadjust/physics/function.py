@@ -22,12 +22,10 @@ class FunctionPhysics(Physics):
     """Physics given as a torch function, differentiable by autograd.
 
     Args:
-        function: Maps rows ``N x d`` to outputs ``N x m``, or ``N`` if ``m`` is 1. Parameters of a
-            ``torch.nn.Module`` stay as they are: train it before.
-        unknowns: Unknown parameters by name; their values are then the function's second argument,
-            ``N`` each: ``lambda X, p: p.mass * X[:, 0]``.
-        inputs: The columns of X that the function reads. Default: all.
-        name: The name in messages. Default: the function's.
+        function: Maps rows ``N x d`` to outputs ``N x m``, or ``N`` if ``m`` is 1. With unknown
+            parameters their values, ``N`` each, are its second argument: ``lambda X, p: p.mass *
+            X[:, 0]``. Parameters of a ``torch.nn.Module`` stay as they are: train it before.
+        unknowns, inputs, name: As of :class:`Physics`.
 
     Raises:
         TypeError: If ``function`` is not callable.
@@ -70,41 +68,30 @@ def as_physics(physics: Physics | Callable[[Tensor], Tensor]) -> Physics:
         return physics
     if callable(physics) and not isinstance(physics, type):
         return FunctionPhysics(physics)
-    is_class = isinstance(physics, type)
-    found = f"the class {physics.__name__}" if is_class else f"a {type(physics).__name__}"
     raise TypeError(
-        f"physics must be a Physics or a callable; found {found}. Pass a torch function of rows "
-        "N x d, ODEPhysics(rhs, step, state_dim) for an equation of motion, or "
-        "BlackBoxPhysics(function) for NumPy code and simulators."
+        f"physics must be a Physics or a callable, not a class; found a {type(physics).__name__}, "
+        f"{physics!r}. Pass a torch function of rows N x d, ODEPhysics(rhs, step, state_dim) for "
+        "an equation of motion, or BlackBoxPhysics(function) for NumPy code and simulators."
     )
 
 
 def array_physics(physics: Any, X: NDArray[np.float64]) -> Physics:
     """Return a physics of a NumPy function, a torch function or module, or a Physics.
 
-    A function is called with the first row of ``X``, as an array. If it returns a tensor, or fails
-    with the array and returns a tensor for one, it is a torch function; otherwise a NumPy function.
-
-    Args:
-        physics: A function of rows ``N x d``; a torch module, of which a copy is taken, so that
-            fitting leaves the user's as it is; or a Physics.
-        X: Inputs, ``N x d``.
+    A function is called with the first row of the inputs ``X``, ``N x d``, as an array. If it
+    returns a tensor, or fails with the array and returns a tensor for one, it is a torch function;
+    otherwise a NumPy function. A module, or Physics, is copied, so that fits leave the user's as it
+    is.
 
     Raises:
         TypeError: If it is none of these.
         PhysicsError: If a function fails both with an array and with a tensor.
-
-    Example:
-        >>> row = np.zeros((1, 2))
-        >>> array_physics(np.sin, row), array_physics(torch.sin, row)
-        (BlackBoxPhysics(name='sin', ...), FunctionPhysics(name='sin', ...))
     """
     if isinstance(physics, torch.nn.Module):
         return as_physics(deepcopy(physics))
     made = as_physics(physics)  # which checks it
-    row = X[:1].copy()
     try:
-        value = physics(row)
+        value = physics(X[:1].copy())
     except Exception as of_array:
         try:
             value = physics(torch.from_numpy(X[:1].copy()))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict
 from importlib import import_module
 from operator import attrgetter
@@ -52,13 +53,10 @@ def is_formula(path: str) -> bool:
 
 
 def physics_from_path(path: str) -> Physics:
-    """Import the physics that a path of ``import_path`` names.
+    """Return the physics that a text of ``import_path`` names.
 
     Importing a module runs its code, so take paths from files that you trust only. A formula is
     read and runs nothing.
-
-    Args:
-        path: As ``import_path`` returns it.
 
     Raises:
         ValueError: If the path has another form, cannot be imported, or names something else.
@@ -75,38 +73,27 @@ def physics_from_path(path: str) -> Physics:
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"Found {path!r} as a formula, which is damaged: {error}") from error
     module, _, name = path.partition(":")
-    if not module or not name:
-        raise ValueError(
-            f"Found {path!r} as the path of a physics, expected 'package.module:qualname'."
-        )
     try:
-        physics = attrgetter(name)(import_module(module))
+        return as_physics(attrgetter(name)(import_module(module)))
     except Exception as error:  # importing runs the user's code
         raise ValueError(
-            f"The physics {path!r} cannot be imported ({type(error).__name__}: {error}). Put its "
-            "module where Python finds it, under its old name, or give the physics itself."
+            f"The physics {path!r} cannot be imported ({type(error).__name__}: {error}). Expected "
+            "'package.module:qualname'. Put its module where Python finds it, under its old name, "
+            "or give the physics itself."
         ) from error
-    try:
-        return as_physics(physics)
-    except TypeError as error:
-        raise ValueError(f"The path {path!r} does not name a physics: {error}") from error
 
 
 def _path_of(thing: Any) -> str | None:
     """Return the name of a thing in the module of its class, or of a callable that it contains."""
     owners = [thing]
     if isinstance(thing, Physics):
-        owners += filter(callable, vars(thing).values())
-        owners += thing.modules()
+        owners += [*vars(thing).values(), *thing.modules()]
     for owner in owners:
         module = sys.modules.get(getattr(owner, "__module__", None) or "")
         # Only functions and classes know their names.
         own = getattr(thing, "__qualname__", None)
         for name in [own] if own else getattr(module, "__dict__", ()):
-            try:
-                found = attrgetter(name)(module)
-            except AttributeError:
-                continue
-            if found is thing:
-                return f"{owner.__module__}:{name}"
+            with suppress(AttributeError):
+                if attrgetter(name)(module) is thing:
+                    return f"{owner.__module__}:{name}"
     return None

@@ -26,8 +26,7 @@ class ParameterValues(dict[str, Any]):
         self.rows = rows
 
     def __missing__(self, name: str) -> Any:
-        names = ", ".join(self) or "none"
-        raise KeyError(f"Unknown parameter {name!r}; expected one of {names}.")
+        raise KeyError(f"Unknown parameter {name!r}; expected one of {', '.join(self) or 'none'}.")
 
     def __getattr__(self, name: str) -> Any:
         try:
@@ -44,10 +43,7 @@ class PhysicsParameters(ParameterValues):
 
     Args:
         unknowns: The parameters.
-        draws: Draws of each, ``K``, in their units.
-
-    Attributes:
-        draws: All draws, ``K x p``.
+        draws: Draws of each, ``K``, in their units; all, ``K x p``, are an attribute.
 
     Example:
         >>> import torch

@@ -9,10 +9,9 @@ import signal
 import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from string import Formatter
-from tempfile import NamedTemporaryFile
+from uuid import uuid4
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -39,7 +38,6 @@ class SubprocessPhysics(BlackBoxPhysics):
     Args:
         command: The program and its arguments, ``["prog", "--temperature", "{T}"]``; no shell.
         names: The names of the inputs, in their order, for placeholders.
-        unknowns: Unknown parameters by name, each of which has a placeholder.
         stdin: A text with placeholders that the program reads from its standard input. Default:
             nothing.
         parse: Maps the printed text to the outputs, a number or ``m``. Default: it is numbers
@@ -48,8 +46,7 @@ class SubprocessPhysics(BlackBoxPhysics):
         cache: A folder in which outputs are kept, by command and ``stdin``, for all processes that
             name it. A run that failed is not kept. The program itself may change unseen: remove the
             folder after that.
-        inputs: The columns of X that the program reads. Default: all.
-        name: The name in messages. Default: the program's.
+        unknowns, inputs, name: As of :class:`Physics`; each unknown parameter has a placeholder.
 
     Raises:
         TypeError: If ``command`` is one text, or not a list of texts.
@@ -77,50 +74,38 @@ class SubprocessPhysics(BlackBoxPhysics):
         inputs: Sequence[int] | None = None,
         name: str | None = None,
     ) -> None:
-        is_list = not isinstance(command, str) and all(isinstance(part, str) for part in command)
-        if not is_list or not command:
+        if isinstance(command, str) or not command:
             raise TypeError(
                 f"command must be a list of texts, ['prog', '{{T}}'], found {command!r}; "
                 "shlex.split makes one of a line."
             )
-        if timeout is not None:
-            checked_number("timeout", timeout, above=0)
-        found = _placeholders([*command, stdin or ""])
-        known = [*names, *(unknowns or ())]
-        if unclear := sorted(each for each in found if not each.isdigit() and each not in known):
-            raise ValueError(
-                f"The placeholder {{{unclear[0]}}} is no name of an input or unknown parameter; "
-                f"expected one of {', '.join(known) or 'none'}. Give names=['T', ...] in the order "
-                "of the inputs, or take their numbers, {0}; a brace itself is {{."
-            )
-        if silent := [each for each in (unknowns or ()) if each not in found]:
-            raise ValueError(
-                f"The command has no placeholder of the unknown parameter {silent[0]}; expected "
-                f"{{{silent[0]}}} where its value goes."
-            )
-        folder = None if cache is None else Path(cache).absolute()
         super().__init__(
-            _Run(tuple(command), tuple(names), stdin, parse or _numbers, timeout, folder),
+            self._run,
             unknowns=unknowns,
             batched=False,
             gradient=None,
             inputs=inputs,
             name=name or Path(command[0]).name,
         )
+        if timeout is not None:
+            checked_number("timeout", timeout, above=0)
+        parts = [part for text in (*command, stdin or "") for part in Formatter().parse(text)]
+        fields = {field for _, field, _, _ in parts if field is not None}
+        unclear = {field for field in fields if not field.isdigit()} - {*names, *self.unknowns}
+        if unclear or not fields >= {*self.unknowns}:
+            raise ValueError(
+                f"The placeholders of the command and stdin are {sorted(fields)}; expected names "
+                f"of inputs, which are names={[*names]}, or their numbers, {{0}}, and each unknown "
+                f"parameter, which are {[*self.unknowns]}. A brace itself is {{{{."
+            )
+        self.command = tuple(command)
+        self.names = tuple(names)
+        self.stdin = stdin
+        self.parse = parse or _numbers
+        self.timeout = timeout
+        self.cache = None if cache is None else Path(cache).absolute()
 
-
-@dataclass(frozen=True)
-class _Run:
-    """A run of the program; other processes have a copy of it."""
-
-    command: tuple[str, ...]
-    names: tuple[str, ...]
-    stdin: str | None
-    parse: Callable[[str], ArrayLike]
-    timeout: float | None
-    cache: Path | None
-
-    def __call__(self, row: NDArray[np.float64], *parameters: Mapping[str, float]) -> ArrayLike:
+    def _run(self, row: NDArray[np.float64], *parameters: Mapping[str, float]) -> ArrayLike:
         """Return the outputs at a row of inputs."""
         values = row.tolist()
         if self.names and len(self.names) != len(values):
@@ -139,46 +124,37 @@ class _Run:
         """Return the printed text, from the cache if it is there."""
         if self.cache is None:
             return _printed(command, stdin, self.timeout)
-        key = json.dumps({"command": command, "stdin": stdin})
-        file = self.cache / f"{hashlib.sha256(key.encode()).hexdigest()}.json"
+        asked = {"command": command, "stdin": stdin}
+        key = hashlib.sha256(json.dumps(asked).encode()).hexdigest()
+        file = self.cache / f"{key}.json"
         with suppress(OSError, ValueError, KeyError):  # without a file, or with a damaged one
             return str(json.loads(file.read_text(encoding="utf-8"))["stdout"])
         text = _printed(command, stdin, self.timeout)
         self.cache.mkdir(parents=True, exist_ok=True)
-        with NamedTemporaryFile(
-            "w", encoding="utf-8", dir=self.cache, suffix=".part", delete=False
-        ) as part:
-            json.dump({**json.loads(key), "stdout": text}, part)
-        Path(part.name).replace(file)  # at once, as other processes may read or write it now
+        part = self.cache / f"{key}.{uuid4().hex}.part"
+        part.write_text(json.dumps({**asked, "stdout": text}), encoding="utf-8")
+        part.replace(file)  # at once, as other processes may read or write it now
         return text
 
 
 def _numbers(text: str) -> list[float]:
     """Return the numbers in a text of nothing else."""
     try:
-        if words := text.replace(",", " ").split():
-            return [float(word) for word in words]
+        return [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
-        pass
-    raise ValueError(
-        f"the program printed {text.strip()[:_SHOWN]!r}, expected numbers alone; give parse=..., a "
-        "function from the text to the outputs"
-    )
+        raise ValueError(
+            f"the program printed {text.strip()[:_SHOWN]!r}, expected numbers alone; give "
+            "parse=..., a function from the text to the outputs"
+        ) from None
 
 
 def _printed(command: list[str], stdin: str | None, timeout: float | None) -> str:
     """Return the text that a program prints; an error if it fails."""
     pipe = subprocess.PIPE
     source = subprocess.DEVNULL if stdin is None else pipe
-    try:
-        process = subprocess.Popen(
-            command, stdin=source, stdout=pipe, stderr=pipe, text=True, start_new_session=True
-        )
-    except FileNotFoundError:
-        raise FileNotFoundError(
-            f"the program {command[0]!r} was not found where it is to run; give its full path"
-        ) from None
-    with process:
+    with subprocess.Popen(
+        command, stdin=source, stdout=pipe, stderr=pipe, text=True, start_new_session=True
+    ) as process:
         try:
             printed, written = process.communicate(stdin, timeout)
         except BaseException:
@@ -190,14 +166,3 @@ def _printed(command: list[str], stdin: str | None, timeout: float | None) -> st
     if process.returncode:
         raise subprocess.CalledProcessError(process.returncode, command, printed, written)
     return printed
-
-
-def _placeholders(texts: Sequence[str]) -> set[str]:
-    """Return the names and numbers in braces."""
-    try:
-        fields = [field for text in texts for _, field, _, _ in Formatter().parse(text)]
-    except ValueError as error:
-        raise ValueError(
-            f"The texts {texts!r} are no templates ({error}); a brace itself is {{{{ or }}}}."
-        ) from None
-    return {field for field in fields if field is not None}
