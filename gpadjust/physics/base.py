@@ -19,9 +19,8 @@ from gpadjust.physics.unknown import Unknown, Unknowns
 
 _NONE = Unknowns({})
 _CALL = (
-    " It is called with a tensor of rows N x d and, if it has unknown parameters, named as "
-    "unknowns={'mass': Unknown(...)}, with their values p, such as p.mass, one for each row. Wrap "
-    "NumPy code as BlackBoxPhysics(function)."
+    " It is called with a tensor of rows N x d and, with unknowns={'mass': Unknown(...)}, their "
+    "values p, such as p.mass. Wrap NumPy code as BlackBoxPhysics(function)."
 )
 
 
@@ -29,26 +28,23 @@ class Physics(torch.nn.Module, ABC):
     r"""The crude model :math:`f_p : \mathbb{R}^d \to \mathbb{R}^m` of a system.
 
     A subclass computes the outputs of some rows in ``evaluate``; calling the physics adds batch
-    shapes, the choice of columns, and checks. It must be deterministic.
+    shapes, the choice of columns, and checks. It must be deterministic. Wrong arguments raise a
+    TypeError or ValueError, a failure a :class:`PhysicsError`.
 
     A model learns the ``unknowns`` by :func:`gpadjust.fit`; other fits leave them at the guesses. A
     deep copy of a physics without parameters and buffers is the physics itself, so that a
     simulator's handle outlives the copies that GP libraries make of their models.
 
     Args:
-        unknowns: The unknown parameters by name, such as ``{"mass": Unknown(1.0, factor=1.5)}``. A
-            function has their values as its last argument, ``p.mass`` or ``p["mass"]``.
-        inputs: The columns of X that the physics reads, in its order; negative ones count from
-            the end. Default: all.
+        unknowns: The unknown parameters by name, ``p`` of them, such as ``{"mass": Unknown(1.0,
+            factor=1.5)}``. A function has their values as its last argument, ``p.mass`` or
+            ``p["mass"]``.
+        inputs: The columns of X that the physics reads, at least one, in its order; negative ones
+            count from the end. Default: all.
         name: The name in messages. Default: that of the function, or of the class.
 
     Attributes:
         num_outputs: ``m``; None until the first call if it is not known before.
-        unknowns: The unknown parameters, ``p`` of them.
-
-    Raises:
-        TypeError: If ``inputs`` are not whole numbers.
-        ValueError: If ``inputs`` is empty.
 
     Example:
         >>> class Drag(Physics):
@@ -78,15 +74,11 @@ class Physics(torch.nn.Module, ABC):
 
     @abstractmethod
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """Return the outputs of some rows, without checks.
+        """Return the outputs of some rows ``N x m``, or ``N`` if ``m`` is 1.
 
         Args:
             X: ``N x d``, the columns ``inputs`` only.
-            parameters: One argument if there are unknown parameters, their values by name, ``N``
-                each: ``p.mass`` or ``p["mass"]``. None otherwise.
-
-        Returns:
-            ``N x m`` outputs, or ``N`` if ``m`` is 1.
+            parameters: One argument if there are unknown parameters: their values, ``N`` each.
         """
 
     def forward(self, X: Tensor, parameters: Tensor | None = None) -> Tensor:
@@ -140,15 +132,9 @@ class Physics(torch.nn.Module, ABC):
     def or_nan(self, X: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Return the outputs without gradient, NaN in rows at which the physics fails.
 
-        If its error has no ``partial`` result, all rows of the same ``parameters`` are NaN.
-
-        Args:
-            X: ``batch_shape x n x d``, floating point.
-            parameters: As of :meth:`forward`.
-
-        Raises:
-            PhysicsError: If it fails for all rows before the number of outputs is known, or is not
-                one of some rows.
+        The arguments are those of :meth:`forward`. If its error has no ``partial`` result, all rows
+        of the same ``parameters`` are NaN; one that names no rows, or occurs before the number of
+        outputs is known, is raised.
         """
         columns = self._with_parameters(self.read(X), parameters)
         with torch.no_grad():
@@ -159,22 +145,16 @@ class Physics(torch.nn.Module, ABC):
     def read(self, X: Tensor) -> Tensor:
         """Return the columns of ``X`` (``... x n x d``) that the physics reads, checked."""
         is_floating = torch.is_tensor(X) and X.is_floating_point()
-        if not is_floating or X.dim() < 2 or X.shape[-1] == 0:
+        d = X.shape[-1] if is_floating and X.dim() > 1 else 0
+        if d == 0 or any(not -d <= i < d for i in self.inputs or ()):
             found = f"{X.dtype}, {tuple(X.shape)}" if torch.is_tensor(X) else type(X).__name__
+            columns = "" if self.inputs is None else f", with the columns inputs={self.inputs}"
             raise (ValueError if is_floating else TypeError)(
                 f"Physics {self.name!r} takes a floating-point tensor X of shape batch_shape x n x "
-                f"d; found {found}. Convert with torch.as_tensor(X, dtype=torch.float64); a single "
-                "point is X.unsqueeze(0)."
+                f"d{columns}; found {found}. Convert with torch.as_tensor(X, dtype=torch.float64); "
+                "a single point is X.unsqueeze(0)."
             )
-        if self.inputs is None:
-            return X
-        try:
-            return X[..., list(self.inputs)]
-        except IndexError:
-            raise ValueError(
-                f"Physics {self.name!r} reads the columns inputs={self.inputs}, but X has the "
-                f"shape {tuple(X.shape)}. Pass all columns, or correct inputs."
-            ) from None
+        return X if self.inputs is None else X[..., list(self.inputs)]
 
     def check_names(self, names: Sequence[str]) -> None:
         """Raise a ValueError if the physics names its columns, and data have them otherwise."""
@@ -236,11 +216,11 @@ class Physics(torch.nn.Module, ABC):
         made.__dict__.update(deepcopy(self.__dict__, memo))
         return made
 
-    def _arguments(self, rows: Tensor) -> tuple[Tensor, *tuple[ParameterValues, ...]]:
-        """Return the arguments of :meth:`evaluate`, of rows ``N x (d + p)``."""
+    def _arguments(self, rows: Any) -> tuple[Any, ...]:
+        """Return the arguments of :meth:`evaluate`, of rows ``N x (d + p)`` or a single one."""
         d = rows.shape[-1] - len(self.unknowns)
-        values = ParameterValues(self.unknowns, rows[:, d:])
-        return (rows[:, :d], values) if self.unknowns else (rows,)
+        values = ParameterValues(self.unknowns, rows[..., d:])
+        return (rows[..., :d], values) if self.unknowns else (rows,)
 
     def _with_parameters(self, columns: Tensor, parameters: Tensor | None) -> Tensor:
         """Return ``... x n x (d + p)``, with parameters ``... x p`` at the end of each row."""

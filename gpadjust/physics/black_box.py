@@ -30,10 +30,10 @@ class BlackBoxPhysics(Physics):
     joblib.parallel_config(backend="loky", n_jobs=4)``, or any other backend of joblib, a cluster's
     included.
 
-    Each distinct row is evaluated once, and its result remembered, even when other rows fail. The
-    memory is dropped when a parameter or buffer of the physics changes, or dtype and device of the
-    inputs; it cannot see other changes, such as a plain attribute: call ``forget()`` after those.
-    Copies and pickles begin without it. Threads may share a physics if what it calls allows that.
+    Each distinct row is evaluated once, and its result remembered, even when other rows fail, until
+    a parameter or buffer of the physics changes, or dtype and device of the inputs. Call
+    ``forget()`` after other changes, such as of a plain attribute. Copies and pickles begin without
+    this memory. Threads may share a physics if what it calls allows that.
 
     Args:
         function: Maps a float64 array of rows ``N x d`` to ``N x m``, or ``N`` if ``m`` is 1; with
@@ -43,13 +43,8 @@ class BlackBoxPhysics(Physics):
         gradient: ``"finite-difference"``: central differences give the gradient in X, by ``2 d``
             evaluations per row in the backward pass, which are not remembered. Second derivatives
             are not available. None: the outputs are constants to autograd.
-        fd_step: The step of the finite differences in the units of X. Default:
-            ``eps^(1/3) max(1, |x|)``.
+        fd_step: The step of the differences in the units of X. Default: ``eps^(1/3) max(1, |x|)``.
         unknowns, inputs, name: As of :class:`Physics`.
-
-    Raises:
-        TypeError: If ``function`` is not callable, or a setting is not a number.
-        ValueError: If a setting is not one of the above.
 
     Example:
         >>> physics = BlackBoxPhysics(lambda x: np.sin(x[0]) * x[1], batched=False)
@@ -82,29 +77,21 @@ class BlackBoxPhysics(Physics):
         self.forget()
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """Return the function's outputs, as :meth:`Physics.evaluate`.
-
-        Raises:
-            PhysicsError: If single rows fail. It contains the outputs of the others.
-        """
-
-        def arguments(x: NDArray[np.float64], *values: NDArray[np.float64]) -> list[Any]:
-            return [x, *(ParameterValues(self.unknowns, each) for each in values)]
-
-        tensors = [X, *(each.rows for each in parameters)]
-        # Copies, to which a simulator may write.
-        arrays = [tensor.detach().cpu().double().numpy().copy() for tensor in tensors]
+        """Return the function's outputs; an error of single rows contains those of the others."""
+        # A copy, to which a simulator may write.
+        tensor = torch.cat([X, *(values.rows for values in parameters)], dim=-1)
+        rows = tensor.detach().cpu().double().numpy()
         if self.batched:
-            return torch.from_numpy(real_array(self.function(*arguments(*arrays))))
+            return torch.from_numpy(real_array(self.function(*self._arguments(rows))))
         from joblib import Parallel, delayed  # slow to import
 
-        rows = zip(*arrays, strict=True)
-        results = Parallel()(delayed(_call_row)(self.function, *arguments(*row)) for row in rows)
-        m = next((len(y) for y in results if not isinstance(y, Exception)), 1)
+        call = delayed(_call_row)
+        results = Parallel()(call(self.function, *self._arguments(row)) for row in rows)
+        m = next((len(y) for y in results if not isinstance(y, PhysicsError)), 1)
         Y = np.full((len(X), m), np.nan)
-        errors: dict[int, Exception] = {}
+        errors: dict[int, PhysicsError] = {}
         for i, y in enumerate(results):
-            if isinstance(y, Exception):
+            if isinstance(y, PhysicsError):
                 errors[i] = y
             elif len(y) != m:
                 errors[i] = PhysicsError(f"found {len(y)} output(s), expected {m} as before")
@@ -148,11 +135,6 @@ class RowMemo:
 
     When new rows do not fit, it forgets all and begins again with these. Rows that two threads ask
     for at the same moment may be evaluated by both. Copies and pickles of it are empty.
-
-    Example:
-        >>> memo = RowMemo(capacity=100)
-        >>> memo.recall(torch.tensor([[2.0], [2.0]]), torch.square).flatten(), len(memo)
-        (tensor([4., 4.]), 1)
     """
 
     def __init__(self, capacity: int) -> None:
@@ -169,20 +151,18 @@ class RowMemo:
     def recall(
         self, rows: Tensor, evaluate: Callable[[Tensor], Tensor], learn: bool = True
     ) -> Tensor:
-        """Return the values of some rows, of which a function computes those not remembered.
+        """Return the values of rows ``N x d``, evaluated where it does not remember them.
 
-        Args:
-            rows: ``N x d``.
-            evaluate: Maps the distinct unknown rows ``k x d`` to values ``k x m``. If it raises a
-                ``PhysicsError``, the finite rows of its ``partial`` result are remembered, and its
-                ``rows`` restated.
-            learn: Whether new values are remembered.
+        ``evaluate`` maps distinct rows ``k x d`` to values ``k x m``, which it remembers if it is
+        to ``learn``; after a ``PhysicsError`` the finite rows of its ``partial`` result.
         """
         keys, known = row_keys(rows), self._rows  # to which other threads only add
-        places = {key: i for i, key in enumerate(keys) if key not in known}
-        new = [*places]
-        values = rows[:0]
-        if new or not keys:
+        if not keys:
+            return evaluate(rows)
+        outputs = {key: known[key] for key in keys if key in known}
+        places = {key: i for i, key in enumerate(keys) if key not in outputs}
+        if places:
+            new = [*places]
             try:
                 values = evaluate(rows[[*places.values()]])
             except PhysicsError as error:
@@ -196,10 +176,8 @@ class RowMemo:
                 raise
             if learn:
                 self.store(new, values)
-        if not keys:
-            return values
-        found = dict(zip(new, values, strict=True))
-        return torch.stack([found[k] if k in found else known[k] for k in keys]).to(rows)
+            outputs.update(zip(new, values, strict=True))
+        return torch.stack([outputs[key] for key in keys]).to(rows)
 
     def store(self, keys: list[bytes], values: Tensor) -> None:
         """Remember values ``N x m``, without an autograd graph, by distinct keys."""
@@ -224,10 +202,9 @@ class FiniteDifferences(torch.autograd.Function):
     .. math:: \frac{\partial f_k}{\partial x_j} \approx
         \frac{f_k(x + h_j e_j) - f_k(x - h_j e_j)}{2 h_j}
 
-    Call ``FiniteDifferences.apply(rows, Y, physics, step)``: rows are ``N x (d + p)``, columns of X
-    and parameters, by which the gradient is 0; Y is ``N x m``; the step :math:`h` is in the
-    columns' units, by default ``eps^(1/3) max(1, |x|)``. An error names the rows around which the
-    physics fails. A second derivative raises a ``NotImplementedError``.
+    ``FiniteDifferences.apply(rows, Y, physics, step)`` returns ``N x m`` outputs Y of the rows
+    ``N x (d + p)``, columns of X and parameters; the gradient is 0 by the latter. An error names
+    the rows around which the physics fails.
     """
 
     @staticmethod
@@ -244,16 +221,15 @@ class FiniteDifferences(torch.autograd.Function):
         """Return the gradient in the rows, by one call of the physics."""
         if torch.is_grad_enabled():  # by create_graph=True
             raise NotImplementedError(
-                "A physics by finite differences has first derivatives only; for second ones write "
-                "it in torch, as FunctionPhysics."
+                "Finite differences give first derivatives only; write the physics in torch, as "
+                "FunctionPhysics, for second ones."
             )
         (rows,) = ctx.saved_tensors
-        p = len(ctx.physics.unknowns)
-        X = rows[:, : rows.shape[1] - p]
-        n, d = X.shape
-        h = torch.finfo(X.dtype).eps ** (1 / 3) * X.abs().clamp(min=1.0)
-        h = h if ctx.step is None else torch.full_like(X, ctx.step)
-        moves = pad(torch.diag_embed(h), (0, p))
+        n, p = len(rows), len(ctx.physics.unknowns)
+        d = rows.shape[1] - p
+        h = torch.finfo(rows.dtype).eps ** (1 / 3) * rows.abs().clamp(min=1.0)
+        h = h if ctx.step is None else torch.full_like(rows, ctx.step)
+        moves = torch.diag_embed(h)[:, :d]
         sides = rows.unsqueeze(1) + torch.stack([moves, -moves])  # 2 x n x d x (d + p)
         try:
             Y = ctx.physics.fresh_rows(sides.flatten(0, 2))
@@ -275,7 +251,7 @@ class FiniteDifferences(torch.autograd.Function):
 
 
 def _call_row(function: NumpyFunction, *row: Any) -> NDArray[np.float64] | PhysicsError:
-    """Return a function's outputs ``(m,)`` at a row, or the exception that it raises."""
+    """Return a function's outputs ``(m,)`` at a row, or an error by the one that it raises."""
     try:
         y = np.atleast_1d(real_array(function(*row)))
         if y.ndim > 1 or not len(y):

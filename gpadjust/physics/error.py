@@ -19,8 +19,7 @@ class PhysicsError(RuntimeError):
         partial: ``N x m`` outputs when only some rows failed, NaN in those.
 
     Attributes:
-        inputs: ``len(rows) x d`` inputs of those rows, and then unknown parameters, if the physics
-            has any; or None if unknown.
+        inputs: ``len(rows) x (d + p)``, the inputs and unknown parameters of those rows, or None.
 
     Example:
         >>> print(PhysicsError("physics 'pendulum' returned NaN.", rows=[7]))
@@ -50,10 +49,9 @@ class PhysicsWarning(UserWarning):
     """A physics is obviously off at the training inputs, and it shows why.
 
     ``gpadjust.validation.compare``, the report and ``CKARegressor`` give it by at least five
-    observations of an output: a factor, as of other units; the opposite sign; an offset; inputs, or
-    targets, that were scaled beforehand, while f_p reads and returns raw units. A physics with
-    unknown parameters is not judged: its first values are guesses. A fit of unknown parameters of
-    dynamics warns where the transitions do not determine one.
+    observations of an output: a factor, as of other units; the opposite sign; an offset; inputs or
+    targets that were scaled beforehand. A physics with unknown parameters is judged only in fits of
+    dynamics, if the transitions do not determine one of them.
     """
 
 

@@ -19,18 +19,10 @@ from gpadjust.physics.parameters import ParameterValues
 from gpadjust.physics.unknown import Unknown
 
 _LONGEST = 2000  # characters
-_OPERATORS: dict[type[ast.AST], Callable[..., Tensor]] = {
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: operator.truediv,
-    ast.Pow: operator.pow,
-    ast.USub: operator.neg,
-    ast.UAdd: operator.pos,
-    ast.Lt: operator.lt,
-    ast.LtE: operator.le,
-    ast.Gt: operator.gt,
-    ast.GtE: operator.ge,
+# Parts of a tree, and the functions of the module operator.
+_PAIRS = "Add:add Sub:sub Mult:mul Div:truediv Pow:pow USub:neg UAdd:pos Lt:lt LtE:le Gt:gt GtE:ge"
+_OPERATORS: dict[str, Callable[..., Tensor]] = {
+    part: getattr(operator, name) for part, name in (pair.split(":") for pair in _PAIRS.split())
 }
 _OF_TORCH = "sin cos tan asin acos atan atan2 sinh cosh tanh exp log log10 sqrt abs sign"
 _FUNCTIONS: dict[str, Callable[..., Tensor]] = {
@@ -42,17 +34,16 @@ _FUNCTIONS: dict[str, Callable[..., Tensor]] = {
 }
 _GRAMMAR = (
     "Formulas have numbers, names, pi, + - * / and ** (^ is not a power), brackets, comparisons of "
-    f"two values such as a < b, and the functions {', '.join(_FUNCTIONS)}; min and max are of two, "
-    "and where(a < b, x, y) of three. Commas part the outputs. There are no units, no = and no "
-    "names with blanks: water flow is water_flow, and lambda, which Python reserves, is lambda_."
+    f"two values such as a < b, and the functions {', '.join(_FUNCTIONS)}, such as max(a, b) and "
+    "where(a < b, x, y). Commas part the outputs. There are no units and no =; water flow is "
+    "water_flow, and lambda, which Python reserves, is lambda_."
 )
 
 
 class FormulaPhysics(Physics):
-    """Physics given as a formula, a text in Python's notation.
+    """Physics given as a formula, a text in Python's notation, which a saved model contains.
 
-    The text is read, never executed, so that a formula from a stranger does no harm; a saved model
-    contains it.
+    It is read, never executed, so that a formula from a stranger does no harm.
 
     Args:
         formula: The output, or outputs with commas between them, such as ``"U * I, U / I"``. It has
@@ -64,13 +55,6 @@ class FormulaPhysics(Physics):
             that names cannot have become ``_``: "air flow [m3/h]" is ``air_flow``, and "lambda" is
             ``lambda_``.
         unknowns, name: As of :class:`Physics`.
-
-    Attributes:
-        columns: The names of columns that the formula may use.
-
-    Raises:
-        TypeError: If the formula is not a text.
-        ValueError: If it is not a formula, or has an unknown name; or if two names are the same.
 
     Example:
         >>> import torch
@@ -96,16 +80,14 @@ class FormulaPhysics(Physics):
         again = [name for name in known if known.count(name) > 1]
         if again:
             raise ValueError(
-                "Expected different names of columns and unknown parameters, and none 'pi'; found "
-                f"{again[0]!r} more than once."
+                f"Expected different names of columns, unknown parameters and 'pi'; found {known}."
             )
         self._outputs = parse(formula)
         absent = sorted(_names(self._outputs) - {*known})
         if absent:
             raise ValueError(
                 f"The formula {formula!r} has {absent[0]!r}; expected one of its names: "
-                f"{', '.join(known)}. Give its value as a number, or name it as an unknown "
-                "parameter."
+                f"{', '.join(known)}. Give its value as a number, or an unknown parameter."
             )
         self.num_outputs = len(self._outputs)
 
@@ -116,17 +98,13 @@ class FormulaPhysics(Physics):
         if any(places.get(name, i) != i for i, name in enumerate(found)):
             raise ValueError(
                 f"The formula {self.formula!r} has the columns {', '.join(self.columns)}, and the "
-                f"data have {', '.join(found)}: expected the same order. Make the formula with the "
-                "columns in the order of the data."
+                f"data have {', '.join(found)}: give it the columns in the order of the data."
             )
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """Return the values of the formula, ``N x m``."""
         if X.shape[-1] != len(self.columns):
-            names = ", ".join(self.columns)
-            raise ValueError(
-                f"the formula has {len(self.columns)} columns, {names}, and X has {X.shape[-1]}"
-            )
+            raise ValueError(f"the formula has columns {self.columns}, and X has {X.shape[-1]}")
         values = dict(zip(self.columns, X.unbind(-1), strict=True))
         values["pi"] = X.new_tensor(math.pi)
         for own in parameters:
@@ -149,11 +127,7 @@ def names_in(formula: str) -> set[str]:
 
 
 def parse(formula: str) -> list[ast.expr]:
-    """Return the outputs of a formula, each as a tree of allowed parts.
-
-    Raises:
-        ValueError: If it is not a formula.
-    """
+    """Return the outputs of a formula, each as a tree of allowed parts, or raise a ValueError."""
     try:
         if len(formula) > _LONGEST:
             raise ValueError(f"it has more than {_LONGEST} characters")
@@ -186,12 +160,12 @@ def _value(node: ast.expr, values: Mapping[str, Tensor], like: Tensor) -> Tensor
         case ast.Constant(value=int() | float() as value) if type(value) is not bool:
             return like.new_tensor(float(value))
         case ast.UnaryOp(op=op, operand=operand):
-            function, parts = _OPERATORS.get(type(op)), [operand]
+            function, parts = _OPERATORS.get(type(op).__name__), [operand]
         case (
             ast.BinOp(op=op, left=left, right=right)
             | ast.Compare(ops=[op], left=left, comparators=[right])
         ):
-            function, parts = _OPERATORS.get(type(op)), [left, right]
+            function, parts = _OPERATORS.get(type(op).__name__), [left, right]
         case ast.Call(func=ast.Name(id=name), args=parts, keywords=[]):
             function = _FUNCTIONS.get(name)
     if function is None:

@@ -27,9 +27,6 @@ class FunctionPhysics(Physics):
             X[:, 0]``. Parameters of a ``torch.nn.Module`` stay as they are: train it before.
         unknowns, inputs, name: As of :class:`Physics`.
 
-    Raises:
-        TypeError: If ``function`` is not callable.
-
     Example:
         >>> import torch
         >>> physics = FunctionPhysics(lambda X: X[:, 0] * X[:, 1], name="power")
@@ -57,9 +54,6 @@ class FunctionPhysics(Physics):
 def as_physics(physics: Physics | Callable[[Tensor], Tensor]) -> Physics:
     """Return a physics as it is, or a torch function of rows ``N x d`` as a ``FunctionPhysics``.
 
-    Raises:
-        TypeError: If ``physics`` is neither, or a class instead of an instance of it.
-
     Example:
         >>> as_physics(torch.sin)
         FunctionPhysics(name='sin', inputs=None, num_outputs=None)
@@ -79,13 +73,9 @@ def array_physics(physics: Any, X: NDArray[np.float64]) -> Physics:
     """Return a physics of a NumPy function, a torch function or module, or a Physics.
 
     A function is called with the first row of the inputs ``X``, ``N x d``, as an array. If it
-    returns a tensor, or fails with the array and returns a tensor for one, it is a torch function;
-    otherwise a NumPy function. A module, or Physics, is copied, so that fits leave the user's as it
-    is.
-
-    Raises:
-        TypeError: If it is none of these.
-        PhysicsError: If a function fails both with an array and with a tensor.
+    returns a tensor, or fails with the array and returns a tensor for one, it is a torch function.
+    A module, or Physics, is copied, so that fits leave the user's as it is. Raises a TypeError for
+    something else, and a PhysicsError if a function fails both ways.
     """
     if isinstance(physics, torch.nn.Module):
         return as_physics(deepcopy(physics))
@@ -99,7 +89,6 @@ def array_physics(physics: Any, X: NDArray[np.float64]) -> Physics:
             raise PhysicsError(
                 f"Physics {made.name!r} failed at the first row of X, as a NumPy array "
                 f"({described(of_array)}) and as a torch tensor ({described(of_tensor)}). Expected "
-                "a function of rows N x d that takes one of them; of a single row, "
-                "BlackBoxPhysics(function, batched=False)."
+                "a function of rows N x d; of a single row, take BlackBoxPhysics(batched=False)."
             ) from of_array
     return made if torch.is_tensor(value) else BlackBoxPhysics(physics)

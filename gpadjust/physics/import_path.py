@@ -22,15 +22,12 @@ _FORMULA = "formula:"
 
 
 def import_path(physics: Physics | Callable[[Tensor], Tensor]) -> str | None:
-    """Return the path of a physics, for ``physics_from_path``.
+    """Return ``"package.module:qualname"`` of a physics, for ``physics_from_path``.
 
-    A ``FunctionPhysics`` without a path of its own has that of its function if it was made of this
-    alone. Objects have a path if they are attributes of the module of their class or callables.
-
-    Returns:
-        ``"package.module:qualname"``; of a ``FormulaPhysics`` ``"formula:"`` and its arguments;
-        None for what has no name in a module, as lambdas and functions inside of functions. A path
-        in ``__main__`` is valid for the same script only.
+    Of a ``FormulaPhysics`` it is ``"formula:"`` and its arguments; of what has no name in a module,
+    as lambdas and functions inside of functions, None. Objects have a path if they are attributes
+    of the module of their class or callables; a ``FunctionPhysics`` also that of its function if it
+    was made of this alone. A path in ``__main__`` is valid for the same script only.
 
     Example:
         >>> import_path(physics_from_path), import_path(lambda X: X)
@@ -53,13 +50,10 @@ def is_formula(path: str) -> bool:
 
 
 def physics_from_path(path: str) -> Physics:
-    """Return the physics that a text of ``import_path`` names.
+    """Return the physics that a text of ``import_path`` names, or raise a ValueError.
 
     Importing a module runs its code, so take paths from files that you trust only. A formula is
     read and runs nothing.
-
-    Raises:
-        ValueError: If the path has another form, cannot be imported, or names something else.
 
     Example:
         >>> physics_from_path("torch:sin").name
@@ -78,8 +72,7 @@ def physics_from_path(path: str) -> Physics:
     except Exception as error:  # importing runs the user's code
         raise ValueError(
             f"The physics {path!r} cannot be imported ({type(error).__name__}: {error}). Expected "
-            "'package.module:qualname'. Put its module where Python finds it, under its old name, "
-            "or give the physics itself."
+            "'package.module:qualname', of a module where Python finds it, or the physics itself."
         ) from error
 
 

@@ -20,8 +20,6 @@ from gpadjust.checks import checked_number
 from gpadjust.physics.black_box import BlackBoxPhysics
 from gpadjust.physics.unknown import Unknown
 
-_SHOWN = 200  # characters of an output that is not understood
-
 
 class SubprocessPhysics(BlackBoxPhysics):
     """Physics given as an external program, which is run once for each row.
@@ -31,26 +29,19 @@ class SubprocessPhysics(BlackBoxPhysics):
     (``{T:.3f}``; by default all digits), and ``{{`` is a brace. The outputs are what the program
     prints. If its exit code is not 0, the row fails, with what it wrote to stderr in the error.
 
-    Rows run in parallel inside ``with joblib.parallel_config(n_jobs=4)``, and are remembered, as of
-    a :class:`~gpadjust.BlackBoxPhysics`. There is no gradient in X, as programs seldom print the
-    digits that differences need.
+    Rows run in parallel and are remembered as of a :class:`~gpadjust.BlackBoxPhysics`. There is no
+    gradient in X, as programs seldom print the digits that differences need.
 
     Args:
         command: The program and its arguments, ``["prog", "--temperature", "{T}"]``; no shell.
         names: The names of the inputs, in their order, for placeholders.
-        stdin: A text with placeholders that the program reads from its standard input. Default:
-            nothing.
+        stdin: A text with placeholders for the program's standard input. Default: nothing.
         parse: Maps the printed text to the outputs, a number or ``m``. Default: it is numbers
             alone, between spaces, commas or line ends.
         timeout: Seconds after which a run is ended, and has failed. Default: none.
         cache: A folder in which outputs are kept, by command and ``stdin``, for all processes that
-            name it. A run that failed is not kept. The program itself may change unseen: remove the
-            folder after that.
+            name it; a failure is not kept. Remove it when the program itself has changed.
         unknowns, inputs, name: As of :class:`Physics`; each unknown parameter has a placeholder.
-
-    Raises:
-        TypeError: If ``command`` is one text, or not a list of texts.
-        ValueError: If a placeholder names nothing, or an unknown parameter has none.
 
     Example:
         >>> import sys, torch
@@ -67,7 +58,7 @@ class SubprocessPhysics(BlackBoxPhysics):
         *,
         names: Sequence[str] = (),
         unknowns: Mapping[str, Unknown] | None = None,
-        stdin: str | None = None,
+        stdin: str = "",
         parse: Callable[[str], ArrayLike] | None = None,
         timeout: float | None = None,
         cache: str | Path | None = None,
@@ -89,7 +80,7 @@ class SubprocessPhysics(BlackBoxPhysics):
         )
         if timeout is not None:
             checked_number("timeout", timeout, above=0)
-        parts = [part for text in (*command, stdin or "") for part in Formatter().parse(text)]
+        parts = [part for text in (*command, stdin) for part in Formatter().parse(text)]
         fields = {field for _, field, _, _ in parts if field is not None}
         unclear = {field for field in fields if not field.isdigit()} - {*names, *self.unknowns}
         if unclear or not fields >= {*self.unknowns}:
@@ -109,22 +100,18 @@ class SubprocessPhysics(BlackBoxPhysics):
         """Return the outputs at a row of inputs."""
         values = row.tolist()
         if self.names and len(self.names) != len(values):
-            raise ValueError(
-                f"names has {len(self.names)} entries, {', '.join(self.names)}, but a row "
-                f"{len(values)}; name every column that is read, or give inputs=[...]"
-            )
+            raise ValueError(f"expected names of all columns, or inputs=, found {self.names}")
         named = dict(zip(self.names, values, strict=False))
         for each in parameters:
-            named |= {name: float(value) for name, value in each.items()}
+            named |= each
         command = [part.format(*values, **named) for part in self.command]
-        stdin = None if self.stdin is None else self.stdin.format(*values, **named)
-        return self.parse(self._output(command, stdin))
+        return self.parse(self._output(command, self.stdin.format(*values, **named)))
 
-    def _output(self, command: list[str], stdin: str | None) -> str:
+    def _output(self, command: list[str], stdin: str) -> str:
         """Return the printed text, from the cache if it is there."""
         if self.cache is None:
             return _printed(command, stdin, self.timeout)
-        asked = {"command": command, "stdin": stdin}
+        asked = {"command": command, "stdin": stdin or None}
         key = hashlib.sha256(json.dumps(asked).encode()).hexdigest()
         file = self.cache / f"{key}.json"
         with suppress(OSError, ValueError, KeyError):  # without a file, or with a damaged one
@@ -143,17 +130,16 @@ def _numbers(text: str) -> list[float]:
         return [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
         raise ValueError(
-            f"the program printed {text.strip()[:_SHOWN]!r}, expected numbers alone; give "
+            f"the program printed {text.strip()[:200]!r}, expected numbers alone; give "
             "parse=..., a function from the text to the outputs"
         ) from None
 
 
-def _printed(command: list[str], stdin: str | None, timeout: float | None) -> str:
+def _printed(command: list[str], stdin: str, timeout: float | None) -> str:
     """Return the text that a program prints; an error if it fails."""
     pipe = subprocess.PIPE
-    source = subprocess.DEVNULL if stdin is None else pipe
     with subprocess.Popen(
-        command, stdin=source, stdout=pipe, stderr=pipe, text=True, start_new_session=True
+        command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, start_new_session=True
     ) as process:
         try:
             printed, written = process.communicate(stdin, timeout)

@@ -24,19 +24,15 @@ class Unknown:
 
     Its prior is one of three: :math:`N(\text{guess}, \text{sd}^2)`; a log-normal one, of which
     ``factor`` is one standard deviation (1.5: two thirds to one and a half times the guess are
-    likely); or, with neither, the uniform one between ``bounds``. Bounds in addition to ``sd`` or
-    ``factor`` cut their prior off.
+    likely); or, with neither, the uniform one between ``bounds``, which cut off the other two.
 
     Args:
-        guess: The value that the physics has where nothing was learnt; inside the bounds.
+        guess: The value that the physics has where nothing was learnt; inside the bounds, and
+            positive if there is a ``factor``.
         sd: Standard deviation of a normal prior, in the parameter's unit.
         factor: What a log-normal prior multiplies or divides the guess by, above 1.
         bounds: The least and the largest possible value.
         unit: Its unit, for tables and figures.
-
-    Raises:
-        TypeError: If a number is not one.
-        ValueError: If numbers are out of range, or there is no prior, or more than one.
 
     Example:
         >>> Unknown(9.81, sd=0.1, unit="m/s²"), Unknown(0.2, bounds=(0.0, 1.0)).prior_text
@@ -66,8 +62,7 @@ class Unknown:
         if not (low < self.guess < high and is_positive and is_one_prior):
             raise ValueError(
                 "Expected a guess inside of the bounds, above 0 with a factor, and one prior: sd, "
-                "that of a normal one, or factor, that of a log-normal one, or two finite bounds; "
-                f"found {self!r}."
+                f"factor, or two finite bounds; found {self!r}."
             )
 
     def __repr__(self) -> str:
@@ -85,10 +80,8 @@ class Unknown:
             parts.append(f"{self.guess:g} ± {self.sd:g}")
         if self.factor is not None:
             parts.append(f"{self.guess:g}, factor {self.factor:g}")
-        if math.isfinite(high - low):
+        if self.bounds != _UNBOUNDED:
             parts.append(f"{low:g} to {high:g}")
-        elif self.bounds != _UNBOUNDED:
-            parts.append(f"above {low:g}" if high == math.inf else f"below {high:g}")
         return ", ".join(parts)
 
     def value(self, z: Tensor) -> Tensor:
@@ -131,9 +124,7 @@ class Unknown:
 class Unknowns(dict[str, Unknown]):
     """The unknown parameters of a physics, by name, and their coordinates.
 
-    Raises:
-        TypeError: If they are not a mapping from names to ``Unknown``.
-        ValueError: If a name cannot be an attribute.
+    Raises a TypeError if they are something else, a ValueError if a name cannot be an attribute.
     """
 
     def __init__(self, unknowns: Mapping[str, Unknown]) -> None:
@@ -146,10 +137,7 @@ class Unknowns(dict[str, Unknown]):
         for name in unknowns:
             is_word = isinstance(name, str) and name.isidentifier() and not iskeyword(name)
             if not is_word or name.startswith("_") or name == "rows" or hasattr(dict, name):
-                raise ValueError(
-                    "Unknown parameters have names such as 'mass', that can be attributes; found "
-                    f"{name!r}."
-                )
+                raise ValueError(f"Expected a name that can be an attribute, found {name!r}.")
         super().__init__(unknowns)
 
     @property

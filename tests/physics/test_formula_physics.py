@@ -49,7 +49,7 @@ WRONG = {
     "a ** (": "never closed",
     "a^2": "'a \\^ 2' is not a part of a formula.*\\^ is not a power",
     "sinn(a)": r"'sinn\(a\)' is not a part of a formula.*functions sin, ",
-    "max(a)": "missing 1 required.*min and max are of two",
+    "max(a)": r"missing 1 required.*such as max\(a, b\)",
     "where(a, b)": "missing 1 required",
     "sin(a, b)": "takes 1 positional",
     "()": r"'\(\)' is not a part",
@@ -92,9 +92,9 @@ def test_names_and_columns():
     names = ["air flow [m3/h]", "E", "2nd", "dT/dt", "lambda [W/mK]", "\u00b5"]
     assert [*map(symbol, names)] == ["air_flow", "E", "_2nd", "dT_dt", "lambda_", "\u03bc"]
     assert FormulaPhysics("\u00b5", ["\u00b5 [m]"])(X[:, :1])[0] == 1
-    refused(ValueError, "and none 'pi'", FormulaPhysics, "pi", ["pi"])
-    refused(ValueError, "found 'a' more than once", FormulaPhysics, "a", ["a", "a [m]"])
-    with pytest.raises(ValueError, match="found 'a' more than once"):
+    refused(ValueError, r"different names.*found \['pi', 'pi'\]", FormulaPhysics, "pi", ["pi"])
+    refused(ValueError, r"found \['a', 'a', 'pi'\]", FormulaPhysics, "a", ["a", "a [m]"])
+    with pytest.raises(ValueError, match=r"found \['a', 'a', 'pi'\]"):
         FormulaPhysics("a", ["a"], unknowns={"a": Unknown(1.0, sd=1.0)})
     refused(TypeError, "must be a text", FormulaPhysics, torch.sin, ["a"])
     data = pd.DataFrame(X.numpy(), columns=["b [m]", "a"])
@@ -103,7 +103,7 @@ def test_names_and_columns():
         with pytest.raises(ValueError, match="has the columns a, b, and the data have b, a"):
             CKA(data, X[:, :1], physics=physics)
     CKA(data[["a", "b [m]"]], X[:, :1], physics=formula)
-    refused(PhysicsError, "has 2 columns, a, b, and X has 1", formula, X[:, :1])
+    refused(PhysicsError, r"has columns \('a', 'b'\), and X has 1", formula, X[:, :1])
 
 
 def test_a_formula_can_be_made_of_its_text_and_is_saved(tmp_path):

@@ -149,7 +149,7 @@ class TestErrors:
     def test_adaptive_method_gives_up_on_a_stiff_rhs(self, method, monkeypatch):
         monkeypatch.setattr("gpadjust.physics.ode._MOST_STEPS", 50)
         physics = ODEPhysics(lambda s, a: -1e9 * (s - s.cos()), 1.0, 1, method=method, name="clamp")
-        message = rf"'{method}' of physics 'clamp' did not reach.*max_num_steps exc.*'rk4'"
+        message = "'clamp' raised AssertionError: max_num_steps exceeded"
         with pytest.raises(PhysicsError, match=message) as caught:
             physics(torch.ones(2, 1, dtype=torch.float64))
         assert caught.value.rows == (0, 1)
@@ -174,7 +174,7 @@ class TestErrors:
         physics = ODEPhysics(users, 0.1, 1, method="dopri5")
         refused(PhysicsError, "AssertionError: negative mass", physics, x)
         blows_up = ODEPhysics(lambda s, a: s**2, 2.0, 1, method="dopri5")
-        refused(PhysicsError, "not reach the end", blows_up, x)
+        refused(PhysicsError, "underflow in dt", blows_up, x)
 
     def test_blow_up_names_the_row(self):
         physics = ODEPhysics(lambda s, a: s**3, 1.0, 1)

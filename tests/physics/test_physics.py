@@ -81,7 +81,7 @@ def test_bad_settings_and_inputs(points):
         says = re.escape(f"batch_shape x n x d; found torch.float64, {shape}")
         refused(ValueError, says, FunctionPhysics(square), points(*shape))
     for column in (2, -3):
-        says = rf"inputs=\(0, {column}\), but X has the shape \(5, 2\)"
+        says = rf"inputs=\(0, {column}\); found torch.float64, \(5, 2\)"
         refused(ValueError, says, FunctionPhysics(square, inputs=[0, column]), points(5, 2))
     refused(TypeError, "abstract", Physics)
 

@@ -80,7 +80,7 @@ def test_failures_and_bad_input(law):
     refused(
         ValueError, "timeout must be finite and above 0", SubprocessPhysics, ["prog"], timeout=0
     )
-    with pytest.raises(PhysicsError, match="names has 1 entries"):
+    with pytest.raises(PhysicsError, match="names of all columns"):
         SubprocessPhysics(["prog", "{T}"], names=["T"])(torch.zeros(1, 2).double())
 
 

@@ -147,7 +147,7 @@ def test_what_is_no_prior():
 
 def test_names_and_priors_that_are_none():
     for name in ("two words", "1st", "_hidden", "lambda", "rows", "keys", 3):
-        says = rf"names.*found {name!r}"
+        says = rf"name that can.*found {name!r}"
         refused(ValueError, says, FunctionPhysics, wave, unknowns={name: A})
     for none in ({"mass": 1.0}, ["mass"], A):
         refused(TypeError, r"Unknown\(guess, sd=", FunctionPhysics, wave, unknowns=none)
@@ -310,7 +310,7 @@ def test_pickles_and_copies(name, points):
 def test_a_function_that_takes_other_arguments_is_told_what_it_is_called_with():
     X = torch.ones(2, 1, dtype=torch.float64)
     without = FunctionPhysics(lambda X: X[:, 0], unknowns={"a": Unknown(1.0, sd=1.0)})
-    refused(PhysicsError, r"with their values p, such as p\.mass", without, X)
-    refused(PhysicsError, "named as unknowns=", FunctionPhysics(lambda X, p: p.a * X[:, 0]), X)
+    refused(PhysicsError, r"their values p, such as p\.mass", without, X)
+    refused(PhysicsError, "with unknowns=", FunctionPhysics(lambda X, p: p.a * X[:, 0]), X)
     misspelt = FunctionPhysics(lambda X, p: p.b * X[:, 0], unknowns={"a": Unknown(1.0, sd=1.0)})
     refused(PhysicsError, r"parameter 'b'; expected one of a\.", misspelt, X)
