@@ -18,10 +18,6 @@ from gpadjust.physics.parameters import ParameterValues
 from gpadjust.physics.unknown import Unknown, Unknowns
 
 _NONE = Unknowns({})
-_CALL = (
-    " It is called with a tensor of rows N x d and, with unknowns={'mass': Unknown(...)}, their "
-    "values p, such as p.mass. Wrap NumPy code as BlackBoxPhysics(function)."
-)
 
 
 class Physics(torch.nn.Module, ABC):
@@ -82,21 +78,15 @@ class Physics(torch.nn.Module, ABC):
         """
 
     def forward(self, X: Tensor, parameters: Tensor | None = None) -> Tensor:
-        """Return the outputs of the physics.
+        """Return the outputs of the physics, ``batch_shape x n x m``, of X's dtype.
+
+        Dimensions along which X is expanded (stride 0) are evaluated once; the gradient is then
+        right for the tensor that was expanded.
 
         Args:
             X: ``batch_shape x n x d``, floating point.
             parameters: Values of the unknown parameters, ``... x p``, which broadcast with the
                 batch shape. Default: the guesses.
-
-        Returns:
-            ``batch_shape x n x m``, of X's dtype. Dimensions along which X is expanded (stride 0)
-            are evaluated once; the gradient is then right for the tensor that was expanded.
-
-        Raises:
-            TypeError: If X is not a floating-point tensor.
-            ValueError: If X lacks a dimension or column, or parameters are of another shape.
-            PhysicsError: If the physics fails, or returns something else than finite outputs.
         """
         columns = self.read(X)
         # Of the copies of an expanded leaf, each has a gradient of its own.
@@ -183,10 +173,9 @@ class Physics(torch.nn.Module, ABC):
                 error.partial = self._shaped(error.partial, rows)
             raise
         except Exception as error:
-            is_call = "positional argument" in str(error) or "Can't call numpy()" in str(error)
             raise PhysicsError(
-                f"Physics {self.name!r} raised {described(error)}.{_CALL if is_call else ''} The "
-                f"call was for {n} row(s):",
+                f"Physics {self.name!r} raised {described(error)}. The call was for {n} row(s), "
+                f"with unknowns={[*self.unknowns]}:",
                 range(n),
             ) from error
         Y = self._shaped(Y, rows)
@@ -205,8 +194,7 @@ class Physics(torch.nn.Module, ABC):
 
     def extra_repr(self) -> str:
         """Return the settings that ``repr`` shows."""
-        text = f"name={self.name!r}, inputs={self.inputs}, num_outputs={self.num_outputs}"
-        return f"{text}, unknowns={dict(self.unknowns)!r}" if self.unknowns else text
+        return f"name={self.name!r}, inputs={self.inputs}, unknowns={dict(self.unknowns)!r}"
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         """Return the physics itself if it has no parameters and buffers, else a copy."""

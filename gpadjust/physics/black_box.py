@@ -26,23 +26,22 @@ NumpyFunction = Callable[..., ArrayLike]
 class BlackBoxPhysics(Physics):
     """Physics given as a NumPy function or a simulator.
 
-    Simulations of single rows (``batched=False``) run in parallel inside ``with
-    joblib.parallel_config(backend="loky", n_jobs=4)``, or any other backend of joblib, a cluster's
-    included.
+    Single rows (``batched=False``) run in parallel inside ``with
+    joblib.parallel_config(backend="loky", n_jobs=4)``, or another backend of joblib, a cluster's.
 
     Each distinct row is evaluated once, and its result remembered, even when other rows fail, until
     a parameter or buffer of the physics changes, or dtype and device of the inputs. Call
-    ``forget()`` after other changes, such as of a plain attribute. Copies and pickles begin without
-    this memory. Threads may share a physics if what it calls allows that.
+    ``forget()`` after other changes. Copies and pickles begin without this memory. Threads may
+    share a physics if what it calls allows that.
 
     Args:
         function: Maps a float64 array of rows ``N x d`` to ``N x m``, or ``N`` if ``m`` is 1; with
             ``batched=False``, one row ``(d,)``, and a number for each unknown parameter, to
             ``(m,)`` or a scalar.
         batched: Whether the function takes all rows at once.
-        gradient: ``"finite-difference"``: central differences give the gradient in X, by ``2 d``
-            evaluations per row in the backward pass, which are not remembered. Second derivatives
-            are not available. None: the outputs are constants to autograd.
+        gradient: ``"finite-difference"``: central differences give the gradient in X, without
+            second derivatives, by ``2 d`` evaluations per row in the backward pass, which are not
+            remembered. None: the outputs are constants to autograd.
         fd_step: The step of the differences in the units of X. Default: ``eps^(1/3) max(1, |x|)``.
         unknowns, inputs, name: As of :class:`Physics`.
 
@@ -109,7 +108,13 @@ class BlackBoxPhysics(Physics):
 
     def of_rows(self, rows: Tensor) -> Tensor:
         """Return the outputs of rows from the memory, with the gradient that was chosen."""
-        Y = self._recall(rows.detach())
+        tensors = [*self.parameters(), *self.buffers()]
+        # Values are compared, not versions: `p.data.fill_(...)` leaves a tensor's version as it is.
+        state = [rows.dtype, rows.device, *(tensor.tolist() for tensor in tensors)]
+        if self._remembered_for != state:
+            self._remembered_for = state
+            self.forget()
+        Y = self._memo.recall(rows.detach(), super().of_rows)
         if self.gradient is None or not (torch.is_grad_enabled() and rows.requires_grad):
             return Y
         return FiniteDifferences.apply(rows.double(), Y.double(), self, self.fd_step).to(rows)
@@ -118,16 +123,6 @@ class BlackBoxPhysics(Physics):
         """Empty the memory; call it after a change that the physics cannot see."""
         # A new memo: what other threads are evaluating right now ends in the old one.
         self._memo = RowMemo(_REMEMBERED)
-
-    def _recall(self, rows: Tensor) -> Tensor:
-        """Return ``N x m`` outputs, from the memory where it has them."""
-        tensors = [*self.parameters(), *self.buffers()]
-        # Values are compared, not versions: `p.data.fill_(...)` leaves a tensor's version as it is.
-        state = [rows.dtype, rows.device, *(tensor.tolist() for tensor in tensors)]
-        if self._remembered_for != state:
-            self._remembered_for = state
-            self.forget()
-        return self._memo.recall(rows, super().of_rows)
 
 
 class RowMemo:
@@ -251,7 +246,7 @@ class FiniteDifferences(torch.autograd.Function):
 
 
 def _call_row(function: NumpyFunction, *row: Any) -> NDArray[np.float64] | PhysicsError:
-    """Return a function's outputs ``(m,)`` at a row, or an error by the one that it raises."""
+    """Return a function's outputs ``(m,)`` at a row, or an error."""
     try:
         y = np.atleast_1d(real_array(function(*row)))
         if y.ndim > 1 or not len(y):

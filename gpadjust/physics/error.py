@@ -46,12 +46,10 @@ class PhysicsError(RuntimeError):
 
 
 class PhysicsWarning(UserWarning):
-    """A physics is obviously off at the training inputs, and it shows why.
+    """A physics is obviously off at five or more observations: a factor, sign, offset, or scaling.
 
-    ``gpadjust.validation.compare``, the report and ``CKARegressor`` give it by at least five
-    observations of an output: a factor, as of other units; the opposite sign; an offset; inputs or
-    targets that were scaled beforehand. A physics with unknown parameters is judged only in fits of
-    dynamics, if the transitions do not determine one of them.
+    ``gpadjust.validation.compare``, the report and ``CKARegressor`` give it, except of a physics
+    with unknown parameters; fits of dynamics, if the transitions do not determine one of these.
     """
 
 

@@ -51,9 +51,8 @@ class FormulaPhysics(Physics):
             comparisons, and the functions sin, cos, tan, asin, acos, atan, atan2, sinh, cosh, tanh,
             exp, log and ln (the same), log10, sqrt, abs, sign, min and max of two, and
             ``where(a < b, x, y)``.
-        columns: The names of the columns of X, ``d`` of them. Names lose their unit, and characters
-            that names cannot have become ``_``: "air flow [m3/h]" is ``air_flow``, and "lambda" is
-            ``lambda_``.
+        columns: The names of the columns of X, ``d`` of them, without units and with ``_`` for
+            other marks: "air flow [m3/h]" is ``air_flow``, and "lambda" is ``lambda_``.
         unknowns, name: As of :class:`Physics`.
 
     Example:
@@ -122,7 +121,7 @@ def symbol(name: str) -> str:
 
 
 def names_in(formula: str) -> set[str]:
-    """Return the names of columns and parameters in a formula, without those of functions."""
+    """Return the names of columns and parameters in a formula."""
     return _names(parse(formula)) - {"pi"}
 
 

@@ -56,7 +56,7 @@ def as_physics(physics: Physics | Callable[[Tensor], Tensor]) -> Physics:
 
     Example:
         >>> as_physics(torch.sin)
-        FunctionPhysics(name='sin', inputs=None, num_outputs=None)
+        FunctionPhysics(name='sin', inputs=None, unknowns={})
     """
     if isinstance(physics, Physics):
         return physics

@@ -32,10 +32,9 @@ class ODEPhysics(Physics):
     or :math:`s(h) - s` with ``difference=True``.
 
     Args:
-        rhs: The time derivative :math:`g`, from the state ``N x state_dim`` and the action
-            ``N x a`` (``a`` may be 0) to ``N x state_dim``; with ``unknowns`` also from their
-            values, ``N`` each. Or a :class:`FormulaPhysics` of state and action, whose unknown
-            parameters it then has.
+        rhs: The time derivative :math:`g`, a function of state ``N x state_dim``, action ``N x a``
+            (``a`` may be 0) and, with ``unknowns``, their values, ``N`` each, to ``N x state_dim``.
+            Or a :class:`FormulaPhysics` of state and action, with its unknown parameters.
         step: The duration of the step, in the time unit of ``rhs``.
         state_dim: The number of leading columns that contain the state; the action follows.
         substeps: Integration steps within the step, for the fixed-step methods.
@@ -43,9 +42,8 @@ class ODEPhysics(Physics):
             rows of a batch, on which a row's result then depends within their tolerances. They fail
             if ``rhs`` is stiff, for all rows: use ``"rk4"`` with many substeps.
         difference: Whether the output is the change of the state instead of the new state.
-        gradient: Source of the gradient in X: ``"autograd"``, or ``"finite-difference"``, central
-            differences in a single call, which is several times faster if there are many substeps,
-            with first derivatives only.
+        gradient: Source of the gradient in X: ``"autograd"``, or ``"finite-difference"``, without
+            second derivatives, which is several times faster if there are many substeps.
         unknowns, inputs, name: As of :class:`Physics`.
 
     It needs torchdiffeq, ``pip install "gpadjust[ode]"``.

@@ -23,14 +23,10 @@ class ParameterValues(dict[str, Any]):
         super().__init__((name, rows[..., i]) for i, name in enumerate(names))
         self.rows = rows
 
-    def __missing__(self, name: str) -> Any:
-        raise KeyError(f"Unknown parameter {name!r}; expected one of {', '.join(self) or 'none'}.")
-
     def __getattr__(self, name: str) -> Any:
-        try:
+        if name in self:
             return self[name]
-        except KeyError as error:
-            raise AttributeError(error.args[0]) from None
+        raise AttributeError(f"Unknown parameter {name!r}; expected one of {', '.join(self)}.")
 
 
 class PhysicsParameters(ParameterValues):

@@ -66,10 +66,7 @@ class SubprocessPhysics(BlackBoxPhysics):
         name: str | None = None,
     ) -> None:
         if isinstance(command, str) or not command:
-            raise TypeError(
-                f"command must be a list of texts, ['prog', '{{T}}'], found {command!r}; "
-                "shlex.split makes one of a line."
-            )
+            raise TypeError(f"command must be a list, as of shlex.split; found {command!r}.")
         super().__init__(
             self._run,
             unknowns=unknowns,
@@ -85,9 +82,9 @@ class SubprocessPhysics(BlackBoxPhysics):
         unclear = {field for field in fields if not field.isdigit()} - {*names, *self.unknowns}
         if unclear or not fields >= {*self.unknowns}:
             raise ValueError(
-                f"The placeholders of the command and stdin are {sorted(fields)}; expected names "
-                f"of inputs, which are names={[*names]}, or their numbers, {{0}}, and each unknown "
-                f"parameter, which are {[*self.unknowns]}. A brace itself is {{{{."
+                f"The placeholders are {sorted(fields)}; expected inputs, which are "
+                f"names={[*names]} or numbers, {{0}}, and each unknown parameter, "
+                f"{[*self.unknowns]}. A brace itself is {{{{."
             )
         self.command = tuple(command)
         self.names = tuple(names)

@@ -50,14 +50,10 @@ class Unknown:
         for name, least in (("sd", 0.0), ("factor", 1.0)):
             if getattr(self, name) is not None:
                 checked_number(name, getattr(self, name), above=least)
-        try:
-            low, high = (float(end) for end in self.bounds)
-        except (TypeError, ValueError):
-            raise TypeError(f"bounds must be two numbers; found {self.bounds!r}.") from None
+        low, high = map(float, self.bounds)
         object.__setattr__(self, "bounds", (low, high))
-        is_one_prior = (self.sd is None) != (self.factor is None)
-        if self.sd is None and self.factor is None:
-            is_one_prior = math.isfinite(high - low)
+        spreads = (self.sd is not None) + (self.factor is not None)
+        is_one_prior = spreads == 1 or (spreads == 0 and math.isfinite(high - low))
         is_positive = self.factor is None or self.guess > 0
         if not (low < self.guess < high and is_positive and is_one_prior):
             raise ValueError(
@@ -74,15 +70,12 @@ class Unknown:
     @property
     def prior_text(self) -> str:
         """The prior, for tables."""
-        low, high = self.bounds
-        parts = []
-        if self.sd is not None:
-            parts.append(f"{self.guess:g} ± {self.sd:g}")
-        if self.factor is not None:
-            parts.append(f"{self.guess:g}, factor {self.factor:g}")
-        if self.bounds != _UNBOUNDED:
-            parts.append(f"{low:g} to {high:g}")
-        return ", ".join(parts)
+        limits = "{:g} to {:g}".format(*self.bounds)
+        if self.sd is None and self.factor is None:
+            return limits
+        spread = f" ± {self.sd:g}" if self.factor is None else f", factor {self.factor:g}"
+        text = f"{self.guess:g}{spread}"
+        return text if self.bounds == _UNBOUNDED else f"{text}, {limits}"
 
     def value(self, z: Tensor) -> Tensor:
         """Return the value at a coordinate, which is standard normal by the prior."""

@@ -72,10 +72,10 @@ def test_failures_and_bad_input(law):
     refused(TypeError, r"shlex\.split", SubprocessPhysics, "prog {T}")
     with pytest.raises(PhysicsError, match=r"expected a scalar or outputs.*found \(0,\)"):
         SubprocessPhysics([sys.executable, "-c", ""])(line(1))
-    says = r"are \['T'\]; expected names of inputs, which are names=\['t'\]"
+    says = r"are \['T'\]; expected inputs, which are names=\['t'\]"
     refused(ValueError, says, SubprocessPhysics, ["prog", "{T}"], names=["t"])
     refused(ValueError, "Single '{' encountered", SubprocessPhysics, ["prog", "{"])
-    with pytest.raises(ValueError, match=r"are \[\]; expected.* unknown parameter, .*\['k'\]"):
+    with pytest.raises(ValueError, match=r"are \[\]; expected.* unknown parameter, \['k'\]"):
         SubprocessPhysics(["prog"], unknowns={"k": Unknown(4.0, sd=1.0)})
     refused(
         ValueError, "timeout must be finite and above 0", SubprocessPhysics, ["prog"], timeout=0
