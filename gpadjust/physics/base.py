@@ -110,10 +110,9 @@ class Physics(torch.nn.Module, ABC):
         if is_cut and len(Y) and not self._has_warned:
             self._has_warned = True
             warnings.warn(
-                f"No gradient flows through physics {self.name!r}: X requires grad, its outputs do "
-                "not. Use BlackBoxPhysics(function, gradient='finite-difference'), or "
-                "optimize_acqf(..., options={'with_grad': False}); ignore this if the outputs do "
-                "not depend on X.",
+                f"No gradient flows through physics {self.name!r}, although X requires it. Take "
+                "BlackBoxPhysics(function), or optimize_acqf(..., options={'with_grad': False}); "
+                "ignore this if the outputs do not depend on X.",
                 UserWarning,
                 stacklevel=2,
             )
@@ -155,10 +154,7 @@ class Physics(torch.nn.Module, ABC):
         return torch.cat([self.read(X), *own], dim=-1)
 
     def of_rows(self, rows: Tensor) -> Tensor:
-        """Return the outputs ``N x m`` of rows ``N x (d + p)``: columns and parameters.
-
-        The rows that an error names are these. Subclasses with a memory use it here.
-        """
+        """Return the outputs ``N x m`` of rows ``N x (d + p)``, from a memory if there is one."""
         if len(rows) or self.num_outputs is None:
             return Physics.fresh_rows(self, rows)  # not a subclass's, which may skip evaluate
         return rows.new_empty(0, self.num_outputs)
@@ -197,7 +193,6 @@ class Physics(torch.nn.Module, ABC):
         return f"name={self.name!r}, inputs={self.inputs}, unknowns={dict(self.unknowns)!r}"
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        """Return the physics itself if it has no parameters and buffers, else a copy."""
         if not [*self.parameters(), *self.buffers()]:
             return self
         memo[id(self)] = made = copy(self)
@@ -251,8 +246,7 @@ class Physics(torch.nn.Module, ABC):
             raise PhysicsError(
                 f"Physics {self.name!r} returned {found}, expected a real tensor of shape "
                 f"{expected}, one row per row of X. For a constant return X.new_full((len(X),), "
-                "value); for NumPy code take BlackBoxPhysics(function), for a function of a single "
-                "row BlackBoxPhysics(function, batched=False)."
+                "value); NumPy code is BlackBoxPhysics(function), of a single row batched=False."
             )
         self.num_outputs = Y.shape[1]
         return Y.to(rows)

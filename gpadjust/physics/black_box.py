@@ -20,8 +20,6 @@ from gpadjust.physics.unknown import Unknown
 
 _REMEMBERED = 100_000  # rows
 
-NumpyFunction = Callable[..., ArrayLike]
-
 
 class BlackBoxPhysics(Physics):
     """Physics given as a NumPy function or a simulator.
@@ -55,7 +53,7 @@ class BlackBoxPhysics(Physics):
 
     def __init__(
         self,
-        function: NumpyFunction,
+        function: Callable[..., ArrayLike],
         *,
         unknowns: Mapping[str, Unknown] | None = None,
         batched: bool = True,
@@ -86,16 +84,11 @@ class BlackBoxPhysics(Physics):
 
         call = delayed(_call_row)
         results = Parallel()(call(self.function, *self._arguments(row)) for row in rows)
-        m = next((len(y) for y in results if not isinstance(y, PhysicsError)), 1)
-        Y = np.full((len(X), m), np.nan)
-        errors: dict[int, PhysicsError] = {}
-        for i, y in enumerate(results):
-            if isinstance(y, PhysicsError):
-                errors[i] = y
-            elif len(y) != m:
-                errors[i] = PhysicsError(f"found {len(y)} output(s), expected {m} as before")
-            else:
-                Y[i] = y
+        m = next((len(y) for y in results if isinstance(y, np.ndarray)), 1)
+        odd = PhysicsError(f"ValueError: found other than {m} output(s), as in other rows")
+        found = [odd if isinstance(y, np.ndarray) and len(y) != m else y for y in results]
+        errors = {i: y for i, y in enumerate(found) if isinstance(y, PhysicsError)}
+        Y = np.stack([np.full(m, np.nan) if isinstance(y, PhysicsError) else y for y in found])
         if errors:
             first = next(iter(errors.values()))
             raise PhysicsError(
@@ -146,10 +139,9 @@ class RowMemo:
     def recall(
         self, rows: Tensor, evaluate: Callable[[Tensor], Tensor], learn: bool = True
     ) -> Tensor:
-        """Return the values of rows ``N x d``, evaluated where it does not remember them.
+        """Return the values of rows ``N x d``, by a function of distinct rows if not remembered.
 
-        ``evaluate`` maps distinct rows ``k x d`` to values ``k x m``, which it remembers if it is
-        to ``learn``; after a ``PhysicsError`` the finite rows of its ``partial`` result.
+        After its ``PhysicsError`` the finite rows of the ``partial`` result are remembered.
         """
         keys, known = row_keys(rows), self._rows  # to which other threads only add
         if not keys:
@@ -245,7 +237,7 @@ class FiniteDifferences(torch.autograd.Function):
         return pad(gradient, (0, p)), None, None, None
 
 
-def _call_row(function: NumpyFunction, *row: Any) -> NDArray[np.float64] | PhysicsError:
+def _call_row(function: Callable[..., ArrayLike], *row: Any) -> NDArray[np.float64] | PhysicsError:
     """Return a function's outputs ``(m,)`` at a row, or an error."""
     try:
         y = np.atleast_1d(real_array(function(*row)))

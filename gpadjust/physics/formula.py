@@ -56,7 +56,6 @@ class FormulaPhysics(Physics):
         unknowns, name: As of :class:`Physics`.
 
     Example:
-        >>> import torch
         >>> power = FormulaPhysics("U * I", ["U [V]", "I [A]"])
         >>> power(torch.tensor([[230.0, 2.0], [230.0, 3.0]], dtype=torch.float64))
         tensor([[460.],
@@ -76,17 +75,14 @@ class FormulaPhysics(Physics):
         self.formula = formula
         self.columns = tuple(map(symbol, columns))
         known = [*self.columns, *self.unknowns, "pi"]
-        again = [name for name in known if known.count(name) > 1]
-        if again:
-            raise ValueError(
-                f"Expected different names of columns, unknown parameters and 'pi'; found {known}."
-            )
+        if len({*known}) < len(known):
+            raise ValueError(f"Expected different names, and none 'pi'; found {known}.")
         self._outputs = parse(formula)
         absent = sorted(_names(self._outputs) - {*known})
         if absent:
             raise ValueError(
                 f"The formula {formula!r} has {absent[0]!r}; expected one of its names: "
-                f"{', '.join(known)}. Give its value as a number, or an unknown parameter."
+                f"{', '.join(known)}. Give its value as a number, or add it to unknowns."
             )
         self.num_outputs = len(self._outputs)
 

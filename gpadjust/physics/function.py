@@ -28,7 +28,6 @@ class FunctionPhysics(Physics):
         unknowns, inputs, name: As of :class:`Physics`.
 
     Example:
-        >>> import torch
         >>> physics = FunctionPhysics(lambda X: X[:, 0] * X[:, 1], name="power")
         >>> physics(torch.tensor([[230.0, 2.0], [230.0, 3.0]], dtype=torch.float64))
         tensor([[460.],
@@ -52,12 +51,7 @@ class FunctionPhysics(Physics):
 
 
 def as_physics(physics: Physics | Callable[[Tensor], Tensor]) -> Physics:
-    """Return a physics as it is, or a torch function of rows ``N x d`` as a ``FunctionPhysics``.
-
-    Example:
-        >>> as_physics(torch.sin)
-        FunctionPhysics(name='sin', inputs=None, unknowns={})
-    """
+    """Return a physics as it is, or a torch function of rows ``N x d`` as a ``FunctionPhysics``."""
     if isinstance(physics, Physics):
         return physics
     if callable(physics) and not isinstance(physics, type):

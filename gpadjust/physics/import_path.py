@@ -54,10 +54,6 @@ def physics_from_path(path: str) -> Physics:
 
     Importing a module runs its code, so take paths from files that you trust only. A formula is
     read and runs nothing.
-
-    Example:
-        >>> physics_from_path("torch:sin").name
-        'sin'
     """
     if is_formula(path):
         try:
@@ -78,10 +74,8 @@ def physics_from_path(path: str) -> Physics:
 
 def _path_of(thing: Any) -> str | None:
     """Return the name of a thing in the module of its class, or of a callable that it contains."""
-    owners = [thing]
-    if isinstance(thing, Physics):
-        owners += [*vars(thing).values(), *thing.modules()]
-    for owner in owners:
+    is_physics = isinstance(thing, Physics)
+    for owner in [*thing.modules(), *vars(thing).values()] if is_physics else [thing]:
         module = sys.modules.get(getattr(owner, "__module__", None) or "")
         # Only functions and classes know their names.
         own = getattr(thing, "__qualname__", None)

@@ -29,7 +29,7 @@ class ODEPhysics(Physics):
 
     .. math:: f_p(s, a) = s(h), \qquad \dot{s}(t) = g(s(t), a), \quad s(0) = s,
 
-    or :math:`s(h) - s` with ``difference=True``.
+    or :math:`s(h) - s` with ``difference=True``. It needs ``pip install "gpadjust[ode]"``.
 
     Args:
         rhs: The time derivative :math:`g`, a function of state ``N x state_dim``, action ``N x a``
@@ -46,14 +46,11 @@ class ODEPhysics(Physics):
             second derivatives, which is several times faster if there are many substeps.
         unknowns, inputs, name: As of :class:`Physics`.
 
-    It needs torchdiffeq, ``pip install "gpadjust[ode]"``.
-
     Example:
         >>> decay = ODEPhysics(lambda state, action: -state + action, step=1.0, state_dim=1)
         >>> decay(torch.tensor([[1.0, 0.0], [1.0, 1.0]], dtype=torch.float64))
         tensor([[0.3679],
                 [1.0000]], dtype=torch.float64)
-        >>> same = ODEPhysics(FormulaPhysics("-x + u", ["x", "u"]), step=1.0, state_dim=1)
     """
 
     def __init__(

@@ -62,7 +62,7 @@ class Unknown:
             )
 
     def __repr__(self) -> str:
-        """Return the code that makes it, without defaults."""
+        # The code that makes it, without defaults.
         options = [(each.name, getattr(self, each.name), each.default) for each in fields(self)[1:]]
         texts = [f"{name}={value!r}" for name, value, default in options if value != default]
         return f"Unknown({', '.join([repr(self.guess), *texts])})"
@@ -124,8 +124,7 @@ class Unknowns(dict[str, Unknown]):
         is_mapping = isinstance(unknowns, Mapping)
         if not is_mapping or not all(isinstance(u, Unknown) for u in unknowns.values()):
             raise TypeError(
-                "unknowns must map names to Unknown(guess, sd=...), such as "
-                f"{{'mass': Unknown(1.0, factor=1.5)}}; found {unknowns!r}."
+                f"unknowns must map names to Unknown(guess, sd=...); found {unknowns!r}."
             )
         for name in unknowns:
             is_word = isinstance(name, str) and name.isidentifier() and not iskeyword(name)

@@ -154,7 +154,7 @@ def test_bad_settings():
 
 def test_wrong_results(points):
     for function, batched, says in (
-        (lambda x: x[0] + x[1], True, r"single row BlackBox.*batched=False"),
+        (lambda x: x[0] + x[1], True, r"single row batched=False"),
         (lambda x: np.zeros((2, 2)), False, r"a scalar or outputs.*found \(2, 2\)"),
         *(
             (lambda x, result=result: result, batched, f"expected real numbers, found {found}")
@@ -175,7 +175,7 @@ class TestFailures:
             return np.zeros(int(x[0])) if x[0] else np.array([1 // 0])
 
         tape = BlackBoxPhysics(fragile, batched=False, name="tape")
-        with pytest.raises(PhysicsError, match=r"found 3 output\(s\), expected 2") as caught:
+        with pytest.raises(PhysicsError, match=r"found other than 2 output\(s\)") as caught:
             tape(torch.tensor([[2.0], [3.0], [2.0]]))
         assert caught.value.rows == (1,)
         tape(torch.tensor([[2.0]]))  # nor is it hidden by rows that fail
