@@ -70,11 +70,10 @@ class Physics(torch.nn.Module, ABC):
 
     @abstractmethod
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """Return the outputs of some rows ``N x m``, or ``N`` if ``m`` is 1.
+        """Return the outputs of rows X, ``N x d``, as ``N x m``, or ``N`` if ``m`` is 1.
 
-        Args:
-            X: ``N x d``, the columns ``inputs`` only.
-            parameters: One argument if there are unknown parameters: their values, ``N`` each.
+        X has the columns ``inputs`` only. If there are unknown parameters, there is one more
+        argument, their values, ``N`` each.
         """
 
     def forward(self, X: Tensor, parameters: Tensor | None = None) -> Tensor:

@@ -18,8 +18,6 @@ from gpadjust.physics.error import PhysicsError, described
 from gpadjust.physics.parameters import ParameterValues
 from gpadjust.physics.unknown import Unknown
 
-_REMEMBERED = 100_000  # rows
-
 
 class BlackBoxPhysics(Physics):
     """Physics given as a NumPy function or a simulator.
@@ -115,17 +113,17 @@ class BlackBoxPhysics(Physics):
     def forget(self) -> None:
         """Empty the memory; call it after a change that the physics cannot see."""
         # A new memo: what other threads are evaluating right now ends in the old one.
-        self._memo = RowMemo(_REMEMBERED)
+        self._memo = RowMemo()
 
 
 class RowMemo:
     """A dictionary of at most ``capacity`` input rows to output rows, which threads may share.
 
-    When new rows do not fit, it forgets all and begins again with these. Rows that two threads ask
-    for at the same moment may be evaluated by both. Copies and pickles of it are empty.
+    When new rows do not fit, it forgets all and begins again with these. Two threads may evaluate
+    the same row at the same moment. Copies and pickles of it are empty.
     """
 
-    def __init__(self, capacity: int) -> None:
+    def __init__(self, capacity: int = 100_000) -> None:
         self.capacity = capacity
         self._rows: dict[bytes, Tensor] = {}
         self._lock = Lock()

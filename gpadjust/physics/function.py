@@ -67,9 +67,8 @@ def array_physics(physics: Any, X: NDArray[np.float64]) -> Physics:
     """Return a physics of a NumPy function, a torch function or module, or a Physics.
 
     A function is called with the first row of the inputs ``X``, ``N x d``, as an array. If it
-    returns a tensor, or fails with the array and returns a tensor for one, it is a torch function.
-    A module, or Physics, is copied, so that fits leave the user's as it is. Raises a TypeError for
-    something else, and a PhysicsError if a function fails both ways.
+    returns a tensor, or fails with the array and returns a tensor for one, it is a torch function;
+    if it fails with both, there is a PhysicsError. A module is copied, so that fits leave it.
     """
     if isinstance(physics, torch.nn.Module):
         return as_physics(deepcopy(physics))

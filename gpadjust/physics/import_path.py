@@ -38,10 +38,9 @@ def import_path(physics: Physics | Callable[[Tensor], Tensor]) -> str | None:
         settings = {"formula": physics.formula, "columns": physics.columns, "name": physics.name}
         return f"{_FORMULA}{json.dumps({**settings, 'unknowns': unknowns})}"
     path = _path_of(physics)
-    if path is None and type(physics) is FunctionPhysics:
-        is_plain = physics.inputs is None and not physics.unknowns
-        return _path_of(physics.function) if is_plain else None
-    return path
+    if path or type(physics) is not FunctionPhysics or physics.unknowns or physics.inputs:
+        return path
+    return _path_of(physics.function)
 
 
 def is_formula(path: str) -> bool:

@@ -15,8 +15,7 @@ from gpadjust.physics.unknown import Unknown
 class ParameterValues(dict[str, Any]):
     """Values of parameters by their names, as items or attributes: ``p["mass"]``, ``p.mass``.
 
-    ``rows`` is a tensor or array of values, ``N x p``, or ``p`` of a single row; each name has
-    ``N``, or a number.
+    All are ``rows``, ``N x p`` or ``p`` of a single row; each name has ``N``, or a number.
     """
 
     def __init__(self, names: Iterable[str], rows: Any) -> None:

@@ -27,8 +27,7 @@ class Unknown:
     likely); or, with neither, the uniform one between ``bounds``, which cut off the other two.
 
     Args:
-        guess: The value that the physics has where nothing was learnt; inside the bounds, and
-            positive if there is a ``factor``.
+        guess: The value that the physics has where nothing was learnt; inside the bounds.
         sd: Standard deviation of a normal prior, in the parameter's unit.
         factor: What a log-normal prior multiplies or divides the guess by, above 1.
         bounds: The least and the largest possible value.
@@ -115,10 +114,7 @@ class Unknown:
 
 
 class Unknowns(dict[str, Unknown]):
-    """The unknown parameters of a physics, by name, and their coordinates.
-
-    Raises a TypeError if they are something else, a ValueError if a name cannot be an attribute.
-    """
+    """The unknown parameters of a physics, by name, and their coordinates."""
 
     def __init__(self, unknowns: Mapping[str, Unknown]) -> None:
         is_mapping = isinstance(unknowns, Mapping)
