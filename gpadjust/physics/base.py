@@ -32,11 +32,9 @@ class Physics(torch.nn.Module, ABC):
     simulator's handle outlives the copies that GP libraries make of their models.
 
     Args:
-        unknowns: The unknown parameters by name, ``p`` of them, such as ``{"mass": Unknown(1.0,
-            factor=1.5)}``. A function has their values as its last argument, ``p.mass`` or
-            ``p["mass"]``.
-        inputs: The columns of X that the physics reads, at least one, in its order; negative ones
-            count from the end. Default: all.
+        unknowns: The ``p`` unknown parameters, such as ``{"mass": Unknown(1.0, factor=1.5)}``.
+            Their values are a function's last argument, ``p.mass`` or ``p["mass"]``.
+        inputs: The columns of X to read, in order; negative ones from the end. Default: all.
         name: The name in messages. Default: that of the function, or of the class.
 
     Attributes:
@@ -47,9 +45,8 @@ class Physics(torch.nn.Module, ABC):
         ...     def evaluate(self, X):
         ...         return -0.5 * X * X.abs()
         >>> drag = Drag(inputs=[-1])
-        >>> drag(torch.tensor([[7.0, 1.0], [7.0, 2.0]]))
-        tensor([[-0.5000],
-                [-2.0000]])
+        >>> drag(torch.tensor([[7.0, 2.0]]))
+        tensor([[-2.]])
     """
 
     def __init__(

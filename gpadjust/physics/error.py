@@ -13,13 +13,12 @@ _LONGEST = 500  # characters of what a subprocess wrote
 class PhysicsError(RuntimeError):
     """A physics failed, or gave something other than one finite row of outputs per input row.
 
+    Its ``inputs``, ``len(rows) x (d + p)``, are columns and parameters of the rows, or None.
+
     Args:
         message: What was found, what was expected, and the way out.
         rows: The failing rows, counted over the flattened leading dimensions of X; none if unknown.
         partial: ``N x m`` outputs when only some rows failed, NaN in those.
-
-    Attributes:
-        inputs: ``len(rows) x (d + p)``, the inputs and unknown parameters of those rows, or None.
 
     Example:
         >>> print(PhysicsError("physics 'pendulum' returned NaN.", rows=[7]))

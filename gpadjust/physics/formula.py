@@ -57,9 +57,8 @@ class FormulaPhysics(Physics):
 
     Example:
         >>> power = FormulaPhysics("U * I", ["U [V]", "I [A]"])
-        >>> power(torch.tensor([[230.0, 2.0], [230.0, 3.0]], dtype=torch.float64))
-        tensor([[460.],
-                [690.]], dtype=torch.float64)
+        >>> power(torch.tensor([[230.0, 2.0]], dtype=torch.float64))
+        tensor([[460.]], dtype=torch.float64)
     """
 
     def __init__(

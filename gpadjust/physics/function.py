@@ -29,9 +29,8 @@ class FunctionPhysics(Physics):
 
     Example:
         >>> physics = FunctionPhysics(lambda X: X[:, 0] * X[:, 1], name="power")
-        >>> physics(torch.tensor([[230.0, 2.0], [230.0, 3.0]], dtype=torch.float64))
-        tensor([[460.],
-                [690.]], dtype=torch.float64)
+        >>> physics(torch.tensor([[230.0, 2.0]], dtype=torch.float64))
+        tensor([[460.]], dtype=torch.float64)
     """
 
     def __init__(
@@ -58,8 +57,7 @@ def as_physics(physics: Physics | Callable[[Tensor], Tensor]) -> Physics:
         return FunctionPhysics(physics)
     raise TypeError(
         f"physics must be a Physics or a callable, not a class; found a {type(physics).__name__}, "
-        f"{physics!r}. Pass a torch function of rows N x d, ODEPhysics(rhs, step, state_dim) for "
-        "an equation of motion, or BlackBoxPhysics(function) for NumPy code and simulators."
+        f"{physics!r}. Pass a torch function of rows N x d, an ODEPhysics, or a BlackBoxPhysics."
     )
 
 

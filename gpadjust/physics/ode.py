@@ -48,9 +48,8 @@ class ODEPhysics(Physics):
 
     Example:
         >>> decay = ODEPhysics(lambda state, action: -state + action, step=1.0, state_dim=1)
-        >>> decay(torch.tensor([[1.0, 0.0], [1.0, 1.0]], dtype=torch.float64))
-        tensor([[0.3679],
-                [1.0000]], dtype=torch.float64)
+        >>> decay(torch.tensor([[1.0, 0.0]], dtype=torch.float64))
+        tensor([[0.3679]], dtype=torch.float64)
     """
 
     def __init__(
@@ -111,8 +110,7 @@ class ODEPhysics(Physics):
         options: dict[str, Any] = {"grid_constructor": lambda *_: times}
         if self.method in ADAPTIVE_STEP:
             options = {"max_num_steps": _MOST_STEPS}
-        path = odeint(derivative, state, times[[0, -1]], method=self.method, options=options)
-        end: Tensor = path[-1]
+        _, end = odeint(derivative, state, times[[0, -1]], method=self.method, options=options)
         return end - state if self.difference else end
 
     def of_rows(self, rows: Tensor) -> Tensor:

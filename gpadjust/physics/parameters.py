@@ -31,9 +31,8 @@ class ParameterValues(dict[str, Any]):
 class PhysicsParameters(ParameterValues):
     """The posterior of the unknown parameters of a physics, as draws.
 
-    It maps names to their draws, ``K`` each, in their units: one, the value itself, after a point
+    It maps names to ``K`` draws each, of ``draws``, ``K x p``: one, the value itself, after a point
     fit (``"map"``) or before any. Conditioning on further observations leaves them as they are.
-    ``draws`` are all, ``K x p``.
 
     Example:
         >>> g = Unknown(9.0, sd=1.0, unit="m/s²")

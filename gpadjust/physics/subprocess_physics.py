@@ -35,8 +35,7 @@ class SubprocessPhysics(BlackBoxPhysics):
         command: The program and its arguments, ``["prog", "--temperature", "{T}"]``; no shell.
         names: The names of the inputs, in their order, for placeholders.
         stdin: A text with placeholders for the program's standard input. Default: nothing.
-        parse: Maps the printed text to the outputs, a number or ``m``. Default: it is numbers
-            alone, between spaces, commas or line ends.
+        parse: Maps the printed text to the outputs. Default: numbers between blanks or commas.
         timeout: Seconds after which a run is ended, and has failed. Default: none.
         cache: A folder in which outputs are kept, by command and ``stdin``, for all processes that
             name it; a failure is not kept. Remove it when the program itself has changed.
@@ -46,9 +45,8 @@ class SubprocessPhysics(BlackBoxPhysics):
         >>> import sys, torch
         >>> program = "import sys; t, k = map(float, sys.argv[1:]); print(k * t**2)"
         >>> fall = SubprocessPhysics([sys.executable, "-c", program, "{t}", "4.9"], names=["t"])
-        >>> fall(torch.tensor([[1.0], [2.0]], dtype=torch.float64))
-        tensor([[ 4.9000],
-                [19.6000]], dtype=torch.float64)
+        >>> fall(torch.tensor([[2.0]], dtype=torch.float64))
+        tensor([[19.6000]], dtype=torch.float64)
     """
 
     def __init__(
