@@ -115,7 +115,7 @@ def test_a_table_that_is_none(folder, capsys):
 
 
 BAD_PHYSICS = {
-    "hill": "'hill', which is none of its names: time.* is given as module:function",
+    "hill": "has 'hill'; expected one of its names: time.* is given as module:function",
     "hill.py:wave": "there is no module 'hill.py'",
     "./hill.py:wave": "Give the module without folder and .py, and run this in its folder",
     "hill:no_function": "physics must be a Physics or a callable.* found a float",
