@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Callable, Mapping, Sequence
 from threading import Lock
 from typing import Any, Literal, cast
@@ -11,48 +10,36 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
+from torch.nn.functional import pad
 
-from gpadjust.checks import check_choice, checked_number, checked_whole, real_array
+from gpadjust.checks import check_choice, checked_number, real_array
 from gpadjust.physics.base import Physics, name_of
 from gpadjust.physics.error import PhysicsError, described
 from gpadjust.physics.parameters import ParameterValues
 from gpadjust.physics.unknown import Unknown
 
-NumpyFunction = Callable[..., ArrayLike]
-Array = NDArray[np.float64]
-
 
 class BlackBoxPhysics(Physics):
     """Physics given as a NumPy function or a simulator.
 
-    Simulations of single rows (``batched=False``) run in parallel inside ``with
-    joblib.parallel_config(backend="loky", n_jobs=4)``, or any other backend of joblib, a cluster's
-    included.
+    Single rows (``batched=False``) run in parallel inside ``with
+    joblib.parallel_config(backend="loky", n_jobs=4)``, or another backend of joblib, a cluster's.
 
-    Each distinct row is evaluated once, and its result remembered, even when other rows fail. The
-    memory is dropped when a parameter or buffer of the physics changes, or dtype and device of the
-    inputs; it cannot see other changes, such as a plain attribute: call ``forget()`` after those.
-    Copies and pickles begin without it. Threads may share a physics if what it calls allows that.
+    Each distinct row is evaluated once, and its result remembered, even when other rows fail, until
+    a parameter or buffer of the physics changes, or dtype and device of the inputs. Call
+    ``forget()`` after other changes. Copies and pickles begin without this memory. Threads may
+    share a physics if what it calls allows that.
 
     Args:
         function: Maps a float64 array of rows ``N x d`` to ``N x m``, or ``N`` if ``m`` is 1; with
-            ``batched=False``, one row ``(d,)`` to ``(m,)`` or a scalar.
-        unknowns: Unknown parameters by name; their values are then the function's second argument,
-            ``p.mass`` or ``p["mass"]``, ``N`` each, or with ``batched=False`` a number. They are
-            learnt by finite differences.
+            ``batched=False``, one row ``(d,)``, and a number for each unknown parameter, to
+            ``(m,)`` or a scalar.
         batched: Whether the function takes all rows at once.
-        gradient: ``"finite-difference"``: central differences give the gradient in X, by ``2 d``
-            evaluations per row in the backward pass, which the memo does not keep. Second
-            derivatives are not available. None: the outputs are constants to autograd.
-        fd_step: The step of the finite differences in the units of X. Default:
-            ``eps^(1/3) max(1, |x|)``.
-        inputs: The columns of X that the function reads. Default: all.
-        memo: The most rows to remember.
-        name: The name in messages. Default: the function's.
-
-    Raises:
-        TypeError: If ``function`` is not callable, or a setting is not a number.
-        ValueError: If a setting is not one of the above.
+        gradient: ``"finite-difference"``: central differences give the gradient in X, without
+            second derivatives, by ``2 d`` evaluations per row in the backward pass, which are not
+            remembered. None: the outputs are constants to autograd.
+        fd_step: The step of the differences in the units of X. Default: ``eps^(1/3) max(1, |x|)``.
+        unknowns, inputs, name: As of :class:`Physics`.
 
     Example:
         >>> physics = BlackBoxPhysics(lambda x: np.sin(x[0]) * x[1], batched=False)
@@ -64,114 +51,79 @@ class BlackBoxPhysics(Physics):
 
     def __init__(
         self,
-        function: NumpyFunction,
+        function: Callable[..., ArrayLike],
         *,
         unknowns: Mapping[str, Unknown] | None = None,
         batched: bool = True,
         gradient: Literal["finite-difference"] | None = "finite-difference",
         fd_step: float | None = None,
         inputs: Sequence[int] | None = None,
-        memo: int = 100_000,
         name: str | None = None,
     ) -> None:
         super().__init__(unknowns=unknowns, inputs=inputs, name=name_of(function, name))
         check_choice("gradient", gradient, ("finite-difference", None))
         if fd_step is not None:
             checked_number("fd_step", fd_step, above=0)
-        self._memo = RowMemo(checked_whole("memo", memo, 0))
-        self._remembered_for: list[Any] = []
         self.function = function
         self.batched = batched
         self.gradient = gradient
         self.fd_step = fd_step
+        self._remembered_for: list[Any] = []
+        self.forget()
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """Return the function's outputs, as :meth:`Physics.evaluate`.
-
-        Raises:
-            PhysicsError: If single rows fail. It contains the outputs of the others.
-        """
-        x, *more = self._arrays(X, *parameters)
+        """Return the function's outputs; an error of single rows contains those of the others."""
+        # A copy, to which a simulator may write.
+        tensor = torch.cat([X, *(values.rows for values in parameters)], dim=-1)
+        rows = tensor.detach().cpu().double().numpy()
         if self.batched:
-            return torch.from_numpy(real_array(self.function(x, *more))).to(X.device)
+            return torch.from_numpy(real_array(self.function(*self._arguments(rows))))
         from joblib import Parallel, delayed  # slow to import
 
-        rows = ([x[i], *(ParameterValues(p, p.rows[i]) for p in more)] for i in range(len(x)))
-        results = Parallel()(delayed(_call_row)(self.function, *row) for row in rows)
-        outputs = [y for y in results if not isinstance(y, Exception)]
-        Y = np.full((len(x), len(outputs[0]) if outputs else 1), np.nan)
-        errors: dict[int, Exception] = {}
-        for i, y in enumerate(results):
-            if isinstance(y, Exception):
-                errors[i] = y
-            elif len(y) != Y.shape[1]:
-                errors[i] = ValueError(f"found {len(y)} output(s), expected {Y.shape[1]} as before")
-            else:
-                Y[i] = y
+        call = delayed(_call_row)
+        results = Parallel()(call(self.function, *self._arguments(row)) for row in rows)
+        m = next((len(y) for y in results if isinstance(y, np.ndarray)), 1)
+        odd = PhysicsError(f"ValueError: found other than {m} output(s), as in other rows")
+        found = [odd if isinstance(y, np.ndarray) and len(y) != m else y for y in results]
+        errors = {i: y for i, y in enumerate(found) if isinstance(y, PhysicsError)}
+        Y = np.stack([np.full(m, np.nan) if isinstance(y, PhysicsError) else y for y in found])
         if errors:
             first = next(iter(errors.values()))
             raise PhysicsError(
-                f"Physics {self.name!r} raised {described(first)}, in the first of {len(errors)} "
-                f"failed row(s) of {len(x)}. Correct it, or exclude such inputs:",
+                f"Physics {self.name!r} raised {first}, in the first of {len(errors)} failed "
+                f"row(s) of {len(X)}. Correct it, or exclude such inputs:",
                 errors,
-                partial=torch.from_numpy(Y) if outputs else None,
-            ) from first
-        return torch.from_numpy(Y).to(X.device)
+                partial=torch.from_numpy(Y) if len(errors) < len(X) else None,
+            ) from first.__cause__
+        return torch.from_numpy(Y)
 
     def of_rows(self, rows: Tensor) -> Tensor:
         """Return the outputs of rows from the memory, with the gradient that was chosen."""
-        if self.gradient is None or not (torch.is_grad_enabled() and rows.requires_grad):
-            return self._recall(rows.detach())
-        return ExternalCall.apply(rows, self._recall, self._slope)
-
-    def forget(self) -> None:
-        """Empty the memory; call it after a change that the physics cannot see."""
-        # A new memo: what other threads are evaluating right now ends in the old one.
-        self._memo = RowMemo(self._memo.capacity)
-
-    def _recall(self, rows: Tensor) -> Tensor:
-        """Return ``N x m`` outputs, from the memory where it has them."""
         tensors = [*self.parameters(), *self.buffers()]
         # Values are compared, not versions: `p.data.fill_(...)` leaves a tensor's version as it is.
         state = [rows.dtype, rows.device, *(tensor.tolist() for tensor in tensors)]
         if self._remembered_for != state:
             self._remembered_for = state
             self.forget()
-        return self._memo.recall(rows, super().of_rows)
+        Y = self._memo.recall(rows.detach(), super().of_rows)
+        if self.gradient is None or not (torch.is_grad_enabled() and rows.requires_grad):
+            return Y
+        return FiniteDifferences.apply(rows.double(), Y.double(), self, self.fd_step).to(rows)
 
-    def _slope(self, rows: Tensor) -> Tensor:
-        """Return the Jacobian, ``N x m x (d + p)``."""
-        return self.jacobian(rows.double().cpu(), self.fd_step).to(rows)
-
-    def _arrays(self, X: Tensor, *parameters: ParameterValues) -> list[Any]:
-        """Return rows and parameters as arrays, copies to which a simulator may write."""
-        x, *values = (
-            tensor.detach().cpu().double().numpy().copy()
-            for tensor in (X, *(p.rows for p in parameters))
-        )
-        return [x, *(ParameterValues(self.unknowns, rows) for rows in values)]
+    def forget(self) -> None:
+        """Empty the memory; call it after a change that the physics cannot see."""
+        # A new memo: what other threads are evaluating right now ends in the old one.
+        self._memo = RowMemo()
 
 
 class RowMemo:
     """A dictionary of at most ``capacity`` input rows to output rows, which threads may share.
 
-    When new rows do not fit, it forgets all and begins again with these. Rows that two threads ask
-    for at the same moment may be evaluated by both. Copies and pickles of it are empty.
-
-    Example:
-        >>> memo = RowMemo(capacity=100)
-        >>> def square(X):
-        ...     print(f"{len(X)} new row(s)")
-        ...     return X**2
-        >>> memo.recall(torch.tensor([[2.0], [2.0]]), square)
-        1 new row(s)
-        tensor([[4.],
-                [4.]])
-        >>> memo.recall(torch.tensor([[2.0]]), square)
-        tensor([[4.]])
+    When new rows do not fit, it forgets all and begins again with these. Two threads may evaluate
+    the same row at the same moment. Copies and pickles of it are empty.
     """
 
-    def __init__(self, capacity: int) -> None:
+    def __init__(self, capacity: int = 100_000) -> None:
         self.capacity = capacity
         self._rows: dict[bytes, Tensor] = {}
         self._lock = Lock()
@@ -185,38 +137,32 @@ class RowMemo:
     def recall(
         self, rows: Tensor, evaluate: Callable[[Tensor], Tensor], learn: bool = True
     ) -> Tensor:
-        """Return the values of some rows, of which a function computes those not remembered.
+        """Return the values of rows ``N x d``, by a function of distinct rows if not remembered.
 
-        Args:
-            rows: ``N x d``.
-            evaluate: Maps the distinct unknown rows ``k x d`` to values ``k x m``. If it raises a
-                ``PhysicsError``, the finite rows of its ``partial`` result are remembered, and its
-                ``rows`` restated.
-            learn: Whether new values are remembered.
+        After its ``PhysicsError`` the finite rows of the ``partial`` result are remembered.
         """
         keys, known = row_keys(rows), self._rows  # to which other threads only add
-        places: dict[bytes, int] = {}
-        for i, key in enumerate(keys):
-            if key not in known:
-                places.setdefault(key, i)
-        if not keys or not places:
-            return torch.stack([known[key] for key in keys]).to(rows) if keys else evaluate(rows)
-        new = [*places]
-        try:
-            values = evaluate(rows[[*places.values()]])
-        except PhysicsError as error:
-            if error.partial is not None and learn:
-                good = error.partial.isfinite().all(-1)
-                self.store([new[i] for i in good.nonzero()], error.partial[good])
-            error.partial = None
-            if error.inputs is None:
-                failed = {new[i] for i in error.rows}
-                error.rows = tuple(i for i, key in enumerate(keys) if key in failed)
-            raise
-        if learn:
-            self.store(new, values)
-        found = dict(zip(new, values, strict=True))
-        return torch.stack([found[k] if k in found else known[k] for k in keys]).to(rows)
+        if not keys:
+            return evaluate(rows)
+        outputs = {key: known[key] for key in keys if key in known}
+        places = {key: i for i, key in enumerate(keys) if key not in outputs}
+        if places:
+            new = [*places]
+            try:
+                values = evaluate(rows[[*places.values()]])
+            except PhysicsError as error:
+                if error.partial is not None and learn:
+                    good = error.partial.isfinite().all(-1)
+                    self.store([new[i] for i in good.nonzero()], error.partial[good])
+                error.partial = None
+                if error.inputs is None:
+                    failed = {new[i] for i in error.rows}
+                    error.rows = tuple(i for i, key in enumerate(keys) if key in failed)
+                raise
+            if learn:
+                self.store(new, values)
+            outputs.update(zip(new, values, strict=True))
+        return torch.stack([outputs[key] for key in keys]).to(rows)
 
     def store(self, keys: list[bytes], values: Tensor) -> None:
         """Remember values ``N x m``, without an autograd graph, by distinct keys."""
@@ -235,50 +181,68 @@ def row_keys(rows: Tensor) -> list[bytes]:
     return cast(list[bytes], table.view(row_bytes).ravel().tolist())
 
 
-class ExternalCall(torch.autograd.Function):
-    """A function of rows whose Jacobian is computed elsewhere, when the backward pass needs it.
+class FiniteDifferences(torch.autograd.Function):
+    r"""Outputs of a physics, with the gradient in X by central differences in the backward pass.
 
-    Call ``ExternalCall.apply(X, value, jacobian)``: X is ``N x d``, ``value(X)`` is ``N x m`` and
-    ``jacobian(X)`` is ``N x m x d``. A second derivative raises a ``NotImplementedError``.
+    .. math:: \frac{\partial f_k}{\partial x_j} \approx
+        \frac{f_k(x + h_j e_j) - f_k(x - h_j e_j)}{2 h_j}
 
-    Example:
-        >>> X = torch.tensor([[3.0]], requires_grad=True)
-        >>> Y = ExternalCall.apply(X, lambda X: X**2, lambda X: 2 * X.unsqueeze(-1))
-        >>> torch.autograd.grad(Y.sum(), X)
-        (tensor([[6.]]),)
+    ``FiniteDifferences.apply(rows, Y, physics, step)`` returns ``N x m`` outputs Y of the rows
+    ``N x (d + p)``, columns of X and parameters; the gradient is 0 by the latter. An error names
+    the rows around which the physics fails.
     """
 
     @staticmethod
     def forward(
-        ctx: Any, X: Tensor, value: Callable[[Tensor], Tensor], jacobian: Callable[[Tensor], Tensor]
+        ctx: Any, rows: Tensor, Y: Tensor, physics: Physics, step: float | None = None
     ) -> Tensor:
-        """Return the values, ``N x m``."""
-        ctx.save_for_backward(X)
-        ctx.jacobian = jacobian
-        return value(X.detach())
+        """Return the outputs."""
+        ctx.save_for_backward(rows)
+        ctx.physics, ctx.step = physics, step
+        return Y.clone()
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
-        """Return the gradient in X, ``N x d``."""
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
+        """Return the gradient in the rows, by one call of the physics."""
         if torch.is_grad_enabled():  # by create_graph=True
             raise NotImplementedError(
-                "A physics by finite differences has first derivatives only; for second ones write "
-                "it in torch, as FunctionPhysics."
+                "Finite differences give first derivatives only; write the physics in torch, as "
+                "FunctionPhysics, for second ones."
             )
-        (X,) = ctx.saved_tensors
-        return torch.einsum("nm,nmd->nd", grad, ctx.jacobian(X)), None, None
+        (rows,) = ctx.saved_tensors
+        n, p = len(rows), len(ctx.physics.unknowns)
+        d = rows.shape[1] - p
+        h = torch.finfo(rows.dtype).eps ** (1 / 3) * rows.abs().clamp(min=1.0)
+        h = h if ctx.step is None else torch.full_like(rows, ctx.step)
+        moves = torch.diag_embed(h)[:, :d]
+        sides = rows.unsqueeze(1) + torch.stack([moves, -moves])  # 2 x n x d x (d + p)
+        try:
+            Y = ctx.physics.fresh_rows(sides.flatten(0, 2))
+        except PhysicsError as error:
+            if error.inputs is None:
+                error.rows = tuple(sorted({i // d % n for i in error.rows}))
+                error.inputs = rows[[*error.rows]]
+            error.add_note(
+                "This was in the finite differences around these rows. Make their step smaller, or "
+                "choose another gradient."
+            )
+            raise
+        upper, lower = Y.unflatten(0, sides.shape[:3])
+        # The distance that rounding left, not 2 h.
+        width = (sides[0] - sides[1]).diagonal(dim1=-2, dim2=-1)
+        slopes = (upper - lower) / width.unsqueeze(-1)  # n x d x m
+        gradient = torch.einsum("nm,ndm->nd", grad, slopes)
+        return pad(gradient, (0, p)), None, None, None
 
 
-def _call_row(function: NumpyFunction, *row: Any) -> Array | Exception:
-    """Return a function's outputs ``(m,)`` at a row, or the exception that it raises."""
+def _call_row(function: Callable[..., ArrayLike], *row: Any) -> NDArray[np.float64] | PhysicsError:
+    """Return a function's outputs ``(m,)`` at a row, or an error."""
     try:
         y = np.atleast_1d(real_array(function(*row)))
-        if y.ndim > 1:
+        if y.ndim > 1 or not len(y):
             raise ValueError(f"expected a scalar or outputs of shape (m,), found {y.shape}")
         return y
     except Exception as error:
-        try:  # one that does not survive a pickle would break the pool, and lose the other rows
-            pickle.loads(pickle.dumps(error))
-        except Exception:
-            return RuntimeError(f"{type(error).__name__}: {error}")
-        return error
+        failure = PhysicsError(described(error))  # which survives a pickle, unlike some others
+        failure.__cause__ = error
+        return failure

@@ -13,16 +13,12 @@ _LONGEST = 500  # characters of what a subprocess wrote
 class PhysicsError(RuntimeError):
     """A physics failed, or gave something other than one finite row of outputs per input row.
 
+    Its ``inputs``, ``len(rows) x (d + p)``, are columns and parameters of the rows, or None.
+
     Args:
         message: What was found, what was expected, and the way out.
-        rows: The failing rows, as indices into the rows that were asked for.
+        rows: The failing rows, counted over the flattened leading dimensions of X; none if unknown.
         partial: ``N x m`` outputs when only some rows failed, NaN in those.
-
-    Attributes:
-        rows: Indices of the failing rows, counted over the flattened leading dimensions of X;
-            empty if unknown.
-        inputs: ``len(rows) x d`` inputs of those rows, and then unknown parameters, if the physics
-            has any; or None if unknown.
 
     Example:
         >>> print(PhysicsError("physics 'pendulum' returned NaN.", rows=[7]))
@@ -49,20 +45,10 @@ class PhysicsError(RuntimeError):
 
 
 class PhysicsWarning(UserWarning):
-    """A physics is obviously off at the training inputs, and it shows why.
+    """A physics is obviously off at five or more observations: a factor, sign, offset, or scaling.
 
-    ``gpadjust.validation.compare``, the report and ``CKARegressor`` give it by at least five
-    observations of an output: a factor, as of other units; the opposite sign; an offset; inputs, or
-    targets, that were scaled beforehand, while f_p reads and returns raw units. A physics with
-    unknown parameters is not judged: its first values are guesses. A fit of unknown parameters of
-    dynamics warns where the transitions do not determine one.
-
-    Example:
-        >>> import pytest, torch
-        >>> from gpadjust.validation import compare
-        >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
-        >>> with pytest.warns(PhysicsWarning, match="f_p is about 1,000 times too large"):
-        ...     table = compare(X, torch.sin(6 * X), physics=lambda X: 1000 * torch.sin(6 * X))
+    ``gpadjust.validation.compare``, the report and ``CKARegressor`` give it, except of a physics
+    with unknown parameters; fits of dynamics, if the transitions do not determine one of these.
     """
 
 

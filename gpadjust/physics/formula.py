@@ -8,56 +8,42 @@ import operator
 import re
 from collections.abc import Callable, Mapping, Sequence
 from keyword import iskeyword
-from typing import Any
 from unicodedata import normalize
 
 import torch
 from torch import Tensor
 
+from gpadjust.checks import check_kind
 from gpadjust.physics.base import Physics
 from gpadjust.physics.parameters import ParameterValues
 from gpadjust.physics.unknown import Unknown
 
 _LONGEST = 2000  # characters
-_LARGEST = 1e300  # number
-_DEEPEST = 100
-_OPERATORS: dict[type[ast.AST], Callable[..., Any]] = {
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: operator.truediv,
-    ast.Pow: operator.pow,
-    ast.USub: operator.neg,
-    ast.UAdd: operator.pos,
-    ast.Lt: operator.lt,
-    ast.LtE: operator.le,
-    ast.Gt: operator.gt,
-    ast.GtE: operator.ge,
+# Parts of a tree, and the functions of the module operator.
+_PAIRS = "Add:add Sub:sub Mult:mul Div:truediv Pow:pow USub:neg UAdd:pos Lt:lt LtE:le Gt:gt GtE:ge"
+_OPERATORS: dict[str, Callable[..., Tensor]] = {
+    part: getattr(operator, name) for part, name in (pair.split(":") for pair in _PAIRS.split())
 }
-_OF_ONE = "sin cos tan asin acos atan sinh cosh tanh exp log log10 sqrt abs sign"
-# Each with its number of arguments.
-_FUNCTIONS: dict[str, tuple[Callable[..., Tensor], int]] = {
-    **{name: (getattr(torch, name), 1) for name in _OF_ONE.split()},
-    "ln": (torch.log, 1),
-    "atan2": (torch.atan2, 2),
-    "min": (torch.minimum, 2),
-    "max": (torch.maximum, 2),
-    "where": (lambda c, x, y: torch.where(c != 0, x, y), 3),
+_OF_TORCH = "sin cos tan asin acos atan atan2 sinh cosh tanh exp log log10 sqrt abs sign"
+_FUNCTIONS: dict[str, Callable[..., Tensor]] = {
+    **{name: getattr(torch, name) for name in _OF_TORCH.split()},
+    "ln": torch.log,
+    "min": torch.minimum,
+    "max": torch.maximum,
+    "where": lambda c, x, y: torch.where(c != 0, x, y),
 }
 _GRAMMAR = (
-    "Formulas have numbers, names, + - * / and ** (^ is not a power), brackets, comparisons of two "
-    "values such as a < b, and the functions "
-    f"{', '.join(f'{name} of {count}' for name, (_, count) in _FUNCTIONS.items())}. "
-    "pi is a number. Commas part the outputs. There are no units, no = and no names with blanks: "
-    "water flow is water_flow, and lambda, which Python reserves, is lambda_."
+    "Formulas have numbers, names, pi, + - * / and ** (^ is not a power), brackets, comparisons of "
+    f"two values such as a < b, and the functions {', '.join(_FUNCTIONS)}, such as max(a, b) and "
+    "where(a < b, x, y). Commas part the outputs. There are no units and no =; water flow is "
+    "water_flow, and lambda, which Python reserves, is lambda_."
 )
 
 
 class FormulaPhysics(Physics):
-    """Physics given as a formula, a text in Python's notation.
+    """Physics given as a formula, a text in Python's notation, which a saved model contains.
 
-    The text is read, never executed, so that a formula from a stranger does no harm; a saved model
-    contains it.
+    It is read, never executed, so that a formula from a stranger does no harm.
 
     Args:
         formula: The output, or outputs with commas between them, such as ``"U * I, U / I"``. It has
@@ -65,26 +51,14 @@ class FormulaPhysics(Physics):
             comparisons, and the functions sin, cos, tan, asin, acos, atan, atan2, sinh, cosh, tanh,
             exp, log and ln (the same), log10, sqrt, abs, sign, min and max of two, and
             ``where(a < b, x, y)``.
-        columns: The names of the columns of X, ``d`` of them. Names lose their unit, and characters
-            that names cannot have become ``_``: "air flow [m3/h]" is ``air_flow``, and "lambda" is
-            ``lambda_``.
-        unknowns: Unknown parameters by name.
-        name: The name in messages. Default: the formula.
-
-    Attributes:
-        formula: The text.
-        columns: The names of columns that the formula may use.
-
-    Raises:
-        TypeError: If the formula is not a text.
-        ValueError: If it is not a formula, or has an unknown name; or if two names are the same.
+        columns: The names of the columns of X, ``d`` of them, without units and with ``_`` for
+            other marks: "air flow [m3/h]" is ``air_flow``, and "lambda" is ``lambda_``.
+        unknowns, name: As of :class:`Physics`.
 
     Example:
-        >>> import torch
         >>> power = FormulaPhysics("U * I", ["U [V]", "I [A]"])
-        >>> power(torch.tensor([[230.0, 2.0], [230.0, 3.0]], dtype=torch.float64))
-        tensor([[460.],
-                [690.]], dtype=torch.float64)
+        >>> power(torch.tensor([[230.0, 2.0]], dtype=torch.float64))
+        tensor([[460.]], dtype=torch.float64)
     """
 
     def __init__(
@@ -95,23 +69,19 @@ class FormulaPhysics(Physics):
         unknowns: Mapping[str, Unknown] | None = None,
         name: str | None = None,
     ) -> None:
-        if not isinstance(formula, str):
-            raise TypeError(f"Expected a formula as a text, found {formula!r}.")
+        check_kind("formula", formula, str, "a text")
         super().__init__(unknowns=unknowns, name=name or " ".join(formula.split()))
         self.formula = formula
         self.columns = tuple(map(symbol, columns))
         known = [*self.columns, *self.unknowns, "pi"]
-        if again := [name for name in known if known.count(name) > 1]:
-            raise ValueError(
-                "Expected different names of columns and unknown parameters, and none 'pi'; found "
-                f"{again[0]!r} more than once."
-            )
+        if len({*known}) < len(known):
+            raise ValueError(f"Expected different names, and none 'pi'; found {known}.")
         self._outputs = parse(formula)
-        if absent := sorted(names_in(formula) - {*known}):
+        absent = sorted(_names(self._outputs) - {*known})
+        if absent:
             raise ValueError(
                 f"The formula {formula!r} has {absent[0]!r}; expected one of its names: "
-                f"{', '.join(known)}. Give its value as a number, or name it as an unknown "
-                "parameter."
+                f"{', '.join(known)}. Give its value as a number, or add it to unknowns."
             )
         self.num_outputs = len(self._outputs)
 
@@ -122,17 +92,13 @@ class FormulaPhysics(Physics):
         if any(places.get(name, i) != i for i, name in enumerate(found)):
             raise ValueError(
                 f"The formula {self.formula!r} has the columns {', '.join(self.columns)}, and the "
-                f"data have {', '.join(found)}: expected the same order. Make the formula with the "
-                "columns in the order of the data."
+                f"data have {', '.join(found)}: give it the columns in the order of the data."
             )
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """Return the values of the formula, ``N x m``."""
         if X.shape[-1] != len(self.columns):
-            names = ", ".join(self.columns)
-            raise ValueError(
-                f"the formula has {len(self.columns)} columns, {names}, and X has {X.shape[-1]}"
-            )
+            raise ValueError(f"the formula has columns {self.columns}, and X has {X.shape[-1]}")
         values = dict(zip(self.columns, X.unbind(-1), strict=True))
         values["pi"] = X.new_tensor(math.pi)
         for own in parameters:
@@ -150,32 +116,24 @@ def symbol(name: str) -> str:
 
 
 def names_in(formula: str) -> set[str]:
-    """Return the names of columns and parameters in a formula, without those of functions."""
+    """Return the names of columns and parameters in a formula."""
     return _names(parse(formula)) - {"pi"}
 
 
 def parse(formula: str) -> list[ast.expr]:
-    """Return the outputs of a formula, each as a tree of allowed parts.
-
-    Raises:
-        ValueError: If it is not a formula.
-    """
+    """Return the outputs of a formula, each as a tree of allowed parts, or raise a ValueError."""
     try:
         if len(formula) > _LONGEST:
             raise ValueError(f"it has more than {_LONGEST} characters")
         tree = ast.parse(formula.strip(), mode="eval").body
-        outputs = tree.elts if isinstance(tree, ast.Tuple) else [tree]
-        if not outputs:
-            raise ValueError("it has no outputs")
+        outputs = tree.elts if isinstance(tree, ast.Tuple) and tree.elts else [tree]
         one = torch.ones(())
         for output in outputs:
             _value(output, dict.fromkeys(_names(outputs), one), one)
-    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-        is_deep = isinstance(error, RecursionError | MemoryError)
-        why = "it is nested too deeply" if is_deep else getattr(error, "msg", str(error))
+    except Exception as error:  # of reading, or of the trial
         raise ValueError(
             f"Expected a formula such as 'force * length**3 / (3 * E * I)', found {formula!r}: "
-            f"{why}. {_GRAMMAR}"
+            f"{getattr(error, 'msg', error)}. {_GRAMMAR}"
         ) from error
     return outputs
 
@@ -187,34 +145,24 @@ def _names(outputs: Sequence[ast.expr]) -> set[str]:
     return {node.id for node in nodes if isinstance(node, ast.Name) and node not in functions}
 
 
-def _value(node: ast.expr, values: Mapping[str, Tensor], like: Tensor, depth: int = 0) -> Tensor:
-    """Return the value of a part of a formula, ``N`` or one number, in the dtype of ``like``.
-
-    Raises:
-        ValueError: If formulas do not have such a part.
-        RecursionError: If it is nested too deeply.
-    """
-    if depth > _DEEPEST:
-        raise RecursionError
-    function: Callable[..., Tensor]
+def _value(node: ast.expr, values: Mapping[str, Tensor], like: Tensor) -> Tensor:
+    """Return the value of a part of a formula, ``N`` or one number, in the dtype of ``like``."""
+    function: Callable[..., Tensor] | None = None
     match node:
         case ast.Name(id=name):
             return values[name]
         case ast.Constant(value=int() | float() as value) if type(value) is not bool:
-            if abs(value) <= _LARGEST:
-                return like.new_tensor(value)
-            raise ValueError(f"{value} is too large")
-        case ast.UnaryOp(op=op, operand=operand) if type(op) in _OPERATORS:
-            function, parts = _OPERATORS[type(op)], [operand]
-        case ast.BinOp(op=op, left=left, right=right) if type(op) in _OPERATORS:
-            function, parts = _OPERATORS[type(op)], [left, right]
-        case ast.Compare(left=left, ops=[op], comparators=[right]) if type(op) in _OPERATORS:
-            function, parts = _OPERATORS[type(op)], [left, right]
-        case ast.Call(func=ast.Name(id=name), args=parts, keywords=[]) if (
-            name in _FUNCTIONS and len(parts) == _FUNCTIONS[name][1]
+            return like.new_tensor(float(value))
+        case ast.UnaryOp(op=op, operand=operand):
+            function, parts = _OPERATORS.get(type(op).__name__), [operand]
+        case (
+            ast.BinOp(op=op, left=left, right=right)
+            | ast.Compare(ops=[op], left=left, comparators=[right])
         ):
-            function = _FUNCTIONS[name][0]
-        case _:
-            raise ValueError(f"{ast.unparse(node)!r} is not a part of a formula")
+            function, parts = _OPERATORS.get(type(op).__name__), [left, right]
+        case ast.Call(func=ast.Name(id=name), args=parts, keywords=[]):
+            function = _FUNCTIONS.get(name)
+    if function is None:
+        raise ValueError(f"{ast.unparse(node)!r} is not a part of a formula")
     # A comparison is one or zero.
-    return function(*(_value(part, values, like, depth + 1) for part in parts)).to(like)
+    return function(*(_value(part, values, like) for part in parts)).to(like)

@@ -22,22 +22,15 @@ class FunctionPhysics(Physics):
     """Physics given as a torch function, differentiable by autograd.
 
     Args:
-        function: Maps rows ``N x d`` to outputs ``N x m``, or ``N`` if ``m`` is 1. Parameters of a
-            ``torch.nn.Module`` stay as they are: train it before.
-        unknowns: Unknown parameters by name; their values are then the function's second argument,
-            ``N`` each: ``lambda X, p: p.mass * X[:, 0]``.
-        inputs: The columns of X that the function reads. Default: all.
-        name: The name in messages. Default: the function's.
-
-    Raises:
-        TypeError: If ``function`` is not callable.
+        function: Maps rows ``N x d`` to outputs ``N x m``, or ``N`` if ``m`` is 1. With unknown
+            parameters their values, ``N`` each, are its second argument: ``lambda X, p: p.mass *
+            X[:, 0]``. Parameters of a ``torch.nn.Module`` stay as they are: train it before.
+        unknowns, inputs, name: As of :class:`Physics`.
 
     Example:
-        >>> import torch
         >>> physics = FunctionPhysics(lambda X: X[:, 0] * X[:, 1], name="power")
-        >>> physics(torch.tensor([[230.0, 2.0], [230.0, 3.0]], dtype=torch.float64))
-        tensor([[460.],
-                [690.]], dtype=torch.float64)
+        >>> physics(torch.tensor([[230.0, 2.0]], dtype=torch.float64))
+        tensor([[460.]], dtype=torch.float64)
     """
 
     def __init__(
@@ -57,54 +50,29 @@ class FunctionPhysics(Physics):
 
 
 def as_physics(physics: Physics | Callable[[Tensor], Tensor]) -> Physics:
-    """Return a physics as it is, or a torch function of rows ``N x d`` as a ``FunctionPhysics``.
-
-    Raises:
-        TypeError: If ``physics`` is neither, or a class instead of an instance of it.
-
-    Example:
-        >>> as_physics(torch.sin)
-        FunctionPhysics(name='sin', inputs=None, num_outputs=None)
-    """
+    """Return a physics as it is, or a torch function of rows ``N x d`` as a ``FunctionPhysics``."""
     if isinstance(physics, Physics):
         return physics
     if callable(physics) and not isinstance(physics, type):
         return FunctionPhysics(physics)
-    is_class = isinstance(physics, type)
-    found = f"the class {physics.__name__}" if is_class else f"a {type(physics).__name__}"
     raise TypeError(
-        f"physics must be a Physics or a callable; found {found}. Pass a torch function of rows "
-        "N x d, ODEPhysics(rhs, step, state_dim) for an equation of motion, or "
-        "BlackBoxPhysics(function) for NumPy code and simulators."
+        f"physics must be a Physics or a callable, not a class; found a {type(physics).__name__}, "
+        f"{physics!r}. Pass a torch function of rows N x d, an ODEPhysics, or a BlackBoxPhysics."
     )
 
 
 def array_physics(physics: Any, X: NDArray[np.float64]) -> Physics:
     """Return a physics of a NumPy function, a torch function or module, or a Physics.
 
-    A function is called with the first row of ``X``, as an array. If it returns a tensor, or fails
-    with the array and returns a tensor for one, it is a torch function; otherwise a NumPy function.
-
-    Args:
-        physics: A function of rows ``N x d``; a torch module, of which a copy is taken, so that
-            fitting leaves the user's as it is; or a Physics.
-        X: Inputs, ``N x d``.
-
-    Raises:
-        TypeError: If it is none of these.
-        PhysicsError: If a function fails both with an array and with a tensor.
-
-    Example:
-        >>> row = np.zeros((1, 2))
-        >>> array_physics(np.sin, row), array_physics(torch.sin, row)
-        (BlackBoxPhysics(name='sin', ...), FunctionPhysics(name='sin', ...))
+    A function is called with the first row of the inputs ``X``, ``N x d``, as an array. If it
+    returns a tensor, or fails with the array and returns a tensor for one, it is a torch function;
+    if it fails with both, there is a PhysicsError. A module is copied, so that fits leave it.
     """
     if isinstance(physics, torch.nn.Module):
         return as_physics(deepcopy(physics))
     made = as_physics(physics)  # which checks it
-    row = X[:1].copy()
     try:
-        value = physics(row)
+        value = physics(X[:1].copy())
     except Exception as of_array:
         try:
             value = physics(torch.from_numpy(X[:1].copy()))
@@ -112,7 +80,6 @@ def array_physics(physics: Any, X: NDArray[np.float64]) -> Physics:
             raise PhysicsError(
                 f"Physics {made.name!r} failed at the first row of X, as a NumPy array "
                 f"({described(of_array)}) and as a torch tensor ({described(of_tensor)}). Expected "
-                "a function of rows N x d that takes one of them; of a single row, "
-                "BlackBoxPhysics(function, batched=False)."
+                "a function of rows N x d; of a single row, take BlackBoxPhysics(batched=False)."
             ) from of_array
     return made if torch.is_tensor(value) else BlackBoxPhysics(physics)

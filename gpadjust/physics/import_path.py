@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict
 from importlib import import_module
 from operator import attrgetter
@@ -21,15 +22,12 @@ _FORMULA = "formula:"
 
 
 def import_path(physics: Physics | Callable[[Tensor], Tensor]) -> str | None:
-    """Return the path of a physics, for ``physics_from_path``.
+    """Return ``"package.module:qualname"`` of a physics, for ``physics_from_path``.
 
-    A ``FunctionPhysics`` without a path of its own has that of its function if it was made of this
-    alone. Objects have a path if they are attributes of the module of their class or callables.
-
-    Returns:
-        ``"package.module:qualname"``; of a ``FormulaPhysics`` ``"formula:"`` and its arguments;
-        None for what has no name in a module, as lambdas and functions inside of functions. A path
-        in ``__main__`` is valid for the same script only.
+    Of a ``FormulaPhysics`` it is ``"formula:"`` and its arguments; of what has no name in a module,
+    as lambdas and functions inside of functions, None. Objects have a path if they are attributes
+    of the module of their class or callables; a ``FunctionPhysics`` also that of its function if it
+    was made of this alone. A path in ``__main__`` is valid for the same script only.
 
     Example:
         >>> import_path(physics_from_path), import_path(lambda X: X)
@@ -40,10 +38,9 @@ def import_path(physics: Physics | Callable[[Tensor], Tensor]) -> str | None:
         settings = {"formula": physics.formula, "columns": physics.columns, "name": physics.name}
         return f"{_FORMULA}{json.dumps({**settings, 'unknowns': unknowns})}"
     path = _path_of(physics)
-    if path is None and type(physics) is FunctionPhysics:
-        is_plain = physics.inputs is None and not physics.unknowns
-        return _path_of(physics.function) if is_plain else None
-    return path
+    if path or type(physics) is not FunctionPhysics or physics.unknowns or physics.inputs:
+        return path
+    return _path_of(physics.function)
 
 
 def is_formula(path: str) -> bool:
@@ -52,20 +49,10 @@ def is_formula(path: str) -> bool:
 
 
 def physics_from_path(path: str) -> Physics:
-    """Import the physics that a path of ``import_path`` names.
+    """Return the physics that a text of ``import_path`` names, or raise a ValueError.
 
     Importing a module runs its code, so take paths from files that you trust only. A formula is
     read and runs nothing.
-
-    Args:
-        path: As ``import_path`` returns it.
-
-    Raises:
-        ValueError: If the path has another form, cannot be imported, or names something else.
-
-    Example:
-        >>> physics_from_path("torch:sin").name
-        'sin'
     """
     if is_formula(path):
         try:
@@ -75,38 +62,24 @@ def physics_from_path(path: str) -> Physics:
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"Found {path!r} as a formula, which is damaged: {error}") from error
     module, _, name = path.partition(":")
-    if not module or not name:
-        raise ValueError(
-            f"Found {path!r} as the path of a physics, expected 'package.module:qualname'."
-        )
     try:
-        physics = attrgetter(name)(import_module(module))
+        return as_physics(attrgetter(name)(import_module(module)))
     except Exception as error:  # importing runs the user's code
         raise ValueError(
-            f"The physics {path!r} cannot be imported ({type(error).__name__}: {error}). Put its "
-            "module where Python finds it, under its old name, or give the physics itself."
+            f"The physics {path!r} cannot be imported ({type(error).__name__}: {error}). Expected "
+            "'package.module:qualname', of a module where Python finds it, or the physics itself."
         ) from error
-    try:
-        return as_physics(physics)
-    except TypeError as error:
-        raise ValueError(f"The path {path!r} does not name a physics: {error}") from error
 
 
 def _path_of(thing: Any) -> str | None:
     """Return the name of a thing in the module of its class, or of a callable that it contains."""
-    owners = [thing]
-    if isinstance(thing, Physics):
-        owners += filter(callable, vars(thing).values())
-        owners += thing.modules()
-    for owner in owners:
+    is_physics = isinstance(thing, Physics)
+    for owner in [*thing.modules(), *vars(thing).values()] if is_physics else [thing]:
         module = sys.modules.get(getattr(owner, "__module__", None) or "")
         # Only functions and classes know their names.
         own = getattr(thing, "__qualname__", None)
         for name in [own] if own else getattr(module, "__dict__", ()):
-            try:
-                found = attrgetter(name)(module)
-            except AttributeError:
-                continue
-            if found is thing:
-                return f"{owner.__module__}:{name}"
+            with suppress(AttributeError):
+                if attrgetter(name)(module) is thing:
+                    return f"{owner.__module__}:{name}"
     return None

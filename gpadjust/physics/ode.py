@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from importlib.util import find_spec
 from typing import Any, Literal
 
 import torch
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from gpadjust.checks import check_choice, checked_number, checked_whole
 from gpadjust.physics.base import Physics, name_of
-from gpadjust.physics.black_box import ExternalCall
+from gpadjust.physics.black_box import FiniteDifferences
 from gpadjust.physics.error import PhysicsError
 from gpadjust.physics.formula import FormulaPhysics
 from gpadjust.physics.parameters import ParameterValues
@@ -18,6 +19,7 @@ from gpadjust.physics.unknown import Unknown
 
 FIXED_STEP = ("euler", "midpoint", "heun2", "heun3", "rk4", "explicit_adams", "implicit_adams")
 ADAPTIVE_STEP = ("dopri5", "dopri8", "bosh3", "fehlberg2", "adaptive_heun")
+_MOST_STEPS = 10_000  # of an adaptive method
 
 
 class ODEPhysics(Physics):
@@ -27,41 +29,27 @@ class ODEPhysics(Physics):
 
     .. math:: f_p(s, a) = s(h), \qquad \dot{s}(t) = g(s(t), a), \quad s(0) = s,
 
-    or :math:`s(h) - s` with ``difference=True``.
+    or :math:`s(h) - s` with ``difference=True``. It needs ``pip install "gpadjust[ode]"``.
 
     Args:
-        rhs: The time derivative :math:`g`, from the state ``N x state_dim`` and the action
-            ``N x a`` (``a`` may be 0) to ``N x state_dim``; with ``unknowns`` also from their
-            values, ``N`` each. Or a :class:`FormulaPhysics` of state and action, whose unknown
-            parameters it then has.
+        rhs: The time derivative :math:`g`, a function of state ``N x state_dim``, action ``N x a``
+            (``a`` may be 0) and, with ``unknowns``, their values, ``N`` each, to ``N x state_dim``.
+            Or a :class:`FormulaPhysics` of state and action, with its unknown parameters.
         step: The duration of the step, in the time unit of ``rhs``.
         state_dim: The number of leading columns that contain the state; the action follows.
         substeps: Integration steps within the step, for the fixed-step methods.
         method: A method of ``torchdiffeq.odeint``. The adaptive ones control one step size for all
-            rows of a batch, on which a row's result then depends within the tolerances.
-        rtol: Relative tolerance of the adaptive methods.
-        atol: Absolute tolerance of the adaptive methods, in the unit of the state.
-        max_steps: The most steps that an adaptive method tries within ``step``.
+            rows of a batch, on which a row's result then depends within their tolerances. They fail
+            if ``rhs`` is stiff, for all rows: use ``"rk4"`` with many substeps.
         difference: Whether the output is the change of the state instead of the new state.
-        unknowns: Unknown parameters of the equation by name, its third argument:
-            ``lambda state, action, p: ... p.mass ...``.
-        gradient: Source of the gradient in X: ``"autograd"``, or ``"finite-difference"``, central
-            differences in a single call, which is several times faster if there are many substeps,
-            with first derivatives only.
-        inputs: The columns of X that contain state and action, in this order. Default: all.
-        name: The name in messages. Default: that of ``rhs``.
-
-    Raises:
-        ImportError: Without torchdiffeq, ``pip install "gpadjust[ode]"``.
-        TypeError: If ``rhs`` is not callable, or a setting is not a number, or not whole.
-        ValueError: If a setting is out of range, or ``method`` or ``gradient`` is unknown.
+        gradient: Source of the gradient in X: ``"autograd"``, or ``"finite-difference"``, without
+            second derivatives, which is several times faster if there are many substeps.
+        unknowns, inputs, name: As of :class:`Physics`.
 
     Example:
         >>> decay = ODEPhysics(lambda state, action: -state + action, step=1.0, state_dim=1)
-        >>> decay(torch.tensor([[1.0, 0.0], [1.0, 1.0]], dtype=torch.float64))
-        tensor([[0.3679],
-                [1.0000]], dtype=torch.float64)
-        >>> same = ODEPhysics(FormulaPhysics("-x + u", ["x", "u"]), step=1.0, state_dim=1)
+        >>> decay(torch.tensor([[1.0, 0.0]], dtype=torch.float64))
+        tensor([[0.3679]], dtype=torch.float64)
     """
 
     def __init__(
@@ -72,84 +60,57 @@ class ODEPhysics(Physics):
         *,
         substeps: int = 10,
         method: str = "rk4",
-        rtol: float = 1e-7,
-        atol: float = 1e-9,
-        max_steps: int = 10_000,
         difference: bool = False,
         unknowns: Mapping[str, Unknown] | None = None,
         gradient: Literal["autograd", "finite-difference"] = "autograd",
         inputs: Sequence[int] | None = None,
         name: str | None = None,
     ) -> None:
-        _odeint()
+        if find_spec("torchdiffeq") is None:
+            raise ImportError('ODEPhysics needs torchdiffeq; run `pip install "gpadjust[ode]"`.')
         if isinstance(rhs, FormulaPhysics):
             unknowns, name = rhs.unknowns, name or rhs.name
-            if rhs.num_outputs != state_dim:
-                raise ValueError(
-                    f"Expected a time derivative of each of the {state_dim} states, found "
-                    f"{rhs.num_outputs} in {rhs.formula!r}."
-                )
         super().__init__(unknowns=unknowns, inputs=inputs, name=name_of(rhs, name, "rhs"))
         check_choice("method", method, FIXED_STEP + ADAPTIVE_STEP)
         check_choice("gradient", gradient, ("autograd", "finite-difference"))
         self.rhs, self.method, self.gradient = rhs, method, gradient
         self.step = checked_number("step", step, above=0)
-        self.rtol = checked_number("rtol", rtol, least=0)
-        self.atol = checked_number("atol", atol, least=0)
         self.state_dim = self.num_outputs = checked_whole("state_dim", state_dim, 1)
         self.substeps = checked_whole("substeps", substeps, 1)
-        self.max_steps = checked_whole("max_steps", max_steps, 1)
         self.difference = difference
 
     def check_names(self, names: Sequence[str]) -> None:
-        """Raise a ValueError if the equations are a text, and data have its columns otherwise."""
+        """Raise a ValueError if the equations are a text, and data have other columns."""
         if isinstance(self.rhs, FormulaPhysics):
             self.rhs.check_names(names)
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """Return the state after the step or its change, ``N x state_dim``.
+        """Return the state after the step or its change, ``N x state_dim``."""
+        from torchdiffeq import odeint  # slow to import
 
-        Raises:
-            PhysicsError: If X has fewer columns, ``rhs`` returns something else than one time
-                derivative per state, or an adaptive method does not arrive.
-        """
-        if X.shape[1] < self.state_dim:
-            raise PhysicsError(
-                f"Physics {self.name!r} needs {self.state_dim} state column(s), then the action; "
-                f"found rows with {X.shape[1]} column(s). Correct state_dim or inputs."
-            )
         state, action = X[:, : self.state_dim], X[:, self.state_dim :]
 
         def derivative(t: Tensor, state: Tensor) -> Tensor:
             if isinstance(self.rhs, FormulaPhysics):
-                return self.rhs.evaluate(torch.cat([state, action], dim=-1), *parameters)
-            rate = self.rhs(state, action, *parameters)
-            if not torch.is_tensor(rate) or rate.shape != state.shape or rate.is_complex():
-                shape = tuple(rate.shape) if torch.is_tensor(rate) else type(rate).__name__
+                rate = self.rhs.evaluate(torch.cat([state, action], dim=-1), *parameters)
+            else:
+                rate = self.rhs(state, action, *parameters)
+            shape = (len(X), self.state_dim)
+            if not torch.is_tensor(rate) or rate.shape != shape or rate.is_complex():
+                found = tuple(rate.shape) if torch.is_tensor(rate) else type(rate).__name__
                 raise PhysicsError(
-                    f"The rhs of physics {self.name!r} returned {shape}, expected a real tensor of "
-                    f"shape {tuple(state.shape)}, as the state: a time derivative of each variable."
+                    f"The rhs of physics {self.name!r} returned {found}, expected a real tensor of "
+                    f"shape {shape}: a time derivative of each state. Correct it, or state_dim, or "
+                    f"inputs; state and action have {X.shape[1]} column(s)."
                 )
             return rate
 
         times = torch.linspace(0.0, self.step, self.substeps + 1, dtype=X.dtype, device=X.device)
-        settings = {"rtol": self.rtol, "atol": self.atol, "method": self.method}
         # A grid of our own: torchdiffeq's step_size rounds up to one substep too many.
         options: dict[str, Any] = {"grid_constructor": lambda *_: times}
         if self.method in ADAPTIVE_STEP:
-            options = {"max_num_steps": self.max_steps}
-        try:
-            path = _odeint()(derivative, state, times[[0, -1]], options=options, **settings)
-        except AssertionError as error:
-            if not str(error).startswith(("max_num_steps exceeded", "underflow in dt")):
-                raise
-            raise PhysicsError(
-                f"The method {self.method!r} of physics {self.name!r} did not reach the end of the "
-                f"time step ({error}) within max_steps={self.max_steps}. The rhs may be stiff: use "
-                "'rk4' with many substeps, larger rtol and atol, or more max_steps.",
-                range(len(X)),
-            ) from error
-        end: Tensor = path[-1]
+            options = {"max_num_steps": _MOST_STEPS}
+        _, end = odeint(derivative, state, times[[0, -1]], method=self.method, options=options)
         return end - state if self.difference else end
 
     def of_rows(self, rows: Tensor) -> Tensor:
@@ -157,22 +118,4 @@ class ODEPhysics(Physics):
         learns = any(p.requires_grad for p in self.parameters())
         if self.gradient == "autograd" or learns or not rows.requires_grad:
             return super().of_rows(rows)
-        return ExternalCall.apply(rows, super().of_rows, self.jacobian)
-
-    def extra_repr(self) -> str:
-        """Return the settings that ``repr`` shows."""
-        return (
-            f"{super().extra_repr()}, step={self.step}, state_dim={self.state_dim}, "
-            f"method={self.method!r}, difference={self.difference}"
-        )
-
-
-def _odeint() -> Any:
-    """Return ``torchdiffeq.odeint``, which an extra brings."""
-    try:
-        from torchdiffeq import odeint
-    except ImportError as error:
-        raise ImportError(
-            'ODEPhysics needs torchdiffeq; run `pip install "gpadjust[ode]"`.'
-        ) from error
-    return odeint
+        return FiniteDifferences.apply(rows, super().of_rows(rows.detach()), self)

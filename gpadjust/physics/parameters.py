@@ -15,51 +15,30 @@ from gpadjust.physics.unknown import Unknown
 class ParameterValues(dict[str, Any]):
     """Values of parameters by their names, as items or attributes: ``p["mass"]``, ``p.mass``.
 
-    Args:
-        names: The names, ``p`` of them.
-        rows: A tensor or array of values, ``N x p``, or ``p`` of a single row. Each name then has
-            ``N``, or a number.
+    All are ``rows``, ``N x p`` or ``p`` of a single row; each name has ``N``, or a number.
     """
 
     def __init__(self, names: Iterable[str], rows: Any) -> None:
         super().__init__((name, rows[..., i]) for i, name in enumerate(names))
         self.rows = rows
 
-    def __missing__(self, name: str) -> Any:
-        names = ", ".join(self) or "none"
-        raise KeyError(f"Unknown parameter {name!r}; expected one of {names}.")
-
     def __getattr__(self, name: str) -> Any:
-        try:
+        if name in self:
             return self[name]
-        except KeyError as error:
-            raise AttributeError(error.args[0]) from None
+        raise AttributeError(f"Unknown parameter {name!r}; expected one of {', '.join(self)}.")
 
 
 class PhysicsParameters(ParameterValues):
     """The posterior of the unknown parameters of a physics, as draws.
 
-    It maps names to their draws, ``K`` each: one, the value itself, after a point fit (``"map"``)
-    or before any. Conditioning on further observations leaves them as they are.
-
-    Args:
-        unknowns: The parameters.
-        draws: Draws of each, ``K``, in their units.
-
-    Attributes:
-        draws: All draws, ``K x p``.
+    It maps names to ``K`` draws each, of ``draws``, ``K x p``: one, the value itself, after a point
+    fit (``"map"``) or before any. Conditioning on further observations leaves them as they are.
 
     Example:
-        >>> import torch
-        >>> from gpadjust.core import CalibratedPhysics, fit
-        >>> from gpadjust.physics import FunctionPhysics, Unknown
         >>> g = Unknown(9.0, sd=1.0, unit="m/s²")
-        >>> law = FunctionPhysics(lambda t, p: 0.5 * p.g * t[:, 0] ** 2, unknowns={"g": g})
-        >>> t = torch.linspace(0.1, 1, 8, dtype=torch.float64).unsqueeze(-1)
-        >>> model = CalibratedPhysics(t, 0.5 * 9.81 * t**2, physics=law)
-        >>> result = fit(model)
-        >>> len(model.physics_parameters["g"])
-        256
+        >>> PhysicsParameters({"g": g}, [torch.tensor([9.7, 9.9])])
+           mean  95 % interval   prior  unit
+        g  9.8   9.705 to 9.895  9 ± 1  m/s²
     """
 
     def __init__(self, unknowns: Mapping[str, Unknown], draws: Sequence[Tensor]) -> None:

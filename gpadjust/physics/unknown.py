@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import cached_property
 from keyword import iskeyword
-from statistics import NormalDist
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,8 +24,7 @@ class Unknown:
 
     Its prior is one of three: :math:`N(\text{guess}, \text{sd}^2)`; a log-normal one, of which
     ``factor`` is one standard deviation (1.5: two thirds to one and a half times the guess are
-    likely); or, with neither, the uniform one between ``bounds``. Bounds in addition to ``sd`` or
-    ``factor`` cut their prior off.
+    likely); or, with neither, the uniform one between ``bounds``, which cut off the other two.
 
     Args:
         guess: The value that the physics has where nothing was learnt; inside the bounds.
@@ -34,10 +32,6 @@ class Unknown:
         factor: What a log-normal prior multiplies or divides the guess by, above 1.
         bounds: The least and the largest possible value.
         unit: Its unit, for tables and figures.
-
-    Raises:
-        TypeError: If a number is not one.
-        ValueError: If numbers are out of range, or there is no prior, or more than one.
 
     Example:
         >>> Unknown(9.81, sd=0.1, unit="m/s²"), Unknown(0.2, bounds=(0.0, 1.0)).prior_text
@@ -55,29 +49,19 @@ class Unknown:
         for name, least in (("sd", 0.0), ("factor", 1.0)):
             if getattr(self, name) is not None:
                 checked_number(name, getattr(self, name), above=least)
-        try:
-            low, high = (float(end) for end in self.bounds)
-        except (TypeError, ValueError):
-            raise TypeError(f"bounds must be two numbers; found {self.bounds!r}.") from None
+        low, high = map(float, self.bounds)
         object.__setattr__(self, "bounds", (low, high))
-        if not low < self.guess < high:
+        spreads = (self.sd is not None) + (self.factor is not None)
+        is_one_prior = spreads == 1 or (spreads == 0 and math.isfinite(high - low))
+        is_positive = self.factor is None or self.guess > 0
+        if not (low < self.guess < high and is_positive and is_one_prior):
             raise ValueError(
-                f"guess must be inside of the bounds; found {self.guess} and {self.bounds}."
-            )
-        if self.factor is not None and self.guess <= 0:
-            raise ValueError(
-                f"A factor is about a positive guess; found {self.guess}. Give sd instead."
-            )
-        if self.sd is not None and self.factor is not None:
-            raise ValueError("Found sd and factor; give one of them.")
-        if self._is_uniform and not math.isfinite(high - low):
-            raise ValueError(
-                "Found no prior; give sd, the standard deviation of a normal one, or factor, that "
-                "of a log-normal one, or two finite bounds."
+                "Expected a guess inside of the bounds, above 0 with a factor, and one prior: sd, "
+                f"factor, or two finite bounds; found {self!r}."
             )
 
     def __repr__(self) -> str:
-        """Return the code that makes it, without defaults."""
+        # The code that makes it, without defaults.
         options = [(each.name, getattr(self, each.name), each.default) for each in fields(self)[1:]]
         texts = [f"{name}={value!r}" for name, value, default in options if value != default]
         return f"Unknown({', '.join([repr(self.guess), *texts])})"
@@ -85,11 +69,8 @@ class Unknown:
     @property
     def prior_text(self) -> str:
         """The prior, for tables."""
-        low, high = self.bounds
-        limits = f"{low:g} to {high:g}"
-        if math.inf in (high, -low):
-            limits = f"above {low:g}" if high == math.inf else f"below {high:g}"
-        if self._is_uniform:
+        limits = "{:g} to {:g}".format(*self.bounds)
+        if self.sd is None and self.factor is None:
             return limits
         spread = f" ± {self.sd:g}" if self.factor is None else f", factor {self.factor:g}"
         text = f"{self.guess:g}{spread}"
@@ -99,67 +80,52 @@ class Unknown:
         """Return the value at a coordinate, which is standard normal by the prior."""
         low, high = self.bounds
         below, above = self._tails
-        share = below + (above - below) * ndtr(z.clamp(-_LARGEST, _LARGEST))
-        if (below, above) != (0.0, 1.0):
-            z = ndtri(share)
+        if self._tails != (0.0, 1.0):
+            z = ndtri(below + (above - below) * ndtr(z.clamp(-_LARGEST, _LARGEST)))
         if self.sd is not None:
             value = self.guess + self.sd * z
         elif self.factor is not None:
             value = self.guess * (math.log(self.factor) * z).exp()
         else:
-            value = low + (high - low) * share
+            value = low + (high - low) * ndtr(z.clamp(-_LARGEST, _LARGEST))
         return value.clamp(low, high)  # beyond there are rounding errors
 
     def coordinate(self, value: Tensor) -> Tensor:
         """Return the coordinate at which :meth:`value` is this one."""
-        low, high = self.bounds
         below, above = self._tails
-        if self._is_uniform:
-            return ndtri((value - low) / (high - low))
-        if self.factor is not None:
-            z = (value.clamp_min(0.0) / self.guess).log() / math.log(self.factor)
-        else:
-            z = (value - self.guess) / (self.sd or 1.0)
-        return z if (below, above) == (0.0, 1.0) else ndtri((ndtr(z) - below) / (above - below))
+        z = self._without_bounds(value)
+        return z if self._tails == (0.0, 1.0) else ndtri((ndtr(z) - below) / (above - below))
 
-    @property
-    def _is_uniform(self) -> bool:
-        return self.sd is None and self.factor is None
-
-    @property
-    def _tails(self) -> tuple[float, float]:
-        """The probabilities below both bounds by the prior without bounds."""
+    def _without_bounds(self, value: Tensor) -> Tensor:
+        """Return the coordinate by the prior that bounds do not cut off."""
         low, high = self.bounds
-        if self._is_uniform:
-            return 0.0, 1.0
-        if self.factor is None:
-            prior = NormalDist(self.guess, self.sd or 1.0)
-            return prior.cdf(low), prior.cdf(high)
-        prior = NormalDist(math.log(self.guess), math.log(self.factor))
-        return prior.cdf(math.log(low)) if low > 0 else 0.0, prior.cdf(math.log(high))
+        if self.sd is not None:
+            return (value - self.guess) / self.sd
+        if self.factor is not None:
+            return (value.clamp_min(0.0) / self.guess).log() / math.log(self.factor)
+        return ndtri((value - low) / (high - low))
+
+    @cached_property
+    def _tails(self) -> tuple[float, ...]:
+        """The probabilities below both bounds by the prior that they do not cut off."""
+        z = self._without_bounds(torch.tensor(self.bounds, dtype=torch.float64))
+        # Unlike those of ndtr, tiny ones are 0: such bounds cut off nothing.
+        return tuple((0.5 * (1 + torch.erf(z / math.sqrt(2)))).tolist())
 
 
 class Unknowns(dict[str, Unknown]):
-    """The unknown parameters of a physics, by name, and their coordinates.
-
-    Raises:
-        TypeError: If they are not a mapping from names to ``Unknown``.
-        ValueError: If a name cannot be an attribute.
-    """
+    """The unknown parameters of a physics, by name, and their coordinates."""
 
     def __init__(self, unknowns: Mapping[str, Unknown]) -> None:
         is_mapping = isinstance(unknowns, Mapping)
         if not is_mapping or not all(isinstance(u, Unknown) for u in unknowns.values()):
             raise TypeError(
-                "unknowns must map names to Unknown(guess, sd=...), such as "
-                f"{{'mass': Unknown(1.0, factor=1.5)}}; found {unknowns!r}."
+                f"unknowns must map names to Unknown(guess, sd=...); found {unknowns!r}."
             )
         for name in unknowns:
-            if not _can_be_attribute(name):
-                raise ValueError(
-                    "Unknown parameters have names such as 'mass', that can be attributes; found "
-                    f"{name!r}."
-                )
+            is_word = isinstance(name, str) and name.isidentifier() and not iskeyword(name)
+            if not is_word or name.startswith("_") or name == "rows" or hasattr(dict, name):
+                raise ValueError(f"Expected a name that can be an attribute, found {name!r}.")
         super().__init__(unknowns)
 
     @property
@@ -176,8 +142,3 @@ class Unknowns(dict[str, Unknown]):
         """Return the coordinates ``... x p`` of values ``... x p``."""
         pairs = zip(self.values(), values.unbind(-1), strict=True)
         return torch.stack([u.coordinate(value) for u, value in pairs], dim=-1)
-
-
-def _can_be_attribute(name: Any) -> bool:
-    is_word = isinstance(name, str) and name.isidentifier() and not iskeyword(name)
-    return is_word and not name.startswith("_") and name != "rows" and not hasattr(dict, name)

@@ -26,7 +26,7 @@ class Fault(NamedTuple):
 
 FAULTS = (
     Fault(
-        "gpadjust/physics/base.py",
+        "gpadjust/physics/black_box.py",
         "i // d % n for i in error.rows",
         "i // d for i in error.rows",
         "A failure on the lower side of a difference blames a row that is not there.",

@@ -48,19 +48,22 @@ WRONG = {
     "": "Expected a formula such as",
     "a ** (": "never closed",
     "a^2": "'a \\^ 2' is not a part of a formula.*\\^ is not a power",
-    "sinn(a)": r"'sinn\(a\)' is not a part of a formula.*functions sin of 1",
-    "max(a)": r"'max\(a\)' is not a part of a formula.*max of 2",
+    "sinn(a)": r"'sinn\(a\)' is not a part of a formula.*functions sin, ",
+    "max(a)": r"missing 1 required.*such as max\(a, b\)",
+    "where(a, b)": "missing 1 required",
+    "sin(a, b)": "takes 1 positional",
+    "()": r"'\(\)' is not a part",
     "a < b < 2": "'a < b < 2' is not a part of a formula.*comparisons of two values",
     "a == b": "'a == b' is not a part",
     "c * a": "has 'c'; expected one of its names: a, b",
     "True": "'True' is not a part",
     "'a'": "is not a part",
     "2j": "'2j' is not a part",
-    "1e999": "inf is too large",
-    "(" * 300 + "a" + ")" * 300: "too many nested|nested too deeply",
+    "1" + "0" * 400: "too large",
+    "(" * 300 + "a" + ")" * 300: "too many nested",
     "a + " * 900 + "a": "more than 2000 characters",
-    "a+" * 900 + "a": "nested too deeply",
-    "-" * 900 + "a": "nested too deeply",
+    "a+" * 900 + "a": "recursion depth",
+    "-" * 900 + "a": "recursion depth",
     "\ud800": "Expected a formula such as",
 }
 
@@ -89,18 +92,18 @@ def test_names_and_columns():
     names = ["air flow [m3/h]", "E", "2nd", "dT/dt", "lambda [W/mK]", "\u00b5"]
     assert [*map(symbol, names)] == ["air_flow", "E", "_2nd", "dT_dt", "lambda_", "\u03bc"]
     assert FormulaPhysics("\u00b5", ["\u00b5 [m]"])(X[:, :1])[0] == 1
-    refused(ValueError, "and none 'pi'", FormulaPhysics, "pi", ["pi"])
-    refused(ValueError, "found 'a' more than once", FormulaPhysics, "a", ["a", "a [m]"])
-    with pytest.raises(ValueError, match="found 'a' more than once"):
+    refused(ValueError, r"different names.*found \['pi', 'pi'\]", FormulaPhysics, "pi", ["pi"])
+    refused(ValueError, r"found \['a', 'a', 'pi'\]", FormulaPhysics, "a", ["a", "a [m]"])
+    with pytest.raises(ValueError, match=r"found \['a', 'a', 'pi'\]"):
         FormulaPhysics("a", ["a"], unknowns={"a": Unknown(1.0, sd=1.0)})
-    refused(TypeError, "as a text", FormulaPhysics, torch.sin, ["a"])
+    refused(TypeError, "must be a text", FormulaPhysics, torch.sin, ["a"])
     data = pd.DataFrame(X.numpy(), columns=["b [m]", "a"])
     formula = FormulaPhysics("a * b", ["a", "b"])
     for physics in (formula, [formula, torch.sin]):
         with pytest.raises(ValueError, match="has the columns a, b, and the data have b, a"):
             CKA(data, X[:, :1], physics=physics)
     CKA(data[["a", "b [m]"]], X[:, :1], physics=formula)
-    refused(PhysicsError, "has 2 columns, a, b, and X has 1", formula, X[:, :1])
+    refused(PhysicsError, r"has columns \('a', 'b'\), and X has 1", formula, X[:, :1])
 
 
 def test_a_formula_can_be_made_of_its_text_and_is_saved(tmp_path):

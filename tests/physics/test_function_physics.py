@@ -33,9 +33,7 @@ def test_numpy_results_and_other_errors(grad, points):
     refused(PhysicsError, r"RuntimeError: .*mat1", physics, X)
     if grad:
         physics = FunctionPhysics(lambda X: torch.from_numpy(np.sin(X.numpy())))
-        with pytest.raises(PhysicsError, match=r"NumPy.*BlackBoxPhysics\(") as caught:
-            physics(X)
-        assert "Can't call numpy()" in str(caught.value.__cause__)
+        refused(PhysicsError, r"RuntimeError: Can't call numpy\(\)", physics, X)
 
 
 def test_missing_gradient_warns_once(points):
@@ -61,7 +59,7 @@ def test_as_physics(points):
         (3.0, "a float"),
         ([torch.sin], "a list"),
         (None, "a NoneType"),
-        (torch.nn.Tanh, "the class Tanh"),
+        (torch.nn.Tanh, "a type, <class.*Tanh"),
     ):
         says = f"found {found}.*torch function.*ODEPhysics.*BlackBoxPhysics"
         refused(TypeError, says, as_physics, thing)

@@ -82,12 +82,12 @@ def test_what_has_no_name(plant):
 
 def test_wrong_path(plant):
     for path, says in (
-        ("plant", "expected 'package.module:qualname'"),
-        (":double", "expected 'package.module:qualname'"),
+        ("plant", "Expected 'package.module:qualname'"),
+        (":double", "Expected 'package.module:qualname'"),
         ("nowhere.at.all:f", r"cannot be imported \(ModuleNotFoundError: No module"),
         (".plant:f", r"cannot be imported \(TypeError"),
         ("plant:absent", r"cannot be imported \(AttributeError: .*absent"),
-        ("plant:number", "does not name a physics: .*found a int"),
-        ("plant:Drag", "does not name a physics: .*the class Drag"),
+        ("plant:number", "found a int"),
+        ("plant:Drag", "<class 'plant.Drag"),
     ):
         refused(ValueError, says, physics_from_path, path)

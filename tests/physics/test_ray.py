@@ -24,7 +24,7 @@ def test_rows_run_on_both_nodes_of_a_cluster():
         ray_node = ray.get_runtime_context().get_node_id()
         return [x[0] ** 2, float(int(ray_node[:8], 16))]
 
-    physics = BlackBoxPhysics(simulator, batched=False, memo=0)
+    physics = BlackBoxPhysics(simulator, batched=False)
     ray.shutdown()  # of what another test of the process has opened
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
     try:
