@@ -14,10 +14,11 @@ FACTORIES = {
 # Functions that may make tensors on the CPU, by why.
 ALLOWED = {
     "numbers of rows or draws, which index tensors of any device": {
+        "core/fitting.py _parts",
         "core/fitting.py _pooled",
-        "core/fitting.py _starts",
         "core/fitting.py modes",
         "core/functions.py __init__",
+        "core/model.py log_likelihood",
         "core/saving.py _built_with",
         "core/saving.py _content",
         "core/stacked.py __init__",
@@ -27,7 +28,7 @@ ALLOWED = {
         "kinds/categories.py __init__",
         "kinds/pyro_model.py pyro_model",
         "kinds/updates.py __init__",
-        "kinds/updates.py update",
+        "kinds/updates.py _updated",
         "many/rest.py rest_of",
         "many/variational_cka.py fit_itself",
         "physics/base.py forward",
@@ -44,6 +45,7 @@ ALLOWED = {
         "kinds/vanishing.py __init__",
         "physics/formula.py parse",
         "physics/parameters.py __init__",
+        "physics/unknown.py _tails",
         "physics/unknown.py guess",
     },
 }

@@ -156,7 +156,7 @@ def test_the_log_of_a_pendulum_tells_its_parameters(tmp_path, monkeypatch, capsy
         exec(block, names)
     assert "inertia" in capsys.readouterr().out
     found = names["dynamics"].model.physics_parameters.mean
-    torch.testing.assert_close(found, names["truth"], rtol=1e-3, atol=0)
+    torch.testing.assert_close(found, names["truth"], rtol=1e-5, atol=0)
     error = names["run"].mean - names["windows"].measured
     assert error.abs().max() < 1e-2
     exec(hidden, names)

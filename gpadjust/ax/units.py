@@ -161,7 +161,11 @@ class PhysicsInUnits(Physics):
             PhysicsError: If the physics fails, or has several outputs.
         """
         raw = self.units.raw(X, self.reads)
-        Y = self.inner.of_rows(self.inner.read_rows(raw, *parameters))
+        try:
+            Y = self.inner.of_rows(self.inner.read_rows(raw, *parameters))
+        except PhysicsError as error:
+            error.partial = None  # it is in other units
+            raise
         if Y.shape[-1] != 1:
             raise PhysicsError(
                 f"The physics {self.name!r} returned {Y.shape[-1]} columns for the metric "

@@ -16,7 +16,6 @@ from gpadjust.core.noise import Noise
 from gpadjust.core.sample import (
     GROUPS,
     Draws,
-    LogLikelihood,
     Normal,
     around_mode,
     maximise,
@@ -175,15 +174,6 @@ def _default_numbers(model: GP) -> tuple[int, int]:
     return 64 if is_shared else 16, 4
 
 
-def _target(model: GP, choice: int) -> LogLikelihood:
-    """Return the log likelihood of a nested model."""
-
-    def log_likelihood(u: Tensor, with_gradient: bool = True) -> tuple[Tensor, Tensor]:
-        return model.log_likelihood(model.table.with_choice(u, choice), with_gradient)
-
-    return log_likelihood
-
-
 def _sampled(model: GP, number: int, seed: int) -> dict[int, Draws]:
     """Return draws of each nested model that is likely enough.
 
@@ -197,7 +187,16 @@ def _sampled(model: GP, number: int, seed: int) -> dict[int, Draws]:
     floor = None
     for k, start in starts.items():
         first, like = 16 if start is None else 4, model.u.detach()[0]
-        draws = sample(_target(model, k), like, number, seed, start, first, n <= _MEDIUM, floor)
+        draws = sample(
+            partial(model.log_likelihood, choice=k),
+            like,
+            number,
+            seed,
+            start,
+            first,
+            n <= _MEDIUM,
+            floor,
+        )
         if draws is None:
             continue
         sampled[k] = draws._replace(u=model.table.with_choice(draws.u, k))
@@ -223,9 +222,13 @@ def _starts(model: GP, seed: int) -> dict[int, Normal]:
             ends[k] = (
                 modes(part, k, seed, is_precise)
                 if is_first
-                else _sorted(part, k, maximise(_target(part, k), ends[k], is_precise))
+                else _sorted(
+                    part, k, maximise(partial(part.log_likelihood, choice=k), ends[k], is_precise)
+                )
             )
-        starts = {k: around_mode(_target(part, k), ends[k][0]) for k in likely}
+        starts = {
+            k: around_mode(partial(part.log_likelihood, choice=k), ends[k][0]) for k in likely
+        }
         likely = _likely(model, {k: evidence for k, (_, evidence) in starts.items()})
     return {k: starts[k][0] for k in likely}
 
@@ -252,7 +255,7 @@ def modes(model: GP, choice: int, seed: int, is_precise: bool = False) -> Tensor
     u = standard_normal((number, *like.shape), generator, like)
     searches = _SEARCHES if choice == 0 else _SEARCHES // 2
     begins = torch.cat([_sorted(model, choice, u)[: searches - 1], torch.zeros_like(u[:1])])
-    ends = maximise(_target(model, choice), begins, is_precise)
+    ends = maximise(partial(model.log_likelihood, choice=choice), begins, is_precise)
     ends = _sorted(model, choice, ends)
     density = _log_density(model, choice, ends)
     is_near = (ends - ends[0]).abs().amax(-1) < _NEAR
@@ -270,7 +273,7 @@ def _sorted(model: GP, choice: int, u: Tensor) -> Tensor:
 
 def _log_density(model: GP, choice: int, u: Tensor) -> Tensor:
     """Return the log posterior density of a nested model but for a constant, ``N x B``."""
-    density = _target(model, choice)(u, False)[0] - 0.5 * u.square().sum(-1)
+    density = partial(model.log_likelihood, choice=choice)(u, False)[0] - 0.5 * u.square().sum(-1)
     return density.nan_to_num(nan=-math.inf)
 
 

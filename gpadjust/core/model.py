@@ -290,12 +290,15 @@ class GP(gpytorch.models.GP, Predictive):
         self._cached = None
 
     @torch.no_grad()
-    def log_likelihood(self, u: Tensor, with_gradient: bool = True) -> tuple[Tensor, Tensor]:
+    def log_likelihood(
+        self, u: Tensor, with_gradient: bool = True, *, choice: int | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Return the log likelihood of the targets at coordinates ``S x B x P``, and its gradient.
 
-        It is in units of the targets, minus infinity where it or f_p is not finite. The gradient is
-        zero if it is not asked for.
+        It is in units of the targets, minus infinity where it or f_p is not finite; a choice is the
+        number of a nested model. The gradient is zero if it is not asked for.
         """
+        u = u if choice is None else self.table.with_choice(u, choice)
         f: list[Tensor] = []
         slopes: Slopes = {}
         if self._unknowns:  # f_p is asked once, at all draws

@@ -166,8 +166,9 @@ class Physics(torch.nn.Module, ABC):
             raise
         except Exception as error:
             raise PhysicsError(
-                f"Physics {self.name!r} raised {described(error)}. The call was for {n} row(s), "
-                f"with unknowns={[*self.unknowns]}:",
+                f"Physics {self.name!r} raised {described(error)}. NumPy code is "
+                f"BlackBoxPhysics(function). The call was for {n} row(s), with "
+                f"unknowns={[*self.unknowns]}:",
                 range(n),
             ) from error
         Y = self._shaped(Y, rows)
