@@ -9,6 +9,7 @@ from botorch.sampling.pathwise import SamplePath
 from torch import Size, Tensor
 
 from gpadjust.checks import checked_whole
+from gpadjust.core.kernels import Features
 from gpadjust.core.terms import WeightedSum
 from gpadjust.core.unknowns import standard_normal
 
@@ -40,18 +41,13 @@ class Functions(torch.nn.Module):
         self.number = number
         self.data = self.model.conditioning()
         f, shape = self.data.train, (number, model.num_outputs)
-        self.features: dict[str, Any] = {}
-        self.weights: dict[str, Tensor] = {}
+        self.features: dict[str, Features] = {}
         for term in f.terms:
             if term.kernel is not None:
                 own = {n: v.expand(number, *v.shape[1:]) for n, v in f.own(term).items()}
-                features = term.kernel.features(own, num_features, generator)
-                size = features(f.x).shape[-1]
-                self.features[term.name] = features
-                self.weights[term.name] = standard_normal((*shape, size), generator, f.x)
-            if term.constant is not None:
-                weight = standard_normal((*shape, 1), generator, f.x)
-                self.weights[f"{term.name}.constant"] = weight
+                self.features[term.name] = term.kernel.features(own, num_features, generator)
+        size = f.features(self.features).shape[-1]
+        self.weights = standard_normal((*shape, size), generator, f.x)
         self.update = self.data.update(self._prior(f), generator)
 
     def forward(self, X: Tensor) -> Tensor:
@@ -78,20 +74,7 @@ class Functions(torch.nn.Module):
 
     def _prior(self, f: WeightedSum) -> Tensor:
         """Return the functions from the prior, ``... x k x m x q``."""
-        total = f.mean
-        for term in f.terms:
-            if term.name not in f.weights:
-                continue
-            value: Tensor | float = 0.0
-            if term.name in self.features:
-                phi = self.features[term.name](f.x)
-                value = (phi @ self.weights[term.name].unsqueeze(-1)).squeeze(-1)
-                value = value * f.values.get(f"{term.name}.process", 1.0)
-            if term.constant is not None:
-                sd = f.values[f"{term.name}.constant"].sqrt()
-                value = value + sd * self.weights[f"{term.name}.constant"]
-            total = total + f.weights[term.name] * value
-        return total
+        return f.mean + (f.features(self.features) @ self.weights.unsqueeze(-1)).squeeze(-1)
 
 
 class Paths(SamplePath):

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from gpadjust.core.kernels import Kernel, PullBack
+from gpadjust.core.kernels import Features, Kernel, PullBack
 from gpadjust.core.unknowns import LogNormal, Row, Values
 
 
@@ -63,7 +63,7 @@ class WeightedSum:
     values: Values
     x: Tensor
     mean: Tensor  # ... x S x m x n
-    weights: dict[str, Tensor | Any]  # tensors w_t, shaped as the mean, of the terms in the sum
+    weights: dict[str, Tensor]  # tensors w_t, shaped as the mean, of the terms in the sum
 
     def of_rows(self, rows: slice | Tensor) -> WeightedSum:
         """Return the sum at some of its places."""
@@ -136,6 +136,24 @@ class WeightedSum:
             return by
 
         return total, pull_back
+
+    def features(self, of_kernels: Mapping[str, Features]) -> Tensor:
+        r"""Return features ``... x S x m x n x p`` of the sum, for weights N(0, I).
+
+        .. math:: \left( w_t \varphi_t(x), \; w_t \sqrt{\kappa_t} \right)_t
+
+        Args:
+            of_kernels: :math:`\varphi_t` by the names of the terms.
+        """
+        parts = []
+        for term in self.terms:
+            w = self.weights.get(term.name, torch.zeros_like(self.mean)).unsqueeze(-1)
+            if term.kernel is not None:
+                parts.append(self._process(term, of_kernels[term.name](self.x)) * w)
+            if term.constant is not None:
+                parts.append(self._constant(term).sqrt().unsqueeze(-1) * w)
+        lead = torch.broadcast_shapes(*(each.shape[:-1] for each in parts))
+        return torch.cat([each.expand(*lead, each.shape[-1]) for each in parts], -1)
 
     def _parts(self) -> list[tuple[Term, Tensor]]:
         """Return the terms that vary and have a weight, without processes that no draw contains."""

@@ -247,7 +247,7 @@ def _of_waves(conditioning: Conditioning) -> tuple[Tensor, Tensor]:
             constant = f.values[f"{term.name}.constant"].sqrt().unsqueeze(-1)
             waves.append(constant.expand(*angle.shape[:-1], 1))
         phi = torch.cat(waves, -1)
-        columns.append(phi if weight is None else phi * weight.unsqueeze(-1))
+        columns.append(phi * weight.unsqueeze(-1))
     phi = torch.cat(columns, -1)
     # What the factor has beside the terms is noise, with its nugget.
     noise = conditioning.chol.square().sum(-1) - f.variance()

@@ -237,19 +237,11 @@ class Weights:
 
 
 def design(f: WeightedSum) -> Tensor:
-    """Return the features of a sum, ``... x S x m x n x p``, for weights N(0, I)."""
-    parts, one = [], torch.ones_like(f.x[..., :1])
-    for term in f.terms:
-        w = f.weights.get(term.name, torch.zeros_like(one[..., 0]))
-        b = one if w is None else w.unsqueeze(-1)
-        if term.kernel is not None:
-            generator = torch.Generator()  # not used: the features are the kernel's own
-            process = f.values.get(f"{term.name}.process", one[..., 0]).unsqueeze(-1)
-            parts.append(term.kernel.features(f.own(term), 0, generator)(f.x) * process * b)
-        if term.constant is not None:
-            parts.append(f.values[f"{term.name}.constant"].sqrt().unsqueeze(-1) * b)
-    lead = torch.broadcast_shapes(*(each.shape[:-1] for each in parts))
-    return torch.cat([each.expand(*lead, each.shape[-1]) for each in parts], -1)
+    """Return the kernels' own features of a sum, ``... x S x m x n x p``, for weights N(0, I)."""
+    generator = torch.Generator()  # not used, as these are not random
+    kernels = {term.name: term.kernel for term in f.terms if term.kernel is not None}
+    own = {term.name: f.own(term) for term in f.terms}
+    return f.features({n: k.features(own[n], 0, generator) for n, k in kernels.items()})
 
 
 def _of_rows(model: GP, rows: Tensor) -> GP:

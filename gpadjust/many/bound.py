@@ -23,7 +23,7 @@ def at_points(total: WeightedSum, points: Tensor) -> WeightedSum:
     def of_points(v: Tensor) -> Tensor:
         return v.expand(*v.shape[:-2], m, v.shape[-1])[..., outputs, points]
 
-    weights = {n: None if w is None else of_points(w) for n, w in total.weights.items()}
+    weights = {n: of_points(w) for n, w in total.weights.items()}
     x = total.x.expand(*total.x.shape[:-3], m, *total.x.shape[-2:])[..., outputs, points, :]
     return WeightedSum(total.terms, total.values, x, of_points(total.mean), weights)
 
@@ -101,11 +101,8 @@ def bound(
         with_gradient: Whether the derivatives are asked for.
     """
     values = {name: v.detach().clone().requires_grad_() for name, v in total.values.items()}
-    weights = {
-        n: w if w is None else w.detach().expand(residual.shape).clone()
-        for n, w in total.weights.items()
-    }
-    leaves = {f"{n}.weight": w.requires_grad_() for n, w in weights.items() if w is not None}
+    weights = {n: w.detach().expand(residual.shape).clone() for n, w in total.weights.items()}
+    leaves = {f"{n}.weight": w.requires_grad_() for n, w in weights.items()}
     own = WeightedSum(total.terms, values, total.x, total.mean.detach(), weights)
     with torch.enable_grad():
         rest_variance = WeightedSum(rest.terms, values, rest.x, rest.mean, rest.weights).variance()

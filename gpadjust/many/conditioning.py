@@ -175,14 +175,7 @@ class LaterConditioning(Conditioning):
 
 def joined(old: WeightedSum, late: WeightedSum) -> WeightedSum:
     """Return a sum at the places of two; terms that the old one has not have no weight there."""
-
-    def weight(total: WeightedSum, name: str) -> Tensor:
-        one = torch.ones_like(total.mean)
-        w = total.weights.get(name, torch.zeros_like(one))
-        return one if w is None else w
-
-    weights: dict[str, Tensor | None] = {
-        name: appended(weight(old, name), weight(late, name), -1) for name in late.weights
-    }
+    none = torch.zeros_like(old.mean)
+    weights = {n: appended(old.weights.get(n, none), w, -1) for n, w in late.weights.items()}
     x, mean = appended(old.x, late.x), appended(old.mean, late.mean, -1)
     return WeightedSum(late.terms, late.values, x, mean, weights)
