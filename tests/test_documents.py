@@ -136,6 +136,15 @@ def test_the_tools_come_with_the_extra_dev_and_are_pinned():
             ), package
 
 
+def test_tox_asks_for_the_lowest_versions_and_tests_that_there_are():
+    tox = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["tox"]["env_run_base"]
+    lists = (PROJECT["dependencies"], *PROJECT["optional-dependencies"].values())
+    assert {*tox["deps"]} <= {requirement for each in lists for requirement in each}
+    folders = [part for part in tox["commands"][0] if part.startswith("tests/")]
+    assert folders
+    assert [folder for folder in folders if not (ROOT / folder).is_dir()] == []
+
+
 def test_one_version():
     cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert cited["version"] == gpadjust.__version__

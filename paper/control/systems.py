@@ -289,7 +289,7 @@ def _reacher_env(**options: Any) -> gym.Env[Any, Any]:
     try:
         env = gym.make("Reacher-v5", reward_control_weight=_EFFORT, **options)
     except gym.error.DependencyNotInstalled as error:
-        raise ImportError("The reacher needs MuJoCo: pip install 'mujoco<4' imageio.") from error
+        raise ImportError("The reacher needs MuJoCo: pip install mujoco imageio.") from error
     return ReacherStates(env)
 
 

@@ -1,12 +1,25 @@
 """Draws, evidence and probabilities against numerical integrals, and what a fit promises."""
 
+import math
 import warnings
 
 import pytest
 import torch
 from botorch.sampling import SobolQMCNormalSampler
 
-from gpadjust.core import CKA, GP, Choice, LogNormal, Term, ZeroMeanGP, fit
+from gpadjust.core import (
+    CKA,
+    GP,
+    Choice,
+    LogNormal,
+    PhysicsMeanGP,
+    SamplingWarning,
+    Term,
+    ZeroMeanGP,
+    fit,
+)
+from gpadjust.core.sample import around_mode
+from gpadjust.physics import FunctionPhysics, Unknown
 
 
 def wave(X):
@@ -86,6 +99,54 @@ def test_fitted_twice_is_fitted_once(n):
     assert torch.equal(once.mean, twice.mean)
     assert torch.equal(once.variance, twice.variance)
     assert torch.equal(first.log_evidence, second.log_evidence)
+
+
+def test_the_approximation_of_a_normal_posterior_is_exact():
+    """But for its width, half as much again; a number that data say nothing of keeps its prior."""
+    a, b = torch.tensor([[[4.0, 0.0]], [[0.7, 1.5]]], dtype=torch.float64)
+
+    def log_likelihood(u, with_gradient=True):
+        return -0.5 * (a * (u - b).square()).sum(-1), -a * (u - b)
+
+    found, log_evidence = around_mode(log_likelihood, a * b / (1 + a))
+    expected = 1.5**2 * torch.diag_embed(1 / (1 + a))
+    torch.testing.assert_close(found.root @ found.root.mT, expected)
+    exact = -0.5 * (a * b.square() / (1 + a) + (1 + a).log()).sum(-1)
+    torch.testing.assert_close(log_evidence, exact)
+
+
+def test_the_error_is_how_far_seeds_are_apart():
+    X, e = noisy(8)
+    model, means, variances, errors = ZeroMeanGP(X, wave(X) + e), [], [], []
+    for seed in range(20):
+        with warnings.catch_warnings(action="ignore", category=SamplingWarning):
+            errors.append(fit(model, num_draws=16, seed=seed).error)
+        mean, variance = model.left_out()
+        means.append(mean.mean(0))
+        variances.append(variance.mean(0) + mean.var(0, correction=0))
+    moved = torch.stack(means).var(0) / torch.stack(variances).mean(0)
+    error = torch.tensor(errors).square().mean().sqrt().item()
+    assert 0.5 < error / moved.mean().sqrt().item() < 2
+
+
+def test_evidence_of_targets_in_another_unit():
+    """Of outputs that share an unknown number it is one, in the unit of each that is there."""
+    X, e = noisy(6)
+    Y = torch.cat([1.2 * wave(X) + e, 2.4 * wave(X) - e], 1)
+    Y[2, 1] = torch.nan
+    found = []
+    for size in (1.0, 1024.0):  # without rounding
+        physics = FunctionPhysics(
+            lambda X, p, size=size: (
+                size * p.a.unsqueeze(-1) * torch.cat([wave(X), 2 * wave(X)], -1)
+            ),
+            unknowns={"a": Unknown(1.0, sd=0.5)},
+        )
+        model = PhysicsMeanGP(X, size * Y, physics=physics)
+        with warnings.catch_warnings(action="ignore", category=SamplingWarning):
+            found.append(fit(model, num_draws=16).log_evidence)
+    assert found[0].shape == (1,)
+    assert (found[0] - found[1]).item() == pytest.approx(11 * math.log(1024.0), abs=1e-6)
 
 
 def test_the_generator_is_left_alone():

@@ -131,6 +131,8 @@ def test_outputs_by_number(model_of, uniform, close):
         left_out = zip(subset.left_out(), model.left_out(), strict=True)
         for own, expected in left_out:
             close(own, expected[..., outputs])
+        first = subset.subset_output([0])  # of a part
+        close(first.predict(Z).mean, whole.mean[:, outputs[:1]])
         u = subset.u.detach()
         close(subset.log_likelihood(u)[0], model.log_likelihood(model.u)[0][:, outputs])
     for wrong in ([], [2], [0.5]):
