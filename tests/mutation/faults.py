@@ -158,9 +158,9 @@ FAULTS = (
         "Joint covariances forget that the means of the draws differ.",
     ),
     Fault(
-        "gpadjust/core/functions.py",
-        'value = value * f.values.get(f"{term.name}.process", 1.0)',
-        "value = value * 1.0",
+        "gpadjust/core/terms.py",
+        "parts.append(self._process(term, of_kernels[term.name](self.x)) * w)",
+        "parts.append(of_kernels[term.name](self.x) * w)",
         "Sampled functions vary in draws of nested models without the process.",
     ),
     Fault(
