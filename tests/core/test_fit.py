@@ -115,6 +115,24 @@ def test_the_approximation_of_a_normal_posterior_is_exact():
     torch.testing.assert_close(log_evidence, exact)
 
 
+def test_the_approximation_of_a_narrow_bend():
+    """Its range along the bend is not that of chords across it: r = (s + d^2, d), s and d apart."""
+    narrow, wide = 1e-4, 1e-1
+
+    def log_likelihood(u, with_gradient=True):
+        s, d = u.sum(-1), u[..., 0] - u[..., 1]
+        by_s, by_d = (s + d.square()) / narrow**2, d / wide**2
+        by_d = by_d + 2 * d * by_s
+        slope = -torch.stack([by_s + by_d, by_s - by_d], -1)
+        return -0.5 * ((s + d.square()) / narrow).square() - 0.5 * (d / wide).square(), slope
+
+    found, _ = around_mode(log_likelihood, torch.zeros(1, 2).double())
+    s, d = torch.tensor([[1.0, 1.0], [1.0, -1.0]]).double()
+    hessian = torch.eye(2) + torch.outer(s, s) / narrow**2 + torch.outer(d, d) / wide**2
+    covariance = found.root[0] @ found.root[0].mT
+    torch.testing.assert_close(covariance, 1.2**2 * hessian.inverse(), rtol=1e-3, atol=0)
+
+
 def test_the_error_is_how_far_seeds_are_apart():
     X, e = noisy(8)
     model, means, variances, errors = ZeroMeanGP(X, wave(X) + e), [], [], []
