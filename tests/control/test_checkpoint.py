@@ -414,6 +414,7 @@ def test_what_was_resumed_is_saved_again_as_it_was(make_agent, again, tmp_path):
     given = again()
     scramble()
     resume(first, *given).save(second)
-    given = again()
-    assert_equal(numbers(resume(second, *given).learn(5)), expected)
+    resumed = resume(second, *again())
+    scramble()
+    assert_equal(numbers(resumed.learn(5)), expected)
     assert expected["counts"][-1] == {"costs": [1.0]}

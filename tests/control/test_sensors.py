@@ -134,6 +134,21 @@ def test_angles_go_the_shortest_way():
     assert abs(abs(found.mean[0]) - torch.pi) < 1e-9
 
 
+def test_an_episode_may_begin_beyond_half_a_turn():
+    """All is as it is where angles begin at zero, as nothing depends on where that is."""
+    spec, found = StateSpec(["x", "v"], ["force"], angles=["x"]), []
+    task = task_of(Sensors(["x"]), spec=spec)
+    for zero in (0.0, 3.1):
+        first = Estimate(torch.tensor([zero, 0.0]).double(), 0.1 * torch.eye(2).double())
+        known = StateFilter(first, torch.tensor([0.03]).double(), torch.tensor([0, 0.01]).double())
+        rest = torch.tensor([[zero + 0.1, 0.0]]).double().expand(6, 2)
+        seen = Seen(spec.observe(rest)[:, :2], torch.zeros(5, 1).double())
+        learnt, paths = smooth_episodes(task, known, [seen] * 3, seed=0)
+        off = spec.change(rest.repeat(3, 1), torch.cat(paths))
+        found.append((learnt.noise, learnt.process_noise, off))
+    torch.testing.assert_close(*found, rtol=1e-6, atol=1e-8)
+
+
 def test_noises_and_hidden_states_are_found():
     task, rng = task_of(Sensors(["x"])), np.random.default_rng(0)
     known = StateFilter.guessed(task, torch.tensor([[-1.0], [1.0]]).double())

@@ -31,7 +31,7 @@ def agrees(model, found, expected):
     torch.testing.assert_close(variance, expected[1], rtol=1e-10, atol=1e-10 * prior)
 
 
-QUICK = ("CKA", "CKA, nested", "CKA, missing", "RRA")
+QUICK = ("CKA", "CKA, nested", "CKA, missing", "CKA, scaled inputs", "RRA")
 CASES = [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in MODELS]
 
 

@@ -11,7 +11,14 @@ from gpadjust.dynamics import StateSpec
 from gpadjust.physics import FunctionPhysics, ODEPhysics, PhysicsError, Unknown
 from gpadjust.records import Record, Records, SmoothingWarning, smooth
 from gpadjust.records.chain import Chain, Known
-from gpadjust.records.kalman import Link, Moments, Smoothed, draw_paths, smooth_chain
+from gpadjust.records.kalman import (
+    Link,
+    Moments,
+    Smoothed,
+    draw_paths,
+    expected_squares,
+    smooth_chain,
+)
 from gpadjust.records.record import in_control_steps
 
 STEP, LENGTH = 0.1, 150
@@ -120,6 +127,22 @@ def test_the_smoother_is_the_conditional_distribution_of_all_states(chain):
                 before = covariance[own, row - 3 : row]
                 np.testing.assert_allclose(crossed[t - 1], before, atol=1e-8)
             row += 3
+    path = np.concatenate(draw_paths(found, 1, np.random.default_rng(0)))
+    assert np.ptp(path[:, 2]) == 0
+
+
+def test_what_steps_add_is_expected_over_all_states(chain):
+    mean, covariance, _ = dense(*chain)
+    links, expected, row = chain[0], [], 0
+    for link in links:
+        for matrix, offset in zip(link.matrices, link.offsets, strict=True):
+            both, step = slice(row, row + 6), np.hstack([-matrix, np.eye(3)])[:2]
+            added = step @ mean[both] - offset[:2]
+            expected.append(added**2 + np.diag(step @ covariance[both, both] @ step.T))
+            row += 3
+        row += 3
+    _, found = expected_squares(links, smooth_chain(*chain)[0], 2)
+    np.testing.assert_allclose(found, expected, atol=1e-8)
 
 
 @pytest.mark.slow
