@@ -86,7 +86,7 @@ def test_the_core_brings_no_more_than_botorch():
 
 
 NEEDED = {
-    "torchdiffeq": ("ode", lambda: gpadjust.ODEPhysics(lambda s, a: -s, step=0.1, state_dim=1)),
+    "torchdiffeq": ("ode", lambda: gpadjust.ODEPhysics(lambda s, a: -s, 0.1, 1, method="dopri5")),
     "pyro": ("pyro", lambda: pyro_model(RRA(line(5), line(5), physics=torch.sin))),
 }
 

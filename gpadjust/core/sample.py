@@ -23,7 +23,7 @@ GROUPS = 2  # of draws that are resampled apart, so that their difference shows 
 _LEAPS, _ACCEPTED, _LAST_MOVES, _MOVES, _FAR = 3, 0.8, 4, 3, 60.0
 _SEARCHES, _GAIN = 3, 0.01  # of searches, and of log density, below which there are no more
 _SHARE = 0.5  # of draws that count after each step of the power
-_WIDER = 1.2  # than Laplace's approximation
+_WIDER = 1.5  # than Laplace's approximation
 _STEP, _PASSES = 0.1, 3  # of differences, in coordinates; passes, each with steps by the last
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -17,7 +17,12 @@ from gpadjust.physics.formula import FormulaPhysics
 from gpadjust.physics.parameters import ParameterValues
 from gpadjust.physics.unknown import Unknown
 
-FIXED_STEP = ("euler", "midpoint", "heun2", "heun3", "rk4", "explicit_adams", "implicit_adams")
+# Runge-Kutta methods of a fixed step: the weights of slopes in each further stage, and in the step.
+FIXED_STEP: dict[str, tuple[tuple[float, ...], ...]] = {
+    "euler": ((1.0,),),
+    "midpoint": ((0.5,), (0.0, 1.0)),
+    "rk4": ((1 / 3,), (-1 / 3, 1.0), (1.0, -1.0, 1.0), (0.125, 0.375, 0.375, 0.125)),
+}
 ADAPTIVE_STEP = ("dopri5", "dopri8", "bosh3", "fehlberg2", "adaptive_heun")
 _MOST_STEPS = 10_000  # of an adaptive method
 
@@ -29,7 +34,7 @@ class ODEPhysics(Physics):
 
     .. math:: f_p(s, a) = s(h), \qquad \dot{s}(t) = g(s(t), a), \quad s(0) = s,
 
-    or :math:`s(h) - s` with ``difference=True``. It needs ``pip install "gpadjust[ode]"``.
+    or :math:`s(h) - s` with ``difference=True``.
 
     Args:
         rhs: The time derivative :math:`g`, a function of state ``N x state_dim``, action ``N x a``
@@ -38,9 +43,11 @@ class ODEPhysics(Physics):
         step: The duration of the step, in the time unit of ``rhs``.
         state_dim: The number of leading columns that contain the state; the action follows.
         substeps: Integration steps within the step, for the fixed-step methods.
-        method: A method of ``torchdiffeq.odeint``. The adaptive ones control one step size for all
-            rows of a batch, on which a row's result then depends within their tolerances. They fail
-            if ``rhs`` is stiff, for all rows: use ``"rk4"`` with many substeps.
+        method: ``"euler"``, ``"midpoint"`` or ``"rk4"`` (Kutta's 3/8 rule), of fixed steps, or an
+            adaptive one of ``torchdiffeq.odeint`` (``pip install "gpadjust[ode]"``), such as
+            ``"dopri5"``. These control one step size for all rows of a batch, on which a row's
+            result then depends within their tolerances. They fail if ``rhs`` is stiff, for all
+            rows: use ``"rk4"`` with many substeps.
         difference: Whether the output is the change of the state instead of the new state.
         gradient: Source of the gradient in X: ``"autograd"``, or ``"finite-difference"``, without
             second derivatives, which is several times faster if there are many substeps.
@@ -66,12 +73,15 @@ class ODEPhysics(Physics):
         inputs: Sequence[int] | None = None,
         name: str | None = None,
     ) -> None:
-        if find_spec("torchdiffeq") is None:
-            raise ImportError('ODEPhysics needs torchdiffeq; run `pip install "gpadjust[ode]"`.')
         if isinstance(rhs, FormulaPhysics):
             unknowns, name = rhs.unknowns, name or rhs.name
         super().__init__(unknowns=unknowns, inputs=inputs, name=name_of(rhs, name, "rhs"))
-        check_choice("method", method, FIXED_STEP + ADAPTIVE_STEP)
+        check_choice("method", method, (*FIXED_STEP, *ADAPTIVE_STEP))
+        if method in ADAPTIVE_STEP and find_spec("torchdiffeq") is None:
+            raise ImportError(
+                f'The method {method!r} needs torchdiffeq; run `pip install "gpadjust[ode]"`, or '
+                'take "rk4".'
+            )
         check_choice("gradient", gradient, ("autograd", "finite-difference"))
         self.rhs, self.method, self.gradient = rhs, method, gradient
         self.step = checked_number("step", step, above=0)
@@ -86,11 +96,9 @@ class ODEPhysics(Physics):
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """Return the state after the step or its change, ``N x state_dim``."""
-        from torchdiffeq import odeint  # slow to import
-
         state, action = X[:, : self.state_dim], X[:, self.state_dim :]
 
-        def derivative(t: Tensor, state: Tensor) -> Tensor:
+        def derivative(state: Tensor) -> Tensor:
             if isinstance(self.rhs, FormulaPhysics):
                 rate = self.rhs.evaluate(torch.cat([state, action], dim=-1), *parameters)
             else:
@@ -105,12 +113,18 @@ class ODEPhysics(Physics):
                 )
             return rate
 
-        times = torch.linspace(0.0, self.step, self.substeps + 1, dtype=X.dtype, device=X.device)
-        # A grid of our own: torchdiffeq's step_size rounds up to one substep too many.
-        options: dict[str, Any] = {"grid_constructor": lambda *_: times}
-        if self.method in ADAPTIVE_STEP:
-            options = {"max_num_steps": _MOST_STEPS}
-        _, end = odeint(derivative, state, times[[0, -1]], method=self.method, options=options)
+        if self.method in FIXED_STEP:
+            end = _fixed(derivative, state, self.step / self.substeps, self.substeps, self.method)
+        else:
+            from torchdiffeq import odeint  # slow to import
+
+            times, options = (
+                torch.tensor([0.0, self.step]).to(state),
+                {"max_num_steps": _MOST_STEPS},
+            )
+            _, end = odeint(
+                lambda _, s: derivative(s), state, times, method=self.method, options=options
+            )
         return end - state if self.difference else end
 
     def of_rows(self, rows: Tensor) -> Tensor:
@@ -119,3 +133,24 @@ class ODEPhysics(Physics):
         if self.gradient == "autograd" or learns or not rows.requires_grad:
             return super().of_rows(rows)
         return FiniteDifferences.apply(rows, super().of_rows(rows.detach()), self)
+
+
+def _fixed(
+    derivative: Callable[[Tensor], Tensor], state: Tensor, h: float, number: int, method: str
+) -> Tensor:
+    r"""Return the state after a number of steps h of a Runge-Kutta method.
+
+    With its weights a (Hairer, Norsett and Wanner 1993, section II.1) a step is
+
+    .. math:: k_i = g\Bigl(s + h \sum_{j < i} a_{i j} k_j\Bigr), \quad s + h \sum_i a_i k_i.
+    """
+    for _ in range(number):
+        point, slopes = state, list[Tensor]()
+        for weights in FIXED_STEP[method]:
+            slopes.append(derivative(point))
+            point = state
+            for weight, slope in zip(weights, slopes, strict=True):
+                if weight:
+                    point = point.add(slope, alpha=h * weight)
+        state = point
+    return state

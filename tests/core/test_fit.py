@@ -102,14 +102,14 @@ def test_fitted_twice_is_fitted_once(n):
 
 
 def test_the_approximation_of_a_normal_posterior_is_exact():
-    """But for its width, a fifth more; a number that data say nothing of keeps its prior."""
+    """But for its width, half as much again; a number that data say nothing of keeps its prior."""
     a, b = torch.tensor([[[4.0, 0.0]], [[0.7, 1.5]]], dtype=torch.float64)
 
     def log_likelihood(u, with_gradient=True):
         return -0.5 * (a * (u - b).square()).sum(-1), -a * (u - b)
 
     found, log_evidence = around_mode(log_likelihood, a * b / (1 + a))
-    expected = 1.2**2 * torch.diag_embed(1 / (1 + a))
+    expected = 1.5**2 * torch.diag_embed(1 / (1 + a))
     torch.testing.assert_close(found.root @ found.root.mT, expected)
     exact = -0.5 * (a * b.square() / (1 + a) + (1 + a).log()).sum(-1)
     torch.testing.assert_close(log_evidence, exact)
@@ -130,7 +130,7 @@ def test_the_approximation_of_a_narrow_bend():
     s, d = torch.tensor([[1.0, 1.0], [1.0, -1.0]]).double()
     hessian = torch.eye(2) + torch.outer(s, s) / narrow**2 + torch.outer(d, d) / wide**2
     covariance = found.root[0] @ found.root[0].mT
-    torch.testing.assert_close(covariance, 1.2**2 * hessian.inverse(), rtol=1e-3, atol=0)
+    torch.testing.assert_close(covariance, 1.5**2 * hessian.inverse(), rtol=1e-3, atol=0)
 
 
 def test_the_error_is_how_far_seeds_are_apart():

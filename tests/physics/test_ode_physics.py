@@ -91,7 +91,7 @@ class TestSolutions:
 
         assert math.log2(error(8) / error(16)) == pytest.approx(order, abs=0.2)
 
-    @pytest.mark.parametrize("method", FIXED_STEP + ADAPTIVE_STEP)
+    @pytest.mark.parametrize("method", [*FIXED_STEP, *ADAPTIVE_STEP])
     def test_every_method_solves_a_decay(self, method):
         physics = ODEPhysics(decay, 0.1, 1, substeps=50, method=method)
         X = torch.ones(2, 1, dtype=torch.float64)
@@ -102,7 +102,7 @@ class TestSolutions:
         step=st.floats(1e-6, 1e3),
         dtype=st.sampled_from([torch.float32, torch.float64]),
     )
-    @settings(deadline=None)  # the first call imports torchdiffeq
+    @settings(deadline=None)
     def test_substeps_count(self, substeps, step, dtype):
         calls = 0
 
