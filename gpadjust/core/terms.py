@@ -145,7 +145,7 @@ class WeightedSum:
         Args:
             of_kernels: :math:`\varphi_t` by the names of the terms.
         """
-        parts = []
+        parts = [self.mean.unsqueeze(-1)[..., :0]]  # none where no term varies
         for term in self.terms:
             w = self.weights.get(term.name, torch.zeros_like(self.mean)).unsqueeze(-1)
             if term.kernel is not None:

@@ -25,6 +25,8 @@ def with_options(factory: ModelFactory, options: Mapping[str, Any]) -> ModelFact
     Raises:
         TypeError: If there is a link, and the factory is not a structure or a partial of one.
     """
+    if not callable(factory):
+        return factory  # make_model says what it has to be
     own = factory if isinstance(factory, partial) else partial(factory)
     further = {n: v for n, v in options.items() if n not in own.keywords and v is not None}
     make: Any = own.func

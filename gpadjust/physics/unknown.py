@@ -69,7 +69,10 @@ class Unknown:
     @property
     def prior_text(self) -> str:
         """The prior, for tables."""
-        limits = "{:g} to {:g}".format(*self.bounds)
+        low, high = self.bounds
+        limits = f"{low:g} to {high:g}"
+        if math.inf in (high, -low):
+            limits = f"above {low:g}" if high == math.inf else f"below {high:g}"
         if self.sd is None and self.factor is None:
             return limits
         spread = f" ± {self.sd:g}" if self.factor is None else f", factor {self.factor:g}"

@@ -110,5 +110,5 @@ def test_a_formula_with_the_columns_in_another_order_is_refused():
     pd = pytest.importorskip("pandas")
     law = FormulaPhysics("a - b", ["a", "b"])
     frame = pd.DataFrame({"b": X[:, 0], "a": X[:, 0].sin()})
-    with pytest.raises(ValueError, match="the same order"):
+    with pytest.raises(ValueError, match="in the order of the data"):
         CKA(frame, Y, physics=law)
