@@ -175,34 +175,17 @@ def _default_numbers(model: GP) -> tuple[int, int]:
 
 
 def _sampled(model: GP, number: int, seed: int) -> dict[int, Draws]:
-    """Return draws of each nested model that is likely enough.
-
-    The whole model comes first; of the others those go on that may be as likely as a thousandth.
-    """
+    """Return draws of each nested model; of more than 40 rows of each that is likely enough."""
     n, prior = model.targets().shape[-1], model.table.log_prior
     starts: Mapping[int, Normal | None] = dict.fromkeys(range(len(prior)))
     if n > _SMALL:
         starts = _starts(model, seed)
     sampled: dict[int, Draws] = {}
-    floor = None
     for k, start in starts.items():
         first, like = 16 if start is None else 4, model.u.detach()[0]
-        draws = sample(
-            partial(model.log_likelihood, choice=k),
-            like,
-            number,
-            seed,
-            start,
-            first,
-            n <= _MEDIUM,
-            floor,
-        )
-        if draws is None:
-            continue
+        target = partial(model.log_likelihood, choice=k)
+        draws = sample(target, like, number, seed, start, first, n <= _MEDIUM)
         sampled[k] = draws._replace(u=model.table.with_choice(draws.u, k))
-        if start is None:
-            joint = torch.stack([prior[i] + d.log_evidence.mean(0) for i, d in sampled.items()])
-            floor = joint.amax(0) + math.log(_SELDOM) - prior[(k + 1) % len(prior)]
     return sampled
 
 

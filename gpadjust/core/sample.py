@@ -54,8 +54,7 @@ class Draws(NamedTuple):
 def sample(
     log_likelihood: LogLikelihood, like: Tensor, number: int, seed: int,
     start: Normal | None = None, first: int = 16, with_moves: bool = True,
-    floor: Tensor | None = None,
-) -> Draws | None:  # fmt: skip
+) -> Draws:  # fmt: skip
     r"""Draw from :math:`N(u | 0, I) \, L(u)` by sequential Monte Carlo (Del Moral et al. 2006).
 
     Draws of a start, ``first`` times as many as are kept, are weighted by a power of the ratio of
@@ -71,7 +70,6 @@ def sample(
         start: The start. Default: the prior.
         first: How many draws begin for each that is kept.
         with_moves: Whether draws are moved; without, they are weighted and resampled once.
-        floor: A log evidence ``B``: if that of all problems is below, None is returned.
     """
     generator, shape = torch.Generator().manual_seed(seed), like.shape
     eye = torch.eye(shape[1]).to(like).expand(shape[0], -1, -1)
@@ -102,11 +100,6 @@ def sample(
         if effective is None:
             effective = weights.square().sum(0).reciprocal()
             with_moves = with_moves and (start is None or bool((effective < number).any()))
-        if floor is not None:
-            # What is left of the evidence is at most that of the most likely draw.
-            top = evidence.amax(0) + (1 - power) * value.amax(0)
-            if bool((top < floor).all()):
-                return None
         is_done = bool((power >= 1).all()) or not with_moves
         # Resample, and move.
         root = _root(u, weights, None if start is None else start.root / _WIDER)

@@ -133,6 +133,19 @@ def test_the_approximation_of_a_narrow_bend():
     torch.testing.assert_close(covariance, 1.5**2 * hessian.inverse(), rtol=1e-3, atol=0)
 
 
+@pytest.mark.slow
+def test_a_law_that_is_right_is_as_likely_as_its_corrections():
+    """Little noise: far from the mode its likelihood is less than what the whole model has."""
+    X = torch.linspace(0, 3, 20).double().unsqueeze(-1)
+    law = FunctionPhysics(
+        lambda X, p: p.a * torch.exp(-p.b * X[:, 0]),
+        unknowns={"a": Unknown(1.0, sd=0.5), "b": Unknown(1.0, factor=1.5)},
+    )
+    noise = torch.randn(20, 1, generator=torch.Generator().manual_seed(0)).double()
+    result = fit(CKA(X, 1.2 * torch.exp(-0.8 * X) + 1e-3 * noise, physics=law))
+    assert result.probabilities["as it is"][0] > 0.2
+
+
 def test_the_error_is_how_far_seeds_are_apart():
     X, e = noisy(8)
     model, means, variances, errors = ZeroMeanGP(X, wave(X) + e), [], [], []
