@@ -131,7 +131,7 @@ def _move(
 
     p = standard_normal(u.shape, generator, u)
     jitter = torch.rand(u.shape[:-1], generator=generator, dtype=u.dtype).to(u)
-    leap = (length * (0.6 + 0.8 * jitter)).unsqueeze(-1)
+    leap = (length * (0.1 + 1.3 * jitter)).unsqueeze(-1)  # short ones where the density is narrow
     prior, by_prior = begin.log_density(u)
     energy = power * value + prior - 0.5 * p.square().sum(-1)
     new, new_value, new_slope = here
@@ -240,7 +240,7 @@ def around_mode(log_likelihood: LogLikelihood, mode: Tensor) -> tuple[Normal, Te
     moved = (at_random[0] != 0).any(0).nonzero().flatten()
     hessian = mode.new_zeros(len(mode), p, p)
     for _ in range(_PASSES):
-        step = _STEP * (1 + hessian.diagonal(dim1=-1, dim2=-2).clamp_min(0.0)).rsqrt()  # B x P
+        step = _STEP * (1 + hessian.diagonal(dim1=-1, dim2=-2).abs()).rsqrt()  # B x P
         moves = torch.diag_embed(step)[:, moved].movedim(0, 1)
         value, slope = log_likelihood(torch.cat([here, mode + moves, mode - moves]))
         up, down = slope[1:].chunk(2)
