@@ -133,6 +133,18 @@ def test_the_approximation_of_a_narrow_bend():
     torch.testing.assert_close(covariance, 1.5**2 * hessian.inverse(), rtol=1e-3, atol=0)
 
 
+def test_the_approximation_of_a_peak_that_differences_pass_over():
+    """(1 + (u / w)^2)^-1 is convex beyond w / sqrt(3): the first differences are."""
+    w = 0.02
+
+    def log_likelihood(u, with_gradient=True):
+        return -(1 + (u / w).square()).log().sum(-1), -2 * u / (w**2 + u.square())
+
+    found, _ = around_mode(log_likelihood, torch.zeros(1, 1).double())
+    expected = 1.5**2 / (1 + 2 / w**2)
+    torch.testing.assert_close(found.root.square().item(), expected, rtol=0.05, atol=0)
+
+
 @pytest.mark.slow
 def test_a_law_that_is_right_is_as_likely_as_its_corrections():
     """Little noise: far from the mode its likelihood is less than what the whole model has."""
