@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
+from inspect import signature
 from typing import Any, Self
 
 import gpytorch
@@ -34,7 +35,7 @@ from gpadjust.core.gaussian import (
 from gpadjust.core.kernels import DELTA, RHO, as_kernel
 from gpadjust.core.noise import KnownNoise, Noise
 from gpadjust.core.posterior import MixturePosterior
-from gpadjust.core.summary import summary
+from gpadjust.core.summary import counted, summary
 from gpadjust.core.terms import Places, Term, TermSum, WeightedSum
 from gpadjust.core.unknowns import Choice, Row, Table, Values
 from gpadjust.core.views import (
@@ -50,6 +51,13 @@ from gpadjust.physics.parameters import PhysicsParameters
 Slopes = dict[str, list[Tensor]]
 """Derivatives of each physics by the coordinate of each unknown parameter, ``S x m x n``."""
 
+_KINDS = {
+    "batch": "input_transform=Categories(batches=[column])",
+    "categorical": "input_transform=Categories([column])",
+    "likelihood": "noise=HeavyTails() or noise=RelativeNoise()",
+    "link": "a structure with a link, such as LinkedCKA(..., link='log')",
+    "train_Xvar": "noise=NoisyInputs(X, variances)",
+}  # instead of options of earlier versions or of other functions
 _ENTRIES = 150_000  # of covariances that are computed at once, which caches hold
 _STEP = 1e-4  # of differences by parameters of a physics, in coordinates
 
@@ -164,7 +172,8 @@ class GP(gpytorch.models.GP, Predictive):
         unit: The unit of each output's targets, ``m x 1``.
 
     Raises:
-        TypeError: If data are no float64 tensors, arrays or frames of numbers.
+        TypeError: If data are no float64 tensors, arrays or frames of numbers, or an option is
+            unknown or a class instead of an instance.
         ValueError: If shapes disagree, data are not finite, or there are fewer than two points.
         PhysicsError: If a physics fails at the training inputs.
 
@@ -181,13 +190,21 @@ class GP(gpytorch.models.GP, Predictive):
         self, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike = None, *,
         terms: Sequence[Term], physics: Sequence[Any] = (), noise: Noise | None = None,
         choices: Sequence[Choice] = (), input_transform: Any = None,
-        outcome_transform: Any = None, settings: Mapping[str, Any] | None = None,
+        outcome_transform: Any = None, settings: Mapping[str, Any] | None = None, **others: Any,
     ) -> None:  # fmt: skip
         super().__init__()
+        if others:
+            raise _unknown_option(type(self), next(iter(others)))
+        for name, option in {"noise": noise, "input_transform": input_transform}.items():
+            if isinstance(option, type):
+                own = option.__name__
+                raise TypeError(f"Expected {name} as an instance, {own}(); found the class {own}.")
         if outcome_transform is not None and not isinstance(outcome_transform, Standardize):
             raise ValueError(
                 "Expected outcome_transform=None or Standardize, which has no effect; found "
-                f"{outcome_transform!r}. Transform the targets and the physics before."
+                f"{outcome_transform!r}. Of outputs with bounds take a structure with a link, such "
+                "as LinkedCKA(..., link='log') of gpadjust.kinds; otherwise transform the targets "
+                "and the physics before."
             )
         self.data = Data.of(train_X, train_Y, train_Yvar, input_transform)
         X, Y = self.data.X, self.data.Y
@@ -848,7 +865,8 @@ class GP(gpytorch.models.GP, Predictive):
     def __repr__(self) -> str:
         n, m = self.data.Y.shape[-2:]
         d = self.data.X.shape[-1]
-        return f"{type(self).__name__}({n} points, {d} inputs, {m} outputs, {len(self.u)} draws)"
+        counts = {"point": n, "input": d, "output": m, "draw": len(self.u)}
+        return f"{type(self).__name__}({counted(counts)})"
 
 
 @DrawMatheronPaths.register(Predictive)  # type: ignore[untyped-decorator]
@@ -856,6 +874,19 @@ def _draw_matheron_paths(model: Any, *, sample_shape: Size, **_: Any) -> Paths:
     """Draw functions for BoTorch's ``draw_matheron_paths``, by the model's own features."""
     functions = model.sample_functions(max(1, sample_shape.numel()))
     return Paths(functions, sample_shape)
+
+
+def _unknown_option(structure: type[GP], name: str) -> TypeError:
+    """Return the error of an option that a structure does not have, with the way out."""
+    if name in _KINDS:
+        way = f"expected {_KINDS[name]} of gpadjust.kinds."
+    else:
+        own = [each for each in structure.__mro__ if issubclass(each, GP)]
+        parameters = [p for each in own[:-1] or own for p in signature(each).parameters.values()]
+        names = {p.name for p in parameters if p.kind is p.KEYWORD_ONLY} - {"settings"}
+        names |= {"noise", "input_transform"}
+        way = f"expected some of {', '.join(sorted(names))}. See CHANGELOG.md for earlier names."
+    return TypeError(f"Unknown option {name!r} of {structure.__name__}; {way}")
 
 
 def _with_kernel(term: Any) -> Term:

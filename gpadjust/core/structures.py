@@ -63,8 +63,14 @@ class CKA(GP):
         center: bool | float = True, constants: bool = True,
         nested: bool | Sequence[Choice] = True, extra_terms: Sequence[Term] = (), **options: Any,
     ) -> None:  # fmt: skip
+        for name, value in {"rho_mean": rho_mean, "delta_mean": delta_mean}.items():
+            if isinstance(value, str):
+                raise TypeError(
+                    f"Expected {name} as a number; found {value!r}. Constants of rho and delta are "
+                    "unknown by default."
+                )
         if not isinstance(center, bool | int | float):
-            raise TypeError(f"Expected center as True, False or a number; found {center!r}.")
+            raise TypeError(f"Expected center True (unknown), False or a number; found {center!r}.")
         settings = options | {
             "rho_covar_module": rho_covar_module, "delta_covar_module": delta_covar_module,
             "rho_mean": rho_mean, "delta_mean": delta_mean, "center": center,

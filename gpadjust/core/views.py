@@ -75,7 +75,8 @@ class TermView(_View, Kernel):
 
 def kernel_view(model: Any) -> AdditiveKernel:
     """Return the prior covariance of a model: the sum of its terms' scaled kernels."""
-    return AdditiveKernel(*(TermView(model, t.name) for t in model.terms if t.varies))
+    terms = [term for term in model.terms if term.varies] or model.terms[:1]  # of zeros
+    return AdditiveKernel(*(TermView(model, term.name) for term in terms))
 
 
 class NoiseView(_View, NoiseModule):
