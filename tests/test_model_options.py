@@ -33,8 +33,8 @@ KINDS = {
         {"noise": HeavyTails(base=RelativeNoise())},
         lambda model: has_outliers(model) and isinstance(model.noise.base, RelativeNoise),
     ),
-    "positive outputs": ({"link": "log"}, lambda model: "log" in model.scale),
-    "bounded outputs": ({"link": (0.0, 9.0)}, lambda model: "9" in model.scale),
+    "positive outputs": ({"link": "log"}, lambda model: "log" in model.scale_formula),
+    "bounded outputs": ({"link": (0.0, 9.0)}, lambda model: "9" in model.scale_formula),
     "categories": (
         {"input_transform": Categories([1])},
         lambda model: model.data.transform.levels[1] == (0.0, 1.0, 2.0),

@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 _SMALL, _MEDIUM = 40, 100  # points: up to these draws begin with the prior, and are moved
 _SELDOM = 1e-3  # a nested model of less probability at its mode is not drawn from
 _SEARCHES = 4  # for the mode
-_NEAR, _LESS_LIKELY = 0.3, 5.0  # coordinates of one end; log density of one that is left out
+_NEAR = 0.3  # difference of all coordinates below which two searches have found the same mode
+_LESS_LIKELY = 5.0  # difference of log density from the best mode beyond which a mode is ignored
 _MOVED = 0.35  # predicted standard deviations by which another seed may move the mean
 
 
@@ -95,9 +96,10 @@ def fit(
     Args:
         model: The model.
         method: ``"bayes"`` or ``"map"``.
-        num_draws: Number of draws, a multiple of 4; predictions average over every fourth.
-            Default: 80, 32 or 16 and 16, 8 or 4 of them; 256, 128 or 64 if outputs share unknown
-            numbers, as parameters of a physics.
+        num_draws: Number of draws, a multiple of 4; predictions average over a quarter of them.
+            Default: 80, 32 (of more than 40 points) or 16 (of more than 100), or 256, 128 or 64 if
+            outputs share unknown numbers, as parameters of a physics; predictions then average over
+            16, 8 or 4 of them.
         seed: Seed.
 
     Warns:
@@ -281,7 +283,7 @@ def _evidence(model: GP, sampled: dict[int, Draws]) -> Tensor:
     prior = model.table.log_prior
     logs = torch.stack([prior[k] + draws.log_evidence for k, draws in sampled.items()])
     total = logs.logsumexp(0).logsumexp(0) - math.log(GROUPS)
-    units = model.log_unit()
+    units = model.log_jacobian()
     return total + (units if len(total) > 1 else units.sum())
 
 
@@ -292,13 +294,13 @@ def _pooled(draws: Mapping[int, Draws], weights: Tensor, number: int, part: int 
     """
     problems = []
     for b in range(weights.shape[-1]):
-        rows = []
+        drawn = []
         for k, count in enumerate(_counts(weights[:, b], number)):
             if count:
                 u = draws[k].u if not part else draws[k].u.chunk(GROUPS)[part - 1]
                 at = (torch.arange(count) + 0.5) * len(u) / count
-                rows.append(u[at.long(), b])
-        problems.append(torch.cat(rows))
+                drawn.append(u[at.long(), b])
+        problems.append(torch.cat(drawn))
     return torch.stack(problems, 1)
 
 

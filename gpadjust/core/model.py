@@ -26,11 +26,11 @@ from gpadjust.core.data import ArrayLike, Data, appended, as_given, as_tensor, u
 from gpadjust.core.functions import Functions, Paths
 from gpadjust.core.gaussian import (
     Conditioning,
-    Evidence,
     Marginals,
     Prediction,
+    SumLikelihood,
     add_noise,
-    evidence,
+    sum_likelihood,
 )
 from gpadjust.core.kernels import DELTA, RHO, as_kernel
 from gpadjust.core.noise import KnownNoise, Noise
@@ -341,7 +341,7 @@ class GP(gpytorch.models.GP, Predictive):
         noise = self.noise.variance(values, places, True)
         observed = ~y.isnan()
         residual = (y - total.mean).expand(len(u), *y.shape).nan_to_num() * observed
-        found = self.evidence(total, residual, noise, observed, with_gradient)
+        found = self.sum_likelihood(total, residual, noise, observed, with_gradient)
         value, gradient = found.value, torch.zeros_like(u)
         if with_gradient:
             by = found.by | self.noise.pull_back(values, places, found.by_variance)
@@ -355,12 +355,12 @@ class GP(gpytorch.models.GP, Predictive):
         bad = ~(value.isfinite() & gradient.isfinite().all(-1))
         return value.masked_fill(bad, -torch.inf), gradient.masked_fill(bad.unsqueeze(-1), 0.0)
 
-    def evidence(
+    def sum_likelihood(
         self, train: WeightedSum, residual: Tensor, noise: Tensor, observed: Tensor,
         with_gradient: bool,
-    ) -> Evidence:  # fmt: skip
+    ) -> SumLikelihood:  # fmt: skip
         """Return the log likelihood of residuals ``S x m x n``; a subclass may bound it."""
-        return evidence(train, residual, noise, observed, with_gradient)
+        return sum_likelihood(train, residual, noise, observed, with_gradient)
 
     def conditioned(
         self, train: WeightedSum, noise: Tensor, targets: Tensor, old: Any = None
@@ -373,7 +373,7 @@ class GP(gpytorch.models.GP, Predictive):
         return None
 
     def _by_physics(
-        self, values: Values, places: Places, by: Values, found: Evidence, f_slopes: Slopes
+        self, values: Values, places: Places, by: Values, found: SumLikelihood, f_slopes: Slopes
     ) -> Values:
         """Return derivatives by centers and by the coordinates of a physics' parameters."""
         by_mean = found.by_mean
@@ -435,12 +435,12 @@ class GP(gpytorch.models.GP, Predictive):
             rows = bad.any(-1).to(X).sum_to_size(X.shape[:-1]).flatten().nonzero().flatten()
             error = PhysicsError(
                 f"Physics {physics.name!r} returned {float(Y[bad][0].detach()):.6g}, which targets "
-                f"cannot be, as {self.scale} is modelled; clamp its outputs.", rows.tolist()
+                f"cannot be, as {self.scale_formula} is modelled; clamp its outputs.", rows.tolist()
             )  # fmt: skip
             error.inputs = X.detach().reshape(-1, X.shape[-1])[rows]
             raise error
 
-    scale: str = ""
+    scale_formula: str = ""
     """The scale on which the model is Gaussian, as a formula; empty for that of the targets."""
 
     def read_scale(self, Y: Tensor) -> None:
@@ -466,8 +466,8 @@ class GP(gpytorch.models.GP, Predictive):
         """Return the mean of the known variances, for observations ``... x k x m`` without any."""
         return None if self.data.Yvar is None else self.data.Yvar.mean(-2, keepdim=True)
 
-    def log_unit(self) -> Tensor:
-        """Return the log densities of the targets, ``m``, in the user's units less the model's."""
+    def log_jacobian(self) -> Tensor:
+        """Return the log density of the targets, ``m``, in the user's units less the model's."""
         return -(~self.data.Y.isnan()).sum(-2) * self.unit.squeeze(-1).log()
 
     def targets(self) -> Tensor:
@@ -749,10 +749,10 @@ class GP(gpytorch.models.GP, Predictive):
         new._cached = (self.u.detach().clone(), conditioning)
         return new
 
-    def subset_draws(self, rows: Tensor) -> Self:
+    def subset_draws(self, numbers: Tensor) -> Self:
         """Return the model of some of its draws, with repetitions, by their numbers."""
         new = self._copy()
-        new.set_draws(self.u.detach()[rows])
+        new.set_draws(self.u.detach()[numbers])
         return new
 
     def _copy(self) -> Self:
@@ -797,11 +797,6 @@ class GP(gpytorch.models.GP, Predictive):
     def likelihood(self) -> GaussianLikelihood:
         """The Gaussian likelihood with the model's noise."""
         return likelihood_view(self)
-
-    @property
-    def num_draws_and_outputs(self) -> tuple[int, int]:
-        """``S`` and ``m``."""
-        return len(self.u), self.num_outputs
 
     @property
     def batch_shape(self) -> Size:

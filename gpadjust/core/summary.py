@@ -23,7 +23,7 @@ def summary(model: Any) -> str:
     counts = {"point": n, "input": d, "output": model.num_outputs, "draw": len(model.draws)}
     parts = [counted(counts)]
     parts += [] if model.is_fitted else ["not fitted"]
-    parts += [f"of {model.scale}"] if model.scale else []
+    parts += [f"of {model.scale_formula}"] if model.scale_formula else []
     lines = [f"{type(model).__name__}: {', '.join(parts)}"]
     if model.physics_parameters:
         lines += ["parameters of the physics:", indent(repr(model.physics_parameters), "  ")]

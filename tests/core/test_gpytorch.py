@@ -183,7 +183,7 @@ def test_thompson_samples_and_paths(models, uniform):
 def test_it_reads_as_a_gpytorch_model(models, uniform):
     Z = uniform(5, 2, seed=3)
     for model, physics in zip(models, (wave, both), strict=True):
-        S, m = model.num_draws_and_outputs
+        S, m = len(model.u), model.num_outputs
         lead = [size for size in (S, m) if size > 1]
         expected = physics(Z).mT.expand(S, m, 5)
         prior = model.forward(Z)

@@ -165,8 +165,8 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/core/stacked.py",
-        "picks[mine] = start + rows.long()[mine]",
-        "picks[mine] = rows.long()[mine]",
+        "picks[mine] = start + numbers.long()[mine]",
+        "picks[mine] = numbers.long()[mine]",
         "All components of a mixture are draws of the first model.",
     ),
     Fault(

@@ -337,7 +337,7 @@ def test_a_mixture_in_a_file(X, weights, tmp_path):
     again = load(tmp_path / "stacked.pt", physics=lambda X: X.expand(-1, 2))
     ours, theirs = stacked.posterior(X), again.posterior(X)
     torch.testing.assert_close(theirs.mean, ours.mean)
-    torch.testing.assert_close(theirs.components[1], ours.components[1])
+    torch.testing.assert_close(theirs.gaussians[1], ours.gaussians[1])
     with pytest.raises(ValueError, match="physics"):
         load(tmp_path / "stacked.pt")
 
