@@ -281,7 +281,11 @@ class GP(gpytorch.models.GP, Predictive):
     @property
     def physics_parameters(self) -> PhysicsParameters:
         """Draws ``N`` of each unknown parameter of the physics, in the user's units."""
-        values = self.table.values(self.draws)
+        return self.physics_parameters_at(self.draws)
+
+    def physics_parameters_at(self, u: Tensor) -> PhysicsParameters:
+        """Return the unknown parameters of the physics at coordinates ``N x B x P``."""
+        values = self.table.values(u)
         draws = [p.value(values[f"physics.{n}"][..., 0]) for n, p in self._unknowns.items()]
         return PhysicsParameters(self._unknowns, draws)
 

@@ -186,7 +186,7 @@ def test_warnings_come_once_and_those_of_the_seed_as_advice(scaled):
     assert [str(each.message)[:14] for each in caught] == ["1 of 9 rows eq"]
     rows = compare(*scaled, crude, structures=["zero mean"]).table
     (text,) = _unsampled(rows, {"zero mean": FitResult("bayes", error=0.9)})
-    assert text.startswith("Predictions of zero mean depend on the seed")
+    assert text.startswith("Results of zero mean depend on the seed")
     assert _unsampled(rows, {"zero mean": FitResult("bayes", error=0.1)}) == []
 
 
