@@ -300,7 +300,7 @@ class OfGPyTorch(Kernel):
         if not isinstance(kernel, AnyGPyTorchKernel):
             raise TypeError(
                 "Expected a kernel of gpadjust.core or GPyTorch, such as Stationary(MATERN52) or "
-                f"ScaleKernel(MaternKernel()); found {type(kernel).__name__}."
+                f"ScaleKernel(MaternKernel()); found {kernel!r}."
             )
         if kernel.batch_shape:
             raise ValueError(

@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from dataclasses import replace
 
 import pytest
 import torch
@@ -170,6 +171,28 @@ def test_the_error_is_how_far_seeds_are_apart():
     moved = torch.stack(means).var(0) / torch.stack(variances).mean(0)
     error = torch.tensor(errors).square().mean().sqrt().item()
     assert 0.5 < error / moved.mean().sqrt().item() < 2
+
+
+def test_the_error_of_parameters_is_how_far_seeds_are_apart():
+    X, e = noisy(8)
+    unknowns = {"a": Unknown(1.0, sd=0.5), "b": Unknown(0.0, sd=1.0)}
+    law = FunctionPhysics(lambda X, p: p.a * wave(X)[:, 0] + p.b, unknowns=unknowns)
+    model, means, sds, errors = CKA(X, wave(X) + 0.3 + e, physics=law), [], [], []
+    for seed in range(20):
+        with warnings.catch_warnings(action="ignore", category=SamplingWarning):
+            result = fit(model, num_draws=16, seed=seed)
+        errors.append(result.parameter_error)
+        means.append(model.physics_parameters.mean)
+        sds.append(model.physics_parameters.sd)
+    moved = torch.stack(means).var(0).sqrt() / torch.stack(sds).mean(0)
+    error = torch.tensor(errors).square().mean().sqrt().item()
+    assert 0.5 < error / moved.max().item() < 2
+    assert f"move means of parameters by {result.parameter_error:.2f}." in str(result)
+    with pytest.warns(SamplingWarning) as caught:
+        result = fit(model, num_draws=4, seed=0)
+    assert str(caught[-1].message).startswith("Parameters of the physics depend on the seed")
+    assert not replace(result, error=0.0).converged
+    assert math.isnan(fit(ZeroMeanGP(X, wave(X) + e), num_draws=16).parameter_error)
 
 
 def test_evidence_of_targets_in_another_unit():

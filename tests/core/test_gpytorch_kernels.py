@@ -139,7 +139,7 @@ def test_a_prior_is_that_of_the_kernel():
 
 
 def test_what_is_refused():
-    with pytest.raises(TypeError, match="found str"):
+    with pytest.raises(TypeError, match="found 'rbf'"):
         OfGPyTorch("rbf")
     with pytest.raises(ValueError, match="without batch shape"):
         OfGPyTorch(kernels.RBFKernel(batch_shape=torch.Size([2])))

@@ -112,7 +112,7 @@ def test_it_is_the_model_of_the_logarithms(model, plain):
     one, other = model.left_out(), plain.left_out()
     close(one.log_density(Y), other.log_density(Y.log() - C) - Y.log())
     close(one.probability(Y), other.probability(Y.log() - C))
-    close(model.log_unit(), plain.log_unit() - Y.log().sum())
+    close(model.log_jacobian(), plain.log_jacobian() - Y.log().sum())
     close(model.delta(NEW).mean, plain.delta(NEW).mean)
     functions = model.sample_functions(3, seed=0)(NEW)
     close(functions, (plain.sample_functions(3, seed=0)(NEW) + C).exp())
