@@ -13,6 +13,7 @@ from gpadjust.core import (
     GP,
     Choice,
     LogNormal,
+    Noise,
     PhysicsMeanGP,
     SamplingWarning,
     Term,
@@ -50,7 +51,8 @@ def integral(model):
 def test_evidence_and_draws(n):
     """Of noise alone, with its variance as the only unknown number."""
     X, Y = noisy(n)
-    model = GP(X, Y, terms=[Term("f")])
+    noise = Noise(priors=[LogNormal(1e-3, 55.0)])
+    model = GP(X, Y, terms=[Term("f")], noise=noise)
     assert model.table.size == 1
     expected, mean, sd = integral(model)
     result = fit(model, num_draws=256)

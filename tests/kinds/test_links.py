@@ -154,7 +154,7 @@ def test_samples_have_the_quantiles_and_densities(shares):
     torch.testing.assert_close(torch.stack(shares.interval(NEW[:2])), quantiles[[0, 2]])
     close(posterior.mean, quantiles[1])
     close(posterior.variance, shares.predict(NEW[:2]).variance)
-    y = torch.linspace(-12, 12, 4000, dtype=torch.float64).sigmoid().reshape(-1, 1, 1)
+    y = torch.linspace(-12, 12, 40_000, dtype=torch.float64).sigmoid().reshape(-1, 1, 1)
     total = torch.trapezoid(posterior.density(y.expand(-1, 2, 1)), y, dim=0)
     torch.testing.assert_close(total, torch.ones(2, 1).double(), rtol=1e-3, atol=0.0)
     functions = shares.sample_functions(300, seed=0, num_features=128)(NEW[:2])
