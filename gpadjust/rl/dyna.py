@@ -31,11 +31,12 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
 from gpadjust.checks import check_kind
-from gpadjust.control import EpisodeCheckpoint, RecordedEpisodes, Task
-from gpadjust.control.checkpoint import packed, unpacked
-from gpadjust.control.recorded_episodes import learn_dynamics
+from gpadjust.control import EpisodeCheckpoint, Task
+from gpadjust.control.agent import TaskAgent
+from gpadjust.control.checkpoint import locked, packed, unpacked
+from gpadjust.control.episodes import check_functions, learn_dynamics
 from gpadjust.control.step_guard import check_observation
-from gpadjust.control.task_agent import TaskAgent, locked
+from gpadjust.dynamics import Trajectories
 from gpadjust.rl.buffer import CompactReplayBuffer, MixedReplayBuffer
 from gpadjust.rl.callbacks import AgentCallback, DynaCallback
 from gpadjust.rl.environments import environment_state, guarded, restore_environment
@@ -178,7 +179,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
         serves = self.options.uses_model(self.num_episodes)
         new, num_ended = self._new_episodes()
         if serves and new is not None and self.options.reward_tolerance is not None:
-            new.check(self.ready_task(), self.options.reward_tolerance)
+            check_functions(self.ready_task(), new, self.options.reward_tolerance)
         self.replay_buffer.mix = serves
         with self.timed("update"):
             super().train(gradient_steps, batch_size)
@@ -189,9 +190,10 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
             with self.timed("fit"):
                 known = (self.recorded_episodes(), self.options.score_horizons)
                 metrics = learn_dynamics(self.model_task(), new, *known)
+        assert new.rewards is not None, "of real episodes"
         for name, value in {**metrics, "real_reward": float(new.rewards.mean())}.items():
             self.logger.record(f"model/{name}", value)
-        self.replay_buffer.learnt[: self.replay_buffer.size()] = True
+        self.replay_buffer.learnt |= self.replay_buffer.whole
         self.num_episodes += num_ended
         if serves:
             for hook in self.model_hooks:
@@ -201,7 +203,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
             for name, seconds in self.wall_time.items():
                 self.logger.record(f"model/share_{name}", seconds / total)
 
-    def _new_episodes(self) -> tuple[RecordedEpisodes | None, int]:
+    def _new_episodes(self) -> tuple[Trajectories | None, int]:
         """The real steps that the dynamics have not learnt, if an episode has ended; how many."""
         buffer, dynamics = self.replay_buffer, self.ready_task().dynamics
         num_ended = int((buffer.dones.astype(bool) & ~buffer.failed & ~buffer.learnt).sum())
@@ -209,7 +211,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
             return None, 0
         new = self._recorded(~buffer.learnt if dynamics.has_learnt else None)
         least = 1 if dynamics.is_fitted else 2  # a first fit needs two
-        return (new if new.num_transitions >= least else None), num_ended
+        return (new if len(new) >= least else None), num_ended
 
     def _train_in_model(self, num_episodes: int, batch_size: int) -> None:
         """Run model episodes, side by side, with updates at each step."""
@@ -369,15 +371,12 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
             self.task.refuse(name, part, "MPCAgent can")
         return self.task
 
-    def recorded_episodes(self, newest: int | None = None) -> RecordedEpisodes:
-        """The real steps in the buffer; or the newest of each environment only."""
-        buffer, keep = self.replay_buffer, None
-        if newest is not None:
-            keep = np.zeros_like(buffer.learnt)
-            keep[buffer.pos - 1 - np.arange(min(newest, buffer.size()))] = True
-        return self._recorded(keep)
+    def recorded_episodes(self, newest: int | None = None) -> Trajectories:
+        """Return the real steps in the buffer of episodes that have ended; or the newest ones."""
+        data = self._recorded()
+        return data if newest is None else data.some(slice(max(len(data) - newest, 0), None))
 
-    def _recorded(self, keep: np.ndarray | None = None) -> RecordedEpisodes:
+    def _recorded(self, keep: np.ndarray | None = None) -> Trajectories:
         spec = self.ready_task().dynamics.spec
         return self.replay_buffer.recorded(spec, self.policy.unscale_action, keep)
 
@@ -411,7 +410,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
             self.observation_space,
             self.action_space,
             sampling=self.options.sampling,
-            worst_reward=float(recorded.rewards.min()) if recorded.num_transitions else np.inf,
+            worst_reward=float(min(recorded.rewards, default=np.inf)),
         )
 
     def act_in_model(

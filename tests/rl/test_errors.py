@@ -87,7 +87,7 @@ def test_steps_that_fail_end_their_episodes_and_lose_nothing(
     assert len(told) == len(FAILS)
     agent.learn(10, reset_num_timesteps=False)
     recorded = agent.recorded_episodes()
-    assert agent.task.dynamics.num_transitions == recorded.num_transitions == 28 - len(FAILS)
+    assert agent.task.dynamics.num_transitions == len(recorded) == 28 - len(FAILS)
     moved = recorded.next_states - recorded.states
     torch.testing.assert_close(moved, 0.5 * recorded.actions, atol=0.1, rtol=0)
     assert recorded.begins.sum() == 6
@@ -152,14 +152,14 @@ def test_a_step_that_failed_is_no_data(point_agent, point_env, learnt_dynamics, 
     starts = [0, *(1 + follows.logical_not().nonzero().flatten()).tolist()]
     assert recorded.begins.nonzero().flatten().tolist() == starts
     assert (recorded.episode.diff() > 0).nonzero().flatten().add(1).tolist() == starts[1:]
-    assert dynamics.num_transitions <= recorded.num_transitions
+    assert dynamics.num_transitions <= len(recorded)
 
 
 def test_of_several_environments_one_may_fail(point_agent, point_env):
     env = DummyVecEnv([lambda: Jams(point_env(), (3,)), point_env])
     agent = point_agent(env, train_freq=(5, "step"), reward_tolerance=None).learn(20)
     recorded = agent.recorded_episodes()
-    assert recorded.num_transitions == 19
+    assert len(recorded) == 19
     moved = recorded.next_states - recorded.states
     torch.testing.assert_close(moved, 0.5 * recorded.actions, atol=0.1, rtol=0)
     batch = agent.replay_buffer.sample(200)
