@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
@@ -58,37 +58,17 @@ class CompactReplayBuffer(ReplayBuffer):
         self.full = self.full or self.pos + n >= self.buffer_size
         self.pos = (self.pos + n) % self.buffer_size
 
-    def filled(self) -> dict[str, Any]:
-        """The rows that are filled, and where the next one goes."""
-        rows = {name: torch.from_numpy(getattr(self, name)[: self.size()]) for name in self.rows}
-        return {**rows, "pos": self.pos, "full": self.full}
-
-    def fill(self, content: Mapping[str, Any]) -> None:
-        """Take back what :meth:`filled` gave, with space for the other rows.
-
-        Raises:
-            ValueError: If it is of a buffer of other shapes.
-        """
-        for name in self.rows:
-            found, own = content[name], getattr(self, name)
-            if found.shape[1:] != own.shape[1:] or len(found) > len(own):
-                raise ValueError(
-                    f"Expected {name} of at most {len(own)} rows of shape {own.shape[1:]}, found "
-                    f"{tuple(found.shape)}."
-                )
-        self.__setstate__(dict(content))
-
     def __getstate__(self) -> dict[str, Any]:
-        """The attributes, of the rows those that are filled."""
-        return {**self.__dict__, **self.filled()}
+        """Return the attributes, of the rows those that are filled."""
+        rows = {name: getattr(self, name)[: self.size()] for name in self.rows}
+        return {**self.__dict__, **rows}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take the attributes back, with space for the other rows."""
         self.__dict__.update(state)
         for name in self.rows:
-            filled = state[name].numpy()
-            rows = np.zeros((self.buffer_size, *filled.shape[1:]), dtype=filled.dtype)
-            rows[: len(filled)] = filled
+            rows = np.zeros((self.buffer_size, *state[name].shape[1:]), dtype=state[name].dtype)
+            rows[: len(state[name])] = state[name]
             setattr(self, name, rows)
 
 

@@ -6,8 +6,6 @@ import pytest
 import torch
 
 from gpadjust.control import (
-    CrossEntropy,
-    Planner,
     PolicySearch,
     Return,
     Rollouts,
