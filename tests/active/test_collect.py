@@ -452,6 +452,7 @@ def test_what_cannot_be_collected_by_is_refused(laboratory, uniform):
 
 def test_seeds_and_numbers_of_numpy_are_taken():
     bounds = torch.tensor([[0.0], [1.0]]).double()
-    collection = Collection(bounds, seed=np.int64(3), initial=np.int64(5))
+    given = (lambda X, Y: None, bounds, lambda model: None)
+    collection = Collection(*given, seed=np.int64(3), initial=np.int64(5))
     assert (collection.seed, type(collection.seed)) == (3, int)
-    assert torch.equal(collection.ask(), Collection(bounds, seed=3, initial=5).ask())
+    assert torch.equal(collection.ask(), Collection(*given, seed=3, initial=5).ask())
