@@ -15,7 +15,6 @@ from torch.nn import Module
 from gpadjust.checks import check_choice, check_switch, checked_options, checked_whole
 from gpadjust.core import CKA, GP, FitResult, Prediction, ZeroMeanGP, fit
 from gpadjust.core.model import Predictive
-from gpadjust.dynamics.angle_input import AngleInput
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.joint_errors import error_correlation
 from gpadjust.dynamics.particles import varying_parameters
@@ -29,6 +28,7 @@ from gpadjust.dynamics.state import (
     saved,
 )
 from gpadjust.dynamics.targets import (
+    AngleInput,
     Target,
     TargetPhysics,
     Targets,
