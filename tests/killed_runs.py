@@ -18,7 +18,7 @@ from gpadjust.control import (
     Task,
     resume,
 )
-from gpadjust.control.random_state import RandomState
+from gpadjust.control.checkpoint import RandomState
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.rl import DynaOptions, DynaSAC
 from tests.point import POINT_SPEC, Faulty, Point, linear, near_one

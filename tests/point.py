@@ -179,7 +179,7 @@ def forbid_unpickling(monkeypatch):
         raise AssertionError("unpickled")
 
     calls = [f"{room}.{call}" for room in ("pickle", "cloudpickle") for call in ("load", "loads")]
-    for name in (*calls, "gpadjust.control.pickled_agent._Unpickler"):
+    for name in (*calls, "gpadjust.control.checkpoint._Unpickler"):
         monkeypatch.setattr(name, unpickled)
 
 

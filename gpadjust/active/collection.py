@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from copy import copy
+from numbers import Real
 from typing import Any, Self
 
 import torch
@@ -154,15 +155,11 @@ class Collection(Measurements):
         self.bounds = checked_bounds("bounds", bounds)
         d = self.bounds.shape[-1]
         checked_whole("batch_size", batch_size, 1)
-        if not isinstance(seed, int) or not 0 <= seed < 2**63:
-            raise ValueError(
-                f"Expected seed to be a whole number >= 0 and below 2^63, got {seed!r}."
-            )
-        self.batch_size, self.seed = batch_size, int(seed)
+        self.batch_size, self.seed = batch_size, checked_whole("seed", seed, 0)
         if initial is None:
             initial = 2 * (d + 1) if keep is None else 2
         self._first_points = self.bounds[:0]
-        if not isinstance(initial, int | float | str):
+        if not isinstance(initial, Real | str):
             self._first_points = checked_points("initial", initial, d, self.bounds)
             initial = 2
             if len(self._first_points.unique(dim=0)) < len(self._first_points):

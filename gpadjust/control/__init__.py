@@ -17,7 +17,6 @@ from gpadjust.control.planner import Plan, Planner
 from gpadjust.control.policies import BoundedPolicy, mlp_policy
 from gpadjust.control.policy_search import PolicySearch, SearchResult
 from gpadjust.control.progress import print_progress
-from gpadjust.control.recorded_episodes import RecordedEpisodes
 from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts
 from gpadjust.control.search import CrossEntropy
 from gpadjust.control.state_filter import Estimate, StateFilter
@@ -43,7 +42,6 @@ __all__ = [
     "Planner",
     "PolicySearch",
     "PolicySearchAgent",
-    "RecordedEpisodes",
     "Return",
     "Reward",
     "Rollout",

@@ -1,11 +1,12 @@
-"""The loop of an agent: play an episode, learn the dynamics, improve."""
+"""Agents: a task that real episodes complete, and the loop that plays, learns and improves."""
 
 from __future__ import annotations
 
 import time
 import warnings
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any, ClassVar, Self
 
@@ -19,26 +20,148 @@ from torch import Tensor
 from gpadjust.checks import check_kind, checked_number, checked_whole
 from gpadjust.control.checkpoint import (
     EpisodeCheckpoint,
+    RandomState,
+    locked,
     packed,
+    pickled,
     pickled_environment,
     unpacked,
+    unpickled,
 )
-from gpadjust.control.pickled_agent import pickled, unpickled
-from gpadjust.control.random_state import RandomState
-from gpadjust.control.real_steps import RealStep, RealSteps
-from gpadjust.control.recorded_episodes import RecordedEpisodes, learn_dynamics
+from gpadjust.control.episodes import check_functions, completed, learn_dynamics, warn_of_bounds
 from gpadjust.control.search import random_sequences
 from gpadjust.control.smoothed_episodes import smooth_episodes
 from gpadjust.control.state_filter import StateFilter
 from gpadjust.control.step_guard import StepGuard
 from gpadjust.control.task import Task
-from gpadjust.control.task_agent import TaskAgent, locked
+from gpadjust.dynamics import Trajectories
 from gpadjust.dynamics.free_run import checked_horizons
 
 MAX_HOLD = 5  # steps of a random action
 
 Callback = Callable[["Agent", str, dict[str, float]], Any]
 """What is called with the agent, the name of an event, and its numbers; see :class:`Agent`."""
+
+
+class TaskAgent(ABC):
+    """Base of all agents: a task, which real episodes complete, and the parts of a checkpoint.
+
+    Attributes:
+        task: The task; not saved.
+        wall_time: Seconds spent on each part of the work.
+    """
+
+    task: Any
+    env: Any
+    num_episodes: int
+    num_timesteps: int
+    wall_time: dict[str, float]
+    _random_state: RandomState | None = None  # of a run that goes on, until `learn`
+
+    def ready_task(self) -> Task:
+        """The task, if the agent can learn with it."""
+        return self.task
+
+    def model_task(self) -> Task:
+        """The task, with what environment and real episodes tell where it says nothing.
+
+        Raises:
+            ValueError: If nobody says how long an episode is.
+        """
+        parts = self.recorded_episodes(), self.episode_length(), self.action_bounds()
+        return completed(self.ready_task(), *parts)
+
+    @abstractmethod
+    def action_bounds(self) -> Tensor:
+        """Lower and upper bounds of the actions, ``2 x action_dim``."""
+
+    def episode_length(self) -> int:
+        """Steps of an episode: those of the task, or else the time limit of the environment.
+
+        Raises:
+            ValueError: If there is neither.
+        """
+        length = self.ready_task().episode_length
+        if length is None and (spec := self.env_attribute("spec")) is not None:
+            length = spec.max_episode_steps
+        if length is None:
+            with suppress(AttributeError):  # a TimeLimit that was put around it by hand
+                length = self.env_attribute("_max_episode_steps")
+        if length is None:
+            raise ValueError(
+                "There is no environment, or no time limit that could be read of it; give the task "
+                "an episode_length, the number of steps of an episode."
+            )
+        return int(length)
+
+    def try_task(self, observations: np.ndarray, action_space: Any) -> None:
+        """Call the task's functions at observations ``N x observation_dim`` and a middle action."""
+        self.episode_length()
+        before, task = RandomState.capture(), self.ready_task()
+        seen = torch.from_numpy(observations.astype(np.float64))
+        task.observed.check_observations(seen)
+        # Of a single state much would look right that is not.
+        if task.sensors is None:
+            twice = task.dynamics.spec.decode(seen).repeat(2, 1)
+        else:
+            twice = task.draw_initial_states(2)
+        middle = torch.from_numpy((action_space.low + action_space.high) / 2).double()
+        task.try_functions(twice, middle.expand(len(twice), -1))
+        before.restore()
+
+    @contextmanager
+    def timed(self, part: str) -> Iterator[None]:
+        """Add what is done inside to a part of ``wall_time``."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.wall_time[part] += time.perf_counter() - start
+
+    def __repr__(self) -> str:
+        """Name the agent, its environment and dynamics, what it has done, and its last reward."""
+        env = "no environment" if self.env is None else layer_names(self.env)[-1]
+        if self.task is None:
+            return f"{type(self).__name__}({env}, no task)"
+        recorded, last = self.recorded_episodes(), ""
+        if len(recorded):
+            newest = recorded.rewards[recorded.episode == recorded.episode[-1]]
+            last = f", last reward {newest.mean():.3g} a step"
+        return (
+            f"{type(self).__name__}({env}, {type(self.task.dynamics).__name__}, "
+            f"{self.num_episodes} episodes learnt, {self.num_timesteps} steps{last})"
+        )
+
+    @abstractmethod
+    def recorded_episodes(self, newest: int | None = None) -> Trajectories:
+        """Return the real steps, or the newest of them only."""
+
+    @abstractmethod
+    def env_attribute(self, name: str) -> Any:
+        """An attribute of the environment or of one that it wraps."""
+
+    @classmethod
+    @abstractmethod
+    def wrapped(cls, env: Any) -> Any:
+        """The user's environment as the agent holds it."""
+
+    @classmethod
+    def described(cls, env: Any) -> dict[str, Any]:
+        """The environment in plain values, which are compared before anything is unpickled."""
+        return {
+            "wrappers": " of ".join(layer_names(env)),
+            "observation_space": str(env.observation_space),
+            "action_space": str(env.action_space),
+        }
+
+    @abstractmethod
+    def saved_parts(self) -> dict[str, bytes]:
+        """The files of a checkpoint, by name."""
+
+    @classmethod
+    @abstractmethod
+    def from_parts(cls, parts: dict[str, bytes], env: Any, task: Task) -> Self:
+        """The agent of these files."""
 
 
 class Agent(TaskAgent):
@@ -106,12 +229,7 @@ class Agent(TaskAgent):
             should; after a real episode, if its rewards or terminations are not those of the task.
     """
 
-    not_saved: ClassVar[tuple[str, ...]] = (
-        "env",
-        "_steps",
-        "_callbacks",
-        "_random_state",
-    )
+    not_saved: ClassVar[tuple[str, ...]] = ("env", "_data", "_paths", "_callbacks", "_random_state")
     """Attributes that are not in checkpoints, beside those of the classes above.
 
     A subclass names those that cannot be pickled; a resumed agent lacks them.
@@ -149,7 +267,8 @@ class Agent(TaskAgent):
         self.promised_reward: float | None = None
         self.wall_time = dict.fromkeys(("plan", "fit", "update"), 0.0)
         self.notes: dict[str, Any] = {}
-        self._steps = RealSteps(self.env.action_space)
+        self._data = _no_steps(self.env)
+        self._paths: list[Tensor] = []  # with sensors, states of each smoothed episode, T + 1 rows
         self._promises: list[float | None] = []  # one for each episode
         self._start: NDArray[Any] | None = None  # where the next episode begins, after a reset
         self._env_seed = seed  # of the first reset
@@ -231,45 +350,61 @@ class Agent(TaskAgent):
     def _play(self) -> None:
         """Play a real episode, and keep its steps."""
         observation, self._start = self._reset(), None
-        episode, begins, state = len(self._promises), True, None
-        began, before, rewards = time.perf_counter(), self.num_timesteps, list[float]()
-        self._promises.append(None)
+        began, state, promised = time.perf_counter(), None, None
+        rows: list[tuple[Any, ...]] = []
         random = self._random_actions() if self.model is None else None
         getattr(self.action_noise, "reset", lambda: None)()
-        while True:
-            if random is not None:
-                action = self._steps.scaled(next(random))
-            else:
-                asked = time.perf_counter()
-                with self.timed("plan"):
-                    choice, state = self._chosen(observation, state, np.array([begins]))
-                noise = 0.0 if self.action_noise is None else self.action_noise()
-                action = self._steps.scaled(choice, noise)
-                if begins:
-                    said = self._said(state)
-                    self._promises[episode] = said.get("promised_reward")
-                    self.tell("plan", {**said, "seconds": time.perf_counter() - asked})
-            taken = self._steps.unscaled(action)
-            following, reward, terminated, truncated, info = self.env.step(taken)
-            self.num_timesteps += 1
-            failed = bool(info.get("step_failed"))
-            if not failed:
-                row = (observation, action, following, float(reward), bool(terminated))
-                self._steps.steps.append(RealStep(episode, *row))
-                rewards.append(float(reward))
-            self.tell("step", {"reward": float(reward)})
-            whole = self.num_timesteps - before == self.task.episode_length
-            if failed or terminated or truncated or whole:
-                break
-            observation, begins = following, False
-        if not rewards:
-            self._promises.pop()  # there is no step of it to compare
+        try:
+            while True:
+                if random is not None:
+                    action = next(random)
+                else:
+                    asked = time.perf_counter()
+                    with self.timed("plan"):
+                        action, state = self._chosen(observation, state, np.array([not rows]))
+                    if not rows:
+                        said = self._said(state)
+                        promised = said.get("promised_reward")
+                        self.tell("plan", {**said, "seconds": time.perf_counter() - asked})
+                action = self._explored(action)
+                following, reward, terminated, truncated, info = self.env.step(action)
+                self.num_timesteps += 1
+                failed = bool(info.get("step_failed"))
+                if not failed:
+                    row = (observation, action, following, float(reward), bool(terminated))
+                    rows.append(row)
+                self.tell("step", {"reward": float(reward)})
+                whole = len(rows) == self.task.episode_length
+                if failed or terminated or truncated or whole:
+                    break
+                observation = following
+        finally:
+            if rows:  # else there is no step to compare with a promise
+                self._promises.append(promised)
+                self._keep(rows)
+        if not rows:
             return
-        values: dict[str, float] = {"number": len(self._promises), "steps": len(rewards)}
-        values |= {"reward": sum(rewards) / len(rewards), "seconds": time.perf_counter() - began}
-        if (promised := self._promises[episode]) is not None:
+        values: dict[str, float] = {"number": len(self._promises), "steps": len(rows)}
+        values["reward"] = sum(row[3] for row in rows) / len(rows)
+        values["seconds"] = time.perf_counter() - began
+        if promised is not None:
             values["promised_reward"] = promised
         self.tell("trial", values)
+
+    def _explored(self, action: NDArray[Any]) -> NDArray[Any]:
+        """Return an action with noise, if there is any, within the bounds."""
+        space = self.env.action_space
+        if self.action_noise is not None:
+            action = action + self.action_noise() * (space.high - space.low) / 2
+        return np.clip(action, space.low, space.high).astype(space.dtype)
+
+    def _keep(self, rows: Sequence[tuple[Any, ...]]) -> None:
+        """Keep the steps of an episode, observations as they came."""
+        columns = (np.array(column, dtype=np.float64) for column in zip(*rows, strict=True))
+        before, actions, after, rewards, terminated = map(torch.from_numpy, columns)
+        episode = torch.zeros(len(rows))
+        new = Trajectories(before, actions, after, episode, rewards, terminated.bool())
+        self._data = self._data.append(new)
 
     def _chosen(
         self, observation: NDArray[Any], state: Any, begins: NDArray[np.bool_]
@@ -303,20 +438,22 @@ class Agent(TaskAgent):
             with self.timed("fit"):
                 self._smooth()
         recorded = self.recorded_episodes()
-        new = recorded.some(recorded.episode >= (self.num_episodes if dynamics.has_learnt else 0))
-        if new.num_transitions < (1 if dynamics.is_fitted else 2):  # a first fit needs two
-            self._is_improved &= new.num_transitions == 0  # there is another start
+        is_new = recorded.episode >= self.num_episodes
+        new = recorded.some(is_new) if dynamics.has_learnt else recorded
+        if len(new) < (1 if dynamics.is_fitted else 2):  # a first fit needs two
+            self._is_improved &= len(new) == 0  # there is another start
             return
         if self.reward_tolerance is not None and sensors is None:
-            new.check(self.task, self.reward_tolerance)
+            check_functions(self.task, new, self.reward_tolerance)
         with self.timed("fit"):
-            task = recorded.complete(self.task, self.episode_length(), self.action_bounds())
+            bounds_of_actions = self.action_bounds()
+            task = completed(self.task, recorded, self.episode_length(), bounds_of_actions)
             values = learn_dynamics(task, new, recorded, self.score_horizons)
         bounds = None if self.model is None else self.model.state_bounds
         if bounds is not None and self.task.state_bounds is None:
-            new.warn_of_bounds(bounds)
+            warn_of_bounds(dynamics.spec, new, bounds)
         self.model, self._is_improved = None, False  # it is not the newest any more
-        real = recorded.rewards[recorded.episode >= self.num_episodes].mean()
+        real = recorded.rewards[is_new].mean()
         promises, self.num_episodes = self._promises[self.num_episodes :], len(self._promises)
         kept = [each for each in promises if each is not None]
         # Of actions that were random nothing was promised.
@@ -329,15 +466,15 @@ class Agent(TaskAgent):
 
     def _smooth(self) -> None:
         """Estimate the states behind all episodes, and the noises, in the newest model."""
-        seen = self._steps.seen()
-        if not seen:
+        if not len(self._data):
             return
+        episodes = self._data.episodes()
         newest = self.task.dynamics.before_data()
         assert newest is not None, "checked at the start"
         task = replace(self.task, dynamics=newest)
         known = self.filter
         assert known is not None, "there are sensors"
-        self._filter, self._steps.paths = smooth_episodes(task, known, seen, len(seen))
+        self._filter, self._paths = smooth_episodes(task, known, episodes, len(episodes))
 
     def _improve(self) -> None:
         """Improve in what is known, if that is something and actions are not to be random."""
@@ -388,12 +525,22 @@ class Agent(TaskAgent):
             self._filter = StateFilter.guessed(self.newest_model, self.action_bounds())
         return self._filter
 
-    def recorded_episodes(self, newest: int | None = None) -> RecordedEpisodes:
+    def recorded_episodes(self, newest: int | None = None) -> Trajectories:
         """The real steps; or the newest of them only.
 
         With sensors the states are drawn from what is known of them since they were last learnt.
         """
-        return self._steps.recorded(self.task, newest)
+        data, paths = self._data, self._paths
+        if self.task.sensors is None:
+            spec = self.task.dynamics.spec
+            states, next_states = (spec.decode(each) for each in (data.states, data.next_states))
+        else:  # of the episodes that are smoothed
+            none = torch.empty(0, self.task.dynamics.spec.state_dim, dtype=torch.float64)
+            data = data.some(slice(sum(len(path) - 1 for path in paths)))
+            states = torch.cat([none, *(path[:-1] for path in paths)])
+            next_states = torch.cat([none, *(path[1:] for path in paths)])
+        data = replace(data, states=states, next_states=next_states)
+        return data if newest is None else data.some(slice(max(len(data) - newest, 0), None))
 
     def env_attribute(self, name: str) -> Any:
         """An attribute of the environment or of one that it wraps."""
@@ -520,7 +667,7 @@ class Agent(TaskAgent):
             state["_start"] = None  # it will be reset
         return {
             "agent.pkl": pickled(state, self),
-            "steps.pt": packed(self._steps.state_dict()),
+            "steps.pt": packed({**vars(self._data), "paths": self._paths}),
             "dynamics.pt": packed(self.task.dynamics.state_dict()),
             "environment.pkl": env or b"",
         }
@@ -533,6 +680,28 @@ class Agent(TaskAgent):
         agent = cls.__new__(cls)
         agent.task, agent._callbacks = task, []
         agent.env = cloudpickle.loads(parts["environment.pkl"]) if parts["environment.pkl"] else env
-        agent._steps = RealSteps.of(steps, agent.env.action_space)
+        agent._paths = steps.pop("paths")
+        agent._data = Trajectories(**steps)
         vars(agent).update(unpickled(parts["agent.pkl"], agent))
         return agent
+
+
+def layer_names(env: Any) -> list[str]:
+    """The classes of an environment and of what it wraps, from the outside."""
+    names = [type(env).__name__]
+    held = getattr(env, "envs", None)  # of a vectorised environment, which are alike
+    first = held[0] if isinstance(held, list) and held else None
+    for inner in (getattr(env, "venv", None), getattr(env, "env", None), first):
+        if inner is not None:
+            return names + layer_names(inner)
+    return names
+
+
+def _no_steps(env: Any) -> Trajectories:
+    """Return the steps of an agent that has made none."""
+    observation, action = (
+        torch.empty(0, *space.shape, dtype=torch.float64)
+        for space in (env.observation_space, env.action_space)
+    )
+    rewards = torch.empty(0, dtype=torch.float64)
+    return Trajectories(observation, action, observation, rewards, rewards, rewards.bool())

@@ -194,13 +194,13 @@ class PolicySearchAgent(Agent):
             return False
         if not self.is_trained:
             self.policy.look_at(self._random_states(task))
-        guided, tenth = not self.is_trained, max(1, self.search.updates // 10)
+        tenth = max(1, self.search.updates // 10)
 
         def progress(update: int, value: float) -> None:
             if update % tenth == 0 or update == self.search.updates:
                 self.tell("update", {"number": update, "value": value})
 
-        result = self.search.improve(self.policy, task, guided=guided, progress=progress)
+        result = self.search.improve(self.policy, task, progress=progress)
         self.is_trained, self._reward = True, result.reward
         left = result.left_bounds
         found = {"reward": result.reward, "left_bounds": left, "seconds": result.seconds}

@@ -6,22 +6,64 @@ import io
 import json
 import os
 import pickle
+import random
+import sys
 import warnings
 import zipfile
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import reduce
+from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import cloudpickle
+import numpy as np
 import torch
 from filelock import AcquireReturnProxy, FileLock, Timeout
 
 from gpadjust.checks import check_kind, checked_whole
-from gpadjust.control.random_state import RandomState
 from gpadjust.control.task import Task
-from gpadjust.control.task_agent import TaskAgent
+from gpadjust.dynamics import Dynamics
 from gpadjust.files.sync_folder import sync_folder
 
-_FORMAT = "gpadjust episode checkpoint, version 5"
+_FORMAT = "gpadjust episode checkpoint, version 6"
+
+
+class RandomState(NamedTuple):
+    """The state of the global generators of Python, NumPy and PyTorch, from which a run draws."""
+
+    python: Any
+    numpy: Any
+    torch: Any
+    cuda: list[Any]
+
+    @staticmethod
+    def seed(seed: int) -> None:
+        """Seed all of them."""
+        random.seed(seed)
+        np.random.seed(seed)  # noqa: NPY002 - the generator that SB3 uses
+        torch.manual_seed(seed)
+
+    @classmethod
+    def capture(cls) -> Self:
+        """Return the present state, in tensors and plain values."""
+        name, keys, *others = np.random.get_state()  # noqa: NPY002
+        has_cuda = torch.cuda.is_available()
+        return cls(
+            random.getstate(),
+            (name, np.asarray(keys).tolist(), *others),
+            torch.get_rng_state(),
+            torch.cuda.get_rng_state_all() if has_cuda else [],
+        )
+
+    def restore(self) -> None:
+        """Go back to this state."""
+        random.setstate(self.python)
+        np.random.set_state(self.numpy)  # noqa: NPY002
+        torch.set_rng_state(self.torch)
+        if self.cuda and torch.cuda.is_available():
+            torch.cuda.set_rng_state_all(self.cuda)
 
 
 class EpisodeCheckpoint:
@@ -71,9 +113,9 @@ class EpisodeCheckpoint:
                 f"{lock.lock_file}. Wait for it, or give this run a file of its own."
             ) from error
 
-    def __call__(self, agent: TaskAgent, event: str, values: Any = None) -> None:
+    def __call__(self, agent: Any, event: str, values: Any = None) -> None:
         """Write the file before an episode begins, and when the run is done."""
-        if not isinstance(agent, TaskAgent):
+        if not hasattr(agent, "saved_parts"):
             raise TypeError(
                 "EpisodeCheckpoint is for learners with a model, such as MPCAgent and DynaSAC."
             )
@@ -84,7 +126,7 @@ class EpisodeCheckpoint:
         elif event == "done":
             self._write(agent)
 
-    def write(self, agent: TaskAgent) -> None:
+    def write(self, agent: Any) -> None:
         """Write the state of a run between two episodes.
 
         Raises:
@@ -93,10 +135,10 @@ class EpisodeCheckpoint:
         with self.locked():
             self._write(agent)
 
-    def _write(self, agent: TaskAgent) -> None:
+    def _write(self, agent: Any) -> None:
         manifest = {
             "format": _FORMAT,
-            "algorithm": type(agent).__name__,
+            "algorithm": _path_of(type(agent)),
             "environment": agent.described(agent.env),
             "task": None if agent.task is None else agent.task.describe(),
         }
@@ -125,7 +167,7 @@ class EpisodeCheckpoint:
             temporary.unlink(missing_ok=True)
 
 
-def resume(path: str | Path, env: Any, task: Task, algorithm: type[TaskAgent] | None = None) -> Any:
+def resume(path: str | Path, env: Any, task: Task, algorithm: Any = None) -> Any:
     """Read the agent of a run that :class:`EpisodeCheckpoint` wrote, ready to go on.
 
     Go on with ``agent.learn(total - agent.num_timesteps)`` (of Dyna with
@@ -141,8 +183,8 @@ def resume(path: str | Path, env: Any, task: Task, algorithm: type[TaskAgent] | 
         env: The environment, made and wrapped as for the first part of the run. It is replaced by
             that of the checkpoint, in its state, if that could be saved.
         task: The task of the run, its dynamics fitted or not.
-        algorithm: The class of the agent. Default: the one that the checkpoint names, of the
-            library or of what you have imported.
+        algorithm: The class of the agent. Default: the one that the checkpoint names, if its module
+            is imported.
 
     Returns:
         The agent. ``learn`` restores the random generators; until then you may use them.
@@ -154,10 +196,10 @@ def resume(path: str | Path, env: Any, task: Task, algorithm: type[TaskAgent] | 
     """
     check_kind("task", task, Task, "a Task(dynamics, reward, ...)")
     manifest, parts = _read(path)
-    algorithm = _known(manifest["algorithm"]) if algorithm is None else algorithm
+    algorithm = _class_of(manifest["algorithm"]) if algorithm is None else algorithm
     env = algorithm.wrapped(env)
     own = {
-        "algorithm": algorithm.__name__,
+        "algorithm": _path_of(algorithm),
         "environment": algorithm.described(env),
         "task": json.loads(json.dumps(task.describe(), default=_plain)),
     }
@@ -185,28 +227,21 @@ def _compare(path: str | Path, part: str, found: Any, here: Any) -> None:
         )
 
 
-def _known(name: str) -> type[TaskAgent]:
-    """The class of an agent by its name, of all that are imported; the newest definition of it."""
-    known: dict[str, type[TaskAgent]] = {}
-    waiting: list[Any] = [TaskAgent]
-    while waiting:
-        for each in waiting.pop().__subclasses__():
-            other = known.get(each.__name__, each)
-            if each.__name__ == name and other.__module__ != each.__module__:
-                raise ValueError(
-                    f"The checkpoint is of the class {name!r}, which is one of "
-                    f"{other.__module__} and one of {each.__module__}; pass algorithm, the class "
-                    "of the agent."
-                )
-            known[each.__name__] = each  # a cell of a notebook that ran twice defines it twice
-            waiting.append(each)
-    if name not in known:
+def _path_of(algorithm: type) -> str:
+    return f"{algorithm.__module__}:{algorithm.__qualname__}"
+
+
+def _class_of(path: str) -> Any:
+    """Return the class of an agent in a module that is imported; the newest definition of it."""
+    module, _, names = path.partition(":")
+    found: Any = sys.modules.get(module)
+    found = reduce(lambda each, name: getattr(each, name, None), names.split("."), found)
+    if not hasattr(found, "from_parts"):
         raise ValueError(
-            f"The checkpoint is of the class {name!r}, which is none of {', '.join(known)}; import "
-            "it (DynaSAC and DynaTD3 are of gpadjust.rl), or pass algorithm, the class of the "
-            "agent."
+            f"The checkpoint is of the class {path}, which is not imported; import it (DynaSAC and "
+            "DynaTD3 are of gpadjust.rl), or pass algorithm, the class of the agent."
         )
-    return known[name]
+    return found
 
 
 class _Parts(dict[str, bytes]):
@@ -282,3 +317,81 @@ def warn_unsaved(problem: str) -> None:
 def _plain(value: Any) -> Any:
     """Numbers of NumPy as JSON has them."""
     return value.tolist()
+
+
+@contextmanager
+def locked(callbacks: Iterable[Any]) -> Iterator[None]:
+    """Hold the locks of those callbacks that are checkpoints."""
+    with ExitStack() as held:
+        for each in callbacks:
+            if isinstance(each, EpisodeCheckpoint):
+                held.enter_context(each.locked())
+        yield
+
+
+# The attributes of an agent, in which names stand for task, model and dynamics.
+
+
+class _Pickler(cloudpickle.Pickler):
+    def __init__(self, file: io.BytesIO, agent: Any) -> None:
+        super().__init__(file)
+        task, model = agent.task, agent.model or agent.task
+        self.names = {id(model): "model", id(model.dynamics): "model.dynamics"}
+        self.names |= {id(task): "task", id(task.dynamics): "task.dynamics"}
+
+    def persistent_id(self, value: Any) -> str | None:
+        """Return the name of an object that is not pickled, wherever the agent keeps it."""
+        name = self.names.get(id(value))
+        if name is None and isinstance(value, Dynamics):
+            raise TypeError(
+                "it has dynamics of its own, which no checkpoint holds; make them where they are "
+                "needed"
+            )
+        return name
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(self, file: io.BytesIO, agent: Any) -> None:
+        super().__init__(file)
+        self.agent = agent
+
+    def persistent_load(self, name: str) -> Any:
+        """Return the agent's part of a name; its model is made when it is first asked for."""
+        if name.startswith("model") and self.agent.model is None:
+            self.agent.model = self.agent.known_task()
+        return attrgetter(name)(self.agent)
+
+
+def pickled(state: dict[str, Any], agent: Any) -> bytes:
+    """Return the attributes of an agent in bytes, without task, model and dynamics.
+
+    Raises:
+        TypeError: If one cannot be pickled, whose name it has.
+    """
+
+    def dump(value: Any) -> bytes:
+        file = io.BytesIO()
+        _Pickler(file, agent).dump(value)
+        return file.getvalue()
+
+    try:
+        return dump(state)
+    except Exception as error:  # pickling runs the user's code
+        name = next(name for name, value in state.items() if not _works(dump, value))
+        raise TypeError(
+            f"{type(agent).__name__}.{name} cannot be pickled, as a checkpoint does "
+            f"({type(error).__name__}: {error}). Make it a property, or name it in not_saved."
+        ) from error
+
+
+def _works(dump: Callable[[Any], bytes], value: Any) -> bool:
+    try:
+        dump(value)
+    except Exception:  # of the user's code
+        return False
+    return True
+
+
+def unpickled(content: bytes, agent: Any) -> Any:
+    """Return the attributes, which refer to the task of this agent, its model and its dynamics."""
+    return _Unpickler(io.BytesIO(content), agent).load()

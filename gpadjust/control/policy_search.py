@@ -12,8 +12,6 @@ import torch
 from torch import Tensor, nn
 
 from gpadjust.checks import check_kind, checked_number, checked_whole
-from gpadjust.control.planner import Planner
-from gpadjust.control.policies import BoundedPolicy
 from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts, Score
 from gpadjust.control.task import Task
 
@@ -54,7 +52,7 @@ class PolicySearch:
     same each time. The best one is kept, be it the one that the search began with.
 
     Where gradients do not find the task by themselves (a swing-up: at first no action of the policy
-    matters), plans do: with a ``guide`` the policy first imitates plans of some episodes.
+    matters), let the policy first imitate plans of some episodes, by least squares.
 
     Args:
         objective: What to look for. Default: the mean return; ``Return(quantile=0.2)`` is careful.
@@ -63,8 +61,6 @@ class PolicySearch:
         num_functions: Number of functions that each is followed through, such as 6; None for the
             mean.
         learning_rate: At the start; it decays to a tenth along a cosine.
-        guide: Plans the episodes that the policy imitates before it is improved.
-        num_guides: How many.
 
     Raises:
         TypeError: If something is of another kind.
@@ -94,20 +90,17 @@ class PolicySearch:
     num_starts: int = 24
     num_functions: int | None = None
     learning_rate: float = 3e-3
-    guide: Planner | None = None
-    num_guides: int = 16
 
     def __post_init__(self) -> None:
         """Check the options."""
         told = "an object of an Objective, such as Return()"
         check_kind("objective", self.objective, Objective, told)
-        for name in ("updates", "num_starts", "num_guides"):
+        for name in ("updates", "num_starts"):
             checked_whole(name, getattr(self, name), 1)
         if self.num_functions is not None:
             checked_whole("num_functions", self.num_functions, 1)
         self.objective.check_functions(self.num_functions)
         checked_number("learning_rate", self.learning_rate, above=0)
-        check_kind("guide", self.guide, Planner | None, "a Planner, or None")
 
     def check_task(self, task: Task) -> None:
         """Raise a ValueError if a task has what a policy cannot keep."""
@@ -119,7 +112,6 @@ class PolicySearch:
         policy: Callable[[Tensor], Tensor],
         task: Task,
         *,
-        guided: bool = True,
         progress: Callable[[int, float], None] | None = None,
     ) -> SearchResult:
         """Improve a policy; the randomness is PyTorch's global generator.
@@ -129,8 +121,6 @@ class PolicySearch:
                 parameters are changed; after an error they are as before.
             task: The task, whose dynamics are fitted. It must say where episodes start and how
                 long they are.
-            guided: Whether the policy imitates the ``guide`` first, if there is one: not where a
-                policy that has learnt is to go on.
             progress: Called after each update with its number and what the objective said.
 
         Raises:
@@ -152,32 +142,12 @@ class PolicySearch:
         policy.to("cpu")  # where the dynamics are
         before = {name: t.detach().clone() for name, t in policy.state_dict().items()}
         try:
-            if guided and self.guide is not None:
-                if not isinstance(policy, BoundedPolicy):
-                    raise TypeError(
-                        "A guide plans within the bounds of the actions, which only a "
-                        "BoundedPolicy says, such as mlp_policy(...); found "
-                        f"{type(policy).__name__}."
-                    )
-                _imitate(policy, *self.plans(task, policy.action_bounds))
             return self._improve(policy, task, task.episode_length, progress)
         except BaseException:
             policy.load_state_dict(before)
             raise
         finally:
             policy.to(home)
-
-    def plans(self, task: Task, action_bounds: Tensor) -> tuple[Tensor, Tensor]:
-        """States ``N x state_dim`` and actions ``N x action_dim`` of episodes by the guide."""
-        assert self.guide is not None, "asked before"
-        rollouts, parts = Rollouts(task, None), []
-        for start in task.draw_initial_states(self.num_guides):
-            plan = self.guide.plan(task, start, action_bounds)
-            with torch.no_grad():
-                rollout = rollouts.follow(start, plan.actions.unsqueeze(0))
-            parts.append([part[rollout.made] for part in (rollout.states, rollout.actions)])
-        states, actions = (torch.cat(column) for column in zip(*parts, strict=True))
-        return states, actions
 
     def _improve(
         self,
@@ -256,14 +226,3 @@ class _Best:
             worth = float(self.score(rollout).mean())
         if self.worth is None or worth > self.worth:
             self.worth, self.rollout, self.kept = worth, rollout, deepcopy(policy.state_dict())
-
-
-def _imitate(policy: nn.Module, states: Tensor, actions: Tensor) -> None:
-    """Fit a policy to actions ``N x action_dim`` at states ``N x state_dim``, by least squares."""
-    scale = actions.std(0, correction=0).clamp_min(1e-12)
-    optimizer = torch.optim.Adam(policy.parameters(), lr=5e-3)
-    for _ in range(400):
-        loss = ((policy(states) - actions) / scale).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -11,6 +10,7 @@ from torch import Tensor
 
 from gpadjust.control.state_filter import Estimate, StateFilter, measured_near, wrapped
 from gpadjust.control.task import Task
+from gpadjust.dynamics import Trajectories
 from gpadjust.dynamics.linearised import linearised
 from gpadjust.records.kalman import (
     Array,
@@ -29,20 +29,8 @@ _STEADY = 0.02  # a change of the logarithm of a variance
 _TINY = 1e-300  # of a variance that is none
 
 
-class Seen(NamedTuple):
-    """What sensors showed of an episode of ``T`` steps.
-
-    Args:
-        observations: ``(T + 1) x observation_dim``.
-        actions: ``T x action_dim``.
-    """
-
-    observations: Tensor
-    actions: Tensor
-
-
 def smooth_episodes(
-    task: Task, known: StateFilter, episodes: Sequence[Seen], seed: int
+    task: Task, known: StateFilter, episodes: Sequence[Trajectories], seed: int
 ) -> tuple[StateFilter, list[Tensor]]:
     """Estimate the states behind episodes, and both noises.
 
@@ -53,7 +41,7 @@ def smooth_episodes(
     Args:
         task: The task in the newest model.
         known: The filter by which the episodes were played.
-        episodes: The episodes.
+        episodes: The episodes, with observations in the place of states.
         seed: Seed of the draw.
 
     Returns:
@@ -95,19 +83,25 @@ def _prior(task: Task, known: Array) -> tuple[Array, Array]:
     return np.where(told, guesses, known), np.where(told, _TOLD, _GUESSED)
 
 
-def _filtered(task: Task, known: StateFilter, episodes: Sequence[Seen]) -> list[Tensor]:
+def _filtered(task: Task, known: StateFilter, episodes: Sequence[Trajectories]) -> list[Tensor]:
     """Where the filter believes the episodes to be, each time by what it has seen until then."""
     paths = [list[Tensor]() for _ in episodes]
     now: list[Estimate | None] = [None] * len(episodes)
-    for t in range(max(len(each.observations) for each in episodes)):
-        going = [i for i, each in enumerate(episodes) if len(each.observations) > t]
-        rows = torch.stack([episodes[i].observations[t] for i in going])
+    seen = [_observations(each) for each in episodes]
+    for t in range(max(map(len, seen))):
+        going = [i for i, each in enumerate(seen) if len(each) > t]
+        rows = torch.stack([seen[i][t] for i in going])
         found = known.follow(task, rows, [now[i] for i in going])
         for i, estimate in zip(going, found, strict=True):
             paths[i].append(estimate.mean)
             if t < len(episodes[i].actions):
                 now[i] = estimate._replace(action=episodes[i].actions[t])
     return [_without_jumps(task.dynamics.spec, torch.stack(path)) for path in paths]
+
+
+def _observations(episode: Trajectories) -> Tensor:
+    """Return all observations of an episode of ``T`` steps, ``(T + 1) x observation_dim``."""
+    return torch.cat([episode.states, episode.next_states[-1:]])
 
 
 def _without_jumps(spec: StateSpec, path: Tensor) -> Tensor:
@@ -118,7 +112,7 @@ def _without_jumps(spec: StateSpec, path: Tensor) -> Tensor:
 
 
 def _links(
-    task: Task, paths: Sequence[Tensor], episodes: Sequence[Seen]
+    task: Task, paths: Sequence[Tensor], episodes: Sequence[Trajectories]
 ) -> tuple[list[Link], Array]:
     """The episodes near paths as a linear chain, and the mean variance that is predicted there."""
     spec = task.dynamics.spec
@@ -130,7 +124,7 @@ def _links(
     parts = zip(paths, episodes, near.slope.split(lengths), offsets.split(lengths), strict=True)
     links = []
     for path, seen, slope, offset in parts:
-        pair = measured_near(task, path, seen.observations)
+        pair = measured_near(task, path, _observations(seen))
         links.append(Link(*(part.numpy() for part in (slope, offset, *pair))))
     variance: Array = near.variance.mean(0).numpy()
     return links, variance

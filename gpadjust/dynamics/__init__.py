@@ -1,10 +1,10 @@
 """Distributions of the next state of a system, over the models of this library."""
 
-from gpadjust.dynamics.angle_input import AngleInput
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.free_run import FreeRun
 from gpadjust.dynamics.learned_dynamics import LearnedDynamics
 from gpadjust.dynamics.physics_dynamics import PhysicsDynamics
+from gpadjust.dynamics.targets import AngleInput
 from gpadjust.dynamics.trajectories import Trajectories, Windows
 from gpadjust.states import StateSpec
 

@@ -2,33 +2,56 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
-from typing import Any
+from functools import partial
+from inspect import signature
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import Module
 
-from gpadjust.checks import check_switch, checked_whole
-from gpadjust.core import CKA, GP, FitResult, Prediction
+from gpadjust.checks import check_choice, check_switch, checked_options, checked_whole
+from gpadjust.core import CKA, GP, FitResult, Prediction, ZeroMeanGP, fit
 from gpadjust.core.model import Predictive
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.joint_errors import error_correlation
-from gpadjust.dynamics.learning import (
-    Learnt,
-    Recipe,
-    check_enough_observed,
-    checked_fit_options,
-    made_by,
-)
 from gpadjust.dynamics.particles import varying_parameters
 from gpadjust.dynamics.physics_dynamics import PhysicsDynamics
-from gpadjust.dynamics.state import check_fingerprint, fingerprint
-from gpadjust.dynamics.targets import Target, Targets, checked_physics_error, named_physics
-from gpadjust.kinds.factory import ModelFactory
+from gpadjust.dynamics.state import (
+    PhysicsProbes,
+    check_fingerprint,
+    expect,
+    fingerprint,
+    loaded,
+    saved,
+)
+from gpadjust.dynamics.targets import (
+    AngleInput,
+    Target,
+    TargetPhysics,
+    Targets,
+    checked_physics_error,
+    named_physics,
+    warn_of_differences,
+)
+from gpadjust.dynamics.trajectories import Trajectories
+from gpadjust.kinds.factory import ModelFactory, make_model
 from gpadjust.states import StateSpec
 
+_STATE = ("transitions", "probes", "chunks", "model", "draws", "noise")
 _NUM_FEATURES = 1024  # by default
 _MEAN_ROWS = 200  # kernel rows of a mean: transitions times draws
+
+
+class Learnt(NamedTuple):
+    """Transitions, and the model of them; replaced as a whole, so that no error leaves half."""
+
+    data: Trajectories
+    chunks: tuple[int, ...]  # numbers of transitions: fitted, then conditioned on in turn
+    fitted: GP  # of the first chunk
+    model: GP  # of all
 
 
 class LearnedDynamics(Dynamics):
@@ -105,12 +128,19 @@ class LearnedDynamics(Dynamics):
         self.encode_angles = encode_angles
         self.fit_result: FitResult | None = None
         self.make_model = model
-        self._recipe = Recipe(self.targets, parts, model, encode_angles)
+        self._parts = {name: TargetPhysics(part, self.targets) for name, part in parts.items()}
+        self._options: dict[str, Any] = {}  # of the model
+        if self._parts:
+            one = next(iter(self._parts.values()))
+            self._options["physics"] = one if len(self._parts) == 1 else self._parts
+        if encode_angles and self.targets.angles:
+            self._options["input_transform"] = AngleInput(self.targets.angles)
+        check_factory(model, self._options)
         self.fit_options = checked_fit_options(fit_options)
         self.num_features = num_features
         self.physics_error = checked_physics_error(spec, physics_error)
         self._learnt: Learnt | None = None
-        self._compared = False  # the physics with transitions
+        self._probes: list[PhysicsProbes] = []  # of each physics, by its first transitions
         self._means: tuple[GP, GP] | None = None  # of a model: with few draws
         self._root: tuple[GP, Tensor | None] | None = None  # likewise
 
@@ -148,23 +178,19 @@ class LearnedDynamics(Dynamics):
                 states are not what the spec says (:meth:`StateSpec.check_transitions`).
             PhysicsError: If the physics fails.
         """
-        data = self._checked(states, actions, next_states)
-        known, previous = self._recipe.physics_at(data.states, data.actions), self._learnt
-        if previous is not None:
-            data, known = previous.with_rows(data, known)
-        check_enough_observed(self.spec, data)
-        with self._recipe.restored_on_error():
-            if previous is None and not self._compared:
-                self._recipe.compare_physics(data, known)
-            self._recipe.tell_physics(data, known)
-            model, result = self._recipe.fit(data, previous is None, self.fit_options)
-        self._compared = self._compared or previous is None
-        self.fit_result = result
-        self._learnt = Learnt(data, known, (len(data.states),), model, model)
+        data, before = self._checked(states, actions, next_states), self._learnt
+        values = self._physics_at(data.states, data.actions)
+        if before is not None:
+            data = before.data.append(data)
+        _check_enough_observed(self.spec, data)
+        probes = self._probes or self._compared(data, values)
+        model = self._built(data, quiet=before is not None)
+        self.fit_result = fit(model, **self.fit_options)
+        self._probes, self._learnt = probes, Learnt(data, (len(data),), model, model)
 
     def try_physics(self, states: Tensor, actions: Tensor) -> None:
         """Call the physics once, to find what is wrong with it before there are transitions."""
-        self._recipe.physics_at(states, actions)
+        self._physics_at(states, actions)
 
     def condition(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
         """Condition on further transitions with the unknown numbers as they are.
@@ -174,13 +200,8 @@ class LearnedDynamics(Dynamics):
         """
         before = self._known_so_far()
         new = self._checked(states, actions, next_states)
-        data, known = before.with_rows(new, self._recipe.physics_at(new.states, new.actions))
-        self._learnt = before._replace(
-            data=data,
-            known=known,
-            chunks=(*before.chunks, len(new.states)),
-            model=self._recipe.condition(before.model, new),
-        )
+        chunks, model = (*before.chunks, len(new)), self._conditioned(before.model, new)
+        self._learnt = before._replace(data=before.data.append(new), chunks=chunks, model=model)
 
     def predict(
         self, states: Tensor, actions: Tensor, *, observation_noise: bool = True
@@ -287,10 +308,10 @@ class LearnedDynamics(Dynamics):
 
     def describe(self) -> dict[str, str]:
         """Each setting of these dynamics as a text; of objects, the class."""
-        parts = [*self._recipe.parts]
+        parts = [*self._parts]
         several: dict[str, Any] = {"physics": parts} if len(parts) > 1 else {}
         unknowns: dict[str, str] = {}
-        for part in self._recipe.parts.values():
+        for part in self._parts.values():
             unknowns |= {name: repr(unknown) for name, unknown in part.unknowns.items()}
         if unknowns:
             several["unknowns"] = unknowns
@@ -301,7 +322,7 @@ class LearnedDynamics(Dynamics):
         return fingerprint(
             type(self),
             self.spec,
-            model=made_by(self.make_model),
+            model=_made_by(self.make_model),
             **several,
             target=self.targets.target,
             encode_angles=self.encode_angles,
@@ -310,17 +331,29 @@ class LearnedDynamics(Dynamics):
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """All that was learnt, in tensors and plain values: data, f_p there, draws."""
+        """All that was learnt, in tensors and plain values: data, draws, f_p at some rows."""
         if self._learnt is None:
             return {}
-        return {"fingerprint": self.describe(), **self._learnt.state_dict()}
+        data, chunks, fitted, _ = self._learnt
+
+        def copied(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+            return {name: tensor.clone() for name, tensor in tensors.items()}
+
+        return {
+            "fingerprint": self.describe(),
+            "transitions": saved(data),
+            "probes": [[tensor.clone() for tensor in each] for each in self._probes],
+            "chunks": [*chunks],
+            "model": copied(fitted.state_dict()),
+            "draws": fitted.draws.clone(),
+            "noise": copied(_tensors_of(fitted.noise)),
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take back what :meth:`state_dict` gave; predictions and later fits are the same.
 
         An empty state, that of dynamics that have learnt nothing, lets them forget. The physics is
-        asked about at most three of the transitions, whether it is the one that they were learnt
-        with; a physics that is costly runs for these.
+        compared at three of the transitions, and evaluated at all of them.
 
         Raises:
             TypeError: If it is no dictionary.
@@ -332,7 +365,85 @@ class LearnedDynamics(Dynamics):
         if not state:
             self._learnt = self.fit_result = None
             return
-        self._learnt, self.fit_result = Learnt.loaded(state, self._recipe), None
+        for name in _STATE:
+            if name not in state:
+                raise RuntimeError(f"The state is damaged: it lacks {name!r}.")
+        data = loaded(state["transitions"], self.spec)
+        probes, whole = self._checked_probes(state["probes"]), self._restored(state, data)
+        self._probes, self._learnt, self.fit_result = probes, whole, None
+
+    def _checked_probes(self, given: Any) -> list[PhysicsProbes]:
+        """Take the probes of a state; a RuntimeError unless the physics is the same there."""
+        parts, columns = [*self._parts.values()], self.spec.predicted
+        is_list = isinstance(given, list | tuple) and len(given) == len(parts)
+        expect(is_list, "probes", f"a list of {len(parts)}, one for each physics")
+        probes = [PhysicsProbes.checked(each, self.spec, len(columns)) for each in given]
+        for part, each in zip(parts, probes, strict=True):
+            part.forget()  # a file of another day: it may have changed
+            with torch.no_grad():
+                values = part(self.targets.inputs(each.states, each.actions))
+            each.check(values, part.name, self.spec, columns)
+        return probes
+
+    def _restored(self, state: Mapping[str, Any], data: Trajectories) -> Learnt:
+        """Return what a state has learnt from its transitions; a RuntimeError if it is damaged."""
+        chunks, parameters, draws, noise = (state[name] for name in _STATE[2:])
+        n = len(data)
+        sizes: list[Any] = [*chunks] if isinstance(chunks, list | tuple) else [None]
+        whole = all(isinstance(size, int) and 1 <= size <= n for size in sizes)
+        expect(whole and sum(sizes) == n, "chunks", f"numbers of transitions, {n} in all")
+        for name, tensors in (("model", parameters), ("noise", noise), ("draws", {"": draws})):
+            whole = isinstance(tensors, Mapping) and all(map(torch.is_tensor, tensors.values()))
+            whole = whole and not any(tensor.isnan().any() for tensor in tensors.values())
+            expect(whole, name, "tensors without NaN")
+        parts = [data.some(rows) for rows in torch.arange(n).split(sizes)]
+        fitted = self._built(parts[0], quiet=True)
+        if noise:
+            own: Any = fitted.noise
+            own = type(own)(**{**own.settings, **noise}).of_terms(fitted.term_sum)
+            fitted = fitted.with_noise(own)
+        fitted.load_state_dict(dict(parameters))
+        number, shape = len(fitted.u), fitted.u.shape[1:]
+        whole = draws.shape[1:] == shape and len(draws) >= number
+        expect(whole, "draws", f"{number} or more coordinates {tuple(shape)}")
+        fitted.set_draws(draws.clone(), number)
+        model = fitted.eval()
+        for part in parts[1:]:
+            model = self._conditioned(model, part)
+        return Learnt(data, tuple(sizes), fitted, model)
+
+    def _built(self, data: Trajectories, quiet: bool) -> GP:
+        """Return the model of some transitions; quiet if an earlier one has given its warnings."""
+        with warnings.catch_warnings():
+            if quiet:
+                warnings.simplefilter("ignore")
+            model: GP = make_model(self.make_model, *self._rows(data), kind=GP, **self._options)
+        names = {name: getattr(self.targets, name) for name in ("input_names", "output_names")}
+        model.data = model.data._replace(**names)
+        return model
+
+    def _conditioned(self, model: GP, data: Trajectories) -> GP:
+        """Return the model with further transitions, its unknown numbers as they are."""
+        with torch.no_grad():
+            return model.condition_on_observations(*self._rows(data))
+
+    def _rows(self, data: Trajectories) -> tuple[Tensor, Tensor]:
+        inputs = self.targets.inputs(data.states, data.actions)
+        return inputs, self.targets.encode(data.states, data.next_states)
+
+    def _physics_at(self, states: Tensor, actions: Tensor) -> list[Tensor]:
+        """Return the targets by each physics, ``N x m``, with the guesses of parameters."""
+        inputs = self.targets.inputs(states, actions)
+        with torch.no_grad():
+            return [part(inputs) for part in self._parts.values()]
+
+    def _compared(self, data: Trajectories, values: list[Tensor]) -> list[PhysicsProbes]:
+        """Warn of a physics that returns differences, and return what each says of some rows."""
+        columns = self.spec.predicted
+        for part, own in zip(self._parts.values(), values, strict=True):
+            change = self.targets.decode(data.states, own) - data.states[:, columns]
+            warn_of_differences(part.name, self.spec, data, columns, change)
+        return [PhysicsProbes.of(data.states, data.actions, own, columns) for own in values]
 
     def _varied(
         self, variation: Tensor | float
@@ -380,3 +491,68 @@ class LearnedDynamics(Dynamics):
             mean, variance = self.model.predict(flat, observation_noise=observation_noise)
         mean, variance = (t.reshape(*X.shape[:-1], t.shape[-1]) for t in (mean, variance))
         return self.targets.decode(states, mean), variance
+
+
+def _tensors_of(noise: Any) -> dict[str, Tensor]:
+    """Return what a fit has learnt of single observations."""
+    settings = getattr(noise, "settings", {})
+    return {name: value for name, value in settings.items() if isinstance(value, Tensor)}
+
+
+def check_factory(make: Any, options: Mapping[str, Any]) -> None:
+    """Raise a TypeError unless a model can be made of inputs, targets and these options."""
+    if isinstance(make, Module) or not callable(make):
+        is_module = isinstance(make, Module)
+        found = f"an instance of {type(make).__name__}" if is_module else repr(make)
+        raise TypeError(
+            "Expected model as what makes one of (X, Y, physics=...): a class of gpadjust, such "
+            "as CKA, PhysicsMeanGP or ZeroMeanGP, a functools.partial of it with further "
+            f"arguments, or a function; found {found}."
+        )
+    taken = {"train_X", "train_Y", "train_Yvar", "physics", "input_transform"}
+    if isinstance(make, partial) and (own := sorted(taken & {*make.keywords})):
+        raise TypeError(
+            f"Expected a model whose data and physics come from the dynamics; found {own[0]} in "
+            "the functools.partial: leave it out, and give the physics to the dynamics."
+        )
+    inner, has_physics = _made_by(make), "physics" in options
+    name = getattr(inner, "__name__", repr(inner))
+    if has_physics and isinstance(inner, type) and issubclass(inner, ZeroMeanGP):
+        raise TypeError(
+            f"{name} takes no physics, but one was given: leave it out, or take model=CKA, which "
+            "adjusts it."
+        )
+    try:
+        signature(make).bind(None, None, **options)
+    except TypeError as error:
+        hint = "; pass `physics`, or take model=ZeroMeanGP, which learns without one"
+        raise TypeError(
+            f"{name} cannot make the model from (X, Y, {', '.join(f'{o}=...' for o in options)}): "
+            f"{error}{'' if has_physics else hint}."
+        ) from None
+
+
+def checked_fit_options(options: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return the options of :func:`gpadjust.fit`, without those that are None."""
+    checked = checked_options("fit_options", options, ("method", "num_draws", "seed"))
+    checked = {name: value for name, value in checked.items() if value is not None}
+    check_choice("method", checked.get("method", "bayes"), ("bayes", "map"))
+    return checked
+
+
+def _check_enough_observed(spec: StateSpec, data: Trajectories) -> None:
+    """Raise a ValueError unless each predicted state was measured in two transitions or more."""
+    observed = ~data.next_states[:, spec.predicted].isnan()
+    least, i = observed.sum(0).min(0)
+    if least < 2:
+        name = spec.states[spec.predicted[i]]
+        of = "" if len(observed) < 2 else f" with a measured {name!r}"
+        raise ValueError(
+            f"Expected at least 2 transitions to learn from, got {least}{of}: there is no scale in "
+            "fewer. Collect more before the first update."
+        )
+
+
+def _made_by(make: Any) -> Any:
+    """The function or class that a partial is of."""
+    return _made_by(make.func) if isinstance(make, partial) else make

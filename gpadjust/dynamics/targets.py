@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, get_args
 
 import torch
+from botorch.models.transforms.input import InputTransform
 from torch import Tensor
 
 from gpadjust.checks import check_choice, checked_number
 from gpadjust.dynamics.trajectories import Trajectories
 from gpadjust.physics import ODEPhysics, ParameterValues, Physics, PhysicsError, as_physics
-from gpadjust.physics.black_box import RowMemo, row_keys
 from gpadjust.states import StateSpec
 from gpadjust.states.state_spec import side_by_side
 
 Target = Literal["difference", "absolute"]
-_ALL = 2**62  # rows that a memo holds
 
 
 class Targets:
@@ -71,8 +70,7 @@ class Targets:
 class TargetPhysics(Physics):
     r"""Turns f_p, which returns next states, into a physics of the targets.
 
-    Memory, batching and gradients are those of the physics itself. The values at the training
-    inputs can be given, so that a simulator need not run again when a model is loaded.
+    Memory, batching and gradients are those of the physics itself.
     """
 
     def __init__(self, physics: Physics, targets: Targets) -> None:
@@ -80,22 +78,15 @@ class TargetPhysics(Physics):
         self.physics = physics
         self.targets = targets
         self.num_outputs = len(targets.predicted)
-        self.known = RowMemo(_ALL)
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """The targets that the physics stands for, ``N x m``."""
-        return self._targets_of(self.physics.of_rows, X, *parameters)
-
-    def _targets_of(
-        self, ask: Callable[[Tensor], Tensor], X: Tensor, *parameters: ParameterValues
-    ) -> Tensor:
-        """The targets by what the physics is asked of its rows."""
+        """Return the targets that the physics stands for, ``N x m``."""
         targets = self.targets
         num_states = len(targets.spec.moving)
         states = X[:, :num_states]
         read = X[:, targets.of_physics]
         try:
-            following = ask(self.physics.read_rows(read, *parameters))
+            following = self.physics.of_rows(self.physics.read_rows(read, *parameters))
         except PhysicsError as error:
             error.partial = None  # next states, which are no targets
             raise
@@ -109,34 +100,78 @@ class TargetPhysics(Physics):
             columns.append(column if targets.target == "difference" else states[:, i] + column)
         return torch.stack(columns, dim=-1)
 
-    def know(self, X: Tensor, values: Tensor) -> None:
-        """Take the values at inputs ``N x d`` as given; they replace those known so far."""
-        self.known = RowMemo(_ALL)
-        self.known.store(row_keys(X), values)
-
     def forget(self) -> None:
-        """Forget what was given, and what the physics remembers."""
-        self.known = RowMemo(_ALL)
+        """Forget what the physics remembers."""
         self.physics.forget()
-
-    def of_rows(self, rows: Tensor) -> Tensor:
-        """Like the base class; values that were given are not asked for again."""
-        asks = torch.is_grad_enabled() and rows.requires_grad
-        if asks or not len(self.known) or self.unknowns:
-            return super().of_rows(rows)
-        return self.known.recall(rows, super().of_rows, learn=False)
-
-    def fresh_rows(self, rows: Tensor) -> Tensor:
-        """Like :meth:`of_rows`, evaluated whatever was given or is remembered."""
-        return self._targets_of(self.physics.fresh_rows, *self._arguments(rows))
 
     def extra_repr(self) -> str:
         """The settings that ``repr`` shows."""
         return f"target={self.targets.target!r}"
 
-    def __getstate__(self) -> dict[str, Any]:
-        """All but what is known, which belongs to the data."""
-        return {**self.__dict__, "known": RowMemo(_ALL)}
+
+class AngleInput(InputTransform):
+    r"""Replaces each angle :math:`\theta` in its place by :math:`\sin\theta, \cos\theta`.
+
+    A stationary kernel on the result has no seam where the angle wraps.
+
+    Args:
+        columns: The columns of X that are angles in rad.
+
+    Raises:
+        TypeError: If ``columns`` is no sequence of whole numbers.
+        ValueError: If ``columns`` is empty, or has a negative or repeated number.
+
+    Example:
+        >>> import torch
+        >>> AngleInput([0])(torch.tensor([[0.0, 7.0]]))
+        tensor([[0., 1., 7.]])
+    """
+
+    is_one_to_many = False
+    transform_on_train = True
+    transform_on_eval = True
+    transform_on_fantasize = True
+
+    def __init__(self, columns: Sequence[int]) -> None:
+        super().__init__()
+        if not isinstance(columns, Sequence) or not all(isinstance(i, int) for i in columns):
+            raise TypeError(
+                f"Expected columns as a sequence of numbers, such as [0], got {columns!r}."
+            )
+        self.columns = tuple(columns)
+        distinct = set(self.columns)
+        if not distinct or len(distinct) < len(self.columns) or min(distinct) < 0:
+            raise ValueError(
+                f"Expected columns to be one or more different numbers >= 0, got {columns}."
+            )
+
+    def transform(self, X: Tensor) -> Tensor:
+        """Map ``... x n x d`` to ``... x n x (d + k)``, for ``k`` angles."""
+        if X.shape[-1] <= max(self.columns):
+            raise ValueError(
+                f"Expected X with an angle in column {max(self.columns)}, got shape "
+                f"{tuple(X.shape)}."
+            )
+        parts: list[Tensor] = []
+        for i, column in enumerate(X.unbind(-1)):
+            parts += [column.sin(), column.cos()] if i in self.columns else [column]
+        return torch.stack(parts, dim=-1)
+
+    def column_names(self, names: Sequence[str]) -> list[str]:
+        """The names of the columns of :meth:`transform`, of those of X."""
+        found: list[str] = []
+        for i, name in enumerate(names):
+            found += [f"sin({name})", f"cos({name})"] if i in self.columns else [name]
+        return found
+
+    @property
+    def settings(self) -> dict[str, list[int]]:
+        """The arguments that make it again."""
+        return {"columns": [*self.columns]}
+
+    def equals(self, other: InputTransform) -> bool:
+        """True if ``other`` replaces the same columns."""
+        return isinstance(other, AngleInput) and self.columns == other.columns
 
 
 def check_spec(spec: StateSpec) -> None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -53,7 +53,7 @@ class Windows(NamedTuple):
         return self.some(spread_rows(len(self.states), number, seed, "windows"))
 
 
-@dataclass(frozen=True, eq=False, init=False)
+@dataclass(frozen=True, eq=False)
 class Trajectories:
     """Trajectories of a system: rows of transitions, and to which episode each belongs.
 
@@ -66,6 +66,8 @@ class Trajectories:
         next_states: ``N x state_dim``; NaN where an entry was not measured.
         episode: ``N`` whole numbers; the rows of an episode follow each other. Default: each row is
             an episode, as of transitions that were measured one by one.
+        rewards: ``N``, of an agent's real steps. Default: none.
+        terminated: ``N`` booleans, whether the next state ended the episode. Default: none.
 
     Raises:
         ValueError: If they differ in their numbers of rows, or an episode has rows of another one
@@ -75,24 +77,21 @@ class Trajectories:
     states: Tensor
     actions: Tensor
     next_states: Tensor
-    episode: Tensor
+    episode: Tensor = None  # type: ignore[assignment]
+    rewards: Tensor = None  # type: ignore[assignment]
+    terminated: Tensor = None  # type: ignore[assignment]
 
-    def __init__(
-        self,
-        states: Tensor,
-        actions: Tensor,
-        next_states: Tensor,
-        episode: Tensor | Sequence[int] | None = None,
-    ) -> None:
-        episode = torch.arange(len(states)) if episode is None else torch.as_tensor(episode)
+    def __post_init__(self) -> None:
+        """Number the episodes, and check the numbers of rows."""
+        given: Any = self.episode
+        episode = torch.arange(len(self.states)) if given is None else torch.as_tensor(given)
         if episode.is_floating_point() and (episode != episode.round()).any():
             raise ValueError(f"Expected episode as whole numbers, found {episode.tolist()[:5]}.")
-        rows = {"states": states, "actions": actions, "next_states": next_states}
-        vars(self).update(rows, episode=episode.long())
-        found = {name: len(tensor) for name, tensor in vars(self).items()}
+        object.__setattr__(self, "episode", episode.long())
+        found = {name: len(tensor) for name, tensor in self._columns.items()}
         if len({*found.values()}) > 1 or self.episode.dim() != 1:
             raise ValueError(
-                "Expected states, actions, next_states and episode with as many rows each, found "
+                f"Expected {', '.join(found)} with as many rows each, found "
                 f"{', '.join(f'{number} of {name}' for name, number in found.items())}."
             )
         if len(self.episode.unique_consecutive()) > len(self.episode.unique()):
@@ -130,12 +129,23 @@ class Trajectories:
                 check_observed("the predicted entries of next_states", tensor[:, spec.predicted])
             else:
                 check_finite(name, tensor)
-        states, actions, next_states = (tensor.detach().clone() for tensor in named.values())
-        return cls(states, actions, next_states, episode)
+        copies = {name: tensor.detach().clone() for name, tensor in named.items()}
+        return cls(**copies, episode=episode)  # type: ignore[arg-type]
 
     def __iter__(self) -> Iterator[Tensor]:
         """States, actions and next states."""
         return iter((self.states, self.actions, self.next_states))
+
+    def __len__(self) -> int:
+        """Number of transitions."""
+        return len(self.states)
+
+    @property
+    def steps(self) -> Tensor:
+        """The number of each step in its episode, from 1."""
+        rows = torch.arange(len(self))
+        starts = torch.cat([torch.ones_like(rows[:1]), self.episode.diff()]) != 0
+        return rows - rows.where(starts, torch.zeros_like(rows)).cummax(0).values + 1
 
     @property
     def longest(self) -> int:
@@ -147,25 +157,36 @@ class Trajectories:
         found: list[int] = self.episode.unique_consecutive(return_counts=True)[1].tolist()
         return found
 
+    @property
+    def _columns(self) -> dict[str, Tensor]:
+        """The columns that there are."""
+        return {name: value for name, value in vars(self).items() if value is not None}
+
     def append(self, other: Trajectories) -> Trajectories:
         """These trajectories, then others; no episode goes on in them."""
-        last = self.episode.max() if len(self.episode) else -1
-        first = other.episode.min() if len(other.episode) else 0
-        states, actions, next_states = (torch.cat(pair) for pair in zip(self, other, strict=True))
-        episode = torch.cat([self.episode, other.episode - first + last + 1])
-        return Trajectories(states, actions, next_states, episode)
+        last = self.episode.max() if len(self) else -1
+        first = other.episode.min() if len(other) else 0
+        other = replace(other, episode=other.episode - first + last + 1)
+        columns = self._columns.keys() & other._columns.keys()
+        return Trajectories(
+            **{name: torch.cat([getattr(each, name) for each in (self, other)]) for name in columns}
+        )
 
     def some(self, rows: Tensor | slice) -> Trajectories:
         """The rows of these numbers, a slice, or those where ``N`` booleans are true.
 
         Episodes are numbered again: one ends wherever the row after it is left out.
         """
-        numbers = torch.arange(len(self.states))[rows]
+        numbers = torch.arange(len(self))[rows]
         old = self.episode[numbers]
         ends = (numbers.diff() != 1) | (old.diff() != 0)
         new = torch.cat([torch.zeros_like(old[:1]), ends.long().cumsum(0)])
-        states, actions, next_states = (tensor[numbers] for tensor in self)
-        return Trajectories(states, actions, next_states, new)
+        columns = {name: tensor[numbers] for name, tensor in self._columns.items()}
+        return Trajectories(**columns | {"episode": new})
+
+    def episodes(self) -> list[Trajectories]:
+        """The episodes, each by itself."""
+        return [self.some(rows) for rows in torch.arange(len(self)).split(self._lengths)]
 
     def spread(self, number: int, seed: int = 0) -> Trajectories:
         """Draw a number of the rows evenly: one of each of as many parts of the same length.
@@ -182,7 +203,7 @@ class Trajectories:
             >>> Trajectories(rows, rows, rows + 1).spread(4).states.flatten() // 25
             tensor([0., 1., 2., 3.], dtype=torch.float64)
         """
-        return self.some(spread_rows(len(self.states), number, seed, "transitions"))
+        return self.some(spread_rows(len(self), number, seed, "transitions"))
 
     def windows(self, length: int, stride: int | None = None) -> Windows:
         """Windows within episodes, to compare with :meth:`~gpadjust.dynamics.Dynamics.free_run`.

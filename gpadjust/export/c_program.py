@@ -145,14 +145,19 @@ def c_source(
         f"{'with' if observation_noise else 'without'} the noise; NULL if it is not wanted.",
         f"Numbers in tables: {sum(table.numel() for table in tables.values())}.",
     ]
-    lines = ["/*", *(f" * {line.replace('*/', '* /')}" for line in about), " */", ""]
-    lines += ["#include <math.h>", "", _sizes(found, model.num_outputs)]
+    head = ["/*", *(f" * {line.replace('*/', '* /')}" for line in about), " */", ""]
+    sizes = _sizes(found, model.num_outputs)
+    lines = [f"enum {{ {', '.join(f'{n} = {size}' for n, size in sizes.items())} }};"]
     lines += [*(_declared(*table) for table in tables.items()), ""]
     lines += [f"{'static ' * is_step}void {name}_predict(const double *x, {', '.join(given)})"]
     lines += [f"{{\n{body}    }}\n}}"]
+    # Sizes and tables have names of their own, so that one unit may contain several models.
+    own = "|".join([*sizes, *tables])
+    code = re.sub(rf"(?<!_)\b({own})\b", rf"{name}_\1", "\n".join(lines))
+    more = []
     if isinstance(fitted, LearnedDynamics):
-        lines += ["", *_step(fitted, name, given, found.num_physics)]
-    return "\n".join(lines) + "\n"
+        more = ["", *_step(fitted, name, given, found.num_physics)]
+    return "\n".join([*head, "#include <math.h>", "", code, *more]) + "\n"
 
 
 def _told(fitted: GP | LearnedDynamics, model: GP) -> Iterator[str]:
@@ -165,16 +170,15 @@ def _told(fitted: GP | LearnedDynamics, model: GP) -> Iterator[str]:
         yield f"A step lasts {fitted.spec.step!r}."
 
 
-def _sizes(s: FiniteSum, num_outputs: int) -> str:
-    """Return the sizes of the tables, as names."""
-    sizes = {
+def _sizes(s: FiniteSum, num_outputs: int) -> dict[str, int]:
+    """Return the sizes of the tables."""
+    return {
         "INPUTS": len(s.columns),
         "OUTPUTS": num_outputs,
         "DRAWS": len(s.weights) // num_outputs,
         "FEATURES": s.weights.shape[-1],
         "POINT_SETS": len(s.points),
     }
-    return f"enum {{ {', '.join(f'{name} = {size}' for name, size in sizes.items())} }};"
 
 
 def _tables(s: FiniteSum) -> dict[str, Tensor]:

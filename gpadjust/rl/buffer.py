@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,8 +12,8 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from gpadjust.checks import checked_number, checked_whole
-from gpadjust.control import RecordedEpisodes
 from gpadjust.control.step_guard import fault
+from gpadjust.dynamics import Trajectories
 from gpadjust.states import StateSpec
 
 
@@ -58,37 +58,17 @@ class CompactReplayBuffer(ReplayBuffer):
         self.full = self.full or self.pos + n >= self.buffer_size
         self.pos = (self.pos + n) % self.buffer_size
 
-    def filled(self) -> dict[str, Any]:
-        """The rows that are filled, and where the next one goes."""
-        rows = {name: torch.from_numpy(getattr(self, name)[: self.size()]) for name in self.rows}
-        return {**rows, "pos": self.pos, "full": self.full}
-
-    def fill(self, content: Mapping[str, Any]) -> None:
-        """Take back what :meth:`filled` gave, with space for the other rows.
-
-        Raises:
-            ValueError: If it is of a buffer of other shapes.
-        """
-        for name in self.rows:
-            found, own = content[name], getattr(self, name)
-            if found.shape[1:] != own.shape[1:] or len(found) > len(own):
-                raise ValueError(
-                    f"Expected {name} of at most {len(own)} rows of shape {own.shape[1:]}, found "
-                    f"{tuple(found.shape)}."
-                )
-        self.__setstate__(dict(content))
-
     def __getstate__(self) -> dict[str, Any]:
-        """The attributes, of the rows those that are filled."""
-        return {**self.__dict__, **self.filled()}
+        """Return the attributes, of the rows those that are filled."""
+        rows = {name: getattr(self, name)[: self.size()] for name in self.rows}
+        return {**self.__dict__, **rows}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take the attributes back, with space for the other rows."""
         self.__dict__.update(state)
         for name in self.rows:
-            filled = state[name].numpy()
-            rows = np.zeros((self.buffer_size, *filled.shape[1:]), dtype=filled.dtype)
-            rows[: len(filled)] = filled
+            rows = np.zeros((self.buffer_size, *state[name].shape[1:]), dtype=state[name].dtype)
+            rows[: len(state[name])] = state[name]
             setattr(self, name, rows)
 
 
@@ -219,47 +199,55 @@ class MixedReplayBuffer(CompactReplayBuffer):
         self.model_buffer.reset()
         self.failed[:] = self.learnt[:] = False
 
+    @property
+    def whole(self) -> np.ndarray:
+        """Which places are of episodes that have ended, ``buffer_size x n_envs`` booleans."""
+        places, ended = self._in_time()
+        whole = np.zeros_like(self.failed)
+        whole[places] = np.flip(np.maximum.accumulate(np.flip(ended, axis=0), axis=0), axis=0)
+        return whole
+
     def recorded(
         self,
         spec: StateSpec,
         unscale_action: Callable[[np.ndarray], np.ndarray],
         keep: np.ndarray | None = None,
-    ) -> RecordedEpisodes:
-        """The real steps in the user's units, one environment after the other.
+    ) -> Trajectories:
+        """Return whole real episodes in the user's units, one environment after the other.
+
+        The oldest one of a full buffer is left out, as its beginning may be lost, unless it is the
+        only one.
 
         Args:
             spec: The entries of states and actions.
             unscale_action: The inverse of the scale of the actions in the buffer.
             keep: Which places to take, ``buffer_size x n_envs`` booleans. Default: all.
         """
-        first = self.pos if self.full else 0
-        rows = (first + np.arange(self.size())) % self.buffer_size
-        happened = ~self.failed if keep is None else keep & ~self.failed
+        places, ended = self._in_time()
+        episode = ended.cumsum(0) - ended
+        lost = self.full & (ended.sum(0) > 1) & (episode == 0)
+        chosen = self.whole & ~self.failed & (True if keep is None else keep)
+        taken = (chosen[places] & ~lost).T.flatten()
+        episode = episode + np.arange(self.n_envs) * (len(places) + 1)
 
         def column(values: np.ndarray) -> torch.Tensor:
-            """The values of what happened, in the order of time."""
-            values, chosen = values.swapaxes(0, 1), happened[rows].T.flatten()
-            return torch.from_numpy(values.reshape(-1, *values.shape[2:])[chosen])
+            values = values.swapaxes(0, 1)  # one environment after the other
+            return torch.from_numpy(values.reshape(-1, *values.shape[2:])[taken])
 
         def numbers(name: str) -> torch.Tensor:
-            return column(getattr(self, name)[rows].astype(np.float64))
+            return column(getattr(self, name)[places].astype(np.float64))
 
-        ended = self.dones[rows].astype(bool)
-        begins = np.ones_like(ended)
-        begins[1:] = ended[:-1]
-        episode = begins.cumsum(0) + np.arange(self.n_envs) * (len(rows) + 1)
-        if self.full and begins[1:].any():
-            begins[0] = False  # what came before the oldest row is lost
-        # Those of an episode under way say nothing yet of how far one goes.
-        whole = np.flip(np.maximum.accumulate(np.flip(ended, axis=0), axis=0), axis=0)
-        return RecordedEpisodes(
-            spec,
+        return Trajectories(
             spec.decode(numbers("observations")),
             torch.from_numpy(unscale_action(numbers("actions").numpy())),
             spec.decode(numbers("next_observations")),
+            column(episode),
             numbers("rewards"),
             (numbers("dones") * (1 - numbers("timeouts"))).bool(),
-            column(episode),
-            column(begins),
-            column(whole),
         )
+
+    def _in_time(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the filled places from the oldest on, and whether episodes end there."""
+        first = self.pos if self.full else 0
+        places = (first + np.arange(self.size())) % self.buffer_size
+        return places, self.dones[places].astype(bool)

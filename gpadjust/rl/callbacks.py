@@ -74,11 +74,13 @@ class AgentCallback(DynaCallback):
         self._begun, self._steps_before = time.perf_counter(), self.model.num_timesteps
 
     def _on_rollout_end(self) -> None:
-        rows = (self.model.num_timesteps - self._steps_before) // self.model.n_envs
-        recorded = self.model.recorded_episodes(newest=rows)
-        if recorded.num_transitions:
+        buffer = self.model.replay_buffer
+        number = (self.model.num_timesteps - self._steps_before) // self.model.n_envs
+        newest = buffer.pos - 1 - np.arange(min(number, buffer.size()))
+        rewards = buffer.rewards[newest][~buffer.failed[newest]]
+        if len(rewards):
             values: dict[str, float] = {"number": self.model.num_episodes + 1}
-            values |= {"steps": recorded.num_transitions, "reward": float(recorded.rewards.mean())}
+            values |= {"steps": len(rewards), "reward": float(rewards.mean(dtype=np.float64))}
             values["seconds"] = time.perf_counter() - self._begun
             self.callback(self.model, "trial", values)
 

@@ -7,7 +7,6 @@ import json
 import warnings
 from copy import deepcopy
 from dataclasses import fields
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -19,11 +18,9 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import (
     GymEnv,
     RolloutReturn,
-    TensorDict,
     TrainFreq,
     TrainFrequencyUnit,
 )
@@ -31,12 +28,13 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
 from gpadjust.checks import check_kind
-from gpadjust.control import EpisodeCheckpoint, RecordedEpisodes, Task
-from gpadjust.control.checkpoint import packed, unpacked
-from gpadjust.control.recorded_episodes import learn_dynamics
+from gpadjust.control import EpisodeCheckpoint, Task
+from gpadjust.control.agent import TaskAgent
+from gpadjust.control.checkpoint import locked
+from gpadjust.control.episodes import check_functions, learn_dynamics
 from gpadjust.control.step_guard import check_observation
-from gpadjust.control.task_agent import TaskAgent, locked
-from gpadjust.rl.buffer import CompactReplayBuffer, MixedReplayBuffer
+from gpadjust.dynamics import Trajectories
+from gpadjust.rl.buffer import MixedReplayBuffer
 from gpadjust.rl.callbacks import AgentCallback, DynaCallback
 from gpadjust.rl.environments import environment_state, guarded, restore_environment
 from gpadjust.rl.model_vec_env import ModelVecEnv
@@ -137,7 +135,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
         self.wall_time = dict.fromkeys(("fit", "rollout", "update"), 0.0)
         self.notes: dict[str, Any] = {}
         self.model_hooks: list[DynaCallback] = []
-        self._unread_dynamics: dict[str, Any] = {}  # of an agent that was loaded without a task
+        self.learnt_before: dict[str, Any] = {}  # of a file, as long as there is no task
         if kwargs.get("_init_setup_model", True):
             self.ready_task()
         super().__init__(
@@ -178,7 +176,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
         serves = self.options.uses_model(self.num_episodes)
         new, num_ended = self._new_episodes()
         if serves and new is not None and self.options.reward_tolerance is not None:
-            new.check(self.ready_task(), self.options.reward_tolerance)
+            check_functions(self.ready_task(), new, self.options.reward_tolerance)
         self.replay_buffer.mix = serves
         with self.timed("update"):
             super().train(gradient_steps, batch_size)
@@ -189,9 +187,10 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
             with self.timed("fit"):
                 known = (self.recorded_episodes(), self.options.score_horizons)
                 metrics = learn_dynamics(self.model_task(), new, *known)
+        assert new.rewards is not None, "of real episodes"
         for name, value in {**metrics, "real_reward": float(new.rewards.mean())}.items():
             self.logger.record(f"model/{name}", value)
-        self.replay_buffer.learnt[: self.replay_buffer.size()] = True
+        self.replay_buffer.learnt |= self.replay_buffer.whole
         self.num_episodes += num_ended
         if serves:
             for hook in self.model_hooks:
@@ -201,7 +200,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
             for name, seconds in self.wall_time.items():
                 self.logger.record(f"model/share_{name}", seconds / total)
 
-    def _new_episodes(self) -> tuple[RecordedEpisodes | None, int]:
+    def _new_episodes(self) -> tuple[Trajectories | None, int]:
         """The real steps that the dynamics have not learnt, if an episode has ended; how many."""
         buffer, dynamics = self.replay_buffer, self.ready_task().dynamics
         num_ended = int((buffer.dones.astype(bool) & ~buffer.failed & ~buffer.learnt).sum())
@@ -209,7 +208,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
             return None, 0
         new = self._recorded(~buffer.learnt if dynamics.has_learnt else None)
         least = 1 if dynamics.is_fitted else 2  # a first fit needs two
-        return (new if new.num_transitions >= least else None), num_ended
+        return (new if len(new) >= least else None), num_ended
 
     def _train_in_model(self, num_episodes: int, batch_size: int) -> None:
         """Run model episodes, side by side, with updates at each step."""
@@ -315,7 +314,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
         *args: Any,
     ) -> tuple[int, BaseCallback]:
         """Refuse to spend a real episode on an agent that could not learn from it."""
-        task = self.ready_task()
+        self.ready_task()
         if self.env is None:
             raise ValueError(
                 f"There is no environment to learn in; pass env to {type(self).__name__}.load, or "
@@ -335,9 +334,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
             )
         if reset_num_timesteps or self._last_obs is None:  # SB3 ends the episodes under way
             self.replay_buffer.end_episodes(np.ones(self.n_envs, dtype=bool))
-        if self._unread_dynamics:
-            task.dynamics.load_state_dict(self._unread_dynamics)
-            self._unread_dynamics = {}
+        self._remember()
         self.model_hooks = []  # callbacks that have some add themselves
         noise = deepcopy(self.action_noise)  # which SB3 resets
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args)
@@ -369,15 +366,12 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
             self.task.refuse(name, part, "MPCAgent can")
         return self.task
 
-    def recorded_episodes(self, newest: int | None = None) -> RecordedEpisodes:
-        """The real steps in the buffer; or the newest of each environment only."""
-        buffer, keep = self.replay_buffer, None
-        if newest is not None:
-            keep = np.zeros_like(buffer.learnt)
-            keep[buffer.pos - 1 - np.arange(min(newest, buffer.size()))] = True
-        return self._recorded(keep)
+    def recorded_episodes(self, newest: int | None = None) -> Trajectories:
+        """Return the real steps in the buffer of episodes that have ended; or the newest ones."""
+        data = self._recorded()
+        return data if newest is None else data.some(slice(max(len(data) - newest, 0), None))
 
-    def _recorded(self, keep: np.ndarray | None = None) -> RecordedEpisodes:
+    def _recorded(self, keep: np.ndarray | None = None) -> Trajectories:
         spec = self.ready_task().dynamics.spec
         return self.replay_buffer.recorded(spec, self.policy.unscale_action, keep)
 
@@ -411,7 +405,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
             self.observation_space,
             self.action_space,
             sampling=self.options.sampling,
-            worst_reward=float(recorded.rewards.min()) if recorded.num_transitions else np.inf,
+            worst_reward=float(min(recorded.rewards, default=np.inf)),
         )
 
     def act_in_model(
@@ -446,62 +440,44 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
             way_out = "MPCAgent and PolicySearchAgent can"
             self.task.refuse(type(self).__name__, "sensors", way_out)
             self.task.check_spaces(self.observation_space, self.action_space)
-        self.replay_buffer_kwargs |= {
-            "real_fraction": self.options.real_fraction,
-            "model_buffer_size": self.options.model_buffer_size,
-        }
+        names = ("real_fraction", "model_buffer_size")
+        self.replay_buffer_kwargs |= {name: getattr(self.options, name) for name in names}
         super()._setup_model()
 
     # Saving
 
-    def get_parameters(self) -> dict[str, dict[str, Any]]:
-        """Return SB3's parameters, with the state of the dynamics."""
-        learnt = self._unread_dynamics
-        if self.task is not None and not learnt:
-            learnt = self.task.dynamics.state_dict()
-        return {**super().get_parameters(), "dynamics": learnt}
+    def save(self, *args: Any, **kwargs: Any) -> None:
+        """Save as Stable-Baselines3 does, with what the dynamics have learnt."""
+        if self.task is not None and not self.learnt_before:
+            self.learnt_before = self.task.dynamics.state_dict()
+            try:
+                super().save(*args, **kwargs)
+            finally:
+                self.learnt_before = {}
+        else:  # of an agent that was loaded without a task
+            super().save(*args, **kwargs)
 
-    def set_parameters(
-        self,
-        load_path_or_dict: str | TensorDict,
-        exact_match: bool = True,
-        device: torch.device | str = "auto",
-    ) -> None:
-        """Set parameters; without a task, the dynamics' state is kept for the next ``save``.
+    @classmethod
+    def load(cls, *args: Any, **kwargs: Any) -> Self:
+        """Load as Stable-Baselines3 does; the dynamics of a ``task`` learn what they had learnt.
 
         Raises:
-            ValueError: As in SB3, if something is missing, unless ``exact_match`` is False.
-            RuntimeError: If the state is of other dynamics, or of another physics.
+            RuntimeError: If these were other dynamics, or another physics.
         """
-        if isinstance(load_path_or_dict, dict):
-            parameters: dict[str, Any] = dict(load_path_or_dict)
-        else:
-            parameters = load_from_zip_file(load_path_or_dict, device=device, load_data=False)[1]
-        if exact_match and "dynamics" not in parameters:
-            raise ValueError(
-                "Expected parameters with the state of the dynamics, 'dynamics'; found "
-                f"{sorted(parameters)}. Pass exact_match=False to take the networks alone."
-            )
-        state = _on_cpu(parameters.pop("dynamics", None))
-        if state is None or self.task is None:
-            super().set_parameters(parameters, exact_match, device)
-            self._unread_dynamics = self._unread_dynamics if state is None else state
-            return
-        before = self.task.dynamics.state_dict()
-        self.task.dynamics.load_state_dict(state)
-        try:
-            super().set_parameters(parameters, exact_match, device)
-        except BaseException:
-            self.task.dynamics.load_state_dict(before)
-            raise
+        agent: Self = super().load(*args, **kwargs)
+        agent._remember()
+        return agent
+
+    def _remember(self) -> None:
+        """Let the dynamics of the task take what those of a file had learnt."""
+        if self.task is not None and self.learnt_before:
+            self.task.dynamics.load_state_dict(self.learnt_before)
+            self.learnt_before = {}
 
     def _excluded_save_params(self) -> list[str]:
-        own = ["task", "model_hooks", "_random_state", "_unread_dynamics"]
-        return [*super()._excluded_save_params(), *own]
+        return [*super()._excluded_save_params(), "task", "model_hooks", "_random_state"]
 
-    def load_replay_buffer(
-        self, path: str | Path | io.BufferedIOBase, truncate_last_traj: bool = True
-    ) -> None:
+    def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
         """Load both buffers; the file is a pickle: open only one that you trust."""
         super().load_replay_buffer(path, truncate_last_traj)
         self.replay_buffer.model_buffer.device = self.device
@@ -524,42 +500,30 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
 
     def saved_parts(self) -> dict[str, bytes]:
         """SB3's file of the agent, both buffers, and the environments."""
-        saved = io.BytesIO()
-        self.save(saved)
-        buffers = {name: packed(part.filled()) for name, part in self._buffers().items()}
+        agent, buffers = io.BytesIO(), io.BytesIO()
+        self.save(agent)
+        self.save_replay_buffer(buffers)
         return {
-            "agent.zip": saved.getvalue(),
+            "agent.zip": agent.getvalue(),
+            "buffers.pkl": buffers.getvalue(),
             "action_space.json": json.dumps(self._action_generator.state).encode(),
             "environment.pkl": environment_state(self.env),
-            **buffers,
         }
 
     @classmethod
     def from_parts(cls, parts: dict[str, bytes], env: VecEnv, task: Task) -> Self:
         """The agent that :meth:`saved_parts` saved."""
         agent = cls.load(io.BytesIO(parts["agent.zip"]), env=env, task=task, force_reset=False)
-        for name, buffer in agent._buffers().items():
-            buffer.fill(unpacked(parts[name]))
+        agent.load_replay_buffer(io.BytesIO(parts["buffers.pkl"]), truncate_last_traj=False)
         agent._action_generator.state = json.loads(parts["action_space.json"])
         if not restore_environment(env, parts["environment.pkl"]):
             agent._last_obs = None  # the environment is reset
         return agent
 
-    def _buffers(self) -> dict[str, CompactReplayBuffer]:
-        buffer = self.replay_buffer
-        return {"replay_buffer.pt": buffer, "model_buffer.pt": buffer.model_buffer}
-
     @property
     def _action_generator(self) -> Any:
         """The generator of the first actions, with ``learning_starts``."""
         return self.action_space.np_random.bit_generator
-
-
-def _on_cpu(state: Any) -> Any:
-    """A state of dynamics, which SB3 loads to the device of the networks, where they compute."""
-    if isinstance(state, dict):
-        return {name: _on_cpu(part) for name, part in state.items()}
-    return state.cpu() if torch.is_tensor(state) else state
 
 
 class DynaSAC(Dyna, SAC):

@@ -24,9 +24,9 @@ class DynaOptions:
             newest one, from the same states and actions, as soon as it is fitted. What the first
             models got wrong would mislead the agent for long. It costs a prediction of the whole
             model buffer after each real episode. (The paper does not have it.)
-        real_fraction: Share of real transitions in a batch, see :class:`MixedReplayBuffer`. The
-            default, a real one for ten of the model, is what a uniform draw from both buffers would
-            give with ten model episodes for each real one. (MBPO has 1/20; Janner et al. 2019.)
+        real_fraction: Share of real transitions in a batch, see :class:`MixedReplayBuffer`. By
+            default one for ten of the model, twice as many as a uniform draw from both buffers
+            would have with ``model_episodes=20``. (MBPO has 1/20; Janner et al. 2019.)
         model_buffer_size: Number of model transitions that are kept. Default: as ``buffer_size``.
         num_particles: Model episodes that run side by side. Default: all.
         sampling: How they are sampled, by ``"step"`` or ``"trajectory"``, see

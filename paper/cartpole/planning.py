@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import pandas as pd
 import torch
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from gpadjust.control import (
     CrossEntropy,
@@ -24,6 +24,9 @@ from gpadjust.control import (
     Planner,
     PolicySearch,
     PolicySearchAgent,
+    Rollouts,
+    SearchResult,
+    Task,
 )
 from gpadjust.core import SamplingWarning
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
@@ -110,7 +113,7 @@ def make_agent(
     }
     if learner != "search":
         return MPCAgent(env, task, each_step, first=first, **common)
-    search = PolicySearch(
+    search = GuidedSearch(
         updates=settings.updates,
         num_starts=settings.starts,
         num_functions=None,
@@ -119,6 +122,48 @@ def make_agent(
         num_guides=settings.guides,
     )
     return PolicySearchAgent(env, task, search=search, **common)
+
+
+@dataclass(frozen=True)
+class GuidedSearch(PolicySearch):
+    """A policy search that begins with a policy which imitates plans of some episodes.
+
+    Of a swing-up gradients find nothing by themselves, as at first no action of the policy matters.
+    """
+
+    _: KW_ONLY
+    guide: Planner = field(default_factory=Planner)
+    num_guides: int = 16
+    begun: set[int] = field(default_factory=set)  # policies that have imitated them
+
+    def improve(self, policy: Any, task: Task, **options: Any) -> SearchResult:
+        """Imitate plans, if it is the first time, and improve the policy."""
+        if id(policy) not in self.begun:
+            _imitate(policy, *self.plans(task, policy.action_bounds))
+            self.begun.add(id(policy))
+        return super().improve(policy, task, **options)
+
+    def plans(self, task: Task, action_bounds: Tensor) -> tuple[Tensor, Tensor]:
+        """States ``N x state_dim`` and actions ``N x action_dim`` of episodes by the guide."""
+        rollouts, parts = Rollouts(task, None), []
+        for start in task.draw_initial_states(self.num_guides):
+            plan = self.guide.plan(task, start, action_bounds)
+            with torch.no_grad():
+                rollout = rollouts.follow(start, plan.actions.unsqueeze(0))
+            parts.append([part[rollout.made] for part in (rollout.states, rollout.actions)])
+        states, actions = (torch.cat(column) for column in zip(*parts, strict=True))
+        return states, actions
+
+
+def _imitate(policy: nn.Module, states: Tensor, actions: Tensor) -> None:
+    """Fit a policy to actions ``N x action_dim`` at states ``N x state_dim``, by least squares."""
+    scale = actions.std(0, correction=0).clamp_min(1e-12)
+    optimizer = torch.optim.Adam(policy.parameters(), lr=5e-3)
+    for _ in range(400):
+        loss = ((policy(states) - actions) / scale).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
 
 
 def planners(settings: PlanningSettings) -> tuple[Planner, Planner]:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 import torch
 from botorch import fit_gpytorch_mll
@@ -427,7 +428,8 @@ REFUSED = [
     ({"data": (GIVEN, GIVEN[:3, :1])}, r"shape 4 x m, .* got \(3, 1\)", ValueError),
     ({"data": (GIVEN, GIVEN[:, :1] / 0)}, "Expected the Y of data to be finite", ValueError),
     ({"data": (GIVEN, GIVEN[:, :1] * math.nan)}, "the Y of data to hold an obs", ValueError),
-    ({"seed": -1}, "seed to be a whole number >= 0", ValueError),
+    ({"seed": -1}, "seed must be at least 0; found -1", ValueError),
+    ({"seed": True}, "seed must be a whole number; found True", TypeError),
     ({"optimizer_options": [1]}, r"to be a dictionary, got \[1\]", TypeError),
     ({"optimizer_options": {"q": 2}}, r"without \['q'\]", ValueError),
     ({"model_factory": lambda X, Y: 3}, "factory to make a botorch Model; found int", TypeError),
@@ -446,3 +448,11 @@ def test_what_cannot_be_collected_by_is_refused(laboratory, uniform):
     analytic = lambda model: LogExpectedImprovement(model, best_f=1.0)  # noqa: E731
     with pytest.raises(ValueError, match=r"LogExpectedImprovement takes one .* got q = 2"):
         collect(**laboratory(acquisition=analytic, batch_size=2))
+
+
+def test_seeds_and_numbers_of_numpy_are_taken():
+    bounds = torch.tensor([[0.0], [1.0]]).double()
+    given = (lambda X, Y: None, bounds, lambda model: None)
+    collection = Collection(*given, seed=np.int64(3), initial=np.int64(5))
+    assert (collection.seed, type(collection.seed)) == (3, int)
+    assert torch.equal(collection.ask(), Collection(*given, seed=3, initial=5).ask())

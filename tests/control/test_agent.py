@@ -70,7 +70,7 @@ def test_without_a_physics_the_first_episode_is_random(make_agent, kind, point_d
     assert agent.learn(5).recorded_episodes().actions.unique().numel() > 1
     assert agent.promised_reward is None
     assert agent.model is not None
-    assert agent.learn(5).recorded_episodes().num_transitions == 10
+    assert len(agent.learn(5).recorded_episodes()) == 10
 
 
 @pytest.mark.slow
@@ -130,7 +130,7 @@ def test_episodes_are_played_to_their_end_and_told(make_agent, kind, capsys):
     assert events == [*search, *episode, *episode, "done"]
     episodes = agent.recorded_episodes()
     assert episodes.episode.tolist() == 5 * [0] + 5 * [1]
-    assert episodes.begins.nonzero().flatten().tolist() == [0, 5]
+    assert episodes.steps.tolist() == 2 * [1, 2, 3, 4, 5]
     assert torch.equal(episodes.states[1:5], episodes.next_states[:4])
     assert torch.equal(agent.recorded_episodes(newest=3).states, episodes.states[7:])
     begin = f"{kind.__name__}(Point, LearnedDynamics, 2 episodes learnt, 10 steps"
@@ -294,6 +294,22 @@ def test_an_episode_without_a_step_counts_for_nothing(make_agent, point_env):
     agent = make_agent(Boasts, Jams(point_env(), 6), reward_tolerance=None).learn(11)
     assert agent.num_episodes == 2
     assert agent.promised_reward == -1.0
+
+
+def test_an_episode_that_is_interrupted_before_its_first_step_counts_for_nothing(make_agent):
+    """Else the episodes after it would be numbered from 3, and their promises not compared."""
+
+    def interrupts(agent, event, values):
+        if event == "plan" and agent.num_timesteps == 5:
+            raise KeyboardInterrupt
+
+    trials, agent = Log("trial"), make_agent(MPCAgent, first=WHOLE)
+    with pytest.raises(KeyboardInterrupt):
+        agent.learn(10, interrupts)
+    agent.learn(10, trials)
+    assert agent.num_episodes == 3
+    assert [values["number"] for values in trials] == [2, 3]
+    assert agent.promised_reward == trials[-1]["promised_reward"]
 
 
 def test_a_physics_that_is_to_be_fitted_learns_all_episodes(make_agent, point_task):

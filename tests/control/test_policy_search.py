@@ -6,8 +6,6 @@ import pytest
 import torch
 
 from gpadjust.control import (
-    CrossEntropy,
-    Planner,
     PolicySearch,
     Return,
     Rollouts,
@@ -147,29 +145,6 @@ def test_runaways_and_failures_cost_those_particles_only():
     assert policy.body[0].weight.item() < -0.05
 
 
-def test_a_guide_shows_what_gradients_do_not_find():
-    """The reward is flat but near x = 2, which no gradient from about 0 tells of."""
-    torch.manual_seed(0)
-
-    def reward(states, actions, next_states):
-        return torch.exp(-100 * (next_states[:, 0] - 2).square())
-
-    task = Task(
-        PhysicsDynamics(SPEC, step),
-        reward,
-        initial_states=lambda n: starts(n) / 10,
-        episode_length=5,
-    )
-    guide = Planner(search=CrossEntropy(4), num_random=64)
-    values = {}
-    for name, each in (("alone", None), ("guided", guide)):
-        policy = mlp_policy(SPEC, BOUNDS, (16,))
-        search = PolicySearch(updates=20, num_functions=None, guide=each, num_guides=4)
-        values[name] = search.improve(policy, task).values[-5:].mean()
-    assert values["alone"] < 0.1
-    assert values["guided"] > 0.3
-
-
 def test_an_error_leaves_the_policy_as_it_was():
     policy = linear(SPEC, BOUNDS)
     before = policy.body[0].weight.clone()
@@ -192,12 +167,6 @@ def test_rewards_without_gradient_are_told():
     )
     with pytest.raises(RuntimeError, match="Write the reward in torch"):
         PolicySearch(updates=1).improve(linear(SPEC, BOUNDS), task)
-
-
-def test_a_guide_needs_bounds():
-    policy, task = torch.nn.Linear(1, 1).double(), task_of(PhysicsDynamics(SPEC, step))
-    with pytest.raises(TypeError, match=r"which only a BoundedPolicy says, .* found Linear"):
-        PolicySearch(updates=1, guide=Planner()).improve(policy, task)
 
 
 @pytest.mark.slow

@@ -22,8 +22,8 @@ from gpadjust.control import (
     Task,
     resume,
 )
-from gpadjust.control.smoothed_episodes import Seen, smooth_episodes
-from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
+from gpadjust.control.smoothed_episodes import smooth_episodes
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, Trajectories
 from gpadjust.states import Sensors, StateSpec
 from gpadjust.systems import NoisySensors, System, cart_pole
 from tests.point import linear
@@ -32,6 +32,11 @@ SPEC = StateSpec(["x", "v"], ["force"])
 STEP, LENGTH, NOISE = 0.2, 8, 0.02
 PLAN = Planner(search=CrossEntropy(1), horizon=3, num_random=32)
 SEARCH = PolicySearch(updates=4, num_starts=4, num_functions=2)
+
+
+def episode_of(observations, actions):
+    """An episode of ``T + 1`` observations."""
+    return Trajectories(observations[:-1], actions, observations[1:], torch.zeros(len(actions)))
 
 
 def glide(X, drag=0.0):
@@ -142,7 +147,7 @@ def test_an_episode_may_begin_beyond_half_a_turn():
         first = Estimate(torch.tensor([zero, 0.0]).double(), 0.1 * torch.eye(2).double())
         known = StateFilter(first, torch.tensor([0.03]).double(), torch.tensor([0, 0.01]).double())
         rest = torch.tensor([[zero + 0.1, 0.0]]).double().expand(6, 2)
-        seen = Seen(spec.observe(rest)[:, :2], torch.zeros(5, 1).double())
+        seen = episode_of(spec.observe(rest)[:, :2], torch.zeros(5, 1).double())
         learnt, paths = smooth_episodes(task, known, [seen] * 3, seed=0)
         off = spec.change(rest.repeat(3, 1), torch.cat(paths))
         found.append((learnt.noise, learnt.process_noise, off))
@@ -163,7 +168,7 @@ def test_noises_and_hidden_states_are_found():
                 state = state + torch.tensor([0.0, 0.1]) * torch.from_numpy(rng.normal(size=2))
         truth.append(torch.stack(states))
         seen = truth[-1][:, :1] + 0.05 * torch.from_numpy(rng.normal(size=(41, 1)))
-        episodes.append(Seen(seen, forces))
+        episodes.append(episode_of(seen, forces))
     learnt, paths = smooth_episodes(task, known, episodes, seed=0)
     assert abs(learnt.noise.item() / 0.05 - 1) < 0.15
     assert abs(learnt.process_noise[1].item() / 0.1 - 1) < 0.4
@@ -325,7 +330,7 @@ def test_what_nothing_disturbs_stays_as_it_is_and_starts_vary_together():
     task = replace(task, initial_states=alike)
     known = StateFilter.guessed(task, torch.tensor([[-1.0], [1.0]]).double())
     assert known.process_noise[1] == 0
-    seen = Seen(torch.full((5, 1), 2.0).double(), torch.zeros(4, 1).double())
+    seen = episode_of(torch.full((5, 1), 2.0).double(), torch.zeros(4, 1).double())
     learnt, paths = smooth_episodes(task, known, [seen] * 3, 0)
     assert learnt.process_noise[1] == 0
     assert (torch.stack(paths)[..., 1] - 2).abs().max() < 0.2

@@ -98,7 +98,7 @@ def test_an_episode_that_cannot_begin_is_an_error(make_agent, point_env):
     with pytest.raises(ValueError, match="An episode cannot begin: entry 0 of the observation is"):
         agent.learn(10)
     agent.env.unwrapped.steps = agent.env.env.steps = 0
-    assert agent.learn(5).recorded_episodes().num_transitions == 10
+    assert len(agent.learn(5).recorded_episodes()) == 10
 
 
 EACH = {1: "raises", 4: "nan", 9: "1e30", 12: "reward nan", 13: "reward 1e30", 18: "inf"}
@@ -121,12 +121,12 @@ def test_agents_lose_nothing(make_agent, kind, point_env, faults):
     assert len([each for each in told if each.category is FailedStepWarning]) == len(faults)
     agent.learn(5)
     recorded = agent.recorded_episodes()
-    assert recorded.num_transitions == agent.num_timesteps - len(faults)
-    assert agent.task.dynamics.num_transitions == recorded.num_transitions
+    assert len(recorded) == agent.num_timesteps - len(faults)
+    assert agent.task.dynamics.num_transitions == len(recorded)
     moved = recorded.next_states - recorded.states
     torch.testing.assert_close(moved, 0.5 * recorded.actions, atol=0.1, rtol=0)
     assert recorded.rewards.isfinite().all()
-    assert agent.num_episodes == int(recorded.begins.sum())
+    assert agent.num_episodes == int((recorded.steps == 1).sum())
 
 
 @pytest.mark.parametrize("seen", [np.array([np.nan]), np.array([[0.5], [np.inf]])])

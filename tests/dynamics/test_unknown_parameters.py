@@ -104,7 +104,6 @@ def test_targets_of_a_physics_at_parameters(uniform):
     expected = torch.tensor(rows, dtype=torch.float64)
     for found in (targets(X, speed), targets.or_nan(X, speed)):
         torch.testing.assert_close(found, expected.unsqueeze(-2).expand(3, 4, 2))
-    targets.know(X, torch.zeros(4, 2, dtype=torch.float64))  # of the guesses, which say nothing
     torch.testing.assert_close(targets(X, speed[0]), expected[0].expand(4, 2))
     found = targets.or_nan(X, torch.tensor([[0.5], [9.0]], dtype=torch.float64))
     assert found.isnan().all(-1).all(-1).tolist() == [False, True]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gpadjust.control.random_state import RandomState
+from gpadjust.control.checkpoint import RandomState
 from paper.arm import SLOW, Arm, Reaching, ReachingSettings, Settings, evaluation
 from paper.arm.arm import load_maps
 from paper.arm.claims import claims as arm_claims

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 import torch
 
-from gpadjust.control.random_state import RandomState
+from gpadjust.control.checkpoint import RandomState
 from gpadjust.rl import DynaSAC
 from gpadjust.systems.swing_up import REAL_CART_POLE, START_MEAN, equation_physics
 from paper.cartpole import (

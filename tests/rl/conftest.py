@@ -66,6 +66,7 @@ def tensors_of():
         normalizer = agent.get_vec_normalize_env()
         return {
             "parameters": agent.get_parameters(),
+            "dynamics": agent.task.dynamics.state_dict(),
             "log_ent_coef": getattr(agent, "log_ent_coef", None),
             "buffers": [[getattr(each, name) for name in each.rows] for each in buffers],
             "counts": [agent.num_timesteps, agent.num_episodes, agent._n_updates],

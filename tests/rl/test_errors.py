@@ -87,10 +87,10 @@ def test_steps_that_fail_end_their_episodes_and_lose_nothing(
     assert len(told) == len(FAILS)
     agent.learn(10, reset_num_timesteps=False)
     recorded = agent.recorded_episodes()
-    assert agent.task.dynamics.num_transitions == recorded.num_transitions == 28 - len(FAILS)
+    assert agent.task.dynamics.num_transitions == len(recorded) == 28 - len(FAILS)
     moved = recorded.next_states - recorded.states
     torch.testing.assert_close(moved, 0.5 * recorded.actions, atol=0.1, rtol=0)
-    assert recorded.begins.sum() == 6
+    assert (recorded.steps == 1).sum() == 6
     for group in (*agent.get_parameters()["policy"].values(), recorded.rewards):
         assert group.isfinite().all()
     if layers:
@@ -150,16 +150,17 @@ def test_a_step_that_failed_is_no_data(point_agent, point_env, learnt_dynamics, 
     torch.testing.assert_close(moved, 0.5 * recorded.actions, atol=0.1, rtol=0)
     follows = (recorded.states[1:] == recorded.next_states[:-1]).all(-1)
     starts = [0, *(1 + follows.logical_not().nonzero().flatten()).tolist()]
-    assert recorded.begins.nonzero().flatten().tolist() == starts
+    assert (recorded.steps == 1).nonzero().flatten().tolist() == starts
     assert (recorded.episode.diff() > 0).nonzero().flatten().add(1).tolist() == starts[1:]
-    assert dynamics.num_transitions <= recorded.num_transitions
+    assert dynamics.num_transitions <= len(recorded)
 
 
 def test_of_several_environments_one_may_fail(point_agent, point_env):
     env = DummyVecEnv([lambda: Jams(point_env(), (3,)), point_env])
     agent = point_agent(env, train_freq=(5, "step"), reward_tolerance=None).learn(20)
     recorded = agent.recorded_episodes()
-    assert recorded.num_transitions == 19
+    assert len(recorded) == 18  # the step after the last of these begins an episode that goes on
+    assert agent.replay_buffer.size() == 10
     moved = recorded.next_states - recorded.states
     torch.testing.assert_close(moved, 0.5 * recorded.actions, atol=0.1, rtol=0)
     batch = agent.replay_buffer.sample(200)

@@ -40,47 +40,32 @@ def observe(x):
 
 
 def test_rows_are_states_and_actions_in_the_users_units(recorded):
-    episodes = recorded(4)
-    expected = torch.arange(4.0).double()
+    episodes = recorded(4)  # of the second episode, which goes on, there is nothing yet
+    expected = torch.arange(3.0).double()
     assert episodes.states.dtype == episodes.actions.dtype == torch.float64
     assert torch.equal(episodes.states[:, 0], expected)
     angle = torch.atan2(expected.sin(), expected.cos())
     assert torch.allclose(episodes.states[:, 1], angle, atol=1e-6)
     assert torch.equal(episodes.next_states[:, 0], expected + 0.5)
-    assert torch.equal(episodes.actions, torch.ones(4, 1).double())
+    assert torch.equal(episodes.actions, torch.ones(3, 1).double())
     assert torch.equal(episodes.rewards, -expected)
 
 
 def test_environments_follow_one_another(recorded):
-    assert recorded(2, n_envs=2).states[:, 0].tolist() == [0, 1, 100, 101]
+    episodes = recorded(6, n_envs=2)
+    assert episodes.states[:, 0].tolist() == [0, 1, 2, 3, 4, 5, 100, 101, 102, 103, 104, 105]
+    assert episodes.steps.tolist() == 4 * [1, 2, 3]
 
 
 @pytest.mark.parametrize("n_envs", [1, 2])
-def test_a_full_buffer_is_read_from_its_oldest_row(recorded, n_envs):
-    episodes = recorded(8, n_envs=n_envs, capacity=5)
-    assert episodes.num_transitions == 5 * n_envs
-    assert episodes.states[:5, 0].tolist() == [3, 4, 5, 6, 7]
+def test_of_a_full_buffer_the_episode_that_lost_its_beginning_is_left_out(recorded, n_envs):
+    episodes = recorded(9, n_envs=n_envs, capacity=5)  # rows 4 to 8
+    assert episodes.states[:3, 0].tolist() == [6, 7, 8]
+    assert len(episodes) == 3 * n_envs
+    assert recorded(6, n_envs=n_envs, capacity=3).states[:3, 0].tolist() == [3, 4, 5]
 
 
-@pytest.mark.parametrize(("newest", "expected"), [(2, [6, 7]), (0, []), (99, [3, 4, 5, 6, 7])])
+@pytest.mark.parametrize(("newest", "expected"), [(2, [7, 8]), (0, []), (99, [3, 4, 5, 6, 7, 8])])
 def test_the_newest_rows_alone(recorded, newest, expected):
-    episodes = recorded(8, capacity=5, newest=newest)
+    episodes = recorded(9, capacity=8, newest=newest)
     assert episodes.states[:, 0].tolist() == expected
-
-
-def starts_of(episodes):
-    return sorted(set(episodes.draw_starts(200)[:, 0].tolist()))
-
-
-def test_starts_are_those_of_episodes(recorded):
-    episodes = recorded(8, n_envs=2)
-    assert starts_of(episodes) == [0, 3, 6, 100, 103, 106]
-    assert episodes.draw_starts(5).shape == (5, 2)
-
-
-def test_the_oldest_row_of_a_full_buffer_may_be_no_start(recorded):
-    assert starts_of(recorded(8, capacity=4)) == [6]  # the rows are 4, 5, 6, 7
-
-
-def test_without_a_start_in_the_buffer_the_oldest_row_serves(recorded):
-    assert starts_of(recorded(8, capacity=4, episode_length=20)) == [4]

@@ -140,50 +140,14 @@ def test_both_buffers_are_saved_together(point_agent, tmp_path):
         assert again.device == other.device
 
 
-def test_parameters_can_be_moved(saved, point_agent, learnt_dynamics):
-    agent, path = saved
-    for source in (agent.get_parameters(), str(path)):
-        other = point_agent(dynamics=learnt_dynamics(), seed=9)
-        other.set_parameters(source)
-        assert other.task.dynamics.num_transitions == 10
-        obs = np.zeros((1, 1), dtype=np.float32)
-        np.testing.assert_array_equal(
-            other.predict(obs, deterministic=True)[0], agent.predict(obs, deterministic=True)[0]
-        )
-
-
-def test_parameters_without_dynamics_are_refused_unless_told(saved, point_agent, learnt_dynamics):
-    agent, _ = saved
-    networks = {k: v for k, v in agent.get_parameters().items() if k != "dynamics"}
-    other = point_agent(dynamics=learnt_dynamics(), seed=9)
-    with pytest.raises(
-        ValueError, match=r"with the state of the dynamics, 'dynamics'; found \['act"
-    ):
-        other.set_parameters(networks)
-    other.set_parameters(networks, exact_match=False)
-    assert not other.task.dynamics.is_fitted
-
-
 def test_a_task_that_is_given_after_loading_knows_what_was_learnt(
     saved, point_env, point_task, crude_dynamics
 ):
     agent, path = saved
     loaded = DynaSAC.load(path, env=point_env())
-    known = {k: v for k, v in agent.get_parameters().items() if k != "dynamics"}
-    loaded.set_parameters(known, exact_match=False)
     loaded.task = point_task(dynamics=crude_dynamics(agent.task.dynamics.physics))
     loaded.learn(5, reset_num_timesteps=False)
     assert loaded.task.dynamics.num_transitions == 15
-
-
-def test_parameters_are_taken_as_a_whole(saved, point_agent, learnt_dynamics, tensors_of):
-    agent, _ = saved
-    broken = agent.get_parameters()
-    broken["policy"] = {}
-    other = point_agent(dynamics=learnt_dynamics(), seed=9).learn(5)
-    with pytest.raises(RuntimeError, match="Missing key"):
-        other.set_parameters(broken)
-    assert other.task.dynamics.num_transitions == 5
 
 
 def test_another_physics_is_not_loaded(saved, point_task, crude_dynamics):

@@ -6,10 +6,17 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gpadjust.control import RecordedEpisodes, Task
-from gpadjust.control.recorded_episodes import learn_dynamics
+from gpadjust.control import Task
+from gpadjust.control.episodes import (
+    check_functions,
+    completed,
+    far_bounds,
+    learn_dynamics,
+    learnable,
+    warn_of_bounds,
+)
 from gpadjust.core import Prediction
-from gpadjust.dynamics import Dynamics, PhysicsDynamics, StateSpec
+from gpadjust.dynamics import Dynamics, PhysicsDynamics, StateSpec, Trajectories
 from gpadjust.physics import PhysicsError
 from tests.point import POINT_SPEC
 
@@ -19,22 +26,13 @@ SPEC = StateSpec(["x", "angle"], ["force"], angles=["angle"])
 
 @pytest.fixture
 def recorded():
-    """Records steps 0, 1, ... of episodes of three; `x` is the step, the last episode goes on."""
+    """Records steps 0, 1, ... of episodes of three; `x` is the step."""
 
     def record(num_steps, terminal=False):
         x = torch.arange(float(num_steps)).double()
         states, ends = torch.stack([x, x], -1), x % 3 == 2
-        return RecordedEpisodes(
-            SPEC,
-            states,
-            torch.ones(num_steps, 1).double(),
-            states + 0.5,
-            rewards=-x,
-            terminated=ends & terminal,
-            episode=(x // 3).long(),
-            begins=x % 3 == 0,
-            whole=x < num_steps // 3 * 3,
-        )
+        force = torch.ones(num_steps, 1).double()
+        return Trajectories(states, force, states + 0.5, (x // 3).long(), -x, ends & terminal)
 
     return record
 
@@ -45,10 +43,8 @@ def moved():
     x = torch.tensor([1.0, 0.5, 0.2, 0.4, 0.9, 1.2, 0.7, 0.6, 0.1, 0.3]).double().unsqueeze(-1)
     v = torch.cat([x[1:] - x[:-1], x[:1]]) * 2
     v[4] = -0.3  # the first episode ends there
-    begins = torch.arange(10) % 5 == 0
-    flags = torch.ones(10).bool()
-    number = begins.cumsum(0)
-    return RecordedEpisodes(POINT_SPEC, x, v, x + 0.5 * v, -x[:, 0], ~flags, number, begins, flags)
+    number = torch.arange(10) // 5
+    return Trajectories(x, v, x + 0.5 * v, number, -x[:, 0], torch.zeros(10).bool())
 
 
 def reward(states, actions, next_states):
@@ -60,39 +56,42 @@ def task(reward=reward, terminated=None):
 
 
 def test_starts_are_those_of_episodes(recorded):
-    starts = recorded(8).draw_starts(200)
+    starts = completed(task(), recorded(8), 3, FORCES).initial_states(200)
     assert sorted({*starts[:, 0].tolist()}) == [0, 3, 6]
     assert starts.shape == (200, 2)
 
 
 def test_bounds_are_far_beyond_what_was_seen(recorded):
-    assert recorded(2).bounds() is None  # nobody knows yet how far an episode goes
-    low, high = recorded(4).bounds()
-    assert low[0] == pytest.approx(1.25 - 12.5)  # of the first three rows, a whole episode
+    low, high = far_bounds(SPEC, recorded(3))
+    assert low[0] == pytest.approx(1.25 - 12.5)
     assert high[0] == pytest.approx(1.25 + 12.5)
     assert (low[1], high[1]) == (-math.inf, math.inf)
 
 
 def test_a_task_is_completed_where_it_says_nothing(recorded):
-    whole = recorded(6).complete(task(), 3, FORCES)
+    whole = completed(task(), recorded(6), 3, FORCES)
     assert whole.episode_length == 3
-    assert torch.equal(whole.state_bounds, recorded(6).bounds())  # the physics stays where it is
-    assert recorded(6).complete(replace(whole, episode_length=9), 3, FORCES).episode_length == 9
-    assert recorded(0).complete(task(), 3, FORCES).initial_states is None
+    assert torch.equal(
+        whole.state_bounds, far_bounds(SPEC, recorded(6))
+    )  # the physics stays where it is
+    assert completed(replace(whole, episode_length=9), recorded(6), 3, FORCES).episode_length == 9
+    assert completed(task(), recorded(0), 3, FORCES).initial_states is None
 
 
 def test_bounds_leave_room_for_what_the_physics_reaches(moved):
     fast = Task(PhysicsDynamics(POINT_SPEC, lambda X: X[:, :1] + 4 * X[:, 1:]), reward)
-    low, high = moved.complete(fast, 5, FORCES).state_bounds
+    low, high = completed(fast, moved, 5, FORCES).state_bounds
     # Two starts, at 1.0 and 1.2, go 20 either way in five steps; half of that range beside it.
     middle, half = 1.1, 0.1 + 20.0
     assert low.item() == pytest.approx(middle - 2 * half, abs=0.5)
     assert high.item() == pytest.approx(middle + 2 * half, abs=0.5)
     away = Task(PhysicsDynamics(POINT_SPEC, lambda X: 1e6 * X[:, :1]), reward)
-    close, wide = moved.bounds(), moved.complete(away, 5, FORCES).state_bounds
+    close, wide = far_bounds(POINT_SPEC, moved), completed(away, moved, 5, FORCES).state_bounds
     assert (wide[1] - wide[0]).item() == pytest.approx(10 * (close[1] - close[0]).item())
     still = Task(PhysicsDynamics(POINT_SPEC, lambda X: X[:, :1]), reward)
-    assert torch.equal(moved.complete(still, 5, FORCES).state_bounds, moved.bounds())
+    assert torch.equal(
+        completed(still, moved, 5, FORCES).state_bounds, far_bounds(POINT_SPEC, moved)
+    )
 
 
 def test_a_physics_that_fails_everywhere_reaches_nothing(moved):
@@ -100,18 +99,22 @@ def test_a_physics_that_fails_everywhere_reaches_nothing(moved):
         raise PhysicsError("no", rows=[], partial=None)
 
     task = Task(PhysicsDynamics(POINT_SPEC, fails), reward)
-    assert torch.equal(moved.complete(task, 5, FORCES).state_bounds, moved.bounds())
+    assert torch.equal(
+        completed(task, moved, 5, FORCES).state_bounds, far_bounds(POINT_SPEC, moved)
+    )
 
 
 def test_an_episode_that_a_bound_may_have_held_is_told(moved):
     with pytest.warns(UserWarning, match=r"came to x = 1\.3, .*beyond 1\.31: .*state_bounds"):
-        moved.warn_of_bounds(torch.tensor([[-1.0], [1.31]]))
-    moved.warn_of_bounds(torch.tensor([[-3.0], [3.0]]))
+        warn_of_bounds(POINT_SPEC, moved, torch.tensor([[-1.0], [1.31]]))
+    warn_of_bounds(POINT_SPEC, moved, torch.tensor([[-3.0], [3.0]]))
 
 
 def test_the_environments_functions_pass(recorded):
-    recorded(6).check(task())
-    recorded(6, terminal=True).check(task(terminated=lambda states: (states[:, 0] % 3) > 2))
+    check_functions(task(), recorded(6))
+    check_functions(
+        task(terminated=lambda states: states[:, 0] % 3 > 2), recorded(6, terminal=True)
+    )
 
 
 @pytest.mark.parametrize(
@@ -127,7 +130,7 @@ def test_the_environments_functions_pass(recorded):
 )  # fmt: skip
 def test_other_functions_are_refused_by_their_worst_transition(recorded, terminal, known, message):
     with pytest.raises(ValueError, match=message):
-        recorded(4, terminal).check(task(**known))
+        check_functions(task(**known), recorded(4, terminal))
 
 
 def test_transitions_at_which_the_physics_fails_are_left_out(moved, crude_dynamics):
@@ -138,14 +141,14 @@ def test_transitions_at_which_the_physics_fails_are_left_out(moved, crude_dynami
         return X[:, :1] + 0.4 * X[:, 1:]
 
     with pytest.warns(UserWarning, match="fails at 3 of 10 new transitions"):
-        kept = moved.learnable(crude_dynamics(physics))
+        kept = learnable(crude_dynamics(physics), moved)
     assert torch.equal(kept.states, moved.states[moved.states[:, 0] >= 0.4])
 
     def always(X):
         raise PhysicsError("broken", range(len(X)))
 
     with pytest.raises(PhysicsError, match="broken"):
-        moved.learnable(PhysicsDynamics(POINT_SPEC, always))
+        learnable(PhysicsDynamics(POINT_SPEC, always), moved)
 
 
 class Own(Dynamics):
@@ -172,7 +175,7 @@ class Stiff(Own):
 
 
 def scores(dynamics, moved, horizons=()):
-    known = moved.complete(Task(dynamics, reward), 5, FORCES)
+    known = completed(Task(dynamics, reward), moved, 5, FORCES)
     return learn_dynamics(known, moved, moved, horizons)
 
 
