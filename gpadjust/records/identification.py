@@ -16,9 +16,8 @@ from gpadjust.dynamics.base import TransitionFunctions
 from gpadjust.dynamics.targets import one_physics
 from gpadjust.physics import Physics
 from gpadjust.physics.parameters import PhysicsParameters
-from gpadjust.records.record import Record, Stretch, in_control_steps
-from gpadjust.records.records import Records
-from gpadjust.records.smoothed_records import SmoothedRecords, smooth
+from gpadjust.records.records import Record, Records, in_control_steps
+from gpadjust.records.smoothing import SmoothedRecords, smooth
 from gpadjust.states import StateSpec
 
 GUESSES, IDENTIFIED, PERSISTENCE = "guesses", "identified", "persistence"
@@ -200,28 +199,34 @@ def identify(
         )
     share = checked_number("held_out", held_out, above=0, most=0.5)
     checked_whole("seed", seed, 0)
-    stretches = [s for s in in_control_steps(records.records, spec, step) if len(s.actions)]
-    longest = max(len(stretch.actions) for stretch in stretches)
-    if longest < _LEAST:
+    steps, _ = in_control_steps(records, step)
+    parts = [(each, rows) for each in steps for rows in each.stretches()]
+    lengths = [rows.stop - rows.start - 1 for _, rows in parts]
+    if max(lengths) < _LEAST:
         raise ValueError(
             f"Expected a stretch of {_LEAST} control steps or more, to hold some out, found "
-            f"{longest}; take a shorter step, or a longer log."
+            f"{max(lengths)}; take a shorter step, or a longer log."
         )
-    steps = max(1, int(share * longest))
-    ends = [i for i, each in enumerate(stretches) if len(each.actions) >= 2 * steps]
-    kept = [len(each.actions) - steps * (i in ends) for i, each in enumerate(stretches)]
-    whole = one_physics(physics, spec, "identify one of them")
-    known = Records([_beginning(s, k) for s, k in zip(stretches, kept, strict=True)], spec)
-    smoothed = smooth(known, whole, start=start, num_starts=num_starts, progress=progress)
-    by_guesses = PhysicsDynamics(spec, whole)
-    drawn = _Drawn(spec, whole, smoothed.physics_parameters) if whole.unknowns else by_guesses
-    windows = Windows(
-        torch.stack([smoothed.records.records[i].states[-1] for i in ends]),
-        torch.stack([stretches[i].actions[kept[i] :] for i in ends]),
-        torch.stack([stretches[i].states[kept[i] + 1 :] for i in ends]),
+    held = max(1, int(share * max(lengths)))
+    f_p = one_physics(physics, spec, "identify one of them")
+    known, rest = [], dict[int, tuple[Tensor, Tensor]]()
+    for i, ((each, rows), length) in enumerate(zip(parts, lengths, strict=True)):
+        end = rows.stop - held * (length >= 2 * held)  # what follows is held out
+        begin = slice(rows.start, end)
+        actions = each.actions[begin]
+        known.append(Record(each.times[begin], each.states[begin], actions))
+        if end < rows.stop:
+            rest[i] = each.actions[end - 1 : rows.stop - 1], each.states[end : rows.stop]
+    smoothed = smooth(
+        Records(known, spec), f_p, start=start, num_starts=num_starts, progress=progress
     )
+    by_guesses = PhysicsDynamics(spec, f_p)
+    drawn = _Drawn(spec, f_p, smoothed.physics_parameters) if f_p.unknowns else by_guesses
+    actions, measured = (torch.stack(part) for part in zip(*rest.values(), strict=True))
+    ends = torch.stack([smoothed.records.records[i].states[-1] for i in rest])
+    windows = Windows(ends, actions, measured)
     noises: dict[str, Any] = {
-        "start_noise": torch.stack([smoothed.sd[i][-1] for i in ends]).square().mean(0).sqrt(),
+        "start_noise": torch.stack([smoothed.sd[i][-1] for i in rest]).square().mean(0).sqrt(),
         "noise": smoothed.noise.nan_to_num(),
     }
     runs = {
@@ -235,14 +240,14 @@ def identify(
             **noises,
         )
     }
-    if whole.unknowns:
+    if f_p.unknowns:
         runs[GUESSES] = by_guesses.free_run(
             windows.initial_states, windows.actions, seed=seed, **noises
         )
-    times = stretches[0].times
-    length = float(times[1] - times[0])
-    told = f"Gaps part the log into {len(stretches)} stretches, each smoothed by itself."
-    gaps = [told] * (len(stretches) > len(records.records))
+    length = float(steps.records[0].times[1] - steps.records[0].times[0])
+    total = len(parts)
+    told = f"Gaps part the log into {total} stretches, each smoothed by itself."
+    gaps = [told] * (total > len(records.records))
     remarks = (*gaps, *_of_actions(records, length), *_of_jumps(records))
     return Identification(smoothed, drawn, windows, runs, length, remarks)
 
@@ -277,12 +282,6 @@ class _Drawn(PhysicsDynamics):
             return self._step(states, actions, values)
 
         return step
-
-
-def _beginning(stretch: Stretch, steps: int) -> Record:
-    """A record of the first steps of a stretch; its last action counts for nothing."""
-    actions = torch.cat([stretch.actions[:steps], stretch.actions[-1:]])
-    return Record(stretch.times[: steps + 1], stretch.states[: steps + 1], actions)
 
 
 def _of_actions(records: Records, step: float) -> list[str]:

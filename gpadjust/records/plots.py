@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from torch import Tensor
 
 from gpadjust.dynamics.plots import going_on, labels
-from gpadjust.records.record import Record
+from gpadjust.records.records import Record
 from gpadjust.states import StateSpec
 from gpadjust.validation.plots.drawing import BLUE, GREY, given_axes, tidy
 

@@ -10,7 +10,6 @@ from scipy.linalg import block_diag
 from gpadjust.dynamics import StateSpec
 from gpadjust.physics import FunctionPhysics, ODEPhysics, PhysicsError, Unknown
 from gpadjust.records import Record, Records, SmoothingWarning, smooth
-from gpadjust.records.chain import Chain, Known
 from gpadjust.records.kalman import (
     Link,
     Moments,
@@ -19,7 +18,7 @@ from gpadjust.records.kalman import (
     expected_squares,
     smooth_chain,
 )
-from gpadjust.records.record import in_control_steps
+from gpadjust.records.smoothing import Chain, Estimate
 
 STEP, LENGTH = 0.1, 150
 SPEC = StateSpec(["x", "v"], ["force"])
@@ -331,19 +330,19 @@ def test_a_step_that_goes_where_the_physics_fails_is_taken_in_part():
 
 
 def test_a_path_that_explains_less_is_taken_in_part_or_not_at_all():
-    record, known = measured(*simulated(0)), Known(*np.full((2, 2), math.nan), {})
-    chain = Chain(spring(), SPEC, in_control_steps([record], SPEC, STEP), known)
+    records, unknown = Records(measured(*simulated(0)), SPEC), np.full((3, 2), math.nan)
+    chain = Chain(spring(), records, unknown[0], unknown[1], unknown[:2])
     path, noise = chain.first_path(np.zeros(2)), NOISE.numpy() ** 2
     before = chain.cost(path, noise, noise)
     for size, some in ((0.3, True), (1e6, False)):
-        away = size * chain.spread * np.random.default_rng(0).standard_normal(path.states[0].shape)
-        means = np.concatenate([path.states[0] + away, np.zeros((LENGTH, 2))], axis=1)
+        away = size * chain.spread * np.random.default_rng(0).standard_normal(path.states.shape)
+        means = np.concatenate([path.states + away, np.zeros((LENGTH, 2))], axis=1)
         found = Smoothed(Moments(means, np.zeros((LENGTH, 4, 4))), np.zeros((LENGTH - 1, 4, 4)))
-        move = chain.towards(path, [found], noise, noise)
-        assert chain.cost(move.path, noise, noise) <= before + 0.02
-        assert not move.whole
-        assert (move.refused == 0) == (move.path is not path)
-        assert (move.path is path) or some
+        taken, share = chain.towards(path, Estimate([found], noise, noise, 0.0))
+        assert chain.cost(taken, noise, noise) <= before + 0.02
+        assert share < 1
+        assert (share > 0) == (taken is not path)
+        assert (taken is path) or some
 
 
 def test_a_physics_that_fails_at_measured_states_is_told():
