@@ -21,8 +21,6 @@ from gpadjust.records.smoothing import SmoothedRecords, smooth
 from gpadjust.states import StateSpec
 
 GUESSES, IDENTIFIED, PERSISTENCE = "guesses", "identified", "persistence"
-_PARTICLES = 199
-_LEVEL = 0.95
 _LEAST = 8  # steps of a stretch, of which the last part is held out
 _KNOWN_BEFORE = 0.8  # of a prior's standard deviation: the log tells next to nothing
 _FAR = 3.0  # standard deviations of a prior
@@ -98,7 +96,7 @@ class Identification:
         return [*self.remarks, *_of_parameters(self.parameters), *self._of_errors()]
 
     def _of_errors(self) -> list[str]:
-        told, errors = [], self.errors
+        told = []
         for i, name in enumerate(self.spec.states):
             share = float(self.coverage[i])
             if share < FEW:
@@ -108,12 +106,13 @@ class Identification:
                     "(dry friction, an input), or has a sign or unit wrong. Rely neither on them "
                     "nor on those of the parameters."
                 )
-            told += [
-                f"Along what was held out the identified physics errs no less in {name} than "
-                f"{'the guesses do' if other == GUESSES else 'a state that stays'}."
-                for other, error in errors.items()
-                if other != IDENTIFIED and error[i] <= errors[IDENTIFIED][i]
-            ]
+            errors = {run: float(error[i]) for run, error in self.errors.items()}
+            for other, words in ((GUESSES, "the guesses do"), (PERSISTENCE, "a state that stays")):
+                if errors.get(other, math.inf) <= errors[IDENTIFIED]:
+                    told.append(
+                        "Along what was held out the identified physics errs no less in "
+                        f"{name} than {words}."
+                    )
         return told
 
     def __repr__(self) -> str:
@@ -173,20 +172,18 @@ def identify(
     Example:
         >>> import torch
         >>> from gpadjust.records import Record, Records, identify
-        >>> from gpadjust.physics import ODEPhysics, Unknown
+        >>> from gpadjust.physics import FormulaPhysics, ODEPhysics, Unknown
         >>> from gpadjust.states import StateSpec
-        >>> def spring(x, u, p):
-        ...     return torch.stack([x[:, 1], u[:, 0] - p.stiffness * x[:, 0]], dim=-1)
-        >>> unknowns = {"stiffness": Unknown(1.0, factor=2.0)}
-        >>> physics = ODEPhysics(spring, step=0.1, state_dim=2, unknowns=unknowns)
         >>> t = 0.1 * torch.arange(60, dtype=torch.float64)
-        >>> position = (1.5 * t).cos() + 0.01 * torch.randn(60, dtype=torch.float64)
-        >>> states = torch.stack([position, torch.full_like(t, torch.nan)], dim=-1)
-        >>> record = Record(t, states, torch.zeros_like(states[:, :1]))
+        >>> states = torch.stack([(1.5 * t).cos(), -1.5 * (1.5 * t).sin()], dim=-1)
+        >>> states += 0.01 * torch.randn(60, 2, dtype=torch.float64)
+        >>> record = Record(t, states, torch.zeros(60, 1, dtype=torch.float64))
+        >>> unknowns = {"k": Unknown(1.0, factor=2.0)}
+        >>> rates = FormulaPhysics("v, u - k * x", ["x", "v", "u"], unknowns=unknowns)
         >>> found = identify(
-        ...     Records(record, StateSpec(["x", "v"], ["u"])), physics, start={"v": (0.0, 1.0)}
+        ...     Records(record, StateSpec(["x", "v"], ["u"])), ODEPhysics(rates, 0.1, 2)
         ... )
-        >>> bool(found.errors["identified"][0] < 0.1 * found.errors["guesses"][0])
+        >>> bool((found.errors["identified"] < 0.1 * found.errors["guesses"]).all())
         True
     """
     if not isinstance(records, Records):
@@ -209,47 +206,42 @@ def identify(
         )
     held = max(1, int(share * max(lengths)))
     f_p = one_physics(physics, spec, "identify one of them")
-    known, rest = [], dict[int, tuple[Tensor, Tensor]]()
+    known, ends, actions, measured = [], [], [], []
     for i, ((each, rows), length) in enumerate(zip(parts, lengths, strict=True)):
         end = rows.stop - held * (length >= 2 * held)  # what follows is held out
         begin = slice(rows.start, end)
-        actions = each.actions[begin]
-        known.append(Record(each.times[begin], each.states[begin], actions))
+        known.append(Record(each.times[begin], each.states[begin], each.actions[begin]))
         if end < rows.stop:
-            rest[i] = each.actions[end - 1 : rows.stop - 1], each.states[end : rows.stop]
+            ends.append(i)
+            actions.append(each.actions[end - 1 : rows.stop - 1])
+            measured.append(each.states[end : rows.stop])
     smoothed = smooth(
         Records(known, spec), f_p, start=start, num_starts=num_starts, progress=progress
     )
+    last = torch.stack([smoothed.records.records[i].states[-1] for i in ends])
+    windows = Windows(last, torch.stack(actions), torch.stack(measured))
+    variances = torch.stack([smoothed.sd[i][-1] for i in ends]).square()
+    options: dict[str, Any] = {
+        "start_noise": variances.mean(0).sqrt(),
+        "noise": smoothed.noise.nan_to_num(),
+        "seed": seed,
+    }
     by_guesses = PhysicsDynamics(spec, f_p)
     drawn = _Drawn(spec, f_p, smoothed.physics_parameters) if f_p.unknowns else by_guesses
-    actions, measured = (torch.stack(part) for part in zip(*rest.values(), strict=True))
-    ends = torch.stack([smoothed.records.records[i].states[-1] for i in rest])
-    windows = Windows(ends, actions, measured)
-    noises: dict[str, Any] = {
-        "start_noise": torch.stack([smoothed.sd[i][-1] for i in rest]).square().mean(0).sqrt(),
-        "noise": smoothed.noise.nan_to_num(),
+    moved: dict[str, Any] = {
+        "num_functions": 199,
+        "level": 0.95,
+        "process_noise": smoothed.process_noise,
     }
-    runs = {
-        IDENTIFIED: drawn.free_run(
-            windows.initial_states,
-            windows.actions,
-            num_functions=_PARTICLES,
-            level=_LEVEL,
-            process_noise=smoothed.process_noise,
-            seed=seed,
-            **noises,
-        )
-    }
+    runs = {IDENTIFIED: drawn.free_run(last, windows.actions, **moved, **options)}
     if f_p.unknowns:
-        runs[GUESSES] = by_guesses.free_run(
-            windows.initial_states, windows.actions, seed=seed, **noises
-        )
-    length = float(steps.records[0].times[1] - steps.records[0].times[0])
-    total = len(parts)
-    told = f"Gaps part the log into {total} stretches, each smoothed by itself."
-    gaps = [told] * (total > len(records.records))
-    remarks = (*gaps, *_of_actions(records, length), *_of_jumps(records))
-    return Identification(smoothed, drawn, windows, runs, length, remarks)
+        runs[GUESSES] = by_guesses.free_run(last, windows.actions, **options)
+    length_of_step = float(steps.records[0].times[1] - steps.records[0].times[0])
+    remarks = [*_of_actions(records, length_of_step), *_of_jumps(records)]
+    if len(parts) > len(records):
+        gaps = f"Gaps part the log into {len(parts)} stretches, each smoothed by itself."
+        remarks.insert(0, gaps)
+    return Identification(smoothed, drawn, windows, runs, length_of_step, tuple(remarks))
 
 
 class _Drawn(PhysicsDynamics):
@@ -286,17 +278,18 @@ class _Drawn(PhysicsDynamics):
 
 def _of_actions(records: Records, step: float) -> list[str]:
     """A sentence if actions vary within control steps, over which they are averaged."""
-    within, total = 0.0, 0.0
+    within, most = 0.0, 1
     for record in records:
         size = round(step / record.sampling_step)
-        actions = record.actions[: len(record.actions) // size * size].unflatten(0, (-1, size))
-        spread = actions.var(1, correction=0).nanmean(0) / record.actions.var(0, correction=0)
-        within = max(within, float(spread.nan_to_num().max()) if size > 1 else 0.0)
-        total = max(total, size)
+        if size > 1:
+            steps = record.actions[: len(record.actions) // size * size].unflatten(0, (-1, size))
+            share = steps.var(1, correction=0).nanmean(0) / record.actions.var(0, correction=0)
+            within = max(within, float(share.nan_to_num().max()))
+            most = max(most, size)
     if within <= _VARIES:
         return []
     return [
-        f"The actions vary within a step of {total:.0f} samples, over which they are averaged: "
+        f"The actions vary within a step of {most} samples, over which they are averaged: "
         "parameters and their intervals may be off. Take a shorter step and compare."
     ]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from functools import cached_property
 from itertools import pairwise
@@ -77,8 +77,7 @@ class Record:
         self.actions = self._numbers(actions, "actions", 2)
         labels: Any = segments.tolist() if hasattr(segments, "tolist") else segments
         self.segments = None if labels is None else tuple(labels)
-        self._check_rows()
-        self._check_values()
+        self._check()
 
     def __repr__(self) -> str:
         states, actions = self.states.shape[1], self.actions.shape[1]
@@ -159,19 +158,16 @@ class Record:
             )
         return tensor
 
-    def _check_rows(self) -> None:
-        """Raise an error unless all have as many rows, two or more, one of which follows another.
-
-        A label that is NaN is no label, and would be a segment of its own.
-        """
-        rows = {name: len(getattr(self, name)) for name in ("times", "states", "actions")}
-        if self.segments is not None:
-            rows["segments"] = len(self.segments)
+    def _check(self) -> None:
+        """Raise an error unless rows are as many, two follow each other, and values are known."""
+        parts = {"times": self.times, "states": self.states, "actions": self.actions}
+        rows = {name: len(part) for name, part in parts.items()}
+        rows |= {} if self.segments is None else {"segments": len(self.segments)}
         if len({*rows.values()}) > 1:
             counts = ", ".join(f"{number} of {name}" for name, number in rows.items())
             raise self._error(f": expected as many rows of each, found {counts}.")
         for row, label in enumerate(self.segments or ()):
-            if label is None or label != label:
+            if label is None or label != label:  # NaN, which would be a segment of its own
                 raise self._error(
                     f", row {row}: expected a label of its segment, found {label}; leave out rows "
                     "that are of no segment."
@@ -181,21 +177,19 @@ class Record:
                 ": expected two rows or more of a segment, one after the other, found "
                 f"{len(self.times)} in all; leave the record out, or correct `segments`."
             )
-
-    def _check_values(self) -> None:
-        """Raise an error unless times rise and are finite, as actions are; states may be NaN."""
-        apart = "split the record there, by `segments` or in two, without that row"
-        for name, bad, way_out in (
-            ("times", ~self.times.isfinite(), "leave the row out"),
-            ("states", self.states.isinf(), "put NaN where an entry was not measured"),
-            ("actions", ~self.actions.isfinite(), apart),
-        ):
+        ways_out = {
+            "times": "leave the row out",
+            "states": "put NaN where an entry was not measured",
+            "actions": "split the record there, by `segments` or in two, without that row",
+        }
+        for name, part in parts.items():
+            values = part.reshape(len(part), -1)
+            bad = values.isinf() if name == "states" else ~values.isfinite()
             if bad.any():
-                row, column = bad.reshape(len(bad), -1).nonzero()[0].tolist()
-                value = float(getattr(self, name).reshape(len(bad), -1)[row, column])
+                row, column = bad.nonzero()[0].tolist()
                 raise self._error(
-                    f", row {row}: expected finite numbers, found {value} in column {column} of "
-                    f"{name}; {way_out}."
+                    f", row {row}: expected finite numbers, found {float(values[row, column])} in "
+                    f"column {column} of {name}; {ways_out[name]}."
                 )
         stops = (self.times.diff() <= 0) & self.follows
         if stops.any():
@@ -617,42 +611,33 @@ def _resampled(
             f"Record {record.name!r}: expected a step of half a sampling step, {finest:.4g}, or "
             f"more, as nothing was measured between rows; got {step:.4g}."
         )
-    parts = list[Rows]()
+    parts = []
     for rows in record.stretches(max_gap):
         times, states, actions = record.times[rows], record.states[rows], record.actions[rows]
         num_steps = int((times[-1] - times[0]) / step + _ROUNDING)
         if num_steps:
             edges = times[0] + step * torch.arange(num_steps + 2, dtype=torch.float64)
-            states = _states_at(spec, times, states, edges[:-1])
-            parts.append((edges[:-1], states, _means_between(times, actions, edges)))
-        else:
-            parts.append((times[:1], states[:1], actions[:1]))
+            states = _interpolated(times, states, edges[:-1], spec.change)
+            # The mean of an action is the difference of its integral, which is linear between rows.
+            times = torch.cat([times, times[-1:] + edges[-1:] - edges[:1]])  # the last goes on
+            integral = torch.nn.functional.pad(actions * times.diff()[:, None], (0, 0, 1, 0))
+            integral = _interpolated(times, integral.cumsum(0), edges, lambda a, b: b - a)
+            actions, times = integral.diff(dim=0) / edges.diff()[:, None], edges[:-1]
+        parts.append(
+            (times, states, actions) if num_steps else (times[:1], states[:1], actions[:1])
+        )
     longest = max(len(times) for times, *_ in parts)
     return joined(parts, record.name) if longest > 1 else None
 
 
-def _places(times: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the row before each time, and which share of the way to the next it is."""
+def _interpolated(
+    times: Tensor, values: Tensor, at: Tensor, change: Callable[[Tensor, Tensor], Tensor]
+) -> Tensor:
+    """Return values ``n x k`` on the lines between rows; at a row that row, but for rounding."""
     rows = (torch.searchsorted(times, at, right=True) - 1).clamp(0, len(times) - 2)
     share = ((at - times[rows]) / (times[rows + 1] - times[rows])).clamp(0, 1)
-    at_row = (share - share.round()).abs() < _ROUNDING
-    return rows, torch.where(at_row, share.round(), share)
-
-
-def _states_at(spec: StateSpec, times: Tensor, states: Tensor, at: Tensor) -> Tensor:
-    """Return states ``n x state_dim`` on the lines between those measured at ``times``."""
-    rows, share = _places(times, at)
-    before, after, share = states[rows], states[rows + 1], share.unsqueeze(-1)
-    between = before + share * spec.change(before, after)
+    share = torch.where((share - share.round()).abs() < _ROUNDING, share.round(), share)[:, None]
+    before, after = values[rows], values[rows + 1]
+    between = before + share * change(before, after)
     # At a row it is what was measured there, whether its neighbour was or not.
     return torch.where(share == 0, before, torch.where(share == 1, after, between))
-
-
-def _means_between(times: Tensor, actions: Tensor, edges: Tensor) -> Tensor:
-    """Return means ``n x action_dim`` from edge to edge of actions constant from row to row."""
-    times = torch.cat([times, times[-1:] + edges[-1:] - edges[:1]])  # the last one goes on
-    parts = actions * times.diff().unsqueeze(-1)
-    sums = torch.cat([torch.zeros_like(parts[:1]), parts]).cumsum(0)
-    rows, share = _places(times, edges)
-    total = torch.lerp(sums[rows], sums[rows + 1], share.unsqueeze(-1))
-    return total.diff(dim=0) / edges.diff().unsqueeze(-1)

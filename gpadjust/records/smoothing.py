@@ -54,8 +54,6 @@ _LEAST = 1e-6  # of the standard deviation of a state: no noise is less, but by 
 _HALVINGS = 6
 _BETTER = 0.01  # what a worse path may cost more, by rounding
 _MEDIAN = 0.05  # of a variation beforehand, in standard deviations of a parameter's prior
-_SPREAD = 1.0  # of its logarithm
-_ROUNDS = 60
 
 
 class SmoothingWarning(UserWarning):
@@ -69,8 +67,7 @@ class Estimate(NamedTuple):
     """
 
     stretches: list[Smoothed]
-    noise: Array  # variances d of the errors of what is measured
-    process_noise: Array  # variances d of what a step adds to the physics
+    variances: Array  # of noise and process noise, 2 x d
     log_density: float  # of what was measured
 
     @property
@@ -248,26 +245,27 @@ def smooth(
         )
     steps = _with_known_inputs(steps)
     f_p = one_physics(physics, spec, "smooth by one of them")
-    _check_step(f_p, steps)
-    chain = Chain(
-        f_p,
-        steps,
-        _variances(noise, "noise", spec),
-        _variances(process_noise, "process_noise", spec),
-        _starts(start, spec),
-    )
+    found = float(steps.records[0].times[1] - steps.records[0].times[0])
+    if isinstance(f_p, ODEPhysics) and abs(f_p.step - found) > _SAME * found:
+        raise ValueError(
+            f"Physics {f_p.name!r} makes steps of {f_p.step:g}, but the control step of the "
+            f"records is {found:g}; pass step={f_p.step:g}, or build it with step={found:g}."
+        )
+    known = {"noise": noise, "process_noise": process_noise}
+    variances = np.stack([_variances(sd, name, spec) for name, sd in known.items()])
+    chain = Chain(f_p, steps, variances, _starts(start, spec))
     chain.check_measured()
     if num_starts is None:
         num_starts = 4 if chain.hidden.any() and f_p.unknowns else 1
     checked_whole("num_starts", num_starts, 1)
     estimate = _estimate(chain, max_rounds, num_starts, progress)
-    covariances = [stretch.states.covariances for stretch in estimate.stretches]
-    variances = np.diagonal(np.concatenate(covariances), axis1=1, axis2=2).clip(0)
-    sd = torch.zeros(len(variances), spec.state_dim, dtype=torch.float64)
-    sd[:, spec.moving] = torch.from_numpy(np.sqrt(variances[:, : chain.d]))
+    covariances = np.concatenate([part.states.covariances for part in estimate.stretches])
+    squares = np.diagonal(covariances, axis1=1, axis2=2)[:, : chain.d].clip(0)
+    sd = torch.zeros(len(squares), spec.state_dim, dtype=torch.float64)
+    sd[:, spec.moving] = torch.from_numpy(np.sqrt(squares))
     noises = torch.zeros(2, spec.state_dim, dtype=torch.float64)
-    noises[:, spec.moving] = torch.from_numpy(np.sqrt([estimate.noise, estimate.process_noise]))
-    noises[0, torch.tensor(spec.moving)[torch.from_numpy(chain.hidden)]] = torch.nan
+    noises[:, spec.moving] = torch.from_numpy(np.sqrt(estimate.variances))
+    noises[0, [i for i, hidden in zip(spec.moving, chain.hidden, strict=True) if hidden]] = math.nan
     return SmoothedRecords(
         _with_states(steps, estimate.states),
         sd.split([len(record.times) for record in steps]),
@@ -320,16 +318,6 @@ def _with_known_inputs(steps: Records) -> Records:
             f"Expected stretches with all of {', '.join(names)}, which the physics reads."
         )
     return Records(records, spec)
-
-
-def _check_step(physics: Physics, steps: Records) -> None:
-    """Raise a ValueError unless the physics makes the records' steps, as far as it says."""
-    step = float(steps.records[0].times[1] - steps.records[0].times[0])
-    if isinstance(physics, ODEPhysics) and abs(physics.step - step) > _SAME * step:
-        raise ValueError(
-            f"Physics {physics.name!r} makes steps of {physics.step:g}, but the control step of "
-            f"the records is {step:g}; pass step={physics.step:g}, or build it with step={step:g}."
-        )
 
 
 def _variances(sd: Tensor | None, name: str, spec: StateSpec) -> Array:
@@ -428,19 +416,19 @@ def _search(
     A new trajectory that explains less is taken part of the way only.
     """
     path = chain.first_path(coordinates)
-    noise, process_noise = chain.first_variances(path)
+    variances = chain.first_variances(path)
     if known_at_once:
-        noise, process_noise = chain.checked(noise, process_noise)
+        variances = chain.checked(variances)
     value, gained, steady = -math.inf, math.inf, False
     for _ in range(max_rounds):
         bar.update()
         # E: p(x, theta | y) of the chain x[t + 1] = F[t] x[t] + b[t] + q[t], F = df_p / dx
         links = chain.linearised(path)
-        smoothed, density = smooth_chain(links, chain.starts, noise, process_noise)
+        smoothed, density = smooth_chain(links, chain.starts, *variances)
         if not math.isfinite(density):
             raise np.linalg.LinAlgError
         gained, value = density - value, density
-        estimate = Estimate(smoothed, noise, process_noise, density)
+        estimate = Estimate(smoothed, variances, density)
         # x <- x + share (E[x | y] - x), share = 1, 1/2, ... until p(x, theta, y) is no less
         path, share = chain.towards(path, estimate)
         if 0 < share < 1:
@@ -448,13 +436,12 @@ def _search(
         if steady and abs(gained) < _ARRIVED:
             off = np.abs(estimate.states[:, : chain.d] - path.states) / chain.spread
             return estimate, 0.0 if off.max() < _RIGHT else math.inf
-        # M: log R and log Q move to those of E[(y - x)^2] and E[(x' - f_p)^2], and beyond
-        likely = np.concatenate(chain.checked(*chain.likely_variances(links, smoothed)))
-        old = np.concatenate([noise, process_noise])
+        # M: log R and log Q go to those of E[(y - x)^2] and E[(x' - f_p)^2], and a little further
+        ratio = chain.checked(chain.likely_variances(links, smoothed)) / variances
         faster = _LONGER if gained >= 0 else 1.0
-        moved = (faster * np.log(likely / old)).clip(-_NEARER, _NEARER)
+        moved = (faster * np.log(ratio)).clip(-_NEARER, _NEARER)
         steady = bool((np.abs(moved) < _STEADY).all())
-        noise, process_noise = np.split(old * np.exp(moved), 2)
+        variances = variances * np.exp(moved)
     return estimate, gained
 
 
@@ -471,42 +458,46 @@ class Chain:
     """All stretches, the physics that leads through them, and what is known beforehand.
 
     Rows of the stretches are one after the other: ``M`` states, of which ``N`` are followed by
-    another one. Of known variances ``d`` those to be learnt are NaN, and of means and standard
-    deviations of first states ``2 x d`` the unknown ones.
+    another one. Known are variances of noise and process noise, and mean and standard deviation of
+    first states, ``2 x d`` each; NaN where they are not.
     """
 
-    def __init__(
-        self,
-        physics: Physics,
-        steps: Records,
-        known_noise: Array,
-        known_process_noise: Array,
-        known_start: Array,
-    ) -> None:
+    def __init__(self, physics: Physics, steps: Records, variances: Array, start: Array) -> None:
         self.physics, self.spec = physics, steps.spec
-        self.known_noise, self.known_process_noise = known_noise, known_process_noise
-        self.known_start = known_start
         moving = self.spec.moving
         self.d, self.num_parameters = len(moving), len(physics.unknowns)
         self.angles = [moving.index(i) for i in self.spec.angle_columns if i in moving]
-        lengths = [len(record.times[rows]) for record in steps for rows in record.stretches()]
-        self.ends = np.cumsum(lengths)  # of each stretch, the row after its last one
-        self.firsts = self.ends - lengths
-        self.now = np.setdiff1d(np.arange(self.ends[-1]), self.ends - 1)  # N rows
-        states, actions = (
-            torch.cat([getattr(record, name) for record in steps]) for name in ("states", "actions")
-        )
+        parts = [rows for record in steps for rows in record.stretches()]
+        self.lengths = np.array([rows.stop - rows.start for rows in parts])
+        ends = self.lengths.cumsum()
+        self.firsts = ends - self.lengths
+        self.stretches = [slice(*rows) for rows in zip(self.firsts, ends, strict=True)]
+        self.now = np.setdiff1d(np.arange(ends[-1]), ends - 1)  # rows that another one follows
+        states = torch.cat([record.states for record in steps])
+        actions = torch.cat([record.actions for record in steps])
         self.recorded = side_by_side(states, actions)  # of which f_p reads what does not move
-        self.measured: Array = states[:, moving].numpy()
-        for rows in self.stretches():
-            self._unwrap(self.measured[rows])
-        self.hidden = np.isnan(self.measured).all(0)
-        self.middle, self.spread = self._sizes()
-        self.starts = [self._start(self.measured[rows]) for rows in self.stretches()]
-
-    def stretches(self) -> list[slice]:
-        """Rows of each stretch."""
-        return [slice(*edges) for edges in zip(self.firsts, self.ends, strict=True)]
+        y = self.measured = states[:, moving].numpy()
+        for rows in self.stretches:
+            for i in self.angles:  # go on without jumps
+                seen = rows.start + np.flatnonzero(~np.isnan(y[rows, i]))
+                y[seen, i] = np.unwrap(y[seen, i])
+        self.hidden, self.known_variances, self.known_start = np.isnan(y).all(0), variances, start
+        # By how much each state varies, as far as is known
+        middle, (mean, sd) = _means(y, otherwise=0.0), start
+        varies = np.fmax(sd, np.sqrt(_means((y - middle) ** 2, otherwise=0.0)))
+        middle = np.where(((~np.isnan(y)).sum(0) < 2) & ~np.isnan(mean), mean, middle)
+        size = np.maximum(np.abs(middle), np.nan_to_num(np.abs(y)).max(0))
+        self.spread = np.fmax(varies, _SIZE * np.where(size > 0, size, 1.0))
+        self.least = (_LEAST * self.spread) ** 2
+        # First states: as is known, or about the first number of a stretch
+        numbers = np.stack([rows.start + np.isnan(y[rows]).argmin(0) for rows in self.stretches])
+        first = y[numbers, np.arange(self.d)]
+        first = np.where(np.isnan(first), middle, first)
+        self.first = np.where(np.isnan(mean), first, mean)  # S x d
+        self.first_variance = np.where(np.isnan(sd), _WIDE * self.spread, sd) ** 2
+        p = self.num_parameters  # standard normal a priori
+        covariance = np.diag(np.concatenate([self.first_variance, np.ones(p)]))
+        self.starts = [(np.concatenate([x, np.zeros(p)]), covariance) for x in self.first]
 
     def check_measured(self) -> None:
         """Raise a ValueError if nothing was measured, or a hidden state has no start."""
@@ -522,7 +513,7 @@ class Chain:
     def starts_of_search(self, number: int) -> Iterator[tuple[Array, bool]]:
         """Coordinates of the parameters, and whether variances that are known are so at once."""
         p = self.num_parameters
-        something_known = not np.isnan([self.known_noise, self.known_process_noise]).all()
+        something_known = not np.isnan(self.known_variances).all()
         yield np.zeros(p), False
         if something_known and number > 1:
             yield np.zeros(p), True
@@ -533,17 +524,16 @@ class Chain:
 
     def first_path(self, parameters: Array) -> Path:
         """Measured states, and between them and in hidden ones where f_p leads."""
-        states, measured = self.measured.copy(), self.measured.copy()
-        lengths, x = self.ends - self.firsts, np.stack([mean[: self.d] for mean, _ in self.starts])
-        for t in range(lengths.max() if np.isnan(measured).any() else 0):
-            going = np.flatnonzero(lengths > t)
+        states, measured, x = self.measured.copy(), self.measured.copy(), self.first.copy()
+        for t in range(self.lengths.max() if np.isnan(measured).any() else 0):
+            going = self.lengths > t
             rows = self.firsts[going] + t
             if t:  # after a gap the angle may have gone round
                 measured[rows] = self._near(measured[rows], x[going])
             states[rows] = np.where(np.isnan(measured[rows]), x[going], measured[rows])
             x[going] = states[rows]
-            going = np.flatnonzero(lengths > t + 1)
-            if len(going):
+            going = self.lengths > t + 1
+            if going.any():
                 x[going] = self._defined(self.firsts[going] + t, x[going], parameters)
         following = self._defined(self.now, states[self.now], parameters)
         return Path(states, measured, parameters, following)
@@ -553,84 +543,66 @@ class Chain:
         following = self.follow(self.now, states[self.now], parameters)
         return Path(states, self._near(self.measured, states), parameters, following)
 
-    def first_variances(self, path: Path) -> tuple[Array, Array]:
+    def first_variances(self, path: Path) -> Array:
         """First variances of both noises, by f_p's errors in single steps."""
         change = ((path.following - path.states[self.now]) ** 2).mean(0)
         errors = (path.measured[self.now + 1] - path.following) ** 2
-        errors = _means(errors, otherwise=_HIDDEN**2 * change)
-        least = (_LEAST * self.spread) ** 2
-        return (_SHARE * errors).clip(least), (2 * _SHARE * errors).clip(least)
+        noise = _SHARE * _means(errors, otherwise=_HIDDEN**2 * change)
+        return np.stack([noise, 2 * noise]).clip(self.least)
 
-    def checked(self, noise: Array, process_noise: Array) -> tuple[Array, Array]:
+    def checked(self, variances: Array) -> Array:
         """Variances with what is known of them, and none too small to reckon with."""
-        least = (_LEAST * self.spread) ** 2
-        known, known_process = self.known_noise, self.known_process_noise
-        noise = np.where(np.isnan(known), noise, known)
-        process_noise = np.where(np.isnan(known_process), process_noise, known_process)
-        return noise.clip(least), process_noise.clip(least)
+        known = self.known_variances
+        return np.where(np.isnan(known), variances, known).clip(self.least)
 
     def linearised(self, path: Path) -> list[Link]:
-        r"""The chain near a path, by central differences of f_p.
-
-        With :math:`z = (x, \theta)`, :math:`z_{t+1} = F_t z_t + b_t`.
-        """
+        """The chain near a path, by central differences of f_p: z[t + 1] = F[t] z[t] + b[t]."""
         d, p, x = self.d, self.num_parameters, path.states[self.now]
         sizes = _STEP * np.concatenate([self.spread, np.ones(p)])
-        moves = np.diag(sizes)
-        ahead, behind = (
-            self.follow(
-                self.now, x + sign * moves[:, None, :d], path.parameters + sign * moves[:, d:]
-            )
-            for sign in (1.0, -1.0)
-        )
+        dx, dtheta = np.split(np.diag(sizes), [d], axis=1)
+        ahead = self.follow(self.now, x + dx[:, None], path.parameters + dtheta)
+        behind = self.follow(self.now, x - dx[:, None], path.parameters - dtheta)
         slope = (ahead - behind) / (2 * sizes)[:, None, None]
-        F = np.zeros((len(x), d + p, d + p))
+        F = np.tile(np.eye(d + p), (len(x), 1, 1))
         F[:, :d] = np.moveaxis(np.nan_to_num(slope), 0, -1)  # 0 where f_p fails nearby
-        F[:, d:, d:] = np.eye(p)
-        theta = np.broadcast_to(path.parameters, (len(x), p))
-        z, onward = np.hstack([x, theta]), np.hstack([path.following, theta])
-        b = onward - np.einsum("tij,tj->ti", F, z)
-        outputs = np.eye(d, d + p)
-        links = []
-        for i, rows in enumerate(self.stretches()):
-            steps = slice(rows.start - i, rows.stop - i - 1)  # each stretch has one step less
-            measured = path.measured[rows]
-            links.append(
-                Link(F[steps], b[steps], np.tile(outputs, (len(measured), 1, 1)), measured)
-            )
+        z = np.hstack([x, np.tile(path.parameters, (len(x), 1))])
+        b = np.zeros_like(z)
+        b[:, :d] = path.following - np.einsum("tij,tj->ti", F[:, :d], z)
+        cuts = (self.lengths - 1).cumsum()[:-1]
+        outputs, links = np.eye(d, d + p), []
+        parts = zip(self.stretches, np.split(F, cuts), np.split(b, cuts), strict=True)
+        for rows, matrices, offsets in parts:
+            y = path.measured[rows]
+            links.append(Link(matrices, offsets, np.tile(outputs, (len(y), 1, 1)), y))
         return links
 
     def towards(self, path: Path, estimate: Estimate) -> tuple[Path, float]:
         """The path to the estimate, or as much of the way as explains more; the share, maybe 0."""
-        ahead = estimate.states
-        states, parameters = ahead[:, : self.d] - path.states, ahead[0, self.d :] - path.parameters
-        before, share = self.cost(path, estimate.noise, estimate.process_noise), 1.0
+        ahead, theta = estimate.states[:, : self.d], estimate.states[0, self.d :]
+        before, share = self.cost(path, estimate.variances), 1.0
         for _ in range(_HALVINGS):
-            x, theta = path.states + share * states, path.parameters + share * parameters
-            other = Path(x, path.measured, theta, self.follow(self.now, x[self.now], theta))
-            cost = self.cost(other, estimate.noise, estimate.process_noise)
-            if cost <= before + _BETTER:  # false of NaN
+            states = path.states + share * (ahead - path.states)
+            parameters = path.parameters + share * (theta - path.parameters)
+            following = self.follow(self.now, states[self.now], parameters)
+            other = Path(states, path.measured, parameters, following)
+            if self.cost(other, estimate.variances) <= before + _BETTER:  # false of NaN
                 return other, share
             share /= 2
         return path, 0.0
 
-    def likely_variances(
-        self, links: Sequence[Link], smoothed: Sequence[Smoothed]
-    ) -> tuple[Array, Array]:
-        """Variances of noise and process_noise, most likely given the states' distribution."""
+    def likely_variances(self, links: Sequence[Link], smoothed: Sequence[Smoothed]) -> Array:
+        """Variances of both noises, most likely given the states' distribution."""
         measured, added = expected_squares(links, smoothed, self.d)
-        return _means(measured, otherwise=self.spread**2), added.mean(0)  # of hidden: any number
+        noise = _means(measured, otherwise=self.spread**2)  # of hidden states any number
+        return np.stack([noise, added.mean(0)])
 
-    def cost(self, path: Path, noise: Array, process_noise: Array) -> float:
+    def cost(self, path: Path, variances: Array) -> float:
         """Twice the negative log density of a path, but for a constant; NaN where f_p fails."""
-        x, d = path.states, self.d
-        first, variance = (np.stack(part)[:, :d] for part in zip(*self.starts, strict=True))
-        return float(
-            np.nansum((path.measured - x) ** 2 / noise)
-            + ((x[self.now + 1] - path.following) ** 2 / process_noise).sum()
-            + ((x[self.firsts] - first) ** 2 / np.diagonal(variance, axis1=1, axis2=2)).sum()
-            + (path.parameters**2).sum()
-        )
+        noise, process_noise = variances
+        errors = np.nansum((path.measured - path.states) ** 2 / noise)
+        added = (path.states[self.now + 1] - path.following) ** 2 / process_noise
+        begins = (path.states[self.firsts] - self.first) ** 2 / self.first_variance
+        return float(errors + added.sum() + begins.sum() + (path.parameters**2).sum())
 
     def _defined(self, rows: Array, states: Array, parameters: Array) -> Array:
         """Next states by f_p, ``n x d``; an error where it fails."""
@@ -650,13 +622,13 @@ class Chain:
     def follow(self, rows: Array, states: Array, parameters: Array) -> Array:
         """Next states ``... x n x d``, NaN where f_p fails, of angles near those of ``states``.
 
-        Rows ``n`` are those whose actions and states that do not move f_p reads.
+        Rows ``n`` have the actions, and the states that do not move, which f_p reads.
         """
         inputs = self.recorded[rows].expand(*states.shape[:-1], -1).clone()
         inputs[..., self.spec.moving] = torch.from_numpy(np.ascontiguousarray(states))
-        X, unknowns = inputs[..., self.spec.physics_columns], self.physics.unknowns
+        unknowns = self.physics.unknowns
         values = unknowns.at(torch.from_numpy(parameters)) if unknowns else None
-        following = self.physics.or_nan(X, values)
+        following = self.physics.or_nan(inputs[..., self.spec.physics_columns], values)
         check_next_values(self.physics, following, states.shape[-1])
         return self._near(following.numpy(), states)
 
@@ -665,33 +637,6 @@ class Chain:
         near, a = states.copy(), self.angles
         near[..., a] -= 2 * np.pi * np.round((states[..., a] - others[..., a]) / (2 * np.pi))
         return near
-
-    def _sizes(self) -> tuple[Array, Array]:
-        """The middle of each state, and by how much it varies, as far as is known."""
-        y, (mean, sd) = self.measured, self.known_start
-        few = (~np.isnan(y)).sum(0) < 2
-        middle = np.where(few & ~np.isnan(mean), mean, _means(y, otherwise=0.0))
-        varies = np.sqrt(_means((y - _means(y, otherwise=0.0)) ** 2, otherwise=0.0))
-        size = np.maximum(np.abs(middle), np.nan_to_num(np.abs(y)).max(0))
-        least = _SIZE * np.where(size > 0, size, 1.0)
-        return middle, np.fmax(np.fmax(sd, varies), least)
-
-    def _start(self, measured: Array) -> tuple[Array, Array]:
-        """Mean and covariance of the first state of a stretch, and of the parameters."""
-        first = np.isnan(measured).argmin(0)  # row that has a number
-        mean, sd = measured[first, np.arange(self.d)], _WIDE * self.spread
-        mean = np.where(np.isnan(mean), self.middle, mean)
-        known_mean, known_sd = self.known_start
-        mean = np.where(np.isnan(known_mean), mean, known_mean)
-        sd = np.where(np.isnan(known_sd), sd, known_sd)
-        p = self.num_parameters
-        return np.concatenate([mean, np.zeros(p)]), np.diag([*sd**2, *np.ones(p)])
-
-    def _unwrap(self, measured: Array) -> None:
-        """Let the angles of a stretch's measured states go on without jumps."""
-        for i in self.angles:
-            rows = ~np.isnan(measured[:, i])
-            measured[rows, i] = np.unwrap(measured[rows, i])
 
 
 def _means(values: Array, otherwise: Array | float) -> Array:
@@ -712,11 +657,11 @@ def variation(chain: Chain, estimate: Estimate) -> Tensor:
     precision, pull = _told(chain, estimate)
     start = math.log(_MEDIAN)
     log_v = torch.full_like(pull[0], start).requires_grad_()
-    search = torch.optim.LBFGS([log_v], max_iter=_ROUNDS, line_search_fn="strong_wolfe")
+    search = torch.optim.LBFGS([log_v], max_iter=60, line_search_fn="strong_wolfe")
 
     def cost() -> Tensor:
         search.zero_grad()
-        prior = 0.5 * ((log_v - start) / _SPREAD).square().sum()
+        prior = 0.5 * (log_v - start).square().sum()
         value = prior - log_evidence(precision, pull, log_v.exp())
         value.backward()
         return value
@@ -753,7 +698,7 @@ def _told(chain: Chain, estimate: Estimate) -> tuple[Tensor, Tensor]:
     precisions, pulls = [], []
     for link, (mean, covariance) in zip(chain.linearised(path), chain.starts, strict=True):
         start = np.concatenate([mean[:d], parameters]), covariance  # a standard normal prior there
-        (alone,), _ = smooth_chain([link], [start], estimate.noise, estimate.process_noise)
+        (alone,), _ = smooth_chain([link], [start], *estimate.variances)
         covariance = alone.states.covariances[0, d:, d:]
         # No stretch knows less than its prior, but by rounding.
         values, vectors = np.linalg.eigh(np.linalg.inv(covariance) - np.eye(p))

@@ -330,16 +330,16 @@ def test_a_step_that_goes_where_the_physics_fails_is_taken_in_part():
 
 
 def test_a_path_that_explains_less_is_taken_in_part_or_not_at_all():
-    records, unknown = Records(measured(*simulated(0)), SPEC), np.full((3, 2), math.nan)
-    chain = Chain(spring(), records, unknown[0], unknown[1], unknown[:2])
-    path, noise = chain.first_path(np.zeros(2)), NOISE.numpy() ** 2
-    before = chain.cost(path, noise, noise)
+    records, unknown = Records(measured(*simulated(0)), SPEC), np.full((2, 2), math.nan)
+    chain = Chain(spring(), records, unknown, unknown)
+    path, noises = chain.first_path(np.zeros(2)), np.tile(NOISE.numpy() ** 2, (2, 1))
+    before = chain.cost(path, noises)
     for size, some in ((0.3, True), (1e6, False)):
         away = size * chain.spread * np.random.default_rng(0).standard_normal(path.states.shape)
         means = np.concatenate([path.states + away, np.zeros((LENGTH, 2))], axis=1)
         found = Smoothed(Moments(means, np.zeros((LENGTH, 4, 4))), np.zeros((LENGTH - 1, 4, 4)))
-        taken, share = chain.towards(path, Estimate([found], noise, noise, 0.0))
-        assert chain.cost(taken, noise, noise) <= before + 0.02
+        taken, share = chain.towards(path, Estimate([found], noises, 0.0))
+        assert chain.cost(taken, noises) <= before + 0.02
         assert share < 1
         assert (share > 0) == (taken is not path)
         assert (taken is path) or some
