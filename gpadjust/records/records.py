@@ -89,29 +89,20 @@ class Record:
     @property
     def sampling_step(self) -> float:
         """The mean time from one row to the next, without gaps."""
-        steps = self.times.diff()[self.follows]
+        steps = self.times.diff()[self._follows]
         return float(steps[steps <= _GAP * steps.median()].mean())
-
-    @cached_property
-    def follows(self) -> Tensor:
-        """Whether rows but the first are of the segment of the row before, ``N - 1`` booleans."""
-        labels = self.segments or [0] * len(self.times)
-        same = [label == after for label, after in pairwise(labels)]
-        return torch.tensor(same, dtype=torch.bool)
 
     def stretches(self, max_gap: float | None = None) -> list[slice]:
         """Return the rows that follow each other, stretch by stretch.
 
-        Args:
-            max_gap: The longest time between two rows that follow each other. Default: 1.5 times
-                the median.
+        ``max_gap`` is the longest time between two such rows; by default 1.5 times the median.
 
         Raises:
             ValueError: If times differ so much that it takes ``max_gap`` to say what a gap is.
         """
         steps = self.times.diff()
         if max_gap is None:
-            within = steps[self.follows]
+            within = steps[self._follows]
             max_gap = _GAP * float(within.median())
             longer = int((within > max_gap).sum())
             if longer > max(1, _OFTEN * len(within)):
@@ -121,17 +112,10 @@ class Record:
                     f"{max_gap / _GAP:.4g}. Bring it to even steps with `records.resampled(step, "
                     "max_gap=...)`, where max_gap is the longest time to interpolate over."
                 )
-        ends = (~self.follows | (steps > max_gap)).nonzero().flatten() + 1
+        ends = (~self._follows | (steps > max_gap)).nonzero().flatten() + 1
         return [slice(*edges) for edges in pairwise([0, *ends.tolist(), len(self.times)])]
 
-    def remember(self, spec: StateSpec) -> None:
-        """Write earlier states and actions into the states of control steps that hold them."""
-        rows = self.follows.nonzero().flatten()
-        for _ in spec.previous:  # as often as the longest chain of them needs
-            earlier = self.states[rows], self.actions[rows]
-            self.states[rows + 1] = spec.remember(self.states[rows + 1], *earlier)
-
-    def check_even(self) -> None:
+    def _check_even(self) -> None:
         """Raise a ValueError unless the sampling is even, to a tenth of its step."""
         step = self.sampling_step
         for rows in self.stretches():
@@ -144,6 +128,13 @@ class Record:
                     f"{float(steps[row]):.4g} from row {rows.start + row} to the next. Bring it to "
                     "even steps with `records.resampled(step)`."
                 )
+
+    @cached_property
+    def _follows(self) -> Tensor:
+        """True for each row but the first that is of the segment of the one before, ``N - 1``."""
+        labels = self.segments or [0] * len(self.times)
+        same = [label == after for label, after in pairwise(labels)]
+        return torch.tensor(same, dtype=torch.bool)
 
     def _error(self, message: str) -> ValueError:
         return ValueError(f"Record {self.name!r}{message}")
@@ -172,7 +163,7 @@ class Record:
                     f", row {row}: expected a label of its segment, found {label}; leave out rows "
                     "that are of no segment."
                 )
-        if not self.follows.any():
+        if not self._follows.any():
             raise self._error(
                 ": expected two rows or more of a segment, one after the other, found "
                 f"{len(self.times)} in all; leave the record out, or correct `segments`."
@@ -191,7 +182,7 @@ class Record:
                     f", row {row}: expected finite numbers, found {float(values[row, column])} in "
                     f"column {column} of {name}; {ways_out[name]}."
                 )
-        stops = (self.times.diff() <= 0) & self.follows
+        stops = (self.times.diff() <= 0) & self._follows
         if stops.any():
             row = int(stops.nonzero()[0]) + 1
             before, time = self.times[row - 1 : row + 1].tolist()
@@ -290,9 +281,8 @@ class Records:
     ) -> Records:
         r"""Read records from CSV files, one from each.
 
-        The first line of a file names its columns; those that are not asked for are left alone. A
-        field of a state is empty or NaN where it was not measured. States that hold previous values
-        need no column.
+        The first line of a file names its columns, of which there may be others. A field of a state
+        is empty or NaN where it was not measured. States that hold previous values need no column.
 
         Args:
             files: The file, or several.
@@ -331,8 +321,8 @@ class Records:
         check_spec(spec)
         state_columns = _columns(states, spec.states, "states")
         action_columns = _columns(actions, spec.actions, "actions")
-
-        def read(file: str | Path) -> Record:
+        records = []
+        for file in [files] if isinstance(files, str | Path) else files:
             table = TableColumns(file, delimiter, decimal=decimal)
             if isinstance(time, str):
                 times = table.numbers(time)
@@ -348,35 +338,22 @@ class Records:
                     measured.append(table.numbers(column, may_miss=True))
             taken = [table.numbers(column) for column in action_columns.values()]
             labels = None if segment is None else table.texts(segment)
-            return Record(
-                times, torch.stack(measured, -1), torch.stack(taken, -1), labels, str(file)
-            )
-
-        several = [files] if isinstance(files, str | Path) else files
-        return cls([read(file) for file in several], spec)
+            columns = torch.stack(measured, -1), torch.stack(taken, -1)
+            records.append(Record(times, *columns, labels, str(file)))
+        return cls(records, spec)
 
     @classmethod
     def of_windows(cls, windows: Windows, spec: StateSpec, step: float) -> Records:
-        """Make a record of each window, in control steps, such as to :func:`smooth` them.
+        """Make a record of each window, such as of an agent's episodes, to :func:`smooth` them.
 
         Args:
-            windows: Windows, such as an agent's episodes in full length.
+            windows: Windows, in control steps.
             spec: What the entries of states and actions are.
             step: The control step, in the unit of the times.
 
         Raises:
             TypeError: If ``spec`` is no :class:`StateSpec`, or ``step`` no number.
             ValueError: If ``step`` is not positive, or windows have not the columns of the spec.
-
-        Example:
-            >>> import torch
-            >>> from gpadjust.dynamics import Trajectories
-            >>> from gpadjust.records import Records
-            >>> from gpadjust.states import StateSpec
-            >>> x = torch.arange(6, dtype=torch.float64).unsqueeze(-1)
-            >>> episodes = Trajectories(x, x, x + 1, episode=[0, 0, 0, 1, 1, 1])
-            >>> [*Records.of_windows(episodes.windows(3), StateSpec(["x"], ["v"]), step=0.1)][0]
-            Record('window 0', 4 rows every 0.1, 1 state, 1 action)
         """
         rows = torch.arange(windows.states.shape[1], dtype=torch.float64)
         times = checked_number("step", step, above=0) * rows
@@ -433,8 +410,7 @@ class Records:
         Args:
             length: The number ``T`` of control steps.
             step: The control step, as of :meth:`trajectories`.
-            stride: How many steps after a window starts the next one. Default: ``length``, so that
-                they do not overlap.
+            stride: Steps from the start of a window to that of the next. Default: ``length``.
 
         Raises:
             ValueError: If no stretch is as long, a state is hidden, or as :meth:`trajectories`.
@@ -468,11 +444,11 @@ class Records:
         max_gap = None if max_gap is None else checked_number("max_gap", max_gap, above=0)
         records, left_out = [], []
         for record in self.records:
-            even = _resampled(record, self.spec, step, max_gap)
-            if even is None:
-                left_out.append(record.name)
+            parts = _even_parts(record, self.spec, step, max_gap)
+            if any(len(times) > 1 for times, *_ in parts):
+                records.append(joined(parts, record.name))
             else:
-                records.append(even)
+                left_out.append(record.name)
         if not records:
             raise ValueError(
                 f"Expected stretches as long as a step, {step:.4g}, found none; take a shorter "
@@ -554,14 +530,22 @@ def in_control_steps(records: Records, step: float | None) -> tuple[Records, int
                 parts.append((record.times[taken], states, actions))
         total, kept = total + len(stretches), kept + len(parts)
         if parts:
-            steps.append(joined(parts, record.name))
-            steps[-1].remember(records.spec)
+            steps.append(remember(joined(parts, record.name), records.spec))
     if not steps:
         raise ValueError(
             f"Expected a stretch of {every + 1} rows or more, which are a control step, found none "
             f"of {total}; take a shorter step."
         )
     return Records(steps, records.spec), total - kept
+
+
+def remember(record: Record, spec: StateSpec) -> Record:
+    """Write earlier states and actions into the states of control steps that hold them."""
+    rows = record._follows.nonzero().flatten()
+    for _ in spec.previous:  # as often as the longest chain of them needs
+        earlier = record.states[rows], record.actions[rows]
+        record.states[rows + 1] = spec.remember(record.states[rows + 1], *earlier)
+    return record
 
 
 def joined(parts: Sequence[Rows], name: str) -> Record:
@@ -574,7 +558,7 @@ def joined(parts: Sequence[Rows], name: str) -> Record:
 def _rows_a_step(records: Records, step: float | None) -> int:
     """Return the number of rows of the records that make a control step."""
     for record in records:
-        record.check_even()
+        record._check_even()
     fast, *_, slow = sorted((*records, records.records[0]), key=lambda each: each.sampling_step)
     sampling, spec_step = fast.sampling_step, records.spec.step
     if slow.sampling_step - sampling > _SAME * sampling:
@@ -601,10 +585,8 @@ def _rows_a_step(records: Records, step: float | None) -> int:
     return every
 
 
-def _resampled(
-    record: Record, spec: StateSpec, step: float, max_gap: float | None
-) -> Record | None:
-    """Return a record with rows of this step; None if no stretch is as long as one."""
+def _even_parts(record: Record, spec: StateSpec, step: float, max_gap: float | None) -> list[Rows]:
+    """Return rows of this step, stretch by stretch; of a shorter one its first row."""
     finest = _FINEST * record.sampling_step
     if step < finest:
         raise ValueError(
@@ -615,19 +597,17 @@ def _resampled(
     for rows in record.stretches(max_gap):
         times, states, actions = record.times[rows], record.states[rows], record.actions[rows]
         num_steps = int((times[-1] - times[0]) / step + _ROUNDING)
-        if num_steps:
-            edges = times[0] + step * torch.arange(num_steps + 2, dtype=torch.float64)
-            states = _interpolated(times, states, edges[:-1], spec.change)
-            # The mean of an action is the difference of its integral, which is linear between rows.
-            times = torch.cat([times, times[-1:] + edges[-1:] - edges[:1]])  # the last goes on
-            integral = torch.nn.functional.pad(actions * times.diff()[:, None], (0, 0, 1, 0))
-            integral = _interpolated(times, integral.cumsum(0), edges, lambda a, b: b - a)
-            actions, times = integral.diff(dim=0) / edges.diff()[:, None], edges[:-1]
-        parts.append(
-            (times, states, actions) if num_steps else (times[:1], states[:1], actions[:1])
-        )
-    longest = max(len(times) for times, *_ in parts)
-    return joined(parts, record.name) if longest > 1 else None
+        if not num_steps:
+            parts.append((times[:1], states[:1], actions[:1]))
+            continue
+        edges = times[0] + step * torch.arange(num_steps + 2, dtype=torch.float64)
+        states = _interpolated(times, states, edges[:-1], spec.change)
+        # The mean of an action is the difference of its integral, which is linear between rows.
+        times = torch.cat([times, times[-1:] + edges[-1:] - edges[:1]])  # the last one goes on
+        integral = torch.nn.functional.pad(actions * times.diff()[:, None], (0, 0, 1, 0)).cumsum(0)
+        integral = _interpolated(times, integral, edges, lambda before, after: after - before)
+        parts.append((edges[:-1], states, integral.diff(dim=0) / edges.diff()[:, None]))
+    return parts
 
 
 def _interpolated(

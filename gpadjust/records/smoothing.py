@@ -25,15 +25,9 @@ from gpadjust.dynamics.particles import even_normal, of_states
 from gpadjust.dynamics.targets import check_next_values, one_physics
 from gpadjust.physics import ODEPhysics, Physics, PhysicsError
 from gpadjust.physics.parameters import PhysicsParameters
-from gpadjust.records.kalman import (
-    Array,
-    Link,
-    Smoothed,
-    draw_paths,
-    expected_squares,
-    smooth_chain,
-)
-from gpadjust.records.records import Record, Records, in_control_steps, joined
+from gpadjust.records import kalman
+from gpadjust.records.kalman import Array, Link, Smoothed
+from gpadjust.records.records import Record, Records, in_control_steps, joined, remember
 from gpadjust.states import StateSpec
 from gpadjust.states.state_spec import side_by_side
 
@@ -101,14 +95,13 @@ class SmoothedRecords:
     @property
     def physics_parameters(self) -> PhysicsParameters:
         """The posterior of the unknown parameters of the physics; empty if it has none."""
-        unknowns, moments = self._chain.physics.unknowns, self._estimate.stretches[0].states
+        unknowns, d = self._chain.physics.unknowns, self._chain.d
         if not unknowns:
             return PhysicsParameters({}, [])
-        p = len(unknowns)
-        mean = torch.from_numpy(moments.means[0, -p:].copy())
-        covariance = torch.from_numpy(moments.covariances[0, -p:, -p:].copy())
-        values, vectors = torch.linalg.eigh(covariance)
-        spread = even_normal(_DRAWS, p, seed=0) * values.clamp_min(0).sqrt()
+        moments = self._estimate.stretches[0].states
+        mean = torch.from_numpy(moments.means[0, d:].copy())
+        values, vectors = torch.linalg.eigh(torch.from_numpy(moments.covariances[0, d:, d:].copy()))
+        spread = even_normal(_DRAWS, len(unknowns), seed=0) * values.clamp_min(0).sqrt()
         return PhysicsParameters(unknowns, unknowns.at(mean + spread @ vectors.mT).unbind(-1))
 
     @cached_property
@@ -116,11 +109,11 @@ class SmoothedRecords:
         """Variation of the parameters from one stretch of the records to another, ``p``.
 
         Standard deviations, in those of each parameter's prior: with 0.1, and a prior of a factor
-        of 1.5, by some 4 %. Stretches of which each has parameters of its own are explained by
-        these best, given the noises; where they tell nothing, 0.05. No equation is right in all:
-        what it lacks shows as parameters that vary, and moves a free run for as long as that lasts,
-        where process noise averages out. :meth:`Dynamics.free_run` takes it. Records of one machine
-        and day tell nothing of another's.
+        of 1.5, some 4 %. They explain best, given the noises, stretches that have parameters of
+        their own each; where the stretches tell nothing, they are 0.05. No equation is right in
+        all: what it lacks shows as parameters that vary, and moves a free run for as long as that
+        lasts, where process noise averages out. :meth:`Dynamics.free_run` takes it. Records of one
+        machine and day tell nothing of another's.
 
         Raises:
             ValueError: If the physics has no unknown parameters.
@@ -135,14 +128,11 @@ class SmoothedRecords:
         Unlike the most likely ones they scatter about the physics as the machine does, so that a
         model which learns from them finds the right noise.
 
-        Args:
-            seed: Seed of the draw.
-
         Raises:
-            ValueError: If it is no whole number of 0 or more.
+            ValueError: If the seed is no whole number of 0 or more.
         """
         rng = np.random.default_rng(checked_whole("seed", seed, 0))
-        paths = draw_paths(self._estimate.stretches, self._chain.num_parameters, rng)
+        paths = kalman.draw_paths(self._estimate.stretches, self._chain.num_parameters, rng)
         return _with_states(self.records, np.concatenate(paths))
 
     def __repr__(self) -> str:
@@ -196,10 +186,7 @@ def smooth(
             the physics. Default: 4 with hidden states, else 1.
         max_rounds: The most rounds of smoothing of each. With hidden states all of them may be
             needed: 4 starts of 100 rounds, half a minute for 300 rows and a physics of formulas.
-        progress: Whether to show a progress bar.
-
-    Returns:
-        The states, their uncertainty, and what decided them.
+        progress: If True, show a progress bar.
 
     Raises:
         TypeError: If an argument is of the wrong type.
@@ -261,19 +248,19 @@ def smooth(
     estimate = _estimate(chain, max_rounds, num_starts, progress)
     covariances = np.concatenate([part.states.covariances for part in estimate.stretches])
     squares = np.diagonal(covariances, axis1=1, axis2=2)[:, : chain.d].clip(0)
-    sd = torch.zeros(len(squares), spec.state_dim, dtype=torch.float64)
-    sd[:, spec.moving] = torch.from_numpy(np.sqrt(squares))
-    noises = torch.zeros(2, spec.state_dim, dtype=torch.float64)
-    noises[:, spec.moving] = torch.from_numpy(np.sqrt(estimate.variances))
-    noises[0, [i for i, hidden in zip(spec.moving, chain.hidden, strict=True) if hidden]] = math.nan
+
+    def roots(variances: Array) -> Tensor:
+        """Of all states, 0 of those that the physics does not move."""
+        sd = torch.zeros(len(variances), spec.state_dim, dtype=torch.float64)
+        sd[:, spec.moving] = torch.from_numpy(np.sqrt(variances))
+        return sd
+
+    sd = roots(squares).split([len(record.times) for record in steps])
+    noises = roots(estimate.variances)
+    noises[0, np.array(spec.moving)[chain.hidden]] = math.nan
+    smoothed = _with_states(steps, estimate.states)
     return SmoothedRecords(
-        _with_states(steps, estimate.states),
-        sd.split([len(record.times) for record in steps]),
-        noises[0],
-        noises[1],
-        estimate.log_density,
-        chain,
-        estimate,
+        smoothed, sd, noises[0], noises[1], estimate.log_density, chain, estimate
     )
 
 
@@ -283,8 +270,8 @@ def _with_states(steps: Records, path: Array) -> Records:
     for record in steps:
         states, end = record.states.clone(), row + len(record.times)
         states[:, moving] = torch.from_numpy(path[row:end, : len(moving)].copy())
-        records.append(Record(record.times, states, record.actions, record.segments, record.name))
-        records[-1].remember(steps.spec)
+        new = Record(record.times, states, record.actions, record.segments, record.name)
+        records.append(remember(new, steps.spec))
         row = end
     return Records(records, steps.spec)
 
@@ -424,7 +411,7 @@ def _search(
         bar.update()
         # E: p(x, theta | y) of the chain x[t + 1] = F[t] x[t] + b[t] + q[t], F = df_p / dx
         links = chain.linearised(path)
-        smoothed, density = smooth_chain(links, chain.starts, *variances)
+        smoothed, density = kalman.smooth_chain(links, chain.starts, *variances)
         if not math.isfinite(density):
             raise np.linalg.LinAlgError
         gained, value = density - value, density
@@ -592,7 +579,7 @@ class Chain:
 
     def likely_variances(self, links: Sequence[Link], smoothed: Sequence[Smoothed]) -> Array:
         """Variances of both noises, most likely given the states' distribution."""
-        measured, added = expected_squares(links, smoothed, self.d)
+        measured, added = kalman.expected_squares(links, smoothed, self.d)
         noise = _means(measured, otherwise=self.spread**2)  # of hidden states any number
         return np.stack([noise, added.mean(0)])
 
@@ -641,8 +628,9 @@ class Chain:
 
 def _means(values: Array, otherwise: Array | float) -> Array:
     """Means of the numbers of each column, or otherwise of one that has none."""
-    number = (~np.isnan(values)).sum(0)
-    return np.where(number > 0, np.nansum(values, 0) / number.clip(1), otherwise)
+    columns = np.ascontiguousarray(values.T)
+    number = (~np.isnan(columns)).sum(1)
+    return np.where(number > 0, np.nansum(columns, 1) / number.clip(1), otherwise)
 
 
 def variation(chain: Chain, estimate: Estimate) -> Tensor:
@@ -698,7 +686,7 @@ def _told(chain: Chain, estimate: Estimate) -> tuple[Tensor, Tensor]:
     precisions, pulls = [], []
     for link, (mean, covariance) in zip(chain.linearised(path), chain.starts, strict=True):
         start = np.concatenate([mean[:d], parameters]), covariance  # a standard normal prior there
-        (alone,), _ = smooth_chain([link], [start], *estimate.variances)
+        (alone,), _ = kalman.smooth_chain([link], [start], *estimate.variances)
         covariance = alone.states.covariances[0, d:, d:]
         # No stretch knows less than its prior, but by rounding.
         values, vectors = np.linalg.eigh(np.linalg.inv(covariance) - np.eye(p))
