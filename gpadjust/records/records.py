@@ -115,7 +115,7 @@ class Record:
         ends = (~self._follows | (steps > max_gap)).nonzero().flatten() + 1
         return [slice(*edges) for edges in pairwise([0, *ends.tolist(), len(self.times)])]
 
-    def _check_even(self) -> None:
+    def check_even(self) -> None:
         """Raise a ValueError unless the sampling is even, to a tenth of its step."""
         step = self.sampling_step
         for rows in self.stretches():
@@ -558,7 +558,7 @@ def joined(parts: Sequence[Rows], name: str) -> Record:
 def _rows_a_step(records: Records, step: float | None) -> int:
     """Return the number of rows of the records that make a control step."""
     for record in records:
-        record._check_even()
+        record.check_even()
     fast, *_, slow = sorted((*records, records.records[0]), key=lambda each: each.sampling_step)
     sampling, spec_step = fast.sampling_step, records.spec.step
     if slow.sampling_step - sampling > _SAME * sampling:

@@ -498,7 +498,7 @@ class Chain:
             )
 
     def starts_of_search(self, number: int) -> Iterator[tuple[Array, bool]]:
-        """Coordinates of the parameters, and whether variances that are known are so at once."""
+        """Yield coordinates of the parameters, and if known variances are so from the beginning."""
         p = self.num_parameters
         something_known = not np.isnan(self.known_variances).all()
         yield np.zeros(p), False
@@ -510,7 +510,7 @@ class Chain:
                 yield coordinates, something_known and i % 2 == 1
 
     def first_path(self, parameters: Array) -> Path:
-        """Measured states, and between them and in hidden ones where f_p leads."""
+        """Return measured states, and between them and in hidden ones those to which f_p leads."""
         states, measured, x = self.measured.copy(), self.measured.copy(), self.first.copy()
         for t in range(self.lengths.max() if np.isnan(measured).any() else 0):
             going = self.lengths > t
@@ -526,24 +526,24 @@ class Chain:
         return Path(states, measured, parameters, following)
 
     def path(self, states: Array, parameters: Array) -> Path:
-        """The path of these states, NaN where f_p fails."""
+        """Return the path of these states, NaN where f_p fails."""
         following = self.follow(self.now, states[self.now], parameters)
         return Path(states, self._near(self.measured, states), parameters, following)
 
     def first_variances(self, path: Path) -> Array:
-        """First variances of both noises, by f_p's errors in single steps."""
+        """Return first variances of both noises, by f_p's errors in single steps."""
         change = ((path.following - path.states[self.now]) ** 2).mean(0)
         errors = (path.measured[self.now + 1] - path.following) ** 2
         noise = _SHARE * _means(errors, otherwise=_HIDDEN**2 * change)
         return np.stack([noise, 2 * noise]).clip(self.least)
 
     def checked(self, variances: Array) -> Array:
-        """Variances with what is known of them, and none too small to reckon with."""
+        """Return variances, in their place the known ones, and none too small to compute with."""
         known = self.known_variances
         return np.where(np.isnan(known), variances, known).clip(self.least)
 
     def linearised(self, path: Path) -> list[Link]:
-        """The chain near a path, by central differences of f_p: z[t + 1] = F[t] z[t] + b[t]."""
+        """Linearise the chain near a path: z[t + 1] = F[t] z[t] + b[t] with z = (x, theta)."""
         d, p, x = self.d, self.num_parameters, path.states[self.now]
         sizes = _STEP * np.concatenate([self.spread, np.ones(p)])
         dx, dtheta = np.split(np.diag(sizes), [d], axis=1)
@@ -564,7 +564,7 @@ class Chain:
         return links
 
     def towards(self, path: Path, estimate: Estimate) -> tuple[Path, float]:
-        """The path to the estimate, or as much of the way as explains more; the share, maybe 0."""
+        """Go to the estimate, or as much of the way as explains more; return the share, maybe 0."""
         ahead, theta = estimate.states[:, : self.d], estimate.states[0, self.d :]
         before, share = self.cost(path, estimate.variances), 1.0
         for _ in range(_HALVINGS):
@@ -578,13 +578,13 @@ class Chain:
         return path, 0.0
 
     def likely_variances(self, links: Sequence[Link], smoothed: Sequence[Smoothed]) -> Array:
-        """Variances of both noises, most likely given the states' distribution."""
+        """Return variances of both noises, most likely given the states' distribution."""
         measured, added = kalman.expected_squares(links, smoothed, self.d)
         noise = _means(measured, otherwise=self.spread**2)  # of hidden states any number
         return np.stack([noise, added.mean(0)])
 
     def cost(self, path: Path, variances: Array) -> float:
-        """Twice the negative log density of a path, but for a constant; NaN where f_p fails."""
+        """Return twice the negative log density of a path, up to a constant; NaN if f_p fails."""
         noise, process_noise = variances
         errors = np.nansum((path.measured - path.states) ** 2 / noise)
         added = (path.states[self.now + 1] - path.following) ** 2 / process_noise
@@ -592,7 +592,7 @@ class Chain:
         return float(errors + added.sum() + begins.sum() + (path.parameters**2).sum())
 
     def _defined(self, rows: Array, states: Array, parameters: Array) -> Array:
-        """Next states by f_p, ``n x d``; an error where it fails."""
+        """Return next states by f_p, ``n x d``; raise an error where it fails."""
         following = self.follow(rows, states, parameters)
         failed = np.flatnonzero(~np.isfinite(following).all(1))
         if len(failed):
@@ -607,7 +607,7 @@ class Chain:
         return following
 
     def follow(self, rows: Array, states: Array, parameters: Array) -> Array:
-        """Next states ``... x n x d``, NaN where f_p fails, of angles near those of ``states``.
+        """Return next states ``... x n x d``, NaN where f_p fails, angles near those of ``states``.
 
         Rows ``n`` have the actions, and the states that do not move, which f_p reads.
         """
@@ -620,21 +620,21 @@ class Chain:
         return self._near(following.numpy(), states)
 
     def _near(self, states: Array, others: Array) -> Array:
-        """States ``... x d``, their angles within half a turn of those of others."""
+        """Return states ``... x d``, their angles within half a turn of those of others."""
         near, a = states.copy(), self.angles
         near[..., a] -= 2 * np.pi * np.round((states[..., a] - others[..., a]) / (2 * np.pi))
         return near
 
 
 def _means(values: Array, otherwise: Array | float) -> Array:
-    """Means of the numbers of each column, or otherwise of one that has none."""
+    """Return means of the numbers of each column, or ``otherwise`` if it has none."""
     columns = np.ascontiguousarray(values.T)
     number = (~np.isnan(columns)).sum(1)
     return np.where(number > 0, np.nansum(columns, 1) / number.clip(1), otherwise)
 
 
 def variation(chain: Chain, estimate: Estimate) -> Tensor:
-    r"""Standard deviations of stretches' parameters, ``p``, in those of the priors.
+    r"""Estimate standard deviations of stretches' parameters, ``p``, in those of the priors.
 
     With :math:`\theta_s = \theta + \eta_s` in the coordinates in which priors are standard normal,
     :math:`\eta_s \sim N(0, \operatorname{diag}(v^2))` for stretch s, and the noises as they were
@@ -642,7 +642,7 @@ def variation(chain: Chain, estimate: Estimate) -> Tensor:
     Laird and Ware 1982), with :math:`\log v \sim N(\log 0.05, 1)`: what the stretches say nothing
     of stays there.
     """
-    precision, pull = _told(chain, estimate)
+    precision, pull = _of_each_stretch(chain, estimate)
     start = math.log(_MEDIAN)
     log_v = torch.full_like(pull[0], start).requires_grad_()
     search = torch.optim.LBFGS([log_v], max_iter=60, line_search_fn="strong_wolfe")
@@ -659,7 +659,7 @@ def variation(chain: Chain, estimate: Estimate) -> Tensor:
 
 
 def log_evidence(precision: Tensor, pull: Tensor, v: Tensor) -> Tensor:
-    r"""The log density of all stretches by v, but for a constant.
+    r"""Return the log density of all stretches by v, up to a constant.
 
     What stretch s says of its parameters is
     :math:`\exp(h_s^\top \theta_s - \theta_s^\top \Lambda_s \theta_s / 2)`; :math:`\eta_s`, and then
@@ -678,8 +678,8 @@ def log_evidence(precision: Tensor, pull: Tensor, v: Tensor) -> Tensor:
     return own + common - whole.diagonal().log().sum()
 
 
-def _told(chain: Chain, estimate: Estimate) -> tuple[Tensor, Tensor]:
-    """Precision and pull of each stretch, by smoothing it alone about the estimate by all."""
+def _of_each_stretch(chain: Chain, estimate: Estimate) -> tuple[Tensor, Tensor]:
+    """Return precision and pull of each stretch, smoothed alone about the estimate by all."""
     d, p = chain.d, chain.num_parameters
     parameters = estimate.states[0, d:]
     path = chain.path(estimate.states[:, :d], parameters)
