@@ -96,24 +96,22 @@ class Identification:
         return [*self.remarks, *_of_parameters(self.parameters), *self._of_errors()]
 
     def _of_errors(self) -> list[str]:
-        told = []
+        sentences, errors, shares = [], self.errors, self.coverage.tolist()
         for i, name in enumerate(self.spec.states):
-            share = float(self.coverage[i])
-            if share < FEW:
-                told.append(
-                    f"Of {name} the intervals of 95 % hold {100 * share:.0f} % of what was held "
-                    "out: the physics lacks something whose errors last longer than process noise "
-                    "(dry friction, an input), or has a sign or unit wrong. Rely neither on them "
-                    "nor on those of the parameters."
+            if shares[i] < FEW:
+                sentences.append(
+                    f"Of {name} the intervals of 95 % hold {100 * shares[i]:.0f} % of what was "
+                    "held out: the physics lacks something whose errors last longer than process "
+                    "noise (dry friction, an input), or has a sign or unit wrong. Rely neither on "
+                    "them nor on those of the parameters."
                 )
-            errors = {run: float(error[i]) for run, error in self.errors.items()}
             for other, words in ((GUESSES, "the guesses do"), (PERSISTENCE, "a state that stays")):
-                if errors.get(other, math.inf) <= errors[IDENTIFIED]:
-                    told.append(
+                if other in errors and errors[other][i] <= errors[IDENTIFIED][i]:
+                    sentences.append(
                         "Along what was held out the identified physics errs no less in "
                         f"{name} than {words}."
                     )
-        return told
+        return sentences
 
     def __repr__(self) -> str:
         """Parameters, noises and errors."""
@@ -186,8 +184,7 @@ def identify(
         >>> bool((found.errors["identified"] < 0.1 * found.errors["guesses"]).all())
         True
     """
-    if not isinstance(records, Records):
-        raise TypeError(f"Expected records as Records([record, ...], spec), found {records!r}.")
+    steps, _ = in_control_steps(records, step)
     spec = records.spec
     if len(spec.moving) < spec.state_dim:
         raise ValueError(
@@ -196,7 +193,6 @@ def identify(
         )
     share = checked_number("held_out", held_out, above=0, most=0.5)
     checked_whole("seed", seed, 0)
-    steps, _ = in_control_steps(records, step)
     parts = [(each, rows) for each in steps for rows in each.stretches()]
     lengths = [rows.stop - rows.start - 1 for _, rows in parts]
     if max(lengths) < _LEAST:
@@ -220,20 +216,21 @@ def identify(
     )
     last = torch.stack([smoothed.records.records[i].states[-1] for i in ends])
     windows = Windows(last, torch.stack(actions), torch.stack(measured))
-    variances = torch.stack([smoothed.sd[i][-1] for i in ends]).square()
-    options: dict[str, Any] = {
-        "start_noise": variances.mean(0).sqrt(),
-        "noise": smoothed.noise.nan_to_num(),
-        "seed": seed,
-    }
+    start_noise = torch.stack([smoothed.sd[i][-1] for i in ends]).square().mean(0).sqrt()
+    noise = smoothed.noise.nan_to_num()
+    options: dict[str, Any] = {"start_noise": start_noise, "noise": noise, "seed": seed}
     by_guesses = PhysicsDynamics(spec, f_p)
     drawn = _Drawn(spec, f_p, smoothed.physics_parameters) if f_p.unknowns else by_guesses
-    moved: dict[str, Any] = {
-        "num_functions": 199,
-        "level": 0.95,
-        "process_noise": smoothed.process_noise,
+    runs = {
+        IDENTIFIED: drawn.free_run(
+            last,
+            windows.actions,
+            num_functions=199,
+            level=0.95,
+            process_noise=smoothed.process_noise,
+            **options,
+        )
     }
-    runs = {IDENTIFIED: drawn.free_run(last, windows.actions, **moved, **options)}
     if f_p.unknowns:
         runs[GUESSES] = by_guesses.free_run(last, windows.actions, **options)
     length_of_step = float(steps.records[0].times[1] - steps.records[0].times[0])
@@ -277,48 +274,44 @@ class _Drawn(PhysicsDynamics):
 
 
 def _of_actions(records: Records, step: float) -> list[str]:
-    """A sentence if actions vary within control steps, over which they are averaged."""
-    within, most = 0.0, 1
-    for record in records:
-        size = round(step / record.sampling_step)
-        if size > 1:
-            steps = record.actions[: len(record.actions) // size * size].unflatten(0, (-1, size))
-            share = steps.var(1, correction=0).nanmean(0) / record.actions.var(0, correction=0)
-            within = max(within, float(share.nan_to_num().max()))
-            most = max(most, size)
-    if within <= _VARIES:
+    """Return a sentence if actions vary within control steps, over which they are averaged."""
+    size, shares = round(step / records.records[0].sampling_step), [torch.zeros(1)]
+    for record in records if size > 1 else ():
+        steps = record.actions[: len(record.actions) // size * size].unflatten(0, (-1, size))
+        shares.append(steps.var(1, correction=0).nanmean(0) / record.actions.var(0, correction=0))
+    if torch.cat(shares).nan_to_num().max() <= _VARIES:
         return []
     return [
-        f"The actions vary within a step of {most} samples, over which they are averaged: "
+        f"The actions vary within a step of {size} samples, over which they are averaged: "
         "parameters and their intervals may be off. Take a shorter step and compare."
     ]
 
 
 def _of_jumps(records: Records) -> list[str]:
-    """Sentences on states that jump by a turn."""
-    told = []
+    """Return sentences on states that jump by a turn."""
+    sentences = []
     for i, name in enumerate(records.spec.states):
         moves = torch.cat([record.states[:, i].diff() for record in records])
         moves = moves[~moves.isnan()].abs()
         for turn, way in ((2 * math.pi, "say so"), (360.0, "convert it to rad, and say so")):
             jumps = ((moves / turn - 1).abs() < _NEAR_A_TURN).any()
             if name not in records.spec.angles and jumps and moves.median() < 0.1 * turn:
-                told.append(f"{name} jumps by a turn: if it is an angle, {way} (`angles`).")
-    return told
+                sentences.append(f"{name} jumps by a turn: if it is an angle, {way} (`angles`).")
+    return sentences
 
 
 def _of_parameters(parameters: PhysicsParameters | None) -> list[str]:
-    """Sentences on parameters of which the log says little, or which were guessed badly."""
+    """Return sentences on parameters of which the log says little, or which were guessed badly."""
     if parameters is None:
         return []
-    told = []
+    sentences = []
     for name, unknown in parameters.unknowns.items():
         z = unknown.coordinate(parameters[name])
         if z.mean().abs() > _FAR:
-            told.append(
+            sentences.append(
                 f"{name} is {float(z.mean().abs()):.1f} standard deviations of its prior from its "
                 "guess: a sign, a unit, or a physics that lacks something?"
             )
         elif z.std() > _KNOWN_BEFORE:
-            told.append(f"The log says next to nothing of {name}: it stays as known before.")
-    return told
+            sentences.append(f"The log says next to nothing of {name}: it stays as known before.")
+    return sentences

@@ -95,7 +95,8 @@ class Record:
     def stretches(self, max_gap: float | None = None) -> list[slice]:
         """Return the rows that follow each other, stretch by stretch.
 
-        ``max_gap`` is the longest time between two such rows; by default 1.5 times the median.
+        Args:
+            max_gap: The longest time between two such rows. Default: 1.5 times the median.
 
         Raises:
             ValueError: If times differ so much that it takes ``max_gap`` to say what a gap is.
@@ -402,7 +403,7 @@ class Records:
         return kept
 
     def windows(self, length: int, step: float | None = None, stride: int | None = None) -> Windows:
-        """Return windows of all records, to compare with a free run of :class:`Dynamics`.
+        """Cut windows, to compare with :meth:`~gpadjust.dynamics.Dynamics.free_run`.
 
         A window starts only at a state that was measured in full; else at the next one that was.
         What follows may lack entries.
@@ -464,10 +465,7 @@ class Records:
         return Records(records, self.spec)
 
     def _transitions(self, step: float | None) -> tuple[Trajectories, int]:
-        """All control steps, an episode for each stretch, and how many stretches are shorter.
-
-        States are NaN as they were measured.
-        """
+        """Return all steps, an episode for each stretch, and how many stretches are shorter."""
         steps, short = in_control_steps(self, step)
         stretches = [(each, rows) for each in steps for rows in each.stretches()]
         states = [each.states[rows] for each, rows in stretches]
@@ -513,30 +511,33 @@ def in_control_steps(records: Records, step: float | None) -> tuple[Records, int
     Also return how many stretches are left out, as they are shorter than a step. For ``step`` see
     :meth:`Records.trajectories`.
     """
-    every, steps, total, kept = _rows_a_step(records, step), [], 0, 0
+    if not isinstance(records, Records):
+        raise TypeError(f"Expected records as Records([record, ...], spec), found {records!r}.")
+    every, spec = _rows_a_step(records, step), records.spec
+    steps, short = [], 0
     for record in records:
-        stretches = record.stretches()
         parts = []
-        for rows in stretches:
+        for rows in record.stretches():
             num_steps = (rows.stop - rows.start - 1) // every
-            if num_steps:
-                taken = slice(rows.start, rows.start + num_steps * every + 1, every)
-                states = record.states[taken].clone()
-                if every > 1:  # recorded ones are of a row before, not of a step
-                    states[0, records.spec.previous_columns] = math.nan
-                actions = record.actions[rows][: num_steps * every]
-                actions = actions.unflatten(0, (num_steps, every)).mean(1)
-                actions = torch.cat([actions, actions[-1:]])  # the last: not read
-                parts.append((record.times[taken], states, actions))
-        total, kept = total + len(stretches), kept + len(parts)
+            if not num_steps:
+                short += 1
+                continue
+            taken = slice(rows.start, rows.start + num_steps * every + 1, every)
+            states = record.states[taken].clone()
+            if every > 1:  # recorded ones are of a row before, not of a step
+                states[0, spec.previous_columns] = math.nan
+            actions = record.actions[rows][: num_steps * every]
+            actions = actions.unflatten(0, (num_steps, every)).mean(1)
+            actions = torch.cat([actions, actions[-1:]])  # the last: not read
+            parts.append((record.times[taken], states, actions))
         if parts:
-            steps.append(remember(joined(parts, record.name), records.spec))
+            steps.append(remember(joined(parts, record.name), spec))
     if not steps:
         raise ValueError(
             f"Expected a stretch of {every + 1} rows or more, which are a control step, found none "
-            f"of {total}; take a shorter step."
+            f"of {short}; take a shorter step."
         )
-    return Records(steps, records.spec), total - kept
+    return Records(steps, spec), short
 
 
 def remember(record: Record, spec: StateSpec) -> Record:

@@ -218,11 +218,9 @@ def smooth(
         >>> bool((found.physics_parameters.mean - 2.25).abs() < 0.05)
         True
     """
-    if not isinstance(records, Records):
-        raise TypeError(f"Expected records as Records([record, ...], spec), found {records!r}.")
-    spec = records.spec
     checked_whole("max_rounds", max_rounds, 1)
     steps, short = in_control_steps(records, step)
+    spec = records.spec
     if short:
         total = short + sum(len(record.stretches()) for record in steps)
         warnings.warn(
