@@ -61,13 +61,9 @@ class Estimate(NamedTuple):
     """
 
     stretches: list[Smoothed]
+    states: Array  # their means, one stretch after the other, M x (d + p)
     variances: Array  # of noise and process noise, 2 x d
     log_density: float  # of what was measured
-
-    @property
-    def states(self) -> Array:
-        """Means of the states of all stretches and of the parameters, ``M x (d + p)``."""
-        return np.concatenate([stretch.states.means for stretch in self.stretches])
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -264,13 +260,13 @@ def smooth(
 
 def _with_states(steps: Records, path: Array) -> Records:
     """Return records of other states that move, ``M x (d + p)`` one record after the other."""
-    records, moving, row = [], steps.spec.moving, 0
-    for record in steps:
-        states, end = record.states.clone(), row + len(record.times)
-        states[:, moving] = torch.from_numpy(path[row:end, : len(moving)].copy())
+    records, moving = [], steps.spec.moving
+    parts = torch.from_numpy(path[:, : len(moving)]).split([len(record.times) for record in steps])
+    for record, part in zip(steps, parts, strict=True):
+        states = record.states.clone()
+        states[:, moving] = part
         new = Record(record.times, states, record.actions, record.segments, record.name)
         records.append(remember(new, steps.spec))
-        row = end
     return Records(records, steps.spec)
 
 
@@ -413,7 +409,8 @@ def _search(
         if not math.isfinite(density):
             raise np.linalg.LinAlgError
         gained, value = density - value, density
-        estimate = Estimate(smoothed, variances, density)
+        means = np.concatenate([stretch.states.means for stretch in smoothed])
+        estimate = Estimate(smoothed, means, variances, density)
         # x <- x + share (E[x | y] - x), share = 1, 1/2, ... until p(x, theta, y) is no less
         path, share = chain.towards(path, estimate)
         if 0 < share < 1:
@@ -514,7 +511,7 @@ class Chain:
             going = self.lengths > t
             rows = self.firsts[going] + t
             if t:  # after a gap the angle may have gone round
-                measured[rows] = self._near(measured[rows], x[going])
+                measured[rows] = self.near(measured[rows], x[going])
             states[rows] = np.where(np.isnan(measured[rows]), x[going], measured[rows])
             x[going] = states[rows]
             going = self.lengths > t + 1
@@ -522,11 +519,6 @@ class Chain:
                 x[going] = self._defined(self.firsts[going] + t, x[going], parameters)
         following = self._defined(self.now, states[self.now], parameters)
         return Path(states, measured, parameters, following)
-
-    def path(self, states: Array, parameters: Array) -> Path:
-        """Return the path of these states, NaN where f_p fails."""
-        following = self.follow(self.now, states[self.now], parameters)
-        return Path(states, self._near(self.measured, states), parameters, following)
 
     def first_variances(self, path: Path) -> Array:
         """Return first variances of both noises, by f_p's errors in single steps."""
@@ -615,9 +607,9 @@ class Chain:
         values = unknowns.at(torch.from_numpy(parameters)) if unknowns else None
         following = self.physics.or_nan(inputs[..., self.spec.physics_columns], values)
         check_next_values(self.physics, following, states.shape[-1])
-        return self._near(following.numpy(), states)
+        return self.near(following.numpy(), states)
 
-    def _near(self, states: Array, others: Array) -> Array:
+    def near(self, states: Array, others: Array) -> Array:
         """Return states ``... x d``, their angles within half a turn of those of others."""
         near, a = states.copy(), self.angles
         near[..., a] -= 2 * np.pi * np.round((states[..., a] - others[..., a]) / (2 * np.pi))
@@ -680,7 +672,9 @@ def _of_each_stretch(chain: Chain, estimate: Estimate) -> tuple[Tensor, Tensor]:
     """Return precision and pull of each stretch, smoothed alone about the estimate by all."""
     d, p = chain.d, chain.num_parameters
     parameters = estimate.states[0, d:]
-    path = chain.path(estimate.states[:, :d], parameters)
+    states = estimate.states[:, :d]
+    following = chain.follow(chain.now, states[chain.now], parameters)
+    path = Path(states, chain.near(chain.measured, states), parameters, following)
     precisions, pulls = [], []
     for link, (mean, covariance) in zip(chain.linearised(path), chain.starts, strict=True):
         start = np.concatenate([mean[:d], parameters]), covariance  # a standard normal prior there

@@ -338,7 +338,7 @@ def test_a_path_that_explains_less_is_taken_in_part_or_not_at_all():
         away = size * chain.spread * np.random.default_rng(0).standard_normal(path.states.shape)
         means = np.concatenate([path.states + away, np.zeros((LENGTH, 2))], axis=1)
         found = Smoothed(Moments(means, np.zeros((LENGTH, 4, 4))), np.zeros((LENGTH - 1, 4, 4)))
-        taken, share = chain.towards(path, Estimate([found], noises, 0.0))
+        taken, share = chain.towards(path, Estimate([found], means, noises, 0.0))
         assert chain.cost(taken, noises) <= before + 0.02
         assert share < 1
         assert (share > 0) == (taken is not path)
