@@ -469,14 +469,11 @@ class Records:
         steps, short = in_control_steps(self, step)
         stretches = [(each, rows) for each in steps for rows in each.stretches()]
         states = [each.states[rows] for each, rows in stretches]
-        actions = [each.actions[rows][:-1] for each, rows in stretches]
-        lengths = torch.tensor([len(part) for part in actions])
-        return Trajectories(
-            torch.cat([part[:-1] for part in states]),
-            torch.cat(actions),
-            torch.cat([part[1:] for part in states]),
-            torch.arange(len(stretches)).repeat_interleave(lengths),
-        ), short
+        actions = torch.cat([each.actions[rows][:-1] for each, rows in stretches])
+        before = torch.cat([part[:-1] for part in states])
+        after = torch.cat([part[1:] for part in states])
+        episode = [i for i, part in enumerate(states) for _ in part[1:]]
+        return Trajectories(before, actions, after, episode), short
 
     def _hidden(self, data: Trajectories) -> str:
         """The way out if states were never measured; empty if there are none."""

@@ -54,18 +54,6 @@ class SmoothingWarning(UserWarning):
     """The states of a record did not settle."""
 
 
-class Estimate(NamedTuple):
-    """The states that stretches went through, and what decided that.
-
-    Moments are of ``d`` states and after them the coordinates of the ``p`` unknown parameters.
-    """
-
-    stretches: list[Smoothed]
-    states: Array  # their means, one stretch after the other, M x (d + p)
-    variances: Array  # of noise and process noise, 2 x d
-    log_density: float  # of what was measured
-
-
 @dataclass(frozen=True, repr=False, eq=False)
 class SmoothedRecords:
     r"""The states of a machine while it was recorded, as :func:`smooth` finds them.
@@ -337,6 +325,18 @@ def _starts(start: Mapping[str, tuple[float, float]] | None, spec: StateSpec) ->
     return moments
 
 
+class Estimate(NamedTuple):
+    """The states that stretches went through, and what decided that.
+
+    Moments are of ``d`` states and after them the coordinates of the ``p`` unknown parameters.
+    """
+
+    stretches: list[Smoothed]
+    states: Array  # their means, one stretch after the other, M x (d + p)
+    variances: Array  # of noise and process noise, 2 x d
+    log_density: float  # of what was measured
+
+
 def _estimate(chain: Chain, max_rounds: int, num_starts: int, progress: bool) -> Estimate:
     """Find states, parameters of the physics and sizes of errors that explain stretches best.
 
@@ -562,7 +562,8 @@ class Chain:
             parameters = path.parameters + share * (theta - path.parameters)
             following = self.follow(self.now, states[self.now], parameters)
             other = Path(states, path.measured, parameters, following)
-            if self.cost(other, estimate.variances) <= before + _BETTER:  # false of NaN
+            cost = self.cost(other, estimate.variances)
+            if cost <= before + _BETTER:  # false of NaN
                 return other, share
             share /= 2
         return path, 0.0
