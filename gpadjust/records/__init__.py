@@ -1,10 +1,8 @@
 """Records of machines: read, resampled, smoothed, and cut into windows."""
 
 from gpadjust.records.identification import Identification, identify
-from gpadjust.records.record import Record
-from gpadjust.records.records import Records
-from gpadjust.records.smoothed_records import SmoothedRecords, smooth
-from gpadjust.records.smoothing import SmoothingWarning
+from gpadjust.records.records import Record, Records
+from gpadjust.records.smoothing import SmoothedRecords, SmoothingWarning, smooth
 
 __all__ = [
     "Identification",

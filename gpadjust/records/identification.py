@@ -16,14 +16,11 @@ from gpadjust.dynamics.base import TransitionFunctions
 from gpadjust.dynamics.targets import one_physics
 from gpadjust.physics import Physics
 from gpadjust.physics.parameters import PhysicsParameters
-from gpadjust.records.record import Record, Stretch, in_control_steps
-from gpadjust.records.records import Records
-from gpadjust.records.smoothed_records import SmoothedRecords, smooth
+from gpadjust.records.records import Record, Records, in_control_steps
+from gpadjust.records.smoothing import SmoothedRecords, smooth
 from gpadjust.states import StateSpec
 
 GUESSES, IDENTIFIED, PERSISTENCE = "guesses", "identified", "persistence"
-_PARTICLES = 199
-_LEVEL = 0.95
 _LEAST = 8  # steps of a stretch, of which the last part is held out
 _KNOWN_BEFORE = 0.8  # of a prior's standard deviation: the log tells next to nothing
 _FAR = 3.0  # standard deviations of a prior
@@ -99,23 +96,22 @@ class Identification:
         return [*self.remarks, *_of_parameters(self.parameters), *self._of_errors()]
 
     def _of_errors(self) -> list[str]:
-        told, errors = [], self.errors
+        sentences, errors, shares = [], self.errors, self.coverage.tolist()
         for i, name in enumerate(self.spec.states):
-            share = float(self.coverage[i])
-            if share < FEW:
-                told.append(
-                    f"Of {name} the intervals of 95 % hold {100 * share:.0f} % of what was held "
-                    "out: the physics lacks something whose errors last longer than process noise "
-                    "(dry friction, an input), or has a sign or unit wrong. Rely neither on them "
-                    "nor on those of the parameters."
+            if shares[i] < FEW:
+                sentences.append(
+                    f"Of {name} the intervals of 95 % hold {100 * shares[i]:.0f} % of what was "
+                    "held out: the physics lacks something whose errors last longer than process "
+                    "noise (dry friction, an input), or has a sign or unit wrong. Rely neither on "
+                    "them nor on those of the parameters."
                 )
-            told += [
-                f"Along what was held out the identified physics errs no less in {name} than "
-                f"{'the guesses do' if other == GUESSES else 'a state that stays'}."
-                for other, error in errors.items()
-                if other != IDENTIFIED and error[i] <= errors[IDENTIFIED][i]
-            ]
-        return told
+            for other, words in ((GUESSES, "the guesses do"), (PERSISTENCE, "a state that stays")):
+                if other in errors and errors[other][i] <= errors[IDENTIFIED][i]:
+                    sentences.append(
+                        "Along what was held out the identified physics errs no less in "
+                        f"{name} than {words}."
+                    )
+        return sentences
 
     def __repr__(self) -> str:
         """Parameters, noises and errors."""
@@ -174,24 +170,21 @@ def identify(
     Example:
         >>> import torch
         >>> from gpadjust.records import Record, Records, identify
-        >>> from gpadjust.physics import ODEPhysics, Unknown
+        >>> from gpadjust.physics import FormulaPhysics, ODEPhysics, Unknown
         >>> from gpadjust.states import StateSpec
-        >>> def spring(x, u, p):
-        ...     return torch.stack([x[:, 1], u[:, 0] - p.stiffness * x[:, 0]], dim=-1)
-        >>> unknowns = {"stiffness": Unknown(1.0, factor=2.0)}
-        >>> physics = ODEPhysics(spring, step=0.1, state_dim=2, unknowns=unknowns)
         >>> t = 0.1 * torch.arange(60, dtype=torch.float64)
-        >>> position = (1.5 * t).cos() + 0.01 * torch.randn(60, dtype=torch.float64)
-        >>> states = torch.stack([position, torch.full_like(t, torch.nan)], dim=-1)
-        >>> record = Record(t, states, torch.zeros_like(states[:, :1]))
+        >>> states = torch.stack([(1.5 * t).cos(), -1.5 * (1.5 * t).sin()], dim=-1)
+        >>> states += 0.01 * torch.randn(60, 2, dtype=torch.float64)
+        >>> record = Record(t, states, torch.zeros(60, 1, dtype=torch.float64))
+        >>> unknowns = {"k": Unknown(1.0, factor=2.0)}
+        >>> rates = FormulaPhysics("v, u - k * x", ["x", "v", "u"], unknowns=unknowns)
         >>> found = identify(
-        ...     Records(record, StateSpec(["x", "v"], ["u"])), physics, start={"v": (0.0, 1.0)}
+        ...     Records(record, StateSpec(["x", "v"], ["u"])), ODEPhysics(rates, 0.1, 2)
         ... )
-        >>> bool(found.errors["identified"][0] < 0.1 * found.errors["guesses"][0])
+        >>> bool((found.errors["identified"] < 0.1 * found.errors["guesses"]).all())
         True
     """
-    if not isinstance(records, Records):
-        raise TypeError(f"Expected records as Records([record, ...], spec), found {records!r}.")
+    steps, _ = in_control_steps(records, step)
     spec = records.spec
     if len(spec.moving) < spec.state_dim:
         raise ValueError(
@@ -200,51 +193,52 @@ def identify(
         )
     share = checked_number("held_out", held_out, above=0, most=0.5)
     checked_whole("seed", seed, 0)
-    stretches = [s for s in in_control_steps(records.records, spec, step) if len(s.actions)]
-    longest = max(len(stretch.actions) for stretch in stretches)
-    if longest < _LEAST:
+    parts = [(each, rows) for each in steps for rows in each.stretches()]
+    lengths = [rows.stop - rows.start - 1 for _, rows in parts]
+    if max(lengths) < _LEAST:
         raise ValueError(
             f"Expected a stretch of {_LEAST} control steps or more, to hold some out, found "
-            f"{longest}; take a shorter step, or a longer log."
+            f"{max(lengths)}; take a shorter step, or a longer log."
         )
-    steps = max(1, int(share * longest))
-    ends = [i for i, each in enumerate(stretches) if len(each.actions) >= 2 * steps]
-    kept = [len(each.actions) - steps * (i in ends) for i, each in enumerate(stretches)]
-    whole = one_physics(physics, spec, "identify one of them")
-    known = Records([_beginning(s, k) for s, k in zip(stretches, kept, strict=True)], spec)
-    smoothed = smooth(known, whole, start=start, num_starts=num_starts, progress=progress)
-    by_guesses = PhysicsDynamics(spec, whole)
-    drawn = _Drawn(spec, whole, smoothed.physics_parameters) if whole.unknowns else by_guesses
-    windows = Windows(
-        torch.stack([smoothed.records.records[i].states[-1] for i in ends]),
-        torch.stack([stretches[i].actions[kept[i] :] for i in ends]),
-        torch.stack([stretches[i].states[kept[i] + 1 :] for i in ends]),
+    held = max(1, int(share * max(lengths)))
+    f_p = one_physics(physics, spec, "identify one of them")
+    known, ends, actions, measured = [], [], [], []
+    for i, ((each, rows), length) in enumerate(zip(parts, lengths, strict=True)):
+        end = rows.stop - held * (length >= 2 * held)  # what follows is held out
+        begin = slice(rows.start, end)
+        known.append(Record(each.times[begin], each.states[begin], each.actions[begin]))
+        if end < rows.stop:
+            ends.append(i)
+            actions.append(each.actions[end - 1 : rows.stop - 1])
+            measured.append(each.states[end : rows.stop])
+    smoothed = smooth(
+        Records(known, spec), f_p, start=start, num_starts=num_starts, progress=progress
     )
-    noises: dict[str, Any] = {
-        "start_noise": torch.stack([smoothed.sd[i][-1] for i in ends]).square().mean(0).sqrt(),
-        "noise": smoothed.noise.nan_to_num(),
-    }
+    last = torch.stack([smoothed.records.records[i].states[-1] for i in ends])
+    windows = Windows(last, torch.stack(actions), torch.stack(measured))
+    start_noise = torch.stack([smoothed.sd[i][-1] for i in ends]).square().mean(0).sqrt()
+    noise = smoothed.noise.nan_to_num()
+    options: dict[str, Any] = {"start_noise": start_noise, "noise": noise, "seed": seed}
+    by_guesses = PhysicsDynamics(spec, f_p)
+    drawn = _Drawn(spec, f_p, smoothed.physics_parameters) if f_p.unknowns else by_guesses
     runs = {
         IDENTIFIED: drawn.free_run(
-            windows.initial_states,
+            last,
             windows.actions,
-            num_functions=_PARTICLES,
-            level=_LEVEL,
+            num_functions=199,
+            level=0.95,
             process_noise=smoothed.process_noise,
-            seed=seed,
-            **noises,
+            **options,
         )
     }
-    if whole.unknowns:
-        runs[GUESSES] = by_guesses.free_run(
-            windows.initial_states, windows.actions, seed=seed, **noises
-        )
-    times = stretches[0].times
-    length = float(times[1] - times[0])
-    told = f"Gaps part the log into {len(stretches)} stretches, each smoothed by itself."
-    gaps = [told] * (len(stretches) > len(records.records))
-    remarks = (*gaps, *_of_actions(records, length), *_of_jumps(records))
-    return Identification(smoothed, drawn, windows, runs, length, remarks)
+    if f_p.unknowns:
+        runs[GUESSES] = by_guesses.free_run(last, windows.actions, **options)
+    length_of_step = float(steps.records[0].times[1] - steps.records[0].times[0])
+    remarks = [*_of_actions(records, length_of_step), *_of_jumps(records)]
+    if len(parts) > len(records):
+        gaps = f"Gaps part the log into {len(parts)} stretches, each smoothed by itself."
+        remarks.insert(0, gaps)
+    return Identification(smoothed, drawn, windows, runs, length_of_step, tuple(remarks))
 
 
 class _Drawn(PhysicsDynamics):
@@ -279,54 +273,45 @@ class _Drawn(PhysicsDynamics):
         return step
 
 
-def _beginning(stretch: Stretch, steps: int) -> Record:
-    """A record of the first steps of a stretch; its last action counts for nothing."""
-    actions = torch.cat([stretch.actions[:steps], stretch.actions[-1:]])
-    return Record(stretch.times[: steps + 1], stretch.states[: steps + 1], actions)
-
-
 def _of_actions(records: Records, step: float) -> list[str]:
-    """A sentence if actions vary within control steps, over which they are averaged."""
-    within, total = 0.0, 0.0
-    for record in records:
-        size = round(step / record.sampling_step)
-        actions = record.actions[: len(record.actions) // size * size].unflatten(0, (-1, size))
-        spread = actions.var(1, correction=0).nanmean(0) / record.actions.var(0, correction=0)
-        within = max(within, float(spread.nan_to_num().max()) if size > 1 else 0.0)
-        total = max(total, size)
-    if within <= _VARIES:
+    """Return a sentence if actions vary within control steps, over which they are averaged."""
+    size, shares = round(step / records.records[0].sampling_step), [torch.zeros(1)]
+    for record in records if size > 1 else ():
+        steps = record.actions[: len(record.actions) // size * size].unflatten(0, (-1, size))
+        shares.append(steps.var(1, correction=0).nanmean(0) / record.actions.var(0, correction=0))
+    if torch.cat(shares).nan_to_num().max() <= _VARIES:
         return []
     return [
-        f"The actions vary within a step of {total:.0f} samples, over which they are averaged: "
+        f"The actions vary within a step of {size} samples, over which they are averaged: "
         "parameters and their intervals may be off. Take a shorter step and compare."
     ]
 
 
 def _of_jumps(records: Records) -> list[str]:
-    """Sentences on states that jump by a turn."""
-    told = []
+    """Return sentences on states that jump by a turn."""
+    sentences = []
     for i, name in enumerate(records.spec.states):
         moves = torch.cat([record.states[:, i].diff() for record in records])
         moves = moves[~moves.isnan()].abs()
         for turn, way in ((2 * math.pi, "say so"), (360.0, "convert it to rad, and say so")):
             jumps = ((moves / turn - 1).abs() < _NEAR_A_TURN).any()
             if name not in records.spec.angles and jumps and moves.median() < 0.1 * turn:
-                told.append(f"{name} jumps by a turn: if it is an angle, {way} (`angles`).")
-    return told
+                sentences.append(f"{name} jumps by a turn: if it is an angle, {way} (`angles`).")
+    return sentences
 
 
 def _of_parameters(parameters: PhysicsParameters | None) -> list[str]:
-    """Sentences on parameters of which the log says little, or which were guessed badly."""
+    """Return sentences on parameters of which the log says little, or which were guessed badly."""
     if parameters is None:
         return []
-    told = []
+    sentences = []
     for name, unknown in parameters.unknowns.items():
         z = unknown.coordinate(parameters[name])
         if z.mean().abs() > _FAR:
-            told.append(
+            sentences.append(
                 f"{name} is {float(z.mean().abs()):.1f} standard deviations of its prior from its "
                 "guess: a sign, a unit, or a physics that lacks something?"
             )
         elif z.std() > _KNOWN_BEFORE:
-            told.append(f"The log says next to nothing of {name}: it stays as known before.")
-    return told
+            sentences.append(f"The log says next to nothing of {name}: it stays as known before.")
+    return sentences

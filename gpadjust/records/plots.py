@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from torch import Tensor
 
 from gpadjust.dynamics.plots import going_on, labels
-from gpadjust.records.record import Record
+from gpadjust.records.records import Record, Records
 from gpadjust.states import StateSpec
 from gpadjust.validation.plots.drawing import BLUE, GREY, given_axes, tidy
 
@@ -62,19 +62,7 @@ def plot_record(
         >>> plot_record(record, StateSpec(["x"], ["v"]), units={"x": "m", "v": "m/s"}).shape
         (2,)
     """
-    for name, value, kind in (("record", record, Record), ("spec", spec, StateSpec)):
-        if not isinstance(value, kind):
-            raise TypeError(
-                f"Expected {name} as a {kind.__name__}, got {type(value).__name__}"
-                + ("; of `records` draw each." if kind is Record else ".")
-            )
-    found = record.states.shape[1], record.actions.shape[1]
-    if found != (spec.state_dim, spec.action_dim):
-        raise ValueError(
-            f"Expected a record of the spec's states, {', '.join(spec.states)}, and actions, "
-            f"{', '.join(spec.actions)}, found {found[0]} and {found[1]} columns; pass the spec of "
-            "this machine."
-        )
+    Records([record], spec)  # checks types and columns
     names, stretches = [*spec.states, *spec.actions], record.stretches()
     called = labels(spec, units)
     if axes is None:

@@ -1,36 +1,328 @@
-"""The states that a machine was in, from noisy and incomplete records and a physics."""
+r"""The states that a machine went through, from noisy and incomplete records and a physics.
+
+From top to bottom: :func:`smooth`; the search for the most likely states, parameters and noises;
+the chain of Gaussian states that the physics makes near a path; the variation of parameters from
+one stretch to another. Moments of a chain are from :mod:`gpadjust.records.kalman`.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gpadjust.checks import progress_bar
-from gpadjust.dynamics.particles import even_normal
-from gpadjust.physics import PhysicsError
-from gpadjust.records.chain import Chain
-from gpadjust.records.kalman import Array, Smoothed, smooth_chain
+from gpadjust.checks import checked_whole, progress_bar
+from gpadjust.dynamics.particles import even_normal, of_states
+from gpadjust.dynamics.targets import check_next_values, one_physics
+from gpadjust.physics import ODEPhysics, Physics, PhysicsError
+from gpadjust.physics.parameters import PhysicsParameters
+from gpadjust.records import kalman
+from gpadjust.records.kalman import Array, Link, Smoothed
+from gpadjust.records.records import Record, Records, in_control_steps, joined, remember
+from gpadjust.states import StateSpec
+from gpadjust.states.state_spec import side_by_side
 
+_DRAWS = 256  # of the parameters
+_SAME = 0.01  # of a step, by which another one may differ from it
 _LONGER = 1.6  # than a step of expectation maximisation, in logarithms
 _NEARER = math.log(4)  # the most that a logarithm of a variance changes in a round
 _ARRIVED = 0.01  # nats of the log density
 _STEADY = 0.05  # a change of the logarithm of a variance
 _STILL = 0.1  # nats, a change that is not settled
 _RIGHT = 0.01  # standard deviations of the states, by which one may be off for good
+_STEP = 1e-4  # of differences, in standard deviations of a parameter or a state
+_WIDE = 10.0  # standard deviations of a state, by which the first one may be elsewhere
+_SIZE = 1e-3  # of a state's size: it varies by no less
+_SHARE = 0.25  # of the variance of f_p's errors in single steps: that of the noise at first
+_HIDDEN = 0.1  # of the change in a step: what it adds to a state that is never measured, at first
+_LEAST = 1e-6  # of the standard deviation of a state: no noise is less, but by rounding
+_HALVINGS = 6
+_BETTER = 0.01  # what a worse path may cost more, by rounding
 _MEDIAN = 0.05  # of a variation beforehand, in standard deviations of a parameter's prior
-_SPREAD = 1.0  # of its logarithm
-_ROUNDS = 60
 
 
 class SmoothingWarning(UserWarning):
     """The states of a record did not settle."""
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class SmoothedRecords:
+    r"""The states of a machine while it was recorded, as :func:`smooth` finds them.
+
+    Attributes:
+        records: The most likely states, at the control steps.
+        sd: Their standard deviations, ``N x state_dim`` of each record; 0 of states that the
+            physics does not move.
+        noise: Standard deviations of the errors of what was measured, ``state_dim``; NaN of a state
+            that never was, 0 of those that the physics does not move.
+        process_noise: Standard deviations of what a step adds to the physics, ``state_dim``.
+        log_density: Of what was measured, near these states.
+    """
+
+    records: Records
+    sd: tuple[Tensor, ...]
+    noise: Tensor
+    process_noise: Tensor
+    log_density: float
+    _chain: Chain
+    _estimate: Estimate
+
+    @property
+    def physics_parameters(self) -> PhysicsParameters:
+        """The posterior of the unknown parameters of the physics; empty if it has none."""
+        unknowns, d = self._chain.physics.unknowns, self._chain.d
+        if not unknowns:
+            return PhysicsParameters({}, [])
+        moments = self._estimate.stretches[0].states
+        mean = torch.from_numpy(moments.means[0, d:].copy())
+        values, vectors = torch.linalg.eigh(torch.from_numpy(moments.covariances[0, d:, d:].copy()))
+        spread = even_normal(_DRAWS, len(unknowns), seed=0) * values.clamp_min(0).sqrt()
+        return PhysicsParameters(unknowns, unknowns.at(mean + spread @ vectors.mT).unbind(-1))
+
+    @cached_property
+    def variation(self) -> Tensor:
+        """Variation of the parameters from one stretch of the records to another, ``p``.
+
+        Standard deviations, in those of each parameter's prior: with 0.1, and a prior of a factor
+        of 1.5, some 4 %. They explain best, given the noises, stretches that have parameters of
+        their own each; where the stretches tell nothing, they are 0.05. No equation is right in
+        all: what it lacks shows as parameters that vary, and moves a free run for as long as that
+        lasts, where process noise averages out. :meth:`Dynamics.free_run` takes it. Records of one
+        machine and day tell nothing of another's.
+
+        Raises:
+            ValueError: If the physics has no unknown parameters.
+        """
+        if not self._chain.physics.unknowns:
+            raise ValueError("Expected a physics with unknown parameters; found none, that vary.")
+        return variation(self._chain, self._estimate)
+
+    def draw(self, seed: int = 0) -> Records:
+        """Draw states from their posterior, along each record.
+
+        Unlike the most likely ones they scatter about the physics as the machine does, so that a
+        model which learns from them finds the right noise.
+
+        Raises:
+            ValueError: If the seed is no whole number of 0 or more.
+        """
+        rng = np.random.default_rng(checked_whole("seed", seed, 0))
+        paths = kalman.draw_paths(self._estimate.stretches, self._chain.num_parameters, rng)
+        return _with_states(self.records, np.concatenate(paths))
+
+    def __repr__(self) -> str:
+        """Names, noise and process noise."""
+        spec = self.records.spec
+        rows = zip(spec.states, self.noise.tolist(), self.process_noise.tolist(), strict=True)
+        lines = [f"{name}: noise {e:.3g}, process noise {q:.3g}" for name, e, q in rows]
+        return "\n".join([f"SmoothedRecords of {len(self.records)}", *lines])
+
+
+def smooth(
+    records: Records,
+    physics: Physics | Callable[[Tensor], Tensor],
+    step: float | None = None,
+    *,
+    start: Mapping[str, tuple[float, float]] | None = None,
+    noise: Tensor | None = None,
+    process_noise: Tensor | None = None,
+    num_starts: int | None = None,
+    max_rounds: int = 100,
+    progress: bool = False,
+) -> SmoothedRecords:
+    r"""Estimate the states of a machine, measured with noise or not at all, along its records.
+
+    The records are taken for
+
+    .. math:: x_{t+1} = f_p(x_t, u_t; \theta) + q_t, \quad y_t = x_t + e_t, \quad
+              q_t \sim N(0, Q), \quad e_t \sim N(0, R)
+
+    with diagonal R, the noise, and Q, the process noise, which has all that f_p does not know.
+    States x, unknown parameters :math:`\theta` of the physics, R and Q are estimated together, by
+    an iterated extended Kalman smoother and expectation maximisation. Where Q turns out small this
+    fits f_p to free runs, as shooting methods do; where it is large, to single steps, but not
+    from noisy states (errors in variables). Look at the noise that is found: a physics that is
+    wrong beyond its parameters takes for noise what it does not follow, and pulls states to itself.
+
+    Args:
+        records: The records. A state that is NaN throughout is hidden.
+        physics: The next values of the states that are neither exogenous nor previous actions,
+            from these and the actions, as of :class:`LearnedDynamics`; its unknown parameters are
+            learnt from all records together.
+        step: The control step, as of :meth:`Records.trajectories`.
+        start: Of states by name, mean and standard deviation at the beginning of each stretch;
+            needed of hidden ones. Default: about the first that was measured.
+        noise: Standard deviations ``state_dim`` of the errors of what was measured; NaN for those
+            to be learnt. Default: all.
+        process_noise: The same of what a step adds to f_p. Learnt, it makes the best predictions of
+            the next measurement; said to be small, it fits f_p to long free runs, to which errors
+            that persist, as of a wrong f_p, would otherwise be noise.
+        num_starts: How many starts to take the best end of, if there is something to learn of
+            the physics. Default: 4 with hidden states, else 1.
+        max_rounds: The most rounds of smoothing of each. With hidden states all of them may be
+            needed: 4 starts of 100 rounds, half a minute for 300 rows and a physics of formulas.
+        progress: If True, show a progress bar.
+
+    Raises:
+        TypeError: If an argument is of the wrong type.
+        ValueError: If a hidden state has no start, names or numbers are wrong, or as
+            :meth:`Records.trajectories`.
+        PhysicsError: If the physics fails at measured states.
+        RuntimeError: If the states diverge from all starts.
+
+    Warns:
+        SmoothingWarning: If the states did not settle.
+
+    Example:
+        A mass on a spring of unknown stiffness, of which only the position is measured:
+
+        >>> import torch
+        >>> from gpadjust.records import Record, Records, smooth
+        >>> from gpadjust.physics import ODEPhysics, Unknown
+        >>> from gpadjust.states import StateSpec
+        >>> def spring(x, u, p):
+        ...     return torch.stack([x[:, 1], u[:, 0] - p.stiffness * x[:, 0]], dim=-1)
+        >>> unknowns = {"stiffness": Unknown(1.0, factor=2.0)}
+        >>> physics = ODEPhysics(spring, step=0.1, state_dim=2, unknowns=unknowns)
+        >>> t = 0.1 * torch.arange(50, dtype=torch.float64)
+        >>> position = (1.5 * t).cos() + 0.01 * torch.randn(50, dtype=torch.float64)
+        >>> states = torch.stack([position, torch.full_like(t, torch.nan)], dim=-1)
+        >>> spec = StateSpec(["x", "v"], ["u"])
+        >>> records = Records(Record(t, states, torch.zeros_like(states[:, :1])), spec)
+        >>> found = smooth(records, physics, start={"v": (0.0, 1.0)})
+        >>> bool((found.physics_parameters.mean - 2.25).abs() < 0.05)
+        True
+    """
+    checked_whole("max_rounds", max_rounds, 1)
+    steps, short = in_control_steps(records, step)
+    spec = records.spec
+    if short:
+        total = short + sum(len(record.stretches()) for record in steps)
+        warnings.warn(
+            f"Left out: {short} of {total} stretches, shorter than a step.",
+            UserWarning,
+            stacklevel=2,
+        )
+    steps = _with_known_inputs(steps)
+    f_p = one_physics(physics, spec, "smooth by one of them")
+    found = float(steps.records[0].times[1] - steps.records[0].times[0])
+    if isinstance(f_p, ODEPhysics) and abs(f_p.step - found) > _SAME * found:
+        raise ValueError(
+            f"Physics {f_p.name!r} makes steps of {f_p.step:g}, but the control step of the "
+            f"records is {found:g}; pass step={f_p.step:g}, or build it with step={found:g}."
+        )
+    known = {"noise": noise, "process_noise": process_noise}
+    variances = np.stack([_variances(sd, name, spec) for name, sd in known.items()])
+    chain = Chain(f_p, steps, variances, _starts(start, spec))
+    chain.check_measured()
+    if num_starts is None:
+        num_starts = 4 if chain.hidden.any() and f_p.unknowns else 1
+    checked_whole("num_starts", num_starts, 1)
+    estimate = _estimate(chain, max_rounds, num_starts, progress)
+    covariances = np.concatenate([part.states.covariances for part in estimate.stretches])
+    squares = np.diagonal(covariances, axis1=1, axis2=2)[:, : chain.d].clip(0)
+
+    def roots(variances: Array) -> Tensor:
+        """Of all states, 0 of those that the physics does not move."""
+        sd = torch.zeros(len(variances), spec.state_dim, dtype=torch.float64)
+        sd[:, spec.moving] = torch.from_numpy(np.sqrt(variances))
+        return sd
+
+    sd = roots(squares).split([len(record.times) for record in steps])
+    noises = roots(estimate.variances)
+    noises[0, np.array(spec.moving)[chain.hidden]] = math.nan
+    smoothed = _with_states(steps, estimate.states)
+    return SmoothedRecords(
+        smoothed, sd, noises[0], noises[1], estimate.log_density, chain, estimate
+    )
+
+
+def _with_states(steps: Records, path: Array) -> Records:
+    """Return records of other states that move, ``M x (d + p)`` one record after the other."""
+    records, moving = [], steps.spec.moving
+    parts = torch.from_numpy(path[:, : len(moving)]).split([len(record.times) for record in steps])
+    for record, part in zip(steps, parts, strict=True):
+        states = record.states.clone()
+        states[:, moving] = part
+        new = Record(record.times, states, record.actions, record.segments, record.name)
+        records.append(remember(new, steps.spec))
+    return Records(records, steps.spec)
+
+
+def _with_known_inputs(steps: Records) -> Records:
+    """Return stretches from where all is known that the physics reads beside states that move."""
+    spec, records = steps.spec, []
+    beside = [i for i in spec.physics_columns if i < spec.state_dim and i not in spec.moving]
+    names = [spec.states[i] for i in beside]
+    for name in names:
+        held = name
+        while held in spec.previous:
+            held = spec.previous[held]
+        if held != name and held in spec.states:
+            raise ValueError(
+                f"The physics reads {name!r}, an earlier value of the state {held!r}, which smooth "
+                "would have to find, too; it takes earlier actions only."
+            )
+    for record in steps:
+        parts = []
+        for rows in record.stretches():
+            unknown = record.states[rows, beside][:-1].isnan().any(1).nonzero().flatten().tolist()
+            first = rows.start + max(unknown, default=-1) + 1
+            if first < rows.stop - 1:
+                part = slice(first, rows.stop)
+                parts.append((record.times[part], record.states[part], record.actions[part]))
+        if parts:
+            records.append(joined(parts, record.name))
+    if not records:
+        raise ValueError(
+            f"Expected stretches with all of {', '.join(names)}, which the physics reads."
+        )
+    return Records(records, spec)
+
+
+def _variances(sd: Tensor | None, name: str, spec: StateSpec) -> Array:
+    """Return variances of the states that move, NaN where they are to be learnt."""
+    if sd is None:
+        return np.full(len(spec.moving), math.nan)
+    sd = of_states(sd, name, (spec.state_dim,))
+    if (sd <= 0).any() or sd.isinf().any():
+        raise ValueError(
+            f"Expected {name} as standard deviations above 0, or NaN for those to be learnt, got "
+            f"{sd.tolist()}."
+        )
+    variances: Array = sd[spec.moving].square().numpy()
+    return variances
+
+
+def _starts(start: Mapping[str, tuple[float, float]] | None, spec: StateSpec) -> Array:
+    """Return means and standard deviations, ``2 x d``, of first states; NaN if they are unknown."""
+    if start is not None and not isinstance(start, Mapping):
+        raise TypeError(
+            f"Expected start as a dictionary, such as {{{spec.states[0]!r}: (0.0, 1.0)}}: mean and "
+            f"standard deviation, got {start!r}."
+        )
+    names = [spec.states[i] for i in spec.moving]
+    moments = np.full((2, len(names)), math.nan)
+    for name, pair in (start or {}).items():
+        if name not in names:
+            raise ValueError(f"start: there is no {name!r} among the states that move, {names}.")
+        numbers = isinstance(pair, Sequence) and all(isinstance(x, Real) for x in pair)
+        if not numbers or len(pair) != 2 or not -math.inf < pair[0] < math.inf > pair[1] > 0:
+            raise ValueError(
+                f"start: expected mean and standard deviation of {name!r}, the latter above 0, got "
+                f"{pair!r}."
+            )
+        moments[:, names.index(name)] = pair
+    return moments
 
 
 class Estimate(NamedTuple):
@@ -40,25 +332,13 @@ class Estimate(NamedTuple):
     """
 
     stretches: list[Smoothed]
-    noise: Array  # variances d of the errors of what is measured
-    process_noise: Array  # variances d of what a step adds to the physics
+    states: Array  # their means, one stretch after the other, M x (d + p)
+    variances: Array  # of noise and process noise, 2 x d
     log_density: float  # of what was measured
 
 
-class _End(NamedTuple):
-    """Result of a search, and by how much the log density still changed, 0 if it arrived."""
-
-    estimate: Estimate
-    gained: float
-
-
-def estimate(chain: Chain, max_rounds: int, num_starts: int, progress: bool) -> Estimate:
-    """States, parameters of the physics and sizes of errors that explain stretches best.
-
-    Each round linearises the physics along the trajectories found so far, smooths them (an iterated
-    extended Kalman smoother, Bell 1994, with the unknown parameters as constants of the state) and
-    takes the variances that are most likely given these (expectation maximisation, Shumway and
-    Stoffer 1982). A new trajectory that explains less is taken part of the way only.
+def _estimate(chain: Chain, max_rounds: int, num_starts: int, progress: bool) -> Estimate:
+    """Find states, parameters of the physics and sizes of errors that explain stretches best.
 
     Of several starts the best end counts. They are at the guesses of the parameters, and then at
     draws from their priors. Variances that are known come down to this from the sizes of f_p's
@@ -72,9 +352,9 @@ def estimate(chain: Chain, max_rounds: int, num_starts: int, progress: bool) -> 
     Warns:
         SmoothingWarning: If there are no rounds left.
     """
-    ends = list[_End]()
+    ends = list[tuple[Estimate, float]]()
     with progress_bar(progress, total=num_starts * max_rounds, unit="round") as bar:
-        for i, (coordinates, known_at_once) in enumerate(_starts(chain, num_starts)):
+        for i, (coordinates, known_at_once) in enumerate(chain.starts_of_search(num_starts)):
             bar.set_description(f"start {i + 1} of {num_starts}")
             bar.update(i * max_rounds - bar.n)  # a search that has settled leaves rounds
             try:
@@ -90,7 +370,7 @@ def estimate(chain: Chain, max_rounds: int, num_starts: int, progress: bool) -> 
             "parameters, a start of hidden states, more of the noise, or a larger num_starts."
         )
     # Log densities are to be compared where the variances that are known are so by then.
-    best, gained = max(ends, key=lambda end: (abs(end.gained) <= _STILL, end.estimate.log_density))
+    best, gained = max(ends, key=lambda end: (abs(end[1]) <= _STILL, end[0].log_density))
     if abs(gained) > _STILL:
         warnings.warn(
             f"The states did not settle in {max_rounds} rounds. Raise max_rounds, say more of what "
@@ -102,52 +382,250 @@ def estimate(chain: Chain, max_rounds: int, num_starts: int, progress: bool) -> 
     return best
 
 
-def _starts(chain: Chain, number: int) -> Iterator[tuple[Array, bool]]:
-    """Coordinates of the parameters, and whether variances that are known are so at once."""
-    p = chain.num_parameters
-    something_known = not np.isnan([chain.known.noise, chain.known.process_noise]).all()
-    yield np.zeros(p), False
-    if something_known and number > 1:
-        yield np.zeros(p), True
-    others = max(number - 2, 0) if something_known else number - 1
-    if p and others:
-        for i, coordinates in enumerate(even_normal(others, p, seed=0).numpy()):
-            yield coordinates, something_known and i % 2 == 1
-
-
 def _search(
     chain: Chain, coordinates: Array, known_at_once: bool, max_rounds: int, bar: Any
-) -> _End:
-    """Search from these parameters."""
+) -> tuple[Estimate, float]:
+    r"""Search from these parameters; the log density still changes by as much as is returned.
+
+    Each round linearises the physics along the trajectories found so far, smooths them (an iterated
+    extended Kalman smoother, Bell 1994, with the unknown parameters as constants of the state) and
+    takes the variances that are most likely given these (expectation maximisation, Shumway and
+    Stoffer 1982):
+
+    .. math:: R = E[(y_t - x_t)^2], \quad Q = E[(x_{t+1} - f_p(x_t, u_t; \theta))^2]
+
+    A new trajectory that explains less is taken part of the way only.
+    """
     path = chain.first_path(coordinates)
-    noise, process_noise = chain.first_variances(path)
+    variances = chain.first_variances(path)
     if known_at_once:
-        noise, process_noise = chain.checked(noise, process_noise)
-    value, steady = -math.inf, False
+        variances = chain.checked(variances)
+    value, gained, steady = -math.inf, math.inf, False
     for _ in range(max_rounds):
         bar.update()
+        # E: p(x, theta | y) of the chain x[t + 1] = F[t] x[t] + b[t] + q[t], F = df_p / dx
         links = chain.linearised(path)
-        starts = [(mean, np.diag(variance)) for mean, variance in chain.starts]
-        found, density = smooth_chain(links, starts, noise, process_noise)
+        smoothed, density = kalman.smooth_chain(links, chain.starts, *variances)
         if not math.isfinite(density):
             raise np.linalg.LinAlgError
-        faster, gained, value = _LONGER if density >= value else 1.0, density - value, density
-        estimate = Estimate(found, noise, process_noise, density)
-        path, whole, refused = chain.towards(path, found, noise, process_noise)
-        if not whole and not refused:
+        gained, value = density - value, density
+        means = np.concatenate([stretch.states.means for stretch in smoothed])
+        estimate = Estimate(smoothed, means, variances, density)
+        # x <- x + share (E[x | y] - x), share = 1, 1/2, ... until p(x, theta, y) is no less
+        path, share = chain.towards(path, estimate)
+        if 0 < share < 1:
             continue
         if steady and abs(gained) < _ARRIVED:
-            return _End(estimate, 0.0 if refused < _RIGHT else math.inf)
-        likely = np.concatenate(chain.checked(*chain.likely_variances(links, found)))
-        old = np.concatenate([noise, process_noise])
-        moved = (faster * np.log(likely / old)).clip(-_NEARER, _NEARER)
+            off = np.abs(estimate.states[:, : chain.d] - path.states) / chain.spread
+            return estimate, 0.0 if off.max() < _RIGHT else math.inf
+        # M: log R and log Q go to those of E[(y - x)^2] and E[(x' - f_p)^2], and a little further
+        ratio = chain.checked(chain.likely_variances(links, smoothed)) / variances
+        faster = _LONGER if gained >= 0 else 1.0
+        moved = (faster * np.log(ratio)).clip(-_NEARER, _NEARER)
         steady = bool((np.abs(moved) < _STEADY).all())
-        noise, process_noise = np.split(old * np.exp(moved), 2)
-    return _End(estimate, gained)
+        variances = variances * np.exp(moved)
+    return estimate, gained
 
 
-def variation(chain: Chain, found: Estimate) -> Tensor:
-    r"""Standard deviations of stretches' parameters, ``p``, in those of the priors.
+class Path(NamedTuple):
+    """States through all stretches, and what was measured, angles within half a turn of them."""
+
+    states: Array  # M x d
+    measured: Array  # M x d
+    parameters: Array  # p
+    following: Array  # f_p there, N x d
+
+
+class Chain:
+    """All stretches, the physics that leads through them, and what is known beforehand.
+
+    Rows of the stretches are one after the other: ``M`` states, of which ``N`` are followed by
+    another one. Known are variances of noise and process noise, and mean and standard deviation of
+    first states, ``2 x d`` each; NaN where they are not.
+    """
+
+    def __init__(self, physics: Physics, steps: Records, variances: Array, start: Array) -> None:
+        self.physics, self.spec = physics, steps.spec
+        moving = self.spec.moving
+        self.d, self.num_parameters = len(moving), len(physics.unknowns)
+        self.angles = [moving.index(i) for i in self.spec.angle_columns if i in moving]
+        parts = [rows for record in steps for rows in record.stretches()]
+        self.lengths = np.array([rows.stop - rows.start for rows in parts])
+        ends = self.lengths.cumsum()
+        self.firsts = ends - self.lengths
+        self.stretches = [slice(*rows) for rows in zip(self.firsts, ends, strict=True)]
+        self.now = np.setdiff1d(np.arange(ends[-1]), ends - 1)  # rows that another one follows
+        states = torch.cat([record.states for record in steps])
+        actions = torch.cat([record.actions for record in steps])
+        self.recorded = side_by_side(states, actions)  # of which f_p reads what does not move
+        y = self.measured = states[:, moving].numpy()
+        for rows in self.stretches:
+            for i in self.angles:  # go on without jumps
+                seen = rows.start + np.flatnonzero(~np.isnan(y[rows, i]))
+                y[seen, i] = np.unwrap(y[seen, i])
+        self.hidden, self.known_variances, self.known_start = np.isnan(y).all(0), variances, start
+        # By how much each state varies, as far as is known
+        middle, (mean, sd) = _means(y, otherwise=0.0), start
+        varies = np.fmax(sd, np.sqrt(_means((y - middle) ** 2, otherwise=0.0)))
+        middle = np.where(((~np.isnan(y)).sum(0) < 2) & ~np.isnan(mean), mean, middle)
+        size = np.maximum(np.abs(middle), np.nan_to_num(np.abs(y)).max(0))
+        self.spread = np.fmax(varies, _SIZE * np.where(size > 0, size, 1.0))
+        self.least = (_LEAST * self.spread) ** 2
+        # First states: as is known, or about the first number of a stretch
+        numbers = np.stack([rows.start + np.isnan(y[rows]).argmin(0) for rows in self.stretches])
+        first = y[numbers, np.arange(self.d)]
+        first = np.where(np.isnan(first), middle, first)
+        self.first = np.where(np.isnan(mean), first, mean)  # S x d
+        self.first_variance = np.where(np.isnan(sd), _WIDE * self.spread, sd) ** 2
+        p = self.num_parameters  # standard normal a priori
+        covariance = np.diag(np.concatenate([self.first_variance, np.ones(p)]))
+        self.starts = [(np.concatenate([x, np.zeros(p)]), covariance) for x in self.first]
+
+    def check_measured(self) -> None:
+        """Raise a ValueError if nothing was measured, or a hidden state has no start."""
+        names = [self.spec.states[i] for i in self.spec.moving]
+        if self.hidden.all():
+            raise ValueError(f"Expected measured states, found none of {', '.join(names)}.")
+        for i in np.flatnonzero(self.hidden & np.isnan(self.known_start[0])):
+            raise ValueError(
+                f"State {names[i]!r} was never measured; say where it may be at the beginning of a "
+                f"stretch, such as start={{{names[i]!r}: (0.0, 1.0)}}: mean and standard deviation."
+            )
+
+    def starts_of_search(self, number: int) -> Iterator[tuple[Array, bool]]:
+        """Yield coordinates of the parameters, and if known variances are so from the beginning."""
+        p = self.num_parameters
+        something_known = not np.isnan(self.known_variances).all()
+        yield np.zeros(p), False
+        if something_known and number > 1:
+            yield np.zeros(p), True
+        others = max(number - 2, 0) if something_known else number - 1
+        if p and others:
+            for i, coordinates in enumerate(even_normal(others, p, seed=0).numpy()):
+                yield coordinates, something_known and i % 2 == 1
+
+    def first_path(self, parameters: Array) -> Path:
+        """Return measured states, and between them and in hidden ones those to which f_p leads."""
+        states, measured, x = self.measured.copy(), self.measured.copy(), self.first.copy()
+        for t in range(self.lengths.max() if np.isnan(measured).any() else 0):
+            going = self.lengths > t
+            rows = self.firsts[going] + t
+            if t:  # after a gap the angle may have gone round
+                measured[rows] = self.near(measured[rows], x[going])
+            states[rows] = np.where(np.isnan(measured[rows]), x[going], measured[rows])
+            x[going] = states[rows]
+            going = self.lengths > t + 1
+            if going.any():
+                x[going] = self._defined(self.firsts[going] + t, x[going], parameters)
+        following = self._defined(self.now, states[self.now], parameters)
+        return Path(states, measured, parameters, following)
+
+    def first_variances(self, path: Path) -> Array:
+        """Return first variances of both noises, by f_p's errors in single steps."""
+        change = ((path.following - path.states[self.now]) ** 2).mean(0)
+        errors = (path.measured[self.now + 1] - path.following) ** 2
+        noise = _SHARE * _means(errors, otherwise=_HIDDEN**2 * change)
+        return np.stack([noise, 2 * noise]).clip(self.least)
+
+    def checked(self, variances: Array) -> Array:
+        """Return variances, in their place the known ones, and none too small to compute with."""
+        known = self.known_variances
+        return np.where(np.isnan(known), variances, known).clip(self.least)
+
+    def linearised(self, path: Path) -> list[Link]:
+        """Linearise the chain near a path: z[t + 1] = F[t] z[t] + b[t] with z = (x, theta)."""
+        d, p, x = self.d, self.num_parameters, path.states[self.now]
+        sizes = _STEP * np.concatenate([self.spread, np.ones(p)])
+        dx, dtheta = np.split(np.diag(sizes), [d], axis=1)
+        ahead = self.follow(self.now, x + dx[:, None], path.parameters + dtheta)
+        behind = self.follow(self.now, x - dx[:, None], path.parameters - dtheta)
+        slope = (ahead - behind) / (2 * sizes)[:, None, None]
+        F = np.tile(np.eye(d + p), (len(x), 1, 1))
+        F[:, :d] = np.moveaxis(np.nan_to_num(slope), 0, -1)  # 0 where f_p fails nearby
+        z = np.hstack([x, np.tile(path.parameters, (len(x), 1))])
+        b = np.zeros_like(z)
+        b[:, :d] = path.following - np.einsum("tij,tj->ti", F[:, :d], z)
+        cuts = (self.lengths - 1).cumsum()[:-1]
+        outputs, links = np.eye(d, d + p), []
+        parts = zip(self.stretches, np.split(F, cuts), np.split(b, cuts), strict=True)
+        for rows, matrices, offsets in parts:
+            y = path.measured[rows]
+            links.append(Link(matrices, offsets, np.tile(outputs, (len(y), 1, 1)), y))
+        return links
+
+    def towards(self, path: Path, estimate: Estimate) -> tuple[Path, float]:
+        """Go to the estimate, or as much of the way as explains more; return the share, maybe 0."""
+        ahead, theta = estimate.states[:, : self.d], estimate.states[0, self.d :]
+        before, share = self.cost(path, estimate.variances), 1.0
+        for _ in range(_HALVINGS):
+            states = path.states + share * (ahead - path.states)
+            parameters = path.parameters + share * (theta - path.parameters)
+            following = self.follow(self.now, states[self.now], parameters)
+            other = Path(states, path.measured, parameters, following)
+            cost = self.cost(other, estimate.variances)
+            if cost <= before + _BETTER:  # false of NaN
+                return other, share
+            share /= 2
+        return path, 0.0
+
+    def likely_variances(self, links: Sequence[Link], smoothed: Sequence[Smoothed]) -> Array:
+        """Return variances of both noises, most likely given the states' distribution."""
+        measured, added = kalman.expected_squares(links, smoothed, self.d)
+        noise = _means(measured, otherwise=self.spread**2)  # of hidden states any number
+        return np.stack([noise, added.mean(0)])
+
+    def cost(self, path: Path, variances: Array) -> float:
+        """Return twice the negative log density of a path, up to a constant; NaN if f_p fails."""
+        noise, process_noise = variances
+        errors = np.nansum((path.measured - path.states) ** 2 / noise)
+        added = (path.states[self.now + 1] - path.following) ** 2 / process_noise
+        begins = (path.states[self.firsts] - self.first) ** 2 / self.first_variance
+        return float(errors + added.sum() + begins.sum() + (path.parameters**2).sum())
+
+    def _defined(self, rows: Array, states: Array, parameters: Array) -> Array:
+        """Return next states by f_p, ``n x d``; raise an error where it fails."""
+        following = self.follow(rows, states, parameters)
+        failed = np.flatnonzero(~np.isfinite(following).all(1))
+        if len(failed):
+            action = self.recorded[rows[failed[0]], self.spec.state_dim :].tolist()
+            raise PhysicsError(
+                f"Physics {self.physics.name!r} fails at {len(failed)} of {len(states)} states "
+                f"where smoothing begins, the first of which is {states[failed[0]].tolist()} under "
+                f"the action {action}. They are measured ones, which may be "
+                "some noise beyond what is possible, or where the physics leads from `start` with "
+                "its guesses: let it go on smoothly beyond its limits, or say another start."
+            )
+        return following
+
+    def follow(self, rows: Array, states: Array, parameters: Array) -> Array:
+        """Return next states ``... x n x d``, NaN where f_p fails, angles near those of ``states``.
+
+        Rows ``n`` have the actions, and the states that do not move, which f_p reads.
+        """
+        inputs = self.recorded[rows].expand(*states.shape[:-1], -1).clone()
+        inputs[..., self.spec.moving] = torch.from_numpy(np.ascontiguousarray(states))
+        unknowns = self.physics.unknowns
+        values = unknowns.at(torch.from_numpy(parameters)) if unknowns else None
+        following = self.physics.or_nan(inputs[..., self.spec.physics_columns], values)
+        check_next_values(self.physics, following, states.shape[-1])
+        return self.near(following.numpy(), states)
+
+    def near(self, states: Array, others: Array) -> Array:
+        """Return states ``... x d``, their angles within half a turn of those of others."""
+        near, a = states.copy(), self.angles
+        near[..., a] -= 2 * np.pi * np.round((states[..., a] - others[..., a]) / (2 * np.pi))
+        return near
+
+
+def _means(values: Array, otherwise: Array | float) -> Array:
+    """Return means of the numbers of each column, or ``otherwise`` if it has none."""
+    columns = np.ascontiguousarray(values.T)
+    number = (~np.isnan(columns)).sum(1)
+    return np.where(number > 0, np.nansum(columns, 1) / number.clip(1), otherwise)
+
+
+def variation(chain: Chain, estimate: Estimate) -> Tensor:
+    r"""Estimate standard deviations of stretches' parameters, ``p``, in those of the priors.
 
     With :math:`\theta_s = \theta + \eta_s` in the coordinates in which priors are standard normal,
     :math:`\eta_s \sim N(0, \operatorname{diag}(v^2))` for stretch s, and the noises as they were
@@ -155,14 +633,14 @@ def variation(chain: Chain, found: Estimate) -> Tensor:
     Laird and Ware 1982), with :math:`\log v \sim N(\log 0.05, 1)`: what the stretches say nothing
     of stays there.
     """
-    precision, pull = _told(chain, found)
+    precision, pull = _of_each_stretch(chain, estimate)
     start = math.log(_MEDIAN)
     log_v = torch.full_like(pull[0], start).requires_grad_()
-    search = torch.optim.LBFGS([log_v], max_iter=_ROUNDS, line_search_fn="strong_wolfe")
+    search = torch.optim.LBFGS([log_v], max_iter=60, line_search_fn="strong_wolfe")
 
     def cost() -> Tensor:
         search.zero_grad()
-        prior = 0.5 * ((log_v - start) / _SPREAD).square().sum()
+        prior = 0.5 * (log_v - start).square().sum()
         value = prior - log_evidence(precision, pull, log_v.exp())
         value.backward()
         return value
@@ -172,7 +650,7 @@ def variation(chain: Chain, found: Estimate) -> Tensor:
 
 
 def log_evidence(precision: Tensor, pull: Tensor, v: Tensor) -> Tensor:
-    r"""The log density of all stretches by v, but for a constant.
+    r"""Return the log density of all stretches by v, up to a constant.
 
     What stretch s says of its parameters is
     :math:`\exp(h_s^\top \theta_s - \theta_s^\top \Lambda_s \theta_s / 2)`; :math:`\eta_s`, and then
@@ -191,17 +669,17 @@ def log_evidence(precision: Tensor, pull: Tensor, v: Tensor) -> Tensor:
     return own + common - whole.diagonal().log().sum()
 
 
-def _told(chain: Chain, found: Estimate) -> tuple[Tensor, Tensor]:
-    """Precision and pull of each stretch, by smoothing it alone about the estimate by all."""
-    d, p = len(found.noise), chain.num_parameters
-    parameters = found.stretches[0].states.means[0, d:]
-    path = chain.path([s.states.means[:, :d] for s in found.stretches], parameters)
+def _of_each_stretch(chain: Chain, estimate: Estimate) -> tuple[Tensor, Tensor]:
+    """Return precision and pull of each stretch, smoothed alone about the estimate by all."""
+    d, p = chain.d, chain.num_parameters
+    parameters = estimate.states[0, d:]
+    states = estimate.states[:, :d]
+    following = chain.follow(chain.now, states[chain.now], parameters)
+    path = Path(states, chain.near(chain.measured, states), parameters, following)
     precisions, pulls = [], []
-    for link, (mean, variance) in zip(chain.linearised(path), chain.starts, strict=True):
-        mean, variance = mean.copy(), variance.copy()
-        mean[d:], variance[d:] = parameters, 1.0  # a standard normal prior there
-        start = mean, np.diag(variance)
-        (alone,), _ = smooth_chain([link], [start], found.noise, found.process_noise)
+    for link, (mean, covariance) in zip(chain.linearised(path), chain.starts, strict=True):
+        start = np.concatenate([mean[:d], parameters]), covariance  # a standard normal prior there
+        (alone,), _ = kalman.smooth_chain([link], [start], *estimate.variances)
         covariance = alone.states.covariances[0, d:, d:]
         # No stretch knows less than its prior, but by rounding.
         values, vectors = np.linalg.eigh(np.linalg.inv(covariance) - np.eye(p))

@@ -120,27 +120,6 @@ def test_advice_on_parameters():
     assert "standard deviations of its prior from its guess" in told
 
 
-LAGGED = Records(
-    Record(torch.arange(9).double(), *torch.zeros(2, 9, 2).double()),
-    StateSpec(["x", "x_1"], ["u", "w"], previous={"x_1": "x"}),
-)
-REFUSED = [
-    ({"records": oscillation(20)}, TypeError, r"Records\(\[record"),
-    ({"held_out": 0.7}, ValueError, "at most 0.5"),
-    ({"records": Records(oscillation(6), SPEC)}, ValueError, "8 control steps or more"),
-    ({"seed": -1}, ValueError, "seed"),
-    ({"start": None}, ValueError, "'v' was never measured"),
-    ({"records": LAGGED}, ValueError, "states that all move"),
-]
-
-
-def test_bad_arguments():
-    for given, error, words in REFUSED:
-        given = {"records": Records(oscillation(20), SPEC), "physics": spring(), **given}
-        with pytest.raises(error, match=words):
-            quickly(given.pop("records"), given.pop("physics"), **given)
-
-
 @pytest.mark.slow
 def test_actions_that_vary_within_a_step_and_angles_that_jump_are_said():
     record = oscillation(121)

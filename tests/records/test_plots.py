@@ -1,4 +1,4 @@
-"""Figures of records: gaps, segments, and what is no record of a machine."""
+"""Figures of records: gaps and segments."""
 
 import math
 

@@ -1,7 +1,6 @@
-"""Records of machines: transitions, windows and even steps, and what is no record."""
+"""Records of machines: transitions, windows and even steps."""
 
 import math
-from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -90,18 +89,6 @@ def test_no_step_crosses_segments_gaps_or_records():
         assert steps_of_episodes(data) == lengths
 
 
-def test_windows_do_not_cross_records_that_join():
-    """A machine that starts and ends at rest: one record ends where the other begins."""
-    states = column(0, 1, 2, 2, 1, 0)
-    record = Record(torch.arange(6).double(), states, torch.ones_like(states))
-    data = Records([record, record], SPEC).trajectories()
-    assert torch.equal(data.next_states[4], data.states[5])
-    assert steps_of_episodes(data) == [5, 5]
-    assert len(data.windows(5).actions) == 2
-    with pytest.raises(ValueError, match="the longest stretch has 5"):
-        data.windows(8)
-
-
 def test_the_clock_may_start_anew_in_a_segment():
     times = torch.cat([torch.arange(5), torch.arange(4)]).double()
     record = counted(9, at=times, segments=torch.tensor([1] * 5 + [2] * 4))
@@ -128,32 +115,6 @@ def test_states_that_were_not_measured():
     assert data.states[:, 0].tolist() == [0, 1, 5]
     assert data.next_states[1].tolist() == pytest.approx([2, nan], nan_ok=True)
     assert steps_of_episodes(data) == [2, 1]
-    states[:, 1] = nan
-    never = Records([Record(times, states, torch.zeros(8, 1).double())], POINT)
-    with pytest.raises(ValueError, match=r"found none of 7; .* state by state: x 6, v 0"):
-        never.trajectories()
-
-
-def test_a_row_that_is_left_out_ends_an_episode():
-    """At rest a position alone does not tell the next row from the one after it."""
-    states = torch.zeros(6, 2, dtype=torch.float64)
-    states[0], states[1, 1], states[2, 1], states[5] = 1.0, 1.0, torch.nan, 2.0
-    records = Records([Record(torch.arange(6).double(), states, torch.zeros(6, 1).double())], POINT)
-    with pytest.warns(UserWarning, match="1 of 5 steps, 1 of which"):
-        data = records.trajectories()
-    assert data.next_states[1].isnan().tolist() == [False, True]
-    assert steps_of_episodes(data) == [2, 2]
-
-
-def test_windows_of_a_hidden_state_are_those_of_what_smoothing_finds():
-    states = torch.full((9, 2), torch.nan, dtype=torch.float64)
-    states[:, 0] = torch.arange(9)
-    records = Records([Record(torch.arange(9).double(), states, torch.zeros(9, 1).double())], POINT)
-    for ask in (records.trajectories, lambda: records.windows(3)):
-        with pytest.raises(
-            ValueError, match=r"'v' was never measured.*smooth\(.*draw\(\)\.windows"
-        ):
-            ask()
 
 
 def test_stretches_that_are_too_short_are_left_out():
@@ -162,31 +123,6 @@ def test_stretches_that_are_too_short_are_left_out():
         assert records.trajectories().states.flatten().tolist() == [1, 2, 3, 4, 6, 7]
     with pytest.warns(UserWarning, match="2 of 3 stretches"):
         assert records.trajectories(0.04).states.flatten().tolist() == [1]
-    with pytest.raises(ValueError, match=r"6 rows or more, which are a control step, .* none of 3"):
-        records.trajectories(0.05)
-
-
-@pytest.mark.parametrize("step", [0.01, 0.02])
-def test_previous_actions_are_those_of_the_step_before(step):
-    spec = StateSpec(["x", "last"], ["u"], previous={"last": "u"})
-    record = counted(7)
-    states = torch.cat([record.states, torch.full_like(record.states, math.nan)], -1)
-    states[0, 1] = -1.0
-    known = Records([Record(record.times, states, record.actions)], spec)
-    states[0, 1] = math.nan
-    unknown = Records([Record(record.times, states, record.actions)], spec)
-    with pytest.warns(UserWarning, match="1 of which start"):
-        later = unknown.trajectories(step)
-    assert len(later.states) == round(0.06 / step) - 1
-    torch.testing.assert_close(later.next_states[:, 1:], later.actions)
-    torch.testing.assert_close(later.states[1:, 1:], later.actions[:-1])
-    if step == 0.01:
-        data = known.trajectories(step)
-        assert data.states[0, 1] == -1
-    else:  # what was recorded at the first row is of a row before, not of a step
-        with pytest.warns(UserWarning, match="1 of which start"):
-            data = known.trajectories(step)
-    torch.testing.assert_close(later.states, data.states[-len(later.states) :])
 
 
 @pytest.mark.parametrize("names", [("x_1", "x_2", "u_1"), ("u_1", "x_2", "x_1")])
@@ -226,33 +162,12 @@ def test_the_step_of_the_spec_is_the_default():
     record = counted(9)
     records = Records([Record(record.times, record.states.repeat(1, 2), record.actions)], spec)
     assert records.trajectories().states[:, 0].tolist() == [0, 2, 4, 6]
-    with pytest.raises(ValueError, match=r"step of the spec, 0\.02, got 0\.04; leave `step` out"):
-        records.trajectories(0.04)
 
 
 def jittery(seed=0, num_rows=200, by=0.3):
     generator = torch.Generator().manual_seed(seed)
     share = torch.rand(num_rows, generator=generator, dtype=torch.float64) - 0.5
     return 0.01 * (torch.arange(num_rows) + by * share)
-
-
-def test_steps_that_records_do_not_have():
-    uneven = counted(6, at=torch.tensor([0, 1, 3, 4, 7, 8.0]).double())
-    slow = [counted(9), counted(9, step=0.02, name="slow")]
-    for records, step, words in (
-        ([counted(9)], 0.025, r"multiple of .* 0\.01, got 0\.025; take 0\.02, or first `rec"),
-        ([counted(9)], 0.004, r"got 0\.004; take 0\.01\."),
-        (slow, 0.04, r"0\.02 of 'slow'; .*d\(0\.02"),
-        ([counted(200, at=jittery(), name="rough")], 0.01, r"'rough': .* a tenth of its step 0\.0"),
-        ([uneven], 1, "2 of 5 times .* max_gap"),
-        ([counted(9)], -0.1, "step must be finite and above 0; found -0.1"),
-    ):
-        for take in (
-            Records(records, SPEC).trajectories,
-            partial(Records(records, SPEC).windows, 1),
-        ):
-            with pytest.raises(ValueError, match=words):
-                take(step)
 
 
 def test_even_records_stay_as_they_are_when_resampled():
@@ -328,20 +243,6 @@ def test_windows_have_the_steps_of_transitions():
         assert torch.equal(windows.actions[i], data.actions[row : row + 3])
     sliding = records.windows(3, 0.02, stride=1)
     assert len(sliding.initial_states) == 4 + 6 + 9
-    with pytest.raises(ValueError, match=r"stretches of 12 steps .* the longest stretch has 11"):
-        records.windows(12, 0.02)
-    with pytest.raises(ValueError, match="length must be at least 1"):
-        records.windows(0)
-    with pytest.raises(ValueError, match="stride must be"):
-        records.windows(2, stride=0)
-
-
-def test_windows_start_at_what_was_measured():
-    states = column(math.nan, 1, 2, math.nan, math.nan, 5, 6, 7)
-    record = Record(torch.arange(8).double(), states, torch.zeros(8, 1).double())
-    windows = Records([record], SPEC).windows(2)
-    assert windows.initial_states.flatten().tolist() == [1, 5]
-    assert windows.measured[0, :, 0].tolist() == pytest.approx([2, math.nan], nan_ok=True)
 
 
 def test_a_few_transitions_spread_over_all():
@@ -358,6 +259,14 @@ def test_a_few_transitions_spread_over_all():
     assert torch.equal(data.spread(101).states, data.states)
     with pytest.raises(ValueError, match=r"number <= 101, .* got 102"):
         data.spread(102)
+
+
+def test_dates_and_durations_are_seconds_since_the_first():
+    days = pd.date_range("2026-10-25 01:30", periods=4, freq="30min", tz="Europe/Berlin")
+    universal, states = days.tz_convert("UTC").tz_localize(None), column(0, 1, 2, 3)
+    durations = days - days[0]
+    for times in (days, universal, durations, durations.to_pytimedelta(), days.to_pydatetime()):
+        assert Record(times, states, states).times.tolist() == [0, 1800, 3600, 5400]
 
 
 def test_a_record_takes_tensors_arrays_and_frames():
@@ -377,31 +286,6 @@ def test_a_record_takes_tensors_arrays_and_frames():
         if parts is not frames:
             parts[1][0] = 9
             assert record.states[0] == 1, "it has data of its own"
-
-
-THREE = torch.arange(3).double()
-
-
-REFUSED = [
-    ({"times": torch.tensor([0, 2, 1.0]).double()}, ValueError, "row 2: .*found 1 after 2"),
-    ({"times": torch.tensor([0, math.nan, 1]).double()}, ValueError, "row 1: .*nan .* times"),
-    ({"times": THREE.unsqueeze(-1)}, ValueError, r"times of shape N, got \(3, 1\)"),
-    ({"states": THREE}, ValueError, r"N x state_dim, got \(3,\); .*reshape\(-1, 1\)"),
-    ({"states": column(0, math.inf, 0)}, ValueError, "row 1: .*inf in column 0 of states; put N"),
-    ({"actions": column(0, 0, math.nan)}, ValueError, "row 2: .*nan in column 0 of actions"),
-    ({"actions": column(0, 0)}, ValueError, "3 of times, 3 of states, 2 of actions"),
-    ({"states": np.array([["a"], ["b"], ["c"]])}, TypeError, "contain numbers only"),
-    ({"segments": [1, 1]}, ValueError, "3 of actions, 2 of segments"),
-    ({"segments": [1, math.nan, 1]}, ValueError, "row 1: expected a label .*found nan"),
-    ({"segments": [1, 2, 1]}, ValueError, "two rows or more of a segment, .* found 3 in all"),
-]
-
-
-def test_what_is_no_record():
-    good = {"times": THREE, "states": column(0, 1, 2), "actions": column(0, 0, 0)}
-    for changed, error, words in REFUSED:
-        with pytest.raises(error, match=words):
-            Record(**{**good, **changed}, name="r")
 
 
 @pytest.fixture
@@ -468,21 +352,6 @@ def test_columns_of_the_same_names_need_no_words_and_hidden_states_no_column(csv
         assert record.states[:, 1].isnan().all()
         with pytest.raises(ValueError, match="expected a column 'before'"):
             Records.read_csv(file, spec, states={"last": "before"})
-
-
-def test_what_is_no_file_of_a_record(csv):
-    head, good = "time,q,dq,tau\n", csv("time,q,dq,tau\n0,1,2,3\n1,4,5,6\n", "good.csv")
-    for text, words in (
-        ("\n\n", ".*expected a line of names and then rows, found an empty file"),
-        ("time,q,dq\n0,1,2\n", ".*line 1: expected a column 'tau', found 'time', 'q', 'dq'"),
-        (head + "0,1,2,3\n\n1,2,x,3\n", r".*line 4, column 3 \('dq'\): .*found 'x'"),
-        (head + "0,1,inf,3\n1,2,3,4\n", r".*line 2, column 3 \('dq'\): .*found 'inf'"),
-        (head + "0,1,2,3\n1,2,3,\n", r".*line 3, column 4 \('tau'\): .* number, found ''"),
-        (head + "0,1,2,3\n2,2,3,4\n1,2,3,4\n", "', row 2: .*found 1 after 2"),
-        (head + "0,1,2,3\n", "': expected two rows or more"),
-    ):
-        with pytest.raises(ValueError, match=f"log.csv{words}"):
-            Records.read_csv([good, csv(text)], POINT, **NAMES)
 
 
 def test_windows_are_drawn_evenly_and_are_records_again():
