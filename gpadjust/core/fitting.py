@@ -27,7 +27,8 @@ from gpadjust.core.unknowns import standard_normal
 if TYPE_CHECKING:
     from gpadjust.core.model import GP
 
-_SMALL, _MEDIUM = 40, 100  # points: up to these draws begin with the prior, and are moved
+_SMALL = 40  # points: up to these draws begin with the prior
+_MEDIUM, _SHARED = 100, 200  # up to these they are moved; the latter if outputs share numbers
 _SELDOM = 1e-3  # a nested model of less probability at its mode is not drawn from
 _SEARCHES = 4  # for the mode
 _NEAR = 0.3  # difference of all coordinates below which two searches have found the same mode
@@ -94,9 +95,9 @@ def fit(
     """Fit a model to its data, from the prior: what it held before has no influence.
 
     ``"bayes"`` draws all unknown numbers from their posterior: by sequential Monte Carlo from the
-    prior up to 40 points, from Laplace's approximation beyond; beyond 100 points its draws are
-    weighted once and not moved. Nested models are drawn from apart and pooled by their posterior
-    probabilities. ``"map"`` brings the numbers of the whole model to their most likely values.
+    prior up to 40 points, from Laplace's approximation beyond; beyond 100 points (200 if outputs
+    share unknown numbers, as parameters of a physics) its draws are weighted once and not moved.
+    Nested models are drawn from apart and pooled by their posterior probabilities. ``"map"`` brings the numbers of the whole model to their most likely values.
 
     Args:
         model: The model.
@@ -194,6 +195,7 @@ def _default_numbers(model: GP) -> tuple[int, int]:
 def _sampled(model: GP, number: int, seed: int) -> dict[int, Draws]:
     """Return draws of each nested model; of more than 40 rows of each that is likely enough."""
     n, prior = model.targets().shape[-1], model.table.log_prior
+    has_moves = n <= (_SHARED if model.table.shared else _MEDIUM)
     starts: Mapping[int, Normal | None] = dict.fromkeys(range(len(prior)))
     if n > _SMALL:
         starts = _starts(model, seed)
@@ -201,7 +203,7 @@ def _sampled(model: GP, number: int, seed: int) -> dict[int, Draws]:
     for k, start in starts.items():
         first, like = 16 if start is None else 4, model.u.detach()[0]
         target = partial(model.log_likelihood, choice=k)
-        draws = sample(target, like, number, seed, start, first, n <= _MEDIUM)
+        draws = sample(target, like, number, seed, start, first, has_moves)
         sampled[k] = draws._replace(u=model.table.with_choice(draws.u, k))
     return sampled
 

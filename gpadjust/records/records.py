@@ -473,7 +473,7 @@ class Records:
         before = torch.cat([part[:-1] for part in states])
         after = torch.cat([part[1:] for part in states])
         episode = [i for i, part in enumerate(states) for _ in part[1:]]
-        return Trajectories(before, actions, after, episode), short
+        return Trajectories(before, actions, after, torch.tensor(episode)), short
 
     def _hidden(self, data: Trajectories) -> str:
         """The way out if states were never measured; empty if there are none."""
