@@ -97,7 +97,8 @@ def fit(
     ``"bayes"`` draws all unknown numbers from their posterior: by sequential Monte Carlo from the
     prior up to 40 points, from Laplace's approximation beyond; beyond 100 points (200 if outputs
     share unknown numbers, as parameters of a physics) its draws are weighted once and not moved.
-    Nested models are drawn from apart and pooled by their posterior probabilities. ``"map"`` brings the numbers of the whole model to their most likely values.
+    Nested models are drawn from apart and pooled by their posterior probabilities. ``"map"``
+    brings the numbers of the whole model to their most likely values.
 
     Args:
         model: The model.
