@@ -195,19 +195,10 @@ def main(command: Sequence[str] | None = None) -> int:
     arguments = parser().parse_args(command)
     try:
         # Not earlier: --help and what is wrong with options need no torch.
-        from gpadjust.physics import PhysicsError
+        from gpadjust.report.command import run
 
-        if arguments.command == "report":
-            from gpadjust.report.command import run
-        else:
-            from gpadjust.report.log_command import run
-    except ImportError as error:
-        return _fail(str(error))
-    except KeyboardInterrupt:
-        return _fail("interrupted; nothing was written.", 130)
-    try:
         run(arguments, command)
-    except (ValueError, OSError, ImportError, PhysicsError) as error:
+    except (ValueError, OSError, ImportError) as error:
         return _fail(str(error))
     except SystemExit as error:  # of the user's code
         return _fail(

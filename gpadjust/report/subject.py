@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
@@ -11,34 +11,50 @@ from torch import Tensor
 
 from gpadjust.core import GP, StackedGP
 from gpadjust.kinds.ar1 import AR1
-from gpadjust.kinds.categories import Categories, levels_of
+from gpadjust.kinds.categories import Categories
 from gpadjust.physics import Physics
 from gpadjust.validation import Comparison, LeaveOneOut, leave_one_out
 from gpadjust.validation.leave_one_out import observations
-from gpadjust.validation.plots.adjustments import adjustments_of
 from gpadjust.validation.plots.drawing import column
 from gpadjust.validation.plots.predictions import physics_at
 
 
-class Adjusted(NamedTuple):
-    """A model of one structure, whose rho, delta and trust are shown for an output.
+@dataclass(frozen=True)
+class Origin:
+    """Origin of a page, as far as its subject does not know it.
 
     Attributes:
-        structure: The name of the structure.
-        model: The model.
-        output: Which of its outputs.
-        weight: Its weight in a mixture; 1 if there is none.
+        settings: Names and values of settings.
+        remarks: Sentences on the data.
+        notes: Sentences on the fit, such as warnings.
+        how: Code or a command that compares a model with others.
+        physics: A Python expression of the physics for whoever loads the model; empty if the
+            model's file holds it, or its name.
+        modules: The modules that this expression needs.
+        units: Units by the names of states and actions of a log and ``"time"``.
+        program: A program that identifies the machine of a log in Python, and goes on.
+    """
+
+    settings: Mapping[str, str] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    how: str = "report(compare(train_X, train_Y, physics))"
+    physics: str = ""
+    modules: tuple[str, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
+    program: str = ""
+
+
+class Adjusted(NamedTuple):
+    """A model of one structure, whose rho, delta and trust are shown for one of its outputs.
+
+    Its weight in a mixture is 1 if there is no mixture.
     """
 
     structure: str
     model: GP
     output: int
     weight: float
-
-    @property
-    def terms(self) -> list[str]:
-        """The names of rho and delta, as far as the model has them."""
-        return adjustments_of(self.model)
 
 
 @dataclass(frozen=True)
@@ -74,75 +90,70 @@ class Subject:
         return self.model.data.output_names
 
     @property
-    def counts(self) -> list[int]:
-        """The number of observations of each output, without outliers."""
-        counts: list[int] = (~self.judged.isnan()).sum(0).tolist()
-        return counts
-
-    @property
     def judged(self) -> Tensor:
         """Observations that errors and coverage are of, ``n x m``, NaN where it is an outlier."""
         outlier = self.loo.is_outlier
         return self.Y if outlier is None else self.Y.masked_fill(outlier, torch.nan)
 
+    @property
+    def counts(self) -> list[int]:
+        """The number of observations of each output, without outliers."""
+        counts: list[int] = (~self.judged.isnan()).sum(0).tolist()
+        return counts
+
     def outliers(self, output: int) -> list[str]:
         """Return the names of the rows whose observation of an output counts as an outlier."""
         outlier = self.loo.is_outlier
-        if outlier is None:
-            return []
-        return [self.rows[i] for i in outlier[:, output].nonzero().flatten().tolist()]
+        places = [] if outlier is None else outlier[:, output].nonzero().flatten().tolist()
+        return [self.rows[i] for i in places]
+
+    @property
+    def categories(self) -> Categories | None:
+        """The categories and batches among the inputs, if there are any."""
+        transform = self.model.data.transform
+        return transform if isinstance(transform, Categories) else None
 
     @property
     def names(self) -> dict[int, tuple[str, ...]]:
-        """The names of the categories that are texts, by their column; their numbers are from 0."""
-        levels = levels_of(self.model).items()
-        texts = {i: tuple(str(name) for name in own) for i, own in levels}
-        return {i: texts[i] for i, own in levels if own == texts[i]}
-
-    @property
-    def batches(self) -> list[int]:
-        """The columns of batches."""
-        transform = self.model.data.transform
-        return transform.batches if isinstance(transform, Categories) else []
+        """The names of categories that are texts, by their column; their numbers are from 0."""
+        levels = {} if self.categories is None else self.categories.levels
+        texts = {i: tuple(map(str, own)) for i, own in levels.items()}
+        return {i: texts[i] for i, own in levels.items() if own == texts[i]}
 
     @property
     def base(self) -> Tensor:
         """The medians of the inputs, ``d``, for slices; of categories a level."""
-        middle, level = self.X.quantile(0.5, dim=0), self.X.median(0).values
-        levels = levels_of(self.model)
-        which = [i in levels for i in range(len(middle))]
-        return level.where(torch.tensor(which), middle)
+        levels = {} if self.categories is None else self.categories.levels
+        is_level = torch.tensor([i in levels for i in range(len(self.inputs))])
+        return self.X.median(0).values.where(is_level, self.X.quantile(0.5, dim=0))
+
+    @property
+    def models(self) -> Sequence[GP]:
+        """The models that were compared, or are mixed, or the one."""
+        if self.comparison is not None:
+            return [*self.comparison.models.values()]
+        return self.model.models if isinstance(self.model, StackedGP) else [self.model]
 
     @property
     def physics(self) -> dict[str, Physics]:
         """The physics by their names."""
-        return {part.name: part for model in self._models() for part in model.physics}
+        return {part.name: part for model in self.models for part in model.physics}
 
     @property
     def has_physics(self) -> bool:
         """Whether there is a physics; AR1 knows it through samples alone."""
-        return bool(self.physics) or any(isinstance(model, AR1) for model in self._models())
+        return bool(self.physics) or any(isinstance(model, AR1) for model in self.models)
 
     @property
-    def as_it_is(self) -> str:
-        """Description of the unadjusted physics."""
-        unknown = any(physics.unknowns for physics in self.physics.values())
-        return "with fitted parameters" if unknown else "as it is"
+    def is_fitted_physics(self) -> bool:
+        """Whether the physics has unknown parameters, which were fitted."""
+        return any(physics.unknowns for physics in self.physics.values())
 
     def physics_at(self, X: Tensor, output: int) -> dict[str, Tensor]:
         """Return an output of each physics that is shown, ``n``."""
         shown = self.adjusted[output]
-        if shown is None:
-            return {}
-        return {name: column(f, output) for name, f in physics_at(shown.model, X).items()}
-
-    def _models(self) -> Iterator[GP]:
-        if self.comparison is not None:
-            yield from self.comparison.models.values()
-        elif isinstance(self.model, StackedGP):
-            yield from self.model.models
-        else:
-            yield self.model
+        values = {} if shown is None else physics_at(shown.model, X)
+        return {name: column(f, output) for name, f in values.items()}
 
 
 def subject_of(thing: object, rows: Sequence[object] | None = None) -> Subject:
@@ -180,14 +191,15 @@ def subject_of(thing: object, rows: Sequence[object] | None = None) -> Subject:
 
 def _adjusted(model: GP | StackedGP, comparison: Comparison | None, output: int) -> Adjusted | None:
     """Return the structure of most weight that adjusts a physics, of what predicts an output."""
-    candidates = [(type(model).__name__, model, 1.0)]
     if comparison is not None:
         rows = [*comparison.table.values()][output]
-        candidates = [(r.structure, comparison.models[r.structure], r.weight) for r in rows]
+        candidates = [(row.structure, comparison.models[row.structure], row.weight) for row in rows]
     elif isinstance(model, StackedGP):
         weights = zip(model.weights.items(), model.models, strict=True)
-        candidates = [(name, each, own[output]) for (name, own), each in weights]
-    for name, each, weight in sorted(candidates, key=lambda each: -each[2]):
-        if isinstance(each, GP) and each.physics:
-            return Adjusted(name, each, output, weight)
+        candidates = [(name, part, own[output]) for (name, own), part in weights]
+    else:
+        candidates = [(type(model).__name__, model, 1.0)]
+    for name, part, weight in sorted(candidates, key=lambda candidate: -candidate[2]):
+        if isinstance(part, GP) and part.physics:
+            return Adjusted(name, part, output, weight)
     return None

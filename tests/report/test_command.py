@@ -116,11 +116,11 @@ def test_a_table_that_is_none(folder, capsys):
 
 BAD_PHYSICS = {
     "hill": "has 'hill'; expected one of its names: time.* is given as module:function",
-    "hill.py:wave": "there is no module 'hill.py'",
+    "hill.py:wave": "hill.py cannot be imported: .* Is it 'hill'",
     "./hill.py:wave": "Give the module without folder and .py, and run this in its folder",
     "hill:no_function": "physics must be a Physics or a callable.* found a float",
     "broken:f": r"broken cannot be imported: ZeroDivisionError: .* \(broken.py, line 2\)",
-    "lacks:f": "lacks cannot be imported: it needs 'no_such_module_here', which is not installed",
+    "lacks:f": "lacks cannot be imported: ModuleNotFoundError: .*no_such_module.*lacks.py",
     "hill:two": "expected 1 column, one for each of --outputs head",
     "hill:noise": "expected the same values whenever it is called, found others in 9 of 9 rows",
     "hill:huge": r"found others in 1 of 9 rows.*\n  line 10: time \[s\] = 1$",
@@ -138,12 +138,12 @@ def test_a_physics_that_is_none_or_fails(folder, capsys):
 
 BAD_OPTIONS = {
     ("--out", "report.pdf"): "Expected a page such as 'report.html'",
-    ("--out", "taken.html"): "'taken.pt' is a folder, where the model's file would be",
+    ("--out", "taken.html"): "'taken.pt' is a folder, where a file would be",
     ("--physics", "hill:wave"): "Expected different --physics, found hill:wave more than once",
     ("--inputs", "time,head"): "as inputs and outputs, got 'head \\[m\\]' more than once",
-    ("--units", "head"): "Expected --units such as a=1,b=2, found 'head'",
+    ("--units", "head"): "Expected --units such as a=1,b=2, with different names, found 'head'",
     ("--units", "tail=m"): "--units names 'tail', which is none of 'time', 'head'",
-    ("--noise", "much"): "standard deviation in the output's unit, such as 0.1, found 'much'",
+    ("--noise", "much"): "standard deviation in the unit of 'head', such as 0.1, found 'much'",
     ("--sheet", "a"): r"data.csv: expected a workbook, \*.xlsx, to have a sheet 'a'",
     ("--unknown", "a=2 +- 1"): "--unknown names 'a', which is in no formula. A function has its",
     ("--categories", "note"): "The category 'note' is none of --inputs time; name it there",
