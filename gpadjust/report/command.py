@@ -1,7 +1,8 @@
-"""The commands ``gpadjust report`` and ``gpadjust identify``, run in one way."""
+"""The commands ``gpadjust report`` and ``gpadjust identify``: read, work, write, in one way."""
 
 from __future__ import annotations
 
+import re
 import shlex
 import sys
 import warnings
@@ -11,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gpadjust.core import CKA, GP, Noise, fit
+from gpadjust.core import CKA, Noise, fit
 from gpadjust.kinds.categories import Categories
 from gpadjust.kinds.factory import with_options
 from gpadjust.kinds.heavy_tails import HeavyTails
@@ -19,53 +20,25 @@ from gpadjust.kinds.noisy_inputs import NoisyInputs
 from gpadjust.kinds.relative import RelativeNoise
 from gpadjust.physics import ODEPhysics, PhysicsError, PhysicsWarning
 from gpadjust.records import Identification, Records, identify
-from gpadjust.report.given_physics import (
-    GivenPhysics,
-    columns_of,
-    given_physics,
-    hidden_of,
-    imports_of,
-    is_path,
-    motion,
-    unknowns_of,
-)
-from gpadjust.report.inputs import (
-    Columns,
-    TableData,
-    check_names,
-    digest_of,
-    log_columns,
-    mark_of,
-    names_of,
-    noise_variances,
-    number_of,
-    open_table,
-    pairs,
-    read_table,
-    variances_of,
-)
+from gpadjust.report import given_physics as physics_of
+from gpadjust.report import inputs as read
 from gpadjust.report.markup import bare, listed, plural
 from gpadjust.report.page import checked_path, write
 from gpadjust.report.subject import Origin, Subject, subject_of
 from gpadjust.states import StateSpec
-from gpadjust.validation import Comparison, compare
+from gpadjust.validation import compare
 from gpadjust.validation.plausibility import complaint
 
+_FIT = re.compile(r" --f(i|it)?[ =](compare|bayes|map)\b")
 _DEGREES = ("deg", "degree", "degrees", "°")
 _DIGITS = 6  # of a sampling step, which is a mean of differences
 _NO_NOTES = (DeprecationWarning, PendingDeprecationWarning)
 
 
 class Job(NamedTuple):
-    """A command whose options and files are read, and whose physics was evaluated.
+    """A command whose options, files and physics are read."""
 
-    Attributes:
-        lines: Sentences on the data, for the terminal.
-        origin: What the page says of data, physics and settings.
-        work: What takes time, and gives the subject of the page.
-    """
-
-    lines: Sequence[str]
+    lines: Sequence[str]  # on the data, for the terminal
     origin: Origin
     work: Callable[[], Subject | Identification]
 
@@ -86,19 +59,17 @@ def run(arguments: Namespace, command: Sequence[str]) -> None:
     files = arguments.data if is_log else [arguments.data]
     path = checked_path(arguments.out, *files, model=not is_log)
     lines, origin, work = (_of_log if is_log else _of_table)(arguments)
-    for line in lines:
-        print(line, file=sys.stderr, flush=True)
+    _say(*lines)
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("default")
             subject = work()
         texts = [str(w.message) for w in caught if not issubclass(w.category, _NO_NOTES)]
         notes = tuple(dict.fromkeys(texts))
-        for note in notes:
-            print(f"Warning: {note}", file=sys.stderr, flush=True)
-        settings = {"command": f"gpadjust {shlex.join(command)}", **origin.settings}
-        settings["seed"] = str(arguments.seed)
-        origin = replace(origin, settings=settings, notes=notes, how=_comparing(command))
+        _say(*(f"Warning: {note}" for note in notes))
+        words = f"gpadjust {shlex.join(command)}"
+        settings = {"command": words, **origin.settings, "seed": str(arguments.seed)}
+        origin = replace(origin, settings=settings, notes=notes, how=_FIT.sub("", words))
         headline = write(subject, path, arguments.title, origin, progress=True)
     except PhysicsError as error:
         raise ValueError(str(error)) from error
@@ -108,81 +79,76 @@ def run(arguments: Namespace, command: Sequence[str]) -> None:
     print(f"{headline}\nWrote {listed(written)}.")
 
 
-def _comparing(command: Sequence[str]) -> str:
-    """Return the command that compares structures: the same without ``--fit``."""
-    kept: list[str] = []
-    words = iter(command)
-    for word in words:
-        option, equals, _ = word.partition("=")
-        if not (option.startswith("--f") and "--fit".startswith(option)):
-            kept.append(word)
-        elif not equals:
-            next(words, None)
-    return f"gpadjust {shlex.join(kept)}"
+def _say(*lines: str) -> None:
+    """Print lines beside the result, while a command works."""
+    for line in lines:
+        print(line, file=sys.stderr, flush=True)
 
 
 def _of_table(arguments: Namespace) -> Job:
     """Read the table and the physics of ``gpadjust report``."""
-    outputs = names_of(arguments.outputs, "--outputs")
-    variances = noise_variances(arguments.noise, outputs)
-    unknowns = unknowns_of(arguments.unknown)
-    marks = (mark_of(arguments.delimiter), arguments.decimal, arguments.sheet)
-    table = open_table(arguments.data, *marks)
-    batches = names_of(arguments.batches, "--batches") if arguments.batches else []
-    categories = names_of(arguments.categories, "--categories") if arguments.categories else []
-    inputs = _inputs(arguments, table.names, outputs, [*unknowns], [*categories, *batches])
-    data = read_table(table, inputs, outputs, [*categories, *batches], arguments)
+    outputs = read.names_of(arguments.outputs, "--outputs")
+    variances = read.noise_variances(arguments.noise, outputs)
+    unknowns = physics_of.unknowns_of(arguments.unknown)
+    marks = (read.mark_of(arguments.delimiter), arguments.decimal, arguments.sheet)
+    table = read.open_table(arguments.data, *marks)
+    batches = read.names_of(arguments.batches, "--batches")
+    groups = [*read.names_of(arguments.categories, "--categories"), *batches]
+    inputs = read.names_of(arguments.inputs, "--inputs")
+    if not inputs:
+        if paths := [text for text in arguments.physics if ":" in text]:
+            raise ValueError(
+                f"Expected --inputs, the columns that {paths[0]} reads, in its order; only "
+                "formulas name their own."
+            )
+        others = [name for name in table.names if not {name, bare(name)} & {*outputs}]
+        inputs = physics_of.columns_of(arguments.physics, others, [*unknowns])
+        inputs += [name for name in groups if name not in {*inputs, *map(bare, inputs)}]
+    data = read.read_table(table, inputs, outputs, groups, arguments)
     options = _options(arguments, inputs, batches, data)
-    physics = given_physics(arguments.physics, data, unknowns)
+    physics, code, modules = physics_of.given_physics(arguments.physics, data, unknowns)
 
     def work() -> Subject:
-        model = _fitted(arguments, data, physics.physics, variances, options)
+        X, noise = data.X, options.get("noise")
+        if isinstance(noise, NoisyInputs):
+            X = read.Columns(X.columns, noise.points)
+        given = (X, data.Y, physics, variances)
+        if arguments.fit == "compare":
+            model: Any = compare(*given, seed=arguments.seed, progress=True, **options)
+        else:
+            _say(f"Fitting CKA by {arguments.fit!r} ...")
+            model = with_options(CKA, options)(X, data.Y, variances, physics=physics)
+            for text in (complaint(part, model.data) for part in model.physics):
+                if text:
+                    warnings.warn(text, PhysicsWarning, stacklevel=1)
+            fit(model, arguments.fit, seed=arguments.seed)
         return subject_of(model, [f"line {line}" for line in data.lines])
 
     rows = f"{arguments.data}: {plural(len(data.lines), 'row')}"
     first = f"{rows}, {listed(data.Y.columns)} from {listed(data.X.columns)}."
-    settings = {"data file": digest_of(arguments.data)}
-    origin = Origin(settings, data.remarks, physics=physics.code, modules=physics.modules)
+    settings = {"data file": read.digest_of(arguments.data)}
+    origin = Origin(settings, data.remarks, physics=code, modules=modules)
     return Job([first, *data.remarks], origin, work)
 
 
-def _inputs(
-    arguments: Namespace, columns: Sequence[str], outputs: Sequence[str],
-    unknowns: Sequence[str], groups: Sequence[str],
-) -> list[str]:  # fmt: skip
-    """Return the names of the inputs: by the option, or of formulas and groups."""
-    if arguments.inputs is not None:
-        return names_of(arguments.inputs, "--inputs")
-    if paths := [text for text in arguments.physics if is_path(text)]:
-        raise ValueError(
-            f"Expected --inputs, the columns that {paths[0]} reads, in its order; only formulas "
-            "name their own."
-        )
-    others = [name for name in columns if not {name, bare(name)} & {*outputs}]
-    inputs = columns_of(arguments.physics, others, unknowns)
-    known = {*inputs, *map(bare, inputs)}
-    return inputs + [name for name in groups if name not in known]
-
-
 def _options(
-    arguments: Namespace, inputs: Sequence[str], batches: Sequence[str], data: TableData
+    arguments: Namespace, inputs: Sequence[str], batches: Sequence[str], data: read.TableData
 ) -> dict[str, Any]:
     """Return the options of a model: noise, link and categories."""
     options: dict[str, Any] = {}
     noise: Noise | None = RelativeNoise() if arguments.noise == "relative" else None
     if arguments.outliers:
         noise = HeavyTails(base=noise)
-    if arguments.input_noise is not None:
-        sds = pairs(arguments.input_noise, "--input-noise")
-        check_names(sds, "--input-noise", inputs, "--inputs")
-        variances = variances_of(sds, "--input-noise", inputs)
+    if (text := arguments.input_noise) is not None:
+        sds = read.pairs(text, "--input-noise")
+        variances = read.variances_of(sds, "--input-noise", inputs, "--inputs")
         noise = NoisyInputs(data.X.values, variances, noise)
     if noise is not None:
         options["noise"] = noise
     if arguments.positive:
         options["link"] = "log"
     if (text := arguments.bounds) is not None:
-        ends = [number_of(end) for end in text.split(",")]
+        ends = [read.number_of(end) for end in text.split(",")]
         if len(ends) != 2 or not ends[0] < ends[1]:
             raise ValueError(
                 f"Expected --bounds as two numbers, the lower first: 0,1; found {text!r}."
@@ -196,49 +162,29 @@ def _options(
     return options
 
 
-def _fitted(
-    arguments: Namespace, data: TableData, physics: Any,
-    variances: list[float] | None, options: dict[str, Any],
-) -> Comparison | GP:  # fmt: skip
-    """Return the comparison of all structures, or one CKA, fitted."""
-    X, Y = data.X, data.Y
-    if isinstance(noise := options.get("noise"), NoisyInputs):
-        X = Columns(X.columns, noise.points)
-    if arguments.fit == "compare":
-        return compare(X, Y, physics, variances, seed=arguments.seed, progress=True, **options)
-    print(f"Fitting CKA by {arguments.fit!r} ...", file=sys.stderr, flush=True)
-    model: GP = with_options(CKA, options)(X, Y, variances, physics=physics)
-    for part in model.physics:
-        if text := complaint(part, model.data):
-            warnings.warn(text, PhysicsWarning, stacklevel=1)
-    fit(model, arguments.fit, seed=arguments.seed)
-    return model
-
-
 def _of_log(arguments: Namespace) -> Job:
     """Read the log and the equations of ``gpadjust identify``."""
-    hidden = hidden_of(arguments.hidden)
-    unknowns = unknowns_of(arguments.unknown)
-    marks = {"delimiter": mark_of(arguments.delimiter), "decimal": arguments.decimal}
-    tables = [open_table(file, **marks) for file in arguments.data]
-    log = listed(digest_of(file) for file in arguments.data)
-    own_units = {name: unit for name, (unit, _) in hidden.items()}
-    columns, units = log_columns(tables, own_units, arguments)
-    states, actions = [*columns["states"]], [*columns["actions"]]
-    angles = names_of(arguments.angles, "--angles") if arguments.angles else []
-    check_names(angles, "--angles", states, "--states")
-    for name in angles:
-        if units.get(name) in _DEGREES:
-            raise ValueError(
-                f"Expected the angle {name!r} in rad, found {units[name]!r}; convert it, or do "
-                "without --angles, which is for angles that go round."
-            )
+    hidden = physics_of.hidden_of(arguments.hidden)
+    unknowns = physics_of.unknowns_of(arguments.unknown)
+    marks = {"delimiter": read.mark_of(arguments.delimiter), "decimal": arguments.decimal}
+    tables = [read.open_table(file, **marks) for file in arguments.data]
+    log = listed(read.digest_of(file) for file in arguments.data)
+    own_units = {name: prior.unit for name, prior in hidden.items()}
+    columns, units = read.log_columns(tables, own_units, arguments)
+    names = [*columns["states"]], [*columns["actions"]]
+    angles = read.names_of(arguments.angles, "--angles")
+    read.check_names(angles, "--angles", names[0], "--states")
+    if wrong := [name for name in angles if units.get(name) in _DEGREES]:
+        raise ValueError(
+            f"Expected the angle {wrong[0]!r} in rad, found {units[wrong[0]]!r}; convert it, or do "
+            "without --angles, which is for angles that go round."
+        )
     reading = {**columns, **marks}
-    read = Records.read_csv(arguments.data, StateSpec(states, actions, angles=angles), **reading)
+    whole = Records.read_csv(arguments.data, StateSpec(*names, angles=angles), **reading)
     step = arguments.step
     if step is None:
-        step = float(f"{read.records[0].sampling_step:.{_DIGITS}g}")
-    given = motion(arguments.physics, states, actions, unknowns, step)
+        step = float(f"{whole.records[0].sampling_step:.{_DIGITS}g}")
+    given = physics_of.motion(arguments.physics, *names, unknowns, step)
     physics = given.physics
     if isinstance(physics, ODEPhysics):
         step = physics.step
@@ -246,9 +192,9 @@ def _of_log(arguments: Namespace) -> Job:
         raise ValueError(
             f"Expected no --step, as the physics has a step of {step:g}, found {arguments.step:g}."
         )
-    spec = StateSpec(states, actions, angles=angles, step=step)
+    spec = StateSpec(*names, angles=angles, step=step)
     options = {
-        "start": {name: start for name, (_, start) in hidden.items()} or None,
+        "start": {name: (own.guess, own.sd) for name, own in hidden.items()} or None,
         "held_out": arguments.held_out,
         "num_starts": arguments.starts,
         "seed": arguments.seed,
@@ -256,31 +202,32 @@ def _of_log(arguments: Namespace) -> Job:
 
     def work() -> Identification:
         try:
-            return identify(Records(read.records, spec), physics, **options, progress=True)
+            return identify(Records(whole.records, spec), physics, **options, progress=True)
         except RuntimeError as error:  # the states diverged, or the physics failed
             raise ValueError(str(error)) from error
 
-    settings = {
-        "log": log,
-        "step": f"{step:g} {units.get('time', 's')}",
-        "physics": f"{physics.name} ({type(physics).__name__})",
-    }
+    time = units.get("time", "s")
+    named = f"{physics.name} ({type(physics).__name__})"
+    settings = {"log": log, "step": f"{step:g} {time}", "physics": named}
     program = _program(arguments.data, spec, reading, given, options)
-    lines = [f"{listed(arguments.data)}: {listed(map(repr, read))}."]
-    return Job(lines, Origin(settings, units=units, program=program), work)
+    line = f"{listed(arguments.data)}: {listed(map(repr, whole))}."
+    return Job([line], Origin(settings, units=units, program=program), work)
 
 
 def _program(
-    files: Sequence[str], spec: StateSpec, reading: Mapping[str, object],
-    physics: GivenPhysics, options: Mapping[str, object],
-) -> str:  # fmt: skip
+    files: Sequence[str],
+    spec: StateSpec,
+    reading: Mapping[str, object],
+    physics: physics_of.GivenPhysics,
+    options: Mapping[str, object],
+) -> str:
     """Return Python code that does the same, and follows further actions."""
     states, actions = [*spec.states], [*spec.actions]
     angles = f", angles={[*spec.angles]!r}" if spec.angles else ""
     read = "".join(f"    {name}={v!r},\n" for name, v in reading.items() if v is not None)
     chosen = "".join(f", {name}={v!r}" for name, v in options.items() if v is not None)
     return f"""\
-{imports_of(physics.code, physics.modules)}
+{physics_of.imports_of(physics.code, physics.modules)}
 from gpadjust.records import Records, identify
 from gpadjust.states import StateSpec
 

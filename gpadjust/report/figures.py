@@ -13,24 +13,9 @@ from gpadjust.physics import PhysicsError
 from gpadjust.report import markup as html
 from gpadjust.report.markup import Markup, drawn, image, number, percent, tag
 from gpadjust.report.subject import Subject
-from gpadjust.validation import Trust, trust
-from gpadjust.validation.plots import (
-    plot_adjustment,
-    plot_coverage,
-    plot_leave_one_out,
-    plot_trust,
-)
+from gpadjust.validation import Trust, plots, trust
+from gpadjust.validation.plots import drawing
 from gpadjust.validation.plots.adjustments import adjustments_of, unadjusted
-from gpadjust.validation.plots.drawing import (
-    DOTS,
-    GREY,
-    RED,
-    band,
-    column,
-    labels,
-    mean_and_ends,
-    tidy,
-)
 from gpadjust.validation.plots.predictions import plot_pit
 
 _MOST = 12  # inputs along which slices are drawn, in all outputs together
@@ -136,10 +121,10 @@ def slices(subject: Subject, output: int, inputs: list[int]) -> list[Markup]:
     for i in inputs:
         axes[0, i].set_ylim(min(low), max(high))
     if shown is not None and terms:
-        plot_adjustment(shown.model, output=shown.output, axes=axes[1:], num_points=_POINTS)
+        plots.plot_adjustment(shown.model, output=shown.output, axes=axes[1:], num_points=_POINTS)
         _name_alike(axes[1:])
     else:
-        for ax, label in zip(axes[-1], labels(subject.model, "input", d), strict=True):
+        for ax, label in zip(axes[-1], drawing.labels(subject.model, "input", d), strict=True):
             ax.set_xlabel(label)
     parts = "the prediction and the physics" if shown is not None else "the prediction"
     below = f"; below, {' and '.join(terms)}" if terms else ""
@@ -152,7 +137,7 @@ def trusts(basis: Trust, output: int, inputs: list[int], name: str) -> list[Mark
     """Return the basis of predictions of an output of a model, by its name, along each input."""
     figures = [html.new_figure(2.0) for _ in basis.input_names]
     axes = np.array([[figure.subplots() for figure in figures]])
-    plot_trust(basis, output=output, axes=[*axes[0]])
+    plots.plot_trust(basis, output=output, axes=[*axes[0]])
     if (legend := axes[0, -1].get_legend()) is not None:
         legend.remove()
     _name_alike(axes)
@@ -164,7 +149,7 @@ def trusts(basis: Trust, output: int, inputs: list[int], name: str) -> list[Mark
 def left_out(subject: Subject, output: int) -> list[Markup]:
     """Return left-out predictions against observations, and their standardized residuals."""
     figures = [html.new_figure(2.9), html.new_figure(2.9)]
-    plot_leave_one_out(subject.loo, output=output, axes=[f.subplots() for f in figures])
+    plots.plot_leave_one_out(subject.loo, output=output, axes=[f.subplots() for f in figures])
     name = subject.outputs[output]
     first = image(figures[0], f"predictions of left-out {name} against observations")
     return [first, image(figures[1], f"their residuals, of {name}")]
@@ -174,7 +159,7 @@ def left_out(subject: Subject, output: int) -> list[Markup]:
 def coverages(subject: Subject, output: int) -> list[Markup]:
     """Return observed against nominal coverage, and the histogram of PIT values."""
     figures = [html.new_figure(2.9), html.new_figure(2.9)]
-    plot_coverage(subject.loo, output=output, ax=figures[0].subplots())
+    plots.plot_coverage(subject.loo, output=output, ax=figures[0].subplots())
     bins = max(4, min(10, subject.counts[output] // 4))
     plot_pit(subject.loo, output=output, bins=bins, ax=figures[1].subplots())
     name = subject.outputs[output]
@@ -194,17 +179,19 @@ def slice_along(subject: Subject, i: int, number_of_points: int) -> Tensor:
 def _prediction(subject: Subject, output: int, i: int, ax: Any) -> None:
     X = slice_along(subject, i, _POINTS)
     x = X[:, i]
-    band(ax, x, *mean_and_ends(subject.model.marginals(X), output, 0.95), 0.95)
+    drawing.band(ax, x, *drawing.mean_and_ends(subject.model.marginals(X), output, 0.95), 0.95)
     curves = subject.physics_at(X, output)
     for k, (name, values) in enumerate(curves.items()):
-        ax.plot(x, values, color=GREY, ls=_STYLES[k % 3], lw=1.2, label=name)
+        ax.plot(x, values, color=drawing.GREY, ls=_STYLES[k % 3], lw=1.2, label=name)
     if len(subject.inputs) == 1:
-        ax.plot(subject.X[:, 0], column(subject.Y, output), color=RED, **DOTS)
-    ax.set_ylabel(labels(subject.model, "output", len(subject.outputs))[output])
+        ax.plot(
+            subject.X[:, 0], drawing.column(subject.Y, output), color=drawing.RED, **drawing.DOTS
+        )
+    ax.set_ylabel(drawing.labels(subject.model, "output", len(subject.outputs))[output])
     ax.set_xlim(float(x[0]), float(x[-1]))
     if len(curves) > 1:
         ax.legend(frameon=False)
-    tidy(ax)
+    drawing.tidy(ax)
 
 
 def _name_alike(axes: Any) -> None:

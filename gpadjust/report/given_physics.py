@@ -30,7 +30,7 @@ from gpadjust.physics import (
 )
 from gpadjust.physics.formula import names_in, parse, symbol
 from gpadjust.physics.function import array_physics
-from gpadjust.report.inputs import TableData, meant
+from gpadjust.report.inputs import TableData, check_different, check_names, meant
 from gpadjust.report.markup import plural
 
 _PATH = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
@@ -45,17 +45,11 @@ _SAME = 1e-6  # as a model's file asks it when it is loaded
 
 
 class GivenPhysics(NamedTuple):
-    """A physics, and the Python code by which a program gives it.
-
-    Attributes:
-        physics: The physics; several by their names.
-        code: An expression of the physics; empty if a model's file holds it, as formulas.
-        modules: The modules that the expression needs.
-    """
+    """A physics, or several by their names, and the Python code by which a program gives it."""
 
     physics: Any
-    code: str
-    modules: tuple[str, ...] = ()
+    code: str  # empty if a model's file holds it, as formulas
+    modules: tuple[str, ...] = ()  # that the code needs
 
 
 def imports_of(code: str, modules: Sequence[str], *names: str) -> str:
@@ -63,18 +57,15 @@ def imports_of(code: str, modules: Sequence[str], *names: str) -> str:
     made = [*(name for name in _MADE if f"{name}(" in code), *names]
     lines = ["from math import inf\n"] if re.search(r"\binf\b", code) else []
     lines += ["import torch", *(f"import {module}" for module in modules)]
-    return "\n".join([*lines, *([f"from gpadjust import {', '.join(made)}"] if made else [])])
+    lines += [f"from gpadjust import {', '.join(made)}"] if made else []
+    return "\n".join(lines)
 
 
 def unknown_of(text: str) -> tuple[str, Unknown]:
     """Return the name and the prior of an unknown parameter.
 
-    Args:
-        text: ``"E [Pa]=210e9 +- 20 %"``, a standard deviation, of a percentage one that keeps the
-            sign; or ``"c=0.1 */ 2"``, a factor; or ``"e=0.1 .. 0.3"``, bounds.
-
-    Raises:
-        ValueError: If it is none of these.
+    It is ``"E [Pa]=210e9 +- 20 %"``, a standard deviation, of a percentage one that keeps the sign;
+    or ``"c=0.1 */ 2"``, a factor; or ``"e=0.1 .. 0.3"``, bounds.
     """
     match = _PRIOR.fullmatch(text)
     try:
@@ -82,19 +73,17 @@ def unknown_of(text: str) -> tuple[str, Unknown]:
             raise ValueError("it has another form")
         name, unit, guess, how, spread, is_share = match.groups()
         first, second = float(guess), float(spread)
-        options: dict[str, Any] = {"unit": unit or ""}
+        options: dict[str, Any] = {"sd": second}
         if is_share and how in ("*/", ".."):
             raise ValueError("a percentage goes with +-")
-        if how == "..":
-            first, options["bounds"] = 0.5 * (first + second), (first, second)
+        if is_share:
+            bounds = (0.0, math.inf) if first > 0 else (-math.inf, 0.0)
+            options = {"sd": 0.01 * second * abs(first), "bounds": bounds}
         elif how == "*/":
-            options["factor"] = second
-        elif is_share:
-            options["sd"] = 0.01 * second * abs(first)
-            options["bounds"] = (0.0, math.inf) if first > 0 else (-math.inf, 0.0)
-        else:
-            options["sd"] = second
-        return name, Unknown(first, **options)
+            options = {"factor": second}
+        elif how == "..":
+            first, options = 0.5 * (first + second), {"bounds": (first, second)}
+        return name, Unknown(first, unit=unit or "", **options)
     except ValueError as error:
         raise ValueError(
             "Expected --unknown such as 'E [Pa]=210e9 +- 20 %', 'c=0.1 */ 2' (a factor), or "
@@ -105,17 +94,15 @@ def unknown_of(text: str) -> tuple[str, Unknown]:
 def unknowns_of(texts: Sequence[str]) -> dict[str, Unknown]:
     """Return the unknown parameters of a command line by their names."""
     pairs = [unknown_of(text) for text in texts]
-    names = [name for name, _ in pairs]
-    if again := [name for name in names if names.count(name) > 1]:
-        raise ValueError(f"Expected different --unknown, found {again[0]!r} more than once.")
+    check_different([name for name, _ in pairs], "--unknown")
     return dict(pairs)
 
 
-def hidden_of(texts: Sequence[str]) -> dict[str, tuple[str, tuple[float, float]]]:
-    """Return the units of hidden states, and mean and sd at the beginning, by their names."""
-    hidden = {}
+def hidden_of(texts: Sequence[str]) -> dict[str, Unknown]:
+    """Return hidden states by their names: unit, and mean and sd at the beginning."""
+    hidden: dict[str, Unknown] = {}
     for text in texts:
-        name, prior = "", None
+        prior: Unknown | None = None
         with suppress(ValueError):
             name, prior = unknown_of(text)
         if prior is None or prior.sd is None:
@@ -123,22 +110,12 @@ def hidden_of(texts: Sequence[str]) -> dict[str, tuple[str, tuple[float, float]]
                 "Expected --hidden with what is known of its beginning, mean and standard "
                 f"deviation, such as 'rate [rad/s]=0 +- 2', found {text!r}."
             )
-        hidden[name] = (prior.unit, (prior.guess, prior.sd))
+        hidden[name] = prior
     return hidden
 
 
-def is_path(text: str) -> bool:
-    """Return whether a physics is given as ``module:function``, and not as a formula."""
-    return ":" in text
-
-
 def columns_of(formulas: Sequence[str], names: Sequence[str], unknowns: Sequence[str]) -> list[str]:
-    """Return the columns among some of a table that formulas name, in the order of the table.
-
-    Raises:
-        ValueError: If one is no formula, they name no column, or what is none and no unknown
-            parameter; or if two columns have the same name but for their units.
-    """
+    """Return the columns among some of a table that formulas name, in the order of the table."""
     named = {name for formula in formulas for name in names_in(formula)}
     known = [symbol(name) for name in names]
     columns = [name for name in names if symbol(name) in named]
@@ -160,39 +137,31 @@ def columns_of(formulas: Sequence[str], names: Sequence[str], unknowns: Sequence
 def given_physics(
     texts: Sequence[str], data: TableData, unknowns: Mapping[str, Unknown]
 ) -> GivenPhysics:
-    """Import functions ``"module:name"``, read formulas, and evaluate them at the data.
-
-    Raises:
-        ValueError: If one has another form, is not there, raises an error or is given twice; if no
-            formula has an unknown parameter; or if a physics fails in some row, which the error
-            names, or returns other values when it is called again.
-    """
-    if again := [text for text in texts if texts.count(text) > 1]:
-        raise ValueError(
-            f"Expected different --physics, found {again[0]} more than once; give it once."
-        )
-    formulas = [text for text in texts if not is_path(text)]
+    """Import functions ``"module:name"``, read formulas, and evaluate them at the data."""
+    check_different(texts, "--physics")
+    formulas = [text for text in texts if ":" not in text]
     parts, code = dict[str, Physics](), dict[str, str]()
     for text in texts:
         try:
-            physics, expression = (_function if is_path(text) else _formula)(text, data, unknowns)
+            make = _function if ":" in text else _formula
+            physics, own = make(text, data, unknowns)
             _check(physics, data)
         except ValueError as error:
             raise ValueError(f"--physics {text}: {error}") from error
         name = text.rpartition(":")[2].rpartition(".")[2]
-        if not is_path(text):  # a name that figures have room for
+        if ":" not in text:  # a name that figures have room for
             name = f"formula {formulas.index(text) + 1}" if len(formulas) > 1 else "formula"
         name = text if name in parts else name
-        parts[name], code[name] = physics, expression
+        parts[name], code[name] = physics, own
     used = {name for physics in parts.values() for name in physics.unknowns}
     if absent := [name for name in unknowns if name not in used]:
         way = "" if formulas else " A function has its own: FunctionPhysics(f, unknowns=...)."
         raise ValueError(f"--unknown names {absent[0]!r}, which is in no formula.{way}")
-    modules = dict.fromkeys(text.partition(":")[0] for text in texts if is_path(text))
-    several = len(parts) > 1
-    whole = ", ".join(f"{name!r}: {own}" for name, own in code.items())
-    expression = f"{{{whole}}}" if several else expression
-    return GivenPhysics(parts if several else physics, expression if modules else "", (*modules,))
+    modules = tuple(dict.fromkeys(text.partition(":")[0] for text in texts if ":" in text))
+    if len(parts) == 1:
+        return GivenPhysics(physics, own if modules else "", modules)
+    several = ", ".join(f"{name!r}: {own}" for name, own in code.items())
+    return GivenPhysics(parts, f"{{{several}}}" if modules else "", modules)
 
 
 def _formula(text: str, data: TableData, unknowns: Mapping[str, Unknown]) -> tuple[Physics, str]:
@@ -202,29 +171,31 @@ def _formula(text: str, data: TableData, unknowns: Mapping[str, Unknown]) -> tup
         physics = FormulaPhysics(text, data.X.columns, unknowns=own)
     except ValueError as error:
         raise ValueError(f"{error} {_HOW}") from error
-    given = f", unknowns={own!r}" if own else ""
-    return physics, f"FormulaPhysics({text!r}, {[*physics.columns]!r}{given})"
+    more = f", unknowns={own!r}" if own else ""
+    return physics, f"FormulaPhysics({text!r}, {[*physics.columns]!r}{more})"
 
 
-def _function(path: str, data: TableData, _: Mapping[str, Unknown]) -> tuple[Physics, str]:
+def _function(path: str, data: TableData, _: object = None) -> tuple[Physics, str]:
     """Return the physics that a path names, and the code that makes it of what the path names."""
-    thing = imported(path)
+    thing, code = imported(path), path.replace(":", ".")
     try:
         physics = array_physics(thing, data.X.to_numpy())
     except (TypeError, PhysicsError) as error:
         row = f" The first row is line {data.lines[0]} of the file."
         raise ValueError(f"{error}{row * isinstance(error, PhysicsError)}") from error
-    code = path.replace(":", ".")
     is_numpy = isinstance(physics, BlackBoxPhysics) and physics is not thing
     return physics, f"BlackBoxPhysics({code})" if is_numpy else code
 
 
 def motion(
-    texts: Sequence[str], states: Sequence[str], actions: Sequence[str],
-    unknowns: Mapping[str, Unknown], step: float,
-) -> GivenPhysics:  # fmt: skip
+    texts: Sequence[str],
+    states: Sequence[str],
+    actions: Sequence[str],
+    unknowns: Mapping[str, Unknown],
+    step: float,
+) -> GivenPhysics:
     """Return the physics ``"module:name"`` of a machine, or of equations, one for each state."""
-    if paths := [text for text in texts if is_path(text)]:
+    if paths := [text for text in texts if ":" in text]:
         path, module = paths[0], paths[0].partition(":")[0]
         if len(texts) > 1 or unknowns:
             raise ValueError(
@@ -252,14 +223,12 @@ def motion(
             f"Expected an equation for each of {', '.join(states)}, all of time derivatives or all "
             f"of next values, found those of {', '.join(sides)}."
         )
-    formula = ", ".join(sides[name] for name in states)
-    if absent := [name for name in unknowns if name not in names_in(formula)]:
-        raise ValueError(f"--unknown names {absent[0]!r}, which is in no equation.")
-    columns = [*states, *actions]
+    formula, columns = ", ".join(sides[name] for name in states), [*states, *actions]
+    check_names(unknowns, "--unknown", names_in(formula), "the names in equations")
     physics: Physics = FormulaPhysics(formula, columns, unknowns=unknowns)
     priors = "".join(f"        {name!r}: {own!r},\n" for name, own in unknowns.items())
-    own = f"{formula!r},\n    {columns},\n    unknowns={{\n{priors}    }},\n"
-    code = f"FormulaPhysics(\n    {own})"
+    rest = f"{formula!r},\n    {columns},\n    unknowns={{\n{priors}    }},\n"
+    code = f"FormulaPhysics(\n    {rest})"
     if primes == {"'"}:
         physics = ODEPhysics(physics, step, len(states))
         code = f"ODEPhysics({code}, step={step!r}, state_dim={len(states)})"
@@ -283,22 +252,17 @@ def imported(path: str) -> Any:
         last = traceback.extract_tb(error.__traceback__)[-1]
         place = f" ({Path(last.filename).name}, line {last.lineno})" * ("<" not in last.filename)
         files = [file.stem for file in Path().glob("*.py")]
-        near = (
-            ""
-            if module in files
-            else f"; Python looks in this folder and those of PYTHONPATH.{meant(module, files)}"
-        )
+        where = f"; Python looks in this folder and those of PYTHONPATH.{meant(module, files)}"
         raise ValueError(
-            f"{module} cannot be imported: {type(error).__name__}: {error}{place}{near}"
+            f"{module} cannot be imported: {type(error).__name__}: {error}{place}"
+            f"{where * (module not in files)}"
         ) from error
     try:
         return attrgetter(name)(found)
     except AttributeError as error:
-        own = [
-            key
-            for key, value in vars(found).items()
-            if isinstance(value, Physics) or getattr(value, "__module__", None) == module
-        ]
+        values = vars(found).items()
+        own = [key for key, value in values if getattr(value, "__module__", None) == module]
+        own += [key for key, value in values if isinstance(value, Physics)]
         has = ", ".join(own) or "no functions"
         raise ValueError(f"{module} has no {name!r}; it has {has}.{meant(name, own)}") from error
 
@@ -315,13 +279,13 @@ def _check(physics: Physics, data: TableData) -> None:
             f"{', '.join(data.Y.columns)}, found {Y.shape[-1]}."
             f"{hint * isinstance(physics, FormulaPhysics)}"
         )
-    same = torch.isclose(again, Y, rtol=_SAME, atol=_SAME * float(Y.abs().max()))
+    is_same = torch.isclose(again, Y, rtol=_SAME, atol=_SAME * float(Y.abs().max()))
     small = f"values between {-LARGEST:.0e} and {LARGEST:.0e}"
     exclude = "Correct the physics there, or exclude such inputs:"
     settle = "Take random numbers out of it, or let it set their seed itself:"
     for expected, wrong, way_out in (
         (small, Y.abs() > LARGEST, exclude),
-        ("the same values whenever it is called", ~same, settle),
+        ("the same values whenever it is called", ~is_same, settle),
     ):
         if rows := wrong.any(-1).nonzero().flatten().tolist():
             found = f"found others in {len(rows)} of {plural(n, 'row')}"

@@ -42,35 +42,24 @@ class Columns:
 
 
 class TableData(NamedTuple):
-    """The inputs and outputs of a file.
-
-    Attributes:
-        X: The inputs, ``n x d``.
-        Y: The outputs, ``n x m``, NaN where there is none.
-        lines: The line of each row in the file.
-        remarks: Rows left out and outputs missing, in sentences.
-        levels: The levels of the categories among the inputs, by name: numbers, or texts, whose
-            numbers from 0 the inputs have.
-    """
+    """Inputs and outputs of a file, ``n x d`` and ``n x m``, NaN where an output is missing."""
 
     X: Columns
     Y: Columns
-    lines: tuple[int, ...]
+    lines: list[int]  # of the rows in the file
     remarks: tuple[str, ...]
-    levels: dict[str, tuple[Any, ...]]
+    levels: dict[str, tuple[Any, ...]]  # of categories; of texts, the inputs are their numbers
 
 
-def open_table(
-    file: str, delimiter: str = ",", decimal: str = ".", sheet: str | None = None
-) -> TableColumns:
+def open_table(file: str, delimiter: str, decimal: str, sheet: str | None = None) -> TableColumns:
     """Open a CSV file or a workbook; the arguments and errors are those of ``TableColumns``."""
     path = Path(file)
-    if path.exists() and not path.is_file():
-        what = "a folder" if path.is_dir() else "a device or a pipe"
-        raise OSError(f"{file!r} is {what}, expected a CSV file.")
     if not path.exists():
         near = (other.name for other in path.absolute().parent.glob("*") if other.is_file())
         raise FileNotFoundError(f"There is no file {file!r}.{meant(path.name, near)}")
+    if not path.is_file():
+        what = "a folder" if path.is_dir() else "a device or a pipe"
+        raise OSError(f"{file!r} is {what}, expected a CSV file.")
     option = "--{} {!r}"
     return TableColumns(file, delimiter, decimal=decimal, sheet=sheet, hint=_HINT, option=option)
 
@@ -89,49 +78,34 @@ def read_table(
     categories: Sequence[str],
     arguments: Namespace,
 ) -> TableData:
-    """Read columns of a table; an output may be missing in some rows.
+    """Read columns of a table, in the order in which the physics takes and returns them.
 
-    Args:
-        table: The table.
-        inputs: The columns of the inputs, in the order in which the physics takes them.
-        outputs: Those of the outputs, in the order in which the physics returns them.
-        categories: The inputs that are categories; others that are texts are, too.
-        arguments: A command line: ``units`` of columns that have none in their names, and the most
-            ``rows`` to take, drawn by ``seed`` if there are more.
-
-    Raises:
-        ValueError: If a column is missing or asked for twice, a field is no number, an input is
-            missing, or there are too few rows.
+    Inputs that are texts are categories, too. A command line has units and the number of rows.
     """
     d, asked = len(inputs), (*inputs, *outputs)
     columns = [column_of(table, name) for name in asked]
-    if again := sorted({name for name in columns if columns.count(name) > 1}):
-        raise ValueError(
-            f"Expected different columns as inputs and outputs, got {again[0]!r} more than once."
-        )
-    if unknown := [name for name in categories if name not in inputs]:
-        raise ValueError(
-            f"The category {unknown[0]!r} is none of --inputs {','.join(inputs)}; name it there."
-        )
+    check_different(columns, "columns as inputs and outputs")
+    known = f"--inputs {','.join(inputs)}; name it there"
+    check_names(categories, "--categories or --batches", inputs, known)
     units = {} if arguments.units is None else pairs(arguments.units, "--units")
     check_names(units, "--units", [*asked, *columns], ", ".join(map(repr, asked)))
-    names, values, levels, remarks = list[str](), [], {}, []
-    for i, (name, column) in enumerate(zip(asked, columns, strict=True)):
+    names, values, remarks = list[str](), list[Tensor](), list[str]()
+    levels: dict[str, tuple[Any, ...]] = {}
+    for name, column in zip(asked, columns, strict=True):
         unit = units.get(name, units.get(column))
         names.append(column if unit is None else f"{bare(column)} [{unit}]")
-        if i < d and (name in categories or _are_names(table, column)):
-            numbers, levels[names[i]] = table.categories(column)
+        if len(values) < d and (name in categories or _are_names(table, column)):
+            numbers, levels[names[-1]] = table.categories(column)
         else:
-            numbers = table.numbers(column, may_miss=i >= d)
+            numbers = table.numbers(column, may_miss=len(values) >= d)
         values.append(numbers)
     everything, lines = torch.stack(values, -1), torch.tensor(table.lines)
     has_none = everything[:, d:].isnan().all(-1)
     rows = (~has_none).nonzero().flatten()
     if left := [str(line) for line in lines[has_none].tolist()]:
         shown = [*left[:10], f"{len(left) - 10} more"] if len(left) > 10 else left
-        remarks.append(
-            f"Left out, as they have no output: line{'s' * (len(left) > 1)} {listed(shown)}."
-        )
+        plural_s = "s" * (len(left) > 1)
+        remarks.append(f"Left out, as they have no output: line{plural_s} {listed(shown)}.")
     if (n := len(rows)) > arguments.rows:
         order = torch.randperm(n, generator=torch.Generator().manual_seed(arguments.seed))
         rows = rows[order[: arguments.rows].sort().values]
@@ -153,10 +127,10 @@ def read_table(
         )
     for name, own in levels.items():
         if isinstance(own[0], str):
-            told = listed(f"{k} is {level}" for k, level in enumerate(own))
-            remarks.append(f"The physics reads {bare(name)} as a number: {told}.")
+            numbered = listed(f"{k} is {level}" for k, level in enumerate(own))
+            remarks.append(f"The physics reads {bare(name)} as a number: {numbered}.")
     X_and_Y = Columns(tuple(names[:d]), X), Columns(tuple(names[d:]), Y)
-    return TableData(*X_and_Y, tuple(lines[rows].tolist()), tuple(remarks), levels)
+    return TableData(*X_and_Y, lines[rows].tolist(), tuple(remarks), levels)
 
 
 def _are_names(table: TableColumns, name: str) -> bool:
@@ -171,38 +145,37 @@ def _are_names(table: TableColumns, name: str) -> bool:
 def log_columns(
     tables: Sequence[TableColumns], hidden: Mapping[str, str], arguments: Namespace
 ) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the columns that a command line names, which all tables of a log have, and units.
+    """Return the columns of a log, as options of ``Records.read_csv``, and their units by name.
 
-    Columns are options of ``Records.read_csv``, those of ``hidden`` states, which have units, None;
-    units are by the names of states and actions and ``"time"``.
+    ``hidden`` states have units, and no column: None.
     """
-    found = {}
+    units = {**hidden}
 
     def numbers(name: str, text: str, may_miss: bool = False) -> str:
         column = column_of(tables[0], text)
         for table in tables:
             table.numbers(column, may_miss=may_miss)
-        found[name] = name_and_unit(column)[1]
+        units[name] = name_and_unit(column)[1]
         return column
 
-    given = pairs(arguments.states, "--states", short=True)
-    check_names(hidden, "--hidden", given, "--states")
+    named = pairs(arguments.states, "--states", short=True)
+    check_names(hidden, "--hidden", named, "--states")
     has_times = math.isnan(number_of(arguments.time))
     time = numbers("time", arguments.time) if has_times else float(arguments.time)
     if not arguments.actions and not has_times:
         raise ValueError("Expected --actions, as there is no column of times to stand for them.")
-    states = dict[str, str | None](dict.fromkeys(given))
-    for name in (name for name in given if name not in hidden):
+    states = dict[str, str | None](dict.fromkeys(named))
+    for name in (name for name in named if name not in hidden):
         try:
-            states[name] = numbers(name, given[name], may_miss=True)
+            states[name] = numbers(name, named[name], may_miss=True)
         except ValueError as error:
             way = f" A state that was not measured: --hidden '{name}=0 +- 1'."
             raise ValueError(f"{error}{way * ('expected a column' in str(error))}") from error
     acting = pairs(arguments.actions or f"time={arguments.time}", "--actions", short=True)
     actions = {name: numbers(name, text) for name, text in acting.items()}
     segment = None if arguments.segment is None else column_of(tables[0], arguments.segment)
-    units = {name: unit for name, unit in {**hidden, **found}.items() if unit}
-    return {"states": states, "actions": actions, "time": time, "segment": segment}, units
+    columns = {"states": states, "actions": actions, "time": time, "segment": segment}
+    return columns, {name: unit for name, unit in units.items() if unit}
 
 
 def mark_of(text: str) -> str:
@@ -219,17 +192,14 @@ def digest_of(file: str) -> str:
     return f"{Path(file).name} (SHA-256 {digest[:12]}...)"
 
 
-def names_of(text: str, option: str) -> list[str]:
-    """Return names with commas between them, quoted as in a CSV file where they have commas.
-
-    Raises:
-        ValueError: If there is none, one is empty, or they are of several lines.
-    """
+def names_of(text: str | None, option: str) -> list[str]:
+    """Return names with commas between them, quoted as in a CSV file where they have commas."""
+    if text is None:
+        return []
     try:
-        (fields,) = csv.reader([text], skipinitialspace=True)
+        names = [field.strip() for field in next(csv.reader([text], skipinitialspace=True))]
     except csv.Error as error:
         raise ValueError(f"Expected names in one line, found {text!r}: {error}.") from error
-    names = [field.strip() for field in fields]
     if not names or "" in names:
         raise ValueError(
             f"Expected names with commas between them, such as a,b, found {option} {text!r}."
@@ -252,10 +222,16 @@ def pairs(text: str, option: str, *, short: bool = False) -> dict[str, str]:
     return values
 
 
-def check_names(names: Iterable[str], option: str, known: Iterable[str], all_of: str) -> None:
-    """Raise a ValueError if an option names what is not known."""
+def check_names(names: Iterable[str], option: str, known: Iterable[str], option_of: str) -> None:
+    """Raise a ValueError if an option names what another one does not."""
     if unknown := [name for name in names if name not in known]:
-        raise ValueError(f"{option} names {unknown[0]!r}, which is none of {all_of}.")
+        raise ValueError(f"{option} names {unknown[0]!r}, which is none of {option_of}.")
+
+
+def check_different(names: Sequence[str], what: str) -> None:
+    """Raise a ValueError if a name is there twice."""
+    if again := sorted(name for name in names if names.count(name) > 1):
+        raise ValueError(f"Expected different {what}, found {again[0]!r} more than once.")
 
 
 def number_of(text: str) -> float:
@@ -266,29 +242,29 @@ def number_of(text: str) -> float:
         return math.nan
 
 
-def variances_of(sds: Mapping[str, str], option: str, names: Sequence[str]) -> list[float]:
-    """Return the variance of each column, of standard deviations by name; without one, 0."""
-    variances = []
-    for name in names:
-        sd = number_of(sds.get(name, "0"))
-        if not 0 <= sd <= LARGEST:
-            raise ValueError(
-                f"Expected {option} as a standard deviation in the unit of {name!r}, such as 0.1, "
-                f"found {sds[name]!r}."
-            )
-        variances.append(sd**2)
-    return variances
-
-
 def noise_variances(text: str | None, outputs: Sequence[str]) -> list[float] | None:
     """Return the variances of outputs, of the standard deviations that a command line has."""
     if text is None or text == "relative":
         return None
     sds = pairs(text, "--noise") if "=" in text else dict.fromkeys(outputs, text)
-    check_names(sds, "--noise", outputs, "--outputs")
+    variances = variances_of(sds, "--noise", outputs, "--outputs")
     if lacking := [name for name in outputs if name not in sds]:
         raise ValueError(f"--noise lacks {lacking[0]!r}: give it for each output, or for none.")
-    return variances_of(sds, "--noise", outputs)
+    return variances
+
+
+def variances_of(
+    sds: Mapping[str, str], option: str, names: Sequence[str], option_of: str
+) -> list[float]:
+    """Return the variance of each column, of standard deviations by name; without one, 0."""
+    check_names(sds, option, names, option_of)
+    for name, text in sds.items():
+        if not 0 <= number_of(text) <= LARGEST:
+            raise ValueError(
+                f"Expected {option} as a standard deviation in the unit of {name!r}, such as 0.1, "
+                f"found {text!r}."
+            )
+    return [number_of(sds.get(name, "0")) ** 2 for name in names]
 
 
 def meant(name: str, known: Iterable[str]) -> str:

@@ -33,13 +33,12 @@ def report(
 ) -> Path:
     """Write a page that shows what a model or a comparison says, for those who decide.
 
-    The page begins with the root mean square errors of your formula, of the adjustment and of the
-    data alone, of left-out observations. It says in words whether the physics helps, and how sure
-    that is; what is recommended and why; where the physics is wrong (rho and delta along each
-    input), and where predictions rest on it; how well left-out observations are predicted, and
-    whether intervals hold what they promise; parameters, advice, data and settings; and how to load
-    the model, which is saved beside it (``report.pt`` beside ``report.html``). It is one file,
-    without scripts and links.
+    The page begins with the left-out errors of your formula, of the adjustment and of the data
+    alone, and says in words whether the physics helps. Then it has what is recommended and why;
+    where the physics is wrong (rho and delta along each input), and where predictions rest on it;
+    left-out observations, and whether intervals hold what they promise; parameters, advice, data
+    and settings; and how to load the model, which is saved beside it (``report.pt`` beside
+    ``report.html``). It is one file, without scripts and links.
 
     The page of a log (:func:`~gpadjust.records.identify`) has a free run along what was held out,
     beside the physics with its guesses and a state that stays; parameters with their intervals,
@@ -53,8 +52,7 @@ def report(
         model: A fitted model, a :class:`~gpadjust.StackedGP`, or a :class:`~gpadjust.Comparison`,
             of which what it recommends is saved; or an :class:`~gpadjust.records.Identification`.
         file: Where to write the page, ``*.html``. Files that are there, this and the model's, are
-            replaced; where the model cannot be saved, the page says why, and an old file of it is
-            removed.
+            replaced; where the model cannot be saved, the page says why.
         title: The title. Default: the names of the outputs.
         rows: The name of each observation, ``n``, such as its line in your file. Default: by its
             number, from 0.
@@ -94,17 +92,7 @@ def report(
 
 
 def checked_path(file: str | Path, *data: str | Path, model: bool = True) -> Path:
-    """Return the absolute path of a page that can be written, the model's beside it.
-
-    Args:
-        file: The page.
-        data: Files that neither may replace.
-        model: Whether a model is written, too.
-
-    Raises:
-        ValueError: If it is not ``*.html``, or the page or the model would replace data.
-        OSError: If the folder is not there, or cannot be written to.
-    """
+    """Return the absolute path of a page that can be written, and a model, and are not the data."""
     path = Path(file)
     if path.suffix.lower() not in (".html", ".htm"):
         raise ValueError(f"Expected a page such as 'report.html' to write to, got {str(file)!r}.")
@@ -128,11 +116,7 @@ def checked_path(file: str | Path, *data: str | Path, model: bool = True) -> Pat
 def write(
     subject: Subject | Identification, path: Path, title: str | None, origin: Origin, progress: bool
 ) -> str:
-    """Write the page, and a model beside it; nothing if either fails.
-
-    Returns:
-        The errors and the answer of each output, for the terminal.
-    """
+    """Write the page, and a model beside it, or nothing; return the headline for the terminal."""
     model_path = path.with_suffix(".pt")
     with TemporaryDirectory(prefix=".report-", dir=path.parent) as folder:
         part, model_part = Path(folder, path.name), Path(folder, model_path.name)

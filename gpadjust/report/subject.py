@@ -21,63 +21,38 @@ from gpadjust.validation.plots.predictions import physics_at
 
 @dataclass(frozen=True)
 class Origin:
-    """Origin of a page, as far as its subject does not know it.
-
-    Attributes:
-        settings: Names and values of settings.
-        remarks: Sentences on the data.
-        notes: Sentences on the fit, such as warnings.
-        how: Code or a command that compares a model with others.
-        physics: A Python expression of the physics for whoever loads the model; empty if the
-            model's file holds it, or its name.
-        modules: The modules that this expression needs.
-        units: Units by the names of states and actions of a log and ``"time"``.
-        program: A program that identifies the machine of a log in Python, and goes on.
-    """
+    """Origin of a page, as far as its subject does not know it."""
 
     settings: Mapping[str, str] = field(default_factory=dict)
-    remarks: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-    how: str = "report(compare(train_X, train_Y, physics))"
-    physics: str = ""
-    modules: tuple[str, ...] = ()
-    units: Mapping[str, str] = field(default_factory=dict)
-    program: str = ""
+    remarks: tuple[str, ...] = ()  # on the data
+    notes: tuple[str, ...] = ()  # on the fit, such as warnings
+    how: str = "report(compare(train_X, train_Y, physics))"  # compares a model with others
+    physics: str = ""  # Python code of the physics, unless the model's file holds it or its name
+    modules: tuple[str, ...] = ()  # that this code needs
+    units: Mapping[str, str] = field(default_factory=dict)  # of a log's states, actions and "time"
+    program: str = ""  # that identifies the machine of a log in Python, and goes on
 
 
 class Adjusted(NamedTuple):
-    """A model of one structure, whose rho, delta and trust are shown for one of its outputs.
-
-    Its weight in a mixture is 1 if there is no mixture.
-    """
+    """A model of one structure, whose rho, delta and trust are shown for an output."""
 
     structure: str
     model: GP
     output: int
-    weight: float
+    weight: float  # in a mixture; 1 if there is none
 
 
 @dataclass(frozen=True)
 class Subject:
-    """The subject of a report.
-
-    Attributes:
-        model: The model that predicts, or a mixture of several.
-        comparison: The comparison that recommends it, if there is one.
-        X: Inputs of the observations, ``n x d``.
-        Y: Observations, ``n x m``, NaN where there is none.
-        loo: Predictions of left-out observations.
-        rows: The name of each row, ``n``.
-        adjusted: For each output what is shown of rho and delta; None if no physics is adjusted.
-    """
+    """The subject of a report: a model, a mixture of several, or what a comparison recommends."""
 
     model: GP | StackedGP
     comparison: Comparison | None
-    X: Tensor
-    Y: Tensor
+    X: Tensor  # n x d
+    Y: Tensor  # n x m, NaN where there is no observation
     loo: LeaveOneOut
-    rows: list[str]
-    adjusted: list[Adjusted | None]
+    rows: list[str]  # their names
+    adjusted: list[Adjusted | None]  # of each output; None if no physics is adjusted
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -157,11 +132,7 @@ class Subject:
 
 
 def subject_of(thing: object, rows: Sequence[object] | None = None) -> Subject:
-    """Return the subject that a model, a mixture of models, or a comparison is.
-
-    Args:
-        thing: One of these.
-        rows: Names of the rows of its data. Default: by their numbers, from 0.
+    """Return the subject that a model, a mixture or a comparison is; rows have numbers or names.
 
     Raises:
         TypeError: If it is none of these.

@@ -19,6 +19,7 @@ def page(
     subject: Subject, title: str | None, saved: Saved | str, origin: Origin, progress: bool = False
 ) -> Page:
     """Return the page; ``saved`` is the model's file, or the reason why there is none."""
+    told = (*(() if subject.comparison is None else subject.comparison.advice), *origin.notes)
     made_by = {
         "Recommendation": lambda: recommendation(subject),
         "Structures": lambda: tables.structures(subject),
@@ -28,7 +29,7 @@ def page(
         "Do the intervals hold?": lambda: tables.coverage(subject),
         "Parameters of the physics": lambda: tables.parameters(subject),
         "What was learnt": lambda: tables.summary(subject),
-        "Advice": lambda: advice(subject, origin),
+        "Advice": lambda: html.bullets(text.replace("+-", "±") for text in told),
         "Data": lambda: tables.data(subject, origin.remarks),
         "Load the model, predict": lambda: tables.loading(subject, saved, origin),
     }
@@ -149,9 +150,3 @@ def recommendation(subject: Subject) -> Markup:
     why = ". It keeps the doubt between them in its intervals."
     first = tag("p", "Recommended: ", mixture, why)
     return html.join([first, tag("p", f"Its weights are {'; '.join(weights)}.")])
-
-
-def advice(subject: Subject, origin: Origin) -> Markup:
-    """Return further sentences of the comparison, and warnings of the fit."""
-    sentences = [] if subject.comparison is None else subject.comparison.advice
-    return html.bullets(text.replace("+-", "±") for text in (*sentences, *origin.notes))

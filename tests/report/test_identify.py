@@ -134,7 +134,7 @@ BAD = {
     ("--hidden", "rate"): r"such as 'rate \[rad/s\]=0 \+- 2', found 'rate'",
     ("--hidden", "rate=0..1"): "mean and standard deviation",
     ("--angles", "torque"): "--angles names 'torque'",
-    ("--unknown", "z=1+-1"): "--unknown names 'z', which is in no equation",
+    ("--unknown", "z=1+-1"): "--unknown names 'z', which is none of the names in equations",
     ("--physics", "rate' = rate"): "one equation for each state",
     ("--physics", "swing:physics"): "Expected swing:physics alone",
     ("--physics", "x' = rate"): "equation for each of angle, rate.* found those of angle, rate, x",
