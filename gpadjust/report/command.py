@@ -88,10 +88,12 @@ def _say(*lines: str) -> None:
 def _of_table(arguments: Namespace) -> Job:
     """Read the table and the physics of ``gpadjust report``."""
     outputs = read.names_of(arguments.outputs, "--outputs")
-    variances = read.noise_variances(arguments.noise, outputs)
+    variances, text = None, arguments.noise
+    if text not in (None, "relative"):
+        sds = read.pairs(text, "--noise") if "=" in text else dict.fromkeys(outputs, text)
+        variances = read.variances_of(sds, "--noise", outputs, "--outputs", all_of=True)
     unknowns = physics_of.unknowns_of(arguments.unknown)
-    marks = (read.mark_of(arguments.delimiter), arguments.decimal, arguments.sheet)
-    table = read.open_table(arguments.data, *marks)
+    table = read.open_table(arguments.data, arguments)
     batches = read.names_of(arguments.batches, "--batches")
     groups = [*read.names_of(arguments.categories, "--categories"), *batches]
     inputs = read.names_of(arguments.inputs, "--inputs")
@@ -141,7 +143,7 @@ def _options(
         noise = HeavyTails(base=noise)
     if (text := arguments.input_noise) is not None:
         sds = read.pairs(text, "--input-noise")
-        variances = read.variances_of(sds, "--input-noise", inputs, "--inputs")
+        variances = read.variances_of(sds, "--input-noise", inputs, "--inputs", all_of=False)
         noise = NoisyInputs(data.X.values, variances, noise)
     if noise is not None:
         options["noise"] = noise
@@ -166,8 +168,8 @@ def _of_log(arguments: Namespace) -> Job:
     """Read the log and the equations of ``gpadjust identify``."""
     hidden = physics_of.hidden_of(arguments.hidden)
     unknowns = physics_of.unknowns_of(arguments.unknown)
-    marks = {"delimiter": read.mark_of(arguments.delimiter), "decimal": arguments.decimal}
-    tables = [read.open_table(file, **marks) for file in arguments.data]
+    way = " A state that was not measured: --hidden 'rate=0 +- 1'."
+    tables = [read.open_table(file, arguments, way) for file in arguments.data]
     log = listed(read.digest_of(file) for file in arguments.data)
     own_units = {name: prior.unit for name, prior in hidden.items()}
     columns, units = read.log_columns(tables, own_units, arguments)
@@ -179,6 +181,7 @@ def _of_log(arguments: Namespace) -> Job:
             f"Expected the angle {wrong[0]!r} in rad, found {units[wrong[0]]!r}; convert it, or do "
             "without --angles, which is for angles that go round."
         )
+    marks = {"delimiter": read.mark_of(arguments.delimiter), "decimal": arguments.decimal}
     reading = {**columns, **marks}
     whole = Records.read_csv(arguments.data, StateSpec(*names, angles=angles), **reading)
     step = arguments.step

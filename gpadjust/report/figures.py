@@ -156,11 +156,11 @@ def left_out(subject: Subject, output: int) -> list[Markup]:
 
 
 @drawn
-def coverages(subject: Subject, output: int) -> list[Markup]:
+def coverages(subject: Subject, output: int, count: int) -> list[Markup]:
     """Return observed against nominal coverage, and the histogram of PIT values."""
     figures = [html.new_figure(2.9), html.new_figure(2.9)]
     plots.plot_coverage(subject.loo, output=output, ax=figures[0].subplots())
-    bins = max(4, min(10, subject.counts[output] // 4))
+    bins = max(4, min(10, count // 4))
     plot_pit(subject.loo, output=output, bins=bins, ax=figures[1].subplots())
     name = subject.outputs[output]
     first = image(figures[0], f"observed against nominal coverage of {name}")
@@ -209,7 +209,8 @@ def _words(subject: Subject, output: int) -> list[str]:
     if shown is None:
         return [f"{_NONE} The figures show the prediction. {_BANDS}"]
     words = []
-    is_it = "with fitted parameters" if subject.is_fitted_physics else "as it is"
+    has_unknowns = any(physics.unknowns for physics in subject.physics.values())
+    is_it = "with fitted parameters" if has_unknowns else "as it is"
     for physics, values in subject.physics_at(subject.X, output).items():
         off = subject.judged[:, output] - values
         rms, mean = number(off.square().nanmean().sqrt()), number(off.nanmean())

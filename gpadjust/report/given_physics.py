@@ -33,7 +33,6 @@ from gpadjust.physics.function import array_physics
 from gpadjust.report.inputs import TableData, check_different, check_names, meant
 from gpadjust.report.markup import plural
 
-_PATH = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
 _PRIOR = re.compile(
     r"\s*([^=\[]+?)\s*(?:\[(.*)\])?\s*=\s*(.+?)\s*(\+/?-|±|\*/|\.\.)\s*(.+?)\s*(%?)\s*"
 )
@@ -119,10 +118,7 @@ def columns_of(formulas: Sequence[str], names: Sequence[str], unknowns: Sequence
     named = {name for formula in formulas for name in names_in(formula)}
     known = [symbol(name) for name in names]
     columns = [name for name in names if symbol(name) in named]
-    if again := [symbol(name) for name in columns if known.count(symbol(name)) > 1]:
-        raise ValueError(
-            f"Several columns are {again[0]!r} in a formula, which has no units; rename one."
-        )
+    check_different([*map(symbol, columns)], "columns in a formula, which has no units")
     absent = sorted(named - {*known, *unknowns})
     if absent or not columns:
         wrong = absent[0] if absent else "none of them"
@@ -238,33 +234,21 @@ def motion(
 def imported(path: str) -> Any:
     """Return the object that a path ``module:name`` names."""
     module, _, name = path.partition(":")
-    if not _PATH.fullmatch(path):
-        file = module.endswith(".py") or "/" in module or "\\" in module
-        hint = " Give the module without folder and .py, and run this in its folder." * file
-        raise ValueError(
-            f"expected module:function, such as pump:head for the function head of pump.py.{hint}"
-        )
+    files = [file.stem for file in Path().glob("*.py")]
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())
     try:
-        found = import_module(module)
+        return attrgetter(name)(import_module(module))
     except (Exception, SystemExit) as error:  # importing runs the user's code
         last = traceback.extract_tb(error.__traceback__)[-1]
-        place = f" ({Path(last.filename).name}, line {last.lineno})" * ("<" not in last.filename)
-        files = [file.stem for file in Path().glob("*.py")]
-        where = f"; Python looks in this folder and those of PYTHONPATH.{meant(module, files)}"
+        is_ours = "importlib" in last.filename or last.filename == __file__
+        place = "" if is_ours else f" ({Path(last.filename).name}, line {last.lineno})"
+        names = [*vars(sys.modules[module])] if module in sys.modules else []
+        near = meant(name, names) if module in files else meant(module, files)
         raise ValueError(
-            f"{module} cannot be imported: {type(error).__name__}: {error}{place}"
-            f"{where * (module not in files)}"
+            "expected module:function, such as pump:head for the function head of pump.py in this "
+            f"folder, or one of PYTHONPATH; found {type(error).__name__}: {error}{place}.{near}"
         ) from error
-    try:
-        return attrgetter(name)(found)
-    except AttributeError as error:
-        values = vars(found).items()
-        own = [key for key, value in values if getattr(value, "__module__", None) == module]
-        own += [key for key, value in values if isinstance(value, Physics)]
-        has = ", ".join(own) or "no functions"
-        raise ValueError(f"{module} has no {name!r}; it has {has}.{meant(name, own)}") from error
 
 
 @torch.no_grad()

@@ -7,6 +7,7 @@ import hashlib
 import math
 from argparse import Namespace
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -51,17 +52,23 @@ class TableData(NamedTuple):
     levels: dict[str, tuple[Any, ...]]  # of categories; of texts, the inputs are their numbers
 
 
-def open_table(file: str, delimiter: str, decimal: str, sheet: str | None = None) -> TableColumns:
-    """Open a CSV file or a workbook; the arguments and errors are those of ``TableColumns``."""
-    path = Path(file)
+def open_table(file: str, arguments: Namespace, hint: str = "") -> TableColumns:
+    """Open a CSV file or a workbook by the marks of a command line; errors have its options."""
+    path, sheet = Path(file), getattr(arguments, "sheet", None)
     if not path.exists():
         near = (other.name for other in path.absolute().parent.glob("*") if other.is_file())
         raise FileNotFoundError(f"There is no file {file!r}.{meant(path.name, near)}")
     if not path.is_file():
         what = "a folder" if path.is_dir() else "a device or a pipe"
         raise OSError(f"{file!r} is {what}, expected a CSV file.")
-    option = "--{} {!r}"
-    return TableColumns(file, delimiter, decimal=decimal, sheet=sheet, hint=_HINT, option=option)
+    return TableColumns(
+        file,
+        mark_of(arguments.delimiter),
+        decimal=arguments.decimal,
+        sheet=sheet,
+        hint=_HINT + hint,
+        option="--{} {!r}",
+    )
 
 
 def column_of(table: TableColumns, name: str) -> str:
@@ -164,13 +171,10 @@ def log_columns(
     time = numbers("time", arguments.time) if has_times else float(arguments.time)
     if not arguments.actions and not has_times:
         raise ValueError("Expected --actions, as there is no column of times to stand for them.")
-    states = dict[str, str | None](dict.fromkeys(named))
-    for name in (name for name in named if name not in hidden):
-        try:
-            states[name] = numbers(name, named[name], may_miss=True)
-        except ValueError as error:
-            way = f" A state that was not measured: --hidden '{name}=0 +- 1'."
-            raise ValueError(f"{error}{way * ('expected a column' in str(error))}") from error
+    states = {
+        name: None if name in hidden else numbers(name, text, may_miss=True)
+        for name, text in named.items()
+    }
     acting = pairs(arguments.actions or f"time={arguments.time}", "--actions", short=True)
     actions = {name: numbers(name, text) for name, text in acting.items()}
     segment = None if arguments.segment is None else column_of(tables[0], arguments.segment)
@@ -196,10 +200,9 @@ def names_of(text: str | None, option: str) -> list[str]:
     """Return names with commas between them, quoted as in a CSV file where they have commas."""
     if text is None:
         return []
-    try:
+    names = [""]
+    with suppress(csv.Error):  # of several lines
         names = [field.strip() for field in next(csv.reader([text], skipinitialspace=True))]
-    except csv.Error as error:
-        raise ValueError(f"Expected names in one line, found {text!r}: {error}.") from error
     if not names or "" in names:
         raise ValueError(
             f"Expected names with commas between them, such as a,b, found {option} {text!r}."
@@ -242,22 +245,13 @@ def number_of(text: str) -> float:
         return math.nan
 
 
-def noise_variances(text: str | None, outputs: Sequence[str]) -> list[float] | None:
-    """Return the variances of outputs, of the standard deviations that a command line has."""
-    if text is None or text == "relative":
-        return None
-    sds = pairs(text, "--noise") if "=" in text else dict.fromkeys(outputs, text)
-    variances = variances_of(sds, "--noise", outputs, "--outputs")
-    if lacking := [name for name in outputs if name not in sds]:
-        raise ValueError(f"--noise lacks {lacking[0]!r}: give it for each output, or for none.")
-    return variances
-
-
 def variances_of(
-    sds: Mapping[str, str], option: str, names: Sequence[str], option_of: str
+    sds: Mapping[str, str], option: str, names: Sequence[str], option_of: str, *, all_of: bool
 ) -> list[float]:
-    """Return the variance of each column, of standard deviations by name; without one, 0."""
+    """Return the variance of each column, of standard deviations by name; 0 unless of all."""
     check_names(sds, option, names, option_of)
+    if lacking := [name for name in names if all_of and name not in sds]:
+        raise ValueError(f"{option} lacks {lacking[0]!r}: give it for each of them, or for none.")
     for name, text in sds.items():
         if not 0 <= number_of(text) <= LARGEST:
             raise ValueError(

@@ -49,56 +49,51 @@ def page(found: Identification, title: str | None, origin: Origin) -> Page:
         f"{html.plural(steps, 'step')} of {step} are learnt from, "
         f"{html.plural(measured[..., 0].numel(), 'step')} held out."
     )
+    answers, rows = _judged(found, units, held_out)
+    head = ["by", "state", "error (root mean square)", "unit", "95 % intervals hold"]
+    free_run = [table("Errors of the free run", head, rows), tag("p", _FREE_RUN.format(held_out))]
+    parameters: list[Markup] = []
+    if found.parameters is not None:
+        caption = "Parameters by what was learnt from"
+        parameters = [html.parameter_table(caption, found.parameters), tag("p", _PARAMETERS)]
     sections = {
-        "Parameters of the physics": _parameters(found),
-        "Free run": _free_run(found, units, held_out),
+        "Parameters of the physics": html.join(parameters),
+        "Free run": html.join([*free_run, _runs(found, units)]),
         "Noise": _noise(found, units),
         "States": _states(found, units),
         "Advice": html.bullets([*found.advice, *origin.notes]),
         "Go on in Python": html.code(origin.program) if origin.program else Markup(),
     }
-    answers = verdicts(found, units, held_out)
-    errors = ("; ".join(f"{by}: {e}" for by, e in verdict.errors.items()) for verdict in answers)
-    lines = [f"{answer.name}: {numbers}." for answer, numbers in zip(answers, errors, strict=True)]
+    lines = []
+    for verdict in answers:
+        each = "; ".join(f"{by}: {error}" for by, error in verdict.errors.items())
+        lines.append(f"{verdict.name}: {each}.")
     title = title or f"Log of {html.listed(spec.states)}"
     question, settings = "Does the physics follow the log?", {**origin.settings}
     return Page(title, lead, question, answers, "\n".join(lines), sections, settings)
 
 
-def verdicts(found: Identification, units: Mapping[str, str], held_out: str) -> list[Verdict]:
-    """Return whether the physics errs less than its guesses and than a state that stays."""
+def _judged(
+    found: Identification, units: Mapping[str, str], held_out: str
+) -> tuple[list[Verdict], list[list[str]]]:
+    """Return whether the physics errs less than guesses and persistence, and rows of a table."""
+    answers, rows = [], []
     note = f"root mean square errors of a free run of {held_out} that was held out"
-    shown = []
-    for name, i in _measured(found).items():
-        rmse = {by: float(found.errors[by][i]) for by in _NAMES if by in found.errors}
-        identified, share = rmse[IDENTIFIED], float(found.coverage[i])
-        answer = "Yes" if share >= FEW else "In part"
-        if not all(identified < error for by, error in rmse.items() if by != IDENTIFIED):
-            answer = "No"
+    is_measured = (~found.windows.measured.isnan()).flatten(0, 1).any(0).tolist()
+    for i in (i for i in range(found.spec.state_dim) if is_measured[i]):
+        name, share = found.spec.states[i], percent(found.coverage[i])
         unit = units.get(name, "")
+        rmse = {by: float(found.errors[by][i]) for by in _NAMES if by in found.errors}
+        answer = "Yes" if found.coverage[i] >= FEW else "In part"
+        if not all(rmse[IDENTIFIED] < error for by, error in rmse.items() if by != IDENTIFIED):
+            answer = "No"
         errors = {_NAMES[by]: f"{number(error)} {unit}".strip() for by, error in rmse.items()}
-        reason = f"Intervals of 95 % hold {percent(share)} of {name} there."
-        shown.append(Verdict(name, errors, note, answer, [reason]))
-    return shown
-
-
-def _parameters(found: Identification) -> Markup:
-    if found.parameters is None:
-        return Markup()
-    posterior = html.parameter_table("Parameters by what was learnt from", found.parameters)
-    return html.join([posterior, tag("p", _PARAMETERS)])
-
-
-def _free_run(found: Identification, units: Mapping[str, str], held_out: str) -> Markup:
-    rows = []
-    for state, i in _measured(found).items():
-        for by in (by for by in _NAMES if by in found.errors):
-            share = percent(found.coverage[i]) if by == IDENTIFIED else "-"
-            unit = units.get(state, "") or "-"
-            rows.append([_NAMES[by], state, number(found.errors[by][i]), unit, share])
-    head = ["by", "state", "error (root mean square)", "unit", "95 % intervals hold"]
-    errors, words = table("Errors of the free run", head, rows), _FREE_RUN.format(held_out)
-    return html.join([errors, tag("p", words), _runs(found, units)])
+        reason = f"Intervals of 95 % hold {share} of {name} there."
+        answers.append(Verdict(name, errors, note, answer, [reason]))
+        for by, error in rmse.items():
+            held = share if by == IDENTIFIED else "-"
+            rows.append([_NAMES[by], name, number(error), unit or "-", held])
+    return answers, rows
 
 
 def _noise(found: Identification, units: Mapping[str, str]) -> Markup:
@@ -146,9 +141,3 @@ def _states(found: Identification, units: Mapping[str, str]) -> list[Markup]:
         what = "hidden" if state in found.hidden else "smoothed"
         images.append(html.image(figure, f"{state}, {what}, with bands of 95 %"))
     return images
-
-
-def _measured(found: Identification) -> dict[str, int]:
-    """Return the places of the states that were measured in what was held out."""
-    seen = (~found.windows.measured.isnan()).flatten(0, 1).any(0).tolist()
-    return {name: i for i, name in enumerate(found.spec.states) if seen[i]}

@@ -209,7 +209,7 @@ def plural(count: int, noun: str) -> str:
 
 def listed(items: Iterable[str]) -> str:
     """Return ``a, b and c``."""
-    *first, last = items
+    *first, last = [*items] or [""]
     return f"{', '.join(first)} and {last}" if first else last
 
 

@@ -53,6 +53,9 @@ class Subject:
     loo: LeaveOneOut
     rows: list[str]  # their names
     adjusted: list[Adjusted | None]  # of each output; None if no physics is adjusted
+    physics: dict[str, Physics]  # by their names
+    has_physics: bool  # AR1 knows its physics through samples alone
+    categories: Categories | None  # and batches, among the inputs
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -70,23 +73,11 @@ class Subject:
         outlier = self.loo.is_outlier
         return self.Y if outlier is None else self.Y.masked_fill(outlier, torch.nan)
 
-    @property
-    def counts(self) -> list[int]:
-        """The number of observations of each output, without outliers."""
-        counts: list[int] = (~self.judged.isnan()).sum(0).tolist()
-        return counts
-
     def outliers(self, output: int) -> list[str]:
         """Return the names of the rows whose observation of an output counts as an outlier."""
         outlier = self.loo.is_outlier
         places = [] if outlier is None else outlier[:, output].nonzero().flatten().tolist()
         return [self.rows[i] for i in places]
-
-    @property
-    def categories(self) -> Categories | None:
-        """The categories and batches among the inputs, if there are any."""
-        transform = self.model.data.transform
-        return transform if isinstance(transform, Categories) else None
 
     @property
     def names(self) -> dict[int, tuple[str, ...]]:
@@ -101,28 +92,6 @@ class Subject:
         levels = {} if self.categories is None else self.categories.levels
         is_level = torch.tensor([i in levels for i in range(len(self.inputs))])
         return self.X.median(0).values.where(is_level, self.X.quantile(0.5, dim=0))
-
-    @property
-    def models(self) -> Sequence[GP]:
-        """The models that were compared, or are mixed, or the one."""
-        if self.comparison is not None:
-            return [*self.comparison.models.values()]
-        return self.model.models if isinstance(self.model, StackedGP) else [self.model]
-
-    @property
-    def physics(self) -> dict[str, Physics]:
-        """The physics by their names."""
-        return {part.name: part for model in self.models for part in model.physics}
-
-    @property
-    def has_physics(self) -> bool:
-        """Whether there is a physics; AR1 knows it through samples alone."""
-        return bool(self.physics) or any(isinstance(model, AR1) for model in self.models)
-
-    @property
-    def is_fitted_physics(self) -> bool:
-        """Whether the physics has unknown parameters, which were fitted."""
-        return any(physics.unknowns for physics in self.physics.values())
 
     def physics_at(self, X: Tensor, output: int) -> dict[str, Tensor]:
         """Return an output of each physics that is shown, ``n``."""
@@ -156,8 +125,17 @@ def subject_of(thing: object, rows: Sequence[object] | None = None) -> Subject:
     names = [f"row {i}" for i in range(len(X))] if rows is None else [str(row) for row in rows]
     if len(names) != len(X):
         raise ValueError(f"Expected {len(X)} names of rows, one for each, found {len(names)}.")
+    if comparison is not None:
+        models: Sequence[GP] = [*comparison.models.values()]
+    else:
+        models = model.models if isinstance(model, StackedGP) else [model]
+    physics = {part.name: part for each in models for part in each.physics}
+    has_physics = bool(physics) or any(isinstance(each, AR1) for each in models)
     adjusted = [_adjusted(model, comparison, j) for j in range(Y.shape[-1])]
-    return Subject(model, comparison, X, Y, loo, names, adjusted)
+    transform = model.data.transform
+    categories = transform if isinstance(transform, Categories) else None
+    subject = (model, comparison, X, Y, loo, names, adjusted)
+    return Subject(*subject, physics, has_physics, categories)
 
 
 def _adjusted(model: GP | StackedGP, comparison: Comparison | None, output: int) -> Adjusted | None:

@@ -110,11 +110,12 @@ def predictions(subject: Subject) -> Markup:
     else:
         how += ", nor have its hyper-parameters: their samples are weighted again for each."
     parts = [tag("p", how)]
+    counts = (~subject.judged.isnan()).sum(0).tolist()
     for j, name in enumerate(subject.outputs):
         rmse = float(subject.loo.score().rmse[j])
         share = percent(rmse / spread_of(subject.Y[:, j]))
         words = (
-            f"{name}: {html.plural(subject.counts[j], 'observation')}, root mean square error "
+            f"{name}: {html.plural(counts[j], 'observation')}, root mean square error "
             f"{html.with_unit(number(rmse), name)}, {share} of the standard deviation of the "
             "observations."
         )
@@ -149,14 +150,15 @@ def coverage(subject: Subject) -> Markup:
     """Return the coverage of the intervals of left-out observations."""
     rows, images = [], []
     shares = {level: subject.loo.score(level).coverage for level in _LEVELS}
-    for j, (name, n) in enumerate(zip(subject.outputs, subject.counts, strict=True)):
+    counts = (~subject.judged.isnan()).sum(0).tolist()
+    for j, (name, n) in enumerate(zip(subject.outputs, counts, strict=True)):
         for level, share in shares.items():
             low, high = (int(binom.ppf(p, n, level)) for p in (0.025, 0.975))
             held = round(float(share[j]) * n)
             says = "too narrow" if held < low else "too wide" if held > high else "in that range"
             cells = [f"{held} of {n}", percent(share[j]), f"{low} to {high} of {n}", says]
             rows.append([f"{name}, {percent(level)}", *cells])
-        images.append(figures.coverages(subject, j))
+        images.append(figures.coverages(subject, j, n))
     head = ["interval", "holds", "share", "if they hold", "the intervals are"]
     return join([tag("p", _COVERAGE), table("Coverage of left-out intervals", head, rows), *images])
 
@@ -227,12 +229,9 @@ def _assumed(model: GP | StackedGP) -> str:
     for noise in noises:
         if isinstance(noise, NoisyInputs):
             pairs = zip(inputs, noise.settings["variances"].mean(0).sqrt(), strict=True)
-            sds = [
-                f"{html.bare(n)} by {html.with_unit(number(sd), n)}" for n, sd in pairs if sd > 0
-            ]
-            words.append(
-                f"inputs that are noisy themselves: {html.listed(sds)} (standard deviations)"
-            )
+            sds = [f"{html.bare(n)} by {html.with_unit(number(s), n)}" for n, s in pairs if s > 0]
+            noisy = f"inputs that are noisy themselves: {html.listed(sds)} (standard deviations)"
+            words.append(noisy)
     if (link := getattr(one, "link", None)) is not None:
         outputs = html.listed(html.bare(name) for name in one.data.output_names)
         below = f" and below {link.upper:g}" * math.isfinite(link.upper)
@@ -240,10 +239,9 @@ def _assumed(model: GP | StackedGP) -> str:
     if isinstance(transform, Categories):
         batches = [inputs[i] for i in transform.batches]
         plain = [inputs[i] for i in transform.levels if i not in transform.batches]
-        words += [f"categories in {html.listed(plain)}"] if plain else []
-        words += (
-            [f"offsets of {html.listed(batches)}, whatever the other inputs are"] if batches else []
-        )
+        words += [f"categories in {html.listed(plain)}"] * bool(plain)
+        offsets = f"offsets of {html.listed(batches)}, whatever the other inputs are"
+        words += [offsets] * bool(batches)
     default = "noise of one size, exact inputs, numbers that may be of any size"
     return f"Assumed: {'; '.join(words or [default])}."
 

@@ -97,7 +97,7 @@ def errors(subject: Subject, output: int) -> dict[str, str]:
     for what, rmse in found.items():
         short, of, physics_name = what.partition(" of ")
         label = _ERRORS.get(short, short)
-        if short == ALONE and subject.is_fitted_physics:
+        if short == ALONE and any(part.unknowns for part in subject.physics.values()):
             label += ", with fitted parameters"
         which = f" ({physics_name.removeprefix('physics ')})" * bool(of)
         shown[f"{label}{which}"] = html.with_unit(html.number(rmse), name)
