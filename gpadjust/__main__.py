@@ -109,9 +109,9 @@ _ABOUT_COMMANDS = {
 def parser() -> ArgumentParser:
     """Return the parser of both commands, with their help."""
     kinds: dict[str, dict[str, Any]] = {
-        **dict.fromkeys(("--outputs", "--states"), {"required": True}),
-        **dict.fromkeys(("--outliers", "--positive"), {"action": "store_true"}),
-        **dict.fromkeys(("--unknown", "--hidden"), {"action": "append", "default": []}),
+        **{name: {"required": True} for name in ("--outputs", "--states")},
+        **{name: {"action": "store_true"} for name in ("--outliers", "--positive")},
+        **{name: {"action": "append", "default": []} for name in ("--unknown", "--hidden")},
         "--physics": {"action": "append", "required": True},
         "--fit": {"choices": ("compare", "bayes", "map"), "default": "compare"},
         "--seed": {"type": partial(_whole, least=0), "default": 0},

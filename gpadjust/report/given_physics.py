@@ -264,14 +264,14 @@ def _check(physics: Physics, data: TableData) -> None:
             f"{hint * isinstance(physics, FormulaPhysics)}"
         )
     is_same = torch.isclose(again, Y, rtol=_SAME, atol=_SAME * float(Y.abs().max()))
-    small = f"values between {-LARGEST:.0e} and {LARGEST:.0e}"
     exclude = "Correct the physics there, or exclude such inputs:"
     settle = "Take random numbers out of it, or let it set their seed itself:"
-    for expected, wrong, way_out in (
-        (small, Y.abs() > LARGEST, exclude),
-        ("the same values whenever it is called", ~is_same, settle),
-    ):
-        if rows := wrong.any(-1).nonzero().flatten().tolist():
+    checks = {
+        f"values between {-LARGEST:.0e} and {LARGEST:.0e}": (Y.abs() > LARGEST, exclude),
+        "the same values whenever it is called": (~is_same, settle),
+    }
+    for expected, (is_wrong, way_out) in checks.items():
+        if rows := is_wrong.any(-1).nonzero().flatten().tolist():
             found = f"found others in {len(rows)} of {plural(n, 'row')}"
             raise ValueError(f"expected {expected}, {found}. {way_out}{_lines(rows, data)}")
 

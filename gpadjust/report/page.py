@@ -34,15 +34,11 @@ def report(
     """Write a page that shows what a model or a comparison says, for those who decide.
 
     The page begins with the left-out errors of your formula, of the adjustment and of the data
-    alone, and says in words whether the physics helps. Then it has what is recommended and why;
-    where the physics is wrong (rho and delta along each input), and where predictions rest on it;
-    left-out observations, and whether intervals hold what they promise; parameters, advice, data
-    and settings; and how to load the model, which is saved beside it (``report.pt`` beside
-    ``report.html``). It is one file, without scripts and links.
-
-    The page of a log (:func:`~gpadjust.records.identify`) has a free run along what was held out,
-    beside the physics with its guesses and a state that stays; parameters with their intervals,
-    noise and hidden states, advice and settings. No model is saved beside it.
+    alone, and the verdict: does the physics help? Then it has what is recommended, where the
+    physics is wrong, left-out observations, parameters, advice, data and settings, and how to load
+    the model, which is saved beside it (``report.pt`` beside ``report.html``). The page of a log
+    (:func:`~gpadjust.records.identify`) has a free run along what was held out, parameters, noise
+    and hidden states, and no model beside it. It is one file, without scripts and links.
 
     Whether the physics helps takes a comparison with a model that has none, so report on what
     :func:`~gpadjust.compare` returns. Units are read from names such as ``"head [m]"``, the columns
