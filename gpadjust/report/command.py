@@ -114,9 +114,9 @@ def _of_table(arguments: Namespace) -> Job:
         X, noise = data.X, options.get("noise")
         if isinstance(noise, NoisyInputs):
             X = read.Columns(X.columns, noise.points)
-        given = (X, data.Y, physics, variances)
         if arguments.fit == "compare":
-            model: Any = compare(*given, seed=arguments.seed, progress=True, **options)
+            seed = arguments.seed
+            model: Any = compare(X, data.Y, physics, variances, seed=seed, progress=True, **options)
         else:
             _say(f"Fitting CKA by {arguments.fit!r} ...")
             model = with_options(CKA, options)(X, data.Y, variances, physics=physics)
@@ -227,7 +227,7 @@ def _program(
     """Return Python code that does the same, and follows further actions."""
     states, actions = [*spec.states], [*spec.actions]
     angles = f", angles={[*spec.angles]!r}" if spec.angles else ""
-    read = "".join(f"    {name}={v!r},\n" for name, v in reading.items() if v is not None)
+    columns = "".join(f"    {name}={v!r},\n" for name, v in reading.items() if v is not None)
     chosen = "".join(f", {name}={v!r}" for name, v in options.items() if v is not None)
     return f"""\
 {physics_of.imports_of(physics.code, physics.modules)}
@@ -238,7 +238,7 @@ spec = StateSpec({states!r}, {actions!r}, step={spec.step!r}{angles})
 records = Records.read_csv(
     {[*files]!r},
     spec,
-{read})
+{columns})
 physics = {physics.code}
 found = identify(records, physics{chosen})
 print(found)

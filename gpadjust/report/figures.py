@@ -60,23 +60,23 @@ def trusted(subject: Subject) -> Markup:
         if shown is None:
             continue
         try:
-            found = trust(shown.model)
+            basis = trust(shown.model)
         except PhysicsError as error:
             failed.append(tag("p", f"{name}: {html.failure(error)}", class_="caution"))
             continue
-        shares = (found.physics, found.data, found.neither)
+        shares = (basis.physics, basis.data, basis.neither)
         rows.append([name, shown.structure, *(percent(share[shown.output]) for share in shares)])
-        images.append(trusts(found, shown.output, inputs, name))
-        points = len(found.X)
+        images.append(trusts(basis, shown.output, inputs, name))
+        points = len(basis.X)
     if not rows:
         return html.join(failed or [tag("p", _NONE)])
     several = "Along each input, for all values of the others"
     over = several if len(subject.inputs) > 1 else "Along the input"
     head = ["output", "by the model", "physics", "data", "neither"]
-    basis = html.table("Basis of the predictions", head, rows)
+    shares_of = html.table("Basis of the predictions", head, rows)
     words = tag("p", _TRUST.format(f"{points:,}"))
     return html.join(
-        [*failed, words, basis, *images, tag("p", f"{over}: {_COLORS}.", class_="note")]
+        [*failed, words, shares_of, *images, tag("p", f"{over}: {_COLORS}.", class_="note")]
     )
 
 
@@ -100,7 +100,7 @@ def inputs_drawn(subject: Subject) -> list[int]:
 
 def point(subject: Subject, X: Tensor, digits: int = 4) -> list[str]:
     """Return the inputs of a point, ``d``, in words: numbers, and the names of categories."""
-    names, values = subject.names, enumerate(X.tolist())
+    names, values = subject.levels, enumerate(X.tolist())
     return [names[i][int(x)] if i in names else number(x, digits) for i, x in values]
 
 
@@ -173,7 +173,7 @@ def slice_along(subject: Subject, i: int, number_of_points: int) -> Tensor:
     pad = 0.5 * low.abs().clamp_min(1.0) if low == high else torch.zeros_like(low)
     X = subject.base.repeat(number_of_points, 1)
     X[:, i] = torch.linspace(float(low - pad), float(high + pad), number_of_points, dtype=X.dtype)
-    return X if subject.categories is None else on_levels(subject.model, X)
+    return on_levels(subject.model, X)
 
 
 def _prediction(subject: Subject, output: int, i: int, ax: Any) -> None:

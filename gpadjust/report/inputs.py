@@ -61,14 +61,9 @@ def open_table(file: str, arguments: Namespace, hint: str = "") -> TableColumns:
     if not path.is_file():
         what = "a folder" if path.is_dir() else "a device or a pipe"
         raise OSError(f"{file!r} is {what}, expected a CSV file.")
-    return TableColumns(
-        file,
-        mark_of(arguments.delimiter),
-        decimal=arguments.decimal,
-        sheet=sheet,
-        hint=_HINT + hint,
-        option="--{} {!r}",
-    )
+    words: dict[str, Any] = {"hint": _HINT + hint, "option": "--{} {!r}"}
+    mark = mark_of(arguments.delimiter)
+    return TableColumns(file, mark, decimal=arguments.decimal, sheet=sheet, **words)
 
 
 def column_of(table: TableColumns, name: str) -> str:

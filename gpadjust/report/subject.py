@@ -48,6 +48,8 @@ class Subject:
 
     model: GP | StackedGP
     comparison: Comparison | None
+    inputs: tuple[str, ...]  # their names
+    outputs: tuple[str, ...]
     X: Tensor  # n x d
     Y: Tensor  # n x m, NaN where there is no observation
     loo: LeaveOneOut
@@ -55,43 +57,15 @@ class Subject:
     adjusted: list[Adjusted | None]  # of each output; None if no physics is adjusted
     physics: dict[str, Physics]  # by their names
     has_physics: bool  # AR1 knows its physics through samples alone
-    categories: Categories | None  # and batches, among the inputs
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """The names of the inputs."""
-        return self.model.data.input_names
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """The names of the outputs."""
-        return self.model.data.output_names
-
-    @property
-    def judged(self) -> Tensor:
-        """Observations that errors and coverage are of, ``n x m``, NaN where it is an outlier."""
-        outlier = self.loo.is_outlier
-        return self.Y if outlier is None else self.Y.masked_fill(outlier, torch.nan)
+    judged: Tensor  # observations that errors and coverage are of, NaN where it is an outlier
+    base: Tensor  # medians of the inputs, d, for slices; of categories a level
+    levels: dict[int, tuple[str, ...]]  # names of categories, by column; their numbers are from 0
+    batches: list[int]  # columns of batches
 
     def outliers(self, output: int) -> list[str]:
         """Return the names of the rows whose observation of an output counts as an outlier."""
-        outlier = self.loo.is_outlier
-        places = [] if outlier is None else outlier[:, output].nonzero().flatten().tolist()
-        return [self.rows[i] for i in places]
-
-    @property
-    def names(self) -> dict[int, tuple[str, ...]]:
-        """The names of categories that are texts, by their column; their numbers are from 0."""
-        levels = {} if self.categories is None else self.categories.levels
-        texts = {i: tuple(map(str, own)) for i, own in levels.items()}
-        return {i: texts[i] for i, own in levels.items() if own == texts[i]}
-
-    @property
-    def base(self) -> Tensor:
-        """The medians of the inputs, ``d``, for slices; of categories a level."""
-        levels = {} if self.categories is None else self.categories.levels
-        is_level = torch.tensor([i in levels for i in range(len(self.inputs))])
-        return self.X.median(0).values.where(is_level, self.X.quantile(0.5, dim=0))
+        is_out = self.Y[:, output].isfinite() & self.judged[:, output].isnan()
+        return [self.rows[i] for i in is_out.nonzero().flatten().tolist()]
 
     def physics_at(self, X: Tensor, output: int) -> dict[str, Tensor]:
         """Return an output of each physics that is shown, ``n``."""
@@ -132,10 +106,19 @@ def subject_of(thing: object, rows: Sequence[object] | None = None) -> Subject:
     physics = {part.name: part for each in models for part in each.physics}
     has_physics = bool(physics) or any(isinstance(each, AR1) for each in models)
     adjusted = [_adjusted(model, comparison, j) for j in range(Y.shape[-1])]
-    transform = model.data.transform
-    categories = transform if isinstance(transform, Categories) else None
-    subject = (model, comparison, X, Y, loo, names, adjusted)
-    return Subject(*subject, physics, has_physics, categories)
+    judged = Y if loo.is_outlier is None else Y.masked_fill(loo.is_outlier, torch.nan)
+    transform, base = model.data.transform, X.quantile(0.5, dim=0)
+    levels: dict[int, tuple[str, ...]] = {}
+    if isinstance(transform, Categories):
+        columns = [*transform.levels]
+        base[columns] = X.median(0).values[columns]
+        texts = {i: tuple(map(str, own)) for i, own in transform.levels.items()}
+        levels = {i: own for i, own in texts.items() if own == transform.levels[i]}
+    batches = transform.batches if isinstance(transform, Categories) else []
+    return Subject(
+        model, comparison, model.data.input_names, model.data.output_names, X, Y, loo, names,
+        adjusted, physics, has_physics, judged, base, levels, batches,
+    )  # fmt: skip
 
 
 def _adjusted(model: GP | StackedGP, comparison: Comparison | None, output: int) -> Adjusted | None:

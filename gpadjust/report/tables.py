@@ -190,7 +190,7 @@ def data(subject: Subject, remarks: tuple[str, ...]) -> Markup:
             known = column[~column.isnan()]
             short, unit = html.name_and_unit(name)
             numbers = [number(end, 4) for end in (known.min(), known.quantile(0.5), known.max())]
-            if kind == "input" and len(rows) in subject.names:  # of which none is the least
+            if kind == "input" and len(rows) in subject.levels:  # of which none is the least
                 numbers = ["-"] * 3
             rows.append([short, kind, unit or "-", *numbers, str(len(column) - len(known))])
     head = ["column", "is", "unit", "least", "median", "most", "missing"]
@@ -275,9 +275,9 @@ def loading(subject: Subject, saved: Saved | str, origin: Origin) -> Markup:
         f"model = load({', '.join(arguments)})",
         f"# a row for each point: {', '.join(map(repr, subject.inputs))}",
     ]
-    for i, own in subject.names.items():
+    for i, own in subject.levels.items():
         levels = [f"{k} is {name}" for k, name in enumerate(own)]
-        if subject.categories is not None and i in subject.categories.batches:
+        if i in subject.batches:
             levels.append("any other number is a new one")
         lines.append(f"# {subject.inputs[i]}: {', '.join(levels)}")
     point = ", ".join(f"{x:.6g}" for x in subject.base.tolist())

@@ -19,7 +19,8 @@ def page(
     subject: Subject, title: str | None, saved: Saved | str, origin: Origin, progress: bool = False
 ) -> Page:
     """Return the page; ``saved`` is the model's file, or the reason why there is none."""
-    told = (*(() if subject.comparison is None else subject.comparison.advice), *origin.notes)
+    advice = [] if subject.comparison is None else subject.comparison.advice
+    sentences = [text.replace("+-", "±") for text in (*advice, *origin.notes)]
     made_by = {
         "Recommendation": lambda: recommendation(subject),
         "Structures": lambda: tables.structures(subject),
@@ -29,7 +30,7 @@ def page(
         "Do the intervals hold?": lambda: tables.coverage(subject),
         "Parameters of the physics": lambda: tables.parameters(subject),
         "What was learnt": lambda: tables.summary(subject),
-        "Advice": lambda: html.bullets(text.replace("+-", "±") for text in told),
+        "Advice": lambda: html.bullets(sentences),
         "Data": lambda: tables.data(subject, origin.remarks),
         "Load the model, predict": lambda: tables.loading(subject, saved, origin),
     }
@@ -64,7 +65,7 @@ def verdicts(subject: Subject, how: str = Origin.how) -> list[Verdict]:
             note += (
                 "; the formula's at the data, with the model's parameters if it has unknown ones"
             )
-        elif subject.categories is not None and subject.categories.batches:
+        elif subject.batches:
             note += "; each with an offset for each batch"
         shown.append(Verdict(name, numbers, note, *_answer(subject, name, how)))
     return shown
@@ -85,21 +86,21 @@ def errors(subject: Subject, output: int) -> dict[str, str]:
     """Return the errors of the formula, its adjustment and the data alone, with the unit."""
     name = subject.outputs[output]
     if subject.comparison is not None:
-        found = subject.comparison.errors()[name]
+        rmse_by = subject.comparison.errors()[name]
     else:
-        physics = subject.physics_at(subject.X, output)
-        off = {n: subject.judged[:, output] - values for n, values in physics.items()}
-        alone = {n: ALONE if len(off) == 1 else f"{ALONE} of {n}" for n in off}
-        found = {alone[n]: float(own.square().nanmean().sqrt()) for n, own in off.items()}
+        values, rmse_by = subject.physics_at(subject.X, output), {}
+        for physics, f_p in values.items():
+            alone = ALONE if len(values) == 1 else f"{ALONE} of {physics}"
+            rmse_by[alone] = float((subject.judged[:, output] - f_p).square().nanmean().sqrt())
         adjusted = "adjusted" if subject.has_physics else "data alone"
-        found[adjusted] = float(subject.loo.score().rmse[output])
+        rmse_by[adjusted] = float(subject.loo.score().rmse[output])
     shown = {}
-    for what, rmse in found.items():
-        short, of, physics_name = what.partition(" of ")
+    for what, rmse in rmse_by.items():
+        short, of, physics = what.partition(" of ")
         label = _ERRORS.get(short, short)
         if short == ALONE and any(part.unknowns for part in subject.physics.values()):
             label += ", with fitted parameters"
-        which = f" ({physics_name.removeprefix('physics ')})" * bool(of)
+        which = f" ({physics.removeprefix('physics ')})" * bool(of)
         shown[f"{label}{which}"] = html.with_unit(html.number(rmse), name)
     return shown
 
@@ -119,9 +120,9 @@ def _answer(subject: Subject, name: str, how: str) -> tuple[str, list[str]]:
             "The comparison has no structure without the physics, or none with it; add 'zero mean' "
             "to its structures."
         ]
-    gain, found = comparison.gain[name], comparison.errors()[name]
+    gain, rmse = comparison.gain[name], comparison.errors()[name]
     sentences = gain.sentences(name)
-    if gain.shown > 0 and found.get("adjusted", 0.0) > found.get("data alone", math.inf):
+    if gain.shown > 0 and rmse.get("adjusted", 0.0) > rmse.get("data alone", math.inf):
         sentences.append(
             "Its error is not the smaller one: what the physics helps with is how sure one is."
         )
