@@ -138,26 +138,25 @@ def given_physics(
     formulas = [text for text in texts if ":" not in text]
     parts, code = dict[str, Physics](), dict[str, str]()
     for text in texts:
+        short = text.rpartition(":")[2].rpartition(".")[2]
+        if text in formulas:  # a name that figures have room for
+            short = f"formula {formulas.index(text) + 1}" if len(formulas) > 1 else "formula"
+        name = text if short in parts else short
+        make = _formula if text in formulas else _function
         try:
-            make = _function if ":" in text else _formula
-            physics, own = make(text, data, unknowns)
-            _check(physics, data)
+            parts[name], code[name] = make(text, data, unknowns)
+            _check(parts[name], data)
         except ValueError as error:
             raise ValueError(f"--physics {text}: {error}") from error
-        name = text.rpartition(":")[2].rpartition(".")[2]
-        if ":" not in text:  # a name that figures have room for
-            name = f"formula {formulas.index(text) + 1}" if len(formulas) > 1 else "formula"
-        name = text if name in parts else name
-        parts[name], code[name] = physics, own
     used = {name for physics in parts.values() for name in physics.unknowns}
     if absent := [name for name in unknowns if name not in used]:
         way = "" if formulas else " A function has its own: FunctionPhysics(f, unknowns=...)."
         raise ValueError(f"--unknown names {absent[0]!r}, which is in no formula.{way}")
     modules = tuple(dict.fromkeys(text.partition(":")[0] for text in texts if ":" in text))
-    if len(parts) == 1:
-        return GivenPhysics(physics, own if modules else "", modules)
     several = ", ".join(f"{name!r}: {own}" for name, own in code.items())
-    return GivenPhysics(parts, f"{{{several}}}" if modules else "", modules)
+    expression = f"{{{several}}}" if len(parts) > 1 else code[name]
+    physics = parts if len(parts) > 1 else parts[name]
+    return GivenPhysics(physics, expression if modules else "", modules)
 
 
 def _formula(text: str, data: TableData, unknowns: Mapping[str, Unknown]) -> tuple[Physics, str]:
@@ -246,8 +245,9 @@ def imported(path: str) -> Any:
         names = [*vars(sys.modules[module])] if module in sys.modules else []
         near = meant(name, names) if module in files else meant(module, files)
         raise ValueError(
-            "expected module:function, such as pump:head for the function head of pump.py in this "
-            f"folder, or one of PYTHONPATH; found {type(error).__name__}: {error}{place}.{near}"
+            f"it cannot be imported, {type(error).__name__}: {error}{place}. Expected "
+            "module:function, such as pump:head for the function head of pump.py in this folder, "
+            f"or one of PYTHONPATH.{near}"
         ) from error
 
 

@@ -26,15 +26,10 @@ _UNIT = re.compile(r"(.*\S)\s*\[([^\[\]]*)\]", flags=re.DOTALL)
 _SHOWN = 3
 _WIDTH = 3.6  # inches: as wide as a column of the page, so that text has its size
 _STYLE: dict[str, Any] = {
-    "font.size": 9.5,
-    "axes.labelsize": 9.5,
-    "axes.titlesize": 9.5,
-    "axes.linewidth": 0.7,
-    "legend.fontsize": 8.5,
-    "svg.fonttype": "path",
-    "svg.hashsalt": "gpadjust",
-    "figure.facecolor": "white",
-    "savefig.facecolor": "white",
+    **dict.fromkeys(("font.size", "axes.labelsize", "axes.titlesize"), 9.5),
+    **dict.fromkeys(("figure.facecolor", "savefig.facecolor"), "white"),
+    **{"axes.linewidth": 0.7, "legend.fontsize": 8.5},
+    **{"svg.fonttype": "path", "svg.hashsalt": "gpadjust"},
 }
 _LARGE = 70_000  # characters, above which a figure of many points is smaller as pixels
 _PLAIN = " <>='/:;,.()!*+@$-_{}\n"  # what a URL between double quotes may have as it is

@@ -119,7 +119,13 @@ def write(
         if isinstance(subject, Identification):
             page = log_page.page(subject, title, origin)
         else:
-            saved = _saved(subject.model, model_part)
+            saved: Saved | str
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", UserWarning)  # the page says it
+                    saved = save(subject.model, model_part)
+            except (TypeError, ValueError) as error:
+                saved = str(error)
             page = verdict.page(subject, title, saved, origin, progress)
         versions = [f"gpadjust {gpadjust.__version__}", f"Python {platform.python_version()}"]
         versions += [f"{name} {version(name)}" for name in _LIBRARIES]
@@ -132,13 +138,3 @@ def write(
             model_path.unlink(missing_ok=True)  # of an earlier page
         part.replace(path)
     return page.headline
-
-
-def _saved(model: GP | StackedGP, path: Path) -> Saved | str:
-    """Save a model; return what its file lacks, or why there is none."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # the page says it
-            return save(model, path)
-    except (TypeError, ValueError) as error:
-        return str(error)

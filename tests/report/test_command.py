@@ -111,10 +111,10 @@ BAD_TABLES = {
 BAD_PHYSICS = {
     "hill": "has 'hill'; expected one of its names: time.* is given as module:function",
     "hill.py:wave": "No module named 'hill.py'.* Is it 'hill'",
-    "./hill.py:wave": "expected module:function, such as pump:head .* in this folder",
+    "./hill.py:wave": "Expected module:function, such as pump:head .* in this folder",
     "hill:no_function": "physics must be a Physics or a callable.* found a float",
-    "broken:f": r"found ZeroDivisionError: .* \(broken.py, line 2\)",
-    "lacks:f": "found ModuleNotFoundError: .*no_such_module.*lacks.py",
+    "broken:f": r"cannot be imported, ZeroDivisionError: .* \(broken.py, line 2\)",
+    "lacks:f": "cannot be imported, ModuleNotFoundError: .*no_such_module.*lacks.py",
     "hill:two": "expected 1 column, one for each of --outputs head",
     "hill:noise": "expected the same values whenever it is called, found others in 9 of 9 rows",
     "hill:huge": r"found others in 1 of 9 rows.*\n  line 10: time \[s\] = 1$",
