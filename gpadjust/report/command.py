@@ -13,11 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gpadjust.core import CKA, Noise, fit
-from gpadjust.kinds.categories import Categories
-from gpadjust.kinds.factory import with_options
-from gpadjust.kinds.heavy_tails import HeavyTails
-from gpadjust.kinds.noisy_inputs import NoisyInputs
-from gpadjust.kinds.relative import RelativeNoise
+from gpadjust.kinds import Categories, HeavyTails, NoisyInputs, RelativeNoise, with_options
 from gpadjust.physics import ODEPhysics, PhysicsError, PhysicsWarning
 from gpadjust.records import Identification, Records, identify
 from gpadjust.report import given_physics as physics_of

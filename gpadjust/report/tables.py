@@ -10,10 +10,8 @@ from scipy.stats import binom
 
 from gpadjust.core import GP, CalibratedPhysics, KnownNoise, Noise, StackedGP
 from gpadjust.core.saving import Saved
-from gpadjust.kinds.categories import Categories
-from gpadjust.kinds.heavy_tails import HeavyTails, RowNoise
-from gpadjust.kinds.noisy_inputs import NoisyInputs
-from gpadjust.kinds.relative import RelativeNoise
+from gpadjust.kinds import Categories, HeavyTails, NoisyInputs, RelativeNoise
+from gpadjust.kinds.heavy_tails import RowNoise
 from gpadjust.physics.import_path import is_formula
 from gpadjust.report import figures
 from gpadjust.report import markup as html
