@@ -40,16 +40,10 @@ class Job(NamedTuple):
 
 
 def run(arguments: Namespace, command: Sequence[str]) -> None:
-    """Read files, work, and write the page; nothing is written if anything fails.
+    """Read files, work, and write the page of a command line, parsed and as it is.
 
-    Args:
-        arguments: A command line as parsed by :func:`gpadjust.__main__.parser`.
-        command: The command line, for the page.
-
-    Raises:
-        OSError: If a file cannot be read or written.
-        ValueError: If an option, the data or the physics are wrong, the physics fails where it is
-            evaluated, or the states of a machine diverge.
+    Nothing is written if anything fails: an OSError of files, a ValueError of options, data, or a
+    physics that fails, or of a machine whose states diverge.
     """
     is_log = arguments.command == "identify"
     files = arguments.data if is_log else [arguments.data]

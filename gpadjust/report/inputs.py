@@ -147,10 +147,7 @@ def _are_names(table: TableColumns, name: str) -> bool:
 def log_columns(
     tables: Sequence[TableColumns], hidden: Mapping[str, str], arguments: Namespace
 ) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the columns of a log, as options of ``Records.read_csv``, and their units by name.
-
-    ``hidden`` states have units, and no column: None.
-    """
+    """Return columns of a log as options of ``Records.read_csv``, None if hidden, and units."""
     units = {**hidden}
 
     def numbers(name: str, text: str, may_miss: bool = False) -> str:

@@ -58,16 +58,13 @@ class Verdict(NamedTuple):
 
 
 class Page(NamedTuple):
-    """A page: a question with its verdicts, sections by their headings, settings by their names.
-
-    The ``headline`` is for the terminal.
-    """
+    """A page: a question with its verdicts, sections by their headings, settings by their names."""
 
     title: str
     lead: str
     question: str
     verdicts: list[Verdict]
-    headline: str
+    headline: str  # for the terminal
     sections: Mapping[str, Markup]
     settings: dict[str, str]
 

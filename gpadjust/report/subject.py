@@ -75,12 +75,7 @@ class Subject:
 
 
 def subject_of(thing: object, rows: Sequence[object] | None = None) -> Subject:
-    """Return the subject that a model, a mixture or a comparison is; rows have numbers or names.
-
-    Raises:
-        TypeError: If it is none of these.
-        ValueError: If it was not fitted, or ``rows`` are not as many as those of its data.
-    """
+    """Return the subject that a model, a mixture or a comparison is; rows have numbers or names."""
     comparison = thing if isinstance(thing, Comparison) else None
     model = comparison.recommended if comparison is not None else thing
     if not isinstance(model, GP | StackedGP):

@@ -53,10 +53,7 @@ def page(
 
 
 def verdicts(subject: Subject, how: str = Origin.how) -> list[Verdict]:
-    """Return the verdict on each output, below the errors of formula, adjustment and data.
-
-    A subject that was not compared has ``how`` in it, code or a command that compares.
-    """
+    """Return the verdict on each output; ``how`` is code or a command that compares."""
     shown = []
     for j, name in enumerate(subject.outputs):
         numbers = errors(subject, j)
