@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from argparse import ArgumentParser, ArgumentTypeError, RawDescriptionHelpFormatter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 _ABOUT = """\
@@ -46,147 +48,97 @@ example: swing.csv has the columns "time [s]", "angle [rad]" and "torque [N m]",
 writes identify.html. Of a Python module, --physics module:name is a physics of the library, or a
 function of rows of states and actions to the next states.
 """
+# An option a paragraph: its name, what the help calls its value, and what it is.
+_OPTIONS = """\
+data: the table: a CSV file in UTF-8, or *.xlsx (the extra excel)
+--inputs a,b: the columns that the physics reads; by default those that its formula names
+--outputs y: the columns that it predicts
+--physics formula: the physics: a formula of the columns' names, with + - * / ** and functions such
+    as sqrt, of several outputs with commas between them; or module:function. Several: give it again
+--unknown E=2+-0.4: an unknown number of the formula, its guess and standard deviation, which may be
+    a percentage; or a factor, E=2*/1.5; or bounds, E=1..3. Several: give it again
+--out page.html: the page to write (%(default)s); the model beside it, page.pt. Both replace what
+    has these names
+--units a=m,y=Pa: units, of columns that do not say them, as "a [m]"
+--noise 0.1: known standard deviation of the outputs; or y=0.1,z=2; or relative, which grows with
+    the physics and is learnt
+--outliers: some measurements may be far off
+--input-noise a=0.5: standard deviations of inputs that are noisy, too
+--positive: the outputs cannot be negative
+--bounds 0,1: the outputs are between these numbers
+--categories a,b: inputs that are names, not sizes: numbers or text
+--batches rig: categories that each shift the outputs by an offset
+--fit: compare structures, which tells whether the physics helps (the default); or one CKA alone, by
+    full Bayes or at the likeliest hyper-parameters, which is quicker
+--seed 0: of the fits (%(default)s)
+--rows 500: the most rows that are taken; of more, so many are drawn at random (%(default)s)
+--sheet name: the sheet of a workbook that has several
+"""
+_OPTIONS_OF_LOGS = """\
+data: the log: CSV files in UTF-8, a record each
+--time t: the column of times (%(default)s), or a number: the time from row to row
+--states a,b: the states, columns of the log; or a=q, where a's column is q
+--hidden b=0+-2: a state that was not measured, with mean and standard deviation at the beginning.
+    Several: give it again
+--actions u: what acts on the machine; without it, the time
+--angles a: states in rad that jump where they have gone round
+--physics equation: an equation for each state: "a'=...", its time derivative, or 'a=...', its next
+    value; or module:name
+--unknown E=2+-0.4: an unknown number of the equations, its guess and standard deviation, which may
+    be a percentage; or a factor, E=2*/1.5; or bounds, E=1..3. Several: give it again
+--step 0.05: the step of the free run, a multiple of the sampling step, which it is by default; a
+    longer one is quicker, and averages the actions over it
+--segment run: a column of labels: where they change, a new run begins
+--held-out 0.25: the share of the log that is held out at its end (%(default)s)
+--starts 4: searches to take the best of
+--out page.html: the page (%(default)s)
+--seed 0: of the free runs (%(default)s)
+"""
+_OPTIONS_OF_BOTH = """\
+--delimiter mark: between two fields (","); ";" or tab, say
+--decimal mark: the decimal mark (".")
+--title text: the title of the page
+"""
 _SEEDS = 2**32
+_ABOUT_COMMANDS = {
+    "report": ("a page about a table and a physics", _ABOUT, _EXAMPLE),
+    "identify": ("a page about a machine by its log, and equations", _ABOUT_LOGS, _EXAMPLE_OF_LOGS),
+}
 
 
 def parser() -> ArgumentParser:
-    """The options, and what they say of themselves."""
+    """Return the parser of both commands, with their help."""
+    kinds: dict[str, dict[str, Any]] = {
+        **{name: {"required": True} for name in ("--outputs", "--states")},
+        **{name: {"action": "store_true"} for name in ("--outliers", "--positive")},
+        **{name: {"action": "append", "default": []} for name in ("--unknown", "--hidden")},
+        "--physics": {"action": "append", "required": True},
+        "--fit": {"choices": ("compare", "bayes", "map"), "default": "compare"},
+        "--seed": {"type": partial(_whole, least=0), "default": 0},
+        "--rows": {"type": partial(_whole, least=1), "default": 500},
+        "--starts": {"type": partial(_whole, least=1)},
+        "--time": {"default": "time"},
+        "--step": {"type": float},
+        "--held-out": {"type": float, "default": 0.25},
+        "--delimiter": {"default": ","},
+        "--decimal": {"default": ".", "choices": (".", ",")},
+    }
     main_parser = ArgumentParser(prog="gpadjust", description="Adjust physics to data.")
     commands = main_parser.add_subparsers(dest="command", required=True)
-    report = commands.add_parser(
-        "report",
-        help="a page about a table and a physics",
-        description=_ABOUT,
-        epilog=_EXAMPLE,
-        formatter_class=RawDescriptionHelpFormatter,
-    )
-    add = report.add_argument
-    add("data", help="the table: a CSV file in UTF-8, or *.xlsx (the extra excel)")
-    add(
-        "--inputs",
-        metavar="a,b",
-        help="the columns that the physics reads; by default those that its formula names",
-    )
-    add("--outputs", required=True, metavar="y", help="the columns that it predicts")
-    add(
-        "--physics",
-        required=True,
-        action="append",
-        metavar="formula",
-        help="the physics: a formula of the columns' names, with + - * / ** and functions such as "
-        "sqrt, of several outputs with commas between them; or module:function. Several: give it "
-        "again",
-    )
-    add("--unknown", **_unknown("formula"))
-    add(
-        "--out",
-        default="report.html",
-        metavar="page.html",
-        help="the page to write (%(default)s); the model beside it, page.pt. Both replace what has "
-        "these names",
-    )
-    add("--units", metavar="a=m,y=Pa", help='units, of columns that do not say them, as "a [m]"')
-    add(
-        "--noise",
-        metavar="0.1",
-        help="known standard deviation of the outputs; or y=0.1,z=2; or relative, which grows with "
-        "the physics and is learnt",
-    )
-    add("--outliers", action="store_true", help="some measurements may be far off")
-    add("--input-noise", metavar="a=0.5", help="standard deviations of inputs that are noisy, too")
-    ends = report.add_mutually_exclusive_group()
-    ends.add_argument("--positive", action="store_true", help="the outputs cannot be negative")
-    ends.add_argument("--bounds", metavar="0,1", help="the outputs are between these numbers")
-    add("--categories", metavar="a,b", help="inputs that are names, not sizes: numbers or text")
-    add("--batches", metavar="rig", help="categories that each shift the outputs by an offset")
-    add(
-        "--fit",
-        choices=("compare", "bayes", "map"),
-        default="compare",
-        help="compare structures, which tells whether the physics helps (the default); or one CKA "
-        "alone, by full Bayes or at the likeliest hyper-parameters, which is quicker",
-    )
-    add("--seed", type=_seed, default=0, metavar="0", help="of the fits (%(default)s)")
-    add(
-        "--rows",
-        type=_positive,
-        default=500,
-        metavar="500",
-        help="the most rows that are taken; of more, so many are drawn at random (%(default)s)",
-    )
-    add("--sheet", metavar="name", help="the sheet of a workbook that has several")
-    add(
-        "--delimiter", default=",", metavar="mark", help='between two fields (","); ";" or tab, say'
-    )
-    add("--decimal", default=".", choices=(".", ","), metavar="mark", help='the decimal mark (".")')
-    add("--title", metavar="text", help="the title of the page")
-    _add_identify(commands.add_parser)
+    for command, (summary, about, example) in _ABOUT_COMMANDS.items():
+        texts: dict[str, Any] = {"help": summary, "description": about, "epilog": example}
+        add_to = commands.add_parser(command, **texts, formatter_class=RawDescriptionHelpFormatter)
+        is_log = command == "identify"
+        ends = add_to if is_log else add_to.add_mutually_exclusive_group()
+        kinds |= {"--out": {"default": f"{command}.html"}, "data": {"nargs": "+"} if is_log else {}}
+        options = (_OPTIONS_OF_LOGS if is_log else _OPTIONS) + _OPTIONS_OF_BOTH
+        for paragraph in re.split(r"\n(?! )", options.strip()):
+            option, _, text = paragraph.partition(": ")
+            name, _, value = option.partition(" ")
+            kind = {"help": " ".join(text.split()), **kinds.get(name, {})}
+            kind |= {"metavar": value} if value else {}
+            (ends if name in ("--positive", "--bounds") else add_to).add_argument(name, **kind)
     return main_parser
-
-
-def _add_identify(add_parser: Callable[..., ArgumentParser]) -> None:
-    """The options of ``gpadjust identify``."""
-    log = add_parser(
-        "identify",
-        help="a page about a machine by its log, and equations",
-        description=_ABOUT_LOGS,
-        epilog=_EXAMPLE_OF_LOGS,
-        formatter_class=RawDescriptionHelpFormatter,
-    )
-    add = log.add_argument
-    add("data", nargs="+", help="the log: CSV files in UTF-8, a record each")
-    add(
-        "--time",
-        default="time",
-        metavar="t",
-        help="the column of times (%(default)s), or a number: the time from row to row",
-    )
-    add(
-        "--states",
-        required=True,
-        metavar="a,b",
-        help="the states, columns of the log; or a=q, where a's column is q",
-    )
-    add(
-        "--hidden",
-        action="append",
-        default=[],
-        metavar="b=0+-2",
-        help="a state that was not measured, with mean and standard deviation at the beginning. "
-        "Several: give it again",
-    )
-    add("--actions", metavar="u", help="what acts on the machine; without it, the time")
-    add("--angles", metavar="a", help="states in rad that jump where they have gone round")
-    add(
-        "--physics",
-        required=True,
-        action="append",
-        metavar="equation",
-        help="an equation for each state: \"a'=...\", its time derivative, or 'a=...', its next "
-        "value; or module:name",
-    )
-    add("--unknown", **_unknown("equations"))
-    add(
-        "--step",
-        type=float,
-        metavar="0.05",
-        help="the step of the free run, a multiple of the sampling step, which it is by default; a "
-        "longer one is quicker, and averages the actions over it",
-    )
-    add("--segment", metavar="run", help="a column of labels: where they change, a new run begins")
-    add(
-        "--held-out",
-        type=float,
-        default=0.25,
-        metavar="0.25",
-        help="the share of the log that is held out at its end (%(default)s)",
-    )
-    add("--starts", type=_positive, metavar="4", help="searches to take the best of")
-    add("--out", default="identify.html", metavar="page.html", help="the page (%(default)s)")
-    add("--seed", type=_seed, default=0, metavar="0", help="of the free runs (%(default)s)")
-    add("--delimiter", default=",", metavar="mark", help='between two fields (",")')
-    add("--decimal", default=".", choices=(".", ","), metavar="mark", help='the decimal mark (".")')
-    add("--title", metavar="text", help="the title of the page")
 
 
 def main(command: Sequence[str] | None = None) -> int:
@@ -195,19 +147,10 @@ def main(command: Sequence[str] | None = None) -> int:
     arguments = parser().parse_args(command)
     try:
         # Not earlier: --help and what is wrong with options need no torch.
-        from gpadjust.physics import PhysicsError
+        from gpadjust.report.command import run
 
-        if arguments.command == "report":
-            from gpadjust.report.command import run
-        else:
-            from gpadjust.report.log_command import run
-    except ImportError as error:
-        return _fail(str(error))
-    except KeyboardInterrupt:
-        return _fail("interrupted; nothing was written.", 130)
-    try:
         run(arguments, command)
-    except (ValueError, OSError, ImportError, PhysicsError) as error:
+    except (ValueError, OSError, ImportError) as error:
         return _fail(str(error))
     except SystemExit as error:  # of the user's code
         return _fail(
@@ -219,31 +162,14 @@ def main(command: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _seed(text: str) -> int:
-    """A seed that all generators take."""
-    try:
-        seed = int(text)
-    except ValueError:
-        seed = -1
-    if not 0 <= seed < _SEEDS:
-        raise ArgumentTypeError(f"expected a whole number from 0 to {_SEEDS - 1}, found {text!r}")
-    return seed
-
-
-def _unknown(where: str) -> dict[str, Any]:
-    """The option of unknown numbers."""
-    text = (
-        f"an unknown number of the {where}, its guess and standard deviation, which may be a "
-        "percentage; or a factor, E=2*/1.5; or bounds, E=1..3. Several: give it again"
-    )
-    return {"action": "append", "default": [], "metavar": "E=2+-0.4", "help": text}
-
-
-def _positive(text: str) -> int:
-    """A number of 1 or more."""
-    if not text.isdecimal() or not int(text):
-        raise ArgumentTypeError(f"expected a whole number from 1 on, found {text!r}")
-    return int(text)
+def _whole(text: str, least: int) -> int:
+    """Return a whole number that a seed may be."""
+    number = int(text) if text.isdecimal() else -1
+    if not least <= number < _SEEDS:
+        raise ArgumentTypeError(
+            f"expected a whole number from {least} to {_SEEDS - 1}, found {text!r}"
+        )
+    return number
 
 
 def _fail(message: str, status: int = 1) -> int:

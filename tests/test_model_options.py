@@ -61,7 +61,8 @@ def data():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", KINDS)
 def test_compare_and_its_page(name, data, tmp_path, monkeypatch):
-    monkeypatch.setattr("gpadjust.report.sections.drawn", lambda draw: Markup())
+    for figure in ("slices", "trusts", "left_out", "coverages"):
+        monkeypatch.setattr(f"gpadjust.report.figures.{figure}", lambda *args: Markup())
     options, has = KINDS[name]
     found = compare(*data, f_p, structures=["physics mean", "CKA"], **options)
     assert len(found.models) == 2

@@ -1,216 +1,243 @@
-"""The command ``gpadjust report``."""
+"""The commands ``gpadjust report`` and ``gpadjust identify``: read, work, write, in one way."""
 
 from __future__ import annotations
 
-import math
+import re
 import shlex
+import sys
 import warnings
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from gpadjust.core import CKA, GP, Noise, fit
-from gpadjust.files.table_columns import LARGEST
-from gpadjust.kinds.categories import Categories
-from gpadjust.kinds.factory import with_options
-from gpadjust.kinds.heavy_tails import HeavyTails
-from gpadjust.kinds.noisy_inputs import NoisyInputs
-from gpadjust.kinds.relative import RelativeNoise
-from gpadjust.physics import PhysicsWarning
-from gpadjust.report.given_physics import (
-    GivenPhysics,
-    columns_of,
-    given_physics,
-    is_path,
-    unknowns_of,
-)
-from gpadjust.report.inputs import (
-    Columns,
-    TableData,
-    mark_of,
-    names_of,
-    noise_variances,
-    notes_of,
-    open_table,
-    pairs,
-    read_table,
-    say,
-)
-from gpadjust.report.markup import listed, name_and_unit, plural
+from gpadjust.core import CKA, Noise, fit
+from gpadjust.kinds import Categories, HeavyTails, NoisyInputs, RelativeNoise, with_options
+from gpadjust.physics import ODEPhysics, PhysicsError, PhysicsWarning
+from gpadjust.records import Identification, Records, identify
+from gpadjust.report import given_physics as physics_of
+from gpadjust.report import inputs as read
+from gpadjust.report.markup import bare, listed, plural
 from gpadjust.report.page import checked_path, write
-from gpadjust.report.sections import Origin, headline
-from gpadjust.report.subject import subject_of
-from gpadjust.validation import Comparison, compare
+from gpadjust.report.subject import Origin, Subject, subject_of
+from gpadjust.states import StateSpec
+from gpadjust.validation import compare
 from gpadjust.validation.plausibility import complaint
+
+_FIT = re.compile(r" --f(i|it)?[ =](compare|bayes|map)\b")
+_DEGREES = ("deg", "degree", "degrees", "°")
+_DIGITS = 6  # of a sampling step, which is a mean of differences
+_NO_NOTES = (DeprecationWarning, PendingDeprecationWarning)
+
+
+class Job(NamedTuple):
+    """A command whose options, files and physics are read."""
+
+    lines: Sequence[str]  # on the data, for the terminal
+    origin: Origin
+    work: Callable[[], Subject | Identification]
 
 
 def run(arguments: Namespace, command: Sequence[str]) -> None:
-    """Read a file, compare, and write the page; nothing is written if anything fails.
+    """Read files, work, and write the page of a command line, parsed and as it is.
 
-    Args:
-        arguments: A command line as parsed by :func:`gpadjust.__main__.parser`.
-        command: The command line, for the page.
-
-    Raises:
-        OSError: If a file cannot be read or written.
-        ValueError: If an option, the data or the physics are wrong.
-        PhysicsError: If the physics fails where the models evaluate it.
+    Nothing is written if anything fails: an OSError of files, a ValueError of options, data, or a
+    physics that fails, or of a machine whose states diverge.
     """
-    path = checked_path(arguments.out, arguments.data)
-    outputs = names_of(arguments.outputs, "--outputs")
-    units = {} if arguments.units is None else pairs(arguments.units, "--units")
-    variances = noise_variances(arguments.noise, outputs)
-    unknowns = unknowns_of(arguments.unknown)
-    marks = (mark_of(arguments.delimiter), arguments.decimal, arguments.sheet)
-    table = open_table(arguments.data, *marks)
-    asked = ((arguments.categories, "--categories"), (arguments.batches, "--batches"))
-    categories, batches = (names_of(names, o) if names else [] for names, o in asked)
-    named = [*categories, *batches]
-    inputs = _inputs(arguments, table.names, outputs, [*unknowns], named)
-    data = read_table(table, inputs, outputs, units, named, arguments.rows, arguments.seed)
-    options = _options(arguments, inputs, data)
-    physics = given_physics(arguments.physics, data, unknowns)
-    names = (listed(data.Y.columns), listed(data.X.columns))
-    say(f"{arguments.data}: {plural(len(data.lines), 'row')}, {names[0]} from {names[1]}.")
-    for remark in data.remarks:
-        say(remark)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("default")
-        model = _fitted(arguments, data, physics, variances, options)
-        subject = subject_of(model, [f"line {line}" for line in data.lines])
-    notes = notes_of(caught)
-    for note in notes:
-        say(f"Warning: {note}")
-    settings = {
-        "command": f"gpadjust {shlex.join(command)}",
-        "data file": f"{Path(arguments.data).name} (SHA-256 {data.digest}...)",
-        "seed": str(arguments.seed),
-    }
-    how = _comparing(command)
-    origin = Origin(settings, data.remarks, notes, physics.code, physics.modules, how)
-    write(subject, path, arguments.title, origin, progress=True)
-    given = Path(arguments.out)
-    written = [
-        str(given.with_suffix(s)) for s in (given.suffix, ".pt") if path.with_suffix(s).exists()
-    ]
-    print(f"{headline(subject, how)}\nWrote {listed(written)}.")
+    is_log = arguments.command == "identify"
+    files = arguments.data if is_log else [arguments.data]
+    path = checked_path(arguments.out, *files, model=not is_log)
+    lines, origin, work = (_of_log if is_log else _of_table)(arguments)
+    _say(*lines)
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("default")
+            subject = work()
+        texts = [str(w.message) for w in caught if not issubclass(w.category, _NO_NOTES)]
+        notes = tuple(dict.fromkeys(texts))
+        _say(*(f"Warning: {note}" for note in notes))
+        words = f"gpadjust {shlex.join(command)}"
+        settings = {"command": words, **origin.settings, "seed": str(arguments.seed)}
+        origin = replace(origin, settings=settings, notes=notes, how=_FIT.sub("", words))
+        headline = write(subject, path, arguments.title, origin, progress=True)
+    except PhysicsError as error:
+        raise ValueError(str(error)) from error
+    written = [arguments.out]
+    if not is_log and path.with_suffix(".pt").exists():
+        written.append(str(Path(arguments.out).with_suffix(".pt")))
+    print(f"{headline}\nWrote {listed(written)}.")
 
 
-def _comparing(command: Sequence[str]) -> str:
-    """Return the command that compares structures: the same without ``--fit``."""
-    kept: list[str] = []
-    words = iter(command)
-    for word in words:
-        option, equals, _ = word.partition("=")
-        if option.startswith("--f") and "--fit".startswith(option):
-            if not equals:
-                next(words, None)
-            continue
-        kept.append(word)
-    return f"gpadjust {shlex.join(kept)}"
+def _say(*lines: str) -> None:
+    """Print lines beside the result, while a command works."""
+    for line in lines:
+        print(line, file=sys.stderr, flush=True)
 
 
-def _fitted(
-    arguments: Namespace,
-    data: TableData,
-    physics: GivenPhysics,
-    variances: list[float] | None,
-    options: dict[str, Any],
-) -> Comparison | GP:
-    X, Y, f_p = data.X, data.Y, physics.physics
-    if isinstance(noise := options.get("noise"), NoisyInputs):
-        X = Columns(X.columns, noise.points)
-    if arguments.fit == "compare":
-        return compare(X, Y, f_p, variances, seed=arguments.seed, progress=True, **options)
-    say(f"Fitting CKA by {arguments.fit!r} ...")
-    model: GP = with_options(CKA, options)(X, Y, variances, physics=f_p)
-    for part in model.physics:
-        if text := complaint(part, model.data):
-            warnings.warn(text, PhysicsWarning, stacklevel=1)
-    fit(model, arguments.fit, seed=arguments.seed)
-    return model
+def _of_table(arguments: Namespace) -> Job:
+    """Read the table and the physics of ``gpadjust report``."""
+    outputs = read.names_of(arguments.outputs, "--outputs")
+    variances, text = None, arguments.noise
+    if text not in (None, "relative"):
+        sds = read.pairs(text, "--noise") if "=" in text else dict.fromkeys(outputs, text)
+        variances = read.variances_of(sds, "--noise", outputs, "--outputs", all_of=True)
+    unknowns = physics_of.unknowns_of(arguments.unknown)
+    table = read.open_table(arguments.data, arguments)
+    batches = read.names_of(arguments.batches, "--batches")
+    groups = [*read.names_of(arguments.categories, "--categories"), *batches]
+    inputs = read.names_of(arguments.inputs, "--inputs")
+    if not inputs:
+        if paths := [text for text in arguments.physics if ":" in text]:
+            raise ValueError(
+                f"Expected --inputs, the columns that {paths[0]} reads, in its order; only "
+                "formulas name their own."
+            )
+        others = [name for name in table.names if not {name, bare(name)} & {*outputs}]
+        inputs = physics_of.columns_of(arguments.physics, others, [*unknowns])
+        inputs += [name for name in groups if name not in {*inputs, *map(bare, inputs)}]
+    data = read.read_table(table, inputs, outputs, groups, arguments)
+    options = _options(arguments, inputs, batches, data)
+    physics, code, modules = physics_of.given_physics(arguments.physics, data, unknowns)
+
+    def work() -> Subject:
+        X, noise = data.X, options.get("noise")
+        if isinstance(noise, NoisyInputs):
+            X = read.Columns(X.columns, noise.points)
+        if arguments.fit == "compare":
+            seed = arguments.seed
+            model: Any = compare(X, data.Y, physics, variances, seed=seed, progress=True, **options)
+        else:
+            _say(f"Fitting CKA by {arguments.fit!r} ...")
+            model = with_options(CKA, options)(X, data.Y, variances, physics=physics)
+            for text in (complaint(part, model.data) for part in model.physics):
+                if text:
+                    warnings.warn(text, PhysicsWarning, stacklevel=1)
+            fit(model, arguments.fit, seed=arguments.seed)
+        return subject_of(model, [f"line {line}" for line in data.lines])
+
+    rows = f"{arguments.data}: {plural(len(data.lines), 'row')}"
+    first = f"{rows}, {listed(data.Y.columns)} from {listed(data.X.columns)}."
+    settings = {"data file": read.digest_of(arguments.data)}
+    origin = Origin(settings, data.remarks, physics=code, modules=modules)
+    return Job([first, *data.remarks], origin, work)
 
 
-def _inputs(
-    arguments: Namespace,
-    names: Sequence[str],
-    outputs: Sequence[str],
-    unknowns: Sequence[str],
-    groups: Sequence[str],
-) -> list[str]:
-    """Return the names of the inputs: by the option, or of formulas and groups."""
-    if arguments.inputs is not None:
-        return names_of(arguments.inputs, "--inputs")
-    if paths := [text for text in arguments.physics if is_path(text)]:
-        raise ValueError(
-            f"Expected --inputs, the columns that {paths[0]} reads, in its order; only formulas "
-            "name their own."
-        )
-    others = [
-        name for name in names if name not in outputs and name_and_unit(name)[0] not in outputs
-    ]
-    found = columns_of(arguments.physics, others, unknowns)
-    bare = {name_and_unit(name)[0] for name in found}
-    return found + [name for name in groups if name not in found and name not in bare]
-
-
-def _options(arguments: Namespace, inputs: Sequence[str], data: TableData) -> dict[str, Any]:
-    """Return the options of a model that a command line has.
-
-    Args:
-        arguments: A command line as parsed by :func:`gpadjust.__main__.parser`.
-        inputs: The names of the inputs as in the file, in the order of the columns.
-        data: The data.
-
-    Raises:
-        ValueError: If one is not a number, or names what is not an input.
-    """
-    found: dict[str, Any] = {}
+def _options(
+    arguments: Namespace, inputs: Sequence[str], batches: Sequence[str], data: read.TableData
+) -> dict[str, Any]:
+    """Return the options of a model: noise, link and categories."""
+    options: dict[str, Any] = {}
     noise: Noise | None = RelativeNoise() if arguments.noise == "relative" else None
     if arguments.outliers:
         noise = HeavyTails(base=noise)
-    if arguments.input_noise is not None:
-        noise = NoisyInputs(data.X.values, _variances(arguments.input_noise, inputs), noise)
+    if (text := arguments.input_noise) is not None:
+        sds = read.pairs(text, "--input-noise")
+        variances = read.variances_of(sds, "--input-noise", inputs, "--inputs", all_of=False)
+        noise = NoisyInputs(data.X.values, variances, noise)
     if noise is not None:
-        found["noise"] = noise
+        options["noise"] = noise
     if arguments.positive:
-        found["link"] = "log"
-    if arguments.bounds is not None:
-        found["link"] = _bounds(arguments.bounds)
+        options["link"] = "log"
+    if (text := arguments.bounds) is not None:
+        ends = [read.number_of(end) for end in text.split(",")]
+        if len(ends) != 2 or not ends[0] < ends[1]:
+            raise ValueError(
+                f"Expected --bounds as two numbers, the lower first: 0,1; found {text!r}."
+            )
+        options["link"] = (ends[0], ends[1])
     if data.levels:
-        bare = {name_and_unit(name)[0]: name for name in data.levels}
-        batches = names_of(arguments.batches, "--batches") if arguments.batches else []
-        batches = [bare.get(name, name) for name in batches]
-        columns = [name for name in data.levels if name not in batches]
-        found["input_transform"] = Categories(columns, batches, data.levels)
-    return found
+        full = {bare(name): name for name in data.levels}
+        named = [full.get(name, name) for name in batches]
+        columns = [name for name in data.levels if name not in named]
+        options["input_transform"] = Categories(columns, named, data.levels)
+    return options
 
 
-def _bounds(text: str) -> tuple[float, float]:
-    """Return the two numbers of ``"0,1"``."""
-    ends = [_number(each) for each in text.split(",")]
-    if len(ends) != 2 or not ends[0] < ends[1]:
-        raise ValueError(f"Expected --bounds as two numbers, the lower first: 0,1; found {text!r}.")
-    return ends[0], ends[1]
-
-
-def _variances(text: str, inputs: Sequence[str]) -> list[float]:
-    """Return the variance of each input, of the standard deviations that a command line has."""
-    given = pairs(text, "--input-noise")
-    if unknown := [name for name in given if name not in inputs]:
-        raise ValueError(f"--input-noise names {unknown[0]!r}, which is none of --inputs.")
-    sds = [_number(given.get(name, "0")) for name in inputs]
-    if not all(0 <= sd <= LARGEST for sd in sds):
+def _of_log(arguments: Namespace) -> Job:
+    """Read the log and the equations of ``gpadjust identify``."""
+    hidden = physics_of.hidden_of(arguments.hidden)
+    unknowns = physics_of.unknowns_of(arguments.unknown)
+    way = " A state that was not measured: --hidden 'rate=0 +- 1'."
+    tables = [read.open_table(file, arguments, way) for file in arguments.data]
+    log = listed(read.digest_of(file) for file in arguments.data)
+    own_units = {name: prior.unit for name, prior in hidden.items()}
+    columns, units = read.log_columns(tables, own_units, arguments)
+    names = [*columns["states"]], [*columns["actions"]]
+    angles = read.names_of(arguments.angles, "--angles")
+    read.check_names(angles, "--angles", names[0], "--states")
+    if wrong := [name for name in angles if units.get(name) in _DEGREES]:
         raise ValueError(
-            "Expected --input-noise as standard deviations in the inputs' units, such as "
-            f"{inputs[0]}=0.5, found {text!r}."
+            f"Expected the angle {wrong[0]!r} in rad, found {units[wrong[0]]!r}; convert it, or do "
+            "without --angles, which is for angles that go round."
         )
-    return [sd**2 for sd in sds]
+    marks = {"delimiter": read.mark_of(arguments.delimiter), "decimal": arguments.decimal}
+    reading = {**columns, **marks}
+    whole = Records.read_csv(arguments.data, StateSpec(*names, angles=angles), **reading)
+    step = arguments.step
+    if step is None:
+        step = float(f"{whole.records[0].sampling_step:.{_DIGITS}g}")
+    given = physics_of.motion(arguments.physics, *names, unknowns, step)
+    physics = given.physics
+    if isinstance(physics, ODEPhysics):
+        step = physics.step
+    if arguments.step not in (None, step):
+        raise ValueError(
+            f"Expected no --step, as the physics has a step of {step:g}, found {arguments.step:g}."
+        )
+    spec = StateSpec(*names, angles=angles, step=step)
+    options = {
+        "start": {name: (own.guess, own.sd) for name, own in hidden.items()} or None,
+        "held_out": arguments.held_out,
+        "num_starts": arguments.starts,
+        "seed": arguments.seed,
+    }
+
+    def work() -> Identification:
+        try:
+            return identify(Records(whole.records, spec), physics, **options, progress=True)
+        except RuntimeError as error:  # the states diverged, or the physics failed
+            raise ValueError(str(error)) from error
+
+    time = units.get("time", "s")
+    named = f"{physics.name} ({type(physics).__name__})"
+    settings = {"log": log, "step": f"{step:g} {time}", "physics": named}
+    program = _program(arguments.data, spec, reading, given, options)
+    line = f"{listed(arguments.data)}: {listed(map(repr, whole))}."
+    return Job([line], Origin(settings, units=units, program=program), work)
 
 
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
+def _program(
+    files: Sequence[str],
+    spec: StateSpec,
+    reading: Mapping[str, object],
+    physics: physics_of.GivenPhysics,
+    options: Mapping[str, object],
+) -> str:
+    """Return Python code that does the same, and follows further actions."""
+    states, actions = [*spec.states], [*spec.actions]
+    angles = f", angles={[*spec.angles]!r}" if spec.angles else ""
+    columns = "".join(f"    {name}={v!r},\n" for name, v in reading.items() if v is not None)
+    chosen = "".join(f", {name}={v!r}" for name, v in options.items() if v is not None)
+    return f"""\
+{physics_of.imports_of(physics.code, physics.modules)}
+from gpadjust.records import Records, identify
+from gpadjust.states import StateSpec
+
+spec = StateSpec({states!r}, {actions!r}, step={spec.step!r}{angles})
+records = Records.read_csv(
+    {[*files]!r},
+    spec,
+{columns})
+physics = {physics.code}
+found = identify(records, physics{chosen})
+print(found)
+
+# From the last state that was learnt from, under other actions: {", ".join(actions)}
+smoothed = found.smoothed
+state = smoothed.records.records[-1].states[-1:]
+plan = torch.zeros(1, 100, {len(actions)}, dtype=torch.float64)  # of 100 steps
+noises = {{"start_noise": smoothed.sd[-1][-1], "process_noise": smoothed.process_noise}}
+run = found.dynamics.free_run(state, plan, noise=False, **noises)
+print(run.mean, run.lower, run.upper)
+"""

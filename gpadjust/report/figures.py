@@ -1,4 +1,4 @@
-"""The figures of the page."""
+"""Sections with figures of a page: where the physics is wrong, and where predictions rest on it."""
 
 from __future__ import annotations
 
@@ -6,41 +6,83 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from gpadjust.kinds.categories import on_levels
 from gpadjust.physics import PhysicsError
-from gpadjust.report.markup import Markup, image, name_and_unit, number, with_unit
+from gpadjust.report import markup as html
+from gpadjust.report.markup import Markup, drawn, image, number, percent, tag
 from gpadjust.report.subject import Subject
-from gpadjust.validation.plots import (
-    plot_adjustment,
-    plot_coverage,
-    plot_leave_one_out,
-    plot_trust,
-)
-from gpadjust.validation.plots.drawing import (
-    DOTS,
-    GREY,
-    RED,
-    band,
-    column,
-    labels,
-    mean_and_ends,
-    tidy,
-)
+from gpadjust.validation import Trust, plots, trust
+from gpadjust.validation.plots import drawing
+from gpadjust.validation.plots.adjustments import adjustments_of, unadjusted
 from gpadjust.validation.plots.predictions import plot_pit
-from gpadjust.validation.trust import Trust
 
 _MOST = 12  # inputs along which slices are drawn, in all outputs together
-_WIDTH = 3.6  # inches: as wide as a column of the page, so that text has its size
 _POINTS = 120  # of a curve
 _STYLES = ("--", "-.", ":")
+_BANDS = "Solid lines are means; bands hold 95 % of the function, without measurement noise."
+_APART = (
+    "Observations are of rho f_p + delta alone: how much of it is rho's and how much delta's the "
+    "data tell far less surely than their sum."
+)
+_NONE = "There is no physics that could be adjusted, trusted or overridden."
+_TRUST = (
+    "Of {} points spread over the box of the data: the share at which the prediction rests on the "
+    "physics (its interval holds f_p, and is narrower than the discrepancies that were seen), on "
+    "the data (its interval excludes f_p: the model is sure that the physics is wrong there), or "
+    "on neither (too few data to tell)."
+)
+_COLORS = "blue where it rests on the physics, orange on the data, grey on neither"
+
+
+def where_wrong(subject: Subject) -> Markup:
+    """Return the prediction beside the physics, rho and delta, for each output."""
+    inputs = inputs_drawn(subject)
+    parts: list[Markup] = []
+    if len(subject.inputs) > 1:
+        values = zip(subject.inputs, point(subject, subject.base, 3), strict=True)
+        pairs = [f"{html.bare(name)} = {html.with_unit(value, name)}" for name, value in values]
+        few = f" (drawn: {len(inputs)} of {len(pairs)} inputs, those that move predictions most)"
+        held = f"Along each input the others stay at the median of the data: {', '.join(pairs)}"
+        parts.append(tag("p", f"{held}{few * (len(inputs) < len(pairs))}.", class_="note"))
+    for j, name in enumerate(subject.outputs):
+        parts += [tag("h3", name)] * (len(subject.outputs) > 1)
+        parts += [tag("p", " ".join(_words(subject, j))), slices(subject, j, inputs)]
+    return html.join(parts)
+
+
+def trusted(subject: Subject) -> Markup:
+    """Return the shares of predictions that rest on the physics, on data, or on neither."""
+    rows, failed, images = [], [], []
+    inputs, points = inputs_drawn(subject), 0
+    for name, shown in zip(subject.outputs, subject.adjusted, strict=True):
+        if shown is None:
+            continue
+        try:
+            basis = trust(shown.model)
+        except PhysicsError as error:
+            failed.append(tag("p", f"{name}: {html.failure(error)}", class_="caution"))
+            continue
+        shares = (basis.physics, basis.data, basis.neither)
+        rows.append([name, shown.structure, *(percent(share[shown.output]) for share in shares)])
+        images.append(trusts(basis, shown.output, inputs, name))
+        points = len(basis.X)
+    if not rows:
+        return html.join(failed or [tag("p", _NONE)])
+    several = "Along each input, for all values of the others"
+    over = several if len(subject.inputs) > 1 else "Along the input"
+    head = ["output", "by the model", "physics", "data", "neither"]
+    shares_of = html.table("Basis of the predictions", head, rows)
+    words = tag("p", _TRUST.format(f"{points:,}"))
+    return html.join(
+        [*failed, words, shares_of, *images, tag("p", f"{over}: {_COLORS}.", class_="note")]
+    )
 
 
 @torch.no_grad()
 def inputs_drawn(subject: Subject) -> list[int]:
-    """The inputs along which slices are drawn: all, or those that move the predictions most."""
+    """Return the inputs along which slices are drawn: those that move the predictions most."""
     d, m = len(subject.inputs), len(subject.outputs)
     most = max(2, _MOST // m)
     if d <= most:
@@ -49,19 +91,26 @@ def inputs_drawn(subject: Subject) -> list[int]:
     effect = torch.zeros(d, dtype=torch.float64)
     for i in range(d):
         try:
-            mean = subject.model.predict(_slice(subject, i, 21)).mean
+            mean = subject.model.predict(slice_along(subject, i, 21)).mean
         except PhysicsError:
             continue  # its figure will say so, if it is among them
         effect[i] = ((mean.amax(0) - mean.amin(0)) / spread.clamp_min(1e-300)).max()
     return sorted(effect.argsort(descending=True)[:most].tolist())
 
 
+def point(subject: Subject, X: Tensor, digits: int = 4) -> list[str]:
+    """Return the inputs of a point, ``d``, in words: numbers, and the names of categories."""
+    names, values = subject.levels, enumerate(X.tolist())
+    return [names[i][int(x)] if i in names else number(x, digits) for i, x in values]
+
+
+@drawn
 def slices(subject: Subject, output: int, inputs: list[int]) -> list[Markup]:
-    """Along each input what is predicted, the physics, rho and delta, the others at the median."""
+    """Return the prediction, the physics, rho and delta along each input, others at the median."""
     shown = subject.adjusted[output]
-    terms = () if shown is None else shown.terms
+    terms = () if shown is None else adjustments_of(shown.model)
     d, rows = len(subject.inputs), 1 + len(terms)
-    figures = _figures(d, 2.1 + 1.5 * len(terms))
+    figures = [html.new_figure(2.1 + 1.5 * len(terms)) for _ in range(d)]
     ratios = [1.4, *[1.0] * len(terms)]
     grids = [f.subplots(rows, sharex=True, squeeze=False, height_ratios=ratios) for f in figures]
     axes = np.hstack(grids)
@@ -72,77 +121,54 @@ def slices(subject: Subject, output: int, inputs: list[int]) -> list[Markup]:
     for i in inputs:
         axes[0, i].set_ylim(min(low), max(high))
     if shown is not None and terms:
-        plot_adjustment(shown.model, output=shown.output, axes=axes[1:], num_points=_POINTS)
-        _without_legend(axes[1, 0])
-        for i in range(1, d):
-            for row, name in zip(axes[1:, i], axes[1:, 0], strict=True):
-                row.set_ylabel(name.get_ylabel())
+        plots.plot_adjustment(shown.model, output=shown.output, axes=axes[1:], num_points=_POINTS)
+        _name_alike(axes[1:])
     else:
-        for i, label in enumerate(labels(subject.model, "input", d)):
-            axes[-1, i].set_xlabel(label)
+        for ax, label in zip(axes[-1], drawing.labels(subject.model, "input", d), strict=True):
+            ax.set_xlabel(label)
     parts = "the prediction and the physics" if shown is not None else "the prediction"
     below = f"; below, {' and '.join(terms)}" if terms else ""
-    return [
-        image(figures[i], f"{parts} of {subject.outputs[output]} over {subject.inputs[i]}{below}")
-        for i in inputs
-    ]
+    alt = f"{parts} of {subject.outputs[output]} over {{}}{below}".format
+    return [image(figures[i], alt(subject.inputs[i])) for i in inputs]
 
 
-def trusts(trusted: Trust, output: int, inputs: list[int], page_output: str) -> list[Markup]:
-    """The basis of predictions along each input."""
-    alt = f"whether the prediction of {page_output} rests on physics, data or neither"
-    figures = _figures(len(trusted.input_names), 2.0)
-    axes = [figure.subplots() for figure in figures]
-    plot_trust(trusted, output=output, axes=axes)
-    _without_legend(axes[-1])
-    for ax in axes:
-        ax.set_ylabel(axes[0].get_ylabel())
-    return [image(figures[i], f"{alt}, over {trusted.input_names[i]}") for i in inputs]
+@drawn
+def trusts(basis: Trust, output: int, inputs: list[int], name: str) -> list[Markup]:
+    """Return the basis of predictions of an output of a model, by its name, along each input."""
+    figures = [html.new_figure(2.0) for _ in basis.input_names]
+    axes = np.array([[figure.subplots() for figure in figures]])
+    plots.plot_trust(basis, output=output, axes=[*axes[0]])
+    if (legend := axes[0, -1].get_legend()) is not None:
+        legend.remove()
+    _name_alike(axes)
+    alt = f"whether the prediction of {name} rests on physics, data or neither"
+    return [image(figures[i], f"{alt}, over {basis.input_names[i]}") for i in inputs]
 
 
+@drawn
 def left_out(subject: Subject, output: int) -> list[Markup]:
-    """Left-out predictions against observations, and their standardized residuals."""
-    figures = _figures(2)
-    plot_leave_one_out(subject.loo, output=output, axes=[f.subplots() for f in figures])
+    """Return left-out predictions against observations, and their standardized residuals."""
+    figures = [html.new_figure(2.9), html.new_figure(2.9)]
+    plots.plot_leave_one_out(subject.loo, output=output, axes=[f.subplots() for f in figures])
     name = subject.outputs[output]
-    alts = (f"predictions of left-out {name} against observations", f"their residuals, of {name}")
-    return [image(figure, alt) for figure, alt in zip(figures, alts, strict=True)]
+    first = image(figures[0], f"predictions of left-out {name} against observations")
+    return [first, image(figures[1], f"their residuals, of {name}")]
 
 
-def coverage(subject: Subject, output: int) -> list[Markup]:
-    """Observed against nominal coverage, and the histogram of PIT values."""
-    figures = _figures(2)
-    plot_coverage(subject.loo, output=output, ax=figures[0].subplots())
-    bins = max(4, min(10, subject.counts[output] // 4))
+@drawn
+def coverages(subject: Subject, output: int, count: int) -> list[Markup]:
+    """Return observed against nominal coverage, and the histogram of PIT values."""
+    figures = [html.new_figure(2.9), html.new_figure(2.9)]
+    plots.plot_coverage(subject.loo, output=output, ax=figures[0].subplots())
+    bins = max(4, min(10, count // 4))
     plot_pit(subject.loo, output=output, bins=bins, ax=figures[1].subplots())
     name = subject.outputs[output]
-    alts = (f"observed against nominal coverage of {name}", f"histogram of PIT values of {name}")
-    return [image(figure, alt) for figure, alt in zip(figures, alts, strict=True)]
+    first = image(figures[0], f"observed against nominal coverage of {name}")
+    return [first, image(figures[1], f"histogram of PIT values of {name}")]
 
 
-def held(subject: Subject, inputs: list[int]) -> str:
-    """At what the other inputs stay."""
-    if len(subject.inputs) == 1:
-        return ""
-    values = zip(subject.inputs, point(subject, subject.base, 3), strict=True)
-    pairs = [f"{name_and_unit(name)[0]} = {with_unit(value, name)}" for name, value in values]
-    drawn_of = f" (drawn: {len(inputs)} of {len(pairs)} inputs, those that move predictions most)"
-    few = drawn_of if len(inputs) < len(pairs) else ""
-    return f"Along each input the others stay at the median of the data: {', '.join(pairs)}{few}."
-
-
-def point(subject: Subject, X: Tensor, digits: int = 4) -> list[str]:
-    """The inputs of a point, ``d``, in words: numbers, and the names of categories."""
-    names, values = subject.names, enumerate(X.tolist())
-    return [names[i][int(x)] if i in names else number(x, digits) for i, x in values]
-
-
-def _figures(number_of_figures: int, height: float = 2.9) -> list[Figure]:
-    size = (_WIDTH, height)  # in inches
-    return [Figure(figsize=size, layout="constrained") for _ in range(number_of_figures)]
-
-
-def _slice(subject: Subject, i: int, number_of_points: int) -> Tensor:
+def slice_along(subject: Subject, i: int, number_of_points: int) -> Tensor:
+    """Return points along an input, over the range of the data, the others at their medians."""
     low, high = subject.X[:, i].min(), subject.X[:, i].max()
     pad = 0.5 * low.abs().clamp_min(1.0) if low == high else torch.zeros_like(low)
     X = subject.base.repeat(number_of_points, 1)
@@ -151,22 +177,57 @@ def _slice(subject: Subject, i: int, number_of_points: int) -> Tensor:
 
 
 def _prediction(subject: Subject, output: int, i: int, ax: Any) -> None:
-    X = _slice(subject, i, _POINTS)
+    X = slice_along(subject, i, _POINTS)
     x = X[:, i]
-    band(ax, x, *mean_and_ends(subject.model.marginals(X), output, 0.95), 0.95)
+    drawing.band(ax, x, *drawing.mean_and_ends(subject.model.marginals(X), output, 0.95), 0.95)
     curves = subject.physics_at(X, output)
     for k, (name, values) in enumerate(curves.items()):
-        ax.plot(x, values, color=GREY, ls=_STYLES[k % 3], lw=1.2, label=name)
+        ax.plot(x, values, color=drawing.GREY, ls=_STYLES[k % 3], lw=1.2, label=name)
     if len(subject.inputs) == 1:
-        ax.plot(subject.X[:, 0], column(subject.Y, output), color=RED, **DOTS)
-    ax.set_ylabel(labels(subject.model, "output", len(subject.outputs))[output])
+        ax.plot(
+            subject.X[:, 0], drawing.column(subject.Y, output), color=drawing.RED, **drawing.DOTS
+        )
+    ax.set_ylabel(drawing.labels(subject.model, "output", len(subject.outputs))[output])
     ax.set_xlim(float(x[0]), float(x[-1]))
     if len(curves) > 1:
         ax.legend(frameon=False)
-    tidy(ax)
+    drawing.tidy(ax)
 
 
-def _without_legend(ax: Any) -> None:
-    """The page says what is drawn, once for all figures."""
-    if ax.get_legend() is not None:
-        ax.get_legend().remove()
+def _name_alike(axes: Any) -> None:
+    """Give each figure the labels of the first; the page says what is drawn, once for all."""
+    if (legend := axes[0, 0].get_legend()) is not None:
+        legend.remove()
+    for row in axes:
+        for ax in row:
+            ax.set_ylabel(row[0].get_ylabel())
+
+
+def _words(subject: Subject, output: int) -> list[str]:
+    """Return the words above the figures of an output."""
+    shown, name = subject.adjusted[output], subject.outputs[output]
+    if shown is None:
+        return [f"{_NONE} The figures show the prediction. {_BANDS}"]
+    words = []
+    has_unknowns = any(physics.unknowns for physics in subject.physics.values())
+    is_it = "with fitted parameters" if has_unknowns else "as it is"
+    for physics, values in subject.physics_at(subject.X, output).items():
+        off = subject.judged[:, output] - values
+        rms, mean = number(off.square().nanmean().sqrt()), number(off.nanmean())
+        words.append(
+            f"At the data, the {physics} ({is_it}) is off by {html.with_unit(rms, name)} (root "
+            f"mean square; observed less physics is {html.with_unit(mean, name)} in the mean)."
+        )
+    top = "the prediction, and dashed the physics"
+    if subject.comparison is not None:
+        top = "the prediction of what is recommended, and dashed the physics"
+    words.append(f"Topmost: {top}{', with the data' * (len(subject.inputs) == 1)}.")
+    if terms := adjustments_of(shown.model):
+        weight = "" if shown.weight == 1 else f" (weight {shown.weight:.2f})"
+        back = [f"{term} = {number(unadjusted(shown.model, term))}" for term in terms]
+        words.append(
+            f"Below: {html.listed(terms)} of {shown.structure}{weight}, with ticks at the data; "
+            f"dashed, what they fall back to without data, {html.listed(back)}."
+        )
+        words += [_APART] * (len(terms) > 1)
+    return [*words, _BANDS]

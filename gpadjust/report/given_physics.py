@@ -1,4 +1,4 @@
-"""The physics of a command line: functions of modules, or formulas with unknown parameters."""
+"""The physics of a command line: functions of modules, formulas, and equations of motion."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ import os
 import re
 import sys
 import traceback
+from ast import unparse
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from importlib import import_module
 from operator import attrgetter
 from pathlib import Path
@@ -20,68 +22,67 @@ from gpadjust.files.table_columns import LARGEST
 from gpadjust.physics import (
     BlackBoxPhysics,
     FormulaPhysics,
+    ODEPhysics,
     Physics,
     PhysicsError,
     Unknown,
+    as_physics,
 )
-from gpadjust.physics.formula import names_in, symbol
+from gpadjust.physics.formula import names_in, parse, symbol
 from gpadjust.physics.function import array_physics
-from gpadjust.report.inputs import TableData, meant
+from gpadjust.report.inputs import TableData, check_different, check_names, meant
 from gpadjust.report.markup import plural
 
-_PATH = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
 _PRIOR = re.compile(
     r"\s*([^=\[]+?)\s*(?:\[(.*)\])?\s*=\s*(.+?)\s*(\+/?-|±|\*/|\.\.)\s*(.+?)\s*(%?)\s*"
 )
+_EQUATION = re.compile(r"\s*([^\W\d]\w*)\s*('?)\s*=(?!=)(.*)", flags=re.DOTALL)
 _HOW = "A Python function is given as module:function, such as pump:head."
 _SHOWN = 5  # rows at which a physics fails
+_MADE = ("BlackBoxPhysics", "FormulaPhysics", "ODEPhysics", "Unknown")
 _SAME = 1e-6  # as a model's file asks it when it is loaded
 
 
 class GivenPhysics(NamedTuple):
-    """A physics, and the Python code by which a program that loads its model gives it.
+    """A physics, or several by their names, and the Python code by which a program gives it."""
 
-    Attributes:
-        physics: The physics; several by their names.
-        code: An expression by its name: ``""`` of a single physics. None if the model's file holds
-            all, as formulas.
-        modules: The modules that these need.
-    """
+    physics: Any
+    code: str  # empty if a model's file holds it, as formulas
+    modules: tuple[str, ...] = ()  # that the code needs
 
-    physics: Physics | dict[str, Physics]
-    code: dict[str, str] | None
-    modules: tuple[str, ...]
+
+def imports_of(code: str, modules: Sequence[str], *names: str) -> str:
+    """Return lines that import what the code of a physics needs, and names of the library."""
+    made = [*(name for name in _MADE if f"{name}(" in code), *names]
+    lines = ["from math import inf\n"] if re.search(r"\binf\b", code) else []
+    lines += ["import torch", *(f"import {module}" for module in modules)]
+    lines += [f"from gpadjust import {', '.join(made)}"] if made else []
+    return "\n".join(lines)
 
 
 def unknown_of(text: str) -> tuple[str, Unknown]:
-    """The name and the prior of an unknown parameter.
+    """Return the name and the prior of an unknown parameter.
 
-    Args:
-        text: ``"E [Pa]=210e9 +- 20 %"``, a standard deviation, of a percentage one that keeps the
-            sign; or ``"c=0.1 */ 2"``, a factor; or ``"e=0.1 .. 0.3"``, bounds.
-
-    Raises:
-        ValueError: If it is none of these.
+    It is ``"E [Pa]=210e9 +- 20 %"``, a standard deviation, of a percentage one that keeps the sign;
+    or ``"c=0.1 */ 2"``, a factor; or ``"e=0.1 .. 0.3"``, bounds.
     """
-    found = _PRIOR.fullmatch(text)
+    match = _PRIOR.fullmatch(text)
     try:
-        if found is None:
+        if match is None:
             raise ValueError("it has another form")
-        name, unit, one, how, other, is_share = found.groups()
-        first, second = float(one), float(other)
-        given: dict[str, Any] = {"unit": unit or ""}
+        name, unit, guess, how, spread, is_share = match.groups()
+        first, second = float(guess), float(spread)
+        options: dict[str, Any] = {"sd": second}
         if is_share and how in ("*/", ".."):
             raise ValueError("a percentage goes with +-")
-        if how == "..":
-            first, given["bounds"] = 0.5 * (first + second), (first, second)
+        if is_share:
+            bounds = (0.0, math.inf) if first > 0 else (-math.inf, 0.0)
+            options = {"sd": 0.01 * second * abs(first), "bounds": bounds}
         elif how == "*/":
-            given["factor"] = second
-        elif is_share:
-            given["sd"] = 0.01 * second * abs(first)
-            given["bounds"] = (0.0, math.inf) if first > 0 else (-math.inf, 0.0)
-        else:
-            given["sd"] = second
-        return name, Unknown(first, **given)
+            options = {"factor": second}
+        elif how == "..":
+            first, options = 0.5 * (first + second), {"bounds": (first, second)}
+        return name, Unknown(first, unit=unit or "", **options)
     except ValueError as error:
         raise ValueError(
             "Expected --unknown such as 'E [Pa]=210e9 +- 20 %', 'c=0.1 */ 2' (a factor), or "
@@ -90,183 +91,171 @@ def unknown_of(text: str) -> tuple[str, Unknown]:
 
 
 def unknowns_of(texts: Sequence[str]) -> dict[str, Unknown]:
-    """The unknown parameters of a command line by their names; the errors of :func:`unknown_of`."""
+    """Return the unknown parameters of a command line by their names."""
     pairs = [unknown_of(text) for text in texts]
-    names = [name for name, _ in pairs]
-    if again := [name for name in names if names.count(name) > 1]:
-        raise ValueError(f"Expected different --unknown, found {again[0]!r} more than once.")
+    check_different([name for name, _ in pairs], "--unknown")
     return dict(pairs)
 
 
-def needs_inf(code: str) -> bool:
-    """Return whether the code of a physics has bounds at infinity, and has to import it."""
-    return re.search(r"\binf\b", code) is not None
-
-
-def is_path(text: str) -> bool:
-    """Return whether a physics is given as ``module:function``, and not as a formula."""
-    return ":" in text
+def hidden_of(texts: Sequence[str]) -> dict[str, Unknown]:
+    """Return hidden states by their names: unit, and mean and sd at the beginning."""
+    hidden: dict[str, Unknown] = {}
+    for text in texts:
+        prior: Unknown | None = None
+        with suppress(ValueError):
+            name, prior = unknown_of(text)
+        if prior is None or prior.sd is None:
+            raise ValueError(
+                "Expected --hidden with what is known of its beginning, mean and standard "
+                f"deviation, such as 'rate [rad/s]=0 +- 2', found {text!r}."
+            )
+        hidden[name] = prior
+    return hidden
 
 
 def columns_of(formulas: Sequence[str], names: Sequence[str], unknowns: Sequence[str]) -> list[str]:
-    """The columns among some of a table that formulas name, in the order of the table.
-
-    Raises:
-        ValueError: If one is no formula, they name no column, or what is none and no unknown
-            parameter; or if two columns have the same name but for their units.
-    """
+    """Return the columns among some of a table that formulas name, in the order of the table."""
     named = {name for formula in formulas for name in names_in(formula)}
     known = [symbol(name) for name in names]
-    found = [name for name in names if symbol(name) in named]
-    if again := [symbol(name) for name in found if known.count(symbol(name)) > 1]:
-        raise ValueError(
-            f"Several columns are {again[0]!r} in a formula, which has no units; rename one."
-        )
+    columns = [name for name in names if symbol(name) in named]
+    check_different([*map(symbol, columns)], "columns in a formula, which has no units")
     absent = sorted(named - {*known, *unknowns})
-    if absent or not found:
+    if absent or not columns:
         wrong = absent[0] if absent else "none of them"
         hint = meant(wrong, [*known, *unknowns]) if absent else ""
         raise ValueError(
             f"Expected a formula of columns of the table, {', '.join(known)}, and of --unknown; "
             f"found {wrong!r} in --physics {formulas[0]!r}.{hint} {_HOW}"
         )
-    return found
+    return columns
 
 
 def given_physics(
     texts: Sequence[str], data: TableData, unknowns: Mapping[str, Unknown]
 ) -> GivenPhysics:
-    """Import functions ``"module:name"``, read formulas, and evaluate them at the data.
-
-    Args:
-        texts: The functions and formulas.
-        data: The data, whose columns formulas have.
-        unknowns: The unknown parameters of the formulas.
-
-    Raises:
-        ValueError: If one has another form, its module or the function is not there or raises
-            an error, it is no physics, or is given twice; if no formula has an unknown parameter;
-            or if the physics fails in some row, which the error names, or returns other values
-            when it is called again.
-    """
-    if again := [text for text in dict.fromkeys(texts) if texts.count(text) > 1]:
-        raise ValueError(
-            f"Expected different --physics, found {again[0]} more than once; give it once."
-        )
-    formulas, paths = ([t for t in texts if is_path(t) == each] for each in (False, True))
-    parts: dict[str, Physics] = {}
-    code: dict[str, str] = {}
+    """Import functions ``"module:name"``, read formulas, and evaluate them at the data."""
+    check_different(texts, "--physics")
+    formulas = [text for text in texts if ":" not in text]
+    parts, code = dict[str, Physics](), dict[str, str]()
     for text in texts:
+        short = text.rpartition(":")[2].rpartition(".")[2]
+        if text in formulas:  # a name that figures have room for
+            short = f"formula {formulas.index(text) + 1}" if len(formulas) > 1 else "formula"
+        name = text if short in parts else short
+        make = _formula if text in formulas else _function
         try:
-            if is_path(text):
-                physics, expression = _function(text, data)
-            else:
-                physics = _formula(text, data, unknowns)
-                expression = _code(physics)
-            _check(physics, data)
+            parts[name], code[name] = make(text, data, unknowns)
+            _check(parts[name], data)
         except ValueError as error:
             raise ValueError(f"--physics {text}: {error}") from error
-        short = text.rpartition(":")[2].rpartition(".")[2]
-        if not is_path(text):  # a name that figures have room for
-            short = f"formula {formulas.index(text) + 1}" if len(formulas) > 1 else "formula"
-        key = text if short in parts else short
-        parts[key], code[key] = physics, expression
     used = {name for physics in parts.values() for name in physics.unknowns}
     if absent := [name for name in unknowns if name not in used]:
         way = "" if formulas else " A function has its own: FunctionPhysics(f, unknowns=...)."
         raise ValueError(f"--unknown names {absent[0]!r}, which is in no formula.{way}")
-    modules = tuple(dict.fromkeys(path.partition(":")[0] for path in paths))
-    if len(parts) > 1:
-        return GivenPhysics(parts, code if paths else None, modules)
-    ((key, physics),) = parts.items()
-    return GivenPhysics(physics, {"": code[key]} if paths else None, modules)
+    modules = tuple(dict.fromkeys(text.partition(":")[0] for text in texts if ":" in text))
+    several = ", ".join(f"{name!r}: {own}" for name, own in code.items())
+    expression = f"{{{several}}}" if len(parts) > 1 else code[name]
+    physics = parts if len(parts) > 1 else parts[name]
+    return GivenPhysics(physics, expression if modules else "", modules)
 
 
-def _formula(text: str, data: TableData, unknowns: Mapping[str, Unknown]) -> FormulaPhysics:
-    """The physics of a formula, with the unknown parameters that it has."""
+def _formula(text: str, data: TableData, unknowns: Mapping[str, Unknown]) -> tuple[Physics, str]:
+    """Return the physics of a formula, with the unknown parameters that it has, and its code."""
     try:
-        own = {name: each for name, each in unknowns.items() if name in names_in(text)}
-        return FormulaPhysics(text, data.X.columns, unknowns=own)
+        own = {name: unknown for name, unknown in unknowns.items() if name in names_in(text)}
+        physics = FormulaPhysics(text, data.X.columns, unknowns=own)
     except ValueError as error:
         raise ValueError(f"{error} {_HOW}") from error
+    more = f", unknowns={own!r}" if own else ""
+    return physics, f"FormulaPhysics({text!r}, {[*physics.columns]!r}{more})"
 
 
-def _function(path: str, data: TableData) -> tuple[Physics, str]:
-    """The physics that a path names, and the code that makes it of what the path names."""
-    thing = imported(path)
+def _function(path: str, data: TableData, _: object = None) -> tuple[Physics, str]:
+    """Return the physics that a path names, and the code that makes it of what the path names."""
+    thing, code = imported(path), path.replace(":", ".")
     try:
         physics = array_physics(thing, data.X.to_numpy())
     except (TypeError, PhysicsError) as error:
         row = f" The first row is line {data.lines[0]} of the file."
         raise ValueError(f"{error}{row * isinstance(error, PhysicsError)}") from error
-    expression = path.replace(":", ".")
     is_numpy = isinstance(physics, BlackBoxPhysics) and physics is not thing
-    return physics, f"BlackBoxPhysics({expression})" if is_numpy else expression
+    return physics, f"BlackBoxPhysics({code})" if is_numpy else code
 
 
-def _code(physics: FormulaPhysics) -> str:
-    """The code that makes the physics of a formula."""
-    text = f"FormulaPhysics({physics.formula!r}, {[*physics.columns]!r}"
-    return text + (f", unknowns={dict(physics.unknowns)!r})" if physics.unknowns else ")")
+def motion(
+    texts: Sequence[str],
+    states: Sequence[str],
+    actions: Sequence[str],
+    unknowns: Mapping[str, Unknown],
+    step: float,
+) -> GivenPhysics:
+    """Return the physics ``"module:name"`` of a machine, or of equations, one for each state."""
+    if paths := [text for text in texts if ":" in text]:
+        path, module = paths[0], paths[0].partition(":")[0]
+        if len(texts) > 1 or unknowns:
+            raise ValueError(
+                f"Expected {path} alone: it has the next values of all states, and its own "
+                "unknown parameters, as of ODEPhysics(f, ..., unknowns=...)."
+            )
+        try:
+            return GivenPhysics(as_physics(imported(path)), path.replace(":", "."), (module,))
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"--physics {path}: {error}") from error
+    sides, primes = dict[str, str](), set[str]()
+    for text in texts:
+        match = _EQUATION.fullmatch(text)
+        trees = [] if match is None else parse(match[3])
+        if match is None or len(trees) != 1 or match[1] in sides:
+            raise ValueError(
+                'Expected --physics as one equation for each state, such as "rate\'=-sin(angle)" '
+                "(a time derivative) or 'level=0.9*level' (its next value), or module:name, found "
+                f"{text!r}."
+            )
+        sides[match[1]] = unparse(trees[0])
+        primes.add(match[2])
+    if {*sides} != {*states} or len(primes) > 1:
+        raise ValueError(
+            f"Expected an equation for each of {', '.join(states)}, all of time derivatives or all "
+            f"of next values, found those of {', '.join(sides)}."
+        )
+    formula, columns = ", ".join(sides[name] for name in states), [*states, *actions]
+    check_names(unknowns, "--unknown", names_in(formula), "the names in equations")
+    physics: Physics = FormulaPhysics(formula, columns, unknowns=unknowns)
+    priors = "".join(f"        {name!r}: {own!r},\n" for name, own in unknowns.items())
+    rest = f"{formula!r},\n    {columns},\n    unknowns={{\n{priors}    }},\n"
+    code = f"FormulaPhysics(\n    {rest})"
+    if primes == {"'"}:
+        physics = ODEPhysics(physics, step, len(states))
+        code = f"ODEPhysics({code}, step={step!r}, state_dim={len(states)})"
+    return GivenPhysics(physics, code)
 
 
 def imported(path: str) -> Any:
-    """The object that a path ``module:name`` names."""
+    """Return the object that a path ``module:name`` names."""
     module, _, name = path.partition(":")
-    if not _PATH.fullmatch(path):
-        file = module.endswith(".py") or "/" in module or "\\" in module
-        hint = " Give the module without folder and .py, and run this in its folder." * file
-        raise ValueError(
-            f"expected module:function, such as pump:head for the function head of pump.py.{hint}"
-        )
+    files = [file.stem for file in Path().glob("*.py")]
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())
     try:
-        found = import_module(module)
-    except ModuleNotFoundError as error:
-        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
-            raise ValueError(
-                f"{module} cannot be imported: it needs {error.name!r}, which is not installed."
-            ) from error
-        near = meant(module, (file.stem for file in Path().glob("*.py")))
-        raise ValueError(
-            f"there is no module {error.name!r} in this folder, or where "
-            f"else Python looks (PYTHONPATH).{near}"
-        ) from error
+        return attrgetter(name)(import_module(module))
     except (Exception, SystemExit) as error:  # importing runs the user's code
         last = traceback.extract_tb(error.__traceback__)[-1]
-        where = f" ({Path(last.filename).name}, line {last.lineno})"
-        place = "" if isinstance(error, SyntaxError) else where
+        is_ours = "importlib" in last.filename or last.filename == __file__
+        place = "" if is_ours else f" ({Path(last.filename).name}, line {last.lineno})"
+        names = [*vars(sys.modules[module])] if module in sys.modules else []
+        near = meant(name, names) if module in files else meant(module, files)
         raise ValueError(
-            f"{module} cannot be imported: {type(error).__name__}: {error}{place}"
+            f"it cannot be imported, {type(error).__name__}: {error}{place}. Expected "
+            "module:function, such as pump:head for the function head of pump.py in this folder, "
+            f"or one of PYTHONPATH.{near}"
         ) from error
-    try:
-        return attrgetter(name)(found)
-    except AttributeError as error:
-        own = [
-            each
-            for each, value in vars(found).items()
-            if isinstance(value, Physics) or getattr(value, "__module__", None) == module
-        ]
-        has = ", ".join(own) or "no functions"
-        raise ValueError(f"{module} has no {name!r}; it has {has}.{meant(name, own)}") from error
 
 
+@torch.no_grad()
 def _check(physics: Physics, data: TableData) -> None:
     """Raise a ValueError that names the lines of the file at which a physics fails."""
-    X, n, m = data.X.values, len(data.lines), len(data.Y.columns)
-    try:
-        with torch.no_grad():
-            Y = physics(X)
-            physics.forget()
-            again = physics(X)
-    except PhysicsError as error:
-        rows, message = error.rows, str(error.args[0])
-        if len(rows) == n > 1:  # a function of all rows does not say which
-            each = {i: found for i in range(n) if (found := _error_at(physics, X[i : i + 1]))}
-            if 0 < len(each) < n:
-                rows, message = tuple(each), next(iter(each.values()))
-        raise ValueError(message + _told(rows, data)) from error
+    n, m = len(data.lines), len(data.Y.columns)
+    Y, again = _values(physics, data), _values(physics, data)
     if Y.shape[-1] != m:
         hint = " Commas part the outputs of a formula: is one a decimal comma?"
         raise ValueError(
@@ -274,30 +263,39 @@ def _check(physics: Physics, data: TableData) -> None:
             f"{', '.join(data.Y.columns)}, found {Y.shape[-1]}."
             f"{hint * isinstance(physics, FormulaPhysics)}"
         )
-    same = torch.isclose(again, Y, rtol=_SAME, atol=_SAME * float(Y.abs().max()))
-    small = f"values between {-LARGEST:.0e} and {LARGEST:.0e}"
+    is_same = torch.isclose(again, Y, rtol=_SAME, atol=_SAME * float(Y.abs().max()))
     exclude = "Correct the physics there, or exclude such inputs:"
     settle = "Take random numbers out of it, or let it set their seed itself:"
-    for expected, wrong, way_out in (
-        (small, Y.abs() > LARGEST, exclude),
-        ("the same values whenever it is called", ~same, settle),
-    ):
-        if lost := wrong.any(-1).nonzero().flatten().tolist():
-            found = f"found others in {len(lost)} of {plural(n, 'row')}"
-            raise ValueError(f"expected {expected}, {found}. {way_out}{_told(lost, data)}")
+    checks = {
+        f"values between {-LARGEST:.0e} and {LARGEST:.0e}": (Y.abs() > LARGEST, exclude),
+        "the same values whenever it is called": (~is_same, settle),
+    }
+    for expected, (is_wrong, way_out) in checks.items():
+        if rows := is_wrong.any(-1).nonzero().flatten().tolist():
+            found = f"found others in {len(rows)} of {plural(n, 'row')}"
+            raise ValueError(f"expected {expected}, {found}. {way_out}{_lines(rows, data)}")
 
 
-def _error_at(physics: Physics, row: Tensor) -> str:
+def _values(physics: Physics, data: TableData) -> Tensor:
+    """Return a physics at the data; its error, if any, names the lines of the file."""
+    X, errors = data.X.values, dict[int, str]()
+    physics.forget()
     try:
-        with torch.no_grad():
-            physics(row)
+        return physics(X)
     except PhysicsError as error:
-        return str(error.args[0])
-    return ""
+        rows, message = [*error.rows], str(error.args[0])
+        for i in range(len(X) if len(rows) == len(X) > 1 else 0):  # which one does not say
+            try:
+                physics(X[i : i + 1])
+            except PhysicsError as of_row:
+                errors[i] = str(of_row.args[0])
+        if 0 < len(errors) < len(X):
+            rows, message = [*errors], next(iter(errors.values()))
+        raise ValueError(message + _lines(rows, data)) from error
 
 
-def _told(rows: Sequence[int], data: TableData) -> str:
-    """The first of some rows by their lines in the file and their inputs."""
+def _lines(rows: Sequence[int], data: TableData) -> str:
+    """Return the first of some rows by their lines in the file and their inputs."""
     shown = []
     for i in rows[:_SHOWN]:
         values = zip(data.X.columns, data.X.values[i].tolist(), strict=True)

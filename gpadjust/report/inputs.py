@@ -1,13 +1,13 @@
-"""Inputs and outputs of a report's command line: columns of a CSV file or a spreadsheet."""
+"""Inputs of a command line: columns of CSV files or a spreadsheet, and options that are texts."""
 
 from __future__ import annotations
 
 import csv
 import hashlib
 import math
-import sys
-import warnings
-from collections.abc import Iterable, Sequence
+from argparse import Namespace
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.files.table_columns import LARGEST, TableColumns
-from gpadjust.report.markup import listed, name_and_unit, plural
+from gpadjust.report.markup import bare, listed, name_and_unit, plural
 
 _HINT = (
     "Name columns as the first line does; a unit in brackets may be left out, so that 'head' is "
@@ -27,12 +27,7 @@ _HINT = (
 
 @dataclass(frozen=True)
 class Columns:
-    """Columns with names, as the models take them: like a DataFrame, as far as they ask.
-
-    Attributes:
-        columns: The names, with units in brackets.
-        values: ``n x k``.
-    """
+    """Columns by their names, with units in brackets: like a DataFrame, as far as models ask."""
 
     columns: tuple[str, ...]
     values: Tensor
@@ -48,111 +43,84 @@ class Columns:
 
 
 class TableData(NamedTuple):
-    """The inputs and outputs of a file.
-
-    Attributes:
-        X: The inputs, ``n x d``.
-        Y: The outputs, ``n x m``, NaN where there is none.
-        lines: The line of each row in the file.
-        remarks: Rows left out and outputs missing, in sentences.
-        digest: The beginning of the file's SHA-256.
-        levels: The levels of the categories among the inputs, by name: numbers, or texts, whose
-            numbers from 0 the inputs have.
-    """
+    """Inputs and outputs of a file, ``n x d`` and ``n x m``, NaN where an output is missing."""
 
     X: Columns
     Y: Columns
-    lines: tuple[int, ...]
+    lines: list[int]  # of the rows in the file
     remarks: tuple[str, ...]
-    digest: str
-    levels: dict[str, tuple[Any, ...]]
+    levels: dict[str, tuple[Any, ...]]  # of categories; of texts, the inputs are their numbers
 
 
-def open_table(
-    file: str, delimiter: str = ",", decimal: str = ".", sheet: str | None = None
-) -> TableColumns:
-    """Open a CSV file or a workbook; the arguments and errors are those of ``TableColumns``."""
-    path = Path(file)
-    if path.exists() and not path.is_file():
+def open_table(file: str, arguments: Namespace, hint: str = "") -> TableColumns:
+    """Open a CSV file or a workbook by the marks of a command line; errors have its options."""
+    path, sheet = Path(file), getattr(arguments, "sheet", None)
+    if not path.exists():
+        near = (other.name for other in path.absolute().parent.glob("*") if other.is_file())
+        raise FileNotFoundError(f"There is no file {file!r}.{meant(path.name, near)}")
+    if not path.is_file():
         what = "a folder" if path.is_dir() else "a device or a pipe"
         raise OSError(f"{file!r} is {what}, expected a CSV file.")
-    if not path.exists():
-        near = (each.name for each in path.absolute().parent.glob("*") if each.is_file())
-        raise FileNotFoundError(f"There is no file {file!r}.{meant(path.name, near)}")
-    said = "--{} {!r}"
-    return TableColumns(file, delimiter, decimal=decimal, sheet=sheet, hint=_HINT, option=said)
+    words: dict[str, Any] = {"hint": _HINT + hint, "option": "--{} {!r}"}
+    mark = mark_of(arguments.delimiter)
+    return TableColumns(file, mark, decimal=arguments.decimal, sheet=sheet, **words)
+
+
+def column_of(table: TableColumns, name: str) -> str:
+    """Return the name of a column with its unit, which may be left out."""
+    short = [*map(bare, table.names)]
+    is_short = name not in table.names and short.count(name) == 1
+    return table.names[short.index(name)] if is_short else name
 
 
 def read_table(
     table: TableColumns,
     inputs: Sequence[str],
     outputs: Sequence[str],
-    units: dict[str, str],
-    categories: Sequence[str] = (),
-    most: int | None = None,
-    seed: int = 0,
+    categories: Sequence[str],
+    arguments: Namespace,
 ) -> TableData:
-    """Read columns of a table; an output may be missing in some rows.
+    """Read columns of a table, in the order in which the physics takes and returns them.
 
-    Args:
-        table: The table.
-        inputs: The columns of the inputs, in the order in which the physics takes them.
-        outputs: Those of the outputs, in the order in which the physics returns them.
-        units: Units of columns whose names do not have them.
-        categories: The inputs that are categories; others that are texts are, too.
-        most: The most rows to take; of more, so many are drawn.
-        seed: Of the drawing.
-
-    Raises:
-        ValueError: If a column is missing or asked for twice, a field is no number, an input is
-            missing, or there are too few rows.
+    Inputs that are texts are categories, too. A command line has units and the number of rows.
     """
-    asked = (*inputs, *outputs)
-    bare = [name_and_unit(name)[0] for name in table.names]
-    headers = [
-        table.names[bare.index(name)] if name not in table.names and bare.count(name) == 1 else name
-        for name in asked
-    ]
-    if again := sorted({name for name in headers if headers.count(name) > 1}):
-        raise ValueError(
-            f"Expected different columns as inputs and outputs, got {again[0]!r} more than once."
-        )
-    d = len(inputs)
-    if unknown := [name for name in categories if name not in inputs]:
-        raise ValueError(
-            f"The category {unknown[0]!r} is none of --inputs {','.join(inputs)}; name it there."
-        )
-    names = _with_units(headers, asked, units)
-    values, levels = [], {}
-    for i, name in enumerate(headers):
-        if i < d and (asked[i] in categories or _are_names(table, name)):
-            column, levels[names[i]] = table.categories(name)
+    d, asked = len(inputs), (*inputs, *outputs)
+    columns = [column_of(table, name) for name in asked]
+    check_different(columns, "columns as inputs and outputs")
+    known = f"--inputs {','.join(inputs)}; name it there"
+    check_names(categories, "--categories or --batches", inputs, known)
+    units = {} if arguments.units is None else pairs(arguments.units, "--units")
+    check_names(units, "--units", [*asked, *columns], ", ".join(map(repr, asked)))
+    names, values, remarks = list[str](), list[Tensor](), list[str]()
+    levels: dict[str, tuple[Any, ...]] = {}
+    for name, column in zip(asked, columns, strict=True):
+        unit = units.get(name, units.get(column))
+        names.append(column if unit is None else f"{bare(column)} [{unit}]")
+        if len(values) < d and (name in categories or _are_names(table, column)):
+            numbers, levels[names[-1]] = table.categories(column)
         else:
-            column = table.numbers(name, may_miss=i >= d)
-        values.append(column)
-    X, Y = torch.stack(values[:d], -1), torch.stack(values[d:], -1)
-    seen = ~Y.isnan().all(-1)
-    remarks = []
-    lines = torch.tensor(table.lines)
-    if left := [str(line) for line in lines[~seen].tolist()]:
+            numbers = table.numbers(column, may_miss=len(values) >= d)
+        values.append(numbers)
+    everything, lines = torch.stack(values, -1), torch.tensor(table.lines)
+    has_none = everything[:, d:].isnan().all(-1)
+    rows = (~has_none).nonzero().flatten()
+    if left := [str(line) for line in lines[has_none].tolist()]:
         shown = [*left[:10], f"{len(left) - 10} more"] if len(left) > 10 else left
+        plural_s = "s" * (len(left) > 1)
+        remarks.append(f"Left out, as they have no output: line{plural_s} {listed(shown)}.")
+    if (n := len(rows)) > arguments.rows:
+        order = torch.randperm(n, generator=torch.Generator().manual_seed(arguments.seed))
+        rows = rows[order[: arguments.rows].sort().values]
         remarks.append(
-            f"Left out, as they have no output: line{'s' * (len(left) > 1)} {listed(shown)}."
+            f"Of {plural(n, 'row')} {arguments.rows:,} were taken, drawn at random by --seed: a "
+            "comparison takes time with the cube of their number. --rows takes more or fewer."
         )
-    X, Y, lines = X[seen], Y[seen], lines[seen]
-    if most is not None and (n := len(lines)) > most:
-        order = torch.randperm(n, generator=torch.Generator().manual_seed(seed))
-        drawn = order[:most].sort().values
-        X, Y, lines = X[drawn], Y[drawn], lines[drawn]
-        remarks.append(
-            f"Of {plural(n, 'row')} {most:,} were taken, drawn at random by --seed: a comparison "
-            "takes time with the cube of their number. --rows takes more or fewer."
-        )
-    for name, y in zip(names[d:], Y.unbind(-1), strict=True):
-        if (number := int((~y.isnan()).sum())) < 2:
+    X, Y = everything[rows].split([d, len(outputs)], -1)
+    for name, count in zip(names[d:], (~Y.isnan()).sum(0).tolist(), strict=True):
+        if count < 2:
             raise ValueError(
                 f"{table.file}: expected two rows or more with a number in {name!r}, found "
-                f"{number}; a comparison wants eight or more to show anything."
+                f"{count}; a comparison wants eight or more to show anything."
             )
     if missing := int(Y.isnan().sum()):
         remarks.append(
@@ -161,11 +129,10 @@ def read_table(
         )
     for name, own in levels.items():
         if isinstance(own[0], str):
-            numbers = listed(f"{k} is {level}" for k, level in enumerate(own))
-            remarks.append(f"The physics reads {name_and_unit(name)[0]} as a number: {numbers}.")
-    digest = digest_of(table.file)
-    columns = Columns(tuple(names[:d]), X), Columns(tuple(names[d:]), Y)
-    return TableData(*columns, tuple(lines.tolist()), tuple(remarks), digest, levels)
+            numbered = listed(f"{k} is {level}" for k, level in enumerate(own))
+            remarks.append(f"The physics reads {bare(name)} as a number: {numbered}.")
+    X_and_Y = Columns(tuple(names[:d]), X), Columns(tuple(names[d:]), Y)
+    return TableData(*X_and_Y, lines[rows].tolist(), tuple(remarks), levels)
 
 
 def _are_names(table: TableColumns, name: str) -> bool:
@@ -177,12 +144,38 @@ def _are_names(table: TableColumns, name: str) -> bool:
     return all(text[0].isalpha() for text in texts) and 2 * len({*texts}) <= max(8, len(texts))
 
 
-def mark_of(text: str) -> str:
-    """The mark between two fields; a tab may be written as in Python.
+def log_columns(
+    tables: Sequence[TableColumns], hidden: Mapping[str, str], arguments: Namespace
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return columns of a log as options of ``Records.read_csv``, None if hidden, and units."""
+    units = {**hidden}
 
-    Raises:
-        ValueError: If it is not one character.
-    """
+    def numbers(name: str, text: str, may_miss: bool = False) -> str:
+        column = column_of(tables[0], text)
+        for table in tables:
+            table.numbers(column, may_miss=may_miss)
+        units[name] = name_and_unit(column)[1]
+        return column
+
+    named = pairs(arguments.states, "--states", short=True)
+    check_names(hidden, "--hidden", named, "--states")
+    has_times = math.isnan(number_of(arguments.time))
+    time = numbers("time", arguments.time) if has_times else float(arguments.time)
+    if not arguments.actions and not has_times:
+        raise ValueError("Expected --actions, as there is no column of times to stand for them.")
+    states = {
+        name: None if name in hidden else numbers(name, text, may_miss=True)
+        for name, text in named.items()
+    }
+    acting = pairs(arguments.actions or f"time={arguments.time}", "--actions", short=True)
+    actions = {name: numbers(name, text) for name, text in acting.items()}
+    segment = None if arguments.segment is None else column_of(tables[0], arguments.segment)
+    columns = {"states": states, "actions": actions, "time": time, "segment": segment}
+    return columns, {name: unit for name, unit in units.items() if unit}
+
+
+def mark_of(text: str) -> str:
+    """Return the mark between two fields, one character; a tab may be written as in Python."""
     mark = {"\\t": "\t", "tab": "\t"}.get(text, text)
     if len(mark) != 1:
         raise ValueError(f"Expected --delimiter as one character, or tab, found {text!r}.")
@@ -190,32 +183,18 @@ def mark_of(text: str) -> str:
 
 
 def digest_of(file: str) -> str:
-    """The beginning of a file's SHA-256."""
-    return hashlib.sha256(Path(file).read_bytes()).hexdigest()[:12]
+    """Return the name of a file, and the beginning of its SHA-256."""
+    digest = hashlib.sha256(Path(file).read_bytes()).hexdigest()
+    return f"{Path(file).name} (SHA-256 {digest[:12]}...)"
 
 
-def say(text: str) -> None:
-    """Print a line beside the result, while a command works."""
-    print(text, file=sys.stderr, flush=True)
-
-
-def notes_of(caught: Sequence[warnings.WarningMessage]) -> tuple[str, ...]:
-    """The texts of warnings that a reader may need, each once."""
-    kinds = (DeprecationWarning, PendingDeprecationWarning)
-    return tuple(dict.fromkeys(str(w.message) for w in caught if not issubclass(w.category, kinds)))
-
-
-def names_of(text: str, option: str) -> list[str]:
-    """Names with commas between them, quoted as in a CSV file where they have commas.
-
-    Raises:
-        ValueError: If there is none, one is empty, or they are of several lines.
-    """
-    try:
-        (fields,) = csv.reader([text], skipinitialspace=True)
-    except csv.Error as error:
-        raise ValueError(f"Expected names in one line, found {text!r}: {error}.") from error
-    names = [field.strip() for field in fields]
+def names_of(text: str | None, option: str) -> list[str]:
+    """Return names with commas between them, quoted as in a CSV file where they have commas."""
+    if text is None:
+        return []
+    names = [""]
+    with suppress(csv.Error):  # of several lines
+        names = [field.strip() for field in next(csv.reader([text], skipinitialspace=True))]
     if not names or "" in names:
         raise ValueError(
             f"Expected names with commas between them, such as a,b, found {option} {text!r}."
@@ -223,55 +202,58 @@ def names_of(text: str, option: str) -> list[str]:
     return names
 
 
-def pairs(text: str, option: str) -> dict[str, str]:
-    """``"a=m,b=s"`` as a dictionary."""
-    found = {}
+def pairs(text: str, option: str, *, short: bool = False) -> dict[str, str]:
+    """Return ``"a=m,b=s"`` as a dictionary; ``"a"`` is ``"a=a"`` if it may be ``short``."""
+    values = dict[str, str]()
     for field in names_of(text, option):
-        name, _, value = (part.strip() for part in field.rpartition("="))
-        if not (name and value):
-            raise ValueError(f"Expected {option} such as a=1,b=2, found {field!r}.")
-        found[name] = value
-    return found
-
-
-def noise_variances(text: str | None, outputs: Sequence[str]) -> list[float] | None:
-    """The variances of outputs, of the standard deviations that a command line has."""
-    if text is None or text == "relative":
-        return None
-    given = pairs(text, "--noise") if "=" in text else dict.fromkeys(outputs, text)
-    if unknown := [name for name in given if name not in outputs]:
-        raise ValueError(f"--noise names {unknown[0]!r}, which is none of --outputs.")
-    if lacking := [name for name in outputs if name not in given]:
-        raise ValueError(f"--noise lacks {lacking[0]!r}: give it for each output, or for none.")
-    variances = []
-    for name in outputs:
-        try:
-            sd = float(given[name])
-        except ValueError:
-            sd = math.nan
-        if not 0 <= sd <= LARGEST:
+        name, equals, value = (part.strip() for part in field.rpartition("="))
+        if short and not equals:
+            name = value
+        if not name or not value or name in values:
             raise ValueError(
-                f"Expected --noise as a standard deviation in the output's unit, such as 0.1, "
-                f"found {given[name]!r}."
+                f"Expected {option} such as a=1,b=2, with different names, found {field!r}."
             )
-        variances.append(sd**2)
-    return variances
+        values[name] = value
+    return values
+
+
+def check_names(names: Iterable[str], option: str, known: Iterable[str], option_of: str) -> None:
+    """Raise a ValueError if an option names what another one does not."""
+    if unknown := [name for name in names if name not in known]:
+        raise ValueError(f"{option} names {unknown[0]!r}, which is none of {option_of}.")
+
+
+def check_different(names: Sequence[str], what: str) -> None:
+    """Raise a ValueError if a name is there twice."""
+    if again := sorted(name for name in names if names.count(name) > 1):
+        raise ValueError(f"Expected different {what}, found {again[0]!r} more than once.")
+
+
+def number_of(text: str) -> float:
+    """Return a number; NaN of another text."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def variances_of(
+    sds: Mapping[str, str], option: str, names: Sequence[str], option_of: str, *, all_of: bool
+) -> list[float]:
+    """Return the variance of each column, of standard deviations by name; 0 unless of all."""
+    check_names(sds, option, names, option_of)
+    if lacking := [name for name in names if all_of and name not in sds]:
+        raise ValueError(f"{option} lacks {lacking[0]!r}: give it for each of them, or for none.")
+    for name, text in sds.items():
+        if not 0 <= number_of(text) <= LARGEST:
+            raise ValueError(
+                f"Expected {option} as a standard deviation in the unit of {name!r}, such as 0.1, "
+                f"found {text!r}."
+            )
+    return [number_of(sds.get(name, "0")) ** 2 for name in names]
 
 
 def meant(name: str, known: Iterable[str]) -> str:
     """Return a hint at the name that was meant, if some is near."""
     near = get_close_matches(name, [*known], n=1)
     return f" Is it {near[0]!r}?" if near else ""
-
-
-def _with_units(headers: list[str], asked: Sequence[str], units: dict[str, str]) -> list[str]:
-    """The names with their units in brackets."""
-    known = {name: i for i, header in enumerate(headers) for name in (header, asked[i])}
-    names = [*headers]
-    for name, unit in units.items():
-        if name not in known:
-            raise ValueError(
-                f"--units names {name!r}, which is none of {', '.join(map(repr, asked))}."
-            )
-        names[known[name]] = f"{name_and_unit(headers[known[name]])[0]} [{unit}]"
-    return names

@@ -7,30 +7,29 @@ import re
 import warnings
 from base64 import b64encode
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import wraps
 from html import escape
 from importlib.resources import files
 from io import BytesIO
-from typing import Any
+from typing import Any, NamedTuple, ParamSpec
 from urllib.parse import quote
 
 from matplotlib import rc_context
 from matplotlib.figure import Figure
+from torch import Tensor
 
-from gpadjust.physics import PhysicsError
+from gpadjust.physics import PhysicsError, PhysicsParameters
 
-_VOID = ("img", "meta", "br")
+P = ParamSpec("P")
+_VOID = ("img", "meta")
 _UNIT = re.compile(r"(.*\S)\s*\[([^\[\]]*)\]", flags=re.DOTALL)
 _SHOWN = 3
+_WIDTH = 3.6  # inches: as wide as a column of the page, so that text has its size
 _STYLE: dict[str, Any] = {
-    "font.size": 9.5,
-    "axes.labelsize": 9.5,
-    "axes.titlesize": 9.5,
-    "axes.linewidth": 0.7,
-    "legend.fontsize": 8.5,
-    "svg.fonttype": "path",
-    "svg.hashsalt": "gpadjust",
-    "figure.facecolor": "white",
-    "savefig.facecolor": "white",
+    **dict.fromkeys(("font.size", "axes.labelsize", "axes.titlesize"), 9.5),
+    **dict.fromkeys(("figure.facecolor", "savefig.facecolor"), "white"),
+    **{"axes.linewidth": 0.7, "legend.fontsize": 8.5},
+    **{"svg.fonttype": "path", "svg.hashsalt": "gpadjust"},
 }
 _LARGE = 70_000  # characters, above which a figure of many points is smaller as pixels
 _PLAIN = " <>='/:;,.()!*+@$-_{}\n"  # what a URL between double quotes may have as it is
@@ -48,13 +47,32 @@ class Markup(str):
     """A text that is HTML already; any other is escaped where it is put into a page."""
 
 
-def tag(name: str, /, *children: str, **attributes: str) -> Markup:
-    """An element.
+class Verdict(NamedTuple):
+    """The answer for an output: its errors with their unit, a note on them, and the reasons."""
 
-    Args:
-        name: Its name.
-        children: Its contents: :class:`Markup` as it is, other texts escaped.
-        attributes: Its attributes; ``class_`` is ``class``, and ``aria_label`` ``aria-label``.
+    name: str
+    errors: Mapping[str, str]
+    note: str
+    answer: str
+    reasons: list[str]
+
+
+class Page(NamedTuple):
+    """A page: a question with its verdicts, sections by their headings, settings by their names."""
+
+    title: str
+    lead: str
+    question: str
+    verdicts: list[Verdict]
+    headline: str  # for the terminal
+    sections: Mapping[str, Markup]
+    settings: dict[str, str]
+
+
+def tag(name: str, /, *children: str, **attributes: str) -> Markup:
+    """Return an element; children that are no :class:`Markup` are escaped.
+
+    Attributes are keywords: ``class_`` is ``class``, and ``aria_label`` ``aria-label``.
 
     Example:
         >>> tag("p", "a < b, ", tag("em", "c"), class_="note")
@@ -68,10 +86,19 @@ def tag(name: str, /, *children: str, **attributes: str) -> Markup:
 
 
 def join(children: Iterable[str]) -> Markup:
-    """Texts beside one another, without an element around them."""
-    return Markup(
-        "".join(child if isinstance(child, Markup) else escape(child) for child in children)
-    )
+    """Return texts beside one another, without an element around them."""
+    return Markup("".join(c if isinstance(c, Markup) else escape(c) for c in children))
+
+
+def bullets(items: Iterable[str]) -> Markup:
+    """Return a list; nothing if there are no items."""
+    elements = [tag("li", item) for item in items]
+    return tag("ul", *elements) if elements else Markup()
+
+
+def code(text: str) -> Markup:
+    """Return a block of code."""
+    return tag("div", tag("pre", tag("code", text)), class_="scroll", tabindex="0")
 
 
 def table(
@@ -82,96 +109,121 @@ def table(
     marked: int | None = None,
     kind: str = "numbers",
 ) -> Markup:
-    """A table whose first column names its rows, in a box that scrolls on a narrow screen.
+    """Return a table whose first column names its rows, in a box that scrolls on narrow screens.
 
-    Args:
-        caption: Its title.
-        head: The names of its columns.
-        rows: Its cells.
-        marked: The row that is set off.
-        kind: The kind of its cells, ``"numbers"`` or ``"words"``.
+    The row ``marked`` is set off; ``kind`` of the cells is ``"numbers"`` or ``"words"``.
     """
-    body = []
+    lines = []
     for i, (name, *cells) in enumerate(rows):
         mark = {"class_": "marked"} if i == marked else {}
-        cells = [tag("td", cell) for cell in cells]
-        body.append(tag("tr", tag("th", name, scope="row"), *cells, **mark))
-    names = [tag("th", name, scope="col") for name in head]
-    whole = tag(
-        "table",
-        tag("caption", caption),
-        tag("thead", tag("tr", *names)),
-        tag("tbody", *body),
-        class_=kind,
-    )
-    return tag("div", whole, class_="scroll", tabindex="0", role="region", aria_label=caption)
+        columns = [tag("td", cell) for cell in cells]
+        lines.append(tag("tr", tag("th", name, scope="row"), *columns, **mark))
+    names = tag("tr", *(tag("th", name, scope="col") for name in head))
+    parts = [tag("caption", caption), tag("thead", names), tag("tbody", *lines)]
+    element = tag("table", *parts, class_=kind)
+    return tag("div", element, class_="scroll", tabindex="0", role="region", aria_label=caption)
 
 
-def bullets(items: Iterable[str]) -> Markup:
-    """A list."""
-    return tag("ul", *(tag("li", item) for item in items))
+def parameter_table(caption: str, parameters: PhysicsParameters) -> Markup:
+    """Return a table of unknown parameters: their posterior, and what was known before."""
+    low, high = parameters.interval()
+    rows = []
+    for i, (name, unknown) in enumerate(parameters.unknowns.items()):
+        spread = ["-", "-"]
+        if parameters.sd[i] > 0:  # not of a point fit
+            interval = f"{number(low[i], 4)} to {number(high[i], 4)}"
+            spread = [number(parameters.sd[i]), interval]
+        mean = number(parameters.mean[i], 4)
+        rows.append([name, mean, *spread, unknown.prior_text, unknown.unit or "-"])
+    head = ["parameter", "mean", "sd", "95 % interval", "known before", "unit"]
+    return table(caption, head, rows)
 
 
-def document(
-    title: str, lead: str, question: str, answer: Markup, sections: Mapping[str, Markup]
-) -> str:
-    """A page of HTML that needs nothing else.
+def cards(verdicts: Sequence[Verdict]) -> Markup:
+    """Return the verdict on each output, below its errors in large numbers."""
+    shown = []
+    for name, errors, note, answer, reasons in verdicts:
+        parts = [tag("h3", name)] if len(verdicts) > 1 else []
+        if errors:
+            numbers = [tag("div", tag("dt", n), tag("dd", value)) for n, value in errors.items()]
+            parts += [tag("dl", *numbers, class_="errors"), tag("p", note, class_="note")]
+        parts.append(tag("p", answer, class_="answer"))
+        parts += [tag("p", reason.replace("+-", "±")) for reason in reasons]
+        kind = {"Yes": "yes", "No": "no"}.get(answer, "open")
+        shown.append(tag("div", *parts, class_=f"card {kind}"))
+    return tag("div", *shown, class_="cards")
 
-    Args:
-        title: The title.
-        lead: A sentence below it.
-        question: The heading of the first part.
-        answer: The first part, before the links to all others.
-        sections: The other parts by their headings.
-    """
-    links = [tag("a", name, href=f"#{_anchor(name)}") for name in sections]
-    body = [
-        tag("section", tag("h2", name), text, id=_anchor(name)) for name, text in sections.items()
-    ]
+
+def document(page: Page) -> Markup:
+    """Return a page of HTML that needs nothing else; sections without text are left out."""
+    sections = {name: text for name, text in page.sections.items() if text}
+    settings = [[name, value] for name, value in page.settings.items()]
+    caption = "How this page came about"
+    sections["Settings"] = table(caption, ["setting", "value"], settings, kind="words")
+    ids = {n: "".join(c if c.isalnum() else "-" for c in n.lower()).strip("-") for n in sections}
     main = tag(
         "main",
-        tag("header", tag("h1", title), tag("p", lead, class_="lead")),
-        tag("h2", question, class_="first"),
-        answer,
-        tag("nav", bullets(links), aria_label="Sections"),
-        *body,
+        tag("header", tag("h1", page.title), tag("p", page.lead, class_="lead")),
+        tag("h2", page.question, class_="first"),
+        cards(page.verdicts),
+        tag("nav", bullets(tag("a", n, href=f"#{ids[n]}") for n in ids), aria_label="Sections"),
+        *(tag("section", tag("h2", n), text, id=ids[n]) for n, text in sections.items()),
     )
     style = Markup(files("gpadjust.report").joinpath("style.css").read_text(encoding="utf-8"))
     head = tag(
         "head",
         tag("meta", charset="utf-8"),
         tag("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        tag("title", title),
+        tag("title", page.title),
         tag("style", style),
     )
     return join([Markup("<!DOCTYPE html>\n"), tag("html", head, tag("body", main), lang="en")])
 
 
-def code(text: str) -> Markup:
-    """A block of code."""
-    return tag("div", tag("pre", tag("code", text)), class_="scroll", tabindex="0")
-
-
-def number(value: float, digits: int = 3) -> str:
-    """A number with some significant digits, without an exponent where it can be read so."""
+def number(value: float | Tensor, digits: int = 3) -> str:
+    """Return a number with some significant digits, without an exponent where that is readable."""
+    value = float(value)
     if not math.isfinite(value):
         return "none" if math.isnan(value) else f"{value:g}"
     text = f"{value:.{digits}g}"
     return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e7 else text
 
 
-def percent(share: float) -> str:
-    """A share in percent."""
-    return f"{100 * share:.0f} %"
+def percent(share: float | Tensor) -> str:
+    """Return a share in percent."""
+    return f"{100 * float(share):.0f} %"
 
 
 def plural(count: int, noun: str) -> str:
-    """Such as ``1 row`` and ``2 rows``."""
+    """Return such as ``1 row`` and ``2 rows``."""
     return f"{count:,} {noun}" + ("" if count == 1 else "s")
 
 
+def listed(items: Iterable[str]) -> str:
+    """Return ``a, b and c``."""
+    *first, last = [*items] or [""]
+    return f"{', '.join(first)} and {last}" if first else last
+
+
+def name_and_unit(name: str) -> tuple[str, str]:
+    """Return ``"head"`` and ``"m"`` of ``"head [m]"``; no unit where none is in brackets."""
+    match = _UNIT.fullmatch(name.strip())
+    return (match[1], match[2].strip()) if match else (name, "")
+
+
+def bare(name: str) -> str:
+    """Return a name without its unit."""
+    return name_and_unit(name)[0]
+
+
+def with_unit(value: str, name: str, form: str = "{} {}") -> str:
+    """Return a number, or words, with the unit of a name; as they are if it has none, or 1."""
+    unit = name_and_unit(name)[1]
+    return form.format(value, unit) if unit not in ("", "1") else value
+
+
 def failure(error: PhysicsError) -> str:
-    """The failure of a physics in a line, with the first inputs at which it fails."""
+    """Return the failure of a physics in a line, with the first inputs at which it fails."""
     message = str(error.args[0]).rstrip(": ")
     if error.inputs is None or not len(error.inputs):
         return message
@@ -180,40 +232,34 @@ def failure(error: PhysicsError) -> str:
     return f"{message.rstrip('.')}: at inputs {listed([*rows, f'{more} more'] if more else rows)}."
 
 
-def name_and_unit(name: str) -> tuple[str, str]:
-    """``"head [m]"`` as ``"head"`` and ``"m"``; no unit where none is in brackets."""
-    found = _UNIT.fullmatch(name.strip())
-    return (found[1], found[2].strip()) if found else (name, "")
+def drawn(draw: Callable[P, list[Markup]]) -> Callable[P, Markup]:
+    """Return a function of figures side by side, or of why a physics fails where there are none."""
+
+    @wraps(draw)
+    def figures(*args: P.args, **options: P.kwargs) -> Markup:
+        try:
+            with rc_context(_STYLE), warnings.catch_warnings():
+                warnings.filterwarnings("ignore", message=_OF_FONTS)
+                images = [tag("figure", image) for image in draw(*args, **options)]
+        except PhysicsError as error:
+            return tag("p", f"No figure: {failure(error)}", class_="caution")
+        return tag("div", *images, class_="figures") if images else Markup()
+
+    return figures
 
 
-def with_unit(value: str, name: str, form: str = "{} {}") -> str:
-    """A number, or words, and the unit that a name carries; as they are if it carries none."""
-    unit = name_and_unit(name)[1]
-    return form.format(value, unit) if unit not in ("", "1") else value
-
-
-def listed(items: Iterable[str]) -> str:
-    """``a, b and c``."""
-    *first, last = items
-    return f"{', '.join(first)} and {last}" if first else last
-
-
-def drawn(draw: Callable[[], list[Markup]]) -> Markup:
-    """Figures side by side, or why there are none: a physics may fail where there are no data."""
-    try:
-        with rc_context(_STYLE), warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message=_OF_FONTS)
-            images = draw()
-    except PhysicsError as error:
-        return tag("p", f"No figure: {failure(error)}", class_="caution")
-    if not images:
-        return Markup()
-    return tag("div", *(tag("figure", image) for image in images), class_="figures")
+def new_figure(height: float) -> Figure:
+    """Return an empty figure as wide as a column of the page, of a height in inches."""
+    return Figure(figsize=(_WIDTH, height), layout="constrained")
 
 
 def image(figure: Figure, alt: str) -> Markup:
-    """A figure as an image in the page: as curves, or many points as pixels."""
-    source = _curves(figure)
+    """Return a figure as an image in the page: as curves, or many points as pixels."""
+    buffer = BytesIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None})
+    text = _NEEDLESS.sub("", buffer.getvalue().decode()).replace('"', "'")
+    text = _PATH.sub(lambda path: _SPACE.sub(r"\1", _BEHIND.sub(r"\1", path[0])), text)
+    source = f"data:image/svg+xml,{quote(text, safe=_PLAIN)}"
     if len(source) > _LARGE:
         buffer = BytesIO()
         figure.savefig(buffer, format="png", dpi=180)
@@ -221,16 +267,3 @@ def image(figure: Figure, alt: str) -> Markup:
         source = min(source, raster, key=len)
     width, height = (str(round(96 * size)) for size in figure.get_size_inches())
     return tag("img", src=Markup(source), alt=alt, width=width, height=height)
-
-
-def _anchor(name: str) -> str:
-    return "".join(c if c.isalnum() else "-" for c in name.lower()).strip("-")
-
-
-def _curves(figure: Figure) -> str:
-    """A figure as SVG, without what a page does not need."""
-    buffer = BytesIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None})
-    text = _NEEDLESS.sub("", buffer.getvalue().decode()).replace('"', "'")
-    text = _PATH.sub(lambda path: _SPACE.sub(r"\1", _BEHIND.sub(r"\1", path[0])), text)
-    return f"data:image/svg+xml,{quote(text, safe=_PLAIN)}"

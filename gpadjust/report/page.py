@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import platform
 import warnings
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from gpadjust.checks import progress_bar
+import gpadjust
 from gpadjust.core import GP, StackedGP, save
 from gpadjust.core.saving import Saved
 from gpadjust.records import Identification
-from gpadjust.report import log_page, sections
-from gpadjust.report.log_page import LogOrigin
-from gpadjust.report.markup import document, listed, plural
-from gpadjust.report.sections import Origin
-from gpadjust.report.subject import Subject, subject_of
+from gpadjust.report import log_page, verdict
+from gpadjust.report.markup import document
+from gpadjust.report.subject import Origin, Subject, subject_of
 from gpadjust.validation import Comparison
+
+_LIBRARIES = ("torch", "gpytorch", "botorch", "numpy")
 
 
 def report(
@@ -30,17 +33,12 @@ def report(
 ) -> Path:
     """Write a page that shows what a model or a comparison says, for those who decide.
 
-    The page begins with the root mean square errors of your formula, of the adjustment and of the
-    data alone, of left-out observations. It says in words whether the physics helps, and how sure
-    that is; what is recommended and why; where the physics is wrong (rho and delta along each
-    input), and where predictions rest on it; how well left-out observations are predicted, and
-    whether intervals hold what they promise; parameters, advice, data and settings; and how to load
-    the model, which is saved beside it (``report.pt`` beside ``report.html``). It is one file,
-    without scripts and links.
-
-    The page of a log (:func:`~gpadjust.records.identify`) has a free run along what was held out,
-    beside the physics with its guesses and a state that stays; parameters with their intervals,
-    noise and hidden states, advice and settings. No model is saved beside it.
+    The page begins with the left-out errors of your formula, of the adjustment and of the data
+    alone, and the verdict: does the physics help? Then it has what is recommended, where the
+    physics is wrong, left-out observations, parameters, advice, data and settings, and how to load
+    the model, which is saved beside it (``report.pt`` beside ``report.html``). The page of a log
+    (:func:`~gpadjust.records.identify`) has a free run along what was held out, parameters, noise
+    and hidden states, and no model beside it. It is one file, without scripts and links.
 
     Whether the physics helps takes a comparison with a model that has none, so report on what
     :func:`~gpadjust.compare` returns. Units are read from names such as ``"head [m]"``, the columns
@@ -50,8 +48,7 @@ def report(
         model: A fitted model, a :class:`~gpadjust.StackedGP`, or a :class:`~gpadjust.Comparison`,
             of which what it recommends is saved; or an :class:`~gpadjust.records.Identification`.
         file: Where to write the page, ``*.html``. Files that are there, this and the model's, are
-            replaced; where the model cannot be saved, the page says why, and an old file of it is
-            removed.
+            replaced; where the model cannot be saved, the page says why.
         title: The title. Default: the names of the outputs.
         rows: The name of each observation, ``n``, such as its line in your file. Default: by its
             number, from 0.
@@ -79,44 +76,31 @@ def report(
         ...     sorted(each.name for each in path.parent.iterdir())
         ['report.html', 'report.pt']
     """
-    told = {name: str(value) for name, value in (settings or {}).items()}
+    origin = Origin({name: str(value) for name, value in (settings or {}).items()})
     path = checked_path(file, model=not isinstance(model, Identification))
-    if isinstance(model, Identification):
-        if rows is not None:
-            raise TypeError("The page of a log has no names of rows; leave `rows` out.")
-        return log_page.write(model, path, title, LogOrigin(settings=told))
-    return write(subject_of(model, rows), path, title, Origin(settings=told), progress)
+    if not isinstance(model, Identification):
+        write(subject_of(model, rows), path, title, origin, progress)
+    elif rows is not None:
+        raise TypeError("The page of a log has no names of rows; leave `rows` out.")
+    else:
+        write(model, path, title, origin, progress)
+    return path
 
 
 def checked_path(file: str | Path, *data: str | Path, model: bool = True) -> Path:
-    """The absolute path of a page that can be written, the model's beside it.
-
-    Args:
-        file: The page.
-        data: Files that neither may replace.
-        model: Whether a model is written, too.
-
-    Raises:
-        ValueError: If it is not ``*.html``, or the page or the model would replace data.
-        OSError: If the folder is not there, or cannot be written to.
-    """
+    """Return the absolute path of a page that can be written, and a model, and are not the data."""
     path = Path(file)
     if path.suffix.lower() not in (".html", ".htm"):
         raise ValueError(f"Expected a page such as 'report.html' to write to, got {str(file)!r}.")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"There is no folder {str(path.parent)!r} to write {path.name} to.")
-    if path.is_dir():
-        raise IsADirectoryError(f"{str(path)!r} is a folder; give the name of a file.")
-    model_path = path.with_suffix(".pt")
-    for own in map(Path, data):
-        for each in (path, model_path)[: 1 + model]:
-            if own.exists() and each.exists() and own.samefile(each):
-                raise ValueError(f"{each.name} is the data; give the page another name by --out.")
-    if model and model_path.is_dir():
-        raise IsADirectoryError(
-            f"{str(model_path)!r} is a folder, where the model's file would be; give the page "
-            "another name."
-        )
+    for own in (path, path.with_suffix(".pt"))[: 1 + model]:
+        if own.is_dir():
+            raise IsADirectoryError(
+                f"{str(own)!r} is a folder, where a file would be; give the page another name."
+            )
+        if any(own.exists() and Path(one).exists() and own.samefile(one) for one in data):
+            raise ValueError(f"{own.name} is the data; give the page another name by --out.")
     try:  # before the work rather than after it
         with TemporaryDirectory(prefix=".report-", dir=path.parent):
             return path.absolute()  # a physics may change the working folder
@@ -126,55 +110,31 @@ def checked_path(file: str | Path, *data: str | Path, model: bool = True) -> Pat
 
 
 def write(
-    subject: Subject, path: Path, title: str | None, origin: Origin, progress: bool = False
-) -> Path:
-    """Write the page, and the model beside it; nothing if either fails."""
+    subject: Subject | Identification, path: Path, title: str | None, origin: Origin, progress: bool
+) -> str:
+    """Write the page, and a model beside it, or nothing; return the headline for the terminal."""
     model_path = path.with_suffix(".pt")
     with TemporaryDirectory(prefix=".report-", dir=path.parent) as folder:
         part, model_part = Path(folder, path.name), Path(folder, model_path.name)
-        saved: Saved | str
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # the page says it
-                saved = save(subject.model, model_part)
-        except (TypeError, ValueError) as error:
-            saved = str(error)
-        title = title or f"Report on {', '.join(subject.outputs)}"
-        text = page(subject, title, saved, origin, progress)
-        part.write_bytes(text.encode("utf-8", errors="xmlcharrefreplace"))
+        if isinstance(subject, Identification):
+            page = log_page.page(subject, title, origin)
+        else:
+            saved: Saved | str
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", UserWarning)  # the page says it
+                    saved = save(subject.model, model_part)
+            except (TypeError, ValueError) as error:
+                saved = str(error)
+            page = verdict.page(subject, title, saved, origin, progress)
+        versions = [f"gpadjust {gpadjust.__version__}", f"Python {platform.python_version()}"]
+        versions += [f"{name} {version(name)}" for name in _LIBRARIES]
+        date = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+        page.settings.update(versions=", ".join(versions), date=date)
+        part.write_bytes(document(page).encode("utf-8", errors="xmlcharrefreplace"))
         if model_part.exists():
             model_part.replace(model_path)
-        else:
+        elif isinstance(subject, Subject):
             model_path.unlink(missing_ok=True)  # of an earlier page
         part.replace(path)
-    return path
-
-
-def page(
-    subject: Subject, title: str, saved: Saved | str, origin: Origin, progress: bool = False
-) -> str:
-    """A page of HTML that needs nothing else; ``saved`` tells why if there is no model."""
-    made_by = {
-        "Recommendation": lambda: sections.recommendation(subject),
-        "Structures": lambda: sections.structures(subject),
-        "Where is the physics wrong?": lambda: sections.where_wrong(subject),
-        "Where trust lies": lambda: sections.trusted(subject),
-        "Left-out predictions": lambda: sections.predictions(subject),
-        "Do the intervals hold?": lambda: sections.coverage(subject),
-        "Parameters of the physics": lambda: sections.parameters(subject),
-        "What was learnt": lambda: sections.summary(subject),
-        "Advice": lambda: sections.advice(subject, [*origin.notes]),
-        "Data": lambda: sections.data(subject, origin),
-        "Load the model, predict": lambda: sections.loading(subject, saved, origin),
-        "Settings": lambda: sections.settings(subject, origin),
-    }
-    bar = progress_bar(progress, made_by.items(), unit="section", leave=False)
-    made = {name: text for name, make in bar if (text := make())}
-    lead = (
-        f"{listed(subject.outputs)} from {listed(subject.inputs)}: "
-        f"{plural(len(subject.X), 'row')} of data, f_a(x) = rho(x) f_p(x) + delta(x)."
-    )
-    if not subject.has_physics:
-        lead = lead.replace(", f_a(x) = rho(x) f_p(x) + delta(x)", ", without physics")
-    first = sections.verdicts(subject, origin.how)
-    return document(title, lead, "Does the physics help?", first, made)
+    return page.headline

@@ -81,7 +81,10 @@ def read():
 @pytest.fixture
 def undrawn(monkeypatch):
     """Leaves the figures out, which take most of the time."""
-    monkeypatch.setattr("gpadjust.report.sections.drawn", lambda draw: Markup())
+    for name in ("slices", "trusts", "left_out", "coverages"):
+        monkeypatch.setattr(f"gpadjust.report.figures.{name}", lambda *args: Markup())
+    for name in ("_runs", "_states"):
+        monkeypatch.setattr(f"gpadjust.report.log_page.{name}", lambda *args: Markup())
 
 
 def f_p(X):

@@ -10,7 +10,6 @@ import torch
 from gpadjust.__main__ import main
 from gpadjust.records import Records, identify
 from gpadjust.report import report
-from gpadjust.report.markup import Markup
 
 LOG = Path(__file__).parents[2] / "examples" / "swing.csv"
 TRUE = {"l": 0.6, "c": 0.15, "J": 0.4, "F": 0.1}  # of the simulation
@@ -27,12 +26,6 @@ def rates(x, u, p):
 physics = ODEPhysics(rates, step=0.1, state_dim=2, unknowns={"l": Unknown(0.5, factor=1.5)})
 def fails(X): raise RuntimeError("no such angle")
 """
-
-
-@pytest.fixture
-def undrawn_log(monkeypatch):
-    """Leaves the figures out."""
-    monkeypatch.setattr("gpadjust.report.log_page.drawn", lambda draw: Markup())
 
 
 def options(*equations, unknowns=PRIORS):
@@ -93,7 +86,7 @@ def test_a_page_of_true_parameters_noise_and_a_free_run(folder, read, capsys):
 
 
 @pytest.mark.slow
-def test_what_the_equations_lack_is_said(folder, read, undrawn_log):
+def test_what_the_equations_lack_is_said(folder, read, undrawn):
     """Without dry friction the viscous one is wrong, and so are the intervals."""
     assert main(["identify", "log.csv", *STATES, *VISCOUS, *QUICKLY, "--title", "A swing"]) == 0
     page = read(folder / "identify.html")
@@ -102,7 +95,7 @@ def test_what_the_equations_lack_is_said(folder, read, undrawn_log):
 
 
 @pytest.mark.slow
-def test_a_physics_of_a_module_has_a_step_of_its_own(folder, read, undrawn_log):
+def test_a_physics_of_a_module_has_a_step_of_its_own(folder, read, undrawn):
     given = ["--physics", "swing:physics", "--starts", "1", "--out", "module.html"]
     assert main(["identify", "log.csv", *STATES, *given]) == 0
     page = read(folder / "module.html")
@@ -110,7 +103,7 @@ def test_a_physics_of_a_module_has_a_step_of_its_own(folder, read, undrawn_log):
     assert "physics = swing.physics" in page.codes[0]
 
 
-def test_without_actions_there_is_the_time_and_next_values_are_equations_too(folder, undrawn_log):
+def test_without_actions_there_is_the_time_and_next_values_are_equations_too(folder, undrawn):
     rows = "".join(f"{k},{k / 2},{5 * 0.9**k}\n" for k in range(24))
     (folder / "cooling.csv").write_text(f"n,t [s],excess [K]\n{rows}")
     given = ["--time", "t", "--states", "T=excess", "--physics", "T = q * T + 0 * time"]
@@ -121,7 +114,7 @@ def test_without_actions_there_is_the_time_and_next_values_are_equations_too(fol
 
 
 @pytest.mark.slow
-def test_python_makes_the_same_page_of_an_identification(folder, read, undrawn_log):
+def test_python_makes_the_same_page_of_an_identification(folder, read, undrawn):
     from tests.records.test_identification import SPEC, START, oscillation, spring
 
     found = identify(Records(oscillation(40), SPEC), spring(), start=START)
@@ -141,7 +134,7 @@ BAD = {
     ("--hidden", "rate"): r"such as 'rate \[rad/s\]=0 \+- 2', found 'rate'",
     ("--hidden", "rate=0..1"): "mean and standard deviation",
     ("--angles", "torque"): "--angles names 'torque'",
-    ("--unknown", "z=1+-1"): "--unknown names 'z', which is in no equation",
+    ("--unknown", "z=1+-1"): "--unknown names 'z', which is none of the names in equations",
     ("--physics", "rate' = rate"): "one equation for each state",
     ("--physics", "swing:physics"): "Expected swing:physics alone",
     ("--physics", "x' = rate"): "equation for each of angle, rate.* found those of angle, rate, x",

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from gpadjust.core import CKA, ZeroMeanGP, fit, load
 from gpadjust.physics import FunctionPhysics, PhysicsError
 from gpadjust.report import report
-from gpadjust.report.figures import _slice
-from gpadjust.report.markup import failure, name_and_unit, number, table, tag
-from gpadjust.report.sections import headline, verdicts
+from gpadjust.report.figures import slice_along
+from gpadjust.report.markup import cards, failure, name_and_unit, number, table, tag
 from gpadjust.report.subject import subject_of
+from gpadjust.report.verdict import headline, verdicts
 from gpadjust.validation import Gain
 
 from .conftest import Page, f_p
@@ -129,11 +129,11 @@ def test_a_model_without_physics(tmp_path, read, undrawn):
 )
 def test_what_is_not_shown_is_not_denied(comparison, gain, answer, says):
     subject = subject_of(dataclasses.replace(comparison, gain={"y": gain}))
-    page = Page(verdicts(subject))
+    page = Page(cards(verdicts(subject)))
     assert page.text.startswith(f"{_three(comparison)} {answer}")
     assert says in page.text
     assert ("not to say" in page.text) == (gain.shown == 0 and abs(gain.elpd) < 2)
-    assert f"\n{answer}. " in headline(subject)
+    assert f"\n{answer}. " in headline(verdicts(subject), "Errors")
 
 
 def test_nothing_is_written_of_what_cannot_be_reported(comparison, tmp_path):
@@ -148,7 +148,7 @@ def test_nothing_is_written_of_what_cannot_be_reported(comparison, tmp_path):
         (comparison, old, {"rows": [1, 2]}, ValueError, "Expected 10 names of rows, .* found 2"),
         (comparison, tmp_path / "a.csv", {}, ValueError, r"page such as 'report.html' .*a.csv"),
         (comparison, tmp_path / "none" / "a.html", {}, FileNotFoundError, "There is no folder"),
-        (comparison, tmp_path / "folder.html", {}, IsADirectoryError, "give the name of a file"),
+        (comparison, tmp_path / "folder.html", {}, IsADirectoryError, "give the page another name"),
     ):
         with pytest.raises(error, match=words):
             report(what, path, **options)
@@ -163,7 +163,7 @@ def test_an_error_on_the_way_leaves_what_was_there(comparison, tmp_path, monkeyp
     def interrupted(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("gpadjust.report.sections.settings", interrupted)
+    monkeypatch.setattr("gpadjust.report.tables.data", interrupted)
     with pytest.raises(KeyboardInterrupt):
         report(comparison, old)
     assert old.read_text() == "old"
@@ -188,7 +188,7 @@ def test_inputs_are_drawn_in_double_precision():
     X = offset * (1 + torch.linspace(0, 1e-8, 7, dtype=torch.float64).unsqueeze(-1))
     model = CKA(X, X / offset, physics=lambda X: torch.zeros_like(X))
     fit(model, "map")
-    drawn = _slice(subject_of(model), 0, 9)
+    drawn = slice_along(subject_of(model), 0, 9)
     assert len(drawn.unique()) == 9
 
 
