@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, Self, TypeVar, cast
 
 import numpy as np
 import torch
@@ -15,11 +16,13 @@ from torch import Tensor
 
 from gpadjust.checks import check_kind, checked_bounds, checked_number, seeded
 from gpadjust.control.constraints import margins
+from gpadjust.control.faults import check_observation
 from gpadjust.control.planner import Plan, Planner
 from gpadjust.control.search import CrossEntropy
+from gpadjust.control.smoothed_episodes import Seen, smooth_episodes
 from gpadjust.control.state_filter import Estimate, StateFilter
-from gpadjust.control.step_guard import check_observation
 from gpadjust.control.task import Task
+from gpadjust.dynamics import Trajectories
 
 _SHORTEST, _LONGEST = 8, 30  # steps ahead
 _SEGMENT = 1.5  # horizons of a step
@@ -37,6 +40,22 @@ FIRST = Planner(
     spread=0.15,
 )
 """The default plan of an episode that begins: the whole of it, at once and in segments."""
+
+
+class _Run(NamedTuple):
+    """Measurements of steps that followed each other, and the actions taken there."""
+
+    observations: list[Tensor]
+    actions: list[Tensor]
+
+    @property
+    def num_transitions(self) -> int:
+        return min(len(self.observations) - 1, len(self.actions)) if self.actions else 0
+
+    def whole(self) -> Seen:
+        """Those of whole transitions."""
+        n = self.num_transitions
+        return Seen(torch.stack(self.observations[: n + 1]), torch.stack(self.actions[:n]))
 
 
 class Planned(NamedTuple):
@@ -77,11 +96,11 @@ Kept = TypeVar("Kept")
 class MPC:
     """Model predictive control: at each step the steps ahead are planned, and the first is made.
 
-    It has the ``predict`` of Stable-Baselines3's policies, so that ``evaluate_policy`` and
-    ``record_video`` take it; what it returns as state is the plan, which the next call improves.
+    :meth:`step` maps a measurement to an action, in a loop of your own; :meth:`learn` lets the
+    dynamics learn what was measured. Before that it plans in the physics.
 
     Args:
-        task: The task; its dynamics must be fitted.
+        task: The task. Its dynamics are what :meth:`learn` updates.
         action_bounds: Lower and upper bounds of the actions, ``2 x action_dim``.
         each_step: Plans at each step but the first. Default: two looks at 128 sequences of a third
             of the episode, of 8 to 30 steps. A horizon must be as long as the manoeuvre
@@ -107,16 +126,17 @@ class MPC:
 
     Example:
         >>> import numpy as np
-        >>> import torch
         >>> from gpadjust.control import MPC, Task
-        >>> from gpadjust.dynamics import PhysicsDynamics, StateSpec
-        >>> point = PhysicsDynamics(StateSpec(["x"], ["v"]), lambda X: X[:, :1] + X[:, 1:])
-        >>> near = lambda states, actions, next_states: -next_states[:, 0].abs()
-        >>> task = Task(point, near, episode_length=4)
-        >>> mpc = MPC(task, torch.tensor([[-1.0], [1.0]]))
-        >>> action, plan = mpc.predict(np.array([0.5]))
-        >>> bool(abs(action + 0.5) < 0.2)
-        True
+        >>> from gpadjust.dynamics import LearnedDynamics, StateSpec
+        >>> spec = StateSpec(["level"], ["pump"])
+        >>> dynamics = LearnedDynamics(spec, lambda X: X[:, :1] + X[:, 1:])
+        >>> task = Task(dynamics, lambda states, actions, following: -following[:, 0].abs())
+        >>> controller = MPC(task, [[-1.0], [1.0]], Planner(horizon=3))
+        >>> level = np.array([0.9])
+        >>> for _ in range(5):  # of the plant, whose pump is weaker
+        ...     level = level + 0.7 * controller.step(level)
+        >>> controller.learn()
+        MPC(LearnedDynamics, 4 transitions learnt)
     """
 
     def __init__(
@@ -159,9 +179,145 @@ class MPC:
         self.first = first
         self.tolerance = tolerance
         self.seed = seed
-        if task.sensors is not None and state_filter is None:
-            state_filter = StateFilter.guessed(task, self.action_bounds)
         self.filter = state_filter
+        if task.sensors is not None and state_filter is None:
+            self.filter = StateFilter.guessed(self.model, self.action_bounds)
+        self._runs: list[_Run] = []
+        self._num_learnt = 0  # of the recorded transitions
+        self.reset()
+
+    @property
+    def model(self) -> Task:
+        """The task in what its dynamics have learnt, or in the physics before that."""
+        dynamics = self.task.dynamics
+        newest = dynamics.before_data() or dynamics
+        return self.task if newest is dynamics else replace(self.task, dynamics=newest)
+
+    def reset(self) -> None:
+        """Begin an episode: forget the plan, and go on with nothing but what was learnt."""
+        self._plan: PlanState | None = None
+        self._runs.append(_Run([], []))
+
+    def step(self, measurement: ArrayLike) -> NDArray[np.float64]:
+        """Choose the action after a measurement; both are recorded for :meth:`learn`.
+
+        Args:
+            measurement: ``observation_dim`` numbers of the task's spec, or of its sensors.
+
+        Returns:
+            The action, ``action_dim`` numbers within the bounds.
+
+        Raises:
+            ValueError: If the measurement has another shape, or numbers that are not finite. It is
+                not recorded, and no transition goes across it; the plan stays.
+            RuntimeError: If there is neither a physics nor anything learnt.
+        """
+        row = self._measured(measurement)
+        with self._recording():
+            actions, self._plan = self._advance(row.unsqueeze(0), self._plan or [None], self.seed)
+        self._runs[-1].actions.append(actions[0])
+        return actions[0].numpy().copy()
+
+    def observe(self, measurement: ArrayLike) -> None:
+        """Record a measurement without an action: the one with which an episode ends.
+
+        Raises:
+            ValueError: As :meth:`step`.
+        """
+        self._measured(measurement)
+        self._runs.append(_Run([], []))
+
+    def learn(self, data: Trajectories | None = None) -> Self:
+        """Let the dynamics learn, and go on in the newest model.
+
+        Args:
+            data: Trajectories of states. Default: the transitions between measurements of
+                :meth:`step` and :meth:`observe` that were not learnt yet. With sensors, the
+                states behind all of them are estimated first.
+
+        Raises:
+            ValueError: If there is no new transition; or trajectories of a task with sensors.
+            PhysicsError: If the physics fails at a transition.
+        """
+        dynamics, spec = self.task.dynamics, self.task.dynamics.spec
+        if data is None:
+            runs = [run for run in self._runs if run.num_transitions]
+            number = sum(run.num_transitions for run in runs)
+            if number == self._num_learnt:
+                raise ValueError(
+                    "There is no new transition to learn, which takes a measurement, an action and "
+                    "the measurement after it: call `step` first, or pass trajectories."
+                )
+            data = self._trajectories(runs)
+            if self.task.sensors is None:
+                data = data.some(slice(self._num_learnt, None))
+        elif self.task.sensors is not None:
+            raise ValueError(
+                "The states behind trajectories of sensors are estimated from what `step` has "
+                "recorded; call learn() without data."
+            )
+        else:
+            number = self._num_learnt
+        following = data.next_states.clone()
+        if self.task.reference is not None:  # set-points stay as they are in the dynamics
+            following[:, spec.exogenous_columns] = data.states[:, spec.exogenous_columns]
+        before = dynamics.state_dict() if self.task.sensors is not None else None
+        if before is not None:  # the states behind all measurements are known better by now
+            dynamics.load_state_dict({})
+        try:
+            dynamics.update(data.states, data.actions, following)
+        except BaseException:
+            if before is not None:
+                dynamics.load_state_dict(before)
+            raise
+        self._num_learnt = number
+        return self
+
+    @contextmanager
+    def _recording(self) -> Iterator[None]:
+        """Begin another run if something fails, so that no transition goes across it."""
+        try:
+            yield
+        except BaseException:
+            self._runs.append(_Run([], []))
+            raise
+
+    def _measured(self, measurement: ArrayLike) -> Tensor:
+        """Return a measurement, checked and recorded."""
+        values = np.atleast_1d(np.asarray(measurement, dtype=np.float64))
+        spec = self.task.observed
+        with self._recording():
+            check_observation(values)
+            if values.ndim != 1:
+                raise ValueError(
+                    f"Expected a measurement of {spec.observation_dim} numbers, found shape "
+                    f"{values.shape}; `predict` takes the measurements of several episodes."
+                )
+            row = torch.tensor(values)
+            spec.check_observations(row)
+        self._runs[-1].observations.append(row)
+        return row
+
+    def _trajectories(self, runs: Sequence[_Run]) -> Trajectories:
+        """Return the transitions of runs; with sensors, of states estimated in the newest model."""
+        spec, seen = self.task.dynamics.spec, [run.whole() for run in runs]
+        if self.filter is None:
+            paths = [spec.decode(each.observations) for each in seen]
+        else:
+            self.filter, paths = smooth_episodes(self.model, self.filter, seen, len(seen))
+        return Trajectories(
+            torch.cat([path[:-1] for path in paths]),
+            torch.cat([each.actions for each in seen]),
+            torch.cat([path[1:] for path in paths]),
+            torch.arange(len(seen)).repeat_interleave(
+                torch.tensor([len(each.actions) for each in seen])
+            ),
+        )
+
+    def __repr__(self) -> str:
+        """Name the dynamics, and how much they have learnt."""
+        learnt = getattr(self.task.dynamics, "num_transitions", self._num_learnt)
+        return f"MPC({type(self.task.dynamics).__name__}, {learnt} transitions learnt)"
 
     def predict(
         self,
@@ -170,36 +326,47 @@ class MPC:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], PlanState]:
-        """Plan actions; arguments and result are those of :meth:`~gpadjust.control.Agent.predict`.
+        """Plan actions, as policies of Stable-Baselines3 do, whose ``evaluate_policy`` takes it.
 
-        The state is the plan. Without one all episodes begin. If ``deterministic``, the search is
-        always the same.
+        Arguments and result are those of :meth:`~gpadjust.control.Agent.predict`. The state is the
+        plan. Without one all episodes begin. If ``deterministic``, the search is always the same.
+        Nothing is recorded.
         """
         check_observation(observation)
         rows = torch.as_tensor(np.atleast_2d(observation), dtype=torch.float64)
         episodes = going_on(state, episode_start, len(rows))
-        known: Sequence[Estimate | None] = [None] * len(rows)
+        found, plans = self._advance(rows, episodes, self.seed if deterministic else None)
+        actions = found.numpy().astype(np.float32)
+        return (actions if np.ndim(observation) > 1 else actions[0]), plans
+
+    def _advance(
+        self, rows: Tensor, episodes: Sequence[Planned | None], seed: int | None
+    ) -> tuple[Tensor, PlanState]:
+        """The actions of episodes at observations, and their plans from there on."""
+        task = self.model
+        estimates: Sequence[Estimate | None] = [None] * len(rows)
         if self.filter is None:
-            states = [*self.task.dynamics.spec.decode(rows)]
+            states = [*task.dynamics.spec.decode(rows)]
         else:
             before = [None if each is None else each.estimate for each in episodes]
-            found = known = self.filter.follow(self.task, rows, before)
+            found = estimates = self.filter.follow(task, rows, before)
             states = [each.mean for each in found]
         plans = []
-        for at, earlier, seen in zip(states, episodes, known, strict=True):
-            with seeded(self.seed if deterministic else None):  # whatever the other rows are
-                plans.append(self.plan(at, earlier, None if seen is None else seen.covariance))
-        actions = torch.stack([plan.actions[0] for plan in plans]).numpy().astype(np.float32)
-        return (actions if np.ndim(observation) > 1 else actions[0]), tuple(
-            plan._replace(
-                actions=plan.actions[1:],
-                next_states=plan.next_states[1:],
-                steps_done=plan.steps_done + 1,
-                before=plan.actions[0],
-                estimate=None if seen is None else seen._replace(action=plan.actions[0]),
+        for state, earlier, estimate in zip(states, episodes, estimates, strict=True):
+            covariance = None if estimate is None else estimate.covariance
+            with seeded(seed):  # whatever the other rows are
+                plan = self.plan(state, earlier, covariance)
+            action = plan.actions[0]
+            plans.append(
+                plan._replace(
+                    actions=plan.actions[1:],
+                    next_states=plan.next_states[1:],
+                    steps_done=plan.steps_done + 1,
+                    before=action,
+                    estimate=None if estimate is None else estimate._replace(action=action),
+                )
             )
-            for plan, seen in zip(plans, known, strict=True)
-        )
+        return torch.stack([cast(Tensor, plan.before) for plan in plans]), tuple(plans)
 
     def plan(
         self, state: Tensor, earlier: Planned | None = None, covariance: Tensor | None = None
@@ -215,7 +382,7 @@ class MPC:
         steps_done = 0 if earlier is None else earlier.steps_done
         length = self.task.episode_length
         left = None if length is None else max(length - steps_done, 1)
-        where = self.task, state, self.action_bounds, left
+        where = self.model, state, self.action_bounds, left
         before = None if earlier is None else earlier.before
         how: dict[str, Any] = {"before": before, "steps_done": steps_done}
         if earlier is not None and len(earlier.actions):
@@ -281,7 +448,7 @@ class MPC:
         if self.task.constraints is None:
             return None
         states = torch.cat([state.unsqueeze(0), along.next_states])[: len(actions)]
-        return margins(self.task, states, actions, self.action_bounds, covariance)
+        return margins(self.model, states, actions, self.action_bounds, covariance)
 
     def _disappoints(self, plan: Plan, earlier: Planned) -> bool:
         """Return whether a plan is worth much less than its steps had promised."""

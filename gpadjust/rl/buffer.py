@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from gpadjust.checks import checked_number, checked_whole
 from gpadjust.control import RecordedEpisodes
-from gpadjust.control.step_guard import fault
+from gpadjust.control.faults import fault
 from gpadjust.states import StateSpec
 
 

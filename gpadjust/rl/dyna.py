@@ -33,8 +33,8 @@ from torch import Tensor
 from gpadjust.checks import check_kind
 from gpadjust.control import EpisodeCheckpoint, RecordedEpisodes, Task
 from gpadjust.control.checkpoint import packed, unpacked
+from gpadjust.control.faults import check_observation
 from gpadjust.control.recorded_episodes import learn_dynamics
-from gpadjust.control.step_guard import check_observation
 from gpadjust.control.task_agent import TaskAgent, locked
 from gpadjust.rl.buffer import CompactReplayBuffer, MixedReplayBuffer
 from gpadjust.rl.callbacks import AgentCallback, DynaCallback
