@@ -7,14 +7,12 @@ from typing import Any
 
 from gpadjust.control.action_rate import ActionRate
 from gpadjust.control.constraints import margins
-from gpadjust.control.mpc import MPC, Planned
-from gpadjust.control.planner import Plan, Planner
+from gpadjust.control.mpc import MPC, CrossEntropy, Plan, Planner
 from gpadjust.control.policies import BoundedPolicy, mlp_policy
 from gpadjust.control.policy_search import PolicySearch, SearchResult
 from gpadjust.control.progress import print_progress
 from gpadjust.control.recorded_episodes import RecordedEpisodes
 from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts
-from gpadjust.control.search import CrossEntropy
 from gpadjust.control.state_filter import Estimate, StateFilter
 from gpadjust.control.task import Constraints, InitialStates, Reward, Step, Task, Termination
 
@@ -33,7 +31,6 @@ __all__ = [
     "MPCAgent",
     "Objective",
     "Plan",
-    "Planned",
     "Planner",
     "PolicySearch",
     "PolicySearchAgent",

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from gpadjust.checks import check_kind, checked_number, checked_whole
-from gpadjust.control.planner import Planner
+from gpadjust.control.mpc import Planner
 from gpadjust.control.policies import BoundedPolicy
 from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts, Score
 from gpadjust.control.task import Task

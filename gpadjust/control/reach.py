@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.checks import seeded
-from gpadjust.control.search import random_sequences
+from gpadjust.control.rollouts import random_sequences
 from gpadjust.dynamics import Dynamics
 from gpadjust.dynamics.particles import step_or_nan
 from gpadjust.physics import PhysicsError

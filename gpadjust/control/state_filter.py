@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.checks import seeded
-from gpadjust.control.rollouts import Rollouts
-from gpadjust.control.search import random_sequences
+from gpadjust.control.rollouts import Rollouts, random_sequences
 from gpadjust.control.task import Task
 from gpadjust.dynamics.linearised import derivatives, linearised
 from gpadjust.records.kalman import Array, measure

@@ -43,6 +43,8 @@ class Step(NamedTuple):
             the physics failed.
         overshoot: ``N``: how far it would have, in halves of the width between the bounds, summed
             over the states; with its gradient, which leads back. 0 where that is not finite.
+        violation: ``N``: how far the constraints with their margins are violated, in sum; 0 where
+            they hold.
     """
 
     next_states: Tensor
@@ -50,6 +52,7 @@ class Step(NamedTuple):
     terminated: Tensor
     left_bounds: Tensor
     overshoot: Tensor
+    violation: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,6 +312,7 @@ class Task:
         move: Callable[[Tensor, Tensor], Tensor] | None = None,
         *,
         set_points: Tensor | None = None,
+        margins: Tensor | None = None,
         some_must_succeed: bool = False,
     ) -> Step:
         """Take actions ``N x action_dim`` at states ``N x state_dim`` of the model.
@@ -318,6 +322,7 @@ class Task:
             actions: The actions.
             move: Next states of these. Default: drawn from the dynamics, row by row.
             set_points: The exogenous states afterwards, see :meth:`set_points`. Default: as before.
+            margins: Of the constraints, ``c``. Default: none.
             some_must_succeed: Whether it is an error that the physics fails for all rows.
 
         Raises:
@@ -330,18 +335,27 @@ class Task:
             following = following.clone()
             following[:, self.dynamics.spec.exogenous_columns] = set_points
         left = ~following.isfinite().all(-1)
-        overshoot = following.new_zeros(len(following))
+        none = following.new_zeros(len(following))
+        overshoot = violation = none
         if self.state_bounds is not None:
             low, high = self.state_bounds
             beyond = (low - following).clamp_min(0.0) + (following - high).clamp_min(0.0)
-            left |= (beyond > 0).any(-1)
-            width = (high - low) / 2
-            beyond = beyond / torch.where(width.isfinite(), width, 1.0)
-            overshoot = torch.where(beyond.isfinite(), beyond, 0.0).sum(-1)
-        following = torch.where(left.unsqueeze(-1), states, following)
+            outside = (beyond > 0).any(-1)
+            if outside.any():
+                left = left | outside
+                width = (high - low) / 2
+                beyond = beyond / torch.where(width.isfinite(), width, 1.0)
+                overshoot = torch.where(beyond.isfinite(), beyond, 0.0).sum(-1)
+        ended = none.bool()
+        if left.any():
+            following = torch.where(left.unsqueeze(-1), states, following)
         rewards = self.rewards(states, actions, following)
-        ended = self.terminations(following) & ~left
-        return Step(following, rewards, ended, left, overshoot)
+        if self.terminated is not None:
+            ended = self.terminations(following) & ~left
+        if self.constraints is not None:
+            values = self.constraint_values(following, actions)
+            violation = (values if margins is None else values + margins).clamp_min(0.0).sum(-1)
+        return Step(following, rewards, ended, left, overshoot, violation)
 
     def widened(self, states: Tensor) -> Task:
         """This task, or one whose bounds give way to states ``N x state_dim`` beyond them."""
