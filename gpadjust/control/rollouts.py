@@ -99,9 +99,9 @@ class Rollouts:
         """
         if self.task.rate is not None:
             sequences = self.task.rate.limited(sequences, self.before)
-        every = sequences.expand(self.num_functions, *sequences.shape)
+        every = sequences.repeat(self.num_functions, 1, 1)
         starts = state.expand(len(sequences), -1)
-        return self._run(starts, every.shape[2], lambda t, states: every[:, :, t], steps_done)
+        return self._run(starts, every.shape[1], lambda t, states: every[:, t], steps_done)
 
     def act(self, states: Tensor, policy: Policy, num_steps: int) -> Rollout:
         """Let a policy act.
@@ -112,11 +112,7 @@ class Rollouts:
             policy: Who acts.
             num_steps: How long, ``T``.
         """
-
-        def choose(t: int, states: Tensor) -> Tensor:
-            return policy(states.flatten(0, 1)).reshape(*states.shape[:2], -1)
-
-        return self._run(states, num_steps, choose, 0)
+        return self._run(states, num_steps, lambda t, states: policy(states), 0)
 
     def has_time(self, num_steps: int = 1) -> bool:
         """Return whether so many steps can be made before the deadline, by the slowest so far."""
@@ -131,41 +127,37 @@ class Rollouts:
     ) -> Rollout:
         """Run episodes of actions that are chosen by the number of the step and the states."""
         task = self.task.widened(starts.flatten(0, -2))
-        states = starts.expand(self.num_functions, *starts.shape[-2:])
-        running = torch.ones(states.shape[:2], dtype=torch.bool)
-        left, overshoot = ~running, torch.zeros(running.shape, dtype=torch.float64)
+        shape = (self.num_functions, starts.shape[-2])  # of all episodes, which are rows below
+        states = starts.expand(*shape, -1).flatten(0, 1)
+        running = torch.ones(len(states), dtype=torch.bool)
+        left, overshoot = ~running, torch.zeros(len(states), dtype=torch.float64)
         steps: list[tuple[Tensor, ...]] = []
         for t in range(num_steps):
             begun = time.perf_counter()
             if t and not self.has_time():
                 break
             actions = choose(t, states)
-            # Where the episodes start the physics has to work; later, all may have come to where
-            # it does not.
-            at, taken = (_tamed_gradient(part.flatten(0, 1)) for part in (states, actions))
-            step = task.step(
+            at, taken = (_tamed_gradient(part) for part in (states, actions))
+            following, rewards, ended, lost, beyond, violation = task.step(
                 at,
                 taken,
                 self._move,
                 set_points=task.set_points(at, steps_done + t + 1),
                 margins=None if self.margins is None else self.margins[: t + 1][-1],
+                # Later, all may have come to where the physics does not work.
                 some_must_succeed=t == 0,
             )
-            following, rewards, ended, lost, beyond, violation = (
-                part.unflatten(0, running.shape) for part in step
-            )
             made = running & ~lost
-            if lost.any():
-                left = left | (running & lost)
-                overshoot = torch.where(running, beyond, overshoot)
+            left = left | (running & lost)
+            overshoot = torch.where(running, beyond, overshoot)
             steps.append((states, actions, following, rewards, made, violation))
             running = made & ~ended
             states = torch.where(running.unsqueeze(-1), following, states)
             self._slowest = max(self._slowest, time.perf_counter() - begun)
-        columns = [torch.stack(parts, dim=2) for parts in zip(*steps, strict=True)]
-        *columns, made, violation = columns
-        violation = violation.masked_fill(~made, 0.0)
-        return Rollout._make([*columns, made, left, overshoot, violation, self.before])
+        columns = [torch.stack(parts, dim=1) for parts in zip(*steps, strict=True)]
+        columns += [left, overshoot, columns.pop().masked_fill(~columns[4], 0.0)]
+        parts = [column.unflatten(0, shape) for column in columns]
+        return Rollout._make([*parts, self.before])
 
     def _move(self, states: Tensor, actions: Tensor) -> Tensor:
         """Return the next states of rows, of which each function has as many."""

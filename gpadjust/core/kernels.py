@@ -191,23 +191,28 @@ class Stationary(Kernel):
         return (e.exp_() if self.profile is RBF else self.profile.value(e)).mul_(scale)
 
     def toward(self, own: Values, other: Tensor) -> Callable[[Tensor], Tensor]:
-        r"""Return the covariances by one product, :math:`e = (x, x^2, 1) \cdot A` of all draws."""
+        r"""Return covariances by one product of all draws, :math:`e = (x, x^2, 1) \cdot A`.
+
+        Of the kernel :math:`s e^e` the logarithm of s is part of A.
+        """
         if type(self).covariance is not Stationary.covariance:  # as of a subclass
             return super().toward(own, other)
         shift, scale = other.mean(-2, keepdim=True), own["outputscale"].unsqueeze(-1)
         w, o = own["lengthscale"].square().reciprocal().unsqueeze(-2), other - shift
-        half = (o.square() * w).sum(-1, keepdim=True) / 2
-        A = torch.cat([o * w, (-w / 2).expand_as(o * w), -half], -1)  # S x m x n' x (2 d + 1)
-        return partial(self._toward, own, other, shift, scale, A)
+        last = -(o.square() * w).sum(-1, keepdim=True) / 2
+        last = last + scale.log() if self.profile is RBF else last
+        A = torch.cat([o * w, (-w / 2).expand_as(o * w), last], -1)  # S x m x n' x (2 d + 1)
+        return partial(self._toward, own, other, shift, A)
 
-    def _toward(
-        self, own: Values, other: Tensor, shift: Tensor, scale: Tensor, A: Tensor, x: Tensor
-    ) -> Tensor:
+    def _toward(self, own: Values, other: Tensor, shift: Tensor, A: Tensor, x: Tensor) -> Tensor:
         if x.shape[-4:-2] != (1, 1):  # points of each draw's own
             return self.covariance(own, x, other)
         z = (x - shift)[..., 0, 0, :, :]
         e = torch.cat([z, z.square(), torch.ones_like(z[..., :1])], -1) @ A.flatten(0, -2).mT
-        return self._scaled(e.clamp_max_(0.0).unflatten(-1, A.shape[:-1]).movedim(-4, -2), scale)
+        e = e.unflatten(-1, A.shape[:-1]).movedim(-4, -2)
+        if self.profile is RBF:
+            return e.exp_()
+        return self._scaled(e.clamp_max_(0.0), own["outputscale"].unsqueeze(-1))
 
     def variance(self, own: Values, x: Tensor) -> Tensor:
         """Return ``s``."""
