@@ -25,9 +25,9 @@ from gpadjust.control.checkpoint import (
 )
 from gpadjust.control.pickled_agent import pickled, unpickled
 from gpadjust.control.random_state import RandomState
+from gpadjust.control.reach import random_sequences
 from gpadjust.control.real_steps import RealStep, RealSteps
 from gpadjust.control.recorded_episodes import RecordedEpisodes, learn_dynamics
-from gpadjust.control.rollouts import random_sequences
 from gpadjust.control.smoothed_episodes import smooth_episodes
 from gpadjust.control.state_filter import StateFilter
 from gpadjust.control.step_guard import StepGuard

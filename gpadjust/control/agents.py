@@ -18,7 +18,8 @@ from gpadjust.control.faults import check_observation
 from gpadjust.control.mpc import MPC, Planner, PlanState, going_on
 from gpadjust.control.policies import BoundedPolicy, mlp_policy
 from gpadjust.control.policy_search import PolicySearch
-from gpadjust.control.rollouts import Rollouts, random_sequences
+from gpadjust.control.reach import random_sequences
+from gpadjust.control.rollouts import Rollouts
 from gpadjust.control.state_filter import Estimate
 from gpadjust.control.task import Task
 from gpadjust.states import StateSpec

@@ -17,7 +17,8 @@ from torch import Tensor
 from gpadjust.checks import check_kind, checked_bounds, checked_number, checked_whole, seeded
 from gpadjust.control.constraints import margins
 from gpadjust.control.faults import check_observation
-from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts, random_sequences
+from gpadjust.control.reach import random_sequences
+from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts
 from gpadjust.control.smoothed_episodes import Seen, smooth_episodes
 from gpadjust.control.state_filter import Estimate, StateFilter
 from gpadjust.control.task import Task
@@ -414,7 +415,7 @@ class _Run(NamedTuple):
         return min(len(self.observations) - 1, len(self.actions)) if self.actions else 0
 
     def whole(self) -> Seen:
-        """Those of whole transitions."""
+        """Return the measurements and actions of whole transitions."""
         n = self.num_transitions
         return Seen(torch.stack(self.observations[: n + 1]), torch.stack(self.actions[:n]))
 
@@ -569,6 +570,12 @@ class MPC:
             PhysicsError: If the physics fails at a transition.
         """
         dynamics, spec = self.task.dynamics, self.task.dynamics.spec
+        hidden, number = self.task.sensors is not None, self._num_learnt
+        if data is not None and hidden:
+            raise ValueError(
+                "The states behind trajectories of sensors are estimated from what `step` has "
+                "recorded; call learn() without data."
+            )
         if data is None:
             runs = [run for run in self._runs if run.num_transitions]
             number = sum(run.num_transitions for run in runs)
@@ -577,21 +584,12 @@ class MPC:
                     "There is no new transition to learn, which takes a measurement, an action and "
                     "the measurement after it: call `step` first, or pass trajectories."
                 )
-            data = self._trajectories(runs)
-            if self.task.sensors is None:
-                data = data.some(slice(self._num_learnt, None))
-        elif self.task.sensors is not None:
-            raise ValueError(
-                "The states behind trajectories of sensors are estimated from what `step` has "
-                "recorded; call learn() without data."
-            )
-        else:
-            number = self._num_learnt
-        following = data.next_states.clone()
+            data = self._trajectories(runs).some(slice(0 if hidden else self._num_learnt, None))
+        following, still = data.next_states.clone(), spec.exogenous_columns
         if self.task.reference is not None:  # set-points stay as they are in the dynamics
-            following[:, spec.exogenous_columns] = data.states[:, spec.exogenous_columns]
-        before = dynamics.state_dict() if self.task.sensors is not None else None
-        if before is not None:  # the states behind all measurements are known better by now
+            following[:, still] = data.states[:, still]
+        before = dynamics.state_dict() if hidden else None
+        if hidden:  # the states behind all measurements are known better by now
             dynamics.load_state_dict({})
         try:
             dynamics.update(data.states, data.actions, following)
@@ -634,14 +632,12 @@ class MPC:
             paths = [spec.decode(each.observations) for each in seen]
         else:
             self.filter, paths = smooth_episodes(self.model, self.filter, seen, len(seen))
-        return Trajectories(
-            torch.cat([path[:-1] for path in paths]),
-            torch.cat([each.actions for each in seen]),
-            torch.cat([path[1:] for path in paths]),
-            torch.arange(len(seen)).repeat_interleave(
-                torch.tensor([len(each.actions) for each in seen])
-            ),
-        )
+        actions = torch.cat([each.actions for each in seen])
+        lengths = torch.tensor([len(each.actions) for each in seen])
+        states = torch.cat([path[:-1] for path in paths])
+        next_states = torch.cat([path[1:] for path in paths])
+        episode = torch.arange(len(seen)).repeat_interleave(lengths)
+        return Trajectories(states, actions, next_states, episode)
 
     def __repr__(self) -> str:
         """Name the dynamics, and how much they have learnt."""
@@ -671,7 +667,7 @@ class MPC:
     def _advance(
         self, rows: Tensor, episodes: Sequence[Plan | None], seed: int | None
     ) -> tuple[Tensor, PlanState]:
-        """The actions of episodes at observations, and their plans from there on."""
+        """Return the actions of episodes at observations, and their plans from there on."""
         task = self.model
         estimates: Sequence[Estimate | None] = [None] * len(rows)
         if self.filter is None:
@@ -769,7 +765,7 @@ class MPC:
 
 
 def going_on(state: Sequence[Kept] | None, episode_start: Any, n: int) -> list[Kept | None]:
-    """What a policy kept of each of ``n`` episodes, its state; None of those that begin."""
+    """Return what a policy kept of each of ``n`` episodes, its state; None of those that begin."""
     if state is None:
         return [None] * n
     begins = np.zeros(n, dtype=bool) if episode_start is None else np.atleast_1d(episode_start)

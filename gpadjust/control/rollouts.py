@@ -165,28 +165,6 @@ class Rollouts:
         return self.functions(*blocks).flatten(0, 1)
 
 
-def random_sequences(n: int, num_steps: int, bounds: Tensor, max_hold: int) -> Tensor:
-    """Draw piecewise constant sequences, from PyTorch's generator.
-
-    Each holds its actions, uniform within the bounds, for a number of steps of its own, from 1 to
-    ``max_hold``.
-
-    Args:
-        n: Number of sequences.
-        num_steps: Their length ``T``.
-        bounds: Lower and upper bounds of the actions, ``2 x action_dim``.
-        max_hold: The most steps that an action is held.
-
-    Returns:
-        ``n x T x action_dim``.
-    """
-    low, high = bounds
-    actions = low + (high - low) * torch.rand(n, num_steps, len(low), dtype=torch.float64)
-    hold = torch.randint(1, max_hold + 1, (n, 1))
-    rows = torch.arange(num_steps) // hold
-    return actions.gather(1, rows.unsqueeze(-1).expand_as(actions))
-
-
 def _tamed_gradient(rows: Tensor) -> Tensor:
     """Return the same rows; of those whose gradient is not finite, or far longer, less flows on.
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpadjust.checks import check_kind, checked_number, checked_whole
+from gpadjust.checks import check_kind, checked_bounds, checked_number, checked_whole
 from gpadjust.control.action_rate import ActionRate
 from gpadjust.dynamics import Dynamics
 from gpadjust.dynamics.particles import step_or_nan
@@ -125,15 +125,11 @@ class Task:
             raise TypeError(
                 "reward must be a function of states, actions, next states; found None."
             )
-        for name, arguments in (
-            ("reward", 3),
-            ("terminated", 1),
-            ("initial_states", 1),
-            ("reference", 2),
-            ("constraints", 2),
-        ):
-            _check_function(getattr(self, name), name, arguments)
-        if self.reference is not None and not self.dynamics.spec.exogenous:
+        arguments = {"reward": 3, "terminated": 1, "initial_states": 1}
+        for name, number in (arguments | {"reference": 2, "constraints": 2}).items():
+            _check_function(getattr(self, name), name, number)
+        spec, hidden = self.dynamics.spec, self.sensors is not None
+        if self.reference is not None and not spec.exogenous:
             raise ValueError(
                 "reference says the values of exogenous states, but the spec has none; name the "
                 "set-points among `exogenous`, and let the environment observe them."
@@ -141,25 +137,24 @@ class Task:
         if self.episode_length is not None:
             checked_whole("episode_length", self.episode_length, 1)
         if self.state_bounds is not None:
-            bounds = _checked_bounds(self.state_bounds, self.dynamics.spec.state_dim)
+            bounds = checked_bounds("state_bounds", self.state_bounds, spec.state_dim, finite=False)
             object.__setattr__(self, "state_bounds", bounds)
         check_kind("sensors", self.sensors, Sensors | None, 'Sensors(["x", "theta"]), say')
-        if self.sensors is not None:
-            self.sensors.spec(self.dynamics.spec)  # checks the names
-            if self.initial_states is None:
-                raise ValueError(
-                    "Of hidden states it must be known where episodes start; pass initial_states, "
-                    "or start of a System, as well as sensors."
-                )
-            if self.reference is not None:
-                raise ValueError(
-                    "The estimate of hidden states takes set-points for constant; leave reference "
-                    "out, or the sensors."
-                )
+        self.observed  # noqa: B018 - checks the names
+        if hidden and self.initial_states is None:
+            raise ValueError(
+                "Of hidden states it must be known where episodes start; pass initial_states, or "
+                "start of a System, as well as sensors."
+            )
+        if hidden and self.reference is not None:
+            raise ValueError(
+                "The estimate of hidden states takes set-points for constant; leave reference out, "
+                "or the sensors."
+            )
         if self.probability is not None:
             checked_number("probability", self.probability, above=0, below=1)
         if self.rate is not None:
-            self.rate.check(self.dynamics.spec.action_dim)
+            self.rate.check(spec.action_dim)
 
     @property
     def observed(self) -> StateSpec:
@@ -400,20 +395,6 @@ def per_row(values: Any, n: int, name: str) -> Tensor:
         row = int((~values.isfinite()).nonzero()[0])
         raise ValueError(f"{name} returned {values[row]} for row {row}; expected finite numbers.")
     return values
-
-
-def _checked_bounds(bounds: Any, state_dim: int) -> Tensor:
-    bounds = torch.as_tensor(bounds, dtype=torch.float64)
-    if bounds.shape != (2, state_dim):
-        raise ValueError(
-            f"state_bounds must be of shape 2 x {state_dim}, lower ones and then upper ones; found "
-            f"{tuple(bounds.shape)}."
-        )
-    if not (bounds[0] < bounds[1]).all():  # NaN is not, either
-        raise ValueError(
-            f"Each lower one of state_bounds must be below its upper one; found {bounds.tolist()}."
-        )
-    return bounds
 
 
 def _check_function(function: Any, name: str, num_arguments: int) -> None:
