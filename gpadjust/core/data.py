@@ -22,7 +22,12 @@ _FAINT = 1e-6  # of the size of the targets: their unit where the prior mean mee
 
 # What NumPy would turn into numbers: kinds of arrays, types of objects, and the way out.
 _NO_NUMBERS: dict[str, tuple[str, tuple[type, ...], str]] = {
-    "text": ("SU", (str, bytes), "convert numbers in text with `.astype(float)`, drop other text"),
+    "text": (
+        "SU",
+        (str, bytes),
+        "convert numbers in text with `.astype(float)`; columns of a frame of inputs may be "
+        "categories, input_transform=Categories() of gpadjust.kinds; drop other text",
+    ),
     "complex numbers": ("c", (complex, np.complexfloating), "give both parts, or take `.real`"),
     "dates or times": (
         "mM",

@@ -30,12 +30,13 @@ if TYPE_CHECKING:
 _SMALL, _MEDIUM = 40, 100  # points: up to these draws begin with the prior, and are moved
 _SELDOM = 1e-3  # a nested model of less probability at its mode is not drawn from
 _SEARCHES = 4  # for the mode
-_NEAR, _LESS_LIKELY = 0.3, 5.0  # coordinates of one end; log density of one that is left out
-_MOVED = 0.35  # predicted standard deviations by which another seed may move the mean
+_NEAR = 0.3  # difference of all coordinates below which two searches have found the same mode
+_LESS_LIKELY = 5.0  # difference of log density from the best mode beyond which a mode is ignored
+_MOVED = 0.35  # standard deviations by which another seed may move means
 
 
 class SamplingWarning(UserWarning):
-    """Another seed would move predictions by much."""
+    """Another seed would move predictions or parameters of the physics by much."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,8 @@ class FitResult:
         error: By how many predicted standard deviations another seed would move the mean at a
             training input that is left out, root mean square; NaN of a point fit.
         num_draws: How many draws predictions average over.
+        parameter_error: By how many posterior standard deviations another seed would move the mean
+            of an unknown parameter of the physics, at most; NaN without any and of a point fit.
     """
 
     method: str
@@ -60,11 +63,12 @@ class FitResult:
     effective: float = math.nan
     error: float = math.nan
     num_draws: int = 1
+    parameter_error: float = math.nan
 
     @property
     def converged(self) -> bool:
-        """Whether predictions hardly depend on the seed."""
-        return not self.error > _MOVED
+        """Whether predictions and parameters of the physics hardly depend on the seed."""
+        return not (self.error > _MOVED or self.parameter_error > _MOVED)
 
     def __str__(self) -> str:
         lines, outputs = [], [*zip(*self.probabilities.values(), strict=True)]
@@ -79,6 +83,8 @@ class FitResult:
                 f"{self.num_draws} draws; another seed would move predictions by {self.error:.2f} "
                 "of their standard deviation."
             )
+            if not math.isnan(self.parameter_error):
+                lines[-1] += f" It would move means of parameters by {self.parameter_error:.2f}."
         return "\n".join(lines)
 
 
@@ -95,13 +101,14 @@ def fit(
     Args:
         model: The model.
         method: ``"bayes"`` or ``"map"``.
-        num_draws: Number of draws, a multiple of 4; predictions average over every fourth.
-            Default: 80, 32 or 16 and 16, 8 or 4 of them; 256, 128 or 64 if outputs share unknown
-            numbers, as parameters of a physics.
+        num_draws: Number of draws, a multiple of 4; predictions average over a quarter of them.
+            Default: 80, 32 (of more than 40 points) or 16 (of more than 100), or 256, 128 or 64 if
+            outputs share unknown numbers, as parameters of a physics; predictions then average over
+            16, 8 or 4 of them.
         seed: Seed.
 
     Warns:
-        SamplingWarning: If another seed would move predictions by much.
+        SamplingWarning: If another seed would move predictions or parameters by much.
 
     Raises:
         ValueError: If the method or number of draws is another one, or the data are a batch.
@@ -126,14 +133,20 @@ def fit(
         result: FitResult | None = model.fit_itself(method, num_draws, seed)
         if result is None:
             result = _fitted(model, method, num_draws, seed)
-    if result.error > _MOVED:
-        warnings.warn(
-            f"Predictions depend on the seed: another one would move them by {result.error:.2f} of "
-            "their standard deviation. Draw more: "
-            f"fit(model, num_draws={4 * len(model.draws)}).",
-            SamplingWarning,
-            stacklevel=2,
-        )
+    errors = {
+        "Predictions depend on the seed: another one would move them": result.error,
+        "Parameters of the physics depend on the seed: another one would move their means": (
+            result.parameter_error
+        ),
+    }
+    for text, error in errors.items():
+        if error > _MOVED:
+            warnings.warn(
+                f"{text} by {error:.2f} of their standard deviation. Draw more: fit(model, "
+                f"num_draws={4 * len(model.draws)}).",
+                SamplingWarning,
+                stacklevel=2,
+            )
     return result
 
 
@@ -148,12 +161,16 @@ def _fitted(model: GP, method: str, num_draws: int | None, seed: int) -> FitResu
     weights = _weights(model, {k: draws.log_evidence for k, draws in sampled.items()})
     shares = weights.mean(1)  # K x B
     model.set_draws(_pooled(sampled, shares, number), kept)
-    error = _error(model, sampled, weights, number) * math.sqrt(number / kept)
+    # Two groups that were resampled apart, with the weights of nested models by each of them.
+    groups = [_pooled(sampled, weights[:, g], number // GROUPS, g + 1) for g in range(GROUPS)]
+    error = _error(model, groups) * math.sqrt(number / kept)
+    has_unknowns = any(physics.unknowns for physics in model.physics)
+    parameter_error = _parameter_error(model, groups) if has_unknowns else math.nan
     choices = zip(model.table.choices, shares.expand(-1, len(model.unit)).tolist(), strict=False)
     effective = min(float(draws.effective.min()) for draws in sampled.values())
     return FitResult(
         method, _evidence(model, sampled), {choice.text: p for choice, p in choices},
-        effective, error, len(model.u),
+        effective, error, len(model.u), parameter_error,
     )  # fmt: skip
 
 
@@ -281,7 +298,7 @@ def _evidence(model: GP, sampled: dict[int, Draws]) -> Tensor:
     prior = model.table.log_prior
     logs = torch.stack([prior[k] + draws.log_evidence for k, draws in sampled.items()])
     total = logs.logsumexp(0).logsumexp(0) - math.log(GROUPS)
-    units = model.log_unit()
+    units = model.log_jacobian()
     return total + (units if len(total) > 1 else units.sum())
 
 
@@ -292,13 +309,13 @@ def _pooled(draws: Mapping[int, Draws], weights: Tensor, number: int, part: int 
     """
     problems = []
     for b in range(weights.shape[-1]):
-        rows = []
+        drawn = []
         for k, count in enumerate(_counts(weights[:, b], number)):
             if count:
                 u = draws[k].u if not part else draws[k].u.chunk(GROUPS)[part - 1]
                 at = (torch.arange(count) + 0.5) * len(u) / count
-                rows.append(u[at.long(), b])
-        problems.append(torch.cat(rows))
+                drawn.append(u[at.long(), b])
+        problems.append(torch.cat(drawn))
     return torch.stack(problems, 1)
 
 
@@ -311,16 +328,24 @@ def _counts(shares: Tensor, number: int) -> list[int]:
     return [int(count) for count in counts]
 
 
-def _error(model: GP, sampled: dict[int, Draws], weights: Tensor, number: int) -> float:
+def _error(model: GP, groups: list[Tensor]) -> float:
     """Return how far another seed would move the mean, in predicted standard deviations.
 
-    The draws are two groups that were resampled apart; with the weights of nested models by each of
-    them they predict the left-out targets. The difference of two means of N / 2 draws has a
-    standard deviation twice that of one of N.
+    Both groups of draws predict the left-out targets. The difference of two means of N / 2 draws
+    has a standard deviation twice that of one of N.
     """
-    draws = [_pooled(sampled, weights[:, g], number // GROUPS, g + 1) for g in range(GROUPS)]
-    groups = [model.left_out_at(u) for u in draws]
-    mean, variance = (torch.cat(each) for each in zip(*groups, strict=True))
+    predicted = [model.left_out_at(u) for u in groups]
+    mean, variance = (torch.cat(each) for each in zip(*predicted, strict=True))
     sd = (variance.mean(0) + mean.var(0, correction=0)).sqrt()
-    difference = (groups[0][0].mean(0) - groups[1][0].mean(0)) / 2
+    difference = (predicted[0][0].mean(0) - predicted[1][0].mean(0)) / 2
     return float((difference / sd).square().nanmean().sqrt())
+
+
+def _parameter_error(model: GP, groups: list[Tensor]) -> float:
+    """Return the same of the means of parameters of the physics, in posterior ones.
+
+    It is the largest of all parameters; all draws count for these.
+    """
+    one, other = (model.physics_parameters_at(u).mean for u in groups)
+    error = (one - other).abs() / (2 * model.physics_parameters_at(torch.cat(groups)).sd)
+    return float(error.nan_to_num().max())  # 0 / 0 where all draws are the same

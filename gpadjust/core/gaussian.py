@@ -79,7 +79,7 @@ def log_likelihood(
     return Likelihood(value, alpha.squeeze(-1), D)
 
 
-class Evidence(NamedTuple):
+class SumLikelihood(NamedTuple):
     """The log likelihood of observations of a weighted sum, ``S x m``, and its derivatives."""
 
     value: Tensor
@@ -88,19 +88,19 @@ class Evidence(NamedTuple):
     by_variance: Tensor  # by the variances of the noise, S x m x n
 
 
-def evidence(
+def sum_likelihood(
     train: WeightedSum, residual: Tensor, noise: Tensor, observed: Tensor, with_gradient: bool
-) -> Evidence:
-    """Return the evidence of residuals ``S x m x n`` of a sum; 0 where they are not observed."""
+) -> SumLikelihood:
+    """Return that of residuals ``S x m x n`` of a sum, which are 0 where not observed."""
     if not with_gradient:
         K = train.cross(train).expand(*residual.shape, residual.shape[-1])
         found = log_likelihood(residual, K, noise, observed, False)
-        return Evidence(found.value, {}, residual, residual)
+        return SumLikelihood(found.value, {}, residual, residual)
     K, pull_back = train.with_pull_back()
     K = K.expand(*residual.shape, residual.shape[-1])
     found = log_likelihood(residual, K, noise, observed)
     by_variance = found.by_covariance.diagonal(dim1=-1, dim2=-2)
-    return Evidence(found.value, pull_back(found.by_covariance), found.by_mean, by_variance)
+    return SumLikelihood(found.value, pull_back(found.by_covariance), found.by_mean, by_variance)
 
 
 class Conditioning:

@@ -195,7 +195,8 @@ class Stationary(Kernel):
 
         Of the kernel :math:`s e^e` the logarithm of s is part of A.
         """
-        if type(self).covariance is not Stationary.covariance:  # as of a subclass
+        own_points = other.shape[-4:-2] != (1, 1)  # of each draw or output
+        if own_points or type(self).covariance is not Stationary.covariance:
             return super().toward(own, other)
         shift, scale = other.mean(-2, keepdim=True), own["outputscale"].unsqueeze(-1)
         w, o = own["lengthscale"].square().reciprocal().unsqueeze(-2), other - shift
@@ -205,7 +206,7 @@ class Stationary(Kernel):
         return partial(self._toward, own, other, shift, A)
 
     def _toward(self, own: Values, other: Tensor, shift: Tensor, A: Tensor, x: Tensor) -> Tensor:
-        if x.shape[-4:-2] != (1, 1):  # points of each draw's own
+        if x.shape[-4:-2] != (1, 1):
             return self.covariance(own, x, other)
         z = (x - shift)[..., 0, 0, :, :]
         e = torch.cat([z, z.square(), torch.ones_like(z[..., :1])], -1) @ A.flatten(0, -2).mT
@@ -334,7 +335,7 @@ class OfGPyTorch(Kernel):
         if not isinstance(kernel, AnyGPyTorchKernel):
             raise TypeError(
                 "Expected a kernel of gpadjust.core or GPyTorch, such as Stationary(MATERN52) or "
-                f"ScaleKernel(MaternKernel()); found {type(kernel).__name__}."
+                f"ScaleKernel(MaternKernel()); found {kernel!r}."
             )
         if kernel.batch_shape:
             raise ValueError(

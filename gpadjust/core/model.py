@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
+from inspect import signature
 from typing import Any, Self
 
 import gpytorch
@@ -25,16 +26,16 @@ from gpadjust.core.data import ArrayLike, Data, appended, as_given, as_tensor, u
 from gpadjust.core.functions import Functions, Paths
 from gpadjust.core.gaussian import (
     Conditioning,
-    Evidence,
     Marginals,
     Prediction,
+    SumLikelihood,
     add_noise,
-    evidence,
+    sum_likelihood,
 )
 from gpadjust.core.kernels import DELTA, RHO, as_kernel
 from gpadjust.core.noise import KnownNoise, Noise
 from gpadjust.core.posterior import MixturePosterior
-from gpadjust.core.summary import summary
+from gpadjust.core.summary import counted, summary
 from gpadjust.core.terms import Places, Term, TermSum, WeightedSum
 from gpadjust.core.unknowns import Choice, Row, Table, Values
 from gpadjust.core.views import (
@@ -50,6 +51,13 @@ from gpadjust.physics.parameters import PhysicsParameters
 Slopes = dict[str, list[Tensor]]
 """Derivatives of each physics by the coordinate of each unknown parameter, ``S x m x n``."""
 
+_KINDS = {
+    "batch": "input_transform=Categories(batches=[column])",
+    "categorical": "input_transform=Categories([column])",
+    "likelihood": "noise=HeavyTails() or noise=RelativeNoise()",
+    "link": "a structure with a link, such as LinkedCKA(..., link='log')",
+    "train_Xvar": "noise=NoisyInputs(X, variances)",
+}  # instead of options of earlier versions or of other functions
 _ENTRIES = 150_000  # of covariances that are computed at once, which caches hold
 _STEP = 1e-4  # of differences by parameters of a physics, in coordinates
 
@@ -164,7 +172,8 @@ class GP(gpytorch.models.GP, Predictive):
         unit: The unit of each output's targets, ``m x 1``.
 
     Raises:
-        TypeError: If data are no float64 tensors, arrays or frames of numbers.
+        TypeError: If data are no float64 tensors, arrays or frames of numbers, or an option is
+            unknown or a class instead of an instance.
         ValueError: If shapes disagree, data are not finite, or there are fewer than two points.
         PhysicsError: If a physics fails at the training inputs.
 
@@ -181,13 +190,21 @@ class GP(gpytorch.models.GP, Predictive):
         self, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike = None, *,
         terms: Sequence[Term], physics: Sequence[Any] = (), noise: Noise | None = None,
         choices: Sequence[Choice] = (), input_transform: Any = None,
-        outcome_transform: Any = None, settings: Mapping[str, Any] | None = None,
+        outcome_transform: Any = None, settings: Mapping[str, Any] | None = None, **others: Any,
     ) -> None:  # fmt: skip
         super().__init__()
+        if others:
+            raise _unknown_option(type(self), next(iter(others)))
+        for name, option in {"noise": noise, "input_transform": input_transform}.items():
+            if isinstance(option, type):
+                own = option.__name__
+                raise TypeError(f"Expected {name} as an instance, {own}(); found the class {own}.")
         if outcome_transform is not None and not isinstance(outcome_transform, Standardize):
             raise ValueError(
                 "Expected outcome_transform=None or Standardize, which has no effect; found "
-                f"{outcome_transform!r}. Transform the targets and the physics before."
+                f"{outcome_transform!r}. Of outputs with bounds take a structure with a link, such "
+                "as LinkedCKA(..., link='log') of gpadjust.kinds; otherwise transform the targets "
+                "and the physics before."
             )
         self.data = Data.of(train_X, train_Y, train_Yvar, input_transform)
         X, Y = self.data.X, self.data.Y
@@ -264,7 +281,11 @@ class GP(gpytorch.models.GP, Predictive):
     @property
     def physics_parameters(self) -> PhysicsParameters:
         """Draws ``N`` of each unknown parameter of the physics, in the user's units."""
-        values = self.table.values(self.draws)
+        return self.physics_parameters_at(self.draws)
+
+    def physics_parameters_at(self, u: Tensor) -> PhysicsParameters:
+        """Return the unknown parameters of the physics at coordinates ``N x B x P``."""
+        values = self.table.values(u)
         draws = [p.value(values[f"physics.{n}"][..., 0]) for n, p in self._unknowns.items()]
         return PhysicsParameters(self._unknowns, draws)
 
@@ -324,7 +345,7 @@ class GP(gpytorch.models.GP, Predictive):
         noise = self.noise.variance(values, places, True)
         observed = ~y.isnan()
         residual = (y - total.mean).expand(len(u), *y.shape).nan_to_num() * observed
-        found = self.evidence(total, residual, noise, observed, with_gradient)
+        found = self.sum_likelihood(total, residual, noise, observed, with_gradient)
         value, gradient = found.value, torch.zeros_like(u)
         if with_gradient:
             by = found.by | self.noise.pull_back(values, places, found.by_variance)
@@ -338,12 +359,12 @@ class GP(gpytorch.models.GP, Predictive):
         bad = ~(value.isfinite() & gradient.isfinite().all(-1))
         return value.masked_fill(bad, -torch.inf), gradient.masked_fill(bad.unsqueeze(-1), 0.0)
 
-    def evidence(
+    def sum_likelihood(
         self, train: WeightedSum, residual: Tensor, noise: Tensor, observed: Tensor,
         with_gradient: bool,
-    ) -> Evidence:  # fmt: skip
+    ) -> SumLikelihood:  # fmt: skip
         """Return the log likelihood of residuals ``S x m x n``; a subclass may bound it."""
-        return evidence(train, residual, noise, observed, with_gradient)
+        return sum_likelihood(train, residual, noise, observed, with_gradient)
 
     def conditioned(
         self, train: WeightedSum, noise: Tensor, targets: Tensor, old: Any = None
@@ -356,7 +377,7 @@ class GP(gpytorch.models.GP, Predictive):
         return None
 
     def _by_physics(
-        self, values: Values, places: Places, by: Values, found: Evidence, f_slopes: Slopes
+        self, values: Values, places: Places, by: Values, found: SumLikelihood, f_slopes: Slopes
     ) -> Values:
         """Return derivatives by centers and by the coordinates of a physics' parameters."""
         by_mean = found.by_mean
@@ -418,12 +439,12 @@ class GP(gpytorch.models.GP, Predictive):
             rows = bad.any(-1).to(X).sum_to_size(X.shape[:-1]).flatten().nonzero().flatten()
             error = PhysicsError(
                 f"Physics {physics.name!r} returned {float(Y[bad][0].detach()):.6g}, which targets "
-                f"cannot be, as {self.scale} is modelled; clamp its outputs.", rows.tolist()
+                f"cannot be, as {self.scale_formula} is modelled; clamp its outputs.", rows.tolist()
             )  # fmt: skip
             error.inputs = X.detach().reshape(-1, X.shape[-1])[rows]
             raise error
 
-    scale: str = ""
+    scale_formula: str = ""
     """The scale on which the model is Gaussian, as a formula; empty for that of the targets."""
 
     def read_scale(self, Y: Tensor) -> None:
@@ -449,8 +470,8 @@ class GP(gpytorch.models.GP, Predictive):
         """Return the mean of the known variances, for observations ``... x k x m`` without any."""
         return None if self.data.Yvar is None else self.data.Yvar.mean(-2, keepdim=True)
 
-    def log_unit(self) -> Tensor:
-        """Return the log densities of the targets, ``m``, in the user's units less the model's."""
+    def log_jacobian(self) -> Tensor:
+        """Return the log density of the targets, ``m``, in the user's units less the model's."""
         return -(~self.data.Y.isnan()).sum(-2) * self.unit.squeeze(-1).log()
 
     def targets(self) -> Tensor:
@@ -732,10 +753,10 @@ class GP(gpytorch.models.GP, Predictive):
         new._cached = (self.u.detach().clone(), conditioning)
         return new
 
-    def subset_draws(self, rows: Tensor) -> Self:
+    def subset_draws(self, numbers: Tensor) -> Self:
         """Return the model of some of its draws, with repetitions, by their numbers."""
         new = self._copy()
-        new.set_draws(self.u.detach()[rows])
+        new.set_draws(self.u.detach()[numbers])
         return new
 
     def _copy(self) -> Self:
@@ -780,11 +801,6 @@ class GP(gpytorch.models.GP, Predictive):
     def likelihood(self) -> GaussianLikelihood:
         """The Gaussian likelihood with the model's noise."""
         return likelihood_view(self)
-
-    @property
-    def num_draws_and_outputs(self) -> tuple[int, int]:
-        """``S`` and ``m``."""
-        return len(self.u), self.num_outputs
 
     @property
     def batch_shape(self) -> Size:
@@ -848,7 +864,8 @@ class GP(gpytorch.models.GP, Predictive):
     def __repr__(self) -> str:
         n, m = self.data.Y.shape[-2:]
         d = self.data.X.shape[-1]
-        return f"{type(self).__name__}({n} points, {d} inputs, {m} outputs, {len(self.u)} draws)"
+        counts = {"point": n, "input": d, "output": m, "draw": len(self.u)}
+        return f"{type(self).__name__}({counted(counts)})"
 
 
 @DrawMatheronPaths.register(Predictive)  # type: ignore[untyped-decorator]
@@ -856,6 +873,19 @@ def _draw_matheron_paths(model: Any, *, sample_shape: Size, **_: Any) -> Paths:
     """Draw functions for BoTorch's ``draw_matheron_paths``, by the model's own features."""
     functions = model.sample_functions(max(1, sample_shape.numel()))
     return Paths(functions, sample_shape)
+
+
+def _unknown_option(structure: type[GP], name: str) -> TypeError:
+    """Return the error of an option that a structure does not have, with the way out."""
+    if name in _KINDS:
+        way = f"expected {_KINDS[name]} of gpadjust.kinds."
+    else:
+        own = [each for each in structure.__mro__ if issubclass(each, GP)]
+        parameters = [p for each in own[:-1] or own for p in signature(each).parameters.values()]
+        names = {p.name for p in parameters if p.kind is p.KEYWORD_ONLY} - {"settings"}
+        names |= {"noise", "input_transform"}
+        way = f"expected some of {', '.join(sorted(names))}. See CHANGELOG.md for earlier names."
+    return TypeError(f"Unknown option {name!r} of {structure.__name__}; {way}")
 
 
 def _with_kernel(term: Any) -> Term:

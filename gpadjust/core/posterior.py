@@ -64,7 +64,7 @@ class MixturePosterior(GPyTorchPosterior):
     def __init__(self, mean: Tensor, covariance: Tensor) -> None:
         shape = torch.broadcast_shapes(mean.shape, covariance.shape[:-1])
         mean, covariance = mean.expand(shape), covariance.expand(*shape, shape[-1])
-        self.components = (mean, covariance)
+        self.gaussians = (mean, covariance)
         center = mean.mean(-3)
         away = (mean - center.unsqueeze(-3)).flatten(-2)  # ... x S x m q
         between = away.mT @ away / away.shape[-2]
@@ -73,14 +73,14 @@ class MixturePosterior(GPyTorchPosterior):
     @property
     def base_sample_shape(self) -> Size:
         """``... x q m``, and of several components one more, which picks the component."""
-        mean, _ = self.components
+        mean, _ = self.gaussians
         S, m, q = mean.shape[-3:]
         return Size([*mean.shape[:-3], q * m + (S > 1)])
 
     @property
     def marginals(self) -> Marginals:
         """The mixtures at each point by itself."""
-        mean, K = self.components
+        mean, K = self.gaussians
         return Marginals(mean.mT, K.diagonal(dim1=-1, dim2=-2).mT)
 
     @property
@@ -96,13 +96,13 @@ class MixturePosterior(GPyTorchPosterior):
     def rsample(self, sample_shape: Size | None = None) -> Tensor:
         """Return samples ``sample_shape x ... x q x m``, with a graph."""
         shape = Size([1]) if sample_shape is None else sample_shape
-        mean, _ = self.components
+        mean, _ = self.gaussians
         base = torch.randn(*shape, *self.base_sample_shape, dtype=mean.dtype, device=mean.device)
         return self.rsample_from_base_samples(shape, base)
 
     def rsample_from_base_samples(self, sample_shape: Size, base_samples: Tensor) -> Tensor:
         """Return samples made of N(0, 1) base samples, ``sample_shape x base_sample_shape``."""
-        mean, K = self.components
+        mean, K = self.gaussians
         S, m, q = mean.shape[-3:]
         shape = (*sample_shape, *mean.shape[:-3])
         base = base_samples.expand(*shape, -1)
@@ -128,7 +128,7 @@ class MixturePosterior(GPyTorchPosterior):
 
     def scalarized(self, weights: Tensor, offset: float = 0.0) -> MixturePosterior:
         """Return the posterior of a weighted sum of the outputs, plus an offset."""
-        mean, K = self.components
+        mean, K = self.gaussians
         m = mean.shape[-2]
         if weights.shape != (m,):
             raise ValueError(f"Expected weights of {m} outputs; found {tuple(weights.shape)}.")

@@ -20,11 +20,17 @@ class LogLikelihood(Protocol):
 
 
 GROUPS = 2  # of draws that are resampled apart, so that their difference shows the error
-_LEAPS, _ACCEPTED, _LAST_MOVES, _MOVES, _FAR = 3, 0.8, 4, 3, 60.0
-_SEARCHES, _GAIN = 3, 0.01  # of searches, and of log density, below which there are no more
-_SHARE = 0.5  # of draws that count after each step of the power
-_WIDER = 1.5  # than Laplace's approximation
-_STEP, _PASSES = 0.1, 3  # of differences, in coordinates; passes, each with steps by the last
+_SHARE = 0.5  # of the kept number of draws, so many count after each step of the power
+_MOVES, _LAST_MOVES = 3, 4  # of each draw after a step of the power, and after the last step
+_LEAPS = 3  # steps of the Hamiltonian dynamics in a move
+_FIRST_LENGTH = 0.3  # of these steps, in standard deviations of the draws
+_ACCEPTED = 0.8  # share of moves that the length is adapted to
+_FAR = 60.0  # coordinates, prior standard deviations, beyond which no draw moves
+_SEARCHES = 3  # of a precise search, at most, each from the end of the last
+_GAIN = 0.01  # log density, of all searches together, below which there is no further one
+_WIDER = 1.5  # standard deviations of a start, in those of Laplace's approximation
+_STEP = 0.1  # of differences for the Hessian, in standard deviations of the prior or posterior
+_PASSES = 3  # over the Hessian, each with steps by the last
 
 
 class Normal(NamedTuple):
@@ -87,7 +93,8 @@ def sample(
     u = begin.mean + (begin.root @ u.unsqueeze(-1)).squeeze(-1)
     value, slope = ratio(u, False)
     power, evidence = like.new_zeros(shape[0]), like.new_zeros(GROUPS, shape[0])
-    length, problems = torch.full_like(power, 0.3), torch.arange(shape[0], device=like.device)
+    length = torch.full_like(power, _FIRST_LENGTH)
+    problems = torch.arange(shape[0], device=like.device)
     least, effective = _SHARE * number, None
     while True:
         # The highest power at which enough draws count.
@@ -103,8 +110,8 @@ def sample(
         is_done = bool((power >= 1).all()) or not with_moves
         # Resample, and move.
         root = _root(u, weights, None if start is None else start.root / _WIDER)
-        rows = _resampled(halves, number // GROUPS, generator)
-        u, value, slope = u[rows, problems], value[rows, problems], slope[rows, problems]
+        kept = _resampled(halves, number // GROUPS, generator)
+        u, value, slope = u[kept, problems], value[kept, problems], slope[kept, problems]
         if is_first and with_moves:
             value, slope = ratio(u)
         for _ in range((_LAST_MOVES if is_done else _MOVES) * with_moves):
@@ -171,16 +178,16 @@ def _step(value: Tensor, power: Tensor, least: float) -> Tensor:
 
 
 def _resampled(logs: Tensor, number: int, generator: torch.Generator) -> Tensor:
-    """Return numbers of rows ``(G number) x B``, systematic in each of the groups of weights."""
+    """Return numbers of draws ``(G number) x B``, systematic in each of the groups of weights."""
     groups, size, problems = logs.shape
     weights = logs.softmax(1)
     offset = torch.rand(groups, 1, problems, generator=generator, dtype=logs.dtype).to(logs)
     steps = torch.arange(number).to(logs).reshape(1, -1, 1)
     heights = ((steps + offset) / number).movedim(1, -1).contiguous()
     total = weights.cumsum(1).movedim(1, -1).contiguous()
-    rows = torch.searchsorted(total, heights).clamp_max(size - 1).movedim(-1, 1)
+    drawn = torch.searchsorted(total, heights).clamp_max(size - 1).movedim(-1, 1)
     shift = size * torch.arange(groups, device=logs.device).reshape(-1, 1, 1)
-    return (rows + shift).reshape(-1, problems)
+    return (drawn + shift).reshape(-1, problems)
 
 
 def _root(u: Tensor, weights: Tensor, expected: Tensor | None) -> Tensor:

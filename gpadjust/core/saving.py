@@ -17,7 +17,7 @@ import torch
 from botorch.models.transforms.input import InputTransform
 from torch import Tensor
 
-from gpadjust.checks import check_kind, check_switch
+from gpadjust.checks import check_switch
 from gpadjust.core.data import names_of
 from gpadjust.core.kernels import Kernel
 from gpadjust.core.model import GP
@@ -72,7 +72,11 @@ def save(model: GP | StackedGP, path: str | Path) -> Saved:
         >>> saved.missing, torch.equal(again.predict(X).mean, model.predict(X).mean)
         ((), True)
     """
-    check_kind("model", model, GP | StackedGP, "a model of gpadjust.core")
+    if not isinstance(model, GP | StackedGP):
+        raise TypeError(
+            f"Expected a model of gpadjust.core; found {type(model).__name__}. Of a comparison "
+            "save comparison.recommended."
+        )
     path = Path(path)
     if path.is_dir() or not path.parent.is_dir():
         raise ValueError(f"Expected path as a file in a folder that exists; found {str(path)!r}.")
@@ -237,7 +241,10 @@ def _built_with(model: GP, n: int) -> dict[str, Tensor]:
 def _loaded(content: dict[str, Any], objects: dict[str, Any], trusted: bool) -> Any:
     """Return the model or mixture of a file, with the objects that are given."""
     if content["format"] != _FORMAT:
-        raise ValueError(f"expected format {_FORMAT}; found {content['format']}.")
+        raise ValueError(
+            f"expected format {_FORMAT}; found {content['format']}, of another version of gpadjust:"
+            " fit the model and save it with this version again."
+        )
     contents = content["models"]
     missing = {name for each in contents.values() for name in each["missing"]}
     known = missing | {"physics" for each in contents.values() if each["physics"]}

@@ -115,13 +115,13 @@ class StackedGP(Wrapper):
         picks, start = torch.zeros_like(owners), 0
         for i, name in enumerate(self.names):
             mine, draws = owners == i, len(models[name].u)
-            rows = (mine.cumsum(0) - 0.5) * draws / mine.sum(0)  # evenly from all draws
-            picks[mine] = start + rows.long()[mine]
+            numbers = (mine.cumsum(0) - 0.5) * draws / mine.sum(0)  # evenly from all draws
+            picks[mine] = start + numbers.long()[mine]
             start += draws
         order = torch.arange(S).unsqueeze(-1)
         if shares.shape[-1] > 1:  # pairs of components of two outputs fill a square evenly
             order = SobolEngine(shares.shape[-1]).draw(S).argsort(0).argsort(0)
-        # S x m: the model of each component and output, and its row in the draws of all models.
+        # S x m: the model of each component and output, and its number among the draws of all.
         shape = (S, self.num_outputs)
         self.owners: Tensor = owners.gather(0, order).expand(shape)
         self.picks: Tensor = picks.gather(0, order).expand(shape)
@@ -161,7 +161,7 @@ class StackedGP(Wrapper):
     ) -> MixturePosterior:
         """Return the joint posterior of some outputs, each of its own components."""
         parts = [
-            model.mixture(X, slice(None), observation_noise).components for model in self.models
+            model.mixture(X, slice(None), observation_noise).gaussians for model in self.models
         ]
         means, covariances = zip(*parts, strict=True)
         mean, K = torch.cat(means, -3), torch.cat(covariances, -4)
@@ -239,7 +239,7 @@ def _check_models(models: Any) -> None:
     sets = [model.data for model in models.values()]
     if len({str([d.X.tolist(), d.Y.tolist(), d.input_names, d.output_names]) for d in sets}) > 1:
         raise ValueError(f"Expected models of the same data; found others in {[*models]}.")
-    scales = {model.scale or "y" for model in models.values()}
+    scales = {model.scale_formula or "y" for model in models.values()}
     if len(scales) > 1:
         raise ValueError(f"Expected models of one scale of y; found {', '.join(sorted(scales))}.")
 

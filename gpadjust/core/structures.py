@@ -11,7 +11,7 @@ from gpadjust.core.model import GP
 from gpadjust.core.terms import Term
 from gpadjust.core.unknowns import Choice, LogNormal
 
-RHO_CONSTANT = LogNormal(0.01, 100.0)  # prior variance of an unknown constant in a scaling
+RHO_CONSTANT = LogNormal(0.01, 100.0)  # prior variance of a constant in rho, or of rho alone
 DELTA_CONSTANT = LogNormal(0.3, 1000.0)  # that in delta, in squared units of the targets
 
 
@@ -63,8 +63,14 @@ class CKA(GP):
         center: bool | float = True, constants: bool = True,
         nested: bool | Sequence[Choice] = True, extra_terms: Sequence[Term] = (), **options: Any,
     ) -> None:  # fmt: skip
+        for name, value in {"rho_mean": rho_mean, "delta_mean": delta_mean}.items():
+            if isinstance(value, str):
+                raise TypeError(
+                    f"Expected {name} as a number; found {value!r}. Constants of rho and delta are "
+                    "unknown by default."
+                )
         if not isinstance(center, bool | int | float):
-            raise TypeError(f"Expected center as True, False or a number; found {center!r}.")
+            raise TypeError(f"Expected center True (unknown), False or a number; found {center!r}.")
         settings = options | {
             "rho_covar_module": rho_covar_module, "delta_covar_module": delta_covar_module,
             "rho_mean": rho_mean, "delta_mean": delta_mean, "center": center,
@@ -149,7 +155,7 @@ class ScaleGP(GP):
     ) -> None:  # fmt: skip
         settings = options | {"covar_module": covar_module, "constants": constants}
         constant = RHO_CONSTANT if constants else None
-        rho = Term("rho", as_kernel(covar_module, LogNormal(0.01, 100.0)), 1.0, constant, 0)
+        rho = Term("rho", as_kernel(covar_module, RHO_CONSTANT), 1.0, constant, 0)
         super().__init__(
             train_X, train_Y, train_Yvar, terms=[rho], physics=[physics], settings=settings,
             **options,

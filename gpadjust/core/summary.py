@@ -21,9 +21,9 @@ def summary(model: Any) -> str:
     variance = model.noise.variance(values, model.places(X, values, model.noise.has_shares), True)
     n, d = X.shape[-2:]
     counts = {"point": n, "input": d, "output": model.num_outputs, "draw": len(model.draws)}
-    parts = [f"{n} {noun}" + "s" * (n != 1) for noun, n in counts.items()]
+    parts = [counted(counts)]
     parts += [] if model.is_fitted else ["not fitted"]
-    parts += [f"of {model.scale}"] if model.scale else []
+    parts += [f"of {model.scale_formula}"] if model.scale_formula else []
     lines = [f"{type(model).__name__}: {', '.join(parts)}"]
     if model.physics_parameters:
         lines += ["parameters of the physics:", indent(repr(model.physics_parameters), "  ")]
@@ -39,6 +39,11 @@ def summary(model: Any) -> str:
             lines += _of_term(model, term, own, j)
         lines += _of_noise(model, variance[..., j, :].sqrt() * model.unit[j], j)
     return "\n".join(lines)
+
+
+def counted(counts: dict[str, int]) -> str:
+    """Return numbers of things by their nouns, such as "8 points, 1 input"."""
+    return ", ".join(f"{n} {noun}" + "s" * (n != 1) for noun, n in counts.items())
 
 
 def _of_term(model: Any, term: Term, values: Values, j: int) -> list[str]:

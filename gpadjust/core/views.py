@@ -30,7 +30,7 @@ def squeezed(values: Tensor, dim: int) -> Tensor:
 
 def _of_all(values: Tensor, model: Any, dim: int) -> Tensor:
     """Return values of each draw and output, ``... (x S) (x m) x n (x n)``."""
-    shape = (*model.num_draws_and_outputs, *[1] * (-dim - 1))
+    shape = (len(model.u), model.num_outputs, *[1] * (-dim - 1))
     return squeezed(values.expand(torch.broadcast_shapes(values.shape, shape)), dim)
 
 
@@ -56,7 +56,7 @@ class TermView(_View, Kernel):
     """The kernel of a term, scaled by its basis on both sides: diag(b) (k + kappa) diag(b)."""
 
     def __init__(self, model: Any, name: str) -> None:
-        lead = torch.Size([size for size in model.num_draws_and_outputs if size > 1])
+        lead = torch.Size([size for size in (len(model.u), model.num_outputs) if size > 1])
         super().__init__(model, batch_shape=lead)
         self.name = name
 
@@ -75,7 +75,8 @@ class TermView(_View, Kernel):
 
 def kernel_view(model: Any) -> AdditiveKernel:
     """Return the prior covariance of a model: the sum of its terms' scaled kernels."""
-    return AdditiveKernel(*(TermView(model, t.name) for t in model.terms if t.varies))
+    terms = [term for term in model.terms if term.varies] or model.terms[:1]  # of zeros
+    return AdditiveKernel(*(TermView(model, term.name) for term in terms))
 
 
 class NoiseView(_View, NoiseModule):

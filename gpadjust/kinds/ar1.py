@@ -91,12 +91,6 @@ class AR1(GP):
         )  # fmt: skip
         self.low = low
 
-    @property
-    def rho_constant(self) -> Tensor:
-        r"""The constant :math:`\rho` of each draw and output, ``S x m``."""
-        rho = self.values["low.kernel.rho"].squeeze(-1)
-        return rho * (self.unit / self._low_unit()).squeeze(-1)
-
     def kernel_inputs(self, X: Tensor) -> Tensor:
         """Return inputs and their level, 1; before the training inputs those of level 0."""
         x = self.data.kernel_inputs(X)

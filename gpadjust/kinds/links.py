@@ -162,7 +162,7 @@ class LinkedPosterior(TransformedPosterior):
     def scalarized(self, weights: Tensor, offset: float = 0.0) -> TransformedPosterior:
         """Return the posterior of one output times its weight, plus an offset."""
         outputs = weights.nonzero().flatten().tolist()
-        mean, K = self.mixture.components
+        mean, K = self.mixture.gaussians
         if weights.shape != mean.shape[-2:-1] or len(outputs) != 1:
             raise ValueError(
                 f"Expected the weight of one of {mean.shape[-2]} outputs with a link; found "
@@ -228,7 +228,7 @@ class Linked(GP):
         self.settings["link"] = link
 
     @property
-    def scale(self) -> str:  # type: ignore[override]
+    def scale_formula(self) -> str:  # type: ignore[override]
         """The link as a formula, and the location that is subtracted."""
         return f"{self.link.formula} - [{', '.join(f'{c:.6g}' for c in self.link.location)}]"
 
@@ -271,9 +271,9 @@ class Linked(GP):
         variances = (self.noise.known.mean(-1, keepdim=True) * self.unit.square()).mT
         return variances * (-2 * self.link.log_slope(Y)).exp()
 
-    def log_unit(self) -> Tensor:
-        """Return the log densities of the targets, ``m``, in the user's units less the model's."""
-        return super().log_unit() + self.link.log_slope(self.data.Y).nansum(-2)
+    def log_jacobian(self) -> Tensor:
+        """Return the log density of the targets, ``m``, in the user's units less the model's."""
+        return super().log_jacobian() + self.link.log_slope(self.data.Y).nansum(-2)
 
     def _noise_at(self, X: Tensor, asked: bool | Tensor) -> Tensor:
         """Return variances of g, given ones by the delta method at predictions."""

@@ -55,9 +55,9 @@ class Widened(Wrapper):
         self, X: ArrayLike, outputs: list[int] | slice, observation_noise: bool | Tensor
     ) -> MixturePosterior:
         """Return the joint posterior of some outputs."""
-        mean, K = self.model.mixture(X, outputs, observation_noise).components
+        mean, K = self.model.mixture(X, outputs, observation_noise).gaussians
         is_own = self._is_own(observation_noise)
-        own = K if is_own else self.model.mixture(X, outputs, False).components[1]
+        own = K if is_own else self.model.mixture(X, outputs, False).gaussians[1]
         root = self.factors(self.data.new_inputs(X))[..., outputs].sqrt().mT.unsqueeze(-3)
         return MixturePosterior(mean, K + own * (root.unsqueeze(-1) * root.unsqueeze(-2) - 1))
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gpadjust.core.gaussian import Evidence, add_noise
+from gpadjust.core.gaussian import SumLikelihood, add_noise
 from gpadjust.core.terms import WeightedSum
 
 _NUGGET = 1e-8  # of inducing values, in their mean variance: sums over rows divide errors by it
@@ -78,7 +78,7 @@ class Sums(NamedTuple):
 def bound(
     total: WeightedSum, points: Tensor, rest: WeightedSum, residual: Tensor, noise: Tensor,
     observed: Tensor, with_gradient: bool,
-) -> Evidence:  # fmt: skip
+) -> SumLikelihood:  # fmt: skip
     r"""Return the evidence lower bound of Titsias (2009), and its derivatives.
 
     With :math:`\Lambda = I + \sum_i w_i v_i v_i^T`, :math:`c = \sum_i w_i r_i v_i` and weights
@@ -120,7 +120,7 @@ def bound(
     value = -0.5 * (size + log_det + misfit + unseen)
     value = value.masked_fill(info > 0, -torch.inf)
     if not with_gradient or not value.isfinite().any():
-        return Evidence(value, {}, torch.zeros_like(residual), torch.zeros_like(residual))
+        return SumLikelihood(value, {}, torch.zeros_like(residual), torch.zeros_like(residual))
     # By the sums: 2 G = I - Lambda^-1 - Lambda^-1 c c^T Lambda^-1, and Lambda^-1 c.
     by_square = eye - torch.cholesky_inverse(chol) - best @ best.mT
     # By v_i it is w_i (2 G v_i + r_i Lambda^-1 c), by k_i = L v_i that solved with L^T.
@@ -147,4 +147,4 @@ def bound(
     if rest_variance.requires_grad:
         rest_variance.backward(by_noise.sum_to_size(rest_variance.shape))
     by = {name: leaf.grad for name, leaf in (values | leaves).items() if leaf.grad is not None}
-    return Evidence(value, by, -by_residual, by_noise)
+    return SumLikelihood(value, by, -by_residual, by_noise)

@@ -56,7 +56,7 @@ class SparseConditioning(Conditioning):
         self.train = at_points(total, points)
         self.observed = torch.ones_like(self.train.mean, dtype=torch.bool)
 
-    def evidence(self) -> Tensor:
+    def bound(self) -> Tensor:
         """Return the lower bound of the log likelihood, ``S x m``; see :func:`~.bound`."""
         sizes = (2 * math.pi / self.weight).log().masked_fill(self.weight == 0, 0.0).sum(-1)
         seen = (self.weight * (self.residual.square() + self.prior - self.rest)).sum(-1)

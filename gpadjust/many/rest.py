@@ -66,12 +66,15 @@ def rest_of(
     def likelihood(has_rest: bool) -> Callable[..., tuple[Tensor, Tensor]]:
         def log_density(u: Tensor, with_gradient: bool = True) -> tuple[Tensor, Tensor]:
             leaf = u.detach().requires_grad_()
-            with torch.enable_grad():
+            with torch.set_grad_enabled(with_gradient):
                 values = table.values(leaf)
                 K = kernel.covariance(_of_kernel(values), groups)
                 K = K if has_rest else 0 * K
                 variance = of_groups(noise(values)).expand(K.shape[:-1])
-            found = log_likelihood(residual.expand(K.shape[:-1]), K, variance, observed)
+            residuals = residual.expand(K.shape[:-1])
+            found = log_likelihood(residuals, K, variance, observed, with_gradient)
+            if not with_gradient:
+                return found.value.sum(0), torch.zeros_like(u)
             by = (found.by_covariance, found.by_covariance.diagonal(dim1=-1, dim2=-2))
             parts = [(v, d) for v, d in zip((K, variance), by, strict=True) if v.requires_grad]
             tensors, slopes = zip(*parts, strict=True)

@@ -12,7 +12,7 @@ from gpadjust.checks import checked_whole
 from gpadjust.core import CKA, Choice, FitResult, Kernel, Noise, Stationary, Term
 from gpadjust.core.data import ArrayLike
 from gpadjust.core.fitting import modes
-from gpadjust.core.gaussian import Conditioning, Evidence
+from gpadjust.core.gaussian import Conditioning, SumLikelihood
 from gpadjust.core.posterior import MixturePosterior
 from gpadjust.core.sample import maximise
 from gpadjust.core.terms import WeightedSum
@@ -43,7 +43,7 @@ class VariationalCKA(CKA):
     residuals of close rows; it has the kind of kernel that delta has.
 
     :func:`~gpadjust.fit` finds the most likely numbers, whichever method it is asked for; so many
-    rows determine them. ``log_likelihood`` is the lower bound of the evidence. Models of some
+    rows determine them. ``log_likelihood`` returns a lower bound. Models of some
     rows, :meth:`subset_rows`, are exact, and further observations are conditioned on exactly.
 
     Args as of :class:`~gpadjust.CKA` but for nested models, which large data sets need not, and:
@@ -100,13 +100,13 @@ class VariationalCKA(CKA):
 
     # By inducing points.
 
-    def evidence(
+    def sum_likelihood(
         self, train: WeightedSum, residual: Tensor, noise: Tensor, observed: Tensor,
         with_gradient: bool,
-    ) -> Evidence:  # fmt: skip
-        """Return the lower bound of the evidence, or of an exact model of some rows itself."""
+    ) -> SumLikelihood:  # fmt: skip
+        """Return its lower bound, or of an exact model of some rows the log likelihood itself."""
         if self.inducing is None:
-            return super().evidence(train, residual, noise, observed, with_gradient)
+            return super().sum_likelihood(train, residual, noise, observed, with_gradient)
         total, rest = (part_of(train, _REST, is_in) for is_in in (False, True))
         return bound(total, self.inducing, rest, residual, noise, observed, with_gradient)
 
@@ -142,7 +142,7 @@ class VariationalCKA(CKA):
 
     def delta(self, X: ArrayLike) -> MixturePosterior:
         """Return the posterior of what is added to the physics, the rest included."""
-        parts = [self.term(name, X).components for name in ("delta", _REST)]
+        parts = [self.term(name, X).gaussians for name in ("delta", _REST)]
         mean, K = (sum(each) for each in zip(*parts, strict=True))
         return MixturePosterior(mean, K)
 
@@ -186,8 +186,8 @@ class VariationalCKA(CKA):
         self.inducing = whole.inducing
         self.set_draws(u)
         self._cached = whole._cached  # of the same draw, if there is no rest
-        units = self.log_unit()
-        total = posterior.evidence()[0] + units
+        units = self.log_jacobian()
+        total = posterior.bound()[0] + units
         return FitResult("map", total if self.table.problems > 1 else total.sum(0, keepdim=True))
 
     @torch.no_grad()
@@ -252,9 +252,9 @@ class VariationalCKA(CKA):
         new.inducing = None
         return new
 
-    def subset_draws(self, rows: Tensor) -> Self:
+    def subset_draws(self, numbers: Tensor) -> Self:
         """Return the model of some of its draws, with repetitions, by their numbers."""
-        new = super().subset_draws(rows)
+        new = super().subset_draws(numbers)
         new._cached = self._cached  # of the same draws, if they are
         return new
 

@@ -27,9 +27,9 @@ class Physics(torch.nn.Module, ABC):
     shapes, the choice of columns, and checks. It must be deterministic. Wrong arguments raise a
     TypeError or ValueError, a failure a :class:`PhysicsError`.
 
-    A model learns the ``unknowns`` by :func:`gpadjust.fit`; other fits leave them at the guesses. A
-    deep copy of a physics without parameters and buffers is the physics itself, so that a
-    simulator's handle outlives the copies that GP libraries make of their models.
+    A model learns the ``unknowns`` by :func:`gpadjust.fit`, by draws or as a point; until then they
+    are at the guesses. A deep copy of a physics without parameters and buffers is the physics
+    itself, so that a simulator's handle outlives the copies that GP libraries make of their models.
 
     Args:
         unknowns: The ``p`` unknown parameters, such as ``{"mass": Unknown(1.0, factor=1.5)}``.
@@ -48,6 +48,9 @@ class Physics(torch.nn.Module, ABC):
         >>> drag(torch.tensor([[7.0, 2.0]]))
         tensor([[-2.]])
     """
+
+    advice: str = "NumPy code is BlackBoxPhysics(function), of a single row batched=False."
+    """A sentence for errors of what ``evaluate`` calls."""
 
     def __init__(
         self,
@@ -107,8 +110,8 @@ class Physics(torch.nn.Module, ABC):
             self._has_warned = True
             warnings.warn(
                 f"No gradient flows through physics {self.name!r}, although X requires it. Take "
-                "BlackBoxPhysics(function), or optimize_acqf(..., options={'with_grad': False}); "
-                "ignore this if the outputs do not depend on X.",
+                "BlackBoxPhysics(function, gradient='finite-difference'), or optimize_acqf(..., "
+                "options={'with_grad': False}); ignore this if the outputs do not depend on X.",
                 UserWarning,
                 stacklevel=2,
             )
@@ -166,9 +169,8 @@ class Physics(torch.nn.Module, ABC):
             raise
         except Exception as error:
             raise PhysicsError(
-                f"Physics {self.name!r} raised {described(error)}. NumPy code is "
-                f"BlackBoxPhysics(function). The call was for {n} row(s), with "
-                f"unknowns={[*self.unknowns]}:",
+                f"Physics {self.name!r} raised {described(error)}. {self.advice} The call was for "
+                f"{n} row(s), with unknowns={[*self.unknowns]}:",
                 range(n),
             ) from error
         Y = self._shaped(Y, rows)
@@ -242,8 +244,8 @@ class Physics(torch.nn.Module, ABC):
             expected = f"({n}, m) or ({n},)" if m is None else f"({n}, {m}), as before"
             raise PhysicsError(
                 f"Physics {self.name!r} returned {found}, expected a real tensor of shape "
-                f"{expected}, one row per row of X. For a constant return X.new_full((len(X),), "
-                "value); NumPy code is BlackBoxPhysics(function), of a single row batched=False."
+                f"{expected}, one row per row of X. For a constant return 0 * X[:, 0] + value. "
+                f"{self.advice}"
             )
         self.num_outputs = Y.shape[1]
         return Y.to(rows)

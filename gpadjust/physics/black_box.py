@@ -25,10 +25,11 @@ class BlackBoxPhysics(Physics):
     Single rows (``batched=False``) run in parallel inside ``with
     joblib.parallel_config(backend="loky", n_jobs=4)``, or another backend of joblib, a cluster's.
 
-    Each distinct row is evaluated once, and its result remembered, even when other rows fail, until
-    a parameter or buffer of the physics changes, or dtype and device of the inputs. Call
-    ``forget()`` after other changes. Copies and pickles begin without this memory. Threads may
-    share a physics if what it calls allows that.
+    A call evaluates each distinct row once and remembers its result, even when other rows fail,
+    until a parameter or buffer of the physics changes, or dtype and device of the inputs. Call
+    ``forget()`` after other changes. Copies and pickles begin without this memory. The likelihood
+    of unknown parameters, whose values seldom repeat, does without it. Threads may share a physics
+    if what it calls allows that.
 
     Args:
         function: Maps a float64 array of rows ``N x d`` to ``N x m``, or ``N`` if ``m`` is 1; with
@@ -48,6 +49,8 @@ class BlackBoxPhysics(Physics):
         >>> X.grad
         tensor([[2.0000, 0.0000]], dtype=torch.float64)
     """
+
+    advice = "If the function takes a single row, set batched=False."
 
     def __init__(
         self,

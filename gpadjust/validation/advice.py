@@ -194,13 +194,13 @@ def _elpd(value: float, error: float, better: str, otherwise: str, worse: str) -
 
 
 def _unsampled(table: Mapping[str, list[Candidate]], results: Mapping[str, FitResult]) -> list[str]:
-    """Return which structures with weight predict otherwise by other seeds."""
+    """Return which structures with weight have other results by other seeds."""
     names = {row.structure for rows in table.values() for row in rows if row.weight > _COUNTS}
     low = [name for name, result in results.items() if name in names and not result.converged]
     if not low:
         return []
     return [
-        f"Predictions of {', '.join(low)} depend on the seed: doubt the intervals, and fit again "
+        f"Results of {', '.join(low)} depend on the seed: doubt the intervals, and fit again "
         "with more num_draws or narrower priors."
     ]
 

@@ -145,8 +145,8 @@ def test_it_is_the_expected_kullback_leibler_divergence(about):
     points = torch.cat([D, Z])
     with torch.no_grad():
         simulated = model.posterior(Z, observation_noise=True).sample(torch.Size([4000]))
-        before = getattr(model, about)(points).components
-        after = getattr(model.condition_on_observations(Z, simulated), about)(points).components
+        before = getattr(model, about)(points).gaussians
+        after = getattr(model.condition_on_observations(Z, simulated), about)(points).gaussians
     shift = after[0][:, 0, 0] - before[0][0, 0]
     K0, K1 = (K.reshape(-1, len(points), len(points))[0] for _, K in (before, after))
     K0 = K0 + 1e-9 * K0.diagonal().mean() * torch.eye(len(points))

@@ -131,7 +131,7 @@ class Formulas:
     """All outputs and draws of a model: moments of the mixture, with outputs in front of points."""
 
     def __init__(self, model, X, Y, *physics, Yvar=None, ranges=1.0):
-        S, m = model.num_draws_and_outputs
+        S, m = len(model.u), model.num_outputs
         self.parts = [
             [Dense(model, X, Y, physics, j, s, Yvar, ranges) for j in range(m)] for s in range(S)
         ]

@@ -115,7 +115,7 @@ def test_the_likelihood(name, known, data, drawn, formulas, close):
     model, X, Y, physics, Yvar = problem(name, data, 2, known, True, 1e3)
     value, _ = drawn(model).log_likelihood(model.u)
     formula = formulas(model, X, Y, *physics, Yvar=Yvar)
-    close(value + model.log_unit(), formula.each(lambda part: part.log_likelihood()))
+    close(value + model.log_jacobian(), formula.each(lambda part: part.log_likelihood()))
 
 
 def test_means_and_a_center_are_in_the_users_units(data, drawn, formulas, uniform, close):

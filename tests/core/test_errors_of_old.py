@@ -9,8 +9,8 @@ from botorch.acquisition.multi_objective.logei import qLogNoisyExpectedHypervolu
 from botorch.models import ModelListGP, SingleTaskGP
 
 from gpadjust import compare
-from gpadjust.core import CKA, RRA, PhysicsMeanGP, ZeroMeanGP, fit
-from gpadjust.kinds import LinkedCKA, NoisyInputs, RelativeNoise
+from gpadjust.core import CKA, RRA, PhysicsMeanGP, ZeroMeanGP, fit, save
+from gpadjust.kinds import Categories, HeavyTails, LinkedCKA, NoisyInputs, RelativeNoise
 from gpadjust.physics import FormulaPhysics
 from tests.systems import line, normal, refused, same, uniform, wave
 
@@ -36,6 +36,32 @@ def test_a_second_fit_is_the_first(make):
     once = model.predict(X)
     fit(model, num_draws=16)
     assert all(map(torch.equal, once, model.predict(X)))
+
+
+@pytest.mark.parametrize(("options", "words"), [
+    ({"likelihood": "relative"}, r"option 'likelihood' of CKA; expected noise=HeavyTails\(\)"),
+    ({"categorical": ["m"]}, r"Categories\(\[column\]\) of gpadjust.kinds"),
+    ({"batch": "m"}, "Categories"),
+    ({"link": "log"}, "LinkedCKA"),
+    ({"train_Xvar": 0.1}, "NoisyInputs"),
+    ({"kernel": None}, "'kernel' of CKA; expected some of center, .*, rho_mean. See CHANGELOG"),
+    ({"rho_mean": "learn"}, "unknown by default"),
+    ({"delta_mean": "learn"}, "unknown by default"),
+    ({"center": "learn"}, r"True \(unknown\)"),
+    ({"noise": HeavyTails}, r"noise as an instance, HeavyTails\(\)"),
+    ({"input_transform": Categories}, r"input_transform as an instance, Categories\(\)"),
+])  # fmt: skip
+def test_options_of_earlier_versions(options, words):
+    refused(TypeError, words, CKA, X, Y, physics=wave, **options)
+
+
+def test_the_way_out_of_data_and_files(tmp_path):
+    refused(ValueError, "LinkedCKA", CKA, X, Y, physics=wave, outcome_transform="log")
+    frame = pd.DataFrame({"a": X[:, 0], "m": ["steel", "brass"] * 6})
+    refused(TypeError, r"Categories\(\)", CKA, frame, Y, physics=wave)
+    refused(TypeError, "comparison.recommended", save, "a comparison", tmp_path / "model.pt")
+    refused(TypeError, "'likelihood' of ZeroMeanGP", compare, X, Y, wave, likelihood="relative")
+    assert repr(ZeroMeanGP(X, Y)) == "ZeroMeanGP(12 points, 1 input, 1 output, 1 draw)"
 
 
 def test_a_term_that_a_model_has_not():

@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from dataclasses import replace
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from gpadjust.core import (
     GP,
     Choice,
     LogNormal,
+    Noise,
     PhysicsMeanGP,
     SamplingWarning,
     Term,
@@ -49,7 +51,8 @@ def integral(model):
 def test_evidence_and_draws(n):
     """Of noise alone, with its variance as the only unknown number."""
     X, Y = noisy(n)
-    model = GP(X, Y, terms=[Term("f")])
+    noise = Noise(priors=[LogNormal(1e-3, 55.0)])
+    model = GP(X, Y, terms=[Term("f")], noise=noise)
     assert model.table.size == 1
     expected, mean, sd = integral(model)
     result = fit(model, num_draws=256)
@@ -133,6 +136,18 @@ def test_the_approximation_of_a_narrow_bend():
     torch.testing.assert_close(covariance, 1.5**2 * hessian.inverse(), rtol=1e-3, atol=0)
 
 
+def test_the_approximation_of_a_peak_that_differences_pass_over():
+    """(1 + (u / w)^2)^-1 is convex beyond w / sqrt(3): the first differences are."""
+    w = 0.02
+
+    def log_likelihood(u, with_gradient=True):
+        return -(1 + (u / w).square()).log().sum(-1), -2 * u / (w**2 + u.square())
+
+    found, _ = around_mode(log_likelihood, torch.zeros(1, 1).double())
+    expected = 1.5**2 / (1 + 2 / w**2)
+    torch.testing.assert_close(found.root.square().item(), expected, rtol=0.05, atol=0)
+
+
 @pytest.mark.slow
 def test_a_law_that_is_right_is_as_likely_as_its_corrections():
     """Little noise: far from the mode its likelihood is less than what the whole model has."""
@@ -158,6 +173,28 @@ def test_the_error_is_how_far_seeds_are_apart():
     moved = torch.stack(means).var(0) / torch.stack(variances).mean(0)
     error = torch.tensor(errors).square().mean().sqrt().item()
     assert 0.5 < error / moved.mean().sqrt().item() < 2
+
+
+def test_the_error_of_parameters_is_how_far_seeds_are_apart():
+    X, e = noisy(8)
+    unknowns = {"a": Unknown(1.0, sd=0.5), "b": Unknown(0.0, sd=1.0)}
+    law = FunctionPhysics(lambda X, p: p.a * wave(X)[:, 0] + p.b, unknowns=unknowns)
+    model, means, sds, errors = CKA(X, wave(X) + 0.3 + e, physics=law), [], [], []
+    for seed in range(20):
+        with warnings.catch_warnings(action="ignore", category=SamplingWarning):
+            result = fit(model, num_draws=16, seed=seed)
+        errors.append(result.parameter_error)
+        means.append(model.physics_parameters.mean)
+        sds.append(model.physics_parameters.sd)
+    moved = torch.stack(means).var(0).sqrt() / torch.stack(sds).mean(0)
+    error = torch.tensor(errors).square().mean().sqrt().item()
+    assert 0.5 < error / moved.max().item() < 2
+    assert f"move means of parameters by {result.parameter_error:.2f}." in str(result)
+    with pytest.warns(SamplingWarning) as caught:
+        result = fit(model, num_draws=4, seed=0)
+    assert str(caught[-1].message).startswith("Parameters of the physics depend on the seed")
+    assert not replace(result, error=0.0).converged
+    assert math.isnan(fit(ZeroMeanGP(X, wave(X) + e), num_draws=16).parameter_error)
 
 
 def test_evidence_of_targets_in_another_unit():

@@ -21,8 +21,9 @@ from botorch.sampling.pathwise import draw_matheron_paths, get_matheron_path_mod
 from gpytorch.kernels import RBFKernel, ScaleKernel
 from gpytorch.mlls import ExactMarginalLogLikelihood, SumMarginalLogLikelihood
 
-from gpadjust.core import CKA, fit
+from gpadjust.core import CKA, CalibratedPhysics, fit
 from gpadjust.gpytorch import PhysicsMean, PhysicsScaledKernel
+from gpadjust.physics import FunctionPhysics, Unknown
 
 BOUNDS = torch.tensor([[0.0, 0.0], [1.0, 1.0]], dtype=torch.float64)
 SEARCH = {"num_restarts": 2, "raw_samples": 8, "options": {"maxiter": 5}}
@@ -157,6 +158,17 @@ def test_acquisition(models, data, name):
     assert value.isfinite().all()
 
 
+def test_a_physics_without_kernels_is_fitted_by_its_marginal_likelihood(data):
+    X, Y = data
+    gain = {"gain": Unknown(1.0, sd=1.0)}
+    physics = FunctionPhysics(lambda X, p: p.gain.unsqueeze(-1) * wave(X), unknowns=gain)
+    by_mll, by_map = (CalibratedPhysics(X, Y[:, :1], physics=physics) for _ in range(2))
+    assert not by_mll.covar_module(X).to_dense().any()
+    fit_gpytorch_mll(ExactMarginalLogLikelihood(by_mll.likelihood, by_mll))
+    fit(by_map, "map")
+    torch.testing.assert_close(by_mll.u.detach(), by_map.u.detach(), rtol=1e-3, atol=1e-3)
+
+
 def test_thompson_samples_and_paths(models, uniform):
     one, two = models
     X = uniform(6, 2, seed=5)
@@ -171,7 +183,7 @@ def test_thompson_samples_and_paths(models, uniform):
 def test_it_reads_as_a_gpytorch_model(models, uniform):
     Z = uniform(5, 2, seed=3)
     for model, physics in zip(models, (wave, both), strict=True):
-        S, m = model.num_draws_and_outputs
+        S, m = len(model.u), model.num_outputs
         lead = [size for size in (S, m) if size > 1]
         expected = physics(Z).mT.expand(S, m, 5)
         prior = model.forward(Z)

@@ -212,7 +212,7 @@ BAD_FILES = {
     "no such rows": ({"rows_of_fit": True}, "at least 2 points"),
     "fewer names": ({"names": [["a"], ["b", "c"]]}, "a name of each"),
     "more names": ({"names": [["x1", "x2"], ["a", "b", "c"]]}, "a name of each"),
-    "a later format": ({"format": 99}, "expected format"),
+    "another format": ({"format": 3}, "found 3, of another version .* fit the model and save it"),
     "no checks": ({"built_with": {}}, "another physics 1"),
     "no check": ({"built_with": None}, "damaged"),
     "NaN check": ({"built_with": CHECKS | {"mean": bad(CHECKS["mean"])}}, "another mean"),

@@ -115,7 +115,7 @@ def test_later_rows_are_observed_exactly(model, close, has_rest):
     Y[1, 0] = torch.nan if m > 1 else 0.0
     later = model.condition_on_observations(X, Y)
     posterior = model.posterior(torch.cat([X, Z]))
-    mean, K = posterior.mean, posterior.components[1][0]
+    mean, K = posterior.mean, posterior.gaussians[1][0]
     noise = (model.noise.variance(model.values, None) * model.unit.square())[0].detach()
     for j in range(m):  # the posterior of the first rows is the prior of the late ones
         seen = torch.arange(4)[~Y[:, j].isnan()]
@@ -261,7 +261,7 @@ def test_a_fit_meets_the_exact_one():
     lower, upper = model.interval(X)
     assert ((lower < f) & (f < upper)).double().mean() > 0.85
     exact = exact_of(model)
-    assert 0 <= exact.log_likelihood(exact.u)[0] + exact.log_unit() - result.log_evidence < 1.0
+    assert 0 <= exact.log_likelihood(exact.u)[0] + exact.log_jacobian() - result.log_evidence < 1.0
     torch.testing.assert_close(model.predict(X).mean, exact.predict(X).mean, rtol=0, atol=0.02)
     assert len(model.subset_rows(torch.arange(30)).conditioning().alpha[0, 0]) == 30
 

@@ -147,8 +147,8 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/core/fitting.py",
-        "difference = (groups[0][0].mean(0) - groups[1][0].mean(0)) / 2",
-        "difference = (groups[0][0].mean(0) - groups[1][0].mean(0)) / 20",
+        "difference = (predicted[0][0].mean(0) - predicted[1][0].mean(0)) / 2",
+        "difference = (predicted[0][0].mean(0) - predicted[1][0].mean(0)) / 20",
         "The error of a fit by few draws is never large enough for its warning.",
     ),
     Fault(
@@ -165,8 +165,8 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/core/stacked.py",
-        "picks[mine] = start + rows.long()[mine]",
-        "picks[mine] = rows.long()[mine]",
+        "picks[mine] = start + numbers.long()[mine]",
+        "picks[mine] = numbers.long()[mine]",
         "All components of a mixture are draws of the first model.",
     ),
     Fault(

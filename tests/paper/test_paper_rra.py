@@ -19,7 +19,7 @@ def test_closed_form(data, close, uniform, known_noise):
     Z, values = uniform(5, 2, high=2.0, seed=3), model.values
     plain, noisy = model.posterior(Z), model.posterior(Z, observation_noise=True)
     with torch.no_grad():
-        joint = model.mixture(Z, slice(None), False).components[1]
+        joint = model.mixture(Z, slice(None), False).gaussians[1]
     functions = model.sample_functions(1000, seed=0)(Z)
     for j in range(2):
 

@@ -154,7 +154,7 @@ def test_bad_settings():
 
 def test_wrong_results(points):
     for function, batched, says in (
-        (lambda x: x[0] + x[1], True, r"single row batched=False"),
+        (lambda x: x[0] + x[1], True, r"single row, set batched=False"),
         (lambda x: np.zeros((2, 2)), False, r"a scalar or outputs.*found \(2, 2\)"),
         *(
             (lambda x, result=result: result, batched, f"expected real numbers, found {found}")
@@ -164,6 +164,13 @@ def test_wrong_results(points):
     ):
         physics = BlackBoxPhysics(function, batched=batched, name="mill")
         refused(PhysicsError, rf"Physics 'mill' .*{says}", physics, points(3, 2))
+
+
+def test_errors_do_not_advise_what_it_is(points):
+    for function in (lambda X: X[0, 9], lambda X: 1.0):
+        with pytest.raises(PhysicsError, match="set batched=False") as caught:
+            BlackBoxPhysics(function)(points(3, 2))
+        assert "BlackBoxPhysics" not in str(caught.value)
 
 
 class TestFailures:

@@ -190,7 +190,7 @@ class TestChecks:
             (None, r"returned NoneType, expected a real tensor of shape \(4, m\)"),
             (torch.zeros(4, dtype=torch.complex128), "returned torch.complex128"),
             (torch.zeros(3, 1), r"returned torch.float.., \(3, 1\), expected.*\(4, m\) or \(4,\)"),
-            (torch.tensor(1.0), r"returned torch.float.., \(\).*X.new_full"),
+            (torch.tensor(1.0), r"returned torch.float.., \(\).*0 \* X\[:, 0\] \+ value.*BlackBox"),
             (torch.zeros(4, 1, 1), r"returned torch.float.., \(4, 1, 1\)"),
             (torch.zeros(4, 0), r"returned torch.float.., \(4, 0\)"),
         ):

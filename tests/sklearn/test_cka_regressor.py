@@ -425,7 +425,7 @@ REFUSED = [
     ({"physics": lambda X: X[:, 0] * np.nan}, PhysicsError, "finite"),
     ({"fit_method": "hmc"}, ValueError, "Unknown method 'hmc'; expected 'bayes' or 'map'"),
     ({"num_draws": 3}, ValueError, "a multiple of 4; found 3"),
-    ({"model": partial(CKA, centre=0)}, TypeError, "argument 'centre'"),
+    ({"model": partial(CKA, centre=0)}, TypeError, "option 'centre' of CKA"),
     ({"physics": None, "model": CKA}, TypeError, "argument: 'physics'"),
     ({"model_options": ["log"]}, TypeError, "Expected model_options as a dictionary"),
     ({"model_options": {"physics": wave}}, TypeError, "an argument of its own"),

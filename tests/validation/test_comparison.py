@@ -186,7 +186,7 @@ def test_warnings_come_once_and_those_of_the_seed_as_advice(scaled):
     assert [str(each.message)[:14] for each in caught] == ["1 of 9 rows eq"]
     rows = compare(*scaled, crude, structures=["zero mean"]).table
     (text,) = _unsampled(rows, {"zero mean": FitResult("bayes", error=0.9)})
-    assert text.startswith("Predictions of zero mean depend on the seed")
+    assert text.startswith("Results of zero mean depend on the seed")
     assert _unsampled(rows, {"zero mean": FitResult("bayes", error=0.1)}) == []
 
 
@@ -337,7 +337,7 @@ def test_a_mixture_in_a_file(X, weights, tmp_path):
     again = load(tmp_path / "stacked.pt", physics=lambda X: X.expand(-1, 2))
     ours, theirs = stacked.posterior(X), again.posterior(X)
     torch.testing.assert_close(theirs.mean, ours.mean)
-    torch.testing.assert_close(theirs.components[1], ours.components[1])
+    torch.testing.assert_close(theirs.gaussians[1], ours.gaussians[1])
     with pytest.raises(ValueError, match="physics"):
         load(tmp_path / "stacked.pt")
 
