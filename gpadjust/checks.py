@@ -173,13 +173,16 @@ def checked_tensor(name: str, values: Any) -> Tensor:
     raise TypeError(f"Expected {name} to be real numbers, got {values.dtype}.")
 
 
-def checked_bounds(name: str, bounds: Any, columns: int | None = None) -> Tensor:
-    """Finite bounds ``2 x d``, lower ones and then upper ones, in float64.
+def checked_bounds(
+    name: str, bounds: Any, columns: int | None = None, *, finite: bool = True
+) -> Tensor:
+    """Bounds ``2 x d``, lower ones and then upper ones, in float64.
 
     Raises:
         TypeError: If they are no numbers.
         ValueError: If they have another shape (``d`` is ``columns``, or at least 1), are not
-            finite, or a lower one is not below its upper one.
+            finite (or NaN, unless they must be ``finite``), or a lower one is not below its upper
+            one.
     """
     bounds = checked_tensor(name, bounds)
     right = bounds.dim() == 2 and len(bounds) == 2 and bounds.shape[1] > 0
@@ -188,9 +191,10 @@ def checked_bounds(name: str, bounds: Any, columns: int | None = None) -> Tensor
             f"Expected {name} of shape 2 x {'d' if columns is None else columns}, the lower ones "
             f"and then the upper ones, got {tuple(bounds.shape)}."
         )
-    if not bounds.isfinite().all() or (bounds[0] >= bounds[1]).any():
+    if (finite and not bounds.isfinite().all()) or not (bounds[0] < bounds[1]).all():
         raise ValueError(
-            f"Expected finite {name}, each lower one below its upper one, got {bounds.tolist()}."
+            f"Expected {'finite ' * finite}{name}, each lower one below its upper one, got "
+            f"{bounds.tolist()}."
         )
     return bounds
 

@@ -1,26 +1,18 @@
-"""Tasks, planning, policy search, and agents that control by them (the extra ``control``)."""
+"""Tasks, planning, policy search, and agents that control by them.
 
-try:
-    import gymnasium as _  # noqa: F401
-except ImportError as error:
-    raise ImportError(
-        'gpadjust.control needs Gymnasium; run `pip install "gpadjust[control]"`.'
-    ) from error
+Agents and :class:`StepGuard` need Gymnasium (the extra ``control``); all else does without.
+"""
+
+from typing import Any
 
 from gpadjust.control.action_rate import ActionRate
-from gpadjust.control.agent import Agent, Callback
-from gpadjust.control.agents import MPCAgent, PolicySearchAgent
-from gpadjust.control.checkpoint import EpisodeCheckpoint, resume
 from gpadjust.control.constraints import margins
-from gpadjust.control.mpc import MPC, Planned
-from gpadjust.control.planner import Plan, Planner
+from gpadjust.control.mpc import MPC, CrossEntropy, Plan, Planner
 from gpadjust.control.policies import BoundedPolicy, mlp_policy
 from gpadjust.control.policy_search import PolicySearch, SearchResult
 from gpadjust.control.progress import print_progress
 from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts
-from gpadjust.control.search import CrossEntropy
 from gpadjust.control.state_filter import Estimate, StateFilter
-from gpadjust.control.step_guard import FailedStepWarning, StepGuard
 from gpadjust.control.task import Constraints, InitialStates, Reward, Step, Task, Termination
 
 __all__ = [
@@ -38,7 +30,6 @@ __all__ = [
     "MPCAgent",
     "Objective",
     "Plan",
-    "Planned",
     "Planner",
     "PolicySearch",
     "PolicySearchAgent",
@@ -57,3 +48,21 @@ __all__ = [
     "print_progress",
     "resume",
 ]
+
+try:
+    from gpadjust.control.agent import Agent, Callback
+    from gpadjust.control.agents import MPCAgent, PolicySearchAgent
+    from gpadjust.control.checkpoint import EpisodeCheckpoint, resume
+    from gpadjust.control.step_guard import FailedStepWarning, StepGuard
+except ImportError as error:
+    if (error.name or "").startswith("gpadjust"):
+        raise
+    _missing = error
+
+    def __getattr__(name: str) -> Any:
+        """Raise an error that says what to install for the names that are missing."""
+        if name not in __all__:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        raise ImportError(
+            f'{__name__}.{name} needs Gymnasium; run `pip install "gpadjust[control]"`.'
+        ) from _missing

@@ -29,7 +29,7 @@ from gpadjust.control.checkpoint import (
     unpickled,
 )
 from gpadjust.control.episodes import check_functions, completed, learn_dynamics, warn_of_bounds
-from gpadjust.control.search import random_sequences
+from gpadjust.control.reach import random_sequences
 from gpadjust.control.smoothed_episodes import smooth_episodes
 from gpadjust.control.state_filter import StateFilter
 from gpadjust.control.step_guard import StepGuard

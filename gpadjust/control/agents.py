@@ -14,14 +14,13 @@ from torch import Tensor
 
 from gpadjust.checks import check_kind
 from gpadjust.control.agent import MAX_HOLD, Agent
-from gpadjust.control.mpc import MPC, PlanState, going_on
-from gpadjust.control.planner import Planner
+from gpadjust.control.faults import check_observation
+from gpadjust.control.mpc import MPC, Planner, PlanState, going_on
 from gpadjust.control.policies import BoundedPolicy, mlp_policy
 from gpadjust.control.policy_search import PolicySearch
+from gpadjust.control.reach import random_sequences
 from gpadjust.control.rollouts import Rollouts
-from gpadjust.control.search import random_sequences
 from gpadjust.control.state_filter import Estimate
-from gpadjust.control.step_guard import check_observation
 from gpadjust.control.task import Task
 from gpadjust.states import StateSpec
 
@@ -56,6 +55,9 @@ class MPCAgent(Agent):
         MPCAgent(CartPoleSwingUpEnv, LearnedDynamics, 1 episodes learnt, 25 steps, last reward ...)
     """
 
+    not_saved = ("_mpc",)
+    _mpc: tuple[tuple[Any, ...], MPC] | None = None
+
     def __init__(
         self,
         env: Any,
@@ -75,17 +77,17 @@ class MPCAgent(Agent):
 
     @property
     def mpc(self) -> MPC:
-        """The policy in the newest model, or the physics.
+        """The policy in the newest model, or the physics; made once for each.
 
         Raises:
             RuntimeError: If there is neither a physics nor a real episode to plan with.
         """
-        how: dict[str, Any] = {
-            "first": self.first,
-            "tolerance": self.tolerance,
-            "state_filter": self.filter,
-        }
-        return MPC(self.newest_model, self.action_bounds(), self.each_step, **how)
+        planned = self.newest_model, self.each_step, self.first, self.tolerance, self.filter
+        if self._mpc is None or any(a is not b for a, b in zip(planned, self._mpc[0], strict=True)):
+            task, each_step, first, tolerance, known = planned
+            how: dict[str, Any] = {"first": first, "tolerance": tolerance, "state_filter": known}
+            self._mpc = planned, MPC(task, self.action_bounds(), each_step, **how)
+        return self._mpc[1]
 
     def predict(
         self,

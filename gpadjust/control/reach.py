@@ -1,4 +1,4 @@
-"""How far the physics comes within an episode."""
+"""Sequences of random actions, and how far the physics comes by them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from gpadjust.checks import seeded
-from gpadjust.control.search import random_sequences
 from gpadjust.dynamics import Dynamics
 from gpadjust.dynamics.particles import step_or_nan
 from gpadjust.physics import PhysicsError
@@ -14,9 +13,31 @@ from gpadjust.physics import PhysicsError
 _EPISODES = 64
 
 
+def random_sequences(n: int, num_steps: int, bounds: Tensor, max_hold: int) -> Tensor:
+    """Draw piecewise constant sequences, from PyTorch's generator.
+
+    Each holds its actions, uniform within the bounds, for a number of steps of its own, from 1 to
+    ``max_hold``.
+
+    Args:
+        n: Number of sequences.
+        num_steps: Their length ``T``.
+        bounds: Lower and upper bounds of the actions, ``2 x action_dim``.
+        max_hold: The most steps that an action is held.
+
+    Returns:
+        ``n x T x action_dim``.
+    """
+    low, high = bounds
+    actions = low + (high - low) * torch.rand(n, num_steps, len(low), dtype=torch.float64)
+    hold = torch.randint(1, max_hold + 1, (n, 1))
+    rows = torch.arange(num_steps) // hold
+    return actions.gather(1, rows.unsqueeze(-1).expand_as(actions))
+
+
 @torch.no_grad()
 def reach(physics: Dynamics, starts: Tensor, action_bounds: Tensor, num_steps: int) -> Tensor:
-    """Least and greatest states of episodes in a physics, ``2 x state_dim``.
+    """Return least and greatest states of episodes in a physics, ``2 x state_dim``.
 
     Each of 64 episodes holds random actions, of which half are at the bounds, for a number of steps
     of its own, up to all of them; it stays where the physics fails. PyTorch's generator is left as

@@ -18,7 +18,6 @@ from gpadjust.control.task import Task, per_row
 Policy = Callable[[Tensor], Tensor]
 """Actions ``N x action_dim`` at states ``N x state_dim``."""
 
-
 _MOST_MEDIANS = 30.0
 _NEVER = 1e6  # largest rewards of a step: it never pays
 _BACK = 10.0  # largest rewards of a step: few episodes of a policy must outweigh those that stay
@@ -84,10 +83,10 @@ class Rollouts:
     ) -> None:
         self.task, self.margins, self.before = task, margins, before
         self.deadline, self._slowest = deadline, 0.0
+        self.num_functions = 1 if num_functions is None else num_functions
         if num_functions is None:
-            self.num_functions, self.functions = 1, task.dynamics.mean_function()
+            self.functions = task.dynamics.mean_function()
         else:
-            self.num_functions = num_functions
             self.functions = task.dynamics.sample_functions(num_functions)
 
     def follow(self, state: Tensor, sequences: Tensor, steps_done: int = 0) -> Rollout:
@@ -98,13 +97,11 @@ class Rollouts:
             sequences: ``n x T x action_dim``.
             steps_done: How many steps the episode has made by then.
         """
-        n, num_steps = sequences.shape[:2]
         if self.task.rate is not None:
             sequences = self.task.rate.limited(sequences, self.before)
-        every = sequences.expand(self.num_functions, *sequences.shape)
-        return self._run(
-            state.expand(n, -1), num_steps, lambda t, states: every[:, :, t], steps_done
-        )
+        every = sequences.repeat(self.num_functions, 1, 1)
+        starts = state.expand(len(sequences), -1)
+        return self._run(starts, every.shape[1], lambda t, states: every[:, t], steps_done)
 
     def act(self, states: Tensor, policy: Policy, num_steps: int) -> Rollout:
         """Let a policy act.
@@ -115,11 +112,7 @@ class Rollouts:
             policy: Who acts.
             num_steps: How long, ``T``.
         """
-
-        def choose(t: int, states: Tensor) -> Tensor:
-            return policy(states.flatten(0, 1)).reshape(*states.shape[:2], -1)
-
-        return self._run(states, num_steps, choose)
+        return self._run(states, num_steps, lambda t, states: policy(states), 0)
 
     def has_time(self, num_steps: int = 1) -> bool:
         """Return whether so many steps can be made before the deadline, by the slowest so far."""
@@ -130,67 +123,61 @@ class Rollouts:
         starts: Tensor,
         num_steps: int,
         choose: Callable[[int, Tensor], Tensor],
-        steps_done: int = 0,
+        steps_done: int,
     ) -> Rollout:
         """Run episodes of actions that are chosen by the number of the step and the states."""
         task = self.task.widened(starts.flatten(0, -2))
-        states = starts.expand(self.num_functions, *starts.shape[-2:]).clone()
-        running = torch.ones(states.shape[:2], dtype=torch.bool)
-        left = torch.zeros_like(running)
-        overshoot = torch.zeros(running.shape, dtype=torch.float64)
+        shape = (self.num_functions, starts.shape[-2])  # of all episodes, which are rows below
+        states = starts.expand(*shape, -1).flatten(0, 1)
+        running = torch.ones(len(states), dtype=torch.bool)
+        left, overshoot = ~running, torch.zeros(len(states), dtype=torch.float64)
         steps: list[tuple[Tensor, ...]] = []
         for t in range(num_steps):
             begun = time.perf_counter()
             if t and not self.has_time():
                 break
             actions = choose(t, states)
-            # Where the episodes start the physics has to work; later, all may have come to where
-            # it does not.
-            at, taken = (_tamed_gradient(part.flatten(0, 1)) for part in (states, actions))
-            ahead = task.set_points(at, steps_done + t + 1)
-            step = task.step(at, taken, self._move, set_points=ahead, some_must_succeed=t == 0)
-            parts = (part.unflatten(0, running.shape) for part in step)
-            following, rewards, ended, lost, beyond = parts
+            at, taken = (_tamed_gradient(part) for part in (states, actions))
+            following, rewards, ended, lost, beyond, violation = task.step(
+                at,
+                taken,
+                self._move,
+                set_points=task.set_points(at, steps_done + t + 1),
+                margins=None if self.margins is None else self.margins[: t + 1][-1],
+                # Later, all may have come to where the physics does not work.
+                some_must_succeed=t == 0,
+            )
             made = running & ~lost
             left = left | (running & lost)
             overshoot = torch.where(running, beyond, overshoot)
-            violation = self._violation(t, *(part.flatten(0, 1) for part in (following, actions)))
-            violation = violation.view_as(rewards).masked_fill(~made, 0.0)
             steps.append((states, actions, following, rewards, made, violation))
             running = made & ~ended
             states = torch.where(running.unsqueeze(-1), following, states)
             self._slowest = max(self._slowest, time.perf_counter() - begun)
-        columns = [torch.stack(parts, dim=2) for parts in zip(*steps, strict=True)]
-        *columns, violation = columns
-        return Rollout._make([*columns, left, overshoot, violation, self.before])
-
-    def _violation(self, t: int, states: Tensor, actions: Tensor) -> Tensor:
-        """How far the constraints of a step are violated, with their margins, ``N``."""
-        values = self.task.constraint_values(states, actions)
-        if self.margins is not None:
-            values = values + self.margins[min(t, len(self.margins) - 1)]
-        return values.clamp_min(0.0).sum(-1)
+        columns = [torch.stack(parts, dim=1) for parts in zip(*steps, strict=True)]
+        columns += [left, overshoot, columns.pop().masked_fill(~columns[4], 0.0)]
+        parts = [column.unflatten(0, shape) for column in columns]
+        return Rollout._make([*parts, self.before])
 
     def _move(self, states: Tensor, actions: Tensor) -> Tensor:
-        """The next states of rows, of which each function has as many."""
+        """Return the next states of rows, of which each function has as many."""
         blocks = (rows.unflatten(0, (self.num_functions, -1)) for rows in (states, actions))
         return self.functions(*blocks).flatten(0, 1)
 
 
 def _tamed_gradient(rows: Tensor) -> Tensor:
-    """The same rows; of those whose gradient is not finite, or far from the others', less flows on.
+    """Return the same rows; of those whose gradient is not finite, or far longer, less flows on.
 
     Rows are separate episodes; where one runs away, its gradient would outweigh all others.
     """
-    if not rows.requires_grad:
-        return rows
-    rows = rows.view_as(rows)
-    rows.register_hook(_tamed)
+    if rows.requires_grad:
+        rows = rows.view_as(rows)
+        rows.register_hook(_tamed)
     return rows
 
 
 def _tamed(gradient: Tensor) -> Tensor:
-    """Gradients of rows, none longer than so many times their median."""
+    """Return gradients of rows, none longer than so many times their median."""
     gradient = torch.where(gradient.isfinite().all(-1, keepdim=True), gradient, 0.0)
     lengths = gradient.norm(dim=-1, keepdim=True)
     flowing = lengths > 0
@@ -217,7 +204,7 @@ class Objective(ABC):
 
     @abstractmethod
     def of(self, task: Task) -> Score:
-        """The worth of rollouts in a task, as its dynamics stand."""
+        """Return the worth of rollouts in a task, as its dynamics stand."""
 
 
 @dataclass(frozen=True)
@@ -277,7 +264,7 @@ class Return(Objective):
             )
 
     def of(self, task: Task) -> Score:
-        """The return of rollouts."""
+        """Return the return of rollouts."""
         largest = torch.zeros((), dtype=torch.float64)
         rate = task.rate
 
@@ -294,13 +281,14 @@ class Return(Objective):
                 largest = torch.maximum(*(part.detach().abs().max() for part in (rewards, ends)))
             returns = (weights[:-1] * rewards.masked_fill(~rollout.made, 0.0)).sum(-1) + ends
             price = torch.where(largest > 0, largest, 1.0)
+            violation = (weights[:-1] * rollout.violation).sum(-1)
             if rollout.left_bounds.any():
                 lost = rollout.left_bounds.unsqueeze(-1) & ~rollout.made
-                most = (weights[:-1] * rollout.violation).sum(-1).max()  # of constraints
-                missed = _NEVER * ((weights[:-1] * lost).sum(-1) + most * rollout.left_bounds)
-                returns = returns - price * (missed + _BACK * len(weights) * rollout.overshoot)
+                missed = (weights[:-1] * lost).sum(-1) + violation.max() * rollout.left_bounds
+                back = _BACK * len(weights) * rollout.overshoot
+                returns = returns - price * (_NEVER * missed + back)
             if rollout.violation.any():
-                returns = returns - price * _NEVER * (weights[:-1] * rollout.violation).sum(-1)
+                returns = returns - price * _NEVER * violation
             if self.quantile is None:
                 return returns.mean(0)
             return returns.quantile(self.quantile, dim=0)

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from gpadjust.checks import seeded
+from gpadjust.control.reach import random_sequences
 from gpadjust.control.rollouts import Rollouts
-from gpadjust.control.search import random_sequences
 from gpadjust.control.task import Task
 from gpadjust.dynamics.linearised import derivatives, linearised
 from gpadjust.records.kalman import Array, measure

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpadjust.checks import check_kind, checked_number, checked_whole
+from gpadjust.checks import check_kind, checked_bounds, checked_number, checked_whole
 from gpadjust.control.action_rate import ActionRate
 from gpadjust.dynamics import Dynamics
 from gpadjust.dynamics.particles import step_or_nan
@@ -43,6 +43,8 @@ class Step(NamedTuple):
             the physics failed.
         overshoot: ``N``: how far it would have, in halves of the width between the bounds, summed
             over the states; with its gradient, which leads back. 0 where that is not finite.
+        violation: ``N``: how far the constraints with their margins are violated, in sum; 0 where
+            they hold.
     """
 
     next_states: Tensor
@@ -50,6 +52,7 @@ class Step(NamedTuple):
     terminated: Tensor
     left_bounds: Tensor
     overshoot: Tensor
+    violation: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,15 +125,11 @@ class Task:
             raise TypeError(
                 "reward must be a function of states, actions, next states; found None."
             )
-        for name, arguments in (
-            ("reward", 3),
-            ("terminated", 1),
-            ("initial_states", 1),
-            ("reference", 2),
-            ("constraints", 2),
-        ):
-            _check_function(getattr(self, name), name, arguments)
-        if self.reference is not None and not self.dynamics.spec.exogenous:
+        arguments = {"reward": 3, "terminated": 1, "initial_states": 1}
+        for name, number in (arguments | {"reference": 2, "constraints": 2}).items():
+            _check_function(getattr(self, name), name, number)
+        spec, hidden = self.dynamics.spec, self.sensors is not None
+        if self.reference is not None and not spec.exogenous:
             raise ValueError(
                 "reference says the values of exogenous states, but the spec has none; name the "
                 "set-points among `exogenous`, and let the environment observe them."
@@ -138,25 +137,24 @@ class Task:
         if self.episode_length is not None:
             checked_whole("episode_length", self.episode_length, 1)
         if self.state_bounds is not None:
-            bounds = _checked_bounds(self.state_bounds, self.dynamics.spec.state_dim)
+            bounds = checked_bounds("state_bounds", self.state_bounds, spec.state_dim, finite=False)
             object.__setattr__(self, "state_bounds", bounds)
         check_kind("sensors", self.sensors, Sensors | None, 'Sensors(["x", "theta"]), say')
-        if self.sensors is not None:
-            self.sensors.spec(self.dynamics.spec)  # checks the names
-            if self.initial_states is None:
-                raise ValueError(
-                    "Of hidden states it must be known where episodes start; pass initial_states, "
-                    "or start of a System, as well as sensors."
-                )
-            if self.reference is not None:
-                raise ValueError(
-                    "The estimate of hidden states takes set-points for constant; leave reference "
-                    "out, or the sensors."
-                )
+        self.observed  # noqa: B018 - checks the names
+        if hidden and self.initial_states is None:
+            raise ValueError(
+                "Of hidden states it must be known where episodes start; pass initial_states, or "
+                "start of a System, as well as sensors."
+            )
+        if hidden and self.reference is not None:
+            raise ValueError(
+                "The estimate of hidden states takes set-points for constant; leave reference out, "
+                "or the sensors."
+            )
         if self.probability is not None:
             checked_number("probability", self.probability, above=0, below=1)
         if self.rate is not None:
-            self.rate.check(self.dynamics.spec.action_dim)
+            self.rate.check(spec.action_dim)
 
     @property
     def observed(self) -> StateSpec:
@@ -309,6 +307,7 @@ class Task:
         move: Callable[[Tensor, Tensor], Tensor] | None = None,
         *,
         set_points: Tensor | None = None,
+        margins: Tensor | None = None,
         some_must_succeed: bool = False,
     ) -> Step:
         """Take actions ``N x action_dim`` at states ``N x state_dim`` of the model.
@@ -318,6 +317,7 @@ class Task:
             actions: The actions.
             move: Next states of these. Default: drawn from the dynamics, row by row.
             set_points: The exogenous states afterwards, see :meth:`set_points`. Default: as before.
+            margins: Of the constraints, ``c``. Default: none.
             some_must_succeed: Whether it is an error that the physics fails for all rows.
 
         Raises:
@@ -330,18 +330,27 @@ class Task:
             following = following.clone()
             following[:, self.dynamics.spec.exogenous_columns] = set_points
         left = ~following.isfinite().all(-1)
-        overshoot = following.new_zeros(len(following))
+        none = following.new_zeros(len(following))
+        overshoot = violation = none
         if self.state_bounds is not None:
             low, high = self.state_bounds
             beyond = (low - following).clamp_min(0.0) + (following - high).clamp_min(0.0)
-            left |= (beyond > 0).any(-1)
-            width = (high - low) / 2
-            beyond = beyond / torch.where(width.isfinite(), width, 1.0)
-            overshoot = torch.where(beyond.isfinite(), beyond, 0.0).sum(-1)
-        following = torch.where(left.unsqueeze(-1), states, following)
+            outside = (beyond > 0).any(-1)
+            if outside.any():
+                left = left | outside
+                width = (high - low) / 2
+                beyond = beyond / torch.where(width.isfinite(), width, 1.0)
+                overshoot = torch.where(beyond.isfinite(), beyond, 0.0).sum(-1)
+        ended = none.bool()
+        if left.any():
+            following = torch.where(left.unsqueeze(-1), states, following)
         rewards = self.rewards(states, actions, following)
-        ended = self.terminations(following) & ~left
-        return Step(following, rewards, ended, left, overshoot)
+        if self.terminated is not None:
+            ended = self.terminations(following) & ~left
+        if self.constraints is not None:
+            values = self.constraint_values(following, actions)
+            violation = (values if margins is None else values + margins).clamp_min(0.0).sum(-1)
+        return Step(following, rewards, ended, left, overshoot, violation)
 
     def widened(self, states: Tensor) -> Task:
         """This task, or one whose bounds give way to states ``N x state_dim`` beyond them."""
@@ -386,20 +395,6 @@ def per_row(values: Any, n: int, name: str) -> Tensor:
         row = int((~values.isfinite()).nonzero()[0])
         raise ValueError(f"{name} returned {values[row]} for row {row}; expected finite numbers.")
     return values
-
-
-def _checked_bounds(bounds: Any, state_dim: int) -> Tensor:
-    bounds = torch.as_tensor(bounds, dtype=torch.float64)
-    if bounds.shape != (2, state_dim):
-        raise ValueError(
-            f"state_bounds must be of shape 2 x {state_dim}, lower ones and then upper ones; found "
-            f"{tuple(bounds.shape)}."
-        )
-    if not (bounds[0] < bounds[1]).all():  # NaN is not, either
-        raise ValueError(
-            f"Each lower one of state_bounds must be below its upper one; found {bounds.tolist()}."
-        )
-    return bounds
 
 
 def _check_function(function: Any, name: str, num_arguments: int) -> None:

@@ -200,6 +200,10 @@ class Conditioning:
             cross = cross * self.observed.unsqueeze(-2)
         return sought.mean + (cross @ self.alpha.unsqueeze(-1)).squeeze(-1), cross
 
+    def mean_alone(self, sought: WeightedSum) -> Tensor:
+        """Return means without k, which takes half the time."""
+        return sought.mean + sought.cross_times(self.train, self.alpha * self.observed)
+
     def marginals(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Return means and variances at each point, ``... x S x m x q``."""
         mean, cross = self.mean(sought)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
@@ -64,6 +64,7 @@ class WeightedSum:
     x: Tensor
     mean: Tensor  # ... x S x m x n
     weights: dict[str, Tensor]  # tensors w_t, shaped as the mean, of the terms in the sum
+    ready: dict[str, Callable[[Tensor], Tensor]] = field(default_factory=dict)  # of kernels
 
     def of_rows(self, rows: slice | Tensor) -> WeightedSum:
         """Return the sum at some of its places."""
@@ -75,6 +76,13 @@ class WeightedSum:
         """Return the parameters of a term's kernel."""
         start = f"{term.name}.kernel."
         return {n.removeprefix(start): v for n, v in self.values.items() if n.startswith(start)}
+
+    def toward(self, term: Term, x: Tensor) -> Tensor:
+        """Return the covariances of a term's kernel at inputs with the places of the sum."""
+        if term.name not in self.ready:
+            assert term.kernel is not None, "asked before"
+            self.ready[term.name] = term.kernel.toward(self.own(term), self.x)
+        return self.ready[term.name](x)
 
     def variance(self) -> Tensor:
         r"""Return the prior variances, :math:`\sum_t w_t^2 (k_t(x, x) + \kappa_t)`."""
@@ -101,6 +109,22 @@ class WeightedSum:
                 point = None if other is self else other.x
                 k = k + self._process(term, term.kernel.covariance(self.own(term), self.x, point))
             total = total + k * weight.unsqueeze(-1) * other.weights[term.name].unsqueeze(-2)
+        return total
+
+    def cross_times(self, other: WeightedSum, vector: Tensor) -> Tensor:
+        r"""Return the covariances with another sum times v, ``... x S x m x n'``, term by term.
+
+        .. math:: \sum_t w_t(x) \, (k_t(x, x') + \kappa_t) \, (w'_t(x') \circ v)
+        """
+        total = torch.zeros_like(self.mean)
+        for term, weight in self._parts():
+            if term.name in other.weights:
+                v = other.weights[term.name] * vector
+                part = self._constant(term) * v.sum(-1, keepdim=True)
+                if term.kernel is not None:
+                    k = other.toward(term, self.x)
+                    part = part + self._process(term, k @ v.unsqueeze(-1)).squeeze(-1)
+                total = total + weight * part
         return total
 
     def with_pull_back(self) -> tuple[Tensor, PullBack]:

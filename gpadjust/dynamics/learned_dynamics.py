@@ -280,7 +280,7 @@ class LearnedDynamics(Dynamics):
             if has_scale:
                 values = few.predict(X).mean
             else:  # without variances, which cost most
-                means, _ = posterior.mean(few.at(X, posterior.train.values))
+                means = posterior.mean_alone(few.at(X, posterior.train.values))
                 values = (means.mean(-3) * few.unit).mT
             return values.unflatten(0, inputs.shape[:-1])
 

@@ -52,7 +52,8 @@ def step_or_nan(
             place = states[working].clone(), actions[working].clone()  # not of what is written
             states[failed], actions[failed] = place
         else:
-            return following.masked_fill(failed.unsqueeze(-1), torch.nan)
+            is_whole = not failed.any()
+            return following if is_whole else following.masked_fill(failed[:, None], torch.nan)
 
 
 def move_on(

@@ -15,7 +15,7 @@ from gpadjust.checks import check_choice, checked_number
 from gpadjust.dynamics.trajectories import Trajectories
 from gpadjust.physics import ODEPhysics, ParameterValues, Physics, PhysicsError, as_physics
 from gpadjust.states import StateSpec
-from gpadjust.states.state_spec import side_by_side
+from gpadjust.states.state_spec import side_by_side, some_columns
 
 Target = Literal["difference", "absolute"]
 
@@ -54,7 +54,7 @@ class Targets:
 
     def inputs(self, states: Tensor, actions: Tensor) -> Tensor:
         """The raw inputs of a model, ``... x d``; see :attr:`StateSpec.model_columns`."""
-        return side_by_side(states, actions)[..., self.spec.model_columns]
+        return some_columns(side_by_side(states, actions), self.spec.model_columns)
 
     def encode(self, states: Tensor, next_states: Tensor) -> Tensor:
         """Targets ``... x m`` of transitions."""
@@ -64,7 +64,9 @@ class Targets:
 
     def decode(self, states: Tensor, targets: Tensor) -> Tensor:
         """Next values of the predicted states, ``... x m``."""
-        return targets if self.target == "absolute" else states[..., self.spec.predicted] + targets
+        if self.target == "absolute":
+            return targets
+        return some_columns(states, self.spec.predicted) + targets
 
 
 class TargetPhysics(Physics):
@@ -84,7 +86,7 @@ class TargetPhysics(Physics):
         targets = self.targets
         num_states = len(targets.spec.moving)
         states = X[:, :num_states]
-        read = X[:, targets.of_physics]
+        read = some_columns(X, targets.of_physics)
         try:
             following = self.physics.of_rows(self.physics.read_rows(read, *parameters))
         except PhysicsError as error:

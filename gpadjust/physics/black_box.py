@@ -142,10 +142,12 @@ class RowMemo:
     ) -> Tensor:
         """Return the values of rows ``N x d``, by a function of distinct rows if not remembered.
 
+        If none is remembered, and none to be learnt, the function is of all rows as they are.
+
         After its ``PhysicsError`` the finite rows of the ``partial`` result are remembered.
         """
         keys, known = row_keys(rows), self._rows  # to which other threads only add
-        if not keys:
+        if not keys or not (learn or any(key in known for key in keys)):
             return evaluate(rows)
         outputs = {key: known[key] for key in keys if key in known}
         places = {key: i for i, key in enumerate(keys) if key not in outputs}

@@ -12,7 +12,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from gpadjust.checks import checked_number, checked_whole
-from gpadjust.control.step_guard import fault
+from gpadjust.control.faults import fault
 from gpadjust.dynamics import Trajectories
 from gpadjust.states import StateSpec
 

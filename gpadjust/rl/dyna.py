@@ -32,7 +32,7 @@ from gpadjust.control import EpisodeCheckpoint, Task
 from gpadjust.control.agent import TaskAgent
 from gpadjust.control.checkpoint import locked
 from gpadjust.control.episodes import check_functions, learn_dynamics
-from gpadjust.control.step_guard import check_observation
+from gpadjust.control.faults import check_observation
 from gpadjust.dynamics import Trajectories
 from gpadjust.rl.buffer import MixedReplayBuffer
 from gpadjust.rl.callbacks import AgentCallback, DynaCallback

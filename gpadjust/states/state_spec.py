@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from numbers import Real
 
 import torch
@@ -138,35 +139,35 @@ class StateSpec:
         """Number of entries of an observation."""
         return len(self.states) + len(self.angles)
 
-    @property
+    @cached_property
     def moving(self) -> list[int]:
         """The states that the physics moves, neither exogenous nor previous values."""
         still = (*self.exogenous, *self.previous)
         return [i for i, name in enumerate(self.states) if name not in still]
 
-    @property
+    @cached_property
     def predicted(self) -> list[int]:
         """The states that a model predicts, those that move and are not integrated."""
         return [i for i in self.moving if self.states[i] not in self.integrated]
 
-    @property
+    @cached_property
     def exogenous_columns(self) -> list[int]:
         """The states that are exogenous."""
         return [i for i, name in enumerate(self.states) if name in self.exogenous]
 
-    @property
+    @cached_property
     def previous_columns(self) -> list[int]:
         """The states that hold previous values, read by models beside moving ones and action."""
         return [i for i, name in enumerate(self.states) if name in self.previous]
 
-    @property
+    @cached_property
     def physics_columns(self) -> list[int]:
         """The columns that the physics reads, of states and actions side by side."""
         if not self.physics_reads:
             return [*self.moving, *range(self.state_dim, self.state_dim + self.action_dim)]
         return [(*self.states, *self.actions).index(name) for name in self.physics_reads]
 
-    @property
+    @cached_property
     def model_columns(self) -> list[int]:
         """The columns that models read, of states and actions side by side.
 
@@ -178,9 +179,9 @@ class StateSpec:
 
     def physics_inputs(self, states: Tensor, actions: Tensor) -> Tensor:
         """The inputs of the physics at states ``... x state_dim``: ``... x d``."""
-        return side_by_side(states, actions)[..., self.physics_columns]
+        return some_columns(side_by_side(states, actions), self.physics_columns)
 
-    @property
+    @cached_property
     def angle_columns(self) -> list[int]:
         """The states that are angles."""
         return [i for i, name in enumerate(self.states) if name in self.angles]
@@ -333,6 +334,8 @@ class StateSpec:
 
     def complete(self, states: Tensor, actions: Tensor, predicted: Tensor) -> Tensor:
         """The next states, of which a model knows ``predicted``, ``... x len(spec.predicted)``."""
+        if len(self.predicted) == self.state_dim:
+            return predicted
         following = states.expand(*predicted.shape[:-1], self.state_dim).clone()
         following[..., self.predicted] = predicted
         self.remember(following, states, actions)
@@ -356,3 +359,8 @@ class StateSpec:
 def side_by_side(states: Tensor, actions: Tensor) -> Tensor:
     """States ``... x state_dim`` and their actions in one row; one action may be for all."""
     return torch.cat([states, actions.expand(*states.shape[:-1], -1)], dim=-1)
+
+
+def some_columns(rows: Tensor, columns: list[int]) -> Tensor:
+    """Some columns of rows ``... x d``; the rows themselves if these are all, in their order."""
+    return rows if columns == [*range(rows.shape[-1])] else rows[..., columns]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import gymnasium as gym
@@ -122,25 +122,28 @@ class CartPoleEquation:
                 "Expected states ... x 4 (x, theta, x_dot, theta_dot) and actions ... x 1 (force), "
                 f"got {tuple(state.shape)} and {tuple(action.shape)}."
             )
+        mass, half_moment, swung_mass, gravity, arm, damping, dry, drag = (
+            self._own if p is None else _numbers({**vars(self), **p})
+        )
         _, theta, x_dot, theta_dot = state.unbind(-1)
-        own = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        given = {**own, **(p or {})}
-        m, length, g = given["pole_mass"], given["pole_length"], given["gravity"]
-        M = given["cart_mass"] + m
         sin, cos = theta.sin(), theta.cos()
-        push = action[..., 0]
-        if _is_there(given["dry"]):
-            push = push - given["dry"] * (x_dot / _SOFT).tanh()
-        force = push - given["damping"] * x_dot
-        swing = m * length * theta_dot.square() * sin
-        inertia = 4 * M - 3 * m * cos.square()
-        x_ddot = (-2 * swing + 3 * m * g * sin * cos + 4 * force) / inertia
-        theta_ddot = (-3 * swing * cos + 6 * M * g * sin + 6 * force * cos) / (length * inertia)
-        if _is_there(given["drag"]):
-            torque = -given["drag"] * theta_dot * theta_dot.abs()
-            x_ddot = x_ddot + 6 * cos * torque / (length * inertia)
-            theta_ddot = theta_ddot + 12 * M * torque / (m * length**2 * inertia)
+        force = action[..., 0]
+        if dry is not None:
+            force = force - dry * (x_dot / _SOFT).tanh()
+        if damping is not None:
+            force = force - damping * x_dot
+        # The fraction of x_ddot is divided by 4; with it, the pole turns about its moving hinge.
+        net = torch.addcmul(force, theta_dot * theta_dot, half_moment * sin, value=-1)
+        tilt, swung = gravity * sin, swung_mass * cos
+        if drag is not None:
+            tilt = tilt - drag / half_moment * theta_dot * theta_dot.abs()
+        x_ddot = torch.addcmul(net, swung, tilt) / torch.addcmul(mass, swung, cos, value=-1)
+        theta_ddot = torch.addcmul(tilt, cos, x_ddot) / arm
         return torch.stack([x_dot, theta_dot, x_ddot, theta_ddot], dim=-1)
+
+    @cached_property
+    def _own(self) -> tuple[Any, ...]:
+        return _numbers(vars(self))
 
     def energy(self, state: Tensor) -> Tensor:
         """The kinetic and the potential energy in J, ``...``, of states ``... x 4``.
@@ -162,8 +165,13 @@ REAL_CART_POLE = CartPoleEquation(cart_mass=0.5, pole_mass=0.5, pole_length=0.6,
 """The system to control."""
 
 
-def _is_there(friction: float | Tensor) -> bool:
-    return torch.is_tensor(friction) or friction != 0
+def _numbers(values: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Return what the equation multiplies by, as tensors; None for a friction of zero."""
+    m, length = values["pole_mass"], values["pole_length"]
+    numbers = [values["cart_mass"] + m, m * length / 2, 0.75 * m, values["gravity"], length / 1.5]
+    friction = [values[name] for name in ("damping", "dry", "drag")]
+    numbers += [v if torch.is_tensor(v) or v != 0 else None for v in friction]
+    return tuple(v if v is None else torch.as_tensor(v, dtype=torch.float64) for v in numbers)
 
 
 def equation_physics(

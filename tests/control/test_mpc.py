@@ -1,5 +1,7 @@
 """A policy that plans at every step."""
 
+import subprocess
+import sys
 import time
 from dataclasses import replace
 
@@ -7,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from gpadjust.control import MPC, CrossEntropy, Planner, Return, Rollouts, Task
-from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
+from gpadjust.control import MPC, CrossEntropy, MPCAgent, Planner, Return, Rollouts, Task
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec, Trajectories
 
 SPEC = StateSpec(["x"], ["v"])
 BOUNDS = torch.tensor([[-1.0], [2.0]], dtype=torch.float64)
@@ -36,6 +38,91 @@ def test_it_reaches_a_goal_and_stays(task):
         action, plan = mpc.predict(x, plan)
         x = x + 0.5 * action
     assert abs(x - 1) < 0.1
+
+
+def test_a_loop_of_the_users_learns_and_goes_on_in_the_newest_model():
+    """The plant moves half as far as f_p says."""
+    dynamics = LearnedDynamics(SPEC, lambda X: X.sum(-1, True), fit_options={"method": "map"})
+    task = Task(dynamics, to_one, episode_length=6)
+    controller, errors = MPC(task, BOUNDS, quick(horizon=3), first=quick()), []
+    for _ in range(2):
+        controller.reset()
+        x = np.zeros(1)
+        for _ in range(6):
+            action = controller.step(x)
+            assert action.shape == (1,)
+            assert -1 <= action[0] <= 2
+            x = x + 0.5 * action
+            errors.append(abs(float(x[0]) - 1))
+        controller.observe(x)
+        assert controller.learn() is controller
+    assert dynamics.num_transitions == 12
+    moved = dynamics.predict(torch.zeros(1, 1).double(), torch.ones(1, 1).double()).mean
+    assert moved.item() == pytest.approx(0.5, abs=0.01)
+    assert errors[6] < errors[0] - 0.1  # it knows how far it gets by now
+    assert repr(controller) == "MPC(LearnedDynamics, 12 transitions learnt)"
+    rows = torch.linspace(-1, 1, 4).double().unsqueeze(-1)
+    controller.learn(Trajectories(rows, rows, 1.5 * rows))
+    assert dynamics.num_transitions == 16
+
+
+def test_steps_are_the_predictions_along_the_plan(task):
+    controller = MPC(task, BOUNDS, quick())
+    x, plan = np.zeros(1), None
+    for _ in range(3):
+        action, plan = controller.predict(x, plan)
+        taken = controller.step(x)
+        assert taken.astype(np.float32) == action
+        x = x + 0.5 * taken
+
+
+def test_no_transition_goes_across_what_was_not_measured():
+    dynamics = LearnedDynamics(SPEC, lambda X: X.sum(-1, True), fit_options={"method": "map"})
+    controller = MPC(Task(dynamics, to_one, episode_length=9), BOUNDS, quick(0))
+    for x in (0.0, 0.1, np.nan, 7.0, [[1.0], [2.0]], 9.0, 9.1):
+        if np.ndim(x) == 2:
+            with pytest.raises(ValueError, match=r"of 1 numbers, found shape \(2, 1\)"):
+                controller.step(x)
+        elif np.isnan(x):
+            with pytest.raises(ValueError, match=r"entry 0 of the observation is nan.*Stop the ma"):
+                controller.step(x)
+        else:
+            controller.step(x)
+    assert controller.learn().task.dynamics.num_transitions == 2
+    with pytest.raises(ValueError, match="no new transition to learn"):
+        controller.learn()
+
+
+def test_an_agent_makes_one_controller_for_each_model(make_agent, monkeypatch):
+    made, real = [], MPC.__init__
+
+    def init(self, task, *others, **options):
+        made.append(task)
+        real(self, task, *others, **options)
+
+    monkeypatch.setattr(MPC, "__init__", init)
+    agent = make_agent(MPCAgent).learn(15)
+    assert len(made) == 3
+    assert agent.mpc is agent.mpc
+    assert agent.mpc.task is agent.model
+    agent.tolerance = None
+    assert agent.mpc.tolerance is None
+
+
+def test_a_loop_needs_no_gymnasium():
+    code = """
+import sys
+sys.modules["gymnasium"] = None
+from gpadjust.control import MPC, Planner, Task
+from gpadjust.dynamics import PhysicsDynamics, StateSpec
+point = PhysicsDynamics(StateSpec(["x"], ["v"]), lambda X: X.sum(-1, keepdim=True))
+task = Task(point, lambda states, actions, following: -following[:, 0].abs())
+print(MPC(task, [[-1.0], [1.0]], Planner(horizon=2)).step([0.5]).shape)
+from gpadjust.control import MPCAgent
+"""
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert found.stdout == "(1,)\n"
+    assert "gpadjust.control.MPCAgent needs Gymnasium; run `pip install" in found.stderr
 
 
 def test_plans_go_on_from_earlier_ones_and_end_with_the_episode(task, monkeypatch):

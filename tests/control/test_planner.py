@@ -9,7 +9,7 @@ import torch
 
 from gpadjust import ZeroMeanGP
 from gpadjust.control import CrossEntropy, Objective, Planner, Return, Rollouts, Task
-from gpadjust.control.search import random_sequences
+from gpadjust.control.reach import random_sequences
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.physics import PhysicsError
 

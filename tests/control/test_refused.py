@@ -97,8 +97,11 @@ TASKS = [
     (lambda at: ActionRate(price=-1.0), r"price must be .* at least 0"),
     (lambda at: at.task(probability=95), "probability must be above 0 and below 1; found 95"),
     (lambda at: at.task(constraints=lambda s: s), "constraints is called with 2"),
-    (lambda at: at.task(state_bounds=torch.ones(2, 4)), "state_bounds must be of shape 2 x 1"),
-    (lambda at: at.task(state_bounds=[[1.0], [-1.0]]), "below its upper one; found"),
+    (lambda at: at.task(state_bounds=torch.ones(2, 4)), "Expected state_bounds of shape 2 x 1"),
+    (
+        lambda at: at.task(state_bounds=[[1.0], [-1.0]]),
+        "Expected state_bounds, each lower one below its upper one, got",
+    ),
     (lambda at: at.task(episode_length=0), "episode_length must be at least 1; found 0"),
     (lambda at: at.task(dynamics="cka"), "dynamics must be an object of a Dynamics; found 'cka'"),
     (lambda at: at.task(reward=None), "reward must be a function .*found None"),

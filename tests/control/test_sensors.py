@@ -178,6 +178,25 @@ def test_noises_and_hidden_states_are_found():
     assert rough.square().mean().sqrt() > 0.05  # as the machine's; the most likely path is smooth
 
 
+def test_a_loop_of_the_users_learns_from_positions_alone():
+    env, task = glider()
+    controller = MPC(task, [[-1.0], [1.0]], PLAN, first=PLAN)
+    for episode in range(2):
+        controller.reset()
+        seen, _ = env.reset(seed=episode)
+        for _ in range(LENGTH):
+            seen, *_ = env.step(controller.step(seen))
+        controller.observe(seen)
+        before = controller.filter
+        controller.learn()
+        assert task.dynamics.num_transitions == LENGTH * (episode + 1)
+    assert controller.filter is not before
+    assert 0.3 < controller.filter.noise.item() / NOISE < 4
+    states = torch.zeros(2, 2).double()
+    with pytest.raises(ValueError, match=r"call learn\(\) without data"):
+        controller.learn(Trajectories(states, states[:, :1], states))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "kind", [MPCAgent, pytest.param(PolicySearchAgent, marks=pytest.mark.slow)]

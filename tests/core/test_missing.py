@@ -1,9 +1,12 @@
 """Targets that are missing: each output is the model of its own rows."""
 
+import pickle
+
 import pytest
 import torch
+from gpytorch.kernels import MaternKernel
 
-from gpadjust.core import CKA, RRA, ZeroMeanGP
+from gpadjust.core import CKA, MATERN52, RRA, Stationary, ZeroMeanGP
 from tests.systems import crude
 
 
@@ -58,6 +61,20 @@ def test_each_output_is_the_model_of_its_own_rows(
         one = None if noise is None else noise[new][:, [j]]
         later = single.condition_on_observations(new_X[new], new_Y[new][:, [j]], one)
         same(later, more, Z, 1e-7, [j], noise=not known)
+
+
+@pytest.mark.parametrize("name", [*CASES, "matern", "gpytorch"])
+def test_means_alone_are_those_with_covariances(name, gaps, drawn, close, uniform):
+    """Also with a graph, of batches of inputs, and of a model that was pickled."""
+    kernels = {"matern": Stationary(MATERN52), "gpytorch": MaternKernel()}
+    options = {} if name == "ZeroMeanGP" else {"physics": crude}
+    if name in kernels:
+        options["delta_covar_module"] = kernels[name]
+    model, Z = drawn(CASES.get(name, CKA)(*gaps, **options)), uniform(3, 5, 2, high=2.0, seed=4)
+    for each in (model, pickle.loads(pickle.dumps(model))):
+        given = each.conditioning()
+        for X in (Z[0], Z, Z.clone().requires_grad_()):
+            close(given.mean_alone(each.at(X)), given.mean(each.at(X))[0])
 
 
 def test_left_out_predictions_are_missing_too(gaps, drawn):

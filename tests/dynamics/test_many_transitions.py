@@ -36,6 +36,15 @@ def dynamics():
     return dynamics
 
 
+def test_means_by_inducing_points_of_each_output_are_those_of_predictions():
+    X = torch.cat(transitions(60)[:2], -1)
+    model = VariationalCKA(X, X[:, :2].sin(), physics=step, num_inducing=12)
+    model.inducing = torch.stack([torch.arange(12), torch.arange(20, 32)])
+    model.set_draws(model.u.detach())
+    given, at = model.conditioning(), model.at(X[:7] + 0.1)
+    torch.testing.assert_close(given.mean_alone(at), given.mean(at)[0])
+
+
 @pytest.mark.slow
 def test_they_come_back_and_go_on(dynamics):
     before, dynamics = dynamics, make()

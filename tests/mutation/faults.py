@@ -296,7 +296,7 @@ FAULTS = (
         "Margins count on corrections that the actions leave no room for.",
     ),
     Fault(
-        "gpadjust/control/search.py",
+        "gpadjust/control/mpc.py",
         "torch.cat([sequences, drawn]), torch.cat([scores, score(drawn)])",
         "drawn, score(drawn)",
         "The planner forgets its best sequences of earlier rounds.",
