@@ -1,4 +1,4 @@
-"""Without the extras ``control`` and ``rl``."""
+"""Without the extras ``control`` and ``rl``; ``gpadjust.control`` itself needs neither."""
 
 import importlib
 import sys
@@ -11,7 +11,6 @@ import pytest
     [
         ("gpadjust.rl", "stable_baselines3", "rl"),
         ("gpadjust.systems", "gymnasium", "control"),
-        ("gpadjust.control", "gymnasium", "control"),
     ],
 )
 def test_what_is_missing_is_named(package, missing, extra, monkeypatch):
