@@ -18,8 +18,11 @@ def truth(X, fine=0.0):
 
 
 def at_random(model, scale=0.3, seed=0):
-    """The model at random coordinates, without a rest."""
+    """The model at random coordinates, without a rest; noise outweighs the nugget."""
     u = scale * normal(*model.u.shape, seed=seed)
+    values = model.table.values(u)
+    noise = {n: v.clamp_min(1e-3) for n, v in values.items() if n.startswith("noise.")}
+    u = model.table.with_values(u, noise)
     model.set_draws(model.table.with_choice(u, 0))
     return model
 
