@@ -1,4 +1,4 @@
-"""Scores of Gaussian predictions, and of equally weighted mixtures of them.
+"""Scores of Gaussian predictions, and of the mixtures of them that posteriors are.
 
 A true value may be NaN where it was not observed. Scores are over the observed points only, and NaN
 for an output that has none.
@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from botorch.posteriors import Posterior
-from botorch.posteriors.fully_bayesian import MCMC_DIM, GaussianMixturePosterior
+from botorch.posteriors.fully_bayesian import GaussianMixturePosterior
 from torch import Tensor
 from torch.distributions import Normal
 
@@ -21,14 +21,12 @@ from gpadjust.checks import check_columns, check_level
 from gpadjust.core.gaussian import DRAWS, Marginals
 
 
-def rmse(mean: Tensor, y: Tensor, *, mixture_dim: int | None = None) -> Tensor:
-    """Root mean square error over the points.
+def rmse(mean: Tensor, y: Tensor) -> Tensor:
+    """Return the root mean square error over the points.
 
     Args:
-        mean: Predicted means, ``... x n x m``; of a mixture, those of its components.
+        mean: Predicted means, ``... x n x m``.
         y: True values, ``... x n x m``, NaN where not observed.
-        mixture_dim: The dimension of ``mean`` along which the components of an equally weighted
-            mixture lie: -3 for ``... x S x n x m``, as in BoTorch's fully Bayesian posteriors.
 
     Returns:
         ``... x m``, in the units of ``y``.
@@ -42,12 +40,12 @@ def rmse(mean: Tensor, y: Tensor, *, mixture_dim: int | None = None) -> Tensor:
         >>> rmse(torch.tensor([[1.0], [2.0]]), torch.tensor([[1.0], [4.0]]))
         tensor([1.4142])
     """
-    (mean,) = _components(y, mixture_dim, mean=mean)
-    return _mean_over_observed((mean.mean(0) - _filled(y)).square(), y).sqrt()
+    _check(y, mean=mean)
+    return _mean_over_observed((mean - _filled(y)).square(), y).sqrt()
 
 
-def nlpd(mean: Tensor, variance: Tensor, y: Tensor, *, mixture_dim: int | None = None) -> Tensor:
-    """Mean negative log predictive density over the points; lower is better.
+def nlpd(mean: Tensor, variance: Tensor, y: Tensor) -> Tensor:
+    """Return the mean negative log predictive density over the points; lower is better.
 
     Arguments and errors are those of :func:`rmse`, and the predicted ``variance``, of the shape of
     ``mean``, which is not negative.
@@ -61,24 +59,17 @@ def nlpd(mean: Tensor, variance: Tensor, y: Tensor, *, mixture_dim: int | None =
         >>> nlpd(zero, torch.ones(3, 1), zero)
         tensor([0.9189])
     """
-    mean, variance = _components(y, mixture_dim, mean=mean, variance=variance)
-    density = Normal(mean, _sd(variance)).log_prob(_filled(y))
-    return _mean_over_observed(math.log(len(mean)) - density.logsumexp(0), y)
+    return _nlpd(_gaussians(mean, variance, y), y)
 
 
-def crps(mean: Tensor, variance: Tensor, y: Tensor, *, mixture_dim: int | None = None) -> Tensor:
-    r"""Mean continuous ranked probability score over the points; lower is better.
+def crps(mean: Tensor, variance: Tensor, y: Tensor) -> Tensor:
+    """Return the mean continuous ranked probability score over the points; lower is better.
 
-    In closed form (Grimit et al. 2006, for a mixture; Gneiting and Raftery 2007, eq. 21, for one
-    Gaussian), with :math:`A(\mu, \sigma^2) = E|Z|` of :math:`Z \sim N(\mu, \sigma^2)`:
-
-    .. math:: \frac1S \sum_i A(y - \mu_i, \sigma_i^2)
-        - \frac{1}{2 S^2} \sum_{i, j} A(\mu_i - \mu_j, \sigma_i^2 + \sigma_j^2)
+    In closed form (Gneiting and Raftery 2007, eq. 21). Arguments and errors are those of
+    :func:`nlpd`.
 
     Returns:
         ``... x m``, in the units of ``y``.
-
-    Arguments and errors are those of :func:`nlpd`.
 
     Example:
         >>> import torch
@@ -86,22 +77,17 @@ def crps(mean: Tensor, variance: Tensor, y: Tensor, *, mixture_dim: int | None =
         >>> crps(zero, torch.ones(3, 1), zero)
         tensor([0.2337])
     """
-    mean, variance = _components(y, mixture_dim, mean=mean, variance=variance)
-    score = _absolute_moment(_filled(y) - mean, variance).mean(0)
-    for mean_i, variance_i in zip(mean, variance, strict=True):  # all pairs at once are S^2 n m
-        spread = _absolute_moment(mean - mean_i, variance + variance_i).mean(0)
-        score = score - spread / (2 * len(mean))
-    return _mean_over_observed(score, y)
+    return _crps(_gaussians(mean, variance, y), y)
 
 
-def pit(mean: Tensor, variance: Tensor, y: Tensor, *, mixture_dim: int | None = None) -> Tensor:
-    """Probability integral transform: the predicted distribution function at the true value.
+def pit(mean: Tensor, variance: Tensor, y: Tensor) -> Tensor:
+    """Return the probability integral transform: the distribution function at the true value.
+
+    Arguments and errors are those of :func:`nlpd`.
 
     Returns:
         ``... x n x m``, between 0 and 1, or NaN where not observed; uniform if intervals
         of all levels hold (Dawid 1984).
-
-    Arguments and errors are those of :func:`nlpd`.
 
     Example:
         >>> import torch
@@ -109,15 +95,11 @@ def pit(mean: Tensor, variance: Tensor, y: Tensor, *, mixture_dim: int | None = 
         tensor([[0.5000],
                 [0.8413]])
     """
-    mean, variance = _components(y, mixture_dim, mean=mean, variance=variance)
-    return Normal(mean, _sd(variance)).cdf(_filled(y)).mean(0).masked_fill(y.isnan(), math.nan)
+    return _gaussians(mean, variance, y).probability(y)
 
 
-def coverage(
-    mean: Tensor, variance: Tensor, y: Tensor, level: float = 0.95, *,
-    mixture_dim: int | None = None,
-) -> Tensor:  # fmt: skip
-    """Share of the points that lie within the central interval of a given level.
+def coverage(mean: Tensor, variance: Tensor, y: Tensor, level: float = 0.95) -> Tensor:
+    """Return the share of the points that lie within the central interval of a given level.
 
     Arguments and errors are those of :func:`nlpd`, and the nominal coverage ``level``, a number
     between 0 and 1.
@@ -130,11 +112,11 @@ def coverage(
         >>> coverage(torch.zeros(2, 1), torch.ones(2, 1), torch.tensor([[1.0], [3.0]]))
         tensor([0.5000])
     """
-    return central_share(pit(mean, variance, y, mixture_dim=mixture_dim), level)
+    return central_share(pit(mean, variance, y), level)
 
 
 def central_share(pit: Tensor, level: float) -> Tensor:
-    """Share of PIT values (``... x n x m``) in the central interval of a level: ``... x m``."""
+    """Return the share of PIT values ``... x n x m`` in a level's central interval, ``... x m``."""
     check_level(level)
     return _mean_over_observed(((pit - 0.5).abs() <= level / 2).to(pit.dtype), pit)
 
@@ -176,21 +158,19 @@ class Scores:
         *,
         level: float = 0.95,
         interval: tuple[Tensor, Tensor] | None = None,
-        mixture_dim: int | None = None,
         energy: Tensor | None = None,
         output_names: Sequence[str] = (),
     ) -> Scores:
-        """The scores of Gaussian predictions.
+        """Return the scores of Gaussian predictions.
 
         Args:
-            mean: Predicted means, as in :func:`rmse`.
+            mean: Predicted means, ``... x n x m``.
             variance: Predicted variances, of the same shape. NaN where the prediction says none:
                 these points count in ``rmse`` and ``median`` only.
             y: True values, ``... x n x m``, NaN where not observed.
             level: Nominal coverage, between 0 and 1.
             interval: Lower and upper ends of the interval of that level, ``... x n x m`` each.
                 Default: those of the prediction's own distribution.
-            mixture_dim: As in :func:`rmse`.
             energy: The energy score of draws, ``...``.
             output_names: The names of the ``m`` outputs.
 
@@ -205,12 +185,17 @@ class Scores:
             >>> scores.rmse.shape, scores[4].rmse.shape
             (torch.Size([5, 2]), torch.Size([2]))
         """
-        error = (_components(y, mixture_dim, mean=mean)[0].mean(0) - y).abs()
-        silent = variance.isnan()
-        silent = silent if mixture_dim is None else silent.any(mixture_dim)
-        judged = y.masked_fill(silent, math.nan)
-        predicted = mean, variance.nan_to_num(nan=1.0, posinf=math.inf)
-        values = pit(*predicted, judged, mixture_dim=mixture_dim)
+        marginals = _gaussians(mean, variance.nan_to_num(nan=1.0, posinf=math.inf), y)
+        judged = y.masked_fill(variance.isnan(), math.nan)
+        return cls._of(marginals, y, judged, level, interval, energy, tuple(output_names))
+
+    @classmethod
+    def _of(
+        cls, marginals: Marginals, y: Tensor, judged: Tensor, level: float, interval: Any = None,
+        energy: Tensor | None = None, output_names: tuple[str, ...] = (),
+    ) -> Scores:  # fmt: skip
+        """Return the scores of mixtures at each point; only errors of points not judged."""
+        values, mean = marginals.probability(judged), marginals.prediction.mean
         if interval is None:
             share = central_share(values, level)
         else:
@@ -219,14 +204,14 @@ class Scores:
             known = judged + 0 * (interval[0] + interval[1])  # NaN where an end is
             share = _mean_over_observed(inside, known)
         return cls(
-            rmse=rmse(mean, y, mixture_dim=mixture_dim),
-            median=error.nanmedian(-2).values if y.shape[-2] else error.sum(-2) / 0,
-            nlpd=nlpd(*predicted, judged, mixture_dim=mixture_dim),
-            crps=crps(*predicted, judged, mixture_dim=mixture_dim),
+            rmse=rmse(mean, y),
+            median=(mean - y).abs().nanmedian(-2).values if y.shape[-2] else y.sum(-2) / 0,
+            nlpd=_nlpd(marginals, judged),
+            crps=_crps(marginals, judged),
             coverage=share,
             pit=values,
             energy=energy,
-            output_names=tuple(output_names),
+            output_names=output_names,
         )
 
     def __getitem__(self, part: Any) -> Scores:
@@ -277,26 +262,20 @@ def score(posterior: Posterior, Y: Tensor, level: float = 0.95) -> Scores:
         >>> scores.rmse.shape, scores.pit.shape
         (torch.Size([1]), torch.Size([20, 1]))
     """
-    if isinstance(marginals := getattr(posterior, "marginals", None), Marginals):
-        return _of_marginals(marginals, Y, level)
-    dim = MCMC_DIM if isinstance(posterior, GaussianMixturePosterior) else None
     mean, variance = getattr(posterior, "mean", None), getattr(posterior, "variance", None)
+    if isinstance(marginals := getattr(posterior, "marginals", None), Marginals):
+        _check(Y, mean=marginals.prediction.mean)
+        return Scores._of(marginals, Y, Y, level)
     if not (isinstance(mean, Tensor) and isinstance(variance, Tensor)):
         raise TypeError(
             f"Expected a posterior, with a mean and a variance, got {type(posterior).__name__}; "
             "that of a model is `model.posterior(X, observation_noise=True)`."
         )
-    return Scores.of(mean, variance, Y, level=level, mixture_dim=dim)
-
-
-def _of_marginals(marginals: Marginals, Y: Tensor, level: float) -> Scores:
-    """Return the scores of mixtures at each point by itself, as of a model with a link."""
-    if type(marginals) is Marginals:
-        return Scores.of(*marginals, Y, level=level, mixture_dim=DRAWS)
-    scores = Scores.of(*marginals.prediction, Y, level=level)
-    below = marginals.probability(Y)
-    nlpd_ = -_mean_over_observed(marginals.log_density(Y), Y)
-    return replace(scores, nlpd=nlpd_, pit=below, coverage=central_share(below, level))
+    if not isinstance(posterior, GaussianMixturePosterior):
+        return Scores.of(mean, variance, Y, level=level)
+    marginals = Marginals(mean, variance)  # of a fully Bayesian model of BoTorch, likewise
+    _check(Y, mean=marginals.prediction.mean)
+    return Scores._of(marginals, Y, Y, level)
 
 
 def energy_score(draws: Tensor, y: Tensor) -> Tensor:
@@ -330,8 +309,8 @@ def energy_score(draws: Tensor, y: Tensor) -> Tensor:
     return values.masked_fill(~known, 0).sum(-1) / known.sum(-1)
 
 
-def _components(y: Tensor, mixture_dim: int | None, **predicted: Tensor) -> list[Tensor]:
-    """Mean and variance, checked, their components in front: ``S x ... x n x m``."""
+def _check(y: Tensor, **predicted: Tensor) -> None:
+    """Raise an error unless means, and variances, are numbers of the shape of ``y``."""
     for name, values in predicted.items():
         check_columns(name, values, 0, more=True)
     if not isinstance(y, Tensor):
@@ -344,19 +323,11 @@ def _components(y: Tensor, mixture_dim: int | None, **predicted: Tensor) -> list
             f"Expected y of shape ... x n x m, n points of m outputs, got {tuple(y.shape)}; give "
             "one output its column with `.unsqueeze(-1)`, of all that is passed."
         )
-    shape = list(predicted["mean"].shape)
-    if mixture_dim is not None:
-        if mixture_dim not in range(-len(shape), len(shape)):
-            raise ValueError(
-                f"There is no dimension {mixture_dim} in means of shape {tuple(shape)}; of a "
-                "prediction that is not a mixture mixture_dim is None."
-            )
-        del shape[mixture_dim]
     shapes = [tuple(values.shape) for values in predicted.values()]
-    if shape != list(y.shape) or shapes[0] != shapes[-1]:
+    if {*shapes} != {tuple(y.shape)}:
         raise ValueError(
-            f"Expected {' and '.join(predicted)} of y's shape {tuple(y.shape)}, beside the "
-            f"dimension mixture_dim={mixture_dim}, got {' and '.join(map(str, shapes))}."
+            f"Expected {' and '.join(predicted)} of y's shape {tuple(y.shape)}, got "
+            f"{' and '.join(map(str, shapes))}."
         )
     for name, values in predicted.items():
         if values.isnan().any():
@@ -369,9 +340,35 @@ def _components(y: Tensor, mixture_dim: int | None, **predicted: Tensor) -> list
                 f"Expected variances of at least 0, got {values.min().item():.3g}; if they are "
                 "negative by rounding, pass `variance.clamp_min(0)`."
             )
-    if mixture_dim is None:
-        return [values.unsqueeze(0) for values in predicted.values()]
-    return [values.movedim(mixture_dim, 0) for values in predicted.values()]
+
+
+def _gaussians(mean: Tensor, variance: Tensor, y: Tensor) -> Marginals:
+    """Return checked predictions of single Gaussians."""
+    _check(y, mean=mean, variance=variance)
+    return Marginals(mean.unsqueeze(DRAWS), variance.unsqueeze(DRAWS))
+
+
+def _nlpd(marginals: Marginals, y: Tensor) -> Tensor:
+    return _mean_over_observed(-marginals.log_density(_filled(y)), y)
+
+
+def _crps(marginals: Marginals, y: Tensor) -> Tensor:
+    r"""Return the score of mixtures (Grimit et al. 2006), with :math:`A(\mu, \sigma^2) = E|Z|`.
+
+    .. math:: \frac1S \sum_i A(y - \mu_i, \sigma_i^2)
+        - \frac{1}{2 S^2} \sum_{i, j} A(\mu_i - \mu_j, \sigma_i^2 + \sigma_j^2)
+
+    Of a model with a link it is that of a Gaussian with the prediction's mean and variance.
+    """
+    if type(marginals) is Marginals:
+        mean, variance = (each.movedim(DRAWS, 0) for each in marginals)
+    else:
+        mean, variance = (each.unsqueeze(0) for each in marginals.prediction)
+    score = _absolute_moment(_filled(y) - mean, variance).mean(0)
+    for mean_i, variance_i in zip(mean, variance, strict=True):  # all pairs at once are S^2 n m
+        spread = _absolute_moment(mean - mean_i, variance + variance_i).mean(0)
+        score = score - spread / (2 * len(mean))
+    return _mean_over_observed(score, y)
 
 
 def _filled(y: Tensor) -> Tensor:

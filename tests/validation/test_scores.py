@@ -59,18 +59,24 @@ def mixture(uniform):
     )
 
 
+def posterior_of(mean, variance):
+    """The posterior of a mixture of Gaussians that are independent at all points."""
+    return MixturePosterior(mean.mT, torch.diag_embed(variance.mT))
+
+
 def test_mixture_against_scipy(mixture):
     mean, variance, y = (t.numpy() for t in mixture)
     normal = scipy.stats.norm(mean, np.sqrt(variance))
     y = y[:, None]
+    scores = score(posterior_of(*mixture[:2]), mixture[2], level=0.8)
     expected = torch.from_numpy(-np.log(normal.pdf(y).mean(1)).mean(-2))
-    torch.testing.assert_close(nlpd(*mixture, mixture_dim=-3), expected)
+    torch.testing.assert_close(scores.nlpd, expected)
     values = torch.from_numpy(normal.cdf(y).mean(1))
-    torch.testing.assert_close(pit(*mixture, mixture_dim=-3), values)
+    torch.testing.assert_close(scores.pit, values)
     inside = ((values > 0.1) & (values < 0.9)).double().mean(-2)
-    torch.testing.assert_close(coverage(*mixture, 0.8, mixture_dim=-3), inside)
+    torch.testing.assert_close(scores.coverage, inside)
     expected = torch.from_numpy(np.sqrt(((mean.mean(1) - y[:, 0]) ** 2).mean(-2)))
-    torch.testing.assert_close(rmse(mixture[0], mixture[2], mixture_dim=-3), expected)
+    torch.testing.assert_close(scores.rmse, expected)
 
 
 def test_crps_of_a_mixture_is_the_integral(mixture):
@@ -83,17 +89,17 @@ def test_crps_of_a_mixture_is_the_integral(mixture):
         normal = torch.distributions.Normal(mean[batch, :, point, output], sd)
         cdf = normal.cdf(grid.unsqueeze(-1)).mean(-1)
         expected[i] = (cdf - (grid >= y[i]).double()).square().sum() * (grid[1] - grid[0])
-    torch.testing.assert_close(
-        crps(*mixture, mixture_dim=-3), expected.mean(-2), rtol=1e-3, atol=1e-3
-    )
+    found = score(posterior_of(mean, variance), y).crps
+    torch.testing.assert_close(found, expected.mean(-2), rtol=1e-3, atol=1e-3)
 
 
 def test_a_mixture_of_equal_components_is_the_component(prediction):
     mean, variance, y = prediction
     many = [t.unsqueeze(-3).expand(2, 5, 7, 3) for t in (mean, variance)]
+    scores = score(posterior_of(*many), y)
     for one in (nlpd, crps, pit, coverage):
-        torch.testing.assert_close(one(*many, y, mixture_dim=-3), one(*prediction))
-    torch.testing.assert_close(rmse(many[0], y, mixture_dim=-3), rmse(mean, y))
+        torch.testing.assert_close(getattr(scores, one.__name__), one(*prediction))
+    torch.testing.assert_close(scores.rmse, rmse(mean, y))
 
 
 def test_pit_of_calibrated_predictions_is_uniform(uniform):
@@ -106,7 +112,7 @@ def test_pit_of_calibrated_predictions_is_uniform(uniform):
 @pytest.mark.parametrize("num_outputs", [1, 2])
 @pytest.mark.parametrize("mixed", [False, True])
 def test_score_of_a_posterior(uniform, num_outputs, mixed):
-    batch, options = ((5,), {"mixture_dim": -3}) if mixed else ((), {})
+    batch = (5,) if mixed else ()
     mean = uniform(*batch, 7, num_outputs, seed=1)
     variance = uniform(*batch, 7, num_outputs, low=0.1, high=1, seed=2)
     y = uniform(7, num_outputs, seed=3)
@@ -119,20 +125,16 @@ def test_score_of_a_posterior(uniform, num_outputs, mixed):
     joint = joint[0] if num_outputs == 1 else several(joint)
     posterior = GaussianMixturePosterior(joint) if mixed else GPyTorchPosterior(joint)
     scores = score(posterior, y, level=0.5)
-    torch.testing.assert_close(scores.rmse, rmse(mean, y, **options))
-    torch.testing.assert_close(scores.nlpd, nlpd(mean, variance, y, **options))
-    torch.testing.assert_close(scores.crps, crps(mean, variance, y, **options))
-    expected = pit(mean, variance, y, **options)
-    torch.testing.assert_close(scores.pit, expected, equal_nan=True)
-    torch.testing.assert_close(scores.coverage, coverage(mean, variance, y, 0.5, **options))
+    if mixed:
+        expected = score(posterior_of(mean, variance), y, level=0.5)
+    else:
+        expected = Scores.of(mean, variance, y, level=0.5)
+    for name in ("rmse", "median", "nlpd", "crps", "coverage", "pit"):
+        found, other = getattr(scores, name), getattr(expected, name)
+        torch.testing.assert_close(found, other, equal_nan=True)
 
 
-def test_score_of_a_model_is_that_of_its_mixture(mixture, data):
-    mean, variance, y = (each[0] for each in mixture)
-    posterior = MixturePosterior(mean.mT, torch.diag_embed(variance.mT))
-    scores, expected = score(posterior, y), Scores.of(mean, variance, y, mixture_dim=-3)
-    for name in ("rmse", "nlpd", "crps", "coverage", "pit"):
-        torch.testing.assert_close(getattr(scores, name), getattr(expected, name))
+def test_score_of_a_model_with_a_link_is_that_of_the_model_within(data):
     X, Y = data()
     linked = LinkedCKA(X, Y.exp(), physics=lambda X: X[:, :1].exp())
     plain = CKA(X, Y, physics=lambda X: X[:, :1])
@@ -168,8 +170,6 @@ def test_bad_input(prediction, data):
     for one in (crps, pit, coverage):
         with pytest.raises(ValueError, match="Expected mean without NaN, found 1 of 42"):
             one(nan, variance, y)
-    with pytest.raises(ValueError, match="There is no dimension -4"):
-        nlpd(mean, variance, y, mixture_dim=-4)
     with pytest.raises(ValueError, match="Expected mean without NaN, found 1 of 42"):
         rmse(nan, nan)
     with pytest.raises(ValueError, match="level must be between 0 and 1; found"):
@@ -179,23 +179,21 @@ def test_bad_input(prediction, data):
         score(CKA(X, Y, physics=lambda X: X[:, :1]), Y)
 
 
-@pytest.mark.parametrize("mixed", [False, True])
-def test_points_that_were_not_observed_are_left_out(prediction, mixture, mixed):
-    mean, variance, y = mixture if mixed else prediction
-    options = {"mixture_dim": -3} if mixed else {}
+def test_points_that_were_not_observed_are_left_out(prediction):
+    mean, variance, y = prediction
     partial = y.clone()
     partial[:, [0, 3], 0] = torch.nan
     partial[:, :, 2] = torch.nan
     rest = [1, 2, 4, 5, 6]
     for one in (rmse, nlpd, crps, coverage):
         some = {True: (mean,), False: (mean, variance)}[one is rmse]
-        found, whole = one(*some, partial, **options), one(*some, y, **options)
-        part = one(*(t[..., rest, :] for t in some), y[:, rest], **options)
+        found, whole = one(*some, partial), one(*some, y)
+        part = one(*(t[..., rest, :] for t in some), y[:, rest])
         torch.testing.assert_close(found[:, 0], part[:, 0])
         torch.testing.assert_close(found[:, 1], whole[:, 1])
         assert found[:, 2].isnan().all()
-    expected = pit(mean, variance, y, **options).masked_fill(partial.isnan(), torch.nan)
-    found = pit(mean, variance, partial, **options)
+    expected = pit(mean, variance, y).masked_fill(partial.isnan(), torch.nan)
+    found = pit(mean, variance, partial)
     torch.testing.assert_close(found, expected, equal_nan=True)
 
 
