@@ -13,19 +13,17 @@ from gpadjust.checks import check_columns, check_level, seeded
 from gpadjust.core import Prediction
 from gpadjust.dynamics.free_run import (
     FreeRun,
-    check_start,
-    checked_noise,
-    with_lags,
-    without_jumps,
-)
-from gpadjust.dynamics.particles import (
     about_center,
     central_interval,
     check_enough,
+    check_start,
+    checked_noise,
     measurement_noise,
     move_on,
     of_states,
     step_or_nan,
+    with_lags,
+    without_jumps,
 )
 from gpadjust.dynamics.state import fingerprint
 from gpadjust.dynamics.targets import check_spec

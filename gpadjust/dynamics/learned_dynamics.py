@@ -16,9 +16,7 @@ from gpadjust.checks import check_choice, check_switch, checked_options, checked
 from gpadjust.core import CKA, GP, FitResult, Prediction, ZeroMeanGP, fit
 from gpadjust.core.model import Predictive
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
-from gpadjust.dynamics.joint_errors import error_correlation
-from gpadjust.dynamics.particles import varying_parameters
-from gpadjust.dynamics.physics_dynamics import PhysicsDynamics
+from gpadjust.dynamics.physics_dynamics import PhysicsDynamics, varying_parameters
 from gpadjust.dynamics.state import (
     PhysicsProbes,
     check_fingerprint,
@@ -39,6 +37,7 @@ from gpadjust.dynamics.targets import (
 from gpadjust.dynamics.trajectories import Trajectories
 from gpadjust.kinds.factory import ModelFactory, make_model
 from gpadjust.states import StateSpec
+from gpadjust.validation.leave_one_out import error_correlation
 
 _STATE = ("transitions", "probes", "chunks", "model", "draws", "noise")
 _NUM_FEATURES = 1024  # by default

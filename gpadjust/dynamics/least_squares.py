@@ -9,7 +9,6 @@ import torch
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from gpadjust.dynamics.particles import even_normal
 from gpadjust.dynamics.trajectories import Trajectories
 from gpadjust.physics import Physics, PhysicsWarning
 from gpadjust.states import StateSpec
@@ -128,3 +127,10 @@ def _warn_of_parameters(names: tuple[str, ...], precision: Tensor, point: Tensor
         if which.any():
             told = ", ".join(name for name, is_one in zip(names, which, strict=True) if is_one)
             warnings.warn(f"{message.format(told)}.", PhysicsWarning, stacklevel=5)
+
+
+def even_normal(number: int, p: int, seed: int) -> Tensor:
+    """Standard normal draws ``number x p`` that fill space evenly (Sobol)."""
+    engine = torch.quasirandom.SobolEngine(p, scramble=True, seed=seed)
+    shares = engine.draw(number, dtype=torch.float64).clamp(1e-6, 1 - 1e-6)
+    return torch.special.ndtri(shares)

@@ -21,7 +21,8 @@ import torch
 from torch import Tensor
 
 from gpadjust.checks import checked_whole, progress_bar
-from gpadjust.dynamics.particles import even_normal, of_states
+from gpadjust.dynamics.free_run import of_states
+from gpadjust.dynamics.least_squares import even_normal
 from gpadjust.dynamics.targets import check_next_values, one_physics
 from gpadjust.physics import ODEPhysics, Physics, PhysicsError
 from gpadjust.physics.parameters import PhysicsParameters
