@@ -40,7 +40,10 @@ def made(structure=CKA, Y=Y[:, :1], Yvar=None, num_draws=1, **options):
     u = normal(num_draws, *model.u.shape[1:], seed=3)
     if model.table.choices:
         u[..., -1] = 0.0  # the whole model
-    model.set_draws(0.5 * u)
+    # By a noise that is next to none determinants and differences are rounded.
+    values = model.table.values(0.5 * u)
+    noise = {n: v.clamp_min(1e-3) for n, v in values.items() if n.startswith("noise.")}
+    model.set_draws(model.table.with_values(0.5 * u, noise))
     return model
 
 
