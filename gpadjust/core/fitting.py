@@ -33,11 +33,11 @@ _SELDOM = 1e-3  # a nested model of less probability at its mode is not drawn fr
 _SEARCHES = 4  # for the mode
 _NEAR = 0.3  # difference of all coordinates below which two searches have found the same mode
 _LESS_LIKELY = 5.0  # difference of log density from the best mode beyond which a mode is ignored
-_MOVED = 0.35  # standard deviations by which another seed may move means
+_MOVED = 0.35  # predicted standard deviations by which another seed may move the mean
 
 
 class SamplingWarning(UserWarning):
-    """Another seed would move predictions or parameters of the physics by much."""
+    """Another seed would move predictions by much."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,8 @@ class FitResult:
 
     @property
     def converged(self) -> bool:
-        """Whether predictions and parameters of the physics hardly depend on the seed."""
-        return not (self.error > _MOVED or self.parameter_error > _MOVED)
+        """Whether predictions hardly depend on the seed."""
+        return not self.error > _MOVED
 
     def __str__(self) -> str:
         lines, outputs = [], [*zip(*self.probabilities.values(), strict=True)]
@@ -110,7 +110,7 @@ def fit(
         seed: Seed.
 
     Warns:
-        SamplingWarning: If another seed would move predictions or parameters by much.
+        SamplingWarning: If another seed would move predictions by much.
 
     Raises:
         ValueError: If the method or number of draws is another one, or the data are a batch.
@@ -135,20 +135,14 @@ def fit(
         result: FitResult | None = model.fit_itself(method, num_draws, seed)
         if result is None:
             result = _fitted(model, method, num_draws, seed)
-    errors = {
-        "Predictions depend on the seed: another one would move them": result.error,
-        "Parameters of the physics depend on the seed: another one would move their means": (
-            result.parameter_error
-        ),
-    }
-    for text, error in errors.items():
-        if error > _MOVED:
-            warnings.warn(
-                f"{text} by {error:.2f} of their standard deviation. Draw more: fit(model, "
-                f"num_draws={4 * len(model.draws)}).",
-                SamplingWarning,
-                stacklevel=2,
-            )
+    if result.error > _MOVED:
+        warnings.warn(
+            f"Predictions depend on the seed: another one would move them by {result.error:.2f} of "
+            "their standard deviation. Draw more: "
+            f"fit(model, num_draws={4 * len(model.draws)}).",
+            SamplingWarning,
+            stacklevel=2,
+        )
     return result
 
 

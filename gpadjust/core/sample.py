@@ -138,7 +138,7 @@ def _move(
 
     p = standard_normal(u.shape, generator, u)
     jitter = torch.rand(u.shape[:-1], generator=generator, dtype=u.dtype).to(u)
-    leap = (length * (0.1 + 1.3 * jitter)).unsqueeze(-1)  # short ones where the density is narrow
+    leap = (length * (0.6 + 0.8 * jitter)).unsqueeze(-1)
     prior, by_prior = begin.log_density(u)
     energy = power * value + prior - 0.5 * p.square().sum(-1)
     new, new_value, new_slope = here
