@@ -85,14 +85,14 @@ DAMAGES = [
         for change, words in (
             (lambda s: s.pop("model"), "it lacks 'model'"),
             (lambda s: s["transitions"]["actions"][3].fill_(math.nan), r"transitions.*\(row 3\)"),
-            (lambda s: s.update(physics=s["physics"][1:]), r"finite float64 .* \(20, 2\)"),
+            (lambda s: s["probes"][0][0].fill_(math.nan), r"finite float64 .* \(3, 2\)"),
             (lambda s: s.update(chunks=[12, 3]), "20 in all"),
             (lambda s: s["model"].pop("u"), "for CKA"),
             (lambda s: s["model"].update(u=torch.ones(2, 2, 3)), "size mismatch for u"),
             (lambda s: s["model"]["u"].fill_(math.nan), "tensors without NaN"),
             (lambda s: s.update(draws=s["draws"][:1]), "2 or more coordinates"),
-            (lambda s: s.update(physics=None), "without a physics, but there is one here"),
-            (lambda s: s["physics"].mul_(1.1), "another physics than 'push' .* not deterministic"),
+            (lambda s: s.update(probes=[]), "a list of 1, one for each physics"),
+            (lambda s: s["probes"][0][2].mul_(1.1), "another physics than 'push' .* not determin"),
         )
     ),
 ]
