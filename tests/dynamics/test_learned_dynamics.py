@@ -9,6 +9,7 @@ import torch
 from gpadjust import CKA
 from gpadjust.core import Stationary, Term
 from gpadjust.dynamics import LearnedDynamics, StateSpec
+from gpadjust.physics import BlackBoxPhysics
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:f_p is nearly zero", "ignore::gpadjust.core.SamplingWarning"
@@ -184,14 +185,14 @@ def test_a_function_makes_the_model(cart_pole_system):
 
 
 @pytest.mark.slow
-def test_each_transition_costs_one_row_of_the_physics(uniform):
+def test_each_transition_costs_one_row_of_a_physics_that_remembers(uniform):
     rows = []
 
     def physics(X):
         rows.append(len(X))
         return X[:, :1] + 0.1 * X[:, 1:]
 
-    dynamics = LearnedDynamics(StateSpec(["x"], ["v"]), physics)
+    dynamics = LearnedDynamics(StateSpec(["x"], ["v"]), BlackBoxPhysics(physics))
     for seed in range(3):
         x, v = uniform(6, 1, seed=seed), uniform(6, 1, seed=seed + 10)
         dynamics.update(x, v, x + 0.12 * v)
