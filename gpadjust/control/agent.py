@@ -528,7 +528,8 @@ class Agent(TaskAgent):
     def recorded_episodes(self, newest: int | None = None) -> Trajectories:
         """The real steps; or the newest of them only.
 
-        With sensors the states are drawn from what is known of them since they were last learnt.
+        They are those of episodes that have ended. With sensors the states are drawn from what is
+        known of them since they were last learnt.
         """
         data, paths = self._data, self._paths
         if self.task.sensors is None:

@@ -339,9 +339,9 @@ def _error(model: GP, groups: list[Tensor]) -> float:
 
 
 def _parameter_error(model: GP, groups: list[Tensor]) -> float:
-    """Return the same of the means of parameters of the physics, in posterior ones.
+    """Return how far another seed would move the mean of a parameter of the physics.
 
-    It is the largest of all parameters; all draws count for these.
+    It is in posterior standard deviations, the largest of all parameters.
     """
     one, other = (model.physics_parameters_at(u).mean for u in groups)
     error = (one - other).abs() / (2 * model.physics_parameters_at(torch.cat(groups)).sd)

@@ -91,7 +91,7 @@ class SumLikelihood(NamedTuple):
 def sum_likelihood(
     train: WeightedSum, residual: Tensor, noise: Tensor, observed: Tensor, with_gradient: bool
 ) -> SumLikelihood:
-    """Return that of residuals ``S x m x n`` of a sum, which are 0 where not observed."""
+    """Return the likelihood of residuals ``S x m x n`` of a sum; 0 where not observed."""
     if not with_gradient:
         K = train.cross(train).expand(*residual.shape, residual.shape[-1])
         found = log_likelihood(residual, K, noise, observed, False)
