@@ -10,7 +10,6 @@ from gpadjust.control.constraints import margins
 from gpadjust.control.mpc import MPC, CrossEntropy, Plan, Planner
 from gpadjust.control.policies import BoundedPolicy, mlp_policy
 from gpadjust.control.policy_search import PolicySearch, SearchResult
-from gpadjust.control.progress import print_progress
 from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts
 from gpadjust.control.state_filter import Estimate, StateFilter
 from gpadjust.control.task import Constraints, InitialStates, Reward, Step, Task, Termination
@@ -50,7 +49,7 @@ __all__ = [
 ]
 
 try:
-    from gpadjust.control.agent import Agent, Callback
+    from gpadjust.control.agent import Agent, Callback, print_progress
     from gpadjust.control.agents import MPCAgent, PolicySearchAgent
     from gpadjust.control.checkpoint import EpisodeCheckpoint, resume
     from gpadjust.control.step_guard import FailedStepWarning, StepGuard

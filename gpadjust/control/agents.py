@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -82,11 +83,11 @@ class MPCAgent(Agent):
         Raises:
             RuntimeError: If there is neither a physics nor a real episode to plan with.
         """
-        planned = self.newest_model, self.each_step, self.first, self.tolerance, self.filter
-        if self._mpc is None or any(a is not b for a, b in zip(planned, self._mpc[0], strict=True)):
-            task, each_step, first, tolerance, known = planned
+        made_of = self.newest_model, self.each_step, self.first, self.tolerance, self.filter
+        if self._mpc is None or any(map(operator.is_not, made_of, self._mpc[0])):
+            task, each_step, first, tolerance, known = made_of
             how: dict[str, Any] = {"first": first, "tolerance": tolerance, "state_filter": known}
-            self._mpc = planned, MPC(task, self.action_bounds(), each_step, **how)
+            self._mpc = made_of, MPC(task, self.action_bounds(), each_step, **how)
         return self._mpc[1]
 
     def predict(
@@ -185,10 +186,9 @@ class PolicySearchAgent(Agent):
         self.is_trained = False
         self._reward = math.nan  # of a step, as the last search foresaw it
 
-    def try_task(self, observations: NDArray[Any], action_space: Any) -> None:
-        """Call the task's functions, and refuse what a policy cannot keep."""
+    def _check(self) -> None:
         self.search.check_task(self.task)
-        super().try_task(observations, action_space)
+        super()._check()
 
     def improve(self, task: Task) -> bool:
         """Improve the policy, if it is known where episodes start."""

@@ -17,11 +17,11 @@ from torch import Tensor
 
 from gpadjust.checks import check_kind, checked_bounds, checked_number, checked_whole, seeded
 from gpadjust.control.constraints import margins
+from gpadjust.control.episodes import decoded, teach
 from gpadjust.control.faults import check_observation
 from gpadjust.control.reach import random_sequences
 from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts
-from gpadjust.control.smoothed_episodes import smooth_episodes
-from gpadjust.control.state_filter import Estimate, StateFilter
+from gpadjust.control.state_filter import Estimate, StateFilter, smooth_episodes
 from gpadjust.control.task import Task
 from gpadjust.dynamics import Trajectories
 from gpadjust.states import StateSpec
@@ -571,7 +571,6 @@ class MPC:
             ValueError: If there is no new transition; or trajectories of a task with sensors.
             PhysicsError: If the physics fails at a transition.
         """
-        dynamics, spec = self.task.dynamics, self.task.dynamics.spec
         hidden, number = self.task.sensors is not None, self._num_learnt
         if data is not None and hidden:
             raise ValueError(
@@ -587,18 +586,7 @@ class MPC:
                     "the measurement after it: call `step` first, or pass trajectories."
                 )
             data = self._trajectories(runs).some(slice(0 if hidden else self._num_learnt, None))
-        following, still = data.next_states.clone(), spec.exogenous_columns
-        if self.task.reference is not None:  # set-points stay as they are in the dynamics
-            following[:, still] = data.states[:, still]
-        before = dynamics.state_dict() if hidden else None
-        if hidden:  # the states behind all measurements are known better by now
-            dynamics.load_state_dict({})
-        try:
-            dynamics.update(data.states, data.actions, following)
-        except BaseException:
-            if before is not None:
-                dynamics.load_state_dict(before)
-            raise
+        teach(self.task, data)
         self._num_learnt = number
         return self
 
@@ -629,15 +617,11 @@ class MPC:
 
     def _trajectories(self, runs: Sequence[_Run]) -> Trajectories:
         """Return the transitions of runs; with sensors, of states estimated in the newest model."""
-        spec, seen = self.task.dynamics.spec, [run.whole() for run in runs]
-        data = reduce(Trajectories.append, seen)
+        data = reduce(Trajectories.append, [run.whole() for run in runs])
         if self.filter is None:
-            states, next_states = (spec.decode(each) for each in (data.states, data.next_states))
-        else:
-            self.filter, paths = smooth_episodes(self.model, self.filter, seen, len(seen))
-            states = torch.cat([path[:-1] for path in paths])
-            next_states = torch.cat([path[1:] for path in paths])
-        return replace(data, states=states, next_states=next_states)
+            return decoded(self.task.dynamics.spec, data)
+        self.filter, states = smooth_episodes(self.model, self.filter, data, len(runs))
+        return states
 
     def __repr__(self) -> str:
         """Name the dynamics, and how much they have learnt."""

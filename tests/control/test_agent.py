@@ -106,8 +106,8 @@ def test_an_agent_of_ones_own_needs_predict_alone(make_agent):
         ("predict", np.zeros(1), ValueError, r"must return the action, .*\(1,\)"),
         ("predict", (np.zeros((1, 1)), None), ValueError, r"must return the action, .*\(1,\)"),
         ("predict", (np.full(1, np.nan), None), ValueError, r"must return the action, .*\(1,\)"),
-        ("promise", 3.0, TypeError, r"must return a dictionary .* found 3\.0"),
-        ("improve", None, TypeError, "must return whether .*found None"),
+        ("promise", 3.0, TypeError, r"must be a dictionary .* found 3\.0"),
+        ("improve", None, TypeError, "must be True if .*found None"),
         ("predict", (torch.zeros(1).double(), None), None, ""),
     ],
 )
@@ -136,15 +136,9 @@ def test_episodes_are_played_to_their_end_and_told(make_agent, kind, capsys):
     begin = f"{kind.__name__}(Point, LearnedDynamics, 2 episodes learnt, 10 steps"
     assert repr(agent) == f"{begin}, last reward {episodes.rewards[5:].mean():.3g} a step)"
     lines = capsys.readouterr().out.splitlines()
-    number, span = r"-?\d+(\.\d+)?(e-?\d+)?", r"\d+\.\d s"
-    for line in (
-        rf"trial 2: reward {number} a step( \(promised {number}\))?, 5 steps in {span}",
-        rf"fit: {span}, NLPD {number}, coverage \d+%",
-        rf"plan: {span}.*",
-    ):
-        assert sum(re.fullmatch(line, said) is not None for said in lines) == 1 + ("plan" in line)
-    for event in ("update", "search"):
-        assert any(said.startswith(event) for said in lines) == (event in search)
+    printed = [line.partition(":")[0] for line in lines]
+    assert printed == [event for event in events if event not in ("step", "episode", "done")]
+    assert any(re.match(r"trial: number 2, steps 5, reward -\S+, seconds ", line) for line in lines)
 
 
 def test_scores_of_each_new_episode_are_told(make_agent):
