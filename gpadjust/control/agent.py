@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import time
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -27,6 +28,7 @@ from gpadjust.dynamics import Trajectories
 from gpadjust.dynamics.free_run import checked_horizons
 
 MAX_HOLD = 5  # steps of a random action
+_LOST = 0.1  # of runs in the model, which may leave the bounds without a warning
 
 Callback = Callable[["Agent", str, dict[str, float]], Any]
 """What is called with the agent, the name of an event, and its numbers; see :class:`Agent`."""
@@ -39,50 +41,45 @@ class Agent(ABC):
     Before there are data, the model is the physics; without one, or with several, the first
     episode's actions are random.
 
-    An error on the way (a wrong reward, a physics that fails, a fit that does not converge, one of
-    your own to end a run early) loses nothing: the episodes are kept, and the dynamics learn them
-    after the next one. Mend what is wrong, set ``agent.task`` to a task with other functions or
-    dynamics, for example, and call ``learn`` again; dynamics that know nothing learn all episodes.
-    Transitions at which the physics fails are not learnt, with a warning. A step that fails, or
-    gives what cannot be data, is not kept and ends its episode, see :class:`StepGuard`; so does one
-    that did not happen, which an environment tells by a true ``info["step_failed"]``.
+    An error on the way (a wrong reward, a physics that fails, one of your own to end a run early)
+    loses nothing: the episodes are kept, and the dynamics learn them after the next one. Mend what
+    is wrong, set ``agent.task`` to a task with other functions, for example, and call ``learn``
+    again; dynamics that know nothing learn all episodes. Transitions at which the physics fails are
+    not learnt, with a warning. A step that fails is not kept and ends its episode, see
+    :class:`StepGuard`.
 
     Callbacks are called with the agent, the name of an event, and a dictionary of numbers:
 
     - ``"episode"``: an episode begins;
     - ``"plan"``: its first action is chosen, in ``seconds``, with the agent's :meth:`promise`;
     - ``"step"``: a real step was made, with its ``reward``;
-    - ``"trial"``: the episode has ended, with its ``number`` (from 1), ``steps``, ``seconds``, the
-      ``reward`` of a step, and what was promised of it (``promised_reward``);
-    - ``"fit"``: the dynamics have learnt, with the scores of the new steps before that
-      (``nlpd``, ``coverage``, ``rmse/x``, ``coverage_15``, ...), ``real_reward`` of a step and
-      ``promised_reward``;
+    - ``"trial"``: the episode has ended: its ``number`` (from 1), ``steps``, ``seconds``, the
+      ``reward`` of a step, and the ``promised_reward``;
+    - ``"fit"``: the dynamics have learnt, with scores of the new steps before that (``nlpd``,
+      ``coverage``, ``rmse/x``, ``coverage_15``, ...), ``real_reward`` and ``promised_reward``;
     - ``"update"``, ``"search"``: as a subclass has them;
     - ``"done"``: all steps are made.
 
     Args:
-        env: The real environment, of Gymnasium, with a box of observations, as the spec of the
-            dynamics has them, and a box of actions; the attribute has a :class:`StepGuard` around.
-        task: What is known of the system; rewards and terminations are compared with those of
-            each real episode.
+        env: The real environment, of Gymnasium, with boxes of observations and actions as in the
+            spec of the dynamics; the attribute has a :class:`StepGuard` around.
+        task: What is known of the system.
         action_noise: Called at each step for what is added to the action, ``action_dim`` numbers in
             halves of its range, such as Stable-Baselines3's ``NormalActionNoise``.
         random_steps: Episodes that begin before so many real steps have random actions, held for
             up to five steps. Default: the first one is that of the physics.
-        reward_tolerance: How far the known rewards may be from the recorded ones, relative to the
-            largest of an episode; None to check neither rewards nor terminations, as noisy sensors
-            may need.
+        reward_tolerance: How far the known rewards may be from the real ones, relative to the
+            largest of an episode; None to check neither rewards nor terminations.
         score_horizons: Numbers of steps over which each new episode is predicted before it is
-            learnt, open loop along its actions. Some half a second, and with a physics that is
-            costly its evaluation at 39 particles of 4 windows a step; () does without.
+            learnt, open loop along its actions, at 39 particles of 4 windows; () does without.
         seed: Seed of the global generators and the environment. Default: none.
 
     Attributes:
         task: The task; where it is set, the next ``learn`` improves in it first.
         num_timesteps: Real steps.
         num_episodes: Real episodes that the dynamics have learnt.
-        promised_reward: The reward of a step that the model had promised of the newest episodes
-            that were learnt, or None, as of random actions.
+        promised_reward: The reward of a step that the model had promised of the episodes that were
+            learnt last; None of random actions.
         wall_time: Seconds spent on ``"plan"`` (the actions), ``"fit"`` and ``"update"``.
         notes: What you want to keep with the agent; saved and resumed with it.
 
@@ -169,23 +166,17 @@ class Agent(ABC):
         """
 
     def improve(self, task: Task) -> bool:
-        """Improve in the newest model; return whether the agent can act by now.
+        """Improve in the task in the newest model; return whether the agent can act by now.
 
         If it cannot, as where it is not known yet where episodes start, the next episode's actions
         are random.
-
-        Args:
-            task: The task in the newest model, the ``model`` of the next episode.
         """
         return True
 
     def promise(self, state: Any) -> dict[str, float]:
-        """Return the promises of the model for an episode that begins: the numbers of ``"plan"``.
+        """Return the numbers of ``"plan"`` by the state that came with the first action.
 
-        Of these ``promised_reward``, of a step on average, is compared with the real one.
-
-        Args:
-            state: What :meth:`predict` returned with its first action.
+        The ``promised_reward``, of a step on average, is compared with the real one.
         """
         return {}
 
@@ -197,9 +188,8 @@ class Agent(ABC):
         """Play so many further real steps, in whole episodes, and learn from each.
 
         Args:
-            total_timesteps: Number of steps; the episode under way is played to its end.
-            callback: One or more callbacks, such as :class:`EpisodeCheckpoint` or
-                :func:`print_progress`.
+            total_timesteps: Number of steps; the last episode is played to its end.
+            callback: One or more, such as :class:`EpisodeCheckpoint` or :func:`print_progress`.
         """
         callbacks = [] if callback is None else [callback] if callable(callback) else [*callback]
         end = self.num_timesteps + total_timesteps
@@ -221,15 +211,11 @@ class Agent(ABC):
     def _check(self) -> None:
         """Find what is wrong before it costs a real step."""
         task, rate = self.task, self.task.rate
-        if self.action_noise is not None and rate is not None and rate.most is not None:
+        is_limited = rate is not None and rate.most is not None
+        if self.action_noise is not None and (is_limited or task.sensors is not None):
             raise ValueError(
-                "Noise may change actions by more than action_rate allows; leave action_noise out, "
-                "or the limit."
-            )
-        if self.action_noise is not None and task.sensors is not None:
-            raise ValueError(
-                "The estimate of hidden states takes the actions for those that were chosen; leave "
-                "action_noise out, or the sensors."
+                "Noise may change actions by more than action_rate allows, and hidden states are "
+                "estimated by actions without noise; leave action_noise out, or limit and sensors."
             )
         if task.sensors is not None:
             task.dynamics.state_dict()  # or an error: they learn all again after each episode
@@ -373,7 +359,7 @@ class Agent(ABC):
 
     @property
     def task(self) -> Task:
-        """The task."""
+        """What is known of the system."""
         return self._task
 
     @task.setter
@@ -383,6 +369,17 @@ class Agent(ABC):
         )
         self._task, self._filter = task, None
         self._forget_model()
+
+    def warn_of_bounds(self, share: float, what: str) -> None:
+        """Warn if what was planned leaves the bounds of the states in over a tenth of its runs."""
+        if share > _LOST:
+            warnings.warn(
+                f"{share:.0%} of {what} leave the bounds of the states in the model, so that it is "
+                "not to be trusted there. Penalise such states in the reward, widen state_bounds "
+                "of the task, or search longer.",
+                UserWarning,
+                stacklevel=3,
+            )
 
     def _forget_model(self) -> None:
         """Note that there is a newer model, in which the agent has not improved."""
@@ -395,10 +392,10 @@ class Agent(ABC):
 
     @property
     def newest_model(self) -> Task:
-        """``model``, or where the agent has not learnt to act yet, the task in what is known.
+        """``model``, or before the agent has learnt to act, the task in data or physics.
 
         Raises:
-            RuntimeError: If there is neither a physics nor a real episode.
+            RuntimeError: If there is neither.
         """
         task = self.known_task() if self._model is None else self._model
         if task is None:
@@ -410,30 +407,20 @@ class Agent(ABC):
         return task
 
     def known_task(self) -> Task | None:
-        """Return ``model_task`` in the newest model, or the physics; None if nothing is known."""
+        """Return the completed task in the newest model or physics; None if there is neither."""
         dynamics = self.task.dynamics.before_data()
-        return None if dynamics is None else replace(self.model_task(), dynamics=dynamics)
-
-    def model_task(self) -> Task:
-        """Return the task, with length, starts and bounds of environment and episodes."""
-        return episodes.completed(self.task, self.recorded_episodes(), self.env)
+        task = episodes.completed(self.task, self.recorded_episodes(), self.env)
+        return None if dynamics is None else replace(task, dynamics=dynamics)
 
     @property
     def filter(self) -> StateFilter | None:
-        """The filter of what sensors show, with the noises that were learnt; None without sensors.
-
-        Raises:
-            RuntimeError: If there is neither a physics nor a real episode.
-        """
+        """The filter of what sensors show, with the noises that were learnt; None without them."""
         if self._filter is None and self.task.sensors is not None:
             self._filter = StateFilter.guessed(self.newest_model, self.action_bounds())
         return self._filter
 
     def recorded_episodes(self, newest: int | None = None) -> Trajectories:
-        """Return the real steps of episodes that have ended; or the newest steps only.
-
-        With sensors the states are drawn from what is known of them since they were last learnt.
-        """
+        """Return the real steps of episodes that have ended, with sensors by their estimates."""
         is_hidden, spec = self.task.sensors is not None, self.task.dynamics.spec
         data = self._estimated if is_hidden else episodes.decoded(spec, self._observed)
         return episodes.newest(data, newest)

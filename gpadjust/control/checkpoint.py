@@ -28,16 +28,12 @@ from gpadjust.files.sync_folder import sync_folder
 class EpisodeCheckpoint:
     """Writes the whole state of a run after each episode; :func:`resume` goes on.
 
-    It is a callback of :class:`Agent` and of ``gpadjust.rl.Dyna``. The file holds all that the
-    agent and its dynamics learnt, the real episodes, the state of the environment, and all random
-    generators, so that an interrupted run ends with the same numbers, bit for bit, as one that was
-    not (on the same machine and versions). It is replaced atomically: whenever the process dies, a
-    whole checkpoint is on the disk. While it learns, a run holds a lock beside the file
-    (``.lock``): another run that would write there is refused. Other callbacks keep their own
-    state, unless they write it into ``agent.notes``.
-
-    An environment that cannot be pickled (a real robot) is reset when the run goes on, which is
-    then another run, and a warning says so.
+    It is a callback of :class:`Agent` and of ``gpadjust.rl.Dyna``. An interrupted run ends with the
+    same numbers, bit for bit, as one that was not, on the same machine and versions; but an
+    environment that cannot be pickled (a real robot) is reset, with a warning. The file is replaced
+    atomically: whenever the process dies, a whole checkpoint is on the disk. While it learns, a run
+    holds a lock beside the file (``.lock``): another run that would write there is refused. Other
+    callbacks keep their own state, unless they write it into ``agent.notes``.
 
     Args:
         path: The file.
@@ -72,7 +68,7 @@ class EpisodeCheckpoint:
         """Write the state of a run between two episodes.
 
         Raises:
-            TypeError: If an attribute of the agent cannot be pickled, whose name it has.
+            TypeError: If an attribute of the agent cannot be pickled.
             RuntimeError: If another run writes to this file.
         """
         with self.locked():

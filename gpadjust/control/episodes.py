@@ -66,11 +66,7 @@ def action_bounds(env: Any) -> Tensor:
 
 
 def episode_length(task: Task, env: Any) -> int:
-    """Return the steps of an episode: of the task, or else the time limit of the environment.
-
-    Raises:
-        ValueError: If there is neither.
-    """
+    """Return the steps of an episode: of the task, or else the time limit of the environment."""
     length = task.episode_length
     for name in ("spec", "_max_episode_steps"):  # the latter of a TimeLimit put around by hand
         if length is None:
@@ -151,11 +147,7 @@ def try_task(task: Task, observations: np.ndarray, env: Any) -> None:
 def completed(task: Task, data: Trajectories, env: Any) -> Task:
     """Return a task with length, starts and bounds of environment and episodes where it has none.
 
-    The bounds are beyond what was measured and what the physics reaches within an episode from
-    where these started.
-
-    Raises:
-        ValueError: If there is no episode length.
+    The bounds are beyond what was measured and what the physics reaches within an episode.
     """
     length = episode_length(task, env)
     parts: dict[str, Any] = {"episode_length": length}
@@ -174,14 +166,9 @@ def completed(task: Task, data: Trajectories, env: Any) -> Task:
 def far_bounds(spec: StateSpec, data: Trajectories, reached: Tensor | None = None) -> Tensor:
     """Return bounds ``2 x state_dim`` far beyond the states of real episodes.
 
-    They are infinite for angles, constants and previous values.
-
-    Args:
-        spec: The entries of states.
-        data: The episodes.
-        reached: Least and greatest states that the physics reaches. The bounds leave room for
-            them and half of their range beyond, within a hundred half ranges of the data: where
-            the physics runs away, it tells nothing of the system.
+    They are infinite for angles, constants and previous values. They leave room for the least and
+    greatest states that the physics reached, ``2 x state_dim``, and half of their range beyond,
+    within a hundred half ranges of the data: where the physics runs away, it tells nothing.
     """
     states = torch.cat([data.states, data.next_states])
     low, high = states.amin(0), states.amax(0)
@@ -214,41 +201,24 @@ def warn_of_bounds(spec: StateSpec, data: Trajectories, bounds: Tensor) -> None:
 
 
 def warn_of_promise(values: dict[str, float], rewards: Tensor) -> None:
-    """Warn if a real step gave less than promised by a quarter of the range of all rewards.
-
-    The warning also says if data had overridden the physics in most of the predictions. (That
-    alone is no fault: where a model has learnt without noise that its physics is a little off,
-    they do so nearly everywhere.)
-    """
+    """Warn if a real step gave less than promised by a quarter of the range of all rewards."""
     real, promised = values["real_reward"], values["promised_reward"]
     if promised - real <= (max(float(rewards.max()), promised) - float(rewards.min())) / 4:
         return
-    blame, overrides = "", values.get("overrides", 0.0)
-    if overrides > 0.5:
-        blame = (
-            f"In {overrides:.0%} of its predictions data had overridden the physics; "
-            "gpadjust.validation.trust tells where. "
-        )
     warnings.warn(
         f"A step of the last real episode gave a reward of {real:.3g} on average, where "
-        f"the model promised {promised:.3g}: do not trust what is done in it yet. {blame}"
+        f"the model promised {promised:.3g}: do not trust what is done in it yet. "
         "More episodes, a careful objective (Return(quantile=0.2), with num_functions=16), or "
-        "a better physics may help.",
+        "a better physics may help: gpadjust.validation.trust tells where data override it.",
         UserWarning,
         stacklevel=4,
     )
 
 
 def check_functions(task: Task, data: Trajectories, tolerance: float = 1e-3) -> None:
-    """Compare the functions of a task with real episodes.
+    """Raise a ValueError with the worst transition if functions of a task are not the system's.
 
-    Args:
-        task: The user's.
-        data: The episodes.
-        tolerance: Greatest error of the reward, relative to the largest real one.
-
-    Raises:
-        ValueError: If they differ; it shows the worst transition.
+    The tolerance is the greatest error of a reward, relative to the largest real one.
     """
     spec, steps = task.dynamics.spec, data.steps
     expected = task.set_points(data.states, steps)
@@ -291,11 +261,7 @@ def check_functions(task: Task, data: Trajectories, tolerance: float = 1e-3) -> 
 
 
 def learnable(dynamics: Dynamics, data: Trajectories) -> Trajectories:
-    """Return all steps but those at which the physics fails, with a warning.
-
-    Raises:
-        PhysicsError: If it does not say where, or everywhere.
-    """
+    """Return all steps but those at which the physics fails; an error if it fails everywhere."""
     works = torch.ones(len(data), dtype=torch.bool)
     while True:
         try:

@@ -23,15 +23,12 @@ class StepGuard(gym.Wrapper[Any, Any, Any, Any]):
 
     A step fails that raises an error, or whose observation or reward is not finite or larger than
     1e25. The episode is truncated at the last good observation, with a
-    :class:`FailedStepWarning`, a reward of zero and a true ``info["step_failed"]``, so that no
-    learner of the library takes it as data. Agents put a guard around their environment, and Dyna
-    around each of a ``DummyVecEnv``; put one yourself around each environment that another process
-    runs, as in ``SubprocVecEnv([lambda: StepGuard(make()), ...])``.
-
-    An interruption (``KeyboardInterrupt``) and an error of ``reset`` come through.
-
-    Args:
-        env: The environment.
+    :class:`FailedStepWarning`, a reward of zero and a true ``info["step_failed"]``, by which an
+    environment itself may tell that a step did not happen: no learner of the library takes it as
+    data. Agents put a guard around their environment, and Dyna around each of a ``DummyVecEnv``;
+    put one yourself around each environment that another process runs, as in
+    ``SubprocVecEnv([lambda: StepGuard(make()), ...])``. Interruptions and errors of ``reset`` come
+    through.
 
     Raises:
         RuntimeError: By ``step``, if the first step of three episodes on end fails.

@@ -22,20 +22,15 @@ class MixedReplayBuffer(ReplayBuffer):
     of ``batch_size`` samples, ``batch_size * real_fraction`` are real, a fractional number being
     rounded up or down at random so that the mean is exact. As long as one of the buffers is empty,
     or ``mix`` is False, batches come from the real one, or from the model's if that is all there
-    is.
-
-    A real step whose ``info["step_failed"]`` is true did not happen, as where a simulator failed.
-    It is not kept, and ends its episode. (Where other environments made theirs, its place in the
-    row takes the transition of one of them.) Nor is one that cannot be data, of an environment
-    without a :class:`gpadjust.control.StepGuard`.
+    is. A real step that failed (:class:`gpadjust.control.StepGuard`) is not kept, and ends its
+    episode; where other environments made theirs, its place takes a transition of one of them.
 
     Args:
         buffer_size: Capacity of the real buffer.
-        args: As of Stable-Baselines3's ``ReplayBuffer``: a one-dimensional ``Box`` of observations,
-            a ``Box`` of actions, and the device, for example.
+        args: As of Stable-Baselines3's ``ReplayBuffer``.
         real_fraction: Share of real samples in a batch, in [0, 1].
         model_buffer_size: Capacity of the model's buffer. Default: as ``buffer_size``.
-        options: As of ``ReplayBuffer``; ``optimize_memory_usage`` must be False.
+        options: As of ``ReplayBuffer``, whose ``optimize_memory_usage`` must be False.
 
     Attributes:
         model_buffer: The model's transitions, a ``ReplayBuffer`` of one environment.
@@ -44,8 +39,7 @@ class MixedReplayBuffer(ReplayBuffer):
         mix: Whether batches hold model transitions.
 
     Raises:
-        ValueError: If the fraction or the size is out of range, or ``optimize_memory_usage`` is
-            asked for.
+        ValueError: If the fraction or a size is out of range.
     """
 
     def __init__(
@@ -127,18 +121,12 @@ class MixedReplayBuffer(ReplayBuffer):
         rows.pos = (rows.pos + n) % rows.buffer_size
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
-        """Draw a batch from both buffers; the real samples come first.
-
-        Args:
-            batch_size: Number of samples.
-            env: Normalises observations and rewards, see Stable-Baselines3.
-        """
+        """Draw a batch from both buffers, see Stable-Baselines3; the real samples come first."""
         if not self.mix or not self.model_buffer.size():
             return super().sample(batch_size, env)
-        expected = batch_size * self.real_fraction if self.size() else 0.0
-        num_real = int(expected)
+        expected, num_real = batch_size * self.real_fraction, 0
         if self.size():
-            num_real += int(np.random.random() < expected % 1)  # noqa: NPY002
+            num_real = int(expected) + int(np.random.random() < expected % 1)  # noqa: NPY002
         self.model_buffer.device = self.device  # which SB3 sets where it loads a buffer
         parts = [super().sample(num_real, env)] if num_real else []
         if num_real < batch_size:

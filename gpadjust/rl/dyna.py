@@ -44,12 +44,9 @@ class Dyna(OffPolicyAlgorithm):
     and model experience lie in one :class:`MixedReplayBuffer` (Sutton 1990; Wannawas and Faisal
     2023, sec. 2.3). Model steps do not count as time steps. All else is the learner's: callbacks,
     ``VecNormalize``, schedules, ``predict``, and ``save`` and ``load``, which keep the learner
-    alone: an :class:`~gpadjust.control.EpisodeCheckpoint` keeps all of a run.
-
-    An error on the way loses nothing, and steps that fail are no data, as of
-    :class:`gpadjust.control.Agent`: mend what is wrong, set ``agent.task``, for example, and call
-    ``learn`` again. Dynamics that know nothing learn all real episodes. (Where the environment was
-    wrong, ``agent.replay_buffer.reset()`` forgets what it said.)
+    alone: an :class:`~gpadjust.control.EpisodeCheckpoint` keeps all of a run. Errors and steps that
+    fail lose nothing, as of :class:`gpadjust.control.Agent`; where the environment was wrong,
+    ``agent.replay_buffer.reset()`` forgets what it said.
 
     A learner of Stable-Baselines3 becomes one of this family as
     ``class DynaTD3(Dyna, TD3): ...``, if it is off-policy and its ``train`` samples from
@@ -58,8 +55,7 @@ class Dyna(OffPolicyAlgorithm):
     Args:
         policy: As in the learner.
         env: The real environment; observations are those of the spec of the dynamics.
-        task: What is known of the system; the rewards and terminations are compared with those of
-            each real episode before the agent learns from it.
+        task: What is known of the system.
         options: How the model is used.
         buffer_size: Real transitions that the learner keeps.
         learning_starts: As in the learner. Default: the untrained policy acts in the first episode.
@@ -283,12 +279,7 @@ class Dyna(OffPolicyAlgorithm):
     # What it knows
 
     def model_env(self, num_envs: int) -> ModelVecEnv:
-        """Return the dynamics, as they stand, as an environment of ``num_envs`` particles.
-
-        Raises:
-            ValueError: If there are neither real episodes nor ``initial_states``, or no episode
-                length.
-        """
+        """Return the dynamics, as they stand, as an environment of ``num_envs`` particles."""
         rewards = self.replay_buffer.episodes.rewards
         return ModelVecEnv(
             self.model_task(),
@@ -300,11 +291,7 @@ class Dyna(OffPolicyAlgorithm):
         )
 
     def model_task(self) -> Task:
-        """Return the task, with length, starts and bounds of environment and episodes.
-
-        Raises:
-            ValueError: If there is no episode length.
-        """
+        """Return the task, with length, starts and bounds of environment and episodes."""
         return real.completed(self.task, self.recorded_episodes(), self.env)
 
     def recorded_episodes(self, newest: int | None = None) -> Trajectories:
@@ -323,7 +310,7 @@ class Dyna(OffPolicyAlgorithm):
         several = isinstance(callback, list | CallbackList)
         given = getattr(callback, "callbacks", callback) if several else [callback]
         if self.use_sde and any(isinstance(each, EpisodeCheckpoint) for each in given):
-            raise ValueError(
+            raise ValueError(  # SB3 draws noise before it calls callbacks, and again after resume
                 "EpisodeCheckpoint cannot resume generalised state-dependent exploration exactly; "
                 f"use {type(self).__name__} with use_sde=False."
             )
@@ -367,11 +354,7 @@ class Dyna(OffPolicyAlgorithm):
     def predict(
         self, observation: Any, *args: Any, **kwargs: Any
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Choose actions as the learner does; refuse an observation that cannot be data.
-
-        Raises:
-            ValueError: If a number of it is not finite, or larger than 1e25.
-        """
+        """Choose actions as the learner does; a ValueError if an observation cannot be data."""
         check_observation(observation)
         return super().predict(observation, *args, **kwargs)
 
