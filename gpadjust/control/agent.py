@@ -76,6 +76,7 @@ class Agent(ABC):
 
     Attributes:
         task: The task; where it is set, the next ``learn`` improves in it first.
+        model: The task in the newest model, by which it acts; None as long as actions are random.
         num_timesteps: Real steps.
         num_episodes: Real episodes that the dynamics have learnt.
         promised_reward: The reward of a step that the model had promised of the episodes that were
@@ -90,7 +91,7 @@ class Agent(ABC):
             should; after a real episode, if its rewards or terminations are not those of the task.
     """
 
-    not_saved: ClassVar[tuple[str, ...]] = ("env", "_task", "_model", "_callbacks", "_random_state")
+    not_saved: ClassVar[tuple[str, ...]] = ("env", "_task", "model", "_callbacks", "_random_state")
     """Attributes that are not in checkpoints, beside those of the classes above.
 
     A subclass names those that hold a task, a model or the dynamics, or cannot be pickled; a
@@ -98,9 +99,8 @@ class Agent(ABC):
     """
 
     _task: Task
-    _model: Task | None  # the task in the newest model, once it was asked for
-    _acts: bool  # in it; else actions are random
-    _is_improved: bool
+    model: Task | None
+    _can_act: bool | None  # in the newest model; None before it has improved in it
     _filter: StateFilter | None
     _random_state: Any = None  # of a run that goes on, until `learn`
 
@@ -237,7 +237,7 @@ class Agent(ABC):
         """Play a real episode, and record its steps."""
         observation, self._start = self._reset(), None
         begun, state, promised = time.perf_counter(), None, None
-        random_actions = None if self._acts else self._random_actions()
+        random_actions = self._random_actions() if self.model is None else None
         rows: list[episodes.Row] = []
         getattr(self.action_noise, "reset", lambda: None)()
         try:
@@ -318,7 +318,7 @@ class Agent(ABC):
         is_new = known.episode >= self.num_episodes
         new = known.some(is_new) if dynamics.has_learnt else known
         if len(new) < (1 if dynamics.is_fitted else 2):  # a first fit needs two
-            self._is_improved &= len(new) == 0  # there is another start
+            self._can_act = None if len(new) else self._can_act  # there is another start
             return
         if self.reward_tolerance is not None and state_filter is None:
             episodes.check_functions(task, new, self.reward_tolerance)
@@ -326,7 +326,7 @@ class Agent(ABC):
             whole = episodes.completed(task, known, self.env)
             values = episodes.learn_dynamics(whole, new, known, self.score_horizons)
         promises, self.num_episodes = self._promises[self.num_episodes :], len(self._promises)
-        self._forget_model()
+        self.model, self._can_act = None, None
         made = [each for each in promises if each is not None]  # none by random actions
         self.promised_reward = sum(made) / len(made) if made and made == promises else None
         values["real_reward"] = float(known.rewards[is_new].mean())
@@ -339,16 +339,14 @@ class Agent(ABC):
 
     def _improve(self) -> None:
         """Improve in what is known, if that is something and actions are not to be random."""
-        is_time = not self._is_improved and self.num_timesteps >= self.random_steps
-        task = self.known_task() if is_time else None
-        if task is None:
+        is_random = self.num_timesteps < self.random_steps
+        if self._can_act is not None or is_random or (task := self.known_task()) is None:
             return
         with episodes.timed(self.wall_time, "update"):
             can_act: Any = self.improve(task)
         name = f"{type(self).__name__}.improve"
         check_kind(f"The result of {name}", can_act, bool | np.bool_, "True if it can act by now")
-        self._is_improved, self._acts = True, bool(can_act)
-        self._model = task if can_act else None
+        self._can_act, self.model = bool(can_act), task if can_act else None
 
     def tell(self, event: str, values: dict[str, float] | None = None) -> None:
         """Call the callbacks."""
@@ -368,7 +366,7 @@ class Agent(ABC):
             "task", task, Task, "a Task(dynamics, reward, ...), which an agent needs to learn"
         )
         self._task, self._filter = task, None
-        self._forget_model()
+        self.model, self._can_act = None, None
 
     def warn_of_bounds(self, share: float, what: str) -> None:
         """Warn if what was planned leaves the bounds of the states in over a tenth of its runs."""
@@ -381,15 +379,6 @@ class Agent(ABC):
                 stacklevel=3,
             )
 
-    def _forget_model(self) -> None:
-        """Note that there is a newer model, in which the agent has not improved."""
-        self._model, self._acts, self._is_improved = None, False, False
-
-    @property
-    def model(self) -> Task | None:
-        """The task in the newest model, by which it acts; None as long as actions are random."""
-        return self.newest_model if self._acts else None
-
     @property
     def newest_model(self) -> Task:
         """``model``, or before the agent has learnt to act, the task in data or physics.
@@ -397,13 +386,12 @@ class Agent(ABC):
         Raises:
             RuntimeError: If there is neither.
         """
-        task = self.known_task() if self._model is None else self._model
+        task = self.known_task() if self.model is None else self.model
         if task is None:
             raise RuntimeError(
                 f"{type(self).__name__} knows nothing of the system yet; call `learn`, or give the "
                 "dynamics a physics."
             )
-        self._model = task if self._acts else None
         return task
 
     def known_task(self) -> Task | None:
@@ -454,8 +442,9 @@ class Agent(ABC):
 
     def go_on(self, env: Any, task: Task, environment: bytes | None) -> None:
         """Take environment and task, after the attributes of a checkpoint."""
-        self._task, self._model, self._callbacks = task, None, []
+        self._task, self._callbacks = task, []
         self.env = env if environment is None else cloudpickle.loads(environment)
+        self.model = self.known_task() if self._can_act else None
         self._start = None if environment is None else self._start  # it will be reset
 
 
