@@ -171,8 +171,7 @@ class Dyna(OffPolicyAlgorithm):
         buffer, options, dynamics = self.replay_buffer, self.options, self.task.dynamics
         if not buffer.size():
             return  # all steps failed
-        last = np.inf if options.last_model_episode is None else options.last_model_episode
-        uses_model = self.num_episodes < last
+        uses_model = options.uses_model(self.num_episodes)
         known = self.recorded_episodes()
         new = known.some(slice(buffer.num_learnt, None))
         data = new if dynamics.has_learnt else known
@@ -207,11 +206,13 @@ class Dyna(OffPolicyAlgorithm):
 
     def _train_in_model(self, num_episodes: int, batch_size: int) -> None:
         """Run model episodes, side by side, with updates at each step."""
+        if not num_episodes:
+            return
         at_once = self.options.num_particles or num_episodes
         # SB3 counts the updates between two of the target networks from each call of train().
         together = getattr(self, "target_update_interval", 1)
         all_returns, num_left, num_steps = [], 0, 0
-        for start in range(0, num_episodes, at_once or 1):
+        for start in range(0, num_episodes, at_once):
             env = self.model_env(min(num_episodes - start, at_once))
             noise = self._model_noise(env.num_envs)
             with real.timed(self.wall_time, "rollout"):
@@ -244,10 +245,9 @@ class Dyna(OffPolicyAlgorithm):
             all_returns.append(returns)
             for hook in self.model_hooks:
                 hook.on_model_episodes(returns)
-        if num_episodes:
-            self.logger.record("model/ep_rew_mean", float(np.concatenate(all_returns).mean()))
-            self.logger.record("model/left_bounds", num_left)
-        if 0 < num_steps == num_left == self.replay_buffer.model_buffer.size():
+        self.logger.record("model/ep_rew_mean", float(np.concatenate(all_returns).mean()))
+        self.logger.record("model/left_bounds", num_left)
+        if num_steps == num_left == self.replay_buffer.model_buffer.size():
             warnings.warn(
                 "All model episodes left the bounds of the states at once, so the agent has learnt "
                 "nothing of use from the model. Check the task's initial_states, or pass "
