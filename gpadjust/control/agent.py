@@ -221,8 +221,8 @@ class Agent(ABC):
             task.dynamics.state_dict()  # or an error: they learn all again after each episode
             if self.known_task() is None:
                 raise ValueError(
-                    "Hidden states are estimated in a model of the system; give the dynamics a "
-                    "physics, or leave the sensors out."
+                    "Hidden states are estimated in a model; give the dynamics a physics, or leave "
+                    "the sensors out."
                 )
         episodes.try_task(task, np.atleast_2d(self._reset()), self.env)
 
@@ -362,9 +362,7 @@ class Agent(ABC):
 
     @task.setter
     def task(self, task: Task) -> None:
-        check_kind(
-            "task", task, Task, "a Task(dynamics, reward, ...), which an agent needs to learn"
-        )
+        check_kind("task", task, Task, "a Task(dynamics, reward, ...), which it needs to learn")
         self._task, self._filter = task, None
         self.model, self._can_act = None, None
 
@@ -389,8 +387,8 @@ class Agent(ABC):
         task = self.known_task() if self.model is None else self.model
         if task is None:
             raise RuntimeError(
-                f"{type(self).__name__} knows nothing of the system yet; call `learn`, or give the "
-                "dynamics a physics."
+                f"{type(self).__name__} knows nothing of the system yet; call `learn`, or pass "
+                "dynamics with a physics."
             )
         return task
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import cloudpickle
-from filelock import AcquireReturnProxy, FileLock, Timeout
+from filelock import FileLock, Timeout
 
 from gpadjust.checks import check_kind, checked_whole
 from gpadjust.control.episodes import generators, layer_names
@@ -71,20 +71,8 @@ class EpisodeCheckpoint:
             TypeError: If an attribute of the agent cannot be pickled.
             RuntimeError: If another run writes to this file.
         """
-        with self.locked():
+        with locked([self]):
             self._write(agent)
-
-    def locked(self) -> AcquireReturnProxy[Any]:
-        """Acquire the lock of the file, as a context manager."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(self.path.with_name(f"{self.path.name}.lock"))
-        try:
-            return lock.acquire(blocking=False)
-        except Timeout as error:
-            raise RuntimeError(
-                f"Another run writes checkpoints to {self.path}, and holds the lock "
-                f"{lock.lock_file}. Wait for it, or give this run a file of its own."
-            ) from error
 
     def _write(self, agent: Any) -> None:
         about = json.dumps(_about(type(agent), agent.env, agent.task))
@@ -231,7 +219,14 @@ def pickled_environment(env: Any) -> bytes | None:
 def locked(callbacks: Iterable[Any]) -> Iterator[None]:
     """Hold the locks of those callbacks that are checkpoints."""
     with ExitStack() as stack:
-        for callback in callbacks:
-            if isinstance(callback, EpisodeCheckpoint):
-                stack.enter_context(callback.locked())
+        for path in (each.path for each in callbacks if isinstance(each, EpisodeCheckpoint)):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            lock = FileLock(path.with_name(f"{path.name}.lock"))
+            try:
+                stack.enter_context(lock.acquire(blocking=False))
+            except Timeout as error:
+                raise RuntimeError(
+                    f"Another run writes checkpoints to {path}, and holds the lock "
+                    f"{lock.lock_file}. Wait for it, or give this run a file of its own."
+                ) from error
         yield

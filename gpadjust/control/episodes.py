@@ -75,10 +75,7 @@ def episode_length(task: Task, env: Any) -> int:
                 limit = env.get_attr(name)[0] if is_vector else env.get_wrapper_attr(name)
                 length = getattr(limit, "max_episode_steps", limit)
     if length is None:
-        raise ValueError(
-            "There is no environment, or no time limit that could be read of it; give the task "
-            "an episode_length, the number of steps of an episode."
-        )
+        raise ValueError("The environment has no time limit; give the task an episode_length.")
     return int(length)
 
 
@@ -244,11 +241,10 @@ def check_functions(task: Task, data: Trajectories, tolerance: float = 1e-3) -> 
     if (error > tolerance * data.rewards.abs().max().clamp_min(1e-6)).any():
         i = int(error.argmax())
         raise ValueError(
-            "reward(states, actions, next_states) is not the environment's: transition "
-            f"{i} gave {data.rewards[i]:.6g}, but the function says {rewards[i]:.6g}; "
-            f"{row(i)}. Correct the function, or the spec of the state (its order, and "
-            "which entries are angles, seen as sine and then cosine). If rewards or "
-            "observations are noisy, raise reward_tolerance; None checks nothing."
+            f"reward(states, actions, next_states) is not the environment's: transition {i} gave "
+            f"{data.rewards[i]:.6g}, but the function says {rewards[i]:.6g}; {row(i)}. Correct the "
+            "function, or the spec (order of the states, and angles, seen as sine and then "
+            "cosine). If rewards are noisy, raise reward_tolerance; None checks nothing."
         )
     terminated = task.terminations(data.next_states)
     for i in (terminated != data.terminated).nonzero().flatten().tolist():

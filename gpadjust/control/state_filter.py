@@ -33,17 +33,11 @@ _TINY = 1e-300  # in the place of a variance of zero
 
 
 class Estimate(NamedTuple):
-    """An estimate of a state.
+    """An estimate of a state, and the action that is taken there."""
 
-    Args:
-        mean: ``state_dim``.
-        covariance: ``state_dim x state_dim``.
-        action: What is done there, ``action_dim``.
-    """
-
-    mean: Tensor
-    covariance: Tensor
-    action: Tensor | None = None
+    mean: Tensor  # state_dim
+    covariance: Tensor  # state_dim x state_dim
+    action: Tensor | None = None  # action_dim
 
 
 class StateFilter(NamedTuple):
@@ -67,13 +61,8 @@ class StateFilter(NamedTuple):
     def guessed(cls, task: Task, action_bounds: Tensor) -> Self:
         """Return the filter before there are data, by random actions in a task's model.
 
-        Both noises are a tenth of what changes in a step there, unless the sensors have a guess.
-        It takes the first steps, as a system that is not stable runs away later. PyTorch's
-        generator is left as it is.
-
-        Args:
-            task: A task with sensors, starts and length.
-            action_bounds: ``2 x action_dim``.
+        Both noises are a tenth of what changes in a first step there (later an unstable system runs
+        away), unless the sensors have a guess. PyTorch's generator is left as it is.
         """
         spec, sensors = task.dynamics.spec, task.sensors
         assert sensors is not None, "asked before"
@@ -102,9 +91,6 @@ class StateFilter(NamedTuple):
             task: The task in the newest model.
             observations: What the sensors show, ``n x observation_dim``.
             earlier: The estimates before, with the actions taken; None of an episode that begins.
-
-        Raises:
-            PhysicsError: If the physics fails at an estimate.
         """
         spec = task.dynamics.spec
         ahead = [self.start if each is None else each for each in earlier]
@@ -143,8 +129,8 @@ def smooth_episodes(
         seed: Seed of the draw.
 
     Returns:
-        The filter with the noises that are most likely, and the episodes with states drawn from
-        their posterior: as rough as the machine's.
+        The filter with the most likely noises, and the episodes with states drawn from their
+        posterior: as rough as the machine's.
     """
     spec, sensors, episodes = task.dynamics.spec, task.sensors, observed.episodes()
     assert sensors is not None, "asked before"
@@ -213,11 +199,9 @@ def _filtered(
 
 
 def _measured_near(task: Task, states: Tensor, observations: Tensor) -> tuple[Tensor, Tensor]:
-    """Return outputs near ``N`` states as a linear function of these.
+    """Return outputs near ``N`` states as matrices ``N x m x state_dim`` times the state.
 
-    Returns:
-        Matrices ``N x m x state_dim``, and ``N x m`` of what was measured as it would be if
-        outputs were these times the state; angles the shortest way from the angles of the states.
+    And what was measured as it would be by these, ``N x m``; angles the shortest way.
     """
     spec, sensors = task.dynamics.spec, task.sensors
     assert sensors is not None, "asked before"

@@ -114,15 +114,9 @@ class Dyna(OffPolicyAlgorithm):
         **kwargs: Any,
     ) -> None:
         if kwargs.get("n_steps", 1) != 1:
-            raise ValueError(
-                f"{type(self).__name__} has no n-step returns; found n_steps={kwargs['n_steps']}: "
-                "model transitions do not lie in the order of a trajectory."
-            )
+            raise ValueError(f"Dyna has no n-step returns; found n_steps={kwargs['n_steps']}.")
         if gradient_steps == 0:
-            raise ValueError(
-                "gradient_steps must not be 0: without updates on real episodes Stable-Baselines3 "
-                "does not call train(), and the model would never learn. Pass 1 or more, or -1."
-            )
+            raise ValueError("gradient_steps must be 1 or more, or -1, for the model to learn.")
         self.task: Any = task
         self.options = DynaOptions() if options is None else options
         self.num_episodes = 0
@@ -156,8 +150,7 @@ class Dyna(OffPolicyAlgorithm):
         if self.task is None:
             raise ValueError(
                 f"{name} needs a task to learn; found None. Pass task=Task(dynamics, reward, ...) "
-                f"to {name} or, as it is not saved, to {name}.load. Without it the agent can only "
-                "predict."
+                f"to {name} or, as it is not saved, to {name}.load."
             )
         check_kind("task", self.task, Task, "a Task(dynamics, reward, ...)")
         check_kind("options", self.options, DynaOptions, "DynaOptions(...)")
@@ -249,9 +242,8 @@ class Dyna(OffPolicyAlgorithm):
         self.logger.record("model/left_bounds", num_left)
         if num_steps == num_left == self.replay_buffer.model_buffer.size():
             warnings.warn(
-                "All model episodes left the bounds of the states at once, so the agent has learnt "
-                "nothing of use from the model. Check the task's initial_states, or pass "
-                "state_bounds.",
+                "All model episodes left the bounds of the states at once: the agent has learnt "
+                "nothing of use from them. Check the task's initial_states, or pass state_bounds.",
                 UserWarning,
                 stacklevel=2,
             )
@@ -310,10 +302,8 @@ class Dyna(OffPolicyAlgorithm):
         several = isinstance(callback, list | CallbackList)
         given = getattr(callback, "callbacks", callback) if several else [callback]
         if self.use_sde and any(isinstance(each, EpisodeCheckpoint) for each in given):
-            raise ValueError(  # SB3 draws noise before it calls callbacks, and again after resume
-                "EpisodeCheckpoint cannot resume generalised state-dependent exploration exactly; "
-                f"use {type(self).__name__} with use_sde=False."
-            )
+            # SB3 draws noise before it calls callbacks, and again after resume.
+            raise ValueError("EpisodeCheckpoint cannot resume use_sde=True exactly; use False.")
         callbacks = [AgentCallback.around(each) for each in given]
         with locked(given):
             known = callbacks if several else callbacks[0]

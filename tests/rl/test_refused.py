@@ -50,7 +50,7 @@ CALLS = [
     (lambda at: type("Other", (TD3, Dyna), {}), r"Dyna first .* class Other\(Dyna, .* found TD3"),
     (lambda at: type("Other", (Dyna, PPO), {}), "then an off-policy learner, .* found PPO"),
     (lambda at: at.agent(at.env().unwrapped, episode_length=None).learn(5), "no time limit"),
-    (lambda at: at.agent(use_sde=True).learn(5, at.checkpoint), "use_sde=False"),
+    (lambda at: at.agent(use_sde=True).learn(5, at.checkpoint), "cannot resume use_sde=True"),
     (lambda at: at.sac().learn(5, at.checkpoint), "is for learners with a model"),
     (lambda at: at.sac().learn(5, DynaCallback()), "DynaCallback is for Dyna agents.*found SAC"),
     (lambda at: at.agent().model_env(3), "initial_states"),
