@@ -31,20 +31,10 @@ class DynaCallback(BaseCallback):
         return True
 
     def on_model_fit(self, metrics: dict[str, float]) -> None:
-        """Do something after the dynamics were fitted.
-
-        Args:
-            metrics: ``"fit_seconds"``; and of the newest real transitions, predicted before they
-                were learnt, as soon as the dynamics can predict: ``"nlpd"`` and ``"coverage"``,
-                averaged over the states, and ``"rmse/<state>"`` of each.
-        """
+        """Do something after a fit, with the numbers of the event ``"fit"`` of an ``Agent``."""
 
     def on_model_episodes(self, returns: np.ndarray) -> None:
-        """Do something after some model episodes that ran side by side.
-
-        Args:
-            returns: The sum of rewards of each.
-        """
+        """Do something after model episodes that ran side by side, with the return of each."""
 
 
 class AgentCallback(DynaCallback):

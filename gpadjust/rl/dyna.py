@@ -299,14 +299,14 @@ class Dyna(OffPolicyAlgorithm):
 
     def learn(self, total_timesteps: int, callback: Any = None, *args: Any, **kwargs: Any) -> Self:
         """Learn; callbacks may be, or hold, an ``EpisodeCheckpoint`` and ``print_progress``."""
-        several = isinstance(callback, list | CallbackList)
-        given = getattr(callback, "callbacks", callback) if several else [callback]
+        given = callback if isinstance(callback, list) else [callback]
+        given = callback.callbacks if isinstance(callback, CallbackList) else given
         if self.use_sde and any(isinstance(each, EpisodeCheckpoint) for each in given):
             # SB3 draws noise before it calls callbacks, and again after resume.
             raise ValueError("EpisodeCheckpoint cannot resume use_sde=True exactly; use False.")
-        callbacks = [AgentCallback.around(each) for each in given]
+        known = [AgentCallback.around(each) for each in given]
         with locked(given):
-            known = callbacks if several else callbacks[0]
+            known = known[0] if len(known) == 1 else known
             return super().learn(total_timesteps, known, *args, **kwargs)
 
     def _setup_learn(

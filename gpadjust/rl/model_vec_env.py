@@ -39,12 +39,10 @@ class ModelVecEnv(VecEnv):
     Any algorithm of Stable-Baselines3 can learn in it. A step of all particles is one call of the
     model. Its randomness is PyTorch's global generator.
 
-    **Leaving the bounds never pays.** A particle that would leave the bounds of the task or the
-    finite numbers, or meets a failure of the physics, stays where it is, and its episode ends, with
-    ``info["left_bounds"]`` (which the last step of every episode has). Its reward is the worst that
-    was seen. If that is negative the episode is truncated: who learns in it goes on valuing the
-    state where it stayed, so that leaving again and again is as bad as can be, and leaving once
-    costs a step. If all rewards were positive, it is terminated: there is nothing more to earn.
+    Leaving the bounds never pays: a particle that would leave the bounds of the task or the finite
+    numbers, or meets a failure of the physics, stays where it is, and its episode ends, with
+    ``info["left_bounds"]`` and the worst reward that was seen. If that is negative the episode is
+    truncated, as its learner goes on valuing the state where it stayed; else it is terminated.
 
     Args:
         task: What is known; its dynamics must be fitted, and it must say where episodes start and
@@ -54,9 +52,8 @@ class ModelVecEnv(VecEnv):
         action_space: The policy's.
         sampling: ``"step"``: each step is a draw of its own from the predictive distribution, as
             in the paper. ``"trajectory"``: between two calls of ``reset``, each particle follows a
-            transition function of its own, drawn from the posterior, so that what it meets is
-            consistent along its trajectory. (In the terms of PETS, trajectory sampling 1 and
-            infinity; Chua et al. 2018. Stable-Baselines3 calls ``reset`` once in ``learn``.)
+            transition function of its own, drawn from the posterior. (In the terms of PETS,
+            trajectory sampling 1 and infinity; Chua et al. 2018.)
         worst_reward: The worst reward seen elsewhere, such as in real episodes.
 
     Attributes:
