@@ -50,8 +50,7 @@ def plot_record(
     Raises:
         TypeError: If ``record`` is no :class:`Record`, or ``spec`` no :class:`StateSpec`.
         ValueError: If the record has not the columns of the spec, a unit is of an unknown name,
-            the number of ``axes`` is another one, or times are so uneven that what a gap is cannot
-            be told.
+            or the number of ``axes`` is another one.
 
     Example:
         >>> import torch
