@@ -77,7 +77,7 @@ def plot_record(
             end, start = (float(record.times[k]) for k in (before.stop - 1, after.start))
             if end < start:
                 ax.axvspan(end, start, color=GREY, alpha=0.2, lw=0)
-            if record.segments and record.segments[before.start] != record.segments[after.start]:
+            if record.segments[before.start] != record.segments[after.start]:
                 ax.axvline(start, color=GREY, lw=0.8, ls=":")
         ax.set(ylabel=called[name])
         tidy(ax)

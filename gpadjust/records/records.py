@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
-from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpadjust.checks import check_kind, checked_number
+from gpadjust.checks import check_finite, check_kind, checked_number
 from gpadjust.core.data import ArrayLike, as_tensor
 from gpadjust.dynamics import Trajectories, Windows
 from gpadjust.dynamics.targets import check_spec
@@ -25,7 +24,6 @@ _GAP = 1.5  # typical steps: a longer time between two rows is a gap
 _OFTEN = 0.1  # share of the times between rows above which they are not gaps, but uneven
 _JITTER = 0.1  # of the sampling step, by which the time between two rows may differ from it
 _SAME = 0.01  # of a step, by which another one may differ from it
-_EVEN = "Interpolate each column at even times first, as by `numpy.interp`; unwrap angles before."
 
 
 class Record:
@@ -43,6 +41,9 @@ class Record:
         actions: ``N x action_dim``.
         segments: ``N`` labels; a segment ends wherever the label changes. Default: one for all.
         name: The name in errors.
+
+    Attributes:
+        sampling_step: The mean time from one row to the next, without gaps.
 
     Values are tensors in float64, NumPy arrays, or columns of a pandas frame.
 
@@ -72,8 +73,35 @@ class Record:
         self.states = self._numbers(states, "states", 2)
         self.actions = self._numbers(actions, "actions", 2)
         labels: Any = segments.tolist() if hasattr(segments, "tolist") else segments
-        self.segments = None if labels is None else tuple(labels)
-        self._check()
+        self.segments = tuple(labels or [0] * len(self.times))
+        rows = {name: len(getattr(self, name)) for name in ("times", "states", "actions")}
+        rows["segments"] = len(self.segments)
+        if len({*rows.values()}) > 1:
+            counts = ", ".join(f"{number} of {name}" for name, number in rows.items())
+            raise self._error(f": expected as many rows of each, found {counts}.")
+        states = self.states.nan_to_num(nan=0.0, posinf=math.inf, neginf=-math.inf)
+        parts = {"times": self.times.unsqueeze(-1), "states": states, "actions": self.actions}
+        for part, tensor in parts.items():
+            check_finite(f"{part} of record {name!r}", tensor)
+        together = [label == after for label, after in pairwise(self.segments)]
+        self._together = torch.tensor(together, dtype=torch.bool)  # in a segment
+        steps = self.times.diff()
+        if not self._together.any():
+            raise self._error(
+                ": expected two rows or more of a segment, one after the other, found "
+                f"{len(self.times)} in all; leave the record out, or correct `segments`."
+            )
+        stops = (steps <= 0) & self._together
+        if stops.any():
+            row = int(stops.nonzero()[0]) + 1
+            before, time = self.times[row - 1 : row + 1].tolist()
+            raise self._error(
+                f", row {row}: expected times that rise, found {time:.10g} after {before:.10g}. "
+                "Leave out rows that were written twice; where the clock was set again, begin a "
+                "new segment by `segments`."
+            )
+        self._goes_on = self._together & (steps <= _GAP * steps[self._together].median())
+        self.sampling_step = float(steps[self._goes_on].mean())
 
     def __repr__(self) -> str:
         states, actions = self.states.shape[1], self.actions.shape[1]
@@ -82,45 +110,30 @@ class Record:
             f"{states} state{'s' * (states > 1)}, {actions} action{'s' * (actions > 1)})"
         )
 
-    @property
-    def sampling_step(self) -> float:
-        """The mean time from one row to the next, without gaps."""
-        return float(self.times.diff()[self._goes_on].mean())
-
     def stretches(self) -> list[slice]:
         """Return the rows that follow each other without a gap, stretch by stretch."""
         ends = (~self._goes_on).nonzero().flatten() + 1
         return [slice(*edges) for edges in pairwise([0, *ends.tolist(), len(self.times)])]
 
-    def check_even(self) -> None:
-        """Raise a ValueError unless the sampling is even, to a tenth of its step, but for gaps."""
-        steps, step = self.times.diff(), self.sampling_step
-        gaps = int((self._same_segment & ~self._goes_on).sum())
-        total = int(self._same_segment.sum())
-        if gaps > max(1, _OFTEN * total):
+    def rows_in(self, step: float) -> int:
+        """Return how many rows make a control step; a ValueError unless the sampling is even."""
+        times, sampling = self.times.diff(), self.sampling_step
+        is_gap = (self._together & ~self._goes_on)[self._together]
+        is_off = (times[self._goes_on] - sampling).abs() > _JITTER * sampling
+        if is_off.any() or is_gap.sum() > max(1, _OFTEN * len(is_gap)):
+            low, high = times[self._together].aminmax()
             raise self._error(
-                f": expected even sampling with few gaps, found {gaps} of {total} times between "
-                f"rows longer than {_GAP:g} times the median. {_EVEN}"
+                f": expected even sampling, to a tenth of its step {sampling:.4g} and with few "
+                f"gaps, found times between rows from {low:.4g} to {high:.4g}. Interpolate each "
+                "column at even times first, as by `numpy.interp`; unwrap angles before."
             )
-        off = (steps - step).abs().where(self._goes_on, torch.zeros_like(steps))
-        if off.max() > _JITTER * step:
-            row = int(off.argmax())
+        every = round(step / sampling)
+        if abs(step - every * sampling) > _SAME * step:
             raise self._error(
-                f": expected even sampling, to a tenth of its step {step:.4g}, found "
-                f"{float(steps[row]):.4g} from row {row} to the next. {_EVEN}"
+                f": expected a control step that is a whole multiple of the sampling step, "
+                f"{sampling:.4g}, got {step:.4g}; take {max(every, 1) * sampling:.4g}."
             )
-
-    @cached_property
-    def _same_segment(self) -> Tensor:
-        """True for each row but the last if the next one is of the same segment, ``N - 1``."""
-        labels = self.segments or [0] * len(self.times)
-        return torch.tensor([one == other for one, other in pairwise(labels)], dtype=torch.bool)
-
-    @cached_property
-    def _goes_on(self) -> Tensor:
-        """True for each row but the last if the next one follows without a gap, ``N - 1``."""
-        steps = self.times.diff()
-        return self._same_segment & (steps <= _GAP * steps[self._same_segment].median())
+        return every
 
     def _error(self, message: str) -> ValueError:
         return ValueError(f"Record {self.name!r}{message}")
@@ -134,43 +147,6 @@ class Record:
                 + ("; of a single column, use `.reshape(-1, 1)`." if dims > tensor.dim() else ".")
             )
         return tensor
-
-    def _check(self) -> None:
-        """Raise a ValueError unless rows are as many, two follow each other, and values known."""
-        parts = {"times": self.times, "states": self.states, "actions": self.actions}
-        rows = {name: len(part) for name, part in parts.items()}
-        rows |= {} if self.segments is None else {"segments": len(self.segments)}
-        if len({*rows.values()}) > 1:
-            counts = ", ".join(f"{number} of {name}" for name, number in rows.items())
-            raise self._error(f": expected as many rows of each, found {counts}.")
-        if not self._same_segment.any():
-            raise self._error(
-                ": expected two rows or more of a segment, one after the other, found "
-                f"{len(self.times)} in all; leave the record out, or correct `segments`."
-            )
-        ways_out = {
-            "times": "leave the row out",
-            "states": "put NaN where an entry was not measured",
-            "actions": "split the record there, by `segments` or in two, without that row",
-        }
-        for name, part in parts.items():
-            values = part.reshape(len(part), -1)
-            bad = values.isinf() if name == "states" else ~values.isfinite()
-            if bad.any():
-                row, column = bad.nonzero()[0].tolist()
-                raise self._error(
-                    f", row {row}: expected finite numbers, found {float(values[row, column])} in "
-                    f"column {column} of {name}; {ways_out[name]}."
-                )
-        stops = (self.times.diff() <= 0) & self._same_segment
-        if stops.any():
-            row = int(stops.nonzero()[0]) + 1
-            before, time = self.times[row - 1 : row + 1].tolist()
-            raise self._error(
-                f", row {row}: expected times that rise, found {time:.10g} after {before:.10g}. "
-                "Leave out rows that were written twice; where the clock was set again, begin a "
-                "new segment by `segments`."
-            )
 
 
 def _in_seconds(times: ArrayLike) -> ArrayLike:
@@ -363,11 +339,9 @@ class Records:
         complete = ~data.states.isnan().any(-1)
         kept = data.some(complete & ~data.next_states[:, self.spec.predicted].isnan().all(-1))
         if not len(kept.states):
-            columns = zip(self.spec.states, (~data.states.isnan()).sum(0).tolist(), strict=True)
             raise ValueError(
                 f"Expected steps from a state that was measured in full, found none of "
-                f"{len(data.states)}; of these were measured, state by state: "
-                f"{', '.join(f'{name} {number}' for name, number in columns)}.{self._hidden(data)}"
+                f"{len(data.states)}.{self._hidden(data)}"
             )
         if len(kept.states) < len(data.states):
             warnings.warn(
@@ -420,9 +394,10 @@ def control_steps(records: Records, step: float | None) -> Records:
     """
     if not isinstance(records, Records):
         raise TypeError(f"Expected records as Records([record, ...], spec), found {records!r}.")
-    spec, (step, every) = records.spec, _step_and_rows(records, step)
+    spec, step = records.spec, _checked_step(records, step)
     steps, short = [], 0
     for record in records:
+        every = record.rows_in(step)
         for rows in record.stretches():
             number = (rows.stop - rows.start - 1) // every
             if not number:
@@ -439,8 +414,8 @@ def control_steps(records: Records, step: float | None) -> Records:
             steps.append(Record(times, states, actions, name=record.name))
     if not steps:
         raise ValueError(
-            f"Expected a stretch of {every + 1} rows or more, which are a control step, found none "
-            f"of {short}; take a shorter step."
+            f"Expected a stretch as long as a control step, {step:.4g}, found none of {short}; "
+            "take a shorter step."
         )
     if short:
         warnings.warn(
@@ -457,34 +432,18 @@ def remember(states: Tensor, actions: Tensor, spec: StateSpec) -> None:
         states[1:] = spec.remember(states[1:].clone(), states[:-1].clone(), actions[:-1])
 
 
-def _step_and_rows(records: Records, step: float | None) -> tuple[float, int]:
-    """Return the control step, and the number of rows of the records that make it."""
-    for record in records:
-        record.check_even()
-    fast = min(records, key=lambda record: record.sampling_step)
-    slow = max(records, key=lambda record: record.sampling_step)
-    sampling, spec_step = fast.sampling_step, records.spec.step
-    if slow.sampling_step - sampling > _SAME * sampling:
+def _checked_step(records: Records, step: float | None) -> float:
+    """Return the control step: the one given, that of the spec, or the first sampling step."""
+    wanted = None if step is None else checked_number("step", step, above=0)
+    known = records.spec.step
+    if wanted is None or known is None:
+        return wanted or known or records.records[0].sampling_step
+    if abs(wanted - known) > _SAME * known:
         raise ValueError(
-            f"Expected records of one sampling step, found {sampling:.4g} of {fast.name!r} and "
-            f"{slow.sampling_step:.4g} of {slow.name!r}; interpolate them at times of one step, "
-            "or make `Records` of each."
-        )
-    wanted = spec_step if step is None else checked_number("step", step, above=0)
-    if wanted is None:
-        return sampling, 1
-    if spec_step is not None and abs(wanted - spec_step) > _SAME * spec_step:
-        raise ValueError(
-            f"Expected the step of the spec, {spec_step:.4g}, got {wanted:.4g}; leave `step` out, "
+            f"Expected the step of the spec, {known:.4g}, got {wanted:.4g}; leave `step` out, "
             "or make a spec with this step."
         )
-    every = round(wanted / sampling)
-    if abs(wanted - every * sampling) > _SAME * wanted:
-        raise ValueError(
-            f"Expected a control step that is a whole multiple of the sampling step, "
-            f"{sampling:.4g}, got {wanted:.4g}; take {max(every, 1) * sampling:.4g}."
-        )
-    return wanted, every
+    return wanted
 
 
 def _transitions(steps: Records) -> Trajectories:

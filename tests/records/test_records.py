@@ -157,6 +157,13 @@ def test_previous_states_are_those_of_the_steps_before(names, step):
     assert data.states[0, 3] == (0 if k == 1 else 2 * k)
 
 
+def test_records_may_differ_in_their_sampling_steps():
+    records = Records(
+        [counted(9), counted(5, first=20, step=0.02, at=0.02 * torch.arange(5).double())], SPEC
+    )
+    assert records.trajectories(0.04).states.flatten().tolist() == [0, 4, 20, 22]
+
+
 def test_the_step_of_the_spec_is_the_default():
     spec = StateSpec(["x", "v"], ["u"], integrated={"x": "v"}, step=0.02)
     record = counted(9)
