@@ -152,7 +152,7 @@ def identify(
         start: Of hidden states by name, mean and standard deviation at the beginning.
         held_out: The share of the longest stretch without gaps that is held out at its end; as many
             steps are at the end of each other stretch that has twice as many.
-        num_starts: How many starts to take the best end of, as of :func:`smooth`.
+        num_starts: As of :func:`smooth`.
         seed: Seed of the free runs.
         progress: If True, show a progress bar.
 
@@ -160,11 +160,9 @@ def identify(
         The identification; :func:`gpadjust.report.report` makes a page of it.
 
     Raises:
-        TypeError: If an argument is of the wrong type.
         ValueError: If states are exogenous or previous values, the longest stretch has fewer than 8
-            steps, ``held_out`` is not above 0 and at most 0.5, or as :func:`smooth`.
-        PhysicsError: If the physics fails at measured states.
-        RuntimeError: If the states diverge from all starts.
+            steps, ``held_out`` is not above 0 and at most 0.5.
+        TypeError, PhysicsError, RuntimeError: As :func:`smooth`.
 
     Example:
         >>> import torch
@@ -177,10 +175,9 @@ def identify(
         >>> record = Record(t, states, torch.zeros(60, 1, dtype=torch.float64))
         >>> unknowns = {"k": Unknown(1.0, factor=2.0)}
         >>> rates = FormulaPhysics("v, u - k * x", ["x", "v", "u"], unknowns=unknowns)
-        >>> found = identify(
-        ...     Records(record, StateSpec(["x", "v"], ["u"])), ODEPhysics(rates, 0.1, 2)
-        ... )
-        >>> bool((found.errors["identified"] < 0.1 * found.errors["guesses"]).all())
+        >>> log, physics = Records(record, StateSpec(["x", "v"], ["u"])), ODEPhysics(rates, 0.1, 2)
+        >>> errors = identify(log, physics).errors
+        >>> bool((errors["identified"] < 0.1 * errors["guesses"]).all())
         True
     """
     steps, spec = control_steps(records, step), records.spec

@@ -29,10 +29,10 @@ _SAME = 0.01  # of a step, by which another one may differ from it
 class Record:
     """A measured trajectory: times, and the states and actions of a machine there.
 
-    Row k has the state at its time, and the mean of the action from there to the next row. (The
-    last action is not read: if it is not known, repeat the one before.) A record may consist of
-    several stretches, by ``segments`` or because rows are missing: a gap is wherever two rows are
-    more than 1.5 times the median time apart.
+    Row k has the state at its time, and the mean of the action from there to the next row; the last
+    action is not read. A record may consist of several stretches, by ``segments`` or by gaps, where
+    two rows are more than 1.5 times the median time apart. Values are tensors in float64, NumPy
+    arrays, or columns of a pandas frame.
 
     Args:
         times: ``N`` times, in s or the unit of time of the velocities, that rise within a segment.
@@ -44,8 +44,6 @@ class Record:
 
     Attributes:
         sampling_step: The mean time from one row to the next, without gaps.
-
-    Values are tensors in float64, NumPy arrays, or columns of a pandas frame.
 
     Raises:
         TypeError: If values are no numbers, or a tensor is not in float64.
@@ -229,7 +227,7 @@ class Records:
         delimiter: str = ",",
         decimal: str = ".",
     ) -> Records:
-        r"""Read records from CSV files, one from each.
+        """Read records from CSV files, one from each.
 
         The first line of a file names its columns; others may be there. A field of a state is empty
         or NaN where it was not measured. States that hold previous values need no column.
@@ -251,21 +249,6 @@ class Records:
             ValueError: If a name is not in the spec, a file has no rows or not these columns, a
                 field is no number or a time or action is missing, with file, line and column; and
                 as :class:`Record`.
-
-        Example:
-            >>> import tempfile
-            >>> from pathlib import Path
-            >>> from gpadjust.records import Records
-            >>> from gpadjust.states import StateSpec
-            >>> spec = StateSpec(["theta", "omega"], ["torque"], angles=["theta"])
-            >>> with tempfile.TemporaryDirectory() as folder:
-            ...     file = Path(folder, "swing.csv")
-            ...     _ = file.write_text("time,q,dq,u\n0,0.1,0,1\n0.5,0.2,0.4,1\n1,0.5,0.8,0\n")
-            ...     columns = {"theta": "q", "omega": "dq"}
-            ...     records = Records.read_csv(file, spec, states=columns, actions={"torque": "u"})
-            >>> records.trajectories().states
-            tensor([[0.1000, 0.0000],
-                    [0.2000, 0.4000]], dtype=torch.float64)
         """
         check_spec(spec)
         columns: dict[str, Any] = {"states": states or {}, "actions": actions or {}}
@@ -302,14 +285,8 @@ class Records:
     def of_windows(cls, windows: Windows, spec: StateSpec, step: float) -> Records:
         """Make a record of each window, such as of an agent's episodes, to :func:`smooth` them.
 
-        Args:
-            windows: Windows, in control steps.
-            spec: The entries of states and actions.
-            step: The control step, in the unit of the times.
-
-        Raises:
-            TypeError: If ``spec`` is no :class:`StateSpec`, or ``step`` no number.
-            ValueError: If ``step`` is not positive, or windows have not the columns of the spec.
+        The control step is in the unit of the times. Errors are those of :class:`Records`, and of a
+        step that is no number above 0.
         """
         rows = torch.arange(windows.states.shape[1], dtype=torch.float64)
         times = checked_number("step", step, above=0) * rows
@@ -320,7 +297,7 @@ class Records:
     def trajectories(self, step: float | None = None) -> Trajectories:
         """Return the trajectories of all records, to learn dynamics from or to score them by.
 
-        Rows are in the order of the records. An episode ends at a gap, and where a row is left out.
+        An episode ends at a gap, and where a row is left out.
 
         Args:
             step: The control step, in the unit of the times. Default: the step of the spec, and
@@ -355,19 +332,8 @@ class Records:
     def windows(self, length: int, step: float | None = None, stride: int | None = None) -> Windows:
         """Cut windows, to compare with :meth:`~gpadjust.dynamics.Dynamics.free_run`.
 
-        A window starts only at a state that was measured in full; else at the next one that was.
-        What follows may lack entries.
-
-        Args:
-            length: The number ``T`` of control steps.
-            step: The control step, as of :meth:`trajectories`.
-            stride: Steps from the start of a window to that of the next. Default: ``length``.
-
-        Raises:
-            ValueError: If no stretch is as long, a state is hidden, or as :meth:`trajectories`.
-
-        Warns:
-            UserWarning: If stretches are shorter than a step.
+        For ``step`` and errors see :meth:`trajectories`, for the rest :meth:`Trajectories.windows`;
+        no state may be hidden.
         """
         data = _transitions(control_steps(self, step))
         if hidden := self._hidden(data):

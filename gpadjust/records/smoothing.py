@@ -126,8 +126,7 @@ def smooth(
     Args:
         records: The records. A state that is NaN throughout is hidden.
         physics: The next values of the states that are neither exogenous nor previous actions,
-            from these and the actions, as of :class:`LearnedDynamics`; its unknown parameters are
-            learnt from all records together.
+            from these and the actions, as of :class:`LearnedDynamics`.
         step: The control step, as of :meth:`Records.trajectories`.
         start: Of states by name, mean and standard deviation at the beginning of each stretch;
             needed of hidden ones. Default: about the first that was measured.
@@ -136,8 +135,8 @@ def smooth(
         process_noise: The same of what a step adds to f_p. Learnt, it makes the best predictions of
             the next measurement; a small one fits f_p to long free runs, to which errors that
             persist, as of a wrong f_p, would otherwise be noise.
-        num_starts: How many starts to take the best end of, if there is something to learn of
-            the physics. Default: 4 with hidden states, else 1.
+        num_starts: How many starts to take the best end of. Default: 4 with hidden states and
+            unknown parameters, else 1.
         max_rounds: The most rounds of smoothing of each. With hidden states all of them may be
             needed: 4 starts of 100 rounds, half a minute for 300 rows and a physics of formulas.
         progress: If True, show a progress bar.
