@@ -17,7 +17,7 @@ from gpadjust.dynamics.base import TransitionFunctions
 from gpadjust.dynamics.targets import one_physics
 from gpadjust.physics import Physics
 from gpadjust.physics.parameters import PhysicsParameters
-from gpadjust.records.records import Record, Records, control_steps
+from gpadjust.records.records import Records, control_steps
 from gpadjust.records.smoothing import SmoothedRecords, smooth
 from gpadjust.states import StateSpec
 
@@ -140,10 +140,9 @@ def identify(
     """Find parameters, noise and hidden states of a machine, and judge them by a free run.
 
     All but the last part of the records is smoothed (:func:`smooth`). A free run follows the
-    actions from there to the end, and is compared with what was measured. Its particles start
-    where the state may be, have parameters drawn from their posterior, and are moved by the process
-    noise. That is white: where the physics lacks something, whose errors last, intervals are too
-    narrow; the result has their coverage.
+    actions from there to the end, and is compared with the measurements. Its particles start where
+    the state may be, have parameters drawn from their posterior, and are moved by process noise.
+    That is white: where the physics lacks something, whose errors last, intervals are too narrow.
 
     Args:
         records: The records, of states that all move. One that is NaN throughout is hidden.
@@ -204,8 +203,7 @@ def identify(
             ends.append(i)
             actions.append(stretch.actions[end - 1 : -1])
             measured.append(stretch.states[end:])
-        beginning = Record(stretch.times[:end], stretch.states[:end], stretch.actions[:end])
-        beginnings.append(beginning)
+        beginnings.append(stretch.part(slice(end)))
     learnt_from = Records(beginnings, spec)
     smoothed = smooth(learnt_from, f_p, start=start, num_starts=num_starts, progress=progress)
     last = torch.stack([smoothed.records.records[i].states[-1] for i in ends])
@@ -223,25 +221,21 @@ def identify(
     options |= {"process_noise": smoothed.process_noise, "num_functions": 199}
     runs = {IDENTIFIED: dynamics.free_run(last, windows.actions, **options), **runs}
     length = steps.records[0].sampling_step
-    remarks = [*_of_actions(records, length), *_of_jumps(records)]
-    if len(steps) > len(records):
-        gaps = f"Gaps part the log into {len(steps)} stretches, each smoothed by itself."
-        remarks.insert(0, gaps)
+    gaps = [f"Gaps part the log into {len(steps)} stretches, each smoothed by itself."]
+    remarks = gaps if len(steps) > len(records) else []
+    remarks += [*_of_actions(records, length), *_of_jumps(records)]
     return Identification(smoothed, dynamics, windows, runs, length, tuple(remarks))
 
 
 class _Drawn(Dynamics):
     """A physics of which each sampled function has parameters drawn from their posterior."""
 
+    is_fitted = True
+
     def __init__(self, spec: StateSpec, physics: Physics, parameters: PhysicsParameters) -> None:
         super().__init__(spec)
         self.physics = physics
         self.physics_parameters = parameters
-
-    @property
-    def is_fitted(self) -> bool:
-        """True."""
-        return True
 
     def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
         """Refuse: parameters are learnt from records alone."""

@@ -108,6 +108,11 @@ class Record:
             f"{states} state{'s' * (states > 1)}, {actions} action{'s' * (actions > 1)})"
         )
 
+    def part(self, rows: slice) -> Record:
+        """Return some rows, as a record of the same name."""
+        times, states, actions = self.times[rows], self.states[rows], self.actions[rows]
+        return Record(times, states, actions, self.segments[rows], self.name)
+
     def stretches(self) -> list[slice]:
         """Return the rows that follow each other without a gap, stretch by stretch."""
         ends = (~self._goes_on).nonzero().flatten() + 1
@@ -160,9 +165,9 @@ class Records:
     """Measured trajectories of one system.
 
     The control step is a whole multiple k of the sampling step: each k-th row of a stretch is a
-    state, and its action the mean of the k actions. No step leads from one segment, record or side
-    of a gap to another. States that hold previous values (lagged actions and outputs) are filled
-    in, at the first row of a stretch from the record; where that has none, steps begin later.
+    state, and its action the mean of the k actions. No step leads across a gap or from one segment
+    to another. States that hold previous values (lagged actions and outputs) are filled in, at the
+    first row of a stretch from the record; where that has none, steps begin later.
 
     Args:
         records: The records, a :class:`Record` each, or one.

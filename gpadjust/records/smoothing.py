@@ -119,9 +119,7 @@ def smooth(
     with diagonal R, the noise, and Q, the process noise, which has all that f_p lacks. States x,
     unknown parameters :math:`\theta` of the physics, R and Q are estimated together, by an iterated
     extended Kalman smoother and expectation maximisation. Where Q turns out small this fits f_p to
-    free runs, as shooting methods do; where it is large, to single steps, but not from noisy states
-    (errors in variables). Look at the noise: a physics that is wrong beyond its parameters takes
-    for noise what it does not follow, and pulls states to itself.
+    free runs, as shooting methods do; where it is large, to single steps.
 
     Args:
         records: The records. A state that is NaN throughout is hidden.
@@ -133,8 +131,7 @@ def smooth(
         noise: Standard deviations ``state_dim`` of the measurements' errors; NaN for those to be
             learnt. Default: all.
         process_noise: The same of what a step adds to f_p. Learnt, it makes the best predictions of
-            the next measurement; a small one fits f_p to long free runs, to which errors that
-            persist, as of a wrong f_p, would otherwise be noise.
+            the next measurement; a small one fits f_p to long free runs.
         num_starts: How many starts to take the best end of. Default: 4 with hidden states and
             unknown parameters, else 1.
         max_rounds: The most rounds of smoothing of each. With hidden states all of them may be
@@ -144,13 +141,12 @@ def smooth(
     Raises:
         TypeError: If an argument is of the wrong type.
         ValueError: If a hidden state has no start, names or numbers are wrong, or as
-            :meth:`Records.trajectories`.
+            :meth:`Records.trajectories`, as are the warnings.
         PhysicsError: If the physics fails at measured states.
         RuntimeError: If the states diverge from all starts.
 
     Warns:
         SmoothingWarning: If the states did not settle.
-        UserWarning: If stretches are left out, because they are shorter than a step.
 
     Example:
         A mass on a spring of unknown stiffness, of which only the position is measured:
@@ -194,18 +190,18 @@ def smooth(
     noises[0, chain.hidden] = math.nan
     sd_of_noise, sd_of_process = _of_all_states(noises, spec)
     return SmoothedRecords(
-        _with_states(steps, estimate.states),
-        _of_all_states(sd, spec).split([len(record.times) for record in steps]),
-        sd_of_noise,
-        sd_of_process,
-        estimate.log_density,
-        _posterior(f_p, estimate.stretches[0].states, chain.d),
-        estimate.stretches,
+        records=_with_states(steps, estimate.states),
+        sd=_of_all_states(sd, spec).split([len(record.times) for record in steps]),
+        noise=sd_of_noise,
+        process_noise=sd_of_process,
+        log_density=estimate.log_density,
+        physics_parameters=_posterior(f_p, estimate.stretches[0].states, chain.d),
+        _stretches=estimate.stretches,
     )
 
 
 def _posterior(physics: Physics, moments: Moments, d: int) -> PhysicsParameters:
-    """Return draws of the parameters, by moments of states whose entries from d on they are."""
+    """Return draws of the parameters, which are the entries of a state from d on."""
     if not (unknowns := physics.unknowns):
         return PhysicsParameters({}, [])
     mean = torch.from_numpy(moments.means[0, d:].copy())
@@ -251,9 +247,7 @@ def _with_known_inputs(steps: Records) -> Records:
         unknown = record.states[:-1, beside].isnan().any(1).nonzero().flatten().tolist()
         first = max(unknown, default=-1) + 1
         if first < len(record.times) - 1:
-            times, states, actions = record.times, record.states, record.actions
-            part = Record(times[first:], states[first:], actions[first:], name=record.name)
-            records.append(part)
+            records.append(record.part(slice(first, None)))
     if not records:
         raise ValueError(
             f"Expected stretches with all of {', '.join(names)}, which the physics reads."
