@@ -39,7 +39,8 @@ class Record:
             Dates and durations, as the index of a pandas frame, become seconds since the first.
         states: ``N x state_dim``; NaN where an entry was not measured.
         actions: ``N x action_dim``.
-        segments: ``N`` labels; a segment ends wherever the label changes. Default: one for all.
+        segments: ``N`` labels; a segment ends wherever the label changes, and a row whose label is
+            NaN is by itself. Default: one for all.
         name: The name in errors.
 
     Attributes:
@@ -71,7 +72,7 @@ class Record:
         self.states = self._numbers(states, "states", 2)
         self.actions = self._numbers(actions, "actions", 2)
         labels: Any = segments.tolist() if hasattr(segments, "tolist") else segments
-        self.segments = tuple(labels or [0] * len(self.times))
+        self.segments = tuple([0] * len(self.times) if labels is None else labels)
         rows = {name: len(getattr(self, name)) for name in ("times", "states", "actions")}
         rows["segments"] = len(self.segments)
         if len({*rows.values()}) > 1:

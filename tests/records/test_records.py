@@ -118,7 +118,7 @@ def test_states_that_were_not_measured():
 
 
 def test_stretches_that_are_too_short_are_left_out():
-    records = Records([counted(9, segments=[1, 2, 2, 2, 2, 2, 3, 3, 3])], SPEC)
+    records = Records([counted(9, segments=[math.nan, 2, 2, 2, 2, 2, 3, 3, 3])], SPEC)
     with pytest.warns(UserWarning, match="1 of 3 stretches"):
         assert records.trajectories().states.flatten().tolist() == [1, 2, 3, 4, 6, 7]
     with pytest.warns(UserWarning, match="2 of 3 stretches"):

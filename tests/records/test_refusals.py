@@ -59,6 +59,7 @@ def test_what_is_no_record():
         ({"states": column(0, math.inf, 0)}, r"states of record 'r' .*\(row 1\)"),
         ({"actions": column(0, 0, NAN)}, r"actions of record 'r' .*\(row 2\)"),
         ({"actions": column(0, 0)}, "3 of times, 3 of states, 2 of actions"),
+        ({"segments": []}, "3 of actions, 0 of segments"),
         ({"segments": [1, 1]}, "3 of actions, 2 of segments"),
         ({"segments": [1, 2, 1]}, "two rows or more of a segment, .* found 3 in all"),
     ):
