@@ -178,8 +178,8 @@ class Dynamics(ABC):
                 :func:`smooth` draws. Default: nothing.
             variation: Standard deviations by which the physics' unknown parameters differ in a run
                 from those that were learnt, one for each or one for all, in those of their priors:
-                0.1, with a prior of a factor of 1.5, is some 4 %. Take more for another machine
-                than for another day. Each particle keeps its own. Under actions (torques, loads)
+                ``smoothed.variation`` of :func:`smooth`; more for another machine, of which the
+                records tell nothing. Each particle keeps its own. Under actions (torques, loads)
                 beyond those that were learnt from they are larger: three times, where it is by half
                 of their range, but no more than half of the prior's. Default: none.
             state_bounds: Lower and upper bounds, ``2 x state_dim``, as of a task: a particle that

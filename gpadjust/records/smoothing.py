@@ -1,8 +1,8 @@
 """The states of a machine, from noisy and incomplete records and a physics.
 
 From top to bottom: :func:`smooth`; the search for the most likely states, parameters and noises;
-the chain of Gaussian states that the physics makes near a path, whose moments are from
-:mod:`gpadjust.records.kalman`.
+the chain of Gaussian states that the physics makes near a path; the variation of parameters from
+one stretch to another. Moments of a chain are from :mod:`gpadjust.records.kalman`.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,7 +26,7 @@ from gpadjust.dynamics.targets import check_next_values, one_physics
 from gpadjust.physics import ODEPhysics, Physics, PhysicsError
 from gpadjust.physics.parameters import PhysicsParameters
 from gpadjust.records import kalman
-from gpadjust.records.kalman import Array, Link, Moments, Smoothed
+from gpadjust.records.kalman import Array, Link, Smoothed
 from gpadjust.records.records import Record, Records, control_steps, remember
 from gpadjust.states import StateSpec
 from gpadjust.states.state_spec import side_by_side
@@ -46,6 +47,7 @@ _HIDDEN = 0.1  # of the change in a step: what it adds to a state that is never 
 _LEAST = 1e-6  # of the standard deviation of a state: no noise is less, but by rounding
 _HALVINGS = 6
 _BETTER = 0.01  # what a worse path may cost more, by rounding
+_MEDIAN = 0.05  # of a variation beforehand, in standard deviations of a parameter's prior
 
 
 class SmoothingWarning(UserWarning):
@@ -64,8 +66,6 @@ class SmoothedRecords:
             0 of those that the physics does not move.
         process_noise: Standard deviations of what a step adds to the physics, ``state_dim``.
         log_density: Of the measurements, near these states.
-        physics_parameters: The posterior of the unknown parameters of the physics; empty if it has
-            none.
     """
 
     records: Records
@@ -73,8 +73,37 @@ class SmoothedRecords:
     noise: Tensor
     process_noise: Tensor
     log_density: float
-    physics_parameters: PhysicsParameters
-    _stretches: list[Smoothed]
+    _chain: Chain
+    _estimate: Estimate
+
+    @property
+    def physics_parameters(self) -> PhysicsParameters:
+        """The posterior of the unknown parameters of the physics; empty if it has none."""
+        unknowns, d = self._chain.physics.unknowns, self._chain.d
+        if not unknowns:
+            return PhysicsParameters({}, [])
+        moments = self._estimate.stretches[0].states
+        mean = torch.from_numpy(moments.means[0, d:].copy())
+        values, vectors = torch.linalg.eigh(torch.from_numpy(moments.covariances[0, d:, d:].copy()))
+        spread = even_normal(_DRAWS, len(unknowns), seed=0) * values.clamp_min(0).sqrt()
+        return PhysicsParameters(unknowns, unknowns.at(mean + spread @ vectors.mT).unbind(-1))
+
+    @cached_property
+    def variation(self) -> Tensor:
+        """Variation of the parameters from one stretch of the records to another, ``p``.
+
+        Standard deviations, in those of each parameter's prior: with 0.1, and a prior of a factor
+        of 1.5, some 4 %. They explain best, given the noises, stretches of which each has its own
+        parameters; where the stretches tell nothing, they are 0.05. What an equation lacks shows as
+        parameters that vary, and moves a free run for as long as it lasts, where process noise
+        averages out: see ``variation`` of :meth:`Dynamics.free_run`.
+
+        Raises:
+            ValueError: If the physics has no unknown parameters.
+        """
+        if not self._chain.physics.unknowns:
+            raise ValueError("Expected a physics with unknown parameters; found none, that vary.")
+        return variation(self._chain, self._estimate)
 
     def draw(self, seed: int = 0) -> Records:
         """Draw states from their posterior, along each record.
@@ -86,7 +115,7 @@ class SmoothedRecords:
             ValueError: If the seed is no whole number of 0 or more.
         """
         rng = np.random.default_rng(checked_whole("seed", seed, 0))
-        paths = kalman.draw_paths(self._stretches, len(self.physics_parameters), rng)
+        paths = kalman.draw_paths(self._estimate.stretches, self._chain.num_parameters, rng)
         return _with_states(self.records, np.concatenate(paths))
 
     def __repr__(self) -> str:
@@ -189,25 +218,16 @@ def smooth(
     noises = np.sqrt(estimate.variances)
     noises[0, chain.hidden] = math.nan
     sd_of_noise, sd_of_process = _of_all_states(noises, spec)
+    each_sd = _of_all_states(sd, spec).split([len(record.times) for record in steps])
     return SmoothedRecords(
-        records=_with_states(steps, estimate.states),
-        sd=_of_all_states(sd, spec).split([len(record.times) for record in steps]),
-        noise=sd_of_noise,
-        process_noise=sd_of_process,
-        log_density=estimate.log_density,
-        physics_parameters=_posterior(f_p, estimate.stretches[0].states, chain.d),
-        _stretches=estimate.stretches,
+        _with_states(steps, estimate.states),
+        each_sd,
+        sd_of_noise,
+        sd_of_process,
+        estimate.log_density,
+        chain,
+        estimate,
     )
-
-
-def _posterior(physics: Physics, moments: Moments, d: int) -> PhysicsParameters:
-    """Return draws of the parameters, which are the entries of a state from d on."""
-    if not (unknowns := physics.unknowns):
-        return PhysicsParameters({}, [])
-    mean = torch.from_numpy(moments.means[0, d:].copy())
-    values, vectors = torch.linalg.eigh(torch.from_numpy(moments.covariances[0, d:, d:].copy()))
-    spread = even_normal(_DRAWS, len(unknowns), seed=0) * values.clamp_min(0).sqrt()
-    return PhysicsParameters(unknowns, unknowns.at(mean + spread @ vectors.mT).unbind(-1))
 
 
 def _of_all_states(moving: Array, spec: StateSpec) -> Tensor:
@@ -574,3 +594,67 @@ def _means(values: Array, otherwise: Array | float) -> Array:
     columns = np.ascontiguousarray(values.T)
     number = (~np.isnan(columns)).sum(1)
     return np.where(number > 0, np.nansum(columns, 1) / number.clip(1), otherwise)
+
+
+def variation(chain: Chain, estimate: Estimate) -> Tensor:
+    r"""Estimate standard deviations of stretches' parameters, ``p``, in those of the priors.
+
+    With :math:`\theta_s = \theta + \eta_s` in the coordinates in which priors are standard normal,
+    :math:`\eta_s \sim N(0, \operatorname{diag}(v^2))` for stretch s, and the noises as they were
+    found, v is where its posterior density is highest (empirical Bayes for random effects,
+    Laird and Ware 1982), with :math:`\log v \sim N(\log 0.05, 1)`: what the stretches say nothing
+    of stays there.
+    """
+    precision, pull = _of_each_stretch(chain, estimate)
+    start = math.log(_MEDIAN)
+    log_v = torch.full_like(pull[0], start).requires_grad_()
+    search = torch.optim.LBFGS([log_v], max_iter=60, line_search_fn="strong_wolfe")
+
+    def cost() -> Tensor:
+        search.zero_grad()
+        prior = 0.5 * (log_v - start).square().sum()
+        value = prior - log_evidence(precision, pull, log_v.exp())
+        value.backward()
+        return value
+
+    search.step(cost)
+    return log_v.detach().exp()
+
+
+def log_evidence(precision: Tensor, pull: Tensor, v: Tensor) -> Tensor:
+    r"""Return the log density of all stretches by v, up to a constant.
+
+    What stretch s says of its parameters is
+    :math:`\exp(h_s^\top \theta_s - \theta_s^\top \Lambda_s \theta_s / 2)`; :math:`\eta_s`, and then
+    :math:`\theta \sim N(0, I)`, are integrated out. Precisions :math:`\Lambda_s` are
+    ``S x p x p``, pulls :math:`h_s` ``S x p``, standard deviations v of the :math:`\eta_s` ``p``.
+    """
+    eye = torch.eye(len(v), dtype=v.dtype)
+    scaled, h = precision * v, pull * v  # Lambda_s V, V h_s
+    root = torch.linalg.cholesky(eye + v.unsqueeze(-1) * scaled)
+    shift = torch.cholesky_solve(h.unsqueeze(-1), root).squeeze(-1)
+    own = 0.5 * (h * shift).sum() - root.diagonal(dim1=-2, dim2=-1).log().sum()
+    shared = eye + (precision - scaled @ torch.cholesky_solve(scaled.mT, root)).sum(0)
+    left = (pull - (scaled @ shift.unsqueeze(-1)).squeeze(-1)).sum(0).unsqueeze(-1)
+    whole = torch.linalg.cholesky((shared + shared.mT) / 2)
+    common = 0.5 * (left * torch.cholesky_solve(left, whole)).sum()
+    return own + common - whole.diagonal().log().sum()
+
+
+def _of_each_stretch(chain: Chain, estimate: Estimate) -> tuple[Tensor, Tensor]:
+    """Return precision and pull of each stretch, smoothed alone about the estimate by all."""
+    d, p = chain.d, chain.num_parameters
+    parameters = estimate.states[0, d:]
+    states = estimate.states[:, :d]
+    following = chain.follow(chain.now, states[chain.now], parameters)
+    path = Path(states, chain.near(chain.measured, states), parameters, following)
+    precisions, pulls = [], []
+    for link, (mean, covariance) in zip(chain.linearised(path), chain.starts, strict=True):
+        start = np.concatenate([mean[:d], parameters]), covariance  # a standard normal prior there
+        (alone,), _ = kalman.smooth_chain([link], [start], *estimate.variances)
+        covariance = alone.states.covariances[0, d:, d:]
+        # No stretch knows less than its prior, but by rounding.
+        values, vectors = np.linalg.eigh(np.linalg.inv(covariance) - np.eye(p))
+        precisions.append((vectors * values.clip(0)) @ vectors.T)
+        pulls.append(np.linalg.solve(covariance, alone.states.means[0, d:] - parameters))
+    return torch.from_numpy(np.stack(precisions)), torch.from_numpy(np.stack(pulls))

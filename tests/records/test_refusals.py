@@ -165,7 +165,12 @@ def test_what_cannot_be_smoothed():
         refused([(partial(smooth, **given), error, words)])
     with pytest.warns(SmoothingWarning, match="did not settle in 2 rounds"):
         smoothed = smooth(records, body, max_rounds=2)
-    refused([(partial(smoothed.draw, 1.5), TypeError, "seed must be a whole number")])
+    refused(
+        [
+            (partial(smoothed.draw, 1.5), TypeError, "seed must be a whole number"),
+            (lambda: smoothed.variation, ValueError, "physics with unknown parameters"),
+        ]
+    )
 
 
 def test_what_cannot_be_identified():
