@@ -164,7 +164,8 @@ class Dyna(OffPolicyAlgorithm):
         buffer, options, dynamics = self.replay_buffer, self.options, self.task.dynamics
         if not buffer.size():
             return  # all steps failed
-        uses_model = options.uses_model(self.num_episodes)
+        last = options.last_model_episode
+        uses_model = last is None or self.num_episodes < last
         known = self.recorded_episodes()
         new = known.some(slice(buffer.num_learnt, None))
         data = new if dynamics.has_learnt else known

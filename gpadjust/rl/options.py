@@ -65,7 +65,3 @@ class DynaOptions:
             checked_number("reward_tolerance", self.reward_tolerance, least=0)
         if self.score_horizons != ():
             object.__setattr__(self, "score_horizons", checked_horizons(self.score_horizons))
-
-    def uses_model(self, num_episodes: int) -> bool:
-        """Return whether the model is used after so many real episodes."""
-        return self.last_model_episode is None or num_episodes < self.last_model_episode
