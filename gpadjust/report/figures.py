@@ -14,13 +14,12 @@ from gpadjust.report import markup as html
 from gpadjust.report.markup import Markup, drawn, image, number, percent, tag
 from gpadjust.report.subject import Subject
 from gpadjust.validation import Trust, plots, trust
-from gpadjust.validation.plots import drawing
-from gpadjust.validation.plots.adjustments import adjustments_of, unadjusted
-from gpadjust.validation.plots.predictions import plot_pit
+from gpadjust.validation.drawing import labels, share_limits
+from gpadjust.validation.plots import adjustments_of, unadjusted
+from gpadjust.validation.trust import physics_at
 
 _MOST = 12  # inputs along which slices are drawn, in all outputs together
 _POINTS = 120  # of a curve
-_STYLES = ("--", "-.", ":")
 _BANDS = "Solid lines are means; bands hold 95 % of the function, without measurement noise."
 _APART = (
     "Observations are of rho f_p + delta alone: how much of it is rho's and how much delta's the "
@@ -117,14 +116,12 @@ def slices(subject: Subject, output: int, inputs: list[int]) -> list[Markup]:
     with torch.no_grad():
         for i in inputs:
             _prediction(subject, output, i, axes[0, i])
-    low, high = zip(*(axes[0, i].get_ylim() for i in inputs), strict=True)
-    for i in inputs:
-        axes[0, i].set_ylim(min(low), max(high))
+    share_limits([axes[0, i] for i in inputs])
     if shown is not None and terms:
-        plots.plot_adjustment(shown.model, output=shown.output, axes=axes[1:], num_points=_POINTS)
+        plots.plot_adjustment(shown.model, output=shown.output, axes=axes[1:])
         _name_alike(axes[1:])
     else:
-        for ax, label in zip(axes[-1], drawing.labels(subject.model, "input", d), strict=True):
+        for ax, label in zip(axes[-1], labels(subject.inputs), strict=True):
             ax.set_xlabel(label)
     parts = "the prediction and the physics" if shown is not None else "the prediction"
     below = f"; below, {' and '.join(terms)}" if terms else ""
@@ -156,12 +153,11 @@ def left_out(subject: Subject, output: int) -> list[Markup]:
 
 
 @drawn
-def coverages(subject: Subject, output: int, count: int) -> list[Markup]:
+def coverages(subject: Subject, output: int) -> list[Markup]:
     """Return observed against nominal coverage, and the histogram of PIT values."""
     figures = [html.new_figure(2.9), html.new_figure(2.9)]
     plots.plot_coverage(subject.loo, output=output, ax=figures[0].subplots())
-    bins = max(4, min(10, count // 4))
-    plot_pit(subject.loo, output=output, bins=bins, ax=figures[1].subplots())
+    plots.plot_pit(subject.loo, output=output, ax=figures[1].subplots())
     name = subject.outputs[output]
     first = image(figures[0], f"observed against nominal coverage of {name}")
     return [first, image(figures[1], f"histogram of PIT values of {name}")]
@@ -177,21 +173,14 @@ def slice_along(subject: Subject, i: int, number_of_points: int) -> Tensor:
 
 
 def _prediction(subject: Subject, output: int, i: int, ax: Any) -> None:
-    X = slice_along(subject, i, _POINTS)
-    x = X[:, i]
-    drawing.band(ax, x, *drawing.mean_and_ends(subject.model.marginals(X), output, 0.95), 0.95)
-    curves = subject.physics_at(X, output)
-    for k, (name, values) in enumerate(curves.items()):
-        ax.plot(x, values, color=drawing.GREY, ls=_STYLES[k % 3], lw=1.2, label=name)
+    X, shown = slice_along(subject, i, _POINTS), subject.adjusted[output]
+    physics = {} if shown is None else physics_at(shown.model, X)
+    plots.draw_prediction(ax, subject.model, X[:, i], X, output, physics)
     if len(subject.inputs) == 1:
-        ax.plot(
-            subject.X[:, 0], drawing.column(subject.Y, output), color=drawing.RED, **drawing.DOTS
-        )
-    ax.set_ylabel(drawing.labels(subject.model, "output", len(subject.outputs))[output])
-    ax.set_xlim(float(x[0]), float(x[-1]))
-    if len(curves) > 1:
+        plots.draw_data(ax, subject.model, output)
+    ax.set_ylabel(labels(subject.outputs)[output])
+    if len(physics) > 1:
         ax.legend(frameon=False)
-    drawing.tidy(ax)
 
 
 def _name_alike(axes: Any) -> None:

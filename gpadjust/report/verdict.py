@@ -10,7 +10,7 @@ from gpadjust.report import figures, tables
 from gpadjust.report import markup as html
 from gpadjust.report.markup import Markup, Page, Verdict, tag
 from gpadjust.report.subject import Origin, Subject
-from gpadjust.validation.structures import ALONE, STACKED
+from gpadjust.validation.comparison import ALONE, STACKED
 
 _ERRORS = {ALONE: "your formula", "calibrated physics": "your formula, calibrated"}
 

@@ -52,7 +52,7 @@ def _the_table_is_that_of(comparison, page):
     assert head[0] == "structure"
     assert rows[-1][0] == "physics alone"
     assert rows[-1][4] == "-"
-    for row, expected in zip(rows, comparison.rows("y"), strict=True):
+    for row, expected in zip(rows, comparison.table["y"], strict=True):
         assert row[0] == expected.structure
         numbers = [float(text) for text in row[1:5] if text != "-"]
         assert numbers == pytest.approx(expected[1 : 1 + len(numbers)], rel=0.06, abs=0.006)

@@ -159,8 +159,9 @@ def known():
     return Trust(X, override, doubt, ("speed [m/s]", "x2"), ("lift", "drag"))
 
 
-def test_shares_along_each_input(known):
-    axes = plot_trust(known, bins=3)
+def test_shares_along_each_input(known, monkeypatch):
+    monkeypatch.setattr("gpadjust.validation.plots._BINS", 3)
+    axes = plot_trust(known)
     assert axes.shape == (2,)
     assert [ax.get_xlabel() for ax in axes] == ["speed [m/s]", "$x_{2}$"]
     for container, kind in zip(axes[0].containers, ("physics", "data", "neither"), strict=True):

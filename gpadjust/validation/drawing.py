@@ -1,9 +1,10 @@
-"""Parts of all figures: colours, axes, names, bands, and one output of a posterior."""
+"""Parts of all figures: colours, axes, names, bands, and one output of a prediction."""
 
 from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from statistics import NormalDist
 from typing import Any
 
@@ -16,7 +17,6 @@ from torch import Tensor
 
 from gpadjust.checks import check_level, checked_whole
 from gpadjust.core.gaussian import Marginals
-from gpadjust.core.model import Predictive
 
 BLUE, RED, GREY = "#0072B2", "#D55E00", "0.45"  # told apart by the colour-blind, too
 BAND: dict[str, Any] = {"color": BLUE, "alpha": 0.2, "lw": 0}
@@ -24,26 +24,25 @@ DOTS: dict[str, Any] = {"ls": "", "marker": "o", "ms": 4.5, "mec": "white", "mew
 
 
 def quantile(level: float) -> float:
-    """Half the width of the central interval, in standard deviations."""
+    """Return half the width of the central interval, in standard deviations."""
     check_level(level)
     return NormalDist().inv_cdf((1 + level) / 2)
 
 
 def mean_and_ends(prediction: Any, output: int, level: float) -> tuple[Tensor, Tensor, Tensor]:
     """Return the mean and the ends of the interval of one output of a posterior, ``n`` each."""
-    z, marginals = quantile(level), getattr(prediction, "marginals", prediction)
+    marginals = getattr(prediction, "marginals", prediction)
     if isinstance(marginals, Marginals):
-        ends = [marginals.quantile((1 + sign * level) / 2) for sign in (-1, 1)]
         mean = marginals.prediction.mean
+        low, high = (marginals.quantile((1 + sign * level) / 2) for sign in (-1, 1))
     else:
-        mean, half = prediction.mean, z * prediction.variance.sqrt()
-        ends = [mean - half, mean + half]
-    low, high = (column(end, output) for end in ends)
-    return column(mean, output), low, high
+        mean, half = prediction.mean, quantile(level) * prediction.variance.sqrt()
+        low, high = mean - half, mean + half
+    return column(mean, output), column(low, output), column(high, output)
 
 
 def column(values: Tensor, output: int) -> Tensor:
-    """One output of ``n x m`` values."""
+    """Return one output of ``n x m`` values."""
     if values.dim() != 2:
         raise ValueError(
             f"Expected n x m values to draw, got shape {tuple(values.shape)}; plot the elements of "
@@ -54,28 +53,13 @@ def column(values: Tensor, output: int) -> Tensor:
     return values[:, output].detach()
 
 
-def observed(values: Tensor, output: int) -> Tensor:
-    """The points, of ``n``, at which an output is not NaN; at least one."""
-    seen = ~values.isnan()
-    if not seen.any():
-        raise ValueError(
-            f"Output {output} has no observed value to draw, {len(values)} points of NaN; choose "
-            "another `output`."
-        )
-    return seen
-
-
-def labels(of: Any, kind: str, number: int) -> list[str]:
-    """Return the names of the inputs or outputs (``kind``), or x or y with subscripts."""
-    symbol = {"input": "x", "output": "y"}[kind]
-    default = [symbol] if number == 1 else [f"{symbol}{k + 1}" for k in range(number)]
-    owner = of.data if isinstance(of, Predictive) else of  # a model
-    names = getattr(owner, f"{kind}_names", None) or default
+def labels(names: Sequence[str]) -> list[str]:
+    """Return names as labels; x1 and y2, which stand for no name, with subscripts."""
     return [re.sub(r"^([xy])(\d+)$", r"$\1_{\2}$", _as_text(name)) for name in names]
 
 
 def _as_text(name: str) -> str:
-    """A name in which dollars are dollars, unless they hold a formula that can be drawn."""
+    """Return a name in which dollars are dollars, unless they hold a formula to be drawn."""
     lines = []
     for line in name.split("\n"):
         try:
@@ -87,7 +71,7 @@ def _as_text(name: str) -> str:
 
 
 def axes_of(given: Any, rows: int, columns: int, size: float = 3.2) -> Any:
-    """The axes that the user gave as an array, or those of a new figure of pyplot."""
+    """Return the axes that the user gave as an array, or those of a new figure of pyplot."""
     if given is not None:
         return given_axes(given, (rows, columns))
     width = 1.3 * size if columns == 1 else 1.15 * size
@@ -96,7 +80,7 @@ def axes_of(given: Any, rows: int, columns: int, size: float = 3.2) -> Any:
 
 
 def given_axes(axes: Any, shape: tuple[int, ...]) -> Any:
-    """The axes that the user gave, as an array of the shape needed."""
+    """Return the axes that the user gave, as an array of the shape needed."""
     axes = np.asarray(axes)
     number = sum(isinstance(ax, Axes) for ax in axes.flat)
     if not number == axes.size == math.prod(shape):
@@ -111,26 +95,34 @@ def band(ax: Axes, x: Tensor, mean: Tensor, low: Tensor, high: Tensor, level: fl
 
 
 def against_truth(
-    ax: Axes, truth: Tensor, mean: Tensor, ends: Any, level: float, xlabel: str, ylabel: str
+    ax: Axes, truth: Tensor, drawn: Sequence[Tensor], level: float, xlabel: str
 ) -> None:
-    """Draw predictions with the ends of their intervals against what is true."""
-    low, high = ends
+    """Draw predictions, a mean and the ends of its interval, against the true values, ``n``."""
+    seen = ~truth.isnan()
+    truth, mean, low, high = (each[seen] for each in (truth, *drawn))
     diagonal = [min(truth.min(), mean.min()), max(truth.max(), mean.max())]
     ax.plot(diagonal, diagonal, color=GREY, lw=1, ls="--")
-    label, errors = f"mean, {100 * level:g} %", torch.stack([mean - low, high - mean])
-    errors = errors.clamp_min(0.0)
+    errors = torch.stack([mean - low, high - mean]).clamp_min(0.0)
+    label = f"mean, {100 * level:g} %"
     ax.errorbar(truth, mean, errors, color=BLUE, **DOTS, elinewidth=1, alpha=0.85, label=label)
-    ax.set(xlabel=xlabel, ylabel=ylabel)
+    ax.set_xlabel(xlabel)
     ax.legend(frameon=False, loc="upper left")
     tidy(ax)
 
 
+def share_limits(axes: Sequence[Axes]) -> None:
+    """Give axes the same range of y: slices of one function are compared by eye."""
+    low, high = zip(*(ax.get_ylim() for ax in axes), strict=True)
+    for ax in axes:
+        ax.set_ylim(min(low), max(high))
+
+
 def legend(ax: Axes) -> None:
-    """Add a legend and take away what is not needed."""
+    """Add a legend and remove the frame's upper and right sides."""
     ax.legend(frameon=False)
     tidy(ax)
 
 
 def tidy(ax: Axes) -> None:
-    """Take away the frame's upper and right sides."""
+    """Remove the frame's upper and right sides."""
     ax.spines[["top", "right"]].set_visible(False)

@@ -1,0 +1,394 @@
+r"""Figures of predictions, of their coverage, and of where the physics is wrong or trusted.
+
+Each function draws on the axes that it is given, or on those of a new figure, and returns them;
+show or save the figure with ``ax.figure``. They need matplotlib, ``pip install gpadjust[plot]``.
+``output`` is the number of the output to draw, ``level`` the nominal coverage of intervals. Where
+an output was not observed, nothing is drawn.
+
+A TypeError says that an argument is of another kind, a ValueError that it has a wrong value or
+shape, or that there is no such output; both come before there is a figure.
+
+Example:
+    >>> import torch
+    >>> from gpadjust import CKA
+    >>> from gpadjust.validation import leave_one_out, trust
+    >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+    >>> model = CKA(X, 2 * torch.sin(6 * X) + X, physics=lambda X: torch.sin(6 * X))
+    >>> plot_model(model).shape  # predictions, rho and delta
+    (3, 1)
+    >>> plot_adjustment(model).shape  # rho and delta
+    (2, 1)
+    >>> plot_prediction(model, X).get_xlabel()
+    'x'
+    >>> plot_leave_one_out(leave_one_out(model)).shape
+    (2,)
+    >>> plot_coverage(leave_one_out(model)).get_ylabel()
+    'observed coverage'
+    >>> plot_trust(trust(model)).shape
+    (1,)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import cycle
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from scipy.stats import binom
+from torch import Tensor
+
+from gpadjust.checks import check_level, checked_bounds, checked_points, checked_tensor
+from gpadjust.kinds.categories import on_levels
+from gpadjust.validation import drawing
+from gpadjust.validation.drawing import BLUE, GREY, RED, axes_of, column, labels, tidy
+from gpadjust.validation.leave_one_out import LeaveOneOut
+from gpadjust.validation.scores import Scores
+from gpadjust.validation.trust import SIDES, Trust, physics_at
+
+__all__ = [
+    "plot_adjustment",
+    "plot_coverage",
+    "plot_leave_one_out",
+    "plot_model",
+    "plot_prediction",
+    "plot_trust",
+]
+_POINTS = 120  # of a curve
+_STYLES = ("--", "-.", ":")  # of several physics
+_COLORS = (BLUE, RED, "0.85")  # of physics, data and neither
+_BINS = 10  # of each input
+_HONEST = "95 % if intervals hold"
+
+
+def plot_model(model: Any, *, output: int = 0, level: float = 0.95, axes: Any = None) -> Any:
+    r"""Draw predictions, and :math:`\rho` and :math:`\delta` below, along each input.
+
+    The first row has the mean, the central interval and the physics; also the data if there is one
+    input. With more the curves are slices through the median of the training inputs, which are
+    ticks at the bottom. The other rows are those of :func:`plot_adjustment`, if the model adjusts a
+    physics.
+
+    Returns:
+        An array of axes, ``rows x d``.
+    """
+    names = adjustments_of(model)
+    lines = _lines(model, None, None, output, level)
+    axes = axes_of(axes, 1 + len(names), len(lines), 2.6)
+    for i, (ax, (x, X)) in enumerate(zip(axes[0], lines, strict=True)):
+        draw_prediction(ax, model, x, X, output, physics_at(model, X), level)
+        if len(lines) == 1:
+            draw_data(ax, model, output)
+        else:
+            _draw_ticks(ax, model, output, i)
+    drawing.share_limits(axes[0])
+    axes[0, 0].set_ylabel(labels(model.data.output_names)[output])
+    axes[0, 0].legend(frameon=False)
+    if names:
+        plot_adjustment(model, output=output, level=level, axes=axes[1:])
+    else:
+        for ax, label in zip(axes[0], labels(model.data.input_names), strict=True):
+            ax.set_xlabel(label)
+    return axes
+
+
+def plot_adjustment(
+    model: Any,
+    *,
+    bounds: Tensor | None = None,
+    base: Tensor | None = None,
+    output: int = 0,
+    level: float = 0.95,
+    axes: Any = None,
+) -> Any:
+    r"""Draw :math:`\rho` and :math:`\delta` with their intervals: where is the physics wrong?
+
+    One row for each that the model has (a rho for each of several physics), one column for each
+    input, along which the others stay at a base point. The dashed line is what the model falls
+    back to far from data, such as the physics as it is, :math:`\rho = 1` and
+    :math:`\delta = 0`; ticks at the bottom are the training inputs.
+
+    Args:
+        model: A model with ``rho`` or ``delta``.
+        bounds: Range of the inputs, ``2 x d``, a tensor or lists. Default: that of the training
+            inputs.
+        base: The base point, ``d``, a tensor or a list. Default: the median of the training inputs.
+        output: Which output to draw.
+        level: Nominal coverage of the intervals.
+        axes: Axes to draw on. Default: a new figure.
+
+    Returns:
+        An array of axes, ``rows x d``.
+    """
+    names = adjustments_of(model)
+    if not names:
+        raise TypeError(
+            "Expected a model with rho or delta to draw, such as CKA, RRA, ScaleGP and "
+            f"PhysicsMeanGP; found {type(model).__name__}."
+        )
+    lines = _lines(model, bounds, base, output, level)
+    axes = axes_of(axes, len(names), len(lines), 2.6)
+    for i, (x, X) in enumerate(lines):
+        for ax, name in zip(axes[:, i], names, strict=True):
+            with torch.no_grad():
+                drawn = drawing.mean_and_ends(model.term(name, X), output, level)
+            ax.axhline(unadjusted(model, name), color=GREY, lw=1, ls="--")
+            drawing.band(ax, x, *drawn, level)
+            _draw_ticks(ax, model, output, i)
+            ax.set_xlim(float(x[0]), float(x[-1]))
+            tidy(ax)
+        axes[-1, i].set_xlabel(labels(model.data.input_names)[i])
+    outputs = labels(model.data.output_names)
+    suffix = f"\nfor {outputs[output]}" if len(outputs) > 1 else ""
+    for row, name in zip(axes, names, strict=True):
+        drawing.share_limits(row)
+        row[0].set_ylabel(_symbol(name) + suffix)
+    axes[0, 0].legend(frameon=False)
+    return axes
+
+
+def plot_prediction(
+    model: Any,
+    X: Tensor,
+    Y: Tensor | None = None,
+    *,
+    output: int = 0,
+    level: float = 0.95,
+    observation_noise: bool = False,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw predictions at inputs ``n x d``, and true values ``n x m`` there if ``Y`` is given.
+
+    With one input: the mean, the central interval (of observations if ``observation_noise``), the
+    training data, the physics and the truth. With more, which need ``Y``: the predictions against
+    ``Y``, with their intervals.
+    """
+    inputs, outputs = labels(model.data.input_names), labels(model.data.output_names)
+    X = checked_points("X", X, len(inputs))
+    if Y is not None and (Y := checked_tensor("Y", Y)).shape != (len(X), len(outputs)):
+        raise ValueError(
+            f"Expected Y of shape {len(X)} x {len(outputs)}, a row for each of X and a column for "
+            f"each output, got {tuple(Y.shape)}."
+        )
+    with torch.no_grad():
+        posterior = model.posterior(X, observation_noise=observation_noise)
+    drawn = drawing.mean_and_ends(posterior, output, level)
+    if len(inputs) > 1:
+        if Y is None:
+            raise ValueError(
+                f"X has {len(inputs)} inputs, so predictions are drawn against the truth: pass "
+                "`Y`; for slices through a model use `plot_model`."
+            )
+        ax = axes_of(ax, 1, 1)[0, 0]
+        drawing.against_truth(ax, Y[:, output], drawn, level, f"true {outputs[output]}")
+        ax.set_ylabel(f"predicted {outputs[output]}")
+        return ax
+    ax = axes_of(ax, 1, 1)[0, 0]
+    order = X[:, 0].argsort()
+    x = X[order, 0]
+    mean, low, high = (each[order] for each in drawn)
+    drawing.band(ax, x, mean, low, high, level)
+    _draw_physics(ax, x, physics_at(model, X[order]), output)
+    if Y is not None:
+        y = Y[order, output]
+        ax.plot(x[~y.isnan()], y[~y.isnan()], color="black", lw=1, ls=":", label="truth")
+    draw_data(ax, model, output)
+    ax.set(xlabel=inputs[0], ylabel=outputs[output])
+    drawing.legend(ax)
+    return ax
+
+
+def plot_leave_one_out(
+    loo: LeaveOneOut, *, output: int = 0, level: float = 0.95, axes: Any = None
+) -> Any:
+    """Draw left-out predictions against the observations, and standardized residuals.
+
+    ``axes`` are two; so many are returned.
+    """
+    if not isinstance(loo, LeaveOneOut):
+        raise TypeError(
+            f"Expected a LeaveOneOut, got {type(loo).__name__}; pass `leave_one_out(model)`."
+        )
+    z = drawing.quantile(level)
+    values = (loo.Y, loo.mean, loo.variance.sqrt(), loo.residuals)
+    Y, mean, sd, residuals = (column(each, output) for each in values)
+    axes = axes_of(axes, 1, 2)[0]
+    name = labels(loo.output_names)[output]
+    drawn = (mean, mean - z * sd, mean + z * sd)
+    drawing.against_truth(axes[0], Y, drawn, level, f"observed {name}")
+    axes[0].set_ylabel("predicted without it")
+    axes[1].axhspan(-z, z, **drawing.BAND, label=f"{100 * level:g} %")
+    axes[1].axhline(0, color=GREY, lw=1, ls="--")
+    axes[1].plot(mean, residuals, color=BLUE, **drawing.DOTS)
+    top = 1.35 * max(z, residuals.abs().nan_to_num().max().item())  # room for the legend
+    axes[1].set(xlabel="predicted without it", ylabel="standardized residual", ylim=(-top, top))
+    drawing.legend(axes[1])
+    return axes
+
+
+def plot_coverage(
+    prediction: LeaveOneOut | Scores, *, output: int = 0, ax: Axes | None = None
+) -> Axes:
+    """Draw the observed coverage of central intervals against the nominal one.
+
+    Below the diagonal the intervals are too narrow, above it too wide. The band covers 95 % of the
+    observed coverages of predictions whose intervals hold, of as many points, at each level.
+    """
+    pit, ax = _pit_and_axes(prediction, output, ax, 3.6)
+    n, levels = len(pit), np.linspace(0, 1, 201)
+    low, high = (binom.ppf(p, n, levels) / n for p in (0.025, 0.975))
+    ax.fill_between(levels, low, high, color=GREY, alpha=0.2, lw=0, label=_HONEST)
+    ax.plot([0, 1], [0, 1], color=GREY, lw=1, ls="--")
+    reached = [0, *np.sort(2 * abs(pit - 0.5)), 1]
+    shares = [*np.arange(n + 1) / n, 1]
+    ax.step(reached, shares, where="post", color=BLUE, lw=1.8, label="observed")
+    ax.set(xlabel="nominal coverage", ylabel="observed coverage", aspect="equal")
+    ax.set(xlim=(0, 1), ylim=(0, 1.01))
+    ax.legend(frameon=False, loc="upper left")
+    tidy(ax)
+    return ax
+
+
+def plot_pit(prediction: LeaveOneOut | Scores, *, output: int = 0, ax: Axes | None = None) -> Axes:
+    """Draw the histogram of PIT values: flat if intervals hold, U-shaped if too sure.
+
+    The band covers 95 % of the counts of a bin if intervals hold.
+    """
+    pit, ax = _pit_and_axes(prediction, output, ax, 3.2)
+    n = len(pit)
+    bins = max(4, min(_BINS, n // 4))
+    low, high = binom.ppf([0.025, 0.975], n, 1 / bins)
+    ax.hist(pit, bins=bins, range=(0, 1), color=BLUE, alpha=0.75, ec="white")
+    ax.fill_between([0, 1], low, high, color=GREY, alpha=0.25, lw=0, zorder=3, label=_HONEST)
+    ax.axhline(n / bins, color=GREY, lw=1, ls="--", zorder=3)
+    ax.set(xlabel="probability integral transform", ylabel="count", xlim=(0, 1))
+    ax.set_ylim(top=1.25 * max(high, ax.get_ylim()[1]))  # room for the legend
+    drawing.legend(ax)
+    return ax
+
+
+def plot_trust(trust: Trust, *, output: int = 0, axes: Any = None) -> Any:
+    """Draw along each input which share of the predictions rests on physics, data, or neither.
+
+    The shares of all points are in the legend. Return an array of ``d`` axes.
+    """
+    if not isinstance(trust, Trust):
+        raise TypeError(f"Expected a Trust, got {type(trust).__name__}; pass `trust(model)`.")
+    side = column(trust.side, output)
+    axes = axes_of(axes, 1, trust.X.shape[-1])[0]
+    for ax, x, name in zip(axes, trust.X.mT, labels(trust.input_names), strict=True):
+        edges = np.histogram_bin_edges(x.numpy(), _BINS)
+        counts = np.stack([np.histogram(x[side == i].numpy(), edges)[0] for i in range(3)])
+        bottom = np.zeros(_BINS)
+        for kind, color, share in zip(SIDES, _COLORS, counts / counts.sum(0).clip(1), strict=True):
+            label = f"{kind}: {100 * getattr(trust, kind)[output].item():.0f} %"
+            bar: dict[str, Any] = {"width": np.diff(edges), "align": "edge", "color": color}
+            ax.bar(edges[:-1], share, bottom=bottom, **bar, label=label)
+            bottom += share
+        ax.set(xlabel=name, xlim=(edges[0], edges[-1]), ylim=(0, 1))
+        tidy(ax)
+    axes[0].set_ylabel("share of predictions")
+    outputs = labels(trust.output_names)
+    title = f"{outputs[output]} rests on" if len(outputs) > 1 else "rests on"
+    beside: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
+    axes[-1].legend(frameon=False, title=title, alignment="left", **beside)
+    return axes
+
+
+def adjustments_of(model: Any) -> list[str]:
+    """Return the names of the rhos and deltas of a model that vary, if it has a physics."""
+    terms = model.terms if getattr(model, "physics", None) else ()
+    return [t.name for t in terms if t.varies and t.name not in model.data.input_names]
+
+
+def unadjusted(model: Any, name: str) -> float:
+    """Return the value of a rho or a delta away from data."""
+    return float(next(term.mean for term in model.terms if term.name == name))
+
+
+@torch.no_grad()
+def draw_prediction(
+    ax: Axes,
+    model: Any,
+    x: Tensor,
+    X: Tensor,
+    output: int,
+    physics: Mapping[str, Tensor],
+    level: float = 0.95,
+) -> None:
+    """Draw the prediction and each physics, ``n x m``, at points ``X`` over a line ``x``."""
+    drawing.band(ax, x, *drawing.mean_and_ends(model.marginals(X), output, level), level)
+    _draw_physics(ax, x, physics, output)
+    ax.set_xlim(float(x[0]), float(x[-1]))
+    tidy(ax)
+
+
+def _draw_physics(ax: Axes, x: Tensor, physics: Mapping[str, Tensor], output: int) -> None:
+    for (name, f_p), style in zip(physics.items(), cycle(_STYLES), strict=False):
+        ax.plot(x, column(f_p, output), color=GREY, ls=style, lw=1.2, label=name)
+
+
+def draw_data(ax: Axes, model: Any, output: int) -> None:
+    """Draw the observations of an output over the only input."""
+    y = column(model.data.Y, output)
+    x = model.data.X[~y.isnan(), 0]
+    ax.plot(x, y[~y.isnan()], color=RED, **drawing.DOTS, label="data")
+
+
+def _draw_ticks(ax: Axes, model: Any, output: int, i: int) -> None:
+    """Mark at the bottom the values of an input at which an output was observed."""
+    x = model.data.X[~column(model.data.Y, output).isnan(), i]
+    ax.plot(x, torch.zeros(len(x)), "|", color=RED, transform=ax.get_xaxis_transform())
+
+
+def _lines(
+    model: Any, bounds: Any, base: Any, output: int, level: float
+) -> list[tuple[Tensor, Tensor]]:
+    """Return positions ``n`` and points ``n x d`` on a line along each input, through the base."""
+    X = model.data.X
+    d = X.shape[-1]
+    check_level(level)
+    column(model.data.Y, output)  # an error if there is no such output
+    if bounds is None:
+        lower, upper = X.min(0).values, X.max(0).values
+        # An input that never changed is drawn around its value.
+        pad = torch.where(lower == upper, 0.5 * lower.abs().clamp_min(1.0), 0.0)
+        bounds = torch.stack([lower - pad, upper + pad])
+    bounds = checked_bounds("bounds", bounds, d).to(X)
+    base = X.median(0).values if base is None else checked_tensor("base", base).to(X)
+    if base.shape != (d,) or not base.isfinite().all():
+        raise ValueError(f"Expected a base point of {d} inputs, finite, got {base.tolist()}.")
+    lines = []
+    for i in range(d):
+        x = torch.linspace(bounds[0, i], bounds[1, i], _POINTS, dtype=base.dtype)
+        points = base.repeat(_POINTS, 1)
+        points[:, i] = x
+        lines.append((x, on_levels(model, points)))
+    return lines
+
+
+def _symbol(name: str) -> str:
+    """Return the symbols of ``rho``, ``rho_coarse`` and ``delta``."""
+    symbol, _, physics = name.partition("_")
+    if symbol not in ("rho", "delta"):
+        return name
+    return rf"$\{symbol}$" + (f" of {physics}" if physics else "")
+
+
+def _pit_and_axes(
+    prediction: LeaveOneOut | Scores, output: int, ax: Axes | None, size: float
+) -> tuple[np.ndarray, Axes]:
+    """Return the PIT values of what was observed, and the axes; new ones have a title."""
+    scores = prediction.score() if isinstance(prediction, LeaveOneOut) else prediction
+    if not isinstance(scores, Scores):
+        raise TypeError(
+            f"Expected what has PIT values, got {type(prediction).__name__}; pass "
+            "`leave_one_out(model)` of a model, or `score(posterior, Y)` of a posterior."
+        )
+    values = column(scores.pit, output)
+    drawn = axes_of(ax, 1, 1, size)[0, 0]
+    if ax is None and len(scores.output_names) > 1:
+        drawn.set_title(labels(scores.output_names)[output])
+    return values[~values.isnan()].numpy(), drawn

@@ -1,0 +1,213 @@
+"""What the numbers of a comparison show: the verdict on the physics, and advice in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple
+
+from torch import Tensor
+
+from gpadjust.core import FitResult
+
+_SURE = 2.0  # standard errors that a difference takes to be real
+_ENOUGH = 8  # observations of different inputs, for a difference to be shown
+_LEAST = 1e-6  # nats; less is rounding
+_COUNTS = 0.05  # weight with which a structure is a part of what is recommended
+_ANSWERS = {1: "Yes", 0: "Not shown", -1: "No"}
+
+
+class Candidate(NamedTuple):
+    """Quality of the predictions of an output's left-out observations by a structure.
+
+    Attributes:
+        structure: Its name.
+        elpd: Expected log predictive density, the sum over the observations, in nats.
+        elpd_diff: That less the best structure's; 0 for the best.
+        se_diff: The standard error of this difference.
+        weight: Its weight in the stacked model; NaN of a physics alone, which is no part of it.
+        rmse: Root mean square error, relative to the standard deviation of the observations.
+        coverage: Share of the observations within their 95 % intervals.
+        error: Root mean square error, in the output's units.
+        log_evidence: The log evidence of the fit; NaN if there is none.
+        of_use: Probability that the physics is of use, by the evidence of nested models with and
+            without it; NaN if there are none.
+    """
+
+    structure: str
+    elpd: float
+    elpd_diff: float
+    se_diff: float
+    weight: float
+    rmse: float
+    coverage: float
+    error: float
+    log_evidence: float
+    of_use: float
+
+
+class Gain(NamedTuple):
+    """The gain of predictions of an output by the physics, and the verdict on it.
+
+    Attributes:
+        elpd: The difference of expected log predictive densities, the sum over the observations, in
+            nats.
+        se: Its standard error.
+        structure: The structure with the physics.
+        without: The structure without the physics.
+        shown: 1 if the physics is shown to help, by two standard errors and by the evidence of
+            models that were weighed without it; -1 if it is shown to make predictions worse, where
+            no model leaves it out by itself; 0 if neither is, or there are observations of fewer
+            than eight different inputs.
+        by_evidence: Whether a difference of more than two standard errors shows nothing because of
+            models that were weighed without the physics.
+        number: The number of observations, those of the same inputs taken together.
+    """
+
+    elpd: float
+    se: float
+    structure: str
+    without: str
+    shown: int
+    by_evidence: bool = False
+    number: int = _ENOUGH
+
+    @property
+    def answer(self) -> str:
+        """``"Yes"``, ``"Not shown"`` or ``"No"``: does the physics help?"""
+        return _ANSWERS[self.shown]
+
+    def sentences(self, output: str) -> list[str]:
+        """Return the verdict on an output in words, with its number, and why no more is shown."""
+        verdict = {
+            1: f"The physics helps to predict {output}",
+            0: f"These data do not show whether the physics helps to predict {output}",
+            -1: f"With the physics, {output} is predicted worse than without it",
+        }
+        text = _elpd(self.elpd, self.se, self.structure, "without it", self.without)
+        ratio = math.exp(max(-50.0, min(50.0, self.elpd / self.number)))
+        each = f"each of {self.number} left-out observations is {ratio:.3g} times as likely"
+        finding = f"{verdict[self.shown]}: {text}; {each} in geometric mean."
+        return [finding] if self.shown else [finding, self._reason()]
+
+    def _reason(self) -> str:
+        """Return why the physics is neither shown to help nor to do harm."""
+        if self.number < _ENOUGH:
+            return (
+                f"Of fewer than {_ENOUGH} observations the standard error is itself unknown: "
+                "neither is it shown that the physics helps, nor that it does not."
+            )
+        if not self.by_evidence:
+            return (
+                "That is not to say that it does not help: the difference is within two standard "
+                "errors, and more observations may show one."
+            )
+        if self.elpd > 0:
+            return (
+                f"{self.structure} is better by more than two standard errors, but by the evidence "
+                "of a model with and without the physics it is of no use: as the two do not agree, "
+                "nothing is shown."
+            )
+        return (
+            f"{self.structure} is worse by more than two standard errors, but among those "
+            "compared is a model that leaves a physics of no use out by itself: so none is said to "
+            "do harm."
+        )
+
+
+def difference(first: Tensor, second: Tensor) -> tuple[float, float]:
+    """Return the difference of two elpd, and its standard error (Vehtari et al. 2017, eq. 24)."""
+    each = first - second
+    return each.sum().item(), math.sqrt(len(each)) * each.std(correction=0).item()
+
+
+def _sign_of(value: float, error: float) -> int:
+    """Return the sign that a difference is shown to have, or 0."""
+    if abs(value) <= max(_SURE * error, _LEAST):
+        return 0
+    return 1 if value > 0 else -1
+
+
+def gain_of(
+    order: Sequence[str],
+    uses: Collection[str],
+    densities: Mapping[str, Tensor],
+    relevance: Mapping[str, float],
+) -> Gain | None:
+    """Return the gain by the physics; None if no structure uses it, or all do.
+
+    Args:
+        order: The names of the structures, best first.
+        uses: Those that use the physics.
+        densities: Log predictive densities of left-out observations by name, ``n`` each.
+        relevance: The probability that the physics is of use, by the names of models that are
+            averaged with one without it. For a structure without such a probability the highest one
+            counts: one of several physics may be of use, and others not.
+    """
+    best = next((name for name in order if name in uses), None)
+    without = next((name for name in order if name not in uses), None)
+    if best is None or without is None:
+        return None
+    number = len(densities[best])
+    elpd, se = difference(densities[best], densities[without])
+    sign = _sign_of(elpd, se) if number >= _ENOUGH else 0
+    probability = relevance.get(best, max(relevance.values(), default=1.0))
+    is_doubted = probability <= 0.5 if sign > 0 else bool(relevance)
+    by_evidence = bool(sign) and is_doubted
+    return Gain(elpd, se, best, without, 0 if by_evidence else sign, by_evidence, number)
+
+
+def advice(
+    rows: Sequence[Candidate],
+    adjusts: Collection[str],
+    plain: Collection[str],
+    densities: Mapping[str, Tensor],
+    gain: Gain | None,
+) -> list[str]:
+    """Return findings on an output in addition to the verdict, in sentences.
+
+    Args:
+        rows: The structures, best first.
+        adjusts: The names of structures that scale the physics.
+        plain: The names of structures that take it as the mean.
+        densities: Log predictive densities of left-out observations by name, ``n`` each.
+        gain: The verdict.
+    """
+    best, *others = rows
+    sentence = f"{best.structure} predicts left-out observations best (weight {best.weight:.2f})"
+    if near := [row.structure for row in others if not _sign_of(row.elpd_diff, row.se_diff)]:
+        sentence += (
+            f"; not shown to be worse, within {_SURE:.0f} standard errors: {', '.join(near)}"
+        )
+    sentences = [f"{sentence}."]
+    scaled = next((row.structure for row in rows if row.structure in adjusts), None)
+    unscaled = next((row.structure for row in rows if row.structure in plain), None)
+    if scaled and unscaled and (gain is None or gain.shown > 0):
+        value, error = difference(densities[scaled], densities[unscaled])
+        says = "helps" if _sign_of(value, error) > 0 else "is not shown to help"
+        text = _elpd(value, error, scaled, "with the physics as a mean", unscaled)
+        sentences.append(f"Scaling the physics {says}: {text}.")
+    return sentences + [
+        f"By the evidence of {row.structure} with and without it, f_p is of use: {row.of_use:.2f}."
+        for row in rows
+        if not math.isnan(row.of_use)
+    ]
+
+
+def unsampled(
+    table: Mapping[str, Sequence[Candidate]], results: Mapping[str, FitResult]
+) -> list[str]:
+    """Return which structures with weight have other results by other seeds."""
+    names = {row.structure for rows in table.values() for row in rows if row.weight > _COUNTS}
+    low = [name for name, result in results.items() if name in names and not result.converged]
+    if not low:
+        return []
+    return [
+        f"Results of {', '.join(low)} depend on the seed: doubt the intervals, and fit again "
+        "with more num_draws or narrower priors."
+    ]
+
+
+def _elpd(value: float, error: float, better: str, otherwise: str, worse: str) -> str:
+    nats = f"{round(value, 1) + 0.0:+.1f} +- {error:.1f} nats"
+    return f"elpd {nats} ({better}) over that {otherwise} ({worse})"
