@@ -19,7 +19,7 @@ from torch import Tensor
 from gpadjust.dynamics.plots import going_on, labels
 from gpadjust.records.records import Record, Records
 from gpadjust.states import StateSpec
-from gpadjust.validation.drawing import BLUE, GREY, given_axes, tidy
+from gpadjust.validation.plots import BLUE, GREY, given_axes, tidy
 
 __all__ = ["plot_record"]
 

@@ -23,7 +23,7 @@ from gpadjust.report.page import checked_path, write
 from gpadjust.report.subject import Origin, Subject, subject_of
 from gpadjust.states import StateSpec
 from gpadjust.validation import compare
-from gpadjust.validation.plausibility import complaint
+from gpadjust.validation.verdict import complaint
 
 _FIT = re.compile(r" --f(i|it)?[ =](compare|bayes|map)\b")
 _DEGREES = ("deg", "degree", "degrees", "°")

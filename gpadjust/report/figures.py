@@ -8,18 +8,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpadjust.kinds.categories import on_levels
 from gpadjust.physics import PhysicsError
 from gpadjust.report import markup as html
 from gpadjust.report.markup import Markup, drawn, image, number, percent, tag
 from gpadjust.report.subject import Subject
 from gpadjust.validation import Trust, plots, trust
-from gpadjust.validation.drawing import labels, share_limits
-from gpadjust.validation.plots import adjustments_of, unadjusted
+from gpadjust.validation.plots import (
+    adjustments_of,
+    labels,
+    lines_along,
+    share_limits,
+    unadjusted,
+)
 from gpadjust.validation.trust import physics_at
 
 _MOST = 12  # inputs along which slices are drawn, in all outputs together
-_POINTS = 120  # of a curve
 _BANDS = "Solid lines are means; bands hold 95 % of the function, without measurement noise."
 _APART = (
     "Observations are of rho f_p + delta alone: how much of it is rho's and how much delta's the "
@@ -88,9 +91,9 @@ def inputs_drawn(subject: Subject) -> list[int]:
         return [*range(d)]
     spread = subject.Y.sub(subject.Y.nanmean(0)).square().nanmean(0).sqrt()
     effect = torch.zeros(d, dtype=torch.float64)
-    for i in range(d):
+    for i, (_, X) in enumerate(lines_along(subject.model, base=subject.base)):
         try:
-            mean = subject.model.predict(slice_along(subject, i, 21)).mean
+            mean = subject.model.predict(X).mean
         except PhysicsError:
             continue  # its figure will say so, if it is among them
         effect[i] = ((mean.amax(0) - mean.amin(0)) / spread.clamp_min(1e-300)).max()
@@ -113,12 +116,19 @@ def slices(subject: Subject, output: int, inputs: list[int]) -> list[Markup]:
     ratios = [1.4, *[1.0] * len(terms)]
     grids = [f.subplots(rows, sharex=True, squeeze=False, height_ratios=ratios) for f in figures]
     axes = np.hstack(grids)
-    with torch.no_grad():
-        for i in inputs:
-            _prediction(subject, output, i, axes[0, i])
+    lines = lines_along(subject.model, output, base=subject.base)
+    for i in inputs:
+        (x, X), ax = lines[i], axes[0, i]
+        physics = {} if shown is None else physics_at(shown.model, X)
+        plots.draw_prediction(ax, subject.model, x, X, output, physics)
+        if d == 1:
+            plots.draw_data(ax, subject.model, output)
+        if len(physics) > 1:
+            ax.legend(frameon=False)
+        ax.set_ylabel(labels(subject.outputs)[output])
     share_limits([axes[0, i] for i in inputs])
     if shown is not None and terms:
-        plots.plot_adjustment(shown.model, output=shown.output, axes=axes[1:])
+        plots.plot_adjustment(shown.model, base=subject.base, output=output, axes=axes[1:])
         _name_alike(axes[1:])
     else:
         for ax, label in zip(axes[-1], labels(subject.inputs), strict=True):
@@ -161,26 +171,6 @@ def coverages(subject: Subject, output: int) -> list[Markup]:
     name = subject.outputs[output]
     first = image(figures[0], f"observed against nominal coverage of {name}")
     return [first, image(figures[1], f"histogram of PIT values of {name}")]
-
-
-def slice_along(subject: Subject, i: int, number_of_points: int) -> Tensor:
-    """Return points along an input, over the range of the data, the others at their medians."""
-    low, high = subject.X[:, i].min(), subject.X[:, i].max()
-    pad = 0.5 * low.abs().clamp_min(1.0) if low == high else torch.zeros_like(low)
-    X = subject.base.repeat(number_of_points, 1)
-    X[:, i] = torch.linspace(float(low - pad), float(high + pad), number_of_points, dtype=X.dtype)
-    return on_levels(subject.model, X)
-
-
-def _prediction(subject: Subject, output: int, i: int, ax: Any) -> None:
-    X, shown = slice_along(subject, i, _POINTS), subject.adjusted[output]
-    physics = {} if shown is None else physics_at(shown.model, X)
-    plots.draw_prediction(ax, subject.model, X[:, i], X, output, physics)
-    if len(subject.inputs) == 1:
-        plots.draw_data(ax, subject.model, output)
-    ax.set_ylabel(labels(subject.outputs)[output])
-    if len(physics) > 1:
-        ax.legend(frameon=False)
 
 
 def _name_alike(axes: Any) -> None:

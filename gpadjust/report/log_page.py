@@ -11,7 +11,7 @@ from gpadjust.records.identification import FEW, GUESSES, IDENTIFIED, PERSISTENC
 from gpadjust.report import markup as html
 from gpadjust.report.markup import Markup, Page, Verdict, drawn, number, percent, table, tag
 from gpadjust.report.subject import Origin
-from gpadjust.validation.drawing import band, quantile, tidy
+from gpadjust.validation.plots import band, quantile, tidy
 
 _NAMES = {
     GUESSES: "your equations with the guesses",

@@ -14,7 +14,7 @@ from gpadjust.kinds.ar1 import AR1
 from gpadjust.kinds.categories import Categories
 from gpadjust.physics import Physics
 from gpadjust.validation import Comparison, LeaveOneOut, leave_one_out
-from gpadjust.validation.drawing import column
+from gpadjust.validation.plots import column
 from gpadjust.validation.trust import physics_at
 
 

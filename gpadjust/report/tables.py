@@ -19,7 +19,7 @@ from gpadjust.report.given_physics import imports_of
 from gpadjust.report.markup import Markup, join, number, percent, table, tag
 from gpadjust.report.subject import Origin, Subject
 from gpadjust.validation.comparison import ALONE, STACKED, spread_of
-from gpadjust.validation.drawing import quantile
+from gpadjust.validation.plots import quantile
 
 _STRUCTURES = {
     "zero mean": "no physics: a Gaussian process of the data alone",

@@ -28,11 +28,11 @@ from gpadjust.core.data import ArrayLike, Data
 from gpadjust.kinds.factory import ModelFactory, make_model, with_options
 from gpadjust.physics import Physics, PhysicsWarning, as_physics
 from gpadjust.validation.leave_one_out import ROUNDING, LeaveOneOut, leave_one_out
-from gpadjust.validation.plausibility import complaint
 from gpadjust.validation.verdict import (
     Candidate,
     Gain,
     advice,
+    complaint,
     difference,
     gain_of,
     unsampled,

@@ -30,20 +30,30 @@ Example:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+import re
+from collections.abc import Mapping, Sequence
 from itertools import cycle
+from statistics import NormalDist
 from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from matplotlib.axes import Axes
+from matplotlib.mathtext import MathTextParser
 from scipy.stats import binom
 from torch import Tensor
 
-from gpadjust.checks import check_level, checked_bounds, checked_points, checked_tensor
+from gpadjust.checks import (
+    check_level,
+    checked_bounds,
+    checked_points,
+    checked_tensor,
+    checked_whole,
+)
+from gpadjust.core.gaussian import Marginals
 from gpadjust.kinds.categories import on_levels
-from gpadjust.validation import drawing
-from gpadjust.validation.drawing import BLUE, GREY, RED, axes_of, column, labels, tidy
 from gpadjust.validation.leave_one_out import LeaveOneOut
 from gpadjust.validation.scores import Scores
 from gpadjust.validation.trust import SIDES, Trust, physics_at
@@ -56,6 +66,9 @@ __all__ = [
     "plot_prediction",
     "plot_trust",
 ]
+BLUE, RED, GREY = "#0072B2", "#D55E00", "0.45"  # told apart by the colour-blind, too
+BAND: dict[str, Any] = {"color": BLUE, "alpha": 0.2, "lw": 0}
+DOTS: dict[str, Any] = {"ls": "", "marker": "o", "ms": 4.5, "mec": "white", "mew": 0.6}
 _POINTS = 120  # of a curve
 _STYLES = ("--", "-.", ":")  # of several physics
 _COLORS = (BLUE, RED, "0.85")  # of physics, data and neither
@@ -75,7 +88,7 @@ def plot_model(model: Any, *, output: int = 0, level: float = 0.95, axes: Any = 
         An array of axes, ``rows x d``.
     """
     names = adjustments_of(model)
-    lines = _lines(model, None, None, output, level)
+    lines = lines_along(model, output, level)
     axes = axes_of(axes, 1 + len(names), len(lines), 2.6)
     for i, (ax, (x, X)) in enumerate(zip(axes[0], lines, strict=True)):
         draw_prediction(ax, model, x, X, output, physics_at(model, X), level)
@@ -83,7 +96,7 @@ def plot_model(model: Any, *, output: int = 0, level: float = 0.95, axes: Any = 
             draw_data(ax, model, output)
         else:
             _draw_ticks(ax, model, output, i)
-    drawing.share_limits(axes[0])
+    share_limits(axes[0])
     axes[0, 0].set_ylabel(labels(model.data.output_names)[output])
     axes[0, 0].legend(frameon=False)
     if names:
@@ -128,14 +141,14 @@ def plot_adjustment(
             "Expected a model with rho or delta to draw, such as CKA, RRA, ScaleGP and "
             f"PhysicsMeanGP; found {type(model).__name__}."
         )
-    lines = _lines(model, bounds, base, output, level)
+    lines = lines_along(model, output, level, bounds, base)
     axes = axes_of(axes, len(names), len(lines), 2.6)
     for i, (x, X) in enumerate(lines):
         for ax, name in zip(axes[:, i], names, strict=True):
             with torch.no_grad():
-                drawn = drawing.mean_and_ends(model.term(name, X), output, level)
+                drawn = mean_and_ends(model.term(name, X), output, level)
             ax.axhline(unadjusted(model, name), color=GREY, lw=1, ls="--")
-            drawing.band(ax, x, *drawn, level)
+            band(ax, x, *drawn, level)
             _draw_ticks(ax, model, output, i)
             ax.set_xlim(float(x[0]), float(x[-1]))
             tidy(ax)
@@ -143,7 +156,7 @@ def plot_adjustment(
     outputs = labels(model.data.output_names)
     suffix = f"\nfor {outputs[output]}" if len(outputs) > 1 else ""
     for row, name in zip(axes, names, strict=True):
-        drawing.share_limits(row)
+        share_limits(row)
         row[0].set_ylabel(_symbol(name) + suffix)
     axes[0, 0].legend(frameon=False)
     return axes
@@ -174,7 +187,7 @@ def plot_prediction(
         )
     with torch.no_grad():
         posterior = model.posterior(X, observation_noise=observation_noise)
-    drawn = drawing.mean_and_ends(posterior, output, level)
+    drawn = mean_and_ends(posterior, output, level)
     if len(inputs) > 1:
         if Y is None:
             raise ValueError(
@@ -182,21 +195,21 @@ def plot_prediction(
                 "`Y`; for slices through a model use `plot_model`."
             )
         ax = axes_of(ax, 1, 1)[0, 0]
-        drawing.against_truth(ax, Y[:, output], drawn, level, f"true {outputs[output]}")
+        against_truth(ax, Y[:, output], drawn, level, f"true {outputs[output]}")
         ax.set_ylabel(f"predicted {outputs[output]}")
         return ax
     ax = axes_of(ax, 1, 1)[0, 0]
     order = X[:, 0].argsort()
     x = X[order, 0]
     mean, low, high = (each[order] for each in drawn)
-    drawing.band(ax, x, mean, low, high, level)
+    band(ax, x, mean, low, high, level)
     _draw_physics(ax, x, physics_at(model, X[order]), output)
     if Y is not None:
         y = Y[order, output]
         ax.plot(x[~y.isnan()], y[~y.isnan()], color="black", lw=1, ls=":", label="truth")
     draw_data(ax, model, output)
     ax.set(xlabel=inputs[0], ylabel=outputs[output])
-    drawing.legend(ax)
+    legend(ax)
     return ax
 
 
@@ -211,20 +224,20 @@ def plot_leave_one_out(
         raise TypeError(
             f"Expected a LeaveOneOut, got {type(loo).__name__}; pass `leave_one_out(model)`."
         )
-    z = drawing.quantile(level)
+    z = quantile(level)
     values = (loo.Y, loo.mean, loo.variance.sqrt(), loo.residuals)
     Y, mean, sd, residuals = (column(each, output) for each in values)
     axes = axes_of(axes, 1, 2)[0]
     name = labels(loo.output_names)[output]
     drawn = (mean, mean - z * sd, mean + z * sd)
-    drawing.against_truth(axes[0], Y, drawn, level, f"observed {name}")
+    against_truth(axes[0], Y, drawn, level, f"observed {name}")
     axes[0].set_ylabel("predicted without it")
-    axes[1].axhspan(-z, z, **drawing.BAND, label=f"{100 * level:g} %")
+    axes[1].axhspan(-z, z, **BAND, label=f"{100 * level:g} %")
     axes[1].axhline(0, color=GREY, lw=1, ls="--")
-    axes[1].plot(mean, residuals, color=BLUE, **drawing.DOTS)
+    axes[1].plot(mean, residuals, color=BLUE, **DOTS)
     top = 1.35 * max(z, residuals.abs().nan_to_num().max().item())  # room for the legend
     axes[1].set(xlabel="predicted without it", ylabel="standardized residual", ylim=(-top, top))
-    drawing.legend(axes[1])
+    legend(axes[1])
     return axes
 
 
@@ -265,7 +278,7 @@ def plot_pit(prediction: LeaveOneOut | Scores, *, output: int = 0, ax: Axes | No
     ax.axhline(n / bins, color=GREY, lw=1, ls="--", zorder=3)
     ax.set(xlabel="probability integral transform", ylabel="count", xlim=(0, 1))
     ax.set_ylim(top=1.25 * max(high, ax.get_ylim()[1]))  # room for the legend
-    drawing.legend(ax)
+    legend(ax)
     return ax
 
 
@@ -319,7 +332,7 @@ def draw_prediction(
     level: float = 0.95,
 ) -> None:
     """Draw the prediction and each physics, ``n x m``, at points ``X`` over a line ``x``."""
-    drawing.band(ax, x, *drawing.mean_and_ends(model.marginals(X), output, level), level)
+    band(ax, x, *mean_and_ends(model.marginals(X), output, level), level)
     _draw_physics(ax, x, physics, output)
     ax.set_xlim(float(x[0]), float(x[-1]))
     tidy(ax)
@@ -334,7 +347,7 @@ def draw_data(ax: Axes, model: Any, output: int) -> None:
     """Draw the observations of an output over the only input."""
     y = column(model.data.Y, output)
     x = model.data.X[~y.isnan(), 0]
-    ax.plot(x, y[~y.isnan()], color=RED, **drawing.DOTS, label="data")
+    ax.plot(x, y[~y.isnan()], color=RED, **DOTS, label="data")
 
 
 def _draw_ticks(ax: Axes, model: Any, output: int, i: int) -> None:
@@ -343,14 +356,16 @@ def _draw_ticks(ax: Axes, model: Any, output: int, i: int) -> None:
     ax.plot(x, torch.zeros(len(x)), "|", color=RED, transform=ax.get_xaxis_transform())
 
 
-def _lines(
-    model: Any, bounds: Any, base: Any, output: int, level: float
+def lines_along(
+    model: Any, output: int = 0, level: float = 0.95, bounds: Any = None, base: Any = None
 ) -> list[tuple[Tensor, Tensor]]:
-    """Return positions ``n`` and points ``n x d`` on a line along each input, through the base."""
-    X = model.data.X
+    """Return positions ``n`` and points ``n x d`` on a line along each input, through the base.
+
+    Arguments are those of :func:`plot_adjustment`; an error if one is wrong.
+    """
+    X, _ = model.data.X, column(model.data.Y, output)
     d = X.shape[-1]
     check_level(level)
-    column(model.data.Y, output)  # an error if there is no such output
     if bounds is None:
         lower, upper = X.min(0).values, X.max(0).values
         # An input that never changed is drawn around its value.
@@ -392,3 +407,108 @@ def _pit_and_axes(
     if ax is None and len(scores.output_names) > 1:
         drawn.set_title(labels(scores.output_names)[output])
     return values[~values.isnan()].numpy(), drawn
+
+
+def quantile(level: float) -> float:
+    """Return half the width of the central interval, in standard deviations."""
+    check_level(level)
+    return NormalDist().inv_cdf((1 + level) / 2)
+
+
+def mean_and_ends(prediction: Any, output: int, level: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the mean and the ends of the interval of one output of a posterior, ``n`` each."""
+    marginals = getattr(prediction, "marginals", prediction)
+    if isinstance(marginals, Marginals):
+        mean = marginals.prediction.mean
+        low, high = (marginals.quantile((1 + sign * level) / 2) for sign in (-1, 1))
+    else:
+        mean, half = prediction.mean, quantile(level) * prediction.variance.sqrt()
+        low, high = mean - half, mean + half
+    return column(mean, output), column(low, output), column(high, output)
+
+
+def column(values: Tensor, output: int) -> Tensor:
+    """Return one output of ``n x m`` values."""
+    if values.dim() != 2:
+        raise ValueError(
+            f"Expected n x m values to draw, got shape {tuple(values.shape)}; plot the elements of "
+            "a batch one by one."
+        )
+    if checked_whole("output", output, 0) >= values.shape[-1]:
+        raise ValueError(f"There is no output {output}; there are {values.shape[-1]}, from 0.")
+    return values[:, output].detach()
+
+
+def labels(names: Sequence[str]) -> list[str]:
+    """Return names as labels; x1 and y2, which stand for no name, with subscripts."""
+    return [re.sub(r"^([xy])(\d+)$", r"$\1_{\2}$", _as_text(name)) for name in names]
+
+
+def _as_text(name: str) -> str:
+    """Return a name in which dollars are dollars, unless they hold a formula to be drawn."""
+    lines = []
+    for line in name.split("\n"):
+        try:
+            MathTextParser("path").parse(line)
+            lines.append(line)
+        except ValueError:
+            lines.append(line.replace("$", r"\$"))
+    return "\n".join(lines)
+
+
+def axes_of(given: Any, rows: int, columns: int, size: float = 3.2) -> Any:
+    """Return the axes that the user gave as an array, or those of a new figure of pyplot."""
+    if given is not None:
+        return given_axes(given, (rows, columns))
+    width = 1.3 * size if columns == 1 else 1.15 * size
+    figure = plt.figure(figsize=(width * columns, size * rows), layout="constrained")
+    return figure.subplots(rows, columns, squeeze=False)
+
+
+def given_axes(axes: Any, shape: tuple[int, ...]) -> Any:
+    """Return the axes that the user gave, as an array of the shape needed."""
+    axes = np.asarray(axes)
+    number = sum(isinstance(ax, Axes) for ax in axes.flat)
+    if not number == axes.size == math.prod(shape):
+        raise ValueError(f"Expected {' x '.join(map(str, shape))} axes, got {number}.")
+    return axes.reshape(shape)
+
+
+def band(ax: Axes, x: Tensor, mean: Tensor, low: Tensor, high: Tensor, level: float) -> None:
+    """Draw a mean and its interval, ``n`` each."""
+    ax.fill_between(x, low, high, **BAND, label=f"{100 * level:g} %")
+    ax.plot(x, mean, color=BLUE, lw=1.8, label="mean")
+
+
+def against_truth(
+    ax: Axes, truth: Tensor, drawn: Sequence[Tensor], level: float, xlabel: str
+) -> None:
+    """Draw predictions, a mean and the ends of its interval, against the true values, ``n``."""
+    seen = ~truth.isnan()
+    truth, mean, low, high = (each[seen] for each in (truth, *drawn))
+    diagonal = [min(truth.min(), mean.min()), max(truth.max(), mean.max())]
+    ax.plot(diagonal, diagonal, color=GREY, lw=1, ls="--")
+    errors = torch.stack([mean - low, high - mean]).clamp_min(0.0)
+    label = f"mean, {100 * level:g} %"
+    ax.errorbar(truth, mean, errors, color=BLUE, **DOTS, elinewidth=1, alpha=0.85, label=label)
+    ax.set_xlabel(xlabel)
+    ax.legend(frameon=False, loc="upper left")
+    tidy(ax)
+
+
+def share_limits(axes: Sequence[Axes]) -> None:
+    """Give axes the same range of y: slices of one function are compared by eye."""
+    low, high = zip(*(ax.get_ylim() for ax in axes), strict=True)
+    for ax in axes:
+        ax.set_ylim(min(low), max(high))
+
+
+def legend(ax: Axes) -> None:
+    """Add a legend and remove the frame's upper and right sides."""
+    ax.legend(frameon=False)
+    tidy(ax)
+
+
+def tidy(ax: Axes) -> None:
+    """Remove the frame's upper and right sides."""
+    ax.spines[["top", "right"]].set_visible(False)

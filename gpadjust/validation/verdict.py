@@ -1,4 +1,4 @@
-"""What the numbers of a comparison show: the verdict on the physics, and advice in words."""
+"""What data show of a physics, in words: whether it helps, and whether it is obviously off."""
 
 from __future__ import annotations
 
@@ -6,14 +6,36 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from gpadjust.core import FitResult
+from gpadjust.core.data import Data
+from gpadjust.physics import Physics
 
 _SURE = 2.0  # standard errors that a difference takes to be real
 _ENOUGH = 8  # observations of different inputs, for a difference to be shown
 _LEAST = 1e-6  # nats; less is rounding
 _COUNTS = 0.05  # weight with which a structure is a part of what is recommended
+
+# Of the check of a physics at the training inputs.
+_SAID = 5  # observations, for anything to be said
+_MANY = 8  # observations, for the sign or a factor of a twentieth by correlation
+_FAR = 3.0  # standard deviations of the targets, beyond which a physics is off
+_NEAR = 0.5  # of the targets' root mean square; a physics that is nearer is crude, no more
+_WORSE = 1.5  # standard deviations, where the cause is plain
+_APART = 12.0  # standard deviations of the targets; a smaller offset is crudeness
+_FACTOR = 10.0  # a smaller factor is crudeness
+_TINY = 20.0  # times too small: next to nothing, so that the error is that of no physics
+_HUGE = 100.0  # times as large as the targets, whatever its shape
+_EXPLAINS = 1 / 3  # of the error is left, where its cause is found
+_FITS = 0.6  # standard deviations of the targets that a factor leaves
+_LIKE = 0.8  # of the error is left by the opposite, at most
+_FOLLOWS = 0.5  # correlation of a physics that has anything to do with the targets
+_SURELY = 0.9  # correlation that shows what the size of the error does not
+_SHOWN = 3.0  # standard errors of a correlation
+_ROUNDING = 1e-9
+_STANDARD = 1e-6
 _ANSWERS = {1: "Yes", 0: "Not shown", -1: "No"}
 
 
@@ -211,3 +233,106 @@ def unsampled(
 def _elpd(value: float, error: float, better: str, otherwise: str, worse: str) -> str:
     nats = f"{round(value, 1) + 0.0:+.1f} +- {error:.1f} nats"
     return f"elpd {nats} ({better}) over that {otherwise} ({worse})"
+
+
+@torch.no_grad()
+def complaint(physics: Physics, data: Data) -> str:
+    """Return the obvious faults of a physics, of each output; empty if there are none.
+
+    There are none of a physics with unknown parameters, of which the guesses may be wrong.
+    """
+    if physics.unknowns:
+        return ""
+    m, sentences = data.Y.shape[-1], []
+    for name, y, f in zip(data.output_names, data.Y.mT, physics(data.X).mT, strict=True):
+        seen = ~y.isnan()
+        text = _of_output(data.X, y[seen], f[seen]) if int(seen.sum()) >= _SAID else ""
+        sentences += [f"{name}: {text}" if m > 1 else text] * bool(text)
+    return " ".join(sentences)
+
+
+def _of_output(X: Tensor, y: Tensor, f: Tensor) -> str:
+    """Return the fault of f_p for the ``n`` observations of an output."""
+    sd = float(y.std())
+    cause = _cause(X, y, f) if sd > _ROUNDING * _rms(y) else ""
+    if cause and _is_standardised(y.unsqueeze(-1)):
+        cause += " The targets were standardised; f_p has to return what they are in."
+    return cause and (
+        f"at the training inputs f_p has a root mean square error of {_number(_rms(y - f))}, where "
+        f"the targets have a standard deviation of {_number(sd)}: {cause}"
+    )
+
+
+def _cause(X: Tensor, y: Tensor, f: Tensor) -> str:
+    """Return what is wrong with f_p: scaled inputs, or a sign, an offset or a factor."""
+    n, sd, size, rmse = len(y), float(y.std()), _rms(y), _rms(f - y)
+    r = _correlation(y, f)
+    if rmse > (_WORSE if r > _FOLLOWS else 1.0) * sd and _is_standardised(X):
+        return (
+            "are the inputs scaled? Each column of them has mean 0 and standard deviation 1, and "
+            f"the correlation of f_p with the targets is {r:.2f}. f_p reads raw units: give the "
+            "model raw inputs; its input_transform may scale them, and shows f_p raw ones."
+        )
+    if rmse <= _NEAR * size:
+        return ""
+    factor, by_factor = _factor(y, f, r)
+    is_off = rmse > _FAR * sd
+    is_opposite = r < -_FOLLOWS and r**2 * (n - 2) > _SHOWN**2 * (1 - r**2)
+    is_worse = n >= _MANY and rmse > _WORSE * sd and r < -_SURELY
+    if is_opposite and (is_off or is_worse) and _rms(f + y) < (1.0 if is_off else _LIKE) * rmse:
+        large = f", and {_times(factor)}" if abs(factor) > _FACTOR else ""
+        return f"f_p is of the opposite sign (correlation {r:.2f}){large}."
+    is_tiny = n >= _MANY and r > _SURELY and 0 < factor < 1 / _TINY
+    if not is_off and not is_tiny:
+        return ""
+    offset = float((f - y).mean())
+    by_offset = _rms(f - y - offset)
+    if rmse > _APART * sd and by_offset < _EXPLAINS * rmse and by_offset <= by_factor:
+        where = "above" if offset > 0 else "below"
+        return f"f_p is about {_number(abs(offset))} {where} the targets."
+    if factor > 0 and not 1 / _FACTOR < factor < _FACTOR:
+        return f"f_p is {_times(factor)}; are its units those of the targets?"
+    return ""
+
+
+def _factor(y: Tensor, f: Tensor, r: float) -> tuple[float, float]:
+    """Return how many times too large f_p is, 0 if that says nothing, and the error without."""
+    sd, size = float(y.std()), _rms(y)
+    slope = float(f @ y / (f @ f)) if f.any() else 0.0
+    by_factor, affine = _rms(y - slope * f), sd * max(0.0, 1 - r**2) ** 0.5
+    if affine < _FITS * sd and by_factor > 1.5 * affine:  # there is an offset, too
+        slope = r * sd / float(f.std())
+    elif by_factor > _FITS * sd:
+        slope = size / _rms(f) if _rms(f) > _HUGE * size else 0.0
+        slope = -slope if r < -_FOLLOWS else slope
+    return (1 / slope if slope else 0.0), by_factor
+
+
+def _correlation(y: Tensor, f: Tensor) -> float:
+    """Return the correlation; 0 of a constant f_p."""
+    if float(f.std()) <= _ROUNDING * _rms(f):
+        return 0.0
+    return float(torch.corrcoef(torch.stack([y, f]))[0, 1])
+
+
+def _is_standardised(values: Tensor) -> bool:
+    """Return whether a scaler made the columns of ``n x d``; it makes 0 of a constant one."""
+    mean, sd = values.mean(0), values.std(0, correction=0)
+    ones = torch.stack([(sd - 1).abs(), (values.std(0) - 1).abs()]).amin(0) < _STANDARD
+    return bool((mean.abs() < _STANDARD).all() & (ones | (sd == 0)).all() & ones.any())
+
+
+def _rms(values: Tensor) -> float:
+    return float(values.square().mean().sqrt())
+
+
+def _times(factor: float) -> str:
+    """Return a text for a factor, too large or too small."""
+    size = "large" if abs(factor) >= 1 else "small"
+    return f"about {_number(max(abs(factor), 1 / abs(factor)), 2)} times too {size}"
+
+
+def _number(value: float, digits: int = 3) -> str:
+    """Return a number with some significant digits, without an exponent up to ten million."""
+    text = f"{value:.{digits}g}"
+    return f"{float(text):,.0f}" if "e+" in text and value < 1e7 else text
