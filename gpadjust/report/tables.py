@@ -15,7 +15,7 @@ from gpadjust.kinds.heavy_tails import RowNoise
 from gpadjust.physics.import_path import is_formula
 from gpadjust.report import figures
 from gpadjust.report import markup as html
-from gpadjust.report.given_physics import imports_of
+from gpadjust.report.inputs import imports_of
 from gpadjust.report.markup import Markup, join, number, percent, table, tag
 from gpadjust.report.subject import Origin, Subject
 from gpadjust.validation.comparison import ALONE, STACKED, spread_of

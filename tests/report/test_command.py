@@ -14,7 +14,7 @@ from gpadjust.__main__ import main
 from gpadjust.core import load
 from gpadjust.kinds.categories import levels_of
 from gpadjust.physics import Unknown
-from gpadjust.report.given_physics import unknown_of
+from gpadjust.report.inputs import unknown_of
 
 MODULE = """
 import sys

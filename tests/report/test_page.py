@@ -12,8 +12,8 @@ from gpadjust.core import CKA, ZeroMeanGP, fit, load
 from gpadjust.physics import FunctionPhysics, PhysicsError
 from gpadjust.report import report
 from gpadjust.report.markup import cards, failure, name_and_unit, number, table, tag
+from gpadjust.report.page import headline, verdicts
 from gpadjust.report.subject import subject_of
-from gpadjust.report.verdict import headline, verdicts
 from gpadjust.validation import Gain
 from gpadjust.validation.plots import lines_along
 
