@@ -235,8 +235,7 @@ def compare(
             structures share. A structure keeps its own.
 
     Returns:
-        The fitted models, the rankings, the recommended model, and advice in words: whether the
-        physics is shown to help, and whether scaling it is better than taking it as the mean.
+        The fitted models, their rankings, and in words whether the physics is shown to help.
 
     Warns:
         PhysicsWarning: If a physics is obviously off.
@@ -304,9 +303,7 @@ def compare(
         densities = _densities(left_out, j)
         rows = _ranked(j, densities, left_out, models, results, stacked)
         candidates = [row for row in rows if row.structure in models]
-        order = [row.structure for row in candidates]
-        use = {row.structure: row.of_use for row in candidates if not math.isnan(row.of_use)}
-        gain = gain_of(order, uses, densities, use)
+        gain = gain_of(candidates, uses, densities)
         if gain is not None:
             gains[output] = gain
         findings = advice(candidates, adjusts, uses - adjusts, densities, gain)
@@ -462,33 +459,32 @@ def _ranked(
 ) -> list[Candidate]:
     """Return the structures for output j, best first, and beneath them each physics alone."""
     best = max((densities[name] for name in models), key=lambda density: float(density.sum()))
-    weights = dict.fromkeys(models, 0.0) | {n: each[j] for n, each in stacked.weights.items()}
     rows = []
     for name, loo in left_out.items():
-        scores = loo.score()
+        density, scores = densities[name], loo.score()
         error = float(scores.rmse[j])
+        weight = log_evidence = of_use = math.nan
+        if name in models:
+            model, result = models[name], results[name]
+            weight = stacked.weights[name][j] if name in stacked.weights else 0.0
+            if result.log_evidence is not None:
+                log_evidence = float(result.log_evidence.expand(model.num_outputs)[j])
+            if relevance := relevance_of(model, result):
+                of_use = relevance[j]
         rows.append(
             Candidate(
                 name,
-                float(densities[name].sum()),
-                *difference(densities[name], best),
-                weights.get(name, math.nan),
+                float(density.sum()),
+                *difference(density, best),
+                weight,
                 error / spread_of(loo.Y[:, j]),
                 float(scores.coverage[j]),
                 error,
-                *_evidence(j, models.get(name), results.get(name)),
+                log_evidence,
+                of_use,
             )
         )
     return sorted(rows, key=lambda row: (row.structure not in models, -row.elpd))
-
-
-def _evidence(j: int, model: GP | None, result: FitResult | None) -> tuple[float, float]:
-    """Return the log evidence of an output, and the probability that the physics is of use."""
-    if model is None or result is None:
-        return math.nan, math.nan
-    evidence, of_use = result.log_evidence, relevance_of(model, result)
-    log_evidence = math.nan if evidence is None else float(evidence.expand(model.num_outputs)[j])
-    return log_evidence, of_use[j] if of_use else math.nan
 
 
 def relevance_of(model: GP, result: FitResult) -> list[float]:

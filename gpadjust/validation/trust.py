@@ -11,7 +11,6 @@ from botorch.utils.sampling import draw_sobol_samples
 from torch import Tensor
 
 from gpadjust.checks import check_level, checked_whole
-from gpadjust.core import StackedGP
 from gpadjust.core.data import ArrayLike
 from gpadjust.core.model import Predictive
 from gpadjust.kinds.categories import on_levels
@@ -79,10 +78,9 @@ def trust(model: Any, X: ArrayLike = None, *, level: float = 0.95, num_points: i
     - *neither*: the physics may be right, or as wrong as it was elsewhere. The model says what the
       physics says, for want of data.
 
-    The share of the points with *data* is the share of the predictions that override the physics.
-    It does not depend on units: w and D are taken to be at least a thousandth of the standard
-    deviation of the targets, as less makes no difference to speak of. :math:`f_p` is the prior mean
-    of the model, of several physics their weighted sum.
+    w and D are taken to be at least a thousandth of the standard deviation of the targets, as less
+    makes no difference to speak of. :math:`f_p` is the prior mean of the model, of several physics
+    their weighted sum.
 
     Args:
         model: A model with a physics, such as :class:`~gpadjust.CKA`; that of
@@ -110,15 +108,11 @@ def trust(model: Any, X: ArrayLike = None, *, level: float = 0.95, num_points: i
         (True, True)
     """
     check_level(level)
-    if isinstance(model, StackedGP):
-        raise TypeError(
-            "Expected a model of one structure; found a StackedGP, whose models rest on different "
-            "parts: take one of these, such as comparison.models['CKA']."
-        )
     if not isinstance(model, Predictive) or not getattr(model, "physics", None):
         raise TypeError(
             "Expected a model with a physics that it could trust, such as CKA; found "
-            f"{type(model).__name__}. Of LearnedDynamics pass its `model`."
+            f"{type(model).__name__}. Of LearnedDynamics pass its `model`, of a StackedGP one of "
+            "its models, such as comparison.models['CKA']."
         )
     data = model.data
     if X is None:

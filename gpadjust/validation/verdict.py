@@ -151,32 +151,30 @@ def _sign_of(value: float, error: float) -> int:
 
 
 def gain_of(
-    order: Sequence[str],
-    uses: Collection[str],
-    densities: Mapping[str, Tensor],
-    relevance: Mapping[str, float],
+    rows: Sequence[Candidate], uses: Collection[str], densities: Mapping[str, Tensor]
 ) -> Gain | None:
     """Return the gain by the physics; None if no structure uses it, or all do.
 
     Args:
-        order: The names of the structures, best first.
-        uses: Those that use the physics.
+        rows: The structures, best first. For one that is not averaged with a model without the
+            physics the highest probability that it is of use counts: one of several physics may be
+            of use, and others not.
+        uses: The names of structures that use the physics.
         densities: Log predictive densities of left-out observations by name, ``n`` each.
-        relevance: The probability that the physics is of use, by the names of models that are
-            averaged with one without it. For a structure without such a probability the highest one
-            counts: one of several physics may be of use, and others not.
     """
-    best = next((name for name in order if name in uses), None)
-    without = next((name for name in order if name not in uses), None)
+    best = next((row for row in rows if row.structure in uses), None)
+    without = next((row.structure for row in rows if row.structure not in uses), None)
     if best is None or without is None:
         return None
-    number = len(densities[best])
-    elpd, se = difference(densities[best], densities[without])
+    number = len(densities[without])
+    elpd, se = difference(densities[best.structure], densities[without])
     sign = _sign_of(elpd, se) if number >= _ENOUGH else 0
-    probability = relevance.get(best, max(relevance.values(), default=1.0))
-    is_doubted = probability <= 0.5 if sign > 0 else bool(relevance)
+    known = [row.of_use for row in rows if not math.isnan(row.of_use)]
+    of_use = max(known, default=1.0) if math.isnan(best.of_use) else best.of_use
+    is_doubted = of_use <= 0.5 if sign > 0 else bool(known)
     by_evidence = bool(sign) and is_doubted
-    return Gain(elpd, se, best, without, 0 if by_evidence else sign, by_evidence, number)
+    shown = 0 if by_evidence else sign
+    return Gain(elpd, se, best.structure, without, shown, by_evidence, number)
 
 
 def advice(
@@ -188,12 +186,8 @@ def advice(
 ) -> list[str]:
     """Return findings on an output in addition to the verdict, in sentences.
 
-    Args:
-        rows: The structures, best first.
-        adjusts: The names of structures that scale the physics.
-        plain: The names of structures that take it as the mean.
-        densities: Log predictive densities of left-out observations by name, ``n`` each.
-        gain: The verdict.
+    ``adjusts`` are the names of structures that scale the physics, ``plain`` of those that take it
+    as the mean.
     """
     best, *others = rows
     sentence = f"{best.structure} predicts left-out observations best (weight {best.weight:.2f})"

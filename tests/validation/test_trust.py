@@ -139,7 +139,7 @@ def test_bad_input(half, data):
     stacked = StackedGP({"CKA": half}, [1.0])
     for call, error, words in (
         (lambda: trust(ZeroMeanGP(X, Y)), TypeError, "could trust, such as CKA; found ZeroMeanGP"),
-        (lambda: trust(stacked), TypeError, r"found a StackedGP.*comparison\.models\['CKA'\]"),
+        (lambda: trust(stacked), TypeError, r"found StackedGP.*comparison\.models\['CKA'\]"),
         (lambda: trust("CKA"), TypeError, "Of LearnedDynamics pass its `model`"),
         (lambda: trust(half, X), ValueError, "columns"),
         (lambda: trust(half, X[:0, :1]), ValueError, "one point or more"),
