@@ -5,8 +5,7 @@ show or save the figure with ``ax.figure``. They need matplotlib, ``pip install 
 ``output`` is the number of the output to draw, ``level`` the nominal coverage of intervals. Where
 an output was not observed, nothing is drawn.
 
-A TypeError says that an argument is of another kind, a ValueError that it has a wrong value or
-shape, or that there is no such output; both come before there is a figure.
+A TypeError is of an argument of another kind, a ValueError of a wrong value, shape or output.
 
 Example:
     >>> import torch
@@ -98,12 +97,11 @@ def plot_model(model: Any, *, output: int = 0, level: float = 0.95, axes: Any = 
             _draw_ticks(ax, model, output, i)
     share_limits(axes[0])
     axes[0, 0].set_ylabel(labels(model.data.output_names)[output])
-    axes[0, 0].legend(frameon=False)
+    legend(axes[0, 0])
     if names:
         plot_adjustment(model, output=output, level=level, axes=axes[1:])
-    else:
-        for ax, label in zip(axes[0], labels(model.data.input_names), strict=True):
-            ax.set_xlabel(label)
+    for ax, label in zip(axes[-1], labels(model.data.input_names), strict=True):
+        ax.set_xlabel(label)
     return axes
 
 
@@ -146,9 +144,9 @@ def plot_adjustment(
     for i, (x, X) in enumerate(lines):
         for ax, name in zip(axes[:, i], names, strict=True):
             with torch.no_grad():
-                drawn = mean_and_ends(model.term(name, X), output, level)
+                drawn = mean_and_ends(model.term(name, X).marginals, output, level)
             ax.axhline(unadjusted(model, name), color=GREY, lw=1, ls="--")
-            band(ax, x, *drawn, level)
+            band(ax, x, drawn, level)
             _draw_ticks(ax, model, output, i)
             ax.set_xlim(float(x[0]), float(x[-1]))
             tidy(ax)
@@ -185,24 +183,21 @@ def plot_prediction(
             f"Expected Y of shape {len(X)} x {len(outputs)}, a row for each of X and a column for "
             f"each output, got {tuple(Y.shape)}."
         )
+    if Y is None and len(inputs) > 1:
+        raise ValueError(
+            f"X has {len(inputs)} inputs, so predictions are drawn against the truth: pass `Y`; "
+            "for slices through a model use `plot_model`."
+        )
     with torch.no_grad():
-        posterior = model.posterior(X, observation_noise=observation_noise)
-    drawn = mean_and_ends(posterior, output, level)
-    if len(inputs) > 1:
-        if Y is None:
-            raise ValueError(
-                f"X has {len(inputs)} inputs, so predictions are drawn against the truth: pass "
-                "`Y`; for slices through a model use `plot_model`."
-            )
-        ax = axes_of(ax, 1, 1)[0, 0]
+        drawn = mean_and_ends(model.marginals(X, observation_noise), output, level)
+    ax = axes_of(ax, 1, 1)[0, 0]
+    if Y is not None and len(inputs) > 1:
         against_truth(ax, Y[:, output], drawn, level, f"true {outputs[output]}")
         ax.set_ylabel(f"predicted {outputs[output]}")
         return ax
-    ax = axes_of(ax, 1, 1)[0, 0]
     order = X[:, 0].argsort()
     x = X[order, 0]
-    mean, low, high = (each[order] for each in drawn)
-    band(ax, x, mean, low, high, level)
+    band(ax, x, [each[order] for each in drawn], level)
     _draw_physics(ax, x, physics_at(model, X[order]), output)
     if Y is not None:
         y = Y[order, output]
@@ -259,8 +254,7 @@ def plot_coverage(
     ax.step(reached, shares, where="post", color=BLUE, lw=1.8, label="observed")
     ax.set(xlabel="nominal coverage", ylabel="observed coverage", aspect="equal")
     ax.set(xlim=(0, 1), ylim=(0, 1.01))
-    ax.legend(frameon=False, loc="upper left")
-    tidy(ax)
+    legend(ax, loc="upper left")
     return ax
 
 
@@ -305,8 +299,8 @@ def plot_trust(trust: Trust, *, output: int = 0, axes: Any = None) -> Any:
     axes[0].set_ylabel("share of predictions")
     outputs = labels(trust.output_names)
     title = f"{outputs[output]} rests on" if len(outputs) > 1 else "rests on"
-    beside: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
-    axes[-1].legend(frameon=False, title=title, alignment="left", **beside)
+    beside = (1.0, 1.0)
+    legend(axes[-1], title=title, alignment="left", loc="upper left", bbox_to_anchor=beside)
     return axes
 
 
@@ -332,7 +326,7 @@ def draw_prediction(
     level: float = 0.95,
 ) -> None:
     """Draw the prediction and each physics, ``n x m``, at points ``X`` over a line ``x``."""
-    band(ax, x, *mean_and_ends(model.marginals(X), output, level), level)
+    band(ax, x, mean_and_ends(model.marginals(X), output, level), level)
     _draw_physics(ax, x, physics, output)
     ax.set_xlim(float(x[0]), float(x[-1]))
     tidy(ax)
@@ -415,16 +409,10 @@ def quantile(level: float) -> float:
     return NormalDist().inv_cdf((1 + level) / 2)
 
 
-def mean_and_ends(prediction: Any, output: int, level: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the mean and the ends of the interval of one output of a posterior, ``n`` each."""
-    marginals = getattr(prediction, "marginals", prediction)
-    if isinstance(marginals, Marginals):
-        mean = marginals.prediction.mean
-        low, high = (marginals.quantile((1 + sign * level) / 2) for sign in (-1, 1))
-    else:
-        mean, half = prediction.mean, quantile(level) * prediction.variance.sqrt()
-        low, high = mean - half, mean + half
-    return column(mean, output), column(low, output), column(high, output)
+def mean_and_ends(marginals: Marginals, output: int, level: float) -> tuple[Tensor, ...]:
+    """Return the mean and the ends of the interval of one output of predictions, ``n`` each."""
+    ends = [marginals.quantile((1 + sign * level) / 2) for sign in (-1, 1)]
+    return tuple(column(each, output) for each in (marginals.prediction.mean, *ends))
 
 
 def column(values: Tensor, output: int) -> Tensor:
@@ -440,20 +428,18 @@ def column(values: Tensor, output: int) -> Tensor:
 
 
 def labels(names: Sequence[str]) -> list[str]:
-    """Return names as labels; x1 and y2, which stand for no name, with subscripts."""
-    return [re.sub(r"^([xy])(\d+)$", r"$\1_{\2}$", _as_text(name)) for name in names]
+    """Return names as labels; x1 and y2, which stand for no name, with subscripts.
 
-
-def _as_text(name: str) -> str:
-    """Return a name in which dollars are dollars, unless they hold a formula to be drawn."""
-    lines = []
-    for line in name.split("\n"):
+    Dollars are dollars, unless they hold a formula that can be drawn.
+    """
+    shown = []
+    for name in names:
         try:
-            MathTextParser("path").parse(line)
-            lines.append(line)
+            MathTextParser("path").parse(name.replace("\n", " "))
         except ValueError:
-            lines.append(line.replace("$", r"\$"))
-    return "\n".join(lines)
+            name = name.replace("$", r"\$")
+        shown.append(re.sub(r"^([xy])(\d+)$", r"$\1_{\2}$", name))
+    return shown
 
 
 def axes_of(given: Any, rows: int, columns: int, size: float = 3.2) -> Any:
@@ -474,8 +460,9 @@ def given_axes(axes: Any, shape: tuple[int, ...]) -> Any:
     return axes.reshape(shape)
 
 
-def band(ax: Axes, x: Tensor, mean: Tensor, low: Tensor, high: Tensor, level: float) -> None:
-    """Draw a mean and its interval, ``n`` each."""
+def band(ax: Axes, x: Tensor, drawn: Sequence[Tensor], level: float) -> None:
+    """Draw a mean and the ends of its interval, ``n`` each."""
+    mean, low, high = drawn
     ax.fill_between(x, low, high, **BAND, label=f"{100 * level:g} %")
     ax.plot(x, mean, color=BLUE, lw=1.8, label="mean")
 
@@ -492,8 +479,7 @@ def against_truth(
     label = f"mean, {100 * level:g} %"
     ax.errorbar(truth, mean, errors, color=BLUE, **DOTS, elinewidth=1, alpha=0.85, label=label)
     ax.set_xlabel(xlabel)
-    ax.legend(frameon=False, loc="upper left")
-    tidy(ax)
+    legend(ax, loc="upper left")
 
 
 def share_limits(axes: Sequence[Axes]) -> None:
@@ -503,9 +489,9 @@ def share_limits(axes: Sequence[Axes]) -> None:
         ax.set_ylim(min(low), max(high))
 
 
-def legend(ax: Axes) -> None:
+def legend(ax: Axes, **options: Any) -> None:
     """Add a legend and remove the frame's upper and right sides."""
-    ax.legend(frameon=False)
+    ax.legend(frameon=False, **options)
     tidy(ax)
 
 

@@ -10,11 +10,12 @@ import torch
 from botorch.utils.sampling import draw_sobol_samples
 from torch import Tensor
 
-from gpadjust.checks import check_level, checked_whole
+from gpadjust.checks import check_level
 from gpadjust.core.data import ArrayLike
 from gpadjust.core.model import Predictive
 from gpadjust.kinds.categories import on_levels
 
+_POINTS = 512
 SIDES = ("physics", "data", "neither")
 _NOTHING = 1e-3  # of the targets' standard deviation: what makes no difference
 
@@ -62,7 +63,7 @@ class Trust:
 
 
 @torch.no_grad()
-def trust(model: Any, X: ArrayLike = None, *, level: float = 0.95, num_points: int = 512) -> Trust:
+def trust(model: Any, X: ArrayLike = None, *, level: float = 0.95) -> Trust:
     r"""Return where a model's predictions rest on the physics, on the data, or on neither.
 
     With its mean :math:`\mu(x)`, the half width :math:`w(x)` of its central interval (without
@@ -86,14 +87,13 @@ def trust(model: Any, X: ArrayLike = None, *, level: float = 0.95, num_points: i
         model: A model with a physics, such as :class:`~gpadjust.CKA`; that of
             ``LearnedDynamics``, too.
         X: Inputs, ``n x d``, such as states and actions that were visited. Default:
-            ``num_points`` in the box of the training inputs, by Sobol's sequence.
+            512 in the box of the training inputs, by Sobol's sequence.
         level: Nominal coverage of the interval.
-        num_points: Number of points if there is no ``X``.
 
     Raises:
         TypeError: If the model has no physics to be trusted, or is a :class:`~gpadjust.StackedGP`,
             or ``level`` is no number.
-        ValueError: If ``X`` has the wrong shape, or ``level`` or ``num_points`` is out of range.
+        ValueError: If ``X`` has the wrong shape, or ``level`` is not between 0 and 1.
         PhysicsError: If the physics fails.
 
     Example:
@@ -116,9 +116,8 @@ def trust(model: Any, X: ArrayLike = None, *, level: float = 0.95, num_points: i
         )
     data = model.data
     if X is None:
-        number = checked_whole("num_points", num_points, 1)
         box = torch.stack([data.X.amin(0), data.X.amax(0)])
-        points = on_levels(model, draw_sobol_samples(box, n=number, q=1, seed=0).squeeze(-2))
+        points = on_levels(model, draw_sobol_samples(box, n=_POINTS, q=1, seed=0).squeeze(-2))
     else:
         points = data.new_inputs(X)
     if points.dim() != 2 or not len(points):

@@ -100,7 +100,7 @@ def test_outputs_are_judged_one_by_one(data):
     X, Y = data(num_outputs=2)
     Y[:3, 0] = torch.nan
     model = CKA(X, Y, physics=crude)
-    found = trust(model, num_points=16)
+    found = trust(model, 3 * torch.rand(16, 2, dtype=torch.float64))
     assert found.side.shape == found.override.shape == found.doubt.shape == (16, 2)
     torch.testing.assert_close(found.physics + found.data + found.neither, torch.ones(2).double())
     second = trust(model.subset_output([1]), found.X)
