@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 import sys
 import warnings
@@ -24,8 +23,8 @@ from gpadjust.states import StateSpec
 from gpadjust.validation import compare
 from gpadjust.validation.verdict import complaint
 
-_FIT = re.compile(r" --f(i|it)?[ =](compare|bayes|map)\b")
 _DEGREES = ("deg", "degree", "degrees", "°")
+_HOW = "the same command, without --fit."
 _DIGITS = 6  # of a sampling step, which is a mean of differences
 _NO_NOTES = (DeprecationWarning, PendingDeprecationWarning)
 
@@ -58,7 +57,7 @@ def run(arguments: Namespace, command: Sequence[str]) -> None:
         _say(*(f"Warning: {note}" for note in notes))
         words = f"gpadjust {shlex.join(command)}"
         settings = {"command": words, **origin.settings, "seed": str(arguments.seed)}
-        origin = replace(origin, settings=settings, notes=notes, how=_FIT.sub("", words))
+        origin = replace(origin, settings=settings, notes=notes, how=_HOW)
         headline = write(subject, path, arguments.title, origin, progress=True)
     except PhysicsError as error:
         raise ValueError(str(error)) from error

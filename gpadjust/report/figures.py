@@ -58,7 +58,7 @@ def trusted(subject: Subject) -> Markup:
     """Return the shares of predictions that rest on the physics, on data, or on neither."""
     rows, failed, images = [], [], []
     inputs, points = inputs_drawn(subject), 0
-    for name, shown in zip(subject.outputs, subject.adjusted, strict=True):
+    for j, (name, shown) in enumerate(zip(subject.outputs, subject.adjusted, strict=True)):
         if shown is None:
             continue
         try:
@@ -67,8 +67,8 @@ def trusted(subject: Subject) -> Markup:
             failed.append(tag("p", f"{name}: {html.failure(error)}", class_="caution"))
             continue
         shares = (basis.physics, basis.data, basis.neither)
-        rows.append([name, shown.structure, *(percent(share[shown.output]) for share in shares)])
-        images.append(trusts(basis, shown.output, inputs, name))
+        rows.append([name, shown.structure, *(percent(share[j]) for share in shares)])
+        images.append(trusts(basis, j, inputs, name))
         points = len(basis.X)
     if not rows:
         return html.join(failed or [tag("p", _NONE)])

@@ -82,13 +82,12 @@ def report(
         ['report.html', 'report.pt']
     """
     origin = Origin({name: str(value) for name, value in (settings or {}).items()})
-    path = checked_path(file, model=not isinstance(model, Identification))
-    if not isinstance(model, Identification):
-        write(subject_of(model, rows), path, title, origin, progress)
-    elif rows is not None:
+    is_log = isinstance(model, Identification)
+    path = checked_path(file, model=not is_log)
+    if is_log and rows is not None:
         raise TypeError("The page of a log has no names of rows; leave `rows` out.")
-    else:
-        write(model, path, title, origin, progress)
+    subject = model if isinstance(model, Identification) else subject_of(model, rows)
+    write(subject, path, title, origin, progress)
     return path
 
 

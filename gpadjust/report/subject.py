@@ -37,7 +37,6 @@ class Adjusted(NamedTuple):
 
     structure: str
     model: GP
-    output: int
     weight: float  # in a mixture; 1 if there is none
 
 
@@ -129,5 +128,5 @@ def _adjusted(model: GP | StackedGP, comparison: Comparison | None, output: int)
         candidates = [(type(model).__name__, model, 1.0)]
     for name, part, weight in sorted(candidates, key=lambda candidate: -candidate[2]):
         if isinstance(part, GP) and part.physics:
-            return Adjusted(name, part, output, weight)
+            return Adjusted(name, part, weight)
     return None
