@@ -21,9 +21,10 @@ from gpadjust.report import markup as html
 from gpadjust.report.markup import Markup, Page, Verdict, tag
 from gpadjust.report.subject import Origin, Subject, subject_of
 from gpadjust.validation import Comparison
-from gpadjust.validation.comparison import ALONE, STACKED
+from gpadjust.validation.comparison import STACKED
+from gpadjust.validation.verdict import ALONE, CALIBRATED
 
-_ERRORS = {ALONE: "your formula", "calibrated physics": "your formula, calibrated"}
+_ERRORS = {ALONE: "your formula", CALIBRATED: "your formula, calibrated"}
 _LIBRARIES = ("torch", "gpytorch", "botorch", "numpy")
 
 

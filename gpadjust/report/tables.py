@@ -18,8 +18,9 @@ from gpadjust.report import markup as html
 from gpadjust.report.inputs import imports_of
 from gpadjust.report.markup import Markup, join, number, percent, table, tag
 from gpadjust.report.subject import Origin, Subject
-from gpadjust.validation.comparison import ALONE, STACKED, spread_of
+from gpadjust.validation.comparison import STACKED, spread_of
 from gpadjust.validation.plots import quantile
+from gpadjust.validation.verdict import ALONE
 
 _STRUCTURES = {
     "zero mean": "no physics: a Gaussian process of the data alone",

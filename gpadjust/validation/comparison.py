@@ -29,6 +29,10 @@ from gpadjust.kinds.factory import ModelFactory, make_model, with_options
 from gpadjust.physics import Physics, PhysicsWarning, as_physics
 from gpadjust.validation.leave_one_out import ROUNDING, LeaveOneOut, leave_one_out
 from gpadjust.validation.verdict import (
+    ADJUSTED,
+    ALONE,
+    CALIBRATED,
+    DATA,
     Candidate,
     Gain,
     advice,
@@ -39,7 +43,6 @@ from gpadjust.validation.verdict import (
 )
 
 STACKED = "stacked"  # what a comparison calls the mixture of all structures
-ALONE = "physics alone"  # and f_p as it is
 _ALL = 0.95  # weight of a structure that needs no others
 _WORST = -1e6  # nats; a density of zero would make others' differences infinite
 
@@ -66,9 +69,16 @@ class Structure(NamedTuple):
     joins: bool = True
     calibrates: bool = False
 
+    @property
+    def kind(self) -> str:
+        """What its predictions are, as in :class:`Candidate`."""
+        if not self.uses_physics:
+            return DATA
+        return CALIBRATED if self.calibrates else ADJUSTED
+
 
 STRUCTURES = (
-    Structure("calibrated physics", CalibratedPhysics, adjusts=False, joins=False, calibrates=True),
+    Structure(CALIBRATED, CalibratedPhysics, adjusts=False, joins=False, calibrates=True),
     Structure("zero mean", ZeroMeanGP, uses_physics=False, adjusts=False, joins=False),
     Structure("physics mean", PhysicsMeanGP, adjusts=False),
     Structure("CKA", CKA),
@@ -131,22 +141,20 @@ class Comparison:
         that does not; ``"data alone"``, the best structure without it. What was not fitted is not
         there.
         """
-        calibrated = {n for n, model in self.models.items() if isinstance(model, CalibratedPhysics)}
-        using = {name for name, model in self.models.items() if model.physics} - calibrated
+        kinds = {row.structure: row.kind for rows in self.table.values() for row in rows}
+        recommends_adjusting = kinds.get(self.chosen, ADJUSTED) == ADJUSTED
         recommended = self.leave_one_out().score().rmse.tolist()
         errors: dict[str, dict[str, float]] = {}
         for (output, rows), of_recommended in zip(self.table.items(), recommended, strict=True):
-            rmse = {row.structure: row.error for row in rows}  # best first
-            own = {name: rmse[name] for name in rmse if name not in self.models}
-            own |= {name: rmse[name] for name in rmse if name in calibrated}
-            if self.chosen in using or (self.chosen == STACKED and using):
-                own["adjusted"] = of_recommended
-            elif using:
-                own["adjusted"] = next(rmse[name] for name in rmse if name in using)
-            without = [n for n in rmse if n in self.models and n not in using | calibrated]
-            if without:
-                own["data alone"] = rmse[without[0]]
-            errors[output] = own
+            errors[output] = {}
+            for kind in (ALONE, CALIBRATED, ADJUSTED, DATA):
+                of_kind = {row.structure: row.error for row in rows if row.kind == kind}
+                if kind in (ALONE, CALIBRATED):
+                    errors[output] |= of_kind
+                elif of_kind:  # the best is the first
+                    errors[output][kind] = next(iter(of_kind.values()))
+            if ADJUSTED in errors[output] and recommends_adjusting:
+                errors[output][ADJUSTED] = of_recommended
         return errors
 
     def to_dataframe(self) -> Any:
@@ -267,12 +275,10 @@ def compare(
         warnings.simplefilter("always")
         warnings.simplefilter("ignore", SamplingWarning)  # the advice mentions it
         for structure, part in progress_bar(progress, fitted, unit="structure"):
-            factory, name = with_options(structure.model, options), structure.name
-            own = part if structure.uses_physics else None
+            name, factory = structure.name, with_options(structure.model, options)
+            given = {"train_Yvar": train_Yvar, "physics": part if structure.uses_physics else None}
             try:
-                models[name] = make_model(
-                    factory, train_X, train_Y, kind=GP, train_Yvar=train_Yvar, physics=own
-                )
+                models[name] = make_model(factory, train_X, train_Y, kind=GP, **given)
                 results[name] = fit(models[name], seed=seed)
             except Exception as error:
                 error.add_note(f"This is of the structure {name!r}.")
@@ -294,19 +300,19 @@ def compare(
     left_out |= _physics_alone(parts, data, is_outlier)
 
     # Rank the structures for each output, and say what that shows of the physics.
-    uses = {structure.name for structure, _ in fitted if structure.uses_physics}
-    adjusts = {structure.name for structure, _ in fitted if structure.adjusts}
+    kinds = {structure.name: structure.kind for structure, _ in fitted}
+    scaling = {structure.name for structure, _ in fitted if structure.adjusts}
     table: dict[str, list[Candidate]] = {}
     gains: dict[str, Gain] = {}
     sentences: list[str] = []
     for j, output in enumerate(data.output_names):
         densities = _densities(left_out, j)
-        rows = _ranked(j, densities, left_out, models, results, stacked)
+        rows = _ranked(j, densities, left_out, kinds, models, results, stacked)
         candidates = [row for row in rows if row.structure in models]
-        gain = gain_of(candidates, uses, densities)
+        gain = gain_of(candidates, densities)
         if gain is not None:
             gains[output] = gain
-        findings = advice(candidates, adjusts, uses - adjusts, densities, gain)
+        findings = advice(candidates, scaling, densities, gain)
         where = f"{output}: " if len(data.output_names) > 1 else ""
         sentences += [where + finding for finding in findings]
         table[output] = rows
@@ -453,6 +459,7 @@ def _ranked(
     j: int,
     densities: Mapping[str, Tensor],
     left_out: Mapping[str, LeaveOneOut],
+    kinds: Mapping[str, str],
     models: Mapping[str, GP],
     results: Mapping[str, FitResult],
     stacked: StackedGP,
@@ -482,6 +489,7 @@ def _ranked(
                 error,
                 log_evidence,
                 of_use,
+                kinds.get(name, ALONE),
             )
         )
     return sorted(rows, key=lambda row: (row.structure not in models, -row.elpd))

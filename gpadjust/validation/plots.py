@@ -471,8 +471,8 @@ def against_truth(
     ax: Axes, truth: Tensor, drawn: Sequence[Tensor], level: float, xlabel: str
 ) -> None:
     """Draw predictions, a mean and the ends of its interval, against the true values, ``n``."""
-    seen = ~truth.isnan()
-    truth, mean, low, high = (each[seen] for each in (truth, *drawn))
+    is_observed = ~truth.isnan()
+    truth, mean, low, high = (values[is_observed] for values in (truth, *drawn))
     diagonal = [min(truth.min(), mean.min()), max(truth.max(), mean.max())]
     ax.plot(diagonal, diagonal, color=GREY, lw=1, ls="--")
     errors = torch.stack([mean - low, high - mean]).clamp_min(0.0)

@@ -13,6 +13,8 @@ from gpadjust.core import FitResult
 from gpadjust.core.data import Data
 from gpadjust.physics import Physics
 
+ALONE, CALIBRATED, ADJUSTED = "physics alone", "calibrated physics", "adjusted"
+DATA = "data alone"
 _SURE = 2.0  # standard errors that a difference takes to be real
 _ENOUGH = 8  # observations of different inputs, for a difference to be shown
 _LEAST = 1e-6  # nats; less is rounding
@@ -54,6 +56,7 @@ class Candidate(NamedTuple):
         log_evidence: The log evidence of the fit; NaN if there is none.
         of_use: Probability that the physics is of use, by the evidence of nested models with and
             without it; NaN if there are none.
+        kind: ``"physics alone"``, ``"calibrated physics"``, ``"adjusted"`` or ``"data alone"``.
     """
 
     structure: str
@@ -66,6 +69,7 @@ class Candidate(NamedTuple):
     error: float
     log_evidence: float
     of_use: float
+    kind: str
 
 
 class Gain(NamedTuple):
@@ -150,28 +154,25 @@ def _sign_of(value: float, error: float) -> int:
     return 1 if value > 0 else -1
 
 
-def gain_of(
-    rows: Sequence[Candidate], uses: Collection[str], densities: Mapping[str, Tensor]
-) -> Gain | None:
+def gain_of(rows: Sequence[Candidate], densities: Mapping[str, Tensor]) -> Gain | None:
     """Return the gain by the physics; None if no structure uses it, or all do.
 
     Args:
         rows: The structures, best first. For one that is not averaged with a model without the
             physics the highest probability that it is of use counts: one of several physics may be
             of use, and others not.
-        uses: The names of structures that use the physics.
         densities: Log predictive densities of left-out observations by name, ``n`` each.
     """
-    best = next((row for row in rows if row.structure in uses), None)
-    without = next((row.structure for row in rows if row.structure not in uses), None)
+    best = next((row for row in rows if row.kind != DATA), None)
+    without = next((row.structure for row in rows if row.kind == DATA), None)
     if best is None or without is None:
         return None
     number = len(densities[without])
     elpd, se = difference(densities[best.structure], densities[without])
     sign = _sign_of(elpd, se) if number >= _ENOUGH else 0
-    known = [row.of_use for row in rows if not math.isnan(row.of_use)]
-    of_use = max(known, default=1.0) if math.isnan(best.of_use) else best.of_use
-    is_doubted = of_use <= 0.5 if sign > 0 else bool(known)
+    probabilities = [row.of_use for row in rows if not math.isnan(row.of_use)]
+    of_use = max(probabilities, default=1.0) if math.isnan(best.of_use) else best.of_use
+    is_doubted = of_use <= 0.5 if sign > 0 else bool(probabilities)
     by_evidence = bool(sign) and is_doubted
     shown = 0 if by_evidence else sign
     return Gain(elpd, se, best.structure, without, shown, by_evidence, number)
@@ -179,15 +180,13 @@ def gain_of(
 
 def advice(
     rows: Sequence[Candidate],
-    adjusts: Collection[str],
-    plain: Collection[str],
+    scaling: Collection[str],
     densities: Mapping[str, Tensor],
     gain: Gain | None,
 ) -> list[str]:
     """Return findings on an output in addition to the verdict, in sentences.
 
-    ``adjusts`` are the names of structures that scale the physics, ``plain`` of those that take it
-    as the mean.
+    ``scaling`` are the names of structures that do more than to take the physics as the mean.
     """
     best, *others = rows
     sentence = f"{best.structure} predicts left-out observations best (weight {best.weight:.2f})"
@@ -196,8 +195,9 @@ def advice(
             f"; not shown to be worse, within {_SURE:.0f} standard errors: {', '.join(near)}"
         )
     sentences = [f"{sentence}."]
-    scaled = next((row.structure for row in rows if row.structure in adjusts), None)
-    unscaled = next((row.structure for row in rows if row.structure in plain), None)
+    using = [row.structure for row in rows if row.kind != DATA]
+    scaled = next((name for name in using if name in scaling), None)
+    unscaled = next((name for name in using if name not in scaling), None)
     if scaled and unscaled and (gain is None or gain.shown > 0):
         value, error = difference(densities[scaled], densities[unscaled])
         says = "helps" if _sign_of(value, error) > 0 else "is not shown to help"

@@ -25,12 +25,18 @@ from gpadjust.validation.comparison import (
 )
 from gpadjust.validation.verdict import Candidate, advice, gain_of, unsampled
 
-USES = ("physics mean", "CKA")  # the physics
-
 
 def rows_of(names, of_use):
     """Candidates by their names, of which nothing else is asked than a probability."""
-    return [Candidate(name, *[math.nan] * 8, of_use.get(name, math.nan)) for name in names]
+    return [
+        Candidate(
+            name,
+            *[math.nan] * 8,
+            of_use.get(name, math.nan),
+            "data alone" if name == "zero mean" else "adjusted",
+        )
+        for name in names
+    ]
 
 
 def crude(X):
@@ -249,30 +255,30 @@ class TestAdvice:
     def test_a_physics_that_is_worse_than_none(self):
         density = {"zero mean": 4.0, "CKA": 1.0, "physics mean": -9.0}
         values = {n: torch.tensor([v, v + 0.1] * 4).double() for n, v in density.items()}
-        (sentence,) = gain_of(rows_of(density, {}), USES, values).sentences("y")
+        (sentence,) = gain_of(rows_of(density, {}), values).sentences("y")
         assert sentence.startswith("With the physics, y is predicted worse than without it: elpd -")
         assert "-24.0 +- 0.0 nats (CKA)" in sentence
         values["CKA"] = values["zero mean"] + torch.tensor([1.0, -1.0] * 4)
-        finding, reason = gain_of(rows_of(density, {}), USES, values).sentences("y")
+        finding, reason = gain_of(rows_of(density, {}), values).sentences("y")
         assert "do not show whether the physics helps to predict y: elpd +0.0" in finding
         assert "within two standard errors" in reason
         values["CKA"] = values["zero mean"] + 1
-        (sentence,) = gain_of(rows_of(density, {}), USES, values).sentences("y")
+        (sentence,) = gain_of(rows_of(density, {}), values).sentences("y")
         assert sentence.startswith("The physics helps to predict y")
         assert "2.72 times as likely" in sentence  # one nat each
-        _, sentence = advice(rows_of(density, {}), {"CKA"}, {"physics mean"}, values, None)
+        _, sentence = advice(rows_of(density, {}), {"CKA"}, values, None)
         assert sentence.startswith("Scaling the physics helps")
 
     def test_the_physics_of_few_observations_is_neither_praised_nor_denied(self):
         for sign in (1.0, -1.0):
             better = {"zero mean": torch.zeros(8), "CKA": sign * torch.ones(8)}
-            gain = gain_of(rows_of(better, {}), USES, better)
+            gain = gain_of(rows_of(better, {}), better)
             assert gain == Gain(8 * sign, 0.0, "CKA", "zero mean", int(sign))
             few = {name: density[:7] for name, density in better.items()}
-            assert gain_of(rows_of(few, {}), USES, few).shown == 0
-            _, reason = gain_of(rows_of(few, {}), USES, few).sentences("y")
+            assert gain_of(rows_of(few, {}), few).shown == 0
+            _, reason = gain_of(rows_of(few, {}), few).sentences("y")
             assert reason.startswith("Of fewer than 8 observations")
-        assert gain_of(rows_of(["CKA"], {}), USES, better) is None
+        assert gain_of(rows_of(["CKA"], {}), better) is None
 
     def test_the_evidence_has_its_say(self):
         for sign in (1.0, -1.0):
@@ -285,11 +291,11 @@ class TestAdvice:
                 ({"CKA of a": 0.1, "CKA of b": 0.9}, sign > 0),
             ):
                 rows = rows_of(dict.fromkeys([*better, *relevance]), relevance)
-                gain = gain_of(rows, USES, better)
+                gain = gain_of(rows, better)
                 assert gain.shown == (sign if agrees else 0)
                 assert gain.by_evidence is not agrees
         density = {"CKA": torch.ones(8), "zero mean": torch.zeros(8)}
-        gain = gain_of(rows_of(density, {"CKA": 0.1}), USES, density)
+        gain = gain_of(rows_of(density, {"CKA": 0.1}), density)
         finding, reason = gain.sentences("y")
         assert "elpd +8.0 +- 0.0 nats (CKA)" in finding
         assert "by the evidence of a model with and without the physics" in reason
