@@ -19,7 +19,7 @@ from torch import Tensor
 from gpadjust.dynamics.free_run import FreeRun
 from gpadjust.dynamics.trajectories import Windows
 from gpadjust.states import StateSpec
-from gpadjust.validation.plots.drawing import BAND, BLUE, RED, axes_of, legend, tidy
+from gpadjust.validation.plots import BAND, BLUE, RED, axes_of, legend, tidy
 
 __all__ = ["plot_free_run"]
 

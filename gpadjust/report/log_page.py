@@ -11,7 +11,7 @@ from gpadjust.records.identification import FEW, GUESSES, IDENTIFIED, PERSISTENC
 from gpadjust.report import markup as html
 from gpadjust.report.markup import Markup, Page, Verdict, drawn, number, percent, table, tag
 from gpadjust.report.subject import Origin
-from gpadjust.validation.plots.drawing import band, quantile, tidy
+from gpadjust.validation.plots import band, quantile, tidy
 
 _NAMES = {
     GUESSES: "your equations with the guesses",
@@ -135,7 +135,7 @@ def _states(found: Identification, units: Mapping[str, str]) -> list[Markup]:
         ax = figure.subplots()
         path = going_on(record.states[:, i], i in spec.angle_columns)
         half = quantile(0.95) * sd[:, i]
-        band(ax, record.times, path, path - half, path + half, 0.95)
+        band(ax, record.times, (path, path - half, path + half), 0.95)
         ax.set(xlabel=called["time"], ylabel=called[state])
         tidy(ax)
         what = "hidden" if state in found.hidden else "smoothed"

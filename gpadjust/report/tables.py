@@ -15,12 +15,12 @@ from gpadjust.kinds.heavy_tails import RowNoise
 from gpadjust.physics.import_path import is_formula
 from gpadjust.report import figures
 from gpadjust.report import markup as html
-from gpadjust.report.given_physics import imports_of
+from gpadjust.report.inputs import imports_of
 from gpadjust.report.markup import Markup, join, number, percent, table, tag
 from gpadjust.report.subject import Origin, Subject
-from gpadjust.validation.plots.drawing import quantile
-from gpadjust.validation.ranking import spread_of
-from gpadjust.validation.structures import ALONE, STACKED
+from gpadjust.validation.comparison import STACKED, spread_of
+from gpadjust.validation.plots import quantile
+from gpadjust.validation.verdict import ALONE
 
 _STRUCTURES = {
     "zero mean": "no physics: a Gaussian process of the data alone",
@@ -78,15 +78,14 @@ def structures(subject: Subject) -> Markup:
         head = ["structure", *subject.outputs]
         return table("Weights of the mixture", head, rows) if rows else Markup()
     parts, names = [], dict[str, None]()
-    for j, output in enumerate(comparison.table):
+    for output in comparison.table:
         head = ["structure", "elpd", "less the best", "its error", "weight"]
         head += [html.with_unit("RMSE", output, "{} [{}]"), "RMSE / sd", "in 95 %"]
-        spread = spread_of(subject.Y[:, j])
         rows = []
-        for row in comparison.rows(output):
-            weight = "-" if row.structure.startswith(ALONE) else f"{row.weight:.2f}"
+        for row in comparison.table[output]:
+            weight = "-" if math.isnan(row.weight) else f"{row.weight:.2f}"
             elpd = [f"{row.elpd:.4g}", f"{row.elpd_diff:.3g}", f"{row.se_diff:.2g}", weight]
-            rmse = [number(row.rmse * spread), f"{row.rmse:.3g}", percent(row.coverage)]
+            rmse = [number(row.error), f"{row.rmse:.3g}", percent(row.coverage)]
             rows.append([row.structure, *elpd, *rmse])
             names[row.structure] = None
         parts.append(table(f"Left-out predictions of {output}, best first", head, rows, marked=0))
@@ -156,7 +155,7 @@ def coverage(subject: Subject) -> Markup:
             says = "too narrow" if held < low else "too wide" if held > high else "in that range"
             cells = [f"{held} of {n}", percent(share[j]), f"{low} to {high} of {n}", says]
             rows.append([f"{name}, {percent(level)}", *cells])
-        images.append(figures.coverages(subject, j, n))
+        images.append(figures.coverages(subject, j))
     head = ["interval", "holds", "share", "if they hold", "the intervals are"]
     return join([tag("p", _COVERAGE), table("Coverage of left-out intervals", head, rows), *images])
 

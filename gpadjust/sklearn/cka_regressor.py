@@ -34,7 +34,7 @@ from gpadjust.many import VariationalCKA
 from gpadjust.physics import PhysicsWarning
 from gpadjust.physics.function import array_physics
 from gpadjust.physics.parameters import PhysicsParameters
-from gpadjust.validation.plausibility import complaint
+from gpadjust.validation.verdict import complaint
 
 Array = NDArray[np.float64]
 

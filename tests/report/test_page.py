@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from gpadjust.core import CKA, ZeroMeanGP, fit, load
 from gpadjust.physics import FunctionPhysics, PhysicsError
 from gpadjust.report import report
-from gpadjust.report.figures import slice_along
 from gpadjust.report.markup import cards, failure, name_and_unit, number, table, tag
+from gpadjust.report.page import headline, verdicts
 from gpadjust.report.subject import subject_of
-from gpadjust.report.verdict import headline, verdicts
 from gpadjust.validation import Gain
+from gpadjust.validation.plots import lines_along
 
 from .conftest import Page, f_p
 
@@ -52,7 +52,7 @@ def _the_table_is_that_of(comparison, page):
     assert head[0] == "structure"
     assert rows[-1][0] == "physics alone"
     assert rows[-1][4] == "-"
-    for row, expected in zip(rows, comparison.rows("y"), strict=True):
+    for row, expected in zip(rows, comparison.table["y"], strict=True):
         assert row[0] == expected.structure
         numbers = [float(text) for text in row[1:5] if text != "-"]
         assert numbers == pytest.approx(expected[1 : 1 + len(numbers)], rel=0.06, abs=0.006)
@@ -188,8 +188,8 @@ def test_inputs_are_drawn_in_double_precision():
     X = offset * (1 + torch.linspace(0, 1e-8, 7, dtype=torch.float64).unsqueeze(-1))
     model = CKA(X, X / offset, physics=lambda X: torch.zeros_like(X))
     fit(model, "map")
-    drawn = slice_along(subject_of(model), 0, 9)
-    assert len(drawn.unique()) == 9
+    ((_, drawn),) = lines_along(model)
+    assert len(drawn.unique()) == len(drawn) > 9
 
 
 def test_where_a_physics_fails_is_told_in_a_line():

@@ -16,9 +16,27 @@ from gpadjust.kinds.heavy_tails import HeavyTails
 from gpadjust.kinds.links import Linked
 from gpadjust.physics import FunctionPhysics, Unknown
 from gpadjust.validation import STRUCTURES, Gain, Structure, compare, leave_one_out
-from gpadjust.validation.advice import _scaling, _unsampled, physics_gain
-from gpadjust.validation.ranking import best_of, ranking
-from gpadjust.validation.structures import by_name, candidates, known_structures, physics_alone
+from gpadjust.validation.comparison import (
+    _by_name,
+    _candidates,
+    _densities,
+    _known,
+    _physics_alone,
+)
+from gpadjust.validation.verdict import Candidate, advice, gain_of, unsampled
+
+
+def rows_of(names, of_use):
+    """Candidates by their names, of which nothing else is asked than a probability."""
+    return [
+        Candidate(
+            name,
+            *[math.nan] * 8,
+            of_use.get(name, math.nan),
+            "data alone" if name == "zero mean" else "adjusted",
+        )
+        for name in names
+    ]
 
 
 def crude(X):
@@ -51,7 +69,8 @@ def says(comparison, words):
 
 def test_the_best_structure_is_recommended_where_it_is_clear(scaled):
     comparison = compare(*scaled, crude, structures=["physics mean", "CKA"])
-    rows = comparison.table["y"]
+    *rows, alone = comparison.table["y"]
+    assert alone.structure == "physics alone"
     elpd = [row.elpd for row in rows]
     assert elpd == sorted(elpd, reverse=True)
     assert rows[0][:4] == ("CKA", elpd[0], 0.0, 0.0)
@@ -105,6 +124,10 @@ def test_what_is_left_out_is_what_the_tables_tell_of(scaled, noise):
         loo = comparison.left_out[each.structure]
         assert loo.log_density.sum().item() == pytest.approx(each.elpd)
         assert loo.score().coverage.item() == pytest.approx(each.coverage)
+        assert loo.score().rmse.item() == pytest.approx(each.error)
+        assert math.isnan(each.weight) == (each.structure == "physics alone")
+        assert math.isnan(each.log_evidence) == (each.structure == "physics alone")
+        assert math.isnan(each.of_use) == (each.structure != "CKA")
     gain = comparison.gain["y"]
     elpd = {each.structure: each.elpd for each in rows}
     assert gain.elpd == pytest.approx(elpd[gain.structure] - elpd["zero mean"])
@@ -116,8 +139,7 @@ class TestPhysicsAlone:
     def test_its_errors_are_those_of_f_p_and_it_has_no_weight(self, scaled, noise):
         X, Y = scaled
         comparison = compare(X, Y + noise, crude, structures=["zero mean", "CKA"])
-        *candidates, alone = comparison.rows("y")
-        assert candidates == comparison.table["y"]
+        best, _, alone = comparison.table["y"]
         assert alone.structure == "physics alone"
         assert "physics alone" not in {*comparison.models, *comparison.stacked.weights}
         rmse = (Y + noise - crude(X)).square().mean().sqrt().item()
@@ -126,15 +148,14 @@ class TestPhysicsAlone:
         assert alone.rmse == pytest.approx(rmse / (Y + noise).std().item())
         assert errors["adjusted"] == comparison.leave_one_out().score().rmse.item()
         assert errors["data alone"] == comparison.left_out["zero mean"].score().rmse.item()
-        best = comparison.table["y"][0]
         assert alone.elpd_diff == pytest.approx(alone.elpd - best.elpd)
-        assert alone.weight == 0
+        assert math.isnan(alone.weight)
 
     def test_its_densities_are_those_of_an_unknown_variance(self, X, noise):
         Y = torch.cat([crude(X) + noise, 2 * crude(X)], -1)
         Y[3, 0] = torch.nan
         data = Data.of(X, Y, None, None)
-        (loo,) = physics_alone(by_name(lambda X: crude(X).expand(-1, 2)), data).values()
+        (loo,) = _physics_alone(_by_name(lambda X: crude(X).expand(-1, 2)), data).values()
         rest = [i for i in range(8) if i not in (3, 5)]
         errors = (Y - crude(X))[:, 0]
         scales = torch.linspace(-8, 2, 4001, dtype=torch.float64).exp()  # even in their logarithm
@@ -149,21 +170,21 @@ class TestPhysicsAlone:
     def test_an_exact_physics_of_any_number_of_points(self, X):
         for n in (2, 3, 8):
             data = Data.of(X[:n], crude(X[:n]), None, None)
-            (loo,) = physics_alone(by_name(crude), data).values()
+            (loo,) = _physics_alone(_by_name(crude), data).values()
             assert loo.log_density.isfinite().all()
             assert loo.score().coverage.item() == 1
             assert not loo.variance.isnan().any()
 
     def test_known_variances_are_its_noise(self, X, noise):
         data = Data.of(X, crude(X) + noise, 0.04, None)
-        (loo,) = physics_alone(by_name(crude), data).values()
+        (loo,) = _physics_alone(_by_name(crude), data).values()
         expected = torch.distributions.Normal(crude(X), 0.2).log_prob(crude(X) + noise)
         torch.testing.assert_close(loo.log_density, expected)
 
     def test_each_of_several_and_none_of_unknown_parameters(self, X):
         unknown = FunctionPhysics(lambda X, p: p.a * X[:, 0], unknowns={"a": Unknown(1.0, sd=1.0)})
-        physics = by_name({"wave": crude, "line": lambda X: X, "slope": unknown})
-        found = physics_alone(physics, Data.of(X, crude(X), None, None))
+        physics = _by_name({"wave": crude, "line": lambda X: X, "slope": unknown})
+        found = _physics_alone(physics, Data.of(X, crude(X), None, None))
         assert [*found] == ["physics alone of wave", "physics alone of line"]
         torch.testing.assert_close(found["physics alone of line"].mean, X)
 
@@ -185,9 +206,9 @@ def test_warnings_come_once_and_those_of_the_seed_as_advice(scaled):
         compare(X, Y, crude, 1e-3, structures=["zero mean", "physics mean"])
     assert [str(each.message)[:14] for each in caught] == ["1 of 9 rows eq"]
     rows = compare(*scaled, crude, structures=["zero mean"]).table
-    (text,) = _unsampled(rows, {"zero mean": FitResult("bayes", error=0.9)})
+    (text,) = unsampled(rows, {"zero mean": FitResult("bayes", error=0.9)})
     assert text.startswith("Results of zero mean depend on the seed")
-    assert _unsampled(rows, {"zero mean": FitResult("bayes", error=0.1)}) == []
+    assert unsampled(rows, {"zero mean": FitResult("bayes", error=0.1)}) == []
 
 
 @pytest.mark.parametrize("variance", [None, 0.01], ids=["learnt noise", "known noise"])
@@ -209,15 +230,15 @@ def test_rounding_errors_show_nothing(X):
 
 def test_candidates_of_several_physics_and_classes_are_known():
     plain = [structure for structure in STRUCTURES if not structure.calibrates]
-    several = by_name([crude, torch.sin, lambda X: X])
+    several = _by_name([crude, torch.sin, lambda X: X])
     assert [*several] == ["crude", "sin", "f_3"]
-    found = candidates(plain, several)
+    found = _candidates(plain, several)
     names = ["crude", "sin", "f_3", "all"]
     expected = [f"{kind} of {name}" for kind in ("physics mean", "CKA") for name in names]
     assert [structure.name for structure, _ in found] == ["zero mean", *expected]
-    assert [s.name for s, _ in candidates(STRUCTURES, by_name(crude))] == [s.name for s in plain]
+    assert [s.name for s, _ in _candidates(STRUCTURES, _by_name(crude))] == [s.name for s in plain]
     named, classes = (
-        [each._replace(name="", model=None) for each in known_structures(given)]
+        [each._replace(name="", model=None) for each in _known(given)]
         for given in (["CKA", "zero mean"], [partial(CKA, rho_mean=2.0), ZeroMeanGP])
     )
     assert named == classes
@@ -232,37 +253,34 @@ class TestAdvice:
         assert comparison.chosen == "stacked"
 
     def test_a_physics_that_is_worse_than_none(self):
-        names = {structure.name: structure for structure in STRUCTURES}
         density = {"zero mean": 4.0, "CKA": 1.0, "physics mean": -9.0}
         values = {n: torch.tensor([v, v + 0.1] * 4).double() for n, v in density.items()}
-        (sentence,) = physics_gain(names, [*density], values, {}).sentences("y")
+        (sentence,) = gain_of(rows_of(density, {}), values).sentences("y")
         assert sentence.startswith("With the physics, y is predicted worse than without it: elpd -")
         assert "-24.0 +- 0.0 nats (CKA)" in sentence
         values["CKA"] = values["zero mean"] + torch.tensor([1.0, -1.0] * 4)
-        finding, reason = physics_gain(names, [*density], values, {}).sentences("y")
+        finding, reason = gain_of(rows_of(density, {}), values).sentences("y")
         assert "do not show whether the physics helps to predict y: elpd +0.0" in finding
         assert "within two standard errors" in reason
         values["CKA"] = values["zero mean"] + 1
-        (sentence,) = physics_gain(names, [*density], values, {}).sentences("y")
+        (sentence,) = gain_of(rows_of(density, {}), values).sentences("y")
         assert sentence.startswith("The physics helps to predict y")
         assert "2.72 times as likely" in sentence  # one nat each
-        (sentence,) = _scaling(names, [*density], values)
+        _, sentence = advice(rows_of(density, {}), {"CKA"}, values, None)
         assert sentence.startswith("Scaling the physics helps")
 
     def test_the_physics_of_few_observations_is_neither_praised_nor_denied(self):
-        names = {structure.name: structure for structure in STRUCTURES}
         for sign in (1.0, -1.0):
             better = {"zero mean": torch.zeros(8), "CKA": sign * torch.ones(8)}
-            gain = physics_gain(names, [*better], better, {})
+            gain = gain_of(rows_of(better, {}), better)
             assert gain == Gain(8 * sign, 0.0, "CKA", "zero mean", int(sign))
             few = {name: density[:7] for name, density in better.items()}
-            assert physics_gain(names, [*few], few, {}).shown == 0
-            _, reason = physics_gain(names, [*few], few, {}).sentences("y")
+            assert gain_of(rows_of(few, {}), few).shown == 0
+            _, reason = gain_of(rows_of(few, {}), few).sentences("y")
             assert reason.startswith("Of fewer than 8 observations")
-        assert physics_gain(names, ["CKA"], better, {}) is None
+        assert gain_of(rows_of(["CKA"], {}), better) is None
 
     def test_the_evidence_has_its_say(self):
-        names = {structure.name: structure for structure in STRUCTURES}
         for sign in (1.0, -1.0):
             better = {"zero mean": torch.zeros(8), "CKA": sign * torch.ones(8)}
             for relevance, agrees in (
@@ -272,11 +290,12 @@ class TestAdvice:
                 ({"CKA": 0.1, "RRA": 0.9}, False),  # its own is what counts
                 ({"CKA of a": 0.1, "CKA of b": 0.9}, sign > 0),
             ):
-                gain = physics_gain(names, [*better], better, relevance)
+                rows = rows_of(dict.fromkeys([*better, *relevance]), relevance)
+                gain = gain_of(rows, better)
                 assert gain.shown == (sign if agrees else 0)
                 assert gain.by_evidence is not agrees
         density = {"CKA": torch.ones(8), "zero mean": torch.zeros(8)}
-        gain = physics_gain(names, [*density], density, {"CKA": 0.1})
+        gain = gain_of(rows_of(density, {"CKA": 0.1}), density)
         finding, reason = gain.sentences("y")
         assert "elpd +8.0 +- 0.0 nats (CKA)" in finding
         assert "by the evidence of a model with and without the physics" in reason
@@ -349,7 +368,8 @@ def test_several_physics_each_alone_and_all(X, noise, tmp_path):
     comparison = compare(X, Y, physics, structures=["zero mean", "CKA"])
     names = {f"CKA of {name}" for name in ("wave", "line", "all")}
     assert set(comparison.models) == {"zero mean", *names}
-    assert {row.structure for row in comparison.table["y"]} == {"zero mean", *names}
+    rows = {row.structure for row in comparison.table["y"]}
+    assert rows == {"zero mean", *names, "physics alone of wave", "physics alone of line"}
     assert comparison.table["y"][0].structure in ("CKA of wave", "CKA of all")
     both = StackedGP(comparison.models, [0.25] * 4)
     with pytest.warns(UserWarning, match="a lambda"):
@@ -366,22 +386,16 @@ def test_all_structures_by_default(scaled):
     assert comparison.gain["y"].answer == "Yes"
 
 
-def test_an_impossible_observation_ranks_last(scaled):
-    X, Y = scaled
-    good = leave_one_out(CKA(X, Y, physics=crude))
-    bad = leave_one_out(ZeroMeanGP(X, Y))
-    bad.log_density[2] = -torch.inf
-    both = {"bad": bad, "good": good}
-    rows = ranking(both, 0, {"good": 1.0}, best_of(both, 0))
-    assert [row.structure for row in rows] == ["good", "bad"]
-    assert math.isfinite(rows[1].elpd_diff)
-    assert [row.weight for row in rows] == [1.0, 0.0]
+def test_an_impossible_observation_counts_finitely(scaled):
+    loo = leave_one_out(ZeroMeanGP(*scaled))
+    loo.log_density[2] = -torch.inf
+    assert _densities({"bad": loo}, 0)["bad"].isfinite().all()
 
 
 def test_as_a_frame(scaled, monkeypatch):
     found = compare(*scaled, crude, structures=["physics mean", "CKA"])
     table = found.to_dataframe()
-    rows = found.rows("y")
+    rows = found.table["y"]
     assert [*table["structure"]] == [each.structure for each in rows]
     assert {*table["output"]} == {"y"}
     assert table["elpd"].tolist() == [each.elpd for each in rows]
@@ -400,7 +414,6 @@ def test_bad_input(scaled):
         (scaled, {"structures": [Structure("stacked", CKA)]}, "none of them 'stacked'"),
         (scaled, {"structures": [Structure("physics alone", CKA)]}, "or 'physics alone'; found"),
         (scaled, {"structures": "calibrated physics"}, "unknown parameters for 'calibrated phys"),
-        ((X, Y.expand(-1, 65)), {"structures": "zero mean"}, "at most 64 outputs.*found 65"),
         ((X, Y[:5]), {}, "train_Y"),
     ):
         with pytest.raises(ValueError, match=words):
@@ -422,7 +435,6 @@ def test_a_physics_with_unknown_parameters_is_calibrated_by_each_structure():
     assert {row.structure for row in rows} == {"calibrated physics", "physics mean"}
     errors = comparison.errors()["y"]
     assert [*errors] == ["calibrated physics", "adjusted"]
-    assert comparison.rows("y") == rows
 
 
 @pytest.mark.slow

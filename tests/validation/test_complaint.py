@@ -5,7 +5,7 @@ import torch
 
 from gpadjust.core.data import Data
 from gpadjust.physics import FunctionPhysics, Unknown, as_physics
-from gpadjust.validation.plausibility import complaint
+from gpadjust.validation.verdict import complaint
 from tests.systems import line
 
 
