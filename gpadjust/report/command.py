@@ -16,12 +16,12 @@ from gpadjust.kinds import Categories, HeavyTails, NoisyInputs, RelativeNoise, w
 from gpadjust.physics import ODEPhysics, PhysicsError, PhysicsWarning
 from gpadjust.records import Identification, Records, identify
 from gpadjust.report import inputs as read
-from gpadjust.report.markup import bare, listed, plural
 from gpadjust.report.page import checked_path, write
 from gpadjust.report.subject import Origin, Subject, subject_of
 from gpadjust.states import StateSpec
 from gpadjust.validation import compare
-from gpadjust.validation.verdict import complaint
+from gpadjust.validation.verdict import faults
+from gpadjust.words import bare, listed, plural
 
 _DEGREES = ("deg", "degree", "degrees", "°")
 _HOW = "the same command, without --fit."
@@ -108,10 +108,9 @@ def _of_table(arguments: Namespace) -> Job:
         else:
             _say(f"Fitting CKA by {arguments.fit!r} ...")
             model = with_options(CKA, options)(X, data.Y, variances, physics=physics)
-            for text in (complaint(part, model.data) for part in model.physics):
-                if text:
-                    warnings.warn(text, PhysicsWarning, stacklevel=1)
             fit(model, arguments.fit, seed=arguments.seed)
+            for text in faults(model):
+                warnings.warn(text, PhysicsWarning, stacklevel=1)
         return subject_of(model, [f"line {line}" for line in data.lines])
 
     rows = f"{arguments.data}: {plural(len(data.lines), 'row')}"

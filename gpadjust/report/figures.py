@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gpadjust.physics import PhysicsError
 from gpadjust.report import markup as html
-from gpadjust.report.markup import Markup, drawn, image, number, percent, tag
+from gpadjust.report.markup import Markup, drawn, image, tag
 from gpadjust.report.subject import Subject
 from gpadjust.validation import Trust, plots, trust
 from gpadjust.validation.plots import (
@@ -21,6 +21,7 @@ from gpadjust.validation.plots import (
     unadjusted,
 )
 from gpadjust.validation.trust import physics_at
+from gpadjust.words import bare, listed, number, percent, with_unit
 
 _MOST = 12  # inputs along which slices are drawn, in all outputs together
 _BANDS = "Solid lines are means; bands hold 95 % of the function, without measurement noise."
@@ -44,7 +45,7 @@ def where_wrong(subject: Subject) -> Markup:
     parts: list[Markup] = []
     if len(subject.inputs) > 1:
         values = zip(subject.inputs, point(subject, subject.base, 3), strict=True)
-        pairs = [f"{html.bare(name)} = {html.with_unit(value, name)}" for name, value in values]
+        pairs = [f"{bare(name)} = {with_unit(value, name)}" for name, value in values]
         few = f" (drawn: {len(inputs)} of {len(pairs)} inputs, those that move predictions most)"
         held = f"Along each input the others stay at the median of the data: {', '.join(pairs)}"
         parts.append(tag("p", f"{held}{few * (len(inputs) < len(pairs))}.", class_="note"))
@@ -194,8 +195,8 @@ def _words(subject: Subject, output: int) -> list[str]:
         off = subject.judged[:, output] - values
         rms, mean = number(off.square().nanmean().sqrt()), number(off.nanmean())
         words.append(
-            f"At the data, the {physics} ({is_it}) is off by {html.with_unit(rms, name)} (root "
-            f"mean square; observed less physics is {html.with_unit(mean, name)} in the mean)."
+            f"At the data, the {physics} ({is_it}) is off by {with_unit(rms, name)} (root "
+            f"mean square; observed less physics is {with_unit(mean, name)} in the mean)."
         )
     top = "the prediction, and dashed the physics"
     if subject.comparison is not None:
@@ -205,8 +206,8 @@ def _words(subject: Subject, output: int) -> list[str]:
         weight = "" if shown.weight == 1 else f" (weight {shown.weight:.2f})"
         back = [f"{term} = {number(unadjusted(shown.model, term))}" for term in terms]
         words.append(
-            f"Below: {html.listed(terms)} of {shown.structure}{weight}, with ticks at the data; "
-            f"dashed, what they fall back to without data, {html.listed(back)}."
+            f"Below: {listed(terms)} of {shown.structure}{weight}, with ticks at the data; "
+            f"dashed, what they fall back to without data, {listed(back)}."
         )
         words += [_APART] * (len(terms) > 1)
     return [*words, _BANDS]

@@ -35,7 +35,7 @@ from gpadjust.physics import (
 )
 from gpadjust.physics.formula import names_in, parse, symbol
 from gpadjust.physics.function import array_physics
-from gpadjust.report.markup import bare, listed, name_and_unit, plural
+from gpadjust.words import bare, listed, name_and_unit, plural
 
 _HINT = (
     "Name columns as the first line does; a unit in brackets may be left out, so that 'head' is "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import platform
 import warnings
 from collections.abc import Mapping, Sequence
@@ -18,13 +17,15 @@ from gpadjust.core.saving import Saved
 from gpadjust.records import Identification
 from gpadjust.report import figures, log_page, tables
 from gpadjust.report import markup as html
-from gpadjust.report.markup import Markup, Page, Verdict, tag
+from gpadjust.report.markup import Card, Markup, Page, tag
 from gpadjust.report.subject import Origin, Subject, subject_of
 from gpadjust.validation import Comparison
 from gpadjust.validation.comparison import STACKED
-from gpadjust.validation.verdict import ALONE, CALIBRATED
+from gpadjust.validation.verdict import ALONE, AS_IS, CALIBRATED, CORRECTED, NOT
+from gpadjust.words import listed, number, plural, with_unit
 
 _ERRORS = {ALONE: "your formula", CALIBRATED: "your formula, calibrated"}
+_COLORS = {AS_IS: "yes", CORRECTED: "yes", NOT: "no"}
 _LIBRARIES = ("torch", "gpytorch", "botorch", "numpy")
 
 
@@ -167,8 +168,8 @@ def _page(
     bar = progress_bar(progress, made_by.items(), unit="section", leave=False)
     sections = {name: make() for name, make in bar}
     formula = "f_a(x) = rho(x) f_p(x) + delta(x)" if subject.has_physics else "without physics"
-    variables = f"{html.listed(subject.outputs)} from {html.listed(subject.inputs)}"
-    lead = f"{variables}: {html.plural(len(subject.X), 'row')} of data, {formula}."
+    variables = f"{listed(subject.outputs)} from {listed(subject.inputs)}"
+    lead = f"{variables}: {plural(len(subject.X), 'row')} of data, {formula}."
     physics = ", ".join(f"{name} ({type(own).__name__})" for name, own in subject.physics.items())
     settings = {
         **origin.settings,
@@ -176,13 +177,13 @@ def _page(
         "physics": physics or ("known through samples" if subject.has_physics else "none"),
     }
     title = title or f"Report on {', '.join(subject.outputs)}"
-    answers = verdicts(subject, origin.how)
+    answers = cards(subject, origin.how)
     kind = "Errors" if subject.comparison is None else "Left-out errors"
-    question, line = "Does the physics help?", headline(answers, kind)
+    question, line = "Should you use your formula?", headline(answers, kind)
     return Page(title, lead, question, answers, line, sections, settings)
 
 
-def verdicts(subject: Subject, how: str = Origin.how) -> list[Verdict]:
+def cards(subject: Subject, how: str = Origin.how) -> list[Card]:
     """Return the verdict on each output; ``how`` is code or a command that compares."""
     shown = []
     for j, name in enumerate(subject.outputs):
@@ -194,17 +195,18 @@ def verdicts(subject: Subject, how: str = Origin.how) -> list[Verdict]:
             )
         elif subject.batches:
             note += "; each with an offset for each batch"
-        shown.append(Verdict(name, numbers, note, *_answer(subject, name, how)))
+        answer, reasons = _answer(subject, name, how)
+        shown.append(Card(name, numbers, note, answer, reasons, _COLORS.get(answer, "open")))
     return shown
 
 
-def headline(verdicts: list[Verdict], kind: str) -> str:
+def headline(cards: list[Card], kind: str) -> str:
     """Return the errors and the answer of each output, a line each, for the terminal."""
     lines = []
-    for name, numbers, _, answer, reasons in verdicts:
+    for name, numbers, _, answer, reasons, _ in cards:
         each = "; ".join(f"{what}: {value}" for what, value in numbers.items())
         line = f"{kind} of {name}, {each}." if each else f"{name}:"
-        several = len(verdicts) > 1
+        several = len(cards) > 1
         lines.append(f"{line} {answer}." if several else f"{line}\n{answer}. {reasons[0]}")
     return "\n".join(lines)
 
@@ -228,7 +230,7 @@ def errors(subject: Subject, output: int) -> dict[str, str]:
         if short == ALONE and any(part.unknowns for part in subject.physics.values()):
             label += ", with fitted parameters"
         which = f" ({physics.removeprefix('physics ')})" * bool(of)
-        shown[f"{label}{which}"] = html.with_unit(html.number(rmse), name)
+        shown[f"{label}{which}"] = with_unit(number(rmse), name)
     return shown
 
 
@@ -242,18 +244,13 @@ def _answer(subject: Subject, name: str, how: str) -> tuple[str, list[str]]:
             "This is a report of one model; whether the physics helps takes a comparison with a "
             f"model that has none: {how}"
         ]
-    if name not in comparison.gain:
+    if name not in comparison.verdict:
         return "Not asked", [
             "The comparison has no structure without the physics, or none with it; add 'zero mean' "
             "to its structures."
         ]
-    gain, rmse = comparison.gain[name], comparison.errors()[name]
-    sentences = gain.sentences(name)
-    if gain.shown > 0 and rmse.get("adjusted", 0.0) > rmse.get("data alone", math.inf):
-        sentences.append(
-            "Its error is not the smaller one: what the physics helps with is how sure one is."
-        )
-    return gain.answer, sentences
+    verdict = comparison.verdict[name]
+    return verdict.answer, verdict.reasons
 
 
 def recommendation(subject: Subject) -> Markup:
@@ -272,7 +269,7 @@ def recommendation(subject: Subject) -> Markup:
     weights = []
     for output, ranked in comparison.table.items():
         rows = [row for row in ranked if row.weight >= 0.005]
-        shares = html.listed(f"{row.structure} {row.weight:.2f}" for row in rows)
+        shares = listed(f"{row.structure} {row.weight:.2f}" for row in rows)
         weights.append(f"{output}: {shares}" if len(comparison.table) > 1 else shares)
     mixture = tag("strong", "the mixture of all structures")
     why = ". It keeps the doubt between them in its intervals."

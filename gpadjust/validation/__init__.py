@@ -4,17 +4,17 @@ from gpadjust.validation.comparison import STRUCTURES, Comparison, Structure, co
 from gpadjust.validation.leave_one_out import LeaveOneOut, leave_one_out
 from gpadjust.validation.scores import Scores, score
 from gpadjust.validation.trust import Trust, trust
-from gpadjust.validation.verdict import Candidate, Gain
+from gpadjust.validation.verdict import Candidate, Verdict
 
 __all__ = [
     "STRUCTURES",
     "Candidate",
     "Comparison",
-    "Gain",
     "LeaveOneOut",
     "Scores",
     "Structure",
     "Trust",
+    "Verdict",
     "compare",
     "leave_one_out",
     "score",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -28,22 +28,27 @@ from gpadjust.core.data import ArrayLike, Data
 from gpadjust.kinds.factory import ModelFactory, make_model, with_options
 from gpadjust.physics import Physics, PhysicsWarning, as_physics
 from gpadjust.validation.leave_one_out import ROUNDING, LeaveOneOut, leave_one_out
+from gpadjust.validation.trust import physics_at
 from gpadjust.validation.verdict import (
     ADJUSTED,
     ALONE,
     CALIBRATED,
     DATA,
     Candidate,
-    Gain,
-    advice,
-    complaint,
+    Evidence,
+    Verdict,
+    correction_of,
     difference,
-    gain_of,
+    fault_of,
+    next_point,
+    straight_line,
     unsampled,
+    verdict_on,
 )
 
 STACKED = "stacked"  # what a comparison calls the mixture of all structures
 _ALL = 0.95  # weight of a structure that needs no others
+_COUNTS = 0.05  # weight with which a structure is a part of what is recommended
 _WORST = -1e6  # nats; a density of zero would make others' differences infinite
 
 
@@ -101,8 +106,8 @@ class Comparison:
             it is, ``"physics alone"`` (of several ``"physics alone of coarse"`` and so on).
         table: The candidates of each output, best first, by the names of the outputs; beneath them
             each physics alone, which has no weight (NaN).
-        gain: The verdict on the physics, by the names of the outputs; empty if no structure is
-            without it.
+        verdict: The verdict on the physics, by the names of the outputs; empty if no structure is
+            without it, or none with it.
         advice: Further findings, in sentences.
     """
 
@@ -111,7 +116,7 @@ class Comparison:
     stacked: StackedGP
     left_out: dict[str, LeaveOneOut]
     table: dict[str, list[Candidate]]
-    gain: dict[str, Gain]
+    verdict: dict[str, Verdict]
     advice: list[str]
 
     @property
@@ -191,8 +196,10 @@ class Comparison:
                     f"  {row.se_diff:>9.2g}  {weight:>9}  {row.rmse:>9.3g}  {row.coverage:>9.2f}"
                 )
             lines.append("")
-        verdict = [text for name, gain in self.gain.items() for text in gain.sentences(name)]
-        return "\n".join([*lines, *verdict, *self.advice])
+        for output, verdict in self.verdict.items():
+            where = f"{output}: " if len(self.table) > 1 else ""
+            lines.append(" ".join([f"{where}{verdict.answer}.", *verdict.reasons]))
+        return "\n".join([*lines, *self.advice])
 
 
 def compare(
@@ -270,13 +277,14 @@ def compare(
     models: dict[str, GP] = {}
     results: dict[str, FitResult] = {}
 
-    # Fit each structure; each warning of theirs comes once, with those about the physics.
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        warnings.simplefilter("ignore", SamplingWarning)  # the advice mentions it
-        for structure, part in progress_bar(progress, fitted, unit="structure"):
-            name, factory = structure.name, with_options(structure.model, options)
-            given = {"train_Yvar": train_Yvar, "physics": part if structure.uses_physics else None}
+    # Fit each structure.
+    caught: dict[str, list[warnings.WarningMessage]] = {}
+    for structure, part in progress_bar(progress, fitted, unit="structure"):
+        name, factory = structure.name, with_options(structure.model, options)
+        given = {"train_Yvar": train_Yvar, "physics": part if structure.uses_physics else None}
+        with warnings.catch_warnings(record=True) as caught[name]:
+            warnings.simplefilter("always")
+            warnings.simplefilter("ignore", SamplingWarning)  # the advice mentions it
             try:
                 models[name] = make_model(factory, train_X, train_Y, kind=GP, **given)
                 results[name] = fit(models[name], seed=seed)
@@ -284,12 +292,6 @@ def compare(
                 error.add_note(f"This is of the structure {name!r}.")
                 raise
     data = next(iter(models.values())).data
-    messages = {(str(each.message), each.category): None for each in caught}
-    for name, each in parts.items():
-        if text := complaint(each, data):
-            messages[f"{name}: {text}" if name else text, PhysicsWarning] = None
-    for text, category in messages:
-        warnings.warn(text, category, stacklevel=2)
 
     # Predict what is left out, by each structure, by their mixture, and by the physics alone.
     left_out = {name: leave_one_out(model) for name, model in models.items()}
@@ -299,25 +301,95 @@ def compare(
     is_outlier = None if chosen is None else chosen.is_outlier
     left_out |= _physics_alone(parts, data, is_outlier)
 
-    # Rank the structures for each output, and say what that shows of the physics.
+    # Rank the structures for each output.
     kinds = {structure.name: structure.kind for structure, _ in fitted}
-    scaling = {structure.name for structure, _ in fitted if structure.adjusts}
-    table: dict[str, list[Candidate]] = {}
-    gains: dict[str, Gain] = {}
-    sentences: list[str] = []
+    table = {
+        output: _ranked(j, _densities(left_out, j), left_out, kinds, models, results, stacked)
+        for j, output in enumerate(data.output_names)
+    }
+    comparison = Comparison(
+        models, results, stacked, left_out, table, {}, unsampled(table, results)
+    )
+
+    # Judge the physics, and repeat each warning once: of a physics, or of what is recommended.
+    messages: dict[tuple[str, type[Warning]], None] = {}
+    for name, each in caught.items():
+        if any(row.weight > _COUNTS for rows in table.values() for row in rows if row[0] == name):
+            messages |= {(str(one.message), one.category): None for one in each}
+    verdicts: dict[str, Verdict] = {}
     for j, output in enumerate(data.output_names):
-        densities = _densities(left_out, j)
-        rows = _ranked(j, densities, left_out, kinds, models, results, stacked)
-        candidates = [row for row in rows if row.structure in models]
-        gain = gain_of(candidates, densities)
-        if gain is not None:
-            gains[output] = gain
-        findings = advice(candidates, scaling, densities, gain)
-        where = f"{output}: " if len(data.output_names) > 1 else ""
-        sentences += [where + finding for finding in findings]
-        table[output] = rows
-    sentences += unsampled(table, results)
-    return Comparison(models, results, stacked, left_out, table, gains, sentences)
+        formulas = _formulas(comparison, [*parts], j)
+        found = {name: fault_of(data, j, f) for name, f in formulas.items()}
+        for name, fault in found.items():
+            where = f"{name}: " if name else ""
+            where += f"{output}: " if len(data.output_names) > 1 else ""
+            messages |= {(where + fault, PhysicsWarning): None} if fault else {}
+        verdict = _verdict(comparison, j, formulas.get(""), found.get("", ""))
+        if verdict is not None:
+            verdicts[output] = verdict
+    for text, category in messages:
+        warnings.warn(text, category, stacklevel=2)
+    return replace(comparison, verdict=verdicts)
+
+
+def _formulas(comparison: Comparison, names: Sequence[str], j: int) -> dict[str, Tensor]:
+    """Return output j of each physics at the data, unknown parameters as they were fitted."""
+    values = {}
+    for name in names:
+        of = f" of {name}" if name else ""
+        known = [f"{kind}{of}" for kind in (ALONE, CALIBRATED)]
+        loo = next((comparison.left_out[one] for one in known if one in comparison.left_out), None)
+        if loo is not None:
+            values[name] = loo.mean[:, j]
+            continue
+        rows = [*comparison.table.values()][j]
+        models = [comparison.models[row.structure] for row in rows if row.kind == ADJUSTED]
+        for model in (one for one in models if len(one.physics) == 1 and not name):
+            (f,) = physics_at(model, model.data.X).values()
+            values[name] = f[:, j]
+            break
+    return values
+
+
+def _verdict(c: Comparison, j: int, f: Tensor | None, fault: str) -> Verdict | None:
+    """Return the verdict on output j, of a single physics with its values f; None if not asked."""
+    output, rows = [*c.table.items()][j]
+    rows = [row for row in rows if row.structure in c.models]
+    best = next((row for row in rows if row.kind != DATA), None)
+    without = next((row for row in rows if row.kind == DATA), None)
+    if best is None or without is None:
+        return None
+    densities, errors = _densities(c.left_out, j), c.errors()[output]
+    gain, se = difference(densities[best.structure], densities[without.structure])
+    of_use = [row.of_use for row in rows if not math.isnan(row.of_use)]
+    adjusted = next((row for row in rows if row.kind == ADJUSTED), best)
+    alone = line = factor = offset = math.nan
+    loo = c.left_out[best.structure]
+    correction = ""
+    if f is not None:
+        y = loo.Y[:, j]
+        if loo.is_outlier is not None:
+            y = y.masked_fill(loo.is_outlier[:, j], torch.nan)
+        seen = ~y.isnan()
+        alone = float((y - f)[seen].square().mean().sqrt())
+        factor, offset, line = straight_line(y[seen], f[seen])
+        correction = correction_of(c.models[adjusted.structure], j, f)
+    evidence = Evidence(
+        output,
+        len(densities[without.structure]),
+        max(of_use, default=math.nan) if math.isnan(best.of_use) else best.of_use,
+        gain,
+        se,
+        alone,
+        line,
+        errors.get(ADJUSTED, best.error),
+        errors[DATA],
+        factor,
+        offset,
+        fault,
+    )
+    pair = c.models[adjusted.structure], c.models[without.structure]
+    return verdict_on(evidence, correction, next_point(*pair, j))
 
 
 def _known(asked: Any) -> list[Structure]:

@@ -3,21 +3,33 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from gpadjust.core import FitResult
+from gpadjust.core import GP, FitResult
 from gpadjust.core.data import Data
-from gpadjust.physics import Physics
+from gpadjust.kinds.categories import levels_of, on_levels
+from gpadjust.physics import PhysicsError
+from gpadjust.validation.trust import physics_at
+from gpadjust.words import bare, listed, name_and_unit, number, with_unit
 
 ALONE, CALIBRATED, ADJUSTED = "physics alone", "calibrated physics", "adjusted"
 DATA = "data alone"
+AS_IS, CORRECTED = "Use your formula as it is", "Use it corrected"
+NOT, OPEN = "Do not use it", "These data do not tell"
 _SURE = 2.0  # standard errors that a difference takes to be real
-_ENOUGH = 8  # observations of different inputs, for a difference to be shown
-_LEAST = 1e-6  # nats; less is rounding
+_ENOUGH = 8  # observations of different inputs, for any answer
+_LEAST = 1.0  # nats; a smaller difference says nothing
+_SURELY = 0.95  # probability with which nested models decide
+_LARGER = 1.1  # times as large; by less, errors are equal
+_TINY_SHARE = 0.2  # of the largest value of f_p: less is too little for a share of it
+_POINTS = 256  # among which the next observation is looked for
+_APART_BY = 0.3  # standard deviations: predictions that are nearer are the same
+_NAMED = 3  # inputs of a point that a sentence has room for
+_NEGLIGIBLE = 0.1  # of the error; a smaller offset is not named
 _COUNTS = 0.05  # weight with which a structure is a part of what is recommended
 
 # Of the check of a physics at the training inputs.
@@ -34,11 +46,10 @@ _EXPLAINS = 1 / 3  # of the error is left, where its cause is found
 _FITS = 0.6  # standard deviations of the targets that a factor leaves
 _LIKE = 0.8  # of the error is left by the opposite, at most
 _FOLLOWS = 0.5  # correlation of a physics that has anything to do with the targets
-_SURELY = 0.9  # correlation that shows what the size of the error does not
+_TIGHT = 0.9  # correlation that shows what the size of the error does not
 _SHOWN = 3.0  # standard errors of a correlation
 _ROUNDING = 1e-9
 _STANDARD = 1e-6
-_ANSWERS = {1: "Yes", 0: "Not shown", -1: "No"}
 
 
 class Candidate(NamedTuple):
@@ -72,73 +83,56 @@ class Candidate(NamedTuple):
     kind: str
 
 
-class Gain(NamedTuple):
-    """The gain of predictions of an output by the physics, and the verdict on it.
+class Verdict(NamedTuple):
+    """The verdict on a physics for an output: should one use it?
 
     Attributes:
-        elpd: The difference of expected log predictive densities, the sum over the observations, in
-            nats.
-        se: Its standard error.
-        structure: The structure with the physics.
-        without: The structure without the physics.
-        shown: 1 if the physics is shown to help, by two standard errors and by the evidence of
-            models that were weighed without it; -1 if it is shown to make predictions worse, where
-            no model leaves it out by itself; 0 if neither is, or there are observations of fewer
-            than eight different inputs.
-        by_evidence: Whether a difference of more than two standard errors shows nothing because of
-            models that were weighed without the physics.
-        number: The number of observations, those of the same inputs taken together.
+        answer: ``"Use your formula as it is"``, ``"Use it corrected"``, ``"Do not use it"`` or
+            ``"These data do not tell"``.
+        reasons: Why, in sentences.
+        factor: By which the formula is to be multiplied where it is used as it is.
+        offset: What is to be added then, in the unit of the output.
     """
 
-    elpd: float
+    answer: str
+    reasons: list[str]
+    factor: float = 1.0
+    offset: float = 0.0
+
+
+class Evidence(NamedTuple):
+    """What a verdict on an output is reached by.
+
+    Attributes:
+        name: The output, with its unit.
+        number: Observations, those of the same inputs taken together.
+        of_use: Probability that the physics is of use, by nested models with and without it; NaN if
+            none were fitted.
+        gain: The difference of expected log predictive densities with and without the physics, in
+            nats.
+        se: Its standard error.
+        alone: Root mean square error of left-out observations by the formula, with fitted
+            parameters if it has unknown ones; NaN of several.
+        line: The same by the formula up to the factor and offset.
+        adjusted: The same by the best structure that adjusts it.
+        data: The same by the best structure without it.
+        factor: Of the straight line through observations over the formula.
+        offset: Likewise.
+        fault: What is obviously wrong with the formula, in words.
+    """
+
+    name: str
+    number: int
+    of_use: float
+    gain: float
     se: float
-    structure: str
-    without: str
-    shown: int
-    by_evidence: bool = False
-    number: int = _ENOUGH
-
-    @property
-    def answer(self) -> str:
-        """``"Yes"``, ``"Not shown"`` or ``"No"``: does the physics help?"""
-        return _ANSWERS[self.shown]
-
-    def sentences(self, output: str) -> list[str]:
-        """Return the verdict on an output in words, with its number, and why no more is shown."""
-        verdict = {
-            1: f"The physics helps to predict {output}",
-            0: f"These data do not show whether the physics helps to predict {output}",
-            -1: f"With the physics, {output} is predicted worse than without it",
-        }
-        text = _elpd(self.elpd, self.se, self.structure, "without it", self.without)
-        ratio = math.exp(max(-50.0, min(50.0, self.elpd / self.number)))
-        each = f"each of {self.number} left-out observations is {ratio:.3g} times as likely"
-        finding = f"{verdict[self.shown]}: {text}; {each} in geometric mean."
-        return [finding] if self.shown else [finding, self._reason()]
-
-    def _reason(self) -> str:
-        """Return why the physics is neither shown to help nor to do harm."""
-        if self.number < _ENOUGH:
-            return (
-                f"Of fewer than {_ENOUGH} observations the standard error is itself unknown: "
-                "neither is it shown that the physics helps, nor that it does not."
-            )
-        if not self.by_evidence:
-            return (
-                "That is not to say that it does not help: the difference is within two standard "
-                "errors, and more observations may show one."
-            )
-        if self.elpd > 0:
-            return (
-                f"{self.structure} is better by more than two standard errors, but by the evidence "
-                "of a model with and without the physics it is of no use: as the two do not agree, "
-                "nothing is shown."
-            )
-        return (
-            f"{self.structure} is worse by more than two standard errors, but among those "
-            "compared is a model that leaves a physics of no use out by itself: so none is said to "
-            "do harm."
-        )
+    alone: float
+    line: float
+    adjusted: float
+    data: float
+    factor: float
+    offset: float
+    fault: str = ""
 
 
 def difference(first: Tensor, second: Tensor) -> tuple[float, float]:
@@ -147,67 +141,125 @@ def difference(first: Tensor, second: Tensor) -> tuple[float, float]:
     return each.sum().item(), math.sqrt(len(each)) * each.std(correction=0).item()
 
 
-def _sign_of(value: float, error: float) -> int:
-    """Return the sign that a difference is shown to have, or 0."""
-    if abs(value) <= max(_SURE * error, _LEAST):
-        return 0
-    return 1 if value > 0 else -1
+def verdict_on(e: Evidence, correction: str, next_point: str) -> Verdict:
+    """Return the verdict that evidence allows.
 
-
-def gain_of(rows: Sequence[Candidate], densities: Mapping[str, Tensor]) -> Gain | None:
-    """Return the gain by the physics; None if no structure uses it, or all do.
+    The probability of nested models decides whether the formula is of use, unless left-out
+    observations contradict it; their errors decide whether it needs a correction.
 
     Args:
-        rows: The structures, best first. For one that is not averaged with a model without the
-            physics the highest probability that it is of use counts: one of several physics may be
-            of use, and others not.
-        densities: Log predictive densities of left-out observations by name, ``n`` each.
+        e: The evidence.
+        correction: The largest correction, in words; empty if there is none.
+        next_point: Where one more observation would tell most; empty if none among the data would.
     """
-    best = next((row for row in rows if row.kind != DATA), None)
-    without = next((row.structure for row in rows if row.kind == DATA), None)
-    if best is None or without is None:
-        return None
-    number = len(densities[without])
-    elpd, se = difference(densities[best.structure], densities[without])
-    sign = _sign_of(elpd, se) if number >= _ENOUGH else 0
-    probabilities = [row.of_use for row in rows if not math.isnan(row.of_use)]
-    of_use = max(probabilities, default=1.0) if math.isnan(best.of_use) else best.of_use
-    is_doubted = of_use <= 0.5 if sign > 0 else bool(probabilities)
-    by_evidence = bool(sign) and is_doubted
-    shown = 0 if by_evidence else sign
-    return Gain(elpd, se, best.structure, without, shown, by_evidence, number)
 
+    def error(value: float) -> str:
+        return with_unit(number(value), e.name)
 
-def advice(
-    rows: Sequence[Candidate],
-    scaling: Collection[str],
-    densities: Mapping[str, Tensor],
-    gain: Gain | None,
-) -> list[str]:
-    """Return findings on an output in addition to the verdict, in sentences.
-
-    ``scaling`` are the names of structures that do more than to take the physics as the mean.
-    """
-    best, *others = rows
-    sentence = f"{best.structure} predicts left-out observations best (weight {best.weight:.2f})"
-    if near := [row.structure for row in others if not _sign_of(row.elpd_diff, row.se_diff)]:
-        sentence += (
-            f"; not shown to be worse, within {_SURE:.0f} standard errors: {', '.join(near)}"
+    without = f"without it the error is {error(e.data)}, with it {error(e.adjusted)}"
+    where = " Observe where the formula has other values."
+    if next_point:
+        where = f" More observations would tell, the first one {next_point}."
+    if e.fault:
+        fault = f"Your formula seems to be wrong: {e.fault}"
+        return Verdict(OPEN, [fault, "Mend it and ask again: until then no answer is worth much."])
+    if e.number < _ENOUGH:
+        few = f"It takes at least {_ENOUGH} observations of different inputs, and there are"
+        return Verdict(OPEN, [f"{few} {e.number}.{where}"])
+    if e.factor == 0:
+        same = "Your formula has the same value at all observations, which tells nothing of it."
+        return Verdict(OPEN, [f"{same} Observe where it differs."])
+    is_better = e.gain > max(_SURE * e.se, _LEAST)
+    is_worse = -e.gain > max(_SURE * e.se, _LEAST)
+    of_use = e.of_use
+    if math.isnan(of_use):
+        of_use = 1.0 if is_better else 0.0 if is_worse else 0.5
+    if of_use < 1 - _SURELY and not is_better:
+        return Verdict(NOT, [f"{without[0].upper()}{without[1:]}, and the formula alone "
+                             f"is off by {error(e.alone)}."])  # fmt: skip
+    if of_use <= _SURELY or is_worse or e.adjusted > _LARGER * e.data:
+        doubt = f"{without[0].upper()}{without[1:]}: too near one another to tell"
+        if e.adjusted > _LARGER * e.data:
+            doubt = f"{without[0].upper()}{without[1:]}"
+        return Verdict(OPEN, [f"{doubt}.{where}"])
+    simple = e.line if e.alone > _LARGER * e.line else e.alone  # NaN of several
+    if simple <= _LARGER * min(e.adjusted, e.data):
+        if simple == e.alone:
+            reason = f"Its error is {error(e.alone)}, corrected {error(e.adjusted)}"
+            return Verdict(AS_IS, [f"{reason}, of the data alone {error(e.data)}."])
+        line = f"{number(e.factor)} times your formula"
+        if abs(e.offset) > _NEGLIGIBLE * e.line:
+            sign = "plus" if e.offset > 0 else "less"
+            line += f" {sign} {error(abs(e.offset))}"
+        reason = f"Take {line}: its error is {error(e.line)}, as it is {error(e.alone)}, corrected"
+        return Verdict(AS_IS, [f"{reason} {error(e.adjusted)}."], e.factor, e.offset)
+    falls = f"Errors fall from {error(e.alone)} to {error(e.adjusted)}"
+    if math.isnan(e.alone):
+        falls = f"The error is {error(e.adjusted)}, of the data alone {error(e.data)}"
+    reasons = [f"{falls}{'; ' * bool(correction)}{correction}."]
+    if e.data <= _LARGER * e.adjusted:
+        reasons.append(
+            f"Among these data the data alone do as well ({error(e.data)}); the formula counts "
+            "where there are none."
         )
-    sentences = [f"{sentence}."]
-    using = [row.structure for row in rows if row.kind != DATA]
-    scaled = next((name for name in using if name in scaling), None)
-    unscaled = next((name for name in using if name not in scaling), None)
-    if scaled and unscaled and (gain is None or gain.shown > 0):
-        value, error = difference(densities[scaled], densities[unscaled])
-        says = "helps" if _sign_of(value, error) > 0 else "is not shown to help"
-        text = _elpd(value, error, scaled, "with the physics as a mean", unscaled)
-        sentences.append(f"Scaling the physics {says}: {text}.")
-    return sentences + [
-        f"By the evidence of {row.structure} with and without it, f_p is of use: {row.of_use:.2f}."
-        for row in rows
-        if not math.isnan(row.of_use)
-    ]
+    return Verdict(CORRECTED, reasons)
+
+
+def straight_line(y: Tensor, f: Tensor) -> tuple[float, float, float]:
+    """Return factor and offset of y over f by least squares, and the error of left-out ``n``."""
+    varies = float(f.std()) > _ROUNDING * _rms(f)
+    basis = torch.stack([f, torch.ones_like(f)] if varies else [torch.ones_like(f)], -1)
+    q, r = torch.linalg.qr(basis)
+    solution = torch.linalg.solve_triangular(r, q.mT @ y.unsqueeze(-1), upper=True).squeeze(-1)
+    left = (1 - q.square().sum(-1)).clamp_min(_ROUNDING)  # of the errors, if a point is left out
+    error = _rms((y - basis @ solution) / left)
+    factor, offset = solution.tolist() if varies else (0.0, *solution.tolist())
+    return factor, offset, error
+
+
+@torch.no_grad()
+def correction_of(model: GP, j: int, f: Tensor) -> str:
+    """Return the largest correction of a formula's values at the data, in words."""
+    X = model.data.X
+    off = model.predict(X).mean[:, j] - f
+    is_share = bool((f > 0).all() or (f < 0).all())
+    is_large = f.abs() > _TINY_SHARE * f.abs().max()  # where a share says something
+    sizes = torch.where(is_large, off / f.abs(), 0.0) if is_share else off
+    i = int(sizes.abs().argmax())
+    size = f"{100 * sizes[i]:+.0f} %"
+    if not is_share:
+        size = with_unit(f"{'+' * bool(off[i] > 0)}{number(off[i])}", model.data.output_names[j])
+    return f"the largest correction at the data is {size}{_at(model, X[i])}"
+
+
+@torch.no_grad()
+def next_point(first: GP, second: GP, j: int) -> str:
+    """Return where two models' predictions of output j are farthest apart; empty if nowhere."""
+    low, high = first.data.X.amin(0), first.data.X.amax(0)
+    unit = torch.quasirandom.SobolEngine(len(low)).draw(_POINTS, dtype=low.dtype)
+    X = on_levels(first, low + unit * (high - low))
+    try:
+        a, b = first.predict(X), second.predict(X)
+    except PhysicsError:
+        return ""
+    apart = (a.mean - b.mean)[:, j].square() / (a.variance + b.variance)[:, j]
+    i = int(apart.argmax())
+    if apart[i] < _APART_BY**2:
+        return ""
+    name = first.data.output_names[j]
+    values = [with_unit(number(each.mean[i, j]), name) for each in (a, b)]
+    return (
+        f"{_at(first, X[i]).strip()}, where it is {values[0]} with the formula, {values[1]} without"
+    )
+
+
+def _at(model: GP, x: Tensor) -> str:
+    """Return the inputs of a point, ``d``, in words; nothing of more than three."""
+    names = model.data.input_names
+    if len(names) > _NAMED or levels_of(model):
+        return ""
+    pairs = zip(names, x.tolist(), strict=True)
+    return f" at {listed(f'{bare(n)} = {with_unit(number(v), n)}' for n, v in pairs)}"
 
 
 def unsampled(
@@ -224,40 +276,39 @@ def unsampled(
     ]
 
 
-def _elpd(value: float, error: float, better: str, otherwise: str, worse: str) -> str:
-    nats = f"{round(value, 1) + 0.0:+.1f} +- {error:.1f} nats"
-    return f"elpd {nats} ({better}) over that {otherwise} ({worse})"
-
-
-@torch.no_grad()
-def complaint(physics: Physics, data: Data) -> str:
-    """Return the obvious faults of a physics, of each output; empty if there are none.
-
-    There are none of a physics with unknown parameters, of which the guesses may be wrong.
-    """
-    if physics.unknowns:
+def fault_of(data: Data, output: int, f: Tensor) -> str:
+    """Return what is obviously wrong with values ``n`` of f_p of an output; empty if nothing is."""
+    y, X = data.Y[:, output], data.X
+    seen = ~y.isnan() & f.isfinite()
+    y, f = y[seen], f[seen]
+    if len(y) < _SAID:
         return ""
-    m, sentences = data.Y.shape[-1], []
-    for name, y, f in zip(data.output_names, data.Y.mT, physics(data.X).mT, strict=True):
-        seen = ~y.isnan()
-        text = _of_output(data.X, y[seen], f[seen]) if int(seen.sum()) >= _SAID else ""
-        sentences += [f"{name}: {text}" if m > 1 else text] * bool(text)
-    return " ".join(sentences)
-
-
-def _of_output(X: Tensor, y: Tensor, f: Tensor) -> str:
-    """Return the fault of f_p for the ``n`` observations of an output."""
     sd = float(y.std())
-    cause = _cause(X, y, f) if sd > _ROUNDING * _rms(y) else ""
+    cause = _cause(data, output, X[seen], y, f) if sd > _ROUNDING * _rms(y) else ""
     if cause and _is_standardised(y.unsqueeze(-1)):
         cause += " The targets were standardised; f_p has to return what they are in."
+    name = data.output_names[output]
+    errors = [with_unit(number(value), name) for value in (_rms(y - f), sd)]
     return cause and (
-        f"at the training inputs f_p has a root mean square error of {_number(_rms(y - f))}, where "
-        f"the targets have a standard deviation of {_number(sd)}: {cause}"
+        f"at the training inputs f_p has a root mean square error of {errors[0]}, where the "
+        f"targets have a standard deviation of {errors[1]}: {cause}"
     )
 
 
-def _cause(X: Tensor, y: Tensor, f: Tensor) -> str:
+def faults(model: GP) -> list[str]:
+    """Return what is obviously wrong with the physics of a fitted model, for each and output."""
+    found = []
+    for name, values in physics_at(model, model.data.X).items():
+        for j, output in enumerate(model.data.output_names):
+            if fault := fault_of(model.data, j, values[:, j]):
+                where = f"{name}: " if len(model.physics) > 1 else ""
+                found.append(
+                    f"{where}{output}: {fault}" if model.num_outputs > 1 else where + fault
+                )
+    return found
+
+
+def _cause(data: Data, output: int, X: Tensor, y: Tensor, f: Tensor) -> str:
     """Return what is wrong with f_p: scaled inputs, or a sign, an offset or a factor."""
     n, sd, size, rmse = len(y), float(y.std()), _rms(y), _rms(f - y)
     r = _correlation(y, f)
@@ -272,20 +323,20 @@ def _cause(X: Tensor, y: Tensor, f: Tensor) -> str:
     factor, by_factor = _factor(y, f, r)
     is_off = rmse > _FAR * sd
     is_opposite = r < -_FOLLOWS and r**2 * (n - 2) > _SHOWN**2 * (1 - r**2)
-    is_worse = n >= _MANY and rmse > _WORSE * sd and r < -_SURELY
+    is_worse = n >= _MANY and rmse > _WORSE * sd and r < -_TIGHT
     if is_opposite and (is_off or is_worse) and _rms(f + y) < (1.0 if is_off else _LIKE) * rmse:
         large = f", and {_times(factor)}" if abs(factor) > _FACTOR else ""
         return f"f_p is of the opposite sign (correlation {r:.2f}){large}."
-    is_tiny = n >= _MANY and r > _SURELY and 0 < factor < 1 / _TINY
+    is_tiny = n >= _MANY and r > _TIGHT and 0 < factor < 1 / _TINY
     if not is_off and not is_tiny:
         return ""
     offset = float((f - y).mean())
     by_offset = _rms(f - y - offset)
     if rmse > _APART * sd and by_offset < _EXPLAINS * rmse and by_offset <= by_factor:
         where = "above" if offset > 0 else "below"
-        return f"f_p is about {_number(abs(offset))} {where} the targets."
+        return f"f_p is about {number(abs(offset))} {where} the targets."
     if factor > 0 and not 1 / _FACTOR < factor < _FACTOR:
-        return f"f_p is {_times(factor)}; are its units those of the targets?"
+        return f"f_p is {_times(factor)}; {_units(data, output)}"
     return ""
 
 
@@ -323,10 +374,13 @@ def _rms(values: Tensor) -> float:
 def _times(factor: float) -> str:
     """Return a text for a factor, too large or too small."""
     size = "large" if abs(factor) >= 1 else "small"
-    return f"about {_number(max(abs(factor), 1 / abs(factor)), 2)} times too {size}"
+    return f"about {number(max(abs(factor), 1 / abs(factor)), 2)} times too {size}"
 
 
-def _number(value: float, digits: int = 3) -> str:
-    """Return a number with some significant digits, without an exponent up to ten million."""
-    text = f"{value:.{digits}g}"
-    return f"{float(text):,.0f}" if "e+" in text and value < 1e7 else text
+def _units(data: Data, output: int) -> str:
+    """Return the question for the units of f_p, with those that names have."""
+    units = [" in ".join(name_and_unit(name)) for name in data.input_names if "[" in name]
+    name, unit = name_and_unit(data.output_names[output])
+    if not units or not unit:
+        return "are its units those of the targets?"
+    return f"does it give {name} in {unit}, and read {listed(units)}?"

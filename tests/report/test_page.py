@@ -11,11 +11,12 @@ from hypothesis import strategies as st
 from gpadjust.core import CKA, ZeroMeanGP, fit, load
 from gpadjust.physics import FunctionPhysics, PhysicsError
 from gpadjust.report import report
-from gpadjust.report.markup import cards, failure, name_and_unit, number, table, tag
+from gpadjust.report.markup import cards, failure, table, tag
 from gpadjust.report.page import headline, verdicts
 from gpadjust.report.subject import subject_of
 from gpadjust.validation import Gain
 from gpadjust.validation.plots import lines_along
+from gpadjust.words import name_and_unit, number
 
 from .conftest import Page, f_p
 
