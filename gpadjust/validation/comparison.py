@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Normal, StudentT
 
-from gpadjust.checks import progress_bar
+from gpadjust.checks import check_choice, progress_bar
 from gpadjust.core import (
     CKA,
     GP,
@@ -56,31 +56,21 @@ class Structure(NamedTuple):
             itself: a class, or ``functools.partial`` of one. Its keywords are the ``physics``, if
             it uses that, ``train_Yvar``, if there is one, and the options of
             :func:`~gpadjust.compare`.
-        uses_physics: Whether it reads the physics at all.
-        adjusts: Whether it does more than to take the physics as a mean.
-        joins: Whether it takes several physics at once.
-        calibrates: Whether it is of a physics with unknown parameters only.
+        kind: ``"adjusted"``; ``"data alone"`` if it does not use the physics; or
+            ``"calibrated physics"`` if it is of a single physics with unknown parameters only.
+        scales: Whether it does more than to take the physics as the mean.
     """
 
     name: str
     model: ModelFactory
-    uses_physics: bool = True
-    adjusts: bool = True
-    joins: bool = True
-    calibrates: bool = False
-
-    @property
-    def kind(self) -> str:
-        """What its predictions are, as in :class:`Candidate`."""
-        if not self.uses_physics:
-            return DATA
-        return CALIBRATED if self.calibrates else ADJUSTED
+    kind: str = ADJUSTED
+    scales: bool = True
 
 
 STRUCTURES = (
-    Structure(CALIBRATED, CalibratedPhysics, adjusts=False, joins=False, calibrates=True),
-    Structure("zero mean", ZeroMeanGP, uses_physics=False, adjusts=False, joins=False),
-    Structure("physics mean", PhysicsMeanGP, adjusts=False),
+    Structure(CALIBRATED, CalibratedPhysics, kind=CALIBRATED, scales=False),
+    Structure("zero mean", ZeroMeanGP, kind=DATA, scales=False),
+    Structure("physics mean", PhysicsMeanGP, scales=False),
     Structure("CKA", CKA),
 )
 """The structures that :func:`gpadjust.compare` knows; add your own to them."""
@@ -276,7 +266,7 @@ def compare(
         warnings.simplefilter("ignore", SamplingWarning)  # the advice mentions it
         for structure, part in progress_bar(progress, fitted, unit="structure"):
             name, factory = structure.name, with_options(structure.model, options)
-            given = {"train_Yvar": train_Yvar, "physics": part if structure.uses_physics else None}
+            given = {"train_Yvar": train_Yvar, "physics": None if structure.kind == DATA else part}
             try:
                 models[name] = make_model(factory, train_X, train_Y, kind=GP, **given)
                 results[name] = fit(models[name], seed=seed)
@@ -301,7 +291,7 @@ def compare(
 
     # Rank the structures for each output, and say what that shows of the physics.
     kinds = {structure.name: structure.kind for structure, _ in fitted}
-    scaling = {structure.name for structure, _ in fitted if structure.adjusts}
+    scaling = {structure.name for structure, _ in fitted if structure.scales}
     table: dict[str, list[Candidate]] = {}
     gains: dict[str, Gain] = {}
     sentences: list[str] = []
@@ -333,6 +323,8 @@ def _known(asked: Any) -> list[Structure]:
             "Structure of your own, or what makes a model: a class, or functools.partial of one."
         )
     structures = [s if isinstance(s, Structure) else names[s] for s in asked]
+    for structure in structures:
+        check_choice("kind", structure.kind, (ADJUSTED, DATA, CALIBRATED))
     named = {structure.name: structure for structure in structures}
     differ = all(named[structure.name] == structure for structure in structures)
     if not differ or {STACKED, ALONE} & named.keys():
@@ -376,14 +368,14 @@ def _candidates(
     candidates: list[tuple[Structure, Any]] = []
     for structure in structures:
         own = parts
-        if structure.calibrates:
+        if structure.kind == CALIBRATED:
             own = {name: part for name, part in parts.items() if part.unknowns}
-        if not structure.uses_physics or [*parts] == [""]:
+        if structure.kind == DATA or [*parts] == [""]:
             candidates += [(structure, part) for part in [*own.values()][:1]]
             continue
         for name, part in own.items():
             candidates.append((structure._replace(name=f"{structure.name} of {name}"), part))
-        if structure.joins:
+        if structure.kind == ADJUSTED:
             joined = structure._replace(name=f"{structure.name} of all")
             candidates.append((joined, {**parts}))
     if not candidates:

@@ -229,7 +229,7 @@ def test_rounding_errors_show_nothing(X):
 
 
 def test_candidates_of_several_physics_and_classes_are_known():
-    plain = [structure for structure in STRUCTURES if not structure.calibrates]
+    plain = [structure for structure in STRUCTURES if structure.kind != "calibrated physics"]
     several = _by_name([crude, torch.sin, lambda X: X])
     assert [*several] == ["crude", "sin", "f_3"]
     found = _candidates(plain, several)
@@ -381,7 +381,7 @@ def test_several_physics_each_alone_and_all(X, noise, tmp_path):
 @pytest.mark.slow
 def test_all_structures_by_default(scaled):
     comparison = compare(*scaled, crude)
-    known = {structure.name for structure in STRUCTURES if not structure.calibrates}
+    known = {structure.name for structure in STRUCTURES if structure.kind != "calibrated physics"}
     assert set(comparison.models) == known
     assert comparison.gain["y"].answer == "Yes"
 
@@ -412,6 +412,7 @@ def test_bad_input(scaled):
         (scaled, {"structures": ["CKA", "kriging"]}, "structures"),
         (scaled, {"structures": [3.0]}, r"or functools\.partial of one"),
         (scaled, {"structures": [Structure("stacked", CKA)]}, "none of them 'stacked'"),
+        (scaled, {"structures": [Structure("mine", CKA, "best")]}, "kind"),
         (scaled, {"structures": [Structure("physics alone", CKA)]}, "or 'physics alone'; found"),
         (scaled, {"structures": "calibrated physics"}, "unknown parameters for 'calibrated phys"),
         ((X, Y[:5]), {}, "train_Y"),
