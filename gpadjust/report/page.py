@@ -179,7 +179,10 @@ def _page(
     title = title or f"Report on {', '.join(subject.outputs)}"
     answers = cards(subject, origin.how)
     kind = "Errors" if subject.comparison is None else "Left-out errors"
-    question, line = "Should you use your formula?", headline(answers, kind)
+    question = "Should you use your formula?"
+    if not subject.has_physics:
+        question = "How well are left-out observations predicted?"
+    line = headline(answers, kind)
     return Page(title, lead, question, answers, line, sections, settings)
 
 

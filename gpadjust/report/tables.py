@@ -34,10 +34,11 @@ _STRUCTURES = {
 _ELPD = (
     "elpd is the log density of left-out observations, summed, in nats: higher is better. A "
     "difference of less than two of its errors shows nothing. RMSE is of the left-out "
-    "predictions, sd is that of the observations, and the last column is the share of left-out "
-    "observations within their 95 % intervals. Weights are those of the mixture that predicts "
-    "left-out observations best: of structures that predict alike one may have all of it, also "
-    "one that is not the first."
+    "predictions, sd is that of the observations, 'in 95 %' the share of left-out observations "
+    "within their 95 % intervals, and 'of use' the probability that the formula is of use, by "
+    "nested models with and without it. Weights are those of the mixture that predicts left-out "
+    "observations best: of structures that predict alike one may have all of it, also one that is "
+    "not the first."
 )
 _COVERAGE = (
     "If intervals are honest, those of 95 % hold 95 % of left-out observations, but for chance: "
@@ -81,7 +82,7 @@ def structures(subject: Subject) -> Markup:
     parts, names = [], dict[str, None]()
     for output in comparison.table:
         head = ["structure", "elpd", "less the best", "its error", "weight"]
-        head += [with_unit("RMSE", output, "{} [{}]"), "RMSE / sd", "in 95 %"]
+        head += [with_unit("RMSE", output, "{} [{}]"), "RMSE / sd", "in 95 %", "of use"]
         rows = []
         for row in comparison.table[output]:
             weight = "-" if math.isnan(row.weight) else f"{row.weight:.2f}"

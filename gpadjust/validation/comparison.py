@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Normal, StudentT
 
-from gpadjust.checks import progress_bar
+from gpadjust.checks import check_choice, progress_bar
 from gpadjust.core import (
     CKA,
     GP,
@@ -61,31 +61,19 @@ class Structure(NamedTuple):
             itself: a class, or ``functools.partial`` of one. Its keywords are the ``physics``, if
             it uses that, ``train_Yvar``, if there is one, and the options of
             :func:`~gpadjust.compare`.
-        uses_physics: Whether it reads the physics at all.
-        adjusts: Whether it does more than to take the physics as a mean.
-        joins: Whether it takes several physics at once.
-        calibrates: Whether it is of a physics with unknown parameters only.
+        kind: ``"adjusted"``; ``"data alone"`` if it does not use the physics; or
+            ``"calibrated physics"`` if it is of a single physics with unknown parameters only.
     """
 
     name: str
     model: ModelFactory
-    uses_physics: bool = True
-    adjusts: bool = True
-    joins: bool = True
-    calibrates: bool = False
-
-    @property
-    def kind(self) -> str:
-        """What its predictions are, as in :class:`Candidate`."""
-        if not self.uses_physics:
-            return DATA
-        return CALIBRATED if self.calibrates else ADJUSTED
+    kind: str = ADJUSTED
 
 
 STRUCTURES = (
-    Structure(CALIBRATED, CalibratedPhysics, adjusts=False, joins=False, calibrates=True),
-    Structure("zero mean", ZeroMeanGP, uses_physics=False, adjusts=False, joins=False),
-    Structure("physics mean", PhysicsMeanGP, adjusts=False),
+    Structure(CALIBRATED, CalibratedPhysics, kind=CALIBRATED),
+    Structure("zero mean", ZeroMeanGP, kind=DATA),
+    Structure("physics mean", PhysicsMeanGP),
     Structure("CKA", CKA),
 )
 """The structures that :func:`gpadjust.compare` knows; add your own to them."""
@@ -186,14 +174,17 @@ class Comparison:
             lines += [where + each] if each else []
         lines += [""] if lines else []
         width = max(len(row.structure) for rows in self.table.values() for row in rows)
-        head = ("elpd", "elpd diff", "its error", "weight", "RMSE/sd", "coverage")
+        head = ("elpd", "elpd diff", "its error", "weight", "RMSE/sd", "coverage", "of use")
         for output, rows in self.table.items():
             lines.append(f"{output:{width}}" + "".join(f"  {name:>9}" for name in head))
             for row in rows:
-                weight = "-" if math.isnan(row.weight) else f"{row.weight:.2f}"
+                weight, use = (
+                    "-" if math.isnan(x) else f"{x:.2f}" for x in (row.weight, row.of_use)
+                )
                 lines.append(
                     f"{row.structure:{width}}  {row.elpd:>9.4g}  {row.elpd_diff:>9.3g}"
                     f"  {row.se_diff:>9.2g}  {weight:>9}  {row.rmse:>9.3g}  {row.coverage:>9.2f}"
+                    f"  {use:>9}"
                 )
             lines.append("")
         for output, verdict in self.verdict.items():
@@ -281,7 +272,7 @@ def compare(
     caught: dict[str, list[warnings.WarningMessage]] = {}
     for structure, part in progress_bar(progress, fitted, unit="structure"):
         name, factory = structure.name, with_options(structure.model, options)
-        given = {"train_Yvar": train_Yvar, "physics": part if structure.uses_physics else None}
+        given = {"train_Yvar": train_Yvar, "physics": None if structure.kind == DATA else part}
         with warnings.catch_warnings(record=True) as caught[name]:
             warnings.simplefilter("always")
             warnings.simplefilter("ignore", SamplingWarning)  # the advice mentions it
@@ -307,9 +298,8 @@ def compare(
         output: _ranked(j, _densities(left_out, j), left_out, kinds, models, results, stacked)
         for j, output in enumerate(data.output_names)
     }
-    comparison = Comparison(
-        models, results, stacked, left_out, table, {}, unsampled(table, results)
-    )
+    advice = unsampled(table, results)
+    comparison = Comparison(models, results, stacked, left_out, table, {}, advice)
 
     # Judge the physics, and repeat each warning once: of a physics, or of what is recommended.
     messages: dict[tuple[str, type[Warning]], None] = {}
@@ -405,6 +395,8 @@ def _known(asked: Any) -> list[Structure]:
             "Structure of your own, or what makes a model: a class, or functools.partial of one."
         )
     structures = [s if isinstance(s, Structure) else names[s] for s in asked]
+    for structure in structures:
+        check_choice("kind", structure.kind, (ADJUSTED, DATA, CALIBRATED))
     named = {structure.name: structure for structure in structures}
     differ = all(named[structure.name] == structure for structure in structures)
     if not differ or {STACKED, ALONE} & named.keys():
@@ -448,14 +440,14 @@ def _candidates(
     candidates: list[tuple[Structure, Any]] = []
     for structure in structures:
         own = parts
-        if structure.calibrates:
+        if structure.kind == CALIBRATED:
             own = {name: part for name, part in parts.items() if part.unknowns}
-        if not structure.uses_physics or [*parts] == [""]:
+        if structure.kind == DATA or [*parts] == [""]:
             candidates += [(structure, part) for part in [*own.values()][:1]]
             continue
         for name, part in own.items():
             candidates.append((structure._replace(name=f"{structure.name} of {name}"), part))
-        if structure.joins:
+        if structure.kind == ADJUSTED:
             joined = structure._replace(name=f"{structure.name} of all")
             candidates.append((joined, {**parts}))
     if not candidates:

@@ -374,7 +374,7 @@ def _rms(values: Tensor) -> float:
 def _times(factor: float) -> str:
     """Return a text for a factor, too large or too small."""
     size = "large" if abs(factor) >= 1 else "small"
-    return f"about {number(max(abs(factor), 1 / abs(factor)), 2)} times too {size}"
+    return f"about {float(f'{max(abs(factor), 1 / abs(factor)):.2g}'):,g} times too {size}"
 
 
 def _units(data: Data, output: int) -> str:
