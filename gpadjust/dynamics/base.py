@@ -293,12 +293,12 @@ class Dynamics(ABC):
                 f"{tuple(states.shape)} and actions of shape {tuple(actions.shape)}."
             )
 
-    def _check_blocks(self, states: Tensor, actions: Tensor, num_functions: int) -> None:
+    def _check_blocks(self, states: Tensor, actions: Tensor, number: int | None) -> None:
         self._check_pair(states, actions)
-        if states.dim() != 3 or len(states) != num_functions:
+        if number is not None and (states.dim() != 3 or len(states) != number):
             raise ValueError(
-                f"Expected states of shape {num_functions} x N x {self.spec.state_dim}, a block "
-                f"for each function, got {tuple(states.shape)}."
+                f"Expected states of shape {number} x N x {self.spec.state_dim}, a block for each "
+                f"function, got {tuple(states.shape)}."
             )
 
 
@@ -306,10 +306,9 @@ class FreeRun(NamedTuple):
     r"""Predicted states along ``w`` sequences of ``T`` actions, each from its own state.
 
     Step t is the state after t + 1 actions. Each of the ``K`` particles follows one function drawn
-    from the dynamics, and nothing that was measured on the way. Noise is added to what is reported
-    of each step, as to a measurement of it, and moves nothing on; process noise moves the particles
-    themselves. A particle that is lost, because it would leave the bounds or the finite numbers or
-    meet a failure of the physics, stays where it was before.
+    from the dynamics. Noise is added to what is reported of each step, as to a measurement of it,
+    and moves nothing on; process noise moves the particles themselves. A particle that would leave
+    the bounds or the finite numbers, or meet a failure of the physics, is lost: it stays.
 
     The mean of an angle is that on the circle. It goes on from the initial state without jumps of
     :math:`2 \pi`, and interval and particles of each step are about it: compare with what was
@@ -317,13 +316,12 @@ class FreeRun(NamedTuple):
 
     Args:
         mean: ``w x T x state_dim``.
-        lower: What a state, measured if the noise was asked for, is above with probability
-            ``(1 + level) / 2``, ``w x T x state_dim``: an order statistic of the particles, which
-            holds for any distribution. NaN where the physics fails at the mean before, for the
-            noise's sake.
+        lower: What a state is above with probability ``(1 + level) / 2``, ``w x T x state_dim``: an
+            order statistic of the particles, which holds for any distribution. NaN where the noise
+            is not known, as the physics fails at the mean before.
         upper: What it is below with that probability.
-        particles: ``K x w x T x state_dim``, with the noise if that was asked for. An angle is
-            within half a turn of the mean, but for the noise.
+        particles: ``K x w x T x state_dim``; without noise, an angle is within half a turn of the
+            mean.
         lost: Share of the particles that are lost by then, ``w x T``.
         spec: What the entries of states are.
         level: The probability of the intervals.
@@ -575,22 +573,23 @@ def _checked_noise(spec: StateSpec, name: str, noise: Any) -> Tensor | Literal["
 
 
 def checked_horizons(horizons: Sequence[int]) -> tuple[int, ...]:
-    """Return the numbers of steps, in order; an error unless they are different, and at least 1."""
-    steps = tuple(horizons) if isinstance(horizons, Sequence) else ()
-    if not steps or len({*steps}) < len(steps):
+    """Return numbers of steps in order; an error unless they are different, and at least 1."""
+    is_list = isinstance(horizons, Sequence) and len(horizons) > 0
+    if not is_list or len({*horizons}) < len(horizons):
         raise ValueError(
-            f"Expected horizons as different numbers of steps, such as (1, 5, 15), got "
+            "Expected horizons as different numbers of steps, such as (1, 5, 15), got "
             f"{horizons!r}."
         )
-    return tuple(sorted(checked_whole("each horizon", each, 1) for each in steps))
+    return tuple(sorted(checked_whole("each horizon", each, 1) for each in horizons))
 
 
 def of_states(values: Any, name: str, shape: tuple[int, ...]) -> Tensor:
     """Return the user's numbers, one or more for each state, in float64."""
     values = checked_tensor(name, values)
     if values.shape != shape:
+        expected = " x ".join(map(str, shape))
         raise ValueError(
-            f"Expected {name} of shape {' x '.join(map(str, shape))}, an entry for each state, got "
-            f"shape {tuple(values.shape)}."
+            f"Expected {name} of shape {expected}, an entry for each state, got shape "
+            f"{tuple(values.shape)}."
         )
     return values

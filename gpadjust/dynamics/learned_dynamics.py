@@ -13,13 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gpadjust.checks import (
-    check_choice,
-    check_switch,
-    checked_options,
-    checked_tensor,
-    checked_whole,
-)
+from gpadjust.checks import check_choice, checked_options, checked_tensor, checked_whole
 from gpadjust.core import CKA, GP, FitResult, Prediction, ZeroMeanGP, fit
 from gpadjust.core.model import Predictive
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
@@ -83,7 +77,8 @@ class LearnedDynamics(Dynamics):
         spec: What the entries of states and actions are.
         physics: The next values of the states that are neither exogenous nor previous values,
             from the columns ``physics_reads`` of the spec, by default these states and the actions;
-            angles in rad. Several: a list, or a dictionary with their names. Default: none.
+            angles in rad, of which models read sine and cosine. Several: a list, or a dictionary
+            with their names. Default: none.
         model: Makes the model from ``(X, Y, physics=...)``: a class of models such as
             :class:`~gpadjust.CKA` (without physics :class:`~gpadjust.ZeroMeanGP`), a
             ``functools.partial`` of it with further arguments, or a function, which gets
@@ -91,8 +86,6 @@ class LearnedDynamics(Dynamics):
         target: What the model learns: the ``"difference"`` of next state and state, of an angle
             the shortest way round, or the next state itself (``"absolute"``). A scaling of an
             absolute position or angle depends on where its origin is; one of a change does not.
-        encode_angles: Whether the model reads the sine and cosine of angles; the physics always
-            reads the angles.
         fit_options: Options of :func:`gpadjust.fit`: ``method``, ``num_draws`` and ``seed``. By
             default the hyper-parameters are drawn, and what is predicted has their uncertainty,
             too; ``"map"`` takes the most likely ones.
@@ -126,7 +119,6 @@ class LearnedDynamics(Dynamics):
         *,
         model: ModelFactory = CKA,
         target: Target = "difference",
-        encode_angles: bool = True,
         fit_options: Mapping[str, Any] | None = None,
         num_features: int = _NUM_FEATURES,
         physics_error: Mapping[str, float] | None = None,
@@ -134,7 +126,6 @@ class LearnedDynamics(Dynamics):
         super().__init__(spec)
         if checked_whole("num_features", num_features, 2) % 2:
             raise ValueError(f"Expected num_features to be even; found {num_features}.")
-        check_switch("encode_angles", encode_angles)
         options = checked_options("fit_options", fit_options, ("method", "num_draws", "seed"))
         self.fit_options = {name: value for name, value in options.items() if value is not None}
         check_choice("method", self.fit_options.get("method", "bayes"), ("bayes", "map"))
@@ -145,11 +136,10 @@ class LearnedDynamics(Dynamics):
         self._options: dict[str, Any] = {}  # of the model
         if parts:
             self._options["physics"] = parts if len(parts) > 1 else next(iter(parts.values()))
-        if encode_angles and self.targets.angles:
+        if self.targets.angles:
             self._options["input_transform"] = AngleInput(self.targets.angles)
         check_factory(model, self._options)
         self.make_model = model
-        self.encode_angles = encode_angles
         self.num_features = num_features
         self.physics_error = checked_physics_error(spec, physics_error)
         self.fit_result: FitResult | None = None
@@ -237,12 +227,7 @@ class LearnedDynamics(Dynamics):
     def sample_functions(self, num_functions: int, seed: int | None = None) -> TransitionFunctions:
         """Draw transition functions from the posterior, without noise; see :class:`Dynamics`."""
         functions: Any = self.model.sample_functions(num_functions, seed, self.num_features)
-
-        def step(states: Tensor, actions: Tensor) -> Tensor:
-            self._check_blocks(states, actions, num_functions)
-            return self._following(states, actions, functions.each)
-
-        return step
+        return self._step(functions.each, num_functions)
 
     def mean_function(self) -> TransitionFunctions:
         """Return the mean of the predictions, as a function of any ``k`` blocks, with gradients.
@@ -263,11 +248,7 @@ class LearnedDynamics(Dynamics):
                 values = (means.mean(-3) * model.unit).mT
             return values.unflatten(0, inputs.shape[:-1])
 
-        def step(states: Tensor, actions: Tensor) -> Tensor:
-            self._check_pair(states, actions)
-            return self._following(states, actions, mean)
-
-        return step
+        return self._step(mean)
 
     def noise_variance(self, states: Tensor, actions: Tensor) -> Tensor:
         """Return the variance of the learnt noise, ``N x state_dim``."""
@@ -295,7 +276,6 @@ class LearnedDynamics(Dynamics):
             self.spec,
             model=getattr(self.make_model, "func", self.make_model),
             target=self.targets.target,
-            encode_angles=self.encode_angles,
             model_options=getattr(self.make_model, "keywords", {}),
             **{"method": None, **self.fit_options},
             **{name: value for name, value in options.items() if value},
@@ -399,12 +379,17 @@ class LearnedDynamics(Dynamics):
             )
         return self._learnt
 
-    def _following(
-        self, states: Tensor, actions: Tensor, learnt: Callable[[Tensor], Tensor]
-    ) -> Tensor:
-        """Return the next states by what was learnt of their inputs."""
-        values = learnt(self.targets.inputs(states, actions))
-        return self.spec.complete(states, actions, self.targets.decode(states, values))
+    def _step(
+        self, of_inputs: Callable[[Tensor], Tensor], num_functions: int | None = None
+    ) -> TransitionFunctions:
+        """Return a step by targets as a function of the model's inputs."""
+
+        def step(states: Tensor, actions: Tensor) -> Tensor:
+            self._check_blocks(states, actions, num_functions)
+            targets = of_inputs(self.targets.inputs(states, actions))
+            return self.spec.complete(states, actions, self.targets.decode(states, targets))
+
+        return step
 
     def _predict(
         self, states: Tensor, actions: Tensor, observation_noise: bool

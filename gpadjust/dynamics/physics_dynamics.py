@@ -37,15 +37,13 @@ class PhysicsDynamics(Dynamics):
     with the errors :math:`r_{ij}` of the :math:`n_i` measured next values of state i, so that each
     state counts in units of its own error, and the coordinates z of the parameters, which are
     standard normal by their prior (:class:`~gpadjust.physics.Unknown`). The search begins at the
-    best of the guesses and 512 draws from the prior, and is the same for the same transitions. A
-    parameter of which they tell nothing stays in the middle of its prior, with a warning. The
-    errors that are left are taken as the noise of measured next states; the functions have none.
+    best of the guesses and 512 draws from the prior. A parameter of which transitions tell nothing
+    stays in the middle of its prior, with a warning. The errors that are left are taken as the
+    noise of measured next states; the functions have none.
 
     Args:
         spec: What the entries of states and actions are.
-        physics: The next values of the states that are neither exogenous nor previous values,
-            from the columns that the spec says (``physics_reads``): by default these states and
-            the actions.
+        physics: One physics, as of :class:`LearnedDynamics`.
         physics_error: Standard deviations of the error of a step of the physics, by the name of the
             state; its variance until unknown parameters are fitted. Default: none.
 
@@ -92,8 +90,8 @@ class PhysicsDynamics(Dynamics):
     def physics_parameters(self) -> PhysicsParameters:
         """Unknown parameters: 1024 draws about the fitted ones, or the guesses before.
 
-        The draws are of the normal distribution (of the coordinates z) whose precision the slopes
-        of the physics at the optimum say; their ``sd`` are the standard errors, with the prior.
+        The draws of the coordinates z are normal, with the precision that the slopes of the physics
+        at the optimum and the prior have; their ``sd`` are the standard errors.
         """
         unknowns = self.physics.unknowns
         if self._fitted is None:

@@ -26,9 +26,6 @@ class Targets:
     They are the change of each predicted state, :math:`y = s' - s`, of an angle the shortest way
     round; or with ``"absolute"`` its next value :math:`s + (s' - s)`, which is continuous along a
     trajectory even where angles come wrapped.
-
-    Raises:
-        ValueError: If ``target`` is neither.
     """
 
     def __init__(self, spec: StateSpec, target: Target) -> None:
@@ -106,11 +103,7 @@ class AngleInput(InputTransform):
     A stationary kernel on the result has no seam where the angle wraps.
 
     Args:
-        columns: The columns of X that are angles in rad.
-
-    Raises:
-        TypeError: If a column is not a whole number.
-        ValueError: If ``columns`` is empty, or has a negative or repeated number.
+        columns: The columns of X that are angles in rad: one or more different numbers, from 0.
 
     Example:
         >>> import torch

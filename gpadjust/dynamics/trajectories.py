@@ -117,16 +117,16 @@ class Trajectories:
         named = {"states": states, "actions": actions, "next_states": next_states}
         for name, tensor in named.items():
             check_doubles(name, tensor, spec.action_dim if name == "actions" else spec.state_dim)
-            if tensor.dim() != 2 or len(tensor) != len(states) or not len(tensor):
-                raise ValueError(
-                    "Expected states, actions and next_states with as many rows each, and at least "
-                    f"one; got shapes {', '.join(str(tuple(t.shape)) for t in named.values())}."
-                )
-            if name == "next_states":
-                check_observed(name, tensor)
-                check_observed("the predicted entries of next_states", tensor[:, spec.predicted])
-            else:
-                check_finite(name, tensor)
+        if states.dim() != 2 or len({t.shape[:-1] for t in named.values()}) > 1 or not len(states):
+            raise ValueError(
+                "Expected states, actions and next_states with as many rows each, and at least "
+                f"one; got shapes {', '.join(str(tuple(t.shape)) for t in named.values())}."
+            )
+        check_finite("states", states)
+        check_finite("actions", actions)
+        check_observed("next_states", next_states)
+        predicted = next_states[:, spec.predicted]
+        check_observed("the predicted entries of next_states", predicted)
         copies = {name: tensor.detach().clone() for name, tensor in named.items()}
         return cls(**copies, episode=episode)  # type: ignore[arg-type]
 
@@ -193,8 +193,7 @@ class Trajectories:
 
         Args:
             length: The number ``T`` of steps.
-            stride: How many steps after a window starts the next one. Default: ``length``, so that
-                they do not overlap.
+            stride: Steps from the start of a window to that of the next. Default: ``length``.
 
         Raises:
             ValueError: If no episode is as long, or a number is no positive whole one.

@@ -34,7 +34,7 @@ class StateSpec:
         angles: The states that are angles in rad. Policy and model see their sine and cosine, and
             changes are the shortest way round the circle.
         exogenous: The states that stay as they are during an episode, such as a target, or follow
-            the ``reference`` of a task. The policy sees them; models and physics do not, unless
+            the ``reference`` of a task. Policies see them; models and physics only if
             ``physics_reads`` names them.
         integrated: For states that a model need not predict, the states that are their
             velocities: :math:`q' = q + h (v + v') / 2`.
@@ -45,9 +45,9 @@ class StateSpec:
             system that follows its actions with a delay, or of which not all is measured; models
             need not predict them. What holds an angle is an angle.
         physics_reads: The columns of the physics: names of states and actions in its order, such
-            as ``["x", "v", "last_force"]`` of a system that follows its force a step late. What the
-            physics reads, models read. Default: the states that are neither exogenous nor
-            ``previous``, then the actions.
+            as ``["x", "v", "last_force"]`` of a system that follows its force a step late. Models
+            read them, too. Default: the states that are neither exogenous nor ``previous``, then
+            the actions.
 
     Raises:
         TypeError: If names are not strings, ``integrated`` or ``previous`` is no mapping or
@@ -62,14 +62,10 @@ class StateSpec:
         >>> spec = StateSpec(["theta", "theta_dot"], ["torque"], angles=["theta"])
         >>> spec.observe(torch.tensor([[0.0, 2.0]]))
         tensor([[0., 1., 2.]])
-
-        A tank of which the level alone is measured, with two earlier levels and a pump's action:
-
-        >>> previous = {"level_1": "level", "level_2": "level_1", "pump_1": "pump"}
-        >>> spec = StateSpec(["level", *previous], ["pump"], previous=previous)
-        >>> state, action = torch.tensor([3.0, 2.0, 1.0, 0.5]), torch.tensor([0.7])
+        >>> spec = StateSpec(["level", "last"], ["pump"], previous={"last": "level"})
+        >>> state, action = torch.tensor([3.0, 2.0]), torch.tensor([0.7])
         >>> spec.complete(state, action, predicted=torch.tensor([4.0]))
-        tensor([4.0000, 3.0000, 2.0000, 0.7000])
+        tensor([4., 3.])
     """
 
     states: Sequence[str]

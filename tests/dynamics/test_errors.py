@@ -83,7 +83,7 @@ DAMAGES = [
         (damaged(change), RuntimeError, words)
         for change, words in (
             (lambda s: s.pop("model"), "damaged: KeyError.*'model'"),
-            (lambda s: s["transitions"]["actions"][3].fill_(math.nan), r"transitions.*\(row 3\)"),
+            (lambda s: s["transitions"]["actions"][3].fill_(math.nan), "'actions' without NaN"),
             (lambda s: s["probes"][0][0].fill_(math.nan), "damaged.*expected 'probes' without NaN"),
             (lambda s: s["model"].pop("u"), "for CKA"),
             (lambda s: s["model"].update(u=torch.ones(2, 2, 3)), "size mismatch for u"),

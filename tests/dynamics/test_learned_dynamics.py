@@ -254,11 +254,10 @@ def test_each_block_follows_a_function_of_its_own(cart_pole_system, make, costly
 
 def test_predictions_take_leading_dimensions_and_raw_angles(cart_pole_system, make):
     system = cart_pole_system
-    dynamics = make("CKA", system.spec, system.crude, encode_angles=False)
+    dynamics = make("CKA", system.spec, system.crude)
     dynamics.update(*system.trial(0))
     assert isinstance(dynamics.model, CKA)
     assert dynamics.physics is dynamics.model.physics[0].physics is system.crude
-    assert dynamics.model.data.transform is None
     states, actions, _ = system.trial(1)
     whole = dynamics.predict(states, actions)
     blocks = dynamics.predict(states.reshape(5, 5, 4), actions.reshape(5, 5, 1))
