@@ -398,8 +398,9 @@ class LearnedDynamics(Dynamics):
         self._check_pair(states, actions)
         X = self.targets.inputs(states, actions)
         with torch.no_grad():
-            moments = self.model.predict(X.flatten(0, -2), observation_noise=observation_noise)
-        mean, variance = (part.unflatten(0, X.shape[:-1]) for part in moments)
+            rows = X.reshape(-1, X.shape[-1])
+            moments = self.model.predict(rows, observation_noise=observation_noise)
+        mean, variance = (part.reshape(*X.shape[:-1], -1) for part in moments)
         return self.targets.decode(states, mean), variance
 
 

@@ -168,7 +168,7 @@ class PhysicsDynamics(Dynamics):
         """Return settings, fitted values, and the physics' outputs at some transitions."""
         probes, fitted = self._probes and [*self._probes], self._fitted and self._fitted._asdict()
         if fitted is not None:
-            fitted["data"] = columns_of(fitted["data"])
+            fitted["transitions"] = columns_of(fitted.pop("data"))
         return deepcopy({"fingerprint": self.describe(), "probes": probes, "fitted": fitted})
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -181,7 +181,8 @@ class PhysicsDynamics(Dynamics):
         with loading(state, self.describe()) as copy:
             probes, fitted = copy["probes"], copy["fitted"]
             if fitted is not None:
-                fitted = _Fitted(Trajectories.checked(self.spec, **fitted.pop("data")), **fitted)
+                data = Trajectories.checked(self.spec, **fitted.pop("transitions"))
+                fitted = _Fitted(data, **fitted)
                 fitted.noise.view(self.spec.state_dim)
                 self.physics.unknowns.at(fitted.precision @ fitted.point)
             if probes is not None:
