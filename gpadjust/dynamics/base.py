@@ -283,7 +283,8 @@ class Dynamics(ABC):
         self.spec.check_transitions(*data)
         return data
 
-    def _check_pair(self, states: Tensor, actions: Tensor) -> None:
+    def _check_blocks(self, states: Tensor, actions: Tensor, number: int | None = None) -> None:
+        """Raise an error unless states have actions, in as many blocks as there are functions."""
         check_doubles("states", states, self.spec.state_dim)
         check_columns("actions", actions, self.spec.action_dim)
         lead = zip(reversed(actions.shape[:-1]), reversed(states.shape[:-1]), strict=False)
@@ -292,9 +293,6 @@ class Dynamics(ABC):
                 "Expected an action for each state, or one for all, got states of shape "
                 f"{tuple(states.shape)} and actions of shape {tuple(actions.shape)}."
             )
-
-    def _check_blocks(self, states: Tensor, actions: Tensor, number: int | None) -> None:
-        self._check_pair(states, actions)
         if number is not None and (states.dim() != 3 or len(states) != number):
             raise ValueError(
                 f"Expected states of shape {number} x N x {self.spec.state_dim}, a block for each "

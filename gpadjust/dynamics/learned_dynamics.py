@@ -179,14 +179,14 @@ class LearnedDynamics(Dynamics):
             PhysicsError: If the physics fails.
         """
         data, before = self._checked(states, actions, next_states), self._learnt
+        if before is None:
+            probes = [PhysicsProbes.of(part, self.spec, data) for part in self._parts.values()]
+        else:
+            data, probes = before.data.append(data), before.probes
+        self._check_enough(data)
         with warnings.catch_warnings():
             if before is not None:
                 warnings.simplefilter("ignore")  # the first update has given them
-            # At each update, so that an error names rows of these transitions.
-            probes = [PhysicsProbes.of(part, self.spec, data) for part in self._parts.values()]
-            if before is not None:
-                data, probes = before.data.append(data), before.probes
-            self._check_enough(data)
             model = self._built(data)
         self.fit_result = fit(model, **self.fit_options)
         self._learnt = Learnt(data, model, probes)
@@ -306,9 +306,8 @@ class LearnedDynamics(Dynamics):
         compared at three of the transitions, and evaluated at all of them.
 
         Raises:
-            TypeError: If it is no dictionary.
-            RuntimeError: If it is of dynamics of another class, spec, target, model, options or
-                physics, or damaged.
+            TypeError: If it is not a dictionary.
+            RuntimeError: If it is of dynamics of other settings or another physics, or damaged.
             PhysicsError: If the physics fails.
         """
         if state == {}:
@@ -395,7 +394,7 @@ class LearnedDynamics(Dynamics):
         self, states: Tensor, actions: Tensor, observation_noise: bool
     ) -> tuple[Tensor, Tensor]:
         """Return mean and variance of the predicted states, ``... x len(spec.predicted)``."""
-        self._check_pair(states, actions)
+        self._check_blocks(states, actions)
         X = self.targets.inputs(states, actions)
         with torch.no_grad():
             rows = X.reshape(-1, X.shape[-1])

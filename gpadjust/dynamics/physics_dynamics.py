@@ -196,7 +196,7 @@ class PhysicsDynamics(Dynamics):
         return None if self._fitted is None else self.physics.unknowns.at(self._fitted.point)
 
     def _step(self, states: Tensor, actions: Tensor, parameters: Tensor | None = None) -> Tensor:
-        self._check_pair(states, actions)
+        self._check_blocks(states, actions)
         return next_values(self.physics, self.spec, states, actions, parameters)
 
 

@@ -23,11 +23,7 @@ _OF_SIZE = 1e-6  # of the states that it is computed from
 
 
 def fingerprint(kind: type, spec: StateSpec, **settings: Any) -> dict[str, str]:
-    """Return class, spec and settings of dynamics, each as a text.
-
-    Modules and other objects that have no value to compare are named by their class, classes and
-    functions by their name.
-    """
+    """Return class, spec and settings of dynamics, each as a text."""
     # Where nothing is integrated, the step is but the unit of horizons.
     step = spec.step if spec.integrated else None
     settings = {**asdict(spec), "step": step, **settings}
@@ -35,7 +31,7 @@ def fingerprint(kind: type, spec: StateSpec, **settings: Any) -> dict[str, str]:
 
 
 def _text(value: Any) -> str:
-    """Return the value of plain objects, the class of others."""
+    """Return the value of plain objects, the name of classes and functions, the class of others."""
     if isinstance(value, Mapping):
         items = sorted((str(key), _text(part)) for key, part in value.items())
         return "{" + ", ".join(f"{key!r}: {part}" for key, part in items) + "}"
@@ -51,12 +47,7 @@ def _text(value: Any) -> str:
 
 @contextmanager
 def loading(state: Any, expected: dict[str, str]) -> Iterator[dict[str, Any]]:
-    """Give a copy of a state of dynamics, and call it damaged where it cannot be loaded.
-
-    Raises:
-        TypeError: If it is not a dictionary.
-        RuntimeError: If its fingerprint is not as expected, or it is damaged.
-    """
+    """Yield a copy of a state of dynamics; raise a RuntimeError where it cannot be loaded."""
     if not isinstance(state, Mapping):
         raise TypeError(f"Expected a dictionary that `state_dict` gave, found {state!r}.")
     found = state.get("fingerprint")
