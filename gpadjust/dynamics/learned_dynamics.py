@@ -19,7 +19,7 @@ from gpadjust.core.model import Predictive
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.least_squares import even_normal
 from gpadjust.dynamics.physics_dynamics import PhysicsDynamics
-from gpadjust.dynamics.state import PhysicsProbes, columns_of, fingerprint, loading
+from gpadjust.dynamics.state import PhysicsProbes, check_numbers, columns_of, fingerprint, loading
 from gpadjust.dynamics.targets import (
     AngleInput,
     Target,
@@ -318,6 +318,7 @@ class LearnedDynamics(Dynamics):
             probes = [PhysicsProbes(*each) for each in copy["probes"]]
             for part, each in zip(self._parts.values(), probes, strict=True):
                 each.check(part, self.spec)
+            check_numbers({**copy["model"], **copy["noise"], "draws": copy["draws"]})
             data = Trajectories.checked(self.spec, **copy["transitions"])
             model = self._built(data)
             if copy["noise"]:

@@ -14,7 +14,7 @@ from gpadjust.checks import checked_whole
 from gpadjust.core import Prediction
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.least_squares import even_normal, most_likely
-from gpadjust.dynamics.state import PhysicsProbes, columns_of, fingerprint, loading
+from gpadjust.dynamics.state import PhysicsProbes, check_numbers, columns_of, fingerprint, loading
 from gpadjust.dynamics.targets import checked_physics_error, next_values, one_physics
 from gpadjust.dynamics.trajectories import Trajectories
 from gpadjust.physics import Physics
@@ -183,8 +183,8 @@ class PhysicsDynamics(Dynamics):
             if fitted is not None:
                 data = Trajectories.checked(self.spec, **fitted.pop("transitions"))
                 fitted = _Fitted(data, **fitted)
-                fitted.noise.view(self.spec.state_dim)
-                self.physics.unknowns.at(fitted.precision @ fitted.point)
+                values = self.physics.unknowns.at(fitted.precision @ fitted.point)
+                check_numbers({"fitted": values, "noise": fitted.noise.view(self.spec.state_dim)})
             if probes is not None:
                 probes = PhysicsProbes(*probes)
                 probes.check(self.physics, self.spec)

@@ -68,9 +68,6 @@ def loading(state: Any, expected: dict[str, str]) -> Iterator[dict[str, Any]]:
             "were."
         )
     try:
-        for name, tensor in _tensors(state):
-            if name != "next_states" and tensor.isnan().any():  # which may not be measured
-                raise ValueError(f"expected {name!r} without NaN")
         yield deepcopy(dict(state))
     except PhysicsError:
         raise
@@ -81,16 +78,11 @@ def loading(state: Any, expected: dict[str, str]) -> Iterator[dict[str, Any]]:
         ) from error
 
 
-def _tensors(part: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
-    """Yield the tensors of a state, each with the name of the entry that it is in."""
-    if isinstance(part, Tensor):
-        yield name, part
-    elif isinstance(part, Mapping):
-        for key, each in part.items():
-            yield from _tensors(each, str(key))
-    elif isinstance(part, list | tuple):
-        for each in part:
-            yield from _tensors(each, name)
+def check_numbers(tensors: Mapping[str, Tensor]) -> None:
+    """Raise a ValueError if one of a state's tensors has NaN."""
+    for name, tensor in tensors.items():
+        if tensor.isnan().any():
+            raise ValueError(f"expected {name!r} without NaN")
 
 
 def columns_of(data: Trajectories) -> dict[str, Tensor]:
@@ -127,15 +119,16 @@ class PhysicsProbes(NamedTuple):
 
     def check(self, physics: Physics, spec: StateSpec) -> None:
         """Raise a PhysicsError, which is a RuntimeError, if a physics returns something else."""
+        check_numbers(self._asdict())
         physics.forget()  # a file of another day: it may have changed
         with torch.no_grad():
             following = next_values(physics, spec, self.states, self.actions)
         expected = self.states.clone()
         expected[:, spec.moving] += self.changes
-        excess = spec.change(expected, following)[:, spec.moving].abs() - self.tolerance
-        if (excess <= 0).all():
+        gap = spec.change(expected, following)[:, spec.moving].abs()
+        if (gap <= self.tolerance).all():
             return
-        row, column = divmod(int(excess.argmax()), excess.shape[-1])
+        row, column = divmod(int((gap - self.tolerance).argmax()), gap.shape[-1])
         i = spec.moving[column]
         raise PhysicsError(
             f"The state is of dynamics with another physics than {physics.name!r} here. In the "

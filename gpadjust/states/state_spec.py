@@ -99,7 +99,7 @@ class StateSpec:
             raise ValueError(mistake)
 
     def _mistakes(self) -> Iterator[str]:
-        """Contradictions between the names, each as a message."""
+        """Yield contradictions between the names, each as a message."""
         states, actions, angles, previous = self.states, self.actions, self.angles, self.previous
         for argument in ("states", "actions"):
             if not getattr(self, argument):

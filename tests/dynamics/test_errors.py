@@ -83,8 +83,8 @@ DAMAGES = [
         (damaged(change), RuntimeError, words)
         for change, words in (
             (lambda s: s.pop("model"), "damaged: KeyError.*'model'"),
-            (lambda s: s["transitions"]["actions"][3].fill_(math.nan), "'actions' without NaN"),
-            (lambda s: s["probes"][0][0].fill_(math.nan), "damaged.*expected 'probes' without NaN"),
+            (lambda s: s["transitions"]["actions"][3].fill_(math.nan), r"damaged.*\(row 3\)"),
+            (lambda s: s["probes"][0][0].fill_(math.nan), "damaged.*'states' without NaN"),
             (lambda s: s["model"].pop("u"), "for CKA"),
             (lambda s: s["model"].update(u=torch.ones(2, 2, 3)), "size mismatch for u"),
             (lambda s: s["model"]["u"].fill_(math.nan), "damaged.*'u' without NaN"),
