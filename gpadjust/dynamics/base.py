@@ -244,7 +244,7 @@ class Dynamics(ABC):
             particles = torch.stack(path, dim=2)
             center = _center(spec, particles)
             cloud = spec.change(center.expand_as(particles), particles)
-            center = _without_jumps(spec, initial_states, center)
+            center = without_jumps(spec, initial_states, center)
             mean = center + cloud.mean(0)
             if sensors is not None:
                 before = torch.cat([initial_states.unsqueeze(1), mean[:, :-1]], dim=1)
@@ -472,7 +472,7 @@ def _center(spec: StateSpec, particles: Tensor) -> Tensor:
     return center
 
 
-def _without_jumps(spec: StateSpec, initial_states: Tensor, path: Tensor) -> Tensor:
+def without_jumps(spec: StateSpec, initial_states: Tensor, path: Tensor) -> Tensor:
     """Return a path ``w x T x state_dim`` whose angles go on from those of the initial states."""
     path, angles = path.clone(), spec.angle_columns
     before = torch.cat([initial_states.unsqueeze(1), path[:, :-1]], dim=1)

@@ -105,8 +105,7 @@ class PhysicsDynamics(Dynamics):
     def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
         """Fit unknown parameters to these and all earlier transitions; a single row will do.
 
-        The first transitions show whether the physics returns next states. Errors are those of
-        :meth:`LearnedDynamics.update`.
+        Errors are those of :meth:`LearnedDynamics.update`.
 
         Warns:
             PhysicsWarning: If the transitions say next to nothing of a parameter, or contradict

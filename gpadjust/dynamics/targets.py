@@ -212,11 +212,7 @@ def check_next_values(physics: Physics, Y: Tensor, num_states: int) -> None:
 
 
 def warn_of_differences(name: str, spec: StateSpec, data: Trajectories, following: Tensor) -> None:
-    """Warn if the physics seems to return the change of the state instead of the next state.
-
-    It does if the state plus what it returned errs by less than a third, in units of the root mean
-    square of each state's true change.
-    """
+    """Warn if what a physics returned is a third as far off as changes, in their units, or less."""
     scale = spec.change(data.states, data.next_states).square().nanmean(0).sqrt()
     columns, errors = [i for i in spec.moving if scale[i] > 0], []
     for predicted in (following, data.states + following):
@@ -228,7 +224,7 @@ def warn_of_differences(name: str, spec: StateSpec, data: Trajectories, followin
             f"state from it. As a change, its error is {errors[1] / errors[0]:.2g} times that of "
             "the next state. Let it return `next state = state + change`.",
             UserWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
 
 

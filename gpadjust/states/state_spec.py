@@ -41,8 +41,7 @@ class StateSpec:
         step: The time step :math:`h`, in the time unit of the velocities; needed by ``integrated``.
         previous: For states that hold what another entry was a step before, the name of that
             action or state: ``{"last_force": "force"}``, or ``{"x_1": "x", "x_2": "x_1"}`` for two
-            steps back, as in an autoregressive model (NARX). Policy and models see them, as of a
-            system that follows its actions with a delay, or of which not all is measured; models
+            steps back, as in an autoregressive model (NARX). Policy and models see them, and models
             need not predict them. What holds an angle is an angle.
         physics_reads: The columns of the physics: names of states and actions in its order, such
             as ``["x", "v", "last_force"]`` of a system that follows its force a step late. Models
@@ -52,9 +51,9 @@ class StateSpec:
     Raises:
         TypeError: If names are not strings, ``integrated`` or ``previous`` is no mapping or
             ``step`` no number.
-        ValueError: If a name is unknown, repeated, or stands for two things that exclude each
-            other, ``previous`` goes round in a circle, no state is left to predict, or ``step`` is
-            missing or not positive.
+        ValueError: If a name is unknown, repeated or two things that exclude each other,
+            ``previous`` goes round in a circle, no state is left to predict, or ``step`` is missing
+            or not positive.
 
     Example:
         >>> import torch
