@@ -33,8 +33,8 @@ CSV_TO_FREE_RUN = 29  # files that a log passes on the way to a judged free run
 TRIAL, ITERATION = 39, 41  # that a planned trial and an iteration of Dyna pass, fits included
 OF_CONTROL, OF_CONTROL_AND_RL = 11, 13  # of these
 FILES, CLASSES, FUNCTIONS = 13, 16, 128  # that the ten lines of the README pass; fewer are better
-CORE_LINES = 4692
-REPORT, WITH_A_REPORT = 20, 24  # of report and validation, and of what is below, by default
+CORE_LINES = 4702
+REPORT, WITH_A_REPORT = 20, 25  # of report and validation, and of what is below, by default
 IDENTIFIED = 27  # that a log passes on the way to its page
 
 
