@@ -35,7 +35,7 @@ from gpadjust.control.state_filter import StateFilter
 from gpadjust.control.step_guard import StepGuard
 from gpadjust.control.task import Task
 from gpadjust.dynamics import Trajectories
-from gpadjust.dynamics.free_run import checked_horizons
+from gpadjust.dynamics.base import checked_horizons
 
 MAX_HOLD = 5  # steps of a random action
 

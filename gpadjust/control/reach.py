@@ -7,7 +7,7 @@ from torch import Tensor
 
 from gpadjust.checks import seeded
 from gpadjust.dynamics import Dynamics
-from gpadjust.dynamics.free_run import step_or_nan
+from gpadjust.dynamics.base import step_or_nan
 from gpadjust.physics import PhysicsError
 
 _EPISODES = 64

@@ -14,7 +14,7 @@ from torch import Tensor
 from gpadjust.checks import check_kind, checked_bounds, checked_number, checked_whole
 from gpadjust.control.action_rate import ActionRate
 from gpadjust.dynamics import Dynamics
-from gpadjust.dynamics.free_run import step_or_nan
+from gpadjust.dynamics.base import step_or_nan
 from gpadjust.states import Sensors, StateSpec
 
 Reward = Callable[[Tensor, Tensor, Tensor], Tensor]

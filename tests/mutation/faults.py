@@ -261,8 +261,8 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/dynamics/base.py",
-        "found = (mean + self.spec.change(mean, data.next_states))[:, moving]",
-        "found = data.next_states[:, moving]",
+        "measured = mean + self.spec.change(mean, data.next_states)",
+        "measured = data.next_states",
         "An angle that wraps between prediction and truth counts as an error of a full turn.",
     ),
     Fault(
