@@ -232,9 +232,9 @@ def swing_up():
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:A step of the last real episode")
 def test_a_planned_trial_passes_few_files(swing_up):
-    from gpadjust.control import CrossEntropy, MPCAgent, Planner
+    from gpadjust.control import MPCAgent, Planner
 
-    plan = Planner(search=CrossEntropy(1), horizon=0.3, num_random=8)
+    plan = Planner(rounds=1, horizon=0.3, num_random=8)
     agent = MPCAgent(*swing_up, plan, first=plan, seed=0).learn(25)
     files, _, _ = passed(lambda: agent.learn(25))  # the second, in dynamics that have learnt
     own = {file for file in files if file.startswith("control/")}

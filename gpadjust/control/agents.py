@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,9 @@ from torch import Tensor
 from gpadjust.checks import check_kind
 from gpadjust.control.agent import MAX_HOLD, Agent
 from gpadjust.control.faults import check_observation
-from gpadjust.control.mpc import MPC, Planner, PlanState, going_on
-from gpadjust.control.policies import BoundedPolicy, mlp_policy
-from gpadjust.control.policy_search import PolicySearch
-from gpadjust.control.reach import random_sequences
-from gpadjust.control.rollouts import Rollouts
+from gpadjust.control.mpc import MPC, Plan, Planner, going_on
+from gpadjust.control.policy_search import BoundedPolicy, PolicySearch, mlp_policy
+from gpadjust.control.rollouts import Rollouts, random_sequences
 from gpadjust.control.state_filter import Estimate
 from gpadjust.control.task import Task
 from gpadjust.states import StateSpec
@@ -46,10 +44,10 @@ class MPCAgent(Agent):
         ValueError: As :class:`Agent`.
 
     Example:
-        >>> from gpadjust.control import CrossEntropy, MPCAgent, Planner
+        >>> from gpadjust.control import MPCAgent, Planner
         >>> from gpadjust.systems import cart_pole
         >>> system = cart_pole()
-        >>> quick = Planner(search=CrossEntropy(1), horizon=0.3, num_random=16)  # or leave it out
+        >>> quick = Planner(rounds=1, horizon=0.3, num_random=16)  # or leave it out
         >>> agent = MPCAgent(system.make(), system.task(), quick, first=quick, seed=0)
         >>> agent.learn(total_timesteps=25)
         MPCAgent(CartPoleSwingUpEnv, LearnedDynamics, 1 episodes learnt, 25 steps, last reward ...)
@@ -92,10 +90,10 @@ class MPCAgent(Agent):
     def predict(
         self,
         observation: NDArray[Any],
-        state: PlanState | None = None,
+        state: Sequence[Plan] | None = None,
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = False,
-    ) -> tuple[NDArray[Any], PlanState]:
+    ) -> tuple[NDArray[Any], tuple[Plan, ...]]:
         """Plan actions; see :meth:`MPC.predict`.
 
         Raises:
@@ -103,7 +101,7 @@ class MPCAgent(Agent):
         """
         return self.mpc.predict(observation, state, episode_start, deterministic)
 
-    def promise(self, state: PlanState) -> dict[str, float]:
+    def promise(self, state: Sequence[Plan]) -> dict[str, float]:
         """Return the promised reward of a step by the plan of a whole episode."""
         (plan,) = state
         if plan.violation > 0:
@@ -249,10 +247,9 @@ class PolicySearchAgent(Agent):
 
     def _random_states(self, task: Task) -> Tensor:
         """States ``N x state_dim`` of episodes of random actions in a model."""
-        length = self.episode_length()
-        steps = random_sequences(_EPISODES, length, self.action_bounds(), MAX_HOLD).unbind(1)
-        taken = iter(steps)
+        length, bounds = self.episode_length(), self.action_bounds()
+        sequences = random_sequences(_EPISODES, length, bounds, MAX_HOLD)
         with torch.no_grad():
             starts = task.draw_initial_states(_EPISODES)
-            rollout = Rollouts(task, None).act(starts, lambda states: next(taken), length)
+            rollout = Rollouts(task, None).follow(starts, sequences)
         return torch.cat([starts, rollout.next_states[rollout.made]])

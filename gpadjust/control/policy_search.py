@@ -1,29 +1,123 @@
-"""Policies that are improved by gradients through a model."""
+"""Policies, and their search by gradients through a model."""
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import KW_ONLY, dataclass, field
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
-from gpadjust.checks import check_kind, checked_number, checked_whole
-from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts, Score
+from gpadjust.checks import checked_bounds, checked_number, checked_whole
+from gpadjust.control.rollouts import Objective, Return, Rollouts, check_objective
 from gpadjust.control.task import Task
+from gpadjust.states import StateSpec
 
+_NEAR = 0.95  # of the way to a bound: beyond, the tanh has hardly any slope
 _REDRAW_EVERY = 5  # updates after which the policy is judged, and other functions are drawn
 _MAX_GRAD_NORM = 1.0
+
+
+class BoundedPolicy(nn.Module):
+    r"""Actions within bounds, from what the policy sees of a state.
+
+    .. math:: a = \frac{h + l}{2} + \frac{h - l}{2} \tanh(\pi(z)), \quad z = (o - m) / s,
+
+    where o is the observation (:meth:`~gpadjust.states.StateSpec.observe`) and :math:`\pi` the
+    body, whose output is without bounds.
+
+    Args:
+        body: Maps ``N x observation_dim`` to ``N x action_dim``, in float64.
+        spec: What the entries of states and actions are.
+        action_bounds: Lower and upper bounds l and h of the actions, ``2 x action_dim``.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust.control import mlp_policy
+        >>> from gpadjust.states import StateSpec
+        >>> policy = mlp_policy(StateSpec(["x"], ["force"]), torch.tensor([[-2.0], [2.0]]))
+        >>> policy(torch.zeros(3, 1, dtype=torch.float64)).shape
+        torch.Size([3, 1])
+    """
+
+    action_bounds: Tensor
+    origin: Tensor
+    unit: Tensor
+
+    def __init__(self, body: nn.Module, spec: StateSpec, action_bounds: ArrayLike) -> None:
+        super().__init__()
+        self.body = body
+        self.spec = spec
+        bounds = checked_bounds("action_bounds", action_bounds, spec.action_dim)
+        self.register_buffer("action_bounds", bounds)
+        self.register_buffer("origin", torch.zeros(spec.observation_dim, dtype=torch.float64))
+        self.register_buffer("unit", torch.ones(spec.observation_dim, dtype=torch.float64))
+
+    def forward(self, states: Tensor) -> Tensor:
+        """Return actions ``N x action_dim`` at states ``N x state_dim``."""
+        return self.act(self.spec.observe(states))
+
+    def act(self, observations: Tensor) -> Tensor:
+        """Return actions ``N x action_dim`` at observations ``N x observation_dim``."""
+        low, high = self.action_bounds
+        raw = self.body((observations - self.origin) / self.unit)
+        return (low + high) / 2 + (high - low) / 2 * raw.tanh()
+
+    def look_at(self, states: Tensor) -> None:
+        """Take the scale of observations from states ``N x state_dim``; once, before training."""
+        seen = self.spec.observe(states)
+        self.origin.copy_(seen.mean(0))
+        spread = seen.std(0, correction=0)
+        self.unit.copy_(torch.where(spread > 1e-6 * seen.abs().amax(0), spread, 1.0))
+
+
+def mlp_policy(
+    spec: StateSpec,
+    action_bounds: ArrayLike,
+    net_arch: Sequence[int] = (64, 64),
+    first_actions: Sequence[float] | None = None,
+) -> BoundedPolicy:
+    """Return a policy that is a network of layers.
+
+    Args:
+        spec: What the entries of states and actions are.
+        action_bounds: ``2 x action_dim``.
+        net_arch: The widths of the hidden layers; () for a linear function.
+        first_actions: About what it does before it has learnt, ``action_dim`` numbers within the
+            bounds. Default: their middle, which for muscles, say, is to tense them all.
+
+    Raises:
+        ValueError: If ``first_actions`` are beyond the bounds, or another number of them.
+    """
+    low, high = checked_bounds("action_bounds", action_bounds, spec.action_dim)
+    first = torch.as_tensor((low + high) / 2 if first_actions is None else first_actions).double()
+    if first.shape != low.shape or not ((first >= low) & (first <= high)).all():
+        raise ValueError(
+            f"first_actions must be {len(low)} numbers within {low.tolist()} and {high.tolist()}; "
+            f"found {first.tolist()}."
+        )
+    widths = [spec.observation_dim, *net_arch]
+    layers: list[nn.Module] = []
+    for width, following in pairwise(widths):
+        layers += [nn.Linear(width, following, dtype=torch.float64), nn.Tanh()]
+    last = nn.Linear(widths[-1], spec.action_dim, dtype=torch.float64)
+    with torch.no_grad():
+        last.weight.mul_(0.1)  # gentle actions at first
+        last.bias.copy_(((2 * first - low - high) / (high - low)).clamp(-_NEAR, _NEAR).atanh())
+    return BoundedPolicy(nn.Sequential(*layers, last), spec, action_bounds)
 
 
 class SearchResult(NamedTuple):
     """Result of a search.
 
     Args:
-        values: What the objective said in each update, ``updates``; of drawn functions and starts.
+        values: Value of the objective in each update, ``updates``; of drawn functions and starts.
         reward: The mean reward of a step of the policy that was kept, in the draws that were held
             out.
         left_bounds: The share of episodes that left the bounds there.
@@ -51,13 +145,10 @@ class PolicySearch:
     Every few updates the policy is judged from starts, and in functions, that no update sees, the
     same each time. The best one is kept, be it the one that the search began with.
 
-    Where gradients do not find the task by themselves (a swing-up: at first no action of the policy
-    matters), let the policy first imitate plans of some episodes, by least squares.
-
     Args:
         objective: What to look for. Default: the mean return; ``Return(quantile=0.2)`` is careful.
         updates: Gradient steps (Adam).
-        num_starts: Number of starts of each update, in each function.
+        num_starts: Number of starts of each update, the same in each function.
         num_functions: Number of functions that each is followed through, such as 6; None for the
             mean.
         learning_rate: At the start; it decays to a tenth along a cosine.
@@ -93,13 +184,9 @@ class PolicySearch:
 
     def __post_init__(self) -> None:
         """Check the options."""
-        told = "an object of an Objective, such as Return()"
-        check_kind("objective", self.objective, Objective, told)
+        check_objective(self.objective, self.num_functions)
         for name in ("updates", "num_starts"):
             checked_whole(name, getattr(self, name), 1)
-        if self.num_functions is not None:
-            checked_whole("num_functions", self.num_functions, 1)
-        self.objective.check_functions(self.num_functions)
         checked_number("learning_rate", self.learning_rate, above=0)
 
     def check_task(self, task: Task) -> None:
@@ -121,7 +208,7 @@ class PolicySearch:
                 parameters are changed; after an error they are as before.
             task: The task, whose dynamics are fitted. It must say where episodes start and how
                 long they are.
-            progress: Called after each update with its number and what the objective said.
+            progress: Called after each update with its number and the value of the objective.
 
         Raises:
             TypeError: If the policy is no module with parameters.
@@ -140,22 +227,22 @@ class PolicySearch:
             raise ValueError("A policy search needs a task with episode_length; found None.")
         home = next(policy.parameters()).device
         policy.to("cpu")  # where the dynamics are
-        before = {name: t.detach().clone() for name, t in policy.state_dict().items()}
+        best = deepcopy(policy.state_dict())
         try:
-            return self._improve(policy, task, task.episode_length, progress)
-        except BaseException:
-            policy.load_state_dict(before)
-            raise
+            best, result = self._searched(policy, task, task.episode_length, progress)
         finally:
+            policy.load_state_dict(best)
             policy.to(home)
+        return result
 
-    def _improve(
+    def _searched(
         self,
         policy: nn.Module,
         task: Task,
         length: int,
         progress: Callable[[int, float], None] | None,
-    ) -> SearchResult:
+    ) -> tuple[dict[str, Tensor], SearchResult]:
+        """Return the best parameters, and what they reach."""
         begun = time.perf_counter()
         parameters = [p for p in policy.parameters() if p.requires_grad]
         optimizer = torch.optim.Adam(parameters, lr=self.learning_rate)
@@ -164,13 +251,21 @@ class PolicySearch:
         )
         score = self.objective.of(task)
         held_out = Rollouts(task, self.num_functions)
-        best = _Best(held_out, self._starts(task, held_out.num_functions), score, length)
-        values = []
-        for i in range(self.updates):
+        starts = task.draw_initial_states(self.num_starts)
+        values, best_worth = [], -math.inf
+        for i in range(self.updates + 1):
+            if i % _REDRAW_EVERY == 0 or i == self.updates:
+                with torch.no_grad():
+                    rollout = held_out.act(starts, policy, length)
+                    worth = float(score(rollout).mean())
+                if i == 0 or worth > best_worth:
+                    best_worth, best_rollout = worth, rollout
+                    best = deepcopy(policy.state_dict())
+            if i == self.updates:
+                break
             if i % _REDRAW_EVERY == 0:
-                best.judge(policy)
                 rollouts = Rollouts(task, self.num_functions)
-            rollout = rollouts.act(self._starts(task, rollouts.num_functions), policy, length)
+            rollout = rollouts.act(task.draw_initial_states(self.num_starts), policy, length)
             value = score(rollout).mean() / length
             if not value.requires_grad:
                 raise RuntimeError(
@@ -180,49 +275,12 @@ class PolicySearch:
                 )
             optimizer.zero_grad()
             (-value).backward()
-            norm = nn.utils.clip_grad_norm_(parameters, _MAX_GRAD_NORM)
-            if norm.isfinite():
+            if nn.utils.clip_grad_norm_(parameters, _MAX_GRAD_NORM).isfinite():
                 optimizer.step()
             rate.step()
             values.append(value.detach())
             if progress is not None:
                 progress(i + 1, float(value.detach()))
-        best.judge(policy)
-        policy.load_state_dict(best.kept)
-        rewards, left = best.rollout.rewards[best.rollout.made], best.rollout.left_bounds
-        seconds = time.perf_counter() - begun
-        share = float(left.double().mean())
-        return SearchResult(torch.stack(values), float(rewards.mean()), share, seconds)
-
-    def _starts(self, task: Task, num_functions: int) -> Tensor:
-        """Starts of an update: others in each function, unless these are compared at the same."""
-        if self.objective.compares_functions:
-            return task.draw_initial_states(self.num_starts)
-        starts = task.draw_initial_states(num_functions * self.num_starts)
-        return starts.unflatten(0, (num_functions, self.num_starts))
-
-
-class _Best:
-    """The best policy so far, by functions and starts that no update sees.
-
-    Args:
-        rollouts: In the functions.
-        starts: As of :meth:`Rollouts.act`.
-        score: The worth of a rollout.
-        length: Steps of an episode.
-    """
-
-    kept: dict[str, Tensor]
-    rollout: Rollout
-
-    def __init__(self, rollouts: Rollouts, starts: Tensor, score: Score, length: int) -> None:
-        self.rollouts, self.starts, self.score, self.length = rollouts, starts, score, length
-        self.worth: float | None = None
-
-    def judge(self, policy: nn.Module) -> None:
-        """Keep a policy, if it is better than the one that is kept."""
-        with torch.no_grad():
-            rollout = self.rollouts.act(self.starts, policy, self.length)
-            worth = float(self.score(rollout).mean())
-        if self.worth is None or worth > self.worth:
-            self.worth, self.rollout, self.kept = worth, rollout, deepcopy(policy.state_dict())
+        reward = float(best_rollout.rewards[best_rollout.made].mean())
+        left = float(best_rollout.left_bounds.double().mean())
+        return best, SearchResult(torch.stack(values), reward, left, time.perf_counter() - begun)

@@ -7,7 +7,7 @@ import torch
 from gpadjust.control import (
     MPC,
     ActionRate,
-    CrossEntropy,
+    Moment,
     MPCAgent,
     Planner,
     Return,
@@ -30,7 +30,7 @@ def task(**parts):
 
 
 def actions(task, steps=8):
-    quick = Planner(search=CrossEntropy(3), num_random=48, horizon=4)
+    quick = Planner(rounds=3, num_random=48, horizon=4)
     x, plan, taken = np.zeros(1), None, []
     mpc = MPC(task, BOUNDS, quick, first=quick)
     for _ in range(steps):
@@ -58,23 +58,28 @@ def test_a_price_makes_actions_smoother():
 
 def test_sequences_follow_as_fast_as_they_may():
     wanted = torch.tensor([[[0.0, 0.0], [1.0, 1.0], [-1.0, 1.0]]])
-    rate = ActionRate([0.5, 0.25])
-    expected = [[0.0, 0.0], [0.5, 0.25], [0.0, 0.5]]
-    assert rate.limited(wanted)[0].tolist() == expected
-    before = torch.tensor([1.0, 0.0])
-    assert rate.limited(wanted, before)[0].tolist() == [[0.5, 0.0], [1.0, 0.25], [0.5, 0.5]]
-    assert torch.equal(
-        rate.limited(rate.limited(wanted, before), before), rate.limited(wanted, before)
-    )
+    spec = StateSpec(["x"], ["u", "v"])
+    dynamics = PhysicsDynamics(spec, lambda X: X[:, :1])
+    two = Task(dynamics, to_one, action_rate=ActionRate([0.5, 0.25]))
+
+    def taken(before):
+        rollouts = Rollouts(two, None, Moment(action=before))
+        return rollouts.follow(torch.zeros(1).double(), wanted.double()).actions[0, 0].tolist()
+
+    assert taken(None) == [[0.0, 0.0], [0.5, 0.25], [0.0, 0.5]]
+    before = torch.tensor([1.0, 0.0]).double()
+    assert taken(before) == [[0.5, 0.0], [1.0, 0.25], [0.5, 0.5]]
 
 
 def test_the_price_is_of_squared_changes_from_the_action_before():
     priced = task(action_rate=ActionRate(price=2.0))
     way = torch.tensor([[[1.0], [0.0]]]).double()
     for before, expected in ((None, 2.0), (torch.zeros(1).double(), 4.0)):
-        rollout = Rollouts(priced, None, before=before).follow(torch.zeros(1).double(), way)
-        loss = Return().of(task())(rollout) - Return().of(priced)(rollout)
-        assert loss.item() == pytest.approx(expected)
+        rollout = Rollouts(priced, None, Moment(action=before)).follow(torch.zeros(1).double(), way)
+        assert rollout.price.sum().item() == pytest.approx(expected)
+        assert Return().of(priced)(rollout).item() == pytest.approx(
+            rollout.rewards.sum() - expected
+        )
 
 
 def test_random_actions_keep_the_limit_and_noise_is_refused(make_agent, point_env):

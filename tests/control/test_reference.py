@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from gpadjust.control import CrossEntropy, MPCAgent, Planner, Task
-from gpadjust.control.rollouts import Rollouts
+from gpadjust.control import Moment, MPCAgent, Planner, Rollouts, Task
 from gpadjust.dynamics import PhysicsDynamics, StateSpec
 
 SPEC = StateSpec(["x", "goal"], ["v"], exogenous=["goal"])
@@ -45,14 +44,13 @@ class Tracking(gymnasium.Env):
         return np.array([self.x, np.sin(0.8 * self.steps)])
 
 
-PLAN = Planner(search=CrossEntropy(4), horizon=3, num_random=64, max_hold=2)
+PLAN = Planner(rounds=4, horizon=3, num_random=64, max_hold=2)
 
 
 def test_plans_know_the_reference_from_the_step_where_they_begin():
     for done in (0, 5):
-        rollout = Rollouts(point(), None).follow(
-            torch.zeros(2).double(), torch.zeros(1, 3, 1).double(), done
-        )
+        rollouts = Rollouts(point(), None, Moment(steps_done=done))
+        rollout = rollouts.follow(torch.zeros(2).double(), torch.zeros(1, 3, 1).double())
         goals = torch.sin(0.8 * (done + torch.arange(1, 4)))
         assert torch.allclose(rollout.next_states[0, 0, :, 1], goals.double())
         assert torch.allclose(rollout.rewards[0, 0], -goals.abs().double())
@@ -94,7 +92,7 @@ def test_a_set_point_that_is_an_angle_goes_round():
 
 @pytest.mark.parametrize(
     ("reference", "message"),
-    [(lambda s, t: s, r"shape \(2, 1\).*found \(2, 2\)"), (lambda s, t: s[:, :1] / 0, "finite")],
+    [(lambda s, t: s, r"shape 2 x 1; found \(2, 2\)"), (lambda s, t: s[:, :1] / 0, "finite")],
 )
 def test_what_a_reference_returns_is_checked_before_the_first_step(reference, message):
     with pytest.raises(ValueError, match=message):

@@ -11,7 +11,6 @@ import torch
 from gpadjust import ZeroMeanGP
 from gpadjust.control import (
     MPC,
-    CrossEntropy,
     EpisodeCheckpoint,
     Estimate,
     MPCAgent,
@@ -30,7 +29,7 @@ from tests.point import linear
 
 SPEC = StateSpec(["x", "v"], ["force"])
 STEP, LENGTH, NOISE = 0.2, 8, 0.02
-PLAN = Planner(search=CrossEntropy(1), horizon=3, num_random=32)
+PLAN = Planner(rounds=1, horizon=3, num_random=32)
 SEARCH = PolicySearch(updates=4, num_starts=4, num_functions=2)
 
 
