@@ -7,11 +7,11 @@ from typing import Any
 
 from gpadjust.control.constraints import margins
 from gpadjust.control.mpc import MPC, Plan, Planner
-from gpadjust.control.policy_search import BoundedPolicy, PolicySearch, SearchResult, mlp_policy
+from gpadjust.control.policy_search import BoundedPolicy, PolicySearch, SearchResult
 from gpadjust.control.progress import print_progress
-from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts
+from gpadjust.control.rollouts import Objective, Return, Rollouts
 from gpadjust.control.state_filter import Estimate, StateFilter
-from gpadjust.control.task import ActionRate, Moment, Step, Task
+from gpadjust.control.task import ActionRate, Moment, Steps, Task
 
 __all__ = [
     "MPC",
@@ -30,15 +30,13 @@ __all__ = [
     "PolicySearch",
     "PolicySearchAgent",
     "Return",
-    "Rollout",
     "Rollouts",
     "SearchResult",
     "StateFilter",
-    "Step",
     "StepGuard",
+    "Steps",
     "Task",
     "margins",
-    "mlp_policy",
     "print_progress",
     "resume",
 ]

@@ -16,7 +16,7 @@ from gpadjust.checks import check_kind
 from gpadjust.control.agent import MAX_HOLD, Agent
 from gpadjust.control.faults import check_observation
 from gpadjust.control.mpc import MPC, Plan, Planner, going_on
-from gpadjust.control.policy_search import BoundedPolicy, PolicySearch, mlp_policy
+from gpadjust.control.policy_search import BoundedPolicy, PolicySearch
 from gpadjust.control.rollouts import Rollouts, random_sequences
 from gpadjust.control.state_filter import Estimate
 from gpadjust.control.task import Task
@@ -140,8 +140,8 @@ class PolicySearchAgent(Agent):
     Args:
         env: As of :class:`Agent`.
         task: What is known of the system, in PyTorch's functions, as gradients flow through them.
-        policy: Makes the policy of a spec and the bounds of the actions: :func:`mlp_policy`,
-            or a function of yours, such as ``functools.partial(mlp_policy, net_arch=(32,))``.
+        policy: Makes the policy of a spec and the bounds of the actions: :class:`BoundedPolicy`,
+            or a function of yours, such as ``functools.partial(BoundedPolicy, net_arch=(32,))``.
         search: How the policy is improved.
         options: Further arguments of :class:`Agent`.
 
@@ -169,7 +169,7 @@ class PolicySearchAgent(Agent):
         self,
         env: Any,
         task: Task,
-        policy: Callable[[StateSpec, Tensor], BoundedPolicy] = mlp_policy,
+        policy: Callable[[StateSpec, Tensor], BoundedPolicy] = BoundedPolicy,
         search: PolicySearch | None = None,
         **options: Any,
     ) -> None:
@@ -177,7 +177,7 @@ class PolicySearchAgent(Agent):
         check_kind("search", self.search, PolicySearch, "a PolicySearch(...)")
         super().__init__(env, task, **options)
         made = policy(task.dynamics.spec, self.action_bounds()) if callable(policy) else policy
-        told = "a function that makes a BoundedPolicy of a spec and bounds, as mlp_policy does"
+        told = "a function that makes a BoundedPolicy of a spec and bounds, as the class does"
         check_kind("policy", made, BoundedPolicy, told)
         self.policy = made
         self.is_trained = False

@@ -19,14 +19,13 @@ from gpadjust.control.faults import check_observation
 from gpadjust.control.rollouts import (
     Objective,
     Return,
-    Rollout,
     Rollouts,
     check_objective,
     random_sequences,
 )
 from gpadjust.control.smoothed_episodes import smooth_episodes
 from gpadjust.control.state_filter import Estimate, StateFilter
-from gpadjust.control.task import Moment, Task
+from gpadjust.control.task import Moment, Steps, Task
 from gpadjust.dynamics import Trajectories
 from gpadjust.states import StateSpec
 
@@ -42,16 +41,13 @@ class Plan(NamedTuple):
         value: The score of the objective.
         rewards: Rewards of the steps by the model, ``T``, averaged over its functions; 0 after the
             end of the episode.
-        reward: Their mean over the steps that are made; of a plan under way, of all its steps, as
-            promised when it was last planned to its end.
+        reward: Their mean over the steps that are made, when it was last planned to the end.
         left_bounds: The share of the functions in which it leaves the bounds of the states, or
             meets a failure of the physics.
         violation: Violation of the constraints with their margins in the worst step; 0 if none.
         moment: The point of the episode at which the first of the steps is made.
-        promised: Rewards of all steps of an episode under way, those made included, as they were
-            foreseen when it was last planned to its end.
-        estimate: The state as sensors have shown it, and the action that was taken there; None of a
-            task without sensors.
+        promised: Rewards of all steps of the episode, as it was last planned to the end.
+        estimate: The state as sensors have shown it, with the action taken there; else None.
     """
 
     actions: Tensor
@@ -66,7 +62,7 @@ class Plan(NamedTuple):
     estimate: Estimate | None = None
 
     @classmethod
-    def of(cls, rollout: Rollout, n: int, value: float, moment: Moment) -> Plan:
+    def of(cls, rollout: Steps, n: int, value: float, moment: Moment) -> Plan:
         """Return the plan of the actions that were taken in the n-th episodes of a rollout."""
         made = rollout.made[:, n]
         rewards = rollout.rewards[:, n].masked_fill(~made, 0.0).mean(0)
@@ -76,7 +72,7 @@ class Plan(NamedTuple):
             value=value,
             rewards=rewards,
             reward=float(rewards.sum() / made.double().mean(0).sum().clamp_min(1e-12)),
-            left_bounds=float(rollout.left_bounds[:, n].double().mean()),
+            left_bounds=float(rollout.left_bounds[:, n].any(-1).double().mean()),
             violation=float(rollout.violation[:, n].mean(0).max()),
             moment=moment,
         )
@@ -100,30 +96,27 @@ class Planner:
     plan. Each is followed through the model, along its mean or through functions drawn from its
     posterior. The cross-entropy method improves them (Rubinstein 1999): each round draws as many
     from a normal distribution with mean and standard deviation of the best so far, step by step.
-    :class:`MPC` plans again at every step.
 
     Args:
         objective: What to look for: :class:`Return`, or your own.
         rounds: Rounds after the first sequences; 0 takes the best of these.
-        num_elites: The number of best sequences that stay in a round.
+        num_elites: Number of best sequences that stay in a round.
         correlation: Of the deviations from the mean of a step and the next one, in [0, 1): higher
             for smoother actions (Pinneri et al. 2020).
         horizon: The most time to look ahead, in the time unit of ``spec.step``; in steps where the
             spec has none. Default: to the end of the episode.
         num_functions: Number of functions of the posterior that each sequence is followed through;
-            None for the mean of the model alone, which takes least time. (Of a sampled model it is
-            the mean of some samples, see
-            :meth:`~gpadjust.dynamics.LearnedDynamics.mean_function`.)
+            None for the mean of the model, which takes least time
+            (:meth:`~gpadjust.dynamics.LearnedDynamics.mean_function`).
         num_random: Number of random sequences, or of those drawn about an earlier plan.
         max_hold: The most steps that a random sequence holds an action.
-        spread: Standard deviation of what is drawn about an earlier plan, as a share of the range
-            of the actions.
+        spread: Standard deviation about an earlier plan, as a share of the range of the actions.
         seconds: The most time that a plan takes. A round of the search that would take longer does
             not begin; if even the first one would, its sequences are followed, and compared, as far
             as there is time, one step of the model at least. Default: as long as it takes.
 
     Raises:
-        TypeError: If the objective is none, or a number is of another kind.
+        TypeError: If the objective or a number is of another kind.
         ValueError: If a number is out of range.
 
     Example:
@@ -197,8 +190,8 @@ class Planner:
         """Choose the actions of the next steps; the randomness is PyTorch's global generator.
 
         Args:
-            task: The task, whose dynamics have learnt from transitions. Steps beyond its bounds are
-                not made. Its constraints have margins along the earlier plan, or one without them.
+            task: The task, whose dynamics have learnt from transitions. Its constraints have
+                margins along the earlier plan, or along one that was made without them first.
             state: Where the episode is, ``state_dim``.
             action_bounds: Lower and upper bounds of the actions, ``2 x action_dim``, finite.
             num_steps: Number of steps ahead; the plan is of these or of the horizon, ``T``.
@@ -223,39 +216,38 @@ class Planner:
                 f"Expected state of shape {spec.state_dim}, found {tuple(state.shape)}."
             )
         num_steps = self.steps_ahead(spec, task.episode_length if num_steps is None else num_steps)
-        search = task, state, bounds, num_steps
         if task.constraints is not None:
             if earlier is None:
-                earlier = self._searched(*search, None, moment, deadline)
-            path = torch.cat([state.unsqueeze(0), earlier.next_states])[: len(earlier.actions)]
-            along = path[:num_steps], earlier.actions[:num_steps]
-            moment = moment._replace(margins=margins(task, *along, bounds, covariance))
-        return self._searched(*search, earlier, moment, deadline)
+                rollouts = Rollouts(task, self.num_functions, moment, deadline=deadline)
+                earlier = self._searched(rollouts, state, bounds, num_steps, None)
+            actions = earlier.actions[:num_steps]
+            path = torch.cat([state.unsqueeze(0), earlier.next_states])[: len(actions)]
+            moment = moment._replace(margins=margins(task, path, actions, bounds, covariance))
+        rollouts = Rollouts(task, self.num_functions, moment, deadline=deadline)
+        return self._searched(rollouts, state, bounds, num_steps, earlier)
 
     def _searched(
         self,
-        task: Task,
+        rollouts: Rollouts,
         state: Tensor,
         bounds: Tensor,
         num_steps: int,
         earlier: Plan | None,
-        moment: Moment,
-        deadline: float,
     ) -> Plan:
         """Return the best plan that the cross-entropy method finds."""
-        rollouts = Rollouts(task, self.num_functions, moment, deadline=deadline)
-        score = self.objective.of(task)
+        score = self.objective.of(rollouts.task)
         new = self._proposed(num_steps, bounds, earlier)
         sequences, scores, plan = new[:0], torch.zeros(0), cast(Plan, None)
         for number in range(self.rounds + 1):
             if number > 0:
+                # The best so far, and as many new ones from their mean and standard deviation.
                 elites = scores.topk(min(self.num_elites, len(scores))).indices
                 sequences, scores = sequences[elites], scores[elites]
                 mean, sd = sequences.mean(0), sequences.std(0, correction=0)
                 drawn = mean + sd * _correlated_noise(new.shape, self.correlation)
                 new = torch.clamp(drawn, bounds[0], bounds[1])
             rollout = rollouts.follow(state, new)
-            if number > 0 and rollout.made.shape[-1] < num_steps:
+            if number > 0 and rollout.made.shape[-1] < num_steps:  # no time left
                 break
             found = score(rollout)
             if found.shape != (len(new),) or found.isnan().any():
@@ -265,7 +257,7 @@ class Planner:
                 )
             best = int(found.argmax())
             if number == 0 or found[best] > plan.value:
-                plan = Plan.of(rollout, best, float(found[best]), moment)
+                plan = Plan.of(rollout, best, float(found[best]), rollouts.moment)
             sequences, scores = torch.cat([sequences, new]), torch.cat([scores, found])
             if not rollouts.has_time(num_steps):
                 break
@@ -313,19 +305,17 @@ class MPC:
             needs, as energy must be put into a pole before it can stand: try it in f_p alone
             (:class:`~gpadjust.dynamics.PhysicsDynamics`) first.
         first: Plans when an episode begins, which has not to be in time. Default: six looks at the
-            whole episode; as far as ``each_step`` if the task does not say how long an episode is.
-            Objective and functions are those of ``each_step``.
-        tolerance: Where the plan of a step is worth less than what was promised of its steps when
-            the whole was planned, by more than this share of the range of the promised rewards (a
-            step, on average), the rest is planned as when it began; where ``each_step`` has
-            ``seconds``, about that plan, if half of these are left. None for never.
-        seed: Of the searches of deterministic actions, which are the same for the same observation
-            and plan.
-        state_filter: Of a task with sensors, by which observations are states. Default: that before
-            there are data.
+            whole episode, or as far as ``each_step`` if it has no length; objective and functions
+            are those of ``each_step``.
+        tolerance: Where the plan of a step is worth less than was promised of its steps by more
+            than this share of the range of the promised rewards (a step, on average), the rest is
+            planned as when the episode began; where ``each_step`` has ``seconds``, about that plan,
+            if half of these are left. None for never.
+        state_filter: Of a task with sensors, by which observations are states. Default: the one
+            before there are data.
 
     Raises:
-        TypeError: If a planner is none.
+        TypeError: If a planner is of another kind.
         ValueError: If there is neither an episode length nor a horizon, or ``action_bounds`` are no
             bounds.
 
@@ -352,7 +342,6 @@ class MPC:
         *,
         first: Planner | None = None,
         tolerance: float | None = 0.25,
-        seed: int = 0,
         state_filter: StateFilter | None = None,
     ) -> None:
         for name, planner in (("each_step", each_step), ("first", first)):
@@ -373,7 +362,6 @@ class MPC:
         self.each_step = each_step
         self.first = first
         self.tolerance = tolerance
-        self.seed = seed
         self.filter = state_filter
         if task.sensors is not None and state_filter is None:
             self.filter = StateFilter.guessed(self.model, self.action_bounds)
@@ -411,7 +399,7 @@ class MPC:
             RuntimeError: If there is neither a physics nor anything learnt.
         """
         row = self._recorded(measurement)
-        actions, self._plan = self._advance(row.unsqueeze(0), self._plan or [None], self.seed)
+        actions, self._plan = self._advance(row.unsqueeze(0), self._plan or [None], 0)
         self._last = row, actions[0]
         return actions[0].numpy().copy()
 
@@ -521,7 +509,7 @@ class MPC:
         check_observation(observation)
         rows = torch.as_tensor(np.atleast_2d(observation), dtype=torch.float64)
         episodes = going_on(state, episode_start, len(rows))
-        found, plans = self._advance(rows, episodes, self.seed if deterministic else None)
+        found, plans = self._advance(rows, episodes, 0 if deterministic else None)
         actions = found.numpy().astype(np.float32)
         return (actions if np.ndim(observation) > 1 else actions[0]), plans
 

@@ -7,13 +7,13 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from gpadjust.checks import check_kind, checked_number, checked_whole, seeded
-from gpadjust.control.task import Moment, Task
+from gpadjust.control.task import Moment, Steps, Task
 from gpadjust.dynamics import Dynamics
 from gpadjust.dynamics.free_run import step_or_nan
 from gpadjust.physics import PhysicsError
@@ -22,33 +22,6 @@ _MOST_MEDIANS = 30.0
 _NEVER = 1e6  # largest rewards of a step: it never pays
 _BACK = 10.0  # largest rewards of a step: few episodes of a policy must outweigh those that stay
 _EPISODES = 64  # of random actions, by which is known what a physics reaches
-
-
-class Rollout(NamedTuple):
-    """``n`` episodes of ``T`` steps in each of ``k`` functions.
-
-    Args:
-        states: The states at which actions were taken, ``k x n x T x state_dim``.
-        actions: As all up to ``price`` by step, as of :class:`~gpadjust.control.task.Step`.
-        next_states: The states after them.
-        rewards: ``k x n x T``.
-        made: The steps before the end of an episode, booleans. The entries of others mean nothing.
-        violation: 0 where the constraints hold, and after the end.
-        price: What the changes of the actions cost.
-        left_bounds: Whether the step after the last one that was made would have left the bounds,
-            or the physics failed there, ``k x n`` booleans.
-        overshoot: How far that step would have left them, ``k x n``; 0 where none would have.
-    """
-
-    states: Tensor
-    actions: Tensor
-    next_states: Tensor
-    rewards: Tensor
-    made: Tensor
-    violation: Tensor
-    price: Tensor
-    left_bounds: Tensor
-    overshoot: Tensor
 
 
 class Rollouts:
@@ -86,13 +59,13 @@ class Rollouts:
         else:
             self.functions = task.dynamics.sample_functions(num_functions)
 
-    def follow(self, starts: Tensor, sequences: Tensor) -> Rollout:
+    def follow(self, starts: Tensor, sequences: Tensor) -> Steps:
         """Take the actions ``n x T x action_dim``, from one start or ``n x state_dim``."""
         every = sequences.repeat(self.num_functions, 1, 1)
         starts = starts.expand(len(sequences), -1)
         return self._run(starts, every.shape[1], lambda t, states: every[:, t])
 
-    def act(self, starts: Tensor, policy: Callable[[Tensor], Tensor], num_steps: int) -> Rollout:
+    def act(self, starts: Tensor, policy: Callable[[Tensor], Tensor], num_steps: int) -> Steps:
         """Let a policy act from starts ``n x state_dim``."""
         return self._run(starts, num_steps, lambda t, states: policy(states))
 
@@ -102,34 +75,36 @@ class Rollouts:
 
     def _run(
         self, starts: Tensor, num_steps: int, choose: Callable[[int, Tensor], Tensor]
-    ) -> Rollout:
+    ) -> Steps:
         """Run episodes of actions that are chosen by the number of the step and the states."""
         task, moment = self.task.widened(starts), self.moment
         shape = (self.num_functions, len(starts))  # of all episodes, which are rows below
         states = starts.expand(*shape, -1).flatten(0, 1)
         running = torch.ones(len(states), dtype=torch.bool)
-        left, overshoot = ~running, torch.zeros(len(states), dtype=torch.float64)
-        columns: list[tuple[Tensor, ...]] = []
+        steps: list[Steps] = []
         for t in range(num_steps):
             begun = time.perf_counter()
             if t and not self.has_time():
                 break
-            chosen = choose(t, states)
+            at, chosen = _tamed(states), _tamed(choose(t, states))
             # Later, all may have come to where the physics does not work.
-            options: dict[str, Any] = {"move": self._move, "some_must_succeed": t == 0}
-            step = task.step(_tamed(states), _tamed(chosen), moment, **options)
-            made = running & ~step.left_bounds
-            left = left | (running & step.left_bounds)
-            overshoot = torch.where(running, step.overshoot, overshoot)
-            taken = (states, step.actions, step.next_states, step.rewards, made)
-            columns.append((*taken, step.violation, step.price))
+            step = task.step(at, chosen, moment, move=self._move, some_must_succeed=t == 0)
+            made = running & step.made
+            steps.append(
+                step._replace(
+                    states=states,
+                    made=made,
+                    left_bounds=running & step.left_bounds,
+                    overshoot=step.overshoot.masked_fill(~running, 0.0),
+                    violation=step.violation.masked_fill(~made, 0.0),
+                )
+            )
             running = made & ~step.terminated
             states = torch.where(running.unsqueeze(-1), step.next_states, states)
             moment = moment.after(step.actions)
             self._slowest = max(self._slowest, time.perf_counter() - begun)
-        stacked = [torch.stack(parts, dim=1) for parts in zip(*columns, strict=True)]
-        rollout = Rollout(*(part.unflatten(0, shape) for part in (*stacked, left, overshoot)))
-        return rollout._replace(violation=rollout.violation.masked_fill(~rollout.made, 0.0))
+        columns = (torch.stack(parts, dim=1) for parts in zip(*steps, strict=True))
+        return Steps(*(column.unflatten(0, shape) for column in columns))
 
     def _move(self, states: Tensor, actions: Tensor) -> Tensor:
         """Return the next states of rows, of which each function has as many."""
@@ -162,7 +137,7 @@ class Objective(ABC):
     """The goal of a planner or a policy search."""
 
     @abstractmethod
-    def of(self, task: Task) -> Callable[[Rollout], Tensor]:
+    def of(self, task: Task) -> Callable[[Steps], Tensor]:
         """Return the worth of rollouts in a task, as its dynamics stand.
 
         It is a function of a rollout that returns ``n`` numbers, higher is better.
@@ -197,11 +172,11 @@ class Return(Objective):
         if self.quantile is not None:
             checked_number("quantile", self.quantile, least=0, below=1)
 
-    def of(self, task: Task) -> Callable[[Rollout], Tensor]:
+    def of(self, task: Task) -> Callable[[Steps], Tensor]:
         """Return the return of rollouts."""
         largest = 0.0
 
-        def score(rollout: Rollout) -> Tensor:
+        def score(rollout: Steps) -> Tensor:
             nonlocal largest
             rewards = rollout.rewards.double() - rollout.price
             if not largest:  # of the first rollouts, so that later ones compare
@@ -209,10 +184,10 @@ class Return(Objective):
             price = largest or 1.0
             returns = rewards.masked_fill(~rollout.made, 0.0).sum(-1)
             violation = rollout.violation.sum(-1)
-            if rollout.left_bounds.any():
-                lost = rollout.left_bounds.unsqueeze(-1) & ~rollout.made
-                missed = lost.sum(-1) + violation.max() * rollout.left_bounds
-                back = _BACK * (rewards.shape[-1] + 1) * rollout.overshoot
+            left = rollout.left_bounds.any(-1)
+            if left.any():
+                missed = (left.unsqueeze(-1) & ~rollout.made).sum(-1) + violation.max() * left
+                back = _BACK * (rewards.shape[-1] + 1) * rollout.overshoot.sum(-1)
                 returns = returns - price * (_NEVER * missed + back)
             if rollout.violation.any():
                 returns = returns - price * _NEVER * violation

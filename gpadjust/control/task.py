@@ -94,25 +94,30 @@ class Moment(NamedTuple):
         return Moment(self.steps_done + 1, actions, margins)
 
 
-class Step(NamedTuple):
-    """Result of a step from ``N`` states.
+class Steps(NamedTuple):
+    """Steps in a model: ``N`` of them, or ``k x n x T``, of ``n`` episodes in ``k`` functions.
 
     Args:
-        actions: The actions that were taken, as near to the chosen ones as the action rate allows.
-        next_states: ``N x state_dim``; the old state where the step left the bounds.
-        rewards: ``N``; where it left the bounds, the reward of staying.
-        terminated: Whether the next state ends the episode, ``N`` booleans; not where it left.
+        states: The states at which actions were taken, ``... x state_dim``.
+        actions: As near to the chosen ones as the action rate allows, ``... x action_dim``.
+        next_states: ``... x state_dim``; the old state where the step left the bounds.
+        rewards: ``...``, as all that follow; where it left the bounds, the reward of staying.
+        made: Whether the step was made: not where it left the bounds, nor after the end of an
+            episode, where all other entries mean nothing.
+        terminated: Whether the next state ends the episode.
         left_bounds: Whether it would have left the bounds or the finite numbers, or the physics
-            failed, ``N`` booleans.
-        overshoot: How far it would have left the bounds, ``N``, in halves of their width, summed
-            over the states; with its gradient, which leads back. 0 where that is not finite.
-        violation: Violation of the constraints with their margins, ``N``, in sum; 0 if they hold.
-        price: What the change of the action costs, ``N``.
+            failed.
+        overshoot: How far it would have left the bounds, in halves of their width, summed over the
+            states; with its gradient, which leads back. 0 where that is not finite.
+        violation: Violation of the constraints with their margins, in sum; 0 if they hold.
+        price: What the change of the action costs.
     """
 
+    states: Tensor
     actions: Tensor
     next_states: Tensor
     rewards: Tensor
+    made: Tensor
     terminated: Tensor
     left_bounds: Tensor
     overshoot: Tensor
@@ -248,7 +253,7 @@ class Task:
         *,
         move: Callable[[Tensor, Tensor], Tensor] | None = None,
         some_must_succeed: bool = False,
-    ) -> Step:
+    ) -> Steps:
         """Take actions ``N x action_dim`` at states ``N x state_dim`` of the model.
 
         This is the one place where action rate, set-points, bounds and constraints act.
@@ -288,7 +293,8 @@ class Task:
             if moment.margins is not None:
                 values = values + moment.margins[0]
             violation = values.clamp_min(0.0).sum(-1)
-        return Step(actions, following, rewards, terminated, left, overshoot, violation, price)
+        ends = (~left, terminated, left, overshoot)
+        return Steps(states, actions, following, rewards, *ends, violation, price)
 
     def _left_bounds(self, states: Tensor) -> tuple[Tensor, Tensor]:
         """Return which of ``N`` states are beyond the bounds or not finite, and how far beyond."""

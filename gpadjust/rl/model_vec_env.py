@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 from torch import Tensor
 
 from gpadjust.checks import check_choice
-from gpadjust.control import Moment, Step, Task
+from gpadjust.control import Moment, Steps, Task
 from gpadjust.dynamics import TransitionFunctions
 from gpadjust.physics import PhysicsError
 from gpadjust.rl.buffer import CompactReplayBuffer
@@ -198,7 +198,7 @@ class ModelVecEnv(VecEnv):
             buffer.dones[rows, 0] = terminated | timeouts
             buffer.timeouts[rows, 0] = timeouts
 
-    def _step(self, task: Task, states: Tensor, actions: Tensor, moment: Moment) -> Step:
+    def _step(self, task: Task, states: Tensor, actions: Tensor, moment: Moment) -> Steps:
         """A step of a task, in which leaving the bounds is the worst that can be."""
         step = task.step(states, actions, moment, move=self._move)
         self.worst_reward = min(self.worst_reward, float(step.rewards.min()))

@@ -197,6 +197,6 @@ def test_what_leaves_the_bounds_is_worse_than_any_violation():
     sequences = torch.zeros(3, 10, 1).double()
     sequences[1], sequences[2, 0] = -1.0, 1.0  # leaves the bounds after six steps; is nearer
     rollout = Rollouts(given, None, Moment(margins=wide)).follow(torch.zeros(1).double(), sequences)
-    assert rollout.left_bounds.tolist() == [[False, True, False]]
+    assert rollout.left_bounds.any(-1).tolist() == [[False, True, False]]
     stays, leaves, nearer = Return().of(given)(rollout)
     assert stays > nearer > leaves

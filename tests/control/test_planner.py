@@ -123,7 +123,7 @@ def test_episodes_end_in_the_model(origin, options, made):
     sequences = torch.stack([torch.ones(5, 1), -torch.ones(5, 1)]).double()
     steps = Rollouts(half_steps(**options), 2).follow(origin, sequences)
     assert steps.made.tolist() == [[[t < made for t in range(5)], [True] * 5]] * 2
-    assert steps.left_bounds.tolist() == [["terminated" not in options, False]] * 2
+    assert steps.left_bounds.any(-1).tolist() == [["terminated" not in options, False]] * 2
     if "fails_beyond" in options:
         assert steps.states[steps.made].max() <= 0.9
 

@@ -10,13 +10,13 @@ import torch
 from gpadjust.control import (
     MPC,
     ActionRate,
+    BoundedPolicy,
     EpisodeCheckpoint,
     MPCAgent,
     Planner,
     PolicySearch,
     PolicySearchAgent,
     Return,
-    mlp_policy,
 )
 from gpadjust.dynamics import PhysicsDynamics, StateSpec
 from gpadjust.states import Sensors
@@ -79,7 +79,7 @@ VALUES = [
         "PolicySearch cannot learn a task with action_rate",
     ),
     (
-        lambda at: mlp_policy(POINT_SPEC, BOUNDS, first_actions=[3.0]),
+        lambda at: BoundedPolicy(POINT_SPEC, BOUNDS, first_actions=[3.0]),
         r"1 numbers within \[-1.0\] and \[2.0\]; found \[3",
     ),
     (lambda at: EpisodeCheckpoint("run.ckpt", every=0), "every must be at least 1; found 0"),
