@@ -394,8 +394,8 @@ class MPC:
             The action, ``action_dim`` numbers within the bounds.
 
         Raises:
-            ValueError: If the measurement has another shape, or numbers that are not finite. It is
-                not recorded, and no transition goes across it; the plan stays.
+            ValueError: If the measurement has another shape, or numbers that are not finite. No
+                transition goes across it; the plan stays.
             RuntimeError: If there is neither a physics nor anything learnt.
         """
         row = self._recorded(measurement)
@@ -404,11 +404,7 @@ class MPC:
         return actions[0].numpy().copy()
 
     def observe(self, measurement: ArrayLike) -> None:
-        """Record a measurement without an action: the one with which an episode ends.
-
-        Raises:
-            ValueError: As :meth:`step`.
-        """
+        """Record the measurement with which an episode ends; a ValueError as of :meth:`step`."""
         self._recorded(measurement)
 
     def _recorded(self, measurement: ArrayLike) -> Tensor:
@@ -442,8 +438,7 @@ class MPC:
             ValueError: If there is no new transition; or trajectories of a task with sensors.
             PhysicsError: If the physics fails at a transition.
         """
-        dynamics, number = self.task.dynamics, self._num_learnt
-        hidden = self.filter is not None
+        dynamics, hidden, number = self.task.dynamics, self.filter is not None, self._num_learnt
         if data is not None and hidden:
             raise ValueError(
                 "The states behind trajectories of sensors are estimated from what `step` has "
@@ -456,18 +451,19 @@ class MPC:
                     "There is no new transition to learn, which takes a measurement, an action and "
                     "the measurement after it: call `step` first, or pass trajectories."
                 )
+            # The states behind all measurements of sensors are known better by now.
             data = self._states_of(self._steps[0 if hidden else self._num_learnt :])
         following = data.next_states.clone()
         if self.task.reference is not None:  # set-points stay as they are in the dynamics
             still = dynamics.spec.exogenous_columns
             following[:, still] = data.states[:, still]
-        before = dynamics.state_dict() if hidden else None
-        if hidden:  # the states behind all measurements are known better by now
-            dynamics.load_state_dict({})
+        before = dynamics.state_dict() if hidden else {}
         try:
+            if hidden:
+                dynamics.load_state_dict({})
             dynamics.update(data.states, data.actions, following)
         except BaseException:
-            if before is not None:
+            if hidden:
                 dynamics.load_state_dict(before)
             raise
         self._num_learnt = number
@@ -528,21 +524,13 @@ class MPC:
         plans = []
         for state, earlier, estimate in zip(states, episodes, estimates, strict=True):
             with seeded(seed):  # whatever the other rows are
-                plan = self.plan(state, earlier, estimate and estimate.covariance)
+                plan = self._planned(state, earlier, estimate and estimate.covariance)
             plans.append(plan.taken(estimate))
         actions = [cast(Tensor, plan.moment.action) for plan in plans]
         return torch.stack(actions), tuple(plans)
 
-    def plan(
-        self, state: Tensor, earlier: Plan | None = None, covariance: Tensor | None = None
-    ) -> Plan:
-        """Plan the steps ahead of an episode that is at a state.
-
-        Args:
-            state: Where it is, ``state_dim``.
-            earlier: The plan by then; None at the start.
-            covariance: That of the state, ``state_dim x state_dim``, if it is estimated.
-        """
+    def _planned(self, state: Tensor, earlier: Plan | None, covariance: Tensor | None) -> Plan:
+        """Return the steps ahead of an episode at a state, which has the covariance."""
         begun, task, seconds = time.perf_counter(), self.model, self.each_step.seconds
         moment = Moment() if earlier is None else earlier.moment
         left = None

@@ -37,8 +37,8 @@ class Rollouts:
         num_functions: Number ``k`` of functions, drawn from PyTorch's generator; None for the mean
             of the dynamics, as a single one.
         moment: The point of an episode at which all begin. Default: its start.
-        deadline: The time of ``time.perf_counter`` by which episodes are over: there are no steps
-            beyond the first that would take longer, by the slowest so far. Default: none.
+        deadline: The time of ``time.perf_counter`` after which there are no steps but the first, by
+            the slowest so far. Default: none.
     """
 
     def __init__(

@@ -397,10 +397,9 @@ class Task:
         ):
             if not hasattr(space, "high") or space.shape != (size,):
                 raise ValueError(
-                    f"The spec of the {whose} says that the {name} has {size} entries, so a Box "
-                    f"of shape ({size},) is expected; found {space}. States: {tuple(spec.states)}, "
-                    f"of which angles (seen as sine and cosine): {tuple(spec.angles)}; actions: "
-                    f"{tuple(spec.actions)}."
+                    f"The spec of the {whose} says that the {name} has {size} entries (an angle is "
+                    f"seen as sine and cosine), so a Box of shape ({size},) is expected; found "
+                    f"{space}. {spec}."
                 )
         if not np.isfinite([action_space.low, action_space.high]).all():
             raise ValueError(

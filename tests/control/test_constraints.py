@@ -123,6 +123,8 @@ def test_a_plan_keeps_its_margin_of_a_wall():
     assert passed.max() < WALL - margin + 1e-3
     assert passed[-1] == pytest.approx(WALL - margin, abs=0.08)
     assert plan.violation < 1e-3
+    planned = quick(4).plan(task(), torch.zeros(1).double(), BOUNDS).next_states
+    assert planned.max() < WALL - margin + 1e-3
     passed, _ = end(replace(task(), probability=None))
     assert passed[-1] == pytest.approx(WALL, abs=0.05)
     assert passed.max() < WALL + 1e-3
