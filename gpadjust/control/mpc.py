@@ -193,9 +193,8 @@ class Planner:
             task: The task, whose dynamics have learnt from transitions. Its constraints have
                 margins along the earlier plan, or along one that was made without them first.
             state: Where the episode is, ``state_dim``.
-            action_bounds: Lower and upper bounds of the actions, ``2 x action_dim``, finite.
-            num_steps: Number of steps ahead; the plan is of these or of the horizon, ``T``.
-                Default: the episode length of the task.
+            action_bounds: Lower and upper bounds of the actions, ``2 x action_dim``.
+            num_steps: Number of steps before the end. Default: the episode length of the task.
             earlier: A plan to begin with; its last action is held where it is shorter.
             moment: The point of the episode. Default: its beginning.
             covariance: That of the state, ``state_dim x state_dim``, if it is estimated.

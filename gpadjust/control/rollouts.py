@@ -6,6 +6,7 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
@@ -15,7 +16,6 @@ from torch import Tensor
 from gpadjust.checks import check_kind, checked_number, checked_whole, seeded
 from gpadjust.control.task import Moment, Steps, Task
 from gpadjust.dynamics import Dynamics
-from gpadjust.dynamics.free_run import step_or_nan
 from gpadjust.physics import PhysicsError
 
 _MOST_MEDIANS = 30.0
@@ -29,16 +29,14 @@ class Rollouts:
 
     An episode ends where a state says so, or where it would leave the bounds or the finite numbers
     or meet a failure of the physics; that last step is not made. Gradients flow from the rewards to
-    the actions, as far as dynamics and reward have them; where an episode has none that is finite
-    (as where it ran away), it counts as zero.
+    the actions; where an episode has none that is finite, as where it ran away, it counts as zero.
 
     Args:
         task: The task; its dynamics must be fitted.
         num_functions: Number ``k`` of functions, drawn from PyTorch's generator; None for the mean
             of the dynamics, as a single one.
         moment: The point of an episode at which all begin. Default: its start.
-        deadline: The time of ``time.perf_counter`` after which there are no steps but the first, by
-            the slowest so far. Default: none.
+        deadline: The time of ``time.perf_counter`` by which all but a first step are to end.
     """
 
     def __init__(
@@ -138,10 +136,7 @@ class Objective(ABC):
 
     @abstractmethod
     def of(self, task: Task) -> Callable[[Steps], Tensor]:
-        """Return the worth of rollouts in a task, as its dynamics stand.
-
-        It is a function of a rollout that returns ``n`` numbers, higher is better.
-        """
+        """Return a function of the steps of a rollout: ``n`` numbers, higher is better."""
 
 
 @dataclass(frozen=True)
@@ -173,7 +168,7 @@ class Return(Objective):
             checked_number("quantile", self.quantile, least=0, below=1)
 
     def of(self, task: Task) -> Callable[[Steps], Tensor]:
-        """Return the return of rollouts."""
+        """Return the function of a rollout's steps that returns their ``n`` returns."""
         largest = 0.0
 
         def score(rollout: Steps) -> Tensor:
@@ -226,17 +221,11 @@ def random_sequences(n: int, num_steps: int, bounds: Tensor, max_hold: int) -> T
 
 @torch.no_grad()
 def reach(physics: Dynamics, starts: Tensor, action_bounds: Tensor, num_steps: int) -> Tensor:
-    """Return least and greatest states of episodes in a physics, ``2 x state_dim``.
+    """Return least and greatest states of 64 episodes in a physics, ``2 x state_dim``.
 
-    Each of 64 episodes holds random actions, of which half are at the bounds, for a number of steps
-    of its own, up to all of them; it stays where the physics fails. PyTorch's generator is left as
-    it is.
-
-    Args:
-        physics: The physics alone.
-        starts: Where real episodes started, ``n x state_dim``.
-        action_bounds: Lower and upper bounds of the actions, ``2 x action_dim``.
-        num_steps: Length of an episode.
+    Each holds random actions, of which half are at the bounds, for a number of steps of its own, up
+    to all ``num_steps``, from one of the starts ``n x state_dim``. It ends where the physics fails;
+    if that does not say where, the starts alone count. PyTorch's generator is left as it is.
     """
     low, high = action_bounds
     with seeded(0):
@@ -244,13 +233,8 @@ def reach(physics: Dynamics, starts: Tensor, action_bounds: Tensor, num_steps: i
     extreme = torch.where(sequences > (low + high) / 2, high, low)
     sequences[::2] = extreme[::2]
     states = starts[torch.linspace(0, len(starts) - 1, _EPISODES).round().long()]
-    path, step = [states], physics.mean_function()
-    for actions in sequences.unbind(1):
-        try:
-            following = step_or_nan(lambda *at: step(*(x[None] for x in at))[0], states, actions)
-        except PhysicsError:  # it does not say where it fails
-            break
-        states = torch.where(following.isfinite().all(-1, keepdim=True), following, states)
-        path.append(states)
-    everywhere = torch.cat(path)
-    return torch.stack([everywhere.amin(0), everywhere.amax(0)])
+    task = Task(physics, lambda states, actions, next_states: 0 * states[:, 0])
+    with suppress(PhysicsError):
+        run = Rollouts(task, None).follow(states, sequences)
+        states = torch.cat([states, run.next_states[run.made]])
+    return torch.stack([states.amin(0), states.amax(0)])

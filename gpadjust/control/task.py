@@ -266,8 +266,7 @@ class Task:
             some_must_succeed: Whether it is an error that the physics fails for all rows.
 
         Raises:
-            PhysicsError: If the physics does not say where it fails; or fails everywhere, though it
-                must not.
+            PhysicsError: If the physics fails everywhere, or does not say where.
         """
         moment = Moment() if moment is None else moment
         none = torch.zeros(len(states), dtype=torch.float64)
