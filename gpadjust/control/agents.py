@@ -159,7 +159,7 @@ class PolicySearchAgent(Agent):
         >>> from gpadjust.systems import cart_pole
         >>> wide = torch.tensor([[-50.0] * 4, [50.0] * 4])  # far beyond what is ever seen
         >>> system = replace(cart_pole(), state_bounds=wide)
-        >>> search = PolicySearch(updates=2, num_starts=4)
+        >>> search = PolicySearch(updates=2, num_starts=8)
         >>> agent = PolicySearchAgent(system.make(), system.task(), search=search, seed=0)
         >>> agent.learn(total_timesteps=25)
         PolicySearchAgent(CartPoleSwingUpEnv, LearnedDynamics, 1 episodes learnt, 25 steps, ...)
