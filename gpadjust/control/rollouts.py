@@ -79,7 +79,7 @@ class Rollouts:
         shape = (self.num_functions, len(starts))  # of all episodes, which are rows below
         states = starts.expand(*shape, -1).flatten(0, 1)
         running = torch.ones(len(states), dtype=torch.bool)
-        steps: list[Steps] = []
+        columns: list[tuple[Tensor, ...]] = []
         for t in range(num_steps):
             begun = time.perf_counter()
             if t and not self.has_time():
@@ -87,22 +87,21 @@ class Rollouts:
             at, chosen = _tamed(states), _tamed(choose(t, states))
             # Later, all may have come to where the physics does not work.
             step = task.step(at, chosen, moment, move=self._move, some_must_succeed=t == 0)
-            made = running & step.made
-            steps.append(
-                step._replace(
-                    states=states,
-                    made=made,
-                    left_bounds=running & step.left_bounds,
-                    overshoot=step.overshoot.masked_fill(~running, 0.0),
-                    violation=step.violation.masked_fill(~made, 0.0),
-                )
-            )
-            running = made & ~step.terminated
+            columns.append((running, states, *step[1:]))
+            running = running & step.made & ~step.terminated
             states = torch.where(running.unsqueeze(-1), step.next_states, states)
             moment = moment.after(step.actions)
             self._slowest = max(self._slowest, time.perf_counter() - begun)
-        columns = (torch.stack(parts, dim=1) for parts in zip(*steps, strict=True))
-        return Steps(*(column.unflatten(0, shape) for column in columns))
+        stacked = (torch.stack(parts, dim=1) for parts in zip(*columns, strict=True))
+        running, *parts = (part.unflatten(0, shape) for part in stacked)
+        steps = Steps(*parts)
+        made = running & steps.made
+        return steps._replace(
+            made=made,
+            left_bounds=running & steps.left_bounds,
+            overshoot=steps.overshoot.masked_fill(~running, 0.0),
+            violation=steps.violation.masked_fill(~made, 0.0),
+        )
 
     def _move(self, states: Tensor, actions: Tensor) -> Tensor:
         """Return the next states of rows, of which each function has as many."""
