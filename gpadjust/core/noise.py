@@ -13,7 +13,7 @@ from gpadjust.core.data import appended
 from gpadjust.core.terms import Places, TermSum
 from gpadjust.core.unknowns import LogNormal, Row, Values
 
-_PRIOR = LogNormal(1e-3, 55.0)
+_PRIOR = LogNormal(1e-4, 300.0)
 _LEAST = 1e-11  # of the squared unit of the targets
 
 

@@ -221,6 +221,8 @@ class TermSum:
         self.terms = tuple(
             term if term.physics is not None else term._replace(has_center=False) for term in terms
         )
+        plain = [term.name for term in terms if term.physics is None]
+        self.plain = "delta" if "delta" in plain else next(iter(plain), None)
         self.unit = unit
         self.f = [v.reshape(-1, v.shape[-1]) for v in f]
         # The prior mean and standard deviation of a center, m x 1.
@@ -250,10 +252,18 @@ class TermSum:
         return self.middle[i] + self.spread[i] * values[f"{term.name}.center"]
 
     def mean_of(self, term: Term, values: Values) -> Tensor | float:
-        """Return the prior mean of a term's process, which is zero in some nested models."""
+        """Return the prior mean of a term's process, which is zero in some nested models.
+
+        There delta gets c in the place of f_p: a model without physics has its constant for free.
+        """
         mean = term.mean / (self.unit if term.physics is None else 1.0)
-        factor = values.get(f"{term.name}.mean")
-        return mean if factor is None else mean * factor
+        if term.physics is not None:
+            return mean * values.get(f"{term.name}.mean", 1.0)
+        if term.name == self.plain:
+            for other in self.terms:
+                if (factor := values.get(f"{other.name}.mean")) is not None:
+                    mean = mean + other.mean * (1 - factor) * self.center(other, values)
+        return mean
 
     def mean(self, values: Values, places: Places) -> Tensor:
         """Return the prior mean of the sum, ``... x S x m x n``."""
@@ -283,8 +293,7 @@ class TermSum:
         term = next(t for t in self.terms if t.name == name)
         one = torch.ones_like(places.x[..., 0])
         weights = {name: one}
-        plain = [t.name for t in self.terms if t.physics is None]
-        if name == ("delta" if "delta" in plain else next(iter(plain), None)):
+        if name == self.plain:
             centered = [t for t in self.terms if t.has_center]
             weights |= {t.name: -self.center(t, values) * one for t in centered}
         mean = self.mean_of(term, values) * one

@@ -11,22 +11,23 @@ import torch
 from torch import Tensor
 
 from gpadjust.checks import checked_number, checked_whole
+from gpadjust.core import Prediction
 from gpadjust.dynamics import Dynamics, FreeRun, PhysicsDynamics, Windows
 from gpadjust.dynamics.base import TransitionFunctions
 from gpadjust.dynamics.targets import one_physics
 from gpadjust.physics import Physics
 from gpadjust.physics.parameters import PhysicsParameters
-from gpadjust.records.records import Record, Records, in_control_steps
+from gpadjust.records.records import Records, control_steps
 from gpadjust.records.smoothing import SmoothedRecords, smooth
 from gpadjust.states import StateSpec
 
 GUESSES, IDENTIFIED, PERSISTENCE = "guesses", "identified", "persistence"
+FEW = 0.9  # of measurements in intervals of 95 %
 _LEAST = 8  # steps of a stretch, of which the last part is held out
 _KNOWN_BEFORE = 0.8  # of a prior's standard deviation: the log tells next to nothing
 _FAR = 3.0  # standard deviations of a prior
 _VARIES = 1e-3  # share of the variance of an action that is within steps
 _NEAR_A_TURN = 0.12
-FEW = 0.9  # of measurements in intervals of 95 %
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -72,7 +73,7 @@ class Identification:
     def errors(self) -> dict[str, Tensor]:
         """Root mean square errors along the windows, ``state_dim``, NaN of hidden states.
 
-        Beside those of the runs those of ``"persistence"``: the state stays where it was.
+        They are of the runs, and of ``"persistence"``: the state stays where it was.
         """
         still = self.windows.initial_states.unsqueeze(1).expand_as(self.windows.measured)
         paths = {name: run.mean for name, run in self.runs.items()} | {PERSISTENCE: still}
@@ -83,7 +84,7 @@ class Identification:
 
     @property
     def coverage(self) -> Tensor:
-        """Shares of what was measured that the identified run's intervals hold, ``state_dim``."""
+        """Shares of the measurements that the identified run's intervals hold, ``state_dim``."""
         run, measured = self.runs[IDENTIFIED], self.windows.measured
         # Of angles, the measured one within half a turn of the mean.
         measured = run.mean + self.spec.change(run.mean, measured)
@@ -92,11 +93,9 @@ class Identification:
 
     @property
     def advice(self) -> list[str]:
-        """Sentences on what to look at."""
-        return [*self.remarks, *_of_parameters(self.parameters), *self._of_errors()]
-
-    def _of_errors(self) -> list[str]:
-        sentences, errors, shares = [], self.errors, self.coverage.tolist()
+        """Sentences on the log, on parameters, and on errors that are too large."""
+        sentences = [*self.remarks, *_of_parameters(self.parameters)]
+        errors, shares = self.errors, self.coverage.tolist()
         for i, name in enumerate(self.spec.states):
             if shares[i] < FEW:
                 sentences.append(
@@ -117,10 +116,10 @@ class Identification:
         """Parameters, noises and errors."""
         lines = [f"Identification by {self.smoothed!r}"]
         lines += [] if self.parameters is None else [repr(self.parameters)]
-        names = [name for name in self.spec.states if name not in self.hidden]
-        places = [self.spec.states.index(name) for name in names]
+        places = [i for i, name in enumerate(self.spec.states) if name not in self.hidden]
+        names = ", ".join(self.spec.states[i] for i in places)
         steps = self.windows.measured.shape[1]
-        lines.append(f"free run of {steps} steps, root mean square error ({', '.join(names)}):")
+        lines.append(f"free run of {steps} steps, root mean square error ({names}):")
         for name, error in self.errors.items():
             lines.append(f"  {name}: {', '.join(f'{e:.3g}' for e in error[places].tolist())}")
         shares = ", ".join(f"{100 * share:.0f} %" for share in self.coverage[places].tolist())
@@ -141,10 +140,9 @@ def identify(
     """Find parameters, noise and hidden states of a machine, and judge them by a free run.
 
     All but the last part of the records is smoothed (:func:`smooth`). A free run follows the
-    actions from there to the end, and is compared with what was measured. Its particles start
-    where the state may be, have parameters drawn from their posterior, and are moved by the process
-    noise. That is white: where the physics lacks something, whose errors last, intervals are too
-    narrow. How many of them hold is part of what is returned.
+    actions from there to the end, and is compared with the measurements. Its particles start where
+    the state may be, have parameters drawn from their posterior, and are moved by process noise.
+    That is white: where the physics lacks something, whose errors last, intervals are too narrow.
 
     Args:
         records: The records, of states that all move. One that is NaN throughout is hidden.
@@ -153,19 +151,17 @@ def identify(
         start: Of hidden states by name, mean and standard deviation at the beginning.
         held_out: The share of the longest stretch without gaps that is held out at its end; as many
             steps are at the end of each other stretch that has twice as many.
-        num_starts: How many starts to take the best end of, as of :func:`smooth`.
+        num_starts: As of :func:`smooth`.
         seed: Seed of the free runs.
-        progress: Whether to show a progress bar.
+        progress: If True, show a progress bar.
 
     Returns:
-        What was found; :func:`gpadjust.report.report` makes a page of it.
+        The identification; :func:`gpadjust.report.report` makes a page of it.
 
     Raises:
-        TypeError: If an argument is of the wrong type.
         ValueError: If states are exogenous or previous values, the longest stretch has fewer than 8
-            steps, ``held_out`` is not above 0 and at most 0.5, or as :func:`smooth`.
-        PhysicsError: If the physics fails at measured states.
-        RuntimeError: If the states diverge from all starts.
+            steps, ``held_out`` is not above 0 and at most 0.5.
+        TypeError, PhysicsError, RuntimeError: As :func:`smooth`.
 
     Example:
         >>> import torch
@@ -178,14 +174,12 @@ def identify(
         >>> record = Record(t, states, torch.zeros(60, 1, dtype=torch.float64))
         >>> unknowns = {"k": Unknown(1.0, factor=2.0)}
         >>> rates = FormulaPhysics("v, u - k * x", ["x", "v", "u"], unknowns=unknowns)
-        >>> found = identify(
-        ...     Records(record, StateSpec(["x", "v"], ["u"])), ODEPhysics(rates, 0.1, 2)
-        ... )
-        >>> bool((found.errors["identified"] < 0.1 * found.errors["guesses"]).all())
+        >>> log, physics = Records(record, StateSpec(["x", "v"], ["u"])), ODEPhysics(rates, 0.1, 2)
+        >>> errors = identify(log, physics).errors
+        >>> bool((errors["identified"] < 0.1 * errors["guesses"]).all())
         True
     """
-    steps, _ = in_control_steps(records, step)
-    spec = records.spec
+    steps, spec = control_steps(records, step), records.spec
     if len(spec.moving) < spec.state_dim:
         raise ValueError(
             "Expected states that all move, found exogenous ones or previous values; `smooth` "
@@ -193,84 +187,76 @@ def identify(
         )
     share = checked_number("held_out", held_out, above=0, most=0.5)
     checked_whole("seed", seed, 0)
-    parts = [(each, rows) for each in steps for rows in each.stretches()]
-    lengths = [rows.stop - rows.start - 1 for _, rows in parts]
-    if max(lengths) < _LEAST:
+    longest = max(len(stretch.times) - 1 for stretch in steps)
+    if longest < _LEAST:
         raise ValueError(
             f"Expected a stretch of {_LEAST} control steps or more, to hold some out, found "
-            f"{max(lengths)}; take a shorter step, or a longer log."
+            f"{longest}; take a shorter step, or a longer log."
         )
-    held = max(1, int(share * max(lengths)))
+    held = max(1, int(share * longest))
     f_p = one_physics(physics, spec, "identify one of them")
-    known, ends, actions, measured = [], [], [], []
-    for i, ((each, rows), length) in enumerate(zip(parts, lengths, strict=True)):
-        end = rows.stop - held * (length >= 2 * held)  # what follows is held out
-        begin = slice(rows.start, end)
-        known.append(Record(each.times[begin], each.states[begin], each.actions[begin]))
-        if end < rows.stop:
+    beginnings, ends, actions, measured = [], [], [], []
+    for i, stretch in enumerate(steps):
+        end = len(stretch.times)
+        if end - 1 >= 2 * held:
+            end -= held
             ends.append(i)
-            actions.append(each.actions[end - 1 : rows.stop - 1])
-            measured.append(each.states[end : rows.stop])
-    smoothed = smooth(
-        Records(known, spec), f_p, start=start, num_starts=num_starts, progress=progress
-    )
+            actions.append(stretch.actions[end - 1 : -1])
+            measured.append(stretch.states[end:])
+        beginnings.append(stretch.part(slice(end)))
+    learnt_from = Records(beginnings, spec)
+    smoothed = smooth(learnt_from, f_p, start=start, num_starts=num_starts, progress=progress)
     last = torch.stack([smoothed.records.records[i].states[-1] for i in ends])
     windows = Windows(last, torch.stack(actions), torch.stack(measured))
-    start_noise = torch.stack([smoothed.sd[i][-1] for i in ends]).square().mean(0).sqrt()
-    noise = smoothed.noise.nan_to_num()
-    options: dict[str, Any] = {"start_noise": start_noise, "noise": noise, "seed": seed}
-    by_guesses = PhysicsDynamics(spec, f_p)
-    drawn = _Drawn(spec, f_p, smoothed.physics_parameters) if f_p.unknowns else by_guesses
-    runs = {
-        IDENTIFIED: drawn.free_run(
-            last,
-            windows.actions,
-            num_functions=199,
-            level=0.95,
-            process_noise=smoothed.process_noise,
-            **options,
-        )
+    options: dict[str, Any] = {
+        "start_noise": torch.stack([smoothed.sd[i][-1] for i in ends]).square().mean(0).sqrt(),
+        "noise": smoothed.noise.nan_to_num(),
+        "seed": seed,
     }
+    dynamics: Dynamics = PhysicsDynamics(spec, f_p)
+    runs = {}
     if f_p.unknowns:
-        runs[GUESSES] = by_guesses.free_run(last, windows.actions, **options)
-    length_of_step = float(steps.records[0].times[1] - steps.records[0].times[0])
-    remarks = [*_of_actions(records, length_of_step), *_of_jumps(records)]
-    if len(parts) > len(records):
-        gaps = f"Gaps part the log into {len(parts)} stretches, each smoothed by itself."
-        remarks.insert(0, gaps)
-    return Identification(smoothed, drawn, windows, runs, length_of_step, tuple(remarks))
+        runs[GUESSES] = dynamics.free_run(last, windows.actions, **options)
+        dynamics = _Drawn(spec, f_p, smoothed.physics_parameters)
+    options |= {"process_noise": smoothed.process_noise, "num_functions": 199}
+    runs = {IDENTIFIED: dynamics.free_run(last, windows.actions, **options), **runs}
+    length = steps.records[0].sampling_step
+    gaps = [f"Gaps part the log into {len(steps)} stretches, each smoothed by itself."]
+    remarks = gaps if len(steps) > len(records) else []
+    remarks += [*_of_actions(records, length), *_of_jumps(records)]
+    return Identification(smoothed, dynamics, windows, runs, length, tuple(remarks))
 
 
-class _Drawn(PhysicsDynamics):
-    """A physics of which each sampled function has parameters drawn from a posterior."""
+class _Drawn(Dynamics):
+    """A physics of which each sampled function has parameters drawn from their posterior."""
+
+    is_fitted = True
 
     def __init__(self, spec: StateSpec, physics: Physics, parameters: PhysicsParameters) -> None:
-        super().__init__(spec, physics)
-        self._parameters = parameters
+        super().__init__(spec)
+        self.physics = physics
+        self.physics_parameters = parameters
 
-    @property
-    def physics_parameters(self) -> PhysicsParameters:
-        """The posterior."""
-        return self._parameters
+    def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
+        """Refuse: parameters are learnt from records alone."""
+        raise RuntimeError("These dynamics learn by `identify` alone; call it with more records.")
 
-    @property
-    def _values(self) -> Tensor:
-        """Means, for predictions that are of one function."""
-        return self._parameters.mean
+    def predict(self, states: Tensor, actions: Tensor) -> Prediction:
+        """Return the next states by the parameters' means, and no variance."""
+        following = self._follow(states, actions, self.physics_parameters.mean)
+        return Prediction(following, torch.zeros_like(following))
 
     def sample_functions(self, num_functions: int, seed: int | None = None) -> TransitionFunctions:
-        """The physics with draws of the parameters, the same ones for the same seed."""
+        """Return the physics with draws of the parameters, the same ones for the same seed."""
         checked_whole("num_functions", num_functions, 1)
         generator = torch.Generator().manual_seed(0 if seed is None else seed)
-        draws = self._parameters.draws
+        draws = self.physics_parameters.draws
         order = torch.randperm(len(draws), generator=generator)
         values = draws[order[torch.arange(num_functions) % len(draws)]]
+        return lambda states, actions: self._follow(states, actions, values)
 
-        def step(states: Tensor, actions: Tensor) -> Tensor:
-            self._check_blocks(states, actions, num_functions)
-            return self._step(states, actions, values)
-
-        return step
+    def _follow(self, states: Tensor, actions: Tensor, values: Tensor) -> Tensor:
+        return self.physics(self.spec.physics_inputs(states, actions), values)
 
 
 def _of_actions(records: Records, step: float) -> list[str]:
@@ -301,7 +287,7 @@ def _of_jumps(records: Records) -> list[str]:
 
 
 def _of_parameters(parameters: PhysicsParameters | None) -> list[str]:
-    """Return sentences on parameters of which the log says little, or which were guessed badly."""
+    """Return sentences on parameters that the log does not tell, or that contradict their prior."""
     if parameters is None:
         return []
     sentences = []

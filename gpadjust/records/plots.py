@@ -1,9 +1,4 @@
-"""Figures of records of a machine.
-
-Each function draws on the axes that it is given, or on those of a new figure, and returns them;
-show or save the figure with ``axes.flat[0].figure``. They need matplotlib,
-``pip install gpadjust[plot]``.
-"""
+"""The figure of a record of a machine; it needs matplotlib, ``pip install gpadjust[plot]``."""
 
 from __future__ import annotations
 
@@ -13,8 +8,6 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import torch
-from matplotlib.axes import Axes
-from torch import Tensor
 
 from gpadjust.dynamics.plots import going_on, labels
 from gpadjust.records.records import Record, Records
@@ -34,33 +27,23 @@ def plot_record(
     """Draw a record over time, a panel for each state and each action.
 
     Lines end where a stretch does: gaps are grey, and a dotted line is where a segment begins.
-    Segments whose clock starts again lie over each other. Angles go on without jumps, from within
-    half a turn at the beginning of a stretch.
+    Segments whose clock starts again lie over each other. Dots are rows without neighbours. Angles
+    go on without jumps, from within half a turn at the beginning of a stretch.
 
     Args:
         record: The record.
-        spec: What the entries of its states and actions are.
+        spec: The entries of its states and actions.
         units: Units for the labels, by the names of states and actions and ``"time"``, such as
             ``{"omega": "rad/s"}``. Default: rad of angles, and s.
         axes: As many axes as states and actions. Default: a new figure.
 
     Returns:
-        An array of these axes.
+        An array of these axes; ``axes[0].figure`` is the figure.
 
     Raises:
         TypeError: If ``record`` is no :class:`Record`, or ``spec`` no :class:`StateSpec`.
         ValueError: If the record has not the columns of the spec, a unit is of an unknown name,
-            the number of ``axes`` is another one, or times are so uneven that what a gap is cannot
-            be told.
-
-    Example:
-        >>> import torch
-        >>> from gpadjust.records import Record
-        >>> from gpadjust.states import StateSpec
-        >>> times = 0.01 * torch.arange(100, dtype=torch.float64)
-        >>> record = Record(times, times.sin().unsqueeze(-1), times.cos().unsqueeze(-1))
-        >>> plot_record(record, StateSpec(["x"], ["v"]), units={"x": "m", "v": "m/s"}).shape
-        (2,)
+            or the number of ``axes`` is another one.
     """
     Records([record], spec)  # checks types and columns
     names, stretches = [*spec.states, *spec.actions], record.stretches()
@@ -72,25 +55,19 @@ def plot_record(
     for i, (name, ax) in enumerate(zip(names, axes, strict=True)):
         style = "default" if i < spec.state_dim else "steps-post"
         for rows in stretches:
-            line = going_on(values[rows, i], i in spec.angle_columns)
-            _draw_known(ax, record.times[rows], line, drawstyle=style)
+            times, line = record.times[rows], going_on(values[rows, i], i in spec.angle_columns)
+            ax.plot(times, line, color=BLUE, lw=1.1, drawstyle=style)
+            known = torch.nn.functional.pad(~line.isnan(), (1, 1))
+            if (alone := known[1:-1] & ~known[:-2] & ~known[2:]).any():
+                ax.plot(times[alone], line[alone], ".", color=BLUE, ms=3)
         for before, after in pairwise(stretches):
             end, start = (float(record.times[k]) for k in (before.stop - 1, after.start))
             if end < start:
                 ax.axvspan(end, start, color=GREY, alpha=0.2, lw=0)
-            if record.segments and record.segments[before.start] != record.segments[after.start]:
+            if record.segments[before.start] != record.segments[after.start]:
                 ax.axvline(start, color=GREY, lw=0.8, ls=":")
         ax.set(ylabel=called[name])
         tidy(ax)
     axes[-1].set(xlabel=called["time"])
     axes[0].figure.align_ylabels(list(axes))
     return axes
-
-
-def _draw_known(ax: Axes, times: Tensor, values: Tensor, **options: Any) -> None:
-    """Draw a line through ``n`` values with NaN, and dots where one has no neighbours."""
-    known = torch.nn.functional.pad(~values.isnan(), (1, 1))
-    alone = known[1:-1] & ~known[:-2] & ~known[2:]
-    ax.plot(times, values, color=BLUE, lw=1.1, **options)
-    if alone.any():
-        ax.plot(times[alone], values[alone], ".", color=BLUE, ms=3)

@@ -1,12 +1,10 @@
-"""Measured trajectories of a machine: checked, read from files, in control steps, at even times."""
+"""Measured trajectories of a machine: checked, read from files, in control steps."""
 
 from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from datetime import UTC, datetime, timedelta
-from functools import cached_property
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpadjust.checks import checked_number
+from gpadjust.checks import check_finite, check_kind, checked_number
 from gpadjust.core.data import ArrayLike, as_tensor
 from gpadjust.dynamics import Trajectories, Windows
 from gpadjust.dynamics.targets import check_spec
@@ -23,37 +21,35 @@ from gpadjust.files.table_columns import TableColumns
 from gpadjust.states import StateSpec
 
 _GAP = 1.5  # typical steps: a longer time between two rows is a gap
-_OFTEN = 0.1  # of all times between rows: so many gaps are none
-_SAME = 0.01  # of a step, by which another one may differ from it
-_ROUNDING = 1e-6  # of a step
-_FINEST = 0.5  # sampling steps: with shorter ones most new rows would lie between the same two
+_OFTEN = 0.1  # share of the times between rows above which they are not gaps, but uneven
 _JITTER = 0.1  # of the sampling step, by which the time between two rows may differ from it
-
-Rows = tuple[Tensor, Tensor, Tensor]  # times, states and actions
+_SAME = 0.01  # of a step, by which another one may differ from it
 
 
 class Record:
     """A measured trajectory: times, and the states and actions of a machine there.
 
-    Row k has the state at its time, and the mean of the action from there to the next row. (That of
-    the last row counts for nothing: if it is not known, repeat the one before.) A record may be in
-    parts, by ``segments`` or because rows are missing, which is a gap: wherever two rows are more
-    than 1.5 times the median time apart. Rows on either side of a gap do not follow each other.
+    Row k has the state at its time, and the mean of the action from there to the next row; the last
+    action is not read. A record may consist of several stretches, by ``segments`` or by gaps, where
+    two rows are more than 1.5 times the median time apart. Values are tensors in float64, NumPy
+    arrays, or columns of a pandas frame.
 
     Args:
         times: ``N`` times, in s or the unit of time of the velocities, that rise within a segment.
             Dates and durations, as the index of a pandas frame, become seconds since the first.
         states: ``N x state_dim``; NaN where an entry was not measured.
         actions: ``N x action_dim``.
-        segments: ``N`` labels; a segment ends wherever the label changes. Default: one for all.
-        name: What errors call it.
+        segments: ``N`` labels; a segment ends wherever the label changes, and a row whose label is
+            NaN is by itself. Default: one for all.
+        name: The name in errors.
 
-    Tensors in float64, NumPy arrays, and columns of a pandas frame will do.
+    Attributes:
+        sampling_step: The mean time from one row to the next, without gaps.
 
     Raises:
         TypeError: If values are no numbers, or a tensor is not in float64.
         ValueError: If shapes disagree, times do not rise or are not finite, a state is infinite, an
-            action or a label is missing, or no row follows another.
+            action is missing, or no row follows another.
 
     Example:
         >>> import torch
@@ -76,8 +72,35 @@ class Record:
         self.states = self._numbers(states, "states", 2)
         self.actions = self._numbers(actions, "actions", 2)
         labels: Any = segments.tolist() if hasattr(segments, "tolist") else segments
-        self.segments = None if labels is None else tuple(labels)
-        self._check()
+        self.segments = tuple([0] * len(self.times) if labels is None else labels)
+        rows = {name: len(getattr(self, name)) for name in ("times", "states", "actions")}
+        rows["segments"] = len(self.segments)
+        if len({*rows.values()}) > 1:
+            counts = ", ".join(f"{number} of {name}" for name, number in rows.items())
+            raise self._error(f": expected as many rows of each, found {counts}.")
+        states = self.states.nan_to_num(nan=0.0, posinf=math.inf, neginf=-math.inf)
+        parts = {"times": self.times.unsqueeze(-1), "states": states, "actions": self.actions}
+        for part, tensor in parts.items():
+            check_finite(f"{part} of record {name!r}", tensor)
+        together = [label == after for label, after in pairwise(self.segments)]
+        self._together = torch.tensor(together, dtype=torch.bool)  # in a segment
+        steps = self.times.diff()
+        if not self._together.any():
+            raise self._error(
+                ": expected two rows or more of a segment, one after the other, found "
+                f"{len(self.times)} in all; leave the record out, or correct `segments`."
+            )
+        stops = (steps <= 0) & self._together
+        if stops.any():
+            row = int(stops.nonzero()[0]) + 1
+            before, time = self.times[row - 1 : row + 1].tolist()
+            raise self._error(
+                f", row {row}: expected times that rise, found {time:.10g} after {before:.10g}. "
+                "Leave out rows that were written twice; where the clock was set again, begin a "
+                "new segment by `segments`."
+            )
+        self._goes_on = self._together & (steps <= _GAP * steps[self._together].median())
+        self.sampling_step = float(steps[self._goes_on].mean())
 
     def __repr__(self) -> str:
         states, actions = self.states.shape[1], self.actions.shape[1]
@@ -86,56 +109,35 @@ class Record:
             f"{states} state{'s' * (states > 1)}, {actions} action{'s' * (actions > 1)})"
         )
 
-    @property
-    def sampling_step(self) -> float:
-        """The mean time from one row to the next, without gaps."""
-        steps = self.times.diff()[self._follows]
-        return float(steps[steps <= _GAP * steps.median()].mean())
+    def part(self, rows: slice) -> Record:
+        """Return some rows, as a record of the same name."""
+        times, states, actions = self.times[rows], self.states[rows], self.actions[rows]
+        return Record(times, states, actions, self.segments[rows], self.name)
 
-    def stretches(self, max_gap: float | None = None) -> list[slice]:
-        """Return the rows that follow each other, stretch by stretch.
-
-        Args:
-            max_gap: The longest time between two such rows. Default: 1.5 times the median.
-
-        Raises:
-            ValueError: If times differ so much that it takes ``max_gap`` to say what a gap is.
-        """
-        steps = self.times.diff()
-        if max_gap is None:
-            within = steps[self._follows]
-            max_gap = _GAP * float(within.median())
-            longer = int((within > max_gap).sum())
-            if longer > max(1, _OFTEN * len(within)):
-                raise self._error(
-                    f": expected even sampling with few gaps, found {longer} of {len(within)} "
-                    f"times between rows longer than {_GAP:g} times the median, "
-                    f"{max_gap / _GAP:.4g}. Bring it to even steps with `records.resampled(step, "
-                    "max_gap=...)`, where max_gap is the longest time to interpolate over."
-                )
-        ends = (~self._follows | (steps > max_gap)).nonzero().flatten() + 1
+    def stretches(self) -> list[slice]:
+        """Return the rows that follow each other without a gap, stretch by stretch."""
+        ends = (~self._goes_on).nonzero().flatten() + 1
         return [slice(*edges) for edges in pairwise([0, *ends.tolist(), len(self.times)])]
 
-    def check_even(self) -> None:
-        """Raise a ValueError unless the sampling is even, to a tenth of its step."""
-        step = self.sampling_step
-        for rows in self.stretches():
-            steps = self.times[rows].diff()
-            off = (steps - step).abs()
-            if len(off) and off.max() > _JITTER * step:
-                row = int(off.argmax())
-                raise self._error(
-                    f": expected even sampling, to a tenth of its step {step:.4g}, found "
-                    f"{float(steps[row]):.4g} from row {rows.start + row} to the next. Bring it to "
-                    "even steps with `records.resampled(step)`."
-                )
-
-    @cached_property
-    def _follows(self) -> Tensor:
-        """True for each row but the first that is of the segment of the one before, ``N - 1``."""
-        labels = self.segments or [0] * len(self.times)
-        same = [label == after for label, after in pairwise(labels)]
-        return torch.tensor(same, dtype=torch.bool)
+    def rows_in(self, step: float) -> int:
+        """Return how many rows make a control step; a ValueError unless the sampling is even."""
+        times, sampling = self.times.diff(), self.sampling_step
+        is_gap = (self._together & ~self._goes_on)[self._together]
+        is_off = (times[self._goes_on] - sampling).abs() > _JITTER * sampling
+        if is_off.any() or is_gap.sum() > max(1, _OFTEN * len(is_gap)):
+            low, high = times[self._together].aminmax()
+            raise self._error(
+                f": expected even sampling, to a tenth of its step {sampling:.4g} and with few "
+                f"gaps, found times between rows from {low:.4g} to {high:.4g}. Interpolate each "
+                "column at even times first, as by `numpy.interp`; unwrap angles before."
+            )
+        every = round(step / sampling)
+        if abs(step - every * sampling) > _SAME * step:
+            raise self._error(
+                f": expected a control step that is a whole multiple of the sampling step, "
+                f"{sampling:.4g}, got {step:.4g}; take {max(every, 1) * sampling:.4g}."
+            )
+        return every
 
     def _error(self, message: str) -> ValueError:
         return ValueError(f"Record {self.name!r}{message}")
@@ -150,76 +152,27 @@ class Record:
             )
         return tensor
 
-    def _check(self) -> None:
-        """Raise an error unless rows are as many, two follow each other, and values are known."""
-        parts = {"times": self.times, "states": self.states, "actions": self.actions}
-        rows = {name: len(part) for name, part in parts.items()}
-        rows |= {} if self.segments is None else {"segments": len(self.segments)}
-        if len({*rows.values()}) > 1:
-            counts = ", ".join(f"{number} of {name}" for name, number in rows.items())
-            raise self._error(f": expected as many rows of each, found {counts}.")
-        for row, label in enumerate(self.segments or ()):
-            if label is None or label != label:  # NaN, which would be a segment of its own
-                raise self._error(
-                    f", row {row}: expected a label of its segment, found {label}; leave out rows "
-                    "that are of no segment."
-                )
-        if not self._follows.any():
-            raise self._error(
-                ": expected two rows or more of a segment, one after the other, found "
-                f"{len(self.times)} in all; leave the record out, or correct `segments`."
-            )
-        ways_out = {
-            "times": "leave the row out",
-            "states": "put NaN where an entry was not measured",
-            "actions": "split the record there, by `segments` or in two, without that row",
-        }
-        for name, part in parts.items():
-            values = part.reshape(len(part), -1)
-            bad = values.isinf() if name == "states" else ~values.isfinite()
-            if bad.any():
-                row, column = bad.nonzero()[0].tolist()
-                raise self._error(
-                    f", row {row}: expected finite numbers, found {float(values[row, column])} in "
-                    f"column {column} of {name}; {ways_out[name]}."
-                )
-        stops = (self.times.diff() <= 0) & self._follows
-        if stops.any():
-            row = int(stops.nonzero()[0]) + 1
-            before, time = self.times[row - 1 : row + 1].tolist()
-            raise self._error(
-                f", row {row}: expected times that rise, found {time:.10g} after {before:.10g}. "
-                "Leave out rows that were written twice; where the clock was set again, begin a "
-                "new segment by `segments`."
-            )
-
 
 def _in_seconds(times: ArrayLike) -> ArrayLike:
     """Return dates and durations as seconds since the first, anything else as it is."""
-    if not hasattr(times, "dtype") or isinstance(times, Tensor) or not len(times):
+    kind = getattr(getattr(times, "dtype", None), "kind", "")
+    if kind not in ("M", "m"):
         return times
-    dates = np.asarray(times)
-    first = dates.flat[0]
-    if dates.dtype.kind == "O" and isinstance(first, datetime | timedelta):
-        kind = "datetime64[ns]" if isinstance(first, datetime) else "timedelta64[ns]"
-        if getattr(first, "tzinfo", None) is not None:  # NumPy has no time zones
-            dates = np.array([date.astimezone(UTC).replace(tzinfo=None) for date in dates])
-        dates = dates.astype(kind)
-    return (dates - dates[0]) / np.timedelta64(1, "s") if dates.dtype.kind in "mM" else times
+    dates = np.asarray(times, dtype=f"{kind}8[ns]")  # in UTC, if they have a time zone
+    return (dates - dates[:1]) / np.timedelta64(1, "s")
 
 
 class Records:
     """Measured trajectories of one system.
 
-    The control step is a whole multiple of the sampling step: of its states each k-th row of a
-    stretch is one, and its action the mean of the k actions. No step leads from one segment, record
-    or side of a gap to another. States that hold previous values (lagged actions and outputs) are
-    filled in: what was there a step before, and at the first row of a stretch what was recorded
-    there. Where nothing was, steps begin later by as many as the spec looks back.
+    The control step is a whole multiple k of the sampling step: each k-th row of a stretch is a
+    state, and its action the mean of the k actions. No step leads across a gap or from one segment
+    to another. States that hold previous values (lagged actions and outputs) are filled in, at the
+    first row of a stretch from the record; where that has none, steps begin later.
 
     Args:
         records: The records, a :class:`Record` each, or one.
-        spec: What the entries of their states and actions are.
+        spec: The entries of their states and actions.
 
     Raises:
         TypeError: If ``spec`` is no :class:`StateSpec`, or a record no :class:`Record`.
@@ -280,48 +233,38 @@ class Records:
         delimiter: str = ",",
         decimal: str = ".",
     ) -> Records:
-        r"""Read records from CSV files, one from each.
+        """Read records from CSV files, one from each.
 
-        The first line of a file names its columns, of which there may be others. A field of a state
-        is empty or NaN where it was not measured. States that hold previous values need no column.
+        The first line of a file names its columns; others may be there. A field of a state is empty
+        or NaN where it was not measured. States that hold previous values need no column.
 
         Args:
             files: The file, or several.
-            spec: What the entries of states and actions are.
-            states: Which columns have the states, such as ``{"theta": "q"}``; None for a state that
-                is hidden, which :func:`smooth` estimates. Default, also for states that are not
-                said: the columns of their names.
+            spec: The entries of states and actions.
+            states: Columns by the names of states, such as ``{"theta": "q"}``; None for a hidden
+                state, which :func:`smooth` estimates. Default: the columns of their names.
             actions: The same for the actions.
             time: The column of times, or where there is none the time from one row to the next.
             segment: The column of the labels of segments. Default: a file is one segment.
-            delimiter: What is between two fields.
+            delimiter: The mark between two fields.
             decimal: The decimal mark of numbers, a point or a comma.
 
         Raises:
             OSError: If a file cannot be read.
             TypeError: If ``spec`` is no :class:`StateSpec`.
-            ValueError: If a name is none of the spec, a file has no rows or not these columns, a
+            ValueError: If a name is not in the spec, a file has no rows or not these columns, a
                 field is no number or a time or action is missing, with file, line and column; and
                 as :class:`Record`.
-
-        Example:
-            >>> import tempfile
-            >>> from pathlib import Path
-            >>> from gpadjust.records import Records
-            >>> from gpadjust.states import StateSpec
-            >>> spec = StateSpec(["theta", "omega"], ["torque"], angles=["theta"])
-            >>> with tempfile.TemporaryDirectory() as folder:
-            ...     file = Path(folder, "swing.csv")
-            ...     _ = file.write_text("time,q,dq,u\n0,0.1,0,1\n0.5,0.2,0.4,1\n1,0.5,0.8,0\n")
-            ...     columns = {"theta": "q", "omega": "dq"}
-            ...     records = Records.read_csv(file, spec, states=columns, actions={"torque": "u"})
-            >>> records.trajectories().states
-            tensor([[0.1000, 0.0000],
-                    [0.2000, 0.4000]], dtype=torch.float64)
         """
         check_spec(spec)
-        state_columns = _columns(states, spec.states, "states")
-        action_columns = _columns(actions, spec.actions, "actions")
+        columns: dict[str, Any] = {"states": states or {}, "actions": actions or {}}
+        for argument, given in columns.items():
+            check_kind(argument, given, Mapping, "a dictionary from names of the spec to columns")
+            if unknown := [name for name in given if name not in getattr(spec, argument)]:
+                raise ValueError(
+                    f"There is no {unknown[0]!r} among the {argument} of the spec, "
+                    f"{getattr(spec, argument)}."
+                )
         records = []
         for file in [files] if isinstance(files, str | Path) else files:
             table = TableColumns(file, delimiter, decimal=decimal)
@@ -331,30 +274,25 @@ class Records:
                 rows = torch.arange(len(table), dtype=torch.float64)
                 times = checked_number("time", time, above=0) * rows
             measured = []
-            for name, column in state_columns.items():
-                filled_in = name in spec.previous and name == column and name not in table.names
-                if column is None or filled_in:
+            for name in spec.states:
+                filled_in = name in spec.previous and name not in table.names
+                column = columns["states"].get(name, None if filled_in else name)
+                if column is None:
                     measured.append(torch.full_like(times, math.nan))
                 else:
                     measured.append(table.numbers(column, may_miss=True))
-            taken = [table.numbers(column) for column in action_columns.values()]
+            taken = [table.numbers(columns["actions"].get(name, name)) for name in spec.actions]
             labels = None if segment is None else table.texts(segment)
-            columns = torch.stack(measured, -1), torch.stack(taken, -1)
-            records.append(Record(times, *columns, labels, str(file)))
+            parts = times, torch.stack(measured, -1), torch.stack(taken, -1)
+            records.append(Record(*parts, labels, str(file)))
         return cls(records, spec)
 
     @classmethod
     def of_windows(cls, windows: Windows, spec: StateSpec, step: float) -> Records:
         """Make a record of each window, such as of an agent's episodes, to :func:`smooth` them.
 
-        Args:
-            windows: Windows, in control steps.
-            spec: What the entries of states and actions are.
-            step: The control step, in the unit of the times.
-
-        Raises:
-            TypeError: If ``spec`` is no :class:`StateSpec`, or ``step`` no number.
-            ValueError: If ``step`` is not positive, or windows have not the columns of the spec.
+        The control step is in the unit of the times. Errors are those of :class:`Records`, and of a
+        step that is no number above 0.
         """
         rows = torch.arange(windows.states.shape[1], dtype=torch.float64)
         times = checked_number("step", step, above=0) * rows
@@ -363,10 +301,9 @@ class Records:
         return cls([Record(times, *part, name=f"window {i}") for i, part in parts], spec)
 
     def trajectories(self, step: float | None = None) -> Trajectories:
-        """Return the trajectories of all records, as dynamics learn them and score them.
+        """Return the trajectories of all records, to learn dynamics from or to score them by.
 
-        Rows are in the order of the records. An episode is what follows each other without a gap,
-        and without a row that is left out.
+        An episode ends at a gap, and where a row is left out.
 
         Args:
             step: The control step, in the unit of the times. Default: the step of the spec, and
@@ -381,21 +318,17 @@ class Records:
                 in full, or end at one of which nothing was measured that a model predicts; or
                 stretches, because they are shorter than a step.
         """
-        data, short = self._transitions(step)
+        data = _transitions(control_steps(self, step))
         complete = ~data.states.isnan().any(-1)
         kept = data.some(complete & ~data.next_states[:, self.spec.predicted].isnan().all(-1))
         if not len(kept.states):
-            columns = zip(self.spec.states, (~data.states.isnan()).sum(0).tolist(), strict=True)
             raise ValueError(
                 f"Expected steps from a state that was measured in full, found none of "
-                f"{len(data.states)}; of these were measured, state by state: "
-                f"{', '.join(f'{name} {number}' for name, number in columns)}.{self._hidden(data)}"
+                f"{len(data.states)}.{self._hidden(data)}"
             )
-        if short or len(kept.states) < len(data.states):
-            total = short + len(data.episode.unique())
+        if len(kept.states) < len(data.states):
             warnings.warn(
-                f"Left out: {short} of {total} stretches, shorter than a step; "
-                f"{len(data.states) - len(kept.states)} of {len(data.states)} steps, "
+                f"Left out: {len(data.states) - len(kept.states)} of {len(data.states)} steps, "
                 f"{int((~complete).sum())} of which start at a state not measured in full.",
                 UserWarning,
                 stacklevel=2,
@@ -405,78 +338,16 @@ class Records:
     def windows(self, length: int, step: float | None = None, stride: int | None = None) -> Windows:
         """Cut windows, to compare with :meth:`~gpadjust.dynamics.Dynamics.free_run`.
 
-        A window starts only at a state that was measured in full; else at the next one that was.
-        What follows may lack entries.
-
-        Args:
-            length: The number ``T`` of control steps.
-            step: The control step, as of :meth:`trajectories`.
-            stride: Steps from the start of a window to that of the next. Default: ``length``.
-
-        Raises:
-            ValueError: If no stretch is as long, a state is hidden, or as :meth:`trajectories`.
+        For ``step`` and errors see :meth:`trajectories`, for the rest :meth:`Trajectories.windows`;
+        no state may be hidden.
         """
-        data, _ = self._transitions(step)
+        data = _transitions(control_steps(self, step))
         if hidden := self._hidden(data):
             raise ValueError(f"Expected states measured in full, for windows to start at.{hidden}")
         return data.windows(length, stride)
 
-    def resampled(self, step: float, *, max_gap: float | None = None) -> Records:
-        """Return records with even rows of this step, from the beginning of each stretch.
-
-        States are on the line between the two rows about them (angles the shortest way round),
-        which errs by up to an eighth of their acceleration times the square of the time between
-        the rows, and NaN if one of these is; actions are means over the new steps. Stretches are
-        segments of the new record, of a single row where they are shorter than a step.
-
-        Args:
-            step: The time from one new row to the next.
-            max_gap: The longest time between two rows to interpolate over. Default: 1.5 times the
-                median of a record.
-
-        Raises:
-            ValueError: If the step is less than half a sampling step, no stretch is as long as a
-                step, or times differ so much that it takes ``max_gap`` to say what a gap is.
-
-        Warns:
-            UserWarning: If whole records are left out.
-        """
-        step = checked_number("step", step, above=0)
-        max_gap = None if max_gap is None else checked_number("max_gap", max_gap, above=0)
-        records, left_out = [], []
-        for record in self.records:
-            parts = _even_parts(record, self.spec, step, max_gap)
-            if any(len(times) > 1 for times, *_ in parts):
-                records.append(joined(parts, record.name))
-            else:
-                left_out.append(record.name)
-        if not records:
-            raise ValueError(
-                f"Expected stretches as long as a step, {step:.4g}, found none; take a shorter "
-                "step, or a longer max_gap."
-            )
-        if left_out:
-            warnings.warn(
-                f"Records are left out that have no stretch as long as a step of {step:.4g}: "
-                f"{', '.join(left_out)}.",
-                UserWarning,
-                stacklevel=2,
-            )
-        return Records(records, self.spec)
-
-    def _transitions(self, step: float | None) -> tuple[Trajectories, int]:
-        """Return all steps, an episode for each stretch, and how many stretches are shorter."""
-        steps, short = in_control_steps(self, step)
-        stretches = [(each, rows) for each in steps for rows in each.stretches()]
-        states = [each.states[rows] for each, rows in stretches]
-        actions = torch.cat([each.actions[rows][:-1] for each, rows in stretches])
-        before = torch.cat([part[:-1] for part in states])
-        after = torch.cat([part[1:] for part in states])
-        episode = [i for i, part in enumerate(states) for _ in part[1:]]
-        return Trajectories(before, actions, after, torch.tensor(episode)), short
-
     def _hidden(self, data: Trajectories) -> str:
-        """The way out if states were never measured; empty if there are none."""
+        """Return the way out if states were never measured; empty if there are none."""
         never = data.states.isnan().all(0).nonzero().flatten().tolist()
         if not never:
             return ""
@@ -487,135 +358,72 @@ class Records:
         )
 
 
-def _columns(given: Any, names: Sequence[str], argument: str) -> dict[str, Any]:
-    """Return the column of each name: the one given, or else that of the same name."""
-    given = {} if given is None else given
-    if not isinstance(given, Mapping):
-        raise TypeError(
-            f"Expected {argument} as a dictionary from names of the spec to columns, such as "
-            f"{{{names[0]!r}: 'q'}}, found {given!r}."
-        )
-    if unknown := [name for name in given if name not in names]:
-        raise ValueError(
-            f"There is no {unknown[0]!r} among the {argument} of the spec, {tuple(names)}."
-        )
-    return {name: given.get(name, name) for name in names}
+def control_steps(records: Records, step: float | None) -> Records:
+    """Return records whose rows are control steps, at even times: one for each stretch.
 
-
-def in_control_steps(records: Records, step: float | None) -> tuple[Records, int]:
-    """Return records whose rows are control steps, each stretch a segment.
-
-    Also return how many stretches are left out, as they are shorter than a step. For ``step`` see
-    :meth:`Records.trajectories`.
+    For ``step`` and errors see :meth:`Records.trajectories`; a warning says how many stretches are
+    left out.
     """
     if not isinstance(records, Records):
         raise TypeError(f"Expected records as Records([record, ...], spec), found {records!r}.")
-    every, spec = _rows_a_step(records, step), records.spec
+    spec, step = records.spec, _checked_step(records, step)
     steps, short = [], 0
     for record in records:
-        parts = []
+        every = record.rows_in(step)
         for rows in record.stretches():
-            num_steps = (rows.stop - rows.start - 1) // every
-            if not num_steps:
+            number = (rows.stop - rows.start - 1) // every
+            if not number:
                 short += 1
                 continue
-            taken = slice(rows.start, rows.start + num_steps * every + 1, every)
-            states = record.states[taken].clone()
+            end = rows.start + number * every
+            times = record.times[rows.start] + step * torch.arange(number + 1, dtype=torch.float64)
+            states = record.states[rows.start : end + 1 : every].clone()
             if every > 1:  # recorded ones are of a row before, not of a step
                 states[0, spec.previous_columns] = math.nan
-            actions = record.actions[rows][: num_steps * every]
-            actions = actions.unflatten(0, (num_steps, every)).mean(1)
+            actions = record.actions[rows.start : end].unflatten(0, (number, every)).mean(1)
             actions = torch.cat([actions, actions[-1:]])  # the last: not read
-            parts.append((record.times[taken], states, actions))
-        if parts:
-            steps.append(remember(joined(parts, record.name), spec))
+            remember(states, actions, spec)
+            steps.append(Record(times, states, actions, name=record.name))
     if not steps:
         raise ValueError(
-            f"Expected a stretch of {every + 1} rows or more, which are a control step, found none "
-            f"of {short}; take a shorter step."
+            f"Expected a stretch as long as a control step, {step:.4g}, found none of {short}; "
+            "take a shorter step."
         )
-    return Records(steps, spec), short
+    if short:
+        warnings.warn(
+            f"Left out: {short} of {short + len(steps)} stretches, shorter than a step.",
+            UserWarning,
+            stacklevel=3,
+        )
+    return Records(steps, spec)
 
 
-def remember(record: Record, spec: StateSpec) -> Record:
-    """Write earlier states and actions into the states of control steps that hold them."""
-    rows = record._follows.nonzero().flatten()
+def remember(states: Tensor, actions: Tensor, spec: StateSpec) -> None:
+    """Write earlier states and actions into the states of a stretch that hold them."""
     for _ in spec.previous:  # as often as the longest chain of them needs
-        earlier = record.states[rows], record.actions[rows]
-        record.states[rows + 1] = spec.remember(record.states[rows + 1], *earlier)
-    return record
+        states[1:] = spec.remember(states[1:].clone(), states[:-1].clone(), actions[:-1])
 
 
-def joined(parts: Sequence[Rows], name: str) -> Record:
-    """Return a record with a segment for each part."""
-    labels = [i for i, (times, *_) in enumerate(parts) for _ in times]
-    times, states, actions = (torch.cat(column) for column in zip(*parts, strict=True))
-    return Record(times, states, actions, labels, name)
-
-
-def _rows_a_step(records: Records, step: float | None) -> int:
-    """Return the number of rows of the records that make a control step."""
-    for record in records:
-        record.check_even()
-    fast, *_, slow = sorted((*records, records.records[0]), key=lambda each: each.sampling_step)
-    sampling, spec_step = fast.sampling_step, records.spec.step
-    if slow.sampling_step - sampling > _SAME * sampling:
+def _checked_step(records: Records, step: float | None) -> float:
+    """Return the control step: the one given, that of the spec, or the first sampling step."""
+    wanted = None if step is None else checked_number("step", step, above=0)
+    known = records.spec.step
+    if wanted is None or known is None:
+        return wanted or known or records.records[0].sampling_step
+    if abs(wanted - known) > _SAME * known:
         raise ValueError(
-            f"Expected records of one sampling step, found {sampling:.4g} of {fast.name!r} and "
-            f"{slow.sampling_step:.4g} of {slow.name!r}; bring them to one by "
-            f"`records.resampled({slow.sampling_step:.4g})`."
-        )
-    wanted = spec_step if step is None else checked_number("step", step, above=0)
-    if wanted is None:
-        return 1
-    if spec_step is not None and abs(wanted - spec_step) > _SAME * spec_step:
-        raise ValueError(
-            f"Expected the step of the spec, {spec_step:.4g}, got {wanted:.4g}; leave `step` out, "
+            f"Expected the step of the spec, {known:.4g}, got {wanted:.4g}; leave `step` out, "
             "or make a spec with this step."
         )
-    every = round(wanted / sampling)
-    if abs(wanted - every * sampling) > _SAME * wanted:
-        other = f", or first `records.resampled({wanted:.4g})`" if every else ""
-        raise ValueError(
-            f"Expected a control step that is a whole multiple of the sampling step, "
-            f"{sampling:.4g}, got {wanted:.4g}; take {max(every, 1) * sampling:.4g}{other}."
-        )
-    return every
+    return wanted
 
 
-def _even_parts(record: Record, spec: StateSpec, step: float, max_gap: float | None) -> list[Rows]:
-    """Return rows of this step, stretch by stretch; of a shorter one its first row."""
-    finest = _FINEST * record.sampling_step
-    if step < finest:
-        raise ValueError(
-            f"Record {record.name!r}: expected a step of half a sampling step, {finest:.4g}, or "
-            f"more, as nothing was measured between rows; got {step:.4g}."
-        )
-    parts = []
-    for rows in record.stretches(max_gap):
-        times, states, actions = record.times[rows], record.states[rows], record.actions[rows]
-        num_steps = int((times[-1] - times[0]) / step + _ROUNDING)
-        if not num_steps:
-            parts.append((times[:1], states[:1], actions[:1]))
-            continue
-        edges = times[0] + step * torch.arange(num_steps + 2, dtype=torch.float64)
-        states = _interpolated(times, states, edges[:-1], spec.change)
-        # The mean of an action is the difference of its integral, which is linear between rows.
-        times = torch.cat([times, times[-1:] + edges[-1:] - edges[:1]])  # the last one goes on
-        integral = torch.nn.functional.pad(actions * times.diff()[:, None], (0, 0, 1, 0)).cumsum(0)
-        integral = _interpolated(times, integral, edges, lambda before, after: after - before)
-        parts.append((edges[:-1], states, integral.diff(dim=0) / edges.diff()[:, None]))
-    return parts
-
-
-def _interpolated(
-    times: Tensor, values: Tensor, at: Tensor, change: Callable[[Tensor, Tensor], Tensor]
-) -> Tensor:
-    """Return values ``n x k`` on the lines between rows; at a row that row, but for rounding."""
-    rows = (torch.searchsorted(times, at, right=True) - 1).clamp(0, len(times) - 2)
-    share = ((at - times[rows]) / (times[rows + 1] - times[rows])).clamp(0, 1)
-    share = torch.where((share - share.round()).abs() < _ROUNDING, share.round(), share)[:, None]
-    before, after = values[rows], values[rows + 1]
-    between = before + share * change(before, after)
-    # At a row it is what was measured there, whether its neighbour was or not.
-    return torch.where(share == 0, before, torch.where(share == 1, after, between))
+def _transitions(steps: Records) -> Trajectories:
+    """Return all transitions of records in control steps, an episode for each."""
+    lengths = torch.tensor([len(record.times) - 1 for record in steps])
+    return Trajectories(
+        torch.cat([record.states[:-1] for record in steps]),
+        torch.cat([record.actions[:-1] for record in steps]),
+        torch.cat([record.states[1:] for record in steps]),
+        torch.arange(len(steps)).repeat_interleave(lengths),
+    )

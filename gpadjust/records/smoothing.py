@@ -1,4 +1,4 @@
-r"""The states that a machine went through, from noisy and incomplete records and a physics.
+"""The states of a machine, from noisy and incomplete records and a physics.
 
 From top to bottom: :func:`smooth`; the search for the most likely states, parameters and noises;
 the chain of Gaussian states that the physics makes near a path; the variation of parameters from
@@ -13,14 +13,13 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gpadjust.checks import checked_whole, progress_bar
+from gpadjust.checks import check_kind, checked_whole, finite_array, progress_bar
 from gpadjust.dynamics.free_run import of_states
 from gpadjust.dynamics.least_squares import even_normal
 from gpadjust.dynamics.targets import check_next_values, one_physics
@@ -28,7 +27,7 @@ from gpadjust.physics import ODEPhysics, Physics, PhysicsError
 from gpadjust.physics.parameters import PhysicsParameters
 from gpadjust.records import kalman
 from gpadjust.records.kalman import Array, Link, Smoothed
-from gpadjust.records.records import Record, Records, in_control_steps, joined, remember
+from gpadjust.records.records import Record, Records, control_steps, remember
 from gpadjust.states import StateSpec
 from gpadjust.states.state_spec import side_by_side
 
@@ -57,16 +56,16 @@ class SmoothingWarning(UserWarning):
 
 @dataclass(frozen=True, repr=False, eq=False)
 class SmoothedRecords:
-    r"""The states of a machine while it was recorded, as :func:`smooth` finds them.
+    r"""The states of a machine while it was recorded, as :func:`smooth` estimates them.
 
     Attributes:
-        records: The most likely states, at the control steps.
+        records: The most likely states at the control steps, a record for each stretch.
         sd: Their standard deviations, ``N x state_dim`` of each record; 0 of states that the
             physics does not move.
-        noise: Standard deviations of the errors of what was measured, ``state_dim``; NaN of a state
-            that never was, 0 of those that the physics does not move.
+        noise: Standard deviations of the measurements' errors, ``state_dim``; NaN of hidden states,
+            0 of those that the physics does not move.
         process_noise: Standard deviations of what a step adds to the physics, ``state_dim``.
-        log_density: Of what was measured, near these states.
+        log_density: Of the measurements, near these states.
     """
 
     records: Records
@@ -94,11 +93,10 @@ class SmoothedRecords:
         """Variation of the parameters from one stretch of the records to another, ``p``.
 
         Standard deviations, in those of each parameter's prior: with 0.1, and a prior of a factor
-        of 1.5, some 4 %. They explain best, given the noises, stretches that have parameters of
-        their own each; where the stretches tell nothing, they are 0.05. No equation is right in
-        all: what it lacks shows as parameters that vary, and moves a free run for as long as that
-        lasts, where process noise averages out. :meth:`Dynamics.free_run` takes it. Records of one
-        machine and day tell nothing of another's.
+        of 1.5, some 4 %. They explain best, given the noises, stretches of which each has its own
+        parameters; where the stretches tell nothing, they are 0.05. What an equation lacks shows as
+        parameters that vary, and moves a free run for as long as it lasts, where process noise
+        averages out: see ``variation`` of :meth:`Dynamics.free_run`.
 
         Raises:
             ValueError: If the physics has no unknown parameters.
@@ -147,28 +145,24 @@ def smooth(
     .. math:: x_{t+1} = f_p(x_t, u_t; \theta) + q_t, \quad y_t = x_t + e_t, \quad
               q_t \sim N(0, Q), \quad e_t \sim N(0, R)
 
-    with diagonal R, the noise, and Q, the process noise, which has all that f_p does not know.
-    States x, unknown parameters :math:`\theta` of the physics, R and Q are estimated together, by
-    an iterated extended Kalman smoother and expectation maximisation. Where Q turns out small this
-    fits f_p to free runs, as shooting methods do; where it is large, to single steps, but not
-    from noisy states (errors in variables). Look at the noise that is found: a physics that is
-    wrong beyond its parameters takes for noise what it does not follow, and pulls states to itself.
+    with diagonal R, the noise, and Q, the process noise, which has all that f_p lacks. States x,
+    unknown parameters :math:`\theta` of the physics, R and Q are estimated together, by an iterated
+    extended Kalman smoother and expectation maximisation. Where Q turns out small this fits f_p to
+    free runs, as shooting methods do; where it is large, to single steps.
 
     Args:
         records: The records. A state that is NaN throughout is hidden.
         physics: The next values of the states that are neither exogenous nor previous actions,
-            from these and the actions, as of :class:`LearnedDynamics`; its unknown parameters are
-            learnt from all records together.
+            from these and the actions, as of :class:`LearnedDynamics`.
         step: The control step, as of :meth:`Records.trajectories`.
         start: Of states by name, mean and standard deviation at the beginning of each stretch;
             needed of hidden ones. Default: about the first that was measured.
-        noise: Standard deviations ``state_dim`` of the errors of what was measured; NaN for those
-            to be learnt. Default: all.
+        noise: Standard deviations ``state_dim`` of the measurements' errors; NaN for those to be
+            learnt. Default: all.
         process_noise: The same of what a step adds to f_p. Learnt, it makes the best predictions of
-            the next measurement; said to be small, it fits f_p to long free runs, to which errors
-            that persist, as of a wrong f_p, would otherwise be noise.
-        num_starts: How many starts to take the best end of, if there is something to learn of
-            the physics. Default: 4 with hidden states, else 1.
+            the next measurement; a small one fits f_p to long free runs.
+        num_starts: How many starts to take the best end of. Default: 4 with hidden states and
+            unknown parameters, else 1.
         max_rounds: The most rounds of smoothing of each. With hidden states all of them may be
             needed: 4 starts of 100 rounds, half a minute for 300 rows and a physics of formulas.
         progress: If True, show a progress bar.
@@ -176,7 +170,7 @@ def smooth(
     Raises:
         TypeError: If an argument is of the wrong type.
         ValueError: If a hidden state has no start, names or numbers are wrong, or as
-            :meth:`Records.trajectories`.
+            :meth:`Records.trajectories`, as are the warnings.
         PhysicsError: If the physics fails at measured states.
         RuntimeError: If the states diverge from all starts.
 
@@ -199,52 +193,48 @@ def smooth(
         >>> states = torch.stack([position, torch.full_like(t, torch.nan)], dim=-1)
         >>> spec = StateSpec(["x", "v"], ["u"])
         >>> records = Records(Record(t, states, torch.zeros_like(states[:, :1])), spec)
-        >>> found = smooth(records, physics, start={"v": (0.0, 1.0)})
-        >>> bool((found.physics_parameters.mean - 2.25).abs() < 0.05)
+        >>> smoothed = smooth(records, physics, start={"v": (0.0, 1.0)})
+        >>> bool((smoothed.physics_parameters.mean - 2.25).abs() < 0.05)
         True
     """
     checked_whole("max_rounds", max_rounds, 1)
-    steps, short = in_control_steps(records, step)
-    spec = records.spec
-    if short:
-        total = short + sum(len(record.stretches()) for record in steps)
-        warnings.warn(
-            f"Left out: {short} of {total} stretches, shorter than a step.",
-            UserWarning,
-            stacklevel=2,
-        )
-    steps = _with_known_inputs(steps)
+    steps = _with_known_inputs(control_steps(records, step))
+    spec, length = records.spec, steps.records[0].sampling_step
     f_p = one_physics(physics, spec, "smooth by one of them")
-    found = float(steps.records[0].times[1] - steps.records[0].times[0])
-    if isinstance(f_p, ODEPhysics) and abs(f_p.step - found) > _SAME * found:
+    if isinstance(f_p, ODEPhysics) and abs(f_p.step - length) > _SAME * length:
         raise ValueError(
             f"Physics {f_p.name!r} makes steps of {f_p.step:g}, but the control step of the "
-            f"records is {found:g}; pass step={f_p.step:g}, or build it with step={found:g}."
+            f"records is {length:g}; pass step={f_p.step:g}, or build it with step={length:g}."
         )
     known = {"noise": noise, "process_noise": process_noise}
     variances = np.stack([_variances(sd, name, spec) for name, sd in known.items()])
     chain = Chain(f_p, steps, variances, _starts(start, spec))
-    chain.check_measured()
     if num_starts is None:
         num_starts = 4 if chain.hidden.any() and f_p.unknowns else 1
     checked_whole("num_starts", num_starts, 1)
     estimate = _estimate(chain, max_rounds, num_starts, progress)
     covariances = np.concatenate([part.states.covariances for part in estimate.stretches])
-    squares = np.diagonal(covariances, axis1=1, axis2=2)[:, : chain.d].clip(0)
-
-    def roots(variances: Array) -> Tensor:
-        """Of all states, 0 of those that the physics does not move."""
-        sd = torch.zeros(len(variances), spec.state_dim, dtype=torch.float64)
-        sd[:, spec.moving] = torch.from_numpy(np.sqrt(variances))
-        return sd
-
-    sd = roots(squares).split([len(record.times) for record in steps])
-    noises = roots(estimate.variances)
-    noises[0, np.array(spec.moving)[chain.hidden]] = math.nan
-    smoothed = _with_states(steps, estimate.states)
+    sd = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)[:, : chain.d].clip(0))
+    noises = np.sqrt(estimate.variances)
+    noises[0, chain.hidden] = math.nan
+    sd_of_noise, sd_of_process = _of_all_states(noises, spec)
+    each_sd = _of_all_states(sd, spec).split([len(record.times) for record in steps])
     return SmoothedRecords(
-        smoothed, sd, noises[0], noises[1], estimate.log_density, chain, estimate
+        _with_states(steps, estimate.states),
+        each_sd,
+        sd_of_noise,
+        sd_of_process,
+        estimate.log_density,
+        chain,
+        estimate,
     )
+
+
+def _of_all_states(moving: Array, spec: StateSpec) -> Tensor:
+    """Return rows of all states, from those that the physics moves; 0 of the others."""
+    rows = torch.zeros(len(moving), spec.state_dim, dtype=torch.float64)
+    rows[:, spec.moving] = torch.from_numpy(moving)
+    return rows
 
 
 def _with_states(steps: Records, path: Array) -> Records:
@@ -254,13 +244,13 @@ def _with_states(steps: Records, path: Array) -> Records:
     for record, part in zip(steps, parts, strict=True):
         states = record.states.clone()
         states[:, moving] = part
-        new = Record(record.times, states, record.actions, record.segments, record.name)
-        records.append(remember(new, steps.spec))
+        remember(states, record.actions, steps.spec)
+        records.append(Record(record.times, states, record.actions, name=record.name))
     return Records(records, steps.spec)
 
 
 def _with_known_inputs(steps: Records) -> Records:
-    """Return stretches from where all is known that the physics reads beside states that move."""
+    """Return stretches from where all inputs of the physics that do not move are known."""
     spec, records = steps.spec, []
     beside = [i for i in spec.physics_columns if i < spec.state_dim and i not in spec.moving]
     names = [spec.states[i] for i in beside]
@@ -274,15 +264,10 @@ def _with_known_inputs(steps: Records) -> Records:
                 "would have to find, too; it takes earlier actions only."
             )
     for record in steps:
-        parts = []
-        for rows in record.stretches():
-            unknown = record.states[rows, beside][:-1].isnan().any(1).nonzero().flatten().tolist()
-            first = rows.start + max(unknown, default=-1) + 1
-            if first < rows.stop - 1:
-                part = slice(first, rows.stop)
-                parts.append((record.times[part], record.states[part], record.actions[part]))
-        if parts:
-            records.append(joined(parts, record.name))
+        unknown = record.states[:-1, beside].isnan().any(1).nonzero().flatten().tolist()
+        first = max(unknown, default=-1) + 1
+        if first < len(record.times) - 1:
+            records.append(record.part(slice(first, None)))
     if not records:
         raise ValueError(
             f"Expected stretches with all of {', '.join(names)}, which the physics reads."
@@ -292,9 +277,8 @@ def _with_known_inputs(steps: Records) -> Records:
 
 def _variances(sd: Tensor | None, name: str, spec: StateSpec) -> Array:
     """Return variances of the states that move, NaN where they are to be learnt."""
-    if sd is None:
-        return np.full(len(spec.moving), math.nan)
-    sd = of_states(sd, name, (spec.state_dim,))
+    unknown = torch.full((spec.state_dim,), math.nan, dtype=torch.float64)
+    sd = of_states(unknown if sd is None else sd, name, (spec.state_dim,))
     if (sd <= 0).any() or sd.isinf().any():
         raise ValueError(
             f"Expected {name} as standard deviations above 0, or NaN for those to be learnt, got "
@@ -306,28 +290,26 @@ def _variances(sd: Tensor | None, name: str, spec: StateSpec) -> Array:
 
 def _starts(start: Mapping[str, tuple[float, float]] | None, spec: StateSpec) -> Array:
     """Return means and standard deviations, ``2 x d``, of first states; NaN if they are unknown."""
-    if start is not None and not isinstance(start, Mapping):
-        raise TypeError(
-            f"Expected start as a dictionary, such as {{{spec.states[0]!r}: (0.0, 1.0)}}: mean and "
-            f"standard deviation, got {start!r}."
-        )
     names = [spec.states[i] for i in spec.moving]
+    start = {} if start is None else start
+    example = f"a dictionary, such as {{{names[0]!r}: (0.0, 1.0)}}: mean and standard deviation"
+    check_kind("start", start, Mapping, example)
     moments = np.full((2, len(names)), math.nan)
-    for name, pair in (start or {}).items():
+    for name, pair in start.items():
         if name not in names:
             raise ValueError(f"start: there is no {name!r} among the states that move, {names}.")
-        numbers = isinstance(pair, Sequence) and all(isinstance(x, Real) for x in pair)
-        if not numbers or len(pair) != 2 or not -math.inf < pair[0] < math.inf > pair[1] > 0:
+        numbers = finite_array(pair, (2,))
+        if numbers is None or numbers[1] <= 0:
             raise ValueError(
                 f"start: expected mean and standard deviation of {name!r}, the latter above 0, got "
                 f"{pair!r}."
             )
-        moments[:, names.index(name)] = pair
+        moments[:, names.index(name)] = numbers
     return moments
 
 
 class Estimate(NamedTuple):
-    """The states that stretches went through, and what decided that.
+    """The states of all stretches, and the variances by which they were found.
 
     Moments are of ``d`` states and after them the coordinates of the ``p`` unknown parameters.
     """
@@ -335,24 +317,11 @@ class Estimate(NamedTuple):
     stretches: list[Smoothed]
     states: Array  # their means, one stretch after the other, M x (d + p)
     variances: Array  # of noise and process noise, 2 x d
-    log_density: float  # of what was measured
+    log_density: float  # of the measurements
 
 
 def _estimate(chain: Chain, max_rounds: int, num_starts: int, progress: bool) -> Estimate:
-    """Find states, parameters of the physics and sizes of errors that explain stretches best.
-
-    Of several starts the best end counts. They are at the guesses of the parameters, and then at
-    draws from their priors. Variances that are known come down to this from the sizes of f_p's
-    errors in single steps, as a trajectory that may hardly leave the physics is often found by way
-    of those that may; of every other start they are so from the beginning.
-
-    Raises:
-        PhysicsError: If the physics fails at the measured states.
-        RuntimeError: If no start leads anywhere.
-
-    Warns:
-        SmoothingWarning: If there are no rounds left.
-    """
+    """Find the most likely states, parameters of the physics and variances from several starts."""
     ends = list[tuple[Estimate, float]]()
     with progress_bar(progress, total=num_starts * max_rounds, unit="round") as bar:
         for i, (coordinates, known_at_once) in enumerate(chain.starts_of_search(num_starts)):
@@ -429,7 +398,7 @@ def _search(
 
 
 class Path(NamedTuple):
-    """States through all stretches, and what was measured, angles within half a turn of them."""
+    """States through all stretches, and the measurements, angles within half a turn of them."""
 
     states: Array  # M x d
     measured: Array  # M x d
@@ -442,7 +411,8 @@ class Chain:
 
     Rows of the stretches are one after the other: ``M`` states, of which ``N`` are followed by
     another one. Known are variances of noise and process noise, and mean and standard deviation of
-    first states, ``2 x d`` each; NaN where they are not.
+    first states, ``2 x d`` each; NaN where they are not. A ValueError says if nothing was measured,
+    or a hidden state has no start.
     """
 
     def __init__(self, physics: Physics, steps: Records, variances: Array, start: Array) -> None:
@@ -450,8 +420,7 @@ class Chain:
         moving = self.spec.moving
         self.d, self.num_parameters = len(moving), len(physics.unknowns)
         self.angles = [moving.index(i) for i in self.spec.angle_columns if i in moving]
-        parts = [rows for record in steps for rows in record.stretches()]
-        self.lengths = np.array([rows.stop - rows.start for rows in parts])
+        self.lengths = np.array([len(record.times) for record in steps])
         ends = self.lengths.cumsum()
         self.firsts = ends - self.lengths
         self.stretches = [slice(*rows) for rows in zip(self.firsts, ends, strict=True)]
@@ -462,11 +431,20 @@ class Chain:
         y = self.measured = states[:, moving].numpy()
         for rows in self.stretches:
             for i in self.angles:  # go on without jumps
-                seen = rows.start + np.flatnonzero(~np.isnan(y[rows, i]))
-                y[seen, i] = np.unwrap(y[seen, i])
-        self.hidden, self.known_variances, self.known_start = np.isnan(y).all(0), variances, start
+                known = rows.start + np.flatnonzero(~np.isnan(y[rows, i]))
+                y[known, i] = np.unwrap(y[known, i])
+        self.hidden, self.known_variances = np.isnan(y).all(0), variances
+        (mean, sd), names = start, [self.spec.states[i] for i in moving]
+        if self.hidden.all():
+            raise ValueError(f"Expected measured states, found none of {', '.join(names)}.")
+        for column in np.flatnonzero(self.hidden & np.isnan(mean)):
+            name = repr(names[column])
+            raise ValueError(
+                f"State {name} was never measured; say where it may be at the beginning of a "
+                f"stretch, such as start={{{name}: (0.0, 1.0)}}: mean and standard deviation."
+            )
         # By how much each state varies, as far as is known
-        middle, (mean, sd) = _means(y, otherwise=0.0), start
+        middle = _means(y, otherwise=0.0)
         varies = np.fmax(sd, np.sqrt(_means((y - middle) ** 2, otherwise=0.0)))
         middle = np.where(((~np.isnan(y)).sum(0) < 2) & ~np.isnan(mean), mean, middle)
         size = np.maximum(np.abs(middle), np.nan_to_num(np.abs(y)).max(0))
@@ -482,28 +460,21 @@ class Chain:
         covariance = np.diag(np.concatenate([self.first_variance, np.ones(p)]))
         self.starts = [(np.concatenate([x, np.zeros(p)]), covariance) for x in self.first]
 
-    def check_measured(self) -> None:
-        """Raise a ValueError if nothing was measured, or a hidden state has no start."""
-        names = [self.spec.states[i] for i in self.spec.moving]
-        if self.hidden.all():
-            raise ValueError(f"Expected measured states, found none of {', '.join(names)}.")
-        for i in np.flatnonzero(self.hidden & np.isnan(self.known_start[0])):
-            raise ValueError(
-                f"State {names[i]!r} was never measured; say where it may be at the beginning of a "
-                f"stretch, such as start={{{names[i]!r}: (0.0, 1.0)}}: mean and standard deviation."
-            )
-
     def starts_of_search(self, number: int) -> Iterator[tuple[Array, bool]]:
-        """Yield coordinates of the parameters, and if known variances are so from the beginning."""
+        """Yield coordinates of the parameters, and if known variances are so from the beginning.
+
+        They are at the guesses, and then at draws from the priors. Variances that are known come
+        down to this from the sizes of f_p's errors in single steps, as a trajectory that may hardly
+        leave the physics is often found by way of those that may; of every other start they are so
+        from the beginning.
+        """
         p = self.num_parameters
         something_known = not np.isnan(self.known_variances).all()
-        yield np.zeros(p), False
-        if something_known and number > 1:
-            yield np.zeros(p), True
-        others = max(number - 2, 0) if something_known else number - 1
-        if p and others:
-            for i, coordinates in enumerate(even_normal(others, p, seed=0).numpy()):
-                yield coordinates, something_known and i % 2 == 1
+        starts = [np.zeros(p)] * (2 if something_known else 1)
+        if p and number > len(starts):
+            starts += [*even_normal(number - len(starts), p, seed=0).numpy()]
+        for i, coordinates in enumerate(starts[:number]):
+            yield coordinates, something_known and i % 2 == 1
 
     def first_path(self, parameters: Array) -> Path:
         """Return measured states, and between them and in hidden ones those to which f_p leads."""

@@ -13,20 +13,14 @@ if TYPE_CHECKING:
 SIZE = WIDTH, HEIGHT = 600, 300
 METRE = 140.0  # pixels
 ROAM = 1.5  # the cart moves in the frame up to here (m); beyond, the frame moves with it
-TRACK_LEVEL = 0.5  # of the height
 
 
 def draw_cart_pole(
     canvas: pygame.Surface, x: float, theta: float, length: float, reach: float
 ) -> None:
-    """Draw a cart-pole.
+    """Draw a cart at x, a pole at an angle from upright, and an arrow of the force, in m and rad.
 
-    Args:
-        canvas: ``SMOOTH`` times as large as :data:`SIZE`.
-        x: Where the cart is, in m.
-        theta: The angle of the pole from upright, in rad.
-        length: The length of the pole, in m.
-        reach: The length of the arrow of the force, in m.
+    The canvas is ``SMOOTH`` times as large as :data:`SIZE`.
     """
     import pygame
 
@@ -35,16 +29,14 @@ def draw_cart_pole(
     left = x - min(max(x, -ROAM), ROAM) - WIDTH / METRE / 2  # of the frame, in m
 
     def at(across: float, up: float) -> tuple[float, float]:
-        return (across - left) * scale, SMOOTH * HEIGHT * TRACK_LEVEL - up * scale
+        return (across - left) * scale, SMOOTH * HEIGHT / 2 - up * scale
 
     canvas.fill(WHITE)
     draw.line(canvas, GREY, at(left, 0), at(left + WIDTH / METRE, 0), round(0.012 * scale))
     for tick in range(math.ceil(2 * left), math.floor(2 * (left + WIDTH / METRE)) + 1):
         draw.line(canvas, LIGHT, at(tick / 2, -0.06), at(tick / 2, -0.14), round(0.01 * scale))
-
-    goal = at(0, length)
-    draw.circle(canvas, GREEN, goal, 0.08 * scale, round(0.014 * scale))
-    draw.circle(canvas, GREEN, goal, 0.016 * scale)
+    draw.circle(canvas, GREEN, at(0, length), 0.08 * scale, round(0.014 * scale))  # the goal
+    draw.circle(canvas, GREEN, at(0, length), 0.016 * scale)
 
     cart = pygame.Rect(0, 0, round(0.4 * scale), round(0.18 * scale))
     cart.center = (round(at(x, 0)[0]), round(at(x, 0)[1]))
@@ -66,8 +58,8 @@ def draw_cart_pole(
 
     if reach:
         side = math.copysign(1.0, reach)
-        start, head, level = x + side * 0.22, min(0.08, abs(reach)), 0.0
+        start = x + side * 0.22
         end = start + reach
-        neck = end - side * head
-        draw.line(canvas, BLACK, at(start, level), at(neck, level), round(0.025 * scale))
-        draw.polygon(canvas, BLACK, [at(end, level), at(neck, 0.05), at(neck, -0.05)])
+        neck = end - side * min(0.08, abs(reach))
+        draw.line(canvas, BLACK, at(start, 0), at(neck, 0), round(0.025 * scale))
+        draw.polygon(canvas, BLACK, [at(end, 0), at(neck, 0.05), at(neck, -0.05)])

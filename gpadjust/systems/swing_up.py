@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gpadjust.checks import (
     check_columns,
+    check_kind,
     check_switch,
     checked_number,
     checked_options,
@@ -41,14 +42,11 @@ CART_POLE_SPEC = StateSpec(
 )
 """The state of the cart-pole; policy and model see sine and cosine of the angle."""
 
-CART_POLE_RAW_SPEC = replace(CART_POLE_SPEC, angles=())
-"""The same state with the angle as it is, not wrapped: the observation is the state."""
-
 
 def cart_pole_spec(encode_angle: bool = True, time_step: float = TIME_STEP) -> StateSpec:
     """Return the spec of these options of the environment."""
     step = checked_number("time_step", time_step, above=0)
-    return replace(CART_POLE_SPEC if encode_angle else CART_POLE_RAW_SPEC, step=step)
+    return replace(CART_POLE_SPEC, angles=("theta",) if encode_angle else (), step=step)
 
 
 @dataclass(frozen=True)
@@ -104,15 +102,10 @@ class CartPoleEquation:
             checked_number(entry.name, getattr(self, entry.name), **limits)
 
     def __call__(self, state: Tensor, action: Tensor, p: Mapping[str, Any] | None = None) -> Tensor:
-        """The time derivative of the state.
+        """Return the time derivative ``... x 4`` of states ``... x 4`` under forces ``... x 1``.
 
-        Args:
-            state: ``... x 4``: position, angle, velocity and angular velocity, in m, rad and s.
-            action: ``... x 1``, the force in N.
-            p: Other values of some parameters by name, ``...`` each.
-
-        Returns:
-            ``... x 4``.
+        States are position, angle, velocity and angular velocity, in m, rad and s, the force in N;
+        ``p`` has other values of some parameters by name, ``...`` each.
 
         Raises:
             ValueError: If the last dimensions are not 4 and 1.
@@ -145,21 +138,6 @@ class CartPoleEquation:
     def _own(self) -> tuple[Any, ...]:
         return _numbers(vars(self))
 
-    def energy(self, state: Tensor) -> Tensor:
-        """The kinetic and the potential energy in J, ``...``, of states ``... x 4``.
-
-        The potential energy is zero when the pole is level.
-        """
-        _, theta, x_dot, theta_dot = state.unbind(-1)
-        m, length = self.pole_mass, self.pole_length
-        cos = theta.cos()
-        kinetic = (
-            (self.cart_mass + m) * x_dot.square() / 2
-            - m * length * x_dot * theta_dot * cos / 2
-            + m * length**2 * theta_dot.square() / 6
-        )
-        return kinetic + m * self.gravity * length * cos / 2
-
 
 REAL_CART_POLE = CartPoleEquation(cart_mass=0.5, pole_mass=0.5, pole_length=0.6, damping=0.1)
 """The system to control."""
@@ -179,21 +157,13 @@ def equation_physics(
     time_step: float = TIME_STEP,
     unknowns: Mapping[str, Unknown] | None = None,
 ) -> ODEPhysics:
-    """The state of a cart-pole a time step later, under a force that is held.
+    """Return the state of a cart-pole a time step (in s) later, under a force that is held.
 
     It does not limit the force, as the environment does. It integrates by Runge-Kutta of order four
-    with substeps of at most 0.02 s.
-
-    Args:
-        equation: Such as a :class:`CartPoleEquation`.
-        time_step: In s.
-        unknowns: Parameters of the equation that are unknown.
-
-    Returns:
-        A physics of columns ``[x, theta, x_dot, theta_dot, force]``.
+    with substeps of at most 0.02 s. Some parameters of the equation may be unknown.
 
     Example:
-        >>> physics = equation_physics(REAL_CART_POLE)
+        >>> physics = equation_physics(REAL_CART_POLE)  # of columns x, theta, their rates, force
         >>> physics(torch.tensor([[0.0, 0.0, 0.0, 0.0, 1.0]], dtype=torch.float64))
         tensor([[0.0081, 0.0206, 0.1627, 0.4233]], dtype=torch.float64)
     """
@@ -205,15 +175,7 @@ def equation_physics(
 
 
 def believed_cart_pole(seed: int) -> CartPoleEquation:
-    """The cart-pole as someone may believe it to be, who has not measured it.
-
-    :func:`~gpadjust.systems.cart_pole` says from where masses and length are drawn; there is no
-    friction.
-
-    Raises:
-        TypeError: If ``seed`` is no whole number.
-        ValueError: If it is negative.
-    """
+    """Return the cart-pole that someone believes in who has not measured it, without friction."""
     random = np.random.default_rng(checked_whole("seed", seed, 0))
     drawn = random.uniform([0.4, 0.5, 0.5], [0.6, 0.7, 0.7])
     cart_mass, pole_mass, pole_length = map(float, drawn)
@@ -221,20 +183,12 @@ def believed_cart_pole(seed: int) -> CartPoleEquation:
 
 
 def cart_pole_cost(states: Tensor, pole_length: float = REAL_CART_POLE.pole_length) -> Tensor:
-    r"""The cost of states, in [0, 1].
+    r"""Return the cost, in [0, 1], of states ``... x 4``, by the distance d of the tip of the pole.
 
-    With the distance :math:`d` of the pole's tip from where it is when the pole stands upright
-    over the origin,
+    The goal of the tip is where it is when the pole stands upright over the origin:
 
     .. math:: c = 1 - \exp(-2 d^2), \qquad
         d^2 = (x - l \sin\theta)^2 + (l \cos\theta - l)^2.
-
-    Args:
-        states: ``... x 4``.
-        pole_length: The length :math:`l` of the pole, in m.
-
-    Returns:
-        ``...``.
     """
     check_columns("states", states, 4)
     x, theta = states[..., 0], states[..., 1]
@@ -244,15 +198,12 @@ def cart_pole_cost(states: Tensor, pole_length: float = REAL_CART_POLE.pole_leng
 
 
 def cart_pole_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
-    """The reward ``...`` of transitions: minus the cost of the next states ``... x 4``."""
+    """Return the rewards of transitions: minus the cost of the next states ``... x 4``."""
     return -cart_pole_cost(next_states)
 
 
 def cart_pole_start(n: int) -> Tensor:
-    r"""Draw ``n x 4`` start states, hanging at rest but for a spread, from PyTorch's generator.
-
-    Each is from :math:`\mathcal{N}([0, \pi, 0, 0], 0.2^2 I)`.
-    """
+    """Draw start states ``n x 4`` from N([0, pi, 0, 0], 0.2²), by PyTorch's generator."""
     checked_whole("n", n, 0)
     mean = torch.tensor(START_MEAN, dtype=torch.float64)
     return mean + START_STD * torch.randn(n, 4, dtype=torch.float64)
@@ -267,24 +218,18 @@ class CartPoleSwingUpEnv(ViewedEnv):
     ``state`` has the true state in float64. The reward is minus the cost
     of the state that was reached, in [-1, 0], by the distance of the tip from its goal; the
     ``info`` of a step has the ``"cost"``. An episode does not terminate; ``gym.make`` truncates it
-    after 25 steps.
-
-    ``reset(options={"state": [x, theta, x_dot, theta_dot]})`` starts from this state.
-
-    Environments can be pickled at any time and go on as they were, with their random state; the
-    window of a copy opens again.
+    after 25 steps. Environments can be pickled at any time and go on as they were.
 
     Args:
-        render_mode: ``"human"`` shows a window, ``"rgb_array"`` lets ``render`` return a frame.
-            Both need the package ``pygame-ce``.
-        encode_angle: Whether the observation has sine and cosine in place of the angle. Without,
-            it is the state :math:`[x, \theta, \dot{x}, \dot\theta]`, the angle not wrapped.
+        render_mode: ``"rgb_array"`` lets ``render`` return a frame, which needs ``pygame-ce``;
+            ``gymnasium.wrappers.HumanRendering`` shows them in a window.
+        encode_angle: If False, the observation is the state
+            :math:`[x, \theta, \dot{x}, \dot\theta]`, the angle not wrapped.
         equation: The system. Default: the real one.
         time_step: In s.
 
     Raises:
-        TypeError: If ``encode_angle`` is no bool, ``equation`` no equation or ``time_step`` no
-            number.
+        TypeError: If an argument is of another type.
         ValueError: If there is no such render mode, or ``time_step`` is not positive.
 
     Example:
@@ -298,7 +243,7 @@ class CartPoleSwingUpEnv(ViewedEnv):
         -0.004
     """
 
-    caption, size = "Cart-pole", SIZE
+    size = SIZE
     metadata = {"render_modes": RENDER_MODES, "render_fps": round(1 / TIME_STEP)}  # noqa: RUF012
 
     def __init__(
@@ -311,10 +256,7 @@ class CartPoleSwingUpEnv(ViewedEnv):
     ) -> None:
         super().__init__(render_mode)
         check_switch("encode_angle", encode_angle)
-        if not isinstance(equation, CartPoleEquation):
-            raise TypeError(
-                f"equation must be a CartPoleEquation, such as REAL_CART_POLE; found {equation!r}."
-            )
+        check_kind("equation", equation, CartPoleEquation, "a CartPoleEquation")
         self.equation = equation
         self.physics = equation_physics(equation, time_step)
         self.metadata = {**self.metadata, "render_fps": max(round(1 / time_step), 1)}
@@ -328,17 +270,14 @@ class CartPoleSwingUpEnv(ViewedEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Start an episode.
+        """Start an episode, by default from N([0, pi, 0, 0], 0.2²), around hanging at rest.
 
-        Args:
-            seed: For the random start, and those that follow.
-            options: ``{"state": ...}``, the four entries of the state to start from, of magnitude
-                at most 100. Default: drawn around the hanging pole at rest, with standard
-                deviation 0.2.
+        With ``options={"state": [x, theta, x_dot, theta_dot]}`` it starts there.
 
         Raises:
             TypeError: If ``options`` is no dictionary.
-            ValueError: If ``options`` has another key, or the state is not four such numbers.
+            ValueError: If ``options`` has another key, or the state is not four numbers of
+                magnitude at most 100.
         """
         super().reset(seed=seed)
         options = checked_options("options", options, ("state",))
@@ -349,24 +288,16 @@ class CartPoleSwingUpEnv(ViewedEnv):
                     "options['state'] must be four finite numbers, x, theta, x_dot and theta_dot, "
                     f"of magnitude at most {MAX_START:g}; found {options['state']!r}."
                 )
-            state = given
+            self.state = given
         else:
-            state = self.np_random.normal(START_MEAN, START_STD)
-        self.state = state
+            self.state = self.np_random.normal(START_MEAN, START_STD)
         self._force = 0.0
-        self._show()
-        return self._observe(state), {}
+        return self._observe(self.state), {}
 
     def step(
         self, action: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Push the cart for a time step.
-
-        Args:
-            action: The force in N, of shape ``(1,)``; clipped to [-10, 10].
-
-        Returns:
-            Observation, reward, False, False and ``{"cost": ...}``.
+        """Push the cart for a time step by a force in N, of shape ``(1,)``.
 
         Raises:
             ValueError: If the action is not one finite number.
@@ -386,7 +317,6 @@ class CartPoleSwingUpEnv(ViewedEnv):
             cost = cart_pole_cost(state, self.equation.pole_length).item()
         self.state = state.numpy()
         self._force = float(force[0])
-        self._show()
         return self._observe(self.state), -cost, False, False, {"cost": cost}
 
     def _draw(self, canvas: Any, state: NDArray[np.float64]) -> None:
@@ -409,9 +339,9 @@ def cart_pole(
     time_step: float = TIME_STEP,
     episode_length: int = 25,
 ) -> System:
-    """The swing-up of a cart-pole; its physics has other masses, another length and no friction.
+    """Return the swing-up of a cart-pole, a :class:`CartPoleSwingUpEnv`.
 
-    Its environment is :class:`CartPoleSwingUpEnv`.
+    Its physics has other masses, another length and no friction.
 
     Args:
         seed: Of the physics, whose masses are drawn from U(0.4, 0.6) kg for the cart and
@@ -419,14 +349,10 @@ def cart_pole(
         dry: Dry friction of the real cart, in N, which no parameter of the physics describes.
         drag: Drag of the real pole, in N m s²/rad², likewise.
         noise: Standard deviations of the sensors' noise, by the name of the state.
-        unknowns: Whether masses, length and damping of the physics are unknown parameters.
+        unknowns: If True, masses, length and damping of the physics are unknown parameters.
         encode_angle: As of the environment.
         time_step: In s.
         episode_length: In steps.
-
-    Raises:
-        TypeError: If an option is of another kind.
-        ValueError: If it is out of range.
 
     Example:
         >>> from gpadjust import systems

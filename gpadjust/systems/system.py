@@ -24,9 +24,9 @@ class System:
     """A system to control: the real one as an environment, and what is known of it.
 
     Args:
-        env: Makes the environment, such as its class; keyword arguments of :meth:`make` are passed
-            on.
-        spec: What the entries of states and actions are.
+        env: Makes the environment, such as its class; it gets the keyword arguments of
+            :meth:`make`.
+        spec: The entries of states and actions.
         physics: f_p, the next values of the states that are neither exogenous nor previous values,
             from these and the actions, or from what ``spec.physics_reads`` names; possibly with
             unknown parameters.
@@ -34,21 +34,18 @@ class System:
             states ``N x state_dim``.
         start: Draws ``n`` states at which episodes start, ``n x state_dim``. Default: those at
             which real episodes started.
-        terminated: Whether states ``N x state_dim`` end an episode, ``N`` booleans. Default: none.
+        terminated: A function of states ``N x state_dim`` to ``N`` booleans: the end of an episode.
         episode_length: Steps after which an episode is truncated; an environment's own time limit
             may only be longer. Default: the time limit of the environment.
-        state_bounds: As of a :class:`~gpadjust.control.Task`.
-        reference: Set-points that move, as of a :class:`~gpadjust.control.Task`.
-        constraints: As of a :class:`~gpadjust.control.Task`.
-        probability: As of a :class:`~gpadjust.control.Task`.
-        action_rate: As of a :class:`~gpadjust.control.Task`.
+        state_bounds, reference, constraints, probability, action_rate: As of a
+            :class:`~gpadjust.control.Task`.
         physics_error: As of :class:`~gpadjust.dynamics.LearnedDynamics`, of the dynamics that
             :meth:`task` makes.
         noise: Standard deviations of the sensors' noise, by the name of the state or output, which
             :class:`NoisySensors` adds to what the environment observes.
-        sensors: What is measured of the states, as of a :class:`~gpadjust.control.Task`. ``env``
-            observes the states, and :meth:`make` shows what is measured of them; or it observes
-            that itself. Default: all of the states.
+        sensors: The outputs that are measured, as of a :class:`~gpadjust.control.Task`. ``env``
+            observes the states, of which :meth:`make` shows the outputs, or the outputs alone.
+            Default: all of the states.
 
     Raises:
         TypeError: If ``env``, ``physics`` or ``reward`` is not callable, or ``spec``, ``sensors``
@@ -81,15 +78,14 @@ class System:
 
     def __post_init__(self) -> None:
         """Check the parts that a task does not check."""
-        if not isinstance(self.spec, StateSpec):
-            raise TypeError(f"spec must be a StateSpec; found {self.spec!r}.")
+        check_kind("spec", self.spec, StateSpec, "a StateSpec")
         for name in ("env", "reward"):
             if not callable(getattr(self, name)):
                 hint = ", its class or `lambda: env`" if name == "env" else ""
                 raise TypeError(f"{name} must be a function{hint}; found {getattr(self, name)!r}.")
         check_kind("sensors", self.sensors, Sensors | None, 'Sensors(["x", "theta"]), say')
-        told = "standard deviations by the name of the state"
-        check_kind("physics_error", self.physics_error, Mapping | None, told)
+        expected = "standard deviations by the name of the state"
+        check_kind("physics_error", self.physics_error, Mapping | None, expected)
         object.__setattr__(self, "physics", as_physics(self.physics))
 
     @property
@@ -101,7 +97,7 @@ class System:
         """Make an environment, truncated after ``episode_length`` steps.
 
         Args:
-            options: Keyword arguments of ``env``, such as ``render_mode="human"``.
+            options: Keyword arguments of ``env``, such as ``render_mode="rgb_array"``.
 
         Raises:
             ValueError: If the environment's own time limit is less than ``episode_length``, or it
@@ -117,38 +113,26 @@ class System:
             )
         if self.episode_length not in (None, limit):
             env = gym.wrappers.TimeLimit(env, self.episode_length)
-        if self._shows_what_is_measured(env):
+        if self.sensors is None and not self.noise:
             return env
-        return NoisySensors(env, self.spec, self.noise or {}, self.sensors)
-
-    def _shows_what_is_measured(self, env: gym.Env[Any, Any]) -> bool:
-        """Return whether an environment observes that itself, by the number of entries.
-
-        Raises:
-            ValueError: If it observes neither that nor the states.
-        """
-        if self.sensors is None:
-            return not self.noise
         shape, states = env.observation_space.shape, self.spec.observation_dim
-        outputs = self.sensors.spec(self.spec).observation_dim
-        if shape != (states,) and (shape != (outputs,) or self.noise):
+        if self.sensors is not None and shape != (states,):
+            outputs = self.sensors.spec(self.spec).observation_dim
+            if shape == (outputs,) and not self.noise:
+                return env
             raise ValueError(
                 f"The environment must observe the states ({states} entries), of which "
                 f"`system.make()` shows what the sensors measure, or that alone ({outputs} "
                 f"entries), without `noise`; found {env.observation_space}."
             )
-        return shape != (states,)
+        return NoisySensors(env, self.spec, self.noise or {}, self.sensors)
 
     def task(self, dynamics: Dynamics | None = None) -> Task:
-        """The task that agents and planners take.
+        """Return the task that agents and planners take.
 
-        Args:
-            dynamics: The model of the system, which learns: make others for another run. Default:
-                :class:`~gpadjust.dynamics.LearnedDynamics` with the physics.
-
-        Raises:
-            TypeError: If ``dynamics`` are none, or a function takes other arguments.
-            ValueError: If a number or the bounds are out of range.
+        The dynamics are the model of the system, which learns: make others for another run. By
+        default they are :class:`~gpadjust.dynamics.LearnedDynamics` with the physics. Errors are
+        those of a :class:`~gpadjust.control.Task`.
         """
         from gpadjust.control import Task
         from gpadjust.dynamics import LearnedDynamics

@@ -1,4 +1,4 @@
-"""Environments seen otherwise: with previous actions, through sensors."""
+"""Environments with previous actions, or as sensors show them."""
 
 from __future__ import annotations
 
@@ -17,20 +17,18 @@ Array = NDArray[np.float32]
 
 
 class RememberAction(gym.Wrapper[Array, Array, Array, Array], gym.utils.RecordConstructorArgs):
-    """Appends the actions that were taken last to the observation, the newest first.
+    """Appends the last actions to the observation, the newest first; at first they are zeros.
 
-    At the start of an episode they are zeros. Where a system follows its actions with a delay that
-    the observation does not show, such as the activation of muscles, the next observation depends
-    on earlier actions. A :class:`~gpadjust.states.StateSpec` declares them in ``previous``, such as
-    ``{"force_1": "force", "force_2": "force_1"}`` of two steps.
-
-    What is appended is the action clipped to its space, as the environments of this library take
-    it. Observations keep their data type, if that is floating-point.
+    Where a system follows its actions with a delay that the observation does not show, such as the
+    activation of muscles, the next observation depends on earlier actions. A
+    :class:`~gpadjust.states.StateSpec` declares them in ``previous``, such as
+    ``{"force_1": "force", "force_2": "force_1"}`` of two steps. Actions are clipped to their space,
+    as the environments of this library take them.
 
     Args:
         env: An environment whose observations and actions are boxes of one dimension; zero is an
             action.
-        steps: How many actions it remembers.
+        steps: The number of actions.
 
     Raises:
         TypeError: If ``steps`` is no whole number.
@@ -49,16 +47,15 @@ class RememberAction(gym.Wrapper[Array, Array, Array, Array], gym.utils.RecordCo
     def __init__(self, env: gym.Env[Array, Array], *, steps: int = 1) -> None:
         gym.utils.RecordConstructorArgs.__init__(self, steps=steps)
         gym.Wrapper.__init__(self, env)
-        self._steps = checked_whole("steps", steps, 1)
-        seen, taken = env.observation_space, env.action_space
+        checked_whole("steps", steps, 1)
+        seen: Any = env.observation_space
+        taken: Any = env.action_space
         for name, space in (("observation", seen), ("action", taken)):
             if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
                 raise ValueError(
                     f"RememberAction needs an {name} space that is a Box of one dimension; found "
                     f"{space}. Put gymnasium.wrappers.FlattenObservation or RescaleAction inside."
                 )
-        assert isinstance(seen, gym.spaces.Box), "checked above"
-        assert isinstance(taken, gym.spaces.Box), "checked above"
         self._taken = taken
         self._last = np.zeros((steps, *taken.shape), dtype=taken.dtype)
         if not taken.contains(self._last[0]):
@@ -66,14 +63,10 @@ class RememberAction(gym.Wrapper[Array, Array, Array, Array], gym.utils.RecordCo
                 f"RememberAction starts from the action zero, which is not in {taken}. Put "
                 "gymnasium.wrappers.RescaleAction inside."
             )
-        floating = np.issubdtype(seen.dtype, np.floating)
-        # Integers could not hold the action.
-        self._dtype = seen.dtype if floating else np.result_type(seen.dtype, taken.dtype)
-        self.observation_space = gym.spaces.Box(
-            self._extended(seen.low, np.tile(taken.low, steps)),
-            self._extended(seen.high, np.tile(taken.high, steps)),
-            dtype=self._dtype.type,
-        )
+        dtype = np.result_type(seen.dtype, taken.dtype).type
+        low = np.concatenate([seen.low, np.tile(taken.low, steps)], dtype=dtype)
+        high = np.concatenate([seen.high, np.tile(taken.high, steps)], dtype=dtype)
+        self.observation_space = gym.spaces.Box(low, high, dtype=dtype)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -81,18 +74,18 @@ class RememberAction(gym.Wrapper[Array, Array, Array, Array], gym.utils.RecordCo
         """Start an episode; its first observation ends with zeros."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._last = np.zeros_like(self._last)
-        return self._extended(observation, self._last), info
+        return self._extended(observation), info
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Take an action; the observation ends with it, clipped, and those before it."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         taken = np.clip(action, self._taken.low, self._taken.high)
         self._last = np.concatenate([taken[None], self._last[:-1]]).astype(self._last.dtype)
-        extended = self._extended(observation, self._last)
-        return extended, float(reward), terminated, truncated, info
+        return self._extended(observation), float(reward), terminated, truncated, info
 
-    def _extended(self, observation: Array, actions: Array) -> Array:
-        return np.concatenate([observation, actions.ravel()]).astype(self._dtype)
+    def _extended(self, observation: Array) -> Array:
+        dtype = self.observation_space.dtype
+        return np.concatenate([observation, self._last.ravel()]).astype(dtype)
 
 
 class NoisySensors(gym.ObservationWrapper[Array, Array, Array], gym.utils.RecordConstructorArgs):
@@ -100,9 +93,9 @@ class NoisySensors(gym.ObservationWrapper[Array, Array, Array], gym.utils.Record
 
     Args:
         env: The environment, which observes the states of the spec.
-        spec: What they are; an angle gets its noise before its sine and cosine are taken.
+        spec: The states; an angle gets its noise before its sine and cosine are taken.
         sd: Standard deviations by the name of the state or output; the others have no noise.
-        sensors: What is measured. Default: all of the states.
+        sensors: The outputs that are measured. Default: all of the states.
 
     Raises:
         TypeError: If a standard deviation is no number.

@@ -48,6 +48,7 @@ class Dense:
             return default if name not in values else values[name][s, j]
 
         self.names, self.bases, self.means, self.centers, self.kernels = [], [], [], [], []
+        instead = 0.0
         for term in model.terms:
             size, basis = unit**2, lambda X: torch.ones_like(X[:, 0])
             if term.physics is not None:
@@ -59,7 +60,9 @@ class Dense:
             self.names.append(term.name)
             self.bases.append(basis)
             self.centers.append(c)
-            self.means.append(term.mean * number(f"{term.name}.mean", 1.0))
+            share = number(f"{term.name}.mean", 1.0)
+            self.means.append(term.mean * share)
+            instead += (1 - share) * term.mean * c  # of f_p in models without it
             kappa = number(f"{term.name}.constant", 0.0) * size
             start = f"{term.name}.kernel."
             scale = number(f"{start}outputscale", 0.0) * size * number(f"{term.name}.process", 1.0)
@@ -71,6 +74,8 @@ class Dense:
                 return scale * covariance(term.kernel, length, A, B) + kappa
 
             self.kernels.append(k)
+        if "delta" in self.names:
+            self.means[self.names.index("delta")] += instead
         if Yvar is None:
             self.noise = (
                 (number("noise.variance") + LEAST) * unit**2 * torch.ones(len(self.y)).double()

@@ -103,14 +103,13 @@ def test_with_dense_runs_results_are_those_of_the_simulator(n):
     noise = 0.02 * torch.randn(n, 1, generator=torch.Generator().manual_seed(0)).double()
     known = EmulatedPhysics(runs, wave(runs), num_components=2)
     Z = 1.4 * line(9)
-    emulated, exact = (
-        PhysicsMeanGP(X, wave(X) + 0.1 * X + noise, physics=p) for p in (known, wave)
-    )
+    data = X, wave(X) + 0.1 * X + noise, torch.full_like(X, 0.02**2)
+    emulated, exact = (PhysicsMeanGP(*data, physics=p) for p in (known, wave))
     for model in (emulated, exact):
         fit(model)
     a, b = emulated.predict(Z), exact.predict(Z)
-    assert ((a.mean - b.mean).abs() < 0.5 * b.variance.sqrt()).all()
-    torch.testing.assert_close(a.variance.sqrt(), b.variance.sqrt(), rtol=0.4, atol=1e-3)
+    assert ((a.mean - b.mean).abs() < 0.6 * b.variance.sqrt()).all()
+    torch.testing.assert_close(a.variance.sqrt(), b.variance.sqrt(), rtol=0.3, atol=1e-3)
 
 
 @pytest.mark.slow

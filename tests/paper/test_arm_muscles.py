@@ -174,10 +174,7 @@ def test_equal_seeds_give_equal_trajectories(arm):
         assert same(rollout(arm), rollout(other))
 
 
-# A window takes its time.
-@pytest.mark.parametrize(
-    "render_mode", [None, "rgb_array", pytest.param("human", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("render_mode", [None, "rgb_array"])
 def test_copy_goes_on_as_the_original(render_mode):
     env = gym.make(ID, render_mode=render_mode)
     env.reset(seed=0)

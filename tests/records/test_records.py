@@ -1,4 +1,4 @@
-"""Records of machines: transitions, windows and even steps."""
+"""Records of machines: transitions and windows."""
 
 import math
 from itertools import pairwise
@@ -110,7 +110,7 @@ def test_states_that_were_not_measured():
     )
     times, states = torch.arange(8).double(), states.double()
     records = Records([Record(times, states, torch.zeros(8, 1).double())], POINT)
-    with pytest.warns(UserWarning, match=r"0 of 1 stretches.*4 of 7 steps, 2 of which start at"):
+    with pytest.warns(UserWarning, match=r"Left out: 4 of 7 steps, 2 of which start at"):
         data = records.trajectories()
     assert data.states[:, 0].tolist() == [0, 1, 5]
     assert data.next_states[1].tolist() == pytest.approx([2, nan], nan_ok=True)
@@ -118,7 +118,7 @@ def test_states_that_were_not_measured():
 
 
 def test_stretches_that_are_too_short_are_left_out():
-    records = Records([counted(9, segments=[1, 2, 2, 2, 2, 2, 3, 3, 3])], SPEC)
+    records = Records([counted(9, segments=[math.nan, 2, 2, 2, 2, 2, 3, 3, 3])], SPEC)
     with pytest.warns(UserWarning, match="1 of 3 stretches"):
         assert records.trajectories().states.flatten().tolist() == [1, 2, 3, 4, 6, 7]
     with pytest.warns(UserWarning, match="2 of 3 stretches"):
@@ -157,78 +157,18 @@ def test_previous_states_are_those_of_the_steps_before(names, step):
     assert data.states[0, 3] == (0 if k == 1 else 2 * k)
 
 
+def test_records_may_differ_in_their_sampling_steps():
+    records = Records(
+        [counted(9), counted(5, first=20, step=0.02, at=0.02 * torch.arange(5).double())], SPEC
+    )
+    assert records.trajectories(0.04).states.flatten().tolist() == [0, 4, 20, 22]
+
+
 def test_the_step_of_the_spec_is_the_default():
     spec = StateSpec(["x", "v"], ["u"], integrated={"x": "v"}, step=0.02)
     record = counted(9)
     records = Records([Record(record.times, record.states.repeat(1, 2), record.actions)], spec)
     assert records.trajectories().states[:, 0].tolist() == [0, 2, 4, 6]
-
-
-def jittery(seed=0, num_rows=200, by=0.3):
-    generator = torch.Generator().manual_seed(seed)
-    share = torch.rand(num_rows, generator=generator, dtype=torch.float64) - 0.5
-    return 0.01 * (torch.arange(num_rows) + by * share)
-
-
-def test_even_records_stay_as_they_are_when_resampled():
-    records = Records([counted(31, segments=[0] * 14 + [1] * 17), counted(23, first=5.0)], SPEC)
-    expected = records.trajectories(0.04)
-    again = records.resampled(0.04)
-    assert [record.name for record in again] == [record.name for record in records]
-    for one, other in zip(again.trajectories(), expected, strict=True):
-        torch.testing.assert_close(one, other)
-
-
-def test_uneven_records_are_interpolated():
-    """Of a state that is a line in time, and an action that is constant from row to row."""
-    times = jittery(by=0.45)
-    actions = times.diff(append=times[-1:] + 1).reciprocal()  # of one unit from row to row
-    record = Record(times, 3 * times.unsqueeze(-1) - 1, actions.unsqueeze(-1))
-    data = Records([record], SPEC).resampled(0.025).trajectories()
-    torch.testing.assert_close(data.next_states - data.states, torch.full_like(data.states, 0.075))
-    passed = np.interp(times[0] + 0.025 * np.arange(len(data.states) + 1), times, np.arange(200))
-    np.testing.assert_allclose(data.actions[:, 0], np.diff(passed) / 0.025)
-
-
-def test_resampled_angles_go_the_shortest_way():
-    spec = StateSpec(["x"], ["u"], angles=["x"])
-    turned = torch.atan2((7 * jittery()).sin(), (7 * jittery()).cos()).unsqueeze(-1)
-    record = Record(jittery(), turned, torch.zeros(200, 1).double())
-    data = Records([record], spec).resampled(0.01).trajectories()
-    change = spec.change(data.states, data.next_states)
-    torch.testing.assert_close(change, torch.full_like(change, 0.07))
-
-
-def test_resampled_states_that_were_not_measured():
-    states = column(0, 1, 2, math.nan, 4, 5, 6)
-    record = Record(torch.arange(7).double(), states, torch.zeros(7, 1).double())
-    half = Records([record], SPEC).resampled(0.5).records[0].states.flatten().tolist()
-    nan = math.nan
-    assert half == pytest.approx([0, 0.5, 1, 1.5, 2, nan, nan, nan, 4, 4.5, 5, 5.5, 6], nan_ok=True)
-    shifted = Records([record], SPEC).resampled(1.5).records[0].states.flatten().tolist()
-    assert shifted == pytest.approx([0, 1.5, nan, 4.5, 6], nan_ok=True)
-
-
-def test_rows_that_are_met_but_for_rounding_need_no_neighbours():
-    times, states = 0.1 * torch.arange(31).double(), torch.full((31, 1), math.nan).double()
-    states[::3, 0] = torch.arange(11).double()
-    record = Record(times, states, torch.zeros(31, 1).double())
-    assert (times[0] + 0.3 * torch.arange(11) != times[::3]).any()
-    (even,) = Records([record], SPEC).resampled(0.3)
-    assert even.states.flatten().tolist() == [*range(11)]
-
-
-def test_gaps_are_not_interpolated_over_unless_they_are_said_to_be_none():
-    times = torch.cat([torch.arange(20), torch.arange(22, 40), torch.arange(49, 60)]).double()
-    record = Record(times, times.unsqueeze(-1), times.unsqueeze(-1))
-    records = Records([record], SPEC)
-    (even,) = records.resampled(2)
-    assert [int(even.times[rows.start]) for rows in even.stretches()] == [0, 22, 49]
-    assert len(records.resampled(2, max_gap=3).records[0].stretches()) == 2
-    bridged = records.resampled(2, max_gap=10)
-    data = bridged.trajectories()
-    assert (data.next_states - data.states).unique().tolist() == [2]
-    assert len(data.states) == 29
 
 
 def test_windows_have_the_steps_of_transitions():
@@ -265,7 +205,7 @@ def test_dates_and_durations_are_seconds_since_the_first():
     days = pd.date_range("2026-10-25 01:30", periods=4, freq="30min", tz="Europe/Berlin")
     universal, states = days.tz_convert("UTC").tz_localize(None), column(0, 1, 2, 3)
     durations = days - days[0]
-    for times in (days, universal, durations, durations.to_pytimedelta(), days.to_pydatetime()):
+    for times in (days, universal, durations, durations.to_numpy(), days.to_series()):
         assert Record(times, states, states).times.tolist() == [0, 1800, 3600, 5400]
 
 

@@ -251,7 +251,7 @@ def test_a_model_learns_from_draws_segment_by_segment():
     parts = Record(record.times, record.states, record.actions, labels, "spring")
     with pytest.warns(UserWarning, match="1 of 3 stretches, shorter than a step"):
         found = smooth(Records(parts, SPEC), spring())
-    assert [record.name for record in found.records.records] == ["spring"]
+    assert [record.name for record in found.records] == ["spring", "spring"]
     transitions = [found.draw(seed).trajectories() for seed in (0, 0, 1)]
     assert len(transitions[0].states) == 69 + 78
     assert torch.equal(transitions[0].states, transitions[1].states)

@@ -9,14 +9,14 @@ from gpadjust.control import Task
 from gpadjust.dynamics import LearnedDynamics, StateSpec
 from gpadjust.rl import DynaOptions, DynaSAC
 from gpadjust.systems import CartPoleSwingUpEnv, RememberAction, cart_pole
-from gpadjust.systems.swing_up import CART_POLE_RAW_SPEC, cart_pole_reward, cart_pole_start
+from gpadjust.systems.swing_up import cart_pole_reward, cart_pole_spec, cart_pole_start
 
 SMALL = {"batch_size": 8, "policy_kwargs": {"net_arch": [8]}, "seed": 0, "device": "cpu"}
 
 
 @pytest.mark.slow
 def test_actions_taken_in_the_model_are_remembered():
-    raw = CART_POLE_RAW_SPEC
+    raw = cart_pole_spec(encode_angle=False)
     spec = StateSpec([*raw.states, "last"], raw.actions, previous={"last": raw.actions[0]})
     env = gym.wrappers.TimeLimit(RememberAction(CartPoleSwingUpEnv(encode_angle=False)), 5)
 

@@ -190,6 +190,7 @@ def test_the_seed_of_draws(data):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:Predictions depend on the seed")
 def test_the_seed_of_the_fit(data):
     def scales(state):
         regressor = CKARegressor(wave, random_state=state, num_draws=16)

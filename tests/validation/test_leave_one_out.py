@@ -154,17 +154,17 @@ def test_other_models_are_refused(data):
 
 @pytest.mark.slow
 def test_it_is_about_fits_without_each_point():
-    X = torch.linspace(0, 1, 10, dtype=torch.float64).unsqueeze(-1)
-    noise = 0.1 * torch.randn(10, 1, generator=torch.Generator().manual_seed(1)).double()
+    X = torch.linspace(0, 1, 15, dtype=torch.float64).unsqueeze(-1)
+    noise = 0.1 * torch.randn(15, 1, generator=torch.Generator().manual_seed(1)).double()
     Y = 3 * (6 * X).sin() + X + noise
     for build in (lambda *data: PhysicsMeanGP(*data, physics=lambda X: (6 * X).sin()), ZeroMeanGP):
         model, elpd = build(X, Y), 0.0
         fit(model)
-        for i in range(10):
-            rest = torch.arange(10) != i
+        for i in range(15):
+            rest = torch.arange(15) != i
             part = build(X[rest], Y[rest])
             fit(part)
             elpd += part.marginals(X[[i]], True).log_density(Y[[i]]).item()
         found = leave_one_out(model).log_density.sum().item()
-        assert found == pytest.approx(elpd, abs=2)
+        assert found == pytest.approx(elpd, abs=1)
         assert math.isfinite(elpd)

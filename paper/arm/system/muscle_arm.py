@@ -62,7 +62,7 @@ class MuscleArmEnv(ViewedEnv):
         for all others of that process, those of other models included.
 
     Args:
-        render_mode: ``"human"`` or ``"rgb_array"``; both need ``pygame-ce``.
+        render_mode: ``"rgb_array"``, which needs ``pygame-ce``.
         strength: The factor on the forces of the muscles, in (0, 2]. Electrical stimulation
             recruits part of a muscle; 1 is a healthy arm's.
         accuracy: The relative accuracy of the integrator, in (0, 1).
@@ -85,7 +85,7 @@ class MuscleArmEnv(ViewedEnv):
         True
     """
 
-    caption, size = "Muscle arm", SIZE
+    size = SIZE
     metadata = {"render_modes": RENDER_MODES, "render_fps": round(1 / ARM_TIME_STEP)}  # noqa: RUF012
 
     def __init__(
@@ -125,7 +125,6 @@ class MuscleArmEnv(ViewedEnv):
         self.state = np.concatenate([start, target])
         self.activations = np.full(len(MUSCLES), REST_ACTIVATION)
         self._failed = False
-        self._show()
         return self.state.astype(np.float32), {}
 
     def step(
@@ -159,7 +158,6 @@ class MuscleArmEnv(ViewedEnv):
         else:
             self.state = np.concatenate([end[:4], self.state[4:]])
             self.activations = end[4:]
-        self._show()
         state = torch.from_numpy(self.state)
         reward = -angle_error(state).item()
         info = {"hand_distance_cm": hand_distance_cm(state).item(), "step_failed": self._failed}
