@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.control.delay import find_delay
-from gpadjust.control.reach import reach
+from gpadjust.control.rollouts import reach
 from gpadjust.control.task import Task
 from gpadjust.dynamics import Dynamics, LearnedDynamics, Trajectories
 from gpadjust.dynamics.base import typical_change
