@@ -55,10 +55,6 @@ data: the table: a CSV file in UTF-8, or *.xlsx (the extra excel)
 --outputs y: the columns that it predicts
 --physics formula: the physics: a formula of the columns' names, with + - * / ** and functions such
     as sqrt, of several outputs with commas between them; or module:function. Several: give it again
---unknown E=2+-0.4: an unknown number of the formula, its guess and standard deviation, which may be
-    a percentage; or a factor, E=2*/1.5; or bounds, E=1..3. Several: give it again
---out page.html: the page to write (%(default)s); the model beside it, page.pt. Both replace what
-    has these names
 --units a=m,y=Pa: units, of columns that do not say them, as "a [m]"
 --noise 0.1: known standard deviation of the outputs; or y=0.1,z=2; or relative, which grows with
     the physics and is learnt
@@ -70,7 +66,6 @@ data: the table: a CSV file in UTF-8, or *.xlsx (the extra excel)
 --batches rig: categories that each shift the outputs by an offset
 --fit: compare structures, which tells whether the physics helps (the default); or one CKA alone, by
     full Bayes or at the likeliest hyper-parameters, which is quicker
---seed 0: of the fits (%(default)s)
 --rows 500: the most rows that are taken; of more, so many are drawn at random (%(default)s)
 --sheet name: the sheet of a workbook that has several
 """
@@ -84,17 +79,18 @@ data: the log: CSV files in UTF-8, a record each
 --angles a: states in rad that jump where they have gone round
 --physics equation: an equation for each state: "a'=...", its time derivative, or 'a=...', its next
     value; or module:name
---unknown E=2+-0.4: an unknown number of the equations, its guess and standard deviation, which may
-    be a percentage; or a factor, E=2*/1.5; or bounds, E=1..3. Several: give it again
 --step 0.05: the step of the free run, a multiple of the sampling step, which it is by default; a
     longer one is quicker, and averages the actions over it
 --segment run: a column of labels: where they change, a new run begins
 --held-out 0.25: the share of the log that is held out at its end (%(default)s)
 --starts 4: searches to take the best of
---out page.html: the page (%(default)s)
---seed 0: of the free runs (%(default)s)
 """
 _OPTIONS_OF_BOTH = """\
+--unknown E=2+-0.4: an unknown number of the physics, its guess and standard deviation, which may be
+    a percentage; or a factor, E=2*/1.5; or bounds, E=1..3. Several: give it again
+--out page.html: the page to write (%(default)s), with a model the model beside it, page.pt; both
+    replace what has these names
+--seed 0: of the fits and free runs (%(default)s)
 --delimiter mark: between two fields (","); ";" or tab, say
 --decimal mark: the decimal mark (".")
 --title text: the title of the page

@@ -20,12 +20,12 @@ from torch import Tensor
 from gpadjust.checks import check_kind, checked_number, checked_whole
 from gpadjust.control import episodes
 from gpadjust.control.checkpoint import EpisodeCheckpoint, locked, pickled_environment
-from gpadjust.control.reach import random_sequences
+from gpadjust.control.rollouts import random_sequences
 from gpadjust.control.state_filter import StateFilter, smooth_episodes
 from gpadjust.control.step_guard import StepGuard
 from gpadjust.control.task import Task
 from gpadjust.dynamics import Trajectories
-from gpadjust.dynamics.free_run import checked_horizons
+from gpadjust.dynamics.base import checked_horizons
 
 MAX_HOLD = 5  # steps of a random action
 _LOST = 0.1  # of runs in the model, which may leave the bounds without a warning
@@ -298,11 +298,10 @@ class Agent(ABC):
         num_steps, bounds, rate = self.episode_length(), self.action_bounds(), self.task.rate
         before: Tensor | None = None
         while True:
-            sequences = random_sequences(1, num_steps, bounds, MAX_HOLD)
-            if rate is not None:
-                sequences = rate.limited(sequences, before)
-            yield from sequences[0].numpy().astype(self.env.action_space.dtype)
-            num_steps, before = 1, sequences[0, -1]
+            for action in random_sequences(1, num_steps, bounds, MAX_HOLD)[0]:
+                before = action if rate is None else rate.limited(action, before)
+                yield before.numpy().astype(self.env.action_space.dtype)
+            num_steps = 1
 
     def _learn_dynamics(self) -> None:
         """Let the dynamics learn the episodes that they have not, if there are any."""

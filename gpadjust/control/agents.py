@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import operator
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,11 +16,9 @@ from torch import Tensor
 from gpadjust.checks import check_kind
 from gpadjust.control.agent import MAX_HOLD, Agent
 from gpadjust.control.faults import check_observation
-from gpadjust.control.mpc import MPC, Planner, PlanState, going_on
-from gpadjust.control.policies import BoundedPolicy, mlp_policy
-from gpadjust.control.policy_search import PolicySearch
-from gpadjust.control.reach import random_sequences
-from gpadjust.control.rollouts import Rollouts
+from gpadjust.control.mpc import MPC, Plan, Planner, going_on
+from gpadjust.control.policy_search import BoundedPolicy, PolicySearch
+from gpadjust.control.rollouts import Rollouts, random_sequences
 from gpadjust.control.task import Task
 from gpadjust.states import StateSpec
 
@@ -42,10 +40,10 @@ class MPCAgent(Agent):
         options: Further arguments of :class:`Agent`, which has the errors, too.
 
     Example:
-        >>> from gpadjust.control import CrossEntropy, MPCAgent, Planner
+        >>> from gpadjust.control import MPCAgent, Planner
         >>> from gpadjust.systems import cart_pole
         >>> system = cart_pole()
-        >>> quick = Planner(search=CrossEntropy(1), horizon=0.3, num_random=16)  # or leave it out
+        >>> quick = Planner(rounds=1, horizon=0.3, num_random=16)  # or leave it out
         >>> agent = MPCAgent(system.make(), system.task(), quick, first=quick, seed=0)
         >>> agent.learn(total_timesteps=25)
         MPCAgent(CartPoleSwingUpEnv, LearnedDynamics, 1 episodes learnt, 25 steps, last reward ...)
@@ -88,14 +86,14 @@ class MPCAgent(Agent):
     def predict(
         self,
         observation: NDArray[Any],
-        state: PlanState | None = None,
+        state: Sequence[Plan] | None = None,
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = False,
-    ) -> tuple[NDArray[Any], PlanState]:
+    ) -> tuple[NDArray[Any], tuple[Plan, ...]]:
         """Plan actions; see :meth:`MPC.predict`."""
         return self.mpc.predict(observation, state, episode_start, deterministic)
 
-    def promise(self, state: PlanState) -> dict[str, float]:
+    def promise(self, state: Sequence[Plan]) -> dict[str, float]:
         """Return the promised reward of a step by the plan of a whole episode."""
         (plan,) = state
         promises = {"left_bounds": plan.left_bounds}
@@ -128,8 +126,8 @@ class PolicySearchAgent(Agent):
     Args:
         env: As of :class:`Agent`.
         task: What is known of the system, in PyTorch's functions, as gradients flow through them.
-        policy: Makes the policy of a spec and the bounds of the actions: :func:`mlp_policy`,
-            or a function of yours, such as ``functools.partial(mlp_policy, net_arch=(32,))``.
+        policy: Makes the policy of a spec and the bounds of the actions: :class:`BoundedPolicy`,
+            or a function of yours, such as ``functools.partial(BoundedPolicy, net_arch=(32,))``.
         search: How the policy is improved.
         options: Further arguments of :class:`Agent`, which has the errors, too.
 
@@ -143,7 +141,7 @@ class PolicySearchAgent(Agent):
         >>> from gpadjust.systems import cart_pole
         >>> wide = torch.tensor([[-50.0] * 4, [50.0] * 4])  # far beyond what is ever seen
         >>> system = replace(cart_pole(), state_bounds=wide)
-        >>> search = PolicySearch(updates=2, num_starts=4, num_functions=2)
+        >>> search = PolicySearch(updates=2, num_starts=8)
         >>> agent = PolicySearchAgent(system.make(), system.task(), search=search, seed=0)
         >>> agent.learn(total_timesteps=25)
         PolicySearchAgent(CartPoleSwingUpEnv, LearnedDynamics, 1 episodes learnt, 25 steps, ...)
@@ -153,7 +151,7 @@ class PolicySearchAgent(Agent):
         self,
         env: Any,
         task: Task,
-        policy: Callable[[StateSpec, Tensor], BoundedPolicy] = mlp_policy,
+        policy: Callable[[StateSpec, Tensor], BoundedPolicy] = BoundedPolicy,
         search: PolicySearch | None = None,
         **options: Any,
     ) -> None:
@@ -161,7 +159,7 @@ class PolicySearchAgent(Agent):
         check_kind("search", self.search, PolicySearch, "a PolicySearch(...)")
         super().__init__(env, task, **options)
         made = policy(task.dynamics.spec, self.action_bounds()) if callable(policy) else policy
-        expected = "a function that makes a BoundedPolicy of a spec and bounds, as mlp_policy does"
+        expected = "a function that makes a BoundedPolicy of a spec and bounds, as the class does"
         check_kind("policy", made, BoundedPolicy, expected)
         self.policy = made
         self.is_trained = False
@@ -177,10 +175,10 @@ class PolicySearchAgent(Agent):
             return False
         if not self.is_trained:
             length, bounds = self.episode_length(), self.action_bounds()
-            actions = iter(random_sequences(_EPISODES, length, bounds, MAX_HOLD).unbind(1))
+            sequences = random_sequences(_EPISODES, length, bounds, MAX_HOLD)
             with torch.no_grad():
                 starts = task.draw_initial_states(_EPISODES)
-                run = Rollouts(task, None).act(starts, lambda states: next(actions), length)
+                run = Rollouts(task, None).follow(starts, sequences)
             self.policy.look_at(torch.cat([starts, run.next_states[run.made]]))
         last = self.search.updates
         tenth = max(1, last // 10)

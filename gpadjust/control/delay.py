@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.dynamics import Dynamics, Trajectories
-from gpadjust.dynamics.free_run import step_or_nan
+from gpadjust.dynamics.base import step_or_nan
 from gpadjust.physics import PhysicsError
 
 _LEAST = 8  # transitions before which the action has changed, beside as many as moving states

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -14,7 +16,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 from torch import Tensor
 
 from gpadjust.checks import check_choice, checked_whole
-from gpadjust.control import Step, Task
+from gpadjust.control import Moment, Steps, Task
 from gpadjust.dynamics import TransitionFunctions
 from gpadjust.physics import PhysicsError
 
@@ -130,8 +132,8 @@ class ModelVecEnv(VecEnv):
     def transition(self, actions: np.ndarray) -> ModelStep:
         """Step all particles, without a new start for those whose episode ended."""
         self._is_followed = True
-        ahead = self.task.set_points(self._states, self._steps + 1)
-        step = self._step(self._states, torch.as_tensor(actions, dtype=torch.float64), ahead)
+        moves = torch.as_tensor(actions, dtype=torch.float64)
+        step = self._step(self.task, self._states, moves, Moment(self._steps))
         self._states = step.next_states
         self._steps += 1
         self.num_left_bounds += int(step.left_bounds.sum())
@@ -160,11 +162,12 @@ class ModelVecEnv(VecEnv):
                 for column in (buffer.observations, buffer.next_observations, buffer.actions)
             )
             low, high = (torch.from_numpy(bound).double() for bound in (space.low, space.high))
-            states, ahead = spec.decode(obs), None
-            self.task = self.task.widened(states)
-            if self.task.reference is not None:  # the numbers of the steps are not in the buffer
+            states = spec.decode(obs)
+            task = self.task = self.task.widened(states)
+            if task.reference is not None:  # the numbers of the steps are not in the buffer
                 ahead = spec.decode(after)[:, spec.exogenous_columns]
-            step = self._step(states, low + (scaled + 1) / 2 * (high - low), ahead)
+                task = replace(task, reference=partial(_recorded, ahead))
+            step = self._step(task, states, low + (scaled + 1) / 2 * (high - low), Moment())
             terminated = step.terminated.numpy()
             limits = buffer.timeouts[rows, 0].astype(bool) | step.left_bounds.numpy()
             buffer.next_observations[rows, 0] = self._observe(step.next_states)
@@ -172,9 +175,9 @@ class ModelVecEnv(VecEnv):
             buffer.dones[rows, 0] = terminated | limits
             buffer.timeouts[rows, 0] = limits & ~terminated
 
-    def _step(self, states: Tensor, actions: Tensor, set_points: Tensor | None) -> Step:
-        """Return a step of the task, in which leaving the bounds is the worst that can be."""
-        step = self.task.step(states, actions, self._move, set_points=set_points)
+    def _step(self, task: Task, states: Tensor, actions: Tensor, moment: Moment) -> Steps:
+        """Return a step of a task, in which leaving the bounds is the worst that can be."""
+        step = task.step(states, actions, moment, move=self._move)
         self.worst_reward = min(self.worst_reward, float(step.rewards.min()))
         if not step.left_bounds.any():
             return step
@@ -241,3 +244,8 @@ class ModelVecEnv(VecEnv):
 
     def close(self) -> None:
         """Close nothing."""
+
+
+def _recorded(set_points: Tensor, states: Tensor, steps: Tensor) -> Tensor:
+    """Return set-points that were recorded."""
+    return set_points
