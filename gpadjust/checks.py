@@ -326,7 +326,8 @@ def long_work(text: str, unit: str) -> Iterator[None]:
     if not is_seen or find_spec("tqdm") is None:
         yield
         return
-    with progress_bar(True, desc=text, unit=unit, delay=_PATIENCE, leave=False) as bar:
+    options: dict[str, Any] = {"delay": _PATIENCE, "leave": False, "miniters": 1}
+    with progress_bar(True, desc=text, unit=unit, **options) as bar:
         token = _BAR.set(bar)
         try:
             yield

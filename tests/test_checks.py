@@ -190,7 +190,7 @@ def test_a_fit_shows_a_bar_after_five_seconds_where_somebody_sees_it(capsys, mon
         monkeypatch.setattr(sys.stderr, "isatty", lambda is_seen=is_seen: is_seen, raising=False)
         monkeypatch.setattr(checks, "_PATIENCE", patience)
         fit(ZeroMeanGP(X, X.sin()), "map")
-        assert ("likelihoods" in capsys.readouterr().err) == (is_seen and patience == 0)
+        assert ("evaluations" in capsys.readouterr().err) == (is_seen and patience == 0)
     monkeypatch.setitem(sys.modules, "tqdm", None)
     fit(ZeroMeanGP(X, X.sin()), "map")
     assert not capsys.readouterr().err

@@ -133,7 +133,7 @@ def fit(
     if model.data.Y.dim() > 2:
         batch = tuple(model.batch_shape)
         raise ValueError(f"Expected a model of one data set; found fantasies, a batch {batch}.")
-    with threads_for(len(model.data.Y)), long_work("fit", " likelihoods"):
+    with threads_for(len(model.data.Y)), long_work("fit", " evaluations"):
         result: FitResult | None = model.fit_itself(method, num_draws, seed)
         if result is None:
             result = _fitted(model, method, num_draws, seed)

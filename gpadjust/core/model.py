@@ -321,7 +321,6 @@ class GP(gpytorch.models.GP, Predictive):
         It is in units of the targets, minus infinity where it or f_p is not finite; a choice is the
         number of a nested model. The gradient is zero if it is not asked for.
         """
-        tick()
         u = u if choice is None else self.table.with_choice(u, choice)
         f: list[Tensor] = []
         slopes: Slopes = {}
@@ -331,6 +330,7 @@ class GP(gpytorch.models.GP, Predictive):
         parts = []
         for rows in torch.arange(len(u)).split(max(1, _ENTRIES // (n * n * m))):
             own = {name: [each[rows] for each in by_f] for name, by_f in slopes.items()}
+            tick()
             part = self._log_likelihood(u[rows], [each[rows] for each in f], own, with_gradient)
             parts.append(part)
         value, gradient = (torch.cat(each) for each in zip(*parts, strict=True))
