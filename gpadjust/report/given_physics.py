@@ -8,7 +8,7 @@ import re
 import sys
 import traceback
 from ast import unparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from importlib import import_module
 from operator import attrgetter
@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gpadjust.files.table_columns import LARGEST
+from gpadjust.files.table import LARGEST
 from gpadjust.physics import (
     BlackBoxPhysics,
     FormulaPhysics,
@@ -28,7 +28,7 @@ from gpadjust.physics import (
     Unknown,
     as_physics,
 )
-from gpadjust.physics.formula import names_in, parse, symbol
+from gpadjust.physics.formula import has_pi, names_in, parse, symbol
 from gpadjust.physics.function import array_physics
 from gpadjust.report.inputs import TableData, check_different, check_names, meant
 from gpadjust.report.markup import plural
@@ -38,6 +38,7 @@ _PRIOR = re.compile(
 )
 _EQUATION = re.compile(r"\s*([^\W\d]\w*)\s*('?)\s*=(?!=)(.*)", flags=re.DOTALL)
 _HOW = "A Python function is given as module:function, such as pump:head."
+_CELL = re.compile(r"[A-Z]{1,2}\d+")
 _SHOWN = 5  # rows at which a physics fails
 _MADE = ("BlackBoxPhysics", "FormulaPhysics", "ODEPhysics", "Unknown")
 _SAME = 1e-6  # as a model's file asks it when it is loaded
@@ -92,7 +93,7 @@ def unknown_of(text: str) -> tuple[str, Unknown]:
 
 def unknowns_of(texts: Sequence[str]) -> dict[str, Unknown]:
     """Return the unknown parameters of a command line by their names."""
-    pairs = [unknown_of(text) for text in texts]
+    pairs = [(symbol(name), prior) for name, prior in map(unknown_of, texts)]
     check_different([name for name, _ in pairs], "--unknown")
     return dict(pairs)
 
@@ -113,21 +114,39 @@ def hidden_of(texts: Sequence[str]) -> dict[str, Unknown]:
     return hidden
 
 
-def columns_of(formulas: Sequence[str], names: Sequence[str], unknowns: Sequence[str]) -> list[str]:
-    """Return the columns among some of a table that formulas name, in the order of the table."""
+def columns_of(
+    formulas: Sequence[str], names: Sequence[str], inputs: Sequence[str], unknowns: Sequence[str]
+) -> list[str]:
+    """Return the columns that formulas name beside inputs, in the order of the table."""
     named = {name for formula in formulas for name in names_in(formula)}
-    known = [symbol(name) for name in names]
+    known = [symbol(name) for name in (*inputs, *names)]
     columns = [name for name in names if symbol(name) in named]
     check_different([*map(symbol, columns)], "columns in a formula, which has no units")
     absent = sorted(named - {*known, *unknowns})
-    if absent or not columns:
+    if absent or not (columns or inputs):
         wrong = absent[0] if absent else "none of them"
         hint = meant(wrong, [*known, *unknowns]) if absent else ""
+        if _CELL.fullmatch(wrong):
+            hint = f" {wrong} seems to be a cell: write the name of its column."
         raise ValueError(
             f"Expected a formula of columns of the table, {', '.join(known)}, and of --unknown; "
-            f"found {wrong!r} in --physics {formulas[0]!r}.{hint} {_HOW}"
+            f"found {wrong!r} in --physics {formulas[0]!r}.{hint} Another name for a column: "
+            f'--inputs "d=wire d". {_HOW}'
         )
     return columns
+
+
+def check_constants(formulas: Iterable[str], names: Iterable[str]) -> None:
+    """Raise a ValueError if formulas name pi and a column or an unknown parameter has that name."""
+    if "pi_" not in map(symbol, names):
+        return
+    for formula in formulas:
+        if has_pi(formula):
+            raise ValueError(
+                f"Found pi in --physics {formula!r}: formulas take it as 3.14159, and here is a "
+                "'pi' of your own. Write yours as pi_, and the number as 3.14159; or give the "
+                'column another name, such as "p=pi".'
+            )
 
 
 def given_physics(
@@ -209,7 +228,7 @@ def motion(
             raise ValueError(
                 'Expected --physics as one equation for each state, such as "rate\'=-sin(angle)" '
                 "(a time derivative) or 'level=0.9*level' (its next value), or module:name, found "
-                f"{text!r}."
+                f'{text!r}. Names have no blanks: --states "T=Temperature 1".'
             )
         sides[match[1]] = unparse(trees[0])
         primes.add(match[2])
