@@ -29,13 +29,13 @@ ROOMS = sorted(path.parent for path in ROOT.glob("*/__init__.py"))
 BELOW = ("botorch", "gpytorch", "linear_operator")  # libraries that ours builds on
 
 
-CSV_TO_FREE_RUN = 32  # files that a log passes on the way to a judged free run
+CSV_TO_FREE_RUN = 34  # files that a log passes on the way to a judged free run
 TRIAL, ITERATION = 40, 42  # that a planned trial and an iteration of Dyna pass, fits included
 OF_CONTROL, OF_CONTROL_AND_RL = 11, 13  # of these
 FILES, CLASSES, FUNCTIONS = 13, 16, 128  # that the ten lines of the README pass; fewer are better
-CORE_LINES = 4702
+CORE_LINES = 4704
 REPORT, WITH_A_REPORT = 20, 25  # of report and validation, and of what is below, by default
-IDENTIFIED = 29  # that a log passes on the way to its page
+IDENTIFIED = 31  # that a log passes on the way to its page
 
 
 def passed(call):

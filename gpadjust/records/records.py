@@ -161,7 +161,7 @@ def _in_seconds(times: ArrayLike) -> ArrayLike:
     if kind in ("O", "U", "T") and len(times) and is_moment(str(next(iter(times)))):
         return np.array(seconds_of([*map(str, times)]))
     if kind not in ("M", "m"):
-        return times
+        return times.to_numpy() if hasattr(times, "to_numpy") else times
     dates = np.asarray(times, dtype=f"{kind}8[ns]")  # in UTC, if they have a time zone
     return (dates - dates[:1]) / np.timedelta64(1, "s")
 
