@@ -57,10 +57,6 @@ data: the table: a CSV file, or *.xlsx (the extra excel)
 --physics formula: the physics: a formula of the columns' names, with + - * / ** or ^ and functions
     such as sqrt, or a spreadsheet's, of several outputs with commas between them; or
     module:function. Several: give it again
---unknown E=2+-0.4: an unknown number of the formula, its guess and standard deviation, which may be
-    a percentage; or a factor, E=2*/1.5; or bounds, E=1..3. Several: give it again
---out page.html: the page to write (%(default)s); the model beside it, page.pt. Both replace what
-    has these names
 --units a=m,y=Pa: units, of columns that do not say them, as "a [m]"
 --noise 0.1: known standard deviation of the outputs; or y=0.1,z=2; or relative, which grows with
     the physics and is learnt
@@ -72,7 +68,6 @@ data: the table: a CSV file, or *.xlsx (the extra excel)
 --batches rig: categories that each shift the outputs by an offset
 --fit: compare structures, which tells whether the physics helps (the default); or one CKA alone, by
     full Bayes or at the likeliest hyper-parameters, which is quicker
---seed 0: of the fits (%(default)s)
 --rows 500: the most rows that are taken; of more, so many are drawn at random (%(default)s)
 """
 _OPTIONS_OF_LOGS = """\
@@ -87,17 +82,18 @@ data: the log: CSV files or *.xlsx, a record each
 --angles a: states in rad that jump where they have gone round
 --physics equation: an equation for each state: "a'=...", its time derivative, or 'a=...', its next
     value; or module:name
---unknown E=2+-0.4: an unknown number of the equations, its guess and standard deviation, which may
-    be a percentage; or a factor, E=2*/1.5; or bounds, E=1..3. Several: give it again
 --step 0.05: the step of the free run, a multiple of the sampling step, which it is by default; a
     longer one is quicker, and averages the actions over it
 --segment run: a column of labels: where they change, a new run begins
 --held-out 0.25: the share of the log that is held out at its end (%(default)s)
 --starts 4: searches to take the best of
---out page.html: the page (%(default)s)
---seed 0: of the free runs (%(default)s)
 """
 _OPTIONS_OF_BOTH = """\
+--unknown E=2+-0.4: an unknown number of the physics, its guess and standard deviation, which may be
+    a percentage; or a factor, E=2*/1.5; or bounds, E=1..3. Several: give it again
+--out page.html: the page to write (%(default)s), with a model the model beside it, page.pt; both
+    replace what has these names
+--seed 0: of the fits and free runs (%(default)s)
 --names a,b: names of all columns, of a file without, or in place of its own
 --delimiter mark: between two fields, such as ";" or tab; found by default
 --decimal mark: the decimal mark, "." or ","; found by default

@@ -9,7 +9,6 @@ import torch
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from gpadjust.control import (
-    CrossEntropy,
     EpisodeCheckpoint,
     MPCAgent,
     Planner,
@@ -25,7 +24,7 @@ from tests.point import POINT_SPEC, Faulty, Point, linear, near_one
 
 TOTAL = 40  # steps, of episodes of five where none fails
 FAILS = {8: "raises", 16: "nan", 23: "reward 1e30"}
-PLAN = Planner(search=CrossEntropy(1), horizon=3, num_random=32, max_hold=1)
+PLAN = Planner(rounds=1, horizon=3, num_random=32, max_hold=1)
 
 
 def reward(states, actions, next_states):

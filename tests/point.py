@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 import torch
 
-from gpadjust.control import Task, mlp_policy
+from gpadjust.control import BoundedPolicy, Task
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 
-linear = partial(mlp_policy, net_arch=())
+linear = partial(BoundedPolicy, net_arch=())
 POINT_SPEC = StateSpec(["x"], ["v"])
 FEW = {"num_draws": 8}
 

@@ -14,7 +14,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 import gpadjust
 from gpadjust import FunctionPhysics, Unknown
 from gpadjust.__main__ import main
-from gpadjust.control import CrossEntropy, Planner
+from gpadjust.control import Planner
 from tests.export.apart import apart
 from tests.systems import line
 
@@ -175,11 +175,11 @@ def test_the_agent_learns_and_goes_on(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     code, again, own = blocks("docs/guide/control.md")
     assert "=2 * 25" in code
-    quick = "Planner(search=CrossEntropy(1), horizon=0.3, num_random=16)"
+    quick = "Planner(rounds=1, horizon=0.3, num_random=16)"
     code = code.replace("=2 * 25", "=25").replace(
         "MPCAgent(env, system.task(),", f"MPCAgent(env, system.task(), {quick}, first={quick},"
     )
-    names = {"Planner": Planner, "CrossEntropy": CrossEntropy}
+    names = {"Planner": Planner}
     exec(code, names)
     assert names["agent"].num_episodes == 1
     files = {path.name for path in tmp_path.iterdir()}

@@ -5,15 +5,13 @@ Agents and :class:`StepGuard` need Gymnasium (the extra ``control``); all else d
 
 from typing import Any
 
-from gpadjust.control.action_rate import ActionRate
 from gpadjust.control.constraints import margins
-from gpadjust.control.mpc import MPC, CrossEntropy, Plan, Planner
-from gpadjust.control.policies import BoundedPolicy, mlp_policy
-from gpadjust.control.policy_search import PolicySearch, SearchResult
+from gpadjust.control.mpc import MPC, Plan, Planner
+from gpadjust.control.policy_search import BoundedPolicy, PolicySearch, SearchResult
 from gpadjust.control.progress import print_progress
-from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts
+from gpadjust.control.rollouts import Objective, Return, Rollouts
 from gpadjust.control.state_filter import Estimate, StateFilter
-from gpadjust.control.task import Constraints, InitialStates, Reward, Step, Task, Termination
+from gpadjust.control.task import ActionRate, Moment, Steps, Task
 
 __all__ = [
     "MPC",
@@ -21,30 +19,24 @@ __all__ = [
     "Agent",
     "BoundedPolicy",
     "Callback",
-    "Constraints",
-    "CrossEntropy",
     "EpisodeCheckpoint",
     "Estimate",
     "FailedStepWarning",
-    "InitialStates",
     "MPCAgent",
+    "Moment",
     "Objective",
     "Plan",
     "Planner",
     "PolicySearch",
     "PolicySearchAgent",
     "Return",
-    "Reward",
-    "Rollout",
     "Rollouts",
     "SearchResult",
     "StateFilter",
-    "Step",
     "StepGuard",
+    "Steps",
     "Task",
-    "Termination",
     "margins",
-    "mlp_policy",
     "print_progress",
     "resume",
 ]

@@ -29,13 +29,13 @@ from gpadjust.control.checkpoint import (
     unpickled,
 )
 from gpadjust.control.episodes import check_functions, completed, learn_dynamics, warn_of_bounds
-from gpadjust.control.reach import random_sequences
+from gpadjust.control.rollouts import random_sequences
 from gpadjust.control.smoothed_episodes import smooth_episodes
 from gpadjust.control.state_filter import StateFilter
 from gpadjust.control.step_guard import StepGuard
 from gpadjust.control.task import Task
 from gpadjust.dynamics import Trajectories
-from gpadjust.dynamics.free_run import checked_horizons
+from gpadjust.dynamics.base import checked_horizons
 
 MAX_HOLD = 5  # steps of a random action
 
@@ -616,12 +616,10 @@ class Agent(TaskAgent):
         num_steps, bounds, rate = self.episode_length(), self.action_bounds(), self.task.rate
         before: Tensor | None = None
         while True:
-            sequences = random_sequences(1, num_steps, bounds, MAX_HOLD)
-            if rate is not None:
-                sequences = rate.limited(sequences, before)
-            for action in sequences[0]:
-                yield action.numpy().astype(self.env.action_space.dtype)
-            num_steps, before = 1, sequences[0, -1]
+            for action in random_sequences(1, num_steps, bounds, MAX_HOLD)[0]:
+                before = action if rate is None else rate.limited(action, before)
+                yield before.numpy().astype(self.env.action_space.dtype)
+            num_steps = 1
 
     def _compare(self, values: dict[str, float], recorded: Tensor) -> None:
         """Warn if a real step gave less than promised by a quarter of the range of all rewards.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,9 @@ from torch import Tensor
 from gpadjust.checks import check_kind
 from gpadjust.control.agent import MAX_HOLD, Agent
 from gpadjust.control.faults import check_observation
-from gpadjust.control.mpc import MPC, Planner, PlanState, going_on
-from gpadjust.control.policies import BoundedPolicy, mlp_policy
-from gpadjust.control.policy_search import PolicySearch
-from gpadjust.control.reach import random_sequences
-from gpadjust.control.rollouts import Rollouts
+from gpadjust.control.mpc import MPC, Plan, Planner, going_on
+from gpadjust.control.policy_search import BoundedPolicy, PolicySearch
+from gpadjust.control.rollouts import Rollouts, random_sequences
 from gpadjust.control.state_filter import Estimate
 from gpadjust.control.task import Task
 from gpadjust.states import StateSpec
@@ -46,10 +44,10 @@ class MPCAgent(Agent):
         ValueError: As :class:`Agent`.
 
     Example:
-        >>> from gpadjust.control import CrossEntropy, MPCAgent, Planner
+        >>> from gpadjust.control import MPCAgent, Planner
         >>> from gpadjust.systems import cart_pole
         >>> system = cart_pole()
-        >>> quick = Planner(search=CrossEntropy(1), horizon=0.3, num_random=16)  # or leave it out
+        >>> quick = Planner(rounds=1, horizon=0.3, num_random=16)  # or leave it out
         >>> agent = MPCAgent(system.make(), system.task(), quick, first=quick, seed=0)
         >>> agent.learn(total_timesteps=25)
         MPCAgent(CartPoleSwingUpEnv, LearnedDynamics, 1 episodes learnt, 25 steps, last reward ...)
@@ -92,10 +90,10 @@ class MPCAgent(Agent):
     def predict(
         self,
         observation: NDArray[Any],
-        state: PlanState | None = None,
+        state: Sequence[Plan] | None = None,
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = False,
-    ) -> tuple[NDArray[Any], PlanState]:
+    ) -> tuple[NDArray[Any], tuple[Plan, ...]]:
         """Plan actions; see :meth:`MPC.predict`.
 
         Raises:
@@ -103,7 +101,7 @@ class MPCAgent(Agent):
         """
         return self.mpc.predict(observation, state, episode_start, deterministic)
 
-    def promise(self, state: PlanState) -> dict[str, float]:
+    def promise(self, state: Sequence[Plan]) -> dict[str, float]:
         """Return the promised reward of a step by the plan of a whole episode."""
         (plan,) = state
         if plan.violation > 0:
@@ -142,8 +140,8 @@ class PolicySearchAgent(Agent):
     Args:
         env: As of :class:`Agent`.
         task: What is known of the system, in PyTorch's functions, as gradients flow through them.
-        policy: Makes the policy of a spec and the bounds of the actions: :func:`mlp_policy`,
-            or a function of yours, such as ``functools.partial(mlp_policy, net_arch=(32,))``.
+        policy: Makes the policy of a spec and the bounds of the actions: :class:`BoundedPolicy`,
+            or a function of yours, such as ``functools.partial(BoundedPolicy, net_arch=(32,))``.
         search: How the policy is improved.
         options: Further arguments of :class:`Agent`.
 
@@ -161,7 +159,7 @@ class PolicySearchAgent(Agent):
         >>> from gpadjust.systems import cart_pole
         >>> wide = torch.tensor([[-50.0] * 4, [50.0] * 4])  # far beyond what is ever seen
         >>> system = replace(cart_pole(), state_bounds=wide)
-        >>> search = PolicySearch(updates=2, num_starts=4, num_functions=2)
+        >>> search = PolicySearch(updates=2, num_starts=8)
         >>> agent = PolicySearchAgent(system.make(), system.task(), search=search, seed=0)
         >>> agent.learn(total_timesteps=25)
         PolicySearchAgent(CartPoleSwingUpEnv, LearnedDynamics, 1 episodes learnt, 25 steps, ...)
@@ -171,7 +169,7 @@ class PolicySearchAgent(Agent):
         self,
         env: Any,
         task: Task,
-        policy: Callable[[StateSpec, Tensor], BoundedPolicy] = mlp_policy,
+        policy: Callable[[StateSpec, Tensor], BoundedPolicy] = BoundedPolicy,
         search: PolicySearch | None = None,
         **options: Any,
     ) -> None:
@@ -179,7 +177,7 @@ class PolicySearchAgent(Agent):
         check_kind("search", self.search, PolicySearch, "a PolicySearch(...)")
         super().__init__(env, task, **options)
         made = policy(task.dynamics.spec, self.action_bounds()) if callable(policy) else policy
-        told = "a function that makes a BoundedPolicy of a spec and bounds, as mlp_policy does"
+        told = "a function that makes a BoundedPolicy of a spec and bounds, as the class does"
         check_kind("policy", made, BoundedPolicy, told)
         self.policy = made
         self.is_trained = False
@@ -249,10 +247,9 @@ class PolicySearchAgent(Agent):
 
     def _random_states(self, task: Task) -> Tensor:
         """States ``N x state_dim`` of episodes of random actions in a model."""
-        length = self.episode_length()
-        steps = random_sequences(_EPISODES, length, self.action_bounds(), MAX_HOLD).unbind(1)
-        taken = iter(steps)
+        length, bounds = self.episode_length(), self.action_bounds()
+        sequences = random_sequences(_EPISODES, length, bounds, MAX_HOLD)
         with torch.no_grad():
             starts = task.draw_initial_states(_EPISODES)
-            rollout = Rollouts(task, None).act(starts, lambda states: next(taken), length)
+            rollout = Rollouts(task, None).follow(starts, sequences)
         return torch.cat([starts, rollout.next_states[rollout.made]])

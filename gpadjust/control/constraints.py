@@ -19,7 +19,7 @@ def margins(
     action_bounds: Tensor,
     covariance: Tensor | None = None,
 ) -> Tensor:
-    r"""By how much constraints must hold in the mean of a plan, for them to hold in the system.
+    r"""Return how far constraints must hold in the mean of a plan, to hold in the system.
 
     The covariance of the states is carried along the plan: noise is another one in each step, and
     what is not known of the mean errs in the same direction all along. Deviations are corrected by
@@ -46,7 +46,9 @@ def margins(
     if task.probability is None:
         return torch.zeros_like(task.constraint_values(states, actions))
     near = linearised(task.dynamics, states, actions)
-    slopes = _slopes(task, near.mean, actions)
+    with torch.enable_grad():
+        at = near.mean.clone().requires_grad_(True)
+        (slopes,) = derivatives(task.constraint_values(at, actions), [at])
     num_steps, num_constraints, dim = slopes.shape
     share = (1 - task.probability) / (task.episode_length or num_steps) / num_constraints
     quantile = torch.special.ndtri(slopes.new_tensor(1 - share)).clamp_min(0.0)
@@ -97,10 +99,3 @@ def _feedback(near: Linearised, slopes: Tensor, half_range: Tensor) -> Tensor:
 def _along(slopes: Tensor, covariance: Tensor) -> Tensor:
     """Variances ``c`` in the directions of slopes ``c x state_dim``."""
     return ((slopes.unsqueeze(-2) @ covariance).squeeze(-2) * slopes).sum(-1)
-
-
-def _slopes(task: Task, states: Tensor, actions: Tensor) -> Tensor:
-    """The derivatives of the constraints by the states, ``N x c x state_dim``."""
-    with torch.enable_grad():
-        at = states.detach().clone().requires_grad_(True)
-        return derivatives(task.constraint_values(at, actions), [at])[0]

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.dynamics import Dynamics, Trajectories
-from gpadjust.dynamics.free_run import step_or_nan
+from gpadjust.dynamics.base import step_or_nan
 from gpadjust.physics import PhysicsError
 from gpadjust.states import StateSpec
 

@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from gpadjust.control.delay import find_delay
-from gpadjust.control.reach import reach
+from gpadjust.control.rollouts import reach
 from gpadjust.control.task import Task
 from gpadjust.dynamics import Dynamics, LearnedDynamics, Trajectories
-from gpadjust.dynamics.free_run import typical_change
+from gpadjust.dynamics.base import typical_change
 from gpadjust.physics import PhysicsError
 from gpadjust.states import StateSpec
 from gpadjust.validation.trust import trust

@@ -1,33 +1,115 @@
-"""Policies that are improved by gradients through a model."""
+"""Policies, and their search by gradients through a model."""
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import KW_ONLY, dataclass, field
-from typing import NamedTuple
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
-from gpadjust.checks import check_kind, checked_number, checked_whole
-from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts, Score
+from gpadjust.checks import checked_bounds, checked_number, checked_whole
+from gpadjust.control.rollouts import Objective, Return, Rollouts, check_objective
 from gpadjust.control.task import Task
+from gpadjust.states import StateSpec
 
+_NEAR = 0.95  # of the way to a bound: beyond, the tanh has hardly any slope
 _REDRAW_EVERY = 5  # updates after which the policy is judged, and other functions are drawn
 _MAX_GRAD_NORM = 1.0
+
+
+class BoundedPolicy(nn.Module):
+    r"""A network whose actions are within bounds.
+
+    .. math:: a = \frac{h + l}{2} + \frac{h - l}{2} \tanh(\pi(z)), \quad z = (o - m) / s,
+
+    where o is the observation (:meth:`~gpadjust.states.StateSpec.observe`) and :math:`\pi` the
+    ``body``, layers of float64 in whose place another module may be set.
+
+    Args:
+        spec: What the entries of states and actions are.
+        action_bounds: Lower and upper bounds l and h of the actions, ``2 x action_dim``.
+        net_arch: The widths of the hidden layers; () for a linear function.
+        first_actions: About what it does before it has learnt, ``action_dim`` numbers within the
+            bounds. Default: their middle, which for muscles, say, is to tense them all.
+
+    Raises:
+        ValueError: If ``first_actions`` are beyond the bounds, or another number of them.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust.control import BoundedPolicy
+        >>> from gpadjust.states import StateSpec
+        >>> policy = BoundedPolicy(StateSpec(["x"], ["force"]), [[-2.0], [2.0]])
+        >>> policy(torch.zeros(3, 1, dtype=torch.float64)).shape
+        torch.Size([3, 1])
+    """
+
+    action_bounds: Tensor
+    origin: Tensor
+    unit: Tensor
+
+    def __init__(
+        self,
+        spec: StateSpec,
+        action_bounds: ArrayLike,
+        net_arch: Sequence[int] = (64, 64),
+        first_actions: Sequence[float] | None = None,
+    ) -> None:
+        super().__init__()
+        bounds = checked_bounds("action_bounds", action_bounds, spec.action_dim)
+        low, high = bounds
+        first = (low + high) / 2 if first_actions is None else torch.tensor(first_actions).double()
+        if first.shape != low.shape or not ((first >= low) & (first <= high)).all():
+            raise ValueError(
+                f"first_actions must be {len(low)} numbers within {low.tolist()} and "
+                f"{high.tolist()}; found {first.tolist()}."
+            )
+        self.spec = spec
+        self.register_buffer("action_bounds", bounds)
+        self.register_buffer("origin", torch.zeros(spec.observation_dim, dtype=torch.float64))
+        self.register_buffer("unit", torch.ones(spec.observation_dim, dtype=torch.float64))
+        layers: list[nn.Module] = []
+        for widths in pairwise([spec.observation_dim, *net_arch, spec.action_dim]):
+            layers += [nn.Linear(*widths, dtype=torch.float64), nn.Tanh()]
+        self.body = nn.Sequential(*layers[:-1])
+        last: Any = self.body[-1]
+        with torch.no_grad():
+            last.weight.mul_(0.1)  # gentle actions at first
+            last.bias.copy_(((2 * first - low - high) / (high - low)).clamp(-_NEAR, _NEAR).atanh())
+
+    def forward(self, states: Tensor) -> Tensor:
+        """Return actions ``N x action_dim`` at states ``N x state_dim``."""
+        return self.act(self.spec.observe(states))
+
+    def act(self, observations: Tensor) -> Tensor:
+        """Return actions ``N x action_dim`` at observations ``N x observation_dim``."""
+        low, high = self.action_bounds
+        raw = self.body((observations - self.origin) / self.unit)
+        return (low + high) / 2 + (high - low) / 2 * raw.tanh()
+
+    def look_at(self, states: Tensor) -> None:
+        """Take the scale of observations from states ``N x state_dim``; once, before training."""
+        seen = self.spec.observe(states)
+        self.origin.copy_(seen.mean(0))
+        spread = seen.std(0, correction=0)
+        self.unit.copy_(torch.where(spread > 1e-6 * seen.abs().amax(0), spread, 1.0))
 
 
 class SearchResult(NamedTuple):
     """Result of a search.
 
     Args:
-        values: What the objective said in each update, ``updates``; of drawn functions and starts.
-        reward: The mean reward of a step of the policy that was kept, in the draws that were held
-            out.
+        values: Value of the objective in each update, ``updates``; of drawn functions and starts.
+        reward: The mean reward of a step of the best policy, in the draws that were held out.
         left_bounds: The share of episodes that left the bounds there.
-        seconds: How long it took.
+        seconds: Duration.
     """
 
     values: Tensor
@@ -42,24 +124,17 @@ class PolicySearch:
 
     Each update lets the policy act from ``num_starts`` states, and follows the gradient of the
     objective back through all steps, through policy, f_p and what was learnt (Deisenroth and
-    Rasmussen 2011; Parmas et al. 2018; Amadio et al. 2022). With ``num_functions`` it acts in as
-    many functions, each of them deterministic and the same along an episode; new ones are drawn as
-    the search goes on, so that the policy cannot lean on the errors of a few. After one or two real
-    episodes they may differ too much for one policy. A black box as physics has the gradients of
-    its finite differences.
-
-    Every few updates the policy is judged from starts, and in functions, that no update sees, the
-    same each time. The best one is kept, be it the one that the search began with.
-
-    Where gradients do not find the task by themselves (a swing-up: at first no action of the policy
-    matters), let the policy first imitate plans of some episodes, by least squares.
+    Rasmussen 2011; Parmas et al. 2018; Amadio et al. 2022). A black box as physics has the
+    gradients of its finite differences. Every few updates other functions are drawn, so that the
+    policy cannot lean on the errors of a few, and it is judged from starts, and in functions, that
+    no update sees, the same each time. The best one is kept, be it the one at the beginning.
 
     Args:
         objective: What to look for. Default: the mean return; ``Return(quantile=0.2)`` is careful.
         updates: Gradient steps (Adam).
-        num_starts: Number of starts of each update, in each function.
-        num_functions: Number of functions that each is followed through, such as 6; None for the
-            mean.
+        num_starts: Number of starts of each update.
+        num_functions: Number of functions in which it acts from each, such as 6; after one or two
+            real episodes they may differ too much for one policy. None for the mean.
         learning_rate: At the start; it decays to a tenth along a cosine.
 
     Raises:
@@ -68,7 +143,7 @@ class PolicySearch:
 
     Example:
         >>> import torch
-        >>> from gpadjust.control import PolicySearch, Task, mlp_policy
+        >>> from gpadjust.control import BoundedPolicy, PolicySearch, Task
         >>> from gpadjust.dynamics import PhysicsDynamics, StateSpec
         >>> spec = StateSpec(["x"], ["v"])
         >>> task = Task(
@@ -78,7 +153,7 @@ class PolicySearch:
         ...     episode_length=5,
         ... )
         >>> _ = torch.manual_seed(0)
-        >>> policy = mlp_policy(spec, torch.tensor([[-1.0], [1.0]]), net_arch=())
+        >>> policy = BoundedPolicy(spec, [[-1.0], [1.0]], net_arch=())
         >>> result = PolicySearch(updates=30, learning_rate=0.1).improve(policy, task)
         >>> bool(result.values[-5:].mean() > result.values[:5].mean())
         True
@@ -93,13 +168,9 @@ class PolicySearch:
 
     def __post_init__(self) -> None:
         """Check the options."""
-        told = "an object of an Objective, such as Return()"
-        check_kind("objective", self.objective, Objective, told)
-        for name in ("updates", "num_starts"):
-            checked_whole(name, getattr(self, name), 1)
-        if self.num_functions is not None:
-            checked_whole("num_functions", self.num_functions, 1)
-        self.objective.check_functions(self.num_functions)
+        check_objective(self.objective, self.num_functions)
+        checked_whole("updates", self.updates, 1)
+        checked_whole("num_starts", self.num_starts, 1)
         checked_number("learning_rate", self.learning_rate, above=0)
 
     def check_task(self, task: Task) -> None:
@@ -109,7 +180,7 @@ class PolicySearch:
 
     def improve(
         self,
-        policy: Callable[[Tensor], Tensor],
+        policy: nn.Module,
         task: Task,
         *,
         progress: Callable[[int, float], None] | None = None,
@@ -119,9 +190,8 @@ class PolicySearch:
         Args:
             policy: A module from states ``N x state_dim`` to actions ``N x action_dim``, whose
                 parameters are changed; after an error they are as before.
-            task: The task, whose dynamics are fitted. It must say where episodes start and how
-                long they are.
-            progress: Called after each update with its number and what the objective said.
+            task: The task, whose dynamics are fitted, with episode length and starts.
+            progress: Called after each update with its number and the value of the objective.
 
         Raises:
             TypeError: If the policy is no module with parameters.
@@ -132,97 +202,56 @@ class PolicySearch:
         """
         if not isinstance(policy, nn.Module) or not [*policy.parameters()]:
             raise TypeError(
-                f"policy must be a module with parameters, such as mlp_policy(...); found "
+                f"policy must be a module with parameters, such as BoundedPolicy(...); found "
                 f"{policy!r}."
             )
         self.check_task(task)
         if task.episode_length is None:
             raise ValueError("A policy search needs a task with episode_length; found None.")
+        begun, values, length = time.perf_counter(), list[Tensor](), task.episode_length
         home = next(policy.parameters()).device
         policy.to("cpu")  # where the dynamics are
-        before = {name: t.detach().clone() for name, t in policy.state_dict().items()}
-        try:
-            return self._improve(policy, task, task.episode_length, progress)
-        except BaseException:
-            policy.load_state_dict(before)
-            raise
-        finally:
-            policy.to(home)
-
-    def _improve(
-        self,
-        policy: nn.Module,
-        task: Task,
-        length: int,
-        progress: Callable[[int, float], None] | None,
-    ) -> SearchResult:
-        begun = time.perf_counter()
+        result = before = deepcopy(policy.state_dict())
         parameters = [p for p in policy.parameters() if p.requires_grad]
         optimizer = torch.optim.Adam(parameters, lr=self.learning_rate)
         rate = torch.optim.lr_scheduler.CosineAnnealingLR(
             optimizer, self.updates, eta_min=self.learning_rate / 10
         )
-        score = self.objective.of(task)
-        held_out = Rollouts(task, self.num_functions)
-        best = _Best(held_out, self._starts(task, held_out.num_functions), score, length)
-        values = []
-        for i in range(self.updates):
-            if i % _REDRAW_EVERY == 0:
-                best.judge(policy)
-                rollouts = Rollouts(task, self.num_functions)
-            rollout = rollouts.act(self._starts(task, rollouts.num_functions), policy, length)
-            value = score(rollout).mean() / length
-            if not value.requires_grad:
-                raise RuntimeError(
-                    "No gradient flows from the rewards to the policy: the task's reward or the "
-                    "dynamics are computed without PyTorch's autograd. Write the reward in torch, "
-                    "without .detach() and .numpy()."
-                )
-            optimizer.zero_grad()
-            (-value).backward()
-            norm = nn.utils.clip_grad_norm_(parameters, _MAX_GRAD_NORM)
-            if norm.isfinite():
-                optimizer.step()
-            rate.step()
-            values.append(value.detach())
-            if progress is not None:
-                progress(i + 1, float(value.detach()))
-        best.judge(policy)
-        policy.load_state_dict(best.kept)
-        rewards, left = best.rollout.rewards[best.rollout.made], best.rollout.left_bounds
-        seconds = time.perf_counter() - begun
-        share = float(left.double().mean())
-        return SearchResult(torch.stack(values), float(rewards.mean()), share, seconds)
-
-    def _starts(self, task: Task, num_functions: int) -> Tensor:
-        """Starts of an update: others in each function, unless these are compared at the same."""
-        if self.objective.compares_functions:
-            return task.draw_initial_states(self.num_starts)
-        starts = task.draw_initial_states(num_functions * self.num_starts)
-        return starts.unflatten(0, (num_functions, self.num_starts))
-
-
-class _Best:
-    """The best policy so far, by functions and starts that no update sees.
-
-    Args:
-        rollouts: In the functions.
-        starts: As of :meth:`Rollouts.act`.
-        score: The worth of a rollout.
-        length: Steps of an episode.
-    """
-
-    kept: dict[str, Tensor]
-    rollout: Rollout
-
-    def __init__(self, rollouts: Rollouts, starts: Tensor, score: Score, length: int) -> None:
-        self.rollouts, self.starts, self.score, self.length = rollouts, starts, score, length
-        self.worth: float | None = None
-
-    def judge(self, policy: nn.Module) -> None:
-        """Keep a policy, if it is better than the one that is kept."""
-        with torch.no_grad():
-            rollout = self.rollouts.act(self.starts, policy, self.length)
-            worth = float(self.score(rollout).mean())
-        if self.worth is None or worth > self.worth:
-            self.worth, self.rollout, self.kept = worth, rollout, deepcopy(policy.state_dict())
+        try:
+            score, held_out = self.objective.of(task), Rollouts(task, self.num_functions)
+            starts = task.draw_initial_states(self.num_starts)
+            best, best_worth = before, -math.inf
+            for i in range(self.updates + 1):
+                if i % _REDRAW_EVERY == 0 or i == self.updates:
+                    with torch.no_grad():
+                        judged = held_out.act(starts, policy, length)
+                        worth = float(score(judged).mean())
+                    if i == 0 or worth > best_worth:
+                        best, best_worth = deepcopy(policy.state_dict()), worth
+                        reward = float(judged.rewards[judged.made].mean())
+                        left = float(judged.left_bounds.any(-1).double().mean())
+                if i == self.updates:
+                    break
+                if i % _REDRAW_EVERY == 0:
+                    rollouts = Rollouts(task, self.num_functions)
+                drawn = task.draw_initial_states(self.num_starts)
+                value = score(rollouts.act(drawn, policy, length)).mean() / length
+                if not value.requires_grad:
+                    raise RuntimeError(
+                        "No gradient flows from the rewards to the policy: the task's reward or "
+                        "the dynamics are computed without PyTorch's autograd. Write the reward in "
+                        "torch, without .detach() and .numpy()."
+                    )
+                optimizer.zero_grad()
+                (-value).backward()
+                if nn.utils.clip_grad_norm_(parameters, _MAX_GRAD_NORM).isfinite():
+                    optimizer.step()
+                rate.step()
+                values.append(value.detach())
+                if progress is not None:
+                    progress(i + 1, float(values[-1]))
+            result = best
+        finally:
+            policy.load_state_dict(result)
+            policy.to(home)
+        return SearchResult(torch.stack(values), reward, left, time.perf_counter() - begun)

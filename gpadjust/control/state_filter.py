@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.checks import seeded
-from gpadjust.control.reach import random_sequences
-from gpadjust.control.rollouts import Rollouts
+from gpadjust.control.rollouts import Rollouts, random_sequences
 from gpadjust.control.task import Task
 from gpadjust.dynamics.linearised import derivatives, linearised
 from gpadjust.records.kalman import Array, measure
@@ -68,8 +67,8 @@ class StateFilter(NamedTuple):
         length = min(task.episode_length or 1, _HOLD)
         with seeded(0), torch.no_grad():
             starts = task.draw_initial_states(_EPISODES)
-            steps = iter(random_sequences(_EPISODES, length, action_bounds, _HOLD).unbind(1))
-            run = Rollouts(task, None).act(starts, lambda states: next(steps), length)
+            sequences = random_sequences(_EPISODES, length, action_bounds, _HOLD)
+            run = Rollouts(task, None).follow(starts, sequences)
             rows, following = run.states[run.made], run.next_states[run.made]
             seen = [sensors.measure(spec, states) for states in (rows, following)]
         change = spec.change(rows, following).square().mean(0)

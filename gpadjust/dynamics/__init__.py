@@ -1,7 +1,6 @@
 """Distributions of the next state of a system, over the models of this library."""
 
-from gpadjust.dynamics.base import Dynamics, TransitionFunctions
-from gpadjust.dynamics.free_run import FreeRun
+from gpadjust.dynamics.base import Dynamics, FreeRun, TransitionFunctions
 from gpadjust.dynamics.learned_dynamics import LearnedDynamics
 from gpadjust.dynamics.physics_dynamics import PhysicsDynamics
 from gpadjust.dynamics.targets import AngleInput

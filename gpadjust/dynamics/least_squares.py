@@ -33,12 +33,12 @@ def most_likely(
         Coordinates ``p``; the precision of these by the transitions, ``p x p``, without the prior;
         and mean squares of the errors, ``state_dim``, 0 of states that do not move.
     """
-    n, unknowns = len(data.states), physics.unknowns
-    whole = _Errors(physics, spec, data)
+    unknowns, whole = physics.unknowns, _Errors(physics, spec, data)
     guess = unknowns.coordinates(unknowns.guess)
     if not whole.at(guess).isfinite().all():
         physics(whole.inputs)  # which says where it fails
-    rows = torch.linspace(0, n - 1, min(n, _SEARCHED), dtype=torch.float64).round().long()
+    number = min(len(data), _SEARCHED)
+    rows = torch.linspace(0, len(data) - 1, number, dtype=torch.float64).round().long()
     some = _Errors(physics, spec, data.some(rows))
     starts = torch.cat([guess.unsqueeze(0), even_normal(_GUESSES, len(guess), seed=0)])
     best = some.loss(starts).nan_to_num(nan=torch.inf).argsort()[:_STARTS]
@@ -50,7 +50,7 @@ def most_likely(
     freedom = whole.count.sum() / (whole.count.sum() - len(unknowns)).clamp_min(1)
     noise = torch.zeros(spec.state_dim, dtype=torch.float64)
     noise[spec.moving] = errors.square().sum(-1) / whole.count.clamp_min(1) * freedom
-    _warn_of_parameters(tuple(unknowns), precision, point)
+    _warn_of_parameters([*unknowns], precision, point)
     return point, precision, noise
 
 
@@ -72,8 +72,7 @@ class _Errors:
         predicted = self.data.states.expand(*following.shape[:-1], -1).clone()
         predicted[..., self.spec.moving] = following
         errors = self.spec.change(predicted, self.data.next_states)[..., self.spec.moving].mT
-        errors = errors.where(self.observed, torch.zeros_like(errors))
-        return errors.nan_to_num(nan=torch.inf)
+        return errors.masked_fill(~self.observed, 0.0).nan_to_num(nan=torch.inf)
 
     def slopes(self, z: Tensor) -> Tensor:
         """Return derivatives of the errors at ``p`` coordinates, ``p x m x n``."""
@@ -112,7 +111,7 @@ class _Errors:
         return z
 
 
-def _warn_of_parameters(names: tuple[str, ...], precision: Tensor, point: Tensor) -> None:
+def _warn_of_parameters(names: list[str], precision: Tensor, point: Tensor) -> None:
     """Warn of parameters of which transitions tell next to nothing, or that contradict a prior.
 
     The first take part in directions in which the transitions have next to none of the prior's
@@ -121,16 +120,16 @@ def _warn_of_parameters(names: tuple[str, ...], precision: Tensor, point: Tensor
     values, vectors = torch.linalg.eigh(precision)
     silent = vectors[:, values < _UNTOLD].norm(dim=-1) > _TAKES_PART
     for which, message in (
-        (silent, "Transitions say next to nothing of {} of the physics: give narrower priors"),
-        (point.abs() > _FAR, "Transitions and prior disagree about {} of the physics: look at it"),
+        (silent, "Transitions say next to nothing of {} of the physics: give narrower priors."),
+        (point.abs() > _FAR, "Transitions and prior disagree about {} of the physics: look at it."),
     ):
-        if which.any():
-            told = ", ".join(name for name, is_one in zip(names, which, strict=True) if is_one)
-            warnings.warn(f"{message.format(told)}.", PhysicsWarning, stacklevel=5)
+        told = ", ".join(name for name, is_one in zip(names, which, strict=True) if is_one)
+        if told:
+            warnings.warn(message.format(told), PhysicsWarning, stacklevel=5)
 
 
 def even_normal(number: int, p: int, seed: int) -> Tensor:
-    """Standard normal draws ``number x p`` that fill space evenly (Sobol)."""
+    """Return standard normal draws ``number x p`` that fill space evenly (Sobol)."""
     engine = torch.quasirandom.SobolEngine(p, scramble=True, seed=seed)
     shares = engine.draw(number, dtype=torch.float64).clamp(1e-6, 1 - 1e-6)
     return torch.special.ndtri(shares)

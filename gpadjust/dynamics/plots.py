@@ -1,8 +1,6 @@
 """Figures of free runs beside what was measured.
 
-Each function draws on the axes that it is given, or on those of a new figure, and returns them;
-show or save the figure with ``axes.flat[0].figure``. They need matplotlib,
-``pip install gpadjust[plot]``.
+They need matplotlib, ``pip install gpadjust[plot]``.
 """
 
 from __future__ import annotations
@@ -13,13 +11,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
 from torch import Tensor
 
-from gpadjust.dynamics.free_run import FreeRun
+from gpadjust.checks import check_choice
+from gpadjust.dynamics.base import FreeRun
 from gpadjust.dynamics.trajectories import Windows
 from gpadjust.states import StateSpec
-from gpadjust.validation.plots.drawing import BAND, BLUE, RED, axes_of, legend, tidy
+from gpadjust.validation.plots import BAND, BLUE, RED, axes_of, legend, tidy
 
 __all__ = ["plot_free_run"]
 
@@ -55,44 +53,51 @@ def plot_free_run(
         axes: ``len(states) x len(rows)`` axes. Default: a new figure.
 
     Returns:
-        An array of these axes.
+        An array of these axes; show or save the figure with ``axes.flat[0].figure``.
 
     Raises:
-        TypeError: If a run is no :class:`FreeRun`, or ``windows`` are no :class:`Windows`.
-        ValueError: If runs are not of these windows, a name is unknown, there is no such window, or
-            the number of ``axes`` is another one.
-
-    Example:
-        >>> import torch
-        >>> from gpadjust.dynamics import PhysicsDynamics, StateSpec, Trajectories
-        >>> spec = StateSpec(["x"], ["v"])
-        >>> times = 0.1 * torch.arange(41, dtype=torch.float64).unsqueeze(-1)
-        >>> x, v = times.sin(), times.cos()
-        >>> windows = Trajectories(x[:-1], v[:-1], x[1:], torch.zeros(40)).windows(20)
-        >>> dynamics = PhysicsDynamics(spec, physics=lambda X: X[:, :1] + 0.1 * X[:, 1:])
-        >>> run = dynamics.free_run(windows.initial_states, windows.actions)
-        >>> plot_free_run(run, windows, step=0.1, units={"x": "m"}).shape
-        (1, 2)
+        ValueError: If runs are not of these windows, a name is unknown, or the number of ``axes``
+            is another one.
+        IndexError: If there is no such window.
     """
-    others = dict(others or {})
-    _check_runs({"run": run, **others}, windows)
-    spec, num_windows = run.spec, len(run.mean)
+    spec, shape, runs = run.spec, tuple(windows.measured.shape), {"free run": run, **(others or {})}
+    for name, each in runs.items():
+        if each.mean.shape != shape:
+            raise ValueError(
+                f"Expected {name} of these windows, w x T x state_dim {shape}, got runs of shape "
+                f"{tuple(each.mean.shape)}; pass windows and runs of all of them, and choose by "
+                "`rows`."
+            )
     if rows is None:
-        rows = torch.linspace(0, num_windows - 1, min(num_windows, _SHOWN)).round().int().tolist()
-    if not len(rows) or any(row not in range(-num_windows, num_windows) for row in rows):
-        raise ValueError(
-            f"Expected rows as numbers of windows from 0 to {num_windows - 1}, got {rows!r}."
-        )
+        rows = np.linspace(0, shape[0] - 1, min(shape[0], _SHOWN)).round().astype(int).tolist()
     names = [spec.states[i] for i in spec.moving] if states is None else list(states)
-    check_names("states", names, spec.states)
+    for name in names:
+        check_choice("state", name, spec.states)
     called, step = labels(spec, units), spec.step if step is None else step
     grid = axes_of(axes, len(names), len(rows), 2.5)
-    times = (1 if step is None else step) * np.arange(run.mean.shape[1] + 1)
+    times = (1 if step is None else step) * np.arange(shape[1] + 1)
     for name, line in zip(names, grid, strict=True):
         i = spec.states.index(name)
-        for row, ax in zip(rows, line, strict=True):
-            _draw_free_run(ax, times, run, windows, others, (int(row), i))
         line[0].set(ylabel=called[name])
+        for row, ax in zip(rows, line, strict=True):
+            recorded = windows.states[row, :, i]
+            measured = going_on(recorded, i in spec.angle_columns)
+            low, high, *means = (
+                torch.cat([measured[:1], values[row, :, i] - recorded[0] + measured[0]])
+                for values in (run.lower, run.upper, *(each.mean for each in runs.values()))
+            )
+            # Where particles start is not known here: the interval is that from step 1 on.
+            label = f"{100 * run.level:g} %"
+            ax.fill_between(times[1:], low[1:], high[1:], **BAND, label=label)
+            ax.plot(times, means[0], color=BLUE, lw=1.5, label="free run")
+            for k, (label, mean) in enumerate(zip([*runs][1:], means[1:], strict=True)):
+                ax.plot(times, mean, "--", color=_OTHERS[k % len(_OTHERS)], lw=1.3, label=label)
+            ax.plot(times, measured, "o", color="black", ms=3, label="measured")
+            shown = torch.cat([means[0], measured[~measured.isnan()]])
+            room = float(_ROOM * (shown.max() - shown.min()))
+            if room > 0:
+                ax.set_ylim(float(shown.min()) - room, float(shown.max()) + room)
+            tidy(ax)
     for ax in grid[-1]:
         ax.set(xlabel="steps" if step is None else called["time"])
     if axes is None:
@@ -104,61 +109,8 @@ def plot_free_run(
     return grid
 
 
-def _draw_free_run(
-    ax: Axes,
-    times: np.ndarray,
-    run: FreeRun,
-    windows: Windows,
-    others: Mapping[str, FreeRun],
-    at: tuple[int, int],
-) -> None:
-    """Draw one state of one window, ``at = (row, column)``."""
-    (row, i), spec = at, run.spec
-    recorded = windows.states[row, :, i]
-    measured = going_on(recorded, i in spec.angle_columns)
-    turns = recorded[:1] - measured[:1]
-
-    def path(values: Tensor) -> Tensor:
-        return torch.cat([recorded[:1], values[row, :, i]]) - turns
-
-    low, high, mean = path(run.lower), path(run.upper), path(run.mean)
-    # Where particles start is not known here: the interval is that from the first step on.
-    ax.fill_between(times[1:], low[1:], high[1:], **BAND, label=f"{100 * run.level:g} %")
-    ax.plot(times, mean, color=BLUE, lw=1.5, label="free run")
-    for k, (label, other) in enumerate(others.items()):
-        ax.plot(times, path(other.mean), "--", color=_OTHERS[k % len(_OTHERS)], lw=1.3, label=label)
-    ax.plot(times, measured, "o", color="black", ms=3, label="measured")
-    held = torch.cat([mean, measured[~measured.isnan()]])
-    low, high = held.min(), held.max()
-    if high > low:
-        room = _ROOM * (high - low)
-        ax.set_ylim(float(low - room), float(high + room))
-    tidy(ax)
-
-
-def _check_runs(runs: Mapping[str, FreeRun], windows: Windows) -> None:
-    """Raise an error unless these are free runs of the windows."""
-    if not isinstance(windows, Windows):
-        raise TypeError(
-            f"Expected windows as Windows, got {type(windows).__name__}; pass "
-            "`records.windows(length)`, or `Windows(initial_states, actions, measured)`."
-        )
-    for name, run in runs.items():
-        if not isinstance(run, FreeRun):
-            raise TypeError(
-                f"Expected {name} as a FreeRun, got {type(run).__name__}; pass "
-                "`dynamics.free_run(windows.initial_states, windows.actions)`."
-            )
-        if run.mean.shape != windows.measured.shape:
-            raise ValueError(
-                f"Expected {name} of these windows, w x T x state_dim "
-                f"{tuple(windows.measured.shape)}, got runs of shape {tuple(run.mean.shape)}; pass "
-                "windows and runs of all of them, and choose by `rows`."
-            )
-
-
 def going_on(values: Tensor, is_angle: bool) -> Tensor:
-    """One state over time, ``n`` with NaN; an angle without jumps, at first within half a turn."""
+    """Return a state over time, ``n`` with NaN; an angle without jumps, from within half a turn."""
     values, known = values.clone(), ~values.isnan()
     if is_angle and known.any():
         path = torch.from_numpy(np.unwrap(values[known].numpy()))
@@ -167,16 +119,9 @@ def going_on(values: Tensor, is_angle: bool) -> Tensor:
 
 
 def labels(spec: StateSpec, units: Mapping[str, str] | None) -> dict[str, str]:
-    """Labels of axes, by the names of states and actions and "time"."""
+    """Return labels of axes, by the names of states and actions and "time"."""
     names = (*spec.states, *spec.actions, "time")
+    for name in units or {}:
+        check_choice("name in units", name, names)
     units = {"time": "s", **dict.fromkeys(spec.angles, "rad"), **(units or {})}
-    check_names("units", units, names)
     return {name: f"{name} in {units[name]}" if units.get(name) else name for name in names}
-
-
-def check_names(argument: str, names: Any, known: Sequence[str]) -> None:
-    """Raise a ValueError unless there are names, all of them known."""
-    unknown = [name for name in names if name not in known]
-    if unknown or not len(names):
-        found = repr(unknown[0]) if unknown else "none"
-        raise ValueError(f"Expected {argument} of {', '.join(known)}, found {found}.")

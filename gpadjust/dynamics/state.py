@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import asdict
 from types import FunctionType
 from typing import Any, NamedTuple
@@ -10,156 +12,129 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from gpadjust.dynamics.targets import next_values, warn_of_differences
 from gpadjust.dynamics.trajectories import Trajectories
+from gpadjust.physics import Physics, PhysicsError
 from gpadjust.states import StateSpec
 
-_COLUMNS = ("states", "actions", "next_states")  # of transitions in a state
 _PROBES = 3
-_OF_SPREAD = 1e-4  # of what the physics says, by which another machine's may differ
+_OF_SPREAD = 1e-4  # of what the physics returns, by which another machine's may differ
 _OF_SIZE = 1e-6  # of the states that it is computed from
 
 
 def fingerprint(kind: type, spec: StateSpec, **settings: Any) -> dict[str, str]:
-    """Class, spec and settings of dynamics, each as a text.
-
-    A setting that is a mapping counts by its items. Modules and other objects that have no value to
-    compare are named by their class, classes and functions by their name.
-    """
+    """Return class, spec and settings of dynamics, each as a text."""
     # Where nothing is integrated, the step is but the unit of horizons.
     step = spec.step if spec.integrated else None
     settings = {**asdict(spec), "step": step, **settings}
     return {"class": kind.__name__, **{name: _text(value) for name, value in settings.items()}}
 
 
-def check_fingerprint(state: dict[str, Any], expected: dict[str, str]) -> None:
-    """Raise a RuntimeError, as PyTorch does, if a state is of other dynamics.
+def _text(value: Any) -> str:
+    """Return the value of plain objects, the name of classes and functions, the class of others."""
+    if isinstance(value, Mapping):
+        items = sorted((str(key), _text(part)) for key, part in value.items())
+        return "{" + ", ".join(f"{key!r}: {part}" for key, part in items) + "}"
+    if isinstance(value, list | tuple):
+        return "(" + ", ".join(map(_text, value)) + ")"
+    if isinstance(value, float):
+        return repr(float(value))  # NumPy's print their type
+    if value is None or isinstance(value, bool | int | str):
+        return repr(value)
+    is_named = isinstance(value, type | FunctionType)
+    return value.__name__ if is_named else f"<{type(value).__name__}>"
 
-    The state of dynamics that learnt nothing is empty, and fits all.
-    """
+
+@contextmanager
+def loading(state: Any, expected: dict[str, str]) -> Iterator[dict[str, Any]]:
+    """Yield a copy of a state of dynamics; raise a RuntimeError where it cannot be loaded."""
     if not isinstance(state, Mapping):
         raise TypeError(f"Expected a dictionary that `state_dict` gave, found {state!r}.")
-    if not state:
-        return
     found = state.get("fingerprint")
     if not isinstance(found, Mapping):
         raise RuntimeError(
             "The state does not say of what dynamics it is; expected one that `state_dict` gave, "
             f"with a 'fingerprint'. It holds {sorted(map(str, state))}."
         )
-    names = [name for name in {**expected, **found} if found.get(name) != expected.get(name)]
-    if names:
-        different = "; ".join(
-            f"{name} is {found.get(name, 'missing')} in the state, {expected.get(name, 'missing')} "
-            "here"
-            for name in names
-        )
+    differences = [
+        f"{name} is {found.get(name, 'missing')} in the state, {expected.get(name, 'missing')} here"
+        for name in {**expected, **found}
+        if found.get(name) != expected.get(name)
+    ]
+    if differences:
         raise RuntimeError(
             f"The state is of {found.get('class')} with other settings than this "
-            f"{expected['class']}: {different}. Load it into dynamics built as they were."
+            f"{expected['class']}: {'; '.join(differences)}. Load it into dynamics built as they "
+            "were."
         )
+    try:
+        yield deepcopy(dict(state))
+    except PhysicsError:
+        raise
+    except (AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+        raise RuntimeError(
+            f"The state is damaged: {error!r}. Load one that `state_dict` gave, or learn from its "
+            "transitions again."
+        ) from error
+
+
+def check_numbers(tensors: Mapping[str, Tensor]) -> None:
+    """Raise a ValueError if one of a state's tensors has NaN."""
+    for name, tensor in tensors.items():
+        if tensor.isnan().any():
+            raise ValueError(f"expected {name!r} without NaN")
+
+
+def columns_of(data: Trajectories) -> dict[str, Tensor]:
+    """Return the columns of transitions, as :meth:`Trajectories.checked` takes them."""
+    return dict(zip(("states", "actions", "next_states"), data, strict=True))
 
 
 class PhysicsProbes(NamedTuple):
-    """A few transitions, and what a physics says of them."""
+    """A few transitions, and what a physics returns at these, with the guesses of parameters."""
 
     states: Tensor  # k x state_dim
     actions: Tensor  # k x action_dim
-    values: Tensor  # k x m
+    changes: Tensor  # of the states that move, k x m
     tolerance: Tensor  # by how much the same physics may differ, m
 
     @classmethod
-    def of(
-        cls, states: Tensor, actions: Tensor, values: Tensor, columns: list[int]
-    ) -> PhysicsProbes:
-        """At most 3 of ``N`` rows: of each third that where the physics says what is least usual.
+    def of(cls, physics: Physics, spec: StateSpec, data: Trajectories) -> PhysicsProbes:
+        """Take of each third of the rows that where the physics returns what is least usual.
 
-        It says values, ``N x m``, of the states in these columns.
+        There is a warning if it seems to return changes.
         """
-        departure = (values - values.mean(0)).abs()
+        with torch.no_grad():
+            following = next_values(physics, spec, data.states, data.actions)
+        warn_of_differences(physics.name, spec, data, following)
+        changes = spec.change(data.states, following)[:, spec.moving]
+        departure = (changes - changes.mean(0)).abs()
         spread = departure.square().mean(0).sqrt()
         unusual = (departure / spread.clamp_min(torch.finfo(spread.dtype).tiny)).amax(-1)
-        rows = torch.arange(len(values)).tensor_split(_PROBES)
-        chosen = torch.stack([some[unusual[some].argmax()] for some in rows if len(some)])
-        size = torch.cat([states[:, columns], values]).abs().amax(0)
+        parts = [rows for rows in torch.arange(len(data)).tensor_split(_PROBES) if len(rows)]
+        chosen = torch.stack([rows[unusual[rows].argmax()] for rows in parts])
+        size = torch.cat([data.states[:, spec.moving], changes]).abs().amax(0)
         tolerance = _OF_SPREAD * spread + _OF_SIZE * size
-        return cls(states[chosen], actions[chosen], values[chosen], tolerance)
+        return cls(data.states[chosen], data.actions[chosen], changes[chosen], tolerance)
 
-    @classmethod
-    def checked(cls, given: Any, spec: StateSpec, num_values: int) -> PhysicsProbes:
-        """Take probes from a state; a RuntimeError if they are none."""
-        expect(
-            isinstance(given, list | tuple) and len(given) > 0,
-            "probes",
-            "a list of float64 tensors",
-        )
-        k = len(given[0]) if torch.is_tensor(given[0]) and given[0].dim() else 0
-        widths = (spec.state_dim, spec.action_dim, num_values)
-        return cls(*copies(given, "probes", *((k, width) for width in widths), (num_values,)))
-
-    def check(self, found: Tensor, physics: str, spec: StateSpec, columns: list[int]) -> None:
-        """Raise a RuntimeError, as PyTorch does of a state, if a physics found something else.
-
-        It is ``k x m``, of the states in these columns.
-        """
-        names = [spec.states[i] for i in columns]
-        gap = found - self.values
-        for i in (i for i, name in enumerate(names) if name in spec.angles):
-            gap[:, i] = torch.atan2(gap[:, i].sin(), gap[:, i].cos())
-        excess = gap.abs() - self.tolerance
-        if (excess <= 0).all():
+    def check(self, physics: Physics, spec: StateSpec) -> None:
+        """Raise a PhysicsError, which is a RuntimeError, if a physics returns something else."""
+        check_numbers(self._asdict())
+        physics.forget()  # a file of another day: it may have changed
+        with torch.no_grad():
+            following = next_values(physics, spec, self.states, self.actions)
+        expected = self.states.clone()
+        expected[:, spec.moving] += self.changes
+        gap = spec.change(expected, following)[:, spec.moving].abs()
+        if (gap <= self.tolerance).all():
             return
-        row, column = divmod(int(excess.argmax()), excess.shape[-1])
-        raise RuntimeError(
-            f"The state is of dynamics with another physics than {physics!r} here. In the state "
-            f"{self.states[row].tolist()}, after the action {self.actions[row].tolist()}, that "
-            f"one said {float(self.values[row, column]):.6g} of {names[column]!r}, this one says "
-            f"{float(found[row, column]):.6g}. Load the state into dynamics of the physics that it "
+        row, column = divmod(int((gap - self.tolerance).argmax()), gap.shape[-1])
+        i = spec.moving[column]
+        raise PhysicsError(
+            f"The state is of dynamics with another physics than {physics.name!r} here. In the "
+            f"state {self.states[row].tolist()}, after the action {self.actions[row].tolist()}, "
+            f"that one said {float(expected[row, i]):.6g} of {spec.states[i]!r}, this one says "
+            f"{float(following[row, i]):.6g}. Load the state into dynamics of the physics that it "
             "was learnt with, or learn from its transitions again. A physics that is not "
             "deterministic looks the same: dynamics need one that says the same each time."
         )
-
-
-def expect(right: bool, name: str, expected: str) -> None:
-    """Raise a RuntimeError, as PyTorch does, unless a part of a state is right."""
-    if not right:
-        raise RuntimeError(f"The state is damaged: expected {name!r} as {expected}.")
-
-
-def copies(given: Sequence[Any], name: str, *shapes: tuple[int, ...]) -> list[Tensor]:
-    """Copies of finite float64 tensors of these shapes; a RuntimeError if they are none."""
-    found = [tuple(t.shape) for t in given if torch.is_tensor(t) and t.dtype == torch.float64]
-    whole = (
-        len(found) == len(given) and found == [*shapes] and all(t.isfinite().all() for t in given)
-    )
-    expect(whole, name, f"finite float64 values of shape {' and '.join(map(str, shapes))}")
-    return [tensor.clone() for tensor in given]
-
-
-def saved(data: Trajectories) -> dict[str, Tensor]:
-    """Transitions as a state has them, without episodes."""
-    return {name: tensor.clone() for name, tensor in zip(_COLUMNS, data, strict=True)}
-
-
-def loaded(given: Any, spec: StateSpec) -> Trajectories:
-    """Copies of the transitions of a state; a RuntimeError if they are damaged."""
-    whole = isinstance(given, Mapping) and {*given} == {*_COLUMNS}
-    expect(whole, "transitions", f"a dictionary of {', '.join(_COLUMNS)}")
-    try:
-        return Trajectories.checked(spec, **given)
-    except (TypeError, ValueError) as error:
-        raise RuntimeError(f"The state is damaged in its transitions. {error}") from error
-
-
-def _text(value: Any) -> str:
-    """The value of plain objects, the class of others."""
-    if isinstance(value, Mapping):
-        items = sorted((str(key), _text(part)) for key, part in value.items())
-        return "{" + ", ".join(f"{key!r}: {part}" for key, part in items) + "}"
-    if isinstance(value, (list, tuple)):
-        return "(" + ", ".join(_text(part) for part in value) + ")"
-    if isinstance(value, float):
-        return repr(float(value))  # NumPy's print their type
-    if value is None or isinstance(value, (bool, int, str)):
-        return repr(value)
-    named = isinstance(value, (type, FunctionType))
-    return value.__name__ if named else f"<{type(value).__name__}>"

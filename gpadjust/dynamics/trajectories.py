@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
@@ -33,24 +33,12 @@ class Windows(NamedTuple):
         return torch.cat([self.initial_states.unsqueeze(1), self.measured], dim=1)
 
     def some(self, rows: Tensor | list[int]) -> Windows:
-        """The windows of these numbers, or those where a tensor of ``w`` booleans is true.
-
-        Example:
-            >>> import torch
-            >>> from gpadjust.dynamics import Trajectories
-            >>> x = torch.arange(9, dtype=torch.float64).unsqueeze(-1)
-            >>> windows = Trajectories(x[:-1], x[:-1], x[1:], torch.zeros(8)).windows(2)
-            >>> fast = (windows.states.abs() > 3).any(1).any(-1)
-            >>> windows.some(fast).states[..., 0]
-            tensor([[2., 3., 4.],
-                    [4., 5., 6.],
-                    [6., 7., 8.]], dtype=torch.float64)
-        """
+        """Return the windows of these numbers, or those where ``w`` booleans are true."""
         return Windows(*(part[rows] for part in self))
 
     def spread(self, number: int, seed: int = 0) -> Windows:
         """Draw a number of the windows evenly, as by :meth:`Trajectories.spread`."""
-        return self.some(spread_rows(len(self.states), number, seed, "windows"))
+        return self.some(spread_rows(len(self.actions), number, seed))
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +60,16 @@ class Trajectories:
     Raises:
         ValueError: If they differ in their numbers of rows, or an episode has rows of another one
             between its own.
+
+    Example:
+        >>> x = torch.arange(6, dtype=torch.float64).unsqueeze(-1)
+        >>> two = Trajectories(x, x, x + 1, episode=[0, 0, 0, 0, 1, 1])
+        >>> two.windows(2).states[..., 0]
+        tensor([[0., 1., 2.],
+                [2., 3., 4.],
+                [4., 5., 6.]], dtype=torch.float64)
+        >>> two.spread(2).states.flatten() // 3
+        tensor([0., 1.], dtype=torch.float64)
     """
 
     states: Tensor
@@ -113,39 +111,37 @@ class Trajectories:
 
         Raises:
             TypeError: If they are not float64 tensors.
-            ValueError: If shapes disagree, there are no rows, values are not finite, or of a next
-                state nothing was measured that a model predicts.
+            ValueError: If shapes disagree, there are no rows, values are not finite, or nothing
+                was measured of a next state that a model predicts.
         """
         named = {"states": states, "actions": actions, "next_states": next_states}
         for name, tensor in named.items():
             check_doubles(name, tensor, spec.action_dim if name == "actions" else spec.state_dim)
-            if tensor.dim() != 2 or len(tensor) != len(states) or not len(tensor):
-                raise ValueError(
-                    "Expected states, actions and next_states with as many rows each, and at least "
-                    f"one; got shapes {', '.join(str(tuple(t.shape)) for t in named.values())}."
-                )
-            if name == "next_states":
-                check_observed(name, tensor)
-                check_observed("the predicted entries of next_states", tensor[:, spec.predicted])
-            else:
-                check_finite(name, tensor)
+        if states.dim() != 2 or len({t.shape[:-1] for t in named.values()}) > 1 or not len(states):
+            raise ValueError(
+                "Expected states, actions and next_states with as many rows each, and at least "
+                f"one; got shapes {', '.join(str(tuple(t.shape)) for t in named.values())}."
+            )
+        check_finite("states", states)
+        check_finite("actions", actions)
+        check_observed("next_states", next_states)
+        predicted = next_states[:, spec.predicted]
+        check_observed("the predicted entries of next_states", predicted)
         copies = {name: tensor.detach().clone() for name, tensor in named.items()}
         return cls(**copies, episode=episode)  # type: ignore[arg-type]
 
     def __iter__(self) -> Iterator[Tensor]:
-        """States, actions and next states."""
+        """Yield states, actions and next states."""
         return iter((self.states, self.actions, self.next_states))
 
     def __len__(self) -> int:
-        """Number of transitions."""
+        """Return the number of transitions."""
         return len(self.states)
 
     @property
     def steps(self) -> Tensor:
         """The number of each step in its episode, from 1."""
-        rows = torch.arange(len(self))
-        starts = torch.cat([torch.ones_like(rows[:1]), self.episode.diff()]) != 0
-        return rows - rows.where(starts, torch.zeros_like(rows)).cummax(0).values + 1
+        return torch.cat([torch.arange(n) for n in self._lengths or [0]]) + 1
 
     @property
     def longest(self) -> int:
@@ -154,83 +150,56 @@ class Trajectories:
 
     @property
     def _lengths(self) -> list[int]:
-        found: list[int] = self.episode.unique_consecutive(return_counts=True)[1].tolist()
-        return found
+        lengths: list[int] = self.episode.unique_consecutive(return_counts=True)[1].tolist()
+        return lengths
 
     @property
     def _columns(self) -> dict[str, Tensor]:
-        """The columns that there are."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
     def append(self, other: Trajectories) -> Trajectories:
-        """These trajectories, then others; no episode goes on in them."""
+        """Return these trajectories, then others; no episode goes on in them."""
         last = self.episode.max() if len(self) else -1
         first = other.episode.min() if len(other) else 0
-        other = replace(other, episode=other.episode - first + last + 1)
-        columns = self._columns.keys() & other._columns.keys()
-        return Trajectories(
-            **{name: torch.cat([getattr(each, name) for each in (self, other)]) for name in columns}
-        )
+        parts = self._columns, other._columns
+        parts[1]["episode"] = other.episode - first + last + 1
+        names = parts[0].keys() & parts[1].keys()
+        return Trajectories(**{name: torch.cat([part[name] for part in parts]) for name in names})
 
     def some(self, rows: Tensor | slice) -> Trajectories:
-        """The rows of these numbers, a slice, or those where ``N`` booleans are true.
+        """Return the rows of these numbers, a slice, or those where ``N`` booleans are true.
 
         Episodes are numbered again: one ends wherever the row after it is left out.
         """
         numbers = torch.arange(len(self))[rows]
-        old = self.episode[numbers]
-        ends = (numbers.diff() != 1) | (old.diff() != 0)
-        new = torch.cat([torch.zeros_like(old[:1]), ends.long().cumsum(0)])
-        columns = {name: tensor[numbers] for name, tensor in self._columns.items()}
-        return Trajectories(**columns | {"episode": new})
+        columns = {name: column[numbers] for name, column in self._columns.items()}
+        begins = (numbers.diff() != 1) | (columns["episode"].diff() != 0)
+        columns["episode"][1:] = begins.cumsum(0)
+        columns["episode"][:1] = 0
+        return Trajectories(**columns)
 
     def episodes(self) -> list[Trajectories]:
-        """The episodes, each by itself."""
+        """Return the episodes, each by itself."""
         return [self.some(rows) for rows in torch.arange(len(self)).split(self._lengths)]
 
     def spread(self, number: int, seed: int = 0) -> Trajectories:
-        """Draw a number of the rows evenly: one of each of as many parts of the same length.
-
-        PyTorch's generator is left as it is.
-
-        Raises:
-            ValueError: If there are fewer, or ``number`` is no positive whole number.
-
-        Example:
-            >>> import torch
-            >>> from gpadjust.dynamics import Trajectories
-            >>> rows = torch.arange(100, dtype=torch.float64).unsqueeze(-1)
-            >>> Trajectories(rows, rows, rows + 1).spread(4).states.flatten() // 25
-            tensor([0., 1., 2., 3.], dtype=torch.float64)
-        """
-        return self.some(spread_rows(len(self), number, seed, "transitions"))
+        """Draw a number of the rows evenly: one of each of as many parts of the same length."""
+        return self.some(spread_rows(len(self), number, seed))
 
     def windows(self, length: int, stride: int | None = None) -> Windows:
-        """Windows within episodes, to compare with :meth:`~gpadjust.dynamics.Dynamics.free_run`.
+        """Cut windows within episodes, to compare with :meth:`Dynamics.free_run`.
 
         A window starts only at a state that was measured in full; else at the next one that was.
 
         Args:
             length: The number ``T`` of steps.
-            stride: How many steps after a window starts the next one. Default: ``length``, so that
-                they do not overlap.
+            stride: Steps from the start of a window to that of the next. Default: ``length``.
 
         Raises:
             ValueError: If no episode is as long, or a number is no positive whole one.
-
-        Example:
-            >>> import torch
-            >>> from gpadjust.dynamics import Trajectories
-            >>> x = torch.arange(6, dtype=torch.float64).unsqueeze(-1)
-            >>> two = Trajectories(x, x, x + 1, episode=[0, 0, 0, 0, 1, 1])
-            >>> two.windows(2).states[..., 0]
-            tensor([[0., 1., 2.],
-                    [2., 3., 4.],
-                    [4., 5., 6.]], dtype=torch.float64)
         """
         checked_whole("length", length, 1)
-        stride = length if stride is None else stride
-        checked_whole("stride", stride, 1)
+        stride = length if stride is None else checked_whole("stride", stride, 1)
         complete, starts, end = (~self.states.isnan().any(-1)).tolist(), [], 0
         for steps in self._lengths:
             row, end = end, end + steps
@@ -254,15 +223,10 @@ def check_doubles(name: str, tensor: Tensor, columns: int) -> None:
         raise TypeError(f"Expected {name} in float64, got {tensor.dtype}; use `{name}.double()`.")
 
 
-def spread_rows(total: int, number: int, seed: int, what: str) -> Tensor:
-    """Draw from the numbers below ``total``, one of each of ``number`` parts of the same length.
-
-    Raises:
-        ValueError: If there are fewer, or ``number`` is no positive whole number.
-    """
-    checked_whole("number", number, 1)
-    if number > total:
-        raise ValueError(f"Expected number <= {total}, the {what} that there are, got {number}.")
+def spread_rows(total: int, number: int, seed: int) -> Tensor:
+    """Draw from the numbers below ``total``, one of each of ``number`` parts of the same length."""
+    if checked_whole("number", number, 1) > total:
+        raise ValueError(f"Expected number <= {total}, that of all there are, got {number}.")
     edges = torch.arange(number + 1) * total // number
     generator = torch.Generator().manual_seed(seed)
     share = torch.rand(number, generator=generator, dtype=torch.float64)

@@ -12,7 +12,7 @@ import torch
 from gpadjust.dynamics.plots import going_on, labels
 from gpadjust.records.records import Record, Records
 from gpadjust.states import StateSpec
-from gpadjust.validation.plots.drawing import BLUE, GREY, given_axes, tidy
+from gpadjust.validation.plots import BLUE, GREY, given_axes, tidy
 
 __all__ = ["plot_record"]
 

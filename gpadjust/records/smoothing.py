@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.checks import check_kind, checked_whole, finite_array, progress_bar
-from gpadjust.dynamics.free_run import of_states
+from gpadjust.dynamics.base import of_states
 from gpadjust.dynamics.least_squares import even_normal
 from gpadjust.dynamics.targets import check_next_values, one_physics
 from gpadjust.physics import ODEPhysics, Physics, PhysicsError

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 import sys
 import warnings
@@ -16,17 +15,16 @@ from gpadjust.core import CKA, Noise, fit
 from gpadjust.kinds import Categories, HeavyTails, NoisyInputs, RelativeNoise, with_options
 from gpadjust.physics import ODEPhysics, PhysicsError, PhysicsWarning
 from gpadjust.records import Identification, Records, identify
-from gpadjust.report import given_physics as physics_of
 from gpadjust.report import inputs as read
-from gpadjust.report.markup import bare, listed, plural
 from gpadjust.report.page import checked_path, write
 from gpadjust.report.subject import Origin, Subject, subject_of
 from gpadjust.states import StateSpec
 from gpadjust.validation import compare
-from gpadjust.validation.plausibility import complaint
+from gpadjust.validation.verdict import faults
+from gpadjust.words import bare, listed, plural
 
-_FIT = re.compile(r" --f(i|it)?[ =](compare|bayes|map)\b")
 _DEGREES = ("deg", "degree", "degrees", "°")
+_HOW = "the same command, without --fit."
 _DIGITS = 6  # of a sampling step, which is a mean of differences
 _NO_NOTES = (DeprecationWarning, PendingDeprecationWarning)
 
@@ -59,7 +57,7 @@ def run(arguments: Namespace, command: Sequence[str]) -> None:
         _say(*(f"Warning: {note}" for note in notes))
         words = f"gpadjust {shlex.join(command)}"
         settings = {"command": words, **origin.settings, "seed": str(arguments.seed)}
-        origin = replace(origin, settings=settings, notes=notes, how=_FIT.sub("", words))
+        origin = replace(origin, settings=settings, notes=notes, how=_HOW)
         headline = write(subject, path, arguments.title, origin, progress=True)
     except PhysicsError as error:
         raise ValueError(str(error)) from error
@@ -82,7 +80,7 @@ def _of_table(arguments: Namespace) -> Job:
     if text not in (None, "relative"):
         sds = read.pairs(text, "--noise") if "=" in text else dict.fromkeys(outputs, text)
         variances = read.variances_of(sds, "--noise", [*outputs], "--outputs", all_of=True)
-    unknowns = physics_of.unknowns_of(arguments.unknown)
+    unknowns = read.unknowns_of(arguments.unknown)
     table = read.open_table(arguments.data, arguments)
     batches = read.names_of(arguments.batches, "--batches")
     groups = [*read.names_of(arguments.categories, "--categories"), *batches]
@@ -90,7 +88,7 @@ def _of_table(arguments: Namespace) -> Job:
     formulas = [text for text in arguments.physics if ":" not in text]
     taken = {table.label(column) for column in (*inputs.values(), *outputs.values())}
     others = [name for name in table.names if name and table.label(name) not in taken]
-    physics_of.check_constants(formulas, [*inputs, *others, *unknowns])
+    read.check_constants(formulas, [*inputs, *others, *unknowns])
     if paths := [text for text in arguments.physics if ":" in text]:
         if not inputs:
             raise ValueError(
@@ -99,12 +97,12 @@ def _of_table(arguments: Namespace) -> Job:
             )
     else:
         named = [table.bare(name) if name == column else name for name, column in inputs.items()]
-        found = physics_of.columns_of(formulas, others, named, [*unknowns])
+        found = read.columns_of(formulas, others, named, [*unknowns])
         inputs |= {name: name for name in found}
         inputs |= {name: name for name in groups if name not in {*inputs, *map(bare, inputs)}}
     data = read.read_table(table, inputs, outputs, groups, arguments)
     options = _options(arguments, [*inputs], batches, data)
-    physics, code, modules = physics_of.given_physics(arguments.physics, data, unknowns)
+    physics, code, modules = read.given_physics(arguments.physics, data, unknowns)
 
     def work() -> Subject:
         X, noise = data.X, options.get("noise")
@@ -116,10 +114,9 @@ def _of_table(arguments: Namespace) -> Job:
         else:
             _say(f"Fitting CKA by {arguments.fit!r} ...")
             model = with_options(CKA, options)(X, data.Y, variances, physics=physics)
-            for text in (complaint(part, model.data) for part in model.physics):
-                if text:
-                    warnings.warn(text, PhysicsWarning, stacklevel=1)
             fit(model, arguments.fit, seed=arguments.seed)
+            for text in faults(model):
+                warnings.warn(text, PhysicsWarning, stacklevel=1)
         return subject_of(model, [f"line {line}" for line in data.lines])
 
     rows = f"{arguments.data}: {plural(len(data.lines), 'row')}"
@@ -162,8 +159,8 @@ def _options(
 
 def _of_log(arguments: Namespace) -> Job:
     """Read the log and the equations of ``gpadjust identify``."""
-    hidden = physics_of.hidden_of(arguments.hidden)
-    unknowns = physics_of.unknowns_of(arguments.unknown)
+    hidden = read.hidden_of(arguments.hidden)
+    unknowns = read.unknowns_of(arguments.unknown)
     way = " A state that was not measured: --hidden 'rate=0 +- 1'."
     tables = [read.open_table(file, arguments, way) for file in arguments.data]
     log = listed(read.digest_of(file) for file in arguments.data)
@@ -182,12 +179,12 @@ def _of_log(arguments: Namespace) -> Job:
     renamed = {tables[0].bare(column) for column in own.values() if column is not None}
     others = [name for name in tables[0].names if name not in renamed]
     sides = [text.partition("=")[2] for text in arguments.physics if ":" not in text]
-    physics_of.check_constants(sides, [*own, *others, *unknowns])
+    read.check_constants(sides, [*own, *others, *unknowns])
     reading = {**columns, **read.table_options(arguments)}
     step = arguments.step
     if step is None:
         step = float(f"{whole.records[0].sampling_step:.{_DIGITS}g}")
-    given = physics_of.motion(arguments.physics, *names, unknowns, step)
+    given = read.motion(arguments.physics, *names, unknowns, step)
     physics = given.physics
     if isinstance(physics, ODEPhysics):
         step = physics.step
@@ -221,7 +218,7 @@ def _program(
     files: Sequence[str],
     spec: StateSpec,
     reading: Mapping[str, object],
-    physics: physics_of.GivenPhysics,
+    physics: read.GivenPhysics,
     options: Mapping[str, object],
 ) -> str:
     """Return Python code that does the same, and follows further actions."""
@@ -230,7 +227,7 @@ def _program(
     columns = "".join(f"    {name}={v!r},\n" for name, v in reading.items() if v is not None)
     chosen = "".join(f", {name}={v!r}" for name, v in options.items() if v is not None)
     return f"""\
-{physics_of.imports_of(physics.code, physics.modules)}
+{read.imports_of(physics.code, physics.modules)}
 from gpadjust.records import Records, identify
 from gpadjust.states import StateSpec
 

@@ -8,19 +8,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpadjust.kinds.categories import on_levels
 from gpadjust.physics import PhysicsError
 from gpadjust.report import markup as html
-from gpadjust.report.markup import Markup, drawn, image, number, percent, tag
+from gpadjust.report.markup import Markup, drawn, image, tag
 from gpadjust.report.subject import Subject
 from gpadjust.validation import Trust, plots, trust
-from gpadjust.validation.plots import drawing
-from gpadjust.validation.plots.adjustments import adjustments_of, unadjusted
-from gpadjust.validation.plots.predictions import plot_pit
+from gpadjust.validation.plots import (
+    adjustments_of,
+    labels,
+    lines_along,
+    share_limits,
+    unadjusted,
+)
+from gpadjust.validation.trust import physics_at
+from gpadjust.words import bare, listed, number, percent, with_unit
 
 _MOST = 12  # inputs along which slices are drawn, in all outputs together
-_POINTS = 120  # of a curve
-_STYLES = ("--", "-.", ":")
 _BANDS = "Solid lines are means; bands hold 95 % of the function, without measurement noise."
 _APART = (
     "Observations are of rho f_p + delta alone: how much of it is rho's and how much delta's the "
@@ -42,7 +45,7 @@ def where_wrong(subject: Subject) -> Markup:
     parts: list[Markup] = []
     if len(subject.inputs) > 1:
         values = zip(subject.inputs, point(subject, subject.base, 3), strict=True)
-        pairs = [f"{html.bare(name)} = {html.with_unit(value, name)}" for name, value in values]
+        pairs = [f"{bare(name)} = {with_unit(value, name)}" for name, value in values]
         few = f" (drawn: {len(inputs)} of {len(pairs)} inputs, those that move predictions most)"
         held = f"Along each input the others stay at the median of the data: {', '.join(pairs)}"
         parts.append(tag("p", f"{held}{few * (len(inputs) < len(pairs))}.", class_="note"))
@@ -56,7 +59,7 @@ def trusted(subject: Subject) -> Markup:
     """Return the shares of predictions that rest on the physics, on data, or on neither."""
     rows, failed, images = [], [], []
     inputs, points = inputs_drawn(subject), 0
-    for name, shown in zip(subject.outputs, subject.adjusted, strict=True):
+    for j, (name, shown) in enumerate(zip(subject.outputs, subject.adjusted, strict=True)):
         if shown is None:
             continue
         try:
@@ -65,8 +68,8 @@ def trusted(subject: Subject) -> Markup:
             failed.append(tag("p", f"{name}: {html.failure(error)}", class_="caution"))
             continue
         shares = (basis.physics, basis.data, basis.neither)
-        rows.append([name, shown.structure, *(percent(share[shown.output]) for share in shares)])
-        images.append(trusts(basis, shown.output, inputs, name))
+        rows.append([name, shown.structure, *(percent(share[j]) for share in shares)])
+        images.append(trusts(basis, j, inputs, name))
         points = len(basis.X)
     if not rows:
         return html.join(failed or [tag("p", _NONE)])
@@ -89,9 +92,9 @@ def inputs_drawn(subject: Subject) -> list[int]:
         return [*range(d)]
     spread = subject.Y.sub(subject.Y.nanmean(0)).square().nanmean(0).sqrt()
     effect = torch.zeros(d, dtype=torch.float64)
-    for i in range(d):
+    for i, (_, X) in enumerate(lines_along(subject.model, base=subject.base)):
         try:
-            mean = subject.model.predict(slice_along(subject, i, 21)).mean
+            mean = subject.model.predict(X).mean
         except PhysicsError:
             continue  # its figure will say so, if it is among them
         effect[i] = ((mean.amax(0) - mean.amin(0)) / spread.clamp_min(1e-300)).max()
@@ -114,17 +117,22 @@ def slices(subject: Subject, output: int, inputs: list[int]) -> list[Markup]:
     ratios = [1.4, *[1.0] * len(terms)]
     grids = [f.subplots(rows, sharex=True, squeeze=False, height_ratios=ratios) for f in figures]
     axes = np.hstack(grids)
-    with torch.no_grad():
-        for i in inputs:
-            _prediction(subject, output, i, axes[0, i])
-    low, high = zip(*(axes[0, i].get_ylim() for i in inputs), strict=True)
+    lines = lines_along(subject.model, output, base=subject.base)
     for i in inputs:
-        axes[0, i].set_ylim(min(low), max(high))
+        (x, X), ax = lines[i], axes[0, i]
+        physics = {} if shown is None else physics_at(shown.model, X)
+        plots.draw_prediction(ax, subject.model, x, X, output, physics)
+        if d == 1:
+            plots.draw_data(ax, subject.model, output)
+        if len(physics) > 1:
+            ax.legend(frameon=False)
+        ax.set_ylabel(labels(subject.outputs)[output])
+    share_limits([axes[0, i] for i in inputs])
     if shown is not None and terms:
-        plots.plot_adjustment(shown.model, output=shown.output, axes=axes[1:], num_points=_POINTS)
+        plots.plot_adjustment(shown.model, base=subject.base, output=output, axes=axes[1:])
         _name_alike(axes[1:])
     else:
-        for ax, label in zip(axes[-1], drawing.labels(subject.model, "input", d), strict=True):
+        for ax, label in zip(axes[-1], labels(subject.inputs), strict=True):
             ax.set_xlabel(label)
     parts = "the prediction and the physics" if shown is not None else "the prediction"
     below = f"; below, {' and '.join(terms)}" if terms else ""
@@ -156,42 +164,14 @@ def left_out(subject: Subject, output: int) -> list[Markup]:
 
 
 @drawn
-def coverages(subject: Subject, output: int, count: int) -> list[Markup]:
+def coverages(subject: Subject, output: int) -> list[Markup]:
     """Return observed against nominal coverage, and the histogram of PIT values."""
     figures = [html.new_figure(2.9), html.new_figure(2.9)]
     plots.plot_coverage(subject.loo, output=output, ax=figures[0].subplots())
-    bins = max(4, min(10, count // 4))
-    plot_pit(subject.loo, output=output, bins=bins, ax=figures[1].subplots())
+    plots.plot_pit(subject.loo, output=output, ax=figures[1].subplots())
     name = subject.outputs[output]
     first = image(figures[0], f"observed against nominal coverage of {name}")
     return [first, image(figures[1], f"histogram of PIT values of {name}")]
-
-
-def slice_along(subject: Subject, i: int, number_of_points: int) -> Tensor:
-    """Return points along an input, over the range of the data, the others at their medians."""
-    low, high = subject.X[:, i].min(), subject.X[:, i].max()
-    pad = 0.5 * low.abs().clamp_min(1.0) if low == high else torch.zeros_like(low)
-    X = subject.base.repeat(number_of_points, 1)
-    X[:, i] = torch.linspace(float(low - pad), float(high + pad), number_of_points, dtype=X.dtype)
-    return on_levels(subject.model, X)
-
-
-def _prediction(subject: Subject, output: int, i: int, ax: Any) -> None:
-    X = slice_along(subject, i, _POINTS)
-    x = X[:, i]
-    drawing.band(ax, x, *drawing.mean_and_ends(subject.model.marginals(X), output, 0.95), 0.95)
-    curves = subject.physics_at(X, output)
-    for k, (name, values) in enumerate(curves.items()):
-        ax.plot(x, values, color=drawing.GREY, ls=_STYLES[k % 3], lw=1.2, label=name)
-    if len(subject.inputs) == 1:
-        ax.plot(
-            subject.X[:, 0], drawing.column(subject.Y, output), color=drawing.RED, **drawing.DOTS
-        )
-    ax.set_ylabel(drawing.labels(subject.model, "output", len(subject.outputs))[output])
-    ax.set_xlim(float(x[0]), float(x[-1]))
-    if len(curves) > 1:
-        ax.legend(frameon=False)
-    drawing.tidy(ax)
 
 
 def _name_alike(axes: Any) -> None:
@@ -215,8 +195,8 @@ def _words(subject: Subject, output: int) -> list[str]:
         off = subject.judged[:, output] - values
         rms, mean = number(off.square().nanmean().sqrt()), number(off.nanmean())
         words.append(
-            f"At the data, the {physics} ({is_it}) is off by {html.with_unit(rms, name)} (root "
-            f"mean square; observed less physics is {html.with_unit(mean, name)} in the mean)."
+            f"At the data, the {physics} ({is_it}) is off by {with_unit(rms, name)} (root "
+            f"mean square; observed less physics is {with_unit(mean, name)} in the mean)."
         )
     top = "the prediction, and dashed the physics"
     if subject.comparison is not None:
@@ -226,8 +206,8 @@ def _words(subject: Subject, output: int) -> list[str]:
         weight = "" if shown.weight == 1 else f" (weight {shown.weight:.2f})"
         back = [f"{term} = {number(unadjusted(shown.model, term))}" for term in terms]
         words.append(
-            f"Below: {html.listed(terms)} of {shown.structure}{weight}, with ticks at the data; "
-            f"dashed, what they fall back to without data, {html.listed(back)}."
+            f"Below: {listed(terms)} of {shown.structure}{weight}, with ticks at the data; "
+            f"dashed, what they fall back to without data, {listed(back)}."
         )
         words += [_APART] * (len(terms) > 1)
     return [*words, _BANDS]

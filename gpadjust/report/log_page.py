@@ -9,9 +9,10 @@ from gpadjust.dynamics.plots import going_on, labels, plot_free_run
 from gpadjust.records import Identification
 from gpadjust.records.identification import FEW, GUESSES, IDENTIFIED, PERSISTENCE
 from gpadjust.report import markup as html
-from gpadjust.report.markup import Markup, Page, Verdict, drawn, number, percent, table, tag
+from gpadjust.report.markup import Card, Markup, Page, drawn, table, tag
 from gpadjust.report.subject import Origin
-from gpadjust.validation.plots.drawing import band, quantile, tidy
+from gpadjust.validation.plots import band, quantile, tidy
+from gpadjust.words import listed, number, percent, plural
 
 _NAMES = {
     GUESSES: "your equations with the guesses",
@@ -43,11 +44,11 @@ def page(found: Identification, title: str | None, origin: Origin) -> Page:
     times = (number(n * found.step) for n in (1, measured.shape[1]))
     step, held_out = (f"{time} {units.get('time', '')}".strip() for time in times)
     steps = sum(len(record.times) - 1 for record in found.smoothed.records)
-    hidden = f", {html.listed(found.hidden)} hidden" if found.hidden else ""
+    hidden = f", {listed(found.hidden)} hidden" if found.hidden else ""
     lead = (
-        f"{html.listed(spec.states)}{hidden}, under {html.listed(spec.actions)}: "
-        f"{html.plural(steps, 'step')} of {step} are learnt from, "
-        f"{html.plural(measured[..., 0].numel(), 'step')} held out."
+        f"{listed(spec.states)}{hidden}, under {listed(spec.actions)}: "
+        f"{plural(steps, 'step')} of {step} are learnt from, "
+        f"{plural(measured[..., 0].numel(), 'step')} held out."
     )
     answers, rows = _judged(found, units, held_out)
     head = ["by", "state", "error (root mean square)", "unit", "95 % intervals hold"]
@@ -68,14 +69,14 @@ def page(found: Identification, title: str | None, origin: Origin) -> Page:
     for verdict in answers:
         each = "; ".join(f"{by}: {error}" for by, error in verdict.errors.items())
         lines.append(f"{verdict.name}: {each}.")
-    title = title or f"Log of {html.listed(spec.states)}"
+    title = title or f"Log of {listed(spec.states)}"
     question, settings = "Does the physics follow the log?", {**origin.settings}
     return Page(title, lead, question, answers, "\n".join(lines), sections, settings)
 
 
 def _judged(
     found: Identification, units: Mapping[str, str], held_out: str
-) -> tuple[list[Verdict], list[list[str]]]:
+) -> tuple[list[Card], list[list[str]]]:
     """Return whether the physics errs less than guesses and persistence, and rows of a table."""
     answers, rows = [], []
     note = f"root mean square errors of a free run of {held_out} that was held out"
@@ -89,7 +90,8 @@ def _judged(
             answer = "No"
         errors = {_NAMES[by]: f"{number(error)} {unit}".strip() for by, error in rmse.items()}
         reason = f"Intervals of 95 % hold {share} of {name} there."
-        answers.append(Verdict(name, errors, note, answer, [reason]))
+        color = {"Yes": "yes", "No": "no"}.get(answer, "open")
+        answers.append(Card(name, errors, note, answer, [reason], color))
         for by, error in rmse.items():
             held = share if by == IDENTIFIED else "-"
             rows.append([_NAMES[by], name, number(error), unit or "-", held])
@@ -135,7 +137,7 @@ def _states(found: Identification, units: Mapping[str, str]) -> list[Markup]:
         ax = figure.subplots()
         path = going_on(record.states[:, i], i in spec.angle_columns)
         half = quantile(0.95) * sd[:, i]
-        band(ax, record.times, path, path - half, path + half, 0.95)
+        band(ax, record.times, (path, path - half, path + half), 0.95)
         ax.set(xlabel=called["time"], ylabel=called[state])
         tidy(ax)
         what = "hidden" if state in found.hidden else "smoothed"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import warnings
 from base64 import b64encode
@@ -16,13 +15,12 @@ from urllib.parse import quote
 
 from matplotlib import rc_context
 from matplotlib.figure import Figure
-from torch import Tensor
 
 from gpadjust.physics import PhysicsError, PhysicsParameters
+from gpadjust.words import listed, number
 
 P = ParamSpec("P")
 _VOID = ("img", "meta")
-_UNIT = re.compile(r"(.*\S)\s*\[([^\[\]]*)\]", flags=re.DOTALL)
 _SHOWN = 3
 _WIDTH = 3.6  # inches: as wide as a column of the page, so that text has its size
 _STYLE: dict[str, Any] = {
@@ -47,23 +45,27 @@ class Markup(str):
     """A text that is HTML already; any other is escaped where it is put into a page."""
 
 
-class Verdict(NamedTuple):
-    """The answer for an output: its errors with their unit, a note on them, and the reasons."""
+class Card(NamedTuple):
+    """The answer for an output: its errors with their unit, a note on them, and the reasons.
+
+    The color is ``"yes"``, ``"no"`` or ``"open"``.
+    """
 
     name: str
     errors: Mapping[str, str]
     note: str
     answer: str
     reasons: list[str]
+    color: str = "open"
 
 
 class Page(NamedTuple):
-    """A page: a question with its verdicts, sections by their headings, settings by their names."""
+    """A page: a question with its answers, sections by their headings, settings by their names."""
 
     title: str
     lead: str
     question: str
-    verdicts: list[Verdict]
+    cards: list[Card]
     headline: str  # for the terminal
     sections: Mapping[str, Markup]
     settings: dict[str, str]
@@ -139,18 +141,17 @@ def parameter_table(caption: str, parameters: PhysicsParameters) -> Markup:
     return table(caption, head, rows)
 
 
-def cards(verdicts: Sequence[Verdict]) -> Markup:
+def beside(cards: Sequence[Card]) -> Markup:
     """Return the verdict on each output, below its errors in large numbers."""
     shown = []
-    for name, errors, note, answer, reasons in verdicts:
-        parts = [tag("h3", name)] if len(verdicts) > 1 else []
+    for name, errors, note, answer, reasons, color in cards:
+        parts = [tag("h3", name)] if len(cards) > 1 else []
         if errors:
             numbers = [tag("div", tag("dt", n), tag("dd", value)) for n, value in errors.items()]
             parts += [tag("dl", *numbers, class_="errors"), tag("p", note, class_="note")]
         parts.append(tag("p", answer, class_="answer"))
         parts += [tag("p", reason.replace("+-", "±")) for reason in reasons]
-        kind = {"Yes": "yes", "No": "no"}.get(answer, "open")
-        shown.append(tag("div", *parts, class_=f"card {kind}"))
+        shown.append(tag("div", *parts, class_=f"card {color}"))
     return tag("div", *shown, class_="cards")
 
 
@@ -165,7 +166,7 @@ def document(page: Page) -> Markup:
         "main",
         tag("header", tag("h1", page.title), tag("p", page.lead, class_="lead")),
         tag("h2", page.question, class_="first"),
-        cards(page.verdicts),
+        beside(page.cards),
         tag("nav", bullets(tag("a", n, href=f"#{ids[n]}") for n in ids), aria_label="Sections"),
         *(tag("section", tag("h2", n), text, id=ids[n]) for n, text in sections.items()),
     )
@@ -178,48 +179,6 @@ def document(page: Page) -> Markup:
         tag("style", style),
     )
     return join([Markup("<!DOCTYPE html>\n"), tag("html", head, tag("body", main), lang="en")])
-
-
-def number(value: float | Tensor, digits: int = 3) -> str:
-    """Return a number with some significant digits, without an exponent where that is readable."""
-    value = float(value)
-    if not math.isfinite(value):
-        return "none" if math.isnan(value) else f"{value:g}"
-    text = f"{value:.{digits}g}"
-    return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e7 else text
-
-
-def percent(share: float | Tensor) -> str:
-    """Return a share in percent."""
-    return f"{100 * float(share):.0f} %"
-
-
-def plural(count: int, noun: str) -> str:
-    """Return such as ``1 row`` and ``2 rows``."""
-    return f"{count:,} {noun}" + ("" if count == 1 else "s")
-
-
-def listed(items: Iterable[str]) -> str:
-    """Return ``a, b and c``."""
-    *first, last = [*items] or [""]
-    return f"{', '.join(first)} and {last}" if first else last
-
-
-def name_and_unit(name: str) -> tuple[str, str]:
-    """Return ``"head"`` and ``"m"`` of ``"head [m]"``; no unit where none is in brackets."""
-    match = _UNIT.fullmatch(name.strip())
-    return (match[1], match[2].strip()) if match else (name, "")
-
-
-def bare(name: str) -> str:
-    """Return a name without its unit."""
-    return name_and_unit(name)[0]
-
-
-def with_unit(value: str, name: str, form: str = "{} {}") -> str:
-    """Return a number, or words, with the unit of a name; as they are if it has none, or 1."""
-    unit = name_and_unit(name)[1]
-    return form.format(value, unit) if unit not in ("", "1") else value
 
 
 def failure(error: PhysicsError) -> str:

@@ -14,9 +14,8 @@ from gpadjust.kinds.ar1 import AR1
 from gpadjust.kinds.categories import Categories
 from gpadjust.physics import Physics
 from gpadjust.validation import Comparison, LeaveOneOut, leave_one_out
-from gpadjust.validation.leave_one_out import observations
-from gpadjust.validation.plots.drawing import column
-from gpadjust.validation.plots.predictions import physics_at
+from gpadjust.validation.plots import column
+from gpadjust.validation.trust import physics_at
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,6 @@ class Adjusted(NamedTuple):
 
     structure: str
     model: GP
-    output: int
     weight: float  # in a mixture; 1 if there is none
 
 
@@ -89,7 +87,7 @@ def subject_of(thing: object, rows: Sequence[object] | None = None) -> Subject:
             f"Expected a fitted model; found {model!r}: call `gpadjust.fit(model)` first. To learn "
             "whether the physics helps, report on `gpadjust.compare(train_X, train_Y, physics)`."
         )
-    X, Y = observations(model)
+    X, Y = model.data.X, model.data.Y
     loo = leave_one_out(model) if comparison is None else comparison.leave_one_out()
     names = [f"row {i}" for i in range(len(X))] if rows is None else [str(row) for row in rows]
     if len(names) != len(X):
@@ -120,7 +118,9 @@ def _adjusted(model: GP | StackedGP, comparison: Comparison | None, output: int)
     """Return the structure of most weight that adjusts a physics, of what predicts an output."""
     if comparison is not None:
         rows = [*comparison.table.values()][output]
-        candidates = [(row.structure, comparison.models[row.structure], row.weight) for row in rows]
+        models = comparison.models
+        ranked = [(row.structure, row.weight) for row in rows if row.structure in models]
+        candidates = [(name, models[name], weight) for name, weight in ranked]
     elif isinstance(model, StackedGP):
         weights = zip(model.weights.items(), model.models, strict=True)
         candidates = [(name, part, own[output]) for (name, own), part in weights]
@@ -128,5 +128,5 @@ def _adjusted(model: GP | StackedGP, comparison: Comparison | None, output: int)
         candidates = [(type(model).__name__, model, 1.0)]
     for name, part, weight in sorted(candidates, key=lambda candidate: -candidate[2]):
         if isinstance(part, GP) and part.physics:
-            return Adjusted(name, part, output, weight)
+            return Adjusted(name, part, weight)
     return None

@@ -15,12 +15,13 @@ from gpadjust.kinds.heavy_tails import RowNoise
 from gpadjust.physics.import_path import is_formula
 from gpadjust.report import figures
 from gpadjust.report import markup as html
-from gpadjust.report.given_physics import imports_of
-from gpadjust.report.markup import Markup, join, number, percent, table, tag
+from gpadjust.report.inputs import imports_of
+from gpadjust.report.markup import Markup, join, table, tag
 from gpadjust.report.subject import Origin, Subject
-from gpadjust.validation.plots.drawing import quantile
-from gpadjust.validation.ranking import spread_of
-from gpadjust.validation.structures import ALONE, STACKED
+from gpadjust.validation.comparison import STACKED, spread_of
+from gpadjust.validation.plots import quantile
+from gpadjust.validation.verdict import ALONE
+from gpadjust.words import bare, listed, name_and_unit, number, percent, plural, with_unit
 
 _STRUCTURES = {
     "zero mean": "no physics: a Gaussian process of the data alone",
@@ -33,10 +34,11 @@ _STRUCTURES = {
 _ELPD = (
     "elpd is the log density of left-out observations, summed, in nats: higher is better. A "
     "difference of less than two of its errors shows nothing. RMSE is of the left-out "
-    "predictions, sd is that of the observations, and the last column is the share of left-out "
-    "observations within their 95 % intervals. Weights are those of the mixture that predicts "
-    "left-out observations best: of structures that predict alike one may have all of it, also "
-    "one that is not the first."
+    "predictions, sd is that of the observations, 'in 95 %' the share of left-out observations "
+    "within their 95 % intervals, and 'of use' the probability that the formula is of use, by "
+    "nested models with and without it. Weights are those of the mixture that predicts left-out "
+    "observations best: of structures that predict alike one may have all of it, also one that is "
+    "not the first."
 )
 _COVERAGE = (
     "If intervals are honest, those of 95 % hold 95 % of left-out observations, but for chance: "
@@ -78,15 +80,14 @@ def structures(subject: Subject) -> Markup:
         head = ["structure", *subject.outputs]
         return table("Weights of the mixture", head, rows) if rows else Markup()
     parts, names = [], dict[str, None]()
-    for j, output in enumerate(comparison.table):
+    for output in comparison.table:
         head = ["structure", "elpd", "less the best", "its error", "weight"]
-        head += [html.with_unit("RMSE", output, "{} [{}]"), "RMSE / sd", "in 95 %"]
-        spread = spread_of(subject.Y[:, j])
+        head += [with_unit("RMSE", output, "{} [{}]"), "RMSE / sd", "in 95 %", "of use"]
         rows = []
-        for row in comparison.rows(output):
-            weight = "-" if row.structure.startswith(ALONE) else f"{row.weight:.2f}"
+        for row in comparison.table[output]:
+            weight = "-" if math.isnan(row.weight) else f"{row.weight:.2f}"
             elpd = [f"{row.elpd:.4g}", f"{row.elpd_diff:.3g}", f"{row.se_diff:.2g}", weight]
-            rmse = [number(row.rmse * spread), f"{row.rmse:.3g}", percent(row.coverage)]
+            rmse = [number(row.error), f"{row.rmse:.3g}", percent(row.coverage)]
             rows.append([row.structure, *elpd, *rmse])
             names[row.structure] = None
         parts.append(table(f"Left-out predictions of {output}, best first", head, rows, marked=0))
@@ -113,13 +114,13 @@ def predictions(subject: Subject) -> Markup:
         rmse = float(subject.loo.score().rmse[j])
         share = percent(rmse / spread_of(subject.Y[:, j]))
         words = (
-            f"{name}: {html.plural(counts[j], 'observation')}, root mean square error "
-            f"{html.with_unit(number(rmse), name)}, {share} of the standard deviation of the "
+            f"{name}: {plural(counts[j], 'observation')}, root mean square error "
+            f"{with_unit(number(rmse), name)}, {share} of the standard deviation of the "
             "observations."
         )
         if out := subject.outliers(j):
             are = "is taken for an outlier" if len(out) == 1 else "are taken for outliers"
-            words += f" {html.listed(out)} {are}: errors and coverage on this page leave them out."
+            words += f" {listed(out)} {are}: errors and coverage on this page leave them out."
         parts += [tag("p", words), figures.left_out(subject, j), _worst(subject, j)]
     return join(parts)
 
@@ -132,7 +133,7 @@ def _worst(subject: Subject, j: int) -> Markup:
         distance = distance.masked_fill(loo.is_outlier[:, j], torch.inf)
     order = [i for i in distance.argsort(descending=True).tolist() if distance[i] >= 0][:_WORST]
     inputs = subject.inputs if len(subject.inputs) <= 4 else ()
-    head = ["", *(html.with_unit(what, name, "{} [{}]") for what in ("observed", "predicted"))]
+    head = ["", *(with_unit(what, name, "{} [{}]") for what in ("observed", "predicted"))]
     rows = []
     for i in order:
         mean, half = loo.mean[i, j], quantile(0.95) * loo.variance[i, j].sqrt()
@@ -156,7 +157,7 @@ def coverage(subject: Subject) -> Markup:
             says = "too narrow" if held < low else "too wide" if held > high else "in that range"
             cells = [f"{held} of {n}", percent(share[j]), f"{low} to {high} of {n}", says]
             rows.append([f"{name}, {percent(level)}", *cells])
-        images.append(figures.coverages(subject, j, n))
+        images.append(figures.coverages(subject, j))
     head = ["interval", "holds", "share", "if they hold", "the intervals are"]
     return join([tag("p", _COVERAGE), table("Coverage of left-out intervals", head, rows), *images])
 
@@ -186,13 +187,13 @@ def data(subject: Subject, remarks: tuple[str, ...]) -> Markup:
     for kind, names, values in kinds:
         for name, column in zip(names, values.unbind(-1), strict=True):
             known = column[~column.isnan()]
-            short, unit = html.name_and_unit(name)
+            short, unit = name_and_unit(name)
             numbers = [number(end, 4) for end in (known.min(), known.quantile(0.5), known.max())]
             if kind == "input" and len(rows) in subject.levels:  # of which none is the least
                 numbers = ["-"] * 3
             rows.append([short, kind, unit or "-", *numbers, str(len(column) - len(known))])
     head = ["column", "is", "unit", "least", "median", "most", "missing"]
-    first = [f"{html.plural(len(subject.X), 'row')} of data.", _repeats(subject)]
+    first = [f"{plural(len(subject.X), 'row')} of data.", _repeats(subject)]
     items = html.bullets([*first, *remarks, _assumed(subject.model)])
     return join([table("Columns", head, rows), items])
 
@@ -210,10 +211,10 @@ def _repeats(subject: Subject) -> str:
         groups = [group - group.mean() for group in groups if len(group) > 1]
         if groups:
             sd = (torch.cat(groups).square().sum() / sum(len(g) - 1 for g in groups)).sqrt()
-            spreads.append(f"{html.with_unit(number(sd), name)} ({html.bare(name)})")
+            spreads.append(f"{with_unit(number(sd), name)} ({bare(name)})")
     by = f", and their outputs differ by a standard deviation of {', '.join(spreads)}"
     differ = by if spreads else ""
-    return f"{html.plural(repeated, 'row')} share their inputs with another{differ}."
+    return f"{plural(repeated, 'row')} share their inputs with another{differ}."
 
 
 def _assumed(model: GP | StackedGP) -> str:
@@ -227,18 +228,18 @@ def _assumed(model: GP | StackedGP) -> str:
     for noise in noises:
         if isinstance(noise, NoisyInputs):
             pairs = zip(inputs, noise.settings["variances"].mean(0).sqrt(), strict=True)
-            sds = [f"{html.bare(n)} by {html.with_unit(number(s), n)}" for n, s in pairs if s > 0]
-            noisy = f"inputs that are noisy themselves: {html.listed(sds)} (standard deviations)"
+            sds = [f"{bare(n)} by {with_unit(number(s), n)}" for n, s in pairs if s > 0]
+            noisy = f"inputs that are noisy themselves: {listed(sds)} (standard deviations)"
             words.append(noisy)
     if (link := getattr(one, "link", None)) is not None:
-        outputs = html.listed(html.bare(name) for name in one.data.output_names)
+        outputs = listed(bare(name) for name in one.data.output_names)
         below = f" and below {link.upper:g}" * math.isfinite(link.upper)
         words.append(f"{outputs} above {link.lower:g}{below}")
     if isinstance(transform, Categories):
         batches = [inputs[i] for i in transform.batches]
         plain = [inputs[i] for i in transform.levels if i not in transform.batches]
-        words += [f"categories in {html.listed(plain)}"] * bool(plain)
-        offsets = f"offsets of {html.listed(batches)}, whatever the other inputs are"
+        words += [f"categories in {listed(plain)}"] * bool(plain)
+        offsets = f"offsets of {listed(batches)}, whatever the other inputs are"
         words += [offsets] * bool(batches)
     default = "noise of one size, exact inputs, numbers that may be of any size"
     return f"Assumed: {'; '.join(words or [default])}."
@@ -252,7 +253,7 @@ def loading(subject: Subject, saved: Saved | str, origin: Origin) -> Markup:
     words = [f"The model is in {file}, beside this page; run this in its folder."]
     arguments = [repr(file)]
     if origin.physics:
-        where = f"module{'s' * (len(origin.modules) > 1)} {html.listed(origin.modules)}"
+        where = f"module{'s' * (len(origin.modules) > 1)} {listed(origin.modules)}"
         words.append(f"Python has to find the {where}: there, or in a folder on PYTHONPATH.")
         arguments.append(f"physics={origin.physics}")
         missing = [name for name in missing if name != "physics"]

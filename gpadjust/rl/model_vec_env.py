@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -13,7 +15,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 from torch import Tensor
 
 from gpadjust.checks import check_choice
-from gpadjust.control import Step, Task
+from gpadjust.control import Moment, Steps, Task
 from gpadjust.dynamics import TransitionFunctions
 from gpadjust.physics import PhysicsError
 from gpadjust.rl.buffer import CompactReplayBuffer
@@ -149,8 +151,7 @@ class ModelVecEnv(VecEnv):
         """Step all particles, without a new start for those whose episode ended."""
         moves = torch.as_tensor(actions, dtype=torch.float64)
         self._is_followed = True
-        ahead = self.task.set_points(self._states, self._steps + 1)
-        step = self._step(self._states, moves, ahead)
+        step = self._step(self.task, self._states, moves, Moment(self._steps))
         self._states = step.next_states
         self._steps += 1
         self.num_left_bounds += int(step.left_bounds.sum())
@@ -183,12 +184,12 @@ class ModelVecEnv(VecEnv):
             actions = torch.from_numpy(low + (scaled + 1) / 2 * (high - low))
             spec = self.task.dynamics.spec
             states = spec.decode(obs)
-            self.task = self.task.widened(states)
-            ahead = None
-            if self.task.reference is not None:  # the numbers of the steps are not in the buffer
+            task = self.task = self.task.widened(states)
+            if task.reference is not None:  # the numbers of the steps are not in the buffer
                 after = torch.from_numpy(buffer.next_observations[rows, 0].astype(np.float64))
                 ahead = spec.decode(after)[:, spec.exogenous_columns]
-            step = self._step(states, actions, ahead)
+                task = replace(task, reference=partial(_recorded, ahead))
+            step = self._step(task, states, actions, Moment())
             terminated = step.terminated.numpy()
             limits = buffer.timeouts[rows, 0].astype(bool) | step.left_bounds.numpy()
             timeouts = limits & ~terminated
@@ -197,9 +198,9 @@ class ModelVecEnv(VecEnv):
             buffer.dones[rows, 0] = terminated | timeouts
             buffer.timeouts[rows, 0] = timeouts
 
-    def _step(self, states: Tensor, actions: Tensor, set_points: Tensor | None) -> Step:
-        """A step of the task, in which leaving the bounds is the worst that can be."""
-        step = self.task.step(states, actions, self._move, set_points=set_points)
+    def _step(self, task: Task, states: Tensor, actions: Tensor, moment: Moment) -> Steps:
+        """A step of a task, in which leaving the bounds is the worst that can be."""
+        step = task.step(states, actions, moment, move=self._move)
         self.worst_reward = min(self.worst_reward, float(step.rewards.min()))
         if not step.left_bounds.any():
             return step
@@ -269,3 +270,8 @@ class ModelVecEnv(VecEnv):
     def _observe(self, states: Tensor) -> np.ndarray:
         seen: np.ndarray = self.task.dynamics.spec.observe(states).numpy()
         return seen.astype(self.observation_space.dtype)
+
+
+def _recorded(set_points: Tensor, states: Tensor, steps: Tensor) -> Tensor:
+    """Return set-points that were recorded."""
+    return set_points

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import get_args
 
 from gpadjust.checks import check_choice, check_switch, checked_number, checked_whole
-from gpadjust.dynamics.free_run import checked_horizons
+from gpadjust.dynamics.base import checked_horizons
 from gpadjust.rl.model_vec_env import Sampling
 
 

@@ -34,7 +34,7 @@ from gpadjust.many import VariationalCKA
 from gpadjust.physics import PhysicsWarning
 from gpadjust.physics.function import array_physics
 from gpadjust.physics.parameters import PhysicsParameters
-from gpadjust.validation.plausibility import complaint
+from gpadjust.validation.verdict import faults
 
 Array = NDArray[np.float64]
 
@@ -178,11 +178,10 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             "output_names": output_names or model.data.output_names,
         }
         model.data = model.data._replace(**names)
-        if len(model.physics) == 1 and (text := complaint(model.physics[0], model.data)):
-            message = f"Physics {model.physics[0].name!r}: {text}"
-            warnings.warn(message, PhysicsWarning, stacklevel=2)
         seed = _seed(self.random_state)
         self.fit_result_ = fit(model, self.fit_method, num_draws=self.num_draws, seed=seed)
+        for text in faults(model):
+            warnings.warn(text, PhysicsWarning, stacklevel=2)
         self.model_ = model
         self.__dict__.pop("physics_parameters_", None)
         if len(model.physics_parameters):

@@ -6,12 +6,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any
 
-import torch
+import numpy as np
 from torch import Tensor
 
-from gpadjust.checks import checked_number
-from gpadjust.states.spec_checks import checked_names
-from gpadjust.states.state_spec import StateSpec
+from gpadjust.checks import check_choice, check_kind, checked_number
+from gpadjust.states.state_spec import StateSpec, checked_names
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +28,8 @@ class Sensors:
 
     Raises:
         TypeError: If names are not strings, or ``function`` is none.
-        ValueError: If there is no output, or a guess is of no output or not positive.
+        ValueError: If there is no output, or a guess is of no output or not positive; later, if
+            a function returns another shape, or an output is no state and there is no function.
 
     Example:
         >>> import torch
@@ -51,50 +51,41 @@ class Sensors:
 
     def __post_init__(self) -> None:
         """Check names and guesses."""
-        object.__setattr__(self, "outputs", checked_names(self.outputs, "outputs"))
+        object.__setattr__(self, "outputs", checked_names("outputs", self.outputs))
         if not self.outputs:
             raise ValueError("outputs must be one or more different names; found none.")
-        if self.function is not None and not callable(self.function):
-            raise TypeError(f"function must be a function of states; found {self.function!r}.")
+        if self.function is not None:
+            check_kind("function", self.function, Callable, "a function of states")
         object.__setattr__(self, "noise", dict(self.noise))
         for name, guess in self.noise.items():
             checked_number(f"The noise of {name!r}", guess, above=0)
-            if name not in self.outputs:
-                raise ValueError(f"There is no output {name!r}; the outputs are {self.outputs}.")
+            check_choice("output", name, self.outputs)
 
     def spec(self, spec: StateSpec) -> StateSpec:
-        """The outputs as a spec, which says how they are observed.
-
-        Raises:
-            ValueError: If an output is none of the states of ``spec``, and there is no function.
-        """
+        """Return the outputs as a spec, which says how they are observed."""
         if self.function is not None:
             return StateSpec(self.outputs, spec.actions)
-        unknown = [name for name in self.outputs if name not in spec.states]
-        if unknown:
-            raise ValueError(
-                f"Sensors: there is no state {unknown[0]!r}; the states are {spec.states}. Of "
-                "other outputs say the function, Sensors(names, function)."
-            )
+        for name in self.outputs:
+            if name not in spec.states:
+                raise ValueError(
+                    f"Sensors: there is no state {name!r}; the states are {spec.states}. Of other "
+                    "outputs say the function, Sensors(names, function)."
+                )
         angles = [name for name in self.outputs if name in spec.angles]
         return StateSpec(self.outputs, spec.actions, angles=angles)
 
     def measure(self, spec: StateSpec, states: Tensor) -> Tensor:
-        """Outputs ``N x len(outputs)`` of states ``N x state_dim``, without noise.
-
-        Raises:
-            ValueError: If the function returns another shape.
-        """
+        """Return outputs ``N x len(outputs)`` of states ``N x state_dim``, without noise."""
         if self.function is None:
             return states[:, [spec.states.index(name) for name in self.outputs]]
-        found: Any = self.function(states)
-        if not isinstance(found, Tensor) or found.shape != (len(states), len(self.outputs)):
+        values: Any = self.function(states)
+        shape = len(states), len(self.outputs)
+        if not isinstance(values, Tensor) or values.shape != shape:
             raise ValueError(
-                f"Sensors: function must return a tensor of shape {len(states)} x "
-                f"{len(self.outputs)}, the outputs {self.outputs} of each state; found "
-                f"{tuple(torch.as_tensor(found).shape)}."
+                f"Sensors: function must return a tensor of shape {shape[0]} x {shape[1]}, the "
+                f"outputs {self.outputs} of each state; found {tuple(np.shape(values))}."
             )
-        return found
+        return values
 
     def describe(self) -> dict[str, Any]:
         """Return the sensors in plain values: of the function, whether there is one."""

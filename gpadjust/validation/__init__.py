@@ -1,29 +1,22 @@
 """Judging predictions, and choosing by them. `gpadjust.validation.plots` needs matplotlib."""
 
-from gpadjust.validation.advice import Gain
-from gpadjust.validation.comparison import Comparison, compare
+from gpadjust.validation.comparison import STRUCTURES, Comparison, Structure, compare
 from gpadjust.validation.leave_one_out import LeaveOneOut, leave_one_out
-from gpadjust.validation.ranking import Candidate
-from gpadjust.validation.scores import Scores, coverage, crps, nlpd, pit, rmse, score
-from gpadjust.validation.structures import STRUCTURES, Structure
+from gpadjust.validation.scores import Scores, score
 from gpadjust.validation.trust import Trust, trust
+from gpadjust.validation.verdict import Candidate, Verdict
 
 __all__ = [
     "STRUCTURES",
     "Candidate",
     "Comparison",
-    "Gain",
     "LeaveOneOut",
     "Scores",
     "Structure",
     "Trust",
+    "Verdict",
     "compare",
-    "coverage",
-    "crps",
     "leave_one_out",
-    "nlpd",
-    "pit",
-    "rmse",
     "score",
     "trust",
 ]

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from botorch.models import ModelListGP, SingleTaskGP
-from botorch.models.transforms.outcome import Standardize
 from torch import Tensor
 
 from gpadjust.core import GP, StackedGP
@@ -35,7 +32,7 @@ class LeaveOneOut:
             deviations of at least 1e-8 of that of the observations, as less is rounding. NaN where
             there is no observation.
         pit: The predicted probabilities of less than was observed; NaN where nothing was.
-        output_names: The names of the outputs; empty if the model has none.
+        output_names: The names of the outputs.
         is_outlier: Whether an observation is an outlier of a noise with heavy tails, ``n x m``;
             None of other noise. Scores leave these out, but for the density.
     """
@@ -46,7 +43,7 @@ class LeaveOneOut:
     variance: Tensor
     log_density: Tensor
     pit: Tensor
-    output_names: tuple[str, ...] = ()
+    output_names: tuple[str, ...]
     is_outlier: Tensor | None = None
 
     @property
@@ -59,15 +56,12 @@ class LeaveOneOut:
         return torch.where(z.abs() < _FAR, z, (self.Y - self.mean) / self.variance.sqrt())
 
     def score(self, level: float = 0.95) -> Scores:
-        """Return the scores of the predictions.
-
-        Args:
-            level: Nominal coverage, between 0 and 1.
-        """
+        """Return the scores of the predictions, with the coverage of intervals of a level."""
         Y = self.Y if self.is_outlier is None else self.Y.masked_fill(self.is_outlier, torch.nan)
-        names, pit = self.output_names, self.pit.masked_fill(Y.isnan(), torch.nan)
         mean = self.mean.nan_to_num()  # where nothing was observed
-        scores = Scores.of(mean, self.variance, Y, level=level, output_names=names)
+        scores = Scores.of(mean, self.variance, Y, level=level, output_names=self.output_names)
+        # Predictions are mixtures, whose probabilities and densities are known better.
+        pit = self.pit.masked_fill(Y.isnan(), torch.nan)
         share, nlpd = central_share(pit, level), -self.log_density.nanmean(-2)
         return replace(scores, pit=pit, coverage=share, nlpd=nlpd)
 
@@ -90,13 +84,11 @@ def leave_one_out(model: Any) -> LeaveOneOut:
     weights, and the scale of the outcomes, have seen all.
 
     Args:
-        model: A model of this library, a ``SingleTaskGP``, or a ``ModelListGP`` of such with the
-            same training inputs.
+        model: A model of this library, such as :class:`~gpadjust.CKA`, or a
+            :class:`~gpadjust.StackedGP`.
 
     Raises:
         TypeError: If the model is of another kind.
-        ValueError: If its outcome transform is not a shift and scale, or the parts of a list have
-            different inputs.
 
     Example:
         >>> import torch
@@ -108,22 +100,17 @@ def leave_one_out(model: Any) -> LeaveOneOut:
         >>> loo.mean.shape, bool(loo.score().rmse < 0.1)
         (torch.Size([8, 1]), True)
     """
-    if isinstance(model, ModelListGP):
-        return _side_by_side([leave_one_out(part) for part in model.models])
-    if isinstance(model, SingleTaskGP):
-        return _of_botorch(model)
-    if not isinstance(model, StackedGP) and not isinstance(model, GP):
+    if not isinstance(model, GP | StackedGP):
         raise TypeError(
-            "Expected a model of this library, a SingleTaskGP, or a ModelListGP of such; found "
-            f"{type(model).__name__}. Of a model without leave-one-out predictions hold some "
-            "observations out, and compare model.interval(X) with them."
+            f"Expected a model of this library, such as CKA; found {type(model).__name__}. Of a "
+            "list take each model by itself; of a model without leave-one-out predictions hold "
+            "some observations out, and compare model.interval(X) with them."
         )
     marginals, data = _left_out(model), model.data
-    Y = data.Y
     is_outlier = getattr(getattr(model, "noise", None), "is_outlier", None)
     return LeaveOneOut(
-        data.X, Y, *marginals.prediction, marginals.log_density(Y), marginals.probability(Y),
-        data.output_names, is_outlier,
+        data.X, data.Y, *marginals.prediction, marginals.log_density(data.Y),
+        marginals.probability(data.Y), data.output_names, is_outlier,
     )  # fmt: skip
 
 
@@ -160,60 +147,6 @@ def _mixed(model: StackedGP, parts: list[Marginals]) -> Tensor:
             chosen.append(torch.stack([each[rows, :, j] for each in (part.means, part.variances)]))
         outputs.append(torch.cat(chosen, 1))
     return torch.stack(outputs, -1)
-
-
-def _of_botorch(model: SingleTaskGP) -> LeaveOneOut:
-    """Return leave-one-out predictions by a model of BoTorch, in the user's units."""
-    transform = getattr(model, "outcome_transform", None)
-    if transform is not None and not isinstance(transform, Standardize):
-        raise ValueError(
-            "Expected outcome_transform as Standardize or None, so that predictions are Gaussian "
-            f"in the user's units; found {type(transform).__name__}. Transform the data before."
-        )
-    was_training = model.training
-    model.train()  # in which its inputs are the user's
-    X, y = model.train_inputs[0], model.train_targets
-    prior = model.likelihood(model(X), [X])
-    alpha = torch.linalg.solve(prior.covariance_matrix, (y - prior.mean).unsqueeze(-1)).squeeze(-1)
-    variance = prior.covariance_matrix.inverse().diagonal(dim1=-1, dim2=-2).reciprocal()
-    model.train(was_training)
-    several = model.num_outputs > 1
-    X = X[0] if several else X
-    Y, mean, variance = (
-        each.mT if several else each.unsqueeze(-1) for each in (y, y - alpha * variance, variance)
-    )
-    if transform is not None:
-        Y, _ = transform.untransform(Y)
-        mean, variance = transform.untransform(mean, variance)
-    marginals = Marginals(mean.unsqueeze(DRAWS), variance.unsqueeze(DRAWS))
-    return LeaveOneOut(X, Y, mean, variance, marginals.log_density(Y), marginals.probability(Y))
-
-
-def _side_by_side(parts: Sequence[LeaveOneOut]) -> LeaveOneOut:
-    """Return the outputs of several models as those of one."""
-    first = parts[0]
-    if any(part.X.shape != first.X.shape or not torch.equal(part.X, first.X) for part in parts):
-        raise ValueError(
-            "Expected models of the same training inputs in the list; found others: call "
-            "`leave_one_out` on each of `model.models`."
-        )
-    names = ("Y", "mean", "variance", "log_density", "pit")
-    columns: dict[str, Any] = {n: torch.cat([getattr(p, n) for p in parts], -1) for n in names}
-    masks = [part.is_outlier for part in parts]
-    if any(mask is not None for mask in masks):
-        none = [torch.zeros_like(part.Y, dtype=torch.bool) for part in parts]
-        pairs = zip(masks, none, strict=True)
-        columns["is_outlier"] = torch.cat([n if mask is None else mask for mask, n in pairs], -1)
-    outputs = tuple(name for part in parts for name in part.output_names)
-    return replace(first, output_names=outputs, **columns)
-
-
-def observations(model: Any) -> tuple[Tensor, Tensor]:
-    """Return the observations of a model in the user's units, ``n x d`` and ``n x m``."""
-    if hasattr(model, "data"):
-        return model.data.X, model.data.Y
-    loo = leave_one_out(model)
-    return loo.X, loo.Y
 
 
 def error_correlation(model: Any) -> Tensor | None:

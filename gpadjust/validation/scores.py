@@ -7,8 +7,8 @@ for an output that has none.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -19,100 +19,6 @@ from torch.distributions import Normal
 
 from gpadjust.checks import check_columns, check_level
 from gpadjust.core.gaussian import DRAWS, Marginals
-
-
-def rmse(mean: Tensor, y: Tensor) -> Tensor:
-    """Return the root mean square error over the points.
-
-    Args:
-        mean: Predicted means, ``... x n x m``.
-        y: True values, ``... x n x m``, NaN where not observed.
-
-    Returns:
-        ``... x m``, in the units of ``y``.
-
-    Raises:
-        TypeError: If ``mean`` or ``y`` are no tensors of numbers.
-        ValueError: If the shapes disagree, or ``mean`` has NaN.
-
-    Example:
-        >>> import torch
-        >>> rmse(torch.tensor([[1.0], [2.0]]), torch.tensor([[1.0], [4.0]]))
-        tensor([1.4142])
-    """
-    _check(y, mean=mean)
-    return _mean_over_observed((mean - _filled(y)).square(), y).sqrt()
-
-
-def nlpd(mean: Tensor, variance: Tensor, y: Tensor) -> Tensor:
-    """Return the mean negative log predictive density over the points; lower is better.
-
-    Arguments and errors are those of :func:`rmse`, and the predicted ``variance``, of the shape of
-    ``mean``, which is not negative.
-
-    Returns:
-        ``... x m``, in nats.
-
-    Example:
-        >>> import torch
-        >>> zero = torch.zeros(3, 1)
-        >>> nlpd(zero, torch.ones(3, 1), zero)
-        tensor([0.9189])
-    """
-    return _nlpd(_gaussians(mean, variance, y), y)
-
-
-def crps(mean: Tensor, variance: Tensor, y: Tensor) -> Tensor:
-    """Return the mean continuous ranked probability score over the points; lower is better.
-
-    In closed form (Gneiting and Raftery 2007, eq. 21). Arguments and errors are those of
-    :func:`nlpd`.
-
-    Returns:
-        ``... x m``, in the units of ``y``.
-
-    Example:
-        >>> import torch
-        >>> zero = torch.zeros(3, 1)
-        >>> crps(zero, torch.ones(3, 1), zero)
-        tensor([0.2337])
-    """
-    return _crps(_gaussians(mean, variance, y), y)
-
-
-def pit(mean: Tensor, variance: Tensor, y: Tensor) -> Tensor:
-    """Return the probability integral transform: the distribution function at the true value.
-
-    Arguments and errors are those of :func:`nlpd`.
-
-    Returns:
-        ``... x n x m``, between 0 and 1, or NaN where not observed; uniform if intervals
-        of all levels hold (Dawid 1984).
-
-    Example:
-        >>> import torch
-        >>> pit(torch.zeros(2, 1), torch.ones(2, 1), torch.tensor([[0.0], [1.0]]))
-        tensor([[0.5000],
-                [0.8413]])
-    """
-    return _gaussians(mean, variance, y).probability(y)
-
-
-def coverage(mean: Tensor, variance: Tensor, y: Tensor, level: float = 0.95) -> Tensor:
-    """Return the share of the points that lie within the central interval of a given level.
-
-    Arguments and errors are those of :func:`nlpd`, and the nominal coverage ``level``, a number
-    between 0 and 1.
-
-    Returns:
-        ``... x m``, between 0 and 1; near ``level`` if the intervals hold.
-
-    Example:
-        >>> import torch
-        >>> coverage(torch.zeros(2, 1), torch.ones(2, 1), torch.tensor([[1.0], [3.0]]))
-        tensor([0.5000])
-    """
-    return central_share(pit(mean, variance, y), level)
 
 
 def central_share(pit: Tensor, level: float) -> Tensor:
@@ -133,9 +39,12 @@ class Scores:
         rmse: Root mean square error, ``... x m``, in y's units.
         median: Median absolute error, ``... x m``, in y's units.
         nlpd: Mean negative log predictive density, ``... x m``, in nats.
-        crps: Mean continuous ranked probability score, ``... x m``, in y's units.
+        crps: Mean continuous ranked probability score, ``... x m``, in y's units (Gneiting and
+            Raftery 2007, eq. 21).
         coverage: Share of the points in the central interval, ``... x m``.
-        pit: Probability integral transform of each point, ``... x n x m``, NaN where not observed.
+        pit: Probability integral transform of each point, ``... x n x m``: the distribution
+            function at the true value, NaN where not observed. Uniform between 0 and 1 if intervals
+            of all levels hold (Dawid 1984).
         energy: Mean energy score of all outputs together, ``...``, where there are draws of them.
         output_names: The names of the outputs; empty if they have none.
     """
@@ -161,7 +70,7 @@ class Scores:
         energy: Tensor | None = None,
         output_names: Sequence[str] = (),
     ) -> Scores:
-        """Return the scores of Gaussian predictions.
+        """Return the scores of Gaussian predictions, in closed form.
 
         Args:
             mean: Predicted means, ``... x n x m``.
@@ -175,8 +84,9 @@ class Scores:
             output_names: The names of the ``m`` outputs.
 
         Raises:
-            TypeError: As :func:`coverage`.
-            ValueError: As :func:`coverage`.
+            TypeError: If these are no tensors of numbers, or ``level`` is no number.
+            ValueError: If the shapes disagree, means have NaN, variances are negative, or ``level``
+                is not between 0 and 1.
 
         Example:
             >>> import torch
@@ -185,53 +95,28 @@ class Scores:
             >>> scores.rmse.shape, scores[4].rmse.shape
             (torch.Size([5, 2]), torch.Size([2]))
         """
-        marginals = _gaussians(mean, variance.nan_to_num(nan=1.0, posinf=math.inf), y)
+        gaussians = _gaussians(mean, variance.nan_to_num(nan=1.0, posinf=math.inf), y)
         judged = y.masked_fill(variance.isnan(), math.nan)
-        return cls._of(marginals, y, judged, level, interval, energy, tuple(output_names))
-
-    @classmethod
-    def _of(
-        cls, marginals: Marginals, y: Tensor, judged: Tensor, level: float, interval: Any = None,
-        energy: Tensor | None = None, output_names: tuple[str, ...] = (),
-    ) -> Scores:  # fmt: skip
-        """Return the scores of mixtures at each point; only errors of points not judged."""
-        values, mean = marginals.probability(judged), marginals.prediction.mean
-        if interval is None:
-            share = central_share(values, level)
-        else:
-            check_level(level)
-            inside = ((interval[0] <= judged) & (judged <= interval[1])).to(mean.dtype)
+        scores = _scores(gaussians, y, judged, level)
+        if interval is not None:
             known = judged + 0 * (interval[0] + interval[1])  # NaN where an end is
-            share = _mean_over_observed(inside, known)
-        return cls(
-            rmse=rmse(mean, y),
-            median=(mean - y).abs().nanmedian(-2).values if y.shape[-2] else y.sum(-2) / 0,
-            nlpd=_nlpd(marginals, judged),
-            crps=_crps(marginals, judged),
-            coverage=share,
-            pit=values,
-            energy=energy,
-            output_names=output_names,
-        )
+            inside = (interval[0] <= known) & (known <= interval[1])
+            scores = replace(scores, coverage=_mean_over_observed(inside.to(mean.dtype), known))
+        return replace(scores, energy=energy, output_names=tuple(output_names))
 
     def __getitem__(self, part: Any) -> Scores:
-        """The scores of a part of the batch: an index of its leading dimensions.
+        """Return the scores of a part of the batch, by an index of its leading dimensions.
 
         Raises:
-            IndexError: If there is no batch, or not this part of it.
+            TypeError: If there is no batch.
+            IndexError: If the batch has not this part.
         """
         if self.rmse.dim() < 2:
-            raise IndexError(
+            raise TypeError(
                 "These scores have no batch to take a part of; an output is `scores.rmse[j]`."
             )
-        given: dict[str, Any] = vars(self)
-        parts = {name: v[part] for name, v in given.items() if isinstance(v, Tensor)}
-        return Scores(**{**given, **parts})
-
-    def __iter__(self) -> Iterator[Scores]:
-        """The scores of each part of the batch; an IndexError if there is none."""
-        whole = self[:]  # an IndexError of the first part would end a loop in silence
-        return (whole[i] for i in range(len(whole.rmse)))
+        parts: dict[str, Any] = {n: v[part] for n, v in vars(self).items() if isinstance(v, Tensor)}
+        return replace(self, **parts)
 
 
 def score(posterior: Posterior, Y: Tensor, level: float = 0.95) -> Scores:
@@ -262,24 +147,25 @@ def score(posterior: Posterior, Y: Tensor, level: float = 0.95) -> Scores:
         >>> scores.rmse.shape, scores.pit.shape
         (torch.Size([1]), torch.Size([20, 1]))
     """
-    mean, variance = getattr(posterior, "mean", None), getattr(posterior, "variance", None)
-    if isinstance(marginals := getattr(posterior, "marginals", None), Marginals):
-        _check(Y, mean=marginals.prediction.mean)
-        return Scores._of(marginals, Y, Y, level)
-    if not (isinstance(mean, Tensor) and isinstance(variance, Tensor)):
-        raise TypeError(
-            f"Expected a posterior, with a mean and a variance, got {type(posterior).__name__}; "
-            "that of a model is `model.posterior(X, observation_noise=True)`."
-        )
-    if not isinstance(posterior, GaussianMixturePosterior):
-        return Scores.of(mean, variance, Y, level=level)
-    marginals = Marginals(mean, variance)  # of a fully Bayesian model of BoTorch, likewise
+    marginals = getattr(posterior, "marginals", None)
+    if not isinstance(marginals, Marginals):
+        mean, variance = getattr(posterior, "mean", None), getattr(posterior, "variance", None)
+        if not (isinstance(mean, Tensor) and isinstance(variance, Tensor)):
+            raise TypeError(
+                "Expected a posterior, with a mean and a variance, got "
+                f"{type(posterior).__name__}; that of a model is `model.posterior(X, "
+                "observation_noise=True)`."
+            )
+        if isinstance(posterior, GaussianMixturePosterior):
+            marginals = Marginals(mean, variance)  # of the draws of a fully Bayesian model
+        else:
+            marginals = _gaussians(mean, variance, Y)
     _check(Y, mean=marginals.prediction.mean)
-    return Scores._of(marginals, Y, Y, level)
+    return _scores(marginals, Y, Y, level)
 
 
 def energy_score(draws: Tensor, y: Tensor) -> Tensor:
-    r"""Mean energy score of draws of all outputs together; lower is better.
+    r"""Return the mean energy score of draws of all outputs together; lower is better.
 
     :math:`\frac1K \sum_i |x_i - y| - \frac{1}{2 K (K - 1)} \sum_{i \neq j} |x_i - x_j|` of ``K``
     draws (Gneiting and Raftery 2007, sec. 4.3; without bias of ``K``: Ferro 2014). Give all outputs
@@ -309,47 +195,19 @@ def energy_score(draws: Tensor, y: Tensor) -> Tensor:
     return values.masked_fill(~known, 0).sum(-1) / known.sum(-1)
 
 
-def _check(y: Tensor, **predicted: Tensor) -> None:
-    """Raise an error unless means, and variances, are numbers of the shape of ``y``."""
-    for name, values in predicted.items():
-        check_columns(name, values, 0, more=True)
-    if not isinstance(y, Tensor):
-        raise TypeError(
-            f"Expected y to be a torch tensor, got {type(y).__name__}; convert it with "
-            "`torch.as_tensor(y, dtype=torch.float64)`."
-        )
-    if y.dim() < 2:
-        raise ValueError(
-            f"Expected y of shape ... x n x m, n points of m outputs, got {tuple(y.shape)}; give "
-            "one output its column with `.unsqueeze(-1)`, of all that is passed."
-        )
-    shapes = [tuple(values.shape) for values in predicted.values()]
-    if {*shapes} != {tuple(y.shape)}:
-        raise ValueError(
-            f"Expected {' and '.join(predicted)} of y's shape {tuple(y.shape)}, got "
-            f"{' and '.join(map(str, shapes))}."
-        )
-    for name, values in predicted.items():
-        if values.isnan().any():
-            raise ValueError(
-                f"Expected {name} without NaN, found {int(values.isnan().sum())} of "
-                f"{values.numel()}; only y may be NaN, where it was not observed."
-            )
-        if name == "variance" and (values < 0).any():
-            raise ValueError(
-                f"Expected variances of at least 0, got {values.min().item():.3g}; if they are "
-                "negative by rounding, pass `variance.clamp_min(0)`."
-            )
-
-
-def _gaussians(mean: Tensor, variance: Tensor, y: Tensor) -> Marginals:
-    """Return checked predictions of single Gaussians."""
-    _check(y, mean=mean, variance=variance)
-    return Marginals(mean.unsqueeze(DRAWS), variance.unsqueeze(DRAWS))
-
-
-def _nlpd(marginals: Marginals, y: Tensor) -> Tensor:
-    return _mean_over_observed(-marginals.log_density(_filled(y)), y)
+def _scores(marginals: Marginals, y: Tensor, judged: Tensor, level: float) -> Scores:
+    """Return the scores of mixtures; errors at ``y``, all else at the values that are judged."""
+    mean, values = marginals.prediction.mean, marginals.probability(judged)
+    # A median of no points is an error of torch.
+    median = (mean - y).abs().nanmedian(-2).values if y.shape[-2] else y.sum(-2) / 0
+    return Scores(
+        rmse=_mean_over_observed((mean - _filled(y)).square(), y).sqrt(),
+        median=median,
+        nlpd=_mean_over_observed(-marginals.log_density(_filled(judged)), judged),
+        crps=_crps(marginals, judged),
+        coverage=central_share(values, level),
+        pit=values,
+    )
 
 
 def _crps(marginals: Marginals, y: Tensor) -> Tensor:
@@ -371,25 +229,53 @@ def _crps(marginals: Marginals, y: Tensor) -> Tensor:
     return _mean_over_observed(score, y)
 
 
-def _filled(y: Tensor) -> Tensor:
-    """True values with a number where they are NaN, which is left out later."""
-    return y.masked_fill(y.isnan(), 0)
-
-
-def _mean_over_observed(values: Tensor, y: Tensor) -> Tensor:
-    """The mean over the points at which ``y`` is not NaN, ``... x n x m`` to ``... x m``."""
-    missing = y.isnan()
-    return values.masked_fill(missing, 0).sum(-2) / (~missing).sum(-2)
-
-
 def _absolute_moment(mean: Tensor, variance: Tensor) -> Tensor:
-    """The expectation of ``|Z|`` for a normal ``Z``."""
-    sd = _sd(variance)
+    """Return the expectation of ``|Z|`` for a normal ``Z``."""
+    # Next to no variance instead of none, so that the score has its limit.
+    sd = variance.sqrt().clamp_min(torch.finfo(variance.dtype).tiny ** 0.5)
     z = mean / sd
     normal = Normal(torch.zeros_like(z), torch.ones_like(z))
     return mean * (2 * normal.cdf(z) - 1) + 2 * sd * normal.log_prob(z).exp()
 
 
-def _sd(variance: Tensor) -> Tensor:
-    """Standard deviations, next to none instead of none, so that scores have their limits."""
-    return variance.sqrt().clamp_min(torch.finfo(variance.dtype).tiny ** 0.5)
+def _gaussians(mean: Tensor, variance: Tensor, y: Tensor) -> Marginals:
+    """Return checked predictions of single Gaussians."""
+    _check(y, mean=mean, variance=variance)
+    return Marginals(mean.unsqueeze(DRAWS), variance.unsqueeze(DRAWS))
+
+
+def _check(y: Tensor, **predicted: Tensor) -> None:
+    """Raise an error unless means, and variances, are numbers of the shape of ``y``."""
+    for name, values in {**predicted, "y": y}.items():
+        check_columns(name, values, 0, more=True)
+    if y.dim() < 2:
+        raise ValueError(
+            f"Expected y of shape ... x n x m, n points of m outputs, got {tuple(y.shape)}; give "
+            "one output its column with `.unsqueeze(-1)`, of all that is passed."
+        )
+    for name, values in predicted.items():
+        if values.shape != y.shape:
+            raise ValueError(
+                f"Expected {name} of y's shape {tuple(y.shape)}, got {tuple(values.shape)}."
+            )
+        if values.isnan().any():
+            raise ValueError(
+                f"Expected {name} without NaN, found {int(values.isnan().sum())} of "
+                f"{values.numel()}; only y may be NaN, where it was not observed."
+            )
+        if name == "variance" and (values < 0).any():
+            raise ValueError(
+                f"Expected variances of at least 0, got {values.min().item():.3g}; if they are "
+                "negative by rounding, pass `variance.clamp_min(0)`."
+            )
+
+
+def _filled(y: Tensor) -> Tensor:
+    """Return true values with a number where they are NaN, which is left out later."""
+    return y.masked_fill(y.isnan(), 0)
+
+
+def _mean_over_observed(values: Tensor, y: Tensor) -> Tensor:
+    """Return the mean over the points at which ``y`` is not NaN, ``... x n x m`` to ``... x m``."""
+    missing = y.isnan()
+    return values.masked_fill(missing, 0).sum(-2) / (~missing).sum(-2)

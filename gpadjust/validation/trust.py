@@ -10,13 +10,12 @@ import torch
 from botorch.utils.sampling import draw_sobol_samples
 from torch import Tensor
 
-from gpadjust.checks import check_level, checked_whole
-from gpadjust.core import StackedGP
+from gpadjust.checks import check_level
 from gpadjust.core.data import ArrayLike
 from gpadjust.core.model import Predictive
 from gpadjust.kinds.categories import on_levels
-from gpadjust.validation.leave_one_out import observations
 
+_POINTS = 512
 SIDES = ("physics", "data", "neither")
 _NOTHING = 1e-3  # of the targets' standard deviation: what makes no difference
 
@@ -32,42 +31,39 @@ class Trust:
             excludes the physics.
         doubt: The half width in typical discrepancies, :math:`w / D`, ``n x m``.
         input_names: The names of the inputs.
-        output_names: The names of the outputs; empty if the model has none.
+        output_names: The names of the outputs.
     """
 
     X: Tensor
     override: Tensor
     doubt: Tensor
-    input_names: tuple[str, ...] = ()
-    output_names: tuple[str, ...] = ()
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
 
     @property
     def side(self) -> Tensor:
         """The basis of each prediction, ``n x m``: 0, 1 or 2 for physics, data or neither."""
-        open_ = torch.where(self.doubt > 1, 2, 0)
-        return torch.where(self.override > 1, 1, open_)
+        without_data = torch.where(self.doubt > 1, 2, 0)
+        return torch.where(self.override > 1, 1, without_data)
 
     @property
     def physics(self) -> Tensor:
         """Share of the points at which the physics holds, ``m``."""
-        return self._share("physics")
+        return (self.side == 0).double().mean(0)
 
     @property
     def data(self) -> Tensor:
         """Share of the points at which the data override the physics, ``m``."""
-        return self._share("data")
+        return (self.side == 1).double().mean(0)
 
     @property
     def neither(self) -> Tensor:
         """Share of the points at which the data say too little to tell, ``m``."""
-        return self._share("neither")
-
-    def _share(self, side: str) -> Tensor:
-        return (self.side == SIDES.index(side)).double().mean(0)
+        return (self.side == 2).double().mean(0)
 
 
 @torch.no_grad()
-def trust(model: Any, X: ArrayLike = None, *, level: float = 0.95, num_points: int = 512) -> Trust:
+def trust(model: Any, X: ArrayLike = None, *, level: float = 0.95) -> Trust:
     r"""Return where a model's predictions rest on the physics, on the data, or on neither.
 
     With its mean :math:`\mu(x)`, the half width :math:`w(x)` of its central interval (without
@@ -83,23 +79,21 @@ def trust(model: Any, X: ArrayLike = None, *, level: float = 0.95, num_points: i
     - *neither*: the physics may be right, or as wrong as it was elsewhere. The model says what the
       physics says, for want of data.
 
-    The share of the points with *data* is the share of the predictions that override the physics.
-    It does not depend on units: w and D are taken to be at least a thousandth of the standard
-    deviation of the targets, as less makes no difference to speak of. :math:`f_p` is the prior mean
-    of the model, of several physics their weighted sum.
+    w and D are taken to be at least a thousandth of the standard deviation of the targets, as less
+    makes no difference to speak of. :math:`f_p` is the prior mean of the model, of several physics
+    their weighted sum.
 
     Args:
         model: A model with a physics, such as :class:`~gpadjust.CKA`; that of
             ``LearnedDynamics``, too.
         X: Inputs, ``n x d``, such as states and actions that were visited. Default:
-            ``num_points`` in the box of the training inputs, by Sobol's sequence.
+            512 in the box of the training inputs, by Sobol's sequence.
         level: Nominal coverage of the interval.
-        num_points: Number of points if there is no ``X``.
 
     Raises:
         TypeError: If the model has no physics to be trusted, or is a :class:`~gpadjust.StackedGP`,
             or ``level`` is no number.
-        ValueError: If ``X`` has the wrong shape, or ``level`` or ``num_points`` is out of range.
+        ValueError: If ``X`` has the wrong shape, or ``level`` is not between 0 and 1.
         PhysicsError: If the physics fails.
 
     Example:
@@ -114,31 +108,30 @@ def trust(model: Any, X: ArrayLike = None, *, level: float = 0.95, num_points: i
         (True, True)
     """
     check_level(level)
-    if isinstance(model, StackedGP):
-        raise TypeError(
-            "Expected a model of one structure; found a StackedGP, whose models rest on different "
-            "parts: take one of these, such as comparison.models['CKA']."
-        )
     if not isinstance(model, Predictive) or not getattr(model, "physics", None):
         raise TypeError(
             "Expected a model with a physics that it could trust, such as CKA; found "
-            f"{type(model).__name__}. Of LearnedDynamics pass its `model`."
+            f"{type(model).__name__}. Of LearnedDynamics pass its `model`, of a StackedGP one of "
+            "its models, such as comparison.models['CKA']."
         )
-    train_X, train_Y = observations(model)
-    points = _points(model, train_X, num_points) if X is None else model.data.new_inputs(X)
+    data = model.data
+    if X is None:
+        box = torch.stack([data.X.amin(0), data.X.amax(0)])
+        points = on_levels(model, draw_sobol_samples(box, n=_POINTS, q=1, seed=0).squeeze(-2))
+    else:
+        points = data.new_inputs(X)
     if points.dim() != 2 or not len(points):
         raise ValueError(
             f"Expected X of shape n x d, one point or more; found {tuple(points.shape)}."
         )
     mean, variance = model.predict(points)
     away = (mean - prior_mean(model, points)).abs()
-    discrepancy = _rms(train_Y - prior_mean(model, train_X))
-    least = _NOTHING * _rms(train_Y - train_Y.nanmean(0))
+    discrepancy = _rms(data.Y - prior_mean(model, data.X))
+    least = _NOTHING * _rms(data.Y - data.Y.nanmean(0))
     least = least.clamp_min(torch.finfo(least.dtype).tiny)
     half = torch.maximum(NormalDist().inv_cdf((1 + level) / 2) * variance.sqrt(), least)
     doubt = half / torch.maximum(discrepancy, least)
-    names = model.data.input_names, model.data.output_names
-    return Trust(points, away / half, doubt, *names)
+    return Trust(points, away / half, doubt, data.input_names, data.output_names)
 
 
 def prior_mean(model: Any, X: Tensor) -> Tensor:
@@ -149,11 +142,17 @@ def prior_mean(model: Any, X: Tensor) -> Tensor:
     return prior
 
 
-def _points(model: Any, train_X: Tensor, num_points: int) -> Tensor:
-    """Return points in the box of the training inputs, on the levels of categories."""
-    num_points = checked_whole("num_points", num_points, 1)
-    bounds = torch.stack([train_X.amin(0), train_X.amax(0)])
-    return on_levels(model, draw_sobol_samples(bounds, n=num_points, q=1, seed=0).squeeze(-2))
+@torch.no_grad()
+def physics_at(model: Any, X: Tensor) -> dict[str, Tensor]:
+    """Return the outputs ``n x m`` of each physics by name, the means of their draws."""
+    names = {t.physics: t.name.removeprefix("rho_") for t in getattr(model, "terms", ())}
+    outputs = model.places(X, model.values).f if getattr(model, "physics", None) else []
+    found: dict[str, Tensor] = {}
+    for i, f in enumerate(outputs):
+        name = f"physics {names.get(i, i + 1)}" if len(outputs) > 1 else "physics"
+        values = (f * model.unit).mT
+        found[name] = model.marginals_of(values, torch.zeros_like(values)).prediction.mean
+    return found
 
 
 def _rms(values: Tensor) -> Tensor:

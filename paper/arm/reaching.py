@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.noise import NormalActionNoise
 from torch import Tensor
 
-from gpadjust.control import PolicySearch, PolicySearchAgent, mlp_policy
+from gpadjust.control import BoundedPolicy, PolicySearch, PolicySearchAgent
 from gpadjust.core import SamplingWarning
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.physics import as_physics
@@ -118,7 +118,7 @@ def make_agent(experiment: Reaching, system: str, learner: str, seed: int) -> Po
     return PolicySearchAgent(
         known.make(),
         task,
-        partial(mlp_policy, first_actions=[settings.first_action] * 4),
+        partial(BoundedPolicy, first_actions=[settings.first_action] * 4),
         search,
         reward_tolerance=None,
         score_horizons=(),

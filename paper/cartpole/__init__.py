@@ -308,7 +308,6 @@ class Planning(Experiment):
     calls: ClassVar[tuple[str, ...]] = (
         "gpadjust.dynamics.LearnedDynamics",
         "gpadjust.control.Planner",
-        "gpadjust.control.CrossEntropy",
         "gpadjust.control.PolicySearch",
     )
 

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from gpadjust.control import (
-    CrossEntropy,
     MPCAgent,
     Planner,
     PolicySearch,
@@ -168,17 +167,15 @@ def _imitate(policy: nn.Module, states: Tensor, actions: Tensor) -> None:
 
 def planners(settings: PlanningSettings) -> tuple[Planner, Planner]:
     """The planner of each step, and that of a trial that begins."""
-    elites, correlation = settings.elites, settings.correlation
+    search: dict[str, Any] = {"num_elites": settings.elites, "correlation": settings.correlation}
     each_step = Planner(
-        search=CrossEntropy(settings.rounds, num_elites=elites, correlation=correlation),
+        rounds=settings.rounds,
+        **search,
         horizon=settings.horizon * settings.time_step,
         num_random=settings.sequences,
         spread=settings.spread,
     )
-    first = Planner(
-        search=CrossEntropy(settings.first_rounds, num_elites=elites, correlation=correlation),
-        num_random=settings.first_sequences,
-    )
+    first = Planner(rounds=settings.first_rounds, **search, num_random=settings.first_sequences)
     return each_step, first
 
 

@@ -73,7 +73,6 @@ class Known(Experiment):
     calls: ClassVar[tuple[str, ...]] = (
         "gpadjust.dynamics.LearnedDynamics",
         "gpadjust.control.Planner",
-        "gpadjust.control.CrossEntropy",
     )
 
     def describe(self, *kind: Any) -> dict[str, Any]:

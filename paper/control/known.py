@@ -11,7 +11,7 @@ from typing import Any
 
 import pandas as pd
 
-from gpadjust.control import CrossEntropy, MPCAgent, Planner
+from gpadjust.control import MPCAgent, Planner
 from gpadjust.core import SamplingWarning
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.physics import as_physics
@@ -59,14 +59,14 @@ def make_agent(
     """The agent of a run, at its start, and what it controls."""
     known = SYSTEMS[system](_PHYSICS.get(learner, "crude"))
     task = known.task(dynamics(settings, known, learner))
-    search = partial(CrossEntropy, num_elites=settings.elites, correlation=0.5)
-    each_step = Planner(
-        search=search(settings.rounds),
+    planner = partial(Planner, num_elites=settings.elites, correlation=0.5)
+    each_step = planner(
+        rounds=settings.rounds,
         horizon=HORIZONS[system] * (known.spec.step or 1.0),
         num_random=settings.sequences,
         spread=settings.spread,
     )
-    first = Planner(search=search(settings.first_rounds), num_random=settings.first_sequences)
+    first = planner(rounds=settings.first_rounds, num_random=settings.first_sequences)
     # Reacher-v5's reward is of a moment before the end of the step, a millimetre off.
     options: dict[str, Any] = {"score_horizons": (), "reward_tolerance": 0.02, "seed": seed}
     return MPCAgent(known.make(), task, each_step, first=first, **options), known

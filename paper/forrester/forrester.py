@@ -37,7 +37,7 @@ from torch.nn import functional
 
 from gpadjust import RRA, fit
 from gpadjust.gpytorch import PhysicsMean, PhysicsScaledKernel
-from gpadjust.validation import coverage, crps, nlpd, rmse
+from gpadjust.validation import Scores
 from paper.common.experiment import Run, Table
 from paper.common.figures import save, strips
 from paper.common.learners import LEARNERS, LITERAL
@@ -59,7 +59,7 @@ MODELS = {
 """By the paper's names, those of the registry."""
 NAMES = [*MODELS]
 FIRST_LOOK = 3  # data sets
-_SCORES = {"nlpd": nlpd, "crps": crps, "coverage": coverage}
+_SCORES = ("nlpd", "crps", "coverage")
 _ABOUT_HALF = (0.4, 0.6)  # below the physics mean
 _EXACT = 1e-5  # the noise of the low level of AR1, a share of its variance
 _STEPS, _NOISES = (25, 50, 100), (1e-4, 1e-2)  # of the other settings
@@ -82,16 +82,15 @@ def run(experiment: Forrester, reading: str, protocol: str, seed: int) -> Run:
     X, Y = observations(seed, settings.observations)
     y = truth(POINTS)
     rows: list[dict[str, Any]] = [
-        {"model": "f_p", "rmse": rmse(CRUDE[reading](POINTS), y).item()}
+        {"model": "f_p", "rmse": (CRUDE[reading](POINTS) - y).square().mean().sqrt().item()}
         | dict.fromkeys([*_SCORES, "seconds"])
     ]
     for name, model, seconds in _models(reading, protocol, X, Y, settings):
         with torch.no_grad():
             posterior = model.posterior(POINTS, observation_noise=True)
-            mean, variance = posterior.mean, posterior.variance
-        scores = {score: call(mean, variance, y).item() for score, call in _SCORES.items()}
-        error = rmse(mean, y).item()
-        rows.append({"model": name, "rmse": error, **scores, "seconds": seconds})
+            scores = Scores.of(posterior.mean, posterior.variance, y)
+        judged = {each: getattr(scores, each).item() for each in ("rmse", *_SCORES)}
+        rows.append({"model": name, **judged, "seconds": seconds})
     return {column: [row[column] for row in rows] for column in rows[0]}
 
 

@@ -17,7 +17,7 @@ from scipy.stats import gmean
 from gpadjust import CKA, EmulatedPhysics, FunctionPhysics, PhysicsWarning, fit
 from gpadjust.core import SamplingWarning
 from gpadjust.physics import Physics
-from gpadjust.validation import rmse
+from gpadjust.validation import Scores
 from paper.common.experiment import Run, Table
 from paper.common.tables import markdown, number
 from paper.laboratory import Emulated
@@ -40,15 +40,15 @@ def run(experiment: Emulated, name: str, model: str, seed: int) -> Run:
         exact = low(test_X)
         predicted = emulated.emulator.predict(test_X)
         lower, upper = emulated.emulator.interval(test_X)
-        own["emulator_error"] = (rmse(predicted.mean, exact) / truth.std()).item()
+        own["emulator_error"] = (Scores.of(*predicted, exact).rmse / truth.std()).item()
         own["emulator_coverage"] = ((lower <= exact) & (exact <= upper)).double().mean().item()
         physics = emulated if model == "emulated" else FunctionPhysics(emulated)
     fitted = CKA(X, Y, physics=physics)
     fit(fitted)
     with torch.no_grad():
-        mean, (lower, upper) = fitted.predict(test_X).mean, fitted.interval(test_X)
+        prediction, (lower, upper) = fitted.predict(test_X), fitted.interval(test_X)
     return {
-        "error": (rmse(mean, truth) / truth.std()).item(),
+        "error": (Scores.of(*prediction, truth).rmse / truth.std()).item(),
         "coverage": ((lower <= truth) & (truth <= upper)).double().mean().item(),
         "width": ((upper - lower).mean() / truth.std()).item(),
         "seconds": time.perf_counter() - begin,

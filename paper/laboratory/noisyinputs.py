@@ -21,7 +21,7 @@ from gpadjust import CKA, CalibratedPhysics, fit
 from gpadjust.core import SamplingWarning
 from gpadjust.kinds import NoisyInputs
 from gpadjust.physics import FunctionPhysics, Unknown
-from gpadjust.validation import rmse
+from gpadjust.validation import Scores
 from paper.common.experiment import Run, Table
 from paper.common.figures import panels, save
 from paper.common.tables import markdown, number
@@ -125,9 +125,9 @@ def run(experiment: Noisyinputs, problem: str, model: str, seed: int) -> Run:
         fitted = CalibratedPhysics(X, case.Y, physics=known.physics(), noise=noise)
     fit(fitted)
     seconds = time.perf_counter() - begin
-    mean, (lower, upper) = fitted.predict(case.test).mean, fitted.interval(case.test)
+    (mean, variance), (lower, upper) = fitted.predict(case.test), fitted.interval(case.test)
     found = {
-        "rmse": rmse(mean, case.truth).item(),
+        "rmse": Scores.of(mean, variance, case.truth).rmse.item(),
         "coverage": ((lower <= case.truth) & (case.truth <= upper)).double().mean().item(),
         "seconds": seconds,
     }

@@ -24,7 +24,7 @@ from gpadjust import CalibratedPhysics, PhysicsMeanGP, fit
 from gpadjust.core import GP, SamplingWarning
 from gpadjust.kinds import Vanishing as VanishingKernel
 from gpadjust.physics import FunctionPhysics, Unknown
-from gpadjust.validation import rmse
+from gpadjust.validation import Scores
 from paper.common.experiment import Run, Table
 from paper.common.figures import panels, save
 from paper.common.orthogonal import Orthogonal
@@ -111,12 +111,12 @@ def run(experiment: Vanishing, problem: str, model: str, seed: int) -> Run:
     low, high = (float(end[i]) for end in parameters.interval())
     with torch.no_grad():
         test = torch.tensor(case.asked.to_numpy())
-        mean, (lower, upper) = fitted.predict(test).mean, fitted.interval(test)
+        prediction, (lower, upper) = fitted.predict(test), fitted.interval(test)
     return {
         "interval": [low, high],
         "mean": float(parameters.mean[i]),
         "true": case.true,
-        "rmse": rmse(mean, case.truth).item(),
+        "rmse": Scores.of(*prediction, case.truth).rmse.item(),
         "coverage": ((lower <= case.truth) & (case.truth <= upper)).double().mean().item(),
         "seconds": seconds,
     }

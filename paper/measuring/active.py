@@ -21,7 +21,7 @@ from torch import Tensor
 from gpadjust import fit
 from gpadjust.active import collect, qAdjustmentInformationGain
 from gpadjust.active.information_gain import About
-from gpadjust.validation import coverage, rmse
+from gpadjust.validation import Scores
 from paper.common.experiment import Run, Table
 from paper.common.tables import markdown, settings_table
 from paper.measuring import Active, Settings
@@ -160,13 +160,15 @@ def scored(system: Problem, kind: str, settings: Settings, X: Tensor) -> dict[st
             mean, variance = model.predict(test_X, observation_noise=True)
         scores["measurements"].append(n)
         scores["nrmse"].append(relative_error(mean, test_Y))
-        scores["coverage"].append(coverage(mean, variance, test_Y).mean().item())
+        coverage = Scores.of(mean, variance, test_Y).coverage
+        scores["coverage"].append(coverage.mean().item())
     return scores
 
 
 def relative_error(mean: Tensor, truth: Tensor) -> float:
     """The root mean square over the outputs, each in units of the truth's standard deviation."""
-    return (rmse(mean, truth) / truth.std(0)).square().mean().sqrt().item()
+    error = (mean - truth).square().mean(0) / truth.var(0)
+    return error.mean().sqrt().item()
 
 
 @contextmanager

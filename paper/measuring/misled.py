@@ -20,7 +20,7 @@ from torch.quasirandom import SobolEngine
 
 from gpadjust import fit
 from gpadjust.checks import seeded
-from gpadjust.validation.advice import relevance_of
+from gpadjust.validation.comparison import relevance_of
 from paper.common.experiment import Run, Table
 from paper.common.learners import LEARNERS
 from paper.common.tables import Cell, frame, groups, number, of, table

@@ -14,7 +14,7 @@ from torch import Tensor
 from gpadjust import CKA, CalibratedPhysics, PhysicsMeanGP, fit
 from gpadjust.core import GP, SamplingWarning, Stationary, Term
 from gpadjust.physics import Physics
-from gpadjust.validation import rmse
+from gpadjust.validation import Scores
 from paper.common.experiment import Run, Table
 from paper.common.orthogonal import Orthogonal
 from paper.common.tables import markdown, number
@@ -53,13 +53,13 @@ def run(experiment: Parameters, problem: str, model: str, seed: int) -> Run:
     low, high = (end.tolist() for end in fitted.physics_parameters.interval())
     best = known.best
     with torch.no_grad():
-        mean = fitted.predict(known.X).mean
+        mean, variance = fitted.predict(known.X)
         lower, upper = fitted.interval(known.X)
     return {
         "intervals": {name: [low[i], high[i]] for i, name in enumerate(best)},
         "best": best,
         "true": dict(known.true),
-        "rmse": rmse(mean, known.system).item(),
+        "rmse": Scores.of(mean, variance, known.system).rmse.item(),
         "coverage": _share((lower <= known.system) & (known.system <= upper)),
         "seconds": seconds,
     }

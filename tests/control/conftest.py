@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import pytest
 
 from gpadjust.control import (
-    CrossEntropy,
     MPCAgent,
     Planner,
     PolicySearch,
@@ -15,7 +14,7 @@ from gpadjust.control import (
 from tests.point import *  # noqa: F403
 from tests.point import linear, near_one
 
-PLAN = Planner(search=CrossEntropy(1), horizon=3, num_random=32, max_hold=1)
+PLAN = Planner(rounds=1, horizon=3, num_random=32, max_hold=1)
 SEARCH = PolicySearch(updates=12, num_starts=6, num_functions=2, learning_rate=0.05)
 
 

@@ -9,7 +9,7 @@ import torch
 
 from gpadjust.control import (
     MPC,
-    CrossEntropy,
+    Moment,
     MPCAgent,
     Planner,
     PolicySearchAgent,
@@ -102,7 +102,7 @@ def test_without_a_probability_there_are_no_margins():
 
 
 def quick(rounds=2, **options):
-    return Planner(search=CrossEntropy(rounds), num_random=48, **options)
+    return Planner(rounds=rounds, num_random=48, **options)
 
 
 def end(task, start=0.0, steps=10, noise=0.0, seed=0):
@@ -123,6 +123,8 @@ def test_a_plan_keeps_its_margin_of_a_wall():
     assert passed.max() < WALL - margin + 1e-3
     assert passed[-1] == pytest.approx(WALL - margin, abs=0.08)
     assert plan.violation < 1e-3
+    planned = quick(4).plan(task(), torch.zeros(1).double(), BOUNDS).next_states
+    assert planned.max() < WALL - margin + 1e-3
     passed, _ = end(replace(task(), probability=None))
     assert passed[-1] == pytest.approx(WALL, abs=0.05)
     assert passed.max() < WALL + 1e-3
@@ -158,7 +160,7 @@ def test_a_violation_costs_more_than_any_reward_and_as_much_as_it_is():
     values = Return().of(sure)(rollout)
     assert (values[2:] < values[0] - 1e5).all()
     assert values.argsort(descending=True).tolist() == [1, 0, 2, 3]
-    tight = Rollouts(sure, None, margins=rows(0.25)).follow(torch.zeros(1).double(), ways)
+    tight = Rollouts(sure, None, Moment(margins=rows(0.25))).follow(torch.zeros(1).double(), ways)
     assert tight.violation[0, :, 1].tolist() == [0.0, 0.25, 1.25, 2.25]
 
 
@@ -196,7 +198,7 @@ def test_what_leaves_the_bounds_is_worse_than_any_violation():
     wide = torch.full((10, 1), 500.0).double()
     sequences = torch.zeros(3, 10, 1).double()
     sequences[1], sequences[2, 0] = -1.0, 1.0  # leaves the bounds after six steps; is nearer
-    rollout = Rollouts(given, None, margins=wide).follow(torch.zeros(1).double(), sequences)
-    assert rollout.left_bounds.tolist() == [[False, True, False]]
+    rollout = Rollouts(given, None, Moment(margins=wide)).follow(torch.zeros(1).double(), sequences)
+    assert rollout.left_bounds.any(-1).tolist() == [[False, True, False]]
     stays, leaves, nearer = Return().of(given)(rollout)
     assert stays > nearer > leaves

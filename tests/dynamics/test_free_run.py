@@ -8,7 +8,7 @@ import torch
 
 from gpadjust.core import Prediction
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics, StateSpec
-from gpadjust.dynamics.free_run import step_or_nan
+from gpadjust.dynamics.base import step_or_nan
 from gpadjust.physics import PhysicsError
 from gpadjust.records import Record, Records
 

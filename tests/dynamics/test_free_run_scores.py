@@ -8,7 +8,7 @@ import torch
 from scipy.stats import norm
 
 from gpadjust.dynamics import FreeRun, PhysicsDynamics, StateSpec
-from gpadjust.dynamics.free_run import central_interval
+from gpadjust.dynamics.base import central_interval
 from gpadjust.records import Record, Records
 
 SPEC = StateSpec(["x", "theta"], ["u"], angles=["theta"])

@@ -1,6 +1,8 @@
-"""What dynamics predict, in limiting cases."""
+"""What dynamics predict, in limiting cases, and how they go on learning and are stored."""
 
+import io
 import math
+import warnings
 from functools import partial
 
 import pytest
@@ -254,11 +256,10 @@ def test_each_block_follows_a_function_of_its_own(cart_pole_system, make, costly
 
 def test_predictions_take_leading_dimensions_and_raw_angles(cart_pole_system, make):
     system = cart_pole_system
-    dynamics = make("CKA", system.spec, system.crude, encode_angles=False)
+    dynamics = make("CKA", system.spec, system.crude)
     dynamics.update(*system.trial(0))
     assert isinstance(dynamics.model, CKA)
     assert dynamics.physics is dynamics.model.physics[0].physics is system.crude
-    assert dynamics.model.data.transform is None
     states, actions, _ = system.trial(1)
     whole = dynamics.predict(states, actions)
     blocks = dynamics.predict(states.reshape(5, 5, 4), actions.reshape(5, 5, 1))
@@ -272,7 +273,7 @@ def test_bad_data_are_refused_and_what_was_learnt_stands(cart_pole_system, make)
     dynamics = make("CKA", system.spec, system.crude)
     with pytest.raises(ValueError, match="at least 2 transitions to learn from, got 1"):
         dynamics.update(states[:1], actions[:1], following[:1])
-    for call in (dynamics.predict, dynamics.sample, lambda *a: dynamics.condition(*a, following)):
+    for call in (dynamics.predict, dynamics.sample):
         with pytest.raises(RuntimeError, match="call `update`"):
             call(states, actions)
     dynamics.update(states, actions, following)
@@ -291,3 +292,42 @@ def test_bad_data_are_refused_and_what_was_learnt_stands(cart_pole_system, make)
         dynamics.predict(states[:, :3], actions)
     assert dynamics.num_transitions == 6
     assert torch.equal(dynamics.predict(states, actions).mean, before)
+
+
+def stored(dynamics):
+    file = io.BytesIO()
+    torch.save(dynamics.state_dict(), file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
+
+
+def agree(first, second, states, actions):
+    pairs = zip(first.predict(states, actions), second.predict(states, actions), strict=True)
+    return all(torch.equal(a, b) for a, b in pairs)
+
+
+@pytest.mark.slow
+def test_loaded_dynamics_go_on_bit_by_bit(cart_pole_system, make, costly_kind):
+    system, kind = cart_pole_system, costly_kind
+    dynamics, other = (make(kind, system.spec, system.crude) for _ in range(2))
+    for seed in (0, 1):
+        dynamics.update(*system.trial(seed, 12))
+    other.load_state_dict(stored(dynamics))
+    test = system.trial(9)[:2]
+    assert agree(dynamics, other, *test)
+    for each in (dynamics, other):
+        each.update(*system.trial(3, 12))
+    assert agree(dynamics, other, *test)
+    assert other.num_transitions == 36
+
+
+@pytest.mark.slow
+def test_refits_are_quiet_and_leave_the_generator_alone(cart_pole_system, make):
+    system = cart_pole_system
+    dynamics = make("CKA", system.spec, system.crude, fit_options=None)
+    state = torch.get_rng_state()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for seed in range(3):
+            dynamics.update(*system.trial(seed))
+    assert torch.equal(torch.get_rng_state(), state)

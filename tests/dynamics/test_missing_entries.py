@@ -40,20 +40,6 @@ def test_each_state_is_learnt_from_its_own_rows(cart_pole_system, make, costly_k
         assert_same(*pair, column, rtol=1e-4, atol=1e-7)
 
 
-@pytest.mark.slow
-def test_conditioning_skips_what_is_missing(cart_pole_system, make, holed):
-    system, test = cart_pole_system, cart_pole_system.trial(9)[:2]
-    dynamics, other = (make("CKA", system.spec, system.crude) for _ in range(2))
-    dynamics.update(*system.trial(1))
-    other.load_state_dict(dynamics.state_dict())
-    dynamics.condition(*(t[4:5] for t in holed))
-    other.condition(*(t[4:5] for t in system.trial(0)))
-    assert_same(dynamics.predict(*test), other.predict(*test), 0)
-    before = make("CKA", system.spec, system.crude)
-    before.update(*system.trial(1))
-    assert_same(dynamics.predict(*test), before.predict(*test), slice(1, None))
-
-
 def test_scores_are_over_what_was_measured(cart_pole_system, learnt_cart_pole, holed):
     system, dynamics = cart_pole_system, learnt_cart_pole
     scores = dynamics.score(*holed)
@@ -83,7 +69,7 @@ def test_a_row_of_nothing_is_refused(cart_pole_system, learnt_cart_pole, make, h
     system, dynamics = cart_pole_system, learnt_cart_pole
     holed[2][11] = math.nan
     new = make("CKA", system.spec, system.crude)
-    for call in (new.update, dynamics.update, dynamics.condition, dynamics.score):
+    for call in (new.update, dynamics.update, dynamics.score):
         with pytest.raises(ValueError, match=r"observation in each row.*\(row 11\)"):
             call(*holed)
     assert dynamics.num_transitions == 25

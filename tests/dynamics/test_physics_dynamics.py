@@ -84,7 +84,7 @@ def test_a_crude_physics_of_next_states_is_not():
 
 
 def test_bad_input_is_refused():
-    with pytest.raises(TypeError, match="Expected spec as a StateSpec"):
+    with pytest.raises(TypeError, match="spec must be a StateSpec"):
         PhysicsDynamics(["x", "v"], push)
     with pytest.raises(ValueError, match="difference=False"):
         PhysicsDynamics(SPEC, ODEPhysics(lambda x, a: x, 0.1, 2, difference=True))

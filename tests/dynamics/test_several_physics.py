@@ -1,12 +1,9 @@
 """Dynamics of several physics."""
 
-import io
-
 import pytest
 import torch
 
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
-from gpadjust.physics import PhysicsError
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:f_p is nearly zero", "ignore::gpadjust.core.SamplingWarning"
@@ -34,15 +31,6 @@ def test_every_structure_takes_several(cart_pole_system, make, still, kind):
     assert dynamics.sample_functions(2, seed=0)(*blocks).shape == (2, 3, 4)
 
 
-def test_targets_are_those_of_each_part(cart_pole_system, make, still):
-    system = cart_pole_system
-    dynamics = make("CKA", system.spec, [system.crude, still])
-    states, actions, _ = system.trial(0)
-    one = [make("CKA", system.spec, part) for part in (system.crude, still)]
-    expected = [each._physics_at(states, actions)[0] for each in one]
-    assert all(map(torch.equal, dynamics._physics_at(states, actions), expected))
-
-
 def test_the_better_physics_gets_the_weight(cart_pole_system, make, still):
     system = cart_pole_system
     dynamics = make("CKA", system.spec, {"still": still, "truth": system.truth})
@@ -55,27 +43,12 @@ def test_the_better_physics_gets_the_weight(cart_pole_system, make, still):
     torch.testing.assert_close(rho, torch.ones_like(rho), rtol=0, atol=1e-3)
 
 
-@pytest.mark.slow
-def test_what_is_loaded_goes_on_as_it_was(cart_pole_system, make, still):
+def test_a_state_is_of_the_same_physics_in_the_same_order(cart_pole_system, make, still):
     system = cart_pole_system
-
-    def named(part):
-        return make("CKA", system.spec, {"rod": system.crude, "still": part})
-
-    dynamics, other = named(still), named(still)
-    for seed in (0, 1):
-        dynamics.update(*system.trial(seed, 8))
-    dynamics.condition(*(t[:1] for t in system.trial(2)))
-    file = io.BytesIO()
-    torch.save(dynamics.state_dict(), file)
-    file.seek(0)
-    other.load_state_dict(torch.load(file, weights_only=True))
-    for each in (dynamics, other):
-        each.update(*system.trial(3, 8))
-    test = system.trial(9)[:2]
-    for one, two in zip(dynamics.predict(*test), other.predict(*test), strict=True):
-        assert torch.equal(one, two)
-    swapped = make("CKA", system.spec, {"still": still, "rod": system.crude})
+    parts = {"rod": system.crude, "still": still}
+    dynamics = make("CKA", system.spec, parts, fit_options=POINT_FIT)
+    dynamics.update(*system.trial(0, 8))
+    swapped = make("CKA", system.spec, dict([*parts.items()][::-1]), fit_options=POINT_FIT)
     with pytest.raises(RuntimeError, match="physics is"):
         swapped.load_state_dict(dynamics.state_dict())
 
@@ -89,5 +62,5 @@ def test_each_part_is_checked(cart_pole_system, make, still):
     with pytest.warns(UserWarning, match="'late' seems to return the change"):
         make("CKA", system.spec, parts, fit_options=POINT_FIT).update(*system.trial(0))
     dynamics = LearnedDynamics(system.spec, [system.crude, lambda X: X[:, :3]])
-    with pytest.raises(PhysicsError, match="next values of the 4 states"):
+    with pytest.raises(ValueError, match="next values of the 4 states"):
         dynamics.update(*system.trial(0))

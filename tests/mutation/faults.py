@@ -261,8 +261,8 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/dynamics/base.py",
-        "found = (mean + self.spec.change(mean, data.next_states))[:, moving]",
-        "found = data.next_states[:, moving]",
+        "measured = mean + self.spec.change(mean, data.next_states)",
+        "measured = data.next_states",
         "An angle that wraps between prediction and truth counts as an error of a full turn.",
     ),
     Fault(
@@ -285,8 +285,8 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/control/policy_search.py",
-        "policy.load_state_dict(best.kept)",
-        "best.kept.clear()",
+        "if i == 0 or worth > best_worth:",
+        "if True:",
         "A search ends with its last policy, not with the best one.",
     ),
     Fault(
@@ -297,8 +297,8 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/control/mpc.py",
-        "torch.cat([sequences, drawn]), torch.cat([scores, score(drawn)])",
-        "drawn, score(drawn)",
+        "torch.cat([sequences, new]), torch.cat([scores, found])",
+        "new, found",
         "The planner forgets its best sequences of earlier rounds.",
     ),
     Fault(

@@ -73,7 +73,7 @@ def test_what_is_no_record():
             (lambda: Records(Record(**good), POINT), ValueError, "expected 2 columns of states, x"),
             (lambda: plot_record(Records(moved(), POINT), POINT), TypeError, "found Records"),
             (lambda: plot_record(Record(**good), POINT), ValueError, "2 columns of states"),
-            (lambda: plot_record(moved(), "x"), TypeError, "spec as a StateSpec"),
+            (lambda: plot_record(moved(), "x"), TypeError, "spec must be a StateSpec"),
         ]
     )
 

@@ -11,11 +11,12 @@ from hypothesis import strategies as st
 from gpadjust.core import CKA, ZeroMeanGP, fit, load
 from gpadjust.physics import FunctionPhysics, PhysicsError
 from gpadjust.report import report
-from gpadjust.report.figures import slice_along
-from gpadjust.report.markup import cards, failure, name_and_unit, number, table, tag
+from gpadjust.report.markup import beside, failure, table, tag
+from gpadjust.report.page import cards, headline
 from gpadjust.report.subject import subject_of
-from gpadjust.report.verdict import headline, verdicts
-from gpadjust.validation import Gain
+from gpadjust.validation import Verdict
+from gpadjust.validation.plots import lines_along
+from gpadjust.words import name_and_unit, number
 
 from .conftest import Page, f_p
 
@@ -30,9 +31,8 @@ def test_a_comparison(comparison, tmp_path, read):
     assert len(page.images) == 6
     assert all(len(image["alt"]) > 10 for image in page.images)
     _the_table_is_that_of(comparison, page)
-    (gain,) = comparison.gain.values()
-    assert f"{_three(comparison)} Yes The physics helps to predict y: elpd" in page.text
-    assert f"{gain.elpd:+.1f} ± {gain.se:.1f} nats" in page.text
+    (verdict,) = comparison.verdict.values()
+    assert f"{_three(comparison)} {verdict.answer} {' '.join(verdict.reasons)}" in page.text
     for sentence in comparison.advice:
         assert sentence.replace("+-", "±") in page.text
     _left_out_is_that_of(comparison.leave_one_out(), page)
@@ -52,7 +52,7 @@ def _the_table_is_that_of(comparison, page):
     assert head[0] == "structure"
     assert rows[-1][0] == "physics alone"
     assert rows[-1][4] == "-"
-    for row, expected in zip(rows, comparison.rows("y"), strict=True):
+    for row, expected in zip(rows, comparison.table["y"], strict=True):
         assert row[0] == expected.structure
         numbers = [float(text) for text in row[1:5] if text != "-"]
         assert numbers == pytest.approx(expected[1 : 1 + len(numbers)], rel=0.06, abs=0.006)
@@ -117,23 +117,19 @@ def test_a_model_without_physics(tmp_path, read, undrawn):
     assert load(tmp_path / "report.pt").data.output_names == ("y",)
 
 
-@pytest.mark.parametrize(
-    ("gain", "answer", "says"),
-    [
-        (Gain(5.0, 1.0, "CKA", "zero mean", 1), "Yes", "+5.0 ± 1.0 nats"),
-        (Gain(-5.0, 1.0, "CKA", "zero mean", -1), "No", "is predicted worse than without it"),
-        (Gain(1.0, 1.0, "CKA", "zero mean", 0), "Not shown", "not to say that it does not help"),
-        (Gain(9.0, 1.0, "CKA", "zero mean", 0, True), "Not shown", "by the evidence of a model"),
-        (Gain(-9.0, 1.0, "CKA", "zero mean", 0, True), "Not shown", "none is said to do harm"),
-    ],
-)
-def test_what_is_not_shown_is_not_denied(comparison, gain, answer, says):
-    subject = subject_of(dataclasses.replace(comparison, gain={"y": gain}))
-    page = Page(cards(verdicts(subject)))
-    assert page.text.startswith(f"{_three(comparison)} {answer}")
-    assert says in page.text
-    assert ("not to say" in page.text) == (gain.shown == 0 and abs(gain.elpd) < 2)
-    assert f"\n{answer}. " in headline(verdicts(subject), "Errors")
+def test_the_verdict_and_its_color(comparison):
+    for answer, color in (
+        ("Use your formula as it is", "yes"),
+        ("Use it corrected", "yes"),
+        ("Do not use it", "no"),
+        ("These data do not tell", "open"),
+    ):
+        verdict = Verdict(answer, ["One reason.", "Another."])
+        shown = cards(subject_of(dataclasses.replace(comparison, verdict={"y": verdict})))
+        page = beside(shown)
+        assert Page(page).text == f"{_three(comparison)} {answer} One reason. Another."
+        assert f'class="card {color}"' in page
+        assert headline(shown, "Errors").endswith(f"\n{answer}. One reason.")
 
 
 def test_nothing_is_written_of_what_cannot_be_reported(comparison, tmp_path):
@@ -188,8 +184,8 @@ def test_inputs_are_drawn_in_double_precision():
     X = offset * (1 + torch.linspace(0, 1e-8, 7, dtype=torch.float64).unsqueeze(-1))
     model = CKA(X, X / offset, physics=lambda X: torch.zeros_like(X))
     fit(model, "map")
-    drawn = slice_along(subject_of(model), 0, 9)
-    assert len(drawn.unique()) == 9
+    ((_, drawn),) = lines_along(model)
+    assert len(drawn.unique()) == len(drawn) > 9
 
 
 def test_where_a_physics_fails_is_told_in_a_line():

@@ -71,7 +71,10 @@ CALLS = [
 ]
 FUNCTIONS = [
     ({"initial_states": lambda n: torch.ones(n)}, r"initial_states\(2\) must return .* 2 x 1"),
-    ({"initial_states": lambda n: torch.full((n, 1), torch.nan)}, "finite states; found"),
+    (
+        {"initial_states": lambda n: torch.full((n, 1), torch.nan)},
+        r"initial_states\(2\) returned .*expected finite",
+    ),
     ({"reward": lambda s, a, n: n}, r"reward must return one value per row, shape \(2,\)"),
     ({"terminated": lambda s: s}, r"terminated must return one value per row"),
     ({"dynamics": LearnedDynamics(POINT_SPEC, lambda X: X)}, "1 states .* got 2 columns"),

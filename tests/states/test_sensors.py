@@ -37,7 +37,7 @@ def test_bad_sensors_are_told():
         (lambda: Sensors([]), ValueError, "one or more"),
         (lambda: Sensors("x"), TypeError, "sequence of names"),
         (lambda: Sensors(["x"], 3), TypeError, "function of states; found 3"),
-        (lambda: Sensors(["x"], noise={"v": 1.0}), ValueError, "no output 'v'"),
+        (lambda: Sensors(["x"], noise={"v": 1.0}), ValueError, "Unknown output 'v'"),
         (lambda: Sensors(["x"], noise={"x": 0.0}), ValueError, "above 0"),
         (lambda: Sensors(["height"]).spec(SPEC), ValueError, r"no state 'height'.*Sensors\(names"),
         (lambda: pair.measure(SPEC, STATE), ValueError, r"shape 1 x 2.*found \(1,\)"),

@@ -11,8 +11,10 @@ from gpytorch.distributions import MultitaskMultivariateNormal, MultivariateNorm
 from gpadjust.core import CKA
 from gpadjust.core.posterior import MixturePosterior
 from gpadjust.kinds.links import LinkedCKA
-from gpadjust.validation import Scores, coverage, crps, nlpd, pit, rmse, score
+from gpadjust.validation import Scores, score
 from gpadjust.validation.scores import energy_score
+
+NAMES = ("rmse", "median", "nlpd", "crps", "coverage", "pit")
 
 
 @pytest.fixture
@@ -29,7 +31,7 @@ def prediction(uniform):
 def test_crps_of_a_sharp_prediction_is_the_absolute_error(prediction):
     mean, _, y = prediction
     sharp = torch.full_like(mean, 1e-16)
-    torch.testing.assert_close(crps(mean, sharp, y), (mean - y).abs().mean(-2))
+    torch.testing.assert_close(Scores.of(mean, sharp, y).crps, (mean - y).abs().mean(-2))
 
 
 @pytest.mark.parametrize("level", [0.5, 0.9, 0.95])
@@ -38,14 +40,15 @@ def test_coverage_of_calibrated_predictions(uniform, level):
     mean, variance = uniform(n, 2, seed=1), uniform(n, 2, low=0.1, high=2, seed=2)
     y = mean + variance.sqrt() * torch.randn(n, 2, dtype=torch.float64)
     sd = (level * (1 - level) / n) ** 0.5
-    assert ((coverage(mean, variance, y, level) - level).abs() < 5 * sd).all()
+    assert ((Scores.of(mean, variance, y, level=level).coverage - level).abs() < 5 * sd).all()
 
 
 def test_coverage_of_overconfident_predictions_is_too_low(uniform):
     y = torch.randn(10_000, 1, dtype=torch.float64)
     variance = torch.full_like(y, 0.25)
     expected = 2 * scipy.stats.norm.cdf(1.959964 / 2) - 1
-    assert coverage(torch.zeros_like(y), variance, y).item() == pytest.approx(expected, abs=0.025)
+    share = Scores.of(torch.zeros_like(y), variance, y).coverage.item()
+    assert share == pytest.approx(expected, abs=0.025)
 
 
 @pytest.fixture
@@ -97,15 +100,15 @@ def test_a_mixture_of_equal_components_is_the_component(prediction):
     mean, variance, y = prediction
     many = [t.unsqueeze(-3).expand(2, 5, 7, 3) for t in (mean, variance)]
     scores = score(posterior_of(*many), y)
-    for one in (nlpd, crps, pit, coverage):
-        torch.testing.assert_close(getattr(scores, one.__name__), one(*prediction))
-    torch.testing.assert_close(scores.rmse, rmse(mean, y))
+    expected = Scores.of(*prediction)
+    for name in NAMES:
+        torch.testing.assert_close(getattr(scores, name), getattr(expected, name))
 
 
 def test_pit_of_calibrated_predictions_is_uniform(uniform):
     mean, variance = uniform(5000, 1, seed=1), uniform(5000, 1, low=0.1, high=2, seed=2)
     y = mean + variance.sqrt() * torch.randn(5000, 1, dtype=torch.float64)
-    values = pit(mean, variance, y)
+    values = Scores.of(mean, variance, y).pit
     assert scipy.stats.kstest(values.flatten().numpy(), "uniform").pvalue > 1e-3
 
 
@@ -129,7 +132,7 @@ def test_score_of_a_posterior(uniform, num_outputs, mixed):
         expected = score(posterior_of(mean, variance), y, level=0.5)
     else:
         expected = Scores.of(mean, variance, y, level=0.5)
-    for name in ("rmse", "median", "nlpd", "crps", "coverage", "pit"):
+    for name in NAMES:
         found, other = getattr(scores, name), getattr(expected, name)
         torch.testing.assert_close(found, other, equal_nan=True)
 
@@ -148,9 +151,10 @@ def test_score_of_a_model_with_a_link_is_that_of_the_model_within(data):
 def test_predictions_without_variance_have_their_limits():
     mean, y = torch.tensor([[1.0], [2.0]]).double(), torch.tensor([[1.5], [2.0]]).double()
     variance = torch.zeros_like(mean)
-    torch.testing.assert_close(crps(mean, variance, y), torch.tensor([0.25]).double())
-    assert nlpd(mean, variance, y) > 1e10
-    assert coverage(mean, variance, y) == 0.5
+    scores = Scores.of(mean, variance, y)
+    torch.testing.assert_close(scores.crps, torch.tensor([0.25]).double())
+    assert scores.nlpd > 1e10
+    assert scores.coverage == 0.5
 
 
 def test_bad_input(prediction, data):
@@ -159,21 +163,17 @@ def test_bad_input(prediction, data):
     negative[0, 1, 2], nan[0, 1, 2] = -0.5, torch.nan
     for values, error, words in (
         ((mean.numpy(), variance, y), TypeError, r"got ndarray; convert .*as_tensor\(mean, "),
+        ((mean, variance, y.tolist()), TypeError, r"got list; convert .*as_tensor\(y, "),
         ((mean, negative, y), ValueError, r"at least 0, got -0.5; .*`variance.clamp_min\(0\)`"),
-        ((mean, nan, y), ValueError, "Expected variance without NaN, found 1 of 42"),
+        ((nan, variance, y), ValueError, "Expected mean without NaN, found 1 of 42"),
         ((mean[0, :, 0],) * 3, ValueError, r"y of shape ... x n x m.*unsqueeze\(-1\)"),
-        ((mean, variance[..., :2], y), ValueError, r"\(2, 7, 3\) and \(2, 7, 2\)"),
-        ((mean, variance, y[..., :1]), ValueError, r"y's shape \(2, 7, 1\)"),
+        ((mean, variance[..., :2], y), ValueError, r"variance of y's shape \(2, 7, 3\), got"),
+        ((mean, variance, y[..., :1]), ValueError, r"mean of y's shape \(2, 7, 1\), got"),
     ):
         with pytest.raises(error, match=words):
-            nlpd(*values)
-    for one in (crps, pit, coverage):
-        with pytest.raises(ValueError, match="Expected mean without NaN, found 1 of 42"):
-            one(nan, variance, y)
-    with pytest.raises(ValueError, match="Expected mean without NaN, found 1 of 42"):
-        rmse(nan, nan)
+            Scores.of(*values)
     with pytest.raises(ValueError, match="level must be between 0 and 1; found"):
-        coverage(*prediction, level=95)
+        Scores.of(*prediction, level=95)
     X, Y = data()
     with pytest.raises(TypeError, match=r"got CKA; that of a model is `model.posterior\(X, "):
         score(CKA(X, Y, physics=lambda X: X[:, :1]), Y)
@@ -185,24 +185,24 @@ def test_points_that_were_not_observed_are_left_out(prediction):
     partial[:, [0, 3], 0] = torch.nan
     partial[:, :, 2] = torch.nan
     rest = [1, 2, 4, 5, 6]
-    for one in (rmse, nlpd, crps, coverage):
-        some = {True: (mean,), False: (mean, variance)}[one is rmse]
-        found, whole = one(*some, partial), one(*some, y)
-        part = one(*(t[..., rest, :] for t in some), y[:, rest])
-        torch.testing.assert_close(found[:, 0], part[:, 0])
-        torch.testing.assert_close(found[:, 1], whole[:, 1])
-        assert found[:, 2].isnan().all()
-    expected = pit(mean, variance, y).masked_fill(partial.isnan(), torch.nan)
-    found = pit(mean, variance, partial)
-    torch.testing.assert_close(found, expected, equal_nan=True)
+    found, whole = Scores.of(mean, variance, partial), Scores.of(*prediction)
+    part = Scores.of(*(each[:, rest] for each in prediction))
+    for name in ("rmse", "nlpd", "crps", "coverage"):
+        of_found, of_whole, of_part = (getattr(each, name) for each in (found, whole, part))
+        torch.testing.assert_close(of_found[:, 0], of_part[:, 0])
+        torch.testing.assert_close(of_found[:, 1], of_whole[:, 1])
+        assert of_found[:, 2].isnan().all()
+    expected = whole.pit.masked_fill(partial.isnan(), torch.nan)
+    torch.testing.assert_close(found.pit, expected, equal_nan=True)
 
 
 def test_gradients_of_scores_skip_what_was_not_observed(prediction):
     mean, variance, y = (t.clone() for t in prediction)
     y[0, 1, 2] = torch.nan
     mean.requires_grad_()
-    for value in (rmse(mean, y), nlpd(mean, variance, y), crps(mean, variance, y)):
-        (gradient,) = torch.autograd.grad(value.sum(), mean)
+    scores = Scores.of(mean, variance, y)
+    for value in (scores.rmse, scores.nlpd, scores.crps):
+        (gradient,) = torch.autograd.grad(value.sum(), mean, retain_graph=True)
         assert gradient.isfinite().all()
         assert gradient[0, 1, 2] == 0
 
@@ -213,8 +213,9 @@ def test_scores_of_a_batch_are_those_of_its_parts(prediction):
     energy = torch.tensor([1.0, 2.0])
     whole = Scores.of(*prediction, interval=(lower, upper), energy=energy, output_names="abc")
     part = whole[1]
-    torch.testing.assert_close(part.rmse, rmse(mean[1], y[1]))
-    torch.testing.assert_close(part.pit, pit(mean[1], variance[1], y[1]))
+    expected = Scores.of(mean[1], variance[1], y[1])
+    torch.testing.assert_close(part.rmse, expected.rmse)
+    torch.testing.assert_close(part.pit, expected.pit)
     torch.testing.assert_close(part.median, (mean[1] - y[1]).abs().median(0).values)
     inside = ((lower[1] <= y[1]) & (y[1] <= upper[1])).double().mean(0)
     torch.testing.assert_close(part.coverage, inside)
@@ -222,7 +223,7 @@ def test_scores_of_a_batch_are_those_of_its_parts(prediction):
     parts = [*whole]
     assert len(parts) == len(whole.rmse) > 1
     torch.testing.assert_close(torch.stack([each.rmse for each in parts]), whole.rmse)
-    with pytest.raises(IndexError, match="no batch"):
+    with pytest.raises(TypeError, match="no batch"):
         list(zip(part, range(3), strict=False))  # which is not to end in silence
 
 
@@ -231,10 +232,10 @@ def test_where_no_variance_is_said_only_errors_count(prediction):
     variance[:, 2], variance[..., 0] = torch.nan, torch.nan
     rest = [0, 1, 3, 4, 5, 6]
     scores = Scores.of(mean, variance, y)
-    torch.testing.assert_close(scores.rmse, rmse(mean, y))
-    some = mean[:, rest, 1:], variance[:, rest, 1:], y[:, rest, 1:]
-    for name, one in (("nlpd", nlpd), ("crps", crps), ("coverage", coverage)):
-        torch.testing.assert_close(getattr(scores, name)[:, 1:], one(*some))
+    torch.testing.assert_close(scores.rmse, Scores.of(*prediction).rmse)
+    some = Scores.of(mean[:, rest, 1:], variance[:, rest, 1:], y[:, rest, 1:])
+    for name in ("nlpd", "crps", "coverage"):
+        torch.testing.assert_close(getattr(scores, name)[:, 1:], getattr(some, name))
         assert getattr(scores, name)[:, 0].isnan().all()
     none = Scores.of(mean[:, :0], variance[:, :0], y[:, :0])
     assert none.median.isnan().all()

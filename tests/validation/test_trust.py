@@ -100,7 +100,7 @@ def test_outputs_are_judged_one_by_one(data):
     X, Y = data(num_outputs=2)
     Y[:3, 0] = torch.nan
     model = CKA(X, Y, physics=crude)
-    found = trust(model, num_points=16)
+    found = trust(model, 3 * torch.rand(16, 2, dtype=torch.float64))
     assert found.side.shape == found.override.shape == found.doubt.shape == (16, 2)
     torch.testing.assert_close(found.physics + found.data + found.neither, torch.ones(2).double())
     second = trust(model.subset_output([1]), found.X)
@@ -139,7 +139,7 @@ def test_bad_input(half, data):
     stacked = StackedGP({"CKA": half}, [1.0])
     for call, error, words in (
         (lambda: trust(ZeroMeanGP(X, Y)), TypeError, "could trust, such as CKA; found ZeroMeanGP"),
-        (lambda: trust(stacked), TypeError, r"found a StackedGP.*comparison\.models\['CKA'\]"),
+        (lambda: trust(stacked), TypeError, r"found StackedGP.*comparison\.models\['CKA'\]"),
         (lambda: trust("CKA"), TypeError, "Of LearnedDynamics pass its `model`"),
         (lambda: trust(half, X), ValueError, "columns"),
         (lambda: trust(half, X[:0, :1]), ValueError, "one point or more"),
@@ -159,8 +159,9 @@ def known():
     return Trust(X, override, doubt, ("speed [m/s]", "x2"), ("lift", "drag"))
 
 
-def test_shares_along_each_input(known):
-    axes = plot_trust(known, bins=3)
+def test_shares_along_each_input(known, monkeypatch):
+    monkeypatch.setattr("gpadjust.validation.plots._BINS", 3)
+    axes = plot_trust(known)
     assert axes.shape == (2,)
     assert [ax.get_xlabel() for ax in axes] == ["speed [m/s]", "$x_{2}$"]
     for container, kind in zip(axes[0].containers, ("physics", "data", "neither"), strict=True):

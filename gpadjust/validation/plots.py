@@ -1,0 +1,500 @@
+r"""Figures of predictions, of their coverage, and of where the physics is wrong or trusted.
+
+Each function draws on the axes that it is given, or on those of a new figure, and returns them;
+show or save the figure with ``ax.figure``. They need matplotlib, ``pip install gpadjust[plot]``.
+``output`` is the number of the output to draw, ``level`` the nominal coverage of intervals. Where
+an output was not observed, nothing is drawn.
+
+A TypeError is of an argument of another kind, a ValueError of a wrong value, shape or output.
+
+Example:
+    >>> import torch
+    >>> from gpadjust import CKA
+    >>> from gpadjust.validation import leave_one_out, trust
+    >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+    >>> model = CKA(X, 2 * torch.sin(6 * X) + X, physics=lambda X: torch.sin(6 * X))
+    >>> plot_model(model).shape  # predictions, rho and delta
+    (3, 1)
+    >>> plot_adjustment(model).shape  # rho and delta
+    (2, 1)
+    >>> plot_prediction(model, X).get_xlabel()
+    'x'
+    >>> plot_leave_one_out(leave_one_out(model)).shape
+    (2,)
+    >>> plot_coverage(leave_one_out(model)).get_ylabel()
+    'observed coverage'
+    >>> plot_trust(trust(model)).shape
+    (1,)
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from itertools import cycle
+from statistics import NormalDist
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.mathtext import MathTextParser
+from scipy.stats import binom
+from torch import Tensor
+
+from gpadjust.checks import (
+    check_level,
+    checked_bounds,
+    checked_points,
+    checked_tensor,
+    checked_whole,
+)
+from gpadjust.core.gaussian import Marginals
+from gpadjust.kinds.categories import on_levels
+from gpadjust.validation.leave_one_out import LeaveOneOut
+from gpadjust.validation.scores import Scores
+from gpadjust.validation.trust import SIDES, Trust, physics_at
+
+__all__ = [
+    "plot_adjustment",
+    "plot_coverage",
+    "plot_leave_one_out",
+    "plot_model",
+    "plot_prediction",
+    "plot_trust",
+]
+BLUE, RED, GREY = "#0072B2", "#D55E00", "0.45"  # told apart by the colour-blind, too
+BAND: dict[str, Any] = {"color": BLUE, "alpha": 0.2, "lw": 0}
+DOTS: dict[str, Any] = {"ls": "", "marker": "o", "ms": 4.5, "mec": "white", "mew": 0.6}
+_POINTS = 120  # of a curve
+_STYLES = ("--", "-.", ":")  # of several physics
+_COLORS = (BLUE, RED, "0.85")  # of physics, data and neither
+_BINS = 10  # of each input
+_HONEST = "95 % if intervals hold"
+
+
+def plot_model(model: Any, *, output: int = 0, level: float = 0.95, axes: Any = None) -> Any:
+    r"""Draw predictions, and :math:`\rho` and :math:`\delta` below, along each input.
+
+    The first row has the mean, the central interval and the physics; also the data if there is one
+    input. With more the curves are slices through the median of the training inputs, which are
+    ticks at the bottom. The other rows are those of :func:`plot_adjustment`, if the model adjusts a
+    physics.
+
+    Returns:
+        An array of axes, ``rows x d``.
+    """
+    names = adjustments_of(model)
+    lines = lines_along(model, output, level)
+    axes = axes_of(axes, 1 + len(names), len(lines), 2.6)
+    for i, (ax, (x, X)) in enumerate(zip(axes[0], lines, strict=True)):
+        draw_prediction(ax, model, x, X, output, physics_at(model, X), level)
+        if len(lines) == 1:
+            draw_data(ax, model, output)
+        else:
+            _draw_ticks(ax, model, output, i)
+    share_limits(axes[0])
+    axes[0, 0].set_ylabel(labels(model.data.output_names)[output])
+    legend(axes[0, 0])
+    if names:
+        plot_adjustment(model, output=output, level=level, axes=axes[1:])
+    for ax, label in zip(axes[-1], labels(model.data.input_names), strict=True):
+        ax.set_xlabel(label)
+    return axes
+
+
+def plot_adjustment(
+    model: Any,
+    *,
+    bounds: Tensor | None = None,
+    base: Tensor | None = None,
+    output: int = 0,
+    level: float = 0.95,
+    axes: Any = None,
+) -> Any:
+    r"""Draw :math:`\rho` and :math:`\delta` with their intervals: where is the physics wrong?
+
+    One row for each that the model has (a rho for each of several physics), one column for each
+    input, along which the others stay at a base point. The dashed line is what the model falls
+    back to far from data, such as the physics as it is, :math:`\rho = 1` and
+    :math:`\delta = 0`; ticks at the bottom are the training inputs.
+
+    Args:
+        model: A model with ``rho`` or ``delta``.
+        bounds: Range of the inputs, ``2 x d``, a tensor or lists. Default: that of the training
+            inputs.
+        base: The base point, ``d``, a tensor or a list. Default: the median of the training inputs.
+        output: Which output to draw.
+        level: Nominal coverage of the intervals.
+        axes: Axes to draw on. Default: a new figure.
+
+    Returns:
+        An array of axes, ``rows x d``.
+    """
+    names = adjustments_of(model)
+    if not names:
+        raise TypeError(
+            "Expected a model with rho or delta to draw, such as CKA, RRA, ScaleGP and "
+            f"PhysicsMeanGP; found {type(model).__name__}."
+        )
+    lines = lines_along(model, output, level, bounds, base)
+    axes = axes_of(axes, len(names), len(lines), 2.6)
+    for i, (x, X) in enumerate(lines):
+        for ax, name in zip(axes[:, i], names, strict=True):
+            with torch.no_grad():
+                drawn = mean_and_ends(model.term(name, X).marginals, output, level)
+            ax.axhline(unadjusted(model, name), color=GREY, lw=1, ls="--")
+            band(ax, x, drawn, level)
+            _draw_ticks(ax, model, output, i)
+            ax.set_xlim(float(x[0]), float(x[-1]))
+            tidy(ax)
+        axes[-1, i].set_xlabel(labels(model.data.input_names)[i])
+    outputs = labels(model.data.output_names)
+    suffix = f"\nfor {outputs[output]}" if len(outputs) > 1 else ""
+    for row, name in zip(axes, names, strict=True):
+        share_limits(row)
+        row[0].set_ylabel(_symbol(name) + suffix)
+    axes[0, 0].legend(frameon=False)
+    return axes
+
+
+def plot_prediction(
+    model: Any,
+    X: Tensor,
+    Y: Tensor | None = None,
+    *,
+    output: int = 0,
+    level: float = 0.95,
+    observation_noise: bool = False,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw predictions at inputs ``n x d``, and true values ``n x m`` there if ``Y`` is given.
+
+    With one input: the mean, the central interval (of observations if ``observation_noise``), the
+    training data, the physics and the truth. With more, which need ``Y``: the predictions against
+    ``Y``, with their intervals.
+    """
+    inputs, outputs = labels(model.data.input_names), labels(model.data.output_names)
+    X = checked_points("X", X, len(inputs))
+    if Y is not None and (Y := checked_tensor("Y", Y)).shape != (len(X), len(outputs)):
+        raise ValueError(
+            f"Expected Y of shape {len(X)} x {len(outputs)}, a row for each of X and a column for "
+            f"each output, got {tuple(Y.shape)}."
+        )
+    if Y is None and len(inputs) > 1:
+        raise ValueError(
+            f"X has {len(inputs)} inputs, so predictions are drawn against the truth: pass `Y`; "
+            "for slices through a model use `plot_model`."
+        )
+    with torch.no_grad():
+        drawn = mean_and_ends(model.marginals(X, observation_noise), output, level)
+    ax = axes_of(ax, 1, 1)[0, 0]
+    if Y is not None and len(inputs) > 1:
+        against_truth(ax, Y[:, output], drawn, level, f"true {outputs[output]}")
+        ax.set_ylabel(f"predicted {outputs[output]}")
+        return ax
+    order = X[:, 0].argsort()
+    x = X[order, 0]
+    band(ax, x, [each[order] for each in drawn], level)
+    _draw_physics(ax, x, physics_at(model, X[order]), output)
+    if Y is not None:
+        y = Y[order, output]
+        ax.plot(x[~y.isnan()], y[~y.isnan()], color="black", lw=1, ls=":", label="truth")
+    draw_data(ax, model, output)
+    ax.set(xlabel=inputs[0], ylabel=outputs[output])
+    legend(ax)
+    return ax
+
+
+def plot_leave_one_out(
+    loo: LeaveOneOut, *, output: int = 0, level: float = 0.95, axes: Any = None
+) -> Any:
+    """Draw left-out predictions against the observations, and standardized residuals.
+
+    ``axes`` are two; so many are returned.
+    """
+    if not isinstance(loo, LeaveOneOut):
+        raise TypeError(
+            f"Expected a LeaveOneOut, got {type(loo).__name__}; pass `leave_one_out(model)`."
+        )
+    z = quantile(level)
+    values = (loo.Y, loo.mean, loo.variance.sqrt(), loo.residuals)
+    Y, mean, sd, residuals = (column(each, output) for each in values)
+    axes = axes_of(axes, 1, 2)[0]
+    name = labels(loo.output_names)[output]
+    drawn = (mean, mean - z * sd, mean + z * sd)
+    against_truth(axes[0], Y, drawn, level, f"observed {name}")
+    axes[0].set_ylabel("predicted without it")
+    axes[1].axhspan(-z, z, **BAND, label=f"{100 * level:g} %")
+    axes[1].axhline(0, color=GREY, lw=1, ls="--")
+    axes[1].plot(mean, residuals, color=BLUE, **DOTS)
+    top = 1.35 * max(z, residuals.abs().nan_to_num().max().item())  # room for the legend
+    axes[1].set(xlabel="predicted without it", ylabel="standardized residual", ylim=(-top, top))
+    legend(axes[1])
+    return axes
+
+
+def plot_coverage(
+    prediction: LeaveOneOut | Scores, *, output: int = 0, ax: Axes | None = None
+) -> Axes:
+    """Draw the observed coverage of central intervals against the nominal one.
+
+    Below the diagonal the intervals are too narrow, above it too wide. The band covers 95 % of the
+    observed coverages of predictions whose intervals hold, of as many points, at each level.
+    """
+    pit, ax = _pit_and_axes(prediction, output, ax, 3.6)
+    n, levels = len(pit), np.linspace(0, 1, 201)
+    low, high = (binom.ppf(p, n, levels) / n for p in (0.025, 0.975))
+    ax.fill_between(levels, low, high, color=GREY, alpha=0.2, lw=0, label=_HONEST)
+    ax.plot([0, 1], [0, 1], color=GREY, lw=1, ls="--")
+    reached = [0, *np.sort(2 * abs(pit - 0.5)), 1]
+    shares = [*np.arange(n + 1) / n, 1]
+    ax.step(reached, shares, where="post", color=BLUE, lw=1.8, label="observed")
+    ax.set(xlabel="nominal coverage", ylabel="observed coverage", aspect="equal")
+    ax.set(xlim=(0, 1), ylim=(0, 1.01))
+    legend(ax, loc="upper left")
+    return ax
+
+
+def plot_pit(prediction: LeaveOneOut | Scores, *, output: int = 0, ax: Axes | None = None) -> Axes:
+    """Draw the histogram of PIT values: flat if intervals hold, U-shaped if too sure.
+
+    The band covers 95 % of the counts of a bin if intervals hold.
+    """
+    pit, ax = _pit_and_axes(prediction, output, ax, 3.2)
+    n = len(pit)
+    bins = max(4, min(_BINS, n // 4))
+    low, high = binom.ppf([0.025, 0.975], n, 1 / bins)
+    ax.hist(pit, bins=bins, range=(0, 1), color=BLUE, alpha=0.75, ec="white")
+    ax.fill_between([0, 1], low, high, color=GREY, alpha=0.25, lw=0, zorder=3, label=_HONEST)
+    ax.axhline(n / bins, color=GREY, lw=1, ls="--", zorder=3)
+    ax.set(xlabel="probability integral transform", ylabel="count", xlim=(0, 1))
+    ax.set_ylim(top=1.25 * max(high, ax.get_ylim()[1]))  # room for the legend
+    legend(ax)
+    return ax
+
+
+def plot_trust(trust: Trust, *, output: int = 0, axes: Any = None) -> Any:
+    """Draw along each input which share of the predictions rests on physics, data, or neither.
+
+    The shares of all points are in the legend. Return an array of ``d`` axes.
+    """
+    if not isinstance(trust, Trust):
+        raise TypeError(f"Expected a Trust, got {type(trust).__name__}; pass `trust(model)`.")
+    side = column(trust.side, output)
+    axes = axes_of(axes, 1, trust.X.shape[-1])[0]
+    for ax, x, name in zip(axes, trust.X.mT, labels(trust.input_names), strict=True):
+        edges = np.histogram_bin_edges(x.numpy(), _BINS)
+        counts = np.stack([np.histogram(x[side == i].numpy(), edges)[0] for i in range(3)])
+        bottom = np.zeros(_BINS)
+        for kind, color, share in zip(SIDES, _COLORS, counts / counts.sum(0).clip(1), strict=True):
+            label = f"{kind}: {100 * getattr(trust, kind)[output].item():.0f} %"
+            bar: dict[str, Any] = {"width": np.diff(edges), "align": "edge", "color": color}
+            ax.bar(edges[:-1], share, bottom=bottom, **bar, label=label)
+            bottom += share
+        ax.set(xlabel=name, xlim=(edges[0], edges[-1]), ylim=(0, 1))
+        tidy(ax)
+    axes[0].set_ylabel("share of predictions")
+    outputs = labels(trust.output_names)
+    title = f"{outputs[output]} rests on" if len(outputs) > 1 else "rests on"
+    beside = (1.0, 1.0)
+    legend(axes[-1], title=title, alignment="left", loc="upper left", bbox_to_anchor=beside)
+    return axes
+
+
+def adjustments_of(model: Any) -> list[str]:
+    """Return the names of the rhos and deltas of a model that vary, if it has a physics."""
+    terms = model.terms if getattr(model, "physics", None) else ()
+    return [t.name for t in terms if t.varies and t.name not in model.data.input_names]
+
+
+def unadjusted(model: Any, name: str) -> float:
+    """Return the value of a rho or a delta away from data."""
+    return float(next(term.mean for term in model.terms if term.name == name))
+
+
+@torch.no_grad()
+def draw_prediction(
+    ax: Axes,
+    model: Any,
+    x: Tensor,
+    X: Tensor,
+    output: int,
+    physics: Mapping[str, Tensor],
+    level: float = 0.95,
+) -> None:
+    """Draw the prediction and each physics, ``n x m``, at points ``X`` over a line ``x``."""
+    band(ax, x, mean_and_ends(model.marginals(X), output, level), level)
+    _draw_physics(ax, x, physics, output)
+    ax.set_xlim(float(x[0]), float(x[-1]))
+    tidy(ax)
+
+
+def _draw_physics(ax: Axes, x: Tensor, physics: Mapping[str, Tensor], output: int) -> None:
+    for (name, f_p), style in zip(physics.items(), cycle(_STYLES), strict=False):
+        ax.plot(x, column(f_p, output), color=GREY, ls=style, lw=1.2, label=name)
+
+
+def draw_data(ax: Axes, model: Any, output: int) -> None:
+    """Draw the observations of an output over the only input."""
+    y = column(model.data.Y, output)
+    x = model.data.X[~y.isnan(), 0]
+    ax.plot(x, y[~y.isnan()], color=RED, **DOTS, label="data")
+
+
+def _draw_ticks(ax: Axes, model: Any, output: int, i: int) -> None:
+    """Mark at the bottom the values of an input at which an output was observed."""
+    x = model.data.X[~column(model.data.Y, output).isnan(), i]
+    ax.plot(x, torch.zeros(len(x)), "|", color=RED, transform=ax.get_xaxis_transform())
+
+
+def lines_along(
+    model: Any, output: int = 0, level: float = 0.95, bounds: Any = None, base: Any = None
+) -> list[tuple[Tensor, Tensor]]:
+    """Return positions ``n`` and points ``n x d`` on a line along each input, through the base.
+
+    Arguments are those of :func:`plot_adjustment`; an error if one is wrong.
+    """
+    X, _ = model.data.X, column(model.data.Y, output)
+    d = X.shape[-1]
+    check_level(level)
+    if bounds is None:
+        lower, upper = X.min(0).values, X.max(0).values
+        # An input that never changed is drawn around its value.
+        pad = torch.where(lower == upper, 0.5 * lower.abs().clamp_min(1.0), 0.0)
+        bounds = torch.stack([lower - pad, upper + pad])
+    bounds = checked_bounds("bounds", bounds, d).to(X)
+    base = X.median(0).values if base is None else checked_tensor("base", base).to(X)
+    if base.shape != (d,) or not base.isfinite().all():
+        raise ValueError(f"Expected a base point of {d} inputs, finite, got {base.tolist()}.")
+    lines = []
+    for i in range(d):
+        x = torch.linspace(bounds[0, i], bounds[1, i], _POINTS, dtype=base.dtype)
+        points = base.repeat(_POINTS, 1)
+        points[:, i] = x
+        lines.append((x, on_levels(model, points)))
+    return lines
+
+
+def _symbol(name: str) -> str:
+    """Return the symbols of ``rho``, ``rho_coarse`` and ``delta``."""
+    symbol, _, physics = name.partition("_")
+    if symbol not in ("rho", "delta"):
+        return name
+    return rf"$\{symbol}$" + (f" of {physics}" if physics else "")
+
+
+def _pit_and_axes(
+    prediction: LeaveOneOut | Scores, output: int, ax: Axes | None, size: float
+) -> tuple[np.ndarray, Axes]:
+    """Return the PIT values of what was observed, and the axes; new ones have a title."""
+    scores = prediction.score() if isinstance(prediction, LeaveOneOut) else prediction
+    if not isinstance(scores, Scores):
+        raise TypeError(
+            f"Expected what has PIT values, got {type(prediction).__name__}; pass "
+            "`leave_one_out(model)` of a model, or `score(posterior, Y)` of a posterior."
+        )
+    values = column(scores.pit, output)
+    drawn = axes_of(ax, 1, 1, size)[0, 0]
+    if ax is None and len(scores.output_names) > 1:
+        drawn.set_title(labels(scores.output_names)[output])
+    return values[~values.isnan()].numpy(), drawn
+
+
+def quantile(level: float) -> float:
+    """Return half the width of the central interval, in standard deviations."""
+    check_level(level)
+    return NormalDist().inv_cdf((1 + level) / 2)
+
+
+def mean_and_ends(marginals: Marginals, output: int, level: float) -> tuple[Tensor, ...]:
+    """Return the mean and the ends of the interval of one output of predictions, ``n`` each."""
+    ends = [marginals.quantile((1 + sign * level) / 2) for sign in (-1, 1)]
+    return tuple(column(each, output) for each in (marginals.prediction.mean, *ends))
+
+
+def column(values: Tensor, output: int) -> Tensor:
+    """Return one output of ``n x m`` values."""
+    if values.dim() != 2:
+        raise ValueError(
+            f"Expected n x m values to draw, got shape {tuple(values.shape)}; plot the elements of "
+            "a batch one by one."
+        )
+    if checked_whole("output", output, 0) >= values.shape[-1]:
+        raise ValueError(f"There is no output {output}; there are {values.shape[-1]}, from 0.")
+    return values[:, output].detach()
+
+
+def labels(names: Sequence[str]) -> list[str]:
+    """Return names as labels; x1 and y2, which stand for no name, with subscripts.
+
+    Dollars are dollars, unless they hold a formula that can be drawn.
+    """
+    shown = []
+    for name in names:
+        try:
+            MathTextParser("path").parse(name.replace("\n", " "))
+        except ValueError:
+            name = name.replace("$", r"\$")
+        shown.append(re.sub(r"^([xy])(\d+)$", r"$\1_{\2}$", name))
+    return shown
+
+
+def axes_of(given: Any, rows: int, columns: int, size: float = 3.2) -> Any:
+    """Return the axes that the user gave as an array, or those of a new figure of pyplot."""
+    if given is not None:
+        return given_axes(given, (rows, columns))
+    width = 1.3 * size if columns == 1 else 1.15 * size
+    figure = plt.figure(figsize=(width * columns, size * rows), layout="constrained")
+    return figure.subplots(rows, columns, squeeze=False)
+
+
+def given_axes(axes: Any, shape: tuple[int, ...]) -> Any:
+    """Return the axes that the user gave, as an array of the shape needed."""
+    axes = np.asarray(axes)
+    number = sum(isinstance(ax, Axes) for ax in axes.flat)
+    if not number == axes.size == math.prod(shape):
+        raise ValueError(f"Expected {' x '.join(map(str, shape))} axes, got {number}.")
+    return axes.reshape(shape)
+
+
+def band(ax: Axes, x: Tensor, drawn: Sequence[Tensor], level: float) -> None:
+    """Draw a mean and the ends of its interval, ``n`` each."""
+    mean, low, high = drawn
+    ax.fill_between(x, low, high, **BAND, label=f"{100 * level:g} %")
+    ax.plot(x, mean, color=BLUE, lw=1.8, label="mean")
+
+
+def against_truth(
+    ax: Axes, truth: Tensor, drawn: Sequence[Tensor], level: float, xlabel: str
+) -> None:
+    """Draw predictions, a mean and the ends of its interval, against the true values, ``n``."""
+    is_observed = ~truth.isnan()
+    truth, mean, low, high = (values[is_observed] for values in (truth, *drawn))
+    diagonal = [min(truth.min(), mean.min()), max(truth.max(), mean.max())]
+    ax.plot(diagonal, diagonal, color=GREY, lw=1, ls="--")
+    errors = torch.stack([mean - low, high - mean]).clamp_min(0.0)
+    label = f"mean, {100 * level:g} %"
+    ax.errorbar(truth, mean, errors, color=BLUE, **DOTS, elinewidth=1, alpha=0.85, label=label)
+    ax.set_xlabel(xlabel)
+    legend(ax, loc="upper left")
+
+
+def share_limits(axes: Sequence[Axes]) -> None:
+    """Give axes the same range of y: slices of one function are compared by eye."""
+    low, high = zip(*(ax.get_ylim() for ax in axes), strict=True)
+    for ax in axes:
+        ax.set_ylim(min(low), max(high))
+
+
+def legend(ax: Axes, **options: Any) -> None:
+    """Add a legend and remove the frame's upper and right sides."""
+    ax.legend(frameon=False, **options)
+    tidy(ax)
+
+
+def tidy(ax: Axes) -> None:
+    """Remove the frame's upper and right sides."""
+    ax.spines[["top", "right"]].set_visible(False)
