@@ -30,11 +30,11 @@ Other data, for each of these; names of gpadjust.kinds::
     CKA(X, Y, 0.1**2, physics=f_p)               # noise of a known variance
     CKA(X, Y, physics=f_p, noise=HeavyTails())   # outliers; RelativeNoise(): errors in per cent
     LinkedCKA(X, Y, physics=f_p, link="log")     # positive outputs; (0, 1): between bounds
-    CKA(frame, Y, physics=f_p, input_transform=Categories())   # columns of text
+    CKA(frame, frame["y"], physics=f_p, input_transform=Categories())   # columns of text
 
 Other physics, with unknown parameters or without::
 
-    FormulaPhysics("1 + x", ["x"])               # a formula as text
+    FormulaPhysics("1 + x", ["x"])               # a formula as text, or a spreadsheet's
     BlackBoxPhysics(simulator)                   # NumPy code; SubprocessPhysics: a program
     ODEPhysics(rate, step=0.1, state_dim=1)      # a differential equation
     law = FunctionPhysics(lambda X, p: p.gain * X[:, 0], unknowns={"gain": Unknown(1.0, factor=2)})
@@ -46,7 +46,7 @@ Beyond the models::
     from gpadjust.validation.plots import plot_model       # predictions, rho and delta
     from gpadjust.report import report                     # a page to show
     from gpadjust.active import collect                    # the next point to measure
-    from gpadjust.records import Records, smooth           # log files of machines
+    from gpadjust.records import Records, smooth           # log files of machines, as they are
     from gpadjust.dynamics import LearnedDynamics          # the next state of a system
     from gpadjust.control import MPCAgent                  # a controller; SAC and TD3: gpadjust.rl
     from gpadjust.export import c_source, casadi_function  # onto the machine

@@ -59,6 +59,11 @@ def is_number(text: str) -> bool:
     return any(math.isfinite(number(text, decimal, grouped=True)) for decimal in ".,")
 
 
+def is_missing(text: str) -> bool:
+    """Return whether a field is empty, or says that nothing was measured."""
+    return math.isnan(number(text))
+
+
 def decimal_of(fields: Sequence[str], delimiter: str) -> tuple[str, bool]:
     """Return the decimal mark of a table's numbers, and whether the other one parts thousands.
 

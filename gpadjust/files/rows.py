@@ -13,7 +13,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from gpadjust.files.fields import is_moment, is_number
+from gpadjust.files.fields import is_missing, is_moment, is_number
 
 Row = tuple[int, list[str]]
 """The line at which a row begins, counted from 1, and its fields."""
@@ -55,7 +55,8 @@ def numeric_columns(rows: Sequence[Sequence[str]]) -> set[int]:
     body = rows[len(rows) // 2 :][-_SAMPLE:]
     counts: Counter[int] = Counter()
     for fields in body:
-        counts.update({i: is_value(f) - (not is_value(f)) for i, f in enumerate(fields) if f})
+        known = [i for i, field in enumerate(fields) if not is_missing(field)]
+        counts.update({i: 1 if is_value(fields[i]) else -1 for i in known})
     return {i for i, count in counts.items() if count >= 0}
 
 
@@ -80,14 +81,13 @@ def _delimiter(text: str) -> str:
         rows: list[list[str]] = []
         with suppress(csv.Error):
             rows += [fields for _, fields in islice(_parsed(text, mark), _SAMPLE) if any(fields)]
-        body = rows[len(rows) // 2 :]
-        widths = Counter(map(len, body))
-        width, count = widths.most_common(1)[0] if widths else (1, 0)
-        fields = [field for row in body for field in row if field]
+        widths = Counter(map(len, rows))
+        width, count = widths.most_common(1)[0] if rows else (1, 0)
+        fields = [field for row in rows[len(rows) // 2 :] for field in row]
+        fields = [field for field in fields if not is_missing(field)]
         if width < 2 or not fields:
             continue
-        # Commas of decimals alone do not part fields: 0,5 is one.
-        share = (0.01 + sum(map(is_value, fields)) / len(fields)) * count / len(body)
+        share = (0.01 + sum(map(is_value, fields)) / len(fields)) * count / len(rows)
         if share > 1.001 * most:
             best, most = mark, share
     return best

@@ -1,13 +1,18 @@
 """One small log in the dialects of loggers and spreadsheets, read by both commands alike."""
 
+import csv
+import math
 from datetime import datetime
-from io import BytesIO
+from io import BytesIO, StringIO
 
 import openpyxl
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gpadjust.__main__ import parser
+from gpadjust.files.table import Table
 from gpadjust.records import Records
 from gpadjust.report import inputs as read
 from gpadjust.states import StateSpec
@@ -257,3 +262,43 @@ def test_dates_are_inputs_in_a_unit_of_choice(written):
         (times, _), _, names = by_report(path, {**ALIKE, "time": "date"}, options)
         same(times * size, [0, 0.5, 1.5])
         assert names[0] == f"time [{unit}]"
+
+
+TEXTS = st.sampled_from(["alpha", "b c", "Rig 2", "x,y"])
+NUMBERS = st.one_of(
+    st.integers(-(10**9), 10**9), st.floats(-1e9, 1e9).map(lambda x: round(x, 3)), st.none()
+)
+
+
+@given(
+    columns=st.lists(st.one_of(*(st.lists(x, min_size=4, max_size=4) for x in (TEXTS, NUMBERS)))),
+    form=st.sampled_from(["{}", "{} [m]", "{} (rpm)"]),
+    mark=st.sampled_from([";", "\t", "|", ","]),
+    decimal=st.sampled_from([".", ","]),
+    title=st.sampled_from(["", "Logger 7\n\n"]),
+)
+def test_numbers_are_right_or_refused(tmp_path_factory, columns, form, mark, decimal, title):
+    """Beside texts, and gaps; the first column has times, so that no row is empty."""
+    columns = [[0.5, 1.5, 2.5, 3.75], *columns]
+    buffer = StringIO()
+    writer = csv.writer(buffer, delimiter=mark)
+    writer.writerow([form.format(f"c{i}") for i in range(len(columns))])
+    for row in zip(*columns, strict=True):
+        texts = ["" if x is None else str(x) for x in row]
+        writer.writerow(
+            [
+                t if isinstance(x, str) else t.replace(".", decimal)
+                for x, t in zip(row, texts, strict=True)
+            ]
+        )
+    path = tmp_path_factory.getbasetemp() / "random.csv"
+    path.write_text(title + buffer.getvalue(), encoding="utf-8")
+    for i, column in enumerate(columns):
+        if any(isinstance(x, str) for x in column):
+            continue
+        try:
+            found = Table(path).numbers(f"c{i}", may_miss=True)
+        except ValueError as error:
+            assert "decimal" in str(error) or len(columns) == 1  # noqa: PT017
+        else:
+            same(found, [math.nan if x is None else x for x in column])
