@@ -1,6 +1,6 @@
 """Gaussian processes that adjust a physics model to data: the calls, on one page.
 
-Inputs X are ``n x d``, outputs Y ``n x m``, in your units: float64 tensors, arrays or data frames.
+Inputs X are ``n x d``, outputs Y ``n x m``, in your units: float64 tensors, arrays, frames, Series.
 The physics f_p takes rows of X and returns rows of Y. ``from gpadjust import CKA, fit`` and so on.
 
 The usual way::
@@ -30,7 +30,7 @@ Other data, for each of these; names of gpadjust.kinds::
     CKA(X, Y, 0.1**2, physics=f_p)               # noise of a known variance
     CKA(X, Y, physics=f_p, noise=HeavyTails())   # outliers; RelativeNoise(): errors in per cent
     LinkedCKA(X, Y, physics=f_p, link="log")     # positive outputs; (0, 1): between bounds
-    CKA(frame, frame["y"], physics=f_p, input_transform=Categories())   # columns of text
+    CKA(frame, Y, physics=f_p, input_transform=Categories())   # columns of text
 
 Other physics, with unknown parameters or without::
 

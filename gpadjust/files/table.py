@@ -42,6 +42,7 @@ class Table:
         names: The names of all columns, without units.
         units: Their units, empty where there is none.
         lines: The line of each row, at which an editor shows its beginning.
+        remarks: Sentences on lines that are not read, and on a column that has no name.
 
     Raises:
         OSError: If the file cannot be read.
@@ -87,7 +88,7 @@ class Table:
             what = "only a line of names" if rows else "an empty file"
             raise ValueError(f"{file}: expected a line of names and then rows, found {what}.")
         fields = [row for _, row in rows]
-        header, units, first = _heads(fields)
+        header, units, first = _heads(fields, names is not None)
         if header is None and names is None:
             shown = ", ".join(map(repr, fields[0][:5]))
             raise ValueError(
@@ -95,6 +96,9 @@ class Table:
                 f"{shown}; give names of all columns by {self._option('names', ['a', 'b'])}."
             )
         self._header, self._rows = rows[header or 0][0], rows[first:]
+        self.remarks: list[str] = []
+        if header:
+            self.remarks.append(f"{file}: the names are in line {self._header}; not read before.")
         self.headers = self._one_for_each_field([] if header is None else fields[header], names)
         self.names, self.units = _names_and_units(self.headers, fields[units] if units else [])
         self.lines = tuple(line for line, _ in self._rows)
@@ -255,6 +259,7 @@ class Table:
             found.pop()
         if names is None and len(found) == width - 1 and self._begins_with_names(width):
             found.insert(0, "")
+            self.remarks.append(f"{self.file}: the first column has no name, and those of rows.")
         width = len(found)
         for i, (line, fields) in enumerate(self._rows):
             kept = fields[:width] if not any(fields[width:]) else fields
@@ -318,18 +323,22 @@ class Table:
         return f"{way}."
 
 
-def _heads(rows: Sequence[Sequence[str]]) -> tuple[int | None, int | None, int]:
+def _heads(
+    rows: Sequence[Sequence[str]], names_are_given: bool
+) -> tuple[int | None, int | None, int]:
     """Return the rows that have the names and the units, or None, and the first row of data.
 
-    Names are words above columns of numbers, in the last row before the data.
+    Names are words above columns of numbers, in the last row before the data. A row with numbers
+    there is one of names only if none are given.
     """
     numeric, width = numeric_columns(rows), max(map(len, rows))
     heads = [] if numeric else [0]
     first = 0
     for i, row in enumerate(rows if numeric else ()):
         fields = [row[k] for k in numeric if k < len(row)]
-        has_words = any(map(_is_word, fields))
-        if any(map(is_value, fields)) and (heads or not has_words) and len(row) >= width - 1:
+        has_words, has_values = any(map(_is_word, fields)), any(map(is_value, fields))
+        may_be_data = bool(heads) or names_are_given or not has_words
+        if has_values and may_be_data and len(row) >= width - 1:
             first = i
             break
         if has_words and sum(map(bool, row)) >= min(width, max(2, width - 1)):

@@ -211,7 +211,8 @@ def _of_log(arguments: Namespace) -> Job:
     settings = {"log": log, "step": f"{step:g} {time}", "physics": named}
     program = _program(arguments.data, spec, reading, given, options)
     line = f"{listed(arguments.data)}: {listed(map(repr, whole))}."
-    return Job([line], Origin(settings, units=units, program=program), work)
+    remarks = [remark for table in tables for remark in table.remarks]
+    return Job([line, *remarks], Origin(settings, units=units, program=program), work)
 
 
 def _program(

@@ -123,7 +123,7 @@ def read_table(
     old = [column for _, column in asked]
     known = ", ".join(repr(name) for name, _ in asked)
     check_names(units, "--units", [*inputs, *outputs, *old, *columns], known)
-    names, values, remarks = list[str](), list[Tensor](), list[str]()
+    names, values, remarks = list[str](), list[Tensor](), [*table.remarks]
     levels: dict[str, tuple[Any, ...]] = {}
     for (name, column), label in zip(asked, columns, strict=True):
         short, unit = split_unit(name if name != column else label)
