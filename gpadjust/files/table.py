@@ -84,11 +84,11 @@ class Table:
         else:
             rows, mark = rows_of_text(file, delimiter)
         rows = [row for row in rows if any(row[1])]
-        if len(rows) < 2 - (names is not None):
-            what = "only a line of names" if rows else "an empty file"
-            raise ValueError(f"{file}: expected a line of names and then rows, found {what}.")
         fields = [row for _, row in rows]
         header, units, first = _heads(fields, names is not None)
+        if first >= len(rows):
+            what = "only a line of names" if rows else "an empty file"
+            raise ValueError(f"{file}: expected a line of names and then rows, found {what}.")
         if header is None and names is None:
             shown = ", ".join(map(repr, fields[0][:5]))
             raise ValueError(
@@ -331,7 +331,7 @@ def _heads(
     Names are words above columns of numbers, in the last row before the data. A row with numbers
     there is one of names only if none are given.
     """
-    numeric, width = numeric_columns(rows), max(map(len, rows))
+    numeric, width = numeric_columns(rows), max(map(len, rows), default=0)
     heads = [] if numeric else [0]
     first = 0
     for i, row in enumerate(rows if numeric else ()):

@@ -302,3 +302,15 @@ def test_numbers_are_right_or_refused(tmp_path_factory, columns, form, mark, dec
             assert "decimal" in str(error) or len(columns) == 1  # noqa: PT017
         else:
             same(found, [math.nan if x is None else x for x in column])
+
+
+@given(st.text(alphabet=" \t\n\r,;|\"'#.:/-+_[]()019aAeEnNmM\u00a0\u2212\ufeff\0", max_size=60))
+def test_any_text_is_a_table_or_an_error_of_ours(tmp_path_factory, text):
+    path = tmp_path_factory.getbasetemp() / "any.csv"
+    path.write_bytes(text.encode())
+    try:
+        table = Table(path)
+        for name in {*table.names}:
+            table.times(name, "s")
+    except ValueError as error:
+        assert "any.csv" in str(error)  # noqa: PT017
