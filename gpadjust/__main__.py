@@ -58,8 +58,8 @@ data: the table: a CSV file, or *.xlsx (the extra excel)
     such as sqrt, or a spreadsheet's, of several outputs with commas between them; or
     module:function. Several: give it again
 --units a=m,y=Pa: units, of columns that do not say them, as "a [m]"
---noise 0.1: known standard deviation of the outputs; or y=0.1,z=2; or relative, which grows with
-    the physics and is learnt
+--noise 0.1: known standard deviation of the outputs; or y=0.1,z=2; or learnt: constant, or
+    relative, which grows with the physics. By default the one that left-out observations prefer
 --outliers: some measurements may be far off
 --input-noise a=0.5: standard deviations of inputs that are noisy, too
 --positive: the outputs cannot be negative

@@ -17,7 +17,7 @@ from gpadjust.control import (
     Task,
     resume,
 )
-from gpadjust.control.checkpoint import RandomState
+from gpadjust.control.episodes import generators
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.rl import DynaOptions, DynaSAC
 from tests.point import POINT_SPEC, Faulty, Point, linear, near_one
@@ -47,7 +47,7 @@ def write(agent, folder, learnt):
         "dynamics": agent.task.dynamics.state_dict(),
         "learnt": learnt,
         "counts": [agent.num_timesteps, agent.num_episodes],
-        "random": tuple(RandomState.capture()),
+        "random": generators(),
     }
     torch.save(found, folder / "found.pt")
 

@@ -44,7 +44,7 @@ def test_the_first_command_writes_the_page_that_is_told(tmp_path, monkeypatch, c
     shutil.copytree(ROOT / folder[1], tmp_path / "copy")
     monkeypatch.chdir(tmp_path / "copy")
     assert main(report[1:]) == 0
-    assert "The physics helps" in capsys.readouterr().out
+    assert "Use it corrected" in capsys.readouterr().out
     assert (tmp_path / "copy" / "report.pt").exists()
     page = (tmp_path / "copy" / "report.html").read_text()
     told = re.findall(r"(\d\.\d\d)\s+mm", text)

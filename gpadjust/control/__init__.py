@@ -8,7 +8,6 @@ from typing import Any
 from gpadjust.control.constraints import margins
 from gpadjust.control.mpc import MPC, Plan, Planner
 from gpadjust.control.policy_search import BoundedPolicy, PolicySearch, SearchResult
-from gpadjust.control.progress import print_progress
 from gpadjust.control.rollouts import Objective, Return, Rollouts
 from gpadjust.control.state_filter import Estimate, StateFilter
 from gpadjust.control.task import ActionRate, Moment, Steps, Task
@@ -42,7 +41,7 @@ __all__ = [
 ]
 
 try:
-    from gpadjust.control.agent import Agent, Callback
+    from gpadjust.control.agent import Agent, Callback, print_progress
     from gpadjust.control.agents import MPCAgent, PolicySearchAgent
     from gpadjust.control.checkpoint import EpisodeCheckpoint, resume
     from gpadjust.control.step_guard import FailedStepWarning, StepGuard

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -18,7 +19,6 @@ from gpadjust.control.faults import check_observation
 from gpadjust.control.mpc import MPC, Plan, Planner, going_on
 from gpadjust.control.policy_search import BoundedPolicy, PolicySearch
 from gpadjust.control.rollouts import Rollouts, random_sequences
-from gpadjust.control.state_filter import Estimate
 from gpadjust.control.task import Task
 from gpadjust.states import StateSpec
 
@@ -34,14 +34,10 @@ class MPCAgent(Agent):
     Args:
         env: As of :class:`Agent`.
         task: As of :class:`Agent`.
-        each_step: Plans at each step but the first, see :class:`MPC`.
-        first: Plans when an episode begins, see :class:`MPC`.
-        tolerance: How much a plan may disappoint, see :class:`MPC`.
-        options: Further arguments of :class:`Agent`.
-
-    Raises:
-        TypeError: As :class:`Agent`, or if a planner is none.
-        ValueError: As :class:`Agent`.
+        each_step: Plans at each step but the first, see :class:`MPC`; so for the next two.
+        first: Plans when an episode begins.
+        tolerance: How much a plan may disappoint.
+        options: Further arguments of :class:`Agent`, which has the errors, too.
 
     Example:
         >>> from gpadjust.control import MPCAgent, Planner
@@ -80,11 +76,11 @@ class MPCAgent(Agent):
         Raises:
             RuntimeError: If there is neither a physics nor a real episode to plan with.
         """
-        planned = self.newest_model, self.each_step, self.first, self.tolerance, self.filter
-        if self._mpc is None or any(a is not b for a, b in zip(planned, self._mpc[0], strict=True)):
-            task, each_step, first, tolerance, known = planned
+        made_of = self.newest_model, self.each_step, self.first, self.tolerance, self.filter
+        if self._mpc is None or any(map(operator.is_not, made_of, self._mpc[0])):
+            task, each_step, first, tolerance, known = made_of
             how: dict[str, Any] = {"first": first, "tolerance": tolerance, "state_filter": known}
-            self._mpc = planned, MPC(task, self.action_bounds(), each_step, **how)
+            self._mpc = made_of, MPC(task, self.action_bounds(), each_step, **how)
         return self._mpc[1]
 
     def predict(
@@ -94,16 +90,17 @@ class MPCAgent(Agent):
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = False,
     ) -> tuple[NDArray[Any], tuple[Plan, ...]]:
-        """Plan actions; see :meth:`MPC.predict`.
-
-        Raises:
-            RuntimeError: If there is neither a physics nor a real episode to plan with.
-        """
+        """Plan actions; see :meth:`MPC.predict`."""
         return self.mpc.predict(observation, state, episode_start, deterministic)
 
     def promise(self, state: Sequence[Plan]) -> dict[str, float]:
         """Return the promised reward of a step by the plan of a whole episode."""
         (plan,) = state
+        promises = {"left_bounds": plan.left_bounds}
+        if self.task.constraints is not None:
+            promises["violation"] = plan.violation
+        if len(plan.promised) >= self.episode_length():
+            promises["promised_reward"] = plan.reward
         if plan.violation > 0:
             warnings.warn(
                 f"No plan of an episode was found that holds the constraints with their margins: "
@@ -113,19 +110,8 @@ class MPCAgent(Agent):
                 UserWarning,
                 stacklevel=2,
             )
-        if plan.left_bounds > 0.1:
-            warnings.warn(
-                f"The best plan of an episode leaves the bounds of the states in "
-                f"{plan.left_bounds:.0%} of the functions that it was followed through, so it "
-                "is not to be trusted there. Penalise such states in the reward, widen "
-                "state_bounds of the task, or search longer (MPCAgent(first=...)).",
-                UserWarning,
-                stacklevel=2,
-            )
-        whole = len(plan.promised) >= self.episode_length()
-        said = {"left_bounds": plan.left_bounds}
-        said |= {} if self.task.constraints is None else {"violation": plan.violation}
-        return said | ({"promised_reward": plan.reward} if whole else {})
+        self.warn_of_bounds(plan.left_bounds, "the functions along the best plan of an episode")
+        return promises
 
 
 class PolicySearchAgent(Agent):
@@ -143,14 +129,10 @@ class PolicySearchAgent(Agent):
         policy: Makes the policy of a spec and the bounds of the actions: :class:`BoundedPolicy`,
             or a function of yours, such as ``functools.partial(BoundedPolicy, net_arch=(32,))``.
         search: How the policy is improved.
-        options: Further arguments of :class:`Agent`.
+        options: Further arguments of :class:`Agent`, which has the errors, too.
 
     Attributes:
         policy: The policy.
-
-    Raises:
-        TypeError: As :class:`Agent`, or if policy or search are of another kind.
-        ValueError: As :class:`Agent`.
 
     Example:
         >>> from dataclasses import replace
@@ -177,46 +159,43 @@ class PolicySearchAgent(Agent):
         check_kind("search", self.search, PolicySearch, "a PolicySearch(...)")
         super().__init__(env, task, **options)
         made = policy(task.dynamics.spec, self.action_bounds()) if callable(policy) else policy
-        told = "a function that makes a BoundedPolicy of a spec and bounds, as the class does"
-        check_kind("policy", made, BoundedPolicy, told)
+        expected = "a function that makes a BoundedPolicy of a spec and bounds, as the class does"
+        check_kind("policy", made, BoundedPolicy, expected)
         self.policy = made
         self.is_trained = False
         self._reward = math.nan  # of a step, as the last search foresaw it
 
-    def try_task(self, observations: NDArray[Any], action_space: Any) -> None:
-        """Call the task's functions, and refuse what a policy cannot keep."""
+    def _check(self) -> None:
         self.search.check_task(self.task)
-        super().try_task(observations, action_space)
+        super()._check()
 
     def improve(self, task: Task) -> bool:
         """Improve the policy, if it is known where episodes start."""
         if task.initial_states is None:
             return False
         if not self.is_trained:
-            self.policy.look_at(self._random_states(task))
-        tenth = max(1, self.search.updates // 10)
+            length, bounds = self.episode_length(), self.action_bounds()
+            sequences = random_sequences(_EPISODES, length, bounds, MAX_HOLD)
+            with torch.no_grad():
+                starts = task.draw_initial_states(_EPISODES)
+                run = Rollouts(task, None).follow(starts, sequences)
+            self.policy.look_at(torch.cat([starts, run.next_states[run.made]]))
+        last = self.search.updates
+        tenth = max(1, last // 10)
 
         def progress(update: int, value: float) -> None:
-            if update % tenth == 0 or update == self.search.updates:
+            if update % tenth == 0 or update == last:
                 self.tell("update", {"number": update, "value": value})
 
         result = self.search.improve(self.policy, task, progress=progress)
         self.is_trained, self._reward = True, result.reward
-        left = result.left_bounds
-        found = {"reward": result.reward, "left_bounds": left, "seconds": result.seconds}
-        self.tell("search", found)
-        if left > 0.1:
-            warnings.warn(
-                f"{left:.0%} of the episodes of the policy left the bounds of the states in the "
-                "model, so it is not to be trusted there. Penalise such states in the reward, "
-                "widen state_bounds of the task, or take more updates.",
-                UserWarning,
-                stacklevel=2,
-            )
+        names = ("reward", "left_bounds", "seconds")
+        self.tell("search", {name: getattr(result, name) for name in names})
+        self.warn_of_bounds(result.left_bounds, "the episodes of the policy")
         return True
 
     def promise(self, state: Any) -> dict[str, float]:
-        """The reward of a step that the last search found in the model."""
+        """Return the reward of a step that the last search found in the model."""
         return {"promised_reward": self._reward}
 
     def predict(
@@ -226,30 +205,21 @@ class PolicySearchAgent(Agent):
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[Any], Any]:
-        """The policy's actions, always the same at an observation; see :meth:`Agent.predict`.
+        """Return the policy's actions, always the same at an observation; see :class:`Agent`.
 
         With sensors the state is an :class:`Estimate` of each episode, at whose mean they are.
         """
         check_observation(observation)
-        seen, found = torch.as_tensor(np.asarray(observation)).double(), list[Estimate]()
+        seen, estimates = torch.as_tensor(np.asarray(observation)).double(), []
         if self.filter is not None:
             rows = torch.atleast_2d(seen)
             earlier = going_on(state, episode_start, len(rows))
-            found = self.filter.follow(self.newest_model, rows, earlier)
-            means = self.task.dynamics.spec.observe(torch.stack([each.mean for each in found]))
+            estimates = self.filter.follow(self.newest_model, rows, earlier)
+            means = self.task.dynamics.spec.observe(torch.stack([e.mean for e in estimates]))
             seen = means.reshape(*seen.shape[:-1], -1)
         with torch.no_grad():
             actions = self.policy.act(seen)
-        if found:
-            taken = zip(found, torch.atleast_2d(actions), strict=True)
-            state = tuple(each._replace(action=action) for each, action in taken)
+        if estimates:
+            pairs = zip(estimates, torch.atleast_2d(actions), strict=True)
+            state = tuple(estimate._replace(action=action) for estimate, action in pairs)
         return actions.numpy().astype(np.float32), state
-
-    def _random_states(self, task: Task) -> Tensor:
-        """States ``N x state_dim`` of episodes of random actions in a model."""
-        length, bounds = self.episode_length(), self.action_bounds()
-        sequences = random_sequences(_EPISODES, length, bounds, MAX_HOLD)
-        with torch.no_grad():
-            starts = task.draw_initial_states(_EPISODES)
-            rollout = Rollouts(task, None).follow(starts, sequences)
-        return torch.cat([starts, rollout.next_states[rollout.made]])

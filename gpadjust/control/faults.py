@@ -7,30 +7,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-LARGEST = 1e25
-"""The largest number that an environment may observe or reward.
-
-No quantity of a machine is as large in a unit that is used, nor is the square of one, which a
-reward may be: pressures stay below 1e12 Pa. There is no least one, as for 1e-9 m.
-"""
+_LARGEST = 1e25  # no quantity of a machine, nor its square, is as large in a unit that is used
 
 
 def fault(observation: ArrayLike, reward: Any = 0.0) -> str:
     """Return what cannot be data in an observation or a reward, in words; empty if all can."""
     for name, values in (("observation", observation), ("reward", reward)):
         numbers = np.asarray(values, dtype=np.float64)
-        wrong = ~(np.abs(numbers) <= LARGEST)  # NaN is not, either
-        if wrong.any():
-            place = np.argwhere(wrong)[0]
+        for place in np.argwhere(~(np.abs(numbers) <= _LARGEST)):  # NaN is not, either
             entry = f"entry {', '.join(map(str, place))} of the " if len(place) else "the "
             return (
                 f"{entry}{name} is {numbers[tuple(place)]:g}, where a finite number of at most "
-                f"{LARGEST:g} is expected (a larger quantity needs another unit)"
+                f"{_LARGEST:g} is expected (a larger quantity needs another unit)"
             )
     return ""
 
 
-def check_observation(observation: ArrayLike, what: str = "No action can be chosen") -> None:
-    """Raise a ValueError, which begins with ``what``, if an observation cannot be data."""
-    if problem := fault(observation):
-        raise ValueError(f"{what}: {problem}. Stop the machine, or wait for a good observation.")
+def check_observation(observation: ArrayLike, problem: str = "No action can be chosen") -> None:
+    """Raise a ValueError, which begins with a problem, if an observation cannot be data."""
+    if found := fault(observation):
+        raise ValueError(f"{problem}: {found}. Stop the machine, or wait for a good observation.")

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gpadjust.checks import check_kind, checked_bounds, checked_number, checked_whole, seeded
 from gpadjust.control.constraints import margins
+from gpadjust.control.episodes import decoded, teach
 from gpadjust.control.faults import check_observation
 from gpadjust.control.rollouts import (
     Objective,
@@ -23,8 +24,7 @@ from gpadjust.control.rollouts import (
     check_objective,
     random_sequences,
 )
-from gpadjust.control.smoothed_episodes import smooth_episodes
-from gpadjust.control.state_filter import Estimate, StateFilter
+from gpadjust.control.state_filter import Estimate, StateFilter, smooth_episodes
 from gpadjust.control.task import Moment, Steps, Task
 from gpadjust.dynamics import Trajectories
 from gpadjust.states import StateSpec
@@ -437,7 +437,7 @@ class MPC:
             ValueError: If there is no new transition; or trajectories of a task with sensors.
             PhysicsError: If the physics fails at a transition.
         """
-        dynamics, hidden, number = self.task.dynamics, self.filter is not None, self._num_learnt
+        hidden, number = self.filter is not None, self._num_learnt
         if data is not None and hidden:
             raise ValueError(
                 "The states behind trajectories of sensors are estimated from what `step` has "
@@ -452,19 +452,7 @@ class MPC:
                 )
             # The states behind all measurements of sensors are known better by now.
             data = self._states_of(self._steps[0 if hidden else self._num_learnt :])
-        following = data.next_states.clone()
-        if self.task.reference is not None:  # set-points stay as they are in the dynamics
-            still = dynamics.spec.exogenous_columns
-            following[:, still] = data.states[:, still]
-        before = dynamics.state_dict() if hidden else {}
-        try:
-            if hidden:
-                dynamics.load_state_dict({})
-            dynamics.update(data.states, data.actions, following)
-        except BaseException:
-            if hidden:
-                dynamics.load_state_dict(before)
-            raise
+        teach(self.task, data)
         self._num_learnt = number
         return self
 
@@ -474,12 +462,10 @@ class MPC:
         before, actions, after = (torch.stack(column) for column in columns)
         seen = Trajectories(before, actions, after, torch.tensor(run))
         if self.filter is None:
-            decode = self.task.dynamics.spec.decode
-            return replace(seen, states=decode(seen.states), next_states=decode(seen.next_states))
-        runs = seen.episodes()
-        self.filter, paths = smooth_episodes(self.model, self.filter, runs, len(runs))
-        states = torch.cat([path[:-1] for path in paths])
-        return replace(seen, states=states, next_states=torch.cat([path[1:] for path in paths]))
+            return decoded(self.task.dynamics.spec, seen)
+        number = len(seen.episodes())  # a seed
+        self.filter, states = smooth_episodes(self.model, self.filter, seen, number)
+        return states
 
     def __repr__(self) -> str:
         """Name the dynamics, and how much they have learnt."""

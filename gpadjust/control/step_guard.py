@@ -22,16 +22,13 @@ class StepGuard(gym.Wrapper[Any, Any, Any, Any]):
     """Ends an episode where its step fails, as a step that did not happen.
 
     A step fails that raises an error, or whose observation or reward is not finite or larger than
-    1e25. It is refused with a :class:`FailedStepWarning`. The episode is truncated at the last
-    good observation, with a reward of zero and a true ``info["step_failed"]``, so that no learner
-    of the library takes it as data. Agents put a guard around their environment, and Dyna around
-    each of a ``DummyVecEnv``; put one yourself around each environment that another process runs,
-    as in ``SubprocVecEnv([lambda: StepGuard(make()), ...])``.
-
-    An interruption (``KeyboardInterrupt``) and an error of ``reset`` come through.
-
-    Args:
-        env: The environment.
+    1e25. The episode is truncated at the last good observation, with a
+    :class:`FailedStepWarning`, a reward of zero and a true ``info["step_failed"]``, by which an
+    environment itself may tell that a step did not happen: no learner of the library takes it as
+    data. Agents put a guard around their environment, and Dyna around each of a ``DummyVecEnv``;
+    put one yourself around each environment that another process runs, as in
+    ``SubprocVecEnv([lambda: StepGuard(make()), ...])``. Interruptions and errors of ``reset`` come
+    through.
 
     Raises:
         RuntimeError: By ``step``, if the first step of three episodes on end fails.
@@ -55,7 +52,7 @@ class StepGuard(gym.Wrapper[Any, Any, Any, Any]):
 
     @staticmethod
     def around(env: gym.Env[Any, Any]) -> StepGuard:
-        """The environment with a guard around it, or as it is if it has one."""
+        """Return the environment with a guard around it, or as it is if it has one."""
         return env if isinstance(env, StepGuard) else StepGuard(env)
 
     def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
@@ -69,23 +66,23 @@ class StepGuard(gym.Wrapper[Any, Any, Any, Any]):
         """Make a step, or end the episode where it fails."""
         cause = None
         try:
-            found = self.env.step(action)
-            problem = fault(found[0], found[1])
+            result = self.env.step(action)
+            problem = fault(result[0], result[1])
         except Exception as error:  # whatever a machine, or its driver, does
             cause, problem = error, f"the environment raised {type(error).__name__}: {error}"
         if not problem:
-            self._last, self._steps, self._in_vain = np.array(found[0]), self._steps + 1, 0
-            return found
-        said = f"Step {self._steps + 1} of an episode failed, and ends it: {problem}."
+            self._last, self._steps, self._in_vain = np.array(result[0]), self._steps + 1, 0
+            return result
+        message = f"Step {self._steps + 1} of an episode failed, and ends it: {problem}."
         self._in_vain += self._steps == 0
         if self._in_vain >= _IN_VAIN:
             self._in_vain = 0
             raise RuntimeError(
-                f"{said} Nor was there a good step in the {_IN_VAIN - 1} episodes before. Mend the "
-                "environment and call `learn` again; all earlier steps are kept."
+                f"{message} Nor was there a good step in the {_IN_VAIN - 1} episodes before. Mend "
+                "the environment and call `learn` again; all earlier steps are kept."
             ) from cause
         warnings.warn(
-            f"{said} It is not kept, all earlier steps are, and learning goes on with the next "
+            f"{message} It is not kept, all earlier steps are, and learning goes on with the next "
             "episode. If it happens often, look at the sensor or the simulator.",
             FailedStepWarning,
             stacklevel=2,

@@ -155,9 +155,8 @@ def as_tensor(values: ArrayLike, name: str) -> Tensor:
                 f"Expected {name} in float64; found {values.dtype}; take `{name}.double()`."
             )
         return values
-    array = values
-    if hasattr(values, "to_numpy"):
-        array = values.to_numpy().reshape(*values.shape[:1], *(values.shape[1:] or (1,)))
+    values = values.to_frame() if hasattr(values, "to_frame") else values  # a Series is a column
+    array = values.to_numpy() if hasattr(values, "to_numpy") else values
     if not isinstance(array, np.ndarray):
         raise TypeError(
             f"Expected {name} as a torch tensor, a NumPy array or a DataFrame; found "

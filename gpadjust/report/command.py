@@ -11,6 +11,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import torch
+from torch import Tensor
+
+from gpadjust.checks import progress_bar
 from gpadjust.core import CKA, Noise, fit
 from gpadjust.kinds import Categories, HeavyTails, NoisyInputs, RelativeNoise, with_options
 from gpadjust.physics import ODEPhysics, PhysicsError, PhysicsWarning
@@ -19,12 +23,13 @@ from gpadjust.report import inputs as read
 from gpadjust.report.page import checked_path, write
 from gpadjust.report.subject import Origin, Subject, subject_of
 from gpadjust.states import StateSpec
-from gpadjust.validation import compare
-from gpadjust.validation.verdict import faults
+from gpadjust.validation import compare, leave_one_out
+from gpadjust.validation.verdict import difference, faults
 from gpadjust.words import bare, listed, plural
 
 _DEGREES = ("deg", "degree", "degrees", "°")
 _HOW = "the same command, without --fit."
+_SPAN = 10**0.5  # of positive outputs, from which kinds of noise are compared
 _DIGITS = 6  # of a sampling step, which is a mean of differences
 _NO_NOTES = (DeprecationWarning, PendingDeprecationWarning)
 
@@ -77,7 +82,7 @@ def _of_table(arguments: Namespace) -> Job:
     """Read the table and the physics of ``gpadjust report``."""
     outputs = read.pairs(arguments.outputs, "--outputs", short=True)
     variances, text = None, arguments.noise
-    if text not in (None, "relative"):
+    if text not in (None, "constant", "relative"):
         sds = read.pairs(text, "--noise") if "=" in text else dict.fromkeys(outputs, text)
         variances = read.variances_of(sds, "--noise", [*outputs], "--outputs", all_of=True)
     unknowns = read.unknowns_of(arguments.unknown)
@@ -105,6 +110,8 @@ def _of_table(arguments: Namespace) -> Job:
     physics, code, modules = read.given_physics(arguments.physics, data, unknowns)
 
     def work() -> Subject:
+        if arguments.noise is None and not options.keys() & {"noise", "link"}:
+            options.update(_noise_of(data, physics, options, arguments.seed))
         X, noise = data.X, options.get("noise")
         if isinstance(noise, NoisyInputs):
             X = read.Columns(X.columns, noise.points)
@@ -124,6 +131,44 @@ def _of_table(arguments: Namespace) -> Job:
     settings = {"data file": read.digest_of(arguments.data)}
     origin = Origin(settings, data.remarks, physics=code, modules=modules)
     return Job([first, *data.remarks], origin, work)
+
+
+def _noise_of(
+    data: read.TableData, physics: Any, options: Mapping[str, Any], seed: int
+) -> dict[str, Any]:
+    """Return the option of the noise that left-out observations prefer, and say which.
+
+    Noise of one size stays unless positive outputs span half a decade, and another kind predicts
+    better by a nat and by two standard errors.
+    """
+    Y = data.Y.values
+    known = Y.nan_to_num(nan=1.0)
+    if not (known > 0).all() or not (_max(Y) > _SPAN * -_max(-Y)).all():
+        return {}
+    kinds: dict[str, dict[str, Any]] = {
+        "noise of one size": {},
+        "noise that grows with the formula (--noise relative)": {"noise": RelativeNoise()},
+        "noise of the logarithm (--positive)": {"link": "log"},
+    }
+    densities: dict[str, Tensor] = {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what is chosen is fitted again, and then warns
+        for kind, own in progress_bar(True, kinds.items(), unit="noise", leave=False):
+            model = with_options(CKA, {**options, **own})(data.X, data.Y, physics=physics)
+            fit(model, seed=seed)
+            densities[kind] = leave_one_out(model).log_density.nansum(-1)
+    first, *_ = kinds
+    best = max(kinds, key=lambda kind: float(densities[kind].sum()))
+    gain, se = difference(densities[best], densities[first])
+    if gain <= max(1.0, 2 * se):
+        return {}
+    _say(f"Assumed: {best}, which predicts left-out observations better; else --noise constant.")
+    return kinds[best]
+
+
+def _max(Y: Tensor) -> Tensor:
+    """Return the largest observation of each output."""
+    return Y.nan_to_num(nan=-torch.inf).amax(0)
 
 
 def _options(

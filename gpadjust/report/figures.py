@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -12,23 +9,27 @@ from gpadjust.physics import PhysicsError
 from gpadjust.report import markup as html
 from gpadjust.report.markup import Markup, drawn, image, tag
 from gpadjust.report.subject import Subject
-from gpadjust.validation import Trust, plots, trust
+from gpadjust.validation import plots, trust
 from gpadjust.validation.plots import (
-    adjustments_of,
+    BLUE,
+    DOTS,
+    GREY,
+    RED,
+    band,
+    column,
     labels,
+    legend,
     lines_along,
-    share_limits,
-    unadjusted,
+    mean_and_ends,
+    quantile,
+    tidy,
 )
 from gpadjust.validation.trust import physics_at
-from gpadjust.words import bare, listed, number, percent, with_unit
+from gpadjust.words import bare, name_and_unit, number, percent, with_unit
 
 _MOST = 12  # inputs along which slices are drawn, in all outputs together
+_DECADE = 10.0  # largest over least observation, from which axes are logarithmic
 _BANDS = "Solid lines are means; bands hold 95 % of the function, without measurement noise."
-_APART = (
-    "Observations are of rho f_p + delta alone: how much of it is rho's and how much delta's the "
-    "data tell far less surely than their sum."
-)
 _NONE = "There is no physics that could be adjusted, trusted or overridden."
 _TRUST = (
     "Of {} points spread over the box of the data: the share at which the prediction rests on the "
@@ -36,11 +37,10 @@ _TRUST = (
     "the data (its interval excludes f_p: the model is sure that the physics is wrong there), or "
     "on neither (too few data to tell)."
 )
-_COLORS = "blue where it rests on the physics, orange on the data, grey on neither"
 
 
 def where_wrong(subject: Subject) -> Markup:
-    """Return the prediction beside the physics, rho and delta, for each output."""
+    """Return the correction of the physics along each input, for each output."""
     inputs = inputs_drawn(subject)
     parts: list[Markup] = []
     if len(subject.inputs) > 1:
@@ -51,14 +51,13 @@ def where_wrong(subject: Subject) -> Markup:
         parts.append(tag("p", f"{held}{few * (len(inputs) < len(pairs))}.", class_="note"))
     for j, name in enumerate(subject.outputs):
         parts += [tag("h3", name)] * (len(subject.outputs) > 1)
-        parts += [tag("p", " ".join(_words(subject, j))), slices(subject, j, inputs)]
+        parts += [tag("p", " ".join(_words(subject, j))), corrections(subject, j, inputs)]
     return html.join(parts)
 
 
 def trusted(subject: Subject) -> Markup:
     """Return the shares of predictions that rest on the physics, on data, or on neither."""
-    rows, failed, images = [], [], []
-    inputs, points = inputs_drawn(subject), 0
+    rows, failed, points = [], [], 0
     for j, (name, shown) in enumerate(zip(subject.outputs, subject.adjusted, strict=True)):
         if shown is None:
             continue
@@ -69,18 +68,12 @@ def trusted(subject: Subject) -> Markup:
             continue
         shares = (basis.physics, basis.data, basis.neither)
         rows.append([name, shown.structure, *(percent(share[j]) for share in shares)])
-        images.append(trusts(basis, j, inputs, name))
         points = len(basis.X)
     if not rows:
         return html.join(failed or [tag("p", _NONE)])
-    several = "Along each input, for all values of the others"
-    over = several if len(subject.inputs) > 1 else "Along the input"
     head = ["output", "by the model", "physics", "data", "neither"]
     shares_of = html.table("Basis of the predictions", head, rows)
-    words = tag("p", _TRUST.format(f"{points:,}"))
-    return html.join(
-        [*failed, words, shares_of, *images, tag("p", f"{over}: {_COLORS}.", class_="note")]
-    )
+    return html.join([*failed, tag("p", _TRUST.format(f"{points:,}")), shares_of])
 
 
 @torch.no_grad()
@@ -108,49 +101,78 @@ def point(subject: Subject, X: Tensor, digits: int = 4) -> list[str]:
 
 
 @drawn
-def slices(subject: Subject, output: int, inputs: list[int]) -> list[Markup]:
-    """Return the prediction, the physics, rho and delta along each input, others at the median."""
-    shown = subject.adjusted[output]
-    terms = () if shown is None else adjustments_of(shown.model)
-    d, rows = len(subject.inputs), 1 + len(terms)
-    figures = [html.new_figure(2.1 + 1.5 * len(terms)) for _ in range(d)]
-    ratios = [1.4, *[1.0] * len(terms)]
-    grids = [f.subplots(rows, sharex=True, squeeze=False, height_ratios=ratios) for f in figures]
-    axes = np.hstack(grids)
-    lines = lines_along(subject.model, output, base=subject.base)
-    for i in inputs:
-        (x, X), ax = lines[i], axes[0, i]
-        physics = {} if shown is None else physics_at(shown.model, X)
-        plots.draw_prediction(ax, subject.model, x, X, output, physics)
-        if d == 1:
-            plots.draw_data(ax, subject.model, output)
-        if len(physics) > 1:
-            ax.legend(frameon=False)
-        ax.set_ylabel(labels(subject.outputs)[output])
-    share_limits([axes[0, i] for i in inputs])
-    if shown is not None and terms:
-        plots.plot_adjustment(shown.model, base=subject.base, output=output, axes=axes[1:])
-        _name_alike(axes[1:])
-    else:
-        for ax, label in zip(axes[-1], labels(subject.inputs), strict=True):
-            ax.set_xlabel(label)
-    parts = "the prediction and the physics" if shown is not None else "the prediction"
-    below = f"; below, {' and '.join(terms)}" if terms else ""
-    alt = f"{parts} of {subject.outputs[output]} over {{}}{below}".format
-    return [image(figures[i], alt(subject.inputs[i])) for i in inputs]
+def agreement(subject: Subject, output: int) -> list[Markup]:
+    """Return observations over left-out predictions, by the formula and corrected."""
+    name, y, loo = subject.outputs[output], subject.judged[:, output], subject.loo
+    mean, half = loo.mean[:, output], quantile(0.95) * loo.variance[:, output].sqrt()
+    formulas = [*subject.physics_at(subject.X, output).values()][:1]
+    seen = ~y.isnan()
+    drawn = torch.cat([each[seen] for each in (y, mean, *formulas)])
+    is_log = bool((drawn > 0).all()) and float(y[seen].max() / y[seen].min()) > _DECADE
+    figure = html.new_figure(3.2)
+    ax = figure.subplots()
+    ends = [float(drawn.min()), float(drawn.max())]
+    ax.plot(ends, ends, color=GREY, lw=1, ls="--")
+    for f in formulas:
+        ax.plot(f[seen], y[seen], **DOTS | {"mec": RED, "mfc": "none"}, label="your formula")
+    told = "corrected, left out" if formulas else "predicted, left out"
+    bars = half[seen].minimum(mean[seen] * 0.999) if is_log else half[seen]
+    ax.errorbar(
+        mean[seen], y[seen], xerr=torch.stack([bars, half[seen]]), color=BLUE, elinewidth=0.8,
+        label=told, **DOTS,
+    )  # fmt: skip
+    if is_log:
+        ax.set(xscale="log", yscale="log")
+    ax.set(xlabel=f"predicted {labels(subject.outputs)[output]}", ylabel="measured")
+    legend(ax)
+    tidy(ax)
+    return [image(figure, f"measured over predicted {name}, by the formula and corrected")]
 
 
 @drawn
-def trusts(basis: Trust, output: int, inputs: list[int], name: str) -> list[Markup]:
-    """Return the basis of predictions of an output of a model, by its name, along each input."""
-    figures = [html.new_figure(2.0) for _ in basis.input_names]
-    axes = np.array([[figure.subplots() for figure in figures]])
-    plots.plot_trust(basis, output=output, axes=[*axes[0]])
-    if (legend := axes[0, -1].get_legend()) is not None:
-        legend.remove()
-    _name_alike(axes)
-    alt = f"whether the prediction of {name} rests on physics, data or neither"
-    return [image(figures[i], f"{alt}, over {basis.input_names[i]}") for i in inputs]
+def corrections(subject: Subject, output: int, inputs: list[int]) -> list[Markup]:
+    """Return the correction of the formula along each input, with the data as dots.
+
+    It is what the prediction adds to the physics, in per cent of it, or in the output's unit where
+    the physics changes sign. Without a single physics it is the prediction itself.
+    """
+    shown, name = subject.adjusted[output], subject.outputs[output]
+    at_data = [*subject.physics_at(subject.X, output).values()]
+    lines = lines_along(subject.model, output, base=subject.base)
+    figures, y = [], subject.judged[:, output]
+    is_correction = shown is not None and len(at_data) == 1
+    is_share = is_correction and bool((at_data[0] > 0).all() or (at_data[0] < 0).all())
+    unit = "%" if is_share else name_and_unit(name)[1]
+    label = "correction" if is_correction else labels(subject.outputs)[output]
+    for i in inputs:
+        x, X = lines[i]
+        figure = html.new_figure(2.4)
+        ax = figure.subplots()
+        f, data = torch.zeros_like(x), torch.zeros_like(y)
+        if is_correction:
+            assert shown is not None
+            (values,) = physics_at(shown.model, X).values()
+            f, data = column(values, output), at_data[0]
+            ax.axhline(0, color=GREY, ls="--", lw=1.2)
+        sizes = [100 / each.abs() if is_share else torch.ones_like(each) for each in (f, data)]
+        ends = mean_and_ends(subject.model.marginals(X), output, 0.95)
+        curve, *band_ends = ((each - f) * sizes[0] for each in ends)
+        band(ax, x, [curve, *band_ends], 0.95)
+        dots = (y - data) * sizes[1]
+        ax.plot(subject.X[:, i], dots, color=RED, **DOTS | {"ms": 3})
+        ax.set_ylim(*_limits(torch.cat([curve, dots[~dots.isnan()], 0 * x[:is_correction]])))
+        ax.set(xlim=(float(x[0]), float(x[-1])), xlabel=labels(subject.inputs)[i])
+        ax.set_ylabel(f"{label} [{unit}]" if unit and is_correction else label)
+        tidy(ax)
+        figures.append(image(figure, f"{label} of {name} over {subject.inputs[i]}, with the data"))
+    return figures
+
+
+def _limits(values: Tensor) -> tuple[float, float]:
+    """Return limits of an axis that show all of some values but few that are far off."""
+    low, high = values.quantile(0.01), values.quantile(0.99)
+    room = 0.15 * (high - low).clamp_min(1e-12 * values.abs().max() + 1e-300)
+    return float(low - room), float(high + room)
 
 
 @drawn
@@ -174,15 +196,6 @@ def coverages(subject: Subject, output: int) -> list[Markup]:
     return [first, image(figures[1], f"histogram of PIT values of {name}")]
 
 
-def _name_alike(axes: Any) -> None:
-    """Give each figure the labels of the first; the page says what is drawn, once for all."""
-    if (legend := axes[0, 0].get_legend()) is not None:
-        legend.remove()
-    for row in axes:
-        for ax in row:
-            ax.set_ylabel(row[0].get_ylabel())
-
-
 def _words(subject: Subject, output: int) -> list[str]:
     """Return the words above the figures of an output."""
     shown, name = subject.adjusted[output], subject.outputs[output]
@@ -198,16 +211,10 @@ def _words(subject: Subject, output: int) -> list[str]:
             f"At the data, the {physics} ({is_it}) is off by {with_unit(rms, name)} (root "
             f"mean square; observed less physics is {with_unit(mean, name)} in the mean)."
         )
-    top = "the prediction, and dashed the physics"
-    if subject.comparison is not None:
-        top = "the prediction of what is recommended, and dashed the physics"
-    words.append(f"Topmost: {top}{', with the data' * (len(subject.inputs) == 1)}.")
-    if terms := adjustments_of(shown.model):
-        weight = "" if shown.weight == 1 else f" (weight {shown.weight:.2f})"
-        back = [f"{term} = {number(unadjusted(shown.model, term))}" for term in terms]
-        words.append(
-            f"Below: {listed(terms)} of {shown.structure}{weight}, with ticks at the data; "
-            f"dashed, what they fall back to without data, {listed(back)}."
-        )
-        words += [_APART] * (len(terms) > 1)
+    if len(subject.physics) > 1:
+        return [*words, f"The figures show the prediction. {_BANDS}"]
+    words.append(
+        "The figures show what the prediction adds to it along each input; dots are what each "
+        "observation lies above it, at all values of the other inputs."
+    )
     return [*words, _BANDS]

@@ -57,6 +57,7 @@ class Card(NamedTuple):
     answer: str
     reasons: list[str]
     color: str = "open"
+    picture: Markup = Markup()
 
 
 class Page(NamedTuple):
@@ -142,15 +143,16 @@ def parameter_table(caption: str, parameters: PhysicsParameters) -> Markup:
 
 
 def beside(cards: Sequence[Card]) -> Markup:
-    """Return the verdict on each output, below its errors in large numbers."""
+    """Return the answer on each output, its reasons, its errors in large numbers, its picture."""
     shown = []
-    for name, errors, note, answer, reasons, color in cards:
+    for name, errors, note, answer, reasons, color, picture in cards:
         parts = [tag("h3", name)] if len(cards) > 1 else []
+        parts.append(tag("p", answer, class_="answer"))
+        parts += [tag("p", reason.replace("+-", "±")) for reason in reasons]
         if errors:
             numbers = [tag("div", tag("dt", n), tag("dd", value)) for n, value in errors.items()]
             parts += [tag("dl", *numbers, class_="errors"), tag("p", note, class_="note")]
-        parts.append(tag("p", answer, class_="answer"))
-        parts += [tag("p", reason.replace("+-", "±")) for reason in reasons]
+        parts += [picture] if picture else []
         shown.append(tag("div", *parts, class_=f"card {color}"))
     return tag("div", *shown, class_="cards")
 

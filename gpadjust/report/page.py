@@ -153,13 +153,12 @@ def _page(
     advice = [] if subject.comparison is None else subject.comparison.advice
     sentences = [text.replace("+-", "±") for text in (*advice, *origin.notes)]
     made_by = {
-        "Recommendation": lambda: recommendation(subject),
-        "Structures": lambda: tables.structures(subject),
-        "Where is the physics wrong?": lambda: figures.where_wrong(subject),
-        "Where trust lies": lambda: figures.trusted(subject),
-        "Left-out predictions": lambda: tables.predictions(subject),
-        "Do the intervals hold?": lambda: tables.coverage(subject),
+        "Where is the formula wrong?": lambda: figures.where_wrong(subject),
         "Parameters of the physics": lambda: tables.parameters(subject),
+        "Do the intervals hold?": lambda: tables.coverage(subject),
+        "Left-out predictions": lambda: tables.predictions(subject),
+        "Where trust lies": lambda: figures.trusted(subject),
+        "Structures": lambda: html.join([recommendation(subject), tables.structures(subject)]),
         "What was learnt": lambda: tables.summary(subject),
         "Advice": lambda: html.bullets(sentences),
         "Data": lambda: tables.data(subject, origin.remarks),
@@ -199,14 +198,15 @@ def cards(subject: Subject, how: str = Origin.how) -> list[Card]:
         elif subject.batches:
             note += "; each with an offset for each batch"
         answer, reasons = _answer(subject, name, how)
-        shown.append(Card(name, numbers, note, answer, reasons, _COLORS.get(answer, "open")))
+        color, picture = _COLORS.get(answer, "open"), figures.agreement(subject, j)
+        shown.append(Card(name, numbers, note, answer, reasons, color, picture))
     return shown
 
 
 def headline(cards: list[Card], kind: str) -> str:
     """Return the errors and the answer of each output, a line each, for the terminal."""
     lines = []
-    for name, numbers, _, answer, reasons, _ in cards:
+    for name, numbers, _, answer, reasons, *_ in cards:
         each = "; ".join(f"{what}: {value}" for what, value in numbers.items())
         line = f"{kind} of {name}, {each}." if each else f"{name}:"
         several = len(cards) > 1

@@ -1,9 +1,8 @@
-"""Real and model experience in one replay buffer."""
+"""Real and model experience in one replay buffer, and the real episodes in time."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,101 +11,36 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from gpadjust.checks import checked_number, checked_whole
+from gpadjust.control.episodes import Row, nothing, recorded
 from gpadjust.control.faults import fault
-from gpadjust.dynamics import Trajectories
-from gpadjust.states import StateSpec
 
 
-class CompactReplayBuffer(ReplayBuffer):
-    """A ``ReplayBuffer`` that takes many rows at once, and saves only those that are filled."""
-
-    rows: ClassVar[tuple[str, ...]] = (
-        "observations",
-        "next_observations",
-        "actions",
-        "rewards",
-        "dones",
-        "timeouts",
-    )
-
-    def add_rows(
-        self,
-        obs: np.ndarray,
-        next_obs: np.ndarray,
-        actions: np.ndarray,
-        rewards: np.ndarray,
-        dones: np.ndarray,
-        timeouts: np.ndarray,
-    ) -> None:
-        """Add ``N`` transitions of one environment at once.
-
-        Args:
-            obs: Observations, ``N x d``.
-            next_obs: The observations after them, ``N x d``, also where an episode ended.
-            actions: Actions scaled to [-1, 1], as SB3 stores them, ``N x a``.
-            rewards: ``N`` rewards.
-            dones: Whether the episode ended, ``N``.
-            timeouts: Whether it ended by a time limit alone, ``N``.
-        """
-        if self.n_envs != 1:
-            raise ValueError(f"add_rows() is for buffers of one environment; found {self.n_envs}.")
-        columns = (obs, next_obs, actions, rewards, dones, timeouts)
-        n = min(len(obs), self.buffer_size)
-        places = (self.pos + np.arange(n)) % self.buffer_size
-        for name, values in zip(self.rows, columns, strict=True):
-            getattr(self, name)[places, 0] = values[len(values) - n :]
-        self.full = self.full or self.pos + n >= self.buffer_size
-        self.pos = (self.pos + n) % self.buffer_size
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the attributes, of the rows those that are filled."""
-        rows = {name: getattr(self, name)[: self.size()] for name in self.rows}
-        return {**self.__dict__, **rows}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take the attributes back, with space for the other rows."""
-        self.__dict__.update(state)
-        for name in self.rows:
-            rows = np.zeros((self.buffer_size, *state[name].shape[1:]), dtype=state[name].dtype)
-            rows[: len(state[name])] = state[name]
-            setattr(self, name, rows)
-
-
-class MixedReplayBuffer(CompactReplayBuffer):
+class MixedReplayBuffer(ReplayBuffer):
     """The replay buffer of Dyna: real experience D_R, and beside it model experience D_M.
 
-    To Stable-Baselines3 it is the buffer of the real transitions. The attribute ``model_buffer`` is
-    one of the others. Every batch is drawn from both: of ``batch_size`` samples,
-    ``batch_size * real_fraction`` are real, a fractional number being rounded up or down at random
-    so that the mean is exact. As long as one of the buffers is empty, or ``mix`` is False, batches
-    come from the real one, or from the model's if that is all there is.
-
-    A real step whose ``info["step_failed"]`` is true did not happen, as where a simulator failed.
-    It is not kept: the step before it is the last one of its episode, truncated. (Where other
-    environments made theirs, its place in the row repeats another transition.) Nor is one that
-    cannot be data, of an environment without a :class:`gpadjust.control.StepGuard`.
+    To Stable-Baselines3 it is the buffer of the real transitions. Every batch is drawn from both:
+    of ``batch_size`` samples, ``batch_size * real_fraction`` are real, a fractional number being
+    rounded up or down at random so that the mean is exact. As long as one of the buffers is empty,
+    or ``mix`` is False, batches come from the real one, or from the model's if that is all there
+    is. A real step that failed (:class:`gpadjust.control.StepGuard`) is not kept, and ends its
+    episode; where other environments made theirs, its place takes a transition of one of them.
 
     Args:
         buffer_size: Capacity of the real buffer.
-        args: As of Stable-Baselines3's ``ReplayBuffer``: a one-dimensional ``Box`` of observations,
-            a ``Box`` of actions, and the device, for example.
+        args: As of Stable-Baselines3's ``ReplayBuffer``.
         real_fraction: Share of real samples in a batch, in [0, 1].
         model_buffer_size: Capacity of the model's buffer. Default: as ``buffer_size``.
-        options: As of ``ReplayBuffer``; ``optimize_memory_usage`` must be False.
+        options: As of ``ReplayBuffer``, whose ``optimize_memory_usage`` must be False.
 
     Attributes:
-        model_buffer: The model's transitions.
-        failed: Which places repeat another transition, ``buffer_size x n_envs`` booleans.
-        learnt: Which places the dynamics have learnt, ``buffer_size x n_envs`` booleans.
+        model_buffer: The model's transitions, a ``ReplayBuffer`` of one environment.
+        episodes: All real episodes that have ended, with observations in the place of states.
+        num_learnt: Number of their steps that the dynamics have learnt.
         mix: Whether batches hold model transitions.
-        real_fraction: Share of real samples in a batch.
 
     Raises:
-        ValueError: If the fraction or the size is out of range, or ``optimize_memory_usage`` is
-            asked for.
+        ValueError: If the fraction or a size is out of range.
     """
-
-    rows = (*CompactReplayBuffer.rows, "failed", "learnt")
 
     def __init__(
         self,
@@ -116,22 +50,23 @@ class MixedReplayBuffer(CompactReplayBuffer):
         model_buffer_size: int | None = None,
         **options: Any,
     ) -> None:
-        checked_number("real_fraction", real_fraction, least=0, most=1)
-        if model_buffer_size is not None:
-            checked_whole("model_buffer_size", model_buffer_size, 1)
-        if options.get("optimize_memory_usage"):
-            raise ValueError(
-                "MixedReplayBuffer does not support optimize_memory_usage=True: model transitions "
-                "do not lie in the order of a trajectory."
-            )
-        super().__init__(buffer_size, *args, **options)
-        self.real_fraction = real_fraction
-        self.mix = True
-        self.failed = np.zeros((self.buffer_size, self.n_envs), dtype=bool)
-        self.learnt = np.zeros_like(self.failed)
+        self.real_fraction = checked_number("real_fraction", real_fraction, least=0, most=1)
         size = buffer_size if model_buffer_size is None else model_buffer_size
-        spaces = (self.observation_space, self.action_space)
-        self.model_buffer = CompactReplayBuffer(size, *spaces, self.device)
+        super().__init__(buffer_size, *args, **options)
+        spaces = self.observation_space, self.action_space
+        self.model_buffer = ReplayBuffer(
+            checked_whole("model_buffer_size", size, 1), *spaces, self.device
+        )
+        self.mix = True
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all real and model experience."""
+        super().reset()
+        self.model_buffer.reset()
+        self.episodes = nothing(int(np.prod(self.obs_shape)), self.action_dim)
+        self.num_learnt = 0
+        self._under_way: list[list[Row]] = [[] for _ in range(self.n_envs)]
 
     def add(
         self,
@@ -143,111 +78,59 @@ class MixedReplayBuffer(CompactReplayBuffer):
         infos: list[dict[str, Any]],
     ) -> None:
         """Add a real step of each environment, see Stable-Baselines3."""
-        steps = zip(infos, np.stack([obs, next_obs], 1), reward, strict=True)
-        failed = np.array([bool(info.get("step_failed") or fault(*step)) for info, *step in steps])
-        if failed.any():
-            self.end_episodes(failed)
-        if failed.all():
-            return
-        pos = self.pos
-        super().add(obs, next_obs, action, reward, done, infos)
-        self.failed[pos], self.learnt[pos] = failed, False
-        for i in failed.nonzero()[0]:
-            # Its place in the row is taken by a transition that is sampled once more.
-            row, env = (pos - 1, i) if self.size() > 1 else (pos, int(failed.argmin()))
-            for name in CompactReplayBuffer.rows:
-                getattr(self, name)[pos, i] = getattr(self, name)[row, env]
-            if not self.dones[pos, i]:
-                self.dones[pos, i] = self.timeouts[pos, i] = 1
+        space: Any = self.action_space
+        actions = space.low + (np.float64(action) + 1) / 2 * (space.high - space.low)
+        failed = np.zeros(self.n_envs, dtype=bool)
+        for i, info in enumerate(infos):
+            failed[i] = info.get("step_failed") or fault([obs[i], next_obs[i]], reward[i])
+            if not failed[i]:
+                terminated = done[i] and not info.get("TimeLimit.truncated", False)
+                row = obs[i].copy(), actions[i], next_obs[i].copy(), reward[i], terminated
+                self._under_way[i].append(row)
+            if failed[i] or done[i]:
+                self._end(i)
+        if not failed.all():
+            rows = np.where(failed, failed.argmin(), np.arange(self.n_envs))
+            ends = done[rows], [infos[i] for i in rows]
+            super().add(obs[rows], next_obs[rows], action[rows], reward[rows], *ends)
 
-    def end_episodes(self, environments: np.ndarray) -> None:
-        """Let the newest steps of some environments be the last ones of episodes, truncated.
+    def end_episodes(self) -> None:
+        """End the episodes under way, by their newest steps."""
+        for i in range(self.n_envs):
+            self._end(i)
+
+    def _end(self, i: int) -> None:
+        rows, self._under_way[i] = self._under_way[i], []
+        if rows:
+            self.episodes = self.episodes.append(recorded(rows))
+
+    def add_model_rows(self, *columns: np.ndarray) -> None:
+        """Add ``N`` transitions of the model at once.
 
         Args:
-            environments: Which of them, ``n_envs`` booleans.
+            columns: Observations ``N x d``; the observations after them, also where an episode
+                ended; actions scaled to [-1, 1], as SB3 stores them, ``N x a``; rewards ``N``;
+                whether the episode ended; and whether it ended by a time limit alone.
         """
-        if not self.size():
-            return
-        ended = environments & (self.dones[self.pos - 1] == 0)
-        self.dones[self.pos - 1][ended] = self.timeouts[self.pos - 1][ended] = 1
+        rows, names = self.model_buffer, ("observations", "next_observations", "actions")
+        n = min(len(columns[0]), rows.buffer_size)
+        places = (rows.pos + np.arange(n)) % rows.buffer_size
+        for name, values in zip((*names, "rewards", "dones", "timeouts"), columns, strict=True):
+            getattr(rows, name)[places, 0] = values[len(values) - n :]
+        rows.full = rows.full or rows.pos + n >= rows.buffer_size
+        rows.pos = (rows.pos + n) % rows.buffer_size
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
-        """Draw a batch from both buffers; the real samples come first.
-
-        Args:
-            batch_size: Number of samples.
-            env: Normalises observations and rewards, see Stable-Baselines3.
-        """
+        """Draw a batch from both buffers, see Stable-Baselines3; the real samples come first."""
         if not self.mix or not self.model_buffer.size():
             return super().sample(batch_size, env)
-        if not self.size():
-            return self.model_buffer.sample(batch_size, env)
-        expected = batch_size * self.real_fraction
-        num_real = int(expected) + int(np.random.random() < expected % 1)  # noqa: NPY002
-        parts = []
-        if num_real:
-            parts.append(super().sample(num_real, env))
+        expected, num_real = batch_size * self.real_fraction, 0
+        if self.size():
+            num_real = int(expected) + int(np.random.random() < expected % 1)  # noqa: NPY002
+        self.model_buffer.device = self.device  # which SB3 sets where it loads a buffer
+        parts = [super().sample(num_real, env)] if num_real else []
         if num_real < batch_size:
             parts.append(self.model_buffer.sample(batch_size - num_real, env))
         names = ReplayBufferSamples._fields[:-1]  # the last is for n-step returns
         columns = [torch.cat([getattr(part, name) for part in parts]) for name in names]
         return ReplayBufferSamples(*columns)
-
-    def reset(self) -> None:
-        """Empty both buffers."""
-        super().reset()
-        self.model_buffer.reset()
-        self.failed[:] = self.learnt[:] = False
-
-    @property
-    def whole(self) -> np.ndarray:
-        """Which places are of episodes that have ended, ``buffer_size x n_envs`` booleans."""
-        places, ended = self._in_time()
-        whole = np.zeros_like(self.failed)
-        whole[places] = np.flip(np.maximum.accumulate(np.flip(ended, axis=0), axis=0), axis=0)
-        return whole
-
-    def recorded(
-        self,
-        spec: StateSpec,
-        unscale_action: Callable[[np.ndarray], np.ndarray],
-        keep: np.ndarray | None = None,
-    ) -> Trajectories:
-        """Return whole real episodes in the user's units, one environment after the other.
-
-        The oldest one of a full buffer is left out, as its beginning may be lost, unless it is the
-        only one.
-
-        Args:
-            spec: The entries of states and actions.
-            unscale_action: The inverse of the scale of the actions in the buffer.
-            keep: Which places to take, ``buffer_size x n_envs`` booleans. Default: all.
-        """
-        places, ended = self._in_time()
-        episode = ended.cumsum(0) - ended
-        lost = self.full & (ended.sum(0) > 1) & (episode == 0)
-        chosen = self.whole & ~self.failed & (True if keep is None else keep)
-        taken = (chosen[places] & ~lost).T.flatten()
-        episode = episode + np.arange(self.n_envs) * (len(places) + 1)
-
-        def column(values: np.ndarray) -> torch.Tensor:
-            values = values.swapaxes(0, 1)  # one environment after the other
-            return torch.from_numpy(values.reshape(-1, *values.shape[2:])[taken])
-
-        def numbers(name: str) -> torch.Tensor:
-            return column(getattr(self, name)[places].astype(np.float64))
-
-        return Trajectories(
-            spec.decode(numbers("observations")),
-            torch.from_numpy(unscale_action(numbers("actions").numpy())),
-            spec.decode(numbers("next_observations")),
-            column(episode),
-            numbers("rewards"),
-            (numbers("dones") * (1 - numbers("timeouts"))).bool(),
-        )
-
-    def _in_time(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the filled places from the oldest on, and whether episodes end there."""
-        first = self.pos if self.full else 0
-        places = (first + np.arange(self.size())) % self.buffer_size
-        return places, self.dones[places].astype(bool)

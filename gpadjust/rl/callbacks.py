@@ -31,26 +31,16 @@ class DynaCallback(BaseCallback):
         return True
 
     def on_model_fit(self, metrics: dict[str, float]) -> None:
-        """Called after the dynamics were fitted.
-
-        Args:
-            metrics: ``"fit_seconds"``; and of the newest real transitions, predicted before they
-                were learnt, as soon as the dynamics can predict: ``"nlpd"`` and ``"coverage"``,
-                averaged over the states, and ``"rmse/<state>"`` of each.
-        """
+        """Do something after a fit, with the numbers of the event ``"fit"`` of an ``Agent``."""
 
     def on_model_episodes(self, returns: np.ndarray) -> None:
-        """Called after some model episodes that ran side by side.
-
-        Args:
-            returns: The sum of rewards of each.
-        """
+        """Do something after model episodes that ran side by side, with the return of each."""
 
 
 class AgentCallback(DynaCallback):
-    """Tells a callback of :class:`gpadjust.control.Agent` the events that Dyna agents have, too.
+    """Calls a callback of :class:`gpadjust.control.Agent` at the events that Dyna has, too.
 
-    A trial is a rollout of Stable-Baselines3, which is an episode by default.
+    A trial is a rollout of Stable-Baselines3 in which an episode ends.
     """
 
     def __init__(self, callback: Any) -> None:
@@ -60,9 +50,9 @@ class AgentCallback(DynaCallback):
 
     @staticmethod
     def around(callback: Any) -> Any:
-        """A callback of agents as Stable-Baselines3 takes it; others as they are."""
-        told = isinstance(callback, EpisodeCheckpoint) or callback is print_progress
-        return AgentCallback(callback) if told else callback
+        """Return a callback of agents as Stable-Baselines3 takes it; others as they are."""
+        is_ours = isinstance(callback, EpisodeCheckpoint) or callback is print_progress
+        return AgentCallback(callback) if is_ours else callback
 
     def on_model_fit(self, metrics: dict[str, float]) -> None:
         """Tell that the dynamics have learnt."""
@@ -71,16 +61,16 @@ class AgentCallback(DynaCallback):
     def _on_rollout_start(self) -> None:
         # The updates of the last episode are done, and the next has not begun.
         self.callback(self.model, "episode", {})
-        self._begun, self._steps_before = time.perf_counter(), self.model.num_timesteps
+        self._begun, self._steps_before = (
+            time.perf_counter(),
+            len(self.model.replay_buffer.episodes),
+        )
 
     def _on_rollout_end(self) -> None:
-        buffer = self.model.replay_buffer
-        number = (self.model.num_timesteps - self._steps_before) // self.model.n_envs
-        newest = buffer.pos - 1 - np.arange(min(number, buffer.size()))
-        rewards = buffer.rewards[newest][~buffer.failed[newest]]
-        if len(rewards):
-            values: dict[str, float] = {"number": self.model.num_episodes + 1}
-            values |= {"steps": len(rewards), "reward": float(rewards.mean(dtype=np.float64))}
+        new = self.model.replay_buffer.episodes.some(slice(self._steps_before, None))
+        if len(new):
+            values: dict[str, float] = {"number": self.model.num_episodes + 1, "steps": len(new)}
+            values["reward"] = float(new.rewards.mean())
             values["seconds"] = time.perf_counter() - self._begun
             self.callback(self.model, "trial", values)
 

@@ -10,15 +10,15 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 import torch
 from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 from torch import Tensor
 
-from gpadjust.checks import check_choice
+from gpadjust.checks import check_choice, checked_whole
 from gpadjust.control import Moment, Steps, Task
 from gpadjust.dynamics import TransitionFunctions
 from gpadjust.physics import PhysicsError
-from gpadjust.rl.buffer import CompactReplayBuffer
 
 _CHUNK = 2000  # transitions at once, for the sake of memory
 
@@ -26,20 +26,12 @@ Sampling = Literal["step", "trajectory"]
 
 
 class ModelStep(NamedTuple):
-    """Result of a step of all particles.
-
-    Args:
-        observations: ``num_envs x observation_dim``.
-        rewards: ``num_envs``, as all that follows.
-        terminated: Whether the state ended the episode.
-        truncated: Whether the time limit or the bounds did.
-        left_bounds: Whether the particle would have left the bounds.
-    """
+    """Result of a step of ``n`` particles: observations ``n x d``, and ``n`` of all else."""
 
     observations: np.ndarray
     rewards: np.ndarray
-    terminated: np.ndarray
-    truncated: np.ndarray
+    terminated: np.ndarray  # by the state
+    truncated: np.ndarray  # by the time limit or the bounds
     left_bounds: np.ndarray
 
 
@@ -49,12 +41,10 @@ class ModelVecEnv(VecEnv):
     Any algorithm of Stable-Baselines3 can learn in it. A step of all particles is one call of the
     model. Its randomness is PyTorch's global generator.
 
-    **Leaving the bounds never pays.** A particle that would leave the bounds of the task or the
-    finite numbers, or meets a failure of the physics, stays where it is, and its episode ends, with
-    ``info["left_bounds"]`` (which the last step of every episode has). Its reward is the worst that
-    was seen. If that is negative the episode is truncated: who learns in it goes on valuing the
-    state where it stayed, so that leaving again and again is as bad as can be, and leaving once
-    costs a step. If all rewards were positive, it is terminated: there is nothing more to earn.
+    Leaving the bounds never pays: a particle that would leave the bounds of the task or the finite
+    numbers, or meets a failure of the physics, stays where it is, and its episode ends, with
+    ``info["left_bounds"]`` and the worst reward that was seen. If that is negative the episode is
+    truncated, as its learner goes on valuing the state where it stayed; else it is terminated.
 
     Args:
         task: What is known; its dynamics must be fitted, and it must say where episodes start and
@@ -64,9 +54,8 @@ class ModelVecEnv(VecEnv):
         action_space: The policy's.
         sampling: ``"step"``: each step is a draw of its own from the predictive distribution, as
             in the paper. ``"trajectory"``: between two calls of ``reset``, each particle follows a
-            transition function of its own, drawn from the posterior, so that what it meets is
-            consistent along its trajectory. (In the terms of PETS, trajectory sampling 1 and
-            infinity; Chua et al. 2018. Stable-Baselines3 calls ``reset`` once in ``learn``.)
+            transition function of its own, drawn from the posterior. (In the terms of PETS,
+            trajectory sampling 1 and infinity; Chua et al. 2018.)
         worst_reward: The worst reward seen elsewhere, such as in real episodes.
 
     Attributes:
@@ -90,7 +79,6 @@ class ModelVecEnv(VecEnv):
         sampling: Sampling = "step",
         worst_reward: float = np.inf,
     ) -> None:
-        spec = task.dynamics.spec
         task.refuse("ModelVecEnv", "sensors", "MPCAgent and PolicySearchAgent can")
         task.check_spaces(observation_space, action_space)
         if not task.dynamics.is_fitted:
@@ -98,28 +86,25 @@ class ModelVecEnv(VecEnv):
                 f"{type(task.dynamics).__name__} has not learnt from transitions yet; call "
                 "`update`."
             )
-        if num_envs < 1:
-            raise ValueError(f"num_envs must be at least 1; found {num_envs}.")
         for name in ("initial_states", "episode_length"):
             if getattr(task, name) is None:
                 raise ValueError(f"A ModelVecEnv needs a task with {name}; found None.")
         check_choice("sampling", sampling, get_args(Sampling))
         self.render_mode = None
-        super().__init__(num_envs, observation_space, action_space)
+        super().__init__(checked_whole("num_envs", num_envs, 1), observation_space, action_space)
         self.task = task
         self.episode_length: Any = task.episode_length
         self.sampling = sampling
         self.worst_reward = worst_reward
         self.num_left_bounds = 0
-        self._states = torch.empty(num_envs, spec.state_dim, dtype=torch.float64)
+        self._states = torch.empty(num_envs, task.dynamics.spec.state_dim, dtype=torch.float64)
         self._steps = torch.zeros(num_envs, dtype=torch.long)
         self._functions: TransitionFunctions | None = None
         self._is_followed = True  # whether particles have followed them already
 
     def reset(self) -> np.ndarray:
         """Start all episodes; observations ``num_envs x observation_dim``."""
-        self._states = self._draw_initial(self.num_envs)
-        self._steps.zero_()
+        self._start(torch.ones(self.num_envs, dtype=torch.bool))
         if self._is_followed:
             self._draw_functions()
         return self._observe(self._states)
@@ -132,7 +117,6 @@ class ModelVecEnv(VecEnv):
         """Step all particles; those whose episode ended start another."""
         step = self.transition(self._actions)
         dones = step.terminated | step.truncated
-        observations = step.observations.copy()
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for i in dones.nonzero()[0]:
             infos[i] = {
@@ -140,35 +124,29 @@ class ModelVecEnv(VecEnv):
                 "TimeLimit.truncated": bool(step.truncated[i]),
                 "left_bounds": bool(step.left_bounds[i]),
             }
-        if dones.any():
-            ended = torch.from_numpy(dones)
-            self._states[ended] = self._draw_initial(int(dones.sum()))
-            self._steps[ended] = 0
-            observations[dones] = self._observe(self._states[ended])
-        return observations, step.rewards, dones, infos
+        if not dones.any():
+            return step.observations, step.rewards, dones, infos
+        self._start(torch.from_numpy(dones))
+        return self._observe(self._states), step.rewards, dones, infos
 
     def transition(self, actions: np.ndarray) -> ModelStep:
         """Step all particles, without a new start for those whose episode ended."""
-        moves = torch.as_tensor(actions, dtype=torch.float64)
         self._is_followed = True
+        moves = torch.as_tensor(actions, dtype=torch.float64)
         step = self._step(self.task, self._states, moves, Moment(self._steps))
         self._states = step.next_states
         self._steps += 1
         self.num_left_bounds += int(step.left_bounds.sum())
         truncated = ((self._steps >= self.episode_length) | step.left_bounds) & ~step.terminated
-        return ModelStep(
-            self._observe(self._states),
-            step.rewards.numpy().astype(np.float32),
-            step.terminated.numpy(),
-            truncated.numpy(),
-            step.left_bounds.numpy(),
-        )
+        rewards = step.rewards.numpy().astype(np.float32)
+        ends = (part.numpy() for part in (step.terminated, truncated, step.left_bounds))
+        return ModelStep(self._observe(self._states), rewards, *ends)
 
     def steps_ahead(self) -> np.ndarray:
-        """The steps of each particle before the time limit, ``num_envs``."""
+        """Return the steps of each particle before the time limit, ``num_envs``."""
         return self.episode_length - self._steps.numpy()
 
-    def refresh(self, buffer: CompactReplayBuffer) -> None:
+    def refresh(self, buffer: ReplayBuffer) -> None:
         """Predict the transitions of an earlier model in a buffer again, by the model as it is now.
 
         The states and actions stay, and with them the time limits.
@@ -176,30 +154,29 @@ class ModelVecEnv(VecEnv):
         if not buffer.size():
             return
         self._draw_functions()
-        assert isinstance(self.action_space, spaces.Box), "checked at the start"
-        low, high = self.action_space.low, self.action_space.high
+        space, spec = self.action_space, self.task.dynamics.spec
+        assert isinstance(space, spaces.Box), "checked at the start"
         for rows in np.array_split(np.arange(buffer.size()), -(-buffer.size() // _CHUNK)):
-            obs = torch.from_numpy(buffer.observations[rows, 0].astype(np.float64))
-            scaled = buffer.actions[rows, 0].astype(np.float64)
-            actions = torch.from_numpy(low + (scaled + 1) / 2 * (high - low))
-            spec = self.task.dynamics.spec
+            obs, after, scaled = (
+                torch.from_numpy(column[rows, 0].astype(np.float64))
+                for column in (buffer.observations, buffer.next_observations, buffer.actions)
+            )
+            low, high = (torch.from_numpy(bound).double() for bound in (space.low, space.high))
             states = spec.decode(obs)
             task = self.task = self.task.widened(states)
             if task.reference is not None:  # the numbers of the steps are not in the buffer
-                after = torch.from_numpy(buffer.next_observations[rows, 0].astype(np.float64))
                 ahead = spec.decode(after)[:, spec.exogenous_columns]
                 task = replace(task, reference=partial(_recorded, ahead))
-            step = self._step(task, states, actions, Moment())
+            step = self._step(task, states, low + (scaled + 1) / 2 * (high - low), Moment())
             terminated = step.terminated.numpy()
             limits = buffer.timeouts[rows, 0].astype(bool) | step.left_bounds.numpy()
-            timeouts = limits & ~terminated
             buffer.next_observations[rows, 0] = self._observe(step.next_states)
             buffer.rewards[rows, 0] = step.rewards.numpy()
-            buffer.dones[rows, 0] = terminated | timeouts
-            buffer.timeouts[rows, 0] = timeouts
+            buffer.dones[rows, 0] = terminated | limits
+            buffer.timeouts[rows, 0] = limits & ~terminated
 
     def _step(self, task: Task, states: Tensor, actions: Tensor, moment: Moment) -> Steps:
-        """A step of a task, in which leaving the bounds is the worst that can be."""
+        """Return a step of a task, in which leaving the bounds is the worst that can be."""
         step = task.step(states, actions, moment, move=self._move)
         self.worst_reward = min(self.worst_reward, float(step.rewards.min()))
         if not step.left_bounds.any():
@@ -214,47 +191,30 @@ class ModelVecEnv(VecEnv):
             self._is_followed = False
 
     def _move(self, states: Tensor, actions: Tensor) -> Tensor:
-        """The next states of ``N`` rows, which follow the functions in blocks, if there are any."""
-        functions = self._functions
-        if functions is None:
+        """Return next states of ``N`` rows, which follow functions, if there are any, in blocks."""
+        if self._functions is None:
             return self.task.dynamics.sample(states, actions)
         n, k = len(states), self.num_envs
         filled = torch.arange(-(-n // k) * k).clamp_max(n - 1)
         blocks = (rows[filled].reshape(k, -1, rows.shape[-1]) for rows in (states, actions))
         try:
-            return functions(*blocks).flatten(0, 1)[:n]
+            return self._functions(*blocks).flatten(0, 1)[:n]
         except PhysicsError as error:
             error.rows = tuple(sorted({min(row, n - 1) for row in error.rows}))
             raise
 
-    def close(self) -> None:
-        """Nothing to close."""
+    def _start(self, which: Tensor) -> None:
+        """Start episodes of some particles, ``num_envs`` booleans."""
+        states = self.task.draw_initial_states(int(which.sum()))
+        self.task = self.task.widened(states)
+        self._states, self._steps = self._states.clone(), self._steps.masked_fill(which, 0)
+        self._states[which] = states
 
-    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """The attribute of this environment, once for each particle."""
-        return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
+    def _observe(self, states: Tensor) -> np.ndarray:
+        observations: np.ndarray = self.task.dynamics.spec.observe(states).numpy()
+        return observations.astype(self.observation_space.dtype)
 
-    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of all particles."""
-        if len(list(self._get_indices(indices))) < self.num_envs:
-            raise ValueError("The particles share their attributes; set them for all at once.")
-        setattr(self, attr_name, value)
-
-    def env_method(
-        self,
-        method_name: str,
-        *method_args: Any,
-        indices: VecEnvIndices = None,
-        **method_kwargs: Any,
-    ) -> list[Any]:
-        """Refuse: there are no environments inside."""
-        raise NotImplementedError(
-            f"The particles of a ModelVecEnv have no methods of their own, such as {method_name!r}."
-        )
-
-    def env_is_wrapped(self, wrapper_class: Any, indices: VecEnvIndices = None) -> list[bool]:
-        """False for each particle."""
-        return [False] * len(list(self._get_indices(indices)))
+    # What else Stable-Baselines3 asks of a VecEnv
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seed PyTorch's global generator, from which all particles draw."""
@@ -262,14 +222,28 @@ class ModelVecEnv(VecEnv):
             torch.manual_seed(seed)
         return [None] * self.num_envs
 
-    def _draw_initial(self, n: int) -> Tensor:
-        states = self.task.draw_initial_states(n)
-        self.task = self.task.widened(states)
-        return states
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """Return the attribute of this environment, once for each particle."""
+        return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
-    def _observe(self, states: Tensor) -> np.ndarray:
-        seen: np.ndarray = self.task.dynamics.spec.observe(states).numpy()
-        return seen.astype(self.observation_space.dtype)
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Set an attribute of all particles."""
+        if len(list(self._get_indices(indices))) < self.num_envs:
+            raise ValueError("The particles share their attributes; set them for all at once.")
+        setattr(self, attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, **kwargs: Any) -> list[Any]:
+        """Refuse: there are no environments inside."""
+        raise NotImplementedError(
+            f"Particles have no methods of their own, such as {method_name!r}."
+        )
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: VecEnvIndices = None) -> list[bool]:
+        """Return False for each particle."""
+        return [False for _ in self._get_indices(indices)]
+
+    def close(self) -> None:
+        """Close nothing."""
 
 
 def _recorded(set_points: Tensor, states: Tensor, steps: Tensor) -> Tensor:

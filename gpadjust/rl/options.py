@@ -53,10 +53,10 @@ class DynaOptions:
 
     def __post_init__(self) -> None:
         """Check them."""
-        checked_whole("model_episodes", self.model_episodes, 0)
-        for name in ("last_model_episode", "model_buffer_size", "num_particles"):
-            if getattr(self, name) is not None:
-                checked_whole(name, getattr(self, name), 0 if name == "last_model_episode" else 1)
+        least = {"last_model_episode": 0, "model_buffer_size": 1, "num_particles": 1}
+        for name, number in {"model_episodes": 0, **least}.items():
+            if name not in least or getattr(self, name) is not None:
+                checked_whole(name, getattr(self, name), number)
         checked_number("updates_per_model_step", self.updates_per_model_step, least=0)
         checked_number("real_fraction", self.real_fraction, least=0, most=1)
         check_switch("refresh_model_data", self.refresh_model_data)
@@ -65,7 +65,3 @@ class DynaOptions:
             checked_number("reward_tolerance", self.reward_tolerance, least=0)
         if self.score_horizons != ():
             object.__setattr__(self, "score_horizons", checked_horizons(self.score_horizons))
-
-    def uses_model(self, num_episodes: int) -> bool:
-        """Return whether the model is used after so many real episodes."""
-        return self.last_model_episode is None or num_episodes < self.last_model_episode

@@ -25,7 +25,7 @@ _ENOUGH = 8  # observations of different inputs, for any answer
 _LEAST = 1.0  # nats; a smaller difference says nothing
 _SURELY = 0.95  # probability with which nested models decide
 _LARGER = 1.1  # times as large; by less, errors are equal
-_TINY_SHARE = 0.2  # of the largest value of f_p: less is too little for a share of it
+_TINY_SHARE = 0.05  # of the median size of f_p: less is too little for a share of it
 _POINTS = 256  # among which the next observation is looked for
 _APART_BY = 0.3  # standard deviations: predictions that are nearer are the same
 _NAMED = 3  # inputs of a point that a sentence has room for
@@ -223,7 +223,7 @@ def correction_of(model: GP, j: int, f: Tensor) -> str:
     X = model.data.X
     off = model.predict(X).mean[:, j] - f
     is_share = bool((f > 0).all() or (f < 0).all())
-    is_large = f.abs() > _TINY_SHARE * f.abs().max()  # where a share says something
+    is_large = f.abs() > _TINY_SHARE * f.abs().median()  # where a share says something
     sizes = torch.where(is_large, off / f.abs(), 0.0) if is_share else off
     i = int(sizes.abs().argmax())
     size = f"{100 * sizes[i]:+.0f} %"

@@ -75,7 +75,7 @@ def run(experiment: Planning, system: str, learner: str, seed: int) -> Run:
         before, start = dict(agent.wall_time), time.process_time()
         agent.learn(settings.episode_length)
         costs = -agent.recorded_episodes(newest=settings.episode_length).rewards
-        late = np.stack(agent.env_attribute("episodes")[len(rows)])[
+        late = np.stack(agent.env.get_wrapper_attr("episodes")[len(rows)])[
             -round(1 / settings.time_step) :
         ]
         seconds = {name: agent.wall_time[name] - before[name] for name in ("plan", "fit")}

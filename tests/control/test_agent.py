@@ -106,8 +106,8 @@ def test_an_agent_of_ones_own_needs_predict_alone(make_agent):
         ("predict", np.zeros(1), ValueError, r"must return the action, .*\(1,\)"),
         ("predict", (np.zeros((1, 1)), None), ValueError, r"must return the action, .*\(1,\)"),
         ("predict", (np.full(1, np.nan), None), ValueError, r"must return the action, .*\(1,\)"),
-        ("promise", 3.0, TypeError, r"must return a dictionary .* found 3\.0"),
-        ("improve", None, TypeError, "must return whether .*found None"),
+        ("promise", 3.0, TypeError, r"must be a dictionary .* found 3\.0"),
+        ("improve", None, TypeError, "must be True if .*found None"),
         ("predict", (torch.zeros(1).double(), None), None, ""),
     ],
 )
@@ -136,15 +136,9 @@ def test_episodes_are_played_to_their_end_and_told(make_agent, kind, capsys):
     begin = f"{kind.__name__}(Point, LearnedDynamics, 2 episodes learnt, 10 steps"
     assert repr(agent) == f"{begin}, last reward {episodes.rewards[5:].mean():.3g} a step)"
     lines = capsys.readouterr().out.splitlines()
-    number, span = r"-?\d+(\.\d+)?(e-?\d+)?", r"\d+\.\d s"
-    for line in (
-        rf"trial 2: reward {number} a step( \(promised {number}\))?, 5 steps in {span}",
-        rf"fit: {span}, NLPD {number}, coverage \d+%",
-        rf"plan: {span}.*",
-    ):
-        assert sum(re.fullmatch(line, said) is not None for said in lines) == 1 + ("plan" in line)
-    for event in ("update", "search"):
-        assert any(said.startswith(event) for said in lines) == (event in search)
+    printed = [line.partition(":")[0] for line in lines]
+    assert printed == [event for event in events if event not in ("step", "episode", "done")]
+    assert any(re.match(r"trial: number 2, steps 5, reward -\S+, seconds ", line) for line in lines)
 
 
 def test_scores_of_each_new_episode_are_told(make_agent):
@@ -208,22 +202,6 @@ def test_promises_that_are_not_kept_are_told(make_agent, point_dynamics):
         make_agent(PolicySearchAgent, dynamics=wrong).learn(5)
 
 
-@pytest.mark.slow
-def test_a_promise_that_data_made_against_the_physics_is_told(make_agent, crude_dynamics):
-    """After an episode the model knows that the point moves some ten times as far."""
-
-    class Boasts(PolicySearchAgent):
-        def promise(self, state):
-            return {"promised_reward": 10.0 * self.num_episodes}
-
-    known, log = crude_dynamics(lambda X: X[:, :1] + 0.05 * X[:, 1:]), Log("fit")
-    agent = make_agent(PolicySearchAgent, dynamics=known).learn(5)
-    agent.__class__ = Boasts
-    with pytest.warns(UserWarning, match="In 100% of its predictions data had overridden the phys"):
-        agent.learn(5, log)
-    assert log[0]["overrides"] == 1
-
-
 def test_promises_are_of_the_steps_that_are_made(make_agent):
     """Each step costs 1 until the point is home, which ends the episode; no warning is given."""
     agent = make_agent(
@@ -240,7 +218,7 @@ def test_plans_that_leave_the_bounds_are_told(make_agent, crude_dynamics):
     bounds, log = torch.tensor([[-2.0], [2.0]], dtype=torch.float64), Log("plan")
     away = crude_dynamics(lambda X: X[:, :1] + 3.0)
     agent = make_agent(MPCAgent, dynamics=away, state_bounds=bounds)
-    with pytest.warns(UserWarning, match="leaves the bounds of the states in 100% of the fun"):
+    with pytest.warns(UserWarning, match="100% of the functions .* leave the bounds of the states"):
         agent.learn(2, log)
     assert log[0]["left_bounds"] == 1
 
@@ -249,7 +227,9 @@ def test_policies_that_leave_the_bounds_are_told(make_agent):
     bounds = torch.tensor([[0.99], [1.01]], dtype=torch.float64)
     starts = {"initial_states": lambda n: torch.ones(n, 1).double()}
     agent = make_agent(PolicySearchAgent, state_bounds=bounds, **starts)
-    with pytest.warns(UserWarning, match="left the bounds of the states in the model"):
+    with pytest.warns(
+        UserWarning, match="of the policy leave the bounds of the states in the model"
+    ):
         agent.learn(5)
 
 
@@ -371,7 +351,7 @@ def test_observations_in_another_order_cost_no_episode():
 
 
 def test_an_unknown_time_limit_is_refused(make_agent, point_env):
-    with pytest.raises(ValueError, match=r"no time limit .*give the task an episode_length"):
+    with pytest.raises(ValueError, match=r"no time limit; give the task an episode_length"):
         make_agent(MPCAgent, point_env().unwrapped, episode_length=None).learn(5)
     assert make_agent(MPCAgent, episode_length=None).learn(5).num_episodes == 1
 

@@ -9,23 +9,20 @@ import sys
 import textwrap
 import threading
 import zipfile
-from dataclasses import replace
 from types import ModuleType
 
 import gymnasium
 import pytest
-import torch
 from filelock import FileLock
 
-from gpadjust.control import MPC, EpisodeCheckpoint, MPCAgent, PolicySearchAgent, resume
-from gpadjust.control.checkpoint import RandomState, unpacked
+from gpadjust.control import EpisodeCheckpoint, MPCAgent, PolicySearchAgent, resume
+from gpadjust.control.episodes import generators, set_generators
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
 from tests.control.conftest import PLAN, described
 from tests.point import (
     PowerCut,
     Shouting,
     assert_equal,
-    assert_read_without_pickle,
     forbid_unpickling,
     robot,
     scramble,
@@ -53,7 +50,7 @@ def numbers(agent):
         "dynamics": agent.task.dynamics.state_dict(),
         "learnt": described(agent).learnt(agent),
         "counts": [agent.num_timesteps, agent.num_episodes, agent.promised_reward, agent.notes],
-        "random": tuple(RandomState.capture()),
+        "random": generators(),
     }
 
 
@@ -111,14 +108,15 @@ def test_a_full_disk_leaves_the_file_before_it_and_the_run_goes_on(
     for room in (0, len(before) // 2, len(before) - 1):
         with monkeypatch.context() as patch:
             patch.setattr("builtins.open", lambda *given, room=room: SmallDisk(*given, room=room))
-            with pytest.raises(OSError, match=r"No space left on device; the checkpoint is not"):
+            with pytest.raises(OSError, match=r"No space left on device") as full:
                 agent.learn(5, EpisodeCheckpoint(path))
+        assert "the agent has lost nothing" in full.value.__notes__[0]
         assert agent.num_timesteps == 5
         assert path.read_bytes() == before
         assert {*tmp_path.iterdir()} == {path, path.with_name("run.ckpt.lock")}
     resumed = resume(path, *again())
     for each in (agent, resumed):
-        RandomState(*unpacked(zipfile.ZipFile(path).read("random.pt"))).restore()
+        set_generators(pickle.loads(zipfile.ZipFile(path).read("run.pkl"))[2])
         assert_equal(numbers(each.learn(10, EpisodeCheckpoint(path))), whole)
 
 
@@ -143,6 +141,16 @@ def test_what_a_killed_writer_left_does_not_pile_up(make_agent, tmp_path):
     assert {*tmp_path.iterdir()} == {path, path.with_name("run.ckpt.lock")}
 
 
+@pytest.mark.skipif(os.name != "posix", reason="links need rights there")
+def test_a_link_at_the_name_of_the_part_is_not_followed(make_agent, tmp_path):
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+    (tmp_path / ".run.ckpt.part").symlink_to(victim)
+    make_agent(MPCAgent).save(tmp_path / "run.ckpt")
+    assert victim.read_text() == "precious"
+    assert not (tmp_path / "run.ckpt").is_symlink()
+
+
 @pytest.mark.skipif(os.name != "posix", reason="folders cannot be synchronised there")
 def test_the_name_of_a_checkpoint_is_on_the_disk(make_agent, tmp_path, monkeypatch):
     """After the file itself, its folder is synchronised, or a power cut could lose the new name."""
@@ -152,54 +160,13 @@ def test_the_name_of_a_checkpoint_is_on_the_disk(make_agent, tmp_path, monkeypat
     assert synced == [(tmp_path / "run.ckpt").stat().st_ino, tmp_path.stat().st_ino]
 
 
-class KeepingAgent(MPCAgent):
-    """An agent that keeps what is code of the user's: tasks, the dynamics, a policy in a model."""
-
-    def improve(self, task):
-        self.kept = [task, {"asked": self.task}, task.dynamics, MPC(task, self.action_bounds())]
-        return True
-
-
-def test_a_task_is_not_pickled_wherever_it_is_kept(make_agent, again, tmp_path):
-    class Code:
-        def __call__(self, states, actions, next_states):
-            return -next_states[:, 0].square()
-
-        def __reduce__(self):
-            raise AssertionError("pickled")
-
-    for steps in (5, 0):  # in a model, in the physics
-        agent = make_agent(KeepingAgent, reward=Code()).learn(steps)
-        agent.improve(agent.known_task())
-        agent.model = agent.kept[0]
+@pytest.mark.parametrize("kept", [lambda agent: agent.task, lambda agent: [agent.task.dynamics]])
+def test_code_of_the_users_is_in_no_checkpoint(make_agent, kept, tmp_path):
+    agent = make_agent(MPCAgent)
+    agent.kept = kept(agent)
+    with pytest.raises(TypeError, match=r"MPCAgent.kept .* neither tasks nor .* in not_saved"):
         agent.save(tmp_path / "run.ckpt")
-        env, task = again(reward=Code())
-        resumed = resume(tmp_path / "run.ckpt", env, task)
-        model, asked, dynamics, mpc = resumed.kept
-        assert asked["asked"] is task
-        assert model is resumed.model is mpc.task
-        assert dynamics is model.dynamics
-        assert (dynamics is task.dynamics) == (steps > 0)
-
-
-def test_a_task_with_other_dynamics_is_refused(make_agent, point_task, tmp_path):
-    agent = make_agent(KeepingAgent)
-    agent.kept = point_task()
-    with pytest.raises(TypeError, match=r"KeepingAgent.kept .* dynamics of its own.* in not_saved"):
-        agent.save(tmp_path / "run.ckpt")
-
-
-def test_a_task_that_an_agent_changed_is_kept(make_agent, again, tmp_path):
-    agent = make_agent(MPCAgent).learn(5)
-    agent.shaped = replace(agent.model, reward=seven)
-    agent.save(tmp_path / "run.ckpt")
-    resumed = resume(tmp_path / "run.ckpt", *again())
-    assert resumed.shaped.reward is seven
-    assert resumed.shaped.dynamics is resumed.model.dynamics
-
-
-def seven(states, actions, next_states):
-    return torch.full((len(states),), -7.0, dtype=torch.float64)
+    assert {*tmp_path.iterdir()} == {tmp_path / "run.ckpt.lock"}
 
 
 class Broken:
@@ -297,7 +264,7 @@ def test_other_files_are_refused(make_agent, again, tmp_path):
 def test_an_environment_that_cannot_be_pickled_is_reset(make_agent, point_env, again, tmp_path):
     path = tmp_path / "run.ckpt"
     with (
-        pytest.warns(UserWarning, match="environment cannot be saved .*pickle"),
+        pytest.warns(UserWarning, match="environment cannot be pickled"),
         pytest.raises(PowerCut),
     ):
         make_agent(MPCAgent, robot(point_env())).learn(TOTAL, [EpisodeCheckpoint(path), cut_at(13)])
@@ -316,12 +283,15 @@ def test_what_does_not_fit_is_refused_before_anything_is_unpickled(
     env, task = again()
     wide = again()[0]
     wide.action_space = gymnasium.spaces.Box(-3, 3, (1,))
-    own = "of another environment: "
+    own = "of another run: "
     for given, message in [
-        ((Shouting(env), task), f"{own}wrappers is .*TimeLimit of Point .*, StepGuard of Shouting"),
+        (
+            (Shouting(env), task),
+            f"{own}environment is .*TimeLimit of Point .*, StepGuard of Shouting",
+        ),
         ((wide, task), rf"{own}action_space is Box\(-2"),
-        ((env, task, PolicySearchAgent), "algorithm is .*:MPCAgent in .*:PolicySearchAgent here"),
-        ((env, again(episode_length=9)[1]), "of another task: episode_length is 5 .*, 9 here"),
+        ((env, task, PolicySearchAgent), "agent is .*:MPCAgent in .*:PolicySearchAgent here"),
+        ((env, again(episode_length=9)[1]), "episode_length is 5 .*, 9 here"),
         ((env, again(initial_states=None)[1]), "initial_states is True .*, False here"),
     ]:
         with pytest.raises(ValueError, match=message):
@@ -340,14 +310,6 @@ def test_another_physics_is_refused(make_agent, point_dynamics, again, learns, t
     make_agent(MPCAgent, **known(0.4)).learn(5).save(tmp_path / "run.ckpt")
     with pytest.raises(RuntimeError, match="physics"):
         resume(tmp_path / "run.ckpt", *again(**known(0.41)))
-
-
-@pytest.mark.parametrize("part", ["steps.pt", "random.pt", "dynamics.pt"])
-def test_numbers_are_read_without_pickle(make_agent, again, tmp_path, part):
-    """A planted pickle in the place of arrays does not run."""
-    path = tmp_path / "run.ckpt"
-    make_agent(MPCAgent).learn(5).save(path)
-    assert_read_without_pickle(path, part, lambda: resume(path, *again()))
 
 
 OTHER = """

@@ -1,10 +1,11 @@
 """What real episodes tell, and how dynamics learn them."""
 
 import math
-from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
+from gymnasium import spaces
 
 from gpadjust.control import Task
 from gpadjust.control.episodes import (
@@ -20,7 +21,9 @@ from gpadjust.dynamics import Dynamics, PhysicsDynamics, StateSpec, Trajectories
 from gpadjust.physics import PhysicsError
 from tests.point import POINT_SPEC
 
-FORCES = torch.tensor([[-1.0], [1.0]]).double()
+ENV = SimpleNamespace(
+    action_space=spaces.Box(-1.0, 1.0, (1,)), get_wrapper_attr=lambda name: {"spec": None}[name]
+)
 SPEC = StateSpec(["x", "angle"], ["force"], angles=["angle"])
 
 
@@ -51,12 +54,13 @@ def reward(states, actions, next_states):
     return -states[:, 0]
 
 
-def task(reward=reward, terminated=None):
-    return Task(PhysicsDynamics(SPEC, lambda X: X[:, :2]), reward, terminated=terminated)
+def task(episode_length=5, reward=reward, **parts):
+    dynamics = PhysicsDynamics(SPEC, lambda X: X[:, :2])
+    return Task(dynamics, reward, episode_length=episode_length, **parts)
 
 
 def test_starts_are_those_of_episodes(recorded):
-    starts = completed(task(), recorded(8), 3, FORCES).initial_states(200)
+    starts = completed(task(3), recorded(8), ENV).initial_states(200)
     assert sorted({*starts[:, 0].tolist()}) == [0, 3, 6]
     assert starts.shape == (200, 2)
 
@@ -69,39 +73,36 @@ def test_bounds_are_far_beyond_what_was_seen(recorded):
 
 
 def test_a_task_is_completed_where_it_says_nothing(recorded):
-    whole = completed(task(), recorded(6), 3, FORCES)
+    whole = completed(task(3), recorded(6), ENV)
     assert whole.episode_length == 3
     assert torch.equal(
         whole.state_bounds, far_bounds(SPEC, recorded(6))
     )  # the physics stays where it is
-    assert completed(replace(whole, episode_length=9), recorded(6), 3, FORCES).episode_length == 9
-    assert completed(task(), recorded(0), 3, FORCES).initial_states is None
+    assert completed(task(3), recorded(0), ENV).initial_states is None
 
 
 def test_bounds_leave_room_for_what_the_physics_reaches(moved):
-    fast = Task(PhysicsDynamics(POINT_SPEC, lambda X: X[:, :1] + 4 * X[:, 1:]), reward)
-    low, high = completed(fast, moved, 5, FORCES).state_bounds
+    fast = Task(
+        PhysicsDynamics(POINT_SPEC, lambda X: X[:, :1] + 4 * X[:, 1:]), reward, episode_length=5
+    )
+    low, high = completed(fast, moved, ENV).state_bounds
     # Two starts, at 1.0 and 1.2, go 20 either way in five steps; half of that range beside it.
     middle, half = 1.1, 0.1 + 20.0
     assert low.item() == pytest.approx(middle - 2 * half, abs=0.5)
     assert high.item() == pytest.approx(middle + 2 * half, abs=0.5)
-    away = Task(PhysicsDynamics(POINT_SPEC, lambda X: 1e6 * X[:, :1]), reward)
-    close, wide = far_bounds(POINT_SPEC, moved), completed(away, moved, 5, FORCES).state_bounds
+    away = Task(PhysicsDynamics(POINT_SPEC, lambda X: 1e6 * X[:, :1]), reward, episode_length=5)
+    close, wide = far_bounds(POINT_SPEC, moved), completed(away, moved, ENV).state_bounds
     assert (wide[1] - wide[0]).item() == pytest.approx(10 * (close[1] - close[0]).item())
-    still = Task(PhysicsDynamics(POINT_SPEC, lambda X: X[:, :1]), reward)
-    assert torch.equal(
-        completed(still, moved, 5, FORCES).state_bounds, far_bounds(POINT_SPEC, moved)
-    )
+    still = Task(PhysicsDynamics(POINT_SPEC, lambda X: X[:, :1]), reward, episode_length=5)
+    assert torch.equal(completed(still, moved, ENV).state_bounds, far_bounds(POINT_SPEC, moved))
 
 
 def test_a_physics_that_fails_everywhere_reaches_nothing(moved):
     def fails(X):
         raise PhysicsError("no", rows=[], partial=None)
 
-    task = Task(PhysicsDynamics(POINT_SPEC, fails), reward)
-    assert torch.equal(
-        completed(task, moved, 5, FORCES).state_bounds, far_bounds(POINT_SPEC, moved)
-    )
+    task = Task(PhysicsDynamics(POINT_SPEC, fails), reward, episode_length=5)
+    assert torch.equal(completed(task, moved, ENV).state_bounds, far_bounds(POINT_SPEC, moved))
 
 
 def test_an_episode_that_a_bound_may_have_held_is_told(moved):
@@ -175,7 +176,7 @@ class Stiff(Own):
 
 
 def scores(dynamics, moved, horizons=()):
-    known = completed(Task(dynamics, reward), moved, 5, FORCES)
+    known = completed(Task(dynamics, reward, episode_length=5), moved, ENV)
     return learn_dynamics(known, moved, moved, horizons)
 
 

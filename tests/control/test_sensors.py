@@ -1,7 +1,7 @@
 """Hidden states: the filter by a dense Gaussian, the smoother by what was simulated, agents."""
 
 from dataclasses import replace
-from functools import partial
+from functools import partial, reduce
 
 import gymnasium as gym
 import numpy as np
@@ -21,7 +21,7 @@ from gpadjust.control import (
     Task,
     resume,
 )
-from gpadjust.control.smoothed_episodes import smooth_episodes
+from gpadjust.control.state_filter import smooth_episodes
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, Trajectories
 from gpadjust.states import Sensors, StateSpec
 from gpadjust.systems import NoisySensors, System, cart_pole
@@ -36,6 +36,10 @@ SEARCH = PolicySearch(updates=4, num_starts=4, num_functions=2)
 def episode_of(observations, actions):
     """An episode of ``T + 1`` observations."""
     return Trajectories(observations[:-1], actions, observations[1:], torch.zeros(len(actions)))
+
+
+def several(episodes):
+    return reduce(Trajectories.append, episodes)
 
 
 def glide(X, drag=0.0):
@@ -147,8 +151,8 @@ def test_an_episode_may_begin_beyond_half_a_turn():
         known = StateFilter(first, torch.tensor([0.03]).double(), torch.tensor([0, 0.01]).double())
         rest = torch.tensor([[zero + 0.1, 0.0]]).double().expand(6, 2)
         seen = episode_of(spec.observe(rest)[:, :2], torch.zeros(5, 1).double())
-        learnt, paths = smooth_episodes(task, known, [seen] * 3, seed=0)
-        off = spec.change(rest.repeat(3, 1), torch.cat(paths))
+        learnt, paths = smooth_episodes(task, known, several([seen] * 3), seed=0)
+        off = spec.change(rest[1:].repeat(3, 1), paths.next_states)
         found.append((learnt.noise, learnt.process_noise, off))
     torch.testing.assert_close(*found, rtol=1e-6, atol=1e-8)
 
@@ -168,12 +172,12 @@ def test_noises_and_hidden_states_are_found():
         truth.append(torch.stack(states))
         seen = truth[-1][:, :1] + 0.05 * torch.from_numpy(rng.normal(size=(41, 1)))
         episodes.append(episode_of(seen, forces))
-    learnt, paths = smooth_episodes(task, known, episodes, seed=0)
+    learnt, paths = smooth_episodes(task, known, several(episodes), seed=0)
     assert abs(learnt.noise.item() / 0.05 - 1) < 0.15
     assert abs(learnt.process_noise[1].item() / 0.1 - 1) < 0.4
-    error = torch.cat(paths) - torch.cat(truth)
+    error = paths.states - torch.cat([path[:-1] for path in truth])
     assert error[:, 1].square().mean().sqrt() < 0.2
-    rough = torch.cat([(path[1:, 1] - path[:-1, 1]).abs() for path in paths]) - STEP
+    rough = (paths.next_states - paths.states)[:, 1].abs() - STEP
     assert rough.square().mean().sqrt() > 0.05  # as the machine's; the most likely path is smooth
 
 
@@ -349,9 +353,9 @@ def test_what_nothing_disturbs_stays_as_it_is_and_starts_vary_together():
     known = StateFilter.guessed(task, torch.tensor([[-1.0], [1.0]]).double())
     assert known.process_noise[1] == 0
     seen = episode_of(torch.full((5, 1), 2.0).double(), torch.zeros(4, 1).double())
-    learnt, paths = smooth_episodes(task, known, [seen] * 3, 0)
+    learnt, paths = smooth_episodes(task, known, several([seen] * 3), 0)
     assert learnt.process_noise[1] == 0
-    assert (torch.stack(paths)[..., 1] - 2).abs().max() < 0.2
+    assert (paths.states[:, 1] - 2).abs().max() < 0.2
 
 
 def test_guesses_of_a_system_that_runs_away_are_those_of_its_first_steps():

@@ -280,7 +280,7 @@ FAULTS = (
     Fault(
         "gpadjust/control/checkpoint.py",
         "    agent._random_state = random_state\n",
-        "    random_state.restore()\n",
+        "    from gpadjust.control.episodes import set_generators as go\n    go(random_state)\n",
         "The generators are restored when the agent is read, not when it goes on to learn.",
     ),
     Fault(
@@ -308,7 +308,7 @@ FAULTS = (
         "A measured angle beyond half a turn throws the estimate a turn back.",
     ),
     Fault(
-        "gpadjust/control/smoothed_episodes.py",
+        "gpadjust/control/state_filter.py",
         "near = [path[0] + spec.change(path[0], first) for path in paths]",
         "near = [first for path in paths]",
         "The start of a smoothed episode is a turn away from its first measured angle.",

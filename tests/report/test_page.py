@@ -32,7 +32,7 @@ def test_a_comparison(comparison, tmp_path, read):
     assert all(len(image["alt"]) > 10 for image in page.images)
     _the_table_is_that_of(comparison, page)
     (verdict,) = comparison.verdict.values()
-    assert f"{_three(comparison)} {verdict.answer} {' '.join(verdict.reasons)}" in page.text
+    assert f"{verdict.answer} {' '.join(verdict.reasons)} {_three(comparison)}" in page.text
     for sentence in comparison.advice:
         assert sentence.replace("+-", "±") in page.text
     _left_out_is_that_of(comparison.leave_one_out(), page)
@@ -127,7 +127,7 @@ def test_the_verdict_and_its_color(comparison):
         verdict = Verdict(answer, ["One reason.", "Another."])
         shown = cards(subject_of(dataclasses.replace(comparison, verdict={"y": verdict})))
         page = beside(shown)
-        assert Page(page).text == f"{_three(comparison)} {answer} One reason. Another."
+        assert Page(page).text == f"{answer} One reason. Another. {_three(comparison)}"
         assert f'class="card {color}"' in page
         assert headline(shown, "Errors").endswith(f"\n{answer}. One reason.")
 

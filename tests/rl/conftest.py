@@ -15,6 +15,8 @@ from gpadjust.systems.swing_up import CART_POLE_SPEC, REAL_CART_POLE, equation_p
 from tests.point import *  # noqa: F403
 from tests.point import assert_equal
 
+COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+
 
 @pytest.fixture
 def point_agent(point_env, point_task):
@@ -68,7 +70,8 @@ def tensors_of():
             "parameters": agent.get_parameters(),
             "dynamics": agent.task.dynamics.state_dict(),
             "log_ent_coef": getattr(agent, "log_ent_coef", None),
-            "buffers": [[getattr(each, name) for name in each.rows] for each in buffers],
+            "buffers": [[getattr(each, name) for name in COLUMNS] for each in buffers],
+            "episodes": [vars(agent.replay_buffer.episodes), agent.replay_buffer.num_learnt],
             "counts": [agent.num_timesteps, agent.num_episodes, agent._n_updates],
             "normalised": normalizer and [vars(normalizer.obs_rms), vars(normalizer.ret_rms)],
         }

@@ -5,6 +5,7 @@ import pickle
 
 import numpy as np
 import pytest
+import torch
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
@@ -23,7 +24,7 @@ def buffer():
         for i in range(1, num_real + 1):
             made.add(*real_row(i, n_envs))
         if num_model:
-            made.model_buffer.add_rows(*rows(np.arange(-1, -num_model - 1, -1)))
+            made.add_model_rows(*rows(np.arange(-1, -num_model - 1, -1)))
         return made
 
     return make
@@ -77,17 +78,18 @@ def test_terminations_by_the_time_limit_are_not_dones(buffer):
     made = buffer(0, 0)
     obs, following, actions, rewards, _, _ = rows(np.arange(1, 4))
     dones, timeouts = np.array([0, 1, 1], dtype=bool), np.array([0, 0, 1], dtype=bool)
-    made.model_buffer.add_rows(obs, following, actions, rewards, dones, timeouts)
+    made.add_model_rows(obs, following, actions, rewards, dones, timeouts)
     batch = made.sample(64)
     np.testing.assert_array_equal(batch.dones, batch.rewards == 2)
 
 
 @pytest.mark.parametrize("chunks", [[3, 4], [7, 2, 5], [10], [4, 10], [3, 23], [25, 1], [0, 2]])
 def test_add_rows_keeps_the_newest_rows_in_order(buffer, chunks):
-    many, one = buffer(model_buffer_size=10).model_buffer, buffer(buffer_size=10)
+    mixed, one = buffer(model_buffer_size=10), buffer(buffer_size=10)
+    many = mixed.model_buffer
     start = 1
     for size in chunks:
-        many.add_rows(*rows(np.arange(start, start + size)))
+        mixed.add_model_rows(*rows(np.arange(start, start + size)))
         start += size
     for i in range(1, start):
         one.add(*real_row(i))
@@ -125,7 +127,7 @@ def test_a_copy_goes_on_as_the_buffer_would(buffer, num_rows, copied):
     again = copied(made)
     for side in (made, again):
         side.add(*real_row(99))
-        side.model_buffer.add_rows(*rows(np.array([-98, -99])))
+        side.add_model_rows(*rows(np.array([-98, -99])))
         np.random.seed(1)  # noqa: NPY002
         side.batch = side.sample(40)
     for one, other in zip(made.batch[:-1], again.batch[:-1], strict=True):
@@ -133,12 +135,6 @@ def test_a_copy_goes_on_as_the_buffer_would(buffer, num_rows, copied):
     for one, other in [(made, again), (made.model_buffer, again.model_buffer)]:
         assert (one.pos, one.full) == (other.pos, other.full)
         np.testing.assert_array_equal(one.observations, other.observations)
-
-
-def test_pickles_are_as_small_as_what_they_hold(buffer):
-    small = len(pickle.dumps(buffer(10, 10, buffer_size=100_000)))
-    assert small < 20_000
-    assert len(pickle.dumps(buffer(10, 1010, buffer_size=100_000))) > small + 1000 * 6 * 4
 
 
 def test_samples_are_normalised(buffer, point_env):
@@ -162,4 +158,40 @@ def test_samples_are_normalised(buffer, point_env):
 def test_reset_empties_both(buffer):
     made = buffer(5, 5)
     made.reset()
-    assert made.size() == made.model_buffer.size() == 0
+    assert made.size() == made.model_buffer.size() == len(made.episodes) == 0
+
+
+# Real episodes
+
+
+def played(num_steps, n_envs=1, failing=()):
+    """A buffer of steps 0, 1, ... (plus 100 in the second environment) in episodes of three."""
+    wide = spaces.Box(-4, 4, (1,))
+    made = MixedReplayBuffer(5 * n_envs, OBSERVATIONS, wide, "cpu", n_envs)
+    for t in range(num_steps):
+        obs = np.stack([t + 100.0 * np.arange(n_envs), np.zeros(n_envs)], -1)
+        ends = np.full(n_envs, (t + 1) % 3 == 0)
+        infos = [
+            {"TimeLimit.truncated": t == 2, "step_failed": (t, i) in failing} for i in range(n_envs)
+        ]
+        made.add(obs, obs + 0.5, np.full((n_envs, 1), 0.25), -obs[:, 0], ends, infos)
+    return made
+
+
+def test_episodes_that_have_ended_are_in_the_users_units():
+    """Also of steps that the learner has forgotten, as there is room for five."""
+    found = played(8).episodes  # of the third episode, which goes on, there is nothing yet
+    assert found.states.dtype == found.actions.dtype == torch.float64
+    assert found.states[:, 0].tolist() == found.rewards.neg().tolist() == [0, 1, 2, 3, 4, 5]
+    assert torch.equal(found.next_states, found.states + 0.5)
+    assert torch.equal(found.actions, torch.ones(6, 1).double())
+    assert found.steps.tolist() == 2 * [1, 2, 3]
+    assert found.terminated.tolist() == 5 * [False] + [True]
+    made = played(8)
+    made.end_episodes()
+    assert made.episodes.states[6:, 0].tolist() == [6, 7]
+
+
+def test_episodes_of_several_environments_are_apart_and_end_where_a_step_failed():
+    found = played(4, 2, failing=[(1, 0), (3, 1)]).episodes
+    assert [part.states[:, 0].tolist() for part in found.episodes()] == [[0], [2], [100, 101, 102]]

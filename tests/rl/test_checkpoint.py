@@ -135,7 +135,7 @@ def test_an_environment_that_cannot_be_pickled_is_reset_but_its_wrappers_keep_th
     path = tmp_path / "run.ckpt"
     agent = point_agent(normalised())
     agent.notes["costs"] = [1.0]
-    with pytest.warns(UserWarning, match="environment cannot be saved .*pickle"):
+    with pytest.warns(UserWarning, match="environment cannot be pickled"):
         agent.learn(10, CallbackList([EpisodeCheckpoint(path)]))
     again = resume(path, normalised(), point_task())
     assert again.notes == {"costs": [1.0]}
@@ -154,12 +154,12 @@ def test_what_does_not_fit_is_refused_before_anything_is_unpickled(
     forbid_unpickling(monkeypatch)
     for file, env, algorithm, message in [
         (path, Shouting(point_env()), DynaSAC, "DummyVecEnv of StepGuard of Monitor of Shout"),
-        (path, wrapped(["normalised"]), DynaSAC, "wrappers is"),
+        (path, wrapped(["normalised"]), DynaSAC, "environment is"),
         (
             path,
             point_env(),
             DynaTD3,
-            "of another algorithm: algorithm is .*:DynaSAC in .*:DynaTD3 here",
+            "of another run: agent is .*:DynaSAC in .*:DynaTD3 here",
         ),
         (tmp_path / "two", point_env(), DynaSAC, "num_envs is 2 in the checkpoint, 1 here"),
     ]:

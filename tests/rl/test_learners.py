@@ -8,10 +8,9 @@ from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckA
 
 from gpadjust.control import Task
 from gpadjust.rl import Dyna, DynaOptions, DynaSAC, DynaTD3
-from gpadjust.rl.buffer import CompactReplayBuffer
 from gpadjust.systems.swing_up import cart_pole_reward, cart_pole_start
 from tests.point import assert_equal
-from tests.rl.conftest import model_rows
+from tests.rl.conftest import COLUMNS, model_rows
 
 
 def test_one_that_never_uses_its_model_is_the_learner(point_agent, point_env, normalised):
@@ -37,7 +36,7 @@ def test_one_that_never_uses_its_model_is_the_learner(point_agent, point_env, no
         for (name, weights), (other, expected) in pairs:
             assert name == other
             assert torch.equal(weights, expected), name
-        for name in CompactReplayBuffer.rows:
+        for name in COLUMNS:
             one, other = (getattr(agent.replay_buffer, name) for agent in (ours, theirs))
             np.testing.assert_array_equal(one, other)
         assert model_rows(ours) == 0

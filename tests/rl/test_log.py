@@ -138,8 +138,8 @@ def test_scores_of_trajectories_are_logged_and_change_nothing(
 def test_progress_is_printed(point_agent, capsys):
     point_agent().learn(10, [print_progress])
     lines = capsys.readouterr().out.splitlines()
-    assert [line.partition(" ")[0] for line in lines] == ["trial", "fit:"] * 2
-    assert re.fullmatch(r"trial 2: reward -\d\S* a step, 5 steps in \d+\.\d s", lines[2])
+    assert [line.partition(" ")[0] for line in lines] == ["trial:", "fit:"] * 2
+    assert re.match(r"trial: number 2, steps 5, reward -\d\S*, seconds ", lines[2])
 
 
 def test_its_representation_says_what_it_is(point_agent):

@@ -12,8 +12,7 @@ from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 from gpadjust.control import Task
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
 from gpadjust.physics import PhysicsError
-from gpadjust.rl import ModelVecEnv
-from gpadjust.rl.buffer import CompactReplayBuffer
+from gpadjust.rl import MixedReplayBuffer, ModelVecEnv
 from gpadjust.systems.swing_up import cart_pole_reward, cart_pole_start
 
 WEIGHT = torch.ones(1, requires_grad=True)
@@ -251,10 +250,11 @@ def test_functions_whose_physics_fails_at_any_row(point_particles, choosy_dynami
     """Rows are filled up to blocks of one size, which the physics may blame."""
     env = point_particles(dynamics=choosy_dynamics, sampling="trajectory", num_envs=3)
     env.reset()
-    buffer = CompactReplayBuffer(20, env.observation_space, env.action_space, "cpu")
+    mixed = MixedReplayBuffer(20, env.observation_space, env.action_space, "cpu")
+    buffer = mixed.model_buffer
     scaled = np.where(np.arange(7) == failing, 1.0, 0.1)[:, None]
     zeros = np.zeros(7, dtype=np.float32)
-    buffer.add_rows(np.ones((7, 1)), np.ones((7, 1)), scaled, zeros, zeros, zeros)
+    mixed.add_model_rows(np.ones((7, 1)), np.ones((7, 1)), scaled, zeros, zeros, zeros)
     env.refresh(buffer)
     left = buffer.dones[:7, 0].astype(bool)
     assert left.nonzero()[0].tolist() == [failing]
@@ -275,10 +275,11 @@ def test_refreshed_transitions_end_as_the_model_has_it(
     point_particles, unsure_dynamics, sampling, rows
 ):
     env = point_particles(dynamics=unsure_dynamics, sampling=sampling)
-    buffer = CompactReplayBuffer(20, env.observation_space, env.action_space, "cpu")
+    mixed = MixedReplayBuffer(20, env.observation_space, env.action_space, "cpu")
+    buffer = mixed.model_buffer
     states = np.linspace(0.1, 0.9, rows, dtype=np.float32)[:, None]
     zeros = np.zeros(rows, dtype=np.float32)
-    buffer.add_rows(states, states + 99, 0.2 * states, zeros, zeros, zeros)
+    mixed.add_model_rows(states, states + 99, 0.2 * states, zeros, zeros, zeros)
     env.refresh(buffer)
     assert buffer.size() == rows
     mean, variance = unsure_dynamics.predict(
@@ -320,9 +321,10 @@ def test_functions_are_drawn_once_for_what_is_refreshed_and_the_episodes_after(
         unsure_dynamics, "sample_functions", lambda n, *seed: drawn.append(n) or draw(n, *seed)
     )
     env = point_particles(dynamics=unsure_dynamics, sampling="trajectory")
-    buffer = CompactReplayBuffer(5, env.observation_space, env.action_space, "cpu")
+    mixed = MixedReplayBuffer(5, env.observation_space, env.action_space, "cpu")
+    buffer = mixed.model_buffer
     zeros = np.zeros(2)
-    buffer.add_rows(np.ones((2, 1)), np.ones((2, 1)), np.ones((2, 1)), zeros, zeros, zeros)
+    mixed.add_model_rows(np.ones((2, 1)), np.ones((2, 1)), np.ones((2, 1)), zeros, zeros, zeros)
     env.refresh(buffer)
     env.reset()
     assert drawn == [3]
