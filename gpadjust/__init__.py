@@ -40,10 +40,19 @@ Other physics, with unknown parameters or without::
     law = FunctionPhysics(lambda X, p: p.gain * X[:, 0], unknowns={"gain": Unknown(1.0, factor=2)})
     CalibratedPhysics(X, Y, physics=law)         # the law alone
 
+Each object draws itself, and is a table in a notebook::
+
+    model.plot()                                 # predictions, rho and delta; also of a mixture
+    comparison.plot()                            # of compare: left-out predictions, and scores
+    parameters.plot()                            # model.physics_parameters: posterior and prior
+    leave_one_out(model).plot()                  # left-out predictions, and their residuals
+    collection.plot()                            # of collect: its path, and the best so far
+    identification.plot()                        # of identify: free runs
+
 Beyond the models::
 
     from gpadjust.validation import leave_one_out, trust   # do the intervals hold what they say?
-    from gpadjust.validation.plots import plot_model       # predictions, rho and delta
+    from gpadjust.validation.plots import plot_adjustment  # rho and delta; others beside it
     from gpadjust.report import report                     # a page to show
     from gpadjust.active import collect                    # the next point to measure
     from gpadjust.records import Records, smooth           # log files of machines, as they are

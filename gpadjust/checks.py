@@ -8,8 +8,11 @@ TypeError, a wrong value or shape a ValueError; both say what was found and what
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
+from contextvars import ContextVar
+from importlib.util import find_spec
 from numbers import Real
 from operator import index
 from typing import Any
@@ -307,6 +310,36 @@ def progress_bar(shown: bool, iterable: Iterable[Any] = (), **options: Any) -> A
     except ImportError as error:
         raise ImportError("A progress bar needs tqdm; run `pip install tqdm`.") from error
     return tqdm(iterable, **options)
+
+
+_BAR: ContextVar[Any] = ContextVar("bar", default=None)
+_PATIENCE = 5.0  # seconds, before long work shows a bar
+
+
+@contextmanager
+def long_work(text: str, unit: str) -> Iterator[None]:
+    """Show a bar of what :func:`tick` counts in a block, if that takes more than five seconds.
+
+    It is shown in a terminal or a notebook, if tqdm is installed.
+    """
+    is_seen = hasattr(sys, "ps1") or (sys.stderr is not None and sys.stderr.isatty())
+    if not is_seen or find_spec("tqdm") is None:
+        yield
+        return
+    options: dict[str, Any] = {"delay": _PATIENCE, "leave": False, "miniters": 1}
+    with progress_bar(True, desc=text, unit=unit, **options) as bar:
+        token = _BAR.set(bar)
+        try:
+            yield
+        finally:
+            _BAR.reset(token)
+
+
+def tick() -> None:
+    """Count a unit of the long work that is going on, if any is."""
+    bar = _BAR.get()
+    if bar is not None:
+        bar.update()
 
 
 @contextmanager

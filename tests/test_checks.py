@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from gpadjust import ZeroMeanGP, checks, fit
 from gpadjust.checks import (
     check_choice,
     check_columns,
@@ -24,6 +25,7 @@ from gpadjust.checks import (
     finite_array,
     progress_bar,
 )
+from tests.systems import line
 
 NAN = math.nan
 
@@ -180,3 +182,15 @@ def test_tqdm_is_needed_where_one_is_shown(monkeypatch):
     assert [*progress_bar(False, [5, 6])] == [5, 6]
     with pytest.raises(ImportError, match="pip install tqdm"):
         progress_bar(True, [5, 6])
+
+
+def test_a_fit_shows_a_bar_after_five_seconds_where_somebody_sees_it(capsys, monkeypatch):
+    X = line(5)
+    for is_seen, patience in ((True, 5.0), (False, 0.0), (True, 0.0)):
+        monkeypatch.setattr(sys.stderr, "isatty", lambda is_seen=is_seen: is_seen, raising=False)
+        monkeypatch.setattr(checks, "_PATIENCE", patience)
+        fit(ZeroMeanGP(X, X.sin()), "map")
+        assert ("evaluations" in capsys.readouterr().err) == (is_seen and patience == 0)
+    monkeypatch.setitem(sys.modules, "tqdm", None)
+    fit(ZeroMeanGP(X, X.sin()), "map")
+    assert not capsys.readouterr().err

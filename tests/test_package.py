@@ -22,6 +22,7 @@ import gpadjust
 from gpadjust import RRA
 from gpadjust.kinds import pyro_model
 from tests.systems import line
+from tests.test_display import OBJECTS
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -86,6 +87,7 @@ def test_the_core_brings_no_more_than_botorch():
 
 
 NEEDED = {
+    "matplotlib": ("plot", lambda: RRA(line(5), line(5), physics=torch.sin).plot()),
     "torchdiffeq": ("ode", lambda: gpadjust.ODEPhysics(lambda s, a: -s, 0.1, 1, method="dopri5")),
     "pyro": ("pyro", lambda: pyro_model(RRA(line(5), line(5), physics=torch.sin))),
 }
@@ -116,6 +118,8 @@ def test_each_line_of_the_cheat_sheet_runs(tmp_path, monkeypatch):
     names |= {name: getattr(gpadjust.kinds, name) for name in gpadjust.kinds.__all__}
     frame = pd.DataFrame({"x": X[:, 0], "rig": ["old", "new"] * 3})
     names |= {"simulator": np.sin, "rate": rate, "frame": frame}
+    names |= {name: make() for name, (make, *_) in OBJECTS.items()}
+    names["leave_one_out"] = gpadjust.validation.leave_one_out
     calls = re.findall(r"^ {4}(.+)", inspect.getdoc(gpadjust), flags=re.MULTILINE)
     assert len(calls) > 25
     for call in calls:

@@ -61,7 +61,7 @@ def execute(notebook: NotebookNode) -> None:
         resources={"metadata": {"path": FOLDER}},
     )
     # Models this small are slower with more threads.
-    client.execute(env={"OMP_NUM_THREADS": "1", **os.environ})
+    client.execute(env={"OMP_NUM_THREADS": "1", "TQDM_DISABLE": "1", **os.environ})
     notebook.metadata = nbformat.from_dict(KEPT)
     for cell in notebook.cells:
         cell.metadata = nbformat.from_dict({})

@@ -33,7 +33,9 @@ from gpadjust.checks import (
     seeded,
 )
 from gpadjust.core import fit as fit_by_default
+from gpadjust.display import Display, html_table
 from gpadjust.kinds.factory import ModelFactory, make_model
+from gpadjust.words import number
 
 
 class MeasurementWarning(UserWarning):
@@ -58,7 +60,7 @@ class CollectionError(RuntimeError):
         return str(self.args[0])
 
 
-class Collection(Measurements):
+class Collection(Measurements, Display):
     """Chooses where to measure, for a laboratory that measures when it can.
 
     :meth:`ask` says where, :meth:`tell` takes what came out, in any order and for any points; where
@@ -210,6 +212,20 @@ class Collection(Measurements):
             f"{len(self.pending)} pending{left}; inputs: {self.bounds.shape[-1]}, outputs: {m}; "
             f"{self._place()})"
         )
+
+    def _repr_html_(self) -> str:
+        """Return the lowest and the highest measurement of each output, and the last one."""
+        rows = {"last": len(self.X) - 1} if len(self.X) else {}
+        for j, values in enumerate(self.Y.mT):
+            if not values.isnan().all():
+                rows[f"lowest y{j + 1}"] = int(values.nan_to_num(nan=torch.inf).argmin())
+                rows[f"highest y{j + 1}"] = int(values.nan_to_num(nan=-torch.inf).argmax())
+        numbers = torch.cat([self.X, self.Y], -1).tolist()
+        inputs, outputs = self.X.shape[-1], self.Y.shape[-1]
+        head = ["", "number"]
+        head += [f"x{i + 1}" for i in range(inputs)] + [f"y{j + 1}" for j in range(outputs)]
+        table = [[name, str(k + 1), *map(number, numbers[k])] for name, k in rows.items()]
+        return html_table(repr(self), head, table)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state of a copy or a pickle, whose log is its own and not held."""
@@ -435,13 +451,13 @@ class Collection(Measurements):
 
     def _resume(self, log: MeasurementLog) -> None:
         """Take in what is in the log."""
-        for number, record in enumerate(log.open(self.bounds.tolist()), start=2):
+        for line, record in enumerate(log.open(self.bounds.tolist()), start=2):
             try:
                 self._take(record)
             except (KeyError, TypeError, ValueError, RuntimeError) as error:
                 m = "any number of" if self.num_outputs is None else self.num_outputs
                 raise ValueError(
-                    f"Line {number} of the log {log.path}, {str(record)[:80]}, does not belong to "
+                    f"Line {line} of the log {log.path}, {str(record)[:80]}, does not belong to "
                     f"this collection of {self.bounds.shape[-1]} inputs and {m} outputs "
                     f"({type(error).__name__}: {error}). Remove it, or name another file."
                 ) from error

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from gpadjust.checks import long_work
 from gpadjust.core.noise import Noise
 from gpadjust.core.sample import (
     GROUPS,
@@ -98,7 +99,8 @@ def fit(
     prior up to 40 points, from Laplace's approximation beyond; beyond 100 points (200 if outputs
     share unknown numbers, as parameters of a physics) its draws are weighted once and not moved.
     Nested models are drawn from apart and pooled by their posterior probabilities. ``"map"``
-    brings the numbers of the whole model to their most likely values.
+    brings the numbers of the whole model to their most likely values. After five seconds a bar of
+    tqdm shows that it goes on.
 
     Args:
         model: The model.
@@ -131,7 +133,7 @@ def fit(
     if model.data.Y.dim() > 2:
         batch = tuple(model.batch_shape)
         raise ValueError(f"Expected a model of one data set; found fantasies, a batch {batch}.")
-    with threads_for(len(model.data.Y)):
+    with threads_for(len(model.data.Y)), long_work("fit", " evaluations"):
         result: FitResult | None = model.fit_itself(method, num_draws, seed)
         if result is None:
             result = _fitted(model, method, num_draws, seed)

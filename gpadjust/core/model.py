@@ -22,6 +22,7 @@ from gpytorch.priors import NormalPrior
 from linear_operator import to_linear_operator
 from torch import Size, Tensor
 
+from gpadjust.checks import tick
 from gpadjust.core.data import ArrayLike, Data, appended, as_given, as_tensor, unit_of
 from gpadjust.core.functions import Functions, Paths
 from gpadjust.core.gaussian import (
@@ -35,7 +36,7 @@ from gpadjust.core.gaussian import (
 from gpadjust.core.kernels import DELTA, RHO, as_kernel
 from gpadjust.core.noise import KnownNoise, Noise
 from gpadjust.core.posterior import MixturePosterior
-from gpadjust.core.summary import counted, summary
+from gpadjust.core.summary import counted, summary, summary_html
 from gpadjust.core.terms import Places, Term, TermSum, WeightedSum
 from gpadjust.core.unknowns import Choice, Row, Table, Values
 from gpadjust.core.views import (
@@ -45,6 +46,7 @@ from gpadjust.core.views import (
     likelihood_view,
     squeezed,
 )
+from gpadjust.display import Display
 from gpadjust.physics import Physics, PhysicsError, Unknown, as_physics
 from gpadjust.physics.parameters import PhysicsParameters
 
@@ -62,7 +64,7 @@ _ENTRIES = 150_000  # of covariances that are computed at once, which caches hol
 _STEP = 1e-4  # of differences by parameters of a physics, in coordinates
 
 
-class Predictive(Model, FantasizeMixin):
+class Predictive(Model, FantasizeMixin, Display):
     """A model whose predictions are mixtures of equally likely Gaussians.
 
     A subclass has ``components`` of X and observation_noise, the means and variances of each,
@@ -328,6 +330,7 @@ class GP(gpytorch.models.GP, Predictive):
         parts = []
         for rows in torch.arange(len(u)).split(max(1, _ENTRIES // (n * n * m))):
             own = {name: [each[rows] for each in by_f] for name, by_f in slopes.items()}
+            tick()
             part = self._log_likelihood(u[rows], [each[rows] for each in f], own, with_gradient)
             parts.append(part)
         value, gradient = (torch.cat(each) for each in zip(*parts, strict=True))
@@ -867,6 +870,9 @@ class GP(gpytorch.models.GP, Predictive):
         d = self.data.X.shape[-1]
         counts = {"point": n, "input": d, "output": m, "draw": len(self.u)}
         return f"{type(self).__name__}({counted(counts)})"
+
+    def _repr_html_(self) -> str:
+        return summary_html(self)
 
 
 @DrawMatheronPaths.register(Predictive)  # type: ignore[untyped-decorator]

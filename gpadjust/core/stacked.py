@@ -16,6 +16,7 @@ from gpadjust.core.data import ArrayLike, Data
 from gpadjust.core.gaussian import DRAWS, Marginals
 from gpadjust.core.model import GP, Predictive
 from gpadjust.core.posterior import MixturePosterior
+from gpadjust.display import html_table
 
 _ROUNDS = 1000  # of the search for weights
 
@@ -191,6 +192,10 @@ class StackedGP(Wrapper):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({len(self.picks)} components of {', '.join(self.names)})"
+
+    def _repr_html_(self) -> str:
+        rows = [[name, *(f"{w:.0%}" for w in own)] for name, own in self.weights.items()]
+        return html_table(repr(self), ["weights", *self.data.output_names], rows)
 
 
 class StackedFunctions(Module):

@@ -10,13 +10,31 @@ from torch import Tensor
 
 from gpadjust.core.terms import Term
 from gpadjust.core.unknowns import Values
+from gpadjust.display import html_table
 
 _SD = "standard deviation"
 
 
-@torch.no_grad()
 def summary(model: Any) -> str:
     """Return the unknown numbers of a model, medians of its draws and ranges of 95 % of them."""
+    first, *lines = _lines(model)
+    if model.physics_parameters:
+        table = indent(repr(model.physics_parameters), "  ")
+        lines = ["parameters of the physics:", table, *lines]
+    return "\n".join([first, *lines])
+
+
+def summary_html(model: Any) -> str:
+    """Return the same as tables of HTML."""
+    first, *lines = _lines(model)
+    table = html_table(first, (), [line.partition(": ")[::2] for line in lines])
+    parameters = model.physics_parameters
+    return table + parameters._repr_html_() if parameters else table
+
+
+@torch.no_grad()
+def _lines(model: Any) -> list[str]:
+    """Return what the model is, and the numbers of each output."""
     values, X = model.table.values(model.draws), model.data.X
     variance = model.noise.variance(values, model.places(X, values, model.noise.has_shares), True)
     n, d = X.shape[-2:]
@@ -25,8 +43,6 @@ def summary(model: Any) -> str:
     parts += [] if model.is_fitted else ["not fitted"]
     parts += [f"of {model.scale_formula}"] if model.scale_formula else []
     lines = [f"{type(model).__name__}: {', '.join(parts)}"]
-    if model.physics_parameters:
-        lines += ["parameters of the physics:", indent(repr(model.physics_parameters), "  ")]
     for j, name in enumerate(model.data.output_names):
         own = {key: v[:, j] if v.dim() == 3 else v for key, v in values.items()}
         lines.append(f"{name}:")
@@ -38,7 +54,7 @@ def summary(model: Any) -> str:
         for term in model.terms:
             lines += _of_term(model, term, own, j)
         lines += _of_noise(model, variance[..., j, :].sqrt() * model.unit[j], j)
-    return "\n".join(lines)
+    return lines
 
 
 def counted(counts: dict[str, int]) -> str:

@@ -102,7 +102,10 @@ def plot_free_run(
         ax.set(xlabel="steps" if step is None else called["time"])
     if axes is None:
         handles, texts = grid[0, 0].get_legend_handles_labels()
-        where: dict[str, Any] = {"ncols": len(texts), "loc": "outside upper center"}
+        where: dict[str, Any] = {
+            "ncols": min(len(texts), 2 * len(rows)),
+            "loc": "outside upper center",
+        }
         grid[0, 0].figure.legend(handles, texts, frameon=False, **where)
     else:
         legend(grid[0, 0])

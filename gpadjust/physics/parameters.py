@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.checks import check_level
+from gpadjust.display import Display, html_table
 from gpadjust.physics.unknown import Unknown
 
 
@@ -28,7 +29,7 @@ class ParameterValues(dict[str, Any]):
         raise AttributeError(f"Unknown parameter {name!r}; expected one of {', '.join(self)}.")
 
 
-class PhysicsParameters(ParameterValues):
+class PhysicsParameters(ParameterValues, Display):
     """The posterior of the unknown parameters of a physics, as draws.
 
     It maps names to ``K`` draws each, of ``draws``, ``K x p``: one, the value itself, after a point
@@ -63,11 +64,20 @@ class PhysicsParameters(ParameterValues):
         low, high = self.draws.quantile(ends, dim=0)
         return low, high
 
-    def __repr__(self) -> str:
+    def _rows(self) -> list[tuple[str, str, str, str, str]]:
+        """Return the head and the rows of the table."""
         low, high = self.interval()
         rows = [("", "mean", "95 % interval", "prior", "unit")]
         for i, (name, unknown) in enumerate(self.unknowns.items()):
             interval = f"{low[i]:.4g} to {high[i]:.4g}" if low[i] < high[i] else "-"  # a point fit
             rows.append((name, f"{self.mean[i]:.4g}", interval, unknown.prior_text, unknown.unit))
+        return rows
+
+    def __repr__(self) -> str:
+        rows = self._rows()
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         return "\n".join("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)
+
+    def _repr_html_(self) -> str:
+        head, *rows = self._rows()
+        return html_table("Parameters of the physics", head, rows)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gpadjust.checks import checked_number, checked_whole
 from gpadjust.core import Prediction
+from gpadjust.display import Display, html_table
 from gpadjust.dynamics import Dynamics, FreeRun, PhysicsDynamics, Windows
 from gpadjust.dynamics.base import TransitionFunctions
 from gpadjust.dynamics.targets import one_physics
@@ -20,6 +21,7 @@ from gpadjust.physics.parameters import PhysicsParameters
 from gpadjust.records.records import Records, control_steps
 from gpadjust.records.smoothing import SmoothedRecords, smooth
 from gpadjust.states import StateSpec
+from gpadjust.words import number, percent
 
 GUESSES, IDENTIFIED, PERSISTENCE = "guesses", "identified", "persistence"
 FEW = 0.9  # of measurements in intervals of 95 %
@@ -31,7 +33,7 @@ _NEAR_A_TURN = 0.12
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class Identification:
+class Identification(Display):
     """A machine as its log shows it, as :func:`identify` finds it.
 
     Attributes:
@@ -124,6 +126,16 @@ class Identification:
             lines.append(f"  {name}: {', '.join(f'{e:.3g}' for e in error[places].tolist())}")
         shares = ", ".join(f"{100 * share:.0f} %" for share in self.coverage[places].tolist())
         return "\n".join([*lines, f"  in intervals of 95 %: {shares}"])
+
+    def _repr_html_(self) -> str:
+        parameters = "" if self.parameters is None else self.parameters._repr_html_()
+        caption = f"Errors of free runs of {self.windows.measured.shape[1]} steps"
+        columns = [*map(torch.Tensor.tolist, self.errors.values()), self.coverage.tolist()]
+        rows = [
+            [name, *map(number, errors), "hidden" if name in self.hidden else percent(share)]
+            for name, *errors, share in zip(self.spec.states, *columns, strict=True)
+        ]
+        return parameters + html_table(caption, ["", *self.errors, "in 95 %"], rows)
 
 
 def identify(

@@ -1,4 +1,7 @@
-"""The figure of a record of a machine; it needs matplotlib, ``pip install gpadjust[plot]``."""
+"""Figures of a record of a machine and of its identification.
+
+They need matplotlib, ``pip install gpadjust[plot]``.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +12,13 @@ from typing import Any
 import matplotlib.pyplot as plt
 import torch
 
-from gpadjust.dynamics.plots import going_on, labels
+from gpadjust.dynamics.plots import going_on, labels, plot_free_run
+from gpadjust.records.identification import IDENTIFIED, Identification
 from gpadjust.records.records import Record, Records
 from gpadjust.states import StateSpec
 from gpadjust.validation.plots import BLUE, GREY, given_axes, tidy
 
-__all__ = ["plot_record"]
+__all__ = ["plot_identification", "plot_record"]
 
 
 def plot_record(
@@ -71,3 +75,14 @@ def plot_record(
     axes[-1].set(xlabel=called["time"])
     axes[0].figure.align_ylabels(list(axes))
     return axes
+
+
+def plot_identification(identification: Identification, **options: Any) -> Any:
+    """Draw the free runs that judge an identification, beside the measurements.
+
+    Options and axes are those of :func:`~gpadjust.dynamics.plots.plot_free_run`.
+    """
+    others = {**identification.runs}
+    run, step = others.pop(IDENTIFIED), identification.step
+    defaults: dict[str, Any] = {"others": others, "step": step}
+    return plot_free_run(run, identification.windows, **defaults | options)

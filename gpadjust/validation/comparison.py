@@ -25,6 +25,7 @@ from gpadjust.core import (
     fit,
 )
 from gpadjust.core.data import ArrayLike, Data
+from gpadjust.display import Display, html_table
 from gpadjust.kinds.factory import ModelFactory, make_model, with_options
 from gpadjust.physics import Physics, PhysicsWarning, as_physics
 from gpadjust.validation.leave_one_out import ROUNDING, LeaveOneOut, leave_one_out
@@ -45,6 +46,7 @@ from gpadjust.validation.verdict import (
     unsampled,
     verdict_on,
 )
+from gpadjust.words import number, percent
 
 STACKED = "stacked"  # what a comparison calls the mixture of all structures
 _ALL = 0.95  # weight of a structure that needs no others
@@ -80,7 +82,7 @@ STRUCTURES = (
 
 
 @dataclass(frozen=True)
-class Comparison:
+class Comparison(Display):
     """Fitted models of several structures, and which of them the data prefer.
 
     Print it for the tables and the advice.
@@ -191,6 +193,21 @@ class Comparison:
             where = f"{output}: " if len(self.table) > 1 else ""
             lines.append(" ".join([f"{where}{verdict.answer}.", *verdict.reasons]))
         return "\n".join([*lines, *self.advice])
+
+    def _repr_html_(self) -> str:
+        head = ["structure", "RMSE", "in 95 %", "elpd diff", "its error", "weight"]
+        tables = []
+        for output, candidates in self.table.items():
+            rows = []
+            for row in candidates:
+                numbers = map(number, (row.elpd_diff, row.se_diff))
+                weight = "-" if math.isnan(row.weight) else f"{row.weight:.2f}"
+                rows.append(
+                    [row.structure, number(row.error), percent(row.coverage), *numbers, weight]
+                )
+            verdict = f": {self.verdict[output].answer}" if output in self.verdict else ""
+            tables.append(html_table(output + verdict, head, rows))
+        return "".join(tables)
 
 
 def compare(

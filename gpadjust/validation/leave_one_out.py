@@ -10,7 +10,9 @@ from torch import Tensor
 
 from gpadjust.core import GP, StackedGP
 from gpadjust.core.gaussian import DRAWS, Marginals
+from gpadjust.display import Display, html_table
 from gpadjust.validation.scores import Scores, central_share
+from gpadjust.words import number, percent
 
 ROUNDING = 1e-8  # of the observations' standard deviation; to predict better shows nothing
 _FAR = 6.0  # standard deviations, where a probability next to 1 is rounded
@@ -20,7 +22,7 @@ _COMPONENTS = 64  # that draws are resampled to, for each observation
 
 
 @dataclass(frozen=True)
-class LeaveOneOut:
+class LeaveOneOut(Display):
     """Predictions of each observation from all the others, in the user's units.
 
     Attributes:
@@ -64,6 +66,16 @@ class LeaveOneOut:
         pit = self.pit.masked_fill(Y.isnan(), torch.nan)
         share, nlpd = central_share(pit, level), -self.log_density.nanmean(-2)
         return replace(scores, pit=pit, coverage=share, nlpd=nlpd)
+
+    def _repr_html_(self) -> str:
+        scores = self.score()
+        columns = (scores.rmse, scores.median, scores.coverage, -scores.nlpd)
+        rows = [
+            [name, number(rmse), number(median), percent(share), number(density)]
+            for name, rmse, median, share, density in zip(self.output_names, *columns, strict=True)
+        ]
+        head = ["", "RMSE", "median error", "in 95 %", "mean log density"]
+        return html_table(f"Left-out predictions of {len(self.X)} observations", head, rows)
 
 
 @torch.no_grad()

@@ -53,15 +53,20 @@ from gpadjust.checks import (
 )
 from gpadjust.core.gaussian import Marginals
 from gpadjust.kinds.categories import on_levels
+from gpadjust.physics import PhysicsParameters
+from gpadjust.validation.comparison import Comparison
 from gpadjust.validation.leave_one_out import LeaveOneOut
 from gpadjust.validation.scores import Scores
 from gpadjust.validation.trust import SIDES, Trust, physics_at
+from gpadjust.validation.verdict import ALONE, CALIBRATED
 
 __all__ = [
     "plot_adjustment",
+    "plot_comparison",
     "plot_coverage",
     "plot_leave_one_out",
     "plot_model",
+    "plot_parameters",
     "plot_prediction",
     "plot_trust",
 ]
@@ -87,10 +92,13 @@ def plot_model(model: Any, *, output: int = 0, level: float = 0.95, axes: Any = 
         An array of axes, ``rows x d``.
     """
     names = adjustments_of(model)
+    # Of a mixture the physics is that of one of its models.
+    parts = [part for part in getattr(model, "models", ()) if getattr(part, "physics", None)]
+    with_physics = next(iter(parts), model)
     lines = lines_along(model, output, level)
     axes = axes_of(axes, 1 + len(names), len(lines), 2.6)
     for i, (ax, (x, X)) in enumerate(zip(axes[0], lines, strict=True)):
-        draw_prediction(ax, model, x, X, output, physics_at(model, X), level)
+        draw_prediction(ax, model, x, X, output, physics_at(with_physics, X), level)
         if len(lines) == 1:
             draw_data(ax, model, output)
         else:
@@ -233,6 +241,69 @@ def plot_leave_one_out(
     top = 1.35 * max(z, residuals.abs().nan_to_num().max().item())  # room for the legend
     axes[1].set(xlabel="predicted without it", ylabel="standardized residual", ylim=(-top, top))
     legend(axes[1])
+    return axes
+
+
+def plot_comparison(comparison: Comparison, *, output: int = 0, axes: Any = None) -> Any:
+    """Draw left-out predictions by the formula and by what is recommended, and the scores.
+
+    The first axes have predictions against observations. The second have the expected log
+    predictive density of each structure less that of the best, with two standard errors, and its
+    weight; ``axes`` are these two.
+    """
+    loo = comparison.leave_one_out()
+    mean, sd, y = (column(each, output) for each in (loo.mean, loo.variance.sqrt(), loo.Y))
+    name = labels(loo.output_names)[output]
+    axes = axes_of(axes, 1, 2)[0]
+    half = quantile(0.95) * sd
+    against_truth(axes[0], y, (mean, mean - half, mean + half), 0.95, f"observed {name}")
+    formulas = [each for each in comparison.left_out if each.startswith((ALONE, CALIBRATED))]
+    hollow = DOTS | {"mfc": "none", "mew": 1.0}
+    for formula, color in zip(formulas, cycle((RED, GREY)), strict=False):
+        by_formula = comparison.left_out[formula].mean[:, output]
+        axes[0].plot(y, by_formula, **hollow | {"mec": color}, label=formula)
+    axes[0].containers[0].set_label(f"{comparison.chosen}, 95 %")
+    axes[0].set_ylabel("predicted without it")
+    legend(axes[0], loc="upper left")
+    rows = [row for row in comparison.table[loo.output_names[output]] if not math.isnan(row.weight)]
+    places = range(len(rows))
+    differences, errors = [row.elpd_diff for row in rows], [2 * row.se_diff for row in rows]
+    axes[1].errorbar(differences, places, xerr=errors, color=BLUE, **DOTS, elinewidth=1)
+    axes[1].axvline(0, color=GREY, lw=1, ls="--")
+    axes[1].set_yticks(places, [f"{row.structure}\nweight {row.weight:.2f}" for row in rows])
+    axes[1].set(xlabel="elpd less the best, in nats", ylim=(len(rows) - 0.5, -0.5))
+    tidy(axes[1])
+    return axes
+
+
+def plot_parameters(parameters: PhysicsParameters, *, axes: Any = None) -> Any:
+    """Draw the draws of each unknown parameter of a physics, and its prior.
+
+    A point fit is a line. Return an array of axes, one for each parameter.
+    """
+    if not parameters:
+        raise ValueError("Expected parameters to draw; the physics has no unknown ones.")
+    axes = axes_of(axes, 1, len(parameters), 2.6)[0]
+    for ax, (name, unknown) in zip(axes, parameters.unknowns.items(), strict=True):
+        draws = parameters[name].detach().double()
+        low, high = draws.min(), draws.max()
+        if low < high:
+            style: dict[str, Any] = {"color": BLUE, "alpha": 0.75, "ec": "white"}
+            ax.hist(draws.numpy(), "auto", density=True, label="posterior", **style)
+            low, high = 1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low
+        else:
+            ax.axvline(float(low), color=BLUE, label="value")
+            ends = unknown.value(torch.tensor([-3.0, 3.0]).double())
+            low, high = low.minimum(ends[0]), high.maximum(ends[1])
+        x = torch.linspace(float(low), float(high), _POINTS).double()
+        (density,) = torch.gradient(torch.special.ndtr(unknown.coordinate(x)), spacing=(x,))
+        ax.plot(x, density, color=GREY, ls="--", lw=1.2, label="prior")
+        unit = f" [{unknown.unit}]" if unknown.unit else ""
+        ax.set(xlabel=labels([name])[0] + unit, yticks=[])
+        ax.set_ylim(0, 1.4 * ax.dataLim.y1)  # room for the legend
+        tidy(ax)
+    axes[0].set_ylabel("density")
+    legend(axes[0])
     return axes
 
 

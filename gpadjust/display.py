@@ -1,0 +1,57 @@
+"""How objects show themselves: a figure by ``plot()``, and a table of HTML in a notebook.
+
+The functions that draw are in rooms above those of the objects, so that they are found by name at
+the first figure; matplotlib is imported then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from html import escape
+from importlib import import_module
+from typing import Any
+
+FIGURES = {
+    "Predictive": "validation.plots.plot_model",
+    "PhysicsParameters": "validation.plots.plot_parameters",
+    "LeaveOneOut": "validation.plots.plot_leave_one_out",
+    "Comparison": "validation.plots.plot_comparison",
+    "Collection": "active.plots.plot_collection",
+    "Identification": "records.plots.plot_identification",
+}
+"""The function that draws objects of a class, and of those derived from it."""
+
+
+class Display:
+    """An object with a figure, whose class is in :data:`FIGURES`."""
+
+    def plot(self, **options: Any) -> Any:
+        """Draw the object, by the function of :data:`FIGURES` with these options; return axes.
+
+        Raises:
+            ImportError: If matplotlib is not installed.
+        """
+        names = [kind.__name__ for kind in type(self).__mro__]
+        room, _, name = next(FIGURES[n] for n in names if n in FIGURES).rpartition(".")
+        try:
+            import matplotlib as _  # noqa: F401
+        except ImportError as error:
+            raise ImportError(
+                'plot() needs matplotlib; run `pip install "gpadjust[plot]"`.'
+            ) from error
+        return getattr(import_module(f"gpadjust.{room}"), name)(self, **options)
+
+
+def html_table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table of HTML with every text escaped; spaces at the start of a text stay.
+
+    Example:
+        >>> html_table("a < b", ["", "mean"], [["g", "9.81"]])[:42]
+        '<table><caption>a &lt; b</caption><tr><th '
+    """
+    style = 'style="text-align: left; white-space: pre"'
+    lines = []
+    for kind, cells in [("th", head), *(("td", row) for row in rows)]:
+        texts = [f"<{kind} {style}>{escape(cell)}</{kind}>" for cell in cells]
+        lines += [f"<tr>{''.join(texts)}</tr>"] if texts else []
+    return f"<table><caption>{escape(caption)}</caption>{''.join(lines)}</table>"
