@@ -145,7 +145,13 @@ def parser() -> ArgumentParser:
 def main(command: Sequence[str] | None = None) -> int:
     """Run a command, and return its exit status: 0, or 1 with a message, or 130 if interrupted."""
     command = sys.argv[1:] if command is None else [*command]
-    arguments = parser().parse_args(command)
+    words: list[str] = []
+    for word in command:  # a formula may begin with a minus, which is no option
+        if words[-1:] == ["--physics"] and re.match(r"-[^-]", word):
+            words[-1] = f"--physics={word}"
+        else:
+            words.append(word)
+    arguments = parser().parse_args(words)
     try:
         # Not earlier: --help and what is wrong with options need no torch.
         from gpadjust.report.command import run

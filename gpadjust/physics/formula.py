@@ -35,8 +35,8 @@ _FUNCTIONS: dict[str, Callable[..., Tensor]] = {
 }
 _OF_SHEETS = {"wurzel": "sqrt", "power": "pow", "potenz": "pow", "if": "where", "wenn": "where"}
 _OTHERWISE = {  # in spreadsheets than here, and the way out
-    "log": "LOG has the base 10 there: write log10(x), or ln(x)",
-    "atan2": "ATAN2 takes x first there: write atan(y / x), or atan2(y, x) without =",
+    "log": "LOG of a spreadsheet has the base 10: write log10(x), or ln(x)",
+    "atan2": "ATAN2 of a spreadsheet takes x first: write atan2(y, x) in small letters, without =",
 }
 _SIGNS = str.maketrans({"\u2212": "-", "\u00b7": "*", "\u00d7": "*", "\u00f7": "/", "^": "**"})
 _WORDS = re.compile(rf"\b({'|'.join({*kwlist} - {'True', 'False', 'None'})})\b")

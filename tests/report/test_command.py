@@ -388,6 +388,11 @@ def test_inputs_are_those_given_and_those_that_formulas_name(folder, capsys, und
     assert load("report.pt").data.input_names == ("q", "rig", "in [s]")
 
 
+def test_a_formula_may_begin_with_a_minus(folder, undrawn):
+    command = ["report", "data.csv", "--outputs", "head", "--fit", "map"]
+    assert main([*command, "--physics", "-2*(time - 1)^2"]) == 0
+
+
 def test_a_column_pi_is_never_the_constant(folder, capsys, undrawn):
     rows = [f"{x + 1},{x},{y}" for x, y in ROWS]
     (folder / "data.csv").write_text("\n".join(["pi,po,q", *rows, ""]))
