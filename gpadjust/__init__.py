@@ -1,6 +1,6 @@
 """Gaussian processes that adjust a physics model to data: the calls, on one page.
 
-Inputs X are ``n x d``, outputs Y ``n x m``, in your units: float64 tensors, arrays or data frames.
+Inputs X are ``n x d``, outputs Y ``n x m``, in your units: float64 tensors, arrays, frames, Series.
 The physics f_p takes rows of X and returns rows of Y. ``from gpadjust import CKA, fit`` and so on.
 
 The usual way::
@@ -34,7 +34,7 @@ Other data, for each of these; names of gpadjust.kinds::
 
 Other physics, with unknown parameters or without::
 
-    FormulaPhysics("1 + x", ["x"])               # a formula as text
+    FormulaPhysics("1 + x", ["x"])               # a formula as text, or a spreadsheet's
     BlackBoxPhysics(simulator)                   # NumPy code; SubprocessPhysics: a program
     ODEPhysics(rate, step=0.1, state_dim=1)      # a differential equation
     law = FunctionPhysics(lambda X, p: p.gain * X[:, 0], unknowns={"gain": Unknown(1.0, factor=2)})
@@ -55,7 +55,7 @@ Beyond the models::
     from gpadjust.validation.plots import plot_adjustment  # rho and delta; others beside it
     from gpadjust.report import report                     # a page to show
     from gpadjust.active import collect                    # the next point to measure
-    from gpadjust.records import Records, smooth           # log files of machines
+    from gpadjust.records import Records, smooth           # log files of machines, as they are
     from gpadjust.dynamics import LearnedDynamics          # the next state of a system
     from gpadjust.control import MPCAgent                  # a controller; SAC and TD3: gpadjust.rl
     from gpadjust.export import c_source, casadi_function  # onto the machine

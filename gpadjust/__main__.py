@@ -12,7 +12,7 @@ from typing import Any
 _ABOUT = """\
 One page that shows whether a crude physics model helps to predict your measurements, where it is
 wrong, how well left-out measurements are predicted, and which model to take, which is saved beside
-it. You need a table, whose first line names its columns, and the physics: a formula of these
+it. You need a table, a line of which names its columns, and the physics: a formula of these
 columns, or a Python function.
 """
 _EXAMPLE = """\
@@ -35,7 +35,7 @@ of NumPy arrays or torch tensors, in its folder,
 _ABOUT_LOGS = """\
 One page about a machine by its log: parameters of its equations with intervals, noise of the
 sensors, hidden states, and how well the equations follow the last part of the log, which is held
-out. You need a CSV file, whose first line names its columns, and equations, one for each state.
+out. You need a CSV file, a line of which names its columns, and equations, one for each state.
 """
 _EXAMPLE_OF_LOGS = """\
 example: swing.csv has the columns "time [s]", "angle [rad]" and "torque [N m]", and no rate
@@ -50,11 +50,13 @@ function of rows of states and actions to the next states.
 """
 # An option a paragraph: its name, what the help calls its value, and what it is.
 _OPTIONS = """\
-data: the table: a CSV file in UTF-8, or *.xlsx (the extra excel)
---inputs a,b: the columns that the physics reads; by default those that its formula names
---outputs y: the columns that it predicts
---physics formula: the physics: a formula of the columns' names, with + - * / ** and functions such
-    as sqrt, of several outputs with commas between them; or module:function. Several: give it again
+data: the table: a CSV file, or *.xlsx (the extra excel)
+--inputs a,b: the columns that the physics reads, and others that matter; by default those that its
+    formula names; "d=wire d" calls a column d
+--outputs y: the columns that it predicts; "y=Force 1" calls a column y
+--physics formula: the physics: a formula of the columns' names, with + - * / ** or ^ and functions
+    such as sqrt, or a spreadsheet's, of several outputs with commas between them; or
+    module:function. Several: give it again
 --units a=m,y=Pa: units, of columns that do not say them, as "a [m]"
 --noise 0.1: known standard deviation of the outputs; or y=0.1,z=2; or learnt: constant, or
     relative, which grows with the physics. By default the one that left-out observations prefer
@@ -67,11 +69,12 @@ data: the table: a CSV file in UTF-8, or *.xlsx (the extra excel)
 --fit: compare structures, which tells whether the physics helps (the default); or one CKA alone, by
     full Bayes or at the likeliest hyper-parameters, which is quicker
 --rows 500: the most rows that are taken; of more, so many are drawn at random (%(default)s)
---sheet name: the sheet of a workbook that has several
 """
 _OPTIONS_OF_LOGS = """\
-data: the log: CSV files in UTF-8, a record each
---time t: the column of times (%(default)s), or a number: the time from row to row
+data: the log: CSV files or *.xlsx, a record each
+--time t: the column of times or dates (%(default)s), or a number: the time from row to row
+--time-unit h: the unit of rates, steps and times, to which the column is converted: s, ms, us, min,
+    h or d; seconds by default
 --states a,b: the states, columns of the log; or a=q, where a's column is q
 --hidden b=0+-2: a state that was not measured, with mean and standard deviation at the beginning.
     Several: give it again
@@ -91,8 +94,10 @@ _OPTIONS_OF_BOTH = """\
 --out page.html: the page to write (%(default)s), with a model the model beside it, page.pt; both
     replace what has these names
 --seed 0: of the fits and free runs (%(default)s)
---delimiter mark: between two fields (","); ";" or tab, say
---decimal mark: the decimal mark (".")
+--names a,b: names of all columns, of a file without, or in place of its own
+--delimiter mark: between two fields, such as ";" or tab; found by default
+--decimal mark: the decimal mark, "." or ","; found by default
+--sheet name: the sheet of a workbook that has several
 --title text: the title of the page
 """
 _SEEDS = 2**32
@@ -116,8 +121,8 @@ def parser() -> ArgumentParser:
         "--time": {"default": "time"},
         "--step": {"type": float},
         "--held-out": {"type": float, "default": 0.25},
-        "--delimiter": {"default": ","},
-        "--decimal": {"default": ".", "choices": (".", ",")},
+        "--time-unit": {"choices": ("s", "ms", "us", "min", "h", "d")},
+        "--decimal": {"choices": (".", ",")},
     }
     main_parser = ArgumentParser(prog="gpadjust", description="Adjust physics to data.")
     commands = main_parser.add_subparsers(dest="command", required=True)
@@ -140,7 +145,13 @@ def parser() -> ArgumentParser:
 def main(command: Sequence[str] | None = None) -> int:
     """Run a command, and return its exit status: 0, or 1 with a message, or 130 if interrupted."""
     command = sys.argv[1:] if command is None else [*command]
-    arguments = parser().parse_args(command)
+    words: list[str] = []
+    for word in command:  # a formula may begin with a minus, which is no option
+        if words[-1:] == ["--physics"] and re.match(r"-[^-]", word):
+            words[-1] = f"--physics={word}"
+        else:
+            words.append(word)
+    arguments = parser().parse_args(words)
     try:
         # Not earlier: --help and what is wrong with options need no torch.
         from gpadjust.report.command import run

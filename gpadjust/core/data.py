@@ -56,8 +56,6 @@ class Data(NamedTuple):
             input_transform = deepcopy(input_transform).double().train()
         inputs, outputs = names_of(train_X, "x"), names_of(train_Y, "y")
         X, Y = as_tensor(_coded(train_X, input_transform), "train_X"), as_tensor(train_Y, "train_Y")
-        if hasattr(train_Y, "to_numpy") and Y.dim() == 1:  # a Series is a column
-            Y = Y.unsqueeze(-1)
         for name, tensor in (("train_X", X), ("train_Y", Y)):
             if tensor.dim() != 2:
                 raise ValueError(
@@ -148,7 +146,7 @@ def unit_of(Y: Tensor, mean: Tensor) -> Tensor:
 
 
 def as_tensor(values: ArrayLike, name: str) -> Tensor:
-    """Return a float64 tensor as it is, or one of an array or frame of numbers."""
+    """Return a float64 tensor as it is, or one of an array, frame or Series, which is a column."""
     if isinstance(values, Tensor):
         if values.is_complex():
             raise TypeError(_not_numbers(name, "complex numbers"))
@@ -157,6 +155,7 @@ def as_tensor(values: ArrayLike, name: str) -> Tensor:
                 f"Expected {name} in float64; found {values.dtype}; take `{name}.double()`."
             )
         return values
+    values = values.to_frame() if hasattr(values, "to_frame") else values  # a Series is a column
     array = values.to_numpy() if hasattr(values, "to_numpy") else values
     if not isinstance(array, np.ndarray):
         raise TypeError(
@@ -190,6 +189,7 @@ def variances_of(values: ArrayLike, Y: Tensor, name: str = "train_Yvar") -> Tens
     if isinstance(values, int | float | list | tuple):
         values = torch.tensor(values, dtype=torch.float64, device=Y.device)
     variances, m = as_tensor(values, name), Y.shape[-1]
+    variances = variances.flatten() if variances.shape == (m, 1) != Y.shape else variances
     if variances.shape != Y.shape and variances.shape not in ((), (1,), (m,)):
         raise ValueError(
             f"Expected {name} (known variances) as one number, {m} (one for each column), or of "
@@ -244,6 +244,7 @@ def as_given(values: Tensor, X: ArrayLike, names: Sequence[str]) -> Any:
     """Return values ``... x q x m`` as X came: a tensor, an array, or a frame with these names."""
     if isinstance(X, Tensor):
         return values
+    X = X.to_frame() if hasattr(X, "to_frame") else X  # a Series
     array, library = values.detach().cpu().numpy(), type(X).__module__.partition(".")[0]
     if library == "pandas":
         return type(X)(array, index=X.index, columns=list(names))

@@ -690,7 +690,7 @@ class GP(gpytorch.models.GP, Predictive):
         old, new = self.conditioning(), self._copy()
         new.data = self.data.appended(X, Y)
         is_usual = noise is None
-        noise = self.usual_noise(Y) if noise is None else noise
+        noise = self.usual_noise(Y) if noise is None else as_tensor(noise, "noise")
         if noise is not None and self.noise.known is not None:
             unused = noise.isnan() & Y.isnan()
             noise = noise.masked_fill(unused, 1.0) if unused.any() else noise

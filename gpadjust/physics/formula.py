@@ -7,7 +7,7 @@ import math
 import operator
 import re
 from collections.abc import Callable, Mapping, Sequence
-from keyword import iskeyword
+from keyword import iskeyword, kwlist
 from unicodedata import normalize
 
 import torch
@@ -30,13 +30,20 @@ _FUNCTIONS: dict[str, Callable[..., Tensor]] = {
     "ln": torch.log,
     "min": torch.minimum,
     "max": torch.maximum,
+    "pow": torch.pow,
     "where": lambda c, x, y: torch.where(c != 0, x, y),
 }
+_OF_SHEETS = {"wurzel": "sqrt", "power": "pow", "potenz": "pow", "if": "where", "wenn": "where"}
+_OTHERWISE = {  # in spreadsheets than here, and the way out
+    "log": "LOG of a spreadsheet has the base 10: write log10(x), or ln(x)",
+    "atan2": "ATAN2 of a spreadsheet takes x first: write atan2(y, x) in small letters, without =",
+}
+_SIGNS = str.maketrans({"\u2212": "-", "\u00b7": "*", "\u00d7": "*", "\u00f7": "/", "^": "**"})
+_WORDS = re.compile(rf"\b({'|'.join({*kwlist} - {'True', 'False', 'None'})})\b")
 _GRAMMAR = (
-    "Formulas have numbers, names, pi, + - * / and ** (^ is not a power), brackets, comparisons of "
-    f"two values such as a < b, and the functions {', '.join(_FUNCTIONS)}, such as max(a, b) and "
-    "where(a < b, x, y). Commas part the outputs. There are no units and no =; water flow is "
-    "water_flow, and lambda, which Python reserves, is lambda_."
+    "Formulas have numbers, names, pi, + - * / and ** or ^, brackets, comparisons of two values "
+    f"such as a < b, and the functions {', '.join(_FUNCTIONS)}, such as max(a, b) and "
+    "where(a < b, x, y). Commas part the outputs. There are no units, and water flow is water_flow."
 )
 
 
@@ -47,12 +54,14 @@ class FormulaPhysics(Physics):
 
     Args:
         formula: The output, or outputs with commas between them, such as ``"U * I, U / I"``. It has
-            numbers, names of columns and of unknown parameters, ``pi``, ``+ - * / **``,
+            numbers, names of columns and of unknown parameters, ``pi``, ``+ - * / **`` (or ``^``),
             comparisons, and the functions sin, cos, tan, asin, acos, atan, atan2, sinh, cosh, tanh,
-            exp, log and ln (the same), log10, sqrt, abs, sign, min and max of two, and
-            ``where(a < b, x, y)``.
+            exp, log and ln (the same), log10, sqrt, abs, sign, pow, min and max of two, and
+            ``where(a < b, x, y)``. It may be a spreadsheet's, with ``=`` in front, ``SQRT``,
+            ``PI()`` and ``IF``, and in German, ``0,5*MAX(a;b)``.
         columns: The names of the columns of X, ``d`` of them, without units and with ``_`` for
-            other marks: "air flow [m3/h]" is ``air_flow``, and "lambda" is ``lambda_``.
+            other marks: "air flow [m3/h]" is ``air_flow``. "lambda" is ``lambda`` or ``lambda_``,
+            as all words of Python; a column "pi" is ``pi_``.
         unknowns, name: As of :class:`Physics`.
 
     Example:
@@ -73,11 +82,16 @@ class FormulaPhysics(Physics):
         super().__init__(unknowns=unknowns, name=name or " ".join(formula.split()))
         self.formula = formula
         self.columns = tuple(map(symbol, columns))
-        known = [*self.columns, *self.unknowns, "pi"]
-        if len({*known}) < len(known):
+        known = [*self.columns, *self.unknowns]
+        if len({*known}) < len(known) or "pi" in known:
             raise ValueError(f"Expected different names, and none 'pi'; found {known}.")
         self._outputs = parse(formula)
-        absent = sorted(_names(self._outputs) - {*known})
+        absent = sorted(_names(self._outputs) - {*known, "pi"})
+        if has_pi(formula) and "pi_" in known:
+            raise ValueError(
+                f"The formula {formula!r} has pi, which is 3.14159, and there is a column 'pi', "
+                "which is pi_: write pi_, or the number."
+            )
         if absent:
             raise ValueError(
                 f"The formula {formula!r} has {absent[0]!r}; expected one of its names: "
@@ -111,7 +125,7 @@ def symbol(name: str) -> str:
     """Return the name of a column in a formula: without its unit, and ``_`` for other marks."""
     name = normalize("NFKC", name.partition("[")[0].strip())  # as Python does with names
     bare = re.sub(r"\W+", "_", name).strip("_")
-    bare = f"{bare}_" if iskeyword(bare) else bare
+    bare = f"{bare}_" if iskeyword(bare) or bare == "pi" else bare
     return f"_{bare}" if bare[:1].isdigit() else bare
 
 
@@ -120,22 +134,68 @@ def names_in(formula: str) -> set[str]:
     return _names(parse(formula)) - {"pi"}
 
 
+def has_pi(formula: str) -> bool:
+    """Return whether a formula has pi as a name, not as a spreadsheet's function."""
+    return "pi" in _names(parse(formula))
+
+
 def parse(formula: str) -> list[ast.expr]:
-    """Return the outputs of a formula, each as a tree of allowed parts, or raise a ValueError."""
-    try:
-        if len(formula) > _LONGEST:
-            raise ValueError(f"it has more than {_LONGEST} characters")
-        tree = ast.parse(formula.strip(), mode="eval").body
-        outputs = tree.elts if isinstance(tree, ast.Tuple) and tree.elts else [tree]
-        one = torch.ones(())
-        for output in outputs:
-            _value(output, dict.fromkeys(_names(outputs), one), one)
-    except Exception as error:  # of reading, or of the trial
-        raise ValueError(
-            f"Expected a formula such as 'force * length**3 / (3 * E * I)', found {formula!r}: "
-            f"{getattr(error, 'msg', error)}. {_GRAMMAR}"
-        ) from error
+    """Return the outputs of a formula, each as a tree of allowed parts, or raise a ValueError.
+
+    What is no formula with points and commas may be one with decimal commas and semicolons.
+    """
+    text = formula.strip()
+    of_sheet = text.startswith("=")
+    text = text.removeprefix("=").strip()
+    continental = re.sub(r"(?<=\d),(?=\d)", ".", text).replace(";", ",")
+    errors: list[Exception] = []
+    for reading in dict.fromkeys((text, continental)):
+        try:
+            return _parsed(reading, of_sheet)
+        except Exception as error:  # of reading, or of the trial
+            errors.append(error)
+    cause = errors[-1 if ";" in text else 0]
+    raise ValueError(
+        f"Expected a formula such as 'force * length**3 / (3 * E * I)', found {formula!r}: "
+        f"{getattr(cause, 'msg', cause)}. {_GRAMMAR}"
+    ) from cause
+
+
+def _parsed(text: str, of_sheet: bool) -> list[ast.expr]:
+    """Return the outputs of a formula in Python's notation, or a spreadsheet's, as trees."""
+    if len(text) > _LONGEST:
+        raise ValueError(f"it has more than {_LONGEST} characters")
+    source = _WORDS.sub(r"\1_", text.translate(_SIGNS))
+    tree = ast.parse(source, mode="eval").body
+    outputs = tree.elts if isinstance(tree, ast.Tuple) and tree.elts else [tree]
+    if of_sheet and len(outputs) > 1:
+        raise ValueError("a formula with = in front has one output")
+    one = torch.ones(())
+    for output in outputs:
+        _value(output, dict.fromkeys(_names(outputs), one), one)
+        for node in ast.walk(output):
+            if isinstance(node, ast.Call):
+                name = ast.unparse(node.func)
+                if name.lower() in _OTHERWISE and (of_sheet or name.isupper()):
+                    raise ValueError(_OTHERWISE[name.lower()])
+            elif "^" in text and _is_ambiguous(node, source):
+                raise ValueError(
+                    f"{ast.unparse(node)!r} has two meanings: spreadsheets take -a^2 as (-a)^2, "
+                    "and a^b^c as (a^b)^c; write brackets"
+                )
     return outputs
+
+
+def _is_ambiguous(node: ast.AST, source: str) -> bool:
+    """Return whether a part is a sign before a power, or a power of a power, without brackets."""
+    match node:
+        case ast.UnaryOp(operand=ast.BinOp(op=ast.Pow()) as power):
+            between = node.col_offset + 1, power.col_offset
+        case ast.BinOp(op=ast.Pow(), left=left, right=ast.BinOp(op=ast.Pow()) as power):
+            between = left.end_col_offset or 0, power.col_offset
+        case _:
+            return False
+    return b"(" not in source.encode()[slice(*between)]
 
 
 def _names(outputs: Sequence[ast.expr]) -> set[str]:
@@ -160,8 +220,11 @@ def _value(node: ast.expr, values: Mapping[str, Tensor], like: Tensor) -> Tensor
             | ast.Compare(ops=[op], left=left, comparators=[right])
         ):
             function, parts = _OPERATORS.get(type(op).__name__), [left, right]
+        case ast.Call(func=ast.Name(id=name), args=[], keywords=[]) if name.lower() == "pi":
+            return like.new_tensor(math.pi)
         case ast.Call(func=ast.Name(id=name), args=parts, keywords=[]):
-            function = _FUNCTIONS.get(name)
+            short = name.lower().rstrip("_")
+            function = _FUNCTIONS.get(name) or _FUNCTIONS.get(_OF_SHEETS.get(short, short))
     if function is None:
         raise ValueError(f"{ast.unparse(node)!r} is not a part of a formula")
     # A comparison is one or zero.

@@ -17,7 +17,8 @@ from gpadjust.checks import check_finite, check_kind, checked_number
 from gpadjust.core.data import ArrayLike, as_tensor
 from gpadjust.dynamics import Trajectories, Windows
 from gpadjust.dynamics.targets import check_spec
-from gpadjust.files.table_columns import TableColumns
+from gpadjust.files.fields import is_moment, seconds_of
+from gpadjust.files.table import Table
 from gpadjust.states import StateSpec
 
 _GAP = 1.5  # typical steps: a longer time between two rows is a gap
@@ -36,7 +37,8 @@ class Record:
 
     Args:
         times: ``N`` times, in s or the unit of time of the velocities, that rise within a segment.
-            Dates and durations, as the index of a pandas frame, become seconds since the first.
+            Dates and durations, as the index of a pandas frame or in texts, become seconds since
+            the first.
         states: ``N x state_dim``; NaN where an entry was not measured.
         actions: ``N x action_dim``.
         segments: ``N`` labels; a segment ends wherever the label changes, and a row whose label is
@@ -156,8 +158,10 @@ class Record:
 def _in_seconds(times: ArrayLike) -> ArrayLike:
     """Return dates and durations as seconds since the first, anything else as it is."""
     kind = getattr(getattr(times, "dtype", None), "kind", "")
+    if kind in ("O", "U", "T") and len(times) and is_moment(str(next(iter(times)))):
+        return np.array(seconds_of([*map(str, times)]))
     if kind not in ("M", "m"):
-        return times
+        return times.to_numpy() if hasattr(times, "to_numpy") else times
     dates = np.asarray(times, dtype=f"{kind}8[ns]")  # in UTC, if they have a time zone
     return (dates - dates[:1]) / np.timedelta64(1, "s")
 
@@ -223,38 +227,43 @@ class Records:
     @classmethod
     def read_csv(
         cls,
-        files: str | Path | Iterable[str | Path],
+        files: str | Path | Table | Iterable[str | Path | Table],
         spec: StateSpec,
         *,
         states: Mapping[str, str | None] | None = None,
         actions: Mapping[str, str] | None = None,
         time: str | float = "time",
+        time_unit: str | None = None,
         segment: str | None = None,
-        delimiter: str = ",",
-        decimal: str = ".",
+        **table: Any,
     ) -> Records:
-        """Read records from CSV files, one from each.
+        """Read records from CSV files or workbooks, one from each.
 
-        The first line of a file names its columns; others may be there. A field of a state is empty
-        or NaN where it was not measured. States that hold previous values need no column.
+        A line of a file names its columns; others may be there. A field of a state is empty or NaN
+        where it was not measured. States that hold previous values need no column.
 
         Args:
-            files: The file, or several.
+            files: The file, or several; or a :class:`~gpadjust.files.table.Table` of one.
             spec: The entries of states and actions.
             states: Columns by the names of states, such as ``{"theta": "q"}``; None for a hidden
-                state, which :func:`smooth` estimates. Default: the columns of their names.
+                state, which :func:`smooth` estimates. Default: the columns of their names. Units
+                in brackets may be left out.
             actions: The same for the actions.
             time: The column of times, or where there is none the time from one row to the next.
+                Dates and times of day become the time since the first.
+            time_unit: The unit of times, steps and rates: s, ms, us, min, h or d. Default: seconds;
+                a column in other units of time is converted.
             segment: The column of the labels of segments. Default: a file is one segment.
-            delimiter: The mark between two fields.
-            decimal: The decimal mark of numbers, a point or a comma.
+            **table: Options of :class:`~gpadjust.files.table.Table`: ``delimiter`` and ``decimal``,
+                which are found by default, ``names`` of all columns, and ``sheet``.
 
         Raises:
             OSError: If a file cannot be read.
             TypeError: If ``spec`` is no :class:`StateSpec`.
             ValueError: If a name is not in the spec, a file has no rows or not these columns, a
-                field is no number or a time or action is missing, with file, line and column; and
-                as :class:`Record`.
+                field is no number or a time or action is missing, with file, line and column; the
+                time is in minutes, hours or days, and no ``time_unit`` given; and as
+                :class:`Record`.
         """
         check_spec(spec)
         columns: dict[str, Any] = {"states": states or {}, "actions": actions or {}}
@@ -266,25 +275,26 @@ class Records:
                     f"{getattr(spec, argument)}."
                 )
         records = []
-        for file in [files] if isinstance(files, str | Path) else files:
-            table = TableColumns(file, delimiter, decimal=decimal)
+        for file in [files] if isinstance(files, str | Path | Table) else files:
+            log = file if isinstance(file, Table) else Table(file, **table)
             if isinstance(time, str):
-                times = table.numbers(time)
+                times = log.times(time, time_unit)
             else:
-                rows = torch.arange(len(table), dtype=torch.float64)
+                rows = torch.arange(len(log), dtype=torch.float64)
                 times = checked_number("time", time, above=0) * rows
             measured = []
             for name in spec.states:
-                filled_in = name in spec.previous and name not in table.names
+                filled_in = name in spec.previous and name not in log.names
                 column = columns["states"].get(name, None if filled_in else name)
                 if column is None:
                     measured.append(torch.full_like(times, math.nan))
                 else:
-                    measured.append(table.numbers(column, may_miss=True))
-            taken = [table.numbers(columns["actions"].get(name, name)) for name in spec.actions]
-            labels = None if segment is None else table.texts(segment)
+                    measured.append(log.numbers(column, may_miss=True))
+            acting = [columns["actions"].get(name, name) for name in spec.actions]
+            taken = [times if name == time else log.numbers(name) for name in acting]
+            labels = None if segment is None else log.texts(segment)
             parts = times, torch.stack(measured, -1), torch.stack(taken, -1)
-            records.append(Record(*parts, labels, str(file)))
+            records.append(Record(*parts, labels, log.file))
         return cls(records, spec)
 
     @classmethod

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import contextlib
 import math
+import sys
+import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -47,6 +49,8 @@ _HIDDEN = 0.1  # of the change in a step: what it adds to a state that is never 
 _LEAST = 1e-6  # of the standard deviation of a state: no noise is less, but by rounding
 _HALVINGS = 6
 _BETTER = 0.01  # what a worse path may cost more, by rounding
+_MANY, _PLENTY = 3000, 1000  # steps of a log that takes long, and steps that are plenty
+_TIMED = 500  # steps by which the time of a search is estimated
 _MEDIAN = 0.05  # of a variation beforehand, in standard deviations of a parameter's prior
 
 
@@ -165,7 +169,8 @@ def smooth(
             unknown parameters, else 1.
         max_rounds: The most rounds of smoothing of each. With hidden states all of them may be
             needed: 4 starts of 100 rounds, half a minute for 300 rows and a physics of formulas.
-        progress: If True, show a progress bar.
+        progress: If True, show a progress bar, and of 3,000 steps or more the time that the search
+            may take, with what takes less.
 
     Raises:
         TypeError: If an argument is of the wrong type.
@@ -212,6 +217,8 @@ def smooth(
     if num_starts is None:
         num_starts = 4 if chain.hidden.any() and f_p.unknowns else 1
     checked_whole("num_starts", num_starts, 1)
+    if progress and len(chain.measured) >= _MANY:
+        _print_time(chain, steps, num_starts, max_rounds)
     estimate = _estimate(chain, max_rounds, num_starts, progress)
     covariances = np.concatenate([part.states.covariances for part in estimate.stretches])
     sd = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)[:, : chain.d].clip(0))
@@ -318,6 +325,28 @@ class Estimate(NamedTuple):
     states: Array  # their means, one stretch after the other, M x (d + p)
     variances: Array  # of noise and process noise, 2 x d
     log_density: float  # of the measurements
+
+
+def _print_time(chain: Chain, steps: Records, num_starts: int, max_rounds: int) -> None:
+    """Print the time that a search may take, by the beginning of a stretch, and what takes less."""
+    longest = max(steps, key=lambda record: len(record.times)).part(slice(_TIMED))
+    with contextlib.suppress(ValueError, PhysicsError, np.linalg.LinAlgError):  # the search says so
+        known = chain.known_variances, chain.known_start
+        part = Chain(chain.physics, Records(longest, steps.spec), *known)
+        began = time.perf_counter()
+        path = part.first_path(np.zeros(part.num_parameters))
+        start = time.perf_counter() - began
+        variances = part.checked(part.first_variances(path))
+        kalman.smooth_chain(part.linearised(path), part.starts, *variances)
+        one_round = time.perf_counter() - began - start
+        length, rows = len(chain.measured), len(longest.times)
+        seconds = num_starts * (start + max_rounds * one_round) * length / rows
+        print(
+            f"{length:,} steps: up to some {max(1, round(seconds / 60))} min for {num_starts} "
+            f"start(s) of {max_rounds} rounds, though many settle earlier. Quicker are steps of "
+            f"{max(2, round(length / _PLENTY))} rows (step), fewer starts, or a part of the log.",
+            file=sys.stderr,
+        )
 
 
 def _estimate(chain: Chain, max_rounds: int, num_starts: int, progress: bool) -> Estimate:
@@ -433,7 +462,7 @@ class Chain:
             for i in self.angles:  # go on without jumps
                 known = rows.start + np.flatnonzero(~np.isnan(y[rows, i]))
                 y[known, i] = np.unwrap(y[known, i])
-        self.hidden, self.known_variances = np.isnan(y).all(0), variances
+        self.hidden, self.known_variances, self.known_start = np.isnan(y).all(0), variances, start
         (mean, sd), names = start, [self.spec.states[i] for i in moving]
         if self.hidden.all():
             raise ValueError(f"Expected measured states, found none of {', '.join(names)}.")

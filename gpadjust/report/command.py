@@ -80,27 +80,33 @@ def _say(*lines: str) -> None:
 
 def _of_table(arguments: Namespace) -> Job:
     """Read the table and the physics of ``gpadjust report``."""
-    outputs = read.names_of(arguments.outputs, "--outputs")
+    outputs = read.pairs(arguments.outputs, "--outputs", short=True)
     variances, text = None, arguments.noise
     if text not in (None, "constant", "relative"):
         sds = read.pairs(text, "--noise") if "=" in text else dict.fromkeys(outputs, text)
-        variances = read.variances_of(sds, "--noise", outputs, "--outputs", all_of=True)
+        variances = read.variances_of(sds, "--noise", [*outputs], "--outputs", all_of=True)
     unknowns = read.unknowns_of(arguments.unknown)
     table = read.open_table(arguments.data, arguments)
     batches = read.names_of(arguments.batches, "--batches")
     groups = [*read.names_of(arguments.categories, "--categories"), *batches]
-    inputs = read.names_of(arguments.inputs, "--inputs")
-    if not inputs:
-        if paths := [text for text in arguments.physics if ":" in text]:
+    inputs = read.pairs(arguments.inputs, "--inputs", short=True)
+    formulas = [text for text in arguments.physics if ":" not in text]
+    taken = {table.label(column) for column in (*inputs.values(), *outputs.values())}
+    others = [name for name in table.names if name and table.label(name) not in taken]
+    read.check_constants(formulas, [*inputs, *others, *unknowns])
+    if paths := [text for text in arguments.physics if ":" in text]:
+        if not inputs:
             raise ValueError(
                 f"Expected --inputs, the columns that {paths[0]} reads, in its order; only "
                 "formulas name their own."
             )
-        others = [name for name in table.names if not {name, bare(name)} & {*outputs}]
-        inputs = read.columns_of(arguments.physics, others, [*unknowns])
-        inputs += [name for name in groups if name not in {*inputs, *map(bare, inputs)}]
+    else:
+        named = [table.bare(name) if name == column else name for name, column in inputs.items()]
+        found = read.columns_of(formulas, others, named, [*unknowns])
+        inputs |= {name: name for name in found}
+        inputs |= {name: name for name in groups if name not in {*inputs, *map(bare, inputs)}}
     data = read.read_table(table, inputs, outputs, groups, arguments)
-    options = _options(arguments, inputs, batches, data)
+    options = _options(arguments, [*inputs], batches, data)
     physics, code, modules = read.given_physics(arguments.physics, data, unknowns)
 
     def work() -> Subject:
@@ -204,7 +210,7 @@ def _of_log(arguments: Namespace) -> Job:
     tables = [read.open_table(file, arguments, way) for file in arguments.data]
     log = listed(read.digest_of(file) for file in arguments.data)
     own_units = {name: prior.unit for name, prior in hidden.items()}
-    columns, units = read.log_columns(tables, own_units, arguments)
+    columns, units = read.log_columns(tables[0], own_units, arguments)
     names = [*columns["states"]], [*columns["actions"]]
     angles = read.names_of(arguments.angles, "--angles")
     read.check_names(angles, "--angles", names[0], "--states")
@@ -213,9 +219,13 @@ def _of_log(arguments: Namespace) -> Job:
             f"Expected the angle {wrong[0]!r} in rad, found {units[wrong[0]]!r}; convert it, or do "
             "without --angles, which is for angles that go round."
         )
-    marks = {"delimiter": read.mark_of(arguments.delimiter), "decimal": arguments.decimal}
-    reading = {**columns, **marks}
-    whole = Records.read_csv(arguments.data, StateSpec(*names, angles=angles), **reading)
+    whole = Records.read_csv(tables, StateSpec(*names, angles=angles), **columns)
+    own = {**columns["states"], **columns["actions"]}
+    renamed = {tables[0].bare(column) for column in own.values() if column is not None}
+    others = [name for name in tables[0].names if name not in renamed]
+    sides = [text.partition("=")[2] for text in arguments.physics if ":" not in text]
+    read.check_constants(sides, [*own, *others, *unknowns])
+    reading = {**columns, **read.table_options(arguments)}
     step = arguments.step
     if step is None:
         step = float(f"{whole.records[0].sampling_step:.{_DIGITS}g}")
@@ -246,7 +256,8 @@ def _of_log(arguments: Namespace) -> Job:
     settings = {"log": log, "step": f"{step:g} {time}", "physics": named}
     program = _program(arguments.data, spec, reading, given, options)
     line = f"{listed(arguments.data)}: {listed(map(repr, whole))}."
-    return Job([line], Origin(settings, units=units, program=program), work)
+    remarks = [remark for table in tables for remark in table.remarks]
+    return Job([line, *remarks], Origin(settings, units=units, program=program), work)
 
 
 def _program(

@@ -23,7 +23,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gpadjust.files.table_columns import LARGEST, TableColumns
+from gpadjust.files.fields import split_unit
+from gpadjust.files.table import LARGEST, Table
 from gpadjust.physics import (
     BlackBoxPhysics,
     FormulaPhysics,
@@ -33,19 +34,20 @@ from gpadjust.physics import (
     Unknown,
     as_physics,
 )
-from gpadjust.physics.formula import names_in, parse, symbol
+from gpadjust.physics.formula import has_pi, names_in, parse, symbol
 from gpadjust.physics.function import array_physics
-from gpadjust.words import bare, listed, name_and_unit, plural
+from gpadjust.words import bare, listed, plural
 
 _HINT = (
-    "Name columns as the first line does; a unit in brackets may be left out, so that 'head' is "
-    "'head [m]'."
+    "Name columns as the file does; a unit in brackets may be left out, so that 'head' is 'head "
+    '[m]\', and "h=head" calls it h.'
 )
 _PRIOR = re.compile(
     r"\s*([^=\[]+?)\s*(?:\[(.*)\])?\s*=\s*(.+?)\s*(\+/?-|±|\*/|\.\.)\s*(.+?)\s*(%?)\s*"
 )
 _EQUATION = re.compile(r"\s*([^\W\d]\w*)\s*('?)\s*=(?!=)(.*)", flags=re.DOTALL)
 _HOW = "A Python function is given as module:function, such as pump:head."
+_CELL = re.compile(r"[A-Z]{1,2}\d+")
 _SHOWN = 5  # rows at which a physics fails
 _MADE = ("BlackBoxPhysics", "FormulaPhysics", "ODEPhysics", "Unknown")
 _SAME = 1e-6  # as a model's file asks it when it is loaded
@@ -78,55 +80,67 @@ class TableData(NamedTuple):
     levels: dict[str, tuple[Any, ...]]  # of categories; of texts, the inputs are their numbers
 
 
-def open_table(file: str, arguments: Namespace, hint: str = "") -> TableColumns:
+def open_table(file: str, arguments: Namespace, hint: str = "") -> Table:
     """Open a CSV file or a workbook by the marks of a command line; errors have its options."""
-    path, sheet = Path(file), getattr(arguments, "sheet", None)
+    path = Path(file)
     if not path.exists():
         near = (other.name for other in path.absolute().parent.glob("*") if other.is_file())
         raise FileNotFoundError(f"There is no file {file!r}.{meant(path.name, near)}")
     if not path.is_file():
         what = "a folder" if path.is_dir() else "a device or a pipe"
         raise OSError(f"{file!r} is {what}, expected a CSV file.")
-    words: dict[str, Any] = {"hint": _HINT + hint, "option": "--{} {!r}"}
-    mark = mark_of(arguments.delimiter)
-    return TableColumns(file, mark, decimal=arguments.decimal, sheet=sheet, **words)
+    return Table(file, **table_options(arguments), hint=_HINT + hint, is_command=True)
 
 
-def column_of(table: TableColumns, name: str) -> str:
-    """Return the name of a column with its unit, which may be left out."""
-    short = [*map(bare, table.names)]
-    is_short = name not in table.names and short.count(name) == 1
-    return table.names[short.index(name)] if is_short else name
+def table_options(arguments: Namespace) -> dict[str, Any]:
+    """Return the options of a :class:`Table` that a command line has, None where it has none."""
+    return {
+        "delimiter": None if arguments.delimiter is None else mark_of(arguments.delimiter),
+        "decimal": arguments.decimal,
+        "names": names_of(arguments.names, "--names") or None,
+        "sheet": arguments.sheet,
+    }
 
 
 def read_table(
-    table: TableColumns,
-    inputs: Sequence[str],
-    outputs: Sequence[str],
+    table: Table,
+    inputs: Mapping[str, str],
+    outputs: Mapping[str, str],
     categories: Sequence[str],
     arguments: Namespace,
 ) -> TableData:
-    """Read columns of a table, in the order in which the physics takes and returns them.
+    """Read columns of a table by new names, in the order in which the physics has them.
 
-    Inputs that are texts are categories, too. A command line has units and the number of rows.
+    Inputs that are texts are categories, too; dates are times since the first. A command line has
+    units and the number of rows.
     """
-    d, asked = len(inputs), (*inputs, *outputs)
-    columns = [column_of(table, name) for name in asked]
+    d, asked = len(inputs), [*inputs.items(), *outputs.items()]
+    columns = [table.label(column) for _, column in asked]
     check_different(columns, "columns as inputs and outputs")
     known = f"--inputs {','.join(inputs)}; name it there"
     check_names(categories, "--categories or --batches", inputs, known)
     units = {} if arguments.units is None else pairs(arguments.units, "--units")
-    check_names(units, "--units", [*asked, *columns], ", ".join(map(repr, asked)))
-    names, values, remarks = list[str](), list[Tensor](), list[str]()
+    old = [column for _, column in asked]
+    known = ", ".join(repr(name) for name, _ in asked)
+    check_names(units, "--units", [*inputs, *outputs, *old, *columns], known)
+    names, values, remarks = list[str](), list[Tensor](), [*table.remarks]
     levels: dict[str, tuple[Any, ...]] = {}
-    for name, column in zip(asked, columns, strict=True):
-        unit = units.get(name, units.get(column))
-        names.append(column if unit is None else f"{bare(column)} [{unit}]")
-        if len(values) < d and (name in categories or _are_names(table, column)):
+    for (name, column), label in zip(asked, columns, strict=True):
+        short, unit = split_unit(name if name != column else label)
+        named = [units[key] for key in (name, column, label) if key in units]
+        unit = (named or [unit or table.unit(column)])[0]
+        is_input = len(values) < d
+        if is_dates := is_input and table.has_dates(column):
+            unit = unit or "s"
+            remarks.append(f"{short} is the time since the first row, in {unit}.")
+        names.append(f"{short} [{unit}]" if unit else short)
+        if is_dates:
+            values.append(table.times(column, unit))
+        elif is_input and (name in categories or _are_names(table, column)):
             numbers, levels[names[-1]] = table.categories(column)
+            values.append(numbers)
         else:
-            numbers = table.numbers(column, may_miss=len(values) >= d)
-        values.append(numbers)
+            values.append(table.numbers(column, may_miss=not is_input))
     everything, lines = torch.stack(values, -1), torch.tensor(table.lines)
     has_none = everything[:, d:].isnan().all(-1)
     rows = (~has_none).nonzero().flatten()
@@ -161,7 +175,7 @@ def read_table(
     return TableData(*X_and_Y, lines[rows].tolist(), tuple(remarks), levels)
 
 
-def _are_names(table: TableColumns, name: str) -> bool:
+def _are_names(table: Table, name: str) -> bool:
     """Return whether all fields of a column begin with a letter, and most of them repeat."""
     try:
         texts = table.texts(name)
@@ -171,32 +185,27 @@ def _are_names(table: TableColumns, name: str) -> bool:
 
 
 def log_columns(
-    tables: Sequence[TableColumns], hidden: Mapping[str, str], arguments: Namespace
+    table: Table, hidden: Mapping[str, str], arguments: Namespace
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """Return columns of a log as options of ``Records.read_csv``, None if hidden, and units."""
-    units = {**hidden}
-
-    def numbers(name: str, text: str, may_miss: bool = False) -> str:
-        column = column_of(tables[0], text)
-        for table in tables:
-            table.numbers(column, may_miss=may_miss)
-        units[name] = name_and_unit(column)[1]
-        return column
-
     named = pairs(arguments.states, "--states", short=True)
     check_names(hidden, "--hidden", named, "--states")
     has_times = math.isnan(number_of(arguments.time))
-    time = numbers("time", arguments.time) if has_times else float(arguments.time)
     if not arguments.actions and not has_times:
         raise ValueError("Expected --actions, as there is no column of times to stand for them.")
-    states = {
-        name: None if name in hidden else numbers(name, text, may_miss=True)
-        for name, text in named.items()
+    acting = {"time": arguments.time}
+    if arguments.actions:
+        acting = pairs(arguments.actions, "--actions", short=True)
+    columns = {
+        "states": {name: None if name in hidden else column for name, column in named.items()},
+        "actions": acting,
+        "time": arguments.time if has_times else float(arguments.time),
+        "time_unit": arguments.time_unit,
+        "segment": arguments.segment,
     }
-    acting = pairs(arguments.actions or f"time={arguments.time}", "--actions", short=True)
-    actions = {name: numbers(name, text) for name, text in acting.items()}
-    segment = None if arguments.segment is None else column_of(tables[0], arguments.segment)
-    columns = {"states": states, "actions": actions, "time": time, "segment": segment}
+    own = {**named, **acting}
+    units = {name: hidden[name] if name in hidden else table.unit(own[name]) for name in own}
+    units["time"] = arguments.time_unit or "s"
     return columns, {name: unit for name, unit in units.items() if unit}
 
 
@@ -249,7 +258,7 @@ def unknown_of(text: str) -> tuple[str, Unknown]:
 
 def unknowns_of(texts: Sequence[str]) -> dict[str, Unknown]:
     """Return the unknown parameters of a command line by their names."""
-    pairs = [unknown_of(text) for text in texts]
+    pairs = [(symbol(name), prior) for name, prior in map(unknown_of, texts)]
     check_different([name for name, _ in pairs], "--unknown")
     return dict(pairs)
 
@@ -270,21 +279,39 @@ def hidden_of(texts: Sequence[str]) -> dict[str, Unknown]:
     return hidden
 
 
-def columns_of(formulas: Sequence[str], names: Sequence[str], unknowns: Sequence[str]) -> list[str]:
-    """Return the columns among some of a table that formulas name, in the order of the table."""
+def columns_of(
+    formulas: Sequence[str], names: Sequence[str], inputs: Sequence[str], unknowns: Sequence[str]
+) -> list[str]:
+    """Return the columns that formulas name beside inputs, in the order of the table."""
     named = {name for formula in formulas for name in names_in(formula)}
-    known = [symbol(name) for name in names]
+    known = [symbol(name) for name in (*inputs, *names)]
     columns = [name for name in names if symbol(name) in named]
     check_different([*map(symbol, columns)], "columns in a formula, which has no units")
     absent = sorted(named - {*known, *unknowns})
-    if absent or not columns:
+    if absent or not (columns or inputs):
         wrong = absent[0] if absent else "none of them"
         hint = meant(wrong, [*known, *unknowns]) if absent else ""
+        if _CELL.fullmatch(wrong):
+            hint = f" {wrong} seems to be a cell: write the name of its column."
         raise ValueError(
             f"Expected a formula of columns of the table, {', '.join(known)}, and of --unknown; "
-            f"found {wrong!r} in --physics {formulas[0]!r}.{hint} {_HOW}"
+            f"found {wrong!r} in --physics {formulas[0]!r}.{hint} Another name for a column: "
+            f'--inputs "d=wire d". {_HOW}'
         )
     return columns
+
+
+def check_constants(formulas: Iterable[str], names: Iterable[str]) -> None:
+    """Raise a ValueError if formulas name pi and a column or an unknown parameter has that name."""
+    if "pi_" not in map(symbol, names):
+        return
+    for formula in formulas:
+        if has_pi(formula):
+            raise ValueError(
+                f"Found pi in --physics {formula!r}: formulas take it as 3.14159, and here is a "
+                "'pi' of your own. Write yours as pi_, and the number as 3.14159; or give the "
+                'column another name, such as "p=pi".'
+            )
 
 
 def given_physics(
@@ -366,7 +393,7 @@ def motion(
             raise ValueError(
                 'Expected --physics as one equation for each state, such as "rate\'=-sin(angle)" '
                 "(a time derivative) or 'level=0.9*level' (its next value), or module:name, found "
-                f"{text!r}."
+                f'{text!r}. Names have no blanks: --states "T=Temperature 1".'
             )
         sides[match[1]] = unparse(trees[0])
         primes.add(match[2])

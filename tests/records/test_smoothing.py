@@ -1,6 +1,7 @@
 """States of records: by a dense Gaussian, and by what was simulated."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -373,3 +374,14 @@ def test_intervals_of_parameters_hold_as_often_as_they_say():
         low, high = found.physics_parameters.interval()
         held += int(((low <= truth) & (truth <= high)).sum())
     assert 0.88 <= held / 80 <= 1
+
+
+@pytest.mark.filterwarnings("ignore::gpadjust.records.SmoothingWarning")
+def test_a_long_log_is_told_with_its_time_and_what_takes_less(capsys):
+    run = simulated(0, length=3000)
+    given = {"max_rounds": 1, "num_starts": 1, "progress": True}
+    smooth(Records(measured(*run, 0), SPEC), spring(), **given)
+    told = r"3,000 steps: up to some \d+ min for 1 start\(s\) of 1 rounds.* steps of 3 rows"
+    assert re.search(told, capsys.readouterr().err, flags=re.DOTALL)
+    smooth(Records(measured(*simulated(0, length=100), 0), SPEC), spring(), **given)
+    assert "min for" not in capsys.readouterr().err

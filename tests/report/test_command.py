@@ -93,23 +93,22 @@ def _fails(capsys, command, words):
 
 BAD_TABLES = {
     "": "found an empty file",
-    "time;head\n0;1\n1;2\n": "semicolons between its fields: say so by --delimiter ';'",
+    "0,1\n1,2\n": "expected a line of names before the numbers, found '0', '1'; give names",
     "time,pressure\n0,1\n": r"line 1: expected a column 'head', found 'time', 'pressure'",
     "time,Head [m]\n0,1\n": r"Is it 'Head \[m\]'\?",
     "time,head\n0,1\n1,two\n": r"line 3, column 2 \('head'\): expected a number, or nothing",
     "time,head\n0,1\n,2\n": r"line 3, column 1 \('time'\): expected a number, found ''",
     "time,head\n0,inf\n1,2\n": r"line 2, column 2 \('head'\): .*found 'inf'",
-    'time,head\n0,"1,5"\n1,2\n': "If this comma is a decimal comma, say so by --decimal ','",
+    'time,head\n0,"1,500"\n1,2\n': "If this comma is a decimal comma, say so by --decimal ','",
     "time,head\n0,1\n1,2,3\n": "line 3: expected 2 fields, one for each name, found 3",
     "time,head\n0,1\n1,1e300\n": r"line 3, column 2 .*between -1e\+100 and 1e\+100, found '1e300'",
-    "a pump\ntime,head,a\n0,1,2\n": "Line 1 has one name and line 2 has 3 fields: is line 1 a c",
-    "time,head\n0,1,\n1,2,\n": "last field is empty: is there a ',' too many at its end",
+    "time,head\n0,1,5\n1,2,5\n": "expected 2 fields, .* found 3; .* --names 'time,head,other'",
     "time,head\n0,1\n1,\n": "expected two rows or more with a number in 'head', found 1",
 }
 
 
 BAD_PHYSICS = {
-    "hill": "has 'hill'; expected one of its names: time.* is given as module:function",
+    "hill": "table, time, note, and of --unknown; found 'hill'.* is given as module:function",
     "hill.py:wave": "No module named 'hill.py'.* Is it 'hill'",
     "./hill.py:wave": "Expected module:function, such as pump:head .* in this folder",
     "hill:no_function": "physics must be a Physics or a callable.* found a float",
@@ -143,7 +142,8 @@ BAD_OPTIONS = {
 BAD_FORMULAS = {
     "a * sin(6 * tme)": r"of the table, time, note, and of --unknown; found 'tme' .*'time'\?",
     "a + 2": r"found 'none of them' in --physics",
-    "a * time^2": r"\^ is not a power",
+    "a * -time^2": r"'-time \*\* 2' has two meanings: spreadsheets take .* write brackets",
+    "a * B2": "found 'B2' .* B2 seems to be a cell: write the name of its column",
     "a, time": r"expected 1 column, one for each of --outputs",
     "log(time - 0.55 * a)": r"NaN or inf in 5 of 9 row.*\n  line 2: time \[s\] = 0",
 }
@@ -364,3 +364,43 @@ def test_what_is_missing_is_named(monkeypatch, capsys):
             main(arguments)
         assert end.value.code == 2
         assert "the following arguments are required" in capsys.readouterr().err
+
+
+def test_a_german_spreadsheet_with_a_formula_of_a_spreadsheet(folder, capsys, undrawn):
+    rows = [f"{x};{1000 * (y + 3)};R" for x, y in ROWS]
+    names = "Draht d (mm);Länge über alles [mm];Prüfer"
+    text = "\n".join([names, *rows, ""]).replace(".", ",")
+    (folder / "data.csv").write_bytes(text.encode("cp1252"))
+    physics = "=1000*(3 + 2*SIN(6*d)^1,0) + 0*PI()"
+    given = ["--inputs", "d=Draht d", "--outputs", "y=Länge über alles", "--physics", physics]
+    assert main(["report", "data.csv", "--fit", "map", *given]) == 0
+    assert "y [mm] from d [mm]." in capsys.readouterr().err
+    data = load("report.pt").data
+    assert (data.input_names, data.output_names) == (("d [mm]",), ("y [mm]",))
+    assert data.Y.flatten().tolist() == pytest.approx([1000 * (y + 3) for _, y in ROWS])
+
+
+def test_inputs_are_those_given_and_those_that_formulas_name(folder, capsys, undrawn):
+    rows = [f"{x},{x},R{i % 2},{y}" for i, (x, y) in enumerate(ROWS)]
+    (folder / "data.csv").write_text("\n".join(["in [s],air flow,rig,h", *rows, ""]))
+    given = ["--inputs", "q=air flow,rig", "--physics", "q + sin(6*in)", "--outputs", "h"]
+    assert main(["report", "data.csv", "--fit", "map", *given]) == 0
+    assert load("report.pt").data.input_names == ("q", "rig", "in [s]")
+
+
+def test_a_formula_may_begin_with_a_minus(folder, undrawn):
+    command = ["report", "data.csv", "--outputs", "head", "--fit", "map"]
+    assert main([*command, "--physics", "-2*(time - 1)^2"]) == 0
+
+
+def test_a_column_pi_is_never_the_constant(folder, capsys, undrawn):
+    rows = [f"{x + 1},{x},{y}" for x, y in ROWS]
+    (folder / "data.csv").write_text("\n".join(["pi,po,q", *rows, ""]))
+    for given in ([], ["--inputs", "po"], ["--inputs", "pi,po"]):
+        command = ["report", "data.csv", "--outputs", "q", "--physics", "2*(pi-po)", *given]
+        _fails(capsys, command, "formulas take it as 3.14159, and here is a 'pi' of your own")
+    command = ["report", "data.csv", "--outputs", "q", "--fit", "map"]
+    assert main([*command, "--physics", "2*(pi_-po)*PI()"]) == 0
+    assert load("report.pt").data.input_names == ("pi", "po")
+    assert main([*command, "--inputs", "p=pi", "--physics", "pi*p - po"]) == 0
+    assert load("report.pt").data.input_names == ("p", "po")

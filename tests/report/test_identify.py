@@ -183,3 +183,42 @@ def _fails(folder, capsys, given, message):
     assert re.search(message, err, flags=re.DOTALL), err
     after = {each: each.read_bytes() for each in folder.iterdir() if each.is_file()}
     assert after == before
+
+
+def test_a_column_pi_is_never_the_constant(folder, capsys):
+    rows = "".join(f"{k},{k / 2},{5 * 0.9**k},{k}\n" for k in range(24))
+    (folder / "log.csv").write_text(f"n,time,T,pi\n{rows}")
+    given = ["log.csv", "--states", "T", "--unknown", "q = 0.5 .. 1"]
+    words = "formulas take it as 3.14159, and here is a 'pi' of your own"
+    for more in ([], ["--actions", "pi"]):
+        _fails(folder, capsys, [*given, *more, "--physics", "T = q*T + 0*pi"], words)
+    _fails(folder, capsys, [*given, "--physics", "pi = T"], "an equation for each of T")
+
+
+def test_a_log_with_dates_other_names_and_units_in_round_brackets(folder, read, undrawn):
+    time = [f"{13 + k // 60}:{k % 60:02}" for k in range(0, 96, 4)]
+    speeds = [f"{1000 * 0.9**k:.6f}".replace(".", ",") for k in range(24)]
+    rows = [f"13.02.2015 {t};{speed}" for t, speed in zip(time, speeds, strict=True)]
+    text = "\n".join(["Datum;Motor Optical Speed (RPM)", *rows, ""])
+    (folder / "log.csv").write_text(text)
+    given = ["--time", "Datum", "--time-unit", "h", "--states", "in=Motor Optical Speed"]
+    command = ["identify", "log.csv", *given, "--physics", "in' = -lambda * in"]
+    assert main([*command, "--unknown", "lambda [1/h] = 1 */ 3"]) == 0
+    page = read(folder / "identify.html")
+    (row,) = page.tables["Parameters by what was learnt from"][1:]
+    assert float(row[1]) == pytest.approx(1.5803, rel=1e-3)  # ln(10 / 9) in four minutes
+    assert dict(page.tables["How this page came about"])["step"] == "0.0666667 h"
+    assert page.tables["Noise"][1][-1] == "RPM"
+    names = {}
+    exec(page.codes[0], names)
+    assert names["found"].parameters["lambda_"].mean() == pytest.approx(float(row[1]), rel=1e-3)
+
+
+def test_times_in_milliseconds_are_converted(folder, undrawn):
+    rows = "".join(f"{20 * k},{5 * 0.9**k}\n" for k in range(24))
+    (folder / "log.csv").write_text(f"t [ms],excess (K)\n{rows}")
+    given = ["--time", "t", "--states", "x=excess", "--physics", "x' = -x/tau + 0*time"]
+    assert main(["identify", "log.csv", *given, "--unknown", "tau [s] = 0.1 */ 3"]) == 0
+    text = (folder / "identify.html").read_text()
+    assert "0.1898" in text  # 0.02 / ln(10 / 9)
+    assert "0.02 s" in text
