@@ -42,7 +42,7 @@ class Agent(ABC):
     episode's actions are random.
 
     An error on the way (a wrong reward, a physics that fails, one of your own to end a run early)
-    loses nothing: the episodes are kept, and the dynamics learn them after the next one. Mend what
+    loses nothing: the episodes are kept, and the next ``learn`` begins with them. Mend what
     is wrong, set ``agent.task`` to a task with other functions, for example, and call ``learn``
     again; dynamics that know nothing learn all episodes. Transitions at which the physics fails are
     not learnt, with a warning. A step that fails is not kept and ends its episode, see
@@ -199,6 +199,8 @@ class Agent(ABC):
                 episodes.set_generators(self._random_state)
                 self._random_state = None
             self._check()
+            if len(self._promises) > self.num_episodes:  # learning has failed, or was interrupted
+                self._learn_dynamics()
             self._improve()
             while self.num_timesteps < end:
                 self.tell("episode")

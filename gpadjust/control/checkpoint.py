@@ -26,7 +26,7 @@ from gpadjust.files.sync_folder import sync_folder
 
 
 class EpisodeCheckpoint:
-    """Writes the whole state of a run after each episode; :func:`resume` goes on.
+    """Writes the whole state of a run before and after each episode; :func:`resume` goes on.
 
     It is a callback of :class:`Agent` and of ``gpadjust.rl.Dyna``. An interrupted run ends with the
     same numbers, bit for bit, as one that was not, on the same machine and versions; but an
@@ -55,12 +55,13 @@ class EpisodeCheckpoint:
         self._episodes = 0
 
     def __call__(self, agent: Any, event: str, values: Any = None) -> None:
-        """Write the file before an episode begins, and when the run is done."""
+        """Write the file before and after an episode, and when the run is done."""
         if not hasattr(agent, "environment_state"):
             raise TypeError(
                 "EpisodeCheckpoint is for learners with a model, such as MPCAgent and DynaSAC."
             )
-        if event == "done" or (event == "episode" and self._episodes % self.every == 0):
+        is_due = event in ("episode", "trial") and self._episodes % self.every == 0
+        if event == "done" or is_due:
             self._write(agent)
         self._episodes += event == "episode"
 

