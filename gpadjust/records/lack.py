@@ -16,7 +16,7 @@ from gpadjust.records.kalman import Array, Link
 from gpadjust.records.smoothing import Chain, Estimate
 
 _CHANCE = 0.01  # that a right equation lacks something
-_AGAIN = 2.0  # standard deviations, by which either half of the log tells what the other does
+_AGAIN = 1.64  # standard deviations, one-sided 5 %: by which a half tells what the other does
 _FEW_BINS, _BINS, _IN_BIN = 4, 8, 8  # of a test and a figure; the fewest steps in one of them
 _LAGS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # steps
 _WIDE = 10.0  # times the changes per time: what may be missing
@@ -152,6 +152,10 @@ class _Search:
                 columns = _bins(column, _FEW_BINS)
                 if columns.shape[1] > 1:
                     yield _Candidate(i, name, column, columns, is_lag=False)
+                if _has_both_signs(column):  # one column is told from chance by less than bins
+                    for term in (np.sign(column), column * np.abs(column)):
+                        single = term[:, None] / np.sqrt((term**2).mean())
+                        yield _Candidate(i, name, column, single, is_lag=False)
             for name in spec.actions:
                 late = np.stack([self._late(values[name], lag) for lag in _LAGS], -1)
                 size = np.sqrt((late**2).mean(0))
@@ -255,7 +259,7 @@ class _Search:
             return
         x, is_angle = of.values, of.over in self.chain.spec.angles
         yield from (("constant", np.ones_like(x)), ("line", x), ("square", x**2))
-        if _BOTH_SIGNS < (x > 0).mean() < 1 - _BOTH_SIGNS:
+        if _has_both_signs(x):
             yield from (("sign", np.sign(x)), ("drag", x * np.abs(x)))
         if is_angle:
             yield from (("sin", np.sin(x)), ("cos", np.cos(x)))
@@ -297,6 +301,10 @@ class _Search:
         k = len(mean) - K
         constants = mean[self.chain.d : k]
         return mean[k:], covariance[k:, k:], density, constants, np.concatenate(left)
+
+
+def _has_both_signs(values: Array) -> bool:
+    return bool(_BOTH_SIGNS < (values > 0).mean() < 1 - _BOTH_SIGNS)
 
 
 def _bins(values: Array, most: int) -> Array:
