@@ -16,12 +16,12 @@ from gpadjust.records.kalman import Array, Link
 from gpadjust.records.smoothing import Chain, Estimate
 
 _CHANCE = 0.01  # that a right equation lacks something
-_AGAIN = 1.64  # standard deviations, one-sided 5 %: by which a half tells what the other does
+_AGAIN = 2.0  # standard deviations, by which either half tells what the other does
 _FEW_BINS, _BINS, _IN_BIN = 4, 8, 8  # of a test and a figure; the fewest steps in one of them
 _LAGS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # steps
 _WIDE = 10.0  # times the changes per time: what may be missing
 _ROUNDS = 20  # of expectation maximisation
-_KINEMATIC = 0.01  # of a state's changes, by which they differ from the integral of another
+_KINEMATIC = 0.03  # of a state's changes, by which they differ from the integral of another
 _BOTH_SIGNS = 0.05  # the least share of either sign
 _EXPLAINED = 0.5  # of what bins explain: a term that is short enough for a sentence
 
@@ -62,6 +62,8 @@ class Lack(NamedTuple):
                 f"{self.state}' lacks a lag: {self.over} acts some {self.lag:.2g} late. Try one "
                 f"state more, hidden, q' = ({self.over} - q)/tau, and q in place of {self.over}."
             )
+        if self.shape == "constant":
+            return f"{self.state}' lacks about {self.term} throughout: try an offset."
         if self.term:
             kind = _KINDS.get((self.shape, self.state == self.over), "")
             as_of = f", as of {kind}" if kind else ""
