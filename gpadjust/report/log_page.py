@@ -33,8 +33,7 @@ _FREE_RUN = (
 )
 _NOISE = (
     "Standard deviations. Process noise is what a step adds to the physics; a physics that is "
-    "wrong beyond its parameters makes it large. Where it exceeds the noise of the sensor, Advice "
-    "says what to look for."
+    "wrong beyond its parameters makes it large."
 )
 _COMBINED = (
     "Parameters of a combination go up or down together, and the log cannot part them. Measure one "

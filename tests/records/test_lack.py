@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from html import unescape
 
 import matplotlib as mpl
 import pytest
@@ -10,6 +11,7 @@ import torch
 from gpadjust.physics import FormulaPhysics, ODEPhysics, Unknown
 from gpadjust.records import Record, Records, identify
 from gpadjust.records.plots import plot_lack
+from gpadjust.report import report
 from gpadjust.states import StateSpec
 
 mpl.use("Agg")
@@ -156,3 +158,9 @@ def test_the_figure_of_a_residual(dry, lagging):
     late = plot_lack(lagging.lack, HEATED)
     assert late.get_xlabel().startswith("heater, ")
     assert late.get_ylabel() == "T' lacks, in 1/s"
+
+
+def test_the_page_has_the_sentence_and_the_figure(dry, tmp_path):
+    text = unescape(report(dry, tmp_path / "log.html").read_text(encoding="utf-8"))
+    assert f"rate' lacks about {dry.lack.term}, as of dry friction" in text
+    assert "residual of rate' over rate, and its means" in text
