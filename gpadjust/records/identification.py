@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from itertools import combinations
+from typing import Any, NamedTuple
 
 import torch
+from scipy.stats import t
 from torch import Tensor
 
 from gpadjust.checks import checked_number, checked_whole
@@ -18,6 +21,7 @@ from gpadjust.dynamics.base import TransitionFunctions
 from gpadjust.dynamics.targets import one_physics
 from gpadjust.physics import Physics
 from gpadjust.physics.parameters import PhysicsParameters
+from gpadjust.records.lack import Lack, clearest_lack
 from gpadjust.records.records import Records, control_steps
 from gpadjust.records.smoothing import SmoothedRecords, smooth
 from gpadjust.states import StateSpec
@@ -30,6 +34,35 @@ _KNOWN_BEFORE = 0.8  # of a prior's standard deviation: the log tells next to no
 _FAR = 3.0  # standard deviations of a prior
 _VARIES = 1e-3  # share of the variance of an action that is within steps
 _NEAR_A_TURN = 0.12
+_TOGETHER = 0.95  # a correlation of two parameters, in logarithms
+_TOLD = 0.15  # of the least standard deviation of the two: their combination's is smaller
+_POWERS = ((1, -1), (1, 1), (1, -2), (1, 2), (2, -1), (2, 1))
+_BLOCKS = 5  # of a window, whose errors are compared
+_LARGE = 2.0  # times the noise of the sensor: an error that something missing may have made
+_MOVES = 0.01  # of a state's changes in a step: process noise that matters
+
+_OTHERS = {GUESSES: "the guesses do", PERSISTENCE: "a state that stays"}
+
+
+class Combination(NamedTuple):
+    """A product of powers of two parameters that the log tells better than either of them."""
+
+    name: str  # such as "k/J"
+    first: str
+    second: str
+    unit: str
+    draws: Tensor  # K
+
+    def __str__(self) -> str:
+        """What the log tells, in a sentence."""
+        low, mid, high = self.draws.quantile(_ENDS.to(self.draws)).tolist()
+        return (
+            f"The log tells {self.name}, {mid:.4g} [{low:.4g}, {high:.4g}], and hardly "
+            f"{self.first} and {self.second} each. Measure one of them, and the other follows."
+        )
+
+
+_ENDS = torch.tensor([0.025, 0.5, 0.975])
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -93,10 +126,74 @@ class Identification(Display):
         holds = (run.lower <= measured) & (measured <= run.upper)
         return holds.double().where(~measured.isnan(), torch.nan).nanmean((0, 1))
 
+    @cached_property
+    def lack(self) -> Lack | None:
+        """What the equations lack most clearly, by the part that was learnt from; None if nothing.
+
+        Takes some seconds for thousands of steps, once.
+        """
+        return clearest_lack(self.smoothed._chain, self.smoothed._estimate, self.step)
+
+    @property
+    def combinations(self) -> list[Combination]:
+        """Ratios and products of two parameters, each better told than the parameters."""
+        return [] if self.parameters is None else _told_together(self.parameters)
+
+    @property
+    def verdicts(self) -> dict[str, tuple[str, list[str]]]:
+        """Whether the physics follows the log, by each state that was measured, and why.
+
+        ``"Yes"`` if the free run errs less than the guesses' and than a state that stays, both by
+        more than chance, the intervals hold, and no error that is more than the sensor's has a
+        cause that :attr:`lack` shows. ``"No"`` if it errs no less than a state that stays, or
+        more than the guesses' by more than chance; else ``"In part"``.
+        """
+        verdicts, errors, shares = {}, self.errors, self.coverage.tolist()
+        for i, name in enumerate(self.spec.states):
+            if math.isnan(shares[i]):
+                continue
+            own, answer = errors[IDENTIFIED][i], "Yes"
+            reasons = [f"Intervals of 95 % hold {percent(shares[i])} of {name} there."]
+            if shares[i] < FEW:
+                answer = "In part"
+            if self.lack is not None and own > _LARGE * self.smoothed.noise[i]:
+                answer = "In part"
+                reasons.append(str(self.lack))
+            for other, words in _OTHERS.items():
+                if other not in errors or (own < errors[other][i] and self._beats(other, i)):
+                    continue
+                worse = own >= errors[other][i]
+                reasons.append(f"It errs {'no less' if worse else 'less by chance'} than {words}.")
+                is_no = worse and (other == PERSISTENCE or self._beats(other, i, -1))
+                answer = "No" if is_no or answer == "No" else "In part"
+            verdicts[name] = answer, reasons
+        return verdicts
+
+    def _beats(self, other: str, i: int, sign: int = 1) -> bool:
+        """Return whether errors of state i are below another's, block by block, beyond chance."""
+        measured, own = self.windows.measured, self.runs[IDENTIFIED].mean
+        still = self.windows.initial_states.unsqueeze(1).expand_as(measured)
+        path = still if other == PERSISTENCE else self.runs[other].mean
+        logs = []
+        for each in (own, path):
+            squares = self.spec.change(each, measured)[..., i].square()
+            blocks = squares.tensor_split(min(_BLOCKS, squares.shape[1]), 1)
+            logs.append(torch.cat([block.nanmean(1) for block in blocks]).clamp_min(1e-300).log())
+        gains = sign * (logs[1] - logs[0])
+        gains = gains[~gains.isnan()]
+        if len(gains) < 2:
+            return False
+        least = float(t.ppf(0.95, len(gains) - 1)) * gains.std() / math.sqrt(len(gains))
+        return bool(gains.mean() > least)
+
     @property
     def advice(self) -> list[str]:
         """Sentences on the log, on parameters, and on errors that are too large."""
         sentences = [*self.remarks, *_of_parameters(self.parameters)]
+        sentences += map(str, self.combinations)
+        if self.lack is not None:
+            sentences.append(str(self.lack))
+        sentences += self._of_noise()
         errors, shares = self.errors, self.coverage.tolist()
         for i, name in enumerate(self.spec.states):
             if shares[i] < FEW:
@@ -106,12 +203,34 @@ class Identification(Display):
                     "noise (dry friction, an input), or has a sign or unit wrong. Rely neither on "
                     "them nor on those of the parameters."
                 )
-            for other, words in ((GUESSES, "the guesses do"), (PERSISTENCE, "a state that stays")):
+            for other, words in _OTHERS.items():
                 if other in errors and errors[other][i] <= errors[IDENTIFIED][i]:
                     sentences.append(
                         "Along what was held out the identified physics errs no less in "
                         f"{name} than {words}."
                     )
+        return sentences
+
+    def _of_noise(self) -> list[str]:
+        """Return sentences on process noise that is larger than the noise of the sensor."""
+        records, sentences = self.smoothed.records, []
+        moves = torch.cat([record.states.diff(dim=0) for record in records])
+        sizes = moves.square().mean(0).sqrt()
+        noises = (self.smoothed.noise, self.smoothed.process_noise, sizes)
+        for name, noise, added, size in zip(self.spec.states, *noises, strict=True):
+            if not added > noise or added < _MOVES * size:  # of hidden states it is NaN
+                continue
+            if self.lack is not None:
+                cause = "it stands for what the equations lack, and falls with it"
+            else:
+                cause = (
+                    "no state, action or lag explains it. Look for an input that was not logged; "
+                    "vibration or weather it may be, too, which the intervals then allow for"
+                )
+            sentences.append(
+                f"Process noise of {name} is {added:.2g} a step, {added / noise:.2g} times the "
+                f"noise of its sensor: {cause}."
+            )
         return sentences
 
     def __repr__(self) -> str:
@@ -313,3 +432,40 @@ def _of_parameters(parameters: PhysicsParameters | None) -> list[str]:
         elif z.std() > _KNOWN_BEFORE:
             sentences.append(f"The log says next to nothing of {name}: it stays as known before.")
     return sentences
+
+
+def _told_together(parameters: PhysicsParameters) -> list[Combination]:
+    """Return the best-told combination of parameters that are only known together, tree by tree."""
+    found = []
+    names = [name for name in parameters if (parameters[name] > 0).all()]
+    for first, second in combinations(names, 2):
+        logs = torch.stack([parameters[first], parameters[second]]).log()
+        sd = logs.std(1)
+        if sd.min() == 0 or logs.corrcoef()[0, 1].abs() <= _TOGETHER:
+            continue
+        sizes = [(p * logs[0] + q * logs[1]).std() / math.hypot(p, q) for p, q in _POWERS]
+        least = min(range(len(sizes)), key=sizes.__getitem__)
+        if sizes[least] < _TOLD * sd.min():
+            found.append((float(sizes[least] / sd.min()), first, second, _POWERS[least]))
+    combined, group = [], {name: name for name in names}
+    for _, first, second, (p, q) in sorted(found):
+        if group[first] == group[second]:  # it follows from others
+            continue
+        old, new = group[second], group[first]
+        group = {name: new if own == old else own for name, own in group.items()}
+        powers = parameters[first] ** p * parameters[second] ** q
+        units = [parameters.unknowns[each].unit for each in (first, second)]
+        unit = _product(_bracketed(units[0]), _bracketed(units[1]), p, q)
+        name = _product(first, second, p, q)
+        combined.append(Combination(name, first, second, unit if all(units) else "", powers))
+    return combined
+
+
+def _product(first: str, second: str, p: int, q: int) -> str:
+    """Return such as ``k/J`` and ``k²*J``."""
+    sign = "/" if q < 0 else "*"
+    return f"{first}{'²' * (p == 2)}{sign}{second}{'²' * (abs(q) == 2)}"
+
+
+def _bracketed(unit: str) -> str:
+    return f"({unit})" if " " in unit or "/" in unit else unit

@@ -1,4 +1,4 @@
-"""Figures of a record of a machine and of its identification.
+"""Figures of a record of a machine, of its identification, and of what its equations lack.
 
 They need matplotlib, ``pip install gpadjust[plot]``.
 """
@@ -14,11 +14,12 @@ import torch
 
 from gpadjust.dynamics.plots import going_on, labels, plot_free_run
 from gpadjust.records.identification import IDENTIFIED, Identification
+from gpadjust.records.lack import Lack
 from gpadjust.records.records import Record, Records
 from gpadjust.states import StateSpec
-from gpadjust.validation.plots import BLUE, GREY, given_axes, tidy
+from gpadjust.validation.plots import BLUE, DOTS, GREY, given_axes, legend, quantile, tidy
 
-__all__ = ["plot_identification", "plot_record"]
+__all__ = ["plot_identification", "plot_lack", "plot_record"]
 
 
 def plot_record(
@@ -86,3 +87,39 @@ def plot_identification(identification: Identification, **options: Any) -> Any:
     run, step = others.pop(IDENTIFIED), identification.step
     defaults: dict[str, Any] = {"others": others, "step": step}
     return plot_free_run(run, identification.windows, **defaults | options)
+
+
+def plot_lack(
+    lack: Lack, spec: StateSpec, *, units: Mapping[str, str] | None = None, ax: Any = None
+) -> Any:
+    """Draw the residual of an equation over what it depends on, with its means in bins.
+
+    Args:
+        lack: What the equations lack, as of :attr:`Identification.lack`.
+        spec: The entries of the states and actions of the records.
+        units: Units for the labels, as of :func:`plot_record`.
+        ax: Axes to draw on. Default: a new figure.
+
+    Returns:
+        The axes.
+    """
+    called, units = labels(spec, units), {**dict.fromkeys(spec.angles, "rad"), **(units or {})}
+    unit, time = units.get(lack.state, ""), units.get("time", "s")
+    rate = f"{unit}²" if unit.endswith(f"/{time}") else f"{unit or 1}/{time}"
+    ax = plt.figure(figsize=(5, 3), layout="constrained").subplots() if ax is None else ax
+    half = quantile(0.95) * lack.sd
+    ax.plot(lack.at, lack.residual, **{**DOTS, "ms": 3, "color": "0.7"}, label="each step")
+    ax.axhline(0.0, color=GREY, lw=1, ls="--")
+    bars: dict[str, Any] = {"color": BLUE, "fmt": "o-", "ms": 4, "lw": 1.3, "capsize": 2}
+    ax.errorbar(lack.middles, lack.means, half, **bars, label="mean, 95 %")
+    low, high = float((lack.means - half).min()), float((lack.means + half).max())
+    ends = lack.residual.quantile(lack.residual.new_tensor([0.02, 0.98])).tolist()
+    room = 0.1 * (max(high, ends[1]) - min(low, ends[0]))
+    ax.set_ylim(min(low, ends[0], 0.0) - room, max(high, ends[1], 0.0) + room)
+    over = called[lack.over]
+    if lack.lag is not None:
+        over = f"{lack.over}, {lack.lag:.2g} late, less {lack.over}"
+    ax.set(xlabel=over, ylabel=f"{lack.state}' lacks, in {rate}")
+    legend(ax)
+    tidy(ax)
+    return ax

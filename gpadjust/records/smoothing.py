@@ -521,6 +521,12 @@ class Chain:
         following = self._defined(self.now, states[self.now], parameters)
         return Path(states, measured, parameters, following)
 
+    def path_of(self, estimate: Estimate) -> Path:
+        """Return the path of an estimate."""
+        states, parameters = estimate.states[:, : self.d], estimate.states[0, self.d :]
+        following = self.follow(self.now, states[self.now], parameters)
+        return Path(states, self.near(self.measured, states), parameters, following)
+
     def first_variances(self, path: Path) -> Array:
         """Return first variances of both noises, by f_p's errors in single steps."""
         change = ((path.following - path.states[self.now]) ** 2).mean(0)
@@ -673,10 +679,8 @@ def log_evidence(precision: Tensor, pull: Tensor, v: Tensor) -> Tensor:
 def _of_each_stretch(chain: Chain, estimate: Estimate) -> tuple[Tensor, Tensor]:
     """Return precision and pull of each stretch, smoothed alone about the estimate by all."""
     d, p = chain.d, chain.num_parameters
-    parameters = estimate.states[0, d:]
-    states = estimate.states[:, :d]
-    following = chain.follow(chain.now, states[chain.now], parameters)
-    path = Path(states, chain.near(chain.measured, states), parameters, following)
+    path = chain.path_of(estimate)
+    parameters = path.parameters
     precisions, pulls = [], []
     for link, (mean, covariance) in zip(chain.linearised(path), chain.starts, strict=True):
         start = np.concatenate([mean[:d], parameters]), covariance  # a standard normal prior there

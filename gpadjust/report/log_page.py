@@ -7,7 +7,8 @@ from typing import Any
 
 from gpadjust.dynamics.plots import going_on, labels, plot_free_run
 from gpadjust.records import Identification
-from gpadjust.records.identification import FEW, GUESSES, IDENTIFIED, PERSISTENCE
+from gpadjust.records.identification import GUESSES, IDENTIFIED, PERSISTENCE
+from gpadjust.records.plots import plot_lack
 from gpadjust.report import markup as html
 from gpadjust.report.markup import Card, Markup, Page, drawn, table, tag
 from gpadjust.report.subject import Origin
@@ -34,6 +35,15 @@ _NOISE = (
     "Standard deviations. Process noise is what a step adds to the physics; a physics that is "
     "wrong beyond its parameters makes it large."
 )
+_COMBINED = (
+    "Parameters of a combination go up or down together, and the log cannot part them. Measure one "
+    "of them otherwise, and narrow what is known of it before."
+)
+_LACK = (
+    "Dots are the rate of change of the smoothed states less the equation's, one for each step; "
+    "bars are their means in bins, with intervals of 95 %. Parameters are those that suit such a "
+    "term."
+)
 _HEIGHT = 2.6  # inches of a figure
 _WINDOWS = 3  # that are drawn
 
@@ -57,9 +67,12 @@ def page(found: Identification, title: str | None, origin: Origin) -> Page:
     if found.parameters is not None:
         caption = "Parameters by what was learnt from"
         parameters = [html.parameter_table(caption, found.parameters), tag("p", _PARAMETERS)]
+        parameters.append(_combinations(found))
+    lack = [] if found.lack is None else [tag("p", f"{found.lack} {_LACK}")]
     sections = {
         "Parameters of the physics": html.join(parameters),
         "Free run": html.join([*free_run, _runs(found, units)]),
+        "What the equations lack": html.join([*lack, _residual(found, units)]),
         "Noise": _noise(found, units),
         "States": _states(found, units),
         "Advice": html.bullets([*found.advice, *origin.notes]),
@@ -85,17 +98,38 @@ def _judged(
         name, share = found.spec.states[i], percent(found.coverage[i])
         unit = units.get(name, "")
         rmse = {by: float(found.errors[by][i]) for by in _NAMES if by in found.errors}
-        answer = "Yes" if found.coverage[i] >= FEW else "In part"
-        if not all(rmse[IDENTIFIED] < error for by, error in rmse.items() if by != IDENTIFIED):
-            answer = "No"
+        answer, reasons = found.verdicts[name]
         errors = {_NAMES[by]: f"{number(error)} {unit}".strip() for by, error in rmse.items()}
-        reason = f"Intervals of 95 % hold {share} of {name} there."
         color = {"Yes": "yes", "No": "no"}.get(answer, "open")
-        answers.append(Card(name, errors, note, answer, [reason], color))
+        answers.append(Card(name, errors, note, answer, reasons, color))
         for by, error in rmse.items():
             held = share if by == IDENTIFIED else "-"
             rows.append([_NAMES[by], name, number(error), unit or "-", held])
     return answers, rows
+
+
+def _combinations(found: Identification) -> Markup:
+    """Return a table of combinations of parameters, each told better than these."""
+    rows = []
+    for own in found.combinations:
+        low, middle, high = own.draws.quantile(own.draws.new_tensor([0.025, 0.5, 0.975]))
+        interval = f"{number(low, 4)} to {number(high, 4)}"
+        rows.append([own.name, number(middle, 4), interval, own.unit or "-"])
+    if not rows:
+        return Markup()
+    head = ["combination", "median", "95 % interval", "unit"]
+    return html.join([table("Combinations that the log tells", head, rows), tag("p", _COMBINED)])
+
+
+@drawn
+def _residual(found: Identification, units: Mapping[str, str]) -> list[Markup]:
+    """Return the figure of the residual of what the equations lack, if there is anything."""
+    if found.lack is None:
+        return []
+    figure = html.new_figure(_HEIGHT)
+    plot_lack(found.lack, found.spec, units=units, ax=figure.subplots())
+    alt = f"residual of {found.lack.state}' over {found.lack.over}, and its means"
+    return [html.image(figure, alt)]
 
 
 def _noise(found: Identification, units: Mapping[str, str]) -> Markup:

@@ -1,0 +1,349 @@
+"""What an equation lacks: its residual in each step, over states, actions and their past."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.stats import chi2
+from torch import Tensor
+
+from gpadjust.records import kalman
+from gpadjust.records.kalman import Array, Link
+from gpadjust.records.smoothing import Chain, Estimate
+
+_CHANCE = 0.01  # that a right equation lacks something
+_AGAIN = 2.0  # standard deviations, by which either half tells what the other does
+_FEW_BINS, _BINS, _IN_BIN = 4, 8, 8  # of a test and a figure; the fewest steps in one of them
+_LAGS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # steps
+_WIDE = 10.0  # times the changes per time: what may be missing
+_ROUNDS = 20  # of expectation maximisation
+_KINEMATIC = 0.03  # of a state's changes, by which they differ from the integral of another
+_BOTH_SIGNS = 0.05  # the least share of either sign
+_EXPLAINED = 0.5  # of what bins explain: a term that is short enough for a sentence
+
+_TERMS = {
+    "constant": "",
+    "line": "*{0}",
+    "square": "*{0}**2",
+    "sign": "*sign({0})",
+    "drag": "*{0}*abs({0})",
+    "sin": "*sin({0})",
+    "cos": "*cos({0})",
+}
+_KINDS = {("sign", True): "dry friction", ("drag", True): "drag"}
+
+
+class Lack(NamedTuple):
+    """The residual of a state's equation over what it depends on most clearly.
+
+    It is what the rate of change of the smoothed states has beyond the equation, in the unit of
+    that derivative, with its process noise: a dot for each of ``N`` steps, and means in ``K`` bins.
+    """
+
+    state: str
+    over: str  # a state or an action
+    term: str  # such as "-0.12*sign(rate)"; empty if none of a few simple ones tells it
+    shape: str  # of the term, such as "sign"
+    lag: float | None  # the time by which the action acts late
+    at: Tensor  # N, of what it depends on; of a lag the delayed action less the action
+    residual: Tensor  # N
+    middles: Tensor  # K
+    means: Tensor  # K
+    sd: Tensor  # K, of the means
+
+    def __str__(self) -> str:
+        """What is missing, in a sentence."""
+        if self.lag is not None:
+            return (
+                f"{self.state}' lacks a lag: {self.over} acts some {self.lag:.2g} late. Try one "
+                f"state more, hidden, q' = ({self.over} - q)/tau, and q in place of {self.over}."
+            )
+        if self.shape == "constant":
+            return f"{self.state}' lacks about {self.term} throughout: try an offset."
+        if self.term:
+            kind = _KINDS.get((self.shape, self.state == self.over), "")
+            as_of = f", as of {kind}" if kind else ""
+            return f"{self.state}' lacks about {self.term}{as_of}: try such a term."
+        low, high = self.means.min(), self.means.max()
+        return (
+            f"{self.state}' lacks {low:.2g} to {high:.2g}, depending on {self.over}: the figure of "
+            "its residual shows which term."
+        )
+
+
+class _Candidate(NamedTuple):
+    """What the residual of equation ``i`` may depend on: columns ``N x K``, of a lag or bins."""
+
+    i: int
+    over: str
+    values: Array  # N, or with the lags N x 6
+    columns: Array  # N x K
+    is_lag: bool
+
+
+def clearest_lack(chain: Chain, estimate: Estimate, step: float) -> Lack | None:
+    """Return what the equations lack most clearly; None if nothing is clear.
+
+    What bins of a state add to an equation are constants of the chain of states, beside the
+    parameters, which may be anywhere. They are clear if their chi-square is beyond chance, and if
+    either half of each stretch tells the same: what moves the machine for a while, whatever the
+    states are, does not. Equations that only say that a state is the rate of another are left out.
+    """
+    search = _Search(chain, estimate, step)
+    candidates = [*search.candidates()]
+    if not candidates:
+        return None
+    best = min(candidates, key=lambda each: search.tested(each).chance)
+    search.explain(best)  # process noise, found without it, hid some of it
+    found = search.tested(best)
+    if found.chance + math.log(len(candidates)) > math.log(_CHANCE) or found.again < _AGAIN:
+        return None
+    return search.described(best, found.gain)
+
+
+class _Test(NamedTuple):
+    """If a residual is clear: the log of its chance, what one half tells by the other, nats."""
+
+    chance: float
+    again: float
+    gain: float
+
+
+class _Search:
+    """The chain about the smoothed states, and what may be added to it in each step."""
+
+    def __init__(self, chain: Chain, estimate: Estimate, step: float) -> None:
+        self.chain, self.estimate, self.step, d = chain, estimate, step, chain.d
+        self.variances = estimate.variances
+        path = chain.path_of(estimate)
+        self.links, self.theta = chain.linearised(path), path.parameters
+        self.lengths = [len(link.matrices) for link in self.links]
+        x, self.ahead = path.states[chain.now], path.states[chain.now + 1]
+        self.middle, self.change = (x + self.ahead) / 2, path.following - x
+        # What a rate of change of 1 adds in a step, to second order: h (I + F) / 2.
+        F = np.concatenate([link.matrices[:, :d, :d] for link in self.links])
+        self.pushes = step * (np.eye(d) + F) / 2
+        self.wide = _WIDE * np.sqrt(((self.ahead - x) ** 2).mean(0)) / step
+        moves = [
+            i
+            for i in range(d)
+            if not any(
+                np.square(self.change[:, i] - step * rate).mean()
+                <= _KINEMATIC**2 * np.square(self.change[:, i]).mean()
+                for j in range(d)
+                if j != i
+                for rate in (x[:, j], self.middle[:, j])
+            )
+        ]
+        self.equations = [i for i in moves if self.wide[i] > 0]
+
+    def candidates(self) -> Iterator[_Candidate]:
+        """Yield bins of all states and actions, and lags of the actions, for each equation."""
+        spec = self.chain.spec
+        values = {spec.states[i]: self.middle[:, k] for k, i in enumerate(spec.moving)}
+        actions = self.chain.recorded[self.chain.now, spec.state_dim :].numpy()
+        values |= dict(zip(spec.actions, actions.T, strict=True))
+        for name in spec.angles:
+            values[name] = np.arctan2(np.sin(values[name]), np.cos(values[name]))
+        for i in self.equations:
+            for name, column in values.items():
+                columns = _bins(column, _FEW_BINS)
+                if columns.shape[1] > 1:
+                    yield _Candidate(i, name, column, columns, is_lag=False)
+                if _has_both_signs(column):  # one column is told from chance by less than bins
+                    for term in (np.sign(column), column * np.abs(column)):
+                        single = term[:, None] / np.sqrt((term**2).mean())
+                        yield _Candidate(i, name, column, single, is_lag=False)
+            for name in spec.actions:
+                late = np.stack([self._late(values[name], lag) for lag in _LAGS], -1)
+                size = np.sqrt((late**2).mean(0))
+                if size.min() > 0 and len(self.middle) >= _IN_BIN * len(_LAGS):
+                    yield _Candidate(i, name, late, late / size, is_lag=True)
+
+    def _late(self, action: Array, lag: float) -> Array:
+        """Return an action behind a lag of first order, in steps, less the action itself."""
+        late, end = action.copy(), 0
+        for length in self.lengths:
+            for t in range(end + 1, end + length):
+                late[t] = late[t - 1] + (1 - math.exp(-1 / lag)) * (action[t - 1] - late[t - 1])
+            end += length
+        return late - action
+
+    def explain(self, by: _Candidate) -> None:
+        """Take the variances that are most likely with columns beside the equations."""
+        d = self.chain.d
+        links = [*map(_with, self.links, self._added(by.i, by.columns))]
+        starts = self._starts(self.chain.starts, by.i, by.columns.shape[1])
+        for _ in range(_ROUNDS):
+            found, _ = kalman.smooth_chain(links, starts, *self.variances)
+            noise, added = kalman.expected_squares(links, found, d)
+            likely = self.chain.checked(np.stack([_known_means(noise), added.mean(0)]))
+            likely[0, self.chain.hidden] = self.variances[0, self.chain.hidden]
+            self.variances = likely * np.sqrt(likely / self.variances)  # and a little further
+
+    def tested(self, each: _Candidate) -> _Test:
+        """Return whether what columns add is beyond chance, and again in the other half."""
+        precision, pull = self.told_by_halves(each)
+        prior = np.eye(len(pull[0])) / self.wide[each.i] ** 2
+        halves = np.linalg.solve(precision + prior, pull[..., None])[..., 0]
+        # Of what one half tells, by the other: standard normal if they have nothing in common.
+        sizes = [halves[k] @ precision[1 - k] @ halves[k] for k in (0, 1)]
+        products = [halves[k] @ pull[1 - k] for k in (0, 1)]
+        again = min(products[k] / math.sqrt(max(sizes[k], 1e-300)) for k in (0, 1))
+        whole = pull.sum(0)
+        square = float(whole @ np.linalg.solve(precision.sum(0) + prior, whole))
+        return _Test(float(chi2.logsf(square, len(whole))), float(again), square / 2)
+
+    def told_by_halves(self, of: _Candidate) -> tuple[Array, Array]:
+        """Return precision, ``2 x K x K``, and pull, ``2 x K``, by both halves of the stretches."""
+        K = of.columns.shape[1]
+        prior = np.eye(K) / self.wide[of.i] ** 2
+        precision, pull = np.zeros((2, K, K)), np.zeros((2, K))
+        rows = zip(self.links, self._added(of.i, of.columns), self.chain.firsts, strict=True)
+        anywhere = np.diag(np.append(self.chain.first_variance, [_WIDE**2] * len(self.theta)))
+        for link, added, first in rows:
+            cut = len(added) // 2
+            for k, part in enumerate((slice(0, cut), slice(cut, len(added)))):
+                if part.stop == part.start:
+                    continue
+                end = part.stop + 1
+                measured = slice(part.start, end)
+                shorter = Link(
+                    link.matrices[part],
+                    link.offsets[part],
+                    link.outputs[measured],
+                    link.measured[measured],
+                )
+                own = [(self.estimate.states[first + part.start], anywhere)]
+                mean, covariance, *_ = self._smoothed([shorter], [added[part]], own, of.i)
+                told = np.linalg.inv(covariance)
+                precision[k] += told - prior
+                pull[k] += told @ mean
+        return precision, pull
+
+    def described(self, of: _Candidate, gained: float) -> Lack:
+        """Return the residual in bins beside parameters that suit the term that explains it."""
+        i, d, name = of.i, self.chain.d, of.over
+        starts, best = self.chain.starts, (-math.inf, "", of.values, 0.0, self.theta)
+        _, _, without, *_ = self._smoothed(self.links, None, starts, i)
+        for shape, column in self._terms(of):
+            size = np.sqrt((column**2).mean())
+            added = self._added(i, column[:, None] / size)
+            mean, _, density, parameters, _ = self._smoothed(self.links, added, starts, i)
+            if density > best[0]:
+                best = (density, shape, column, float(mean[0]) / size, parameters)
+        density, shape, column, factor, theta = best
+        # A wide prior costs a term what it does not cost the bins.
+        if not of.is_lag and density - without < _EXPLAINED * gained - math.log(_WIDE):
+            shape, theta = "", self.theta
+        at = column if of.is_lag else of.values
+        columns = _bins(at, _BINS)
+        added = self._added(i, columns)
+        links = [_at(link, d, theta) for link in self.links]
+        own = [(mean[:d], spread[:d, :d]) for mean, spread in starts]
+        mean, covariance, _, _, left = self._smoothed(links, added, own, i)
+        residual = columns @ mean + left / self.pushes[:, i, i]
+        middles = np.array([np.median(at[column > 0]) for column in columns.T])
+        lag = _LAGS[int(shape)] * self.step if of.is_lag else None
+        term = f"{factor:.2g}{_TERMS.get(shape, '').format(name)}" if shape in _TERMS else ""
+        numbers = (at, residual, middles, mean, np.sqrt(np.diag(covariance)))
+        state = self.chain.spec.states[self.chain.spec.moving[i]]
+        return Lack(state, name, term, shape, lag, *map(torch.from_numpy, numbers))
+
+    def _terms(self, of: _Candidate) -> Iterator[tuple[str, Array]]:
+        """Yield names and values of simple terms, ``N``, of which one may be what is missing."""
+        if of.is_lag:
+            yield from ((str(k), late) for k, late in enumerate(of.values.T))
+            return
+        x, is_angle = of.values, of.over in self.chain.spec.angles
+        yield from (("constant", np.ones_like(x)), ("line", x), ("square", x**2))
+        if _has_both_signs(x):
+            yield from (("sign", np.sign(x)), ("drag", x * np.abs(x)))
+        if is_angle:
+            yield from (("sin", np.sin(x)), ("cos", np.cos(x)))
+
+    def _added(self, i: int, columns: Array) -> list[Array]:
+        """Return what columns ``N x K`` in equation i add to all states, for each stretch."""
+        added = self.pushes[:, :, i, None] * columns[:, None]
+        return np.split(added, np.cumsum(self.lengths)[:-1])
+
+    def _starts(
+        self, starts: list[tuple[Array, Array]], i: int, K: int
+    ) -> list[tuple[Array, Array]]:
+        """Return starts with further constants, of which nothing is known."""
+        wide = self.wide[i] ** 2 * np.eye(K)
+        return [(np.append(x, np.zeros(K)), _beside(spread, wide)) for x, spread in starts]
+
+    def _smoothed(
+        self,
+        links: list[Link],
+        added: list[Array] | None,
+        starts: list[tuple[Array, Array]],
+        i: int,
+    ) -> tuple[Array, Array, float, Array, Array]:
+        """Smooth a chain with further constants.
+
+        Return their mean and covariance, the log density, the constants before them, and what the
+        steps add to state i beyond all.
+        """
+        K = 0 if added is None else added[0].shape[2]
+        if added is not None:
+            links = [_with(*pair) for pair in zip(links, added, strict=True)]
+        own = self._starts(starts, i, K)
+        found, density = kalman.smooth_chain(links, own, *self.variances)
+        left = []
+        for link, (states, _) in zip(links, found, strict=True):
+            ahead = np.einsum("tj,tj->t", link.matrices[:, i], states.means[:-1])
+            left.append(states.means[1:, i] - ahead - link.offsets[:, i])
+        mean, covariance = (part[0] for part in found[0].states)
+        k = len(mean) - K
+        constants = mean[self.chain.d : k]
+        return mean[k:], covariance[k:, k:], density, constants, np.concatenate(left)
+
+
+def _has_both_signs(values: Array) -> bool:
+    return bool(_BOTH_SIGNS < (values > 0).mean() < 1 - _BOTH_SIGNS)
+
+
+def _bins(values: Array, most: int) -> Array:
+    """Return indicators of bins that hold as many values each, ``N x K``."""
+    number = max(1, min(most, len(values) // _IN_BIN))
+    inner = np.unique(np.quantile(values, np.arange(1, number) / number))
+    place = np.searchsorted(inner, values, side="right")
+    numbers = np.unique(place)
+    return (place[:, None] == numbers).astype(float)
+
+
+def _at(link: Link, d: int, theta: Array) -> Link:
+    """Return a link of the states alone, with these parameters."""
+    offsets = link.offsets[:, :d] + link.matrices[:, :d, d:] @ theta
+    return Link(link.matrices[:, :d, :d], offsets, link.outputs[:, :, :d], link.measured)
+
+
+def _with(link: Link, added: Array) -> Link:
+    """Return a link with further constants, which add ``T x d x K`` times these to the states."""
+    T, d, K = added.shape
+    D = link.matrices.shape[1]
+    matrices = np.tile(np.eye(D + K), (T, 1, 1))
+    matrices[:, :D, :D], matrices[:, :d, D:] = link.matrices, added
+    offsets, outputs = np.zeros((T, D + K)), np.zeros((*link.outputs.shape[:2], D + K))
+    offsets[:, :D], outputs[:, :, :D] = link.offsets, link.outputs
+    return Link(matrices, offsets, outputs, link.measured)
+
+
+def _beside(first: Array, second: Array) -> Array:
+    """Return a covariance of independent parts."""
+    n = len(first)
+    whole = np.zeros((n + len(second),) * 2)
+    whole[:n, :n], whole[n:, n:] = first, second
+    return whole
+
+
+def _known_means(squares: Array) -> Array:
+    """Return means of the numbers of each column, 1 of a column without any."""
+    number = (~np.isnan(squares)).sum(0)
+    return np.where(number > 0, np.nansum(squares, 0) / number.clip(1), 1.0)
