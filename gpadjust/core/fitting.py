@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 _SMALL = 40  # points: up to these draws begin with the prior
 _MEDIUM, _SHARED = 100, 200  # up to these they are moved; the latter if outputs share numbers
 _SELDOM = 1e-3  # a nested model of less probability at its mode is not drawn from
+_MISSED = 1.0  # log evidence that draws from the prior miss if they have not found the posterior
 _SEARCHES = 4  # for the mode
 _NEAR = 0.3  # difference of all coordinates below which two searches have found the same mode
 _LESS_LIKELY = 5.0  # difference of log density from the best mode beyond which a mode is ignored
@@ -150,7 +151,11 @@ def _fitted(model: GP, method: str, num_draws: int | None, seed: int) -> FitResu
     """Let a model hold draws, or the most likely coordinates."""
     model.noise = model.noise.learnt(model, partial(_roughly_fitted, model, seed))
     if method == "map":
-        model.set_draws(modes(model, 0, seed, is_precise=True)[:1])
+        mode = modes(model, 0, seed, is_precise=True)[:1]
+        if model.table.shared:
+            start, _ = around_mode(partial(model.log_likelihood, choice=0), mode[0], True)
+            mode = model.table.with_choice(start.mean.unsqueeze(0), 0)
+        model.set_draws(mode)
         return FitResult(method)
     number, kept = _default_numbers(model) if num_draws is None else (num_draws, num_draws // 4)
     sampled = _sampled(model, number, seed)
@@ -191,14 +196,16 @@ def _sampled(model: GP, number: int, seed: int) -> dict[int, Draws]:
     """Return draws of each nested model; of more than 40 rows of each that is likely enough."""
     n, prior = model.targets().shape[-1], model.table.log_prior
     has_moves = n <= (_SHARED if model.table.shared else _MEDIUM)
-    starts: Mapping[int, Normal | None] = dict.fromkeys(range(len(prior)))
-    if n > _SMALL:
-        starts = _starts(model, seed)
+    is_small, like = n <= _SMALL, model.u.detach()[0]
+    starts = {} if is_small and not model.table.shared else _starts(model, seed)
     sampled: dict[int, Draws] = {}
-    for k, start in starts.items():
-        first, like = 16 if start is None else 4, model.u.detach()[0]
-        target = partial(model.log_likelihood, choice=k)
-        draws = sample(target, like, number, seed, start, first, has_moves)
+    for k in range(len(prior)) if is_small else starts:
+        draw = partial(sample, partial(model.log_likelihood, choice=k), like, number, seed)
+        ways = [draw()] if is_small else []
+        ways += [draw(starts[k], 4, has_moves)] if k in starts else []
+        # Draws from the prior may not arrive where the posterior is narrow; their evidence tells.
+        evidence = [float(way.log_evidence.mean(0).sum()) for way in ways]
+        draws = ways[-1] if evidence[-1] > evidence[0] + _MISSED else ways[0]
         sampled[k] = draws._replace(u=model.table.with_choice(draws.u, k))
     return sampled
 
@@ -224,7 +231,8 @@ def _starts(model: GP, seed: int) -> dict[int, Normal]:
                 )
             )
         starts = {
-            k: around_mode(partial(part.log_likelihood, choice=k), ends[k][0]) for k in likely
+            k: around_mode(partial(part.log_likelihood, choice=k), ends[k][0], is_precise)
+            for k in likely
         }
         likely = _likely(model, {k: evidence for k, (_, evidence) in starts.items()})
     return {k: starts[k][0] for k in likely}

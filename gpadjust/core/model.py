@@ -344,7 +344,7 @@ class GP(gpytorch.models.GP, Predictive):
         total = self.term_sum.at(values, places)
         noise = self.noise.variance(values, places, True)
         observed = ~y.isnan()
-        residual = (y - total.mean).expand(len(u), *y.shape).nan_to_num() * observed
+        residual = (y - total.mean).expand(len(u), *y.shape).masked_fill(~observed, 0.0)
         found = self.sum_likelihood(total, residual, noise, observed, with_gradient)
         value, gradient = found.value, torch.zeros_like(u)
         if with_gradient:
