@@ -35,7 +35,7 @@ from gpadjust.core.gaussian import (
 from gpadjust.core.kernels import DELTA, RHO, as_kernel
 from gpadjust.core.noise import KnownNoise, Noise
 from gpadjust.core.posterior import MixturePosterior
-from gpadjust.core.summary import counted, summary
+from gpadjust.core.summary import counted, priors, summary
 from gpadjust.core.terms import Places, Term, TermSum, WeightedSum
 from gpadjust.core.unknowns import Choice, Row, Table, Values
 from gpadjust.core.views import (
@@ -636,6 +636,14 @@ class GP(gpytorch.models.GP, Predictive):
     def summary(self) -> str:
         """Return the unknown numbers in words and in the user's units."""
         return summary(self)
+
+    def priors(self) -> Any:
+        """Return a frame of the unknown numbers by their priors, in the user's units.
+
+        Its columns are name, output (empty of numbers that all outputs share), median, both ends
+        of the central 95 % interval, and meaning. Nested models have some of these numbers alone.
+        """
+        return priors(self)
 
     def _graph_for(self, X: Tensor) -> torch.set_grad_enabled:
         """Record a graph if inputs or fantasies ask for one, not for the draws."""

@@ -268,12 +268,12 @@ def around_mode(
     root = _whitening(hessian, torch.eye(p).to(mode).expand_as(hessian), is_precise)
     evidence = value[0] - 0.5 * mode.square().sum(-1) + torch.linalg.slogdet(root).logabsdet
     for _ in range(_REFINED if is_precise else 0):
-        white, before = partial(_white, log_likelihood, mode, root), evidence
+        white, before = partial(white_density, log_likelihood, mode, root), evidence
         mode = (
             mode + (root @ maximise(white, torch.zeros_like(here), True)[0].unsqueeze(-1))[..., 0]
         )
         moves = _STEP * torch.eye(p).to(mode).unsqueeze(1).expand(-1, len(mode), -1)
-        white = partial(_white, log_likelihood, mode, root)
+        white = partial(white_density, log_likelihood, mode, root)
         value, slope = white(torch.cat([torch.zeros_like(here), moves, -moves]))
         up, down = (slope[1:] - torch.cat([moves, -moves])).chunk(2)
         rows = (down - up).nan_to_num().movedim(0, -2) / (2 * _STEP)
@@ -285,7 +285,7 @@ def around_mode(
     return Normal(mode, lower * lower.diagonal(dim1=-1, dim2=-2).sign().unsqueeze(-2)), evidence
 
 
-def _white(
+def white_density(
     log_likelihood: LogLikelihood, mode: Tensor, root: Tensor, v: Tensor, with_gradient: bool = True
 ) -> tuple[Tensor, Tensor]:
     """Return the log density at u = mode + root v over N(v | 0, I), and its gradient by v."""

@@ -1,6 +1,7 @@
 """Judging predictions, and choosing by them. `gpadjust.validation.plots` needs matplotlib."""
 
 from gpadjust.validation.advice import Gain
+from gpadjust.validation.arviz import to_arviz
 from gpadjust.validation.comparison import Comparison, compare
 from gpadjust.validation.leave_one_out import LeaveOneOut, leave_one_out
 from gpadjust.validation.ranking import Candidate
@@ -25,5 +26,6 @@ __all__ = [
     "pit",
     "rmse",
     "score",
+    "to_arviz",
     "trust",
 ]
