@@ -14,7 +14,7 @@ from pkgutil import resolve_name
 CHAPTERS = {
     "forrester": ("Forrester",),
     "structures": ("Structures",),
-    "parameters": ("Parameters",),
+    "parameters": ("Parameters", "Nuts"),
     "measuring": ("Active", "Misled"),
     "cartpole": ("CartPole", "Planning"),
     "arm": ("Arm", "Reaching"),

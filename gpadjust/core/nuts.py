@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from gpadjust.core.model import GP
 
 CHAINS = 4
+_DEPTH = 7  # of a trajectory, 128 steps at most
 
 
 def nuts(model: GP, mode: Tensor, number: int, seed: int) -> tuple[Tensor, float]:
@@ -43,7 +44,7 @@ def nuts(model: GP, mode: Tensor, number: int, seed: int) -> tuple[Tensor, float
             v = torch.randn_like(mode)
             if not density(v.unsqueeze(0), False)[0].isfinite().all():
                 v = torch.zeros_like(v)
-            kernel = NUTS(potential_fn=potential, full_mass=True, target_accept_prob=0.9)
+            kernel = NUTS(potential_fn=potential, full_mass=True, max_tree_depth=_DEPTH)
             size = number // CHAINS
             mcmc = MCMC(
                 kernel, size, warmup_steps=size, initial_params={"v": v}, disable_progbar=True
