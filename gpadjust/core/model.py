@@ -444,6 +444,8 @@ class GP(gpytorch.models.GP, Predictive):
             error.inputs = X.detach().reshape(-1, X.shape[-1])[rows]
             raise error
 
+    has_density = True
+    """Whether :meth:`log_likelihood` is that of the fitted model, which NUTS draws from."""
     scale_formula: str = ""
     """The scale on which the model is Gaussian, as a formula; empty for that of the targets."""
 

@@ -76,7 +76,7 @@ class CKA(GP):
         settings = options | {
             "rho_covar_module": rho_covar_module, "delta_covar_module": delta_covar_module,
             "rho_mean": rho_mean, "delta_mean": delta_mean, "center": center,
-            "constants": constants, "nested": nested, "extra_terms": [*extra_terms],
+            "constants": _plain(constants), "nested": nested, "extra_terms": [*extra_terms],
         }  # fmt: skip
         rhos, functions = _scalings(physics, rho_mean)
         kernel = as_kernel(rho_covar_module, RHO)
@@ -138,7 +138,7 @@ class PhysicsMeanGP(GP):
         physics: Any, covar_module: Any = None, constants: bool | Mapping[str, LogNormal] = True,
         **options: Any,
     ) -> None:  # fmt: skip
-        settings = options | {"covar_module": covar_module, "constants": constants}
+        settings = options | {"covar_module": covar_module, "constants": _plain(constants)}
         rhos, functions = _scalings(physics)
         super().__init__(
             train_X, train_Y, train_Yvar, terms=[*rhos, _delta(covar_module, constants)],
@@ -158,7 +158,7 @@ class ScaleGP(GP):
         physics: Any, covar_module: Any = None, constants: bool | Mapping[str, LogNormal] = True,
         **options: Any,
     ) -> None:  # fmt: skip
-        settings = options | {"covar_module": covar_module, "constants": constants}
+        settings = options | {"covar_module": covar_module, "constants": _plain(constants)}
         constant = _constant(constants, "rho", RHO_CONSTANT)
         rho = Term("rho", as_kernel(covar_module, RHO_CONSTANT), 1.0, constant, 0)
         super().__init__(
@@ -178,7 +178,7 @@ class ZeroMeanGP(GP):
         self, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike = None, *,
         covar_module: Any = None, constants: bool | Mapping[str, LogNormal] = True, **options: Any,
     ) -> None:  # fmt: skip
-        settings = options | {"covar_module": covar_module, "constants": constants}
+        settings = options | {"covar_module": covar_module, "constants": _plain(constants)}
         f = _delta(covar_module, constants, "f")
         super().__init__(train_X, train_Y, train_Yvar, terms=[f], settings=settings, **options)
 
@@ -226,8 +226,13 @@ def _constant(
 ) -> LogNormal | None:
     """Return the prior of a term's constant, None without one."""
     if isinstance(constants, Mapping):
-        return constants.get(name, prior)
+        return LogNormal(*constants.get(name, prior))
     return prior if constants else None
+
+
+def _plain(constants: bool | Mapping[str, LogNormal]) -> Any:
+    """Return constants as a file can hold them."""
+    return {k: (*v,) for k, v in constants.items()} if isinstance(constants, Mapping) else constants
 
 
 def _delta(kernel: Any, constants: bool | Mapping[str, LogNormal], name: str = "delta") -> Term:

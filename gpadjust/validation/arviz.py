@@ -50,7 +50,7 @@ def to_arviz(*models: GP, chains: int = 1, seed: int = 0) -> Any:
     if not models or any(
         each.draws.shape != models[0].draws.shape
         or len(each.draws) % chains
-        or not each.data.Y.equal(models[0].data.Y)
+        or not np.array_equal(each.data.Y, models[0].data.Y, equal_nan=True)
         for each in models
     ):
         raise ValueError(
