@@ -32,8 +32,8 @@ BELOW = ("botorch", "gpytorch", "linear_operator")  # libraries that ours builds
 CSV_TO_FREE_RUN = 33  # files that a log passes on the way to a judged free run
 TRIAL, ITERATION = 40, 42  # that a planned trial and an iteration of Dyna pass, fits included
 OF_CONTROL, OF_CONTROL_AND_RL = 11, 13  # of these
-FILES, CLASSES, FUNCTIONS = 13, 16, 128  # that the ten lines of the README pass; fewer are better
-CORE_LINES = 4692
+FILES, CLASSES, FUNCTIONS = 13, 16, 130  # that the ten lines of the README pass; fewer are better
+CORE_LINES = 4985
 REPORT, WITH_A_REPORT = 20, 24  # of report and validation, and of what is below, by default
 IDENTIFIED = 33  # that a log passes on the way to its page
 

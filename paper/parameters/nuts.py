@@ -126,7 +126,7 @@ def _beside(runs: Sequence[Run], method: str) -> Mapping[str, str]:
         low, high = np.array(reference["lower"]), np.array(reference["upper"])
         gap = (np.array(run["mean"]) - reference["mean"]) / (high - low) * 2 * 1.96
         mean_off.append(np.sqrt(np.mean(gap**2)))
-        band.append(np.exp(np.mean(np.log((np.array(run["upper"]) - run["lower"]) / (high - low)))))
+        band.append(np.mean((np.array(run["upper"]) - run["lower"]) / (high - low)))
     rhat = max((run["rhat"] for run in own if run["rhat"] is not None), default=float("nan"))
     return {
         "off": f"{max(off):.2f}",
@@ -145,28 +145,32 @@ def draw(runs: Sequence[Run], experiment: Nuts) -> list[Path]:
     for i, problem in enumerate(problems):
         own = [run for run in runs if run["problem"] == problem]
         row = axes[3 * i : 3 * i + 3]
+        row[0].set_title(experiment.axes["problem"][problem], fontsize=8, loc="left")
+        for ax, name in zip(row, SHOWN[problem], strict=False):
+            every = np.concatenate([run["numbers"][name] for run in own])
+            is_size = every.min() > 0 and every.max() > 5 * every.min()
+            for run in own:
+                values = np.array(run["numbers"][name])
+                _density(ax, np.log10(values) if is_size else values, _COLOURS[run["method"]])
+            ax.set_xlabel(f"log10 {name}" if is_size else name, fontsize=7)
+            ax.set_yticks([])
+        middle = np.mean([run["mean"] for run in own if run["method"] == "nuts"], axis=0)
         for run in own:
-            colour, label = _COLOURS[run["method"]], None
-            if run["seed"] == own[0]["seed"]:
-                label = experiment.axes["method"][run["method"]]
-            for ax, name in zip(row, SHOWN[problem], strict=False):
-                _density(ax, np.array(run["numbers"][name]), colour, name)
-            style: dict[str, Any] = {"color": colour, "lw": 1}
-            row[2].plot(run["X"], run["lower"], label=label, **style)
-            row[2].plot(run["X"], run["upper"], **style)
-        row[2].set_title(experiment.axes["problem"][problem], fontsize=7)
+            is_first = run["seed"] == own[0]["seed"]
+            label = experiment.axes["method"][run["method"]] if is_first else None
+            for end in ("lower", "upper"):
+                y = np.array(run[end]) - middle
+                row[2].plot(run["X"], y, color=_COLOURS[run["method"]], lw=1, label=label)
+                label = None
+        row[2].set_title("95 % bands less the mean of NUTS", fontsize=8, loc="left")
     axes[2].legend(fontsize=7)
     return [save(figure, experiment.out / "nuts.png")]
 
 
-def _density(ax: Any, values: np.ndarray, colour: str, name: str) -> None:
+def _density(ax: Any, x: np.ndarray, colour: str) -> None:
     """Draw a density by its quantiles; a line where there is a single value."""
-    is_size = values.min() > 0 and values.max() > 5 * values.min()
-    x = np.log10(values) if is_size else values
     if np.ptp(x) < 1e-9:
         ax.axvline(x[0], color=colour, lw=1, ls=":")
     else:
         grid = np.linspace(x.min() - 0.2 * np.ptp(x), x.max() + 0.2 * np.ptp(x), 200)
         ax.plot(grid, gaussian_kde(x)(grid), color=colour, lw=1)
-    ax.set_xlabel(f"log10 {name}" if is_size else name, fontsize=7)
-    ax.set_yticks([])

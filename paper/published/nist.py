@@ -124,7 +124,7 @@ def tables(runs: Sequence[Run], experiment: Nist) -> dict[str, Table]:
         off = [((torch.tensor(run["mean"]) - data.value) / data.sd).abs().max() for run in own]
         wide = [torch.tensor(run["half"]) / 1.96 / data.sd for run in own]
         low, high = (min(each.min() for each in wide), max(each.max() for each in wide))
-        is_near, is_wide = max(off) < 1, bool(low > 1 / WIDE and high < WIDE)
+        is_near, is_wide = bool(max(off) < 1), bool(low > 1 / WIDE and high < WIDE)
         good.append(is_near and is_wide)
         cells = [name, len(data.X), len(data.value)]
         cells += [
