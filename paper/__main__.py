@@ -14,7 +14,7 @@ from pkgutil import resolve_name
 CHAPTERS = {
     "forrester": ("Forrester",),
     "structures": ("Structures",),
-    "parameters": ("Parameters",),
+    "parameters": ("Parameters", "Nuts"),
     "measuring": ("Active", "Misled"),
     "cartpole": ("CartPole", "Planning"),
     "arm": ("Arm", "Reaching"),
@@ -23,7 +23,7 @@ CHAPTERS = {
         *("Noisyinputs", "Outliers", "Relative", "Vanishing"),
     ),
     "control": ("Known", "First"),
-    "published": ("Masses", "Uci", "Emps", "Freeruns", "Formula"),
+    "published": ("Masses", "Uci", "Emps", "Freeruns", "Formula", "Nist"),
     "machines": ("Real", "Tanks"),
 }
 """Folders, and the classes of the experiments that they declare."""

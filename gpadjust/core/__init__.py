@@ -1,9 +1,9 @@
 """The core: sums of Gaussian processes on a physics, with one table of unknown numbers.
 
 Read it in this order: ``unknowns``, ``data``, ``kernels``, ``terms``, ``noise``, ``gaussian``,
-``sample``, ``fitting``, ``model``, ``structures``. What follows from these: ``posterior``,
-``functions`` (samples of functions), ``summary``, ``views`` (the model for GPyTorch), ``stacked``,
-``saving``, ``threads``.
+``sample``, ``nuts``, ``fitting``, ``model``, ``structures``. What follows from these:
+``posterior``, ``functions`` (samples of functions), ``summary``, ``views`` (the model for
+GPyTorch), ``stacked``, ``saving``, ``threads``.
 """
 
 from gpadjust.core.data import Data

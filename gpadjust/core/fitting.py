@@ -14,6 +14,7 @@ from torch import Tensor
 
 from gpadjust.checks import long_work
 from gpadjust.core.noise import Noise
+from gpadjust.core.nuts import CHAINS, nuts
 from gpadjust.core.sample import (
     GROUPS,
     Draws,
@@ -31,9 +32,12 @@ if TYPE_CHECKING:
 _SMALL = 40  # points: up to these draws begin with the prior
 _MEDIUM, _SHARED = 100, 200  # up to these they are moved; the latter if outputs share numbers
 _SELDOM = 1e-3  # a nested model of less probability at its mode is not drawn from
+_MISSED = 1.0  # log evidence that draws from the prior miss if they have not found the posterior
+_OF_NUTS = 1000  # draws, a multiple of 16
 _SEARCHES = 4  # for the mode
 _NEAR = 0.3  # difference of all coordinates below which two searches have found the same mode
 _LESS_LIKELY = 5.0  # difference of log density from the best mode beyond which a mode is ignored
+_MIXED = 1.05  # R-hat below which chains agree
 _MOVED = 0.35  # predicted standard deviations by which another seed may move the mean
 
 
@@ -46,10 +50,10 @@ class FitResult:
     """What :func:`fit` has found; its text is what to read first.
 
     Args:
-        method: ``"bayes"`` or ``"map"``.
+        method: ``"bayes"``, ``"map"`` or ``"nuts"``.
         log_evidence: The log probability of the targets of each output, ``m``, in their units (of
-            outputs that share unknown numbers, of all together); None of a point fit, a lower bound
-            of many rows.
+            outputs that share unknown numbers, of all together); None of a point fit and of NUTS, a
+            lower bound of many rows.
         probabilities: The probability of each nested model by its text, for each output.
         effective: The least number of starting draws that count, of all outputs.
         error: By how many predicted standard deviations another seed would move the mean at a
@@ -57,6 +61,7 @@ class FitResult:
         num_draws: How many draws predictions average over.
         parameter_error: By how many posterior standard deviations another seed would move the mean
             of an unknown parameter of the physics, at most; NaN without any and of a point fit.
+        rhat: The worst split R-hat of all numbers; NaN but of NUTS.
     """
 
     method: str
@@ -66,11 +71,12 @@ class FitResult:
     error: float = math.nan
     num_draws: int = 1
     parameter_error: float = math.nan
+    rhat: float = math.nan
 
     @property
     def converged(self) -> bool:
         """Whether predictions hardly depend on the seed."""
-        return not self.error > _MOVED
+        return not (self.error > _MOVED or self.rhat > _MIXED)
 
     def __str__(self) -> str:
         lines, outputs = [], [*zip(*self.probabilities.values(), strict=True)]
@@ -80,6 +86,9 @@ class FitResult:
             lines.append(f"Probabilities{which}: {', '.join(parts)}.")
         if self.method == "map":
             lines.append("Point fit: intervals ignore what is unknown of the hyper-parameters.")
+        elif self.method == "nuts":
+            text = f"NUTS, {CHAINS} chains; the worst split R-hat is {self.rhat:.3f}."
+            lines.append(f"{self.num_draws} draws; {text}")
         else:
             lines.append(
                 f"{self.num_draws} draws; another seed would move predictions by {self.error:.2f} "
@@ -99,23 +108,25 @@ def fit(
     prior up to 40 points, from Laplace's approximation beyond; beyond 100 points (200 if outputs
     share unknown numbers, as parameters of a physics) its draws are weighted once and not moved.
     Nested models are drawn from apart and pooled by their posterior probabilities. ``"map"``
-    brings the numbers of the whole model to their most likely values. After five seconds a bar of
-    tqdm shows that it goes on.
+    brings the numbers of the whole model to their most likely values. ``"nuts"`` draws from the
+    same density by Pyro's NUTS, in four chains: a slow reference, of a model without nested ones.
+    After five seconds a bar of tqdm shows that it goes on.
 
     Args:
         model: The model.
-        method: ``"bayes"`` or ``"map"``.
+        method: ``"bayes"``, ``"map"`` or ``"nuts"``.
         num_draws: Number of draws, a multiple of 4; predictions average over a quarter of them.
             Default: 80, 32 (of more than 40 points) or 16 (of more than 100), or 256, 128 or 64 if
             outputs share unknown numbers, as parameters of a physics; predictions then average over
-            16, 8 or 4 of them.
+            16, 8 or 4 of them. Of NUTS 1,000, after as many that are not kept.
         seed: Seed.
 
     Warns:
-        SamplingWarning: If another seed would move predictions by much.
+        SamplingWarning: If another seed would move predictions by much, or chains do not agree.
 
     Raises:
-        ValueError: If the method or number of draws is another one, or the data are a batch.
+        ValueError: If the method or number of draws is another one, or the data are a batch; of
+            NUTS also if the model is averaged with nested ones, or is fitted without a density.
 
     Example:
         >>> import torch
@@ -126,8 +137,10 @@ def fit(
     """
     if not hasattr(model, "log_likelihood"):
         raise TypeError(f"Expected a model of gpadjust.core; found {type(model).__name__}.")
-    if method not in ("bayes", "map"):
-        raise ValueError(f"Unknown method {method!r}; expected 'bayes' or 'map'.")
+    if method not in ("bayes", "map", "nuts"):
+        raise ValueError(f"Unknown method {method!r}; expected 'bayes', 'map' or 'nuts'.")
+    if method == "nuts":
+        _check_density(model)
     if num_draws is not None and (num_draws < 4 or num_draws % 4):
         raise ValueError(f"Expected num_draws as a multiple of 4; found {num_draws}.")
     if model.data.Y.dim() > 2:
@@ -137,6 +150,13 @@ def fit(
         result: FitResult | None = model.fit_itself(method, num_draws, seed)
         if result is None:
             result = _fitted(model, method, num_draws, seed)
+    if result.rhat > _MIXED:
+        warnings.warn(
+            f"Chains do not agree, split R-hat is {result.rhat:.2f}. Draw more: "
+            f"fit(model, 'nuts', num_draws={4 * len(model.draws)}).",
+            SamplingWarning,
+            stacklevel=2,
+        )
     if result.error > _MOVED:
         warnings.warn(
             f"Predictions depend on the seed: another one would move them by {result.error:.2f} of "
@@ -148,12 +168,35 @@ def fit(
     return result
 
 
+def _check_density(model: GP) -> None:
+    """Raise a ValueError if NUTS cannot draw from the model."""
+    if not model.has_density:
+        raise ValueError(
+            f"{type(model).__name__} has no density of its unknown numbers, which NUTS needs; take "
+            "a model of gpadjust.core with fewer rows."
+        )
+    if model.table.choices:
+        raise ValueError(
+            "NUTS does not draw from several nested models; build the model with nested=False, and "
+            "compare with the default fit of that."
+        )
+
+
 def _fitted(model: GP, method: str, num_draws: int | None, seed: int) -> FitResult:
     """Let a model hold draws, or the most likely coordinates."""
     model.noise = model.noise.learnt(model, partial(_roughly_fitted, model, seed))
     if method == "map":
-        model.set_draws(modes(model, 0, seed, is_precise=True)[:1])
+        mode = modes(model, 0, seed, is_precise=True)[:1]
+        if model.table.shared:
+            start, _ = around_mode(partial(model.log_likelihood, choice=0), mode[0], True)
+            mode = model.table.with_choice(start.mean.unsqueeze(0), 0)
+        model.set_draws(mode)
         return FitResult(method)
+    if method == "nuts":
+        number = num_draws or _OF_NUTS
+        draws, rhat = nuts(model, modes(model, 0, seed, is_precise=True)[0], number, seed)
+        model.set_draws(draws, number // 4)
+        return FitResult(method, num_draws=len(model.u), rhat=rhat)
     number, kept = _default_numbers(model) if num_draws is None else (num_draws, num_draws // 4)
     sampled = _sampled(model, number, seed)
     weights = _weights(model, {k: draws.log_evidence for k, draws in sampled.items()})
@@ -193,14 +236,16 @@ def _sampled(model: GP, number: int, seed: int) -> dict[int, Draws]:
     """Return draws of each nested model; of more than 40 rows of each that is likely enough."""
     n, prior = model.targets().shape[-1], model.table.log_prior
     has_moves = n <= (_SHARED if model.table.shared else _MEDIUM)
-    starts: Mapping[int, Normal | None] = dict.fromkeys(range(len(prior)))
-    if n > _SMALL:
-        starts = _starts(model, seed)
+    is_small, like = n <= _SMALL, model.u.detach()[0]
+    starts = {} if is_small and not model.table.shared else _starts(model, seed)
     sampled: dict[int, Draws] = {}
-    for k, start in starts.items():
-        first, like = 16 if start is None else 4, model.u.detach()[0]
-        target = partial(model.log_likelihood, choice=k)
-        draws = sample(target, like, number, seed, start, first, has_moves)
+    for k in range(len(prior)) if is_small else starts:
+        draw = partial(sample, partial(model.log_likelihood, choice=k), like, number, seed)
+        ways = [draw()] if is_small else []
+        ways += [draw(starts[k], 4, has_moves)] if k in starts else []
+        # Draws from the prior may not arrive where the posterior is narrow; their evidence tells.
+        evidence = [float(way.log_evidence.mean(0).sum()) for way in ways]
+        draws = ways[-1] if evidence[-1] > evidence[0] + _MISSED else ways[0]
         sampled[k] = draws._replace(u=model.table.with_choice(draws.u, k))
     return sampled
 
@@ -226,7 +271,8 @@ def _starts(model: GP, seed: int) -> dict[int, Normal]:
                 )
             )
         starts = {
-            k: around_mode(partial(part.log_likelihood, choice=k), ends[k][0]) for k in likely
+            k: around_mode(partial(part.log_likelihood, choice=k), ends[k][0], is_precise)
+            for k in likely
         }
         likely = _likely(model, {k: evidence for k, (_, evidence) in starts.items()})
     return {k: starts[k][0] for k in likely}

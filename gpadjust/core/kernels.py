@@ -151,10 +151,17 @@ class Stationary(Kernel):
         profile: k.
         outputscale: The prior of s, in squared units of the targets (of a scaling without unit).
             Default: that of the term.
+        lengthscale: The prior of each lengthscale, in shares of d times the range of its input.
     """
 
-    def __init__(self, profile: Profile = RBF, outputscale: LogNormal | None = None) -> None:
+    lengthscale = LogNormal(1.0, _LENGTH_FACTOR)
+
+    def __init__(
+        self, profile: Profile = RBF, outputscale: LogNormal | None = None,
+        lengthscale: LogNormal = lengthscale,
+    ) -> None:  # fmt: skip
         self.profile, self.outputscale = profile, outputscale or DELTA
+        self.lengthscale = lengthscale
         self.is_given = outputscale is not None
 
     def of_term(self, outputscale: LogNormal) -> Stationary:
@@ -165,13 +172,13 @@ class Stationary(Kernel):
         return new
 
     def rows(self, x: Tensor, num_outputs: int) -> list[Row]:
-        """Return lengthscales like d times the ranges of the inputs, and the outputscale."""
+        """Return the lengthscales of the inputs, and the outputscale."""
         ranges = x.amax(-2) - x.amin(-2)
         ranges = ranges.where(ranges > 0, torch.ones_like(ranges))
-        length = (len(ranges) * ranges).expand(num_outputs, -1)
+        length = (self.lengthscale.median * len(ranges) * ranges).expand(num_outputs, -1)
         scale = length.new_full((num_outputs, 1), self.outputscale.median)
         return [
-            Row.positive("lengthscale", length, _LENGTH_FACTOR),
+            Row.positive("lengthscale", length, self.lengthscale.factor),
             Row.positive("outputscale", scale, self.outputscale.factor),
         ]
 

@@ -36,7 +36,7 @@ from gpadjust.core.gaussian import (
 from gpadjust.core.kernels import DELTA, RHO, as_kernel
 from gpadjust.core.noise import KnownNoise, Noise
 from gpadjust.core.posterior import MixturePosterior
-from gpadjust.core.summary import counted, summary, summary_html
+from gpadjust.core.summary import counted, priors, summary, summary_html
 from gpadjust.core.terms import Places, Term, TermSum, WeightedSum
 from gpadjust.core.unknowns import Choice, Row, Table, Values
 from gpadjust.core.views import (
@@ -347,7 +347,7 @@ class GP(gpytorch.models.GP, Predictive):
         total = self.term_sum.at(values, places)
         noise = self.noise.variance(values, places, True)
         observed = ~y.isnan()
-        residual = (y - total.mean).expand(len(u), *y.shape).nan_to_num() * observed
+        residual = (y - total.mean).expand(len(u), *y.shape).masked_fill(~observed, 0.0)
         found = self.sum_likelihood(total, residual, noise, observed, with_gradient)
         value, gradient = found.value, torch.zeros_like(u)
         if with_gradient:
@@ -448,6 +448,8 @@ class GP(gpytorch.models.GP, Predictive):
             error.inputs = X.detach().reshape(-1, X.shape[-1])[rows]
             raise error
 
+    has_density = True
+    """Whether :meth:`log_likelihood` is that of the fitted model, which NUTS draws from."""
     scale_formula: str = ""
     """The scale on which the model is Gaussian, as a formula; empty for that of the targets."""
 
@@ -640,6 +642,14 @@ class GP(gpytorch.models.GP, Predictive):
     def summary(self) -> str:
         """Return the unknown numbers in words and in the user's units."""
         return summary(self)
+
+    def priors(self) -> Any:
+        """Return a frame of the unknown numbers by their priors, in the user's units.
+
+        Its columns are name, output (empty of numbers that all outputs share), median, both ends
+        of the central 95 % interval, and meaning. Nested models have some of these numbers alone.
+        """
+        return priors(self)
 
     def _graph_for(self, X: Tensor) -> torch.set_grad_enabled:
         """Record a graph if inputs or fantasies ask for one, not for the draws."""

@@ -41,7 +41,9 @@ class CKA(GP):
         delta_mean: The prior mean of delta, in the user's units.
         center: Whether the kernel of rho is scaled by f_p - c with an unknown c, or the number c;
             the paper's model has 0, as has one whose delta cannot contain a constant.
-        constants: Whether rho and delta contain unknown constants.
+        constants: Whether rho and delta contain unknown constants; or the priors of their
+            variances, ``{"rho": LogNormal(0.01, 100.0)}``, of delta in squared units of the
+            targets.
         nested: Whether nested models are averaged over, with constants and one physics; or the
             nested models.
         extra_terms: Further terms, which the formula as it is does not have.
@@ -60,7 +62,7 @@ class CKA(GP):
         self, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike = None, *,
         physics: Any, rho_covar_module: Any = None, delta_covar_module: Any = None,
         rho_mean: float | Sequence[float] | None = None, delta_mean: float = 0.0,
-        center: bool | float = True, constants: bool = True,
+        center: bool | float = True, constants: bool | Mapping[str, LogNormal] = True,
         nested: bool | Sequence[Choice] = True, extra_terms: Sequence[Term] = (), **options: Any,
     ) -> None:  # fmt: skip
         for name, value in {"rho_mean": rho_mean, "delta_mean": delta_mean}.items():
@@ -74,17 +76,18 @@ class CKA(GP):
         settings = options | {
             "rho_covar_module": rho_covar_module, "delta_covar_module": delta_covar_module,
             "rho_mean": rho_mean, "delta_mean": delta_mean, "center": center,
-            "constants": constants, "nested": nested, "extra_terms": [*extra_terms],
+            "constants": _plain(constants), "nested": nested, "extra_terms": [*extra_terms],
         }  # fmt: skip
         rhos, functions = _scalings(physics, rho_mean)
-        kernel, constant = as_kernel(rho_covar_module, RHO), RHO_CONSTANT if constants else None
+        kernel = as_kernel(rho_covar_module, RHO)
+        constant = _constant(constants, "rho", RHO_CONSTANT)
         delta = _delta(delta_covar_module, constants)._replace(mean=delta_mean)
         delta_has_constant = as_kernel(delta.kernel).has_constant
         if center is True and kernel.has_constant and not delta_has_constant:
             center = 0.0  # another one would add a constant to delta
         rhos = [rho._replace(kernel=kernel, constant=constant, has_center=center) for rho in rhos]
         choices = [] if isinstance(nested, bool) else [*nested]
-        has_both = constants and kernel.has_constant and delta_has_constant
+        has_both = constants is not False and kernel.has_constant and delta_has_constant
         if nested is True and has_both and len(rhos) == 1:
             choices = _nested(rhos[0].name, extra_terms, functions[0])
         super().__init__(
@@ -132,9 +135,10 @@ class PhysicsMeanGP(GP):
 
     def __init__(
         self, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike = None, *,
-        physics: Any, covar_module: Any = None, constants: bool = True, **options: Any,
+        physics: Any, covar_module: Any = None, constants: bool | Mapping[str, LogNormal] = True,
+        **options: Any,
     ) -> None:  # fmt: skip
-        settings = options | {"covar_module": covar_module, "constants": constants}
+        settings = options | {"covar_module": covar_module, "constants": _plain(constants)}
         rhos, functions = _scalings(physics)
         super().__init__(
             train_X, train_Y, train_Yvar, terms=[*rhos, _delta(covar_module, constants)],
@@ -151,10 +155,11 @@ class ScaleGP(GP):
 
     def __init__(
         self, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike = None, *,
-        physics: Any, covar_module: Any = None, constants: bool = True, **options: Any,
+        physics: Any, covar_module: Any = None, constants: bool | Mapping[str, LogNormal] = True,
+        **options: Any,
     ) -> None:  # fmt: skip
-        settings = options | {"covar_module": covar_module, "constants": constants}
-        constant = RHO_CONSTANT if constants else None
+        settings = options | {"covar_module": covar_module, "constants": _plain(constants)}
+        constant = _constant(constants, "rho", RHO_CONSTANT)
         rho = Term("rho", as_kernel(covar_module, RHO_CONSTANT), 1.0, constant, 0)
         super().__init__(
             train_X, train_Y, train_Yvar, terms=[rho], physics=[physics], settings=settings,
@@ -171,10 +176,10 @@ class ZeroMeanGP(GP):
 
     def __init__(
         self, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike = None, *,
-        covar_module: Any = None, constants: bool = True, **options: Any,
+        covar_module: Any = None, constants: bool | Mapping[str, LogNormal] = True, **options: Any,
     ) -> None:  # fmt: skip
-        settings = options | {"covar_module": covar_module, "constants": constants}
-        f = _delta(covar_module, constants)._replace(name="f")
+        settings = options | {"covar_module": covar_module, "constants": _plain(constants)}
+        f = _delta(covar_module, constants, "f")
         super().__init__(train_X, train_Y, train_Yvar, terms=[f], settings=settings, **options)
 
 
@@ -216,8 +221,23 @@ def _scalings(physics: Any, means: Any = None) -> tuple[list[Term], list[Any]]:
     return [Term(names[i], mean=float(means[i]), physics=i) for i in range(number)], functions
 
 
-def _delta(kernel: Any, constants: bool) -> Term:
-    return Term("delta", as_kernel(kernel, DELTA), constant=DELTA_CONSTANT if constants else None)
+def _constant(
+    constants: bool | Mapping[str, LogNormal], name: str, prior: LogNormal
+) -> LogNormal | None:
+    """Return the prior of a term's constant, None without one."""
+    if isinstance(constants, Mapping):
+        return LogNormal(*constants.get(name, prior))
+    return prior if constants else None
+
+
+def _plain(constants: bool | Mapping[str, LogNormal]) -> Any:
+    """Return constants as a file can hold them."""
+    return {k: (*v,) for k, v in constants.items()} if isinstance(constants, Mapping) else constants
+
+
+def _delta(kernel: Any, constants: bool | Mapping[str, LogNormal], name: str = "delta") -> Term:
+    constant = _constant(constants, name, DELTA_CONSTANT)
+    return Term(name, as_kernel(kernel, DELTA), constant=constant)
 
 
 def _nested(rho: str, extra_terms: Sequence[Term], physics: Any) -> list[Choice]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from textwrap import indent
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,6 +13,10 @@ from gpadjust.core.unknowns import Values
 from gpadjust.display import html_table
 
 _SD = "standard deviation"
+_MEANINGS = {
+    "lengthscale": "distance over which {} changes",
+    _SD: "size of the changes of {}",
+}
 
 
 def summary(model: Any) -> str:
@@ -64,28 +68,101 @@ def counted(counts: dict[str, int]) -> str:
 
 def _of_term(model: Any, term: Term, values: Values, j: int) -> list[str]:
     """Return the numbers of a term of an output, ``N x k``, at the draws that contain them."""
-    unit = float(model.unit[j]) if term.physics is None else 1.0  # a scaling has none
     everywhere = torch.ones(len(model.draws), 1)
     kept = values.get(f"{term.name}.process", everywhere).squeeze(-1) != 0
     head = f"  {term.name}: prior mean {term.mean:.4g}"
     if term.kernel is not None and not kept.all():
         head += f", varies in {int(kept.sum())} of {len(kept)} draws"
-    lines, start = [head], f"{term.name}.kernel."
-    for key in values if kept.any() else ():
-        if key.startswith(start):
-            numbers, name = values[key][kept], key.removeprefix(start).replace("raw_", "")
-            if name.endswith("outputscale"):
-                numbers, name = numbers.sqrt() * unit, name.replace("outputscale", _SD)
-            labels = _labels(model, term, name, numbers.shape[-1])
-            pairs = zip(labels, numbers.unbind(-1), strict=True)
-            lines += [f"    {name}{label}: {_text(each)}" for label, each in pairs]
-    constant = values.get(f"{term.name}.constant", torch.zeros(1))
-    if constant.any():
-        lines.append(f"    {_SD} of the constant: {_text(constant[constant > 0].sqrt() * unit)}")
-    if f"{term.name}.center" in values:
-        c = model.term_sum.center(term, model.table.values(model.draws))
-        lines.append(f"    center: {_text(c[:, j] * model.unit[j])}")
+    lines = [head]
+    for each in numbers_of_term(model, term, values, j):
+        draws = each.draws
+        if each.is_of_kernel:
+            draws = draws[kept]
+        elif each.name.endswith("constant"):
+            draws = draws[draws > 0]
+        lines += [f"    {each.name}: {_text(draws)}"] if len(draws) else []
     return lines
+
+
+class Number(NamedTuple):
+    """An unknown number in the user's units."""
+
+    name: str
+    draws: Tensor  # N
+    meaning: str
+    is_of_kernel: bool = False
+
+
+def numbers_of_term(model: Any, term: Term, values: Values, j: int) -> list[Number]:
+    """Return the numbers of a term of an output, at values of it, ``N x k``."""
+    unit = float(model.unit[j]) if term.physics is None else 1.0  # a scaling has none
+    numbers, start = [], f"{term.name}.kernel."
+    for key in values:
+        if key.startswith(start):
+            draws, name = values[key], key.removeprefix(start).replace("raw_", "")
+            if name.endswith("outputscale"):
+                draws, name = draws.sqrt() * unit, name.replace("outputscale", _SD)
+            labels = _labels(model, term, name, draws.shape[-1])
+            meaning = _MEANINGS.get(name, f"a number of the kernel of {term.name}")
+            pairs = zip(labels, draws.unbind(-1), strict=True)
+            numbers += [
+                Number(name + label, each, meaning.format(term.name), True) for label, each in pairs
+            ]
+    if (constant := values.get(f"{term.name}.constant")) is not None:
+        size = constant.squeeze(-1).sqrt() * unit
+        meaning = f"size of the constant in {term.name}"
+        numbers.append(Number(f"{_SD} of the constant", size, meaning))
+    if (z := values.get(f"{term.name}.center")) is not None:
+        sums = model.term_sum
+        middle, spread = sums.middle[term.physics or 0], sums.spread[term.physics or 0]
+        center = ((middle + spread * z.unsqueeze(-1)) * model.unit)[..., j, 0]
+        numbers.append(Number("center", center, "value of f_p where its scaling changes nothing"))
+    return numbers
+
+
+def numbers_of(model: Any, u: Tensor) -> dict[tuple[str, str], Number]:
+    """Return all numbers at coordinates ``N x B x P``, by output ("" if shared) and name.
+
+    Those of a term that a nested model lacks are its prior's.
+    """
+    values = model.table.values(u)
+    found = {}
+    for i, (name, unknown) in enumerate(model.physics_parameters.unknowns.items()):
+        draws = model.physics_parameters_at(u).draws[:, i]
+        meaning = "a parameter of the physics" + (unknown.unit and f", in {unknown.unit}")
+        found["", name] = Number(name, draws, meaning)
+    noise = model.noise.variance(values, model.places(model.data.X, values), True)
+    for j, output in enumerate(model.data.output_names):
+        own = {key: v[:, j] if v.dim() == 3 else v for key, v in values.items()}
+        for term in model.terms:
+            for each in numbers_of_term(model, term, own, j):
+                name = f"{term.name} {each.name}"
+                found[output, name] = each._replace(name=name)
+        if model.noise.names:
+            sd = noise[..., j, :].mean(-1).sqrt() * float(model.unit[j])
+            meaning = "noise of an observation, in the mean"
+            found[output, f"noise {_SD}"] = Number(f"noise {_SD}", sd, meaning)
+    return found
+
+
+@torch.no_grad()
+def priors(model: Any) -> Any:
+    """Return a frame of the priors of all numbers of the whole model, in the user's units."""
+    from pandas import DataFrame  # here alone, as models do not need it
+
+    table = model.table
+    if table.has_other_priors:
+        u = table.prior_draws(4000, 0)
+    else:  # each number rises with its coordinate
+        levels = torch.tensor([0.5, 0.025, 0.975]).to(model.u)
+        u = torch.special.ndtri(levels).reshape(-1, 1, 1).expand(-1, table.problems, table.size)
+    levels = torch.tensor([0.5, 0.025, 0.975]).to(model.u)
+    rows = []
+    for (output, _), each in numbers_of(model, table.with_choice(u, 0)).items():
+        ends = each.draws.quantile(levels) if len(u) > 3 else each.draws
+        rows.append([each.name, output, *ends.tolist(), each.meaning])
+    columns = ["name", "output", "median", "2.5 %", "97.5 %", "meaning"]
+    return DataFrame(rows, columns=columns)
 
 
 def _labels(model: Any, term: Term, name: str, number: int) -> list[str]:

@@ -176,6 +176,16 @@ class Table:
                 total = total + (part if self.problems > 1 else part.sum(-1, keepdim=True))
         return total
 
+    def prior_draws(self, number: int, seed: int) -> Tensor:
+        """Return coordinates ``number x B x P`` of draws from the prior."""
+        generator, like = torch.Generator().manual_seed(seed), (*self.own, *self.shared)[0].location
+        u = standard_normal((number, self.problems, self.size), generator, like)
+        if not self.has_other_priors:
+            return u
+        weights = self.log_prior_ratio(u).nan_to_num(neginf=-1e300).softmax(0)
+        problems = [w.multinomial(number, True, generator=generator) for w in weights.mT]
+        return torch.stack([u[rows, b] for b, rows in enumerate(problems)], 1)
+
     def of_outputs(self, outputs: Sequence[int]) -> Table:
         """Return the table of some outputs."""
         own = [row._replace(location=row.location[outputs]) for row in self.own]

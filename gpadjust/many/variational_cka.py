@@ -68,6 +68,7 @@ class VariationalCKA(CKA):
         >>> lower, upper = model.interval(train_X[:3])
     """
 
+    has_density = False
     inducing: Tensor | None
 
     def __init__(

@@ -1,5 +1,6 @@
 """Judging predictions, and choosing by them. `gpadjust.validation.plots` needs matplotlib."""
 
+from gpadjust.validation.arviz import to_arviz
 from gpadjust.validation.comparison import STRUCTURES, Comparison, Structure, compare
 from gpadjust.validation.leave_one_out import LeaveOneOut, leave_one_out
 from gpadjust.validation.scores import Scores, score
@@ -18,5 +19,6 @@ __all__ = [
     "compare",
     "leave_one_out",
     "score",
+    "to_arviz",
     "trust",
 ]

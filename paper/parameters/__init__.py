@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -48,6 +48,37 @@ class Parameters(Experiment):
 
         known = textbook_case(kind[0], 0)
         return {"observations": len(known.X), "noise": known.noise}
+
+
+@dataclass(frozen=True, kw_only=True)
+class NutsSettings:
+    """Settings that decide the numbers."""
+
+    num_draws: int = 240
+    """of NUTS, in four chains, after as many that are not kept"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Nuts(Experiment):
+    """The default fit beside NUTS and the most likely numbers, of the same density."""
+
+    runs: int = 2
+    """seeds of each fit"""
+    out: Path = Path("results/nuts")
+    settings: NutsSettings = field(default_factory=NutsSettings)
+
+    axes: ClassVar[Axes] = {
+        "problem": {
+            "wave": "CKA, 18 points, noise",
+            "forrester": "CKA, 8 points, no noise",
+            "ball": "physics mean, 20 points, two unknowns",
+            "enzyme": "calibrated physics, 14 points, three unknowns",
+            "Thurber": "calibrated physics, 37 points, seven unknowns",
+        },
+        "method": {"bayes": "default", "nuts": "NUTS", "map": '"map"'},
+    }
+    calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA", "gpadjust.PhysicsMeanGP")
+    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "pyro-ppl")
 
 
 LAWS = (

@@ -57,6 +57,13 @@ class Uci(Experiment):
 _TEXTBOOK = tuple(Parameters.axes["problem"])
 RIGHT = ("addend", "gain, noise", "throttle, noise", "lens", "exchanger, noise")
 """Problems whose formula is taken as the truth, with noise."""
+NIST_SETS = (
+    *("Misra1a", "Chwirut2", "Chwirut1", "Lanczos3", "Gauss1", "Gauss2", "DanWood", "Misra1b"),
+    *("Kirby2", "Hahn1", "Nelson", "MGH17", "Lanczos1", "Lanczos2", "Gauss3", "Misra1c"),
+    *("Misra1d", "Roszman1", "ENSO", "MGH09", "Thurber", "BoxBOD", "Rat42", "MGH10"),
+    *("Eckerle4", "Rat43", "Bennett5"),
+)
+"""In NIST's order of difficulty: 8 lower, 11 average, 8 higher."""
 GROUPS = {
     "right": "the formula is right, with noise",
     "laws": "laws with unknown parameters",
@@ -258,3 +265,18 @@ class Masses(Experiment):
     def seeds_of(self, task: str, *kind: Any) -> Sequence[int]:
         """The folds that are left out; one run of the other tasks."""
         return self.seeds if task == "fold" else self.seeds[:1]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Nist(Experiment):
+    """NIST's certified nonlinear regressions: values and intervals from both starts."""
+
+    runs: int = 2
+    """seeds of each set and start"""
+    out: Path = Path("results/nist")
+
+    axes: ClassVar[Axes] = {
+        "name": {name: name for name in NIST_SETS},
+        "start": {1: "start 1", 2: "start 2"},
+    }
+    calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CalibratedPhysics")

@@ -135,8 +135,8 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/core/sample.py",
-        "precision = 1 + values.clamp_min(0.0)",
-        "precision = values.clamp_min(1e-3)",
+        "@ vectors.mT + root.mT @ root",
+        "@ vectors.mT + 1e-3 * root.mT @ root",
         "Laplace's approximation forgets the prior.",
     ),
     Fault(

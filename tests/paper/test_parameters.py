@@ -25,3 +25,11 @@ def test_cases_are_of_their_law(name):
 def test_a_run_of_a_textbook_case(tmp_path):
     main(Parameters(out=tmp_path, runs=2, jobs=1, only=("smooth", "physics")))
     assert "| calibrated physics | slope | 2 |" in (tmp_path / "tables.md").read_text()
+
+
+@pytest.mark.slow
+def test_nuts_and_the_default(ran, tmp_path):
+    runs, tables = ran("nuts", "--only", "enzyme", "--num-draws", "32")
+    assert len(runs) == 6
+    assert "NUTS" in tables
+    assert (tmp_path / "nuts.png").exists()

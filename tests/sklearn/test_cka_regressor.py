@@ -424,7 +424,7 @@ REFUSED = [
     ({"model": "rra", "physics": None}, ValueError, "without one take model='zero_mean'"),
     ({"physics": "wave"}, TypeError, "physics must be a Physics or a callable"),
     ({"physics": lambda X: X[:, 0] * np.nan}, PhysicsError, "finite"),
-    ({"fit_method": "hmc"}, ValueError, "Unknown method 'hmc'; expected 'bayes' or 'map'"),
+    ({"fit_method": "hmc"}, ValueError, "Unknown method 'hmc'; expected 'bayes', 'map' or 'nuts'"),
     ({"num_draws": 3}, ValueError, "a multiple of 4; found 3"),
     ({"model": partial(CKA, centre=0)}, TypeError, "option 'centre' of CKA"),
     ({"physics": None, "model": CKA}, TypeError, "argument: 'physics'"),

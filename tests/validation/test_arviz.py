@@ -1,0 +1,85 @@
+"""Draws for ArviZ: groups, names and units, and what its functions make of them."""
+
+import sys
+import warnings
+
+import matplotlib
+import matplotlib.pyplot
+import pytest
+import torch
+
+from gpadjust import CKA, ZeroMeanGP, fit
+from gpadjust.validation import to_arviz
+from tests.systems import line, refused, wave
+
+matplotlib.use("Agg")
+style = matplotlib.style
+if not hasattr(style, "core"):  # since matplotlib 3.11, which ArviZ 0.8 does not know
+    style.core = style
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")
+    plots = pytest.importorskip("arviz_plots")
+    stats = pytest.importorskip("arviz_stats")
+
+
+def fitted(structure, X, Y, seeds=(0, 1), **options):
+    models = [structure(X, Y, **options) for _ in seeds]
+    for seed, model in zip(seeds, models, strict=True):
+        fit(model, seed=seed)
+    return models
+
+
+@pytest.fixture(scope="module")
+def models():
+    X = line(14)
+    noise = torch.randn(X.shape, generator=torch.Generator().manual_seed(0), dtype=X.dtype)
+    return fitted(CKA, X, 20 * wave(X) + 10 * X + noise, physics=lambda X: 10 * wave(X))
+
+
+def test_groups_have_the_names_and_units_of_the_summary(models):
+    tree = to_arviz(*models)
+    groups = {"posterior", "prior", "log_likelihood", "observed_data", "posterior_predictive"}
+    assert {*tree.children} == groups
+    assert dict(tree.posterior.sizes) == {"chain": 2, "draw": len(models[0].draws)}
+    assert {*tree.posterior.data_vars} == {*models[0].priors()["name"]} == {*tree.prior.data_vars}
+    noise = tree.posterior["noise standard deviation"].to_numpy()
+    assert 0.5 < float(noise[0].mean()) < 2
+    medians = tree.prior.median()
+    for row in models[0].priors().itertuples():
+        if row.name != "rho center":
+            assert float(medians[row.name]) == pytest.approx(row.median, rel=1.5)
+    assert tree.observed_data["y"].shape == (14,)
+    assert tree.posterior_predictive["y"].shape == (2, len(models[0].draws), 14)
+
+
+def test_arviz_works_on_it(models):
+    tree = to_arviz(*models)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # ArviZ's own; colours of matplotlib 3.11 stop its traces
+        loo = stats.loo(tree)
+        assert plots.plot_trace(tree, backend="none").viz is not None
+        assert plots.plot_ppc_dist(tree) is not None
+        summary = stats.summary(tree)
+    left_out = models[0].left_out()
+    lppd = float(left_out.log_density(models[0].data.Y).sum())
+    assert loo.elpd + loo.p == pytest.approx(lppd, abs=2)
+    assert "noise standard deviation" in summary.index
+    matplotlib.pyplot.close("all")
+
+
+def test_outputs_and_missing_targets():
+    X = line(10)
+    Y = torch.cat([wave(X), 2 * wave(X)], 1)
+    Y[3, 1] = torch.nan
+    (model,) = fitted(ZeroMeanGP, X, Y, seeds=[0])
+    tree = to_arviz(model, chains=2)
+    assert "y2: noise standard deviation" in tree.posterior
+    assert tree.log_likelihood["y1"].shape == (2, len(model.draws) // 2, 10)
+    assert tree.observed_data["y2"].shape == (9,)
+
+
+def test_refused(models, monkeypatch):
+    refused(ValueError, "fits of one model", to_arviz)
+    refused(ValueError, "multiple of 3", to_arviz, models[0], chains=3)
+    monkeypatch.setitem(sys.modules, "arviz_base", None)
+    refused(ImportError, r"gpadjust\[arviz\]", to_arviz, *models)
