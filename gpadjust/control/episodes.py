@@ -301,6 +301,14 @@ def teach(task: Task, data: Trajectories) -> None:
         raise
 
 
+def warn_of_delay(dynamics: Dynamics, known: Trajectories, num_new: int) -> None:
+    """Warn of a delay that was not told, after the episodes that have shown it first."""
+    physics = dynamics.physics_alone()
+    delay = None if physics is None else find_delay(physics, known)
+    if delay and physics and find_delay(physics, known.some(slice(len(known) - num_new))) is None:
+        warnings.warn(delay, UserWarning, stacklevel=4)
+
+
 def learn_dynamics(
     task: Task, new: Trajectories, known: Trajectories, horizons: Sequence[int]
 ) -> dict[str, float]:
@@ -359,11 +367,8 @@ def learn_dynamics(
                     numbers[f"coverage_{k}"] = float(far.coverage[i][spec.moving].mean())
                     numbers[f"energy_{k}"] = float(far.energy[i].mean())  # type: ignore[index]
         numbers["score_seconds"] = time.perf_counter() - start
-    # A delay that was not told is told after the episodes that have shown it first.
-    physics, begun = dynamics.physics_alone(), time.perf_counter()
-    delay = None if physics is None else find_delay(physics, known)
-    if delay and physics and find_delay(physics, known.some(slice(len(known) - len(new)))) is None:
-        warnings.warn(delay, UserWarning, stacklevel=3)
+    begun = time.perf_counter()
+    warn_of_delay(dynamics, known, len(new))
     teach(task, data if task.sensors is None else learnable(dynamics, known))
     numbers["fit_seconds"] = time.perf_counter() - begun
     return {name: value for name, value in numbers.items() if not math.isnan(value)}

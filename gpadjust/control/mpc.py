@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gpadjust.checks import check_kind, checked_bounds, checked_number, checked_whole, seeded
 from gpadjust.control.constraints import margins
-from gpadjust.control.episodes import decoded, teach
+from gpadjust.control.episodes import decoded, teach, warn_of_delay
 from gpadjust.control.faults import check_observation
 from gpadjust.control.rollouts import (
     Objective,
@@ -30,6 +30,7 @@ from gpadjust.dynamics import Trajectories
 from gpadjust.states import StateSpec
 
 _PART = 1.5  # horizons of a step that a part of an episode's first plan looks ahead
+_FIRST_ROUNDS = 5  # of the plan of an episode that begins
 _SHORTEST, _LONGEST = 8, 30  # steps ahead
 
 
@@ -105,7 +106,8 @@ class Planner:
         correlation: Of the deviations from the mean of a step and the next one, in [0, 1): higher
             for smoother actions (Pinneri et al. 2020).
         horizon: The most time to look ahead, in the time unit of ``spec.step``; in steps where the
-            spec has none. Default: to the end of the episode.
+            spec has none. Default: to the end of the episode (of a step's plan in :class:`MPC`: a
+            third of the episode, of 8 to 30 steps).
         num_functions: Number of functions of the posterior that each sequence is followed through;
             None for the mean of the model, which takes least time
             (:meth:`~gpadjust.dynamics.LearnedDynamics.mean_function`).
@@ -133,14 +135,14 @@ class Planner:
 
     objective: Objective = field(default_factory=Return)
     _: KW_ONLY
-    rounds: int = 2
-    num_elites: int = 8
-    correlation: float = 0.0
+    rounds: int = 1
+    num_elites: int = 12
+    correlation: float = 0.5
     horizon: float | None = None
     num_functions: int | None = None
-    num_random: int = 80
+    num_random: int = 128
     max_hold: int = 5
-    spread: float = 0.1
+    spread: float = 0.15
     seconds: float | None = None
 
     def __post_init__(self) -> None:
@@ -284,13 +286,6 @@ def _correlated_noise(shape: Sequence[int], correlation: float) -> Tensor:
     return noise
 
 
-EACH_STEP = Planner(rounds=1, num_elites=12, correlation=0.5, num_random=128, spread=0.15)
-"""The default plan of a step: two looks at 128 sequences, of eight to 30 steps."""
-
-FIRST = replace(EACH_STEP, rounds=5)
-"""The default plan of an episode that begins: the whole of it."""
-
-
 class MPC:
     """Model predictive control: at each step the steps ahead are planned, and the first is made.
 
@@ -300,13 +295,12 @@ class MPC:
     Args:
         task: The task. Its dynamics are what :meth:`learn` updates.
         action_bounds: Lower and upper bounds of the actions, ``2 x action_dim``.
-        each_step: Plans at each step but the first. Default: two looks at 128 sequences of a third
-            of the episode, of 8 to 30 steps. A horizon must be as long as the manoeuvre
+        each_step: Plans at each step but the first. A horizon must be as long as the manoeuvre
             needs, as energy must be put into a pole before it can stand: try it in f_p alone
             (:class:`~gpadjust.dynamics.PhysicsDynamics`) first.
-        first: Plans when an episode begins, which has not to be in time. Default: six looks at the
-            whole episode, or as far as ``each_step`` if it has no length; objective and functions
-            are those of ``each_step``.
+        first: Plans when an episode begins, which has not to be in time. Default: five rounds of
+            the whole episode, or as far as ``each_step`` if it has no length; objective and
+            functions are those of ``each_step``.
         tolerance: Where the plan of a step is worth less than was promised of its steps by more
             than this share of the range of the promised rewards (a step, on average), the rest is
             planned as when the episode began; where ``each_step`` has ``seconds``, about that plan,
@@ -315,9 +309,8 @@ class MPC:
             before there are data.
 
     Raises:
-        TypeError: If a planner is of another kind.
-        ValueError: If there is neither an episode length nor a horizon, or ``action_bounds`` are no
-            bounds.
+        TypeError: If the task or a planner is of another kind.
+        ValueError: If a horizon is shorter than a step, or ``action_bounds`` are no bounds.
 
     Example:
         >>> import numpy as np
@@ -344,17 +337,20 @@ class MPC:
         tolerance: float | None = 0.25,
         state_filter: StateFilter | None = None,
     ) -> None:
+        check_kind("task", task, Task, "a Task(dynamics, reward, ...)")
         for name, planner in (("each_step", each_step), ("first", first)):
             check_kind(name, planner, Planner | None, "a Planner(...)")
         if tolerance is not None:
             checked_number("tolerance", tolerance, above=0)
         length, spec = task.episode_length, task.dynamics.spec
-        if each_step is None:
+        each_step = Planner() if each_step is None else each_step
+        if each_step.horizon is None:
             steps = min(max((length or 0) // 3, _SHORTEST), _LONGEST)
-            each_step = replace(EACH_STEP, horizon=steps * (spec.step or 1.0))
+            each_step = replace(each_step, horizon=steps * (spec.step or 1.0))
         if first is None:
             like = {name: getattr(each_step, name) for name in ("objective", "num_functions")}
-            first = replace(FIRST, **like, horizon=each_step.horizon if length is None else None)
+            whole = each_step.horizon if length is None else None
+            first = Planner(rounds=_FIRST_ROUNDS, **like, horizon=whole)
         for planner in (each_step, first):
             planner.steps_ahead(spec, length)  # or an error
         self.task = task
@@ -411,8 +407,8 @@ class MPC:
         """Return a measurement, checked; record the transition to it, if there is one."""
         last, self._last = self._last, None  # no transition goes across what fails from here on
         values = np.atleast_1d(np.asarray(measurement, dtype=np.float64))
-        check_observation(values)
         spec = self.task.observed
+        check_observation(values, names=spec.observations)
         if values.ndim != 1:
             raise ValueError(
                 f"Expected a measurement of {spec.observation_dim} numbers, found shape "
@@ -439,6 +435,9 @@ class MPC:
             PhysicsError: If the physics fails at a transition.
         """
         hidden, number = self.filter is not None, self._num_learnt
+        if data is not None:
+            told = "Trajectories(states, actions, next_states, episode) of tensors"
+            check_kind("data", data, Trajectories, told)
         if data is not None and hidden:
             raise ValueError(
                 "The states behind trajectories of sensors are estimated from what `step` has "
@@ -452,7 +451,9 @@ class MPC:
                     "the measurement after it: call `step` first, or pass trajectories."
                 )
             # The states behind all measurements of sensors are known better by now.
-            data = self._states_of(self._steps[0 if hidden else self._num_learnt :])
+            known = self._states_of(self._steps)
+            data = known if hidden else known.some(slice(self._num_learnt, None))
+            warn_of_delay(self.task.dynamics, known, number - self._num_learnt)
         teach(self.task, data)
         self._num_learnt = number
         return self
@@ -519,9 +520,9 @@ class MPC:
         """Return the steps ahead of an episode at a state, which has the covariance."""
         begun, task, seconds = time.perf_counter(), self.model, self.each_step.seconds
         moment = Moment() if earlier is None else earlier.moment
-        left = None
-        if task.episode_length is not None:
-            left = max(task.episode_length - moment.steps_done, 1)
+        left = None  # beyond the episode's length it looks as far ahead as ever
+        if task.episode_length is not None and moment.steps_done < task.episode_length:
+            left = task.episode_length - moment.steps_done
         at: Any = task, state, self.action_bounds, left
         how: dict[str, Any] = {"moment": moment, "covariance": covariance}
         if earlier is None or not len(earlier.actions):

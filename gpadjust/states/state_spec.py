@@ -221,14 +221,20 @@ class StateSpec:
         ]
         return torch.stack(columns, dim=-1)
 
+    @property
+    def observations(self) -> list[str]:
+        """Names of the entries of an observation."""
+        entries: list[str] = []
+        for name in self.states:
+            entries += [f"sin {name}", f"cos {name}"] if name in self.angles else [name]
+        return entries
+
     def check_observations(self, observations: Tensor) -> None:
         """Raise a ValueError if there are more or fewer entries, or pairs far from the circle.
 
         Observations ``... x observation_dim`` may be those of noisy sensors.
         """
-        entries: list[str] = []
-        for name in self.states:
-            entries += [f"sin {name}", f"cos {name}"] if name in self.angles else [name]
+        entries = self.observations
         try:
             check_columns("observations", observations, len(entries))
         except ValueError as error:
@@ -292,7 +298,10 @@ class StateSpec:
                 row, said, advice = int(rows[0]), *_EXOGENOUS
                 if other is not None:
                     said = f"hold the previous {'action' if is_action else 'state'} {other!r}"
-                    advice = f"Correct `previous`, or take {name!r} out of it, {_PREDICTS}."
+                    advice = (
+                        f"Correct `previous`, or take {name!r} out of it, {_PREDICTS}; or leave "
+                        "out transitions from one episode into the next (reset() where one begins)."
+                    )
                 raise ValueError(
                     f"State {name!r} is said to {said}, but is {float(next_states[row, i]):.6g} "
                     f"where {float(expected[row, i]):.6g} was expected in row {row}. {advice}"

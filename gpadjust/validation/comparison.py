@@ -41,6 +41,7 @@ from gpadjust.validation.verdict import (
     correction_of,
     difference,
     fault_of,
+    is_shown,
     next_point,
     straight_line,
     unsampled,
@@ -372,8 +373,11 @@ def _verdict(c: Comparison, j: int, f: Tensor | None, fault: str) -> Verdict | N
     adjusted = next((row for row in rows if row.kind == ADJUSTED), best)
     alone = line = factor = offset = math.nan
     loo = c.left_out[best.structure]
-    correction = ""
+    correction, is_surpassed = "", False
     if f is not None:
+        formula = next((name for name in (ALONE, CALIBRATED) if name in densities), None)
+        if formula is not None:
+            is_surpassed = is_shown(densities[adjusted.structure], densities[formula])
         y = loo.Y[:, j]
         if loo.is_outlier is not None:
             y = y.masked_fill(loo.is_outlier[:, j], torch.nan)
@@ -394,6 +398,7 @@ def _verdict(c: Comparison, j: int, f: Tensor | None, fault: str) -> Verdict | N
         factor,
         offset,
         fault,
+        is_surpassed,
     )
     pair = c.models[adjusted.structure], c.models[without.structure]
     return verdict_on(evidence, correction, next_point(*pair, j))

@@ -119,6 +119,7 @@ class Evidence(NamedTuple):
         factor: Of the straight line through observations over the formula.
         offset: Likewise.
         fault: What is obviously wrong with the formula, in words.
+        is_surpassed: Whether densities of left-out observations show that the correction is needed.
     """
 
     name: str
@@ -133,6 +134,7 @@ class Evidence(NamedTuple):
     factor: float
     offset: float
     fault: str = ""
+    is_surpassed: bool = False
 
 
 def difference(first: Tensor, second: Tensor) -> tuple[float, float]:
@@ -183,7 +185,8 @@ def verdict_on(e: Evidence, correction: str, next_point: str) -> Verdict:
             doubt = f"{without[0].upper()}{without[1:]}"
         return Verdict(OPEN, [f"{doubt}.{where}"])
     simple = e.line if e.alone > _LARGER * e.line else e.alone  # NaN of several
-    if simple <= _LARGER * min(e.adjusted, e.data):
+    is_enough = not (e.is_surpassed and simple == e.alone)
+    if simple <= _LARGER * min(e.adjusted, e.data) and is_enough:
         if simple == e.alone:
             reason = f"Its error is {error(e.alone)}, corrected {error(e.adjusted)}"
             return Verdict(AS_IS, [f"{reason}, of the data alone {error(e.data)}."])
@@ -203,6 +206,12 @@ def verdict_on(e: Evidence, correction: str, next_point: str) -> Verdict:
             "where there are none."
         )
     return Verdict(CORRECTED, reasons)
+
+
+def is_shown(first: Tensor, second: Tensor) -> bool:
+    """Return whether densities of the first are better by a nat and by two standard errors."""
+    gain, se = difference(first, second)
+    return gain > max(_SURE * se, _LEAST)
 
 
 def straight_line(y: Tensor, f: Tensor) -> tuple[float, float, float]:
