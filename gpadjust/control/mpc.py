@@ -29,6 +29,7 @@ from gpadjust.control.task import Moment, Steps, Task
 from gpadjust.dynamics import Trajectories
 from gpadjust.states import StateSpec
 
+_PART = 1.5  # horizons of a step that a part of an episode's first plan looks ahead
 _SHORTEST, _LONGEST = 8, 30  # steps ahead
 
 
@@ -524,7 +525,7 @@ class MPC:
         at: Any = task, state, self.action_bounds, left
         how: dict[str, Any] = {"moment": moment, "covariance": covariance}
         if earlier is None or not len(earlier.actions):
-            return self._promising(self.first.plan(*at, **how), earlier)
+            return self._promising(self._anew(*at, **how), earlier)
         if seconds is not None:
             how["deadline"] = begun + seconds
         plan = self.each_step.plan(*at, earlier=earlier, **how)
@@ -538,12 +539,42 @@ class MPC:
         if not self._disappoints(plan, earlier):
             return merged
         if seconds is None:
-            return self._promising(self.first.plan(*at, **how), earlier)
+            return self._promising(self._anew(*at, **how), earlier)
         if begun + seconds - time.perf_counter() < seconds / 2:
             return merged
         plan = self.first.plan(*at, earlier=merged, **how)
         is_whole = len(plan.actions) >= len(merged.actions)
         return self._promising(plan, earlier) if is_whole else merged
+
+    def _anew(self, task: Task, state: Tensor, bounds: Tensor, left: int | None, **at: Any) -> Plan:
+        """Return a plan of the steps ahead without an earlier one: the better of two searches.
+
+        One begins with random sequences. Of an unstable system those of a whole episode tell
+        nothing; the other search begins with a plan that is made in the model part by part.
+        """
+        plan = self.first.plan(task, state, bounds, left, **at)
+        horizon, is_limited = self.each_step.horizon, self.first.horizon or self.first.seconds
+        if horizon is None or left is None or is_limited:
+            return plan
+        ahead = replace(self.first, horizon=_PART * horizon)
+        moment, here, done = at["moment"], state, 0
+        part: Plan | None = None
+        if ahead.steps_ahead(task.dynamics.spec, left) >= left:
+            return plan
+        actions, states = bounds[:0], state.unsqueeze(0)[:0]
+        while done < left:
+            part = ahead.plan(task, here, bounds, left - done, earlier=part, moment=moment)
+            k = len(part.actions)
+            k = k if done + k == left else -(-k // 2)  # half of it is made
+            made, here = part.actions[:k], part.next_states[k - 1]
+            actions, states = torch.cat([actions, made]), torch.cat([states, part.next_states[:k]])
+            part = part._replace(actions=part.actions[k:], next_states=part.next_states[k:])
+            for action in made:
+                moment = moment.after(action)
+            done += k
+        rough = plan._replace(actions=actions, next_states=states)
+        other = self.first.plan(task, state, bounds, left, earlier=rough, **at)
+        return max(plan, other, key=lambda each: each.value)
 
     @staticmethod
     def _promising(plan: Plan, earlier: Plan | None) -> Plan:
