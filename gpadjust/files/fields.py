@@ -165,7 +165,6 @@ def seconds_in(unit: str) -> float | None:
 
 
 def time_unit_of(name: str) -> str:
-    """Return the unit at the end of a name such as ``time_ms`` or ``millis``, or nothing."""
+    """Return the unit of time that a name is or ends with, as ``time_ms`` or ``millis``, or ""."""
     last = re.split(r"[\s_.-]+", name.strip())[-1]
-    short = last if len(last) < len(name.strip()) or last.lower() in ("millis", "micros") else ""
-    return short if seconds_in(short) is not None else ""
+    return last if seconds_in(last) is not None else ""

@@ -18,7 +18,8 @@ from gpadjust.files.fields import is_missing, is_moment, is_number
 Row = tuple[int, list[str]]
 """The line at which a row begins, counted from 1, and its fields."""
 
-_MARKS = (";", "\t", "|", ",", " ")
+_SURE = (";", "\t", "|")  # which part fields where a decimal comma or a name with blanks may be
+_MARKS = (*_SURE, ",", " ")
 _SAMPLE = 200  # rows that tell the delimiter
 _CODES = {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 
@@ -87,7 +88,9 @@ def _delimiter(text: str) -> str:
         fields = [field for field in fields if not is_missing(field)]
         if width < 2 or not fields:
             continue
-        share = (0.01 + sum(map(is_value, fields)) / len(fields)) * count / len(rows)
+        # Words count by half, and not where they seem to be several fields.
+        likely = [1.0 if is_value(f) else 0.5 * (not {*f} & {*_SURE}) for f in fields]
+        share = sum(likely) / len(fields) * count / len(rows)
         if share > 1.001 * most:
             best, most = mark, share
     return best

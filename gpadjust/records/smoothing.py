@@ -50,7 +50,7 @@ _LEAST = 1e-6  # of the standard deviation of a state: no noise is less, but by 
 _HALVINGS = 6
 _BETTER = 0.01  # what a worse path may cost more, by rounding
 _MANY, _PLENTY = 3000, 1000  # steps of a log that takes long, and steps that are plenty
-_TIMED = 500  # steps by which the time of a search is estimated
+_TIMED = 200  # steps by which the time of a search is estimated
 _MEDIAN = 0.05  # of a variation beforehand, in standard deviations of a parameter's prior
 
 

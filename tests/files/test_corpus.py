@@ -131,6 +131,9 @@ READ = {
     "milliseconds in a name": case(
         made("time_ms,u,T", times=["0", "500", "1000", "1500"]), {"time": "time_ms"}
     ),
+    "milliseconds as a name": case(
+        made("millis,u,T", times=["0", "500", "1000", "1500"]), {"time": "millis"}
+    ),
     "minutes": case(made("t [min],u,T"), {"time": "t"}, of_time=["--time-unit", "min"]),
     "minutes in hours": case(
         made("t [min],u,T", times=["0", "30", "60", "90"]),
