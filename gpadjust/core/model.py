@@ -393,7 +393,9 @@ class GP(gpytorch.models.GP, Predictive):
             # f_p is in the mean, times g's, and in the weight f_p - c.
             by_f[term.physics] += self.term_sum.mean_of(term, values) * by_mean + by_weight
             if term.has_center is True:
-                without = 1 - values.get(f"{term.name}.mean", torch.ones(()))  # c in f_p's place
+                without = 1 - values.get(
+                    f"{term.name}.mean", by_mean.new_ones(())
+                )  # c in f_p's place
                 by_c = (term.mean * without * by_mean - by_weight).sum(-1, keepdim=True)
                 slopes[f"{term.name}.center"] = by_c * self.term_sum.spread[term.physics]
         if f_slopes and self.noise.has_shares:

@@ -63,7 +63,15 @@ def test_the_cross_entropy_method_finds_an_optimum():
     def planned(rounds, **options):
         calls.clear()
         torch.manual_seed(0)
-        planner = Planner(Near(), rounds=rounds, num_random=60, max_hold=1)
+        planner = Planner(
+            Near(),
+            rounds=rounds,
+            num_elites=8,
+            correlation=0.0,
+            num_random=60,
+            max_hold=1,
+            spread=0.1,
+        )
         return planner.plan(half_steps(), torch.zeros(1).double(), BOUNDS, 4, **options)
 
     plan = planned(12)
@@ -185,7 +193,9 @@ def test_staying_is_better_than_leaving_however_few_the_sequences(origin, seed):
 
 def test_a_plan_of_the_greatest_return(origin):
     """From x = 0 the way to x = 1 and to stay there, by steps of v / 2 with v at most 2."""
-    planner = Planner(Return(), rounds=12, num_random=200, max_hold=1)
+    planner = Planner(
+        Return(), rounds=12, num_elites=8, correlation=0.0, num_random=200, max_hold=1
+    )
     plan = planner.plan(half_steps(), origin, BOUNDS, 4)
     assert plan.value > -0.1
     reached = (plan.actions[:, 0] / 2).cumsum(0)
@@ -237,7 +247,7 @@ class Wrong(Objective):
         ({}, {"action_bounds": BOUNDS * torch.inf}, r"finite action_bounds, .*inf"),
         ({}, {"action_bounds": [[1.0], [-1.0]]}, "action_bounds, each lower one below its upper"),
         ({}, {"num_steps": None}, "a number of steps >= 1 to plan, found None"),
-        ({"objective": Wrong()}, {}, r"Wrong must return one score per seq.* shape \(1, 80\)"),
+        ({"objective": Wrong()}, {}, r"Wrong must return one score per seq.* shape \(1, 128\)"),
     ],
 )
 def test_what_gives_no_plan_is_refused(origin, options, arguments, message):

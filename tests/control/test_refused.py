@@ -58,7 +58,7 @@ VALUES = [
     (lambda at: Planner(rounds=1.5), "rounds must be a whole number; found 1.5"),
     (lambda at: Planner(correlation=1.0), "correlation must be .* below 1"),
     (
-        lambda at: MPC(at.task(episode_length=None), BOUNDS, Planner()),
+        lambda at: MPC(at.task(episode_length=None), BOUNDS, first=Planner()),
         "give the task an episode_length, or the planner a horizon",
     ),
     (lambda at: PolicySearch(updates=0), "updates must be at least 1; found 0"),

@@ -234,7 +234,11 @@ GOOD = Evidence(
         ({"data": 0.1}, "Use it corrected", "the data alone do as well (0.1 N)"),
         ({"alone": math.nan, "line": math.nan}, "Use it corrected", "The error is 0.1 N, of the"),
         ({"alone": 0.1, "line": 0.1}, "Use your formula as it is", "Its error is 0.1 N, corrected"),
-        ({"alone": 0.1, "line": 0.1, "is_surpassed": True}, "Use it corrected", "from 0.1 N to 0.1"),
+        (
+            {"alone": 0.1, "line": 0.1, "is_surpassed": True},
+            "Use it corrected",
+            "from 0.1 N to 0.1",
+        ),
         ({"line": 0.1, "factor": 2.0}, "Use your formula as it is", "Take 2 times your formula: "),
         ({"line": 0.1, "factor": 2.0, "offset": -3.0}, "Use your formula as it is", "less 3 N: "),
         ({"of_use": 0.01, "gain": 0.5}, "Do not use it", "Without it the error is 0.3 N, with it"),
