@@ -400,7 +400,7 @@ class LearnedDynamics(Dynamics):
         with torch.no_grad():
             rows = X.reshape(-1, X.shape[-1])
             moments = self.model.predict(rows, observation_noise=observation_noise)
-        mean, variance = (part.reshape(*X.shape[:-1], -1) for part in moments)
+        mean, variance = (part.reshape(*X.shape[:-1], part.shape[-1]) for part in moments)
         return self.targets.decode(states, mean), variance
 
 

@@ -244,3 +244,27 @@ def test_a_careful_plan_keeps_away_from_what_is_not_known():
         planner = quick(0, objective=Return(quantile=quantile), num_functions=20)
         values[quantile] = planner.plan(task, torch.zeros(1).double(), BOUNDS).value
     assert values[0.1] < values[None]
+
+
+def test_a_loop_goes_on_beyond_the_length_and_warns_of_a_delay():
+    """Of a tank whose pump acts a step late, which nobody has told."""
+
+    def physics(X):
+        return 0.9 * X[:, :1] + 0.5 * X[:, 1:]
+
+    options = {"fit_options": {"method": "map"}}
+    dynamics = LearnedDynamics(StateSpec(["level"], ["pump"]), physics, **options)
+    task = Task(dynamics, lambda s, a, n: -(n[:, 0] - 1).square(), episode_length=20)
+    controller = MPC(task, [[-1.0], [1.0]], quick(horizon=6))
+    rng, level, last, actions = np.random.default_rng(0), np.zeros(1), 0.0, []
+    for _ in range(30):
+        actions.append(controller.step(level)[0])
+        level = 0.9 * level + 0.5 * last + 0.01 * rng.standard_normal(1)
+        last = actions[-1]
+    assert max(map(abs, actions[20:])) > 0.05
+    with pytest.warns(UserWarning, match=r"follow 'pump' 1 step\(s\) late"):
+        controller.learn()
+    with pytest.raises(ValueError, match="'level', entry 0 of the observation is nan"):
+        controller.step([np.nan])
+    with pytest.raises(TypeError, match=r"data must be Trajectories\("):
+        controller.learn([1.0])
