@@ -257,9 +257,9 @@ def next_point(first: GP, second: GP, j: int) -> str:
         return ""
     name = first.data.output_names[j]
     values = [with_unit(number(each.mean[i, j]), name) for each in (a, b)]
-    return (
-        f"{_at(first, X[i]).strip()}, where it is {values[0]} with the formula, {values[1]} without"
-    )
+    where = f"where it is {values[0]} with the formula, {values[1]} without"
+    at = _at(first, X[i]).strip()
+    return f"{at}, {where}" if at else where
 
 
 def _at(model: GP, x: Tensor) -> str:
