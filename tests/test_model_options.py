@@ -61,7 +61,7 @@ def data():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", KINDS)
 def test_compare_and_its_page(name, data, tmp_path, monkeypatch):
-    for figure in ("agreement", "corrections", "left_out", "coverages"):
+    for figure in ("agreement", "corrections", "densities", "left_out", "coverages"):
         monkeypatch.setattr(f"gpadjust.report.figures.{figure}", lambda *args: Markup())
     options, has = KINDS[name]
     found = compare(*data, f_p, structures=["physics mean", "CKA"], **options)

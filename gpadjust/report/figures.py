@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import torch
 from torch import Tensor
 
-from gpadjust.physics import PhysicsError
+from gpadjust.physics import PhysicsError, PhysicsParameters
 from gpadjust.report import markup as html
 from gpadjust.report.markup import Markup, drawn, image, tag
 from gpadjust.report.subject import Subject
@@ -28,6 +30,7 @@ from gpadjust.validation.trust import physics_at
 from gpadjust.words import bare, name_and_unit, number, percent, with_unit
 
 _MOST = 12  # inputs along which slices are drawn, in all outputs together
+_CORRELATED = 0.7  # absolute correlation of parameters whose pair is drawn
 _DECADE = 10.0  # largest over least observation, from which axes are logarithmic
 _BANDS = "Solid lines are means; bands hold 95 % of the function, without measurement noise."
 _NONE = "There is no physics that could be adjusted, trusted or overridden."
@@ -173,6 +176,29 @@ def _limits(values: Tensor) -> tuple[float, float]:
     low, high = values.quantile(0.01), values.quantile(0.99)
     room = 0.15 * (high - low).clamp_min(1e-12 * values.abs().max() + 1e-300)
     return float(low - room), float(high + room)
+
+
+@drawn
+def densities(parameters: PhysicsParameters) -> list[Markup]:
+    """Return the posterior of each parameter beside its prior, and pairs that are correlated."""
+    names = [*parameters]
+    drawn = [html.new_figure(2.0) for _ in names]
+    plots.plot_parameters(parameters, axes=[figure.subplots() for figure in drawn])
+    images = [
+        image(figure, f"density of {name}, posterior and prior")
+        for figure, name in zip(drawn, names, strict=True)
+    ]
+    varying = [i for i in range(len(names)) if parameters.sd[i] > 0]
+    for i, j in combinations(varying, 2):
+        x, y = parameters.draws[:, i], parameters.draws[:, j]
+        if float(torch.corrcoef(torch.stack([x, y]))[0, 1].abs()) > _CORRELATED:
+            figure = html.new_figure(2.4)
+            ax = figure.subplots()
+            ax.plot(x, y, color=BLUE, **DOTS | {"ms": 3})
+            ax.set(xlabel=labels([names[i]])[0], ylabel=labels([names[j]])[0])
+            tidy(ax)
+            images.append(image(figure, f"draws of {names[i]} and {names[j]}, correlated"))
+    return images
 
 
 @drawn

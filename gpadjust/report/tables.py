@@ -170,7 +170,10 @@ def parameters(subject: Subject) -> Markup:
         if isinstance(model, CalibratedPhysics) and by(name) not in known:
             caption = f"Parameters of the physics by itself, with noise ({name})"
             known[caption] = model.physics_parameters
-    parts = [html.parameter_table(caption, own) for caption, own in known.items() if own]
+    parts: list[Markup] = []
+    for caption, own in known.items():
+        if own:
+            parts += [html.parameter_table(caption, own), figures.densities(own)]
     return join([*parts, tag("p", _PARAMETERS)]) if parts else Markup()
 
 

@@ -81,7 +81,7 @@ def read():
 @pytest.fixture
 def undrawn(monkeypatch):
     """Leaves the figures out, which take most of the time."""
-    for name in ("agreement", "corrections", "left_out", "coverages"):
+    for name in ("agreement", "corrections", "densities", "left_out", "coverages"):
         monkeypatch.setattr(f"gpadjust.report.figures.{name}", lambda *args: Markup())
     for name in ("_runs", "_states"):
         monkeypatch.setattr(f"gpadjust.report.log_page.{name}", lambda *args: Markup())
