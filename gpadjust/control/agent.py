@@ -190,7 +190,12 @@ class Agent(ABC):
         Args:
             total_timesteps: Number of steps; the last episode is played to its end.
             callback: One or more, such as :class:`EpisodeCheckpoint` or :func:`print_progress`.
+
+        Raises:
+            TypeError: If ``total_timesteps`` is no whole number.
+            ValueError: If it is negative.
         """
+        checked_whole("total_timesteps", total_timesteps, 0)
         callbacks = [] if callback is None else [callback] if callable(callback) else [*callback]
         end = self.num_timesteps + total_timesteps
         with locked(callbacks):
