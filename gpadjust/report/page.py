@@ -40,10 +40,10 @@ def report(
 ) -> Path:
     """Write a page that shows what a model or a comparison says, for those who decide.
 
-    The page begins with the left-out errors of your formula, of the adjustment and of the data
-    alone, and the verdict: does the physics help? Then it has what is recommended, where the
-    physics is wrong, left-out observations, parameters, advice, data and settings, and how to load
-    the model, which is saved beside it (``report.pt`` beside ``report.html``). The page of a log
+    The page begins with the verdict, should you use your formula, and the left-out errors of the
+    formula, of the adjustment and of the data alone. Then it has where the formula is wrong,
+    parameters, left-out observations, structures, advice, data and settings, and how to load the
+    model, which is saved beside it (``report.pt`` beside ``report.html``). The page of a log
     (:func:`~gpadjust.records.identify`) has a free run along what was held out, parameters, noise
     and hidden states, and no model beside it. It is one file, without scripts and links.
 
