@@ -188,14 +188,14 @@ class Agent(ABC):
         """Play so many further real steps, in whole episodes, and learn from each.
 
         Args:
-            total_timesteps: Number of steps; the last episode is played to its end.
+            total_timesteps: Number of steps; the last episode is played to its end. If it is not
+                positive, as for a run that has ended, episodes that were not learnt are learnt.
             callback: One or more, such as :class:`EpisodeCheckpoint` or :func:`print_progress`.
 
         Raises:
             TypeError: If ``total_timesteps`` is no whole number.
-            ValueError: If it is negative.
         """
-        checked_whole("total_timesteps", total_timesteps, 0)
+        checked_whole("total_timesteps", total_timesteps)
         callbacks = [] if callback is None else [callback] if callable(callback) else [*callback]
         end = self.num_timesteps + total_timesteps
         with locked(callbacks):
