@@ -34,6 +34,7 @@ from gpadjust.validation.verdict import (
     ADJUSTED,
     ALONE,
     CALIBRATED,
+    COUNTS,
     DATA,
     Candidate,
     Evidence,
@@ -51,7 +52,6 @@ from gpadjust.words import number, percent
 
 STACKED = "stacked"  # what a comparison calls the mixture of all structures
 _ALL = 0.95  # weight of a structure that needs no others
-_COUNTS = 0.05  # weight with which a structure is a part of what is recommended
 _WORST = -1e6  # nats; a density of zero would make others' differences infinite
 
 
@@ -322,7 +322,7 @@ def compare(
     # Judge the physics, and repeat each warning once: of a physics, or of what is recommended.
     messages: dict[tuple[str, type[Warning]], None] = {}
     for name, each in caught.items():
-        if any(row.weight > _COUNTS for rows in table.values() for row in rows if row[0] == name):
+        if any(row.weight > COUNTS for rows in table.values() for row in rows if row[0] == name):
             messages |= {(str(one.message), one.category): None for one in each}
     verdicts: dict[str, Verdict] = {}
     for j, output in enumerate(data.output_names):

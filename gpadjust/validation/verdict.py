@@ -30,7 +30,7 @@ _POINTS = 256  # among which the next observation is looked for
 _APART_BY = 0.3  # standard deviations: predictions that are nearer are the same
 _NAMED = 3  # inputs of a point that a sentence has room for
 _NEGLIGIBLE = 0.1  # of the error; a smaller offset is not named
-_COUNTS = 0.05  # weight with which a structure is a part of what is recommended
+COUNTS = 0.05  # weight with which a structure is a part of what is recommended
 
 # Of the check of a physics at the training inputs.
 _SAID = 5  # observations, for anything to be said
@@ -275,7 +275,7 @@ def unsampled(
     table: Mapping[str, Sequence[Candidate]], results: Mapping[str, FitResult]
 ) -> list[str]:
     """Return which structures with weight have other results by other seeds."""
-    names = {row.structure for rows in table.values() for row in rows if row.weight > _COUNTS}
+    names = {row.structure for rows in table.values() for row in rows if row.weight > COUNTS}
     low = [name for name, result in results.items() if name in names and not result.converged]
     if not low:
         return []
