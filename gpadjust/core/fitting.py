@@ -23,6 +23,7 @@ from gpadjust.core.sample import (
     maximise,
     sample,
 )
+from gpadjust.core.straight import FITS, Straight, least_squares_fit
 from gpadjust.core.threads import threads_for
 from gpadjust.core.unknowns import standard_normal
 
@@ -31,10 +32,11 @@ if TYPE_CHECKING:
 
 _SMALL = 40  # points: up to these draws begin with the prior
 _MEDIUM, _SHARED = 100, 200  # up to these they are moved; the latter if outputs share numbers
+_FIRST = 4  # draws from Laplace's approximation for each one that is kept
 _SELDOM = 1e-3  # a nested model of less probability at its mode is not drawn from
-_MISSED = 1.0  # log evidence that draws from the prior miss if they have not found the posterior
 _OF_NUTS = 1000  # draws, a multiple of 16
 _SEARCHES = 4  # for the mode
+_STEPS, _PRECISE_STEPS = 2_000, 200  # of them; those of a precise one begin again where they end
 _NEAR = 0.3  # difference of all coordinates below which two searches have found the same mode
 _LESS_LIKELY = 5.0  # difference of log density from the best mode beyond which a mode is ignored
 _MIXED = 1.05  # R-hat below which chains agree
@@ -240,14 +242,42 @@ def _sampled(model: GP, number: int, seed: int) -> dict[int, Draws]:
     starts = {} if is_small and not model.table.shared else _starts(model, seed)
     sampled: dict[int, Draws] = {}
     for k in range(len(prior)) if is_small else starts:
-        draw = partial(sample, partial(model.log_likelihood, choice=k), like, number, seed)
-        ways = [draw()] if is_small else []
-        ways += [draw(starts[k], 4, has_moves)] if k in starts else []
-        # Draws from the prior may not arrive where the posterior is narrow; their evidence tells.
-        evidence = [float(way.log_evidence.mean(0).sum()) for way in ways]
-        draws = ways[-1] if evidence[-1] > evidence[0] + _MISSED else ways[0]
+        draw = partial(sample, like=like, number=number, seed=seed)
+        density = partial(model.log_likelihood, choice=k)
+        draws = draw(density) if is_small else None
+        if k in starts and model.table.shared:
+            straight, first = Straight(model, starts[k], k), draws
+            points = straight.points(_FIRST * number, seed)
+            draws = draw(
+                straight, start=straight.start, first=_FIRST, with_moves=has_moves, points=points
+            )
+            draws = draws._replace(u=straight.coordinates(draws.u))
+            draws = draws if first is None else _joined(draws, first, straight.misses(first.u))
+        elif draws is None:
+            draws = draw(density, start=starts[k], first=_FIRST, with_moves=has_moves)
         sampled[k] = draws._replace(u=model.table.with_choice(draws.u, k))
     return sampled
+
+
+def _joined(draws: Draws, others: Draws, is_missed: Tensor) -> Draws:
+    """Return draws of a part of the posterior of one problem, and the others from beyond it.
+
+    Each group of both has a share by its evidence, of the others by that of those missed ``N``.
+    """
+    parts, evidence = [], []
+    groups = (draws.u.chunk(GROUPS), others.u.chunk(GROUPS), is_missed.chunk(GROUPS))
+    for g, (u, v, missed) in enumerate(zip(*groups, strict=True)):
+        beyond = others.log_evidence[g] + missed.to(u).mean().log()
+        logs = torch.cat([draws.log_evidence[g], beyond])
+        counts = _counts(logs.softmax(0), len(u))
+        parts += [_some(each, n) for each, n in zip((u, v[missed]), counts, strict=True) if n]
+        evidence.append(logs.logsumexp(0, keepdim=True))
+    return Draws(torch.cat(parts), torch.stack(evidence), draws.effective)
+
+
+def _some(u: Tensor, number: int) -> Tensor:
+    """Return a number of draws, some of them or all of them repeated."""
+    return u[((torch.arange(number) + 0.5) * len(u) / number).long()]
 
 
 def _starts(model: GP, seed: int) -> dict[int, Normal]:
@@ -300,7 +330,11 @@ def modes(model: GP, choice: int, seed: int, is_precise: bool = False) -> Tensor
     u = standard_normal((number, *like.shape), generator, like)
     searches = _SEARCHES if choice == 0 else _SEARCHES // 2
     begins = torch.cat([_sorted(model, choice, u)[: searches - 1], torch.zeros_like(u[:1])])
-    ends = maximise(partial(model.log_likelihood, choice=choice), begins, is_precise)
+    if model.table.shared:
+        tried = model.table.with_choice(torch.cat([begins[-1:], u[: FITS - 1]]), choice)
+        begins[searches - 2] = least_squares_fit(model, tried)
+    most = _PRECISE_STEPS if is_precise else _STEPS
+    ends = maximise(partial(model.log_likelihood, choice=choice), begins, is_precise, most)
     ends = _sorted(model, choice, ends)
     density = _log_density(model, choice, ends)
     is_near = (ends - ends[0]).abs().amax(-1) < _NEAR
@@ -358,8 +392,7 @@ def _pooled(draws: Mapping[int, Draws], weights: Tensor, number: int, part: int 
         for k, count in enumerate(_counts(weights[:, b], number)):
             if count:
                 u = draws[k].u if not part else draws[k].u.chunk(GROUPS)[part - 1]
-                at = (torch.arange(count) + 0.5) * len(u) / count
-                drawn.append(u[at.long(), b])
+                drawn.append(_some(u[:, b], count))
         problems.append(torch.cat(drawn))
     return torch.stack(problems, 1)
 
