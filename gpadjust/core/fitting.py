@@ -23,9 +23,10 @@ from gpadjust.core.sample import (
     maximise,
     sample,
 )
-from gpadjust.core.straight import FITS, Straight, least_squares_fit
+from gpadjust.core.straight import Straight
 from gpadjust.core.threads import threads_for
 from gpadjust.core.unknowns import standard_normal
+from gpadjust.physics.least_squares import FITS, least_squares_fit
 
 if TYPE_CHECKING:
     from gpadjust.core.model import GP
@@ -332,7 +333,7 @@ def modes(model: GP, choice: int, seed: int, is_precise: bool = False) -> Tensor
     begins = torch.cat([_sorted(model, choice, u)[: searches - 1], torch.zeros_like(u[:1])])
     if model.table.shared:
         tried = model.table.with_choice(torch.cat([begins[-1:], u[: FITS - 1]]), choice)
-        begins[searches - 2] = least_squares_fit(model, tried)
+        begins[-2] = _with_least_squares(model, tried)
     most = _PRECISE_STEPS if is_precise else _STEPS
     ends = maximise(partial(model.log_likelihood, choice=choice), begins, is_precise, most)
     ends = _sorted(model, choice, ends)
@@ -342,6 +343,19 @@ def modes(model: GP, choice: int, seed: int, is_precise: bool = False) -> Tensor
     if not (rival > density[0] - _LESS_LIKELY).any():
         return ends[:1]
     return torch.stack([ends[0], ends[second, torch.arange(len(like))]])
+
+
+def _with_least_squares(model: GP, begins: Tensor) -> Tensor:
+    """Return the first of coordinates ``N x B x P`` with the parameters that fit targets best."""
+    p, targets = len(model.table.shared), model.targets().nan_to_num().flatten()
+
+    def misfit(z: Tensor) -> Tensor:
+        other = begins[:1, :, :-p].expand(len(z), -1, -1)
+        u = torch.cat([other, z.to(begins).unsqueeze(1)], -1)
+        return (model.prior_mean(u) - targets).cpu()
+
+    z = least_squares_fit(misfit, begins[:, 0, -p:].cpu()).to(begins)
+    return torch.cat([begins[0, :, :-p], z.unsqueeze(0)], -1)
 
 
 def _sorted(model: GP, choice: int, u: Tensor) -> Tensor:

@@ -1,12 +1,11 @@
-"""Unknown parameters of a physics: fitted by least squares, and in coordinates without ridges."""
+"""Unknown parameters of a physics in coordinates in which their ridges are straight."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
-from scipy.optimize import least_squares
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
@@ -15,14 +14,9 @@ from gpadjust.core.sample import GROUPS, WIDER, Normal, lower_root
 if TYPE_CHECKING:
     from gpadjust.core.model import GP
 
-FITS, _SAME = 8, 3  # by least squares, at most; so many that end alike are enough
-_ALIKE = 0.1  # of log densities
-_ROUNDS, _STEPS = 4, 60  # of the noise in a fit, and of the parameters in a round
-_FIRM = 0.1  # standard deviation of the noise in a fit, of that left, so that data outweigh priors
-_DIFFERENCE = 1e-4  # of coordinates, for derivatives
 _STEP = 0.02  # of differences, in standard deviations of the posterior
 _NEWTON = 20  # steps to a solution
-_SOLVED, _FOUND = 1e-7, 1e-3  # standard deviations that it may be away, and another one is away
+_SOLVED, _FOUND = 1e-5, 1e-3  # standard deviations that it may be away, and another one is away
 
 
 class Straight:
@@ -149,47 +143,3 @@ class Straight:
         p = w.shape[-1]
         parameters = self.mode[..., -p:] + (w @ self.root.mT).unsqueeze(1)
         return torch.cat([other[..., :-p], parameters], -1)
-
-
-def least_squares_fit(model: GP, begins: Tensor) -> Tensor:
-    """Return coordinates ``1 x B x P`` with the parameters that fit f to the targets best.
-
-    Each of the begins, ``N x B x P``, is improved by a trust-region method, with priors as further
-    residuals and the noise that the last round has left. It is the best of several that end alike,
-    or of all.
-    """
-    p, targets = len(model.table.shared), model.targets().nan_to_num().flatten()
-    eye = torch.eye(p, dtype=targets.dtype)
-
-    def misfit(z: Tensor) -> Tensor:
-        other = begins[:1, ..., :-p].expand(len(z), 1, -1)
-        u = torch.cat([other, z.to(begins).unsqueeze(1)], -1)
-        return (model.prior_mean(u) - targets).cpu()
-
-    def residuals(z: Any, noise: float) -> Any:
-        at = torch.as_tensor(z)
-        return torch.cat([misfit(at.unsqueeze(0))[0] / noise, at]).numpy()
-
-    def jacobian(z: Any, noise: float) -> Any:
-        steps = _DIFFERENCE * eye
-        at = torch.as_tensor(z)
-        up, down = misfit(torch.cat([at + steps, at - steps])).chunk(2)
-        slopes = ((up - down) / (2 * _DIFFERENCE)).nan_to_num()
-        return torch.cat([slopes.mT / noise, eye]).numpy()
-
-    ends: list[tuple[float, Tensor]] = []
-    for z in begins[:, 0, -p:].cpu():
-        noise = float(misfit(z.unsqueeze(0)).square().mean().sqrt())
-        for _ in range(_ROUNDS if 0 < noise < math.inf else 0):
-            options = {"args": (_FIRM * noise,), "max_nfev": _STEPS, "ftol": 1e-4, "xtol": 1e-6}
-            z = torch.as_tensor(least_squares(residuals, z.numpy(), jacobian, **options).x)
-            before, noise = noise, float(misfit(z.unsqueeze(0)).square().mean().sqrt())
-            if not 0 < noise < 0.9 * before:
-                break
-        # log density of the parameters at the best noise, with the opposite sign
-        cost = len(targets) * math.log(max(noise, 1e-12)) if math.isfinite(noise) else math.inf
-        ends.append((cost + 0.5 * float(z.square().sum()), z))
-        best = min(ends, key=lambda end: end[0])
-        if sum(end[0] < best[0] + _ALIKE for end in ends) == _SAME:
-            break
-    return torch.cat([begins[:1, ..., :-p], best[1].to(begins).reshape(1, 1, p)], -1)
