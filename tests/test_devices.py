@@ -15,7 +15,8 @@ FACTORIES = {
 ALLOWED = {
     "numbers of rows or draws, which index tensors of any device": {
         "core/fitting.py _parts",
-        "core/fitting.py _some",
+        "core/fitting.py _joined",
+        "core/fitting.py _pooled",
         "core/fitting.py modes",
         "core/functions.py __init__",
         "core/model.py log_likelihood",

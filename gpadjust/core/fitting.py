@@ -271,14 +271,11 @@ def _joined(draws: Draws, others: Draws, is_missed: Tensor) -> Draws:
         beyond = others.log_evidence[g] + missed.to(u).mean().log()
         logs = torch.cat([draws.log_evidence[g], beyond])
         counts = _counts(logs.softmax(0), len(u))
-        parts += [_some(each, n) for each, n in zip((u, v[missed]), counts, strict=True) if n]
+        for each, count in zip((u, v[missed]), counts, strict=True):
+            at = (torch.arange(count) + 0.5) * len(each) / max(count, 1)
+            parts.append(each[at.long()])
         evidence.append(logs.logsumexp(0, keepdim=True))
     return Draws(torch.cat(parts), torch.stack(evidence), draws.effective)
-
-
-def _some(u: Tensor, number: int) -> Tensor:
-    """Return a number of draws, some of them or all of them repeated."""
-    return u[((torch.arange(number) + 0.5) * len(u) / number).long()]
 
 
 def _starts(model: GP, seed: int) -> dict[int, Normal]:
@@ -406,7 +403,8 @@ def _pooled(draws: Mapping[int, Draws], weights: Tensor, number: int, part: int 
         for k, count in enumerate(_counts(weights[:, b], number)):
             if count:
                 u = draws[k].u if not part else draws[k].u.chunk(GROUPS)[part - 1]
-                drawn.append(_some(u[:, b], count))
+                at = (torch.arange(count) + 0.5) * len(u) / count
+                drawn.append(u[at.long(), b])
         problems.append(torch.cat(drawn))
     return torch.stack(problems, 1)
 
