@@ -26,7 +26,7 @@ from gpadjust.core.sample import (
 from gpadjust.core.straight import Straight
 from gpadjust.core.threads import threads_for
 from gpadjust.core.unknowns import standard_normal
-from gpadjust.physics.least_squares import FITS, least_squares_fit
+from gpadjust.physics.least_squares import least_squares_fit
 
 if TYPE_CHECKING:
     from gpadjust.core.model import GP
@@ -329,8 +329,7 @@ def modes(model: GP, choice: int, seed: int, is_precise: bool = False) -> Tensor
     searches = _SEARCHES if choice == 0 else _SEARCHES // 2
     begins = torch.cat([_sorted(model, choice, u)[: searches - 1], torch.zeros_like(u[:1])])
     if model.table.shared:
-        tried = model.table.with_choice(torch.cat([begins[-1:], u[: FITS - 1]]), choice)
-        begins[-2] = _with_least_squares(model, tried)
+        begins[-2] = _with_least_squares(model, choice, u)
     most = _PRECISE_STEPS if is_precise else _STEPS
     ends = maximise(partial(model.log_likelihood, choice=choice), begins, is_precise, most)
     ends = _sorted(model, choice, ends)
@@ -342,17 +341,20 @@ def modes(model: GP, choice: int, seed: int, is_precise: bool = False) -> Tensor
     return torch.stack([ends[0], ends[second, torch.arange(len(like))]])
 
 
-def _with_least_squares(model: GP, begins: Tensor) -> Tensor:
-    """Return the first of coordinates ``N x B x P`` with the parameters that fit targets best."""
+def _with_least_squares(model: GP, choice: int, u: Tensor) -> Tensor:
+    """Return coordinates ``B x P`` with the parameters that fit targets best.
+
+    Others are in the middle of their priors; the search takes draws from these, ``N x B x P``.
+    """
     p, targets = len(model.table.shared), model.targets().nan_to_num().flatten()
+    others = torch.zeros_like(u[:1, :, :-p])
 
     def misfit(z: Tensor) -> Tensor:
-        other = begins[:1, :, :-p].expand(len(z), -1, -1)
-        u = torch.cat([other, z.to(begins).unsqueeze(1)], -1)
-        return (model.prior_mean(u) - targets).cpu()
+        at = torch.cat([others.expand(len(z), -1, -1), z.to(u).unsqueeze(1)], -1)
+        return (model.prior_mean(model.table.with_choice(at, choice)) - targets).cpu()
 
-    z = least_squares_fit(misfit, begins[:, 0, -p:].cpu()).to(begins)
-    return torch.cat([begins[0, :, :-p], z.unsqueeze(0)], -1)
+    z = least_squares_fit(misfit, u[:, 0, -p:].cpu()).to(u)
+    return torch.cat([others[0], z.unsqueeze(0)], -1)
 
 
 def _sorted(model: GP, choice: int, u: Tensor) -> Tensor:
