@@ -82,6 +82,7 @@ if TYPE_CHECKING:
     from gpadjust.many import VariationalCKA
     from gpadjust.physics import (
         BlackBoxPhysics,
+        FMUPhysics,
         FormulaPhysics,
         FunctionPhysics,
         ODEPhysics,
@@ -102,6 +103,7 @@ __all__ = [
     "CalibratedPhysics",
     "Comparison",
     "EmulatedPhysics",
+    "FMUPhysics",
     "FormulaPhysics",
     "FunctionPhysics",
     "ODEPhysics",

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
-from keyword import iskeyword
 
 import torch
 from torch import Tensor
@@ -126,9 +125,12 @@ class Unknowns(dict[str, Unknown]):
                 f"unknowns must map names to Unknown(guess, sd=...); found {unknowns!r}."
             )
         for name in unknowns:
-            is_word = isinstance(name, str) and name.isidentifier() and not iskeyword(name)
-            if not is_word or name.startswith("_") or name == "rows" or hasattr(dict, name):
-                raise ValueError(f"Expected a name that can be an attribute, found {name!r}.")
+            is_text = isinstance(name, str) and name.strip() == name != ""
+            if not is_text or name.startswith("_") or name == "rows" or hasattr(dict, name):
+                raise ValueError(
+                    "Expected a name without blanks at its ends and _ in front, and none of a "
+                    f"dictionary's or 'rows'; found {name!r}."
+                )
         super().__init__(unknowns)
 
     @property
