@@ -1,4 +1,4 @@
-"""Fitted models and dynamics without Python: C, FMUs, and functions of CasADi (the extra ``export``)."""
+"""Fitted models and dynamics without Python: C, FMUs, and CasADi (the extra ``export``)."""
 
 from gpadjust.export.c_program import c_source
 from gpadjust.export.casadi_program import casadi_function

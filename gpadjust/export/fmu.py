@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from string import Template
 from tempfile import TemporaryDirectory
@@ -21,6 +23,16 @@ from gpadjust.export.finite_sum import model_of
 
 _SYSTEMS = {"linux": ("linux", ".so"), "darwin": ("darwin", ".dylib"), "win32": ("win", ".dll")}
 
+_PHYSICS = Template("""\
+static void physics_of(const double *x, double *f_p)
+{
+$statements
+}
+""")
+_GROUPS = {  # of variables, by the arguments of the program
+    **{"x": "inputs", "action": "inputs", "f_p": "f_p"},
+    **{"state": "outputs", "mean": "outputs", "variance": "sd"},
+}
 # The functions of FMI 2.0 for co-simulation, in plain types of C: a boolean or status is an int.
 _INTERFACE = Template("""
 #include <stdlib.h>
@@ -46,7 +58,13 @@ static const double start_values[$size] = {$start};
 $physics
 static void update(double *v)
 {
-$update}
+#if $has_physics
+    const double read[] = {$read};
+    physics_of(read, v + $f_p);
+#endif
+    $call;
+    for (int i = $sd; i < $size; i++) v[i] = sqrt(v[i]);
+}
 
 static int logged(const Instance *c, const char *message)
 {
@@ -151,12 +169,30 @@ EXPORT int fmi2GetStringStatus(void *c, int kind, const char **value) { return 2
 
 
 class _Variable(NamedTuple):
-    """A variable of the FMU; its value reference is its place."""
+    """A variable of an FMU; its value reference is its place."""
 
     name: str
     unit: str
     causality: str
     start: float | None  # of what can be set
+
+
+class _Variables(NamedTuple):
+    """The variables of an FMU, in the order of their value references."""
+
+    inputs: list[_Variable]
+    f_p: list[_Variable]
+    outputs: list[_Variable]
+    sd: list[_Variable]
+
+    @property
+    def all(self) -> list[_Variable]:
+        """All of them."""
+        return [variable for group in self for variable in group]
+
+    def place(self, group: str) -> int:
+        """Return the place of the first variable of a group."""
+        return sum(len(each) for each in self[: self._fields.index(group)])
 
 
 def export_fmu(
@@ -204,76 +240,87 @@ def export_fmu(
         PosixPath('pump.fmu')
     """
     path = Path(path)
-    name, model = path.stem, model_of(fitted)
+    name = path.stem
     code = c_source(fitted, name, variance=variance, observation_noise=observation_noise)
-    is_step = isinstance(fitted, LearnedDynamics)
-    if isinstance(fitted, LearnedDynamics):
-        spec = fitted.spec
-        if spec.step is None:
-            raise ValueError("Expected the duration of a step: StateSpec(..., step=0.1).")
-        step, states, entries = spec.step, [*spec.states], [*spec.states, *spec.actions]
-        inputs, outputs = [*spec.actions], [spec.states[i] for i in spec.moving]
-        read = [entries[i] for i in spec.physics_columns]
-    else:
-        step, states, read = 1.0, [*model.data.output_names], [*model.data.input_names]
-        inputs, outputs = read, states
-    if physics is not None and not len(model.physics):
-        raise ValueError("The model has no physics: leave physics= out.")
-    f_p = [
-        f"f_p{i + 1 if len(model.physics) > 1 else ''}_{output}"
-        for i in range(len(model.physics))
-        for output in outputs
-    ]
-    starts = [0.0] * len(inputs) if is_step else model.data.X[0].tolist()
-    variables = [_variable(n, "input", s) for n, s in zip(inputs, starts, strict=True)]
-    variables += [_variable(n, "input" if physics is None else "local", 0.0) for n in f_p]
-    variables += [_variable(n, "output", 0.0 if is_step else None) for n in states]
-    settable = len(variables) if is_step else len(variables) - len(states)
-    if variance:
-        variables += [_variable(n, "output", None, "_sd") for n in states]
-    names = [variable.name for variable in variables]
+    kind, arguments = _signature(code, name)
+    step = fitted.spec.step if isinstance(fitted, LearnedDynamics) else None
+    if step is None and kind == "step":
+        raise ValueError("Expected the duration of a step: StateSpec(..., step=0.1).")
+    if physics is not None and "f_p" not in arguments:
+        raise ValueError("The program has no f_p as an argument: leave physics= out.")
+    variables = _variables(fitted, arguments, physics is not None)
+    names = [variable.name for variable in variables.all]
     twice = [each for each in names if names.count(each) > 1]
     if twice:
         raise ValueError(f"Expected different names of inputs and outputs; found two {twice[0]!r}.")
-    places = {"inputs": 0, "f_p": len(inputs), "states": len(inputs) + len(f_p)}
-    places["sd"] = places["states"] + len(states)
-    functions, update = "", []
-    if physics is not None:
-        functions = f"static void physics_of(const double *x, double *f_p)\n{{\n{physics}\n}}\n"
-        values = [f"v[{names.index(_variable(each, '', None).name)}]" for each in read]
-        update.append(f"    const double read[{len(read)}] = {{{', '.join(values)}}};")
-        update.append(f"    physics_of(read, v + {places['f_p']});")
-    arguments = ["v + 0"] if not is_step else [f"v + {places['states']}", "v + 0"]
-    arguments += [f"v + {places['f_p']}"] * bool(f_p) + [f"v + {places['states']}"]
-    arguments += [f"v + {places['sd']}"] * variance
-    update.append(f"    {name}_{'step' if is_step else 'predict'}({', '.join(arguments)});")
-    if variance:
-        update.append(
-            f"    for (int i = {places['sd']}; i < {len(variables)}; i++) v[i] = sqrt(v[i]);"
-        )
-    parts = {
-        "name": name,
-        "size": len(variables),
-        "start": ", ".join(repr(variable.start or 0.0) for variable in variables),
-        "physics": functions,
-        "update": "\n".join([*update, ""]),
-        "is_direct": int(not is_step),
-        "settable": settable,
-        "step": repr(step),
-        "guid": hashlib.sha256(f"{code}{physics}".encode()).hexdigest()[:32],
-    }
-    code += _INTERFACE.substitute(parts)
-    xml = _description(name, parts["guid"], variables, step if is_step else None)
+    places = {each: variables.place(group) for each, group in _GROUPS.items()}
+    guid = hashlib.sha256(f"{code}{physics}".encode()).hexdigest()[:32]
+    code += _INTERFACE.substitute(
+        name=name,
+        size=len(names),
+        start=", ".join(repr(variable.start or 0.0) for variable in variables.all),
+        physics="" if physics is None else _PHYSICS.substitute(statements=physics),
+        read=", ".join(f"v[{i}]" for i in _read(fitted, variables)),
+        has_physics=int(physics is not None),
+        f_p=places["f_p"],
+        sd=places["variance"],
+        call=f"{name}_{kind}({', '.join(f'v + {places[each]}' for each in arguments)})",
+        is_direct=int(step is None),
+        settable=places["mean" if step is None else "variance"],
+        step=repr(step or 1.0),
+        guid=guid,
+    )
     system, suffix = _SYSTEMS.get(sys.platform, ("linux", ".so"))
     binary = f"binaries/{system}{64 if sys.maxsize > 2**32 else 32}/{name}{suffix}"
-    files = {"modelDescription.xml": xml.encode(), f"sources/{name}.c": code.encode()}
-    files[binary] = _compiled(code, name, suffix)
+    files = {
+        "modelDescription.xml": _description(name, guid, variables.all, step).encode(),
+        f"sources/{name}.c": code.encode(),
+        binary: _compiled(code, name, suffix),
+    }
     with ZipFile(path, "w", ZIP_DEFLATED) as file:
         for each, content in files.items():
             entry = ZipInfo(each)  # with a fixed date, so that the same model makes the same file
             entry.compress_type, entry.external_attr = ZIP_DEFLATED, 0o755 << 16
             file.writestr(entry, content)
     return path
+
+
+def _signature(code: str, name: str) -> tuple[str, list[str]]:
+    """Return which function a program has, "predict" or "step", and its arguments by name."""
+    (found,) = re.findall(rf"^void {name}_(predict|step)\(([^)]*)\)", code, re.MULTILINE)
+    return found[0], re.findall(r"\*(\w+)", found[1])
+
+
+def _variables(fitted: GP | LearnedDynamics, arguments: list[str], has_physics: bool) -> _Variables:
+    """Return the variables of a model or dynamics."""
+    model = model_of(fitted)
+    if isinstance(fitted, LearnedDynamics):
+        spec = fitted.spec
+        inputs, outputs, start = spec.actions, spec.states, [0.0] * spec.action_dim
+        returned: Sequence[str] = [spec.states[i] for i in spec.moving]
+        first = 0.0
+    else:
+        data = model.data
+        inputs, outputs, start = data.input_names, data.output_names, data.X[0].tolist()
+        returned, first = outputs, None
+    several = [f"f_p{i + 1}" for i in range(len(model.physics))]
+    heads = several if len(several) > 1 else ["f_p"]
+    f_p = [f"{head}_{output}" for head in heads for output in returned if "f_p" in arguments]
+    return _Variables(
+        [_variable(name, "input", value) for name, value in zip(inputs, start, strict=True)],
+        [_variable(name, "local" if has_physics else "input", 0.0) for name in f_p],
+        [_variable(name, "output", first) for name in outputs],
+        [_variable(name, "output", None, "_sd") for name in outputs if "variance" in arguments],
+    )
+
+
+def _read(fitted: GP | LearnedDynamics, variables: _Variables) -> list[int]:
+    """Return the places of what the physics reads."""
+    inputs = [*range(len(variables.inputs))]
+    if not isinstance(fitted, LearnedDynamics):
+        return inputs
+    entries = [*range(variables.place("outputs"), variables.place("sd")), *inputs]
+    return [entries[i] for i in fitted.spec.physics_columns]
 
 
 def _variable(name: str, causality: str, start: float | None, suffix: str = "") -> _Variable:
@@ -334,6 +381,7 @@ def _compiled(code: str, name: str, suffix: str) -> bytes:
         source, library = Path(folder, f"{name}.c"), Path(folder, name + suffix)
         source.write_text(code)
         options = ["-std=c99", "-O2", "-shared", "-fPIC", "-fvisibility=hidden"]
+        options += ["-Werror=implicit-function-declaration"]  # or no one can load the library
         command = [compiler, *options, "-o", str(library), str(source), "-lm"]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:

@@ -15,6 +15,7 @@ from threading import Lock, local
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 KINDS = ("CoSimulation", "ModelExchange")
@@ -113,7 +114,7 @@ class FMU:
     def simulate(
         self,
         values: Mapping[str, float],
-        points: NDArray,
+        points: NDArray[np.float64],
         held: Sequence[Mapping[str, float]],
         tolerance: float,
     ) -> Iterator[_Instance]:

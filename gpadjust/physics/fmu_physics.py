@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -93,7 +94,7 @@ class FMUPhysics(BlackBoxPhysics):
     ) -> None:
         path = Path(fmu).resolve()
         super().__init__(
-            self.simulate,
+            self.simulate,  # type: ignore[arg-type]  # which evaluate calls, of several rows
             unknowns=unknowns,
             batched=False,
             gradient=gradient,
@@ -140,16 +141,15 @@ class FMUPhysics(BlackBoxPhysics):
                 f"columns=, found {X.shape[-1]} column(s)"
             )
         rows = self._table(X, *parameters)
-        groups = [[i] for i in range(len(rows))]
+        place = np.arange(len(rows))
         if "time" in self.input_names:
             others = np.delete(rows, self.input_names.index("time"), axis=1)
-            _, place = np.unique(others, axis=0, return_inverse=True)
-            groups = [np.flatnonzero(place.ravel() == i).tolist() for i in range(max(place) + 1)]
-        found = Parallel()(delayed(self.function)(rows[group]) for group in groups)
-        pairs = [
-            (i, y) for own in zip(groups, found, strict=True) for i, y in zip(*own, strict=True)
-        ]
-        return self._gathered([y for _, y in sorted(pairs, key=lambda pair: pair[0])])
+            place = np.unique(others, axis=0, return_inverse=True)[1].ravel()
+        order = np.argsort(place, kind="stable")
+        groups = np.split(order, np.cumsum(np.bincount(place))[:-1])
+        found = Parallel()(delayed(self.simulate)(rows[group]) for group in groups)
+        results = dict(zip(order.tolist(), chain(*found), strict=True))
+        return self._gathered([results[i] for i in range(len(rows))])
 
     def simulate(self, rows: NDArray[np.float64]) -> list[NDArray[np.float64] | PhysicsError]:
         """Return outputs ``(m,)`` or the error of each of ``N x (d + p)`` rows of one simulation.
@@ -185,41 +185,32 @@ class FMUPhysics(BlackBoxPhysics):
 
     def _points(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return all times at which a simulation stops, from its start to the last output."""
-        start, end = self.start_time, float(times.max())
+        fmu, start, end = opened(self.path, self.kind), self.start_time, float(times.max())
         if times.min() < start:
             raise ValueError(f"expected times from start_time={start:g} on, found {times.min():g}")
-        own, step = opened(self.path, self.kind), self.communication_step
-        points = [[start], times.ravel(), self.signals["time"]]
-        is_stepped = own.kind == "CoSimulation" and step is not None
-        if is_stepped:
-            points.append(np.arange(start, end, step))
-        merged = np.sort(np.concatenate(points))
-        merged = merged[(merged >= start) & (merged <= end)]
-        merged = merged[np.diff(merged, prepend=-np.inf) > _SAME * (end - start)]
-        widths = np.diff(merged)
-        is_even = len(widths) == 0 or np.ptp(widths) <= _SAME * (end - start)
-        is_fixed = (
-            own.kind == "CoSimulation" and not own.interface.canHandleVariableCommunicationStepSize
-        )
-        if is_fixed and not is_even:
+        is_stepped = fmu.kind == "CoSimulation"
+        grid = np.empty(0)
+        if is_stepped and self.communication_step is not None:
+            grid = np.arange(start, end, self.communication_step)
+        points = np.sort(np.concatenate([[start], times.ravel(), self.signals["time"], grid]))
+        points = points[(points >= start) & (points <= end)]
+        points = points[np.diff(points, prepend=-np.inf) > _SAME * (end - start)]
+        steps = np.diff(points)
+        is_even = len(steps) == 0 or np.ptp(steps) <= _SAME * (end - start)
+        if is_stepped and not is_even and not fmu.interface.canHandleVariableCommunicationStepSize:
             raise ValueError(
-                f"{own.name} takes communication steps of one length, found steps from "
-                f"{widths.min():g} to {widths.max():g}: take a communication_step of which the "
+                f"{fmu.name} takes communication steps of one length, found steps from "
+                f"{steps.min():g} to {steps.max():g}: take a communication_step of which the "
                 "times, also of signals, are multiples"
             )
-        return merged
+        return points
 
     def _held(self, points: NDArray[np.float64]) -> list[dict[str, float]]:
-        """Return the values of signals from each point on."""
-        times = self.signals["time"]
-        place = np.searchsorted(times, points + _SAME * np.ptp(points), side="right") - 1
-        columns = {
-            n: each[place.clip(0)].tolist() for n, each in self.signals.items() if n != "time"
-        }
-        return [
-            dict(zip(columns, values, strict=True))
-            for values in zip(*columns.values(), strict=True)
-        ]
+        """Return the values of signals from each point on; nothing if there are none."""
+        names = [name for name in self.signals if name != "time"]
+        late = points + _SAME * np.ptp(points)
+        place = (np.searchsorted(self.signals["time"], late, side="right") - 1).clip(0)
+        return [{n: float(self.signals[n][i]) for n in names} for i in place if names]
 
     def _checked_times(self, times: float | Sequence[float] | None) -> tuple[float, ...]:
         """Return the times of outputs, none if they are a column of X."""

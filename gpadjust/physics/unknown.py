@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
+from keyword import iskeyword
 
 import torch
 from torch import Tensor
@@ -125,11 +126,13 @@ class Unknowns(dict[str, Unknown]):
                 f"unknowns must map names to Unknown(guess, sd=...); found {unknowns!r}."
             )
         for name in unknowns:
-            is_text = isinstance(name, str) and name.strip() == name != ""
-            if not is_text or name.startswith("_") or name == "rows" or hasattr(dict, name):
+            is_path = isinstance(name, str) and ("." in name.strip(".") or "[" in name)
+            is_word = isinstance(name, str) and name.isidentifier() and not iskeyword(name)
+            is_attribute = is_word and not name.startswith("_") and name != "rows"
+            if not is_path and (not is_attribute or hasattr(dict, name)):
                 raise ValueError(
-                    "Expected a name without blanks at its ends and _ in front, and none of a "
-                    f"dictionary's or 'rows'; found {name!r}."
+                    "Expected a name that can be an attribute, or one with a point or bracket, "
+                    f"such as 'link1.mass' or 'wall[1].G', found {name!r}."
                 )
         super().__init__(unknowns)
 
