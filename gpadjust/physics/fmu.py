@@ -5,7 +5,7 @@ from __future__ import annotations
 import atexit
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from difflib import get_close_matches
 from functools import cache
@@ -206,6 +206,7 @@ class _Instance:
 
         self.owner = owner
         self._solver: Any = None
+        self._error: Exception | None = None
         try:
             self.fmu = instantiate_fmu(owner.folder, owner.description, owner.kind, logger=_log)
         except Exception as error:
@@ -218,39 +219,40 @@ class _Instance:
         self, values: Mapping[str, float], start: float, stop: float, tolerance: float
     ) -> dict[str, float]:
         """Initialise at a time; return the values of states, which can only be set afterwards."""
-        from fmpy.simulation import (
-            apply_start_values,
-            settable_in_initialization_mode,
-            settable_in_instantiated,
-        )
+        from fmpy.simulation import settable_in_initialization_mode, settable_in_instantiated
 
-        fmu, owner = self.fmu, self.owner
-        used = SimpleNamespace(  # FMPy goes through all variables of a description
-            modelVariables=[owner.variables[name] for name in values],
-            unitDefinitions=[],
-            fmiVersion=owner.description.fmiVersion,
-        )
-        experiment = {"tolerance": tolerance, "startTime": start, "stopTime": stop}
-        if stop <= start:
-            del experiment["stopTime"]
-        if owner.version == 2:
+        fmu, is_2 = self.fmu, self.owner.version == 2
+        experiment = {"tolerance": tolerance, "startTime": start}
+        if stop > start:
+            experiment["stopTime"] = stop
+        if is_2:
             fmu.setupExperiment(**experiment)
-        left = apply_start_values(fmu, used, dict(values), settable_in_instantiated)
-        fmu.enterInitializationMode(**({} if owner.version == 2 else experiment))
-        left = apply_start_values(fmu, used, left, settable_in_initialization_mode)
+        left = self.set(values, settable_in_instantiated)
+        fmu.enterInitializationMode(**({} if is_2 else experiment))
+        left = self.set(left, settable_in_initialization_mode)
         fmu.exitInitializationMode()
         return left
 
     def get(self, name: str) -> float:
         """Return the present value of a variable."""
         variable = self.owner.variables[name]
-        return float(self._call("get", variable)([variable.valueReference])[0])
+        kind = variable.type
+        if kind == "Enumeration":
+            kind = "Integer" if self.owner.version == 2 else "Int64"
+        return float(getattr(self.fmu, f"get{kind}")([variable.valueReference])[0])
 
-    def set(self, values: Mapping[str, float]) -> None:
-        """Set inputs."""
-        for name, value in values.items():
-            variable = self.owner.variables[name]
-            self._call("set", variable)([variable.valueReference], [variable._python_type(value)])
+    def set(
+        self, values: Mapping[str, float], settable: Callable[[Any], bool] | None = None
+    ) -> dict[str, float]:
+        """Set the values of variables that can be set now; return the others."""
+        from fmpy.simulation import apply_start_values
+
+        description = SimpleNamespace(  # as FMPy goes through all variables of one
+            modelVariables=[self.owner.variables[name] for name in values],
+            unitDefinitions=[],
+            fmiVersion=self.owner.description.fmiVersion,
+        )
+        return apply_start_values(self.fmu, description, dict(values), settable)
 
     def check(self, values: Mapping[str, float]) -> None:
         """Raise a ValueError if a variable is not at the value to which it was set."""
@@ -301,7 +303,11 @@ class _Instance:
                 next_event = self._update()
                 solver.reset(time)
             while following - time > 1e-12 * max(1.0, abs(following)):
-                is_event, _, time = solver.step(time, min(following, next_event))
+                try:
+                    is_event, _, time = solver.step(time, min(following, next_event))
+                finally:
+                    if self._error is not None:
+                        raise self._error
                 fmu.setTime(time)
                 if self.owner.interface.needsCompletedIntegratorStep:
                     is_own, is_end = fmu.completedIntegratorStep()
@@ -322,13 +328,6 @@ class _Instance:
         if not is_dead:
             with suppress(Exception):
                 self.fmu.freeInstance()
-
-    def _call(self, verb: str, variable: Any) -> Any:
-        """Return FMPy's function that gets or sets a variable of this type."""
-        integer = "Integer" if self.owner.version == 2 else "Int64"
-        return getattr(
-            self.fmu, verb + (integer if variable.type == "Enumeration" else variable.type)
-        )
 
     def _update(self) -> float:
         """Iterate discrete states until they stay; return the time of the next event."""
@@ -352,25 +351,35 @@ class _Instance:
             x[self.owner.states.index(name)] = value
         self.fmu.setContinuousStates(x, len(x))
 
+    def _kept(self, function: Callable[..., Any]) -> Callable[..., None]:
+        """Return a function whose first error is kept, as CVode passes over an error in Python."""
+
+        def call(*arguments: Any) -> None:
+            try:
+                if self._error is None:
+                    function(*arguments)
+            except Exception as error:
+                self._error = error
+
+        return call
+
     def _solver_of(self, tolerance: float, time: float) -> Any:
         """Return CVode at the present states."""
         from fmpy.simulation import Input
         from fmpy.sundials import CVodeSolver
 
         fmu, description = self.fmu, self.owner.description
+        rates = "getDerivatives" if self.owner.version == 2 else "getContinuousStateDerivatives"
         if self._solver is None or self._solver.reltol != tolerance:
-            derivatives = (
-                fmu.getDerivatives if self.owner.version == 2 else fmu.getContinuousStateDerivatives
-            )
             self._solver = CVodeSolver(
                 nx=description.numberOfContinuousStates,
                 nz=description.numberOfEventIndicators,
                 get_x=fmu.getContinuousStates,
-                set_x=fmu.setContinuousStates,
-                get_dx=derivatives,
-                get_z=fmu.getEventIndicators,
+                set_x=self._kept(fmu.setContinuousStates),
+                get_dx=self._kept(getattr(fmu, rates)),
+                get_z=self._kept(fmu.getEventIndicators),
                 get_nominals=fmu.getNominalsOfContinuousStates,
-                set_time=fmu.setTime,
+                set_time=self._kept(fmu.setTime),
                 input=Input(fmu, description, None),
                 startTime=time,
                 relativeTolerance=tolerance,

@@ -37,7 +37,6 @@ static const double START_VALUES[VALUES] = {1, 0, 0, 0, 0.7, 9.81};
 typedef struct {
     double v[VALUES], time, largest;
     void *environment;
-    int is_new; /* is the start value of the wall still to be computed? */
 #if FMI == 2
     fmi2CallbackLogger log;
 #else
@@ -106,7 +105,6 @@ static void restart(Model *m)
     memcpy(m->v, START_VALUES, sizeof m->v);
     m->time = 0;
     m->largest = MODEL == 1 ? 1e-2 : 1e-3;
-    m->is_new = 1;
 }
 
 static Model *made(const char *token)
@@ -126,6 +124,16 @@ static STATUS get(Model *m, const Reference *r, size_t n, double *value)
     return OK;
 }
 
+static STATUS derivatives(Model *m, double *dx, size_t n)
+{
+#if MODEL == 1
+    if (m->v[T] > 373.15) return failed(m, "the tank boils");
+#endif
+    rates(m->v);
+    memcpy(dx, m->v + STATES, n * sizeof *dx);
+    return OK;
+}
+
 static STATUS set(Model *m, const Reference *r, size_t n, const double *value)
 {
     for (size_t i = 0; i < n; i++) {
@@ -142,7 +150,6 @@ static STATUS begun(Model *m)
 #if MODEL == 1
     if (m->v[START] > 0) m->v[WALL] = m->v[START];
 #endif
-    m->is_new = 0;
     return OK;
 }
 
@@ -193,7 +200,7 @@ fmi2Status fmi2EnterContinuousTimeMode(fmi2Component c) { return fmi2OK; }
 fmi2Status fmi2CompletedIntegratorStep(fmi2Component c, fmi2Boolean p, fmi2Boolean *e, fmi2Boolean *t) { *e = *t = 0; return fmi2OK; }
 fmi2Status fmi2SetTime(fmi2Component c, fmi2Real t) { ((Model *)c)->time = t; return fmi2OK; }
 fmi2Status fmi2SetContinuousStates(fmi2Component c, const fmi2Real x[], size_t n) { memcpy(((Model *)c)->v, x, n * sizeof *x); return fmi2OK; }
-fmi2Status fmi2GetDerivatives(fmi2Component c, fmi2Real dx[], size_t n) { Model *m = c; rates(m->v); memcpy(dx, m->v + STATES, n * sizeof *dx); return fmi2OK; }
+fmi2Status fmi2GetDerivatives(fmi2Component c, fmi2Real dx[], size_t n) { return derivatives(c, dx, n); }
 fmi2Status fmi2GetEventIndicators(fmi2Component c, fmi2Real z[], size_t n) { for (size_t i = 0; i < n; i++) z[i] = ((Model *)c)->v[0]; return fmi2OK; }
 fmi2Status fmi2GetContinuousStates(fmi2Component c, fmi2Real x[], size_t n) { memcpy(x, ((Model *)c)->v, n * sizeof *x); return fmi2OK; }
 fmi2Status fmi2GetNominalsOfContinuousStates(fmi2Component c, fmi2Real x[], size_t n) { for (size_t i = 0; i < n; i++) x[i] = 1; return fmi2OK; }
@@ -271,7 +278,7 @@ fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance c) { return fmi3OK; }
 fmi3Status fmi3CompletedIntegratorStep(fmi3Instance c, fmi3Boolean p, fmi3Boolean *e, fmi3Boolean *t) { *e = *t = 0; return fmi3OK; }
 fmi3Status fmi3SetTime(fmi3Instance c, fmi3Float64 t) { ((Model *)c)->time = t; return fmi3OK; }
 fmi3Status fmi3SetContinuousStates(fmi3Instance c, const fmi3Float64 x[], size_t n) { memcpy(((Model *)c)->v, x, n * sizeof *x); return fmi3OK; }
-fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance c, fmi3Float64 dx[], size_t n) { Model *m = c; rates(m->v); memcpy(dx, m->v + STATES, n * sizeof *dx); return fmi3OK; }
+fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance c, fmi3Float64 dx[], size_t n) { return derivatives(c, dx, n); }
 fmi3Status fmi3GetEventIndicators(fmi3Instance c, fmi3Float64 z[], size_t n) { for (size_t i = 0; i < n; i++) z[i] = ((Model *)c)->v[0]; return fmi3OK; }
 fmi3Status fmi3GetContinuousStates(fmi3Instance c, fmi3Float64 x[], size_t n) { memcpy(x, ((Model *)c)->v, n * sizeof *x); return fmi3OK; }
 fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance c, fmi3Float64 x[], size_t n) { for (size_t i = 0; i < n; i++) x[i] = 1; return fmi3OK; }

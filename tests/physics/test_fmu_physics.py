@@ -131,8 +131,10 @@ def test_rows_that_fail_are_named_with_the_words_of_the_fmu(fmi, kind):
     assert torch.equal(alone(rows[2:]), physics(rows[2:]))
 
 
-def test_a_simulation_that_breaks_off_has_the_values_before():
-    physics = FMUPhysics(fmu(), ["heater", "time"], ["tank.T"], communication_step=1.0)
+@pytest.mark.parametrize(("fmi", "kind"), KINDS)
+def test_a_simulation_that_breaks_off_has_the_values_before(fmi, kind):
+    options = {"communication_step": 1.0, "kind": kind}
+    physics = FMUPhysics(fmu("tank", fmi), ["heater", "time"], ["tank.T"], **options)
     rows = torch.tensor([[40000.0, 5.0], [40000.0, 9.0], [0.0, 9.0]]).double()
     with pytest.raises(PhysicsError, match="the tank boils") as caught:
         physics(rows)
