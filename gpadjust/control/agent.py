@@ -26,6 +26,7 @@ from gpadjust.control.step_guard import StepGuard
 from gpadjust.control.task import Task
 from gpadjust.dynamics import Trajectories
 from gpadjust.dynamics.base import checked_horizons
+from gpadjust.progress import long_work, tick
 
 MAX_HOLD = 5  # steps of a random action
 _LOST = 0.1  # of runs in the model, which may leave the bounds without a warning
@@ -187,6 +188,8 @@ class Agent(ABC):
     ) -> Self:
         """Play so many further real steps, in whole episodes, and learn from each.
 
+        A bar shows the progress of more than five seconds, where somebody sees it.
+
         Args:
             total_timesteps: Number of steps; the last episode is played to its end. If it is not
                 positive, as for a run that has ended, episodes that were not learnt are learnt.
@@ -198,7 +201,7 @@ class Agent(ABC):
         checked_whole("total_timesteps", total_timesteps)
         callbacks = [] if callback is None else [callback] if callable(callback) else [*callback]
         end = self.num_timesteps + total_timesteps
-        with locked(callbacks):
+        with locked(callbacks), long_work("learn", "steps", total=max(0, total_timesteps)):
             self._callbacks = callbacks
             if self._random_state is not None:  # a run that goes on
                 episodes.set_generators(self._random_state)
@@ -266,6 +269,7 @@ class Agent(ABC):
                 action = np.clip(action, space.low, space.high).astype(space.dtype)
                 following, reward, terminated, truncated, info = self.env.step(action)
                 self.num_timesteps += 1
+                tick("steps")
                 failed = bool(info.get("step_failed"))
                 if not failed:
                     rows.append((observation, action, following, float(reward), bool(terminated)))

@@ -22,7 +22,6 @@ from gpytorch.priors import NormalPrior
 from linear_operator import to_linear_operator
 from torch import Size, Tensor
 
-from gpadjust.checks import tick
 from gpadjust.core.data import ArrayLike, Data, appended, as_given, as_tensor, unit_of
 from gpadjust.core.functions import Functions, Paths
 from gpadjust.core.gaussian import (
@@ -49,6 +48,7 @@ from gpadjust.core.views import (
 from gpadjust.display import Display
 from gpadjust.physics import Physics, PhysicsError, Unknown, as_physics
 from gpadjust.physics.parameters import PhysicsParameters
+from gpadjust.progress import tick
 
 Slopes = dict[str, list[Tensor]]
 """Derivatives of each physics by the coordinate of each unknown parameter, ``S x m x n``."""
@@ -330,7 +330,7 @@ class GP(gpytorch.models.GP, Predictive):
         parts = []
         for rows in torch.arange(len(u)).split(max(1, _ENTRIES // (n * n * m))):
             own = {name: [each[rows] for each in by_f] for name, by_f in slopes.items()}
-            tick()
+            tick("evaluations")
             part = self._log_likelihood(u[rows], [each[rows] for each in f], own, with_gradient)
             parts.append(part)
         value, gradient = (torch.cat(each) for each in zip(*parts, strict=True))

@@ -21,12 +21,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpadjust.checks import check_kind, checked_whole, finite_array, progress_bar
+from gpadjust.checks import check_kind, checked_whole, finite_array
 from gpadjust.dynamics.base import of_states
 from gpadjust.dynamics.least_squares import even_normal
 from gpadjust.dynamics.targets import check_next_values, one_physics
 from gpadjust.physics import ODEPhysics, Physics, PhysicsError
 from gpadjust.physics.parameters import PhysicsParameters
+from gpadjust.progress import long_work
 from gpadjust.records import kalman
 from gpadjust.records.kalman import Array, Link, Smoothed
 from gpadjust.records.records import Record, Records, control_steps, remember
@@ -352,7 +353,8 @@ def _print_time(chain: Chain, steps: Records, num_starts: int, max_rounds: int) 
 def _estimate(chain: Chain, max_rounds: int, num_starts: int, progress: bool) -> Estimate:
     """Find the most likely states, parameters of the physics and variances from several starts."""
     ends = list[tuple[Estimate, float]]()
-    with progress_bar(progress, total=num_starts * max_rounds, unit="round") as bar:
+    total = num_starts * max_rounds
+    with long_work("smooth", "rounds", total=total, at_once=progress) as bar:
         for i, (coordinates, known_at_once) in enumerate(chain.starts_of_search(num_starts)):
             bar.set_description(f"start {i + 1} of {num_starts}")
             bar.update(i * max_rounds - bar.n)  # a search that has settled leaves rounds

@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gpadjust.checks import progress_bar
 from gpadjust.core import CKA, Noise, fit
 from gpadjust.kinds import Categories, HeavyTails, NoisyInputs, RelativeNoise, with_options
 from gpadjust.physics import ODEPhysics, PhysicsError, PhysicsWarning
+from gpadjust.progress import progress_bar
 from gpadjust.records import Identification, Records, identify
 from gpadjust.report import inputs as read
 from gpadjust.report.page import checked_path, write
