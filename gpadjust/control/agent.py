@@ -24,6 +24,7 @@ from gpadjust.control.rollouts import random_sequences
 from gpadjust.control.state_filter import StateFilter, smooth_episodes
 from gpadjust.control.step_guard import StepGuard
 from gpadjust.control.task import Task
+from gpadjust.display import Display
 from gpadjust.dynamics import Trajectories
 from gpadjust.dynamics.base import checked_horizons
 from gpadjust.progress import long_work, tick
@@ -35,7 +36,7 @@ Callback = Callable[["Agent", str, dict[str, float]], Any]
 """What is called with the agent, the name of an event, and its numbers; see :class:`Agent`."""
 
 
-class Agent(ABC):
+class Agent(ABC, Display):
     """A controller that learns from real episodes: :meth:`learn` plays, learns and improves.
 
     A subclass says how it acts (:meth:`predict`) and what it improves in a model (:meth:`improve`).
@@ -421,6 +422,11 @@ class Agent(ABC):
         data = self._estimated if is_hidden else episodes.decoded(spec, self._observed)
         return episodes.newest(data, newest)
 
+    @property
+    def promises(self) -> list[float | None]:
+        """The reward of a step that the model promised of each episode; None of random actions."""
+        return [*self._promises]
+
     def episode_length(self) -> int:
         """Return the steps of an episode, of the task or else the environment."""
         return episodes.episode_length(self.task, self.env)
@@ -432,6 +438,9 @@ class Agent(ABC):
     def __repr__(self) -> str:
         """Name the agent, its environment and dynamics, what it has done, and its last reward."""
         return episodes.described(self)
+
+    def _repr_html_(self) -> str:
+        return episodes.html_of(self)
 
     # Checkpoints
 

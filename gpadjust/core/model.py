@@ -35,7 +35,7 @@ from gpadjust.core.gaussian import (
 from gpadjust.core.kernels import DELTA, RHO, as_kernel
 from gpadjust.core.noise import KnownNoise, Noise
 from gpadjust.core.posterior import MixturePosterior
-from gpadjust.core.summary import counted, priors, summary, summary_html
+from gpadjust.core.summary import counted, summary, summary_html
 from gpadjust.core.terms import Places, Term, TermSum, WeightedSum
 from gpadjust.core.unknowns import Choice, Row, Table, Values
 from gpadjust.core.views import (
@@ -650,7 +650,10 @@ class GP(gpytorch.models.GP, Predictive):
 
         Its columns are name, output (empty of numbers that all outputs share), median, both ends
         of the central 95 % interval, and meaning. Nested models have some of these numbers alone.
+        Its ``plot()`` draws the priors, and beside them the posterior of a fitted model.
         """
+        from gpadjust.core.priors import priors  # with pandas, which models do not need
+
         return priors(self)
 
     def _graph_for(self, X: Tensor) -> torch.set_grad_enabled:

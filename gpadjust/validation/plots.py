@@ -34,6 +34,7 @@ import re
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from statistics import NormalDist
+from textwrap import fill
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -52,6 +53,7 @@ from gpadjust.checks import (
     checked_whole,
 )
 from gpadjust.core.gaussian import Marginals
+from gpadjust.core.priors import Priors
 from gpadjust.kinds.categories import on_levels
 from gpadjust.physics import PhysicsParameters
 from gpadjust.validation.comparison import Comparison
@@ -68,6 +70,7 @@ __all__ = [
     "plot_model",
     "plot_parameters",
     "plot_prediction",
+    "plot_priors",
     "plot_trust",
 ]
 BLUE, RED, GREY = "#0072B2", "#D55E00", "0.45"  # told apart by the colour-blind, too
@@ -78,6 +81,12 @@ _STYLES = ("--", "-.", ":")  # of several physics
 _COLORS = (BLUE, RED, "0.85")  # of physics, data and neither
 _BINS = 10  # of each input
 _HONEST = "95 % if intervals hold"
+_DECADE = 10.0  # highest over lowest, from which axes are logarithmic
+_BARS = 30  # of a histogram of draws
+_COLUMNS = 4  # of panels
+_LINE = 24  # characters of a label
+_POSTERIOR: dict[str, Any] = {"color": BLUE, "alpha": 0.75, "fill": True, "label": "posterior"}
+_PRIOR: dict[str, Any] = {"color": GREY, "lw": 1.2, "label": "prior"}
 
 
 def plot_model(model: Any, *, output: int = 0, level: float = 0.95, axes: Any = None) -> Any:
@@ -305,6 +314,41 @@ def plot_parameters(parameters: PhysicsParameters, *, axes: Any = None) -> Any:
     axes[0].set_ylabel("density")
     legend(axes[0])
     return axes
+
+
+def plot_priors(priors: Priors, *, axes: Any = None) -> Any:
+    """Draw the prior of each unknown number of a model, and its posterior after a fit.
+
+    Curves are shares of draws, on a logarithmic axis where the number spans a decade. Return an
+    array of as many axes as ``model.priors()`` has rows.
+    """
+    n = len(priors.prior)
+    shape = (1, n) if axes is not None else (-(-n // _COLUMNS), min(n, _COLUMNS))
+    axes = axes_of(axes, *shape, 2.4).flatten()
+    posterior = priors.posterior or [each[:0] for each in priors.prior]
+    several = len({*priors["output"]} - {""}) > 1
+    for i, (ax, drawn, after) in enumerate(zip(axes, priors.prior, posterior, strict=False)):
+        inner = drawn.quantile(drawn.new_tensor([0.01, 0.99]))
+        low, high = (float(end) for end in torch.cat([inner, after[after != 0]]).aminmax())
+        is_log = low > 0 and high > _DECADE * low
+        if is_log:
+            edges = np.geomspace(low, high, _BARS + 1)
+            ax.set_xscale("log")
+        else:
+            edges = np.linspace(low, high, _BARS + 1)
+        for draws, style in ((after, _POSTERIOR), (drawn, _PRIOR)):
+            if len(draws):
+                counts, _ = np.histogram(draws, edges)
+                ax.stairs(counts / len(draws), edges, **style)
+        name, output = priors["name"][i], priors["output"][i]
+        name = fill(f"{name} for {output}" if several and output else name, _LINE)
+        ax.set(xlabel=name, yticks=[])
+        tidy(ax)
+    for ax in axes[n:]:
+        ax.remove()
+    axes[0].set_ylabel("share of draws")
+    legend(axes[0])
+    return axes[:n]
 
 
 def plot_coverage(

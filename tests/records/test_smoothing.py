@@ -2,12 +2,14 @@
 
 import math
 import re
+import sys
 
 import numpy as np
 import pytest
 import torch
 from scipy.linalg import block_diag
 
+from gpadjust import progress
 from gpadjust.dynamics import StateSpec
 from gpadjust.physics import FunctionPhysics, ODEPhysics, Unknown
 from gpadjust.records import Record, Records, smooth
@@ -385,3 +387,14 @@ def test_a_long_log_is_told_with_its_time_and_what_takes_less(capsys):
     assert re.search(told, capsys.readouterr().err, flags=re.DOTALL)
     smooth(Records(measured(*simulated(0, length=100), 0), SPEC), spring(), **given)
     assert "min for" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("is_seen", "asked"), [(True, False), (False, False), (False, True)])
+def test_long_smoothing_shows_a_bar_where_somebody_sees_or_asks_for_it(
+    is_seen, asked, monkeypatch, capsys
+):
+    monkeypatch.setattr(progress, "PATIENCE", 0.0)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: is_seen, raising=False)
+    records = Records(measured(*simulated(0, length=50), 0), SPEC)
+    smooth(records, spring(), max_rounds=2, num_starts=1, progress=asked)
+    assert (" rounds" in capsys.readouterr().err) == (is_seen or asked)
