@@ -389,6 +389,7 @@ def test_a_long_log_is_told_with_its_time_and_what_takes_less(capsys):
     assert "min for" not in capsys.readouterr().err
 
 
+@pytest.mark.filterwarnings("ignore::gpadjust.records.SmoothingWarning")
 @pytest.mark.parametrize(("is_seen", "asked"), [(True, False), (False, False), (False, True)])
 def test_long_smoothing_shows_a_bar_where_somebody_sees_or_asks_for_it(
     is_seen, asked, monkeypatch, capsys
@@ -396,5 +397,5 @@ def test_long_smoothing_shows_a_bar_where_somebody_sees_or_asks_for_it(
     monkeypatch.setattr(progress, "PATIENCE", 0.0)
     monkeypatch.setattr(sys.stderr, "isatty", lambda: is_seen, raising=False)
     records = Records(measured(*simulated(0, length=50), 0), SPEC)
-    smooth(records, spring(), max_rounds=2, num_starts=1, progress=asked)
+    smooth(records, spring(), max_rounds=3, num_starts=1, progress=asked)
     assert (" rounds" in capsys.readouterr().err) == (is_seen or asked)
