@@ -228,7 +228,7 @@ def plot_prediction(
 def plot_leave_one_out(
     loo: LeaveOneOut, *, output: int = 0, level: float = 0.95, axes: Any = None
 ) -> Any:
-    """Draw left-out predictions against the observations, and standardized residuals.
+    """Draw observations over left-out predictions, and standardized residuals.
 
     ``axes`` are two; so many are returned.
     """
@@ -237,13 +237,10 @@ def plot_leave_one_out(
             f"Expected a LeaveOneOut, got {type(loo).__name__}; pass `leave_one_out(model)`."
         )
     z = quantile(level)
-    values = (loo.Y, loo.mean, loo.variance.sqrt(), loo.residuals)
-    Y, mean, sd, residuals = (column(each, output) for each in values)
+    mean, residuals = column(loo.mean, output), column(loo.residuals, output)
     axes = axes_of(axes, 1, 2)[0]
-    name = labels(loo.output_names)[output]
-    drawn = (mean, mean - z * sd, mean + z * sd)
-    against_truth(axes[0], Y, drawn, level, f"observed {name}")
-    axes[0].set_ylabel("predicted without it")
+    draw_left_out(axes[0], loo, column(loo.Y, output), output, {}, level=level)
+    legend(axes[0], loc="upper left")
     axes[1].axhspan(-z, z, **BAND, label=f"{100 * level:g} %")
     axes[1].axhline(0, color=GREY, lw=1, ls="--")
     axes[1].plot(mean, residuals, color=BLUE, **DOTS)
@@ -256,24 +253,20 @@ def plot_leave_one_out(
 def plot_comparison(comparison: Comparison, *, output: int = 0, axes: Any = None) -> Any:
     """Draw left-out predictions by the formula and by what is recommended, and the scores.
 
-    The first axes have predictions against observations. The second have the expected log
+    The first axes have observations over predictions. The second have the expected log
     predictive density of each structure less that of the best, with two standard errors, and its
     weight; ``axes`` are these two.
     """
     loo = comparison.leave_one_out()
-    mean, sd, y = (column(each, output) for each in (loo.mean, loo.variance.sqrt(), loo.Y))
-    name = labels(loo.output_names)[output]
     axes = axes_of(axes, 1, 2)[0]
-    half = quantile(0.95) * sd
-    against_truth(axes[0], y, (mean, mean - half, mean + half), 0.95, f"observed {name}")
-    formulas = [each for each in comparison.left_out if each.startswith((ALONE, CALIBRATED))]
-    hollow = DOTS | {"mfc": "none", "mew": 1.0}
-    for formula, color in zip(formulas, cycle((RED, GREY)), strict=False):
-        by_formula = comparison.left_out[formula].mean[:, output]
-        axes[0].plot(y, by_formula, **hollow | {"mec": color}, label=formula)
-    axes[0].containers[0].set_label(f"{comparison.chosen}, 95 %")
-    axes[0].set_ylabel("predicted without it")
-    legend(axes[0], loc="upper left")
+    formulas = {
+        name: column(each.mean, output)
+        for name, each in comparison.left_out.items()
+        if name.startswith((ALONE, CALIBRATED))
+    }
+    name = f"{comparison.chosen}, left out"
+    draw_left_out(axes[0], loo, column(loo.Y, output), output, formulas, name)
+    legend(axes[0])
     rows = [row for row in comparison.table[loo.output_names[output]] if not math.isnan(row.weight)]
     places = range(len(rows))
     differences, errors = [row.elpd_diff for row in rows], [2 * row.se_diff for row in rows]
@@ -457,6 +450,39 @@ def draw_data(ax: Axes, model: Any, output: int) -> None:
     y = column(model.data.Y, output)
     x = model.data.X[~y.isnan(), 0]
     ax.plot(x, y[~y.isnan()], color=RED, **DOTS, label="data")
+
+
+def draw_left_out(
+    ax: Axes,
+    loo: LeaveOneOut,
+    y: Tensor,
+    output: int,
+    formulas: Mapping[str, Tensor],
+    name: str = "",
+    level: float = 0.95,
+) -> Axes:
+    """Draw observations ``n`` over left-out predictions, and over values of formulas, ``n`` each.
+
+    Axes are logarithmic where the observations span a decade.
+    """
+    ends = [column(each, output) for each in loo.interval(level)]
+    seen = ~y.isnan()
+    y, mean, low, high = (each[seen] for each in (y, column(loo.mean, output), *ends))
+    values = {formula: f[seen] for formula, f in formulas.items()}
+    drawn = torch.cat([y, mean, *values.values()])
+    is_log = bool((drawn > 0).all()) and float(y.max() / y.min()) > _DECADE
+    if is_log:
+        low = low.maximum(1e-3 * mean)  # an axis of logarithms has no room for less
+        ax.set(xscale="log", yscale="log")
+    ax.plot([drawn.min(), drawn.max()], [drawn.min(), drawn.max()], color=GREY, lw=1, ls="--")
+    for (formula, f), color in zip(values.items(), cycle((RED, GREY)), strict=False):
+        ax.plot(f, y, **DOTS | {"mec": color, "mfc": "none", "mew": 1.0}, label=formula)
+    name = name or ("corrected, left out" if formulas else "predicted, left out")
+    bars = torch.stack([mean - low, high - mean]).clamp_min(0.0)
+    how: dict[str, Any] = {"color": BLUE, "elinewidth": 0.8, "alpha": 0.85, **DOTS}
+    ax.errorbar(mean, y, xerr=bars, label=f"{name}, {100 * level:g} %", **how)
+    ax.set(xlabel=f"predicted {labels(loo.output_names)[output]}", ylabel="measured")
+    return ax
 
 
 def _draw_ticks(ax: Axes, model: Any, output: int, i: int) -> None:
