@@ -47,9 +47,9 @@ _COVERAGE = (
 )
 _PARAMETERS = (
     "A bias that is free to vary leaves open which values are the true ones: these describe the "
-    "system best together with it. Compare 'known before' with the interval: where they are alike, "
-    "the data say next to nothing."
+    "system best together with it."
 )
+_UNTOLD = "The data say next to nothing of {}, which {} as known before."
 _SUMMARY = (
     "In the units of the data; of samples the median, and the range of 95 % of them. A lengthscale "
     "is the distance over which a function changes, sd how much. Means are those of the prior; "
@@ -173,6 +173,9 @@ def parameters(subject: Subject) -> Markup:
     for caption, own in known.items():
         if own:
             parts += [html.parameter_table(caption, own), figures.densities(own)]
+            if own.untold:
+                stay = "stays" if len(own.untold) == 1 else "stay"
+                parts.append(tag("p", _UNTOLD.format(listed(own.untold), stay)))
     return join([*parts, tag("p", _PARAMETERS)]) if parts else Markup()
 
 
