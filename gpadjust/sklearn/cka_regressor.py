@@ -291,7 +291,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         covariances = []
         for output in range(self.model_.num_outputs):
             posterior = self.model_.posterior(X, [output], observation_noise)
-            covariances.append(posterior.distribution.covariance_matrix)
+            covariances.append(posterior.covariance_matrix)
         return torch.stack(covariances, dim=-1)
 
 
