@@ -24,7 +24,8 @@ from gpadjust.report.page import checked_path, write
 from gpadjust.report.subject import Origin, Subject, subject_of
 from gpadjust.states import StateSpec
 from gpadjust.validation import compare, leave_one_out
-from gpadjust.validation.verdict import difference, faults
+from gpadjust.validation.faults import faults
+from gpadjust.validation.verdict import difference
 from gpadjust.words import bare, listed, plural
 
 _DEGREES = ("deg", "degree", "degrees", "°")

@@ -34,7 +34,7 @@ from gpadjust.many import VariationalCKA
 from gpadjust.physics import PhysicsWarning
 from gpadjust.physics.function import array_physics
 from gpadjust.physics.parameters import PhysicsParameters
-from gpadjust.validation.verdict import faults
+from gpadjust.validation.faults import faults
 
 Array = NDArray[np.float64]
 

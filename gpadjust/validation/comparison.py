@@ -29,6 +29,7 @@ from gpadjust.display import Display, html_table
 from gpadjust.kinds.factory import ModelFactory, make_model, with_options
 from gpadjust.physics import Physics, PhysicsWarning, as_physics
 from gpadjust.progress import progress_bar
+from gpadjust.validation.faults import fault_of
 from gpadjust.validation.leave_one_out import ROUNDING, LeaveOneOut, leave_one_out
 from gpadjust.validation.trust import physics_at
 from gpadjust.validation.verdict import (
@@ -42,7 +43,6 @@ from gpadjust.validation.verdict import (
     Verdict,
     correction_of,
     difference,
-    fault_of,
     is_shown,
     next_point,
     straight_line,
