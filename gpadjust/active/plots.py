@@ -40,10 +40,8 @@ def plot_collection(
     n, d, m = len(X), X.shape[-1], Y.shape[-1]
     best = [] if optimum is None else checked_tensor("optimum", optimum).reshape(-1).tolist()
     best = best * m if len(best) == 1 else best
-    if (len(best) not in (0, m)) or not all(map(math.isfinite, best)):
-        raise ValueError(
-            f"Expected optimum as a finite number of each of {m} outputs; found {best}."
-        )
+    if len(best) not in (0, m) or not all(map(math.isfinite, best)):
+        raise ValueError(f"Expected optimum as {m} finite numbers, one of each output; got {best}.")
     rows = d + m + len(best)
     if axes is None:
         figure = plt.figure(figsize=(6, 1.6 * rows), layout="constrained")
