@@ -177,8 +177,11 @@ def test_an_agent_without_episodes_has_nothing_to_draw():
 
 
 def test_the_figure_of_priors_has_the_posterior_after_a_fit():
-    labels = [
-        {text.get_text() for text in found.priors().plot()[0].get_legend().get_texts()}
-        for found in (ZeroMeanGP(X, Y), model())
-    ]
-    assert labels == [{"prior"}, {"prior", "posterior"}]
+    found = ZeroMeanGP(X, Y)
+    for method, label in ((None, None), ("map", "value"), ("bayes", "posterior")):
+        if method is not None:
+            fit(found, method)
+        shown = found.priors().plot()[-1]  # of the noise
+        assert {label, "prior"} - {None} == {*shown.get_legend_handles_labels()[1]}
+        shares = [each for each in shown.patches if each.get_label() == "prior"]
+        assert sum(shares[0].get_data().values) == pytest.approx(0.98, abs=0.021)

@@ -35,7 +35,7 @@ from collections.abc import Mapping, Sequence
 from itertools import cycle
 from statistics import NormalDist
 from textwrap import fill
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -53,7 +53,6 @@ from gpadjust.checks import (
     checked_whole,
 )
 from gpadjust.core.gaussian import Marginals
-from gpadjust.core.priors import Priors
 from gpadjust.kinds.categories import on_levels
 from gpadjust.physics import PhysicsParameters
 from gpadjust.validation.comparison import Comparison
@@ -61,6 +60,9 @@ from gpadjust.validation.leave_one_out import LeaveOneOut
 from gpadjust.validation.scores import Scores
 from gpadjust.validation.trust import SIDES, Trust, physics_at
 from gpadjust.validation.verdict import ALONE, CALIBRATED
+
+if TYPE_CHECKING:  # it needs pandas
+    from gpadjust.core.priors import Priors
 
 __all__ = [
     "plot_adjustment",
@@ -312,8 +314,8 @@ def plot_parameters(parameters: PhysicsParameters, *, axes: Any = None) -> Any:
 def plot_priors(priors: Priors, *, axes: Any = None) -> Any:
     """Draw the prior of each unknown number of a model, and its posterior after a fit.
 
-    Curves are shares of draws, on a logarithmic axis where the number spans a decade. Return an
-    array of as many axes as ``model.priors()`` has rows.
+    Curves are shares of draws, on a logarithmic axis where the number spans a decade; a point fit
+    is a line. Return an array of as many axes as ``model.priors()`` has rows.
     """
     n = len(priors.prior)
     shape = (1, n) if axes is not None else (-(-n // _COLUMNS), min(n, _COLUMNS))
@@ -329,8 +331,10 @@ def plot_priors(priors: Priors, *, axes: Any = None) -> Any:
             ax.set_xscale("log")
         else:
             edges = np.linspace(low, high, _BARS + 1)
+        if len(after) == 1:
+            ax.axvline(float(after), color=BLUE, label="value")
         for draws, style in ((after, _POSTERIOR), (drawn, _PRIOR)):
-            if len(draws):
+            if len(draws) > 1:
                 counts, _ = np.histogram(draws, edges)
                 ax.stairs(counts / len(draws), edges, **style)
         name, output = priors["name"][i], priors["output"][i]
