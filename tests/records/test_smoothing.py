@@ -145,6 +145,28 @@ def test_what_steps_add_is_expected_over_all_states(chain):
     np.testing.assert_allclose(found, expected, atol=1e-8)
 
 
+def test_a_long_chain_is_computed_in_blocks_side_by_side(monkeypatch):
+    """A random walk of 2,500 rows: density and last state by the textbook, in a few solutions."""
+    rng = np.random.default_rng(0)
+    rows, noise, scatter = 2500, np.array([0.5]), np.array([0.1])
+    one = np.ones((rows, 1, 1))
+    measured = rng.normal(size=(rows, 1)).cumsum(0)
+    link = Link(one[1:], np.zeros((rows - 1, 1)), one, measured)
+    mean, variance, density = 0.3, 2.0, 0.0
+    for y in measured[:, 0]:
+        error, total = y - mean, variance + noise[0]
+        density -= 0.5 * (error**2 / total + math.log(2 * math.pi * total))
+        mean += variance / total * error
+        last, variance = variance * noise[0] / total, variance * noise[0] / total + scatter[0]
+    solutions, solve = [], np.linalg.solve
+    monkeypatch.setattr(np.linalg, "solve", lambda *two: solutions.append(1) or solve(*two))
+    (found,), log_density = smooth_chain([link], [(np.array([0.3]), 2 * one[0])], noise, scatter)
+    assert log_density == pytest.approx(density, rel=1e-12)
+    assert found.states.means[-1, 0] == pytest.approx(mean, rel=1e-12)
+    assert found.states.covariances[-1, 0, 0] == pytest.approx(last, rel=1e-12)
+    assert len(solutions) < 100
+
+
 @pytest.mark.slow
 def test_draws_have_the_moments_and_one_constant(chain):
     mean, covariance, _ = dense(*chain)
