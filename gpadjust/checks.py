@@ -317,17 +317,18 @@ _PATIENCE = 5.0  # seconds, before long work shows a bar
 
 
 @contextmanager
-def long_work(text: str, unit: str) -> Iterator[None]:
+def long_work(text: str, unit: str, total: int | None = None) -> Iterator[None]:
     """Show a bar of what :func:`tick` counts in a block, if that takes more than five seconds.
 
-    It is shown in a terminal or a notebook, if tqdm is installed.
+    It is shown in a terminal or a notebook, if tqdm is installed. With a total of units it also
+    shows the time that is left.
     """
     is_seen = hasattr(sys, "ps1") or (sys.stderr is not None and sys.stderr.isatty())
     if not is_seen or find_spec("tqdm") is None:
         yield
         return
     options: dict[str, Any] = {"delay": _PATIENCE, "leave": False, "miniters": 1}
-    with progress_bar(True, desc=text, unit=unit, **options) as bar:
+    with progress_bar(True, desc=text, unit=unit, total=total, **options) as bar:
         token = _BAR.set(bar)
         try:
             yield
@@ -335,11 +336,11 @@ def long_work(text: str, unit: str) -> Iterator[None]:
             _BAR.reset(token)
 
 
-def tick() -> None:
-    """Count a unit of the long work that is going on, if any is."""
+def tick(to: int | None = None) -> None:
+    """Count a unit of the long work that is going on, if any is, or go to this number of them."""
     bar = _BAR.get()
     if bar is not None:
-        bar.update()
+        bar.update(1 if to is None else to - bar.n)
 
 
 @contextmanager

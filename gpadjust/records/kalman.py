@@ -53,6 +53,8 @@ def smooth_chain(
     Raises:
         LinAlgError: If a variance is not a positive number.
     """
+    if not np.isfinite([*noise, *process_noise]).all():
+        raise np.linalg.LinAlgError(_NO_VARIANCE)
     rows = _Rows.joined(links, starts, noise, process_noise)
     filtered = _filter(rows)
     states, gains = _smooth(rows, filtered)

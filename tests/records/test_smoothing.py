@@ -1,7 +1,6 @@
 """States of records: by a dense Gaussian, and by what was simulated."""
 
 import math
-import re
 
 import numpy as np
 import pytest
@@ -398,12 +397,67 @@ def test_intervals_of_parameters_hold_as_often_as_they_say():
     assert 0.88 <= held / 80 <= 1
 
 
-@pytest.mark.filterwarnings("ignore::gpadjust.records.SmoothingWarning")
-def test_a_long_log_is_told_with_its_time_and_what_takes_less(capsys):
-    run = simulated(0, length=3000)
-    given = {"max_rounds": 1, "num_starts": 1, "progress": True}
-    smooth(Records(measured(*run, 0), SPEC), spring(), **given)
-    told = r"3,000 steps: up to some \d+ min for 1 start\(s\) of 1 rounds.* steps of 3 rows"
-    assert re.search(told, capsys.readouterr().err, flags=re.DOTALL)
-    smooth(Records(measured(*simulated(0, length=100), 0), SPEC), spring(), **given)
-    assert "min for" not in capsys.readouterr().err
+
+
+def pendulum_log(seed, rows=499, step=0.01, noise=0.005):
+    """Log of a pendulum, its angle alone, of mass 0.5 kg and little damping."""
+    rng = np.random.default_rng(seed)
+    torque = np.repeat(rng.uniform(-1, 1, (rows // 25 + 1, 1)), 25, 0)[:rows]
+    physics = swinging({"mass": Unknown(0.5, sd=1.0), "damping": Unknown(0.02, sd=1.0)})
+    row = torch.tensor([[*rng.uniform(-3, 3, 1), 0.0, 0.0]]).double()
+    states = []
+    for u in torch.from_numpy(torque):
+        row[0, 2] = u
+        states.append(row[0, :2].clone())
+        row[:, :2] = physics(row, torch.tensor([0.5, 0.02]).double())
+    states = torch.stack(states)
+    states[:, 0] += noise * torch.from_numpy(rng.normal(size=rows))
+    states[:, 1] = math.nan
+    times = step * torch.arange(rows).double()
+    return Records(Record(times, states, torch.from_numpy(torque)), StateSpec(["q", "w"], ["u"]))
+
+
+def swinging(unknowns):
+    def rates(state, action, p):
+        angle, rate = state.unbind(-1)
+        torque = action[:, 0] - 0.5 * 9.81 * p.mass * angle.sin() - p.damping * rate
+        return torch.stack([rate, torque / (0.25 * p.mass)], dim=-1)
+
+    return ODEPhysics(rates, step=0.01, state_dim=2, substeps=2, unknowns=unknowns)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1000, 1001])
+def test_noise_of_the_sensor_is_not_taken_for_process_noise(seed):
+    """One of six starts ends where process noise of the angle explains all that is measured."""
+    unknowns = {"mass": Unknown(0.3, factor=2.0), "damping": Unknown(0.2, factor=3.0)}
+    records, physics = pendulum_log(seed), swinging(unknowns)
+    found = smooth(records, physics, start={"w": (0.0, 5.0)}, num_starts=6)
+    assert found.noise[0] == pytest.approx(0.005, rel=0.15)
+    assert found.process_noise[0] < 1e-4
+    assert inside(torch.tensor([0.5, 0.02]), found.physics_parameters.interval(0.999))
+
+
+@pytest.fixture
+def ticked(monkeypatch):
+    """Positions of a bar of progress."""
+    import gpadjust.records.smoothing as smoothing
+
+    positions = []
+
+    def tick(to=None):
+        positions.append((positions[-1] if positions else 0) + 1 if to is None else to)
+
+    monkeypatch.setattr(smoothing, "tick", tick)
+    return positions
+
+
+def test_a_right_physics_settles_in_few_rounds_and_progress_never_goes_back(ticked):
+    """Where process noise is none, expectation maximisation would creep for 100 rounds."""
+    records = pendulum_log(0, rows=200)
+    unknowns = {"mass": Unknown(0.4, factor=1.5), "damping": Unknown(0.03, factor=2.0)}
+    found = smooth(records, swinging(unknowns), start={"w": (0.0, 5.0)}, num_starts=2)
+    assert found.process_noise[0] < 1e-4
+    assert ticked == sorted(ticked)
+    assert ticked[1] == 1
+    assert max(position for position in ticked if position < 100) < 60
