@@ -406,7 +406,8 @@ class _Climb:
 
     def __init__(self, curvature: Array) -> None:
         self.first = np.diag(1 / curvature.ravel().clip(1.0))
-        self.inverse, self.last = self.first, None
+        self.inverse = self.first
+        self.last: tuple[Array, Array] | None = None
 
     def step(self, x: Array, gradient: Array, gained: float) -> Array:
         """Return the step from ``x``, to which the last step led, and gained so much."""

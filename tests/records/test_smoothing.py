@@ -397,8 +397,6 @@ def test_intervals_of_parameters_hold_as_often_as_they_say():
     assert 0.88 <= held / 80 <= 1
 
 
-
-
 def pendulum_log(seed, rows=499, step=0.01, noise=0.005):
     """Log of a pendulum, its angle alone, of mass 0.5 kg and little damping."""
     rng = np.random.default_rng(seed)
