@@ -62,41 +62,28 @@ def progress_bar(shown: bool, iterable: Iterable[Any] = (), **options: Any) -> A
 
 
 @contextmanager
-def long_work(
-    text: str, unit: str, *, total: int | None = None, at_once: bool = False
-) -> Iterator[Any]:
+def long_work(text: str, unit: str, *, total: int | None = None) -> Iterator[None]:
     """Show a bar of what :func:`tick` counts in a block, if that takes more than five seconds.
 
-    It is shown in a terminal or a notebook, if tqdm is installed.
-
-    Args:
-        text: What is done.
-        unit: What is counted, such as ``"steps"``.
-        total: How many there will be. Default: unknown.
-        at_once: If True, show the bar from the start, wherever the output goes.
-
-    Yields:
-        The bar, as of :func:`progress_bar`.
-
-    Raises:
-        ImportError: If it is to be shown at once, and tqdm is not installed.
+    It is shown in a terminal or a notebook, if tqdm is installed. With a total of units it also
+    shows the time that is left.
     """
     is_seen = hasattr(sys, "ps1") or (sys.stderr is not None and sys.stderr.isatty())
-    if not at_once and not (is_seen and find_spec("tqdm")):
-        yield _Hidden()
+    if not (is_seen and find_spec("tqdm")):
+        yield
         return
     options: dict[str, Any] = {"desc": text, "unit": f" {unit}", "total": total}
-    options |= {"leave": False, "miniters": 1, "delay": 0.0 if at_once else PATIENCE}
+    options |= {"leave": False, "miniters": 1, "delay": PATIENCE}
     with progress_bar(True, **options) as bar:
         token = _BAR.set((unit, bar))
         try:
-            yield bar
+            yield
         finally:
             _BAR.reset(token)
 
 
-def tick(unit: str) -> None:
-    """Count a unit, if the innermost long work that is going on counts such units."""
+def tick(unit: str, to: int | None = None) -> None:
+    """Count a unit, or go to this number, if the innermost long work counts such units."""
     counted, bar = _BAR.get()
     if counted == unit:
-        bar.update()
+        bar.update(1 if to is None else to - bar.n)

@@ -40,12 +40,21 @@ def test_a_fit_shows_a_bar_after_five_seconds_where_somebody_sees_it(capsys, mon
     assert not capsys.readouterr().err
 
 
-def test_only_the_innermost_work_counts_and_only_its_own_units():
-    with long_work("learn", "steps", total=3, at_once=True) as outer:
+def test_only_the_innermost_work_counts_and_only_its_own_units(monkeypatch):
+    bars = []
+
+    def recorded(shown, **options):
+        bars.append(progress_bar(False))
+        return bars[-1]
+
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr(progress, "progress_bar", recorded)
+    with long_work("learn", "steps", total=3):
         tick("steps")
-        with long_work("fit", "evaluations", at_once=True) as inner:
+        with long_work("fit", "evaluations"):
             tick("evaluations")
             tick("steps")
         tick("evaluations")
+        tick("steps", to=3)
     tick("steps")
-    assert (outer.n, inner.n) == (1, 1)
+    assert [bar.n for bar in bars] == [3, 1]

@@ -265,7 +265,6 @@ def identify(
     held_out: float = 0.25,
     num_starts: int | None = None,
     seed: int = 0,
-    progress: bool = False,
 ) -> Identification:
     """Find parameters, noise and hidden states of a machine, and judge them by a free run.
 
@@ -283,7 +282,6 @@ def identify(
             steps are at the end of each other stretch that has twice as many.
         num_starts: As of :func:`smooth`.
         seed: Seed of the free runs.
-        progress: If True, show a progress bar.
 
     Returns:
         The identification; :func:`gpadjust.report.report` makes a page of it.
@@ -335,7 +333,7 @@ def identify(
             measured.append(stretch.states[end:])
         beginnings.append(stretch.part(slice(end)))
     learnt_from = Records(beginnings, spec)
-    smoothed = smooth(learnt_from, f_p, start=start, num_starts=num_starts, progress=progress)
+    smoothed = smooth(learnt_from, f_p, start=start, num_starts=num_starts)
     last = torch.stack([smoothed.records.records[i].states[-1] for i in ends])
     windows = Windows(last, torch.stack(actions), torch.stack(measured))
     options: dict[str, Any] = {

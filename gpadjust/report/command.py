@@ -248,7 +248,7 @@ def _of_log(arguments: Namespace) -> Job:
 
     def work() -> Identification:
         try:
-            return identify(Records(whole.records, spec), physics, **options, progress=True)
+            return identify(Records(whole.records, spec), physics, **options)
         except RuntimeError as error:  # the states diverged, or the physics failed
             raise ValueError(str(error)) from error
 
