@@ -131,15 +131,20 @@ class FMUPhysics(BlackBoxPhysics):
                 f"{', '.join(names)}: name the inputs in the order of the data."
             )
 
+    def read(self, X: Tensor) -> Tensor:
+        """Return the columns of ``X`` (``... x n x d``) that are inputs of the FMU, checked."""
+        columns = super().read(X)
+        if columns.shape[-1] != len(self.input_names):
+            raise ValueError(
+                f"Physics {self.name!r} has the inputs {', '.join(self.input_names)}; expected a "
+                f"column for each of them, or columns=, found {columns.shape[-1]} column(s)."
+            )
+        return columns
+
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """Return the outputs of simulations; an error of single rows contains those of others."""
         from joblib import Parallel, delayed  # slow to import
 
-        if X.shape[-1] != len(self.input_names):
-            raise ValueError(
-                f"expected a column for each of the inputs {', '.join(self.input_names)}, or "
-                f"columns=, found {X.shape[-1]} column(s)"
-            )
         rows = self._table(X, *parameters)
         place = np.arange(len(rows))
         if "time" in self.input_names:

@@ -272,7 +272,7 @@ def test_steps_of_one_length_and_columns():
     even, odd = (torch.tensor([[0.0, t]]).double() for t in (6.0, 5.0))
     assert physics(even).isfinite().all()
     refused(PhysicsError, "steps of one length, found steps from 1 to 2", physics, odd)
-    refused(PhysicsError, "a column for each of the inputs", physics, X)
+    refused(ValueError, r"a column for each of them, or columns=, found 3", physics, X)
     refused(ValueError, "in the order of the data", physics.check_names, ["time", "heater"])
     chosen = FMUPhysics(path, ["heater"], STATES, times=6.0, columns=[2])
     assert torch.equal(chosen(X[1:2]), physics(even))
