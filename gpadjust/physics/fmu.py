@@ -106,6 +106,14 @@ class FMU:
                 "with initial='exact' for it, or for model exchange, whose states can be set."
             )
 
+    @property
+    def step(self) -> float | None:
+        """The communication step that the FMU names."""
+        experiment = self.description.defaultExperiment
+        step = getattr(self.interface, "fixedInternalStepSize", None)
+        step = step or getattr(experiment, "stepSize", None)
+        return None if step is None else float(step)
+
     def unit(self, name: str) -> str:
         """Return the unit of a variable, or an empty text."""
         variable = self.variable(name)

@@ -110,16 +110,15 @@ class FMUPhysics(BlackBoxPhysics):
         self.start_time = checked_number("start_time", start_time)
         self.tolerance = checked_number("tolerance", tolerance, above=0, below=1)
         self.times = self._checked_times(times)
-        described_as = opened(path, kind)
+        unpacked = opened(path, kind)
+        step = unpacked.step if communication_step is None else communication_step
         self.communication_step = (
-            _own_step(described_as)
-            if communication_step is None
-            else checked_number("communication_step", communication_step, above=0)
+            None if step is None else checked_number("communication_step", step, above=0)
         )
-        self._check(described_as)
+        self._check(unpacked)
         for each, unknown in self.unknowns.items():
             if not unknown.unit:
-                self.unknowns[each] = replace(unknown, unit=described_as.unit(each))
+                self.unknowns[each] = replace(unknown, unit=unpacked.unit(each))
         self.num_outputs = len(self.output_names) * max(1, len(self.times))
 
     def check_names(self, names: Sequence[str]) -> None:
@@ -169,8 +168,7 @@ class FMUPhysics(BlackBoxPhysics):
         failure = PhysicsError("")
         try:
             points = self._points(times)
-            # Of two points within a rounding error the nearest is that of a time.
-            read = np.abs(points[:, None, None] - times).argmin(0)
+            read = _last(points, times, points)
             wanted = {*read.ravel().tolist()}
             simulation = opened(self.path, self.kind).simulate(
                 self.start_values | values, points, self._held(points), self.tolerance
@@ -213,8 +211,7 @@ class FMUPhysics(BlackBoxPhysics):
     def _held(self, points: NDArray[np.float64]) -> list[dict[str, float]]:
         """Return the values of signals from each point on; nothing if there are none."""
         names = [name for name in self.signals if name != "time"]
-        late = points + _SAME * np.ptp(points)
-        place = (np.searchsorted(self.signals["time"], late, side="right") - 1).clip(0)
+        place = _last(self.signals["time"], points, points).clip(0)
         return [{n: float(self.signals[n][i]) for n in names} for i in place if names]
 
     def _checked_times(self, times: float | Sequence[float] | None) -> tuple[float, ...]:
@@ -261,6 +258,13 @@ def _names(argument: str, names: Sequence[str]) -> tuple[str, ...]:
     return tuple(names)
 
 
+def _last(
+    of: NDArray[np.float64], until: NDArray[np.float64], points: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """Return the places of the last times that are not after others, but for rounding errors."""
+    return np.searchsorted(of, until + _SAME * np.ptp(points), side="right") - 1
+
+
 def _signals(signals: Any) -> dict[str, NDArray[np.float64]]:
     """Return signals by name, with their times."""
     if signals is None:
@@ -275,12 +279,3 @@ def _signals(signals: Any) -> dict[str, NDArray[np.float64]]:
             f"found {shapes}."
         )
     return found
-
-
-def _own_step(fmu: FMU) -> float | None:
-    """Return the communication step that an FMU names."""
-    experiment = fmu.description.defaultExperiment
-    step = getattr(fmu.interface, "fixedInternalStepSize", None) or getattr(
-        experiment, "stepSize", None
-    )
-    return None if step is None else float(step)

@@ -26,6 +26,7 @@ TANK = [
     ("wall[1].C", "J/K", "parameter", *CONSTANT, 1000, 0),
     ("loss", "W/K", "parameter", *CONSTANT, 10, 0),
     ("wall_start", "K", "parameter", *CONSTANT, 0, 0),
+    ("walls", "", "parameter", *CONSTANT, 1, 0),
 ]
 BALL = [
     ("h", "m", "output", *STATE, 1, 0),
@@ -60,11 +61,13 @@ def description(name, fmi, variables, number, indicators, interface):
         value = {"unit": unit, "start": None if initial == "calculated" else start}
         if fmi == 2:
             value["derivative"] = rate or ""
-            real = f"<Real{attributes(**value)}/>"
+            kind = "Integer" if own == "walls" else "Real"
+            real = f"<{kind}{attributes(**value)}/>"
             text += f"<ScalarVariable{attributes(**about)}>{real}</ScalarVariable>"
         else:
             value["derivative"] = rate - 1 if rate else ""
-            text += f"<Float64{attributes(**about, **value)}/>"
+            kind = "Int32" if own == "walls" else "Float64"
+            text += f"<{kind}{attributes(**about, **value)}/>"
     if fmi == 2:
         tags = {"Outputs": outputs, "Derivatives": rates, "InitialUnknowns": unknown}
         for tag, places in tags.items():

@@ -25,9 +25,9 @@ typedef fmi3ValueReference Reference;
 #endif
 
 #if MODEL == 1
-enum { TOKEN = 1, STATES = 2, INDICATORS = 0, VALUES = 11 };
-enum { T, WALL, DT, DWALL, HEATER, AMBIENT, C, G, WALL_C, LOSS, START };
-static const double START_VALUES[VALUES] = {300, 300, 0, 0, 0, 300, 4000, 50, 1000, 10, 0};
+enum { TOKEN = 1, STATES = 2, INDICATORS = 0, VALUES = 12 };
+enum { T, WALL, DT, DWALL, HEATER, AMBIENT, C, G, WALL_C, LOSS, START, WALLS };
+static const double START_VALUES[VALUES] = {300, 300, 0, 0, 0, 300, 4000, 50, 1000, 10, 0, 1};
 #else
 enum { TOKEN = 2, STATES = 2, INDICATORS = 1, VALUES = 6 };
 enum { H, V, DH, DV, E, GRAVITY };
@@ -59,7 +59,7 @@ static STATUS failed(Model *m, const char *text)
 static void rates(double *v)
 {
 #if MODEL == 1
-    const double in = v[G] * (v[T] - v[WALL]);
+    const double in = v[WALLS] * v[G] * (v[T] - v[WALL]);
     v[DT] = (v[HEATER] - in) / v[C];
     v[DWALL] = (in - v[LOSS] * (v[WALL] - v[AMBIENT])) / v[WALL_C];
 #else
@@ -145,6 +145,18 @@ static STATUS set(Model *m, const Reference *r, size_t n, const double *value)
     return OK;
 }
 
+static STATUS get_whole(Model *m, const Reference *r, size_t n, int *value)
+{
+    for (size_t i = 0; i < n; i++) value[i] = (int)m->v[r[i]];
+    return OK;
+}
+
+static STATUS set_whole(Model *m, const Reference *r, size_t n, const int *value)
+{
+    for (size_t i = 0; i < n; i++) m->v[r[i]] = value[i];
+    return OK;
+}
+
 static STATUS begun(Model *m)
 {
 #if MODEL == 1
@@ -176,10 +188,10 @@ fmi2Status fmi2Terminate(fmi2Component c) { return fmi2OK; }
 fmi2Status fmi2Reset(fmi2Component c) { restart(c); return fmi2OK; }
 fmi2Status fmi2GetReal(fmi2Component c, const Reference r[], size_t n, fmi2Real v[]) { return get(c, r, n, v); }
 fmi2Status fmi2SetReal(fmi2Component c, const Reference r[], size_t n, const fmi2Real v[]) { return set(c, r, n, v); }
-NONE(fmi2GetInteger, fmi2Component c, const Reference r[], size_t n, fmi2Integer v[])
+fmi2Status fmi2GetInteger(fmi2Component c, const Reference r[], size_t n, fmi2Integer v[]) { return get_whole(c, r, n, v); }
 NONE(fmi2GetBoolean, fmi2Component c, const Reference r[], size_t n, fmi2Boolean v[])
 NONE(fmi2GetString, fmi2Component c, const Reference r[], size_t n, fmi2String v[])
-NONE(fmi2SetInteger, fmi2Component c, const Reference r[], size_t n, const fmi2Integer v[])
+fmi2Status fmi2SetInteger(fmi2Component c, const Reference r[], size_t n, const fmi2Integer v[]) { return set_whole(c, r, n, v); }
 NONE(fmi2SetBoolean, fmi2Component c, const Reference r[], size_t n, const fmi2Boolean v[])
 NONE(fmi2SetString, fmi2Component c, const Reference r[], size_t n, const fmi2String v[])
 NONE(fmi2GetFMUstate, fmi2Component c, fmi2FMUstate *s)
@@ -242,7 +254,9 @@ fmi3Status fmi3Terminate(fmi3Instance c) { return fmi3OK; }
 fmi3Status fmi3Reset(fmi3Instance c) { restart(c); return fmi3OK; }
 fmi3Status fmi3GetFloat64(fmi3Instance c, const Reference r[], size_t n, fmi3Float64 v[], size_t k) { return get(c, r, n, v); }
 fmi3Status fmi3SetFloat64(fmi3Instance c, const Reference r[], size_t n, const fmi3Float64 v[], size_t k) { return set(c, r, n, v); }
-PAIR(Float32) PAIR(Int8) PAIR(UInt8) PAIR(Int16) PAIR(UInt16) PAIR(Int32) PAIR(UInt32) PAIR(Int64) PAIR(UInt64) PAIR(Boolean) PAIR(String)
+fmi3Status fmi3GetInt32(fmi3Instance c, const Reference r[], size_t n, fmi3Int32 v[], size_t k) { return get_whole(c, r, n, v); }
+fmi3Status fmi3SetInt32(fmi3Instance c, const Reference r[], size_t n, const fmi3Int32 v[], size_t k) { return set_whole(c, r, n, v); }
+PAIR(Float32) PAIR(Int8) PAIR(UInt8) PAIR(Int16) PAIR(UInt16) PAIR(UInt32) PAIR(Int64) PAIR(UInt64) PAIR(Boolean) PAIR(String)
 NONE(fmi3GetBinary, fmi3Instance c, const Reference r[], size_t n, size_t s[], fmi3Binary v[], size_t k)
 NONE(fmi3SetBinary, fmi3Instance c, const Reference r[], size_t n, const size_t s[], const fmi3Binary v[], size_t k)
 NONE(fmi3GetClock, fmi3Instance c, const Reference r[], size_t n, fmi3Clock v[])

@@ -177,6 +177,22 @@ def test_a_state_that_is_computed_can_be_set_by_model_exchange_alone():
     assert torch.equal(physics(X), FMUPhysics(fmu(), **STEP, kind="ModelExchange")(X))
 
 
+@pytest.mark.parametrize(("fmi", "kind"), KINDS)
+def test_a_whole_number_is_one(fmi, kind):
+    inputs, outputs = ["tank.T", "walls"], ["tank.T", "walls"]
+    options = {"start_values": {"wall[1].T": 300.0}, "kind": kind, "times": 6.0}
+    physics = FMUPhysics(fmu("tank", fmi), inputs, outputs, **options)
+    found = physics(torch.tensor([[320.0, 2.0]]).double())
+    expected = [tank([320.0, 300.0], 0.0, [6.0], g=100.0)[0, 0].item(), 2.0]
+    assert found[0].tolist() == pytest.approx(expected, rel=1e-7)
+    refused(
+        PhysicsError,
+        "'walls' is 1 after.*set to 1.5.*rounds it",
+        physics,
+        torch.tensor([[320.0, 1.5]]).double(),
+    )
+
+
 def test_a_value_that_the_fmu_overrules_is_noticed():
     physics = FMUPhysics(fmu(), **STEP, start_values={"wall_start": 350.0})
     refused(
