@@ -125,14 +125,19 @@ class FMU:
         points: NDArray[np.float64],
         held: Sequence[Mapping[str, float]],
         tolerance: float,
-    ) -> Iterator[_Instance]:
-        """Yield an instance at each of the ``points`` in time, which begins at the first.
+        outputs: Sequence[str],
+        found: dict[int, Any],
+    ) -> None:
+        """Simulate from the first of the ``points`` in time to the last, and store outputs.
 
         Args:
             values: Start values and parameters by name.
             points: Ascending times.
             held: Values of inputs from each point to the next, for all points; empty for none.
             tolerance: The relative tolerance of the integration.
+            outputs: The variables to read.
+            found: Numbers of points, to which it adds the values of the outputs there; after an
+                error those after it are None.
         """
         times: list[float] = points.tolist()
         with self._instance() as instance:
@@ -144,7 +149,8 @@ class FMU:
             for i, _ in enumerate(run):
                 if i == 0:
                     instance.check(values)
-                yield instance
+                if i in found:
+                    found[i] = [instance.get(name) for name in outputs]
             instance.fmu.terminate()
 
     @contextmanager

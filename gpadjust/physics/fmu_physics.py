@@ -164,27 +164,27 @@ class FMUPhysics(BlackBoxPhysics):
         times = np.array([self.times] * len(rows))
         if values.pop("time", None) is not None:
             times = rows[:, [self.input_names.index("time")]]
-        outputs = dict[int, list[float]]()
+        found = dict[int, Any]()
         failure = PhysicsError("")
         try:
             points = self._points(times)
             read = _last(points, times, points)
-            wanted = {*read.ravel().tolist()}
-            simulation = opened(self.path, self.kind).simulate(
-                self.start_values | values, points, self._held(points), self.tolerance
+            found = dict.fromkeys(read.ravel().tolist())
+            opened(self.path, self.kind).simulate(
+                self.start_values | values,
+                points,
+                self._held(points),
+                self.tolerance,
+                self.output_names,
+                found,
             )
-            for i, instance in enumerate(simulation):
-                if i in wanted:
-                    outputs[i] = [instance.get(name) for name in self.output_names]
         except Exception as error:
             failure = PhysicsError(described(error))
             failure.__cause__ = error
-            if not outputs:
+            if not any(found.values()):
                 return [failure] * len(rows)
-        return [
-            np.concatenate([outputs[i] for i in own]) if {*own} <= outputs.keys() else failure
-            for own in read.tolist()
-        ]
+        parts = [[found[i] for i in own] for own in read.tolist()]
+        return [failure if None in own else np.concatenate(own) for own in parts]
 
     def _points(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return all times at which a simulation stops, from its start to the last output."""

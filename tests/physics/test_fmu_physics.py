@@ -155,6 +155,8 @@ def test_threads_and_processes_have_instances_of_their_own(only_one):
         )
     with joblib.parallel_config(backend="threading", n_jobs=3):
         assert torch.equal(made()(rows), expected)
+    boiling = torch.tensor([[373.0, 373.0, 90000.0]]).double()
+    refused(PhysicsError, "the tank boils", made(), boiling)  # and the next row has an instance
     again = pickle.loads(pickle.dumps(made()))
     assert torch.equal(again(rows), expected)
     assert copy.deepcopy(again) is again
