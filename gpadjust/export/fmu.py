@@ -8,7 +8,6 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from string import Template
 from tempfile import TemporaryDirectory
@@ -243,7 +242,7 @@ def export_fmu(
     name = path.stem
     code = c_source(fitted, name, variance=variance, observation_noise=observation_noise)
     kind, arguments = _signature(code, name)
-    step = fitted.spec.step if isinstance(fitted, LearnedDynamics) else None
+    step = fitted.spec.step if hasattr(fitted, "spec") else None
     if step is None and kind == "step":
         raise ValueError("Expected the duration of a step: StateSpec(..., step=0.1).")
     if physics is not None and "f_p" not in arguments:
@@ -293,19 +292,18 @@ def _signature(code: str, name: str) -> tuple[str, list[str]]:
 
 def _variables(fitted: GP | LearnedDynamics, arguments: list[str], has_physics: bool) -> _Variables:
     """Return the variables of a model or dynamics."""
-    model = model_of(fitted)
-    if isinstance(fitted, LearnedDynamics):
-        spec = fitted.spec
+    spec, f_p = getattr(fitted, "spec", None), list[str]()
+    if spec is not None:
         inputs, outputs, start = spec.actions, spec.states, [0.0] * spec.action_dim
-        returned: Sequence[str] = [spec.states[i] for i in spec.moving]
-        first = 0.0
+        returned, first = [spec.states[i] for i in spec.moving], 0.0
     else:
-        data = model.data
+        data = model_of(fitted).data
         inputs, outputs, start = data.input_names, data.output_names, data.X[0].tolist()
-        returned, first = outputs, None
-    several = [f"f_p{i + 1}" for i in range(len(model.physics))]
-    heads = several if len(several) > 1 else ["f_p"]
-    f_p = [f"{head}_{output}" for head in heads for output in returned if "f_p" in arguments]
+        returned, first = [*outputs], None
+    if "f_p" in arguments:
+        several = len(model_of(fitted).physics)
+        heads = [f"f_p{i + 1}" for i in range(several)] if several > 1 else ["f_p"]
+        f_p = [f"{head}_{output}" for head in heads for output in returned]
     return _Variables(
         [_variable(name, "input", value) for name, value in zip(inputs, start, strict=True)],
         [_variable(name, "local" if has_physics else "input", 0.0) for name in f_p],
@@ -316,11 +314,11 @@ def _variables(fitted: GP | LearnedDynamics, arguments: list[str], has_physics: 
 
 def _read(fitted: GP | LearnedDynamics, variables: _Variables) -> list[int]:
     """Return the places of what the physics reads."""
-    inputs = [*range(len(variables.inputs))]
-    if not isinstance(fitted, LearnedDynamics):
+    inputs, spec = [*range(len(variables.inputs))], getattr(fitted, "spec", None)
+    if spec is None:
         return inputs
     entries = [*range(variables.place("outputs"), variables.place("sd")), *inputs]
-    return [entries[i] for i in fitted.spec.physics_columns]
+    return [entries[i] for i in spec.physics_columns]
 
 
 def _variable(name: str, causality: str, start: float | None, suffix: str = "") -> _Variable:
