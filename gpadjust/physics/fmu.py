@@ -141,10 +141,11 @@ class FMU:
         """
         times: list[float] = points.tolist()
         with self._instance() as instance:
-            states = instance.begin(values, times[0], times[-1], tolerance)
+            instance.begin(values, times[0], times[-1], tolerance)
             if self.kind == "CoSimulation":
                 run = instance.steps(times, held)
             else:
+                states = {name: values[name] for name in self.states if name in values}
                 run = instance.integrate(times, held, tolerance, states)
             for i, _ in enumerate(run):
                 if i == 0:
@@ -231,8 +232,8 @@ class _Instance:
 
     def begin(
         self, values: Mapping[str, float], start: float, stop: float, tolerance: float
-    ) -> dict[str, float]:
-        """Initialise at a time; return the values of states, which can only be set afterwards."""
+    ) -> None:
+        """Initialise at a time, with the values that can be set before."""
         from fmpy.simulation import settable_in_initialization_mode, settable_in_instantiated
 
         fmu, is_2 = self.fmu, self.owner.version == 2
@@ -243,9 +244,8 @@ class _Instance:
             fmu.setupExperiment(**experiment)
         left = self.set(values, settable_in_instantiated)
         fmu.enterInitializationMode(**({} if is_2 else experiment))
-        left = self.set(left, settable_in_initialization_mode)
+        self.set(left, settable_in_initialization_mode)
         fmu.exitInitializationMode()
-        return left
 
     def get(self, name: str) -> float:
         """Return the present value of a variable."""
@@ -304,7 +304,7 @@ class _Instance:
         if held:
             self.set(held[0])
         next_event = self._update()
-        if states:
+        if any(self.get(name) != value for name, value in states.items()):
             self._set_states(states)
             fmu.enterEventMode()
             next_event = self._update()

@@ -195,8 +195,11 @@ def test_a_whole_number_is_one(fmi, kind):
     )
 
 
-def test_a_value_that_the_fmu_overrules_is_noticed():
-    physics = FMUPhysics(fmu(), **STEP, start_values={"wall_start": 350.0})
+def test_a_value_that_the_fmu_overrules_is_noticed_or_set_again():
+    start = {"wall_start": 350.0}
+    physics = FMUPhysics(fmu(), **STEP, start_values=start)
+    exchange = FMUPhysics(fmu(), **STEP, start_values=start, kind="ModelExchange")
+    assert torch.equal(exchange(X), FMUPhysics(fmu(), **STEP, kind="ModelExchange")(X))
     refused(
         PhysicsError, r"'wall\[1\].T' is 350 after its start value was set to 310", physics, X[:1]
     )
