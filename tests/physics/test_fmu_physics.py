@@ -278,11 +278,11 @@ def test_what_is_refused(options, error, words):
 
 
 def test_files_that_are_refused(tmp_path, monkeypatch):
+    shutil.copy(fmu(), tmp_path / "copy.fmu")
     refused(FileNotFoundError, "tank2", FMUPhysics, "tank2.fmu", **STATE)
     (tmp_path / "text.fmu").write_text("no zip")
     refused(ValueError, "as an FMU; it cannot be read", FMUPhysics, tmp_path / "text.fmu", **STATE)
     refused(ValueError, "found win64.*compile", FMUPhysics, of_another_platform(tmp_path), **STATE)
-    shutil.copy(fmu(), tmp_path / "copy.fmu")
     monkeypatch.setitem(sys.modules, "fmpy", None)
     refused(ImportError, r"gpadjust\[fmu\]", FMUPhysics, tmp_path / "copy.fmu", **STATE)
 
