@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from gpadjust import CKA, ZeroMeanGP, fit
+from gpadjust.core import StackedGP
 from gpadjust.validation import to_arviz
 from tests.systems import line, refused, wave
 
@@ -74,6 +75,7 @@ def test_outputs_and_missing_targets():
 
 def test_refused(models, monkeypatch):
     refused(ValueError, "fits of one model", to_arviz)
+    refused(TypeError, "one of its `models`", to_arviz, StackedGP({"a": models[0]}, torch.ones(1)))
     refused(ValueError, "multiple of 3", to_arviz, models[0], chains=3)
     monkeypatch.setitem(sys.modules, "arviz_base", None)
     refused(ImportError, r"gpadjust\[arviz\]", to_arviz, *models)
