@@ -5,6 +5,7 @@ from gpadjust.physics.black_box import BlackBoxPhysics
 from gpadjust.physics.error import PhysicsError, PhysicsWarning
 from gpadjust.physics.formula import FormulaPhysics
 from gpadjust.physics.function import FunctionPhysics, as_physics
+from gpadjust.physics.mujoco import MujocoPhysics
 from gpadjust.physics.ode import ODEPhysics
 from gpadjust.physics.parameters import ParameterValues, PhysicsParameters
 from gpadjust.physics.subprocess_physics import SubprocessPhysics
@@ -14,6 +15,7 @@ __all__ = [
     "BlackBoxPhysics",
     "FormulaPhysics",
     "FunctionPhysics",
+    "MujocoPhysics",
     "ODEPhysics",
     "ParameterValues",
     "Physics",
