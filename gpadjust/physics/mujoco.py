@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from gpadjust.checks import check_kind, checked_number, checked_whole
 from gpadjust.physics.black_box import BlackBoxPhysics
 from gpadjust.physics.error import PhysicsError, described
-from gpadjust.physics.mujoco_parameters import Edit, ModelParameters, names_of
+from gpadjust.physics.mujoco_parameters import LOCK, Edit, ModelParameters, names_of
 from gpadjust.physics.parameters import ParameterValues
 from gpadjust.physics.unknown import Unknown
 from gpadjust.states import Sensors, StateSpec
@@ -24,7 +23,6 @@ from gpadjust.states import Sensors, StateSpec
 Array = NDArray[np.float64]
 
 _AT_ONCE = 50_000  # simulation steps, after which Ctrl-C is heard
-_LOCK = Lock()  # of data, and of MuJoCo's only handler of warnings
 
 
 class MujocoPhysics(BlackBoxPhysics):
@@ -47,7 +45,7 @@ class MujocoPhysics(BlackBoxPhysics):
           \end{pmatrix},
 
       so that any numbers are of an inertia that a body can have (Rucker and Wensing 2022);
-    - joint, tendon: ``damping, frictionloss, armature, stiffness``; joint: ``springref``;
+    - joint, tendon: ``damping, frictionloss, armature, stiffness``;
     - actuator: ``gear``; of a position or velocity servo ``kp, kv``; geom: ``friction`` (sliding);
     - all else is what ``edit`` reads.
 
@@ -112,7 +110,7 @@ class MujocoPhysics(BlackBoxPhysics):
         self.model = model if is_compiled else _compiled(self.source)
         spec = None if is_compiled else partial(_read, self.source)
         own = _state_names(self.model)
-        self.parameters_of_model = ModelParameters(self.model, spec, self.unknowns, edit)
+        self._models = ModelParameters(self.model, spec, self.unknowns, edit)
         self.states = tuple(own if states is None else states)
         self.num_outputs = len(own)
         if len(self.states) != len(own):
@@ -195,7 +193,7 @@ class MujocoPhysics(BlackBoxPhysics):
             )
         values = parameters[0].rows if parameters else np.empty((len(rows), 0))
         distinct, of_row = np.unique(values, axis=0, return_inverse=True)
-        built = [self.parameters_of_model.compiled(each) for each in distinct]
+        built = [self._models.compiled(each) for each in distinct]
         models = [built[i] for i in of_row.ravel()]
         following, _ = self._simulated(models, rows[:, :d], rows[:, d:], self.num_steps)
         unstable = np.flatnonzero(np.isnan(following).any(1)).tolist()
@@ -211,7 +209,7 @@ class MujocoPhysics(BlackBoxPhysics):
 
     def _measured(self, columns: Sequence[int], states: Array) -> Array:
         """Return what sensors show at states ``N x d``."""
-        models = [self.parameters_of_model.compiled(self.unknowns.guess.numpy())] * len(states)
+        models = [self._models.compiled(self.unknowns.guess.numpy())] * len(states)
         actions = np.zeros((len(states), len(self.actions)))
         # Sensors of a simulation step are those of its beginning.
         return self._simulated(models, states, actions, 1)[1][:, columns]
@@ -232,7 +230,7 @@ class MujocoPhysics(BlackBoxPhysics):
         threads = self.threads or torch.get_num_threads()
         pool = Rollout(nthread=threads if threads > 1 else 0)
         at_once = max(1, _AT_ONCE // num_steps)
-        with _LOCK, _without_warnings(), pool:
+        with LOCK, _without_warnings(), pool:
             self._data += [MjData(self.model) for _ in range(threads - len(self._data))]
             for first in range(0, n, at_once):
                 part = slice(first, first + at_once)

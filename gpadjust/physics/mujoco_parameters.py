@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from copy import copy
+from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,14 +21,18 @@ _SHEAR = ("shear_xy", "shear_xz", "shear_yz")
 _SHAPE = {*_CENTER, *_STRETCH, *_SHEAR}  # of the mass of a body, which compiling again writes
 FIELDS = {
     "body": ("mass", *_CENTER, *_STRETCH, *_SHEAR),
-    "joint": ("damping", "frictionloss", "armature", "stiffness", "springref"),
+    "joint": ("damping", "frictionloss", "armature", "stiffness"),
     "tendon": ("damping", "frictionloss", "armature", "stiffness"),
     "actuator": ("gear", "kp", "kv"),
     "geom": ("friction",),
 }
 """Names of parameters, by the kind of element that has them."""
-_SIGNED = {*_CENTER, *_SHEAR, "springref", "gear"}
+_SIGNED = {*_CENTER, *_SHEAR, "gear"}
 _FIXED = ("nq", "nv", "na", "nu", "njnt", "nsensordata")
+_MOST_MODELS, _MOST_BYTES = 1024, 2**28  # that are remembered
+
+LOCK = Lock()
+"""Of data, and of MuJoCo's handler of warnings, of which there is one for all threads."""
 
 Edit = Callable[[Any, ParameterValues], object]
 
@@ -60,6 +65,8 @@ class ModelParameters:
         if edit is not None and spec is None:
             raise ValueError("edit changes an MjSpec; give the MJCF or that, not an MjModel.")
         self.model, self.spec, self.unknowns, self.edit = model, spec, unknowns, edit
+        self._models: dict[bytes, Any] = {}
+        self._data: Any = None  # slower to make than a model
         self.places: dict[str, Place] = {}
         for name, unknown in unknowns.items():
             place = self._place(name)
@@ -76,6 +83,18 @@ class ModelParameters:
 
     def compiled(self, values: Array) -> Any:
         """Return the model with these values of the parameters, ``p``."""
+        key = values.tobytes()
+        with LOCK:
+            if key not in self._models:
+                if len(self._models) >= min(_MOST_MODELS, _MOST_BYTES // self.model.nbuffer):
+                    self._models.clear()
+                self._models[key] = self._compiled(values)
+            return self._models[key]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_models": {}, "_data": None}
+
+    def _compiled(self, values: Array) -> Any:
         import mujoco
 
         if not self.unknowns and self.edit is None:
@@ -89,8 +108,10 @@ class ModelParameters:
         model = copy(self.model) if is_as_compiled else self._edited(named, shapes)
         for name, place in self.places.items():
             if place.field not in _SHAPE:
-                _write(getattr(model, place.kind)(place.element), place.field, named[name])
-        mujoco.mj_setConst(model, mujoco.MjData(model))  # what masses and gears determine
+                _write(model, place, named[name])
+        if self._data is None or not is_as_compiled:
+            self._data = mujoco.MjData(model)
+        mujoco.mj_setConst(model, self._data)  # what masses and gears determine
         return model
 
     def _edited(self, named: ParameterValues, shapes: Mapping[str, Any] | None = None) -> Any:
@@ -120,7 +141,7 @@ class ModelParameters:
             return Place(found[0], element, field)
         if self.edit is not None and not found:
             return None
-        if not kinds:
+        if not kinds or not element:
             raise ValueError(f"Unknown parameter {name!r}; {_expected()}.")
         there = {each for kind in kinds for each in names_of(self.model, kind)}
         raise ValueError(
@@ -170,23 +191,24 @@ def _expected() -> str:
     )
 
 
-def _write(element: Any, field: str, value: float) -> None:
-    """Write a parameter of an element of a compiled model."""
-    match field:
-        case "mass":
+def _write(model: Any, place: Place, value: float) -> None:
+    """Write a parameter into a compiled model."""
+    element = getattr(model, place.kind)(place.element)
+    match place:
+        case Place(field="mass"):
             element.inertia[:] *= value / element.mass[0]
             element.mass[0] = value
-        case "springref":
-            element.qpos_spring[0] = value
-        case "kp":
+        case Place(field="kp"):
             element.gainprm[0] = value
             element.biasprm[1] = -value
-        case "kv":
+        case Place(field="kv"):
             if element.biasprm[1] == 0:  # a servo of velocities
                 element.gainprm[0] = value
             element.biasprm[2] = -value
+        case Place(kind="tendon"):
+            getattr(model, f"tendon_{place.field}")[element.id] = value
         case _:
-            getattr(element, field)[0] = value
+            getattr(element, place.field)[0] = value
 
 
 def _deform(spec: Any, model: Any, shapes: Mapping[str, Mapping[str, float]]) -> None:
