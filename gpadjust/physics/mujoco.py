@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from copy import copy
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from gpadjust.checks import check_kind, checked_number, checked_whole
 from gpadjust.physics.black_box import BlackBoxPhysics
@@ -147,6 +149,14 @@ class MujocoPhysics(BlackBoxPhysics):
         angles = [name for name, turns in zip(self.states, is_angle, strict=False) if turns]
         return StateSpec(self.states, self.actions, angles=angles, step=self.step)
 
+    def mj_model(self, parameters: Tensor | None = None) -> Any:
+        """Return a ``mujoco.MjModel`` with these values of the parameters, ``p``, or the guesses.
+
+        It is for viewers, environments and ``mujoco.mj_saveModel``.
+        """
+        values = self.unknowns.guess if parameters is None else parameters
+        return copy(self._models.compiled(values.detach().cpu().double().numpy()))
+
     def sensors(self, names: Sequence[str] | None = None) -> Sensors:
         """Return sensors of the model as outputs of the state, with parameters at their guesses.
 
@@ -209,7 +219,7 @@ class MujocoPhysics(BlackBoxPhysics):
 
     def _measured(self, columns: Sequence[int], states: Array) -> Array:
         """Return what sensors show at states ``N x d``."""
-        models = [self._models.compiled(self.unknowns.guess.numpy())] * len(states)
+        models = [self.mj_model()] * len(states)
         actions = np.zeros((len(states), len(self.actions)))
         # Sensors of a simulation step are those of its beginning.
         return self._simulated(models, states, actions, 1)[1][:, columns]
