@@ -25,6 +25,7 @@ from gpadjust.states import Sensors, StateSpec
 Array = NDArray[np.float64]
 
 _AT_ONCE = 50_000  # simulation steps, after which Ctrl-C is heard
+_WORTH = 500  # simulation steps, for which another thread pays
 
 
 class MujocoPhysics(BlackBoxPhysics):
@@ -62,7 +63,7 @@ class MujocoPhysics(BlackBoxPhysics):
             ``hinge_dot``; for the activation of an actuator "motor" ``motor_act``.
         actions: The names of the actuators that the action drives, in its order; others get zero.
             Default: all.
-        threads: The number of threads. Default: that of PyTorch.
+        threads: The most threads. Default: those of PyTorch.
         name: As of :class:`Physics`.
 
     Raises:
@@ -145,7 +146,8 @@ class MujocoPhysics(BlackBoxPhysics):
                 "The model has no actuator, and a StateSpec has an action: add a <motor> to the "
                 "MJCF, and let its action be zero."
             )
-        is_angle = (self.model.jnt_type == 3) & ~self.model.jnt_limited.astype(bool)
+        is_hinge = self.model.jnt_type == int(_mujoco().mjtJoint.mjJNT_HINGE)
+        is_angle = is_hinge & (self.model.jnt_limited == 0)
         angles = [name for name, turns in zip(self.states, is_angle, strict=False) if turns]
         return StateSpec(self.states, self.actions, angles=angles, step=self.step)
 
@@ -170,7 +172,9 @@ class MujocoPhysics(BlackBoxPhysics):
                 accelerations and forces do.
         """
         known = dict(zip(names_of(self.model, "sensor"), range(self.model.nsensor), strict=True))
-        of_states = [each for each, i in known.items() if self.model.sensor_needstage[i] < 3]
+        with_forces = int(_mujoco().mjtStage.mjSTAGE_ACC)
+        stages = self.model.sensor_needstage
+        of_states = [each for each, i in known.items() if stages[i] < with_forces]
         names = of_states if names is None else names
         for each in names:
             if each not in of_states:
@@ -238,6 +242,7 @@ class MujocoPhysics(BlackBoxPhysics):
         starts = np.column_stack([np.full(n, length), states])
         ends, sensors = np.empty_like(starts), np.empty((n, self.model.nsensordata))
         threads = self.threads or torch.get_num_threads()
+        threads = min(threads, 1 + n * num_steps // _WORTH)
         pool = Rollout(nthread=threads if threads > 1 else 0)
         at_once = max(1, _AT_ONCE // num_steps)
         with LOCK, _without_warnings(), pool:
@@ -306,7 +311,7 @@ def _state_names(model: Any) -> list[str]:
     mujoco = _mujoco()
     joints = _parts(names_of(model, "joint"), np.ones(model.njnt, int), "joint")
     for name, kind in zip(joints, model.jnt_type, strict=True):
-        if kind < 2:
+        if kind in map(int, (mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_FREE)):
             raise ValueError(
                 f"Joint {name!r} is a ball or free joint, whose quaternions lie on a sphere and "
                 "are no entries of a state: put hinges, and slides, into its body instead."

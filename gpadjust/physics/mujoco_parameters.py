@@ -28,7 +28,6 @@ FIELDS = {
 }
 """Names of parameters, by the kind of element that has them."""
 _SIGNED = {*_CENTER, *_SHEAR, "gear"}
-_FIXED = ("nq", "nv", "na", "nu", "njnt", "nsensordata")
 _MOST_MODELS, _MOST_BYTES = 1024, 2**28  # that are remembered
 
 LOCK = Lock()
@@ -124,11 +123,12 @@ class ModelParameters:
         if shapes:
             _deform(spec, model, shapes)
             model = spec.compile()
-        changed = [each for each in _FIXED if getattr(model, each) != getattr(self.model, each)]
-        if changed or model.opt.timestep != self.model.opt.timestep:
+        before, after = _sizes(self.model), _sizes(model)
+        changed = [name for name, size in before.items() if after[name] != size]
+        if changed:  # data of another size would be written beyond their end
             raise ValueError(
-                f"edit has changed {changed[0] if changed else 'the time step'}; expected other "
-                "numbers in the same joints, actuators and sensors."
+                f"edit has changed {', '.join(changed)}; expected other numbers in the same "
+                "bodies, joints, geoms, actuators and sensors."
             )
         return model
 
@@ -161,8 +161,9 @@ class ModelParameters:
             raise ValueError(f"{name!r} needs the MJCF or an MjSpec; found an MjModel.")
         if place.kind == "body" and own.mass[0] == 0:
             raise ValueError(f"{name!r}: the body has no mass in the MJCF; give it some.")
-        if place.field in ("kp", "kv") and not own.biasprm[1:3].any():
-            raise ValueError(f"{name!r}: the actuator is no servo; its gain is its gear.")
+        feedback = {"kp": slice(1, 2), "kv": slice(1, 3)}.get(place.field)
+        if feedback is not None and not own.biasprm[feedback].any():
+            raise ValueError(f"{name!r}: the actuator is no servo of that; its gain is its gear.")
 
 
 class _Read(ParameterValues):
@@ -181,6 +182,14 @@ def names_of(model: Any, kind: str) -> list[str]:
     """Return the names of the elements of a kind, empty where they have none."""
     number = getattr(model, {"joint": "njnt"}.get(kind, f"n{kind}"), model.nu)  # before MuJoCo 4
     return [getattr(model, kind)(i).name for i in range(number)]
+
+
+def _sizes(model: Any) -> dict[str, float]:
+    """Return the numbers of all elements of a compiled model, and its time step."""
+    names = [name for name in dir(model) if name.startswith("n")]
+    sizes = {name: getattr(model, name) for name in names}
+    own = {name: size for name, size in sizes.items() if isinstance(size, int)}
+    return {**own, "the time step": model.opt.timestep}
 
 
 def _expected() -> str:
