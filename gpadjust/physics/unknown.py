@@ -126,13 +126,13 @@ class Unknowns(dict[str, Unknown]):
                 f"unknowns must map names to Unknown(guess, sd=...); found {unknowns!r}."
             )
         for name in unknowns:
-            is_path = isinstance(name, str) and "." in name.strip(".")  # of a simulator's part
+            is_path = isinstance(name, str) and ("." in name.strip(".") or "[" in name)
             is_word = isinstance(name, str) and name.isidentifier() and not iskeyword(name)
             is_attribute = is_word and not name.startswith("_") and name != "rows"
             if not is_path and (not is_attribute or hasattr(dict, name)):
                 raise ValueError(
-                    "Expected a name that can be an attribute, or one with a point, such as "
-                    f"'link1.mass', found {name!r}."
+                    "Expected a name that can be an attribute, or one with a point or bracket, "
+                    f"such as 'link1.mass' or 'wall[1].G', found {name!r}."
                 )
         super().__init__(unknowns)
 
