@@ -167,14 +167,14 @@ def named_physics(physics: Any, spec: StateSpec) -> dict[str, Physics]:
         part = parts[name] = as_physics(each)
         if isinstance(physics, Mapping) and part is not each:  # a wrapper of ours
             part.name = name
-        if not isinstance(part, ODEPhysics):
-            continue
-        if part.difference:
+        if isinstance(part, ODEPhysics) and part.difference:
             raise ValueError(
                 f"Physics {part.name!r} returns the change of the state (difference=True), but "
                 "dynamics take the next state from it; build it with difference=False."
             )
-        if spec.step is not None and not math.isclose(part.step, spec.step, rel_tol=1e-6):
+        if part.step is None or spec.step is None:
+            continue
+        if not math.isclose(part.step, spec.step, rel_tol=1e-6):
             raise ValueError(
                 f"Physics {part.name!r} makes steps of {part.step:g}, but the spec says "
                 f"{spec.step:g}; build it with step={spec.step:g}, or correct the spec."

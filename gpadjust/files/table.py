@@ -17,7 +17,9 @@ from gpadjust.physics.formula import symbol
 
 LARGEST = 1e100
 """The largest number that is read; squares of more are no numbers."""
-_OF_RECORDS = "Say which column it is, such as `states={'theta': 'q'}`."
+_OF_RECORDS = (
+    "Say which column it is, such as `states={'theta': 'q'}`; None, if a state was not measured."
+)
 
 
 class Table:
