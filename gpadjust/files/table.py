@@ -175,7 +175,7 @@ class Table:
                 or one beyond 1e100.
         """
         column = self._column(name)
-        expected = "a number, or an empty field where it was not measured"
+        expected = "a number, or nothing if it was not measured"
         if not may_miss:
             expected = "a number"
         values = []
