@@ -385,7 +385,7 @@ BAD = {
     "shares": (
         {"link": "logit"},
         ValueError,
-        r"above 0 and below 1, for the link log\(y / \(1 - y\)\)",
+        r"above 0 and below 1 for the link log\(y / \(1 - y\)\)",
     ),
     "name": ({"link": "logarithm"}, TypeError, "Expected link as 'log', 'logit'"),
     "a bound": ({"link": (1.0,)}, TypeError, "two bounds"),

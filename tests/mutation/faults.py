@@ -237,14 +237,14 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/many/bound.py",
-        "value = -0.5 * (size + log_det + misfit + unseen)",
+        "value = -0.5 * (size + log_det + misfit + trace)",
         "value = -0.5 * (size + log_det + misfit)",
         "The bound forgets what inducing values do not specify: it is no bound any more.",
     ),
     Fault(
         "gpadjust/many/conditioning.py",
-        "kept = (1 - self.weight * own).clamp_min(1e-9)",
-        "kept = torch.ones_like(own)",
+        "free = (1 - self.weight * h).clamp_min(1e-9)",
+        "free = torch.ones_like(h)",
         "Left-out residuals of a sparse model are those of the fit.",
     ),
     Fault(
