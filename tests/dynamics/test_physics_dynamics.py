@@ -89,7 +89,7 @@ def test_bad_input_is_refused():
     with pytest.raises(ValueError, match="difference=False"):
         PhysicsDynamics(SPEC, ODEPhysics(lambda x, a: x, 0.1, 2, difference=True))
     timed = StateSpec(["x", "v"], ["push"], step=0.1)
-    with pytest.raises(ValueError, match=r"steps of 0.05, but the spec says 0.1; .*step=0\.1"):
+    with pytest.raises(ValueError, match=r"steps of 0.05, but the spec has 0.1; .*step=0\.1"):
         PhysicsDynamics(timed, ODEPhysics(lambda x, a: x, 0.05, 2))
     dynamics = PhysicsDynamics(SPEC, lambda X: X)
     with pytest.raises(ValueError, match=r"next values of the 2 states .*got 3 columns"):
