@@ -17,33 +17,36 @@ __all__ = ["plot_collection"]
 def plot_collection(collection: Collection, *, axes: Any = None) -> Any:
     """Draw the inputs and outputs of measurements in their order, and the best outputs so far.
 
-    Dots are measurements, hollow ones points that are pending; failed measurements are not drawn.
+    Dots are measurements, hollow dots pending points; failed measurements are not drawn.
 
     Args:
         collection: The collection.
-        axes: As many axes as inputs and outputs. Default: a new figure.
+        axes: An axis for each input and output. Default: a new figure.
 
     Returns:
-        An array of these axes; ``axes[0].figure`` is the figure.
+        An array of the axes; ``axes[0].figure`` is the figure.
     """
-    X, Y, pending, bounds = collection.X, collection.Y, collection.pending, collection.bounds
+    X, Y, pending = collection.X, collection.Y, collection.pending
     n, d, m = len(X), X.shape[-1], Y.shape[-1]
     if axes is None:
         figure = plt.figure(figsize=(6, 1.6 * (d + m)), layout="constrained")
         axes = figure.subplots(d + m, 1, sharex=True, squeeze=False)
     axes = given_axes(axes, (d + m,))
+    # Inputs first, with their bounds and pending points.
     numbers = torch.arange(1, n + len(pending) + 1)
     for i, ax in enumerate(axes[:d]):
-        for bound in bounds[:, i].tolist():
+        for bound in collection.bounds[:, i].tolist():
             ax.axhline(bound, color=GREY, lw=0.8, ls=":")
         ax.plot(numbers[:n], X[:, i], color=BLUE, **DOTS)
         ax.plot(numbers[n:], pending[:, i], color=BLUE, **DOTS | {"mfc": "none", "mec": BLUE})
     for values, ax in zip(Y.mT, axes[d:], strict=True):
+        # A missing output is neither the lowest nor the highest.
         lowest = values.nan_to_num(nan=math.inf).cummin(0).values
         highest = values.nan_to_num(nan=-math.inf).cummax(0).values
         ax.plot(numbers[:n], values, color=GREY, **DOTS)
         for curve, color, label in ((highest, RED, "highest"), (lowest, BLUE, "lowest")):
             ax.step(numbers[:n], curve, where="post", color=color, label=f"{label} so far")
+    # One panel for each input, then for each output.
     names = [*(f"x{i + 1}" for i in range(d)), *(f"y{j + 1}" for j in range(m))]
     for ax, label in zip(axes, labels(names), strict=True):
         ax.set_ylabel(label)

@@ -255,8 +255,8 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/active/points.py",
-        "acquisition.set_X_pending(points if own is None else torch.cat([own, points]))",
-        "acquisition.set_X_pending(points)",
+        "pending = points if before is None else torch.cat([before, points])",
+        "pending = points",
         "Pending points of the acquisition function's own are lost.",
     ),
     Fault(
