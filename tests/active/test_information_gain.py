@@ -265,7 +265,7 @@ REFUSED = [
         lambda: made(VariationalCKA, num_inducing=5),
         "rho",
         TypeError,
-        "if rho were known: ask about 'both'",
+        "given rho: use about='both'",
     ),
     (made, "epsilon", ValueError, r"about='epsilon'; expected 'rho'"),
     (lambda: ModelListGP(made()), "both", TypeError, "found ModelListGP"),
