@@ -27,6 +27,7 @@ from gpadjust.core.structures import (
 )
 
 NAMED = {"log": (0.0, math.inf), "logit": (0.0, 1.0)}
+_LARGEST = 1e150  # without an upper bound: its square, and sums of such, are finite
 _LOW, _HIGH = (NormalDist().cdf(z) for z in (-1.0, 1.0))  # the ends of 68.27 %
 
 
@@ -89,9 +90,9 @@ class Link(NamedTuple):
         return math.log(self.upper - self.lower) - above - below
 
     def inverse(self, z: Tensor) -> Tensor:
-        """Return y of values of g, strictly within the bounds despite rounding."""
+        """Return y of values of g, strictly within the bounds and finite despite rounding."""
         z = z + self.location.to(z)
-        bounds = z.new_tensor([self.lower, self.upper])
+        bounds = z.new_tensor([self.lower, min(self.upper, _LARGEST)])
         least, most = bounds.nextafter(bounds.flip(0)).tolist()
         is_open = math.isinf(self.upper)
         # y = a + e^(g + c), or a + (b - a) / (1 + e^-(g + c))
@@ -121,10 +122,9 @@ class LinkedMarginals(Marginals):
         Rare values decide the moments: for a wide mixture these may be infinite, and the mean
         outside of every interval.
         """
-        # The quantiles at -1 and 1 standard deviations of a Gaussian; infinite ones have a limit.
+        # The quantiles at -1 and 1 standard deviations of a Gaussian.
         sd = (self.quantile(_HIGH) - self.quantile(_LOW)) / 2
-        largest = torch.finfo(sd.dtype).max
-        return Prediction(self.quantile(0.5), sd.square().clamp_max(largest))
+        return Prediction(self.quantile(0.5), sd.square())
 
     def quantile(self, level: float) -> Tensor:
         """Return the quantiles ``... x q x m`` of a level."""
@@ -156,6 +156,25 @@ class LinkedPosterior(TransformedPosterior):
             lambda *_: self.marginals.quantile(0.5),
             lambda *_: self.marginals.prediction.variance,
         )  # fmt: skip
+
+    @property
+    def distribution(self) -> Any:
+        """Raises an AttributeError for code that needs a Gaussian, such as BoTorch's entropy."""
+        raise AttributeError(
+            f"The model is Gaussian in {self.link.formula}, not in y. Take an acquisition function "
+            "that needs the mean and variance alone, or samples: its name begins with qLog."
+        )
+
+    @property
+    def covariance_matrix(self) -> Tensor:
+        """Covariances of the points of one output, ``... x q x q``.
+
+        They have the variances of the predictions, and the correlations of g(y).
+        """
+        K = self.mixture.covariance_matrix
+        # Cov_ij = sd_i corr_ij sd_j
+        scale = (self.variance.squeeze(-1) / K.diagonal(dim1=-1, dim2=-2)).sqrt()
+        return scale.unsqueeze(-1) * K * scale.unsqueeze(-2)
 
     def quantile(self, value: Tensor) -> Tensor:
         """Return quantiles ``... x q x m``; several levels are a further first dimension."""
@@ -199,8 +218,11 @@ class Linked(GP):
     Data, predictions, intervals, samples and functions are in the user's units and within the
     bounds. A logarithm makes rho an exponent and errors relative. Predictions are medians, with the
     square of half the width of the central 68.27 % as variance, see :class:`LinkedMarginals`. The
-    delta method gives the variances of g(y) from known variances of y. ``term``, ``rho``,
-    ``delta`` and the summary are on the scale of g, as are kernels and means among the arguments.
+    delta method gives the variances of g(y) from known variances of y. Acquisition functions by
+    samples average y, however rare large values are;
+    ``objective=GenericMCObjective(lambda Y, X=None: Y[..., 0].log())`` makes them search on the
+    scale of g. ``term``, ``rho``, ``delta`` and the summary are on the scale of g, as are kernels
+    and means among the arguments.
 
     Args as of the structure, and:
 
