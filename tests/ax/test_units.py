@@ -245,7 +245,7 @@ REFUSED = [
     ({"transforms": LOGGED}, r"transform\(s\) LogY of Ax are not supported"),
     ({"transforms": [*Mixed_transforms, TellPhysics]}, "no kernel for categorical"),
     ({"config": {"input_transform_classes": [Normalize]}}, "makes its own parts"),
-    ({"metrics": ["costs"]}, "for costs, which is no metric.*some of cost, load"),
+    ({"metrics": ["costs"]}, "unknown metric costs; expected some of cost, load"),
     ({"physics": lambda X: X[:, 0]}, r"reads the parameter\(s\) glue, which are text"),
     ({"physics": lambda rate, speed: rate}, "but speed is no parameter"),
     ({"physics": lambda rate: torch.stack([rate, rate], -1)}, "2 columns for the me"),
