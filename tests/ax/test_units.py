@@ -247,7 +247,7 @@ REFUSED = [
     ({"config": {"input_transform_classes": [Normalize]}}, "makes its own parts"),
     ({"metrics": ["costs"]}, "unknown metric costs; expected some of cost, load"),
     ({"physics": lambda X: X[:, 0]}, r"reads the parameter\(s\) glue, which are text"),
-    ({"physics": lambda rate, speed: rate}, "but speed is no parameter"),
+    ({"physics": lambda rate, speed: rate}, "but speed is not a parameter"),
     ({"physics": lambda rate: torch.stack([rate, rate], -1)}, "2 columns for the me"),
 ]
 

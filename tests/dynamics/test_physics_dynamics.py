@@ -52,10 +52,10 @@ def test_all_dynamics_are_scored():
 
 def test_states_that_are_not_as_declared_are_named():
     for make, declared, words in (
-        (PhysicsDynamics, {"previous": {"x": "a"}}, "'x' is said to hold the previous action 'a'"),
-        (LearnedDynamics, {"exogenous": ["x"]}, "'x' is said to be exogenous"),
-        (PhysicsDynamics, {"exogenous": ["x"]}, "'x' is said to be exogenous"),
-        (PhysicsDynamics, {"integrated": {"x": "v"}, "step": 0.3}, "'x' is said to be integrated"),
+        (PhysicsDynamics, {"previous": {"x": "a"}}, "'x' is declared as the previous action 'a'"),
+        (LearnedDynamics, {"exogenous": ["x"]}, "'x' is declared as exogenous"),
+        (PhysicsDynamics, {"exogenous": ["x"]}, "'x' is declared as exogenous"),
+        (PhysicsDynamics, {"integrated": {"x": "v"}, "step": 0.3}, "'x' is declared as integrated"),
     ):
         dynamics = make(StateSpec(["x", "v"], ["a"], **declared), push)
         with pytest.raises(ValueError, match=words):
