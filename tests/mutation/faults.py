@@ -267,14 +267,14 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/systems/wrappers.py",
-        "taken = np.clip(action, self._taken.low, self._taken.high)",
-        "taken = action",
+        "clipped = np.clip(action, self._actions.low, self._actions.high)",
+        "clipped = action",
         "The action that is remembered is not the one that was taken.",
     ),
     Fault(
         "gpadjust/rl/dyna.py",
-        "ends = (step.terminated | step.truncated, step.truncated)",
-        "ends = (step.terminated | step.truncated, step.terminated)",
+        "                        step.truncated,",
+        "                        step.terminated,",
         "Terminations count as time limits and the other way round: wrong targets of the critics.",
     ),
     Fault(
