@@ -189,7 +189,7 @@ class Dynamics(ABC):
             RuntimeError: Before the first update.
             TypeError: If states or actions are not float64 tensors.
             ValueError: If shapes disagree, values are not finite, or an option is out of range.
-            PhysicsError: If the physics fails and does not say where.
+            PhysicsError: If the physics fails, and its error does not have the rows.
         """
         spec = self.spec
         _check_start(spec, initial_states, actions)
@@ -434,7 +434,7 @@ def step_or_nan(
 ) -> Tensor:
     """Return the next states ``N x state_dim``; NaN where the physics fails.
 
-    Raise a PhysicsError if it does not say where, or if all rows fail and ``some_must_succeed``.
+    Raise a PhysicsError if it does not have the rows, or if all fail and ``some_must_succeed``.
     """
     states = states.clone()
     actions = actions.clone()
@@ -446,7 +446,7 @@ def step_or_nan(
             failed_before = failed.clone()
             failed[list(error.rows)] = True
             if (failed == failed_before).all() or (failed.all() and some_must_succeed):
-                raise  # it does not say where, or blames rows that have been replaced
+                raise  # it does not have the rows, or rows that have been replaced
             if failed.all():
                 return torch.full_like(states, torch.nan)
             # Evaluate again, with failed rows replaced by one where the physics may not fail.

@@ -79,7 +79,7 @@ class Trajectories:
     terminated: Tensor = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        """Number the episodes, and check the numbers of rows."""
+        """Set the numbers of episodes, and check the numbers of rows."""
         episode: Any = self.episode
         if episode is None:
             episode = torch.arange(len(self.states))

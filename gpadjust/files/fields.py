@@ -184,4 +184,6 @@ def seconds_in(unit: str) -> float | None:
 def time_unit_of(name: str) -> str:
     """Return the unit of time at the end of a name, as in ``time_ms`` or ``millis``, or ""."""
     last = re.split(r"[\s_.-]+", name.strip())[-1]
-    return "" if seconds_in(last) is None else last
+    if seconds_in(last) is None:
+        return ""
+    return last

@@ -47,8 +47,9 @@ class Widened(Wrapper):
     ) -> tuple[Tensor, Tensor]:
         """Return means and variances of each draw, ``... x S x q x m``."""
         mean, variance = self.model.components(X, observation_noise)
-        is_all = self._scales_noise(observation_noise)
-        scaled = variance if is_all else self.model.components(X)[1]
+        scaled = variance
+        if not self._scales_noise(observation_noise):
+            scaled = self.model.components(X)[1]
         # known noise + factor * variance of the function
         factors = self.factors(self.data.new_inputs(X))
         return mean, variance + (factors - 1).unsqueeze(DRAWS) * scaled
@@ -58,8 +59,9 @@ class Widened(Wrapper):
     ) -> MixturePosterior:
         """Return the joint posterior of some outputs."""
         mean, K = self.model.mixture(X, outputs, observation_noise).gaussians
-        is_all = self._scales_noise(observation_noise)
-        scaled = K if is_all else self.model.mixture(X, outputs, False).gaussians[1]
+        scaled = K
+        if not self._scales_noise(observation_noise):
+            scaled = self.model.mixture(X, outputs, False).gaussians[1]
         # K_ij + (sqrt(c_i c_j) - 1) K_ij, with factors c
         root = self.factors(self.data.new_inputs(X))[..., outputs].sqrt().mT.unsqueeze(-3)
         return MixturePosterior(mean, K + scaled * (root.unsqueeze(-1) * root.unsqueeze(-2) - 1))
