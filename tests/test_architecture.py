@@ -51,7 +51,7 @@ CONDITIONALS, TUPLES = 15, 20  # of 1,000 lines of code, at most
 COMMENTS = 7  # of 100 lines of code, at least
 VAGUE = {"found", "told", "given", "known", "kept", "seen", "own", "whole", "each", "said"}
 AVOIDED = re.compile(
-    r"\b(next to nothing|by the default fit|of one's own|(is|are) (none|said)|says?|told|"
+    r"\b(next to nothing|by the default fit|of one's own|is none|(is|are) said|says?|told|"
     r"whether to|goes on|pays|errs?|look at it)\b"
 )
 LAYOUT = {getattr(tokenize, name) for name in ("NL", "NEWLINE", "INDENT", "DEDENT", "ENDMARKER")}

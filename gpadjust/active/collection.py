@@ -54,9 +54,7 @@ class CollectionError(RuntimeError):
 
     def __init__(self, message: str, collection: Collection, X: Tensor, result: Any = None) -> None:
         super().__init__(message, collection, X, result)
-        self.collection = collection
-        self.X = X
-        self.result = result
+        self.collection, self.X, self.result = collection, X, result
 
     def __str__(self) -> str:
         return str(self.args[0])
@@ -156,8 +154,7 @@ class Collection(Measurements, Display):
         self.keep: Keep | None = None
         if keep is not None:
             self.keep = Keep(keep, probability)
-        self.model_factory = model_factory
-        self.acquisition = acquisition
+        self.model_factory, self.acquisition = model_factory, acquisition
         self.bounds = checked_bounds("bounds", bounds)
         self.batch_size = checked_whole("batch_size", batch_size, 1)
         self.seed = checked_whole("seed", seed, 0)

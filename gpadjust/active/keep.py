@@ -98,8 +98,7 @@ class Keep:
             best_points.append(best)
             # Candidates for the rest of the batch.
             is_apart = (distances(points, best, bounds) >= NEAR).all(-1)
-            points = points[is_apart]
-            is_safe = is_safe[is_apart]
+            points, is_safe = points[is_apart], is_safe[is_apart]
         return torch.cat(best_points), torch.cat([bounds[:0], *left_out])
 
     def _candidates(self, bounds: Tensor, centers: Tensor) -> Tensor:

@@ -62,8 +62,7 @@ class Measurements:
             X = checked_points("the X of data", data[0], bounds.shape[-1])
             Y = checked_outcomes(data[1], len(X), num_outputs)
             check_observed("the Y of data", Y)
-            self.X = X
-            self.Y = Y
+            self.X, self.Y = X, Y
             self.num_outputs = Y.shape[-1]
 
     @property

@@ -93,10 +93,8 @@ class _UnitsSetter:
     def __init__(
         self, units: Units, parameters: list[str], observed: set[str], metrics: set[str]
     ) -> None:
-        self.units = units
-        self.parameters = parameters
-        self.observed = observed
-        self.metrics = metrics
+        self.units, self.parameters = units, parameters
+        self.observed, self.metrics = observed, metrics
 
     def spec(self, spec: SurrogateSpec) -> SurrogateSpec:
         """Return a specification with units."""

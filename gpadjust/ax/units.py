@@ -148,9 +148,7 @@ class PhysicsInUnits(Physics):
         reads = origin.names_of(parameters)
         inner = origin.of(reads)
         super().__init__(unknowns=dict(inner.unknowns.items()), name=inner.name)
-        self.origin = origin
-        self.metric = metric
-        self.units = units
+        self.origin, self.metric, self.units = origin, metric, units
         self.reads = reads
         self.inner = inner
 

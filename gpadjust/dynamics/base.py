@@ -436,8 +436,7 @@ def step_or_nan(
 
     Raise a PhysicsError if it does not have the rows, or if all fail and ``some_must_succeed``.
     """
-    states = states.clone()
-    actions = actions.clone()
+    states, actions = states.clone(), actions.clone()
     failed = torch.zeros(len(states), dtype=torch.bool)
     while True:
         try:

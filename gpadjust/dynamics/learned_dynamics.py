@@ -376,8 +376,7 @@ class LearnedDynamics(Dynamics):
         learnt = self._last_learnt()
         if self.physics is None or not self.physics.unknowns:
             return super()._varied(variation)
-        parameters = learnt.model.physics_parameters
-        actions = learnt.data.actions
+        parameters, actions = learnt.model.physics_parameters, learnt.data.actions
         vary = varying_parameters(self.physics, self.spec, parameters, actions, variation)
 
         def sample_functions(num_functions: int, seed: int | None = None) -> TransitionFunctions:
@@ -471,8 +470,7 @@ def varying_parameters(
         )
     sd = sd.expand(p)
     center = unknowns.coordinates(learnt.draws).clamp(-_END, _END).mean(0)
-    low = actions.amin(0)
-    high = actions.amax(0)
+    low, high = actions.amin(0), actions.amax(0)
     # Half of the range; for an action that never varied, its size.
     size = high.abs().where(high != 0, torch.ones_like(high))
     half = ((high - low) / 2).where(high > low, size)

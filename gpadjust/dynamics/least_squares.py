@@ -67,9 +67,7 @@ class _Errors:
     """Errors of a physics in one step, by the coordinates of its unknown parameters."""
 
     def __init__(self, physics: Physics, spec: StateSpec, data: Trajectories) -> None:
-        self.physics = physics
-        self.spec = spec
-        self.data = data
+        self.physics, self.spec, self.data = physics, spec, data
         self.inputs = spec.physics_inputs(data.states, data.actions)
         changes = spec.change(data.states, data.next_states)[:, spec.moving].mT
         self.observed = ~changes.isnan()

@@ -96,8 +96,7 @@ class PhysicsDynamics(Dynamics):
         unknowns = self.physics.unknowns
         if self._fitted is None:
             return PhysicsParameters(unknowns, [*unknowns.guess.unsqueeze(-1)])
-        point = self._fitted.point
-        precision = self._fitted.precision
+        point, precision = self._fitted.point, self._fitted.precision
         # z ~ N(point, (precision + I)^-1) = point + L^-T N(0, I)
         chol = torch.linalg.cholesky(precision + torch.eye(len(point)).to(precision))
         normal = even_normal(_DRAWS, len(point), seed=0)
@@ -184,8 +183,7 @@ class PhysicsDynamics(Dynamics):
         if state == {}:  # before the first update
             state = {"fingerprint": self.describe(), "probes": None, "fitted": None}
         with loading(state, self.describe()) as copy:
-            probes = copy["probes"]
-            fitted = copy["fitted"]
+            probes, fitted = copy["probes"], copy["fitted"]
             if fitted is not None:
                 data = Trajectories.checked(self.spec, **fitted.pop("transitions"))
                 fitted = _Fitted(data, **fitted)
@@ -195,8 +193,7 @@ class PhysicsDynamics(Dynamics):
             if probes is not None:
                 probes = PhysicsProbes(*probes)
                 probes.check(self.physics, self.spec)
-        self._probes = probes
-        self._fitted = fitted
+        self._probes, self._fitted = probes, fitted
 
     @property
     def _values(self) -> Tensor | None:

@@ -30,8 +30,7 @@ class Targets:
 
     def __init__(self, spec: StateSpec, target: Target) -> None:
         check_choice("target", target, get_args(Target))
-        self.spec = spec
-        self.target = target
+        self.spec, self.target = spec, target
         columns = spec.model_columns  # the moving states come first
         self.predicted = [spec.moving.index(i) for i in spec.predicted]
         self.angles = [place for place, i in enumerate(columns) if i in spec.angle_columns]
@@ -68,8 +67,7 @@ class TargetPhysics(Physics):
 
     def __init__(self, physics: Physics, targets: Targets) -> None:
         super().__init__(unknowns=physics.unknowns, name=physics.name)
-        self.physics = physics
-        self.targets = targets
+        self.physics, self.targets = physics, targets
         self.num_outputs = len(targets.predicted)
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:

@@ -99,8 +99,7 @@ def _delimiter(text: str) -> str:
         # score = mean weight of a field times the share of rows with the most common width
         score = sum(weights) / len(fields) * count / len(rows)
         if score > 1.001 * best_score:  # rounding must not decide between equal marks
-            best_mark = mark
-            best_score = score
+            best_mark, best_score = mark, score
     return best_mark
 
 

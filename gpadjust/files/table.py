@@ -76,8 +76,7 @@ class Table:
         is_command: bool = False,
     ) -> None:
         self.file = str(file)
-        self._hint = hint
-        self._is_command = is_command
+        self._hint, self._is_command = hint, is_command
         self._is_text = Path(file).suffix.lower() != ".xlsx"
         mark = ""
         if not self._is_text:

@@ -142,9 +142,7 @@ class AtLevels(Kernel):
     """
 
     def __init__(self, kernel: Kernel, low_x: Tensor, has_rho: bool = False) -> None:
-        self.kernel = kernel
-        self.low_x = low_x
-        self.has_rho = has_rho
+        self.kernel, self.low_x, self.has_rho = kernel, low_x, has_rho
 
     def of_data(self, data: Data) -> AtLevels:
         """Return the kernel of the transformed inputs of a model."""

@@ -50,8 +50,7 @@ class RowNoise(Noise):
         self.base = base
         self.known = base.known
         self.shift = base.shift + moved
-        self.added = added
-        self.moved = moved
+        self.added, self.moved = added, moved
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -148,8 +148,7 @@ class LinkedPosterior(TransformedPosterior):
     """
 
     def __init__(self, mixture: MixturePosterior, link: Link) -> None:
-        self.mixture = mixture
-        self.link = link
+        self.mixture, self.link = mixture, link
         self.marginals = LinkedMarginals(*mixture.marginals, link)
         super().__init__(
             mixture, link.inverse,

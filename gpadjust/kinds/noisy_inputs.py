@@ -116,8 +116,7 @@ class NoisyInputs(RowNoise):
             return self.having(self.base, variance, mean)
         # The slopes depend on the fit, and the fit on the variances by the slopes: iterate.
         for _ in range(_ROUNDS):
-            old_mean = mean
-            old_variance = variance
+            old_mean, old_variance = mean, variance
             rough = fitted(self.having(self.base, variance, mean))
             mean, variance = _moments(posterior_mean, X, spread)
             noise = rough.conditioning().noise[0] - old_variance
@@ -133,8 +132,7 @@ class NoisyInputs(RowNoise):
 def _moments(function: Function, X: Tensor, spread: Tensor) -> tuple[Tensor, Tensor]:
     """Return E f - f and Var f over the errors of the inputs, ``m x n``."""
     center = function(X)
-    mean = torch.zeros_like(center)
-    variance = torch.zeros_like(center)
+    mean, variance = torch.zeros_like(center), torch.zeros_like(center)
     for j in spread.any(0).nonzero().flatten().tolist():
         step = torch.zeros_like(X)
         step[:, j] = spread[:, j]

@@ -192,9 +192,7 @@ class Weights:
     """
 
     def __init__(self, train: WeightedSum, precision: Tensor, pull: Tensor) -> None:
-        self.train = train
-        self.precision = precision
-        self.pull = pull
+        self.train, self.precision, self.pull = train, precision, pull
         self.alpha = pull  # a model reads whether it has a graph
         # Lambda^-1 = R R^T, with R = L^-T and Lambda = L L^T; the mean is R R^T h.
         chol = torch.linalg.cholesky(precision)
@@ -250,8 +248,7 @@ class Weights:
     @torch.no_grad()
     def moved_to(self, model: GP, outputs: Any = slice(None)) -> Self:
         """Return the weights for a model on another device, or of some outputs."""
-        precision = self.precision[:, outputs].to(model.u)
-        pull = self.pull[:, outputs].to(model.u)
+        precision, pull = self.precision[:, outputs].to(model.u), self.pull[:, outputs].to(model.u)
         return type(self)(model.at(model.data.X), precision, pull)
 
 

@@ -68,8 +68,7 @@ class Sums(NamedTuple):
         with torch.no_grad():
             inducing = at_points(total, points)
             root = root_of(inducing)
-            square = torch.zeros_like(root)
-            cross = torch.zeros_like(root[..., 0])
+            square, cross = torch.zeros_like(root), torch.zeros_like(root[..., 0])
             for rows in blocks(residual.shape[-1], root):
                 k = inducing.cross(total.of_rows(rows))
                 v = torch.linalg.solve_triangular(root, k, upper=False)
@@ -131,11 +130,9 @@ def bound(
     by_square = eye - torch.cholesky_inverse(chol) - best @ best.mT
     # By v_i: w_i (2 G v_i + r_i Lambda^-1 c); by k_i = L v_i the same, solved with L^T.
     solved = torch.linalg.solve_triangular(root.mT, torch.cat([by_square, best], -1), upper=True)
-    by_weight = torch.zeros_like(residual)
-    by_residual = torch.zeros_like(residual)
+    by_weight, by_residual = torch.zeros_like(residual), torch.zeros_like(residual)
     for rows in blocks(residual.shape[-1], root):
-        r = residual[..., rows]
-        w = weight[..., rows]
+        r, w = residual[..., rows], weight[..., rows]
         with torch.enable_grad():
             k = at_points(leaf_sum, points).cross(leaf_sum.of_rows(rows))
         v = torch.linalg.solve_triangular(root, k.detach(), upper=False)

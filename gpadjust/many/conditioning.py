@@ -35,10 +35,7 @@ class SparseConditioning(Conditioning):
         self, total: WeightedSum, points: Tensor, prior: Tensor, noise: Tensor, rest: Tensor,
         targets: Tensor,
     ) -> None:  # fmt: skip
-        self.total = total
-        self.prior = prior
-        self.targets = targets
-        self.rest = rest
+        self.total, self.prior, self.targets, self.rest = total, prior, targets, rest
         self.num_rows = targets.shape[-1]
         shape = torch.broadcast_shapes(prior.shape, noise.shape, targets.shape)
         self.noise = noise.expand(shape)
@@ -147,8 +144,7 @@ class LaterConditioning(Conditioning):
         zero = upper.new_zeros(*upper.shape[:-1], k)
         self.inverse = torch.cat([torch.cat([upper, zero], -1), self.below], -2)
         self.chol = self.inverse  # callers read its size
-        self.noise = noise
-        self.targets = targets
+        self.noise, self.targets = noise, targets
         self.is_late = observed
         self.K21 = K21
         mean = late.mean + (K21 @ old.alpha.unsqueeze(-1)).squeeze(-1)

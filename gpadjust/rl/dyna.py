@@ -213,8 +213,7 @@ class Dyna(OffPolicyAlgorithm, Display):
         # multiples of this interval.
         interval = getattr(self, "target_update_interval", 1)
         all_returns: list[np.ndarray] = []
-        num_left = 0
-        num_steps = 0
+        num_left, num_steps = 0, 0
         for start in range(0, num_episodes, at_once):
             env = self.model_env(min(num_episodes - start, at_once))
             noise = self._model_noise(env.num_envs)
@@ -407,8 +406,7 @@ class Dyna(OffPolicyAlgorithm, Display):
 
     def go_on(self, env: VecEnv, task: Task, environment: Any) -> None:
         """Set environment and task, after the attributes of a checkpoint."""
-        self.env = env
-        self.task = task
+        self.env, self.task = env, task
         self.model_hooks = []
         self._vec_normalize_env = unwrap_vec_normalize(env)
         *wrappers, inner = _layers(env)

@@ -94,8 +94,7 @@ class ModelVecEnv(VecEnv):
         super().__init__(checked_whole("num_envs", num_envs, 1), observation_space, action_space)
         self.task = task
         self.episode_length: Any = task.episode_length
-        self.sampling = sampling
-        self.worst_reward = worst_reward
+        self.sampling, self.worst_reward = sampling, worst_reward
         self.num_left_bounds = 0
         self._states = torch.empty(num_envs, task.dynamics.spec.state_dim, dtype=torch.float64)
         self._steps = torch.zeros(num_envs, dtype=torch.long)

@@ -335,8 +335,7 @@ class StateSpec:
         moved[:, i] += trapezoid
         discrepancy = self.change(moved, next_states)[:, i]  # q' - q - h (v + v') / 2
         is_measured = ~discrepancy.isnan()
-        trapezoid = trapezoid[is_measured]
-        discrepancy = discrepancy[is_measured]
+        trapezoid, discrepancy = trapezoid[is_measured], discrepancy[is_measured]
         # w = max(sum h (|v| + |v'|) / 2, sum |q' - q|)
         path = self._trapezoid(name, states.abs(), next_states.abs())[is_measured].sum()
         path = torch.maximum(path, (trapezoid + discrepancy).abs().sum())

@@ -152,8 +152,7 @@ REAL_CART_POLE = CartPoleEquation(cart_mass=0.5, pole_mass=0.5, pole_length=0.6,
 
 def _coefficients(values: Mapping[str, Any]) -> tuple[Any, ...]:
     """Return the coefficients of the equation as tensors; None for a friction of zero."""
-    m = values["pole_mass"]
-    length = values["pole_length"]
+    m, length = values["pole_mass"], values["pole_length"]
     # M, m l / 2, 3/4 m, g, 2/3 l
     numbers = [values["cart_mass"] + m, m * length / 2, 0.75 * m, values["gravity"], length / 1.5]
     # Unknown parameters are tensors, which may be zero in some rows.
