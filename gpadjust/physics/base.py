@@ -189,7 +189,7 @@ class Physics(torch.nn.Module, ABC):
 
     def extra_repr(self) -> str:
         """Return the settings that ``repr`` shows."""
-        return f"name={self.name!r}, inputs={self.inputs}, unknowns={dict(self.unknowns)!r}"
+        return f"name={self.name!r}, inputs={self.inputs}, unknowns={self.unknowns.declared!r}"
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         if not [*self.parameters(), *self.buffers()]:
