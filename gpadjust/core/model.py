@@ -228,7 +228,8 @@ class GP(gpytorch.models.GP, Predictive):
         self.settings = dict(settings or {})
         self._outputs: list[int] | None = None
         self._cached: tuple[Tensor, Conditioning] | None = None
-        self._unknowns = Unknowns.together([each.unknowns for each in self.physics])
+        unknowns = [each.unknowns for each in self.physics]
+        self._unknowns = unknowns[0] if len(unknowns) == 1 else Unknowns.together(unknowns)
         self._f_train: list[Tensor] = []
         self.unit = Y.new_ones(1, 1)  # the user's, until the prior mean is known
         with torch.no_grad():  # a physics may have parameters, as a network does

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gpadjust.dynamics.trajectories import Trajectories
 from gpadjust.physics import Physics, PhysicsWarning
+from gpadjust.physics.unknown import Unknowns
 from gpadjust.states import StateSpec
 
 _SEARCHED = 512  # transitions by which parameters are searched for; all of them refine the best
@@ -33,13 +34,13 @@ def most_likely(
         Coordinates ``p``; the precision of these by the transitions, ``p x p``, without the prior;
         and mean squares of the errors, ``state_dim``, 0 of states that do not move.
     """
-    unknowns, whole = physics.unknowns, _Errors(physics, spec, data)
+    unknowns, whole = physics.unknowns, StepErrors(physics, spec, data)
     guess = unknowns.coordinates(unknowns.guess)
     if not whole.at(guess).isfinite().all():
         physics(whole.inputs)  # which says where it fails
     number = min(len(data), _SEARCHED)
     rows = torch.linspace(0, len(data) - 1, number, dtype=torch.float64).round().long()
-    some = _Errors(physics, spec, data.some(rows))
+    some = StepErrors(physics, spec, data.some(rows))
     starts = torch.cat([guess.unsqueeze(0), even_normal(_GUESSES, len(guess), seed=0)])
     best = some.loss(starts).nan_to_num(nan=torch.inf).argsort()[:_STARTS]
     ends = [some.descend(z, _ROUGH) for z in starts[best] if some.loss(z).isfinite()]
@@ -50,11 +51,11 @@ def most_likely(
     freedom = whole.count.sum() / (whole.count.sum() - len(unknowns)).clamp_min(1)
     noise = torch.zeros(spec.state_dim, dtype=torch.float64)
     noise[spec.moving] = errors.square().sum(-1) / whole.count.clamp_min(1) * freedom
-    _warn_of_parameters([*unknowns], precision, point)
+    _warn_of_parameters(unknowns, precision, point)
     return point, precision, noise
 
 
-class _Errors:
+class StepErrors:
     """Errors of a physics in one step, by the coordinates of its unknown parameters."""
 
     def __init__(self, physics: Physics, spec: StateSpec, data: Trajectories) -> None:
@@ -111,19 +112,21 @@ class _Errors:
         return z
 
 
-def _warn_of_parameters(names: list[str], precision: Tensor, point: Tensor) -> None:
+def _warn_of_parameters(unknowns: Unknowns, precision: Tensor, point: Tensor) -> None:
     """Warn of parameters of which transitions tell next to nothing, or that contradict a prior.
 
     The first take part in directions in which the transitions have next to none of the prior's
-    precision, ``p x p``; the second are at coordinates far from its middle.
+    precision, ``p x p``; the second are at coordinates far from its middle. Of some values of a
+    function there is always next to nothing.
     """
     values, vectors = torch.linalg.eigh(precision)
-    silent = vectors[:, values < _UNTOLD].norm(dim=-1) > _TAKES_PART
+    is_number = torch.tensor([not unknown.function_of for unknown in unknowns.values()])
+    silent = (vectors[:, values < _UNTOLD].norm(dim=-1) > _TAKES_PART) & is_number
     for which, message in (
         (silent, "Transitions say next to nothing of {} of the physics: give narrower priors."),
         (point.abs() > _FAR, "Transitions and prior disagree about {} of the physics: look at it."),
     ):
-        told = ", ".join(name for name, is_one in zip(names, which, strict=True) if is_one)
+        told = ", ".join(name for name, is_one in zip(unknowns, which, strict=True) if is_one)
         if told:
             warnings.warn(message.format(told), PhysicsWarning, stacklevel=5)
 
