@@ -131,7 +131,7 @@ class Unknown:
         """Return the value at a coordinate, which is standard normal by the prior."""
         low, high = self.bounds
         below, above = self._tails
-        if self._tails != (0.0, 1.0):
+        if self.is_cut:
             z = ndtri(below + (above - below) * ndtr(z.clamp(-_LARGEST, _LARGEST)))
         if self.sd is not None:
             value = self.guess + self.sd * z
@@ -141,11 +141,16 @@ class Unknown:
             value = low + (high - low) * ndtr(z.clamp(-_LARGEST, _LARGEST))
         return value.clamp(low, high)  # beyond there are rounding errors
 
+    @property
+    def is_cut(self) -> bool:
+        """Whether the bounds cut off the normal or log-normal prior."""
+        return self._tails != (0.0, 1.0)
+
     def coordinate(self, value: Tensor) -> Tensor:
         """Return the coordinate at which :meth:`value` is this one."""
         below, above = self._tails
         z = self._without_bounds(value)
-        return z if self._tails == (0.0, 1.0) else ndtri((ndtr(z) - below) / (above - below))
+        return z if not self.is_cut else ndtri((ndtr(z) - below) / (above - below))
 
     def _without_bounds(self, value: Tensor) -> Tensor:
         """Return the coordinate by the prior that bounds do not cut off."""

@@ -90,8 +90,8 @@ class Identification(Display):
     def task(self, reward: Callable[[Tensor, Tensor, Tensor], Tensor], **options: Any) -> Any:
         """Return a task in these dynamics, for :class:`~gpadjust.control.MPC` or an agent.
 
-        Plans follow the parameters' means, or draws of them (``Planner(num_functions=20)``); margins
-        of constraints allow for both parameters and process noise.
+        Plans follow the parameters' means, or draws of them (``Planner(num_functions=20)``).
+        Margins of constraints allow for the parameters and for process noise.
 
         Args:
             reward: As of :class:`~gpadjust.control.Task`.
