@@ -18,6 +18,7 @@ FIGURES = {
     "Comparison": "validation.plots.plot_comparison",
     "Collection": "active.plots.plot_collection",
     "Identification": "records.plots.plot_identification",
+    "Lack": "records.plots.plot_lack",
 }
 """The function that draws objects of a class, and of those derived from it."""
 
