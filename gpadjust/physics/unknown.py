@@ -17,8 +17,8 @@ from gpadjust.checks import check_kind, checked_number
 
 _LARGEST = 8.0  # coordinate, beyond which float64 knows no mass of the normal distribution
 _UNBOUNDED = (-math.inf, math.inf)
-_KNOTS = 2.0  # of a function, in a lengthscale
-_MOST_KNOTS = 50
+_KNOTS = 3.0  # of a function, in a lengthscale
+_MOST_KNOTS = 60
 _OF_RANGE = 0.25  # a lengthscale, by default
 _NUGGET = 1e-10
 _FARTHEST = 40.0  # coordinate of a value; at a bound it is infinite
@@ -35,7 +35,7 @@ class Unknown:
     A function of one variable, such as friction of speed, has this prior at each point. Its
     coordinates are a Gaussian process along the variable, with a Matern kernel (5/2); beyond
     ``between`` it stays as it is at the end. Models learn its values at knots, ``friction(0)`` and
-    so on, two in a lengthscale. A function of torch calls it, ``p.friction(speed)``.
+    so on, three in a lengthscale. A function of torch calls it, ``p.friction(speed)``.
 
     Args:
         guess: The value that the physics has where nothing was learnt; inside the bounds.
@@ -56,9 +56,9 @@ class Unknown:
     Example:
         >>> Unknown(9.81, sd=0.1, unit="m/s²"), Unknown(0.2, bounds=(0.0, 1.0)).prior_text
         (Unknown(9.81, sd=0.1, unit='m/s²'), '0 to 1')
-        >>> friction = Unknown(0.1, factor=2.0, function_of="speed", between=(0.0, 8.0))
-        >>> friction.knots.tolist()
-        [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0]
+        >>> friction = Unknown(0.1, factor=2.0, function_of="speed", between=(0.0, 12.0))
+        >>> friction.knots[:4].tolist()
+        [0.0, 1.0, 2.0, 3.0]
     """
 
     guess: float
@@ -261,8 +261,8 @@ class Unknowns(dict[str, Unknown]):
             if not unknown.function_of:
                 self[name] = unknown
             own = {f.name: getattr(unknown, f.name) for f in fields(unknown)}
-            for at in unknown.knots.tolist():
-                self[f"{name}({at:.6g})"] = Knot(**own, function=name, at=at)
+            for at, text in zip(unknown.knots.tolist(), _different(unknown.knots), strict=True):
+                self[f"{name}({text})"] = Knot(**own, function=name, at=at)
 
     @classmethod
     def together(cls, several: Iterable[Unknowns]) -> Unknowns:
@@ -325,3 +325,12 @@ class Unknowns(dict[str, Unknown]):
                 root, z[..., columns].unsqueeze(-1), upper=False
             ).squeeze(-1)
         return z
+
+
+def _different(values: Tensor) -> list[str]:
+    """Return texts of increasing values, of as few digits as make them different."""
+    for digits in range(3, 18):
+        texts = [f"{value:.{digits}g}" for value in values.tolist()]
+        if len({*texts}) == len(texts):
+            break
+    return texts
