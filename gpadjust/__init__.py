@@ -39,6 +39,7 @@ Other physics, with unknown parameters or without::
     ODEPhysics(rate, step=0.1, state_dim=1)      # a differential equation
     law = FunctionPhysics(lambda X, p: p.gain * X[:, 0], unknowns={"gain": Unknown(1.0, factor=2)})
     CalibratedPhysics(X, Y, physics=law)         # the law alone
+    Unknown(0.1, factor=2, function_of="v", between=(0, 9))   # a function in the law, friction(v)
 
 Each object draws itself, and is a table in a notebook::
 
@@ -47,7 +48,7 @@ Each object draws itself, and is a table in a notebook::
     parameters.plot()                            # model.physics_parameters: posterior and prior
     leave_one_out(model).plot()                  # left-out predictions, and their residuals
     collection.plot()                            # of collect: its path, and the best so far
-    identification.plot()                        # of identify: free runs
+    identification.plot()                        # of identify: free runs; .lack.plot()
 
 Beyond the models::
 
