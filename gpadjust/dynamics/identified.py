@@ -36,6 +36,18 @@ class IdentifiedDynamics(Dynamics):
         parameters: The posterior of its unknown parameters.
         noise: Standard deviations of the errors of measured states, ``state_dim``.
         process_noise: The same of what a step adds to the physics.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust.dynamics import IdentifiedDynamics, StateSpec
+        >>> from gpadjust.physics import FormulaPhysics, PhysicsParameters, Unknown
+        >>> unknowns = {"drag": Unknown(0.2, factor=2.0)}
+        >>> physics = FormulaPhysics("(1 - drag) * v + force", ["v", "force"], unknowns=unknowns)
+        >>> parameters = PhysicsParameters(unknowns, [torch.tensor([0.25, 0.35]).double()])
+        >>> noises = torch.full((2, 1), 0.01, dtype=torch.float64)
+        >>> dynamics = IdentifiedDynamics(StateSpec(["v"], ["force"]), physics, parameters, *noises)
+        >>> dynamics.predict(torch.ones(1, 1).double(), torch.zeros(1, 1).double()).mean
+        tensor([[0.7000]], dtype=torch.float64)
     """
 
     is_fitted = True

@@ -72,6 +72,11 @@ def casadi_function(
     """
     fitted = own_dynamics(fitted)
     is_physics = isinstance(fitted, OfPhysics)
+    if is_physics and physics is not None:
+        raise ValueError(
+            "physics=... takes the place of f_p in a model; found a physics, or dynamics that are "
+            "one, which have nothing else. Leave it out, or use that function itself."
+        )
     if not is_physics:
         refuse_parameters(parameters)
         model = model_of(fitted)

@@ -200,5 +200,7 @@ def test_what_is_not_written_is_refused_with_the_way_out():
             c_source(physics, "f", **options)
     with pytest.raises(ValueError, match="that it was learnt with: leave it out"):
         c_source(learnt()[1], "f", parameters=True)
+    with pytest.raises(ValueError, match="which have nothing else"):
+        casadi_function(PHYSICS["rk4"], physics=pushed)
     with pytest.raises(TypeError, match="or what identify returns; found int"):
         c_source(3, "f")
