@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Normal, StudentT
 
-from gpadjust.checks import check_choice, progress_bar
+from gpadjust.checks import check_choice
 from gpadjust.core import (
     CKA,
     GP,
@@ -28,6 +28,8 @@ from gpadjust.core.data import ArrayLike, Data
 from gpadjust.display import Display, html_table
 from gpadjust.kinds.factory import ModelFactory, make_model, with_options
 from gpadjust.physics import Physics, PhysicsWarning, as_physics
+from gpadjust.progress import progress_bar
+from gpadjust.validation.faults import fault_of
 from gpadjust.validation.leave_one_out import ROUNDING, LeaveOneOut, leave_one_out
 from gpadjust.validation.trust import physics_at
 from gpadjust.validation.verdict import (
@@ -41,7 +43,6 @@ from gpadjust.validation.verdict import (
     Verdict,
     correction_of,
     difference,
-    fault_of,
     is_shown,
     next_point,
     straight_line,
