@@ -48,7 +48,7 @@ from gpadjust.core.views import (
 from gpadjust.display import Display
 from gpadjust.physics import Physics, PhysicsError, as_physics
 from gpadjust.physics.parameters import PhysicsParameters
-from gpadjust.physics.unknown import Unknowns
+from gpadjust.physics.unknown import NO_UNKNOWNS, Unknowns
 from gpadjust.progress import tick
 
 Slopes = dict[str, list[Tensor]]
@@ -228,7 +228,7 @@ class GP(gpytorch.models.GP, Predictive):
         self.settings = dict(settings or {})
         self._outputs: list[int] | None = None
         self._cached: tuple[Tensor, Conditioning] | None = None
-        unknowns = [each.unknowns for each in self.physics]
+        unknowns = [each.unknowns for each in self.physics] or [NO_UNKNOWNS]
         self._unknowns = unknowns[0] if len(unknowns) == 1 else Unknowns.together(unknowns)
         self._f_train: list[Tensor] = []
         self.unit = Y.new_ones(1, 1)  # the user's, until the prior mean is known

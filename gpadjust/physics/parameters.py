@@ -27,7 +27,7 @@ class ParameterValues(dict[str, Any]):
         super().__init__((name, rows[..., i]) for i, name in enumerate(names))
         self.rows = rows
         self.functions = dict[str, Curve]()
-        if isinstance(names, Unknowns):
+        if names and isinstance(names, Unknowns):
             for name, (unknown, columns) in names.functions.items():
                 self.functions[name] = Curve(unknown, self._of_function(columns))
 
@@ -63,7 +63,7 @@ class PhysicsParameters(ParameterValues, Display):
 
     def __init__(self, unknowns: Mapping[str, Unknown], draws: Sequence[Tensor]) -> None:
         self.draws = torch.stack([*draws], -1) if unknowns else torch.empty(1, 0)
-        self.unknowns = Unknowns(unknowns)
+        self.unknowns = unknowns if isinstance(unknowns, Unknowns) else Unknowns(unknowns)
         super().__init__(self.unknowns, self.draws)
 
     def _of_function(self, columns: list[int]) -> Tensor:

@@ -327,6 +327,9 @@ class Unknowns(dict[str, Unknown]):
         return z
 
 
+NO_UNKNOWNS = Unknowns({})
+
+
 def _different(values: Tensor) -> list[str]:
     """Return texts of increasing values, of as few digits as make them different."""
     for digits in range(3, 18):
