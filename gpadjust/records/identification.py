@@ -23,7 +23,7 @@ from gpadjust.physics.parameters import PhysicsParameters
 from gpadjust.records.lack import Lack, clearest_lack
 from gpadjust.records.records import Records, control_steps
 from gpadjust.records.smoothing import SmoothedRecords, smooth
-from gpadjust.states import StateSpec
+from gpadjust.states import Sensors, StateSpec
 from gpadjust.words import number, percent
 
 GUESSES, IDENTIFIED, PERSISTENCE = "guesses", "identified", "persistence"
@@ -95,14 +95,22 @@ class Identification(Display):
         Args:
             reward: As of :class:`~gpadjust.control.Task`.
             options: The other arguments of a task. ``state_bounds`` are by default the range of the
-                states in the log, and as much again on either side; angles have none.
+                states in the log, and as much again on either side; angles have none. If states
+                are hidden, ``sensors`` are by default those of the log, with its noise, and
+                ``initial_states`` any states of the log.
         """
         states = torch.cat([record.states for record in self.smoothed.records])
         low, high = states.amin(0), states.amax(0)
         bounds = torch.stack([2 * low - high, 2 * high - low])
         bounds[:, self.spec.angle_columns] = torch.tensor([[-math.inf], [math.inf]]).to(bounds)
+        defaults: dict[str, Any] = {"state_bounds": bounds}
+        if self.hidden:
+            pairs = zip(self.spec.states, self.smoothed.noise.tolist(), strict=True)
+            noise = {name: sd for name, sd in pairs if name not in self.hidden}
+            defaults["sensors"] = Sensors([*noise], noise=noise)
+            defaults["initial_states"] = lambda n: states[torch.randint(len(states), (n,))]
         tasks = import_module("gpadjust.control")  # a room above this one
-        return tasks.Task(self.dynamics, reward, **{"state_bounds": bounds, **options})
+        return tasks.Task(self.dynamics, reward, **defaults | options)
 
     @property
     def spec(self) -> StateSpec:
@@ -312,7 +320,7 @@ def identify(
         >>> import torch
         >>> from gpadjust.records import Record, Records, identify
         >>> from gpadjust.physics import FormulaPhysics, ODEPhysics, Unknown
-        >>> from gpadjust.states import StateSpec
+        >>> from gpadjust.states import Sensors, StateSpec
         >>> t = 0.1 * torch.arange(60, dtype=torch.float64)
         >>> states = torch.stack([(1.5 * t).cos(), -1.5 * (1.5 * t).sin()], dim=-1)
         >>> states += 0.01 * torch.randn(60, 2, dtype=torch.float64)

@@ -6,7 +6,7 @@ from functools import partial
 import pytest
 import torch
 
-from gpadjust.control import Planner
+from gpadjust.control import MPC, Planner
 from gpadjust.physics import FormulaPhysics, FunctionPhysics, ODEPhysics, Unknown
 from gpadjust.records import Record, Records, identify
 from gpadjust.records.identification import _of_jumps
@@ -153,15 +153,23 @@ def test_its_task_has_the_step_and_the_range_of_the_log(found):
     def reward(states, actions, following):
         return -following[:, 0].square()
 
-    task = found.task(reward, episode_length=12)
+    task = found.task(reward, episode_length=40)
     assert task.dynamics is found.dynamics
-    assert (task.dynamics.spec.step, task.episode_length) == (STEP, 12)
+    assert (task.dynamics.spec.step, task.episode_length) == (STEP, 40)
     (record,) = found.smoothed.records
     low, high = record.states.amin(0), record.states.amax(0)
     torch.testing.assert_close(task.state_bounds, torch.stack([2 * low - high, 2 * high - low]))
     assert found.task(reward, state_bounds=None).state_bounds is None
     planner = Planner(num_functions=8, horizon=3 * STEP, num_random=16)
-    state = torch.tensor([0.5, 0.0], dtype=torch.float64)
     torch.manual_seed(0)
-    plan = planner.plan(task, state, [[-2.0], [2.0]])
-    assert plan.actions[0] < 0
+    plan = planner.plan(task, record.states[0], [[-2.0], [2.0]])
+    assert plan.actions.shape == (3, 1)
+    # The rate is hidden from the controller, too.
+    assert (task.sensors.outputs, [*task.sensors.noise]) == (("x",), ["x"])
+    controller = MPC(task, [[-2.0], [2.0]], Planner(horizon=5 * STEP, num_random=32))
+    state, path = torch.tensor([[0.5, 0.0]], dtype=torch.float64), []
+    for _ in range(40):
+        force = torch.as_tensor(controller.step(state[0, :1]))
+        state = spring()(torch.cat([state, force[None]], -1))
+        path.append(float(state[0, 0]))
+    assert max(map(abs, path[-10:])) < 0.1
