@@ -255,9 +255,14 @@ class Unknowns(dict[str, Unknown]):
             if isinstance(unknown, Knot):
                 self[name] = unknown
                 continue
+            is_path = isinstance(name, str) and ("." in name.strip(".") or "[" in name)
             is_word = isinstance(name, str) and name.isidentifier() and not iskeyword(name)
-            if not is_word or name.startswith("_") or name == "rows" or hasattr(dict, name):
-                raise ValueError(f"Expected a name that can be an attribute, found {name!r}.")
+            is_attribute = is_word and not name.startswith("_") and name != "rows"
+            if not is_path and (not is_attribute or hasattr(dict, name)):
+                raise ValueError(
+                    "Expected a name that can be an attribute, or one with a point or bracket, "
+                    f"such as 'link1.mass' or 'wall[1].G', found {name!r}."
+                )
             if not unknown.function_of:
                 self[name] = unknown
             own = {f.name: getattr(unknown, f.name) for f in fields(unknown)}

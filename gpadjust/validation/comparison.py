@@ -400,6 +400,7 @@ def _verdict(c: Comparison, j: int, f: Tensor | None, fault: str) -> Verdict | N
         offset,
         fault,
         is_surpassed,
+        _correction_needed(c.models[adjusted.structure], c.results[adjusted.structure], j),
     )
     pair = c.models[adjusted.structure], c.models[without.structure]
     return verdict_on(evidence, correction, next_point(*pair, j))
@@ -587,6 +588,12 @@ def relevance_of(model: GP, result: FitResult) -> list[float]:
     without = [c.text for c in model.table.choices if any(z.endswith(".mean") for z in c.zeros)]
     shares = [result.probabilities[text] for text in without if text in result.probabilities]
     return [1 - sum(each) for each in zip(*shares, strict=True)]
+
+
+def _correction_needed(model: GP, result: FitResult, j: int) -> float:
+    """Return the probability that f_p of output j needs a correction; NaN if unknown."""
+    shares = [result.probabilities.get(c.text) for c in model.table.choices if not c.zeros]
+    return shares[0][j] if shares and shares[0] else math.nan
 
 
 def spread_of(y: Tensor) -> float:

@@ -24,6 +24,7 @@ _SURE = 2.0  # standard errors that a difference takes to be real
 _ENOUGH = 8  # observations of different inputs, for any answer
 _LEAST = 1.0  # nats; a smaller difference says nothing
 _SURELY = 0.95  # probability with which nested models decide
+_EVEN = 0.5  # probability below which a correction is not believed for a smaller error alone
 _LARGER = 1.1  # times as large; by less, errors are equal
 _TINY_SHARE = 0.05  # of the median size of f_p: less is too little for a share of it
 _POINTS = 256  # among which the next observation is looked for
@@ -101,6 +102,7 @@ class Evidence(NamedTuple):
         offset: Likewise.
         fault: What is obviously wrong with the formula, in words.
         is_surpassed: Whether densities of left-out observations show that the correction is needed.
+        correction_needed: Its probability by nested models; NaN if none were fitted.
     """
 
     name: str
@@ -116,6 +118,7 @@ class Evidence(NamedTuple):
     offset: float
     fault: str = ""
     is_surpassed: bool = False
+    correction_needed: float = math.nan
 
 
 def difference(first: Tensor, second: Tensor) -> tuple[float, float]:
@@ -166,8 +169,8 @@ def verdict_on(e: Evidence, correction: str, next_point: str) -> Verdict:
             doubt = f"{without[0].upper()}{without[1:]}"
         return Verdict(OPEN, [f"{doubt}.{where}"])
     simple = e.line if e.alone > _LARGER * e.line else e.alone  # NaN of several
-    is_enough = not (e.is_surpassed and simple == e.alone)
-    if simple <= _LARGER * min(e.adjusted, e.data) and is_enough:
+    is_as_good = simple <= _LARGER * min(e.adjusted, e.data) or e.correction_needed < _EVEN
+    if is_as_good and not (e.is_surpassed and simple == e.alone):
         if simple == e.alone:
             reason = f"Its error is {error(e.alone)}, corrected {error(e.adjusted)}"
             return Verdict(AS_IS, [f"{reason}, of the data alone {error(e.data)}."])

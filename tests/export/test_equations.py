@@ -49,7 +49,12 @@ PHYSICS = {
     "curves": ODEPhysics(CURVED, 0.1, 2, substeps=2),
 }
 SPEC = StateSpec(
-    ["goal", "x", "v", "last"], ["u"], angles=["x"], exogenous=["goal"], previous={"last": "u"}
+    ["goal", "x", "v", "last"],
+    ["u"],
+    angles=["x"],
+    exogenous=["goal"],
+    previous={"last": "u"},
+    step=0.1,
 )
 
 

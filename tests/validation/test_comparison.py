@@ -256,6 +256,8 @@ GOOD = Evidence(
             "Use it corrected",
             "from 0.1 N to 0.1",
         ),
+        ({"correction_needed": 0.4}, "Use your formula as it is", "Its error is 0.5 N"),
+        ({"correction_needed": 0.4, "is_surpassed": True}, "Use it corrected", "from 0.5 N to 0.1"),
         ({"line": 0.1, "factor": 2.0}, "Use your formula as it is", "Take 2 times your formula: "),
         ({"line": 0.1, "factor": 2.0, "offset": -3.0}, "Use your formula as it is", "less 3 N: "),
         ({"of_use": 0.01, "gain": 0.5}, "Do not use it", "Without it the error is 0.3 N, with it"),
