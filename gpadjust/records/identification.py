@@ -53,7 +53,7 @@ class Combination(NamedTuple):
     draws: Tensor  # K
 
     def __str__(self) -> str:
-        """What the log tells, in a sentence."""
+        """Return a sentence on the value by the log."""
         low, mid, high = self.draws.quantile(_ENDS.to(self.draws)).tolist()
         return (
             f"The log tells {self.name}, {mid:.4g} [{low:.4g}, {high:.4g}], and hardly "
