@@ -21,9 +21,9 @@ from gpadjust.dynamics.base import TransitionFunctions
 from gpadjust.dynamics.targets import one_physics
 from gpadjust.physics import Physics
 from gpadjust.physics.parameters import PhysicsParameters
-from gpadjust.records.lack import Lack, clearest_lack
+from gpadjust.records.lack import Lack, clearest_lack, robust_moments
 from gpadjust.records.records import Records, control_steps
-from gpadjust.records.smoothing import SmoothedRecords, smooth
+from gpadjust.records.smoothing import SmoothedRecords, drawn_parameters, smooth
 from gpadjust.states import StateSpec
 from gpadjust.words import number, percent
 
@@ -39,6 +39,8 @@ _TOLD = 0.15  # of the least standard deviation of the two: their combination's 
 _POWERS = ((1, -1), (1, 1), (1, -2), (1, 2), (2, -1), (2, 1))
 _BLOCKS = 5  # of a window, whose errors are compared
 _LARGE = 2.0  # times the noise of the sensor: an error that something missing may have made
+_WIDER = 1.5  # an interval that allows for missing forces, in place of the one that does not
+_UNSURE = 0.05  # of a prior's standard deviation: uncertainty that matters
 _MOVES = 0.01  # of a state's changes in a step: process noise that matters
 
 _OTHERS = {GUESSES: "the guesses do", PERSISTENCE: "a state that stays"}
@@ -97,6 +99,20 @@ class Identification(Display):
     def parameters(self) -> PhysicsParameters | None:
         """The posterior of the physics' unknown parameters; None if it has none."""
         return self.smoothed.physics_parameters if GUESSES in self.runs else None
+
+    @cached_property
+    def robust_parameters(self) -> PhysicsParameters | None:
+        """The posterior that allows for smooth forces the equations lack; None without parameters.
+
+        White process noise averages out, what equations lack does not: with dry friction missing,
+        the damping stands for it, and its interval is too narrow. Here each equation also has a
+        function of each state, twice as large as its process noise. Of right equations this is 0,
+        and the posterior that of :attr:`parameters`. A prior of the missing force, not a fact.
+        """
+        if self.parameters is None:
+            return None
+        chain, estimate = self.smoothed._chain, self.smoothed._estimate
+        return drawn_parameters(chain.physics, *robust_moments(chain, estimate, self.step))
 
     @property
     def hidden(self) -> list[str]:
@@ -191,6 +207,7 @@ class Identification(Display):
         """Sentences on the log, on parameters, and on errors that are too large."""
         sentences = [*self.remarks, *_of_parameters(self.parameters)]
         sentences += map(str, self.combinations)
+        sentences += self._of_forces()
         if self.lack is not None:
             sentences.append(str(self.lack))
         sentences += self._of_noise()
@@ -210,6 +227,22 @@ class Identification(Display):
                         f"{name} than {words}."
                     )
         return sentences
+
+    def _of_forces(self) -> list[str]:
+        """Return a sentence on parameters that a force which may be missing makes uncertain."""
+        if self.parameters is None or self.robust_parameters is None:
+            return []
+        (low, high), wider = self.robust_parameters.interval(), []
+        times = self.robust_parameters.sd / self.parameters.sd
+        for i, name in enumerate(self.parameters):
+            known = self.parameters.unknowns[name].coordinate(self.robust_parameters[name])
+            if times[i] > _WIDER and known.std() > _UNSURE:
+                wider.append(f"{name} {low[i]:.3g} to {high[i]:.3g} ({times[i]:.2g} times as wide)")
+        return wider and [
+            "The intervals of parameters take errors of the equations for noise of each step. If "
+            "they lack a force that depends on the states, as large as the process noise, the log "
+            f"tells {', '.join(wider)}. Dry friction, say, is hard to tell from damping."
+        ]
 
     def _of_noise(self) -> list[str]:
         """Return sentences on process noise that is larger than the noise of the sensor."""

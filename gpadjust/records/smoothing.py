@@ -77,14 +77,9 @@ class SmoothedRecords:
     @property
     def physics_parameters(self) -> PhysicsParameters:
         """The posterior of the unknown parameters of the physics; empty if it has none."""
-        unknowns, d = self._chain.physics.unknowns, self._chain.d
-        if not unknowns:
-            return PhysicsParameters({}, [])
-        moments = self._estimate.stretches[0].states
-        mean = torch.from_numpy(moments.means[0, d:].copy())
-        values, vectors = torch.linalg.eigh(torch.from_numpy(moments.covariances[0, d:, d:].copy()))
-        spread = even_normal(_DRAWS, len(unknowns), seed=0) * values.clamp_min(0).sqrt()
-        return PhysicsParameters(unknowns, unknowns.at(mean + spread @ vectors.mT).unbind(-1))
+        d, moments = self._chain.d, self._estimate.stretches[0].states
+        mean, covariance = moments.means[0, d:], moments.covariances[0, d:, d:]
+        return drawn_parameters(self._chain.physics, mean, covariance)
 
     @cached_property
     def variation(self) -> Tensor:
@@ -223,6 +218,17 @@ def smooth(
         chain,
         estimate,
     )
+
+
+def drawn_parameters(physics: Physics, mean: Array, covariance: Array) -> PhysicsParameters:
+    """Draw parameters from a normal distribution of their coordinates; none if there are none."""
+    unknowns = physics.unknowns
+    if not unknowns:
+        return PhysicsParameters({}, [])
+    values, vectors = torch.linalg.eigh(torch.from_numpy(covariance.copy()))
+    spread = even_normal(_DRAWS, len(unknowns), seed=0) * values.clamp_min(0).sqrt()
+    at = unknowns.at(torch.from_numpy(mean.copy()) + spread @ vectors.mT)
+    return PhysicsParameters(unknowns, at.unbind(-1))
 
 
 def _of_all_states(moving: Array, spec: StateSpec) -> Tensor:
