@@ -99,7 +99,8 @@ def test_intervals_that_allow_for_a_missing_force_hold_the_damping(dry, right):
     low, high = dry.parameters.interval()
     wide_low, wide_high = dry.robust_parameters.interval()
     assert not low[1] < 0.3 < high[1]
-    assert (wide_low[0] < 4 < wide_high[0]) and (wide_low[1] < 0.3 < wide_high[1])
+    assert wide_low[0] < 4 < wide_high[0]
+    assert wide_low[1] < 0.3 < wide_high[1]
     assert any("c " in each and "Dry friction, say, is hard to tell" in each for each in dry.advice)
     assert right.robust_parameters.sd[1] < 0.1 * dry.robust_parameters.sd[1]
 
