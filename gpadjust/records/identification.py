@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -78,7 +78,8 @@ class Identification(Display):
             stretch.
         runs: Free runs along the windows: ``"identified"``, and ``"guesses"`` by the parameters
             that were guessed, if there are any.
-        step: The control step, in the unit of the times.
+        step: The step of the dynamics, in the unit of the times: the control step, or that of an
+            :class:`ODEPhysics` which makes several of them in a control step.
         remarks: Sentences on the log itself: gaps, actions that vary within a step, angles that
             jump.
     """
@@ -112,7 +113,7 @@ class Identification(Display):
         if self.parameters is None:
             return None
         chain, estimate = self.smoothed._chain, self.smoothed._estimate
-        return drawn_parameters(chain.physics, *robust_moments(chain, estimate, self.step))
+        return drawn_parameters(chain.physics, *robust_moments(chain, estimate, self._control_step))
 
     @property
     def hidden(self) -> list[str]:
@@ -148,7 +149,11 @@ class Identification(Display):
 
         Takes some seconds for thousands of steps, once.
         """
-        return clearest_lack(self.smoothed._chain, self.smoothed._estimate, self.step)
+        return clearest_lack(self.smoothed._chain, self.smoothed._estimate, self._control_step)
+
+    @property
+    def _control_step(self) -> float:
+        return self.smoothed.records.records[0].sampling_step
 
     @property
     def combinations(self) -> list[Combination]:
@@ -357,19 +362,29 @@ def identify(
         )
     held = max(1, int(share * longest))
     f_p = one_physics(physics, spec, "identify one of them")
-    beginnings, ends, actions, measured = [], [], [], []
+    beginnings, ends = [], list[int]()
     for i, stretch in enumerate(steps):
         end = len(stretch.times)
         if end - 1 >= 2 * held:
             end -= held
             ends.append(i)
-            actions.append(stretch.actions[end - 1 : -1])
-            measured.append(stretch.states[end:])
         beginnings.append(stretch.part(slice(end)))
     learnt_from = Records(beginnings, spec)
     smoothed = smooth(learnt_from, f_p, start=start, num_starts=num_starts)
     last = torch.stack([smoothed.records.records[i].states[-1] for i in ends])
+    within = smoothed._chain.within.shape[1]  # steps of the physics in a control step
+    actions, measured = [], []
+    for i in ends:
+        stretch = steps.records[i]
+        each = stretch.within if within > 1 else stretch.actions.unsqueeze(1)
+        actions.append(each[-held - 1 : -1].flatten(0, 1))
+        states = torch.full((held * within, spec.state_dim), torch.nan, dtype=torch.float64)
+        states[within - 1 :: within] = stretch.states[-held:]
+        measured.append(states)
     windows = Windows(last, torch.stack(actions), torch.stack(measured))
+    length = steps.records[0].sampling_step / within
+    if within > 1:
+        spec = replace(spec, step=length)
     options: dict[str, Any] = {
         "start_noise": torch.stack([smoothed.sd[i][-1] for i in ends]).square().mean(0).sqrt(),
         "noise": smoothed.noise.nan_to_num(),
@@ -380,9 +395,8 @@ def identify(
     if f_p.unknowns:
         runs[GUESSES] = dynamics.free_run(last, windows.actions, **options)
         dynamics = _Drawn(spec, f_p, smoothed.physics_parameters)
-    options |= {"process_noise": smoothed.process_noise, "num_functions": 199}
+    options |= {"process_noise": smoothed.process_noise / math.sqrt(within), "num_functions": 199}
     runs = {IDENTIFIED: dynamics.free_run(last, windows.actions, **options), **runs}
-    length = steps.records[0].sampling_step
     gaps = [f"Gaps part the log into {len(steps)} stretches, each smoothed by itself."]
     remarks = gaps if len(steps) > len(records) else []
     remarks += [*_of_actions(records, length), *_of_jumps(records)]
@@ -431,7 +445,8 @@ def _of_actions(records: Records, step: float) -> list[str]:
         return []
     return [
         f"The actions vary within a step of {size} samples, over which they are averaged: "
-        "parameters and their intervals may be off. Take a shorter step and compare."
+        "parameters and their intervals may be off. Give an ODEPhysics the step of the samples, "
+        "which follows each action, or take a shorter step and compare."
     ]
 
 

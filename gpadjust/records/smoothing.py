@@ -146,7 +146,9 @@ def smooth(
         records: The records. A state that is NaN throughout is hidden.
         physics: The next values of the states that are neither exogenous nor previous actions,
             from these and the actions, as of :class:`LearnedDynamics`.
-        step: The control step, as of :meth:`Records.trajectories`.
+        step: The control step, as of :meth:`Records.trajectories`. If it has several samples, an
+            :class:`ODEPhysics` whose step is that of the samples follows the action of each; any
+            other physics is given their mean.
         start: Of states by name, mean and standard deviation at the beginning of each stretch;
             needed of hidden ones. Default: about the first that was measured.
         noise: Standard deviations ``state_dim`` of the measurements' errors; NaN for those to be
@@ -191,14 +193,10 @@ def smooth(
     steps = _with_known_inputs(control_steps(records, step))
     spec, length = records.spec, steps.records[0].sampling_step
     f_p = one_physics(physics, spec, "smooth by one of them")
-    if isinstance(f_p, ODEPhysics) and abs(f_p.step - length) > _SAME * length:
-        raise ValueError(
-            f"Physics {f_p.name!r} makes steps of {f_p.step:g}, but the control step of the "
-            f"records is {length:g}; pass step={f_p.step:g}, or build it with step={length:g}."
-        )
+    substeps = _substeps(f_p, steps, length)
     known = {"noise": noise, "process_noise": process_noise}
     variances = np.stack([_variances(sd, name, spec) for name, sd in known.items()])
-    chain = Chain(f_p, steps, variances, _starts(start, spec))
+    chain = Chain(f_p, steps, variances, _starts(start, spec), substeps)
     if num_starts is None:
         num_starts = 4 if chain.hidden.any() and f_p.unknowns else 1
     checked_whole("num_starts", num_starts, 1)
@@ -217,6 +215,20 @@ def smooth(
         estimate.log_density,
         chain,
         estimate,
+    )
+
+
+def _substeps(f_p: Physics, steps: Records, length: float) -> int:
+    """Return how many steps of the physics make a control step: 1, or as many as it has samples."""
+    if not isinstance(f_p, ODEPhysics) or abs(f_p.step - length) <= _SAME * length:
+        return 1
+    samples, spec = steps.records[0].within.shape[1], steps.spec
+    if len(spec.moving) == spec.state_dim and abs(f_p.step * samples - length) <= _SAME * length:
+        return samples
+    raise ValueError(
+        f"Physics {f_p.name!r} makes steps of {f_p.step:g}, but the control step of the "
+        f"records is {length:g}; pass step={f_p.step:g}, or build it with step={length:g}, or, for "
+        f"states that all move, with the step of the samples, {length / samples:g}."
     )
 
 
@@ -448,7 +460,14 @@ class Chain:
     or a hidden state has no start.
     """
 
-    def __init__(self, physics: Physics, steps: Records, variances: Array, start: Array) -> None:
+    def __init__(
+        self,
+        physics: Physics,
+        steps: Records,
+        variances: Array,
+        start: Array,
+        substeps: int = 1,
+    ) -> None:
         self.physics, self.spec = physics, steps.spec
         moving = self.spec.moving
         self.d, self.num_parameters = len(moving), len(physics.unknowns)
@@ -461,6 +480,9 @@ class Chain:
         states = torch.cat([record.states for record in steps])
         actions = torch.cat([record.actions for record in steps])
         self.recorded = side_by_side(states, actions)  # of which f_p reads what does not move
+        self.within = actions.unsqueeze(1)  # of the steps of f_p in a control step
+        if substeps > 1:
+            self.within = torch.cat([record.within for record in steps])
         y = self.measured = states[:, moving].numpy()
         for rows in self.stretches:
             for i in self.angles:  # go on without jumps
@@ -619,11 +641,14 @@ class Chain:
         Rows ``n`` have the actions, and the states that do not move, which f_p reads.
         """
         inputs = self.recorded[rows].expand(*states.shape[:-1], -1).clone()
-        inputs[..., self.spec.moving] = torch.from_numpy(np.ascontiguousarray(states))
+        following = torch.from_numpy(np.ascontiguousarray(states))
         unknowns = self.physics.unknowns
         values = unknowns.at(torch.from_numpy(parameters)) if unknowns else None
-        following = self.physics.or_nan(inputs[..., self.spec.physics_columns], values)
-        check_next_values(self.physics, following, states.shape[-1])
+        for actions in self.within[rows].unbind(1):
+            inputs[..., self.spec.moving] = following
+            inputs[..., self.spec.state_dim :] = actions
+            following = self.physics.or_nan(inputs[..., self.spec.physics_columns], values)
+            check_next_values(self.physics, following, states.shape[-1])
         return self.near(following.numpy(), states)
 
     def near(self, states: Array, others: Array) -> Array:
