@@ -30,7 +30,6 @@ from gpadjust.words import number, percent
 GUESSES, IDENTIFIED, PERSISTENCE = "guesses", "identified", "persistence"
 FEW = 0.9  # of measurements in intervals of 95 %
 _LEAST = 8  # steps of a stretch, of which the last part is held out
-_KNOWN_BEFORE = 0.8  # of a prior's standard deviation: the log tells next to nothing
 _FAR = 3.0  # standard deviations of a prior
 _VARIES = 1e-3  # share of the variance of an action that is within steps
 _NEAR_A_TURN = 0.12
@@ -475,9 +474,8 @@ def _of_parameters(parameters: PhysicsParameters | None) -> list[str]:
                 f"{name} is {float(z.mean().abs()):.1f} standard deviations of its prior from its "
                 "guess: a sign, a unit, or a physics that lacks something?"
             )
-        elif z.std() > _KNOWN_BEFORE:
-            sentences.append(f"The log says next to nothing of {name}: it stays as known before.")
-    return sentences
+    told = "The log says next to nothing of {}: it stays as known before."
+    return [*sentences, *map(told.format, parameters.untold)]
 
 
 def _told_together(parameters: PhysicsParameters) -> list[Combination]:

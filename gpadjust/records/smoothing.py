@@ -19,12 +19,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpadjust.checks import check_kind, checked_whole, finite_array, long_work, tick
+from gpadjust.checks import check_kind, checked_whole, finite_array
 from gpadjust.dynamics.base import of_states
 from gpadjust.dynamics.least_squares import even_normal
 from gpadjust.dynamics.targets import check_next_values, one_physics
 from gpadjust.physics import ODEPhysics, Physics, PhysicsError
 from gpadjust.physics.parameters import PhysicsParameters
+from gpadjust.progress import long_work, tick
 from gpadjust.records import kalman
 from gpadjust.records.kalman import Array, Link, Smoothed
 from gpadjust.records.records import Record, Records, control_steps, remember
@@ -336,9 +337,9 @@ class Estimate(NamedTuple):
 def _estimate(chain: Chain, max_rounds: int, num_starts: int) -> Estimate:
     """Find the most likely states, parameters of the physics and variances from several starts."""
     ends = list[tuple[Estimate, float]]()
-    with long_work("smooth", " rounds", total=num_starts * max_rounds):
+    with long_work("smooth", "rounds", total=num_starts * max_rounds):
         for i, (coordinates, known_at_once) in enumerate(chain.starts_of_search(num_starts)):
-            tick(to=i * max_rounds)  # a search that has settled leaves rounds
+            tick("rounds", to=i * max_rounds)  # a search that has settled leaves rounds
             try:
                 # Far off numbers end; then another start may lead somewhere.
                 with np.errstate(all="ignore"), contextlib.suppress(np.linalg.LinAlgError):
@@ -389,7 +390,7 @@ def _search(
     climb = _Climb(chain.counts / 2)
     value, gained, hoped = -math.inf, math.inf, math.inf
     for _ in range(max_rounds):
-        tick()
+        tick("rounds")
         # E: p(x, theta | y) of the chain x[t + 1] = F[t] x[t] + b[t] + q[t], F = df_p / dx
         links = chain.linearised(path)
         smoothed, density = kalman.smooth_chain(links, chain.starts, *variances)

@@ -1,12 +1,14 @@
 """States of records: by a dense Gaussian, and by what was simulated."""
 
 import math
+import sys
 
 import numpy as np
 import pytest
 import torch
 from scipy.linalg import block_diag
 
+from gpadjust import progress
 from gpadjust.dynamics import StateSpec
 from gpadjust.physics import FunctionPhysics, ODEPhysics, Unknown
 from gpadjust.records import Record, Records, smooth
@@ -397,6 +399,16 @@ def test_intervals_of_parameters_hold_as_often_as_they_say():
     assert 0.88 <= held / 80 <= 1
 
 
+@pytest.mark.filterwarnings("ignore::gpadjust.records.SmoothingWarning")
+@pytest.mark.parametrize("is_seen", [True, False])
+def test_long_smoothing_shows_a_bar_where_somebody_sees_it(is_seen, monkeypatch, capsys):
+    monkeypatch.setattr(progress, "PATIENCE", 0.0)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: is_seen, raising=False)
+    records = Records(measured(*simulated(0, length=50), 0), SPEC)
+    smooth(records, spring(), max_rounds=3, num_starts=1)
+    assert (" rounds" in capsys.readouterr().err) == is_seen
+
+
 def pendulum_log(seed, rows=499, step=0.01, noise=0.005):
     """Log of a pendulum, its angle alone, of mass 0.5 kg and little damping."""
     rng = np.random.default_rng(seed)
@@ -443,7 +455,7 @@ def ticked(monkeypatch):
 
     positions = []
 
-    def tick(to=None):
+    def tick(unit, to=None):
         positions.append((positions[-1] if positions else 0) + 1 if to is None else to)
 
     monkeypatch.setattr(smoothing, "tick", tick)
