@@ -191,13 +191,13 @@ def smooth(
         True
     """
     checked_whole("max_rounds", max_rounds, 1)
-    steps = _with_known_inputs(control_steps(records, step))
+    steps = with_known_inputs(control_steps(records, step))
     spec, length = records.spec, steps.records[0].sampling_step
     f_p = one_physics(physics, spec, "smooth by one of them")
-    substeps = _substeps(f_p, steps, length)
+    substeps = substeps_of(f_p, steps, length)
     known = {"noise": noise, "process_noise": process_noise}
     variances = np.stack([_variances(sd, name, spec) for name, sd in known.items()])
-    chain = Chain(f_p, steps, variances, _starts(start, spec), substeps)
+    chain = Chain(f_p, steps, variances, first_moments(start, spec), substeps)
     if num_starts is None:
         num_starts = 4 if chain.hidden.any() and f_p.unknowns else 1
     checked_whole("num_starts", num_starts, 1)
@@ -219,7 +219,7 @@ def smooth(
     )
 
 
-def _substeps(f_p: Physics, steps: Records, length: float) -> int:
+def substeps_of(f_p: Physics, steps: Records, length: float) -> int:
     """Return how many steps of the physics make a control step: 1, or as many as it has samples."""
     if not isinstance(f_p, ODEPhysics) or abs(f_p.step - length) <= _SAME * length:
         return 1
@@ -263,7 +263,7 @@ def _with_states(steps: Records, path: Array) -> Records:
     return Records(records, steps.spec)
 
 
-def _with_known_inputs(steps: Records) -> Records:
+def with_known_inputs(steps: Records) -> Records:
     """Return stretches from where all inputs of the physics that do not move are known."""
     spec, records = steps.spec, []
     beside = [i for i in spec.physics_columns if i < spec.state_dim and i not in spec.moving]
@@ -302,7 +302,7 @@ def _variances(sd: Tensor | None, name: str, spec: StateSpec) -> Array:
     return variances
 
 
-def _starts(start: Mapping[str, tuple[float, float]] | None, spec: StateSpec) -> Array:
+def first_moments(start: Mapping[str, tuple[float, float]] | None, spec: StateSpec) -> Array:
     """Return means and standard deviations, ``2 x d``, of first states; NaN if they are unknown."""
     names = [spec.states[i] for i in spec.moving]
     start = {} if start is None else start
