@@ -58,6 +58,7 @@ Beyond the models::
     from gpadjust.validation.plots import plot_adjustment  # rho and delta; others beside it
     from gpadjust.report import report                     # a page to show
     from gpadjust.active import collect                    # the next point to measure
+    from gpadjust.physics import MujocoPhysics             # a MuJoCo model, its unknown numbers
     from gpadjust.records import Records, smooth           # log files of machines, as they are
     from gpadjust.dynamics import LearnedDynamics          # the next state of a system
     from gpadjust.control import MPCAgent                  # a controller; SAC and TD3: gpadjust.rl

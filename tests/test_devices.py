@@ -15,6 +15,7 @@ FACTORIES = {
 ALLOWED = {
     "numbers of rows or draws, which index tensors of any device": {
         "core/fitting.py _parts",
+        "core/fitting.py _joined",
         "core/fitting.py _pooled",
         "core/fitting.py modes",
         "core/functions.py __init__",

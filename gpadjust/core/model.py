@@ -362,6 +362,28 @@ class GP(gpytorch.models.GP, Predictive):
         bad = ~(value.isfinite() & gradient.isfinite().all(-1))
         return value.masked_fill(bad, -torch.inf), gradient.masked_fill(bad.unsqueeze(-1), 0.0)
 
+    def prior_mean(self, u: Tensor) -> Tensor:
+        """Return the mean of the targets at coordinates ``S x B x P``, ``S x (m n)``, in units.
+
+        It is NaN where f_p fails, and 0 of missing targets.
+        """
+        total, _ = self._training_sum(u)
+        missing = self.targets().isnan()
+        return total.mean.expand(len(u), *missing.shape).masked_fill(missing, 0.0).flatten(1)
+
+    def precision_times(self, u: Tensor, v: Tensor) -> Tensor:
+        """Return the inverse covariance of the targets at ``S x B x P`` times ``S x (m n)``."""
+        (total, noise), missing = self._training_sum(u), self.targets().isnan()
+        v = v.reshape(len(u), *missing.shape)
+        return self.sum_likelihood(total, v, noise, ~missing, True).by_mean.flatten(1)
+
+    def _training_sum(self, u: Tensor) -> tuple[WeightedSum, Tensor]:
+        """Return the sum at the training inputs, and the noise's variances."""
+        values = self.table.values(u)
+        places = self.places(self.data.X, values, with_physics=False)
+        places = places._replace(f=self._physics_with_slopes(values, False)[0])
+        return self.term_sum.at(values, places), self.noise.variance(values, places, True)
+
     def sum_likelihood(
         self, train: WeightedSum, residual: Tensor, noise: Tensor, observed: Tensor,
         with_gradient: bool,

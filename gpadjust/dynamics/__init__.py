@@ -1,4 +1,4 @@
-"""Distributions of the next state of a system, over the models of this library."""
+"""Distributions of the next state of a system, by the models of this library."""
 
 from gpadjust.dynamics.base import Dynamics, FreeRun, TransitionFunctions
 from gpadjust.dynamics.learned_dynamics import LearnedDynamics

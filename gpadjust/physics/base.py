@@ -39,6 +39,7 @@ class Physics(torch.nn.Module, ABC):
 
     Attributes:
         num_outputs: ``m``; None until the first call if it is not known before.
+        step: Of a physics that returns the next state, the time until then; None if it is unknown.
 
     Example:
         >>> class Drag(Physics):
@@ -51,6 +52,7 @@ class Physics(torch.nn.Module, ABC):
 
     advice: str = "NumPy code is BlackBoxPhysics(function), of a single row batched=False."
     """A sentence for errors of what ``evaluate`` calls."""
+    step: float | None = None
 
     def __init__(
         self,

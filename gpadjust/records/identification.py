@@ -55,7 +55,7 @@ class Combination(NamedTuple):
     draws: Tensor  # K
 
     def __str__(self) -> str:
-        """What the log tells, in a sentence."""
+        """Return a sentence on the value by the log."""
         low, mid, high = self.draws.quantile(_ENDS.to(self.draws)).tolist()
         return (
             f"The log tells {self.name}, {mid:.4g} [{low:.4g}, {high:.4g}], and hardly "
@@ -77,8 +77,8 @@ class Identification(Display):
             stretch.
         runs: Free runs along the windows: ``"identified"``, and ``"guesses"`` by the parameters
             that were guessed, if there are any.
-        step: The step of the dynamics, in the unit of the times: the control step, or that of an
-            :class:`ODEPhysics` which makes several of them in a control step.
+        step: The step of the dynamics, in the unit of the times: the control step, or that of a
+            physics which makes several of them in a control step.
         remarks: Sentences on the log itself: gaps, actions that vary within a step, angles that
             jump.
     """

@@ -58,7 +58,7 @@ class Lack(NamedTuple):
     sd: Tensor  # K, of the means
 
     def __str__(self) -> str:
-        """What is missing, in a sentence."""
+        """Return a sentence on the missing effect."""
         if self.lag is not None:
             return (
                 f"{self.state}' lacks a lag: {self.over} acts some {self.lag:.2g} late. Try one "

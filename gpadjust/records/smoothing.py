@@ -23,7 +23,7 @@ from gpadjust.checks import check_kind, checked_whole, finite_array
 from gpadjust.dynamics.base import of_states
 from gpadjust.dynamics.least_squares import even_normal
 from gpadjust.dynamics.targets import check_next_values, one_physics
-from gpadjust.physics import ODEPhysics, Physics, PhysicsError
+from gpadjust.physics import Physics, PhysicsError
 from gpadjust.physics.parameters import PhysicsParameters
 from gpadjust.progress import long_work, tick
 from gpadjust.records import kalman
@@ -147,9 +147,9 @@ def smooth(
         records: The records. A state that is NaN throughout is hidden.
         physics: The next values of the states that are neither exogenous nor previous actions,
             from these and the actions, as of :class:`LearnedDynamics`.
-        step: The control step, as of :meth:`Records.trajectories`. If it has several samples, an
-            :class:`ODEPhysics` whose step is that of the samples follows the action of each; any
-            other physics is given their mean.
+        step: The control step, as of :meth:`Records.trajectories`. If it has several samples, a
+            physics whose step is that of the samples follows the action of each; any other one is
+            given their mean.
         start: Of states by name, mean and standard deviation at the beginning of each stretch;
             needed of hidden ones. Default: about the first that was measured.
         noise: Standard deviations ``state_dim`` of the measurements' errors; NaN for those to be
@@ -221,7 +221,7 @@ def smooth(
 
 def substeps_of(f_p: Physics, steps: Records, length: float) -> int:
     """Return how many steps of the physics make a control step: 1, or as many as it has samples."""
-    if not isinstance(f_p, ODEPhysics) or abs(f_p.step - length) <= _SAME * length:
+    if f_p.step is None or abs(f_p.step - length) <= _SAME * length:
         return 1
     samples, spec = steps.records[0].within.shape[1], steps.spec
     if len(spec.moving) == spec.state_dim and abs(f_p.step * samples - length) <= _SAME * length:
