@@ -19,8 +19,6 @@ from gpadjust.physics.fmu import FMU, KINDS, opened
 from gpadjust.physics.parameters import ParameterValues
 from gpadjust.physics.unknown import Unknown
 
-_SAME = 1e-9  # share of the duration within which two points in time are one
-
 
 class FMUPhysics(BlackBoxPhysics):
     r"""Physics given as an FMU of FMI 2 or 3, the file in which simulation programs export a model.
@@ -161,58 +159,29 @@ class FMUPhysics(BlackBoxPhysics):
         The rows differ in time alone.
         """
         values = dict(zip((*self.input_names, *self.unknowns), rows[0].tolist(), strict=True))
-        times = np.array([self.times] * len(rows))
+        times = np.tile(self.times, (len(rows), 1))
         if values.pop("time", None) is not None:
             times = rows[:, [self.input_names.index("time")]]
-        found = dict[int, Any]()
-        failure = PhysicsError("")
         try:
-            points = self._points(times)
-            read = _last(points, times, points)
-            found = dict.fromkeys(read.ravel().tolist())
-            opened(self.path, self.kind).simulate(
+            if times.min() < self.start_time:
+                raise ValueError(f"expected times from start_time={self.start_time:g} on")
+            found, error = opened(self.path, self.kind).simulate(
                 self.start_values | values,
-                points,
-                self._held(points),
-                self.tolerance,
+                self.start_time,
+                times.ravel(),
                 self.output_names,
-                found,
+                self.signals,
+                self.communication_step,
+                self.tolerance,
             )
-        except Exception as error:
-            failure = PhysicsError(described(error))
-            failure.__cause__ = error
-            if not any(found.values()):
-                return [failure] * len(rows)
-        parts = [[found[i] for i in own] for own in read.tolist()]
-        return [failure if None in own else np.concatenate(own) for own in parts]
-
-    def _points(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return all times at which a simulation stops, from its start to the last output."""
-        fmu, start, end = opened(self.path, self.kind), self.start_time, float(times.max())
-        if times.min() < start:
-            raise ValueError(f"expected times from start_time={start:g} on, found {times.min():g}")
-        is_stepped = fmu.kind == "CoSimulation"
-        grid = np.empty(0)
-        if is_stepped and self.communication_step is not None:
-            grid = np.arange(start, end, self.communication_step)
-        points = np.sort(np.concatenate([[start], times.ravel(), self.signals["time"], grid]))
-        points = points[(points >= start) & (points <= end)]
-        points = points[np.diff(points, prepend=-np.inf) > _SAME * (end - start)]
-        steps = np.diff(points)
-        is_even = len(steps) == 0 or np.ptp(steps) <= _SAME * (end - start)
-        if is_stepped and not is_even and not fmu.interface.canHandleVariableCommunicationStepSize:
-            raise ValueError(
-                f"{fmu.name} takes communication steps of one length, found steps from "
-                f"{steps.min():g} to {steps.max():g}: take a communication_step of which the "
-                "times, also of signals, are multiples"
-            )
-        return points
-
-    def _held(self, points: NDArray[np.float64]) -> list[dict[str, float]]:
-        """Return the values of signals from each point on; nothing if there are none."""
-        names = [name for name in self.signals if name != "time"]
-        place = _last(self.signals["time"], points, points).clip(0)
-        return [{n: float(self.signals[n][i]) for n in names} for i in place if names]
+        except Exception as caught:
+            found, error = np.full((times.size, 1), np.nan), caught
+        results = [*found.reshape(len(rows), -1)]
+        if error is None:
+            return results
+        failure = PhysicsError(described(error))
+        failure.__cause__ = error
+        return [failure if np.isnan(row).any() else row for row in results]
 
     def _checked_times(self, times: float | Sequence[float] | None) -> tuple[float, ...]:
         """Return the times of outputs, none if they are a column of X."""
@@ -258,17 +227,10 @@ def _names(argument: str, names: Sequence[str]) -> tuple[str, ...]:
     return tuple(names)
 
 
-def _last(
-    of: NDArray[np.float64], until: NDArray[np.float64], points: NDArray[np.float64]
-) -> NDArray[np.int64]:
-    """Return the places of the last times that are not after others, but for rounding errors."""
-    return np.searchsorted(of, until + _SAME * np.ptp(points), side="right") - 1
-
-
 def _signals(signals: Any) -> dict[str, NDArray[np.float64]]:
     """Return signals by name, with their times."""
     if signals is None:
-        return {"time": np.empty(0)}
+        return {"time": np.array([-np.inf])}  # nothing changes
     found = {str(name): np.atleast_1d(real_array(signals[name])) for name in signals}
     times = found.get("time", np.empty(0))
     is_table = times.ndim == 1 and all(each.shape == times.shape for each in found.values())

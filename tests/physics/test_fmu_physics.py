@@ -88,7 +88,7 @@ def test_rows_that_differ_in_time_share_a_simulation(kind):
     expected = [tank([310.0, 300.0], h, sorted(times)) for h in (0.0, 500.0)]
     places = [sorted(times).index(t) for t in times]
     expected = torch.stack([each[places] for each in expected], 1).flatten(0, 1)
-    torch.testing.assert_close(physics(rows), expected, rtol=1e-7, atol=0)
+    torch.testing.assert_close(physics(rows), expected, rtol=1e-6, atol=0)
     fixed = FMUPhysics(
         fmu(), ["heater"], STATES, times=sorted(times), kind=kind, start_values={"tank.T": 310.0}
     )
@@ -292,7 +292,7 @@ def test_steps_of_one_length_and_columns():
     physics = FMUPhysics(path, ["heater", "time"], STATES, communication_step=2.0)
     even, odd = (torch.tensor([[0.0, t]]).double() for t in (6.0, 5.0))
     assert physics(even).isfinite().all()
-    refused(PhysicsError, "steps of one length, found steps from 1 to 2", physics, odd)
+    refused(PhysicsError, "no step ends at t = 5.*steps of one length", physics, odd)
     refused(ValueError, r"a column for each of them, or columns=, found 3", physics, X)
     refused(ValueError, "in the order of the data", physics.check_names, ["time", "heater"])
     chosen = FMUPhysics(path, ["heater"], STATES, times=6.0, columns=[2])
