@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+Array = NDArray[np.float64]
 KINDS = ("CoSimulation", "ModelExchange")
 _SAME = 1e-9  # share within which two times are one, also of FMPy
 _FATAL = 4  # the status after which no function of an instance may be called
@@ -73,6 +74,8 @@ class FMU:
         self.kind: str = kind or has[0]
         self.variables = {each.name: each for each in description.modelVariables}
         self.states: list[str] = [u.variable.derivative.name for u in description.derivatives]
+        step = getattr(description.coSimulation, "fixedInternalStepSize", None)
+        self.step = step or getattr(description.defaultExperiment, "stepSize", None)
         self._instance: Any = None
         self._errors: list[Exception] = []  # the first one of the instance
         self._folder = fmpy.extract(path)
@@ -97,41 +100,27 @@ class FMU:
         from fmpy.simulation import settable_in_initialization_mode, settable_in_instantiated
 
         variable = self.variable(name)
+        is_settable = settable_in_instantiated(variable) or settable_in_initialization_mode(
+            variable
+        )
         is_state = self.kind == "ModelExchange" and name in self.states
-        if not (
-            is_state
-            or settable_in_instantiated(variable)
-            or settable_in_initialization_mode(variable)
-        ):
+        if not is_state and not is_settable:
             raise ValueError(
-                f"{self.name} permits no start value of {name!r}: it has causality "
-                f"{variable.causality!r}, variability {variable.variability!r} and initial "
+                f"{self.name} permits no start value of {name!r}, which has initial="
                 f"{variable.initial!r}. Name the parameter of its start value, or export the FMU "
                 "with initial='exact' for it, or for model exchange, whose states can be set."
             )
-
-    @property
-    def step(self) -> float | None:
-        """The communication step that the FMU names."""
-        step = getattr(self.description.coSimulation, "fixedInternalStepSize", None)
-        step = step or getattr(self.description.defaultExperiment, "stepSize", None)
-        return None if step is None else float(step)
-
-    def unit(self, name: str) -> str:
-        """Return the unit of a variable, or an empty text."""
-        variable = self.variable(name)
-        return variable.unit or getattr(variable.declaredType, "unit", None) or ""
 
     def simulate(
         self,
         values: Mapping[str, float],
         start: float,
-        times: NDArray[np.float64],
+        times: Array,
         outputs: Sequence[str],
-        signals: Mapping[str, NDArray[np.float64]],
+        signals: Mapping[str, Array],
         step: float | None,
         tolerance: float,
-    ) -> tuple[NDArray[np.float64], Exception | None]:
+    ) -> tuple[Array, Exception | None]:
         """Return outputs ``N x m`` at the times, and the error from which on they are NaN, or None.
 
         Args:
@@ -140,7 +129,7 @@ class FMU:
             times: ``N`` times from the start on, in any order.
             outputs: The names of the outputs.
             signals: Inputs by name with their ``"time"``; each holds until the next.
-            step: The communication step of co-simulation. None: from time to time.
+            step: The communication step of co-simulation. None: the FMU's own, or none.
             tolerance: The relative tolerance.
         """
         from fmpy import simulate_fmu
@@ -150,7 +139,7 @@ class FMU:
         duration = end - start or 1.0
         stop = end
         if self.kind == "ModelExchange":
-            step, stop = duration / _INTERVALS, start + _LONGER * duration
+            step, stop = duration / _INTERVALS, start + _LONGER * (end - start)
         names = {*values, *outputs, *signals}
         description = copy(self.description)  # FMPy goes through all variables of one
         description.modelVariables = [v for v in self.variables.values() if v.name in names]
@@ -178,7 +167,7 @@ class FMU:
                     stop_time=stop,
                     set_stop_time=stop == end,
                     step_finished=go_on,
-                    output_interval=step or duration,
+                    output_interval=float(step or self.step or duration),
                     relative_tolerance=tolerance,
                     start_values=dict(values),
                     input=self._input(values, points, signals),
@@ -193,15 +182,14 @@ class FMU:
                 if recorder is None:
                     raise failure from None
                 result = recorder.result()
-        if failure is None:
-            self._check_start(result[0], values)
-            missing = points[~_places(result["time"], points)[1]]
-            if len(missing):
-                failure = RuntimeError(
-                    f"no step ends at t = {missing[0]:g}, the last one at {result['time'][-1]:g}. "
-                    "The FMU ended the simulation, or takes steps of one length alone: give a "
-                    "communication_step of which the times, also of signals, are multiples"
-                )
+        self._check_start(result[0], values)
+        missing = points[~_places(result["time"], points)[1]]
+        if failure is None and len(missing):
+            failure = RuntimeError(
+                f"no step ends at t = {missing[0]:g}, the last one at {result['time'][-1]:g}. The "
+                "FMU ended the simulation, or takes steps of one length alone: give a "
+                "communication_step of which the times, also of signals, are multiples"
+            )
         place, is_there = _places(result["time"], times)
         table = np.stack([result[name][place].astype(float) for name in outputs], axis=-1)
         return np.where(is_there[:, None], table, np.nan), failure
@@ -209,8 +197,8 @@ class FMU:
     def _input(
         self,
         values: Mapping[str, float],
-        points: NDArray[np.float64],
-        signals: Mapping[str, NDArray[np.float64]],
+        points: Array,
+        signals: Mapping[str, Array],
     ) -> NDArray[np.void] | None:
         """Return inputs as FMPy takes them: two rows at each point, which make it stop there."""
         if len(signals) == 1 and len(points) <= 2:
@@ -289,8 +277,8 @@ class FMU:
             if not abs(found - value) <= 1e-6 * max(1.0, abs(value)):
                 raise ValueError(
                     f"{name!r} is {found:g} after its start value was set to {value:g}: the FMU "
-                    "computes it or rounds it. Take a variable that is free, such as the parameter "
-                    "of its start value"
+                    "computes it or rounds it. Name the parameter of its start value, or take "
+                    "model exchange, whose states can be set"
                 )
 
     def _free(self) -> None:
@@ -324,9 +312,7 @@ def _log(*message: Any) -> None:
     _messages.append(message[-1].decode(errors="replace").strip())
 
 
-def _places(
-    steps: NDArray[np.float64], times: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def _places(steps: Array, times: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the first of the steps that is at each time, but for rounding, and whether it is."""
     place = np.searchsorted(steps, times - _SAME * np.abs(times)).clip(max=len(steps) - 1)
     return place, np.isclose(steps[place], times, rtol=_SAME, atol=0)

@@ -101,22 +101,27 @@ class FMUPhysics(BlackBoxPhysics):
             name=name or path.stem,
         )
         check_choice("kind", kind, (*KINDS, None))
+        if isinstance(inputs, str) or isinstance(outputs, str) or not inputs or not outputs:
+            raise TypeError(
+                f"Expected lists of names of variables; found {inputs!r} and {outputs!r}."
+            )
+        if ("time" in inputs) is not (times is None):
+            raise ValueError(
+                "Expected the times at which outputs are read, such as times=10.0, or 'time' as "
+                f"one of the inputs, and not both; found inputs {inputs} and times={times!r}."
+            )
+        if communication_step is not None:
+            checked_number("communication_step", communication_step, above=0)
+        numbers = [] if times is None else np.atleast_1d(real_array(times)).tolist()
         self.path, self.kind = path, kind
-        self.input_names, self.output_names = _names("inputs", inputs), _names("outputs", outputs)
+        self.input_names, self.output_names = tuple(inputs), tuple(outputs)
         self.start_values = {k: checked_number(k, v) for k, v in (start_values or {}).items()}
         self.signals = _signals(signals)
         self.start_time = checked_number("start_time", start_time)
+        self.times = tuple(checked_number("times", t, least=self.start_time) for t in numbers)
+        self.communication_step = communication_step
         self.tolerance = checked_number("tolerance", tolerance, above=0, below=1)
-        self.times = self._checked_times(times)
-        unpacked = opened(path, kind)
-        step = unpacked.step if communication_step is None else communication_step
-        self.communication_step = (
-            None if step is None else checked_number("communication_step", step, above=0)
-        )
-        self._check(unpacked)
-        for each, unknown in self.unknowns.items():
-            if not unknown.unit:
-                self.unknowns[each] = replace(unknown, unit=unpacked.unit(each))
+        self._check(opened(path, kind))
         self.num_outputs = len(self.output_names) * max(1, len(self.times))
 
     def check_names(self, names: Sequence[str]) -> None:
@@ -128,20 +133,15 @@ class FMUPhysics(BlackBoxPhysics):
                 f"{', '.join(names)}: name the inputs in the order of the data."
             )
 
-    def read(self, X: Tensor) -> Tensor:
-        """Return the columns of ``X`` (``... x n x d``) that are inputs of the FMU, checked."""
-        columns = super().read(X)
-        if columns.shape[-1] != len(self.input_names):
-            raise ValueError(
-                f"Physics {self.name!r} has the inputs {', '.join(self.input_names)}; expected a "
-                f"column for each of them, or columns=, found {columns.shape[-1]} column(s)."
-            )
-        return columns
-
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """Return the outputs of simulations; an error of single rows contains those of others."""
         from joblib import Parallel, delayed  # slow to import
 
+        if X.shape[-1] != len(self.input_names):
+            raise ValueError(
+                f"expected a column of X for each of the inputs {', '.join(self.input_names)}, or "
+                f"columns=; found {X.shape[-1]}"
+            )
         rows = self._table(X, *parameters)
         place = np.arange(len(rows))
         if "time" in self.input_names:
@@ -183,34 +183,24 @@ class FMUPhysics(BlackBoxPhysics):
         failure.__cause__ = error
         return [failure if np.isnan(row).any() else row for row in results]
 
-    def _checked_times(self, times: float | Sequence[float] | None) -> tuple[float, ...]:
-        """Return the times of outputs, none if they are a column of X."""
-        if ("time" in self.input_names) is not (times is None):
-            raise ValueError(
-                "Expected the times at which outputs are read, such as times=10.0, or 'time' as "
-                f"one of the inputs, and not both; found inputs {', '.join(self.input_names)} and "
-                f"times={times!r}."
-            )
-        numbers = [] if times is None else np.atleast_1d(real_array(times)).tolist()
-        return tuple(checked_number("times", t, least=self.start_time) for t in numbers)
-
     def _check(self, fmu: FMU) -> None:
-        """Raise a ValueError if variables are not in the FMU or cannot be set."""
+        """Raise a ValueError if variables are not in the FMU; take the units of parameters."""
         moving = [name for name in self.signals if name != "time"]
         values = [name for name in self.input_names if name != "time"]
         given = [*values, *self.unknowns, *self.start_values, *moving]
-        twice = sorted({name for name in given if given.count(name) > 1})
-        if twice:
-            raise ValueError(
-                f"{twice[0]!r} is given twice: in inputs, unknowns, start_values or signals."
-            )
-        for name in (*values, *self.unknowns, *self.start_values):
-            fmu.check_settable(name)
-        for name in moving:
-            if fmu.variable(name).causality != "input":
+        for name in (*given, *self.output_names):
+            variable = fmu.variable(name)
+            if given.count(name) > 1:
+                raise ValueError(
+                    f"{name!r} is given twice: in inputs, unknowns, start_values or signals."
+                )
+            if name in given and name not in moving:
+                fmu.check_settable(name)
+            if name in moving and variable.causality != "input":
                 raise ValueError(f"Expected signals of inputs of {fmu.name}; {name!r} is not one.")
-        for name in self.output_names:
-            fmu.variable(name)
+            if name in self.unknowns and not self.unknowns[name].unit:
+                unit = variable.unit or getattr(variable.declaredType, "unit", None) or ""
+                self.unknowns[name] = replace(self.unknowns[name], unit=unit)
         left = [name for name in fmu.states if name not in given]
         if left and self.times and {*values} & {*self.output_names} & {*fmu.states}:
             raise ValueError(
@@ -218,13 +208,6 @@ class FMUPhysics(BlackBoxPhysics):
                 f"{fmu.name} would begin each step at its start value: add it to inputs and "
                 "outputs, or, if it does not matter, to start_values."
             )
-
-
-def _names(argument: str, names: Sequence[str]) -> tuple[str, ...]:
-    """Return names of variables, checked."""
-    if isinstance(names, str) or not names or not all(isinstance(n, str) for n in names):
-        raise TypeError(f"{argument} must be a list of names of variables; found {names!r}.")
-    return tuple(names)
 
 
 def _signals(signals: Any) -> dict[str, NDArray[np.float64]]:
