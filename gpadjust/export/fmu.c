@@ -8,12 +8,10 @@
 #else
 #define EXPORT __attribute__((visibility("default")))
 #endif
-#define DOES_NOTHING(name, ...) EXPORT int name(__VA_ARGS__) { return 0; }
-#define REFUSED(name, ...) EXPORT int name(__VA_ARGS__) { return 3; }
-#define NO_VALUES(name, ...) EXPORT int name(__VA_ARGS__) { return n ? 3 : 0; }
+#define RETURNS(status, name) EXPORT int name() { return status; }
 #define NONE_OF(type, value) \
-    NO_VALUES(fmi2Get##type, void *c, const unsigned r[], size_t n, value v[]) \
-    NO_VALUES(fmi2Set##type, void *c, const unsigned r[], size_t n, const value v[])
+    EXPORT int fmi2Get##type(void *c, const unsigned r[], size_t n, value v[]) { return n ? 3 : 0; } \
+    EXPORT int fmi2Set##type(void *c, const unsigned r[], size_t n, value v[]) { return n ? 3 : 0; }
 
 typedef struct {
     void (*log)(void *, const char *, int, const char *, const char *, ...);
@@ -90,26 +88,24 @@ EXPORT int fmi2GetFMUstate(Instance *c, Instance **state)
 }
 EXPORT int fmi2SetFMUstate(Instance *c, const Instance *state) { *c = *state; return 0; }
 EXPORT int fmi2FreeFMUstate(void *c, void **state) { free(*state); *state = NULL; return 0; }
-DOES_NOTHING(fmi2SetDebugLogging, void *c, int on, size_t n, const char *const k[])
-DOES_NOTHING(fmi2SetupExperiment, void *c, int d, double t, double a, int s, double b)
-DOES_NOTHING(fmi2EnterInitializationMode, void *c)
-DOES_NOTHING(fmi2ExitInitializationMode, void *c)
-DOES_NOTHING(fmi2Terminate, void *c)
 NONE_OF(Integer, int)
 NONE_OF(Boolean, int)
-NONE_OF(String, char *)
-NO_VALUES(fmi2SetRealInputDerivatives, void *c, const unsigned r[], size_t n, const int o[],
-          const double v[])
-NO_VALUES(fmi2GetRealOutputDerivatives, void *c, const unsigned r[], size_t n, const int o[],
-          double v[])
-REFUSED(fmi2GetDirectionalDerivative, void *c, const unsigned u[], size_t n, const unsigned k[],
-        size_t m, const double a[], double b[])
-REFUSED(fmi2SerializedFMUstateSize, void *c, void *state, size_t *size)
-REFUSED(fmi2SerializeFMUstate, void *c, void *state, char bytes[], size_t size)
-REFUSED(fmi2DeSerializeFMUstate, void *c, const char bytes[], size_t size, void **state)
-REFUSED(fmi2CancelStep, void *c)
-REFUSED(fmi2GetStatus, void *c, int kind, int *value)
-REFUSED(fmi2GetRealStatus, void *c, int kind, double *value)
-REFUSED(fmi2GetIntegerStatus, void *c, int kind, int *value)
-REFUSED(fmi2GetBooleanStatus, void *c, int kind, int *value)
-REFUSED(fmi2GetStringStatus, void *c, int kind, const char **value)
+NONE_OF(String, const char *)
+RETURNS(0, fmi2SetDebugLogging)
+RETURNS(0, fmi2SetupExperiment)
+RETURNS(0, fmi2EnterInitializationMode)
+RETURNS(0, fmi2ExitInitializationMode)
+RETURNS(0, fmi2Terminate)
+/* Optional, and not there by modelDescription.xml. */
+RETURNS(3, fmi2SetRealInputDerivatives)
+RETURNS(3, fmi2GetRealOutputDerivatives)
+RETURNS(3, fmi2GetDirectionalDerivative)
+RETURNS(3, fmi2SerializedFMUstateSize)
+RETURNS(3, fmi2SerializeFMUstate)
+RETURNS(3, fmi2DeSerializeFMUstate)
+RETURNS(3, fmi2CancelStep)
+RETURNS(3, fmi2GetStatus)
+RETURNS(3, fmi2GetRealStatus)
+RETURNS(3, fmi2GetIntegerStatus)
+RETURNS(3, fmi2GetBooleanStatus)
+RETURNS(3, fmi2GetStringStatus)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import atexit
 import os
-import shutil
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -13,6 +11,7 @@ from ctypes import c_double
 from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from threading import Lock
 from typing import Any
 
@@ -56,7 +55,6 @@ class FMU:
             platforms = fmpy.supported_platforms(path)
         except Exception as error:
             raise ValueError(f"Expected {path} as an FMU; it cannot be read: {error}") from error
-        self.is_2 = description.fmiVersion[0] == "2"
         kinds = dict(zip(KINDS, (description.coSimulation, description.modelExchange), strict=True))
         has = [name for name, interface in kinds.items() if interface is not None]
         if description.fmiVersion[0] not in "23" or not has or kind not in (None, *has):
@@ -75,12 +73,11 @@ class FMU:
         self.variables = {each.name: each for each in description.modelVariables}
         self.states: list[str] = [u.variable.derivative.name for u in description.derivatives]
         step = getattr(description.coSimulation, "fixedInternalStepSize", None)
-        self.step = step or getattr(description.defaultExperiment, "stepSize", None)
+        self.step = float(step or getattr(description.defaultExperiment, "stepSize", None) or 0.0)
         self._instance: Any = None
         self._errors: list[Exception] = []  # the first one of the instance
-        self._folder = fmpy.extract(path)
-        self._process = os.getpid()
-        atexit.register(self._close)
+        self._folder = TemporaryDirectory(ignore_cleanup_errors=True)
+        fmpy.extract(path, self._folder.name)
 
     def variable(self, name: str) -> Any:
         """Return the description of a scalar number, or raise a ValueError."""
@@ -120,8 +117,8 @@ class FMU:
         signals: Mapping[str, Array],
         step: float | None,
         tolerance: float,
-    ) -> tuple[Array, Exception | None]:
-        """Return outputs ``N x m`` at the times, and the error from which on they are NaN, or None.
+    ) -> Array:
+        """Return outputs ``N x m`` at the times.
 
         Args:
             values: Start values and parameters by name.
@@ -136,20 +133,15 @@ class FMU:
 
         changes, end = signals["time"], float(times.max())
         points = np.unique([start, *times, *changes[(start < changes) & (changes < end)]])
-        duration = end - start or 1.0
-        stop = end
+        step, stop = step or self.step or end - start or 1.0, end
         if self.kind == "ModelExchange":
-            step, stop = duration / _INTERVALS, start + _LONGER * (end - start)
+            step, stop = (end - start) / _INTERVALS or 1.0, start + _LONGER * (end - start)
         names = {*values, *outputs, *signals}
         description = copy(self.description)  # FMPy goes through all variables of one
         description.modelVariables = [v for v in self.variables.values() if v.name in names]
-        recorder: Any = None
-        failure: Exception | None = None
 
-        def go_on(time: float, of_steps: Any) -> bool:
-            nonlocal recorder
-            recorder = of_steps
-            if time < end - _SAME * duration:
+        def go_on(time: float, recorder: Any) -> bool:
+            if time < end - _SAME * (end - start):
                 return True
             recorder.sample(time)
             return False
@@ -157,8 +149,8 @@ class FMU:
         with _lock:
             _messages.clear()
             try:
-                result = simulate_fmu(
-                    self._folder,
+                found = simulate_fmu(
+                    self._folder.name,
                     model_description=description,
                     fmu_instance=self._begun(values),
                     fmi_type=self.kind,
@@ -167,32 +159,34 @@ class FMU:
                     stop_time=stop,
                     set_stop_time=stop == end,
                     step_finished=go_on,
-                    output_interval=float(step or self.step or duration),
+                    output_interval=step,
                     relative_tolerance=tolerance,
                     start_values=dict(values),
                     input=self._input(values, points, signals),
                     output=names,
                 )
             except BaseException as error:
-                failure = self._errors[0] if self._errors else error  # type: ignore[assignment]
+                failure = self._errors[0] if self._errors else error
                 self._free()
-                if not isinstance(failure, Exception):
-                    raise
                 failure.stderr = "; ".join(_messages)  # type: ignore[attr-defined]
-                if recorder is None:
-                    raise failure from None
-                result = recorder.result()
-        self._check_start(result[0], values)
-        missing = points[~_places(result["time"], points)[1]]
-        if failure is None and len(missing):
-            failure = RuntimeError(
-                f"no step ends at t = {missing[0]:g}, the last one at {result['time'][-1]:g}. The "
+                raise failure from None
+        for name, value in values.items():
+            first = float(found[name][0])
+            if not abs(first - value) <= 1e-6 * max(1.0, abs(value)):
+                raise ValueError(
+                    f"{name!r} is {first:g} after its start value was set to {value:g}: the FMU "
+                    "computes it or rounds it. Name the parameter of its start value, or take "
+                    "model exchange, whose states can be set"
+                )
+        missing = points[~np.isclose(found["time"][_places(found, points)], points, _SAME, 0)]
+        if len(missing):
+            raise RuntimeError(
+                f"no step ends at t = {missing[0]:g}, the last one at {found['time'][-1]:g}. The "
                 "FMU ended the simulation, or takes steps of one length alone: give a "
                 "communication_step of which the times, also of signals, are multiples"
             )
-        place, is_there = _places(result["time"], times)
-        table = np.stack([result[name][place].astype(float) for name in outputs], axis=-1)
-        return np.where(is_there[:, None], table, np.nan), failure
+        place = _places(found, times)
+        return np.stack([found[name][place].astype(float) for name in outputs], axis=-1)
 
     def _input(
         self,
@@ -231,7 +225,7 @@ class FMU:
         """Return an instance that keeps its first error, even one that CVode passes over."""
         from fmpy import instantiate_fmu
 
-        fmu = instantiate_fmu(self._folder, self.description, self.kind, logger=_log)
+        fmu = instantiate_fmu(self._folder.name, self.description, self.kind, logger=_log)
         # For FMI 2 FMPy has one logger for all FMUs, that of the last instance, alive or not.
         _kept.append(fmu.callbacks)
         call, errors = fmu._call, self._errors
@@ -253,7 +247,9 @@ class FMU:
     def _set_states_at_first_update(self, values: Mapping[str, float]) -> None:
         """Let the first update of discrete states set continuous states by name, too."""
         fmu, n = self._instance, len(self.states)
-        function = "newDiscreteStates" if self.is_2 else "updateDiscreteStates"
+        function = (
+            "newDiscreteStates" if hasattr(fmu, "newDiscreteStates") else "updateDiscreteStates"
+        )
         update = getattr(fmu, function)
 
         def first() -> Any:
@@ -270,17 +266,6 @@ class FMU:
 
         setattr(fmu, function, first)
 
-    def _check_start(self, first: Any, values: Mapping[str, float]) -> None:
-        """Raise a ValueError if a variable is not at the value to which it was set."""
-        for name, value in values.items():
-            found = float(first[name])
-            if not abs(found - value) <= 1e-6 * max(1.0, abs(value)):
-                raise ValueError(
-                    f"{name!r} is {found:g} after its start value was set to {value:g}: the FMU "
-                    "computes it or rounds it. Name the parameter of its start value, or take "
-                    "model exchange, whose states can be set"
-                )
-
     def _free(self) -> None:
         """Free the instance, unless it is dead."""
         is_dead = any(getattr(error, "status", None) == _FATAL for error in self._errors)
@@ -289,12 +274,6 @@ class FMU:
             with suppress(Exception):
                 self._instance.freeInstance()
         self._instance = None
-
-    def _close(self) -> None:
-        """Free the instance, and remove the folder."""
-        if os.getpid() == self._process:
-            self._free()
-            shutil.rmtree(self._folder, ignore_errors=True)
 
 
 @cache
@@ -312,7 +291,7 @@ def _log(*message: Any) -> None:
     _messages.append(message[-1].decode(errors="replace").strip())
 
 
-def _places(steps: Array, times: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the first of the steps that is at each time, but for rounding, and whether it is."""
-    place = np.searchsorted(steps, times - _SAME * np.abs(times)).clip(max=len(steps) - 1)
-    return place, np.isclose(steps[place], times, rtol=_SAME, atol=0)
+def _places(found: Any, times: Array) -> NDArray[np.int64]:
+    """Return the places of the first results at times, but for rounding errors."""
+    places = np.searchsorted(found["time"], times - _SAME * np.abs(times))
+    return places.clip(max=len(found) - 1)

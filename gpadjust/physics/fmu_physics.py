@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,8 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gpadjust.checks import check_choice, checked_number, real_array
-from gpadjust.physics.black_box import BlackBoxPhysics
-from gpadjust.physics.error import PhysicsError, described
+from gpadjust.physics.black_box import BlackBoxPhysics, call_row
+from gpadjust.physics.error import PhysicsError
 from gpadjust.physics.fmu import FMU, KINDS, opened
 from gpadjust.physics.parameters import ParameterValues
 from gpadjust.physics.unknown import Unknown
@@ -30,11 +29,12 @@ class FMUPhysics(BlackBoxPhysics):
     - Dynamics: inputs are states and actions, outputs the states, ``times`` the control step. A
       state can be set if its start value can, or by model exchange.
     - Values over time: one of the inputs is ``"time"``, the FMU's independent variable. Rows that
-      differ in it alone share a simulation; they agree with single ones within the tolerance.
+      differ in it alone share a simulation, and fail together; they agree with single ones within
+      the tolerance.
 
-    Names are those of the FMU, such as ``"wall[1].T"``. An instance that has finished is reset for
-    the next row. Rows run in parallel and are remembered as of a
-    :class:`~gpadjust.BlackBoxPhysics`; a process has one instance of an FMU that permits no more.
+    Names are those of the FMU, such as ``"wall[1].T"``. A process has one instance, which is reset
+    for the next row. Rows run in parallel, in processes, and are remembered as of a
+    :class:`~gpadjust.BlackBoxPhysics`.
 
     Args:
         fmu: The file.
@@ -92,7 +92,7 @@ class FMUPhysics(BlackBoxPhysics):
     ) -> None:
         path = Path(fmu).resolve()
         super().__init__(
-            self.simulate,  # type: ignore[arg-type]  # which evaluate calls, of several rows
+            self.simulate,
             unknowns=unknowns,
             batched=False,
             gradient=gradient,
@@ -149,39 +149,31 @@ class FMUPhysics(BlackBoxPhysics):
             place = np.unique(others, axis=0, return_inverse=True)[1].ravel()
         order = np.argsort(place, kind="stable")
         groups = np.split(order, np.cumsum(np.bincount(place))[:-1])
-        found = Parallel()(delayed(self.simulate)(rows[group]) for group in groups)
-        results = dict(zip(order.tolist(), chain(*found), strict=True))
+        found = Parallel()(delayed(call_row)(self.simulate, rows[group]) for group in groups)
+        results = dict[int, NDArray[np.float64] | PhysicsError]()
+        for group, y in zip(groups, found, strict=True):
+            parts = [y] * len(group) if isinstance(y, PhysicsError) else np.split(y, len(group))
+            results |= dict(zip(group.tolist(), parts, strict=True))
         return self._gathered([results[i] for i in range(len(rows))])
 
-    def simulate(self, rows: NDArray[np.float64]) -> list[NDArray[np.float64] | PhysicsError]:
-        """Return outputs ``(m,)`` or the error of each of ``N x (d + p)`` rows of one simulation.
-
-        The rows differ in time alone.
-        """
+    def simulate(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the outputs, ``N m``, of ``N x (d + p)`` rows that differ in time alone."""
         values = dict(zip((*self.input_names, *self.unknowns), rows[0].tolist(), strict=True))
         times = np.tile(self.times, (len(rows), 1))
         if values.pop("time", None) is not None:
             times = rows[:, [self.input_names.index("time")]]
-        try:
-            if times.min() < self.start_time:
-                raise ValueError(f"expected times from start_time={self.start_time:g} on")
-            found, error = opened(self.path, self.kind).simulate(
-                self.start_values | values,
-                self.start_time,
-                times.ravel(),
-                self.output_names,
-                self.signals,
-                self.communication_step,
-                self.tolerance,
-            )
-        except Exception as caught:
-            found, error = np.full((times.size, 1), np.nan), caught
-        results = [*found.reshape(len(rows), -1)]
-        if error is None:
-            return results
-        failure = PhysicsError(described(error))
-        failure.__cause__ = error
-        return [failure if np.isnan(row).any() else row for row in results]
+        if times.min() < self.start_time:
+            raise ValueError(f"expected times from start_time={self.start_time:g} on")
+        found = opened(self.path, self.kind).simulate(
+            self.start_values | values,
+            self.start_time,
+            times.ravel(),
+            self.output_names,
+            self.signals,
+            self.communication_step,
+            self.tolerance,
+        )
+        return found.ravel()
 
     def _check(self, fmu: FMU) -> None:
         """Raise a ValueError if variables are not in the FMU; take the units of parameters."""
@@ -214,11 +206,10 @@ def _signals(signals: Any) -> dict[str, NDArray[np.float64]]:
     """Return signals by name, with their times."""
     if signals is None:
         return {"time": np.array([-np.inf])}  # nothing changes
-    found = {str(name): np.atleast_1d(real_array(signals[name])) for name in signals}
-    times = found.get("time", np.empty(0))
-    is_table = times.ndim == 1 and all(each.shape == times.shape for each in found.values())
-    if len(found) < 2 or not is_table or not len(times) or (np.diff(times) <= 0).any():
-        shapes = {name: each.shape for name, each in found.items()}
+    found = {str(name): real_array(signals[name]) for name in signals}
+    shapes = {name: each.shape for name, each in found.items()}
+    is_table = "time" in found and len(found) > 1 and len({*shapes.values()}) == 1
+    if not is_table or found["time"].ndim != 1 or not (np.diff(found["time"]) > 0).all():
         raise ValueError(
             "Expected signals as columns of one length, 'time', ascending, and one or more inputs; "
             f"found {shapes}."

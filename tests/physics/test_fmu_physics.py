@@ -132,14 +132,15 @@ def test_rows_that_fail_are_named_with_the_words_of_the_fmu(fmi, kind):
 
 
 @pytest.mark.parametrize(("fmi", "kind"), KINDS)
-def test_a_simulation_that_breaks_off_has_the_values_before(fmi, kind):
+def test_a_simulation_that_breaks_off_fails_in_all_its_rows(fmi, kind):
     options = {"communication_step": 1.0, "kind": kind}
     physics = FMUPhysics(fmu("tank", fmi), ["heater", "time"], ["tank.T"], **options)
-    rows = torch.tensor([[40000.0, 5.0], [40000.0, 9.0], [0.0, 9.0]]).double()
+    rows = torch.tensor([[40000.0, 9.0], [0.0, 9.0], [40000.0, 5.0]]).double()
     with pytest.raises(PhysicsError, match="the tank boils") as caught:
         physics(rows)
-    assert caught.value.rows == (1,)
-    assert physics.or_nan(rows).isnan().flatten().tolist() == [False, True, False]
+    assert caught.value.rows == (0, 2)
+    assert physics.or_nan(rows).isnan().flatten().tolist() == [True, False, True]
+    assert physics(rows[2:]).isfinite().all()
 
 
 @pytest.mark.parametrize("only_one", [False, True])
