@@ -25,6 +25,7 @@ CHAPTERS = {
     "control": ("Known", "First"),
     "published": ("Masses", "Uci", "Emps", "Freeruns", "Formula", "Nist"),
     "machines": ("Real", "Tanks"),
+    "simulators": ("Simulators",),
 }
 """Folders, and the classes of the experiments that they declare."""
 EXPERIMENTS = {

@@ -13,13 +13,13 @@ from itertools import accumulate
 from pathlib import Path
 from string import Template
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from xml.etree.ElementTree import Element, SubElement, tostring
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
-from gpadjust.core import GP
-from gpadjust.dynamics import LearnedDynamics
+from gpadjust.dynamics import Dynamics
 from gpadjust.export.c_program import c_source
+from gpadjust.export.equations import own_dynamics
 from gpadjust.export.finite_sum import model_of
 
 _SYSTEMS = {"linux": ("linux", ".so"), "darwin": ("darwin", ".dylib"), "win32": ("win", ".dll")}
@@ -35,7 +35,7 @@ class _Variable(NamedTuple):
 
 
 def export_fmu(
-    fitted: GP | LearnedDynamics,
+    fitted: Any,
     path: str | Path,
     *,
     physics: str | None = None,
@@ -53,10 +53,10 @@ def export_fmu(
       outputs the states, whose start values can be set, and the standard deviations of that step.
 
     What f_p returns is a further input of each output, ``f_p_NAME``: connect your model to it, or
-    give f_p in C.
+    give f_p in C. It is within where :func:`c_source` has it.
 
     Args:
-        fitted: The model, or dynamics that have learnt.
+        fitted: The model, dynamics that have learnt, or an identification.
         path: The file, ``NAME.fmu``, with a name of C.
         physics: f_p in C, to take the place of its inputs: statements that set ``f_p[0]`` and so
             on, from the columns ``x[0]`` and so on that the physics reads. ``math.h`` is there.
@@ -78,13 +78,13 @@ def export_fmu(
         >>> export_fmu(model, "pump.fmu", physics="f_p[0] = x[0];")  # doctest: +SKIP
         PosixPath('pump.fmu')
     """
-    path = Path(path)
+    path, fitted = Path(path), own_dynamics(fitted)
     name = path.stem
     code = c_source(fitted, name, variance=variance, observation_noise=observation_noise)
     signature = rf"^void {name}_(predict|step)\(([^)]*)\)"
     ((function, text),) = re.findall(signature, code, re.MULTILINE)
     arguments = re.findall(r"\*(\w+)", text)
-    spec = fitted.spec if isinstance(fitted, LearnedDynamics) else None
+    spec = fitted.spec if isinstance(fitted, Dynamics) else None
     step = spec.step if spec else None
     if spec and step is None:
         raise ValueError("Expected the duration of a step: StateSpec(..., step=0.1).")
@@ -134,22 +134,20 @@ def export_fmu(
     return path
 
 
-def _variables(
-    fitted: GP | LearnedDynamics, arguments: list[str], has_physics: bool
-) -> dict[str, list[_Variable]]:
+def _variables(fitted: Any, arguments: list[str], has_physics: bool) -> dict[str, list[_Variable]]:
     """Return the variables by arguments of the program, in the order of their references."""
-    model, f_p = model_of(fitted), list[str]()
-    if isinstance(fitted, LearnedDynamics):
+    f_p = list[str]()
+    if isinstance(fitted, Dynamics):
         spec = fitted.spec
         first: float | None = 0.0
         inputs, outputs, start = spec.actions, spec.states, [0.0] * spec.action_dim
         returned = [spec.states[i] for i in spec.moving]
     else:
-        data, first = model.data, None
+        data, first = model_of(fitted).data, None
         inputs, outputs, start = data.input_names, data.output_names, data.X[0].tolist()
         returned = [*outputs]
     if "f_p" in arguments:
-        several = len(model.physics)
+        several = len(model_of(fitted).physics)
         heads = [f"f_p{i + 1}" for i in range(several)] if several > 1 else ["f_p"]
         f_p = [f"{head}_{output}" for head in heads for output in returned]
     computed = ("local", None) if has_physics else ("input", 0.0)
