@@ -36,6 +36,7 @@ _MEDIUM, _SHARED = 100, 200  # up to these they are moved; the latter if outputs
 _FIRST = 4  # draws from Laplace's approximation for each one that is kept
 _SELDOM = 1e-3  # a nested model of less probability at its mode is not drawn from
 _OF_NUTS = 1000  # draws, a multiple of 16
+_BEFORE_NUTS = 512  # draws of the default fit, around which chains jump
 _SEARCHES = 4  # for the mode
 _STEPS, _STEPS_OF_SHARED = 2_000, 200  # the latter with a fit by least squares, and begun again
 _NEAR = 0.3  # difference of all coordinates below which two searches have found the same mode
@@ -197,7 +198,8 @@ def _fitted(model: GP, method: str, num_draws: int | None, seed: int) -> FitResu
         return FitResult(method)
     if method == "nuts":
         number = num_draws or _OF_NUTS
-        draws, rhat = nuts(model, modes(model, 0, seed, is_precise=True)[0], number, seed)
+        first = _sampled(model, _BEFORE_NUTS, seed)[0].u
+        draws, rhat = nuts(model, first, number, seed)
         model.set_draws(draws, number // 4)
         return FitResult(method, num_draws=len(model.u), rhat=rhat)
     number, kept = _default_numbers(model) if num_draws is None else (num_draws, num_draws // 4)

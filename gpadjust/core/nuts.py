@@ -2,59 +2,119 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from gpadjust.core.sample import LogLikelihood, around_mode, white_density
+from gpadjust.core.sample import LogLikelihood, lower_root, white_density
 
 if TYPE_CHECKING:
     from gpadjust.core.model import GP
 
 CHAINS = 4
-_DEPTH = 7  # of a trajectory, 128 steps at most
+_DEPTH = 5  # of a trajectory, 32 steps at most
+_WARMING = 2  # draws of a chain that are kept for each step before, which adapts
+_JUMPS = 16  # proposals after each trajectory
+_WIDTH = 0.5  # of a proposal around a draw, in standard deviations of all draws
+_FROM_PRIOR = 0.1  # share of proposals, so that densities are bounded by those of proposals
 
 
-def nuts(model: GP, mode: Tensor, number: int, seed: int) -> tuple[Tensor, float]:
+def nuts(model: GP, draws: Tensor, number: int, seed: int) -> tuple[Tensor, float]:
     """Return ``number x B x P`` draws of four chains, one after the other, and the worst R-hat.
 
-    Chains begin with draws from Laplace's approximation at a mode ``B x P``, half as wide again,
-    whose coordinates they move in. R-hat is that of halves of the chains (Gelman et al. 2013).
+    Chains move in coordinates in which other draws, ``N x B x P``, are white. A trajectory of NUTS
+    is followed by Metropolis jumps to points around these draws or from the prior, so that chains
+    change from one mode to another. Where proposals are from does not change what is drawn from,
+    only how soon chains agree. R-hat is that of halves of the chains (Gelman et al. 2013).
 
     Raises:
         ImportError: Without Pyro, ``pip install "gpadjust[pyro]"``.
     """
     try:
-        from pyro.infer import MCMC, NUTS  # here alone, as it takes a second
+        from pyro.infer import NUTS  # here alone, as it takes a second
         from pyro.ops.stats import split_gelman_rubin
     except ImportError as error:
         raise ImportError('"nuts" needs Pyro; run `pip install "gpadjust[pyro]"`.') from error
-    start, _ = around_mode(model.log_likelihood, mode, bool(model.table.shared))
-    density = partial(white_density, model.log_likelihood, start.mean, start.root)
+    jumps, size = _Jumps(model, draws), number // CHAINS
+    warm = size // _WARMING
 
     def potential(v: dict[str, Tensor]) -> Tensor:
-        return _Potential.apply(v["v"], density)
+        return _Potential.apply(v["v"], jumps.density)
 
     chains = []
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         for _ in range(CHAINS):
-            v = torch.randn_like(mode)
-            if not density(v.unsqueeze(0), False)[0].isfinite().all():
-                v = torch.zeros_like(v)
+            proposed = jumps.proposed((warm + size) * _JUMPS)
+            ratios = jumps.log_ratio(proposed).unflatten(0, (-1, _JUMPS))
+            proposed = proposed.unflatten(0, (-1, _JUMPS))
+            # The first proposal that is possible.
+            possible = ratios[0].isfinite().to(torch.int8).argmax(0)
+            v = proposed[0, possible, torch.arange(len(possible))]
             kernel = NUTS(potential_fn=potential, full_mass=True, max_tree_depth=_DEPTH)
-            size = number // CHAINS
-            mcmc = MCMC(
-                kernel, size, warmup_steps=size, initial_params={"v": v}, disable_progbar=True
-            )
-            mcmc.run()
-            chains.append(mcmc.get_samples()["v"].detach())
-    v = torch.stack(chains)
-    u = start.mean + (start.root @ v.unsqueeze(-1)).squeeze(-1)
+            kernel.initial_params = {"v": v}
+            kernel.setup(warm)
+            chain = []
+            for others, by in zip(proposed, ratios, strict=True):
+                v = kernel.sample({"v": v})["v"].detach()
+                v = jumps.moved(v, others, by)
+                kernel.clear_cache()
+                chain.append(v)
+            chains.append(torch.stack(chain[warm:]))
+    u = jumps.coordinates(torch.stack(chains))
     used = u.std((0, 1)) > 0
     return u.flatten(0, 1), float(split_gelman_rubin(u, 0, 1)[used].max())
+
+
+class _Jumps:
+    """Proposals around draws ``N x B x P`` or from the prior, in coordinates v of white draws."""
+
+    def __init__(self, model: GP, draws: Tensor) -> None:
+        away = (draws - draws.mean(0)).movedim(0, -1) / math.sqrt(len(draws) - 1)  # B x P x N
+        floor = 1e-6 * torch.eye(draws.shape[-1]).to(draws).expand(len(away), -1, -1)
+        self.mean, self.root = draws.mean(0), lower_root(torch.cat([away, floor], -1))
+        self.density = partial(white_density, model.log_likelihood, self.mean, self.root)
+        self.draws = self._white(draws)
+
+    def coordinates(self, v: Tensor) -> Tensor:
+        """Return u = mean + root v, ``... x B x P``."""
+        return self.mean + (self.root @ v.unsqueeze(-1)).squeeze(-1)
+
+    def proposed(self, number: int) -> Tensor:
+        """Return proposals v, ``number x B x P``."""
+        z = torch.randn(number, *self.mean.shape, dtype=self.mean.dtype).to(self.mean)
+        near = self.draws[torch.randint(len(self.draws), (number,))] + _WIDTH * z
+        is_prior = torch.rand(number, 1, 1).to(z) < _FROM_PRIOR
+        return torch.where(is_prior, self._white(z), near)
+
+    @torch.no_grad()
+    def log_ratio(self, v: Tensor) -> Tensor:
+        """Return the log density less that of the proposals at v, ``N x B``, but for a constant."""
+        distances = torch.cdist(v.movedim(1, 0), self.draws.movedim(1, 0)).movedim(0, 1)
+        # q(v) = (1 - a) mean_i N(v; v_i, h^2 I) + a N(u; 0, I) |root|
+        near = (-0.5 * (distances / _WIDTH).square()).logsumexp(-1) - math.log(len(self.draws))
+        near = near - self.mean.shape[-1] * math.log(_WIDTH) + math.log(1 - _FROM_PRIOR)
+        log_det = self.root.diagonal(dim1=-1, dim2=-2).log().sum(-1)
+        prior = log_det - 0.5 * self.coordinates(v).square().sum(-1) + math.log(_FROM_PRIOR)
+        value = self.density(v, False)[0] - 0.5 * v.square().sum(-1)
+        return (value - torch.logaddexp(near, prior)).nan_to_num(nan=-math.inf)
+
+    def moved(self, v: Tensor, others: Tensor, ratios: Tensor) -> Tensor:
+        """Return v ``B x P`` after jumps to others, ``J x B x P``, by ratios ``J x B``."""
+        here = self.log_ratio(v.unsqueeze(0))[0]
+        for other, ratio in zip(others, ratios, strict=True):
+            taken = torch.rand(len(v)).to(v) < (ratio - here).exp()
+            v = torch.where(taken.unsqueeze(-1), other, v)
+            here = torch.where(taken, ratio, here)
+        return v
+
+    def _white(self, u: Tensor) -> Tensor:
+        """Return v at u, ``N x B x P``."""
+        away = (u - self.mean).unsqueeze(-1)
+        return torch.linalg.solve_triangular(self.root, away, upper=False).squeeze(-1)
 
 
 class _Potential(torch.autograd.Function):

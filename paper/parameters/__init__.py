@@ -54,8 +54,8 @@ class Parameters(Experiment):
 class NutsSettings:
     """Settings that decide the numbers."""
 
-    num_draws: int = 240
-    """of NUTS, in four chains, after as many that are not kept"""
+    num_draws: int = 1000
+    """of NUTS, in four chains, after half as many that are not kept"""
 
 
 @dataclass(frozen=True, kw_only=True)
