@@ -113,16 +113,18 @@ def fit(
     share unknown numbers, as parameters of a physics) its draws are weighted once and not moved.
     Nested models are drawn from apart and pooled by their posterior probabilities. ``"map"``
     brings the numbers of the whole model to their most likely values. ``"nuts"`` draws from the
-    same density by Pyro's NUTS, in four chains: a slow reference, of a model without nested ones.
+    same density by Pyro's NUTS, in four chains that also jump around draws of the default fit: a
+    slow reference, of a model without nested ones.
     After five seconds a bar of tqdm shows that it goes on.
 
     Args:
         model: The model.
         method: ``"bayes"``, ``"map"`` or ``"nuts"``.
-        num_draws: Number of draws, a multiple of 4; predictions average over a quarter of them.
-            Default: 80, 32 (of more than 40 points) or 16 (of more than 100), or 256, 128 or 64 if
-            outputs share unknown numbers, as parameters of a physics; predictions then average over
-            16, 8 or 4 of them. Of NUTS 1,000, after as many that are not kept.
+        num_draws: Number of draws, a multiple of 4 (of NUTS from 16 on); predictions average over a
+            quarter of them. Default: 80, 32 (of more than 40 points) or 16 (of more than 100), or
+            256, 128 or 64 if outputs share unknown numbers, as parameters of a physics; predictions
+            then average over 16, 8 or 4 of them. Of NUTS 1,000, after half as many that are not
+            kept.
         seed: Seed.
 
     Warns:
@@ -145,8 +147,11 @@ def fit(
         raise ValueError(f"Unknown method {method!r}; expected 'bayes', 'map' or 'nuts'.")
     if method == "nuts":
         _check_density(model)
-    if num_draws is not None and (num_draws < 4 or num_draws % 4):
-        raise ValueError(f"Expected num_draws as a multiple of 4; found {num_draws}.")
+    least = 4 * CHAINS if method == "nuts" else 4  # R-hat needs four draws a chain
+    if num_draws is not None and (num_draws < least or num_draws % 4):
+        raise ValueError(
+            f"Expected num_draws as a multiple of 4, from {least} on; found {num_draws}."
+        )
     if model.data.Y.dim() > 2:
         batch = tuple(model.batch_shape)
         raise ValueError(f"Expected a model of one data set; found fantasies, a batch {batch}.")

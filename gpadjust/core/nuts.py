@@ -25,10 +25,11 @@ _FROM_PRIOR = 0.1  # share of proposals, so that densities are bounded by those 
 def nuts(model: GP, draws: Tensor, number: int, seed: int) -> tuple[Tensor, float]:
     """Return ``number x B x P`` draws of four chains, one after the other, and the worst R-hat.
 
-    Chains move in coordinates in which other draws, ``N x B x P``, are white. A trajectory of NUTS
-    is followed by Metropolis jumps to points around these draws or from the prior, so that chains
-    change from one mode to another. Where proposals are from does not change what is drawn from,
-    only how soon chains agree. R-hat is that of halves of the chains (Gelman et al. 2013).
+    Chains move in coordinates in which draws of the default fit, ``N x B x P``, are white. After
+    each trajectory of NUTS come jumps from mode to mode: Metropolis steps whose proposals are
+    points around these draws, or from the prior (an independence sampler, Tierney 1994). The
+    draws decide how soon chains agree, not the density that chains draw from. R-hat compares
+    halves of the chains (Gelman et al. 2013).
 
     Raises:
         ImportError: Without Pyro, ``pip install "gpadjust[pyro]"``.
@@ -51,7 +52,7 @@ def nuts(model: GP, draws: Tensor, number: int, seed: int) -> tuple[Tensor, floa
             proposed = jumps.proposed((warm + size) * _JUMPS)
             ratios = jumps.log_ratio(proposed).unflatten(0, (-1, _JUMPS))
             proposed = proposed.unflatten(0, (-1, _JUMPS))
-            # The first proposal that is possible.
+            # The chain starts with the first possible proposal, wider than the posterior.
             possible = ratios[0].isfinite().to(torch.int8).argmax(0)
             v = proposed[0, possible, torch.arange(len(possible))]
             kernel = NUTS(potential_fn=potential, full_mass=True, max_tree_depth=_DEPTH)

@@ -7,6 +7,7 @@ import torch
 
 from gpadjust import CKA, CalibratedPhysics, FunctionPhysics, Unknown, fit
 from gpadjust.core import SamplingWarning
+from gpadjust.core.nuts import nuts
 from gpadjust.many import VariationalCKA
 from tests.systems import line, refused, wave
 
@@ -20,21 +21,61 @@ def linear(sd=0.1):
     return CalibratedPhysics(X, 2 * X + sd * noise, torch.full_like(X, sd**2), physics=f_p)
 
 
+def posterior(model):
+    """Return mean and standard deviation of the slope of ``linear``, whose prior is N(1, 1)."""
+    X, Y = model.data.X[:, 0], model.data.Y[:, 0]
+    precision = 1 + float(X.square().sum()) / 0.01
+    return (1 + float((X * Y).sum()) / 0.01) / precision, precision**-0.5
+
+
 @pytest.mark.slow
 def test_draws_of_a_line_are_those_of_its_posterior():
     model = linear()
     result = fit(model, "nuts", num_draws=400)
-    X, Y = model.data.X[:, 0], model.data.Y[:, 0]
-    precision = 1 + X.square().sum() / 0.01
-    mean = (1 + (X * Y).sum() / 0.01) / precision
+    mean, sd = posterior(model)
     found = model.physics_parameters
     assert len(found.draws) == 400
     assert result.converged
     assert result.rhat < 1.05
-    assert float(found.mean) == pytest.approx(float(mean), abs=0.2 * float(precision) ** -0.5)
-    assert float(found.sd) == pytest.approx(float(precision) ** -0.5, rel=0.15)
+    assert float(found.mean) == pytest.approx(mean, abs=0.2 * sd)
+    assert float(found.sd) == pytest.approx(sd, rel=0.15)
     assert "R-hat" in str(result)
     assert model.predict(line(3)).mean.shape == (3, 1)
+
+
+@pytest.mark.slow
+def test_the_draws_that_chains_jump_around_do_not_change_what_is_drawn():
+    model = linear()
+    far = model.u.detach() + 0.3 * torch.randn(64, 1, model.table.size, dtype=torch.float64)
+    u, rhat = nuts(model, far, 400, 0)
+    model.set_draws(u)
+    mean, sd = posterior(model)
+    assert rhat < 1.05
+    assert float(model.physics_parameters.mean) == pytest.approx(mean, abs=0.3 * sd)
+    assert float(model.physics_parameters.sd) == pytest.approx(sd, rel=0.25)
+
+
+def test_chains_jump_between_modes_as_often_as_these_are_likely():
+    X = line(12)
+    f_p = FunctionPhysics(lambda X, p: p.k**2 * X[:, 0], unknowns={"k": Unknown(0.5, sd=1.0)})
+    model = CalibratedPhysics(X, 2 * X, torch.full_like(X, 0.25), physics=f_p)
+    root = 2**0.5
+    k = torch.where(torch.arange(64) % 2 == 0, root, -root).to(X)
+    k = k + 0.1 * torch.randn(64, dtype=X.dtype, generator=torch.Generator().manual_seed(0))
+    row = model.table.shared[0]
+    draws = model.u.detach().expand(64, -1, -1).clone()
+    draws[..., -1] = row.coordinate(k).unsqueeze(-1)  # half of them in each mode
+    u, rhat = nuts(model, draws, 160, 0)
+    model.set_draws(u)
+    positive = (model.physics_parameters.draws > 0).double().mean()
+    # p(k) ~ N(y | k^2 x, 0.25) N(k | 0.5, 1), by sums on a grid.
+    grid = torch.linspace(-4, 4, 4001, dtype=X.dtype)
+    misfit = (2 * X - grid.square() * X).square().sum(0) / 0.25
+    density = (-0.5 * misfit - 0.5 * (grid - 0.5).square()).exp()
+    expected = float(density[grid > 0].sum() / density.sum())
+    assert 0.7 < expected < 0.9
+    assert float(positive) == pytest.approx(expected, abs=0.1)
+    assert rhat < 1.05
 
 
 def test_seeds_and_the_generator_of_the_user():
@@ -60,6 +101,7 @@ def test_refused(monkeypatch):
     X = line(9)
     refused(ValueError, "nested=False", fit, CKA(X, wave(X), physics=wave), "nuts")
     few = VariationalCKA(X, wave(X), physics=wave, num_inducing=4)
+    refused(ValueError, "from 16 on; found 8", fit, linear(), "nuts", num_draws=8)
     refused(ValueError, "no density", fit, few, "nuts")
     monkeypatch.setitem(sys.modules, "pyro.infer", None)
     refused(ImportError, r"gpadjust\[pyro\]", fit, linear(), "nuts")

@@ -428,7 +428,7 @@ REFUSED = [
     ({"physics": "wave"}, TypeError, "physics must be a Physics or a callable"),
     ({"physics": lambda X: X[:, 0] * np.nan}, PhysicsError, "finite"),
     ({"fit_method": "hmc"}, ValueError, "Unknown method 'hmc'; expected 'bayes', 'map' or 'nuts'"),
-    ({"num_draws": 3}, ValueError, "a multiple of 4; found 3"),
+    ({"num_draws": 3}, ValueError, "a multiple of 4, from 4 on; found 3"),
     ({"model": partial(CKA, centre=0)}, TypeError, "option 'centre' of CKA"),
     ({"physics": None, "model": CKA}, TypeError, "argument: 'physics'"),
     ({"model_options": ["log"]}, TypeError, "Expected model_options as a dictionary"),
