@@ -44,10 +44,12 @@ Each object draws itself, and is a table in a notebook::
 
     model.plot()                                 # predictions, rho and delta; also of a mixture
     comparison.plot()                            # of compare: left-out predictions, and scores
+    model.priors().plot()                        # of all numbers; beside them the posterior
     parameters.plot()                            # model.physics_parameters: posterior and prior
     leave_one_out(model).plot()                  # left-out predictions, and their residuals
-    collection.plot()                            # of collect: its path, and the best so far
+    collection.plot()                            # of collect: path and best so far; or regret
     identification.plot()                        # of identify: free runs
+    agent.plot()                                 # its rewards, and the last episode
 
 Beyond the models::
 

@@ -1,4 +1,4 @@
-"""Checks of the numbers, shapes and options that a user gives, progress bars and seeds, for all.
+"""Checks of the numbers, shapes and options that a user gives, and seeds, for all.
 
 A function ``check_...`` raises an error or returns nothing; one called ``checked_...`` also returns
 the value in the form that is worked with. The name of the argument comes first. A wrong kind is a
@@ -8,11 +8,8 @@ TypeError, a wrong value or shape a ValueError; both say what was found and what
 from __future__ import annotations
 
 import math
-import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from contextvars import ContextVar
-from importlib.util import find_spec
 from numbers import Real
 from operator import index
 from typing import Any
@@ -264,82 +261,6 @@ def _check_rows(name: str, bad: Tensor, expected: str) -> None:
 def marked_rows(marked: Tensor) -> list[int]:
     """Return the positions in the last dimension at which something is marked."""
     return sorted({int(where[-1]) for where in marked.nonzero()})
-
-
-class _Hidden:
-    """The methods of a bar of tqdm that this library calls, without a bar."""
-
-    def __init__(self, iterable: Iterable[Any]) -> None:
-        self.iterable, self.n = iterable, 0
-
-    def __enter__(self) -> _Hidden:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        pass
-
-    def __iter__(self) -> Iterator[Any]:
-        return iter(self.iterable)
-
-    def update(self, n: int = 1) -> None:
-        self.n += n
-
-    def set_description(self, text: str) -> None:
-        pass
-
-    def set_postfix(self, **values: object) -> None:
-        pass
-
-
-def progress_bar(shown: bool, iterable: Iterable[Any] = (), **options: Any) -> Any:
-    """Return a bar of tqdm with these options, or an object that goes the same way unseen.
-
-    Raises:
-        ImportError: If it is to be shown, and tqdm is not installed.
-
-    Example:
-        >>> with progress_bar(False, total=3) as bar:
-        ...     bar.update(2)
-        >>> bar.n, [*progress_bar(False, "ab")]
-        (2, ['a', 'b'])
-    """
-    if not shown:
-        return _Hidden(iterable)
-    try:
-        from tqdm import tqdm
-    except ImportError as error:
-        raise ImportError("A progress bar needs tqdm; run `pip install tqdm`.") from error
-    return tqdm(iterable, **options)
-
-
-_BAR: ContextVar[Any] = ContextVar("bar", default=None)
-_PATIENCE = 5.0  # seconds, before long work shows a bar
-
-
-@contextmanager
-def long_work(text: str, unit: str) -> Iterator[None]:
-    """Show a bar of what :func:`tick` counts in a block, if that takes more than five seconds.
-
-    It is shown in a terminal or a notebook, if tqdm is installed.
-    """
-    is_seen = hasattr(sys, "ps1") or (sys.stderr is not None and sys.stderr.isatty())
-    if not is_seen or find_spec("tqdm") is None:
-        yield
-        return
-    options: dict[str, Any] = {"delay": _PATIENCE, "leave": False, "miniters": 1}
-    with progress_bar(True, desc=text, unit=unit, **options) as bar:
-        token = _BAR.set(bar)
-        try:
-            yield
-        finally:
-            _BAR.reset(token)
-
-
-def tick() -> None:
-    """Count a unit of the long work that is going on, if any is."""
-    bar = _BAR.get()
-    if bar is not None:
-        bar.update()
 
 
 @contextmanager

@@ -14,10 +14,13 @@ from typing import Any
 FIGURES = {
     "Predictive": "validation.plots.plot_model",
     "PhysicsParameters": "validation.plots.plot_parameters",
+    "Priors": "validation.plots.plot_priors",
     "LeaveOneOut": "validation.plots.plot_leave_one_out",
     "Comparison": "validation.plots.plot_comparison",
     "Collection": "active.plots.plot_collection",
     "Identification": "records.plots.plot_identification",
+    "Agent": "control.plots.plot_agent",
+    "Dyna": "control.plots.plot_agent",
 }
 """The function that draws objects of a class, and of those derived from it."""
 

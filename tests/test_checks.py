@@ -1,14 +1,12 @@
 """The checks that all rooms share: what they let pass, what they refuse, and in which words."""
 
 import math
-import sys
 from fractions import Fraction
 
 import numpy as np
 import pytest
 import torch
 
-from gpadjust import ZeroMeanGP, checks, fit
 from gpadjust.checks import (
     check_choice,
     check_columns,
@@ -23,9 +21,7 @@ from gpadjust.checks import (
     checked_tensor,
     checked_whole,
     finite_array,
-    progress_bar,
 )
-from tests.systems import line
 
 NAN = math.nan
 
@@ -163,34 +159,3 @@ def test_rows_that_are_not_finite_are_named():
     values[2, 1] = math.inf
     with pytest.raises(ValueError, match=r"Y to be finite, found infinity .*\(row 2\)"):
         check_observed("Y", values)
-
-
-def test_shown_and_unseen_bars_go_the_same_way(capsys):
-    for shown in (False, True):
-        with progress_bar(shown, total=3) as bar:
-            bar.set_description("start")
-            bar.set_postfix(failed=1)
-            bar.update()
-            bar.update(2)
-            assert bar.n == 3
-        assert [*progress_bar(shown, [5, 6], unit="part")] == [5, 6]
-        assert ("start" in capsys.readouterr().err) == shown
-
-
-def test_tqdm_is_needed_where_one_is_shown(monkeypatch):
-    monkeypatch.setitem(sys.modules, "tqdm", None)
-    assert [*progress_bar(False, [5, 6])] == [5, 6]
-    with pytest.raises(ImportError, match="pip install tqdm"):
-        progress_bar(True, [5, 6])
-
-
-def test_a_fit_shows_a_bar_after_five_seconds_where_somebody_sees_it(capsys, monkeypatch):
-    X = line(5)
-    for is_seen, patience in ((True, 5.0), (False, 0.0), (True, 0.0)):
-        monkeypatch.setattr(sys.stderr, "isatty", lambda is_seen=is_seen: is_seen, raising=False)
-        monkeypatch.setattr(checks, "_PATIENCE", patience)
-        fit(ZeroMeanGP(X, X.sin()), "map")
-        assert ("evaluations" in capsys.readouterr().err) == (is_seen and patience == 0)
-    monkeypatch.setitem(sys.modules, "tqdm", None)
-    fit(ZeroMeanGP(X, X.sin()), "map")
-    assert not capsys.readouterr().err

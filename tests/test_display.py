@@ -2,6 +2,7 @@
 
 from functools import partial
 
+import gymnasium
 import matplotlib as mpl
 import numpy as np
 import pytest
@@ -10,11 +11,16 @@ from matplotlib.axes import Axes
 
 from gpadjust import CKA, StackedGP, ZeroMeanGP, compare, fit
 from gpadjust.active import Collection
+from gpadjust.control import MPCAgent, Planner, Task
+from gpadjust.control.episodes import rewards_of
 from gpadjust.display import html_table
+from gpadjust.dynamics import LearnedDynamics
 from gpadjust.physics import FormulaPhysics, ODEPhysics, PhysicsParameters, Unknown
 from gpadjust.records import Record, Records, identify
 from gpadjust.states import StateSpec
 from gpadjust.validation import leave_one_out
+from gpadjust.words import number
+from tests.point import POINT_SPEC, Point
 from tests.systems import line, wave
 
 mpl.use("Agg")
@@ -58,6 +64,30 @@ def identification():
     return identify(log, ODEPhysics(rates, 0.1, 2), num_starts=1)
 
 
+def agent(maker=MPCAgent, **options):
+    """Two episodes of five steps of the point, planned in a physics and in learnt dynamics."""
+    weak = LearnedDynamics(
+        POINT_SPEC, lambda X: X[:, :1] + 0.4 * X[:, 1:], fit_options={"method": "map"}
+    )
+    task = Task(weak, lambda x, u, after: -after[:, 0].square(), episode_length=5)
+    plan = Planner(rounds=1, num_random=32, max_hold=1)
+    options = options or {"each_step": plan, "first": plan, "score_horizons": ()}
+    env = gymnasium.wrappers.TimeLimit(Point(), 5)
+    return maker(env=env, task=task, seed=0, **options).learn(10)
+
+
+def learner():
+    from gpadjust.rl import DynaOptions, DynaSAC  # not at the top, as it is slow
+
+    options = DynaOptions(model_episodes=1, updates_per_model_step=0.2, score_horizons=())
+    small = {"batch_size": 8, "policy_kwargs": {"net_arch": [8]}, "device": "cpu"}
+    return agent(partial(DynaSAC, "MlpPolicy"), options=options, **small)
+
+
+def numbers_of_agent(found):
+    return [number(rewards_of(found)[-1].reward), "10 steps"]
+
+
 def numbers_of_model(found):
     return [text.partition(": ")[2] for text in found.summary().splitlines() if ": " in text]
 
@@ -85,6 +115,18 @@ OBJECTS = {
             *(f"{float(y):.3g}" for y in (found.Y.min(), found.Y.max(), found.Y[-1])),
         ],
     ),
+    "priors": (
+        lambda: model().priors(),
+        8,
+        lambda found: [f"{value:.6f}" for value in found["median"]],
+    ),
+    "priors before a fit": (
+        lambda: ZeroMeanGP(X, torch.cat([Y, Y], -1)).priors(),
+        8,
+        lambda found: ["y1", "y2", "noise standard deviation"],
+    ),
+    "agent": (agent, 3, numbers_of_agent),
+    "learner": (learner, 3, numbers_of_agent),
     "identification": (
         identification,
         2,
@@ -102,8 +144,21 @@ def test_an_object_draws_itself_and_shows_its_numbers(name):
     assert all(isinstance(ax, Axes) and ax.has_data() for ax in axes.flat)
     html = found._repr_html_()
     assert "<script" not in html
-    for number in numbers(found):
-        assert number in html
+    for each in numbers(found):
+        assert each in html
+
+
+def test_a_collection_draws_its_regret_where_the_optimum_is_known():
+    found = collection()
+    axes = found.plot(optimum=3.0)
+    names = ["$x_{1}$", "$x_{2}$", "$y_{1}$", "regret of $y_{1}$"]
+    assert [ax.get_ylabel() for ax in axes] == names
+    (regret,) = axes[-1].get_lines()
+    best = found.Y[:, 0].cummax(0).values
+    np.testing.assert_allclose(regret.get_ydata(), 3.0 - best)
+    for wrong in ([1.0, 2.0], np.nan):
+        with pytest.raises(ValueError, match="optimum as 1 finite numbers, one of each output"):
+            found.plot(optimum=wrong)
 
 
 def test_texts_of_a_table_are_escaped():
@@ -111,3 +166,22 @@ def test_texts_of_a_table_are_escaped():
     html = html_table(texts[0], [texts[1]], [[texts[2]]])
     assert not any(text in html for text in texts)
     assert html.count("&lt;") == 3
+
+
+def test_an_agent_without_episodes_has_nothing_to_draw():
+    found = agent()
+    found._observed = found._observed.some(slice(0))
+    assert "best" not in found._repr_html_()
+    with pytest.raises(ValueError, match="real episodes to draw, found none"):
+        found.plot()
+
+
+def test_the_figure_of_priors_has_the_posterior_after_a_fit():
+    found = ZeroMeanGP(X, Y)
+    for method, label in ((None, None), ("map", "value"), ("bayes", "posterior")):
+        if method is not None:
+            fit(found, method)
+        shown = found.priors().plot()[-1]  # of the noise
+        assert {label, "prior"} - {None} == {*shown.get_legend_handles_labels()[1]}
+        shares = [each for each in shown.patches if each.get_label() == "prior"]
+        assert sum(shares[0].get_data().values) == pytest.approx(0.98, abs=0.021)

@@ -29,12 +29,12 @@ from gpadjust.checks import (
     checked_number,
     checked_points,
     checked_whole,
-    progress_bar,
     seeded,
 )
 from gpadjust.core import fit as fit_by_default
 from gpadjust.display import Display, html_table
 from gpadjust.kinds.factory import ModelFactory, make_model
+from gpadjust.progress import progress_bar
 from gpadjust.words import number
 
 

@@ -3,49 +3,68 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import matplotlib.pyplot as plt
 import torch
 
 from gpadjust.active.collection import Collection
+from gpadjust.checks import checked_tensor
 from gpadjust.validation.plots import BLUE, DOTS, GREY, RED, given_axes, labels, legend, tidy
 
 __all__ = ["plot_collection"]
 
 
-def plot_collection(collection: Collection, *, axes: Any = None) -> Any:
+def plot_collection(
+    collection: Collection, *, optimum: float | Sequence[float] | None = None, axes: Any = None
+) -> Any:
     """Draw the inputs and outputs of measurements in their order, and the best outputs so far.
 
     Dots are measurements, hollow ones points that are pending; failed measurements are not drawn.
 
     Args:
         collection: The collection.
-        axes: As many axes as inputs and outputs. Default: a new figure.
+        optimum: The best value that each output can have, or that all can. The last axes then have
+            the regret, its distance from the nearest measurement so far. Default: without them.
+        axes: As many axes as inputs and outputs, and regrets. Default: a new figure.
 
     Returns:
         An array of these axes; ``axes[0].figure`` is the figure.
+
+    Raises:
+        ValueError: If the optimum is not finite or of another number of outputs, or the number of
+            ``axes`` is another one.
     """
     X, Y, pending, bounds = collection.X, collection.Y, collection.pending, collection.bounds
     n, d, m = len(X), X.shape[-1], Y.shape[-1]
+    best = [] if optimum is None else checked_tensor("optimum", optimum).reshape(-1).tolist()
+    best = best * m if len(best) == 1 else best
+    if len(best) not in (0, m) or not all(map(math.isfinite, best)):
+        raise ValueError(f"Expected optimum as {m} finite numbers, one of each output; got {best}.")
+    rows = d + m + len(best)
     if axes is None:
-        figure = plt.figure(figsize=(6, 1.6 * (d + m)), layout="constrained")
-        axes = figure.subplots(d + m, 1, sharex=True, squeeze=False)
-    axes = given_axes(axes, (d + m,))
+        figure = plt.figure(figsize=(6, 1.6 * rows), layout="constrained")
+        axes = figure.subplots(rows, 1, sharex=True, squeeze=False)
+    axes = given_axes(axes, (rows,))
     numbers = torch.arange(1, n + len(pending) + 1)
     for i, ax in enumerate(axes[:d]):
         for bound in bounds[:, i].tolist():
             ax.axhline(bound, color=GREY, lw=0.8, ls=":")
         ax.plot(numbers[:n], X[:, i], color=BLUE, **DOTS)
         ax.plot(numbers[n:], pending[:, i], color=BLUE, **DOTS | {"mfc": "none", "mec": BLUE})
-    for values, ax in zip(Y.mT, axes[d:], strict=True):
+    for values, ax in zip(Y.mT, axes[d : d + m], strict=True):
         lowest = values.nan_to_num(nan=math.inf).cummin(0).values
         highest = values.nan_to_num(nan=-math.inf).cummax(0).values
         ax.plot(numbers[:n], values, color=GREY, **DOTS)
         for curve, color, label in ((highest, RED, "highest"), (lowest, BLUE, "lowest")):
             ax.step(numbers[:n], curve, where="post", color=color, label=f"{label} so far")
-    names = [*(f"x{i + 1}" for i in range(d)), *(f"y{j + 1}" for j in range(m))]
-    for ax, label in zip(axes, labels(names), strict=True):
+    for values, value, ax in zip(Y.mT, best, axes[d + m :], strict=False):
+        regret = (values - value).abs().nan_to_num(nan=math.inf).cummin(0).values
+        ax.step(numbers[:n], regret, where="post", color=BLUE)
+        ax.set_yscale("log")
+    called = [*labels([f"x{i + 1}" for i in range(d)]), *labels([f"y{j + 1}" for j in range(m)])]
+    for ax, label in zip(axes, [*called, *(f"regret of {y}" for y in called[d:])], strict=False):
         ax.set_ylabel(label)
         tidy(ax)
     if m:

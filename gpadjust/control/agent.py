@@ -24,8 +24,10 @@ from gpadjust.control.rollouts import random_sequences
 from gpadjust.control.state_filter import StateFilter, smooth_episodes
 from gpadjust.control.step_guard import StepGuard
 from gpadjust.control.task import Task
+from gpadjust.display import Display
 from gpadjust.dynamics import Trajectories
 from gpadjust.dynamics.base import checked_horizons
+from gpadjust.progress import long_work, tick
 
 MAX_HOLD = 5  # steps of a random action
 _LOST = 0.1  # of runs in the model, which may leave the bounds without a warning
@@ -34,7 +36,7 @@ Callback = Callable[["Agent", str, dict[str, float]], Any]
 """What is called with the agent, the name of an event, and its numbers; see :class:`Agent`."""
 
 
-class Agent(ABC):
+class Agent(ABC, Display):
     """A controller that learns from real episodes: :meth:`learn` plays, learns and improves.
 
     A subclass says how it acts (:meth:`predict`) and what it improves in a model (:meth:`improve`).
@@ -187,6 +189,8 @@ class Agent(ABC):
     ) -> Self:
         """Play so many further real steps, in whole episodes, and learn from each.
 
+        A bar shows the progress of more than five seconds, where somebody sees it.
+
         Args:
             total_timesteps: Number of steps; the last episode is played to its end. If it is not
                 positive, as for a run that has ended, episodes that were not learnt are learnt.
@@ -198,7 +202,7 @@ class Agent(ABC):
         checked_whole("total_timesteps", total_timesteps)
         callbacks = [] if callback is None else [callback] if callable(callback) else [*callback]
         end = self.num_timesteps + total_timesteps
-        with locked(callbacks):
+        with locked(callbacks), long_work("learn", "steps", total=max(0, total_timesteps)):
             self._callbacks = callbacks
             if self._random_state is not None:  # a run that goes on
                 episodes.set_generators(self._random_state)
@@ -266,6 +270,7 @@ class Agent(ABC):
                 action = np.clip(action, space.low, space.high).astype(space.dtype)
                 following, reward, terminated, truncated, info = self.env.step(action)
                 self.num_timesteps += 1
+                tick("steps")
                 failed = bool(info.get("step_failed"))
                 if not failed:
                     rows.append((observation, action, following, float(reward), bool(terminated)))
@@ -417,6 +422,11 @@ class Agent(ABC):
         data = self._estimated if is_hidden else episodes.decoded(spec, self._observed)
         return episodes.newest(data, newest)
 
+    @property
+    def promises(self) -> list[float | None]:
+        """The reward of a step that the model promised of each episode; None of random actions."""
+        return [*self._promises]
+
     def episode_length(self) -> int:
         """Return the steps of an episode, of the task or else the environment."""
         return episodes.episode_length(self.task, self.env)
@@ -428,6 +438,9 @@ class Agent(ABC):
     def __repr__(self) -> str:
         """Name the agent, its environment and dynamics, what it has done, and its last reward."""
         return episodes.described(self)
+
+    def _repr_html_(self) -> str:
+        return episodes.html_of(self)
 
     # Checkpoints
 

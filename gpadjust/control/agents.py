@@ -20,6 +20,7 @@ from gpadjust.control.mpc import MPC, Plan, Planner, going_on
 from gpadjust.control.policy_search import BoundedPolicy, PolicySearch
 from gpadjust.control.rollouts import Rollouts, random_sequences
 from gpadjust.control.task import Task
+from gpadjust.progress import long_work
 from gpadjust.states import StateSpec
 
 _EPISODES = 128  # of random actions, by which the policy's inputs are scaled
@@ -187,7 +188,8 @@ class PolicySearchAgent(Agent):
             if update % tenth == 0 or update == last:
                 self.tell("update", {"number": update, "value": value})
 
-        result = self.search.improve(self.policy, task, progress=progress)
+        with long_work("search", "updates", total=last):
+            result = self.search.improve(self.policy, task, progress=progress)
         self.is_trained, self._reward = True, result.reward
         names = ("reward", "left_bounds", "seconds")
         self.tell("search", {name: getattr(result, name) for name in names})

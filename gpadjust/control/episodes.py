@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -18,11 +18,13 @@ from torch import Tensor
 from gpadjust.control.delay import find_delay
 from gpadjust.control.rollouts import reach
 from gpadjust.control.task import Task
+from gpadjust.display import html_table
 from gpadjust.dynamics import Dynamics, LearnedDynamics, Trajectories
 from gpadjust.dynamics.base import typical_change
 from gpadjust.physics import PhysicsError
 from gpadjust.states import StateSpec
 from gpadjust.validation.trust import trust
+from gpadjust.words import number
 
 _NEAR = 0.05  # of half the width between bounds: a state that is so near may be held by them
 _MOST = 10.0  # times as far they may be by what the physics reaches
@@ -100,6 +102,39 @@ def described(agent: Any) -> str:
         f"{type(agent).__name__}({env}, {type(agent.task.dynamics).__name__}, "
         f"{agent.num_episodes} episodes learnt, {agent.num_timesteps} steps{last})"
     )
+
+
+class EpisodeReward(NamedTuple):
+    """Rewards of a real episode: its steps, and the mean of a step, also as it was promised."""
+
+    steps: int
+    reward: float
+    promised: float  # NaN of none
+
+
+def rewards_of(agent: Any) -> list[EpisodeReward]:
+    """Return the rewards of each real episode of an agent that was recorded."""
+    data = agent.recorded_episodes()
+    numbers = data.episode.unique_consecutive()
+    rewards = [data.rewards[data.episode == number] for number in numbers]
+    promises = getattr(agent, "promises", None) or [None] * len(rewards)  # learners make none
+    return [
+        EpisodeReward(len(each), float(each.mean()), math.nan if promise is None else promise)
+        for each, promise in zip(rewards, promises, strict=False)
+    ]
+
+
+def html_of(agent: Any) -> str:
+    """Return a table of the first, the best and the last episode of an agent."""
+    rows = rewards_of(agent)
+    best = max(range(len(rows)), key=lambda i: rows[i].reward, default=0)
+    named = {"first": 0, "best": best, "last": len(rows) - 1} if rows else {}
+    head = ["", "episode", "steps", "reward of a step", "promised"]
+    cells = [
+        [name, str(i + 1), str(rows[i].steps), number(rows[i].reward), number(rows[i].promised)]
+        for name, i in named.items()
+    ]
+    return html_table(repr(agent), head, cells)
 
 
 @contextmanager

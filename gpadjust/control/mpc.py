@@ -27,6 +27,7 @@ from gpadjust.control.rollouts import (
 from gpadjust.control.state_filter import Estimate, StateFilter, smooth_episodes
 from gpadjust.control.task import Moment, Steps, Task
 from gpadjust.dynamics import Trajectories
+from gpadjust.progress import long_work, tick
 from gpadjust.states import StateSpec
 
 _PART = 1.5  # horizons of a step that a part of an episode's first plan looks ahead
@@ -249,6 +250,7 @@ class Planner:
                 drawn = mean + sd * _correlated_noise(new.shape, self.correlation)
                 new = torch.clamp(drawn, bounds[0], bounds[1])
             rollout = rollouts.follow(state, new)
+            tick("rounds")
             if number > 0 and rollout.made.shape[-1] < num_steps:  # no time left
                 break
             found = score(rollout)
@@ -510,7 +512,8 @@ class MPC:
             states = [each.mean for each in found]
         plans = []
         for state, earlier, estimate in zip(states, episodes, estimates, strict=True):
-            with seeded(seed):  # whatever the other rows are
+            # The seed makes a plan the same whatever the other rows are.
+            with seeded(seed), long_work("plan", "rounds"):
                 plan = self._planned(state, earlier, estimate and estimate.covariance)
             plans.append(plan.taken(estimate))
         actions = [cast(Tensor, plan.moment.action) for plan in plans]

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from gpadjust.checks import checked_bounds, checked_number, checked_whole
 from gpadjust.control.rollouts import Objective, Return, Rollouts, check_objective
 from gpadjust.control.task import Task
+from gpadjust.progress import tick
 from gpadjust.states import StateSpec
 
 _NEAR = 0.95  # of the way to a bound: beyond, the tanh has hardly any slope
@@ -248,6 +249,7 @@ class PolicySearch:
                     optimizer.step()
                 rate.step()
                 values.append(value.detach())
+                tick("updates")
                 if progress is not None:
                     progress(i + 1, float(values[-1]))
             result = best

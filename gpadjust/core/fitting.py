@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from gpadjust.checks import long_work
 from gpadjust.core.noise import Noise
 from gpadjust.core.nuts import CHAINS, nuts
 from gpadjust.core.sample import (
@@ -25,6 +24,7 @@ from gpadjust.core.sample import (
 )
 from gpadjust.core.threads import threads_for
 from gpadjust.core.unknowns import standard_normal
+from gpadjust.progress import long_work
 
 if TYPE_CHECKING:
     from gpadjust.core.model import GP
@@ -146,7 +146,7 @@ def fit(
     if model.data.Y.dim() > 2:
         batch = tuple(model.batch_shape)
         raise ValueError(f"Expected a model of one data set; found fantasies, a batch {batch}.")
-    with threads_for(len(model.data.Y)), long_work("fit", " evaluations"):
+    with threads_for(len(model.data.Y)), long_work("fit", "evaluations"):
         result: FitResult | None = model.fit_itself(method, num_draws, seed)
         if result is None:
             result = _fitted(model, method, num_draws, seed)

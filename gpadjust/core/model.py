@@ -22,7 +22,6 @@ from gpytorch.priors import NormalPrior
 from linear_operator import to_linear_operator
 from torch import Size, Tensor
 
-from gpadjust.checks import tick
 from gpadjust.core.data import ArrayLike, Data, appended, as_given, as_tensor, unit_of
 from gpadjust.core.functions import Functions, Paths
 from gpadjust.core.gaussian import (
@@ -36,7 +35,7 @@ from gpadjust.core.gaussian import (
 from gpadjust.core.kernels import DELTA, RHO, as_kernel
 from gpadjust.core.noise import KnownNoise, Noise
 from gpadjust.core.posterior import MixturePosterior
-from gpadjust.core.summary import counted, priors, summary, summary_html
+from gpadjust.core.summary import counted, summary, summary_html
 from gpadjust.core.terms import Places, Term, TermSum, WeightedSum
 from gpadjust.core.unknowns import Choice, Row, Table, Values
 from gpadjust.core.views import (
@@ -49,6 +48,7 @@ from gpadjust.core.views import (
 from gpadjust.display import Display
 from gpadjust.physics import Physics, PhysicsError, Unknown, as_physics
 from gpadjust.physics.parameters import PhysicsParameters
+from gpadjust.progress import tick
 
 Slopes = dict[str, list[Tensor]]
 """Derivatives of each physics by the coordinate of each unknown parameter, ``S x m x n``."""
@@ -330,7 +330,7 @@ class GP(gpytorch.models.GP, Predictive):
         parts = []
         for rows in torch.arange(len(u)).split(max(1, _ENTRIES // (n * n * m))):
             own = {name: [each[rows] for each in by_f] for name, by_f in slopes.items()}
-            tick()
+            tick("evaluations")
             part = self._log_likelihood(u[rows], [each[rows] for each in f], own, with_gradient)
             parts.append(part)
         value, gradient = (torch.cat(each) for each in zip(*parts, strict=True))
@@ -650,7 +650,10 @@ class GP(gpytorch.models.GP, Predictive):
 
         Its columns are name, output (empty of numbers that all outputs share), median, both ends
         of the central 95 % interval, and meaning. Nested models have some of these numbers alone.
+        Its ``plot()`` draws the priors, and beside them the posterior of a fitted model.
         """
+        from gpadjust.core.priors import priors  # with pandas, which models do not need
+
         return priors(self)
 
     def _graph_for(self, X: Tensor) -> torch.set_grad_enabled:

@@ -89,6 +89,11 @@ class MixturePosterior(GPyTorchPosterior):
         return self.marginals.prediction.variance
 
     @property
+    def covariance_matrix(self) -> Tensor:
+        """The covariances of the points, and outputs if there are several, of the mixture."""
+        return self.distribution.covariance_matrix
+
+    @property
     def batch_range(self) -> tuple[int, int]:
         """The batch dimensions of base samples."""
         return 0, -1

@@ -145,26 +145,6 @@ def numbers_of(model: Any, u: Tensor) -> dict[tuple[str, str], Number]:
     return found
 
 
-@torch.no_grad()
-def priors(model: Any) -> Any:
-    """Return a frame of the priors of all numbers of the whole model, in the user's units."""
-    from pandas import DataFrame  # here alone, as models do not need it
-
-    table = model.table
-    if table.has_other_priors:
-        u = table.prior_draws(4000, 0)
-    else:  # each number rises with its coordinate
-        levels = torch.tensor([0.5, 0.025, 0.975]).to(model.u)
-        u = torch.special.ndtri(levels).reshape(-1, 1, 1).expand(-1, table.problems, table.size)
-    levels = torch.tensor([0.5, 0.025, 0.975]).to(model.u)
-    rows = []
-    for (output, _), each in numbers_of(model, table.with_choice(u, 0)).items():
-        ends = each.draws.quantile(levels) if len(u) > 3 else each.draws
-        rows.append([each.name, output, *ends.tolist(), each.meaning])
-    columns = ["name", "output", "median", "2.5 %", "97.5 %", "meaning"]
-    return DataFrame(rows, columns=columns)
-
-
 def _labels(model: Any, term: Term, name: str, number: int) -> list[str]:
     """Return labels of a kernel's numbers: the inputs, if it has a lengthscale of each."""
     labels = [""] if number == 1 else [f" {i + 1}" for i in range(number)]

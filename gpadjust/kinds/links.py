@@ -27,6 +27,7 @@ from gpadjust.core.structures import (
 )
 
 NAMED = {"log": (0.0, math.inf), "logit": (0.0, 1.0)}
+_LARGEST = 1e150  # without an upper bound: its square, and sums of such, are finite
 _LOW, _HIGH = (NormalDist().cdf(z) for z in (-1.0, 1.0))  # the ends of 68.27 %
 
 
@@ -86,9 +87,9 @@ class Link(NamedTuple):
         return size - above - below  # dg / dy = 1 / (y - a), or (b - a) / ((y - a) (b - y))
 
     def inverse(self, z: Tensor) -> Tensor:
-        """Return y of values g, within the bounds however large or small these are."""
+        """Return y of values g, within the bounds and finite however large or small these are."""
         z = z + self.location.to(z)
-        bounds = z.new_tensor([self.lower, self.upper])
+        bounds = z.new_tensor([self.lower, min(self.upper, _LARGEST)])
         least, most = bounds.nextafter(bounds.flip(0)).tolist()
         is_open = math.isinf(self.upper)
         above = z.exp() if is_open else (self.upper - self.lower) * z.sigmoid()
@@ -118,8 +119,7 @@ class LinkedMarginals(Marginals):
         beyond the ends of every interval.
         """
         sd = (self.quantile(_HIGH) - self.quantile(_LOW)) / 2
-        largest = torch.finfo(sd.dtype).max
-        return Prediction(self.quantile(0.5), sd.square().clamp_max(largest))
+        return Prediction(self.quantile(0.5), sd.square())
 
     def quantile(self, level: float) -> Tensor:
         """Return the quantiles ``... x q x m`` of a level."""
@@ -149,6 +149,24 @@ class LinkedPosterior(TransformedPosterior):
             lambda *_: self.marginals.quantile(0.5),
             lambda *_: self.marginals.prediction.variance,
         )  # fmt: skip
+
+    @property
+    def distribution(self) -> Any:
+        """An AttributeError for code that needs a Gaussian, such as entropy searches of BoTorch."""
+        raise AttributeError(
+            f"The model is Gaussian in {self.link.formula}, not in y. Take an acquisition function "
+            "that needs the mean and variance alone, or samples: its name begins with qLog."
+        )
+
+    @property
+    def covariance_matrix(self) -> Tensor:
+        """Covariances of the points of one output, ``... x q x q``.
+
+        They have the variances of the predictions, and the correlations of g(y).
+        """
+        K = self.mixture.covariance_matrix
+        scale = (self.variance.squeeze(-1) / K.diagonal(dim1=-1, dim2=-2)).sqrt()
+        return scale.unsqueeze(-1) * K * scale.unsqueeze(-2)
 
     def quantile(self, value: Tensor) -> Tensor:
         """Return quantiles ``... x q x m``; those of several levels are in front."""
@@ -190,7 +208,9 @@ class Linked(GP):
     Data, predictions, intervals, samples and functions are in the user's units and within the
     bounds. A logarithm makes rho an exponent and errors relative. Predictions are medians, with the
     square of half the width of the central 68.27 % as variance, see :class:`LinkedMarginals`. Known
-    variances are those of g(y) by the delta method. ``term``, ``rho``, ``delta`` and the summary
+    variances are those of g(y) by the delta method. Acquisition functions by samples average these,
+    however rare the large ones; ``objective=GenericMCObjective(lambda Y, X=None: Y[..., 0].log())``
+    makes them search on the scale of g. ``term``, ``rho``, ``delta`` and the summary
     are on the scale of g, and so are kernels and means that are given.
 
     Args as of the structure, and:

@@ -12,6 +12,9 @@ from gpadjust.checks import check_level
 from gpadjust.display import Display, html_table
 from gpadjust.physics.unknown import Unknown
 
+_AS_WIDE = 0.8  # of a prior's standard deviation, or more
+_AS_FAR = 0.3  # standard deviations of a prior, or less from its middle
+
 
 class ParameterValues(dict[str, Any]):
     """Values of parameters by their names, as items or attributes: ``p["mass"]``, ``p.mass``.
@@ -63,6 +66,16 @@ class PhysicsParameters(ParameterValues, Display):
         ends = torch.tensor([(1 - level) / 2, (1 + level) / 2]).to(self.draws)
         low, high = self.draws.quantile(ends, dim=0)
         return low, high
+
+    @property
+    def untold(self) -> list[str]:
+        """Names of parameters whose posterior is about their prior; none of a point fit."""
+        coordinates = {name: u.coordinate(self[name]) for name, u in self.unknowns.items()}
+        return [
+            name
+            for name, z in coordinates.items()
+            if z.std(correction=0) > _AS_WIDE and z.mean().abs() < _AS_FAR
+        ]
 
     def _rows(self) -> list[tuple[str, str, str, str, str]]:
         """Return the head and the rows of the table."""

@@ -1,11 +1,14 @@
 """Records of machines: read, resampled, smoothed, and cut into windows."""
 
-from gpadjust.records.identification import Identification, identify
+from gpadjust.records.identification import Combination, Identification, identify
+from gpadjust.records.lack import Lack
 from gpadjust.records.records import Record, Records
 from gpadjust.records.smoothing import SmoothedRecords, SmoothingWarning, smooth
 
 __all__ = [
+    "Combination",
     "Identification",
+    "Lack",
     "Record",
     "Records",
     "SmoothedRecords",

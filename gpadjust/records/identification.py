@@ -30,7 +30,6 @@ from gpadjust.words import number, percent
 GUESSES, IDENTIFIED, PERSISTENCE = "guesses", "identified", "persistence"
 FEW = 0.9  # of measurements in intervals of 95 %
 _LEAST = 8  # steps of a stretch, of which the last part is held out
-_KNOWN_BEFORE = 0.8  # of a prior's standard deviation: the log tells next to nothing
 _FAR = 3.0  # standard deviations of a prior
 _VARIES = 1e-3  # share of the variance of an action that is within steps
 _NEAR_A_TURN = 0.12
@@ -266,7 +265,6 @@ def identify(
     held_out: float = 0.25,
     num_starts: int | None = None,
     seed: int = 0,
-    progress: bool = False,
 ) -> Identification:
     """Find parameters, noise and hidden states of a machine, and judge them by a free run.
 
@@ -284,7 +282,6 @@ def identify(
             steps are at the end of each other stretch that has twice as many.
         num_starts: As of :func:`smooth`.
         seed: Seed of the free runs.
-        progress: If True, show a progress bar.
 
     Returns:
         The identification; :func:`gpadjust.report.report` makes a page of it.
@@ -336,7 +333,7 @@ def identify(
             measured.append(stretch.states[end:])
         beginnings.append(stretch.part(slice(end)))
     learnt_from = Records(beginnings, spec)
-    smoothed = smooth(learnt_from, f_p, start=start, num_starts=num_starts, progress=progress)
+    smoothed = smooth(learnt_from, f_p, start=start, num_starts=num_starts)
     last = torch.stack([smoothed.records.records[i].states[-1] for i in ends])
     windows = Windows(last, torch.stack(actions), torch.stack(measured))
     options: dict[str, Any] = {
@@ -429,9 +426,8 @@ def _of_parameters(parameters: PhysicsParameters | None) -> list[str]:
                 f"{name} is {float(z.mean().abs()):.1f} standard deviations of its prior from its "
                 "guess: a sign, a unit, or a physics that lacks something?"
             )
-        elif z.std() > _KNOWN_BEFORE:
-            sentences.append(f"The log says next to nothing of {name}: it stays as known before.")
-    return sentences
+    told = "The log says next to nothing of {}: it stays as known before."
+    return [*sentences, *map(told.format, parameters.untold)]
 
 
 def _told_together(parameters: PhysicsParameters) -> list[Combination]:

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+_NO_VARIANCE = "a variance is not a positive number"
+
 
 class Link(NamedTuple):
     """Steps of a stretch of the chain: ``x[t + 1] = matrices[t] x[t] + offsets[t]``."""
@@ -28,13 +30,6 @@ class Moments(NamedTuple):
     covariances: Array  # T + 1 x D x D
 
 
-class Filtered(NamedTuple):
-    """States of a stretch by what was measured before them, and by that and their own."""
-
-    ahead: Moments
-    known: Moments
-
-
 class Smoothed(NamedTuple):
     """Distribution of the states of a stretch by all that was measured."""
 
@@ -45,7 +40,7 @@ class Smoothed(NamedTuple):
 def smooth_chain(
     links: Sequence[Link], starts: Sequence[tuple[Array, Array]], noise: Array, process_noise: Array
 ) -> tuple[list[Smoothed], float]:
-    """All stretches of a chain, one after the other (Rauch, Tung and Striebel 1965).
+    """Smooth all stretches of a chain, one after the other (Rauch, Tung and Striebel 1965).
 
     The last entries of a state, beyond those that a stretch starts again with, are constants that
     all stretches share. Starts are means ``d`` and covariances ``d x d`` of the first state of each
@@ -53,28 +48,24 @@ def smooth_chain(
     ``d``.
 
     Returns:
-        What is known of each stretch, and the log density of what was measured.
+        Distribution of the states of each stretch, and the log density of the measurements.
+
+    Raises:
+        LinAlgError: If a variance is not a positive number.
     """
-    (mean, covariance), log_density, filtered = starts[0], 0.0, []
-    d = len(process_noise)
-    for link, (first, spread) in zip(links, starts, strict=True):
-        mean = np.concatenate([first[:d], mean[d:]])
-        shared, covariance = covariance[d:, d:], np.zeros_like(covariance)
-        covariance[:d, :d], covariance[d:, d:] = spread[:d, :d], shared
-        found, gained = _filter(link, mean, covariance, noise, process_noise)
-        filtered.append(found)
-        log_density += gained
-        mean, covariance = found.known.means[-1], found.known.covariances[-1]
-    smoothed = []
-    for link, found in zip(reversed(links), reversed(filtered), strict=True):
-        last, spread = found.known.means[-1], found.known.covariances[-1]
-        # What later stretches say of the constants reaches the end of this one through them.
-        gain = _gain(spread[d:, d:], spread[d:])
-        end = last + gain @ (mean[d:] - last[d:])
-        end_spread = spread + gain @ (covariance[d:, d:] - spread[d:, d:]) @ gain.T
-        smoothed.append(_backwards(link, found, end, end_spread))
-        mean, covariance = (part[0] for part in smoothed[-1].states)
-    return smoothed[::-1], log_density
+    if not np.isfinite([*noise, *process_noise]).all():
+        raise np.linalg.LinAlgError(_NO_VARIANCE)
+    rows = _Rows.joined(links, starts, noise, process_noise)
+    filtered = _filter(rows)
+    states, gains = _smooth(rows, filtered)
+    smoothed, t = [], 0
+    for link in links:
+        end = t + len(link.measured)
+        moments = Moments(states.means[t:end], states.covariances[t:end])
+        back = np.swapaxes(gains[t : end - 1], -1, -2)
+        smoothed.append(Smoothed(moments, moments.covariances[1:] @ back))
+        t = end
+    return smoothed, filtered.log_density
 
 
 def draw_paths(
@@ -118,7 +109,7 @@ def measure(
         spread = covariance @ outputs[i]
         variance, error = outputs[i] @ spread + noise[i], measured[i] - outputs[i] @ mean
         if not 0 < variance < math.inf:
-            raise np.linalg.LinAlgError("a variance is no positive number")
+            raise np.linalg.LinAlgError(_NO_VARIANCE)
         mean = mean + spread / variance * error
         covariance = covariance - np.outer(spread, spread) / variance
         log_density -= 0.5 * (error**2 / variance + math.log(2 * math.pi * variance))
@@ -148,47 +139,200 @@ def expected_squares(
     return np.concatenate(errors), np.concatenate(added)
 
 
-def _filter(
-    link: Link, mean: Array, covariance: Array, noise: Array, process_noise: Array
-) -> tuple[Filtered, float]:
-    """Kalman's filter of a stretch, and the log density of what was measured in it."""
-    D, d, log_density = len(mean), len(process_noise), 0.0
-    shape = len(link.measured), D
-    ahead, known = (Moments(np.empty(shape), np.empty((*shape, D))) for _ in range(2))
-    added = np.zeros((D, D))
-    added[:d, :d] = np.diag(process_noise)
-    for t, measured in enumerate(link.measured):
-        if t:
-            matrix = link.matrices[t - 1]
-            mean = matrix @ mean + link.offsets[t - 1]
-            covariance = matrix @ covariance @ matrix.T + added
-        ahead.means[t], ahead.covariances[t] = mean, covariance
-        mean, covariance, gained = measure(mean, covariance, link.outputs[t], measured, noise)
-        log_density += gained
-        known.means[t], known.covariances[t] = mean, covariance
-    return Filtered(ahead, known), float(log_density)
+class _Rows(NamedTuple):
+    """A chain of ``M`` rows, ``x[t] = F[t] x[t - 1] + o[t] + N(0, Q[t])``, in blocks.
+
+    ``B`` blocks of ``length`` rows, one after the other, are computed side by side.
+    """
+
+    number: int  # M
+    F: Array  # length x B x D x D
+    o: Array  # length x B x D
+    Q: Array  # length x B x D x D
+    outputs: Array  # length x B x m x D
+    measured: Array  # length x B x m; 0 where there is nothing
+    noise: Array  # length x B x m; infinite where there is nothing
+
+    @classmethod
+    def joined(
+        cls,
+        links: Sequence[Link],
+        starts: Sequence[tuple[Array, Array]],
+        noise: Array,
+        process_noise: Array,
+    ) -> _Rows:
+        """Join stretches: from one to the next the constants stay, and the states start again."""
+        measured = np.concatenate([link.measured for link in links])
+        outputs = np.concatenate([link.outputs for link in links])
+        M, _, D = outputs.shape
+        d = len(process_noise)
+        F, o, Q = np.zeros((M, D, D)), np.zeros((M, D)), np.zeros((M, D, D))
+        Q[:, range(d), range(d)] = process_noise
+        t = 0
+        for link, (first, spread) in zip(links, starts, strict=True):
+            F[t, d:, d:] = np.eye(D - d)
+            o[t, :d] = first[:d]
+            Q[t, :d, :d] = spread[:d, :d]
+            steps = slice(t + 1, t + len(link.measured))
+            F[steps] = link.matrices
+            o[steps] = link.offsets
+            t = steps.stop
+        F[0] = 0.0
+        o[0], Q[0] = starts[0]
+        is_seen = ~np.isnan(measured)
+        return cls(
+            M,
+            _cut(F, np.eye(D)),
+            _cut(o, 0.0),
+            _cut(Q, 0.0),
+            _cut(outputs, 0.0),
+            _cut(np.where(is_seen, measured, 0.0), 0.0),
+            _cut(np.where(is_seen, noise, math.inf), math.inf),
+        )
 
 
-def _backwards(link: Link, filtered: Filtered, end: Array, spread: Array) -> Smoothed:
-    """The smoother of a stretch whose last state is known by all that was measured."""
-    means, covariances = filtered.known.means.copy(), filtered.known.covariances.copy()
-    means[-1], covariances[-1] = end, spread
-    crossed = np.empty_like(link.matrices)
-    for t in range(len(link.matrices) - 1, -1, -1):
-        ahead = filtered.ahead.covariances[t + 1]
-        gain = _gain(ahead, link.matrices[t] @ covariances[t])
-        crossed[t] = covariances[t + 1] @ gain.T
-        means[t] += gain @ (means[t + 1] - filtered.ahead.means[t + 1])
-        covariances[t] += gain @ (covariances[t + 1] - ahead) @ gain.T
-        covariances[t] = (covariances[t] + covariances[t].T) / 2
-    return Smoothed(Moments(means, covariances), crossed)
+class _Filtered(NamedTuple):
+    """The filter of all blocks, each from its start x, the state before its first row.
+
+    From starts of 0 without variance the last state of a block is ``A x`` more than found, and the
+    density of its measurements, by x, ``exp(eta' x - x' J x / 2)``.
+    """
+
+    before: Moments  # length x B x ...: of the state before, by measurements until then
+    ahead: Moments  # of the state, by the measurements before it
+    known: Moments  # and by its own
+    A: Array  # B x D x D
+    eta: Array  # B x D
+    J: Array  # B x D x D
+    log_density: float
+
+
+def _filter(rows: _Rows) -> _Filtered:
+    r"""Filter the chain, in some :math:`3 \sqrt M` steps (Särkkä and García-Fernández 2021).
+
+    First all blocks are filtered from a start of 0, side by side; then the states at the starts of
+    the blocks follow, one after the other; then all blocks are filtered again, from these.
+    """
+    B, D = rows.o.shape[1:]
+    starts = Moments(np.zeros((B, D)), np.zeros((B, D, D)))
+    block = _filter_blocks(rows, starts)
+    mean, covariance = np.zeros(D), np.zeros((D, D))
+    for k in range(B):
+        starts.means[k], starts.covariances[k] = mean, covariance
+        # x | y ~ N(m + S (eta - J m), S), S = (P^-1 + J)^-1, for x ~ N(m, P)
+        A, J = block.A[k], block.J[k]
+        S = np.linalg.solve(np.eye(D) + covariance @ J, covariance)
+        mean = A @ (mean + S @ (block.eta[k] - J @ mean)) + block.known.means[-1, k]
+        covariance = _even(A @ S @ A.T) + block.known.covariances[-1, k]
+    return _filter_blocks(rows, starts)
+
+
+def _filter_blocks(rows: _Rows, starts: Moments) -> _Filtered:
+    """Filter all blocks from their starts, ``B`` moments (Kalman 1960)."""
+    means, covariances = starts
+    before, ahead, known = (Moments(np.empty_like(rows.o), np.empty_like(rows.Q)) for _ in range(3))
+    A = np.zeros_like(covariances) + np.eye(means.shape[1])
+    eta, J, log_density = np.zeros_like(means), np.zeros_like(covariances), 0.0
+    for t, F in enumerate(rows.F):
+        before.means[t], before.covariances[t] = means, covariances
+        means = _times(F, means) + rows.o[t]
+        covariances = _even(F @ covariances @ np.swapaxes(F, -1, -2)) + rows.Q[t]
+        A = F @ A
+        ahead.means[t], ahead.covariances[t] = means, covariances
+        # One output by one, as their errors are independent: y = h' x + N(0, R)
+        for i in np.flatnonzero(np.isfinite(rows.noise[t]).any(0)):
+            h, R = rows.outputs[t, :, i], rows.noise[t, :, i]
+            is_seen = np.isfinite(R)
+            spread = _times(covariances, h)
+            variance = (h * spread).sum(-1) + R
+            if not (variance > 0).all() or not np.isfinite(variance[is_seen]).all():
+                raise np.linalg.LinAlgError(_NO_VARIANCE)
+            error = rows.measured[t, :, i] - (h * means).sum(-1)
+            by_error = (error / variance)[:, None]
+            log_density -= 0.5 * (error**2 / variance)[is_seen].sum()
+            log_density -= 0.5 * np.log(2 * math.pi * variance[is_seen]).sum()
+            # By the start, y = g' x + ...
+            g = _times(np.swapaxes(A, -1, -2), h)
+            by_start = g / variance[:, None]
+            eta += g * by_error
+            J += g[:, :, None] * by_start[:, None]
+            A = A - spread[:, :, None] * by_start[:, None]
+            means = means + spread * by_error
+            scaled = spread / np.sqrt(variance)[:, None]
+            covariances = covariances - scaled[:, :, None] * scaled[:, None]
+        known.means[t], known.covariances[t] = means, covariances
+    return _Filtered(before, ahead, known, A, eta, J, float(log_density))
+
+
+def _smooth(rows: _Rows, filtered: _Filtered) -> tuple[Moments, Array]:
+    """Return all states by all measurements, and the gains to each from the one after it.
+
+    With gains G, ``x[t - 1] = G[t] x[t] + c[t] + N(0, L[t])``; again all blocks go side by side,
+    first from an end of 0, then from their ends.
+    """
+    before, ahead = filtered.before, filtered.ahead
+    G = _gain(ahead.covariances, rows.F @ before.covariances)
+    c = before.means - _times(G, ahead.means)
+    L = before.covariances - _even(G @ ahead.covariances @ np.swapaxes(G, -1, -2))
+    ends = Moments(np.zeros_like(c[0]), np.zeros_like(L[0]))
+    block, A = _smooth_blocks(G, c, L, ends)
+    mean, covariance = last = [part[-1, -1] for part in filtered.known]
+    for k in range(len(A) - 1, -1, -1):
+        ends.means[k], ends.covariances[k] = mean, covariance
+        mean = A[k] @ mean + block.means[0, k]
+        covariance = _even(A[k] @ covariance @ A[k].T) + block.covariances[0, k]
+    smoothed, _ = _smooth_blocks(G, c, L, ends)
+    # The state before the first row is nothing; that of the last row is its end.
+    parts = zip(smoothed, last, strict=True)
+    states = [np.concatenate([_joined(part, rows.number)[1:], end[None]]) for part, end in parts]
+    return Moments(*states), _joined(G, rows.number)[1:]
+
+
+def _smooth_blocks(G: Array, c: Array, L: Array, ends: Moments) -> tuple[Moments, Array]:
+    """Return the states before each row by the ends of the blocks, and their products of gains."""
+    means, covariances = ends
+    smoothed, A = Moments(np.empty_like(c), np.empty_like(L)), np.eye(c.shape[-1])
+    for t in range(len(G) - 1, -1, -1):
+        means = _times(G[t], means) + c[t]
+        covariances = _even(G[t] @ covariances @ np.swapaxes(G[t], -1, -2)) + L[t]
+        A = G[t] @ A
+        smoothed.means[t], smoothed.covariances[t] = means, covariances
+    return smoothed, A
+
+
+def _cut(rows: Array, padding: Array | float) -> Array:
+    """Cut rows ``M x ...`` into blocks ``length x B x ...``, the last one padded."""
+    length = math.isqrt(len(rows))
+    number = -(-len(rows) // length)
+    padded = np.empty((number * length, *rows.shape[1:]))
+    padded[: len(rows)] = rows
+    padded[len(rows) :] = padding
+    return np.ascontiguousarray(np.swapaxes(padded.reshape(number, length, *rows.shape[1:]), 0, 1))
+
+
+def _joined(blocks: Array, number: int) -> Array:
+    """Return the first rows of blocks ``length x B x ...``, one block after the other."""
+    return np.swapaxes(blocks, 0, 1).reshape(-1, *blocks.shape[2:])[:number]
+
+
+def _times(matrices: Array, vectors: Array) -> Array:
+    product: Array = (matrices @ vectors[..., None])[..., 0]
+    return product
+
+
+def _even(matrices: Array) -> Array:
+    """Return symmetric matrices, of ones that are so but for rounding."""
+    even: Array = (matrices + np.swapaxes(matrices, -1, -2)) / 2
+    return even
 
 
 def _gain(covariance: Array, crossed: Array) -> Array:
     """``crossed' covariance^-1``, also of constants that are known, which have no variance."""
-    scale = np.sqrt(np.diag(covariance).clip(np.finfo(float).tiny))
-    scaled = covariance / np.outer(scale, scale) + 1e-14 * np.eye(len(scale))
-    gain: Array = np.linalg.solve(scaled, crossed / scale[:, None]).T / scale
+    scale = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1).clip(np.finfo(float).tiny))
+    scaled = covariance / (scale[..., None] * scale[..., None, :])
+    scaled = scaled + 1e-14 * np.eye(scale.shape[-1])
+    solved = np.linalg.solve(scaled, crossed / scale[..., None])
+    gain: Array = np.swapaxes(solved, -1, -2) / scale[..., None, :]
     return gain
 
 

@@ -14,17 +14,18 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gpadjust.checks import progress_bar
 from gpadjust.core import CKA, Noise, fit
 from gpadjust.kinds import Categories, HeavyTails, NoisyInputs, RelativeNoise, with_options
 from gpadjust.physics import ODEPhysics, PhysicsError, PhysicsWarning
+from gpadjust.progress import progress_bar
 from gpadjust.records import Identification, Records, identify
 from gpadjust.report import inputs as read
 from gpadjust.report.page import checked_path, write
 from gpadjust.report.subject import Origin, Subject, subject_of
 from gpadjust.states import StateSpec
 from gpadjust.validation import compare, leave_one_out
-from gpadjust.validation.verdict import difference, faults
+from gpadjust.validation.faults import faults
+from gpadjust.validation.verdict import difference
 from gpadjust.words import bare, listed, plural
 
 _DEGREES = ("deg", "degree", "degrees", "°")
@@ -247,7 +248,7 @@ def _of_log(arguments: Namespace) -> Job:
 
     def work() -> Identification:
         try:
-            return identify(Records(whole.records, spec), physics, **options, progress=True)
+            return identify(Records(whole.records, spec), physics, **options)
         except RuntimeError as error:  # the states diverged, or the physics failed
             raise ValueError(str(error)) from error
 

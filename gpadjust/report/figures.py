@@ -23,7 +23,6 @@ from gpadjust.validation.plots import (
     legend,
     lines_along,
     mean_and_ends,
-    quantile,
     tidy,
 )
 from gpadjust.validation.trust import physics_at
@@ -31,7 +30,6 @@ from gpadjust.words import bare, name_and_unit, number, percent, with_unit
 
 _MOST = 12  # inputs along which slices are drawn, in all outputs together
 _CORRELATED = 0.7  # absolute correlation of parameters whose pair is drawn
-_DECADE = 10.0  # largest over least observation, from which axes are logarithmic
 _BANDS = "Solid lines are means; bands hold 95 % of the function, without measurement noise."
 _NONE = "There is no physics that could be adjusted, trusted or overridden."
 _TRUST = (
@@ -106,29 +104,13 @@ def point(subject: Subject, X: Tensor, digits: int = 4) -> list[str]:
 @drawn
 def agreement(subject: Subject, output: int) -> list[Markup]:
     """Return observations over left-out predictions, by the formula and corrected."""
-    name, y, loo = subject.outputs[output], subject.judged[:, output], subject.loo
-    mean, half = loo.mean[:, output], quantile(0.95) * loo.variance[:, output].sqrt()
-    formulas = [*subject.physics_at(subject.X, output).values()][:1]
-    seen = ~y.isnan()
-    drawn = torch.cat([each[seen] for each in (y, mean, *formulas)])
-    is_log = bool((drawn > 0).all()) and float(y[seen].max() / y[seen].min()) > _DECADE
+    name, formulas = subject.outputs[output], subject.physics_at(subject.X, output)
+    first = dict(zip(["your formula"], formulas.values(), strict=False))
     figure = html.new_figure(3.2)
-    ax = figure.subplots()
-    ends = [float(drawn.min()), float(drawn.max())]
-    ax.plot(ends, ends, color=GREY, lw=1, ls="--")
-    for f in formulas:
-        ax.plot(f[seen], y[seen], **DOTS | {"mec": RED, "mfc": "none"}, label="your formula")
-    told = "corrected, left out" if formulas else "predicted, left out"
-    bars = half[seen].minimum(mean[seen] * 0.999) if is_log else half[seen]
-    ax.errorbar(
-        mean[seen], y[seen], xerr=torch.stack([bars, half[seen]]), color=BLUE, elinewidth=0.8,
-        label=told, **DOTS,
-    )  # fmt: skip
-    if is_log:
-        ax.set(xscale="log", yscale="log")
-    ax.set(xlabel=f"predicted {labels(subject.outputs)[output]}", ylabel="measured")
+    ax = plots.draw_left_out(
+        figure.subplots(), subject.loo, subject.judged[:, output], output, first
+    )
     legend(ax)
-    tidy(ax)
     return [image(figure, f"measured over predicted {name}, by the formula and corrected")]
 
 

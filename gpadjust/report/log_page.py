@@ -22,8 +22,7 @@ _NAMES = {
 }
 _PARAMETERS = (
     "Intervals are of what is known if the physics is right but for these numbers. Where the "
-    "intervals of the free run hold far less than 95 %, it is not, and they are too narrow. "
-    "Compare 'known before' with the interval: where they are alike, the log says next to nothing."
+    "intervals of the free run hold far less than 95 %, it is not, and they are too narrow."
 )
 _FREE_RUN = (
     "The last {} were held out. From the last state before them, the runs follow the actions of "

@@ -11,9 +11,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import gpadjust
-from gpadjust.checks import progress_bar
 from gpadjust.core import GP, StackedGP, save
 from gpadjust.core.saving import Saved
+from gpadjust.progress import progress_bar
 from gpadjust.records import Identification
 from gpadjust.report import figures, log_page, tables
 from gpadjust.report import markup as html

@@ -19,7 +19,6 @@ from gpadjust.report.inputs import imports_of
 from gpadjust.report.markup import Markup, join, table, tag
 from gpadjust.report.subject import Origin, Subject
 from gpadjust.validation.comparison import STACKED, spread_of
-from gpadjust.validation.plots import quantile
 from gpadjust.validation.verdict import ALONE
 from gpadjust.words import bare, listed, name_and_unit, number, percent, plural, with_unit
 
@@ -48,9 +47,9 @@ _COVERAGE = (
 )
 _PARAMETERS = (
     "A bias that is free to vary leaves open which values are the true ones: these describe the "
-    "system best together with it. Compare 'known before' with the interval: where they are alike, "
-    "the data say next to nothing."
+    "system best together with it."
 )
+_UNTOLD = "The data say next to nothing of {}, which {} as known before."
 _SUMMARY = (
     "In the units of the data; of samples the median, and the range of 95 % of them. A lengthscale "
     "is the distance over which a function changes, sd how much. Means are those of the prior; "
@@ -134,11 +133,11 @@ def _worst(subject: Subject, j: int) -> Markup:
     order = [i for i in distance.argsort(descending=True).tolist() if distance[i] >= 0][:_WORST]
     inputs = subject.inputs if len(subject.inputs) <= 4 else ()
     head = ["", *(with_unit(what, name, "{} [{}]") for what in ("observed", "predicted"))]
-    rows = []
+    rows, (low, high) = [], loo.interval()
     for i in order:
-        mean, half = loo.mean[i, j], quantile(0.95) * loo.variance[i, j].sqrt()
-        interval = f"{number(mean - half, 4)} to {number(mean + half, 4)}"
-        cells = [number(loo.Y[i, j], 4), number(mean, 4), interval, f"{loo.residuals[i, j]:+.1f}"]
+        observed, mean = (number(each[i, j], 4) for each in (loo.Y, loo.mean))
+        interval = f"{number(low[i, j], 4)} to {number(high[i, j], 4)}"
+        cells = [observed, mean, interval, f"{loo.residuals[i, j]:+.1f}"]
         cells += figures.point(subject, subject.X[i]) if inputs else []
         rows.append([subject.rows[i] + " (outlier)" * (subject.rows[i] in outliers), *cells])
     caption = f"The {len(rows)} observations of {name} that are farthest from their predictions"
@@ -174,6 +173,9 @@ def parameters(subject: Subject) -> Markup:
     for caption, own in known.items():
         if own:
             parts += [html.parameter_table(caption, own), figures.densities(own)]
+            if own.untold:
+                stay = "stays" if len(own.untold) == 1 else "stay"
+                parts.append(tag("p", _UNTOLD.format(listed(own.untold), stay)))
     return join([*parts, tag("p", _PARAMETERS)]) if parts else Markup()
 
 

@@ -28,6 +28,7 @@ from gpadjust.control import EpisodeCheckpoint, StepGuard, Task
 from gpadjust.control import episodes as real
 from gpadjust.control.checkpoint import locked, pickled_environment
 from gpadjust.control.faults import check_observation
+from gpadjust.display import Display
 from gpadjust.dynamics import Trajectories
 from gpadjust.rl.buffer import MixedReplayBuffer
 from gpadjust.rl.callbacks import AgentCallback, DynaCallback
@@ -35,7 +36,7 @@ from gpadjust.rl.model_vec_env import ModelVecEnv
 from gpadjust.rl.options import DynaOptions
 
 
-class Dyna(OffPolicyAlgorithm):
+class Dyna(OffPolicyAlgorithm, Display):
     r"""A base for off-policy learners, which then train on real episodes and in a model.
 
     After each real episode it updates on what it has, as the learner does; teaches the real
@@ -295,6 +296,9 @@ class Dyna(OffPolicyAlgorithm):
     def __repr__(self) -> str:
         """Name the agent, its environment and dynamics, what it has done, and its last reward."""
         return real.described(self)
+
+    def _repr_html_(self) -> str:
+        return real.html_of(self)
 
     # The loop of Stable-Baselines3
 

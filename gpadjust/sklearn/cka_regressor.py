@@ -34,7 +34,7 @@ from gpadjust.many import VariationalCKA
 from gpadjust.physics import PhysicsWarning
 from gpadjust.physics.function import array_physics
 from gpadjust.physics.parameters import PhysicsParameters
-from gpadjust.validation.verdict import faults
+from gpadjust.validation.faults import faults
 
 Array = NDArray[np.float64]
 
@@ -291,7 +291,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         covariances = []
         for output in range(self.model_.num_outputs):
             posterior = self.model_.posterior(X, [output], observation_noise)
-            covariances.append(posterior.distribution.covariance_matrix)
+            covariances.append(posterior.covariance_matrix)
         return torch.stack(covariances, dim=-1)
 
 

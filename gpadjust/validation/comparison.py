@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Normal, StudentT
 
-from gpadjust.checks import check_choice, progress_bar
+from gpadjust.checks import check_choice
 from gpadjust.core import (
     CKA,
     GP,
@@ -28,6 +28,8 @@ from gpadjust.core.data import ArrayLike, Data
 from gpadjust.display import Display, html_table
 from gpadjust.kinds.factory import ModelFactory, make_model, with_options
 from gpadjust.physics import Physics, PhysicsWarning, as_physics
+from gpadjust.progress import progress_bar
+from gpadjust.validation.faults import fault_of
 from gpadjust.validation.leave_one_out import ROUNDING, LeaveOneOut, leave_one_out
 from gpadjust.validation.trust import physics_at
 from gpadjust.validation.verdict import (
@@ -41,7 +43,6 @@ from gpadjust.validation.verdict import (
     Verdict,
     correction_of,
     difference,
-    fault_of,
     is_shown,
     next_point,
     straight_line,
@@ -399,6 +400,7 @@ def _verdict(c: Comparison, j: int, f: Tensor | None, fault: str) -> Verdict | N
         offset,
         fault,
         is_surpassed,
+        _correction_needed(c.models[adjusted.structure], c.results[adjusted.structure], j),
     )
     pair = c.models[adjusted.structure], c.models[without.structure]
     return verdict_on(evidence, correction, next_point(*pair, j))
@@ -586,6 +588,12 @@ def relevance_of(model: GP, result: FitResult) -> list[float]:
     without = [c.text for c in model.table.choices if any(z.endswith(".mean") for z in c.zeros)]
     shares = [result.probabilities[text] for text in without if text in result.probabilities]
     return [1 - sum(each) for each in zip(*shares, strict=True)]
+
+
+def _correction_needed(model: GP, result: FitResult, j: int) -> float:
+    """Return the probability that f_p of output j needs a correction; NaN if unknown."""
+    shares = [result.probabilities.get(c.text) for c in model.table.choices if not c.zeros]
+    return shares[0][j] if shares and shares[0] else math.nan
 
 
 def spread_of(y: Tensor) -> float:

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gpadjust.checks import check_level
 from gpadjust.core import GP, StackedGP
 from gpadjust.core.gaussian import DRAWS, Marginals
 from gpadjust.display import Display, html_table
@@ -37,6 +38,7 @@ class LeaveOneOut(Display):
         output_names: The names of the outputs.
         is_outlier: Whether an observation is an outlier of a noise with heavy tails, ``n x m``;
             None of other noise. Scores leave these out, but for the density.
+        marginals: The distributions of the predictions; None of Gaussian ones.
     """
 
     X: Tensor
@@ -47,6 +49,15 @@ class LeaveOneOut(Display):
     pit: Tensor
     output_names: tuple[str, ...]
     is_outlier: Tensor | None = None
+    marginals: Marginals | None = None
+
+    def interval(self, level: float = 0.95) -> tuple[Tensor, Tensor]:
+        """Return both ends of the central intervals of a level, ``n x m`` each."""
+        check_level(level)
+        marginals = self.marginals
+        if marginals is None:
+            marginals = Marginals(self.mean.unsqueeze(DRAWS), self.variance.unsqueeze(DRAWS))
+        return marginals.quantile((1 - level) / 2), marginals.quantile((1 + level) / 2)
 
     @property
     def residuals(self) -> Tensor:
@@ -122,7 +133,7 @@ def leave_one_out(model: Any) -> LeaveOneOut:
     is_outlier = getattr(getattr(model, "noise", None), "is_outlier", None)
     return LeaveOneOut(
         data.X, data.Y, *marginals.prediction, marginals.log_density(data.Y),
-        marginals.probability(data.Y), data.output_names, is_outlier,
+        marginals.probability(data.Y), data.output_names, is_outlier, marginals,
     )  # fmt: skip
 
 

@@ -34,7 +34,8 @@ import re
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from statistics import NormalDist
-from typing import Any
+from textwrap import fill
+from typing import TYPE_CHECKING, Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -60,6 +61,9 @@ from gpadjust.validation.scores import Scores
 from gpadjust.validation.trust import SIDES, Trust, physics_at
 from gpadjust.validation.verdict import ALONE, CALIBRATED
 
+if TYPE_CHECKING:  # it needs pandas
+    from gpadjust.core.priors import Priors
+
 __all__ = [
     "plot_adjustment",
     "plot_comparison",
@@ -68,6 +72,7 @@ __all__ = [
     "plot_model",
     "plot_parameters",
     "plot_prediction",
+    "plot_priors",
     "plot_trust",
 ]
 BLUE, RED, GREY = "#0072B2", "#D55E00", "0.45"  # told apart by the colour-blind, too
@@ -78,6 +83,12 @@ _STYLES = ("--", "-.", ":")  # of several physics
 _COLORS = (BLUE, RED, "0.85")  # of physics, data and neither
 _BINS = 10  # of each input
 _HONEST = "95 % if intervals hold"
+_DECADE = 10.0  # highest over lowest, from which axes are logarithmic
+_BARS = 30  # of a histogram of draws
+_COLUMNS = 4  # of panels
+_LINE = 24  # characters of a label
+_POSTERIOR: dict[str, Any] = {"color": BLUE, "alpha": 0.75, "fill": True, "label": "posterior"}
+_PRIOR: dict[str, Any] = {"color": GREY, "lw": 1.2, "label": "prior"}
 
 
 def plot_model(model: Any, *, output: int = 0, level: float = 0.95, axes: Any = None) -> Any:
@@ -219,7 +230,7 @@ def plot_prediction(
 def plot_leave_one_out(
     loo: LeaveOneOut, *, output: int = 0, level: float = 0.95, axes: Any = None
 ) -> Any:
-    """Draw left-out predictions against the observations, and standardized residuals.
+    """Draw observations over left-out predictions, and standardized residuals.
 
     ``axes`` are two; so many are returned.
     """
@@ -228,13 +239,10 @@ def plot_leave_one_out(
             f"Expected a LeaveOneOut, got {type(loo).__name__}; pass `leave_one_out(model)`."
         )
     z = quantile(level)
-    values = (loo.Y, loo.mean, loo.variance.sqrt(), loo.residuals)
-    Y, mean, sd, residuals = (column(each, output) for each in values)
+    mean, residuals = column(loo.mean, output), column(loo.residuals, output)
     axes = axes_of(axes, 1, 2)[0]
-    name = labels(loo.output_names)[output]
-    drawn = (mean, mean - z * sd, mean + z * sd)
-    against_truth(axes[0], Y, drawn, level, f"observed {name}")
-    axes[0].set_ylabel("predicted without it")
+    draw_left_out(axes[0], loo, column(loo.Y, output), output, {}, level=level)
+    legend(axes[0], loc="upper left")
     axes[1].axhspan(-z, z, **BAND, label=f"{100 * level:g} %")
     axes[1].axhline(0, color=GREY, lw=1, ls="--")
     axes[1].plot(mean, residuals, color=BLUE, **DOTS)
@@ -247,24 +255,20 @@ def plot_leave_one_out(
 def plot_comparison(comparison: Comparison, *, output: int = 0, axes: Any = None) -> Any:
     """Draw left-out predictions by the formula and by what is recommended, and the scores.
 
-    The first axes have predictions against observations. The second have the expected log
+    The first axes have observations over predictions. The second have the expected log
     predictive density of each structure less that of the best, with two standard errors, and its
     weight; ``axes`` are these two.
     """
     loo = comparison.leave_one_out()
-    mean, sd, y = (column(each, output) for each in (loo.mean, loo.variance.sqrt(), loo.Y))
-    name = labels(loo.output_names)[output]
     axes = axes_of(axes, 1, 2)[0]
-    half = quantile(0.95) * sd
-    against_truth(axes[0], y, (mean, mean - half, mean + half), 0.95, f"observed {name}")
-    formulas = [each for each in comparison.left_out if each.startswith((ALONE, CALIBRATED))]
-    hollow = DOTS | {"mfc": "none", "mew": 1.0}
-    for formula, color in zip(formulas, cycle((RED, GREY)), strict=False):
-        by_formula = comparison.left_out[formula].mean[:, output]
-        axes[0].plot(y, by_formula, **hollow | {"mec": color}, label=formula)
-    axes[0].containers[0].set_label(f"{comparison.chosen}, 95 %")
-    axes[0].set_ylabel("predicted without it")
-    legend(axes[0], loc="upper left")
+    formulas = {
+        name: column(each.mean, output)
+        for name, each in comparison.left_out.items()
+        if name.startswith((ALONE, CALIBRATED))
+    }
+    name = f"{comparison.chosen}, left out"
+    draw_left_out(axes[0], loo, column(loo.Y, output), output, formulas, name)
+    legend(axes[0])
     rows = [row for row in comparison.table[loo.output_names[output]] if not math.isnan(row.weight)]
     places = range(len(rows))
     differences, errors = [row.elpd_diff for row in rows], [2 * row.se_diff for row in rows]
@@ -305,6 +309,43 @@ def plot_parameters(parameters: PhysicsParameters, *, axes: Any = None) -> Any:
     axes[0].set_ylabel("density")
     legend(axes[0])
     return axes
+
+
+def plot_priors(priors: Priors, *, axes: Any = None) -> Any:
+    """Draw the prior of each unknown number of a model, and its posterior after a fit.
+
+    Curves are shares of draws, on a logarithmic axis where the number spans a decade; a point fit
+    is a line. Return an array of as many axes as ``model.priors()`` has rows.
+    """
+    n = len(priors.prior)
+    shape = (1, n) if axes is not None else (-(-n // _COLUMNS), min(n, _COLUMNS))
+    axes = axes_of(axes, *shape, 2.4).flatten()
+    posterior = priors.posterior or [each[:0] for each in priors.prior]
+    several = len({*priors["output"]} - {""}) > 1
+    for i, (ax, drawn, after) in enumerate(zip(axes, priors.prior, posterior, strict=False)):
+        inner = drawn.quantile(drawn.new_tensor([0.01, 0.99]))
+        low, high = (float(end) for end in torch.cat([inner, after[after != 0]]).aminmax())
+        is_log = low > 0 and high > _DECADE * low
+        if is_log:
+            edges = np.geomspace(low, high, _BARS + 1)
+            ax.set_xscale("log")
+        else:
+            edges = np.linspace(low, high, _BARS + 1)
+        if len(after) == 1:
+            ax.axvline(float(after), color=BLUE, label="value")
+        for draws, style in ((after, _POSTERIOR), (drawn, _PRIOR)):
+            if len(draws) > 1:
+                counts, _ = np.histogram(draws, edges)
+                ax.stairs(counts / len(draws), edges, **style)
+        name, output = priors["name"][i], priors["output"][i]
+        name = fill(f"{name} for {output}" if several and output else name, _LINE)
+        ax.set(xlabel=name, yticks=[])
+        tidy(ax)
+    for ax in axes[n:]:
+        ax.remove()
+    axes[0].set_ylabel("share of draws")
+    legend(axes[0])
+    return axes[:n]
 
 
 def plot_coverage(
@@ -413,6 +454,39 @@ def draw_data(ax: Axes, model: Any, output: int) -> None:
     y = column(model.data.Y, output)
     x = model.data.X[~y.isnan(), 0]
     ax.plot(x, y[~y.isnan()], color=RED, **DOTS, label="data")
+
+
+def draw_left_out(
+    ax: Axes,
+    loo: LeaveOneOut,
+    y: Tensor,
+    output: int,
+    formulas: Mapping[str, Tensor],
+    name: str = "",
+    level: float = 0.95,
+) -> Axes:
+    """Draw observations ``n`` over left-out predictions, and over values of formulas, ``n`` each.
+
+    Axes are logarithmic where the observations span a decade.
+    """
+    ends = [column(each, output) for each in loo.interval(level)]
+    seen = ~y.isnan()
+    y, mean, low, high = (each[seen] for each in (y, column(loo.mean, output), *ends))
+    values = {formula: f[seen] for formula, f in formulas.items()}
+    drawn = torch.cat([y, mean, *values.values()])
+    is_log = bool((drawn > 0).all()) and float(y.max() / y.min()) > _DECADE
+    if is_log:
+        low = low.maximum(1e-3 * mean)  # an axis of logarithms has no room for less
+        ax.set(xscale="log", yscale="log")
+    ax.plot([drawn.min(), drawn.max()], [drawn.min(), drawn.max()], color=GREY, lw=1, ls="--")
+    for (formula, f), color in zip(values.items(), cycle((RED, GREY)), strict=False):
+        ax.plot(f, y, **DOTS | {"mec": color, "mfc": "none", "mew": 1.0}, label=formula)
+    name = name or ("corrected, left out" if formulas else "predicted, left out")
+    bars = torch.stack([mean - low, high - mean]).clamp_min(0.0)
+    how: dict[str, Any] = {"color": BLUE, "elinewidth": 0.8, "alpha": 0.85, **DOTS}
+    ax.errorbar(mean, y, xerr=bars, label=f"{name}, {100 * level:g} %", **how)
+    ax.set(xlabel=f"predicted {labels(loo.output_names)[output]}", ylabel="measured")
+    return ax
 
 
 def _draw_ticks(ax: Axes, model: Any, output: int, i: int) -> None:

@@ -1,6 +1,7 @@
 """Agents: they play an episode, learn the dynamics, and improve."""
 
 import re
+import sys
 from contextlib import nullcontext
 from dataclasses import replace
 
@@ -12,7 +13,7 @@ from gymnasium.wrappers import TransformObservation
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.noise import NormalActionNoise
 
-from gpadjust import ZeroMeanGP
+from gpadjust import ZeroMeanGP, progress
 from gpadjust.control import (
     Agent,
     MPCAgent,
@@ -377,3 +378,19 @@ def test_the_cart_pole_swings_up_in_two_trials():
     task = Task(LearnedDynamics(CART_POLE_SPEC, f_p), cart_pole_reward)
     agent = MPCAgent(env, task, seed=3).learn(50)
     assert agent.recorded_episodes(newest=25).rewards.mean() > -0.45
+
+
+@pytest.mark.parametrize("is_seen", [True, False])
+def test_long_learning_shows_bars_where_somebody_sees_them(
+    make_agent, kind, is_seen, monkeypatch, capsys
+):
+    monkeypatch.setattr(progress, "PATIENCE", 0.0)
+    agent = make_agent(kind)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: is_seen, raising=False)
+    shown = {"learn", " steps", "fit", "plan" if kind is MPCAgent else "search"}
+    counted = []
+    monkeypatch.setattr("gpadjust.control.agent.tick", counted.append)
+    agent.learn(5)
+    assert counted == ["steps"] * 5
+    text = capsys.readouterr().err
+    assert all((each in text) == is_seen for each in shown)

@@ -6,15 +6,18 @@ import pytest
 import torch
 from botorch.acquisition import (
     LogExpectedImprovement,
+    UpperConfidenceBound,
     qLogExpectedImprovement,
     qLogNoisyExpectedImprovement,
+    qNegIntegratedPosteriorVariance,
+    qUpperConfidenceBound,
 )
 from botorch.acquisition.objective import GenericMCObjective, ScalarizedPosteriorTransform
 from botorch.generation import MaxPosteriorSampling
 from botorch.models import ModelListGP, SingleTaskGP
 from botorch.sampling import SobolQMCNormalSampler
 from botorch.sampling.pathwise import draw_matheron_paths
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gpadjust.core import (
@@ -43,6 +46,7 @@ from gpadjust.kinds.links import (
     linked,
 )
 from gpadjust.physics import FunctionPhysics, PhysicsError, Unknown
+from gpadjust.validation import leave_one_out
 
 X = torch.linspace(0.1, 1.0, 12, dtype=torch.float64).unsqueeze(-1)
 NEW = torch.tensor([[0.05], [0.5], [2.5]], dtype=torch.float64)
@@ -183,6 +187,47 @@ def test_predictions_are_within_their_intervals_and_bounds(case, means, log_sd, 
     assert variance.isfinite()
     assert (variance >= 0).all()
     assert link.value(torch.stack([lower, mean, upper])).isfinite().all()
+
+
+@settings(max_examples=10, deadline=None)
+@given(
+    st.sampled_from(["log", "logit", (0.0, 2.0)]),
+    st.sampled_from([CKA, PhysicsMeanGP, ZeroMeanGP]),
+    st.integers(2, 6),
+    st.sampled_from([0.3, 3.0, 30.0]),
+    st.integers(0, 1000),
+)
+@example("log", CKA, 2, 0.3, 1)  # sums of samples were infinite
+def test_whatever_is_asked_is_finite_and_within_its_interval(link, structure, n, spread, seed):
+    """Of few points, far from them, by draws from the prior, which is wider than any posterior."""
+    generator = torch.Generator().manual_seed(seed)
+    x = torch.rand(n, 1, generator=generator).double()
+    z = spread * torch.randn(n, 1, generator=generator).double()
+    unit = {"log": 1.0, "logit": 1.0}.get(link, 2.0)
+    y = z.exp() if link == "log" else unit * z.sigmoid().clamp(1e-9, 1 - 1e-9)
+    physics = {} if structure is ZeroMeanGP else {"physics": lambda X: 0.3 + 0.2 * X[:, :1].sin()}
+    model = linked(structure)(x, y, link=link, **physics)
+    model.set_draws(model.table.prior_draws(16, seed))
+    new = torch.tensor([[0.5], [2.0], [1e3], [-1e6]]).double()
+    left_out = leave_one_out(model)
+    cases = [(left_out.mean, left_out.variance, *left_out.interval())]
+    for noise in (False, True):
+        ends = model.interval(new, observation_noise=noise)
+        posterior = model.posterior(new, observation_noise=noise)
+        cases += [(*model.predict(new, noise), *ends), (posterior.mean, posterior.variance, *ends)]
+    for mean, variance, low, high in cases:
+        assert (low <= mean).all()
+        assert (mean <= high).all()
+        assert all(each.isfinite().all() for each in (variance, variance.sum(), low, high))
+    with torch.no_grad():
+        for function in (
+            UpperConfidenceBound(model, 2.0),
+            LogExpectedImprovement(model, y.max()),
+            qLogExpectedImprovement(model, y.max()),
+            qUpperConfidenceBound(model, 2.0),
+            qNegIntegratedPosteriorVariance(model, new),
+        ):
+            assert function(new.unsqueeze(1)).isfinite().all(), type(function).__name__
 
 
 @pytest.mark.parametrize("bounds", [(0.0, math.inf), (2.0, 5.0), (-1.0, math.inf)])

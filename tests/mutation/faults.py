@@ -315,9 +315,9 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/records/kalman.py",
-        "end_spread = spread + gain @ (covariance[d:, d:] - spread[d:, d:]) @ gain.T",
-        "end_spread = spread",
-        "What later stretches say of the constants makes no earlier state less uncertain.",
+        "covariance = _even(A[k] @ covariance @ A[k].T) + block.covariances[0, k]",
+        "covariance = block.covariances[0, k]",
+        "The uncertainty of later rows does not reach earlier blocks of rows.",
     ),
     Fault(
         "gpadjust/records/kalman.py",

@@ -19,6 +19,7 @@ from gpadjust.physics import (
     PhysicsError,
     Unknown,
 )
+from gpadjust.physics.parameters import PhysicsParameters
 from tests.systems import refused
 
 A, B = Unknown(1.0, sd=0.5), Unknown(2.0, factor=1.5)
@@ -318,3 +319,15 @@ def test_a_function_that_takes_other_arguments_is_told_what_it_is_called_with():
     )
     misspelt = FunctionPhysics(lambda X, p: p.b * X[:, 0], unknowns={"a": Unknown(1.0, sd=1.0)})
     refused(PhysicsError, r"parameter 'b'; expected one of a\.", misspelt, X)
+
+
+@pytest.mark.parametrize(
+    ("middle", "spread", "is_untold"),
+    [(0.0, 1.0, True), (0.1, 0.9, True), (0.0, 0.5, False), (1.0, 1.0, False), (0.0, 0.0, False)],
+)
+@pytest.mark.parametrize("unknown", [A, B, Unknown(1.0, bounds=(0.0, 3.0))])
+def test_a_parameter_is_untold_where_its_posterior_is_its_prior(unknown, middle, spread, is_untold):
+    z = middle + spread * torch.special.ndtri(torch.linspace(0.005, 0.995, 100).double())
+    parameters = PhysicsParameters({"p": unknown}, [unknown.value(z)])
+    assert parameters.untold == ["p"] * is_untold
+    assert PhysicsParameters({"p": unknown}, [unknown.value(z[:1])]).untold == []

@@ -112,7 +112,7 @@ def test_advice_on_parameters():
         x, v, u = X.unbind(-1)
         return torch.stack([x + STEP * v, v + STEP * (u - p.k * x) + 0 * p.idle], -1)
 
-    unknowns = {"k": Unknown(1.0, factor=1.1), "idle": Unknown(1.0, sd=1.0)}
+    unknowns = {"k": Unknown(1.0, factor=1.2), "idle": Unknown(1.0, sd=1.0)}
     physics = FunctionPhysics(of_two, unknowns=unknowns)
     told = " ".join(quickly(Records(oscillation(80), SPEC), physics).advice)
     assert "next to nothing of idle" in told

@@ -1,13 +1,14 @@
 """States of records: by a dense Gaussian, and by what was simulated."""
 
 import math
-import re
+import sys
 
 import numpy as np
 import pytest
 import torch
 from scipy.linalg import block_diag
 
+from gpadjust import progress
 from gpadjust.dynamics import StateSpec
 from gpadjust.physics import FunctionPhysics, ODEPhysics, Unknown
 from gpadjust.records import Record, Records, smooth
@@ -143,6 +144,28 @@ def test_what_steps_add_is_expected_over_all_states(chain):
         row += 3
     _, found = expected_squares(links, smooth_chain(*chain)[0], 2)
     np.testing.assert_allclose(found, expected, atol=1e-8)
+
+
+def test_a_long_chain_is_computed_in_blocks_side_by_side(monkeypatch):
+    """A random walk of 2,500 rows: density and last state by the textbook, in a few solutions."""
+    rng = np.random.default_rng(0)
+    rows, noise, scatter = 2500, np.array([0.5]), np.array([0.1])
+    one = np.ones((rows, 1, 1))
+    measured = rng.normal(size=(rows, 1)).cumsum(0)
+    link = Link(one[1:], np.zeros((rows - 1, 1)), one, measured)
+    mean, variance, density = 0.3, 2.0, 0.0
+    for y in measured[:, 0]:
+        error, total = y - mean, variance + noise[0]
+        density -= 0.5 * (error**2 / total + math.log(2 * math.pi * total))
+        mean += variance / total * error
+        last, variance = variance * noise[0] / total, variance * noise[0] / total + scatter[0]
+    solutions, solve = [], np.linalg.solve
+    monkeypatch.setattr(np.linalg, "solve", lambda *two: solutions.append(1) or solve(*two))
+    (found,), log_density = smooth_chain([link], [(np.array([0.3]), 2 * one[0])], noise, scatter)
+    assert log_density == pytest.approx(density, rel=1e-12)
+    assert found.states.means[-1, 0] == pytest.approx(mean, rel=1e-12)
+    assert found.states.covariances[-1, 0, 0] == pytest.approx(last, rel=1e-12)
+    assert len(solutions) < 100
 
 
 @pytest.mark.slow
@@ -377,11 +400,74 @@ def test_intervals_of_parameters_hold_as_often_as_they_say():
 
 
 @pytest.mark.filterwarnings("ignore::gpadjust.records.SmoothingWarning")
-def test_a_long_log_is_told_with_its_time_and_what_takes_less(capsys):
-    run = simulated(0, length=3000)
-    given = {"max_rounds": 1, "num_starts": 1, "progress": True}
-    smooth(Records(measured(*run, 0), SPEC), spring(), **given)
-    told = r"3,000 steps: up to some \d+ min for 1 start\(s\) of 1 rounds.* steps of 3 rows"
-    assert re.search(told, capsys.readouterr().err, flags=re.DOTALL)
-    smooth(Records(measured(*simulated(0, length=100), 0), SPEC), spring(), **given)
-    assert "min for" not in capsys.readouterr().err
+@pytest.mark.parametrize("is_seen", [True, False])
+def test_long_smoothing_shows_a_bar_where_somebody_sees_it(is_seen, monkeypatch, capsys):
+    monkeypatch.setattr(progress, "PATIENCE", 0.0)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: is_seen, raising=False)
+    records = Records(measured(*simulated(0, length=50), 0), SPEC)
+    smooth(records, spring(), max_rounds=3, num_starts=1)
+    assert (" rounds" in capsys.readouterr().err) == is_seen
+
+
+def pendulum_log(seed, rows=499, step=0.01, noise=0.005):
+    """Log of a pendulum, its angle alone, of mass 0.5 kg and little damping."""
+    rng = np.random.default_rng(seed)
+    torque = np.repeat(rng.uniform(-1, 1, (rows // 25 + 1, 1)), 25, 0)[:rows]
+    physics = swinging({"mass": Unknown(0.5, sd=1.0), "damping": Unknown(0.02, sd=1.0)})
+    row = torch.tensor([[*rng.uniform(-3, 3, 1), 0.0, 0.0]]).double()
+    states = []
+    for u in torch.from_numpy(torque):
+        row[0, 2] = u
+        states.append(row[0, :2].clone())
+        row[:, :2] = physics(row, torch.tensor([0.5, 0.02]).double())
+    states = torch.stack(states)
+    states[:, 0] += noise * torch.from_numpy(rng.normal(size=rows))
+    states[:, 1] = math.nan
+    times = step * torch.arange(rows).double()
+    return Records(Record(times, states, torch.from_numpy(torque)), StateSpec(["q", "w"], ["u"]))
+
+
+def swinging(unknowns):
+    def rates(state, action, p):
+        angle, rate = state.unbind(-1)
+        torque = action[:, 0] - 0.5 * 9.81 * p.mass * angle.sin() - p.damping * rate
+        return torch.stack([rate, torque / (0.25 * p.mass)], dim=-1)
+
+    return ODEPhysics(rates, step=0.01, state_dim=2, substeps=2, unknowns=unknowns)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1000, 1001])
+def test_noise_of_the_sensor_is_not_taken_for_process_noise(seed):
+    """One of six starts ends where process noise of the angle explains all that is measured."""
+    unknowns = {"mass": Unknown(0.3, factor=2.0), "damping": Unknown(0.2, factor=3.0)}
+    records, physics = pendulum_log(seed), swinging(unknowns)
+    found = smooth(records, physics, start={"w": (0.0, 5.0)}, num_starts=6)
+    assert found.noise[0] == pytest.approx(0.005, rel=0.15)
+    assert found.process_noise[0] < 1e-4
+    assert inside(torch.tensor([0.5, 0.02]), found.physics_parameters.interval(0.999))
+
+
+@pytest.fixture
+def ticked(monkeypatch):
+    """Positions of a bar of progress."""
+    import gpadjust.records.smoothing as smoothing
+
+    positions = []
+
+    def tick(unit, to=None):
+        positions.append((positions[-1] if positions else 0) + 1 if to is None else to)
+
+    monkeypatch.setattr(smoothing, "tick", tick)
+    return positions
+
+
+def test_a_right_physics_settles_in_few_rounds_and_progress_never_goes_back(ticked):
+    """Where process noise is none, expectation maximisation would creep for 100 rounds."""
+    records = pendulum_log(0, rows=200)
+    unknowns = {"mass": Unknown(0.4, factor=1.5), "damping": Unknown(0.03, factor=2.0)}
+    found = smooth(records, swinging(unknowns), start={"w": (0.0, 5.0)}, num_starts=2)
+    assert found.process_noise[0] < 1e-4
+    assert ticked == sorted(ticked)
+    assert ticked[1] == 1
+    assert max(position for position in ticked if position < 100) < 60

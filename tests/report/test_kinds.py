@@ -98,6 +98,17 @@ def test_unknown_parameters(tmp_path, read):
     assert float(row[1]) == pytest.approx(float(model.physics_parameters.mean), rel=1e-3)
     assert row[-2:] == ["2 ± 1", "m"]
     assert "(with fitted parameters) is off by" in page.text
+    assert "next to nothing" not in page.text
+
+
+def test_parameters_that_stay_as_known_before_are_named(tmp_path, read, undrawn):
+    X, Y = problem(1, 1)
+    unknowns = {"gain": Unknown(2.0, sd=1.0), "beyond": Unknown(1.0, sd=0.5)}
+    rows = lambda X, p: p.gain * X.sum(-1).sin() + p.beyond * (X[:, 0] - 9).clamp_min(0.0)  # noqa: E731
+    model = CalibratedPhysics(X, Y, physics=FunctionPhysics(rows, unknowns=unknowns))
+    fit(model)
+    page = read(report(model, tmp_path / "report.html"))
+    assert "The data say next to nothing of beyond, which stays as known before." in page.text
 
 
 @pytest.mark.slow

@@ -337,8 +337,11 @@ def test_kinds_of_data(data):
     for options in ({"link": (-5.0, 5.0)}, {"noise": HeavyTails()}):
         regressor = fast(model_options=options).fit(X, y)
         _, std = regressor.predict(Z, return_std=True)
+        _, covariance = regressor.predict(Z, return_cov=True)
         assert regressor.score(X, y) > 0.9
         assert (std > 0).all()
+        assert np.allclose(np.diag(covariance), std**2)
+        assert np.linalg.eigvalsh(covariance).min() > -1e-9 * covariance.max()
         assert regressor.sample_y(Z, 2).shape == (7, 2)
     assert isinstance(fast(model_options={"link": (-5, 5)}).fit(X, y).model_, LinkedCKA)
 

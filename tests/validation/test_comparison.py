@@ -193,6 +193,23 @@ def test_warnings_come_once_and_those_of_the_seed_as_advice(scaled):
     assert unsampled(rows, {"zero mean": FitResult("bayes", error=0.1)}) == []
 
 
+@pytest.mark.parametrize(("rival", "is_told"), [(0.01, False), (1000.0, True)])
+def test_only_what_is_recommended_warns(scaled, rival, is_told):
+    """Of two structures that suppose noises, the nearer one has all weight."""
+
+    def warning(X, Y):
+        warnings.warn("look at this", UserWarning, stacklevel=2)
+        return ZeroMeanGP(X, Y, 100.0**2)
+
+    other = partial(ZeroMeanGP, train_Yvar=rival**2)
+    structures = [Structure("it", warning, "data alone"), Structure("other", other, "data alone")]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = compare(*scaled, crude, structures=structures)
+    assert (found.chosen == "it") == is_told
+    assert ("look at this" in [str(each.message) for each in caught]) == is_told
+
+
 @pytest.mark.parametrize("variance", [None, 0.01], ids=["learnt noise", "known noise"])
 def test_units_make_no_difference(X, scaled, variance):
     Y = scaled[1]
@@ -239,6 +256,8 @@ GOOD = Evidence(
             "Use it corrected",
             "from 0.1 N to 0.1",
         ),
+        ({"correction_needed": 0.4}, "Use your formula as it is", "Its error is 0.5 N"),
+        ({"correction_needed": 0.4, "is_surpassed": True}, "Use it corrected", "from 0.5 N to 0.1"),
         ({"line": 0.1, "factor": 2.0}, "Use your formula as it is", "Take 2 times your formula: "),
         ({"line": 0.1, "factor": 2.0, "offset": -3.0}, "Use your formula as it is", "less 3 N: "),
         ({"of_use": 0.01, "gain": 0.5}, "Do not use it", "Without it the error is 0.3 N, with it"),

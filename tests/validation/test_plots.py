@@ -150,7 +150,9 @@ def test_leave_one_out(plane):
     loo = leave_one_out(plane)
     axes = plot_leave_one_out(loo, output=1)
     drawn = axes[0].containers[0][0].get_xydata()
-    np.testing.assert_allclose(drawn, torch.stack([loo.Y[:, 1], loo.mean[:, 1]], dim=-1))
+    np.testing.assert_allclose(drawn, torch.stack([loo.mean[:, 1], loo.Y[:, 1]], dim=-1))
+    ends = np.array(axes[0].containers[0][2][0].get_segments())[:, :, 0].T
+    np.testing.assert_allclose(ends, torch.stack(loo.interval())[..., 1])
     drawn = axes[1].lines[-1].get_xydata()
     np.testing.assert_allclose(drawn, torch.stack([loo.mean, loo.residuals], dim=-1)[:, 1])
 
@@ -171,7 +173,7 @@ def test_points_that_were_not_observed_are_not_drawn(data):
     loo = leave_one_out(model)
     axes = plot_leave_one_out(loo, output=1)
     drawn = axes[0].containers[0][0].get_xydata()
-    np.testing.assert_allclose(drawn, torch.stack([loo.Y, loo.mean], -1)[rest, 1])
+    np.testing.assert_allclose(drawn, torch.stack([loo.mean, loo.Y], -1)[rest, 1])
     np.testing.assert_allclose(axes[1].lines[-1].get_ydata()[rest], loo.residuals[rest, 1])
     assert np.isfinite(axes[1].get_ylim()).all()
     assert sum(bar.get_height() for bar in plot_pit(loo, output=1).patches) == len(rest)

@@ -5,7 +5,7 @@ import torch
 
 from gpadjust.core.data import Data
 from gpadjust.physics import as_physics
-from gpadjust.validation.verdict import fault_of
+from gpadjust.validation.faults import fault_of
 from tests.systems import line
 
 

@@ -1,0 +1,140 @@
+"""Faults of a physics that data show: scaled inputs, a wrong sign, offset or unit."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gpadjust.core import GP
+from gpadjust.core.data import Data
+from gpadjust.validation.trust import physics_at
+from gpadjust.words import listed, name_and_unit, number, with_unit
+
+_SAID = 5  # observations, for anything to be said
+_MANY = 8  # observations, for the sign or a factor of a twentieth by correlation
+_FAR = 3.0  # standard deviations of the targets, beyond which a physics is off
+_NEAR = 0.5  # of the targets' root mean square; a physics that is nearer is crude, no more
+_WORSE = 1.5  # standard deviations, where the cause is plain
+_APART = 12.0  # standard deviations of the targets; a smaller offset is crudeness
+_FACTOR = 10.0  # a smaller factor is crudeness
+_TINY = 20.0  # times too small: next to nothing, so that the error is that of no physics
+_HUGE = 100.0  # times as large as the targets, whatever its shape
+_EXPLAINS = 1 / 3  # of the error is left, where its cause is found
+_FITS = 0.6  # standard deviations of the targets that a factor leaves
+_LIKE = 0.8  # of the error is left by the opposite, at most
+_FOLLOWS = 0.5  # correlation of a physics that has anything to do with the targets
+_TIGHT = 0.9  # correlation that shows what the size of the error does not
+_SHOWN = 3.0  # standard errors of a correlation
+_ROUNDING = 1e-9  # relative; less is rounding
+_STANDARD = 1e-6  # of means and standard deviations that a scaler made
+
+
+def fault_of(data: Data, output: int, f: Tensor) -> str:
+    """Return what is obviously wrong with values ``n`` of f_p of an output; empty if nothing is."""
+    y, X = data.Y[:, output], data.X
+    seen = ~y.isnan() & f.isfinite()
+    y, f = y[seen], f[seen]
+    if len(y) < _SAID:
+        return ""
+    sd = float(y.std())
+    cause = _cause(data, output, X[seen], y, f) if sd > _ROUNDING * rms(y) else ""
+    if cause and _is_standardised(y.unsqueeze(-1)):
+        cause += " The targets were standardised; f_p has to return what they are in."
+    name = data.output_names[output]
+    errors = [with_unit(number(value), name) for value in (rms(y - f), sd)]
+    return cause and (
+        f"at the training inputs f_p has a root mean square error of {errors[0]}, where the "
+        f"targets have a standard deviation of {errors[1]}: {cause}"
+    )
+
+
+def faults(model: GP) -> list[str]:
+    """Return what is obviously wrong with the physics of a fitted model, for each and output."""
+    found = []
+    for name, values in physics_at(model, model.data.X).items():
+        for j, output in enumerate(model.data.output_names):
+            if fault := fault_of(model.data, j, values[:, j]):
+                where = f"{name}: " if len(model.physics) > 1 else ""
+                found.append(
+                    f"{where}{output}: {fault}" if model.num_outputs > 1 else where + fault
+                )
+    return found
+
+
+def _cause(data: Data, output: int, X: Tensor, y: Tensor, f: Tensor) -> str:
+    """Return what is wrong with f_p: scaled inputs, or a sign, an offset or a factor."""
+    n, sd, size, rmse = len(y), float(y.std()), rms(y), rms(f - y)
+    r = _correlation(y, f)
+    if rmse > (_WORSE if r > _FOLLOWS else 1.0) * sd and _is_standardised(X):
+        return (
+            "are the inputs scaled? Each column of them has mean 0 and standard deviation 1, and "
+            f"the correlation of f_p with the targets is {r:.2f}. f_p reads raw units: give the "
+            "model raw inputs; its input_transform may scale them, and shows f_p raw ones."
+        )
+    if rmse <= _NEAR * size:
+        return ""
+    factor, by_factor = _factor(y, f, r)
+    is_off = rmse > _FAR * sd
+    is_opposite = r < -_FOLLOWS and r**2 * (n - 2) > _SHOWN**2 * (1 - r**2)
+    is_worse = n >= _MANY and rmse > _WORSE * sd and r < -_TIGHT
+    if is_opposite and (is_off or is_worse) and rms(f + y) < (1.0 if is_off else _LIKE) * rmse:
+        large = f", and {_times(factor)}" if abs(factor) > _FACTOR else ""
+        return f"f_p is of the opposite sign (correlation {r:.2f}){large}."
+    is_tiny = n >= _MANY and r > _TIGHT and 0 < factor < 1 / _TINY
+    if not is_off and not is_tiny:
+        return ""
+    offset = float((f - y).mean())
+    by_offset = rms(f - y - offset)
+    if rmse > _APART * sd and by_offset < _EXPLAINS * rmse and by_offset <= by_factor:
+        where = "above" if offset > 0 else "below"
+        return f"f_p is about {number(abs(offset))} {where} the targets."
+    if factor > 0 and not 1 / _FACTOR < factor < _FACTOR:
+        return f"f_p is {_times(factor)}; {_units(data, output)}"
+    return ""
+
+
+def _factor(y: Tensor, f: Tensor, r: float) -> tuple[float, float]:
+    """Return how many times too large f_p is, 0 if that says nothing, and the error without."""
+    sd, size = float(y.std()), rms(y)
+    slope = float(f @ y / (f @ f)) if f.any() else 0.0
+    by_factor, affine = rms(y - slope * f), sd * max(0.0, 1 - r**2) ** 0.5
+    if affine < _FITS * sd and by_factor > 1.5 * affine:  # there is an offset, too
+        slope = r * sd / float(f.std())
+    elif by_factor > _FITS * sd:
+        slope = size / rms(f) if rms(f) > _HUGE * size else 0.0
+        slope = -slope if r < -_FOLLOWS else slope
+    return (1 / slope if slope else 0.0), by_factor
+
+
+def _correlation(y: Tensor, f: Tensor) -> float:
+    """Return the correlation; 0 of a constant f_p."""
+    if float(f.std()) <= _ROUNDING * rms(f):
+        return 0.0
+    return float(torch.corrcoef(torch.stack([y, f]))[0, 1])
+
+
+def _is_standardised(values: Tensor) -> bool:
+    """Return whether a scaler made the columns of ``n x d``; it makes 0 of a constant one."""
+    mean, sd = values.mean(0), values.std(0, correction=0)
+    ones = torch.stack([(sd - 1).abs(), (values.std(0) - 1).abs()]).amin(0) < _STANDARD
+    return bool((mean.abs() < _STANDARD).all() & (ones | (sd == 0)).all() & ones.any())
+
+
+def rms(values: Tensor) -> float:
+    """Return the root mean square of values."""
+    return float(values.square().mean().sqrt())
+
+
+def _times(factor: float) -> str:
+    """Return a text for a factor, too large or too small."""
+    size = "large" if abs(factor) >= 1 else "small"
+    return f"about {float(f'{max(abs(factor), 1 / abs(factor)):.2g}'):,g} times too {size}"
+
+
+def _units(data: Data, output: int) -> str:
+    """Return the question for the units of f_p, with those that names have."""
+    units = [" in ".join(name_and_unit(name)) for name in data.input_names if "[" in name]
+    name, unit = name_and_unit(data.output_names[output])
+    if not units or not unit:
+        return "are its units those of the targets?"
+    return f"does it give {name} in {unit}, and read {listed(units)}?"
