@@ -96,7 +96,9 @@ def stamp(experiment: Experiment, runs: Sequence[Run]) -> str:
         for (date, commit), number in sorted(made.items(), reverse=True)
     ]
     learners = dict.fromkeys(str(run[experiment.key[-2]]) for run in runs)
-    stale = [learner for learner in learners if f"{experiment.name} {learner}" in stale_list()]
+    is_committed = experiment.out.resolve() == STALE.parent / "results"
+    listed = stale_list() if is_committed else set()
+    stale = [learner for learner in learners if f"{experiment.name} {learner}" in listed]
     text = f"Runs: {'; '.join(parts[:3])}{'; others earlier' * (len(parts) > 3)}."
     if stale:
         which = "" if len(stale) == len(learners) else f" ({', '.join(stale)})"

@@ -136,6 +136,13 @@ def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
+def with_rows(text: str, rows: Iterable[Sequence[str]]) -> str:
+    """A table with further rows, such as published numbers; cells that they lack are empty."""
+    width = text.partition("\n")[0].count(" | ") + 1
+    lines = [[*row, *[""] * (width - len(row))] for row in rows]
+    return "\n".join([text, *("| " + " | ".join(line) + " |" for line in lines)])
+
+
 def aligned(text: str) -> str:
     """A text whose tables have columns of equal width, as a terminal shows them."""
     return re.sub(r"^\|.*\|(\n\|.*\|)*$", _aligned, text, flags=re.MULTILINE)

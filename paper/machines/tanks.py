@@ -17,7 +17,7 @@ from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
 from gpadjust.records import SmoothedRecords, SmoothingWarning, smooth
 from paper.common.experiment import Run, Table
 from paper.common.learners import LEARNERS
-from paper.common.tables import Cell, frame, groups, number, of, table
+from paper.common.tables import Cell, frame, groups, of, table, with_rows
 from paper.common.verdicts import Difference
 from paper.machines import CHOSEN, Tanks
 from paper.machines.tanks_systems import FULL, SPEC, START, levels, measured, outputs, physics
@@ -131,6 +131,6 @@ def tables(runs: Sequence[Run], experiment: Tanks) -> dict[str, Table]:
         lambda s, n: f"{axes['learner'][n]}, {axes['sensor'][s]}",
     )
     text = table(rows, columns, "learner")
-    for name, error in sorted(PUBLISHED.items(), key=lambda pair: pair[1]):
-        text += f"\n| {name}, published | {number(error, '.3f')} | | | | | |"
+    published = sorted(PUBLISHED.items(), key=lambda pair: pair[1])
+    text = with_rows(text, [[f"{name}, published", f"{error:.3f}"] for name, error in published])
     return {"learners": Table("Free runs of the validation record", text)}

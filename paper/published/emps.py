@@ -29,7 +29,7 @@ from gpadjust.physics import ParameterValues
 from gpadjust.records import Record, Records, SmoothedRecords, SmoothingWarning, smooth
 from paper.common.experiment import Run, Table
 from paper.common.figures import panels, save
-from paper.common.tables import Cell, frame, groups, markdown, number, of, table
+from paper.common.tables import Cell, frame, groups, markdown, number, of, table, with_rows
 from paper.common.verdicts import Difference
 from paper.published import Emps
 
@@ -189,8 +189,8 @@ def tables(runs: Sequence[Run], experiment: Emps) -> dict[str, Table]:
         "seconds": of("seconds", "mean", ".0f"),
     }
     text = table(parts, columns, "learner")
-    for name, (error, source) in PUBLISHED.items():
-        text += f"\n| {name}, {source} | | {number(error)} | | | | | |"
+    published = [[f"{n}, {source}", "", number(error)] for n, (error, source) in PUBLISHED.items()]
+    text = with_rows(text, published)
     rows = [[f"{n}, {u.unit}", f"{m:.2f} ± {s:.2f}"] for (n, u), (m, s) in
             zip(_UNKNOWNS.items(), AUTHORS.values(), strict=True)]  # fmt: skip
     for own in (run["estimation"] for run in runs if run["learner"] == "fitted"):

@@ -30,7 +30,7 @@ from gpadjust.dynamics import FreeRun, LearnedDynamics, PhysicsDynamics
 from gpadjust.records import SmoothedRecords, SmoothingWarning, smooth
 from paper.common.experiment import Run, Table
 from paper.common.figures import one_legend, panels, save
-from paper.common.tables import across, frame, groups, number, of, table
+from paper.common.tables import across, frame, groups, number, of, table, with_rows
 from paper.common.verdicts import Difference
 from paper.published import Freeruns
 from paper.published.freeruns_systems import SYSTEMS, narx_spec, records
@@ -161,16 +161,12 @@ def tables(runs: Sequence[Run], experiment: Freeruns) -> dict[str, Table]:
         return number(of_all.mean, ".3f") + (f" ± {of_all.error:.1g}" if several else "")
 
     text = table(parts, across(found, "record", labels, rmse), "RMSE")
-    trivial = []
-    for name in labels:
-        output, train = SYSTEMS[name].column(SYSTEMS[name].output), SYSTEMS[name].train
-        error = (output[train:] - output[:train].mean()).square().mean().sqrt()
-        trivial.append(number(float(error), ".3f"))
-    text += "\n| " + " | ".join(["mean of the first part", *trivial]) + " |"
+    there = [name for name in labels if (found["record"] == name).any()]
+    more = {"mean of the first part": [_trivial(name) for name in there]}
     for method, errors in PUBLISHED.items():
-        text += (
-            "\n| " + " | ".join([f"{method}, published", *(f"{e:.3f}" for e in errors), ""]) + " |"
-        )
+        known = dict(zip(labels, errors, strict=False))
+        more[f"{method}, published"] = [number(known.get(name, math.nan), ".3f") for name in there]
+    text = with_rows(text, [[label, *cells] for label, cells in more.items()])
     shown = {"95 % hold": of("coverage", "mean", ".2f"), "half width of 95 %": of("half_width")}
     shown |= {"seconds": of("seconds", "mean", ".0f"), "runs": len}
     each = groups(found, ["record", "learner"], lambda r, name: f"{labels[r]}, {names[name]}")
@@ -178,6 +174,12 @@ def tables(runs: Sequence[Run], experiment: Freeruns) -> dict[str, Table]:
         "errors": Table("RMSE of free runs along the test part", text),
         "details": Table("Intervals and seconds", table(each, shown, "record, learner")),
     }
+
+
+def _trivial(name: str) -> str:
+    """The error of the mean of the first part."""
+    output, train = SYSTEMS[name].column(SYSTEMS[name].output), SYSTEMS[name].train
+    return number(float((output[train:] - output[:train].mean()).square().mean().sqrt()), ".3f")
 
 
 def draw(runs: Sequence[Run], experiment: Freeruns) -> list[Path]:

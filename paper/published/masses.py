@@ -31,7 +31,7 @@ from gpadjust.core import GP, MATERN52, Stationary
 from gpadjust.core.kernels import RHO
 from gpadjust.physics import FunctionPhysics, ParameterValues
 from paper.common.experiment import Run, Table
-from paper.common.tables import Cell, frame, groups, number, of, table
+from paper.common.tables import Cell, frame, groups, number, of, table, with_rows
 from paper.published import Masses
 
 DATA = Path(__file__).parent / "data" / "masses" / "ame2020.csv"
@@ -200,8 +200,7 @@ def tables(runs: Sequence[Run], experiment: Masses) -> dict[str, Table]:
     )
     columns["seconds of a fit"] = of("seconds", "median", ".0f")
     text = table(parts, columns, "model")
-    empty = " |" * (len(columns) - 1)
-    text += "".join(f"\n| {label} | {value} |{empty}" for label, value in PUBLISHED.items())
+    text = with_rows(text, PUBLISHED.items())
     values = {f"{name}, MeV": _parameter(name) for name in _SHELL}
     return {
         "errors": Table("Errors of nuclides that are left out", text),

@@ -21,7 +21,7 @@ from gpadjust.core import SamplingWarning
 from gpadjust.physics import ParameterValues
 from gpadjust.validation import score
 from paper.common.experiment import Run, Table
-from paper.common.tables import Cell, frame, groups, number, of, table
+from paper.common.tables import Cell, frame, groups, number, of, table, with_rows
 from paper.common.verdicts import Difference
 from paper.published import Steels
 from paper.published.rivals import RIVALS
@@ -124,7 +124,6 @@ def tables(runs: Sequence[Run], experiment: Steels) -> dict[str, Table]:
     }
     rows = groups(frame(runs), "method", experiment.axes["method"])
     text = table(rows, columns, "method")
-    empty = " |" * (len(columns) - 1)
-    for name, error in sorted(PUBLISHED.items(), key=lambda pair: pair[1]):
-        text += f"\n| {name}, published | {error} |{empty}"
+    published = sorted(PUBLISHED.items(), key=lambda pair: pair[1])
+    text = with_rows(text, [[f"{name}, published", f"{error}"] for name, error in published])
     return {"errors": Table("312 steels, five fixed folds", text)}

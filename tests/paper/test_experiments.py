@@ -12,7 +12,7 @@ SMALL = {  # options, the number of runs, and a word of the tables
     "functions": (["--only", "wave", "5", "--num-test", "20"], 8, "CKA / formula fitted"),
     "kinds": (["--only", "relative", "noisy_inputs"], 8, "`noise=RelativeNoise()`"),
     "misled": (["--only", "unrelated", "--trials", "2", "--mc-samples", "8"], 8, "median regret"),
-    "parameters": (["--only", "ball", "focus"], 8, "calibrated CKA, gravity"),
+    "parameters": (["--only", "smooth", "focus", "physics", "free"], 6, "free delta, slope"),
     "steels": (["--only", "formula", "gp"], 4, "TPOT-Mat, published"),
     "uci": (["--only", "yacht", "0.1", "gp", "feature", "boosting"], 6, "WGBoost"),
     "nist": (["--only", "DanWood"], 4, "| within both limits | 1 |"),
@@ -42,7 +42,7 @@ SMALL = {  # options, the number of runs, and a word of the tables
             *("--rounds", "0", "--first-rounds", "0"),
         ],
         4,
-        "f_p alone, less CKA's",
+        "median of a trial",
     ),
 }
 
