@@ -37,6 +37,7 @@ Other physics, with unknown parameters or without::
     FormulaPhysics("1 + x", ["x"])               # a formula as text, or a spreadsheet's
     BlackBoxPhysics(simulator)                   # NumPy code; SubprocessPhysics: a program
     ODEPhysics(rate, step=0.1, state_dim=1)      # a differential equation
+    FMUPhysics("tank.fmu", ["T", "P"], ["T"], times=60)    # a model of Modelica or Simulink
     law = FunctionPhysics(lambda X, p: p.gain * X[:, 0], unknowns={"gain": Unknown(1.0, factor=2)})
     CalibratedPhysics(X, Y, physics=law)         # the law alone
 
@@ -60,7 +61,7 @@ Beyond the models::
     from gpadjust.records import Records, smooth           # log files of machines, as they are
     from gpadjust.dynamics import LearnedDynamics          # the next state of a system
     from gpadjust.control import MPCAgent                  # a controller; SAC and TD3: gpadjust.rl
-    from gpadjust.export import c_source, casadi_function  # onto the machine
+    from gpadjust.export import c_source, casadi_function  # onto the machine; export_fmu
     from gpadjust.sklearn import CKARegressor              # scikit-learn; Ax: gpadjust.ax
 """
 
@@ -84,6 +85,7 @@ if TYPE_CHECKING:
     from gpadjust.many import VariationalCKA
     from gpadjust.physics import (
         BlackBoxPhysics,
+        FMUPhysics,
         FormulaPhysics,
         FunctionPhysics,
         ODEPhysics,
@@ -104,6 +106,7 @@ __all__ = [
     "CalibratedPhysics",
     "Comparison",
     "EmulatedPhysics",
+    "FMUPhysics",
     "FormulaPhysics",
     "FunctionPhysics",
     "ODEPhysics",

@@ -16,6 +16,7 @@ from gpadjust import FunctionPhysics, Unknown
 from gpadjust.__main__ import main
 from gpadjust.control import Planner
 from tests.export.apart import apart
+from tests.fmus import fmu
 from tests.systems import line
 
 ROOT = Path(__file__).parents[1]
@@ -61,6 +62,8 @@ def test_the_first_command_writes_the_page_that_is_told(tmp_path, monkeypatch, c
 )
 def test_each_page_runs_by_itself(page, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    if page.stem == "fmus":
+        shutil.copy(fmu(), "tank.fmu")
     names = {}
     for block in blocks(page):
         exec(block, names)

@@ -3,6 +3,7 @@
 from gpadjust.physics.base import Physics
 from gpadjust.physics.black_box import BlackBoxPhysics
 from gpadjust.physics.error import PhysicsError, PhysicsWarning
+from gpadjust.physics.fmu_physics import FMUPhysics
 from gpadjust.physics.formula import FormulaPhysics
 from gpadjust.physics.function import FunctionPhysics, as_physics
 from gpadjust.physics.ode import ODEPhysics
@@ -12,6 +13,7 @@ from gpadjust.physics.unknown import Unknown
 
 __all__ = [
     "BlackBoxPhysics",
+    "FMUPhysics",
     "FormulaPhysics",
     "FunctionPhysics",
     "ODEPhysics",

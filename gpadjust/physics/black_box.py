@@ -76,15 +76,23 @@ class BlackBoxPhysics(Physics):
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """Return the function's outputs; an error of single rows contains those of the others."""
-        # A copy, to which a simulator may write.
-        tensor = torch.cat([X, *(values.rows for values in parameters)], dim=-1)
-        rows = tensor.detach().cpu().double().numpy()
+        rows = self._table(X, *parameters)
         if self.batched:
             return torch.from_numpy(real_array(self.function(*self._arguments(rows))))
         from joblib import Parallel, delayed  # slow to import
 
         call = delayed(_call_row)
         results = Parallel()(call(self.function, *self._arguments(row)) for row in rows)
+        return self._gathered(results)
+
+    @staticmethod
+    def _table(X: Tensor, *parameters: ParameterValues) -> NDArray[np.float64]:
+        """Return rows ``N x (d + p)`` as an array, a copy, to which a simulator may write."""
+        tensor = torch.cat([X, *(values.rows for values in parameters)], dim=-1)
+        return tensor.detach().cpu().double().numpy()
+
+    def _gathered(self, results: list[NDArray[np.float64] | PhysicsError]) -> Tensor:
+        """Return the outputs of rows ``(m,)`` as ``N x m``; an error if some of them failed."""
         m = next((len(y) for y in results if isinstance(y, np.ndarray)), 1)
         odd = PhysicsError(f"ValueError: found other than {m} output(s), as in other rows")
         found = [odd if isinstance(y, np.ndarray) and len(y) != m else y for y in results]
@@ -94,9 +102,9 @@ class BlackBoxPhysics(Physics):
             first = next(iter(errors.values()))
             raise PhysicsError(
                 f"Physics {self.name!r} raised {first}, in the first of {len(errors)} failed "
-                f"row(s) of {len(X)}. Correct it, or exclude such inputs:",
+                f"row(s) of {len(results)}. Correct it, or exclude such inputs:",
                 errors,
-                partial=torch.from_numpy(Y) if len(errors) < len(X) else None,
+                partial=torch.from_numpy(Y) if len(errors) < len(results) else None,
             ) from first.__cause__
         return torch.from_numpy(Y)
 

@@ -126,9 +126,14 @@ class Unknowns(dict[str, Unknown]):
                 f"unknowns must map names to Unknown(guess, sd=...); found {unknowns!r}."
             )
         for name in unknowns:
+            is_path = isinstance(name, str) and ("." in name.strip(".") or "[" in name)
             is_word = isinstance(name, str) and name.isidentifier() and not iskeyword(name)
-            if not is_word or name.startswith("_") or name == "rows" or hasattr(dict, name):
-                raise ValueError(f"Expected a name that can be an attribute, found {name!r}.")
+            is_attribute = is_word and not name.startswith("_") and name != "rows"
+            if not is_path and (not is_attribute or hasattr(dict, name)):
+                raise ValueError(
+                    "Expected a name that can be an attribute, or one with a point or bracket, "
+                    f"such as 'link1.mass' or 'wall[1].G', found {name!r}."
+                )
         super().__init__(unknowns)
 
     @property

@@ -130,6 +130,19 @@ def test_a_file_without_variance_says_the_next_state_alone(tmp_path):
     torch.testing.assert_close(found, dynamics.predict(state, action).mean, rtol=1e-9, atol=1e-12)
 
 
+def test_one_unit_may_contain_several_dynamics(tmp_path):
+    dynamics = [learnt(), learnt("absolute", partial(RRA, num_features=20))]
+    program = compiled(
+        "".join(c_source(each, f"d{i}") for i, each in enumerate(dynamics)), tmp_path
+    )
+    state, action = normal(6, seed=5), normal(1, seed=6)
+    f_p = pushed(torch.cat([state[1:5], action])[None])[0]
+    for i, each in enumerate(dynamics):
+        found = called(getattr(program, f"d{i}_step"), (6, 6), state, action, f_p)[0]
+        expected = each.predict(state, action).mean
+        torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-12)
+
+
 def test_a_step_in_place_is_that_into_another_array(tmp_path):
     """Each entry but the first is made of one that is written before it."""
     spec = StateSpec(

@@ -1,0 +1,116 @@
+"""FMUs of our own C code, made when they are needed: a tank with a wall, and a ball."""
+
+import atexit
+import functools
+import shutil
+import subprocess
+import tempfile
+import zipfile
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import pytest
+
+# Name, unit, causality, variability, initial, start and number of the state it is the rate of; in
+# the order of model.c.
+STATE, CONSTANT = ("continuous", "exact"), ("fixed", "exact")
+TANK = [
+    ("tank.T", "K", "output", *STATE, 300, 0),
+    ("wall[1].T", "K", "local", *STATE, 300, 0),
+    ("der(tank.T)", "", "local", "continuous", "calculated", None, 1),
+    ("der(wall[1].T)", "", "local", "continuous", "calculated", None, 2),
+    ("heater", "W", "input", "continuous", "", 0, 0),
+    ("ambient", "K", "input", "continuous", "", 300, 0),
+    ("tank.C", "J/K", "parameter", *CONSTANT, 4000, 0),
+    ("wall[1].G", "W/K", "parameter", *CONSTANT, 50, 0),
+    ("wall[1].C", "J/K", "parameter", *CONSTANT, 1000, 0),
+    ("loss", "W/K", "parameter", *CONSTANT, 10, 0),
+    ("wall_start", "K", "parameter", *CONSTANT, 0, 0),
+    ("walls", "", "parameter", *CONSTANT, 1, 0),
+]
+BALL = [
+    ("h", "m", "output", *STATE, 1, 0),
+    ("v", "m/s", "output", *STATE, 0, 0),
+    ("der(h)", "", "local", "continuous", "calculated", None, 1),
+    ("der(v)", "", "local", "continuous", "calculated", None, 2),
+    ("e", "", "parameter", *CONSTANT, 0.7, 0),
+    ("g", "m/s2", "parameter", *CONSTANT, 9.81, 0),
+]
+MODELS = {"tank": (1, TANK, 0), "ball": (2, BALL, 1)}
+
+
+def attributes(**values):
+    return "".join(f" {k}={quoteattr(str(v))}" for k, v in values.items() if v not in ("", None))
+
+
+def description(name, fmi, variables, number, indicators, interface):
+    """The modelDescription.xml of one of the models."""
+    exchange = {"completedIntegratorStepNotNeeded": "true"} if fmi == 2 else {}
+    kinds = f"<ModelExchange{attributes(modelIdentifier=name, **exchange, **interface['any'])}/>"
+    kinds += (
+        f"<CoSimulation{attributes(modelIdentifier=name, **interface['any'], **interface['cs'])}/>"
+    )
+    units = "".join(f'<Unit name="{unit}"/>' for unit in sorted({v[1] for v in variables} - {""}))
+    outputs = [i for i, v in enumerate(variables) if v[2] == "output"]
+    rates = [i for i, v in enumerate(variables) if v[6]]
+    unknown = [i for i, v in enumerate(variables) if v[4] in ("calculated", "approx")]
+    text = structure = ""
+    for i, (own, unit, causality, variability, initial, start, rate) in enumerate(variables):
+        about = {"name": own, "valueReference": i, "causality": causality}
+        about |= {"variability": variability, "initial": initial}
+        value = {"unit": unit, "start": None if initial == "calculated" else start}
+        if fmi == 2:
+            value["derivative"] = rate or ""
+            kind = "Integer" if own == "walls" else "Real"
+            real = f"<{kind}{attributes(**value)}/>"
+            text += f"<ScalarVariable{attributes(**about)}>{real}</ScalarVariable>"
+        else:
+            value["derivative"] = rate - 1 if rate else ""
+            kind = "Int32" if own == "walls" else "Float64"
+            text += f"<{kind}{attributes(**about, **value)}/>"
+    if fmi == 2:
+        tags = {"Outputs": outputs, "Derivatives": rates, "InitialUnknowns": unknown}
+        for tag, places in tags.items():
+            entries = "".join(f'<Unknown index="{i + 1}"/>' for i in places)
+            structure += f"<{tag}>{entries}</{tag}>"
+        head = {"fmiVersion": "2.0", "guid": number, "numberOfEventIndicators": indicators}
+    else:
+        about = {"name": "time", "valueReference": 99, "causality": "independent"}
+        text += f"<Float64{attributes(**about, variability='continuous')}/>"
+        tags = {"Output": outputs, "ContinuousStateDerivative": rates, "InitialUnknown": unknown}
+        for tag, places in tags.items():
+            structure += "".join(f'<{tag} valueReference="{i}"/>' for i in places)
+        structure += '<EventIndicator valueReference="0"/>' * indicators
+        head = {"fmiVersion": "3.0", "instantiationToken": number}
+    return (
+        f"<fmiModelDescription{attributes(modelName=name, **head)}>{kinds}"
+        f"<UnitDefinitions>{units}</UnitDefinitions><ModelVariables>{text}</ModelVariables>"
+        f"<ModelStructure>{structure}</ModelStructure></fmiModelDescription>"
+    )
+
+
+@functools.cache
+def fmu(name="tank", fmi=2, *, only_one=False, any_step=True, of=None, initial=None):
+    """The path of an FMU, one whose variable `of` has another `initial`."""
+    fmpy = pytest.importorskip("fmpy")
+    compiler = shutil.which("cc") or pytest.skip("there is no C compiler")
+    number, variables, indicators = MODELS[name]
+    folder = Path(tempfile.mkdtemp(prefix="fmu_"))
+    atexit.register(shutil.rmtree, folder)
+    library = folder / f"{name}{fmpy.sharedLibraryExtension}"
+    headers = Path(fmpy.__file__).parent / "c-code"
+    options = [f"-DFMI={fmi}", f"-DMODEL={number}", f"-DONLY_ONE={int(only_one)}", f"-I{headers}"]
+    command = [compiler, "-std=c99", "-O1", "-shared", "-fPIC", *options]
+    source = Path(__file__).with_name("model.c")
+    subprocess.run([*command, "-o", library, source, "-lm"], check=True)
+    interface = {
+        "any": {"canBeInstantiatedOnlyOncePerProcess": str(only_one).lower()},
+        "cs": {"canHandleVariableCommunicationStepSize": str(any_step).lower()},
+    }
+    variables = [(*v[:4], initial if v[0] == of else v[4], *v[5:]) for v in variables]
+    xml = description(name, fmi, variables, number, indicators, interface)
+    place = fmpy.platform if fmi == 2 else fmpy.platform_tuple
+    with zipfile.ZipFile(folder / f"{name}.fmu", "w") as file:
+        file.writestr("modelDescription.xml", xml)
+        file.write(library, f"binaries/{place}/{library.name}")
+    return folder / f"{name}.fmu"
