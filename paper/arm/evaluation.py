@@ -140,7 +140,7 @@ class ArmRecorder(Recorder):
         for name, value in row.items():
             self.log["evaluations"].setdefault(name, []).append(value)
         if episode in (self.settings.map_after, self.settings.episodes):
-            maps = {name: errors.tolist() for name, errors in by_target.items()}
+            maps = {name: errors.round(2).tolist() for name, errors in by_target.items()}
             self.log["maps"][f"{episode}"] = maps
 
     def _on_rollout_start(self) -> None:

@@ -65,7 +65,7 @@ def run(experiment: Reaching, system: str, learner: str, seed: int) -> Run:
             }
         )
         if trial in MAPPED:
-            maps[f"{trial}"] = errors["all_steps"].tolist()
+            maps[f"{trial}"] = errors["all_steps"].round(2).tolist()
     return {"trials": {name: [row[name] for row in rows] for name in rows[0]}, "maps": maps}
 
 

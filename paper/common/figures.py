@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from io import BytesIO
 from pathlib import Path
 
 import matplotlib as mpl
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from PIL import Image
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write a figure to a file; return it."""
-    with mpl.rc_context({"savefig.dpi": 110}):
-        figure.savefig(path)
+    """Write a figure to a file of few colors, which is small; return it."""
+    drawn = BytesIO()
+    with mpl.rc_context({"savefig.dpi": 100}):
+        figure.savefig(drawn)
+    Image.open(drawn).convert("RGB").quantize(96, dither=Image.Dither.NONE).save(
+        path, optimize=True
+    )
     return path
 
 

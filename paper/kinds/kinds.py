@@ -378,7 +378,9 @@ def tables(runs: Sequence[Run], experiment: Kinds) -> dict[str, Table]:
 
     def better(part: pd.DataFrame) -> str:
         wide = part.pivot_table(index="seed", columns="learner", values="error").dropna()
-        return f"{(wide['option'] < wide['plain']).sum()} of {len(wide)}" if len(wide) else ""
+        if len(wide.columns) < 2:
+            return ""
+        return f"{(wide['option'] < wide['plain']).sum()} of {len(wide)}"
 
     columns: dict[str, Cell] = {
         "plain": lambda part: OPTIONS[part["kind"].iloc[0]][0],
