@@ -21,7 +21,7 @@ from torch import Tensor
 
 
 def checked_whole(name: str, value: Any, least: int | None = None) -> int:
-    """A whole number as an int; not True or False.
+    """Return a whole number as an int; not True or False.
 
     Raises:
         TypeError: If it is none.
@@ -47,7 +47,7 @@ def checked_number(
     most: float | None = None,
     below: float | None = None,
 ) -> float:
-    """A finite real number as a float.
+    """Return a finite real number as a float.
 
     Args:
         name: The argument's name.
@@ -131,7 +131,7 @@ def checked_options(name: str, options: Any, known: Sequence[str]) -> dict[str, 
 
 
 def real_array(values: ArrayLike) -> NDArray[np.float64]:
-    """A copy of real numbers as a float64 array; a TypeError if they are anything else.
+    """Return a copy of real numbers as a float64 array; raise a TypeError for anything else.
 
     NumPy would drop the imaginary part of complex numbers, and take None for NaN and text for
     numbers.
@@ -149,7 +149,7 @@ def real_array(values: ArrayLike) -> NDArray[np.float64]:
 
 
 def finite_array(values: Any, shape: tuple[int, ...]) -> NDArray[np.float64] | None:
-    """A copy of finite real numbers of a shape; None if the values are something else."""
+    """Return a copy of finite real numbers of a shape; None for anything else."""
     try:
         numbers = real_array(values)
     except (TypeError, ValueError):
@@ -158,7 +158,7 @@ def finite_array(values: Any, shape: tuple[int, ...]) -> NDArray[np.float64] | N
 
 
 def checked_tensor(name: str, values: Any) -> Tensor:
-    """A copy of real numbers as a float64 tensor.
+    """Return a copy of real numbers as a float64 tensor.
 
     Raises:
         TypeError: If they are anything else.

@@ -1,6 +1,6 @@
-"""The paper's model as ordinary GPyTorch modules, for an ``ExactGP`` of one's own.
+"""The paper's model as ordinary GPyTorch modules, for your own ``ExactGP``.
 
-A mean and a kernel that read a physics; everything else is GPyTorch's::
+The mean and a kernel evaluate a physics; the rest is GPyTorch's::
 
     class MyCKA(gpytorch.models.ExactGP):
         def __init__(self, X, y, likelihood, f_p):
@@ -39,7 +39,8 @@ class PhysicsMean(Mean):
 
     def __init__(self, physics: Physics | Callable[[Tensor], Tensor], output: int = 0) -> None:
         super().__init__()
-        self.physics, self.output = as_physics(physics), output
+        self.physics = as_physics(physics)
+        self.output = output
 
     def forward(self, x: Tensor) -> Tensor:
         """Return f_p at ``... x n x d``: ``... x n``."""
@@ -51,10 +52,10 @@ class PhysicsScaledKernel(Kernel):
     r"""The kernel of :math:`\rho(x) f_p(x)`: :math:`f_p(x) \, k(x, x') \, f_p(x')`.
 
     Args:
-        base_kernel: k, that of rho.
+        base_kernel: The kernel k of rho.
         physics: As of :class:`PhysicsMean`.
         output: The number of the output.
-        center: A number c that is taken from f_p.
+        center: A number c; the kernel then has :math:`f_p(x) - c` in place of :math:`f_p(x)`.
     """
 
     def __init__(
@@ -65,17 +66,20 @@ class PhysicsScaledKernel(Kernel):
         center: float = 0.0,
     ) -> None:
         super().__init__()
-        self.base_kernel, self.mean = base_kernel, PhysicsMean(physics, output)
+        self.base_kernel = base_kernel
+        self.mean = PhysicsMean(physics, output)
         self.center = center
 
     @property
     def batch_shape(self) -> torch.Size:
-        """That of the base kernel."""
+        """The batch shape of the base kernel."""
         return self.base_kernel.batch_shape
 
     def forward(self, x1: Tensor, x2: Tensor, diag: bool = False, **params: Any) -> Tensor:
         """Return covariances ``... x n x n'``, or variances ``... x n``."""
-        f1, f2 = self.mean(x1) - self.center, self.mean(x2) - self.center
+        f1 = self.mean(x1) - self.center
+        f2 = self.mean(x2) - self.center
+        # cov(x, x') = (f_p(x) - c) k(x, x') (f_p(x') - c)
         if diag:
             variance: Tensor = self.base_kernel(x1, x2, diag=True, **params)
             return f1 * variance * f2

@@ -12,12 +12,14 @@ _UNIT = re.compile(r"(.*\S)\s*\[([^\[\]]*)\]", flags=re.DOTALL)
 
 
 def number(value: float | Tensor, digits: int = 3) -> str:
-    """Return a number with some significant digits, without an exponent where that is readable."""
+    """Return a number with ``digits`` significant digits, below 1e7 without an exponent."""
     value = float(value)
-    if not math.isfinite(value):
-        return "none" if math.isnan(value) else f"{value:g}"
+    if math.isnan(value):
+        return "none"
     text = f"{value:.{digits}g}"
-    return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e7 else text
+    if "e+" in text and abs(value) < 1e7:  # 12,300 rather than 1.23e+04
+        return f"{float(text):.0f}"
+    return text
 
 
 def percent(share: float | Tensor) -> str:
@@ -26,20 +28,22 @@ def percent(share: float | Tensor) -> str:
 
 
 def plural(count: int, noun: str) -> str:
-    """Return such as ``1 row`` and ``2 rows``."""
-    return f"{count:,} {noun}" + ("" if count == 1 else "s")
+    """Return a count with its noun, such as ``1 row`` or ``2 rows``."""
+    return f"{count:,} {noun}" + "s" * (count != 1)
 
 
 def listed(items: Iterable[str]) -> str:
-    """Return ``a, b and c``."""
+    """Return items as a text, such as ``a, b and c``."""
     *first, last = [*items] or [""]
-    return f"{', '.join(first)} and {last}" if first else last
+    return " and ".join([", ".join(first)] * bool(first) + [last])
 
 
 def name_and_unit(name: str) -> tuple[str, str]:
-    """Return ``"head"`` and ``"m"`` of ``"head [m]"``; no unit where none is in brackets."""
+    """Return ``"head"`` and ``"m"`` of ``"head [m]"``; ``""`` without a unit in brackets."""
     match = _UNIT.fullmatch(name.strip())
-    return (match[1], match[2].strip()) if match else (name, "")
+    if not match:
+        return name, ""
+    return match[1], match[2].strip()
 
 
 def bare(name: str) -> str:
@@ -48,6 +52,8 @@ def bare(name: str) -> str:
 
 
 def with_unit(value: str, name: str, form: str = "{} {}") -> str:
-    """Return a number, or words, with the unit of a name; as they are if it has none, or 1."""
+    """Return a value in the unit of a name; the value alone if the unit is missing or 1."""
     unit = name_and_unit(name)[1]
-    return form.format(value, unit) if unit not in ("", "1") else value
+    if unit in ("", "1"):
+        return value
+    return form.format(value, unit)

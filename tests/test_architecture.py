@@ -1,7 +1,10 @@
 """The plan of the house, kept by tests: see docs/architecture.md."""
 
 import ast
+import io
+import re
 import sys
+import tokenize
 from functools import cache
 from pathlib import Path
 
@@ -26,9 +29,9 @@ FLOORS = [
         "progress",
         "words",
         "display",
+        "states",
         "physics",
         "core",
-        "states",
         "files",
         "kinds",
         "many",
@@ -42,13 +45,25 @@ ROOMS = sorted(path.parent for path in ROOT.glob("*/__init__.py"))
 BELOW = ("botorch", "gpytorch", "linear_operator")  # libraries that ours builds on
 
 
+NOT_YET = {"control", "core", "export", "physics", "records", "report", "validation"}
+EDITED = [room for room in ROOMS if room.name not in NOT_YET]  # the words of these are held
+CONDITIONALS, TUPLES = 15, 20  # of 1,000 lines of code, at most
+COMMENTS = 7  # of 100 lines of code, at least
+VAGUE = {"found", "told", "given", "known", "kept", "seen", "own", "whole", "each", "said"}
+AVOIDED = re.compile(
+    r"\b(next to nothing|by the default fit|of one's own|is none|(is|are) said|says?|told|"
+    r"whether to|goes on|pays|errs?|look at it)\b"
+)
+LAYOUT = {getattr(tokenize, name) for name in ("NL", "NEWLINE", "INDENT", "DEDENT", "ENDMARKER")}
+DIRECTIVE = re.compile(r"#\s*(fmt|noqa|type)\b")
+
 CSV_TO_FREE_RUN = 33  # files that a log passes on the way to a judged free run
 TRIAL, ITERATION = 38, 39  # that a planned trial and an iteration of Dyna pass, fits included
 OF_CONTROL, OF_CONTROL_AND_RL = 10, 11  # of these
 FILES, CLASSES, FUNCTIONS = 14, 16, 132  # that the ten lines of the README pass; fewer are better
-CORE_LINES = 5064
+CORE_LINES = 5274
 REPORT, WITH_A_REPORT = 14, 29  # of report and validation, and of what is below, by default
-IDENTIFIED = 31  # that a log passes on the way to its page
+IDENTIFIED = 32  # that a log passes on the way to its page
 
 
 def passed(call):
@@ -315,3 +330,65 @@ def test_no_module_knows_its_owner():
 
     for module in graph:
         visit(module, [])
+
+
+def texts(tree):
+    """Docstrings and messages, f-strings without their values, each with its line."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield node.lineno, node.value
+
+
+@pytest.mark.parametrize("room", EDITED, ids=lambda room: room.name)
+def test_names_and_texts_are_plain(room):
+    for path in room.glob("**/*.py"):
+        names = {node for node in ast.walk(parsed(path)) if isinstance(node, ast.Name)}
+        stored = {node.id for node in names if isinstance(node.ctx, ast.Store)}
+        assert not stored & VAGUE, f"{path.name}: name the content in place of {stored & VAGUE}"
+        for number, text in texts(parsed(path)):
+            match = AVOIDED.search(text)
+            assert match is None, f"{path.name}:{number}: {match[0]!r} in {text[:200]!r}"
+
+
+def measured(path):
+    """Lines of code and of comments, conditional expressions and assignments of tuples to tuples.
+
+    Docstrings are not code; a comment for a tool is not one.
+    """
+    tree, code, comments, docstrings = parsed(path), set(), 0, set()
+    for node in ast.walk(tree):
+        value = getattr(node, "value", None) if isinstance(node, ast.Expr) else None
+        if isinstance(value, ast.Constant) and isinstance(value.value, str):
+            docstrings |= {*range(node.lineno, node.end_lineno + 1)}
+    for token in tokenize.generate_tokens(io.StringIO(path.read_text()).readline):
+        if token.type == tokenize.COMMENT:
+            comments += DIRECTIVE.match(token.string) is None
+        elif token.type not in LAYOUT:
+            code |= {*range(token.start[0], token.end[0] + 1)} - docstrings
+    nodes = [*ast.walk(tree)]
+    conditionals = sum(isinstance(node, ast.IfExp) for node in nodes)
+    assignments = [node for node in nodes if isinstance(node, ast.Assign)]
+    pairs = ((node.targets[0], node.value) for node in assignments)
+    tuples = sum(all(isinstance(side, ast.Tuple) for side in pair) for pair in pairs)
+    return len(code), comments, conditionals, tuples
+
+
+@pytest.mark.parametrize("room", EDITED, ids=lambda room: room.name)
+def test_there_is_one_thought_a_line_and_a_reason_beside_it(room):
+    columns = zip(*(measured(path) for path in room.glob("**/*.py")), strict=True)
+    code, comments, conditionals, tuples = map(sum, columns)
+    assert 1000 * conditionals <= CONDITIONALS * code, f"{conditionals} in {code} lines"
+    assert 1000 * tuples <= TUPLES * code, f"{tuples} in {code} lines"
+    assert 100 * comments >= COMMENTS * code, f"{comments} in {code} lines"
+
+
+@pytest.mark.parametrize("room", EDITED, ids=lambda room: room.name)
+def test_no_expression_hides_another(room):
+    """A conditional expression within another, or an assignment within a call."""
+    hiding = [(ast.IfExp, ast.IfExp), (ast.Call, ast.NamedExpr)]
+    for path in room.glob("**/*.py"):
+        for outer in ast.walk(parsed(path)):
+            inner = [kind for host, kind in hiding if isinstance(outer, host)]
+            nodes = (node for node in ast.walk(outer) if node is not outer)
+            hidden = [node.lineno for node in nodes if isinstance(node, tuple(inner))]
+            assert not hidden, f"{path.name}:{hidden}"

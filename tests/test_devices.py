@@ -15,6 +15,7 @@ FACTORIES = {
 ALLOWED = {
     "numbers of rows or draws, which index tensors of any device": {
         "core/fitting.py _parts",
+        "core/fitting.py _joined",
         "core/fitting.py _pooled",
         "core/fitting.py modes",
         "core/functions.py __init__",
@@ -47,6 +48,7 @@ ALLOWED = {
         "physics/parameters.py __init__",
         "physics/unknown.py _tails",
         "physics/unknown.py guess",
+        "physics/unknown.py knots",
     },
 }
 

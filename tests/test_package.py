@@ -21,6 +21,7 @@ from packaging.utils import canonicalize_name
 import gpadjust
 from gpadjust import RRA
 from gpadjust.kinds import pyro_model
+from gpadjust.physics import MujocoPhysics
 from tests.systems import line
 from tests.test_display import OBJECTS
 
@@ -89,6 +90,7 @@ def test_the_core_brings_no_more_than_botorch():
 NEEDED = {
     "matplotlib": ("plot", lambda: RRA(line(5), line(5), physics=torch.sin).plot()),
     "torchdiffeq": ("ode", lambda: gpadjust.ODEPhysics(lambda s, a: -s, 0.1, 1, method="dopri5")),
+    "mujoco": ("mujoco", lambda: MujocoPhysics("<mujoco/>")),
     "pyro": ("pyro", lambda: pyro_model(RRA(line(5), line(5), physics=torch.sin))),
 }
 

@@ -1,4 +1,4 @@
-"""A collection of measurements, by asking and telling or by a loop."""
+"""A collection of measurements: the next points, their results, and a loop."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ class CollectionError(RuntimeError):
     """A run stopped before its budget was spent.
 
     Args:
-        message: What happened.
+        message: The cause.
         collection: The collection so far.
-        X: The points that were being measured, ``q x d``.
+        X: The points of the last call of the oracle, ``q x d``.
         result: The values of the oracle, if the collection could not take them.
     """
 
@@ -61,21 +61,19 @@ class CollectionError(RuntimeError):
 
 
 class Collection(Measurements, Display):
-    """Chooses where to measure, for a laboratory that measures when it can.
+    """Chooses the points of measurements, for a laboratory or a program.
 
-    :meth:`ask` says where, :meth:`tell` takes what came out, in any order and for any points; where
-    a program can measure, :meth:`run` does both. The first points are a scrambled Sobol design;
-    later ones maximise the acquisition function of a model of all data so far. Points that were
-    asked for and not yet told are pending: acquisition functions that take ``X_pending`` count on
-    them.
+    :meth:`ask` returns the next points, :meth:`tell` takes results, in any order and for any
+    points. :meth:`run` does both with a function that measures. The first points are a scrambled
+    Sobol design; later ones maximise the acquisition function of a model of all data so far. Points
+    without a result are pending: acquisition functions with ``X_pending`` consider them.
 
-    With a log, each measurement is on the disk before :meth:`tell` does anything else, as a line of
-    JSON; so are the points asked for, before :meth:`ask` returns them. A new collection with the
-    same log goes on where the last one stopped, asks for the same points (with the same seed), and
-    has the same points pending. One collection at a time holds a log, until :meth:`close` (or the
-    end of ``with Collection(...) as collection:``), until it is out of scope, or until its process
-    ends. Nothing in a log is executed or unpickled: one from a stranger can be wrong, but does no
-    harm.
+    With a log, :meth:`tell` first writes each measurement to the disk, as a line of JSON, and
+    :meth:`ask` writes its points before it returns them. A new collection with the same log and the
+    same seed continues where the last one stopped, with the same next and pending points. One
+    collection at a time holds a log, until :meth:`close` (or the end of
+    ``with Collection(...) as collection:``), until it is out of scope, or until its process ends.
+    Nothing in a log is executed or unpickled: a log from a stranger may be wrong, but is harmless.
 
     Args:
         model_factory: A callable that makes a new model of ``X``, ``n x d``, and ``Y``, ``n x m``,
@@ -84,26 +82,27 @@ class Collection(Measurements, Display):
         bounds: Bounds of the inputs, ``2 x d``: lower, then upper.
         acquisition: Makes a BoTorch acquisition function of the fitted model.
         batch_size: Number of points that :meth:`ask` returns.
-        initial: Number of measurements, those of ``data`` included, before the first model; or the
-            first points, ``k x d``, no two alike, in place of Sobol's. Default: ``2 (d + 1)``.
-        data: ``(X, Y)`` measured before. They are not logged: give them each time.
-        keep: Numbers ``... x c`` of outputs ``... x m``, each of which is to be at most 0, such as
-            ``lambda Y: Y - 3`` for outputs below 3: measurements are made only where the model says
-            so with a ``probability``. First points, of ``initial`` or ``data``, are then to be
-            given, safe by what you know, such as f_p; they are not checked. Default: no limits.
-        probability: That of a measurement, noise included, being within the limits of ``keep``.
-        num_outputs: Number ``m`` of outputs. Default: that of the first measurement.
+        initial: Number of measurements before the first model, ``data`` included; or the first
+            points, ``k x d``, all different, in place of Sobol's. Default: ``2 (d + 1)``.
+        data: Earlier measurements ``(X, Y)``. They are not logged: pass them each time.
+        keep: Limits of the outputs: a function of outputs ``... x m`` to numbers ``... x c``, each
+            at most 0 if permitted, such as ``lambda Y: Y - 3`` for outputs below 3. Points are then
+            limited to those that keep all limits with ``probability`` by the model. The first
+            points, in ``initial`` or ``data``, must be safe by other knowledge, such as f_p; they
+            are not checked. Default: no limits.
+        probability: Probability of a measurement within the limits of ``keep``, noise included.
+        num_outputs: Number ``m`` of outputs. Default: by the first measurement.
         fit: Fits a new model, in place. Default: :func:`gpadjust.fit`, for models of this library.
-        optimizer_options: Arguments of ``optimize_acqf``, which ``keep`` does without.
+        optimizer_options: Arguments of ``optimize_acqf``, not with ``keep``.
         log: The file of the log.
-        seed: Seed of the design and of the acquisition function's maximisation. The global random
-            state is left alone.
+        seed: Seed of the design and of the maximisation of the acquisition function. The global
+            random state does not change.
 
     Raises:
         TypeError: If ``model_factory``, ``acquisition`` or ``fit`` is not callable, or another
-            argument is of a wrong type.
-        ValueError: If an argument is out of range, or the log is of another problem.
-        LogError: If the log is held by another collection, or cannot be opened for writing.
+            argument has a wrong type.
+        ValueError: If an argument is out of range, or the log belongs to another problem.
+        LogError: If another collection holds the log, or it cannot be opened for writing.
 
     Example:
         >>> from functools import partial
@@ -139,9 +138,9 @@ class Collection(Measurements, Display):
         log: str | os.PathLike[str] | None = None,
         seed: int = 0,
     ) -> None:
-        for name, given in (("model_factory", model_factory), ("acquisition", acquisition)):
-            if not callable(given):
-                raise TypeError(f"Expected {name} to be callable, got {given!r}.")
+        for name, function in (("model_factory", model_factory), ("acquisition", acquisition)):
+            if not callable(function):
+                raise TypeError(f"Expected {name} to be callable, got {function!r}.")
         if isinstance(acquisition, AcquisitionFunction):
             kind = type(acquisition).__name__
             raise TypeError(
@@ -152,12 +151,15 @@ class Collection(Measurements, Display):
             if option is not None and not callable(option):
                 raise TypeError(f"Expected {name} to be callable, got {option!r}.")
         checked_number("probability", probability, above=0, below=1)
-        self.keep = None if keep is None else Keep(keep, probability)
+        self.keep: Keep | None = None
+        if keep is not None:
+            self.keep = Keep(keep, probability)
         self.model_factory, self.acquisition = model_factory, acquisition
         self.bounds = checked_bounds("bounds", bounds)
+        self.batch_size = checked_whole("batch_size", batch_size, 1)
+        self.seed = checked_whole("seed", seed, 0)
         d = self.bounds.shape[-1]
-        checked_whole("batch_size", batch_size, 1)
-        self.batch_size, self.seed = batch_size, checked_whole("seed", seed, 0)
+        # A model needs a scale, that is two measurements of each output.
         if initial is None:
             initial = 2 * (d + 1) if keep is None else 2
         self._first_points = self.bounds[:0]
@@ -167,34 +169,37 @@ class Collection(Measurements, Display):
             if len(self._first_points.unique(dim=0)) < len(self._first_points):
                 raise ValueError(
                     "Expected the points of initial to differ, got some twice. To measure a point "
-                    "again, tell() what came out."
+                    "again, pass the result to tell()."
                 )
         self._fit = fit or fit_by_default
         self._initial = checked_whole("initial, a number of points,", initial, 2)
         self._options = as_options(optimizer_options)
+        # optimize_acqf has no constraints by a model.
         if keep is not None and self._options:
             raise ValueError(
-                f"Expected no optimizer_options with keep, got {sorted(self._options)}: the best "
-                "of random points that are safe is taken, without optimize_acqf. Leave them out."
+                f"Expected no optimizer_options with keep, got {sorted(self._options)}: keep takes "
+                "the best of random safe points, without optimize_acqf. Leave the options out."
             )
         if num_outputs is not None:
             checked_whole("num_outputs", num_outputs, 1)
         super().__init__(self.bounds, num_outputs, data)
+        # A model that limits points needs safe measurements before.
         if keep is not None and len(self._first_points) + self.num_observed < 2:
             raise ValueError(
-                "With keep, the first points must be known as safe, by f_p for example: give two "
+                "With keep, the first points must be known as safe, by f_p for example: pass two "
                 "or more as initial=[[...], ...], or measurements as data=(X, Y); found "
                 f"{len(self._first_points)} and {self.num_observed}."
             )
         self._model: Any = None
         if not isinstance(log, str | os.PathLike | None):
             raise TypeError(f"Expected log to be the path of a file, got {log!r}.")
-        self.log = None if log is None else MeasurementLog(log)
-        if self.log is not None:
+        self.log: MeasurementLog | None = None
+        if log is not None:
+            self.log = MeasurementLog(log)
             try:
                 self._resume(self.log)
             except BaseException:
-                self.close()  # what is raised may keep this half of a collection alive
+                self.close()  # the traceback may keep this object alive, and with it the lock
                 raise
 
     def __enter__(self) -> Self:
@@ -205,44 +210,44 @@ class Collection(Measurements, Display):
 
     def __repr__(self) -> str:
         """Return the state of the collection in a line."""
-        m = "unknown" if self.num_outputs is None else self.num_outputs
-        left = "" if self.keep is None else f", {len(self.left_out)} left out"
-        return (
-            f"Collection({len(self.X)} measurements, {len(self.failed_X)} failed, "
-            f"{len(self.pending)} pending{left}; inputs: {self.bounds.shape[-1]}, outputs: {m}; "
-            f"{self._place()})"
-        )
+        counts = f"{len(self.X)} measurements, {len(self.failed_X)} failed, "
+        counts += f"{len(self.pending)} pending"
+        if self.keep is not None:
+            counts += f", {len(self.left_out)} left out"
+        sizes = f"inputs: {self.bounds.shape[-1]}, outputs: {self.num_outputs or 'unknown'}"
+        return f"Collection({counts}; {sizes}; {self._log_path()})"
 
     def _repr_html_(self) -> str:
         """Return the lowest and the highest measurement of each output, and the last one."""
-        rows = {"last": len(self.X) - 1} if len(self.X) else {}
+        rows: dict[str, int] = {}
+        if len(self.X):
+            rows["last"] = len(self.X) - 1
         for j, values in enumerate(self.Y.mT):
             if not values.isnan().all():
                 rows[f"lowest y{j + 1}"] = int(values.nan_to_num(nan=torch.inf).argmin())
                 rows[f"highest y{j + 1}"] = int(values.nan_to_num(nan=-torch.inf).argmax())
         numbers = torch.cat([self.X, self.Y], -1).tolist()
-        inputs, outputs = self.X.shape[-1], self.Y.shape[-1]
-        head = ["", "number"]
-        head += [f"x{i + 1}" for i in range(inputs)] + [f"y{j + 1}" for j in range(outputs)]
+        head = ["", "number", *(f"x{i + 1}" for i in range(self.X.shape[-1]))]
+        head += [f"y{j + 1}" for j in range(self.Y.shape[-1])]
         table = [[name, str(k + 1), *map(number, numbers[k])] for name, k in rows.items()]
         return html_table(repr(self), head, table)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state of a copy or a pickle, whose log is its own and not held."""
+        """Return the state of a copy or a pickle, which does not hold the log."""
         return {**self.__dict__, "log": copy(self.log)}
 
     @property
     def model(self) -> Any:
-        """The model of all data so far, fitted when it is asked for first.
+        """The model of all data so far, fitted at the first access.
 
         Raises:
             RuntimeError: If there are fewer than two measurements of an output.
-            TypeError: If ``model_factory`` makes no model.
+            TypeError: If ``model_factory`` does not make a model.
         """
-        if self._model is None:
+        if self._model is None:  # new data have removed it
             if self.num_observed < 2:
                 raise RuntimeError(
-                    f"A model needs at least 2 measurements of each output, there are "
+                    f"A model needs at least 2 measurements of each output, found "
                     f"{self.num_observed}."
                 )
             model = make_model(self.model_factory, self.X, self.Y)
@@ -260,74 +265,78 @@ class Collection(Measurements, Display):
             The points, ``q x d``, which are pending from now on.
 
         Raises:
-            RuntimeError: If with ``keep`` fewer points are safe, or the first ones are pending or
-                told too little.
-            TypeError: If ``acquisition`` makes no acquisition function.
+            RuntimeError: If with ``keep`` fewer points are safe, or the first points have too few
+                results.
+            TypeError: If ``acquisition`` does not make an acquisition function.
             ValueError: If it takes single points, and ``q`` is larger.
             LogError: If the points cannot be logged; then they are not pending.
         """
-        q = self.batch_size if q is None else q
+        if q is None:
+            q = self.batch_size
         checked_whole("q", q, 1)
         record: Record = {}
         points = self._design(q)
         if points is None:
+            # A seed by the number of calls: a resumed collection returns the same points.
             with seeded((1_000_003 * self.seed + self._num_asks) % 2**63):
                 function = self._acquisition_function(q)
-                taken = self.pending, self.failed_X
+                others = self.pending, self.failed_X
                 if self.keep is None:
-                    points = best_points(function, self.bounds, q, *taken, self._options)
+                    points = best_points(function, self.bounds, q, *others, self._options)
                 else:
                     points, left_out = self.keep.best_points(
-                        function, self.model, self.bounds, q, self.X, *taken
+                        function, self.model, self.bounds, q, self.X, *others
                     )
                     record = {"left_out": left_out.tolist()}
         self._enter([{"asked": points.tolist(), **record}])
         return points
 
     def tell(self, X: Tensor, Y: Tensor) -> None:
-        """Take measurements, of points asked for or of others.
+        """Add results of measurements, at points of :meth:`ask` or others.
 
         Args:
-            X: The points, ``n x d``, as they were measured: one that is within a hundredth of the
-                bounds' widths of a pending one counts as that.
-            Y: What was measured, ``n x m`` or ``n``. NaN or infinity stand for an output that was
-                not; a row of nothing else has failed.
+            X: The points of the measurements, ``n x d``. A point within a hundredth of the bounds'
+                widths of a pending one counts as that one.
+            Y: The results, ``n x m`` or ``n``. NaN or infinity stand for a missing output; a row of
+                these alone is a failed measurement.
 
         Raises:
-            TypeError: If they are no numbers.
+            TypeError: If the arguments are not numbers.
             ValueError: If shapes disagree.
-            LogError: If they cannot be logged. They are in neither the log nor the collection
-                then; tell them again.
+            LogError: If they cannot be logged. They are then neither in the log nor in the
+                collection; call this again.
 
         Warns:
-            MeasurementWarning: If one of them has failed.
+            MeasurementWarning: If a measurement failed.
         """
         X = checked_points("X", X, self.bounds.shape[-1])
         Y = checked_outcomes(Y, len(X), self.num_outputs)
         self._enter([measurement(x, y) for x, y in zip(X.tolist(), Y.tolist(), strict=True)])
 
     def fail(self, X: Tensor, reason: str | Exception) -> None:
-        """Record that measurements failed. Their points are not asked for again.
+        """Record failed measurements. :meth:`ask` does not return their points again.
 
         Args:
             X: The points, ``n x d``.
-            reason: Why.
+            reason: The cause.
 
         Warns:
             MeasurementWarning: In any case.
         """
         X = checked_points("X", X, self.bounds.shape[-1])
-        message = reason if isinstance(reason, str) else f"{type(reason).__name__}: {reason}"
-        self._enter([{"x": x, "failed": message} for x in X.tolist()])
+        if not isinstance(reason, str):
+            reason = f"{type(reason).__name__}: {reason}"
+        self._enter([{"x": x, "failed": reason} for x in X.tolist()])
 
     def withdraw(self, X: Tensor | None = None) -> None:
-        """Withdraw pending points, which will not be measured, but may be asked for again.
+        """Withdraw pending points without a measurement; :meth:`ask` may return them again.
 
         Args:
-            X: The points, ``n x d``. Default: all that are pending.
+            X: The points, ``n x d``. Default: all pending points.
         """
-        X = self.pending if X is None else checked_points("X", X, self.bounds.shape[-1])
-        self._enter([{"withdrawn": X.tolist()}])
+        if X is None:
+            X = self.pending
+        self._enter([{"withdrawn": checked_points("X", X, self.bounds.shape[-1]).tolist()}])
 
     def run(
         self,
@@ -337,21 +346,19 @@ class Collection(Measurements, Display):
         progress: bool = False,
         max_failures: int = 5,
     ) -> Self:
-        """Ask, measure and tell, until a budget is spent; points that are pending come first.
+        """Measure with an oracle until a budget is spent, pending points first.
 
-        A measurement that fails (the oracle raises an exception, or returns nothing but NaN and
-        infinity) is logged with its message and skipped, with a warning. It counts against the
-        budget, and no point within a hundredth of the bounds' widths of it is asked for again. An
-        exception fails the whole batch. Where some outputs are NaN, each output is learnt from its
-        own measurements.
+        A measurement fails if the oracle raises an exception, which concerns the whole batch, or
+        returns only NaN and infinity for a point. It is logged with its message, with a warning,
+        and counts against the budget; later points keep a hundredth of the bounds' widths away. If
+        some outputs are NaN, each output has its own measurements.
 
         Args:
-            oracle: Measures: maps points ``q x d`` to values ``q x m`` (or ``q``).
-            budget: Number of measurements in all: failed ones and those of the log included, those
-                of ``data`` not.
-            progress: Whether to show a progress bar.
-            max_failures: Number of calls of the oracle, in a row and without any result, that stop
-                it.
+            oracle: Maps points ``q x d`` to measured values ``q x m`` (or ``q``).
+            budget: Number of all measurements, including failures and the log, but not ``data``.
+            progress: If True, show a progress bar.
+            max_failures: Number of successive calls of the oracle without any result after which
+                to stop.
 
         Returns:
             This collection.
@@ -360,9 +367,9 @@ class Collection(Measurements, Display):
             TypeError: If the oracle is not callable.
             ValueError: If a number is out of range.
             LogError: If the log cannot be written.
-            CollectionError: If the oracle fails too often, or what it returns can be no measured
-                values or cannot be logged: it is in the error's ``result`` then, and the points
-                are still pending.
+            CollectionError: If the oracle fails too often, or its result cannot be measured values
+                or cannot be logged: the error has it as ``result``, and the points are still
+                pending.
 
         Warns:
             MeasurementWarning: If a measurement fails.
@@ -371,54 +378,58 @@ class Collection(Measurements, Display):
             raise TypeError(f"Expected the oracle to be callable, got {oracle!r}.")
         checked_whole("budget", budget, 1)
         checked_whole("max_failures", max_failures, 1)
-        done, failures = min(budget, self.num_measured), 0
+        done = min(budget, self.num_measured)
+        failures = 0
         with progress_bar(progress, total=budget, initial=done, unit="measurement") as bar:
-            while (left := budget - self.num_measured) > 0:
-                q = min(self.batch_size, left)
-                # After a resumption the points that it was killed at come first.
+            while self.num_measured < budget:
+                q = min(self.batch_size, budget - self.num_measured)
+                # Pending points come first: a killed run has measured them or not.
                 X = self.pending[:q] if len(self.pending) else self.ask(q)
-                known = len(self.X)
+                num_before = len(self.X)
                 error = self._measure(oracle, X)
+                # Single failures are skipped; many in a row are a broken oracle.
                 bar.update(len(X))
                 bar.set_postfix(failed=len(self.failed_X))
-                failures = 0 if len(self.X) > known else failures + 1
+                failures += 1
+                if len(self.X) > num_before:
+                    failures = 0
                 if failures >= max_failures:
                     raise CollectionError(
                         f"The oracle failed {failures} times in a row, the last time at "
                         f"{X.tolist()}: {error or 'NaN or infinity'}. {len(self.X)} measurements "
-                        f"are in the error's `.collection`; {self._place()}.",
+                        f"are in the error's `.collection`; {self._log_path()}.",
                         self,
                         X,
                     ) from error
         return self
 
     def close(self) -> None:
-        """Let another collection have the log; :meth:`tell` takes it again, if none has written."""
+        """Release the log; :meth:`tell` locks it again, unless another collection wrote to it."""
         if self.log is not None:
             self.log.close()
 
     def _design(self, q: int) -> Tensor | None:
-        """Return the next points that need no model, ``q x d``, or None if a model is to choose."""
-        known = torch.cat([self.X, self.failed_X, self._asked])
-        first = self._first_points[~among(self._first_points, known)]
+        """Return the next points of the design, ``q x d``, or None if a model chooses."""
+        earlier = torch.cat([self.X, self.failed_X, self._asked])
+        first = self._first_points[~among(self._first_points, earlier)]
         if not len(first) and len(self.X) >= self._initial and self.num_observed >= 2:
             return None
-        if self.keep is not None:
+        if self.keep is not None:  # Sobol points may not be safe
             if len(first):
                 return first[:q]
             if len(self.pending):
                 raise RuntimeError(
                     f"All first points are asked for, and {len(self.pending)} of them are pending: "
-                    "tell() these first, as later points are chosen by a model of what came out."
+                    "tell() their results first, as later points need a model of them."
                 )
             raise RuntimeError(
-                f"{self.num_observed} measurements came of the first points, but a model that is "
-                "to keep limits needs two of each output; tell others that are safe."
+                f"The first points gave {self.num_observed} measurements, but a model that keeps "
+                "limits needs two of each output; tell() measurements at other safe points."
             )
-        return torch.cat([first, sobol_points(self.bounds, q, known, self.seed)])[:q]
+        return torch.cat([first, sobol_points(self.bounds, q, earlier, self.seed)])[:q]
 
     def _acquisition_function(self, q: int) -> AcquisitionFunction:
-        """Return the user's acquisition function of the model."""
+        """Return the user's acquisition function of the model, checked."""
         function = self.acquisition(self.model)
         if not isinstance(function, AcquisitionFunction):
             raise TypeError(
@@ -433,29 +444,31 @@ class Collection(Measurements, Display):
         return function
 
     def _enter(self, records: list[Record]) -> None:
-        """Log records, take them in, and warn of measurements that failed."""
-        known = len(self.X)
-        if self.log is not None:
+        """Log records, then apply them, and warn of failed measurements."""
+        num_before = len(self.X)
+        if self.log is not None:  # first, as a power cut may follow
             self.log.append(records)
         for record in records:
             self._take(record)
-        self._model = None if len(self.X) > known else self._model
-        if failed := [record for record in records if "failed" in record]:
+        if len(self.X) > num_before:
+            self._model = None
+        failed = [record for record in records if "failed" in record]
+        if failed:
             warnings.warn(
                 f"{len(failed)} of {len(records)} measurements failed, the first at x = "
-                f"{failed[0]['x']}: {failed[0]['failed']}. They count against a budget, and are "
-                "not asked for again.",
+                f"{failed[0]['x']}: {failed[0]['failed']}. They count against a budget, and "
+                "ask() does not return them again.",
                 MeasurementWarning,
                 stacklevel=3,
             )
 
     def _resume(self, log: MeasurementLog) -> None:
-        """Take in what is in the log."""
+        """Apply the records of the log."""
         for line, record in enumerate(log.open(self.bounds.tolist()), start=2):
             try:
                 self._take(record)
             except (KeyError, TypeError, ValueError, RuntimeError) as error:
-                m = "any number of" if self.num_outputs is None else self.num_outputs
+                m = self.num_outputs or "any number of"
                 raise ValueError(
                     f"Line {line} of the log {log.path}, {str(record)[:80]}, does not belong to "
                     f"this collection of {self.bounds.shape[-1]} inputs and {m} outputs "
@@ -463,23 +476,24 @@ class Collection(Measurements, Display):
                 ) from error
 
     def _measure(self, oracle: Callable[[Tensor], Any], X: Tensor) -> Exception | None:
-        """Measure points and tell them; return what went wrong."""
+        """Measure points and add the results; return the error of the oracle, if any."""
         try:
-            result = oracle(X.clone())
+            result = oracle(X.clone())  # an oracle may change its argument
         except Exception as error:
             self.fail(X, error)
             return error
         try:
             Y = checked_outcomes(result, len(X), self.num_outputs)
         except (TypeError, ValueError) as error:
+            # Measurements may be expensive: a human may recover them from the log.
             if self.log is not None:
                 with suppress(LogError):
                     self.log.append([refusal(X, result, error)])
             raise CollectionError(
-                f"The oracle returned no measured values of the points {X.tolist()}: {error} It is "
-                f"in this error's `.result`; {self._place()}. The points are still pending: tell() "
-                "`.collection` their values, correct the oracle, and run it again. To say that a "
-                "measurement failed, it may raise an exception or return NaN.",
+                f"The oracle returned no measured values for the points {X.tolist()}: {error} The "
+                f"result is in this error's `.result`; {self._log_path()}. The points are still "
+                "pending: tell() `.collection` their values, correct the oracle, and run it again. "
+                "An oracle reports a failure by an exception or by NaN.",
                 self,
                 X,
                 result,
@@ -491,8 +505,8 @@ class Collection(Measurements, Display):
             raise CollectionError(message, self, X, result) from error
         return None
 
-    def _place(self) -> str:
-        """Return the place of the log."""
+    def _log_path(self) -> str:
+        """Return a clause with the path of the log."""
         return "no log was kept" if self.log is None else f"the log is at {self.log.path}"
 
 
@@ -507,15 +521,15 @@ def collect(
     max_failures: int = 5,
     **options: Any,
 ) -> Collection:
-    """Measure where it teaches most, until the budget is spent.
+    """Measure at the most informative points, until the budget is spent.
 
-    It makes a :class:`Collection` with ``options``, lets it :meth:`~Collection.run`, and closes it:
-    arguments, errors and warnings are those of the two. With a log the same call goes on where the
-    last one was killed, or with a larger budget.
+    This makes a :class:`Collection` with ``options``, calls :meth:`~Collection.run`, and closes
+    it, with their arguments, errors and warnings. With a log the same call continues after an
+    interruption, or with a larger budget.
 
     Returns:
-        The collection, with all data in ``X`` and ``Y``, the ``model`` of them, ``failed_X``, and
-        ``ask``, ``tell`` and ``run`` to go on with.
+        The collection, with all data in ``X`` and ``Y``, their ``model``, ``failed_X``, and
+        ``ask``, ``tell`` and ``run`` to continue.
 
     Example:
         >>> from functools import partial

@@ -19,7 +19,7 @@ About = Literal["rho", "delta", "both"]
 
 
 class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch names its own
-    r"""The information that measurements at a batch of points give about rho, delta, or both.
+    r"""The information of measurements at a batch of points about rho, delta, or both.
 
     For :math:`y(x) = \rho(x) f_p(x) + \delta(x) + \varepsilon` it is the mutual information of the
     observations at the points X and the whole function :math:`\rho`, given the data D (Lindley
@@ -30,29 +30,29 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
         = \tfrac{1}{2} \log\det \mathrm{Cov}(y(X) \mid D)
         - \tfrac{1}{2} \log\det \mathrm{Cov}(y(X) \mid D, \rho).
 
-    Both are known exactly. The first is the model's own. For the second, subtract the known
-    :math:`\rho f_p` from all observations: what is left is
-    :math:`\delta(x) + \varepsilon`, and as rho and delta are independent a priori (Kennedy and
-    O'Hagan 2000), it is a regression on delta alone, at the same points with the same noise S,
+    Both have a closed form. The first is the covariance of the model. For the second, subtract the
+    known :math:`\rho f_p` from all observations. The remainder is :math:`\delta(x) + \varepsilon`,
+    and as rho and delta are independent a priori (Kennedy and O'Hagan 2000), this is a regression
+    on delta alone, at the same points with the same noise S,
 
     .. math::
         \mathrm{Cov}(y(X) \mid D, \rho) = k_\delta(X, X)
         - k_\delta(X, D) \, (k_\delta(D, D) + S_D)^{-1} \, k_\delta(D, X) + S_X.
 
-    About :math:`\delta` it is the same with :math:`F_p k_\rho F_p^T` in the place of
-    :math:`k_\delta`; about both, only the noise :math:`S_X` is left. Each determinant is taken in
-    units of the noise, :math:`\det(I + S_X^{-1/2} C S_X^{-1/2})` for the covariance C of what is
-    not noise, which is never singular. Thus
+    About :math:`\delta` it is the same with :math:`F_p k_\rho F_p^T` in place of
+    :math:`k_\delta`; about both, only the noise :math:`S_X` remains. Determinants are in units of
+    the noise, :math:`\det(I + S_X^{-1/2} C S_X^{-1/2})` for the covariance C of the function, and
+    never singular. Thus
 
     .. math:: I(y; \rho, \delta) = I(y; \rho) + I(y; \delta \mid \rho) \geq I(y; \rho) \geq 0.
 
-    Where :math:`f_p(x) = 0` an observation is of delta alone. It still tells about rho as far as
-    it tells what delta was at measured points nearby.
+    Where :math:`f_p(x) = 0` an observation depends on delta alone. It still has information about
+    rho, through delta at measured points nearby.
 
-    It needs no samples, is differentiable as far as f_p is, sums the information of independent
-    outputs, and is averaged over the draws of the model's unknown numbers. Unknown constants are
-    part of their functions. New observations are as noisy as the model predicts; with known noise
-    (``train_Yvar``), as noisy as the old ones on average.
+    The acquisition needs no samples, is differentiable if f_p is, sums the information of
+    independent outputs, and averages over the draws of the model's unknown numbers. Unknown
+    constants are part of their functions. New observations have the noise that the model predicts;
+    with known noise (``train_Yvar``), the average of the old ones.
 
     References:
         M. C. Kennedy and A. O'Hagan, *Predicting the output from a complex computer code when fast
@@ -68,10 +68,10 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
         X_pending: Points that are being measured, ``k x d``.
 
     Raises:
-        TypeError: If the model has no such adjustment, or none of a physics. Information about
-            unknown parameters of the physics is not counted.
-        ValueError: If ``about`` is unknown, or ``"delta"`` of a model with a center, as by default,
-            whose delta is not independent of rho a priori; with ``center=0.0`` it is.
+        TypeError: If the model has no physics, or not this adjustment. Information about unknown
+            parameters of the physics is not included.
+        ValueError: If ``about`` is unknown, or is ``"delta"`` for a model with a center, the
+            default, as delta and rho are then not independent a priori; ``center=0.0`` has none.
 
     Example:
         >>> import torch
@@ -108,15 +108,18 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
         conditioning = model.conditioning()
         values = conditioning.train.values
         places = model.places(X, values)
-        f, noise = model.term_sum.at(values, places), model.noise.variance(values, places)
+        f = model.term_sum.at(values, places)
+        noise = model.noise.variance(values, places)
+        # log det Cov(y(X) | D) / 2
         gain = _log_sds(conditioning.joint(f)[1], noise)
-        if self._remaining_names:
+        if self._remaining_names:  # minus log det Cov(y(X) | D, rho) / 2
             remaining = self._without_adjustment(conditioning)
             gain = gain - _log_sds(remaining.joint(self._part(f))[1], noise)
-        return gain.sum(-1).mean(-1)
+        return gain.sum(-1).mean(-1)  # over outputs, and over draws
 
     def _without_adjustment(self, conditioning: Conditioning) -> Conditioning:
-        """Return the posterior of the other terms, as if the data were of these and noise alone."""
+        """Return the posterior of the other terms, as if the data were these terms and noise."""
+        # One factorisation for all calls of an optimisation.
         if self._cached is None or self._cached[0] is not conditioning:
             train = self._part(conditioning.train)
             part = Conditioning(train, conditioning.noise, conditioning.targets)
@@ -124,21 +127,22 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
         return self._cached[1]
 
     def _part(self, f: WeightedSum) -> WeightedSum:
-        """Return the sum of the terms that are not asked about."""
+        """Return the sum of the terms outside of ``about``."""
         weights = {n: w for n, w in f.weights.items() if n in self._remaining_names}
         return replace(f, weights=weights)
 
 
 def _remaining(model: Any, about: str) -> tuple[str, ...]:
-    """Return the names of the terms that are not asked about, or raise an error."""
+    """Return the names of the terms outside of ``about``, or raise an error."""
     if about not in get_args(About):
         raise ValueError(f"Unknown {about=}; expected 'rho', 'delta' or 'both'.")
     name = type(model).__name__
     if not isinstance(model, GP) or not model.physics:
         raise TypeError(
             f"Expected a model with a physics and with rho or delta, such as CKA; found {name}. "
-            "Without them take BoTorch's qNegIntegratedPosteriorVariance."
+            "For other models take BoTorch's qNegIntegratedPosteriorVariance."
         )
+    # Terms without a process, such as f_p itself, have nothing unknown.
     terms = [term for term in model.terms if term.varies]
     parts = {
         "rho": tuple(term.name for term in terms if term.physics is not None),
@@ -146,23 +150,23 @@ def _remaining(model: Any, about: str) -> tuple[str, ...]:
     }
     if not terms:
         raise TypeError(
-            f"{name} has neither rho nor delta to learn about, and the information about "
-            "parameters of the physics is not computed. Take CKA, which has both."
+            f"{name} has neither rho nor delta, and the information about parameters of the "
+            "physics is not included. Take CKA, which has both."
         )
     if about == "both":
-        return ()
+        return ()  # only noise remains
     if isinstance(model, VariationalCKA):
         raise TypeError(
-            "The inducing values of a VariationalCKA do not tell what would remain unknown if "
-            f"{about} were known: ask about 'both', or take an exact CKA of some thousand points."
+            f"The inducing values of a VariationalCKA have no posterior given {about}: use "
+            "about='both', or an exact CKA of some thousand points."
         )
     other = "delta" if about == "rho" else "rho"
     if not parts[about]:
-        raise TypeError(f"{name} has no unknown {about}; ask about {other!r}, or take CKA.")
+        raise TypeError(f"{name} has no unknown {about}; use about={other!r}, or take CKA.")
     if about == "delta" and any(term.has_center for term in terms):
         raise ValueError(
             f"The {name} has a center of f_p (by default an unknown one), so that delta is not "
-            "independent of rho a priori and its information has no closed form: ask about 'rho' "
+            "independent of rho a priori and its information has no closed form: use about='rho' "
             "or 'both', or build and fit the model with center=0.0."
         )
     return parts[other]
@@ -173,6 +177,7 @@ def _log_sds(covariance: Tensor, noise: Tensor) -> Tensor:
 
     The covariance without noise is ``... x q x q``, the noise variances ``... x q`` (or 1).
     """
+    # log det(I + S^-1/2 C S^-1/2) / 2 = sum_i log L_ii
     sd = noise.sqrt()
     scaled = covariance / (sd.unsqueeze(-1) * sd.unsqueeze(-2))
     one = torch.ones_like(scaled[..., 0])

@@ -1,4 +1,4 @@
-"""Points at which outputs stay, with a probability, where they have to."""
+"""Points at which outputs keep limits with a probability."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from torch import Tensor
 
 from gpadjust.active.points import NEAR, distances, taken_as_pending
 
-_CANDIDATES = 1024  # in all of the bounds, and as many near the points measured
-_REACH = 0.1  # of the bounds' widths: how far from these
-_DRAWS = 1024  # of outputs, by which probabilities are estimated: to 0.007 at 0.95
+_CANDIDATES = 1024  # random points in the bounds, and as many near measured points
+_REACH = 0.1  # standard deviation of the latter, in the bounds' widths
+_DRAWS = 1024  # of outputs, for probabilities with a standard error of 0.007 at 0.95
 _AT_ONCE = 256  # candidates
 
 
 @dataclass(frozen=True)
 class Keep:
-    """A limit of the outputs, and the probability with which a measurement keeps it.
+    """Limits of the outputs, and the probability with which a measurement keeps them.
 
     Args:
-        limits: Numbers ``... x c`` of outputs ``... x m``, each of which is at most 0 where the
-            outputs may be.
-        probability: Of a measurement keeping them all.
+        limits: A function of outputs ``... x m`` to numbers ``... x c``, each at most 0 for
+            permitted outputs.
+        probability: Probability of a measurement within all limits.
     """
 
     limits: Callable[[Tensor], Tensor]
@@ -34,14 +34,14 @@ class Keep:
 
     @torch.no_grad()
     def probabilities(self, model: Any, X: Tensor) -> Tensor:
-        """Return probabilities ``n`` by a model, noise included, of each of ``n x d`` points."""
-        found = []
-        for some in X.split(_AT_ONCE):
-            posterior = model.posterior(some.unsqueeze(-2), observation_noise=True)
+        """Return the probability of a measurement within all limits at points ``n x d``."""
+        shares = []
+        for points in X.split(_AT_ONCE):
+            posterior = model.posterior(points.unsqueeze(-2), observation_noise=True)
             numbers = self.limits(posterior.rsample(torch.Size([_DRAWS])))
-            inside = (numbers <= 0).all(-1)  # draws x n x 1
-            found.append(inside.double().mean((0, -1)))
-        return torch.cat(found)
+            is_inside = (numbers <= 0).all(-1)  # draws x n x 1
+            shares.append(is_inside.double().mean((0, -1)))
+        return torch.cat(shares)
 
     def best_points(
         self,
@@ -53,54 +53,59 @@ class Keep:
         pending: Tensor,
         failed: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """Take the best of random points that are safe by the model (Sui et al. 2015).
+        """Return the best of random points that are safe by the model (Sui et al. 2015).
 
         Args:
             acquisition: The acquisition function.
             model: The model.
             bounds: Bounds of the inputs, ``2 x d``.
             q: Number of points.
-            measured: Points that were measured, ``n x d``.
+            measured: Measured points, ``n x d``.
             pending: As of :func:`~gpadjust.active.points.best_points`.
-            failed: As of the same.
+            failed: As of :func:`~gpadjust.active.points.best_points`.
 
         Returns:
-            The points, ``q x d``, and for each the one that would have been taken without limits,
-            if that is another, ``l x d``.
+            The points, ``q x d``, and the unsafe points with higher values of the acquisition
+            function, ``l x d``, at most one for each.
 
         Raises:
-            RuntimeError: If fewer points are safe, or these are too near to each other.
+            RuntimeError: If fewer points are safe, or these are too close to each other.
         """
+        # Candidates away from failed and pending points, with their probability by the model.
         points = self._candidates(bounds, torch.cat([measured, pending]))
         points = points[(distances(points, torch.cat([failed, pending]), bounds) >= NEAR).all(-1)]
-        safe = self.probabilities(model, points) >= self.probability
-        num_points, num_safe = len(points), int(safe.sum())
-        taken: list[Tensor] = []
+        is_safe = self.probabilities(model, points) >= self.probability
+        num_points = len(points)
+        num_safe = int(is_safe.sum())
+        best_points: list[Tensor] = []
         left_out: list[Tensor] = []
         for _ in range(q):
-            if not safe.any():
+            if not is_safe.any():
                 raise RuntimeError(
-                    f"The model knows {num_safe} of {num_points} points as safe with a probability "
-                    f"of {self.probability:g}, of which {len(taken)} are apart by {NEAR:g} of the "
-                    f"bounds' widths, but {q} are asked for. Tell measurements of points that you "
-                    "know as safe, nearer to each other, or lower the probability."
+                    f"By the model {num_safe} of {num_points} points are safe with a probability "
+                    f"of {self.probability:g}, of which {len(best_points)} are apart by {NEAR:g} "
+                    f"of the bounds' widths; expected {q}. Add measurements at points that you "
+                    "know as safe, closer to each other, or lower the probability."
                 )
-            away = torch.cat([pending, failed, *taken])
-            # One that counts on none takes one point at a time, which is far from these anyway.
-            with taken_as_pending(acquisition, away), torch.no_grad():
+            others = torch.cat([pending, failed, *best_points])
+            # A function without X_pending takes single points, which are apart from others here.
+            with taken_as_pending(acquisition, others), torch.no_grad():
                 values = torch.cat([acquisition(z.unsqueeze(-2)) for z in points.split(_AT_ONCE)])
-            best = points[[int(values.masked_fill(~safe, -torch.inf).argmax())]]
-            if not safe[values.argmax()]:
+            # The best safe point, and the best of all if it is not safe.
+            best = points[[int(values.masked_fill(~is_safe, -torch.inf).argmax())]]
+            if not is_safe[values.argmax()]:
                 left_out.append(points[[int(values.argmax())]])
-            taken.append(best)
-            apart = (distances(points, best, bounds) >= NEAR).all(-1)
-            points, safe = points[apart], safe[apart]
-        return torch.cat(taken), torch.cat([bounds[:0], *left_out])
+            best_points.append(best)
+            # Candidates for the rest of the batch.
+            is_apart = (distances(points, best, bounds) >= NEAR).all(-1)
+            points, is_safe = points[is_apart], is_safe[is_apart]
+        return torch.cat(best_points), torch.cat([bounds[:0], *left_out])
 
-    def _candidates(self, bounds: Tensor, known: Tensor) -> Tensor:
-        """Return random points ``n x d`` in the bounds, half of them near those known."""
+    def _candidates(self, bounds: Tensor, centers: Tensor) -> Tensor:
+        """Return random points ``n x d`` in the bounds, half of them near some centers."""
         seed = int(torch.randint(2**31, (1,)))
         everywhere = draw_sobol_samples(bounds, n=_CANDIDATES, q=1, seed=seed).squeeze(-2)
-        near = known[torch.randint(len(known), (_CANDIDATES,))]
+        # Safe regions grow from measured points, and may be small.
+        near = centers[torch.randint(len(centers), (_CANDIDATES,))]
         near = near + _REACH * (bounds[1] - bounds[0]) * torch.randn_like(near)
         return torch.cat([everywhere, near.clamp(*bounds)])

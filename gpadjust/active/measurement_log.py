@@ -1,4 +1,4 @@
-"""A file that loses no measurement."""
+"""A log file that does not lose measurements."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ _FORMAT = "gpadjust measurements, version 1"
 
 
 class LogError(OSError):
-    """A log of measurements cannot be held, read or written."""
+    """A log of measurements cannot be locked, read or written."""
 
 
 class MeasurementLog:
-    """Records in a file, one line of JSON each, that are on the disk before anything else happens.
+    """Records in a file, one line of JSON each, which :meth:`append` writes to the disk at once.
 
-    Killing the process at any moment leaves a file that can be read again: of what was being
-    written then, whole lines count, and a torn last line is removed before the next is written.
-    Records that cannot be written, as the disk is full, say, leave nothing behind.
+    After the process is killed at any moment, the file can be read again: complete lines count, and
+    a torn last line is removed before the next one is written. If records cannot be written, for
+    example to a full disk, the file does not change.
 
-    One log at a time holds a file: from :meth:`open` on, until it is closed or deleted, or its
-    process ends, be it killed. What it locks is a file beside it, ``<name>.lock``, that stays there
-    and says nothing by itself. Copies and pickles of a log do not hold its file; an :meth:`append`
-    takes it again, if nobody else has written to it.
+    One log at a time holds a file, from :meth:`open` until it is closed or deleted, or its process
+    ends or is killed. The lock is another file in the folder, ``<name>.lock``, which stays there
+    and has no meaning by itself. Copies and pickles of a log do not hold its file; their first
+    :meth:`append` locks it, unless the file has changed.
 
     Args:
         path: The file.
@@ -53,19 +53,19 @@ class MeasurementLog:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path).resolve()
         self._size = 0  # of the records, in bytes
-        self._glue = b""  # what they lack to end a line
-        self._torn = False  # whether part of a record may come after them
+        self._missing_end = b""  # of the last line
+        self._torn = False  # if part of a record may come after the records
         self._lock: BaseFileLock | None = None
 
     def open(self, bounds: list[list[float]]) -> list[Record]:
-        """Hold the file, and return its records; a new file and its folder are made.
+        """Lock the file and return its records; make a new file and its folder if needed.
 
         Args:
-            bounds: Bounds of the inputs, ``2 x d``, which the first line of the file tells.
+            bounds: Bounds of the inputs, ``2 x d``, in the first line of the file.
 
         Raises:
-            LogError: If the file is held already, or cannot be opened for writing.
-            ValueError: If it is of other bounds, or a line is not a record.
+            LogError: If another log holds the file, or it cannot be opened for writing.
+            ValueError: If the file has other bounds, or a line is not a record.
         """
         header = {"format": _FORMAT, "bounds": bounds}
         with self._explained("opened", "Name a file in a folder where you may write."):
@@ -76,25 +76,30 @@ class MeasurementLog:
             with self.path.open("a+b") as file:
                 file.seek(0)
                 content = file.read()
-            if _line(header).startswith(content):
-                self._size, self._torn = 0, True
+            if _line(header).startswith(content):  # an empty file, or a torn header
+                self._size = 0
+                self._torn = True
                 self.append([header])
                 sync_folder(self.path.parent)
                 return []
+        # The tail is empty after a complete line, else a line without its end or a part of one.
         *lines, tail = content.split(b"\n")
         records = [self._record(line, number) for number, line in enumerate(lines, start=1)]
-        self._size, self._glue, self._torn = len(content), b"\n" if tail else b"", False
-        if tail:
-            try:
+        self._size = len(content) - len(tail)
+        self._missing_end = b""
+        self._torn = bool(tail)
+        with suppress(ValueError):  # of a torn last line, which does not count
+            if tail:
                 records.append(self._record(tail, len(lines) + 1))
-            except ValueError:
-                self._size, self._glue, self._torn = len(content) - len(tail), b"", True
+                self._size = len(content)
+                self._missing_end = b"\n"
+                self._torn = False
         if not records or records[0].get("format") != _FORMAT:
-            raise ValueError(f"{self.path} is no log of measurements; name another file.")
+            raise ValueError(f"{self.path} is not a log of measurements; name another file.")
         if records[0].get("bounds") != bounds:
             raise ValueError(
-                f"The log {self.path} is of measurements within the bounds "
-                f"{records[0].get('bounds')}, got {bounds}; name another file, or take those."
+                f"The log {self.path} has measurements within the bounds "
+                f"{records[0].get('bounds')}, got {bounds}; name another file, or take its bounds."
             )
         return records[1:]
 
@@ -102,17 +107,18 @@ class MeasurementLog:
         """Write records at the end, and wait until they are on the disk.
 
         Raises:
-            LogError: If they cannot be written; then none of them is in the file. Or if another
-                holds it, or has written to it.
+            LogError: If the records cannot be written, and are then not in the file; or if another
+                log holds the file, or has written to it.
         """
-        data = self._glue + b"".join(map(_line, records))
+        data = self._missing_end + b"".join(map(_line, records))
         way_out = (
-            "What it held is safe; what it was to take now is not on the disk, and the collection "
-            "has not taken it either. Make room, and tell it again."
+            "Earlier records are safe; the new ones are neither on the disk nor in the collection. "
+            "Make room, and tell it again."
         )
         with self._explained("written", way_out):
             self._hold()
             with self.path.open("r+b", buffering=0) as file:
+                # Bytes after the records are our own torn record, or another program's.
                 size = file.seek(0, os.SEEK_END)
                 if size != self._size and not (self._torn and size > self._size):
                     self.close()
@@ -122,22 +128,25 @@ class MeasurementLog:
                     )
                 try:
                     file.seek(self._size)
-                    file.truncate()
-                    left = data
-                    while left:
-                        left = left[file.write(left) :]
+                    file.truncate()  # a torn record of before
+                    rest = data
+                    while rest:  # a write without buffer may write a part
+                        rest = rest[file.write(rest) :]
                     os.fsync(file.fileno())
                 except BaseException:
+                    # Remove what was written; if that fails, too, the first error says why.
                     self._torn = True
-                    with suppress(OSError):  # of the two errors, the first tells more
+                    with suppress(OSError):
                         file.truncate(self._size)
                         os.fsync(file.fileno())
                         self._torn = False
                     raise
-        self._size, self._glue, self._torn = self._size + len(data), b"", False
+        self._size += len(data)
+        self._missing_end = b""
+        self._torn = False
 
     def close(self) -> None:
-        """Let others hold the file."""
+        """Release the file."""
         self._torn = False
         if self._lock is not None:
             self._lock.release()
@@ -152,26 +161,29 @@ class MeasurementLog:
         if self._lock is not None and self._lock.is_locked:
             return
         lock = FileLock(f"{self.path}.lock", thread_local=False)
-        me, path = f"process {os.getpid()} on {platform.node()}", Path(lock.lock_file)
+        path = Path(lock.lock_file)
+        this_process = f"process {os.getpid()} on {platform.node()}"
         try:
             lock.acquire(timeout=0)
         except Timeout:
+            # The lock file has the name of its holder, for this message alone.
             holder = "another process"
             with suppress(OSError, ValueError):
                 holder = path.read_text().strip() or holder
+            if holder == this_process:
+                holder += ", this one"
             raise LogError(
-                f"The log {self.path} is held by {holder}{', this one' if holder == me else ''}: "
-                "two collections with one log would measure twice. Wait until the other one is "
-                "done, close() it, or name another log."
+                f"The log {self.path} is held by {holder}: two collections with one log would "
+                "measure twice. Wait until the other one is done, close() it, or name another log."
             ) from None
         self._lock = lock
-        if not isinstance(lock, SoftFileLock):  # the file of that one is its own
+        if not isinstance(lock, SoftFileLock):  # a soft lock writes its file itself
             with suppress(OSError):
-                path.write_text(me)
+                path.write_text(this_process)
 
     @contextmanager
     def _explained(self, what: str, way_out: str) -> Iterator[None]:
-        """Say what an error of the file system is about."""
+        """Raise errors of the file system with the path of the log and the way out."""
         try:
             yield
         except LogError:
@@ -180,7 +192,7 @@ class MeasurementLog:
             raise LogError(f"The log {self.path} cannot be {what}: {error}. {way_out}") from error
 
     def _record(self, line: bytes, number: int) -> Record:
-        """Parse one line."""
+        """Return the record in a line."""
         try:
             record = json.loads(line, parse_constant=_refuse)
         except (ValueError, RecursionError):
@@ -194,8 +206,10 @@ class MeasurementLog:
 
 
 def _line(record: Record) -> bytes:
+    """Return the line of a record."""
     return json.dumps(record, allow_nan=False).encode() + b"\n"
 
 
 def _refuse(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is no JSON")
+    """Raise an error: Python's parser takes NaN and infinity, which are not in JSON."""
+    raise ValueError(f"{constant} is not JSON")

@@ -1,4 +1,4 @@
-"""Measurements: made, failed and pending; and the checks of their numbers."""
+"""Measurements: made, failed and pending, with checks of their numbers."""
 
 from __future__ import annotations
 
@@ -15,34 +15,34 @@ from gpadjust.checks import check_observed, checked_points, checked_tensor
 
 
 class Measurements:
-    """The state that records add up to, whether new ones or those of a log.
+    """The state after a sequence of records, new or from a log.
 
     A record is one of
 
-    - ``{"asked": [x, ...], "left_out": [x, ...]}``: points that are to be measured; and what was
-      left out, if there are limits to keep;
-    - ``{"x": x, "y": y}``: a measurement, null where an output was not measured;
-    - ``{"x": x, "failed": message}``: one that failed, whether it has a ``"y"`` or not;
-    - ``{"withdrawn": [x, ...]}``: points that are not to be measured any more;
-    - ``{"refused": result, "of": [x, ...], "because": message}``: what an oracle returned for
-      points and could not be their measured values. It changes nothing; a human may recover it.
+    - ``{"asked": [x, ...], "left_out": [x, ...]}``: points to measure, and better ones that limits
+      exclude;
+    - ``{"x": x, "y": y}``: a measurement, null for a missing output;
+    - ``{"x": x, "failed": message}``: a failed measurement, with or without ``"y"``;
+    - ``{"withdrawn": [x, ...]}``: pending points that will not be measured;
+    - ``{"refused": result, "of": [x, ...], "because": message}``: a result of an oracle that cannot
+      be measured values. It changes nothing; a human may recover it.
 
-    A measurement is of the pending point that it is nearest to, if that is within a hundredth of
-    the bounds' widths: what a laboratory sets is seldom what was asked for to the last digit.
+    A measurement belongs to the nearest pending point within a hundredth of the bounds' widths: a
+    laboratory seldom sets inputs to the last digit.
 
     Args:
         bounds: Bounds of the inputs, ``2 x d``.
         num_outputs: Number ``m`` of outputs, or None for that of the first measurement.
-        data: ``(X, Y)`` measured before, or None.
+        data: Earlier measurements ``(X, Y)``, or None.
 
     Attributes:
-        X: The points measured, ``n x d``, those of ``data`` first.
-        Y: The values measured there, ``n x m``; NaN where an output was not.
-        failed_X: Points at which measuring failed, ``k x d``.
-        pending: Points asked for and not told yet, ``l x d``.
-        left_out: Points that were not asked for, though best, as limits might be left there,
+        X: The measured points, ``n x d``, ``data`` first.
+        Y: The measured values, ``n x m``; NaN for a missing output.
+        failed_X: Points of failed measurements, ``k x d``.
+        pending: Points without a result yet, ``l x d``.
+        left_out: Points with the best values of the acquisition function that limits excluded,
             ``k x d``.
-        num_measured: Number of measurements, failed ones included, those of ``data`` not.
+        num_measured: Number of measurements, including failures but not ``data``.
         num_outputs: Number ``m`` of outputs; None before the first measurement.
     """
 
@@ -50,6 +50,7 @@ class Measurements:
         self, bounds: Tensor, num_outputs: int | None, data: tuple[Tensor, Tensor] | None
     ) -> None:
         self.bounds = bounds
+        # All begin with 0 x d.
         self.X = self.failed_X = self.pending = self.left_out = self._asked = bounds[:0]
         self.Y = torch.zeros(0, num_outputs or 0, dtype=torch.float64)
         self.num_measured = 0
@@ -61,32 +62,34 @@ class Measurements:
             X = checked_points("the X of data", data[0], bounds.shape[-1])
             Y = checked_outcomes(data[1], len(X), num_outputs)
             check_observed("the Y of data", Y)
-            self.X, self.Y, self.num_outputs = X, Y, Y.shape[-1]
+            self.X, self.Y = X, Y
+            self.num_outputs = Y.shape[-1]
 
     @property
     def num_observed(self) -> int:
-        """Number of measurements of the output that was measured least often."""
+        """Number of measurements of the output with the fewest."""
         return int((~self.Y.isnan()).sum(0).min()) if len(self.X) else 0
 
     def _take(self, record: Record) -> None:
-        """Take in one record."""
+        """Apply one record."""
         if "refused" in record:
             return
+        # `_asked` has all points of the design, so that it does not repeat measured ones.
         if "asked" in record:
-            asked = self._points(record["asked"])
-            self.pending = torch.cat([self.pending, asked])
-            self._asked = torch.cat([self._asked, asked])
+            points = self._points(record["asked"])
+            self.pending = torch.cat([self.pending, points])
+            self._asked = torch.cat([self._asked, points])
             self.left_out = torch.cat([self.left_out, self._points(record.get("left_out", []))])
             self._num_asks += 1
-        elif "withdrawn" in record:
+        elif "withdrawn" in record:  # neither pending nor measured
             for x in self._points(record["withdrawn"]):
                 point = self._no_longer_pending(x)
-                self._asked = self._asked[~among(self._asked, point)]
+                self._asked = self._asked[~among(self._asked, point)]  # it may come again
         else:
             self._take_measurement(record)
 
     def _take_measurement(self, record: Record) -> None:
-        """Take in one measurement."""
+        """Apply one measurement."""
         x = self._points([record["x"]])
         if "failed" in record:
             self.failed_X = torch.cat([self.failed_X, x])
@@ -95,17 +98,16 @@ class Measurements:
             y = checked_outcomes([values], 1, self.num_outputs)
             check_observed("y", y)
             self.num_outputs = y.shape[-1]
-            self.X, self.Y = torch.cat([self.X, x]), torch.cat([self.Y, y]) if len(self.Y) else y
+            self.X = torch.cat([self.X, x])
+            self.Y = torch.cat([self.Y, y]) if len(self.Y) else y
         self._no_longer_pending(x[0])
         self.num_measured += 1
 
     def _no_longer_pending(self, x: Tensor) -> Tensor:
-        """Remove the point that ``x`` is of those that are pending, and return it, ``1 x d``.
-
-        If it is none, nothing is removed, and ``0 x d`` returned.
-        """
+        """Remove the pending point at ``x`` and return it, ``1 x d``, or ``0 x d`` if none is."""
         if not len(self.pending):
             return self.pending
+        # The nearest one: several may be within the distance.
         distance, i = distances(x, self.pending, self.bounds).min(-1)
         if distance > NEAR:
             return self.pending[:0]
@@ -116,20 +118,23 @@ class Measurements:
     def _points(self, rows: list[list[float]]) -> Tensor:
         """Return the points of a record, ``n x d``."""
         d = self.X.shape[-1]
-        return checked_points("X", rows, d) if rows else self.X.new_zeros(0, d)
+        if not rows:
+            return self.X.new_zeros(0, d)
+        return checked_points("X", rows, d)
 
 
 def refusal(X: Tensor, result: Any, error: Exception) -> Record:
-    """Return the record of a refused result of an oracle for points ``q x d``.
+    """Return the record of an invalid result of an oracle for points ``q x d``.
 
     Example:
         >>> refusal(torch.zeros(1, 1), {"Y": torch.tensor([1.5, math.nan])}, ValueError("no"))
         {'refused': {'Y': [1.5, 'NaN']}, 'of': [[0.0]], 'because': 'no'}
     """
 
-    def plain(part: Any) -> Any:
+    def plain(part: Any) -> Any:  # arrays and tensors as lists
         return part.tolist() if hasattr(part, "tolist") else repr(part)
 
+    # Through JSON and back, so that the log can have it; NaN becomes a text.
     try:
         result = json.loads(json.dumps(result, default=plain), parse_constant=str)
     except (TypeError, ValueError, RecursionError):
@@ -138,7 +143,7 @@ def refusal(X: Tensor, result: Any, error: Exception) -> Record:
 
 
 def measurement(x: list[float], y: list[float]) -> Record:
-    """Return the record of a measurement, a failed one if no value is finite.
+    """Return the record of a measurement; of a failed one if no value is finite.
 
     Example:
         >>> measurement([0.5], [1.25, float("nan")])
@@ -146,47 +151,50 @@ def measurement(x: list[float], y: list[float]) -> Record:
         >>> measurement([0.5], [float("inf")])
         {'x': [0.5], 'y': [None], 'failed': 'measured [inf]'}
     """
-    values = [value if math.isfinite(value) else None for value in y]
-    record: Record = {"x": x, "y": values}
-    failed = all(value is None for value in values)
-    return record | ({"failed": f"measured {y}"} if failed else {})
+    # JSON has no NaN: null stands for it.
+    record: Record = {"x": x, "y": [value if math.isfinite(value) else None for value in y]}
+    if not any(map(math.isfinite, y)):
+        record["failed"] = f"measured {y}"
+    return record
 
 
 def checked_outcomes(Y: Any, num_points: int, num_outputs: int | None) -> Tensor:
     """Return measured values as ``n x m``, float64; they may be NaN or infinite.
 
     Args:
-        Y: The values, ``n x m`` or ``n``; one number for one point will do.
+        Y: The values, ``n x m`` or ``n``, or one number for one point.
         num_points: Number ``n`` of points.
-        num_outputs: Number ``m`` of outputs, if it is known.
+        num_outputs: Number ``m`` of outputs, or None.
 
     Raises:
-        TypeError: If they are no numbers.
+        TypeError: If the values are not numbers.
         ValueError: If they have another shape.
     """
     Y = checked_tensor("measured values", Y)
-    columns = Y.reshape(-1, 1) if Y.dim() < 2 else Y
-    right = columns.dim() == 2 and len(columns) == num_points and columns.shape[-1] > 0
-    if not right or num_outputs not in (None, columns.shape[-1]):
-        m = "m" if num_outputs is None else num_outputs
+    columns = Y
+    if Y.dim() < 2:  # one output
+        columns = Y.reshape(-1, 1)
+    fits = columns.dim() == 2 and len(columns) == num_points and columns.shape[-1] > 0
+    if not fits or num_outputs not in (None, columns.shape[-1]):
         raise ValueError(
-            f"Expected measured values of shape {num_points} x {m}, a row for each point, got "
-            f"{tuple(Y.shape)}."
+            f"Expected measured values of shape {num_points} x {num_outputs or 'm'}, a row for "
+            f"each point, got {tuple(Y.shape)}."
         )
     return columns
 
 
 def as_options(options: Any) -> dict[str, Any]:
-    """Return options of ``optimize_acqf``; none for None.
+    """Return options of ``optimize_acqf``; an empty dictionary for None.
 
     Raises:
-        TypeError: If they are no dictionary.
-        ValueError: If one of them is not for a user to give.
+        TypeError: If they are not a dictionary.
+        ValueError: If the collection sets one of them.
     """
-    options = {} if options is None else options
+    if options is None:
+        return {}
     if not isinstance(options, dict):
         raise TypeError(f"Expected optimizer_options to be a dictionary, got {options!r}.")
-    own = {"acq_function", "bounds", "q", "return_best_only", "return_full_tree"} & set(options)
-    if own:
-        raise ValueError(f"Expected optimizer_options without {sorted(own)}: these are set here.")
+    twice = {"acq_function", "bounds", "q", "return_best_only", "return_full_tree"} & set(options)
+    if twice:
+        raise ValueError(f"Expected optimizer_options without {sorted(twice)}, which are set here.")
     return options

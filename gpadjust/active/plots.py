@@ -21,25 +21,28 @@ def plot_collection(
 ) -> Any:
     """Draw the inputs and outputs of measurements in their order, and the best outputs so far.
 
-    Dots are measurements, hollow ones points that are pending; failed measurements are not drawn.
+    Dots are measurements, hollow dots pending points; failed measurements are not drawn.
 
     Args:
         collection: The collection.
-        optimum: The best value that each output can have, or that all can. The last axes then have
-            the regret, its distance from the nearest measurement so far. Default: without them.
-        axes: As many axes as inputs and outputs, and regrets. Default: a new figure.
+        optimum: The best value of each output, or of all. Further axes then have the regret, the
+            distance of the closest measurement so far. Default: none.
+        axes: An axis for each input, output and regret. Default: a new figure.
 
     Returns:
-        An array of these axes; ``axes[0].figure`` is the figure.
+        An array of the axes; ``axes[0].figure`` is the figure.
 
     Raises:
-        ValueError: If the optimum is not finite or of another number of outputs, or the number of
-            ``axes`` is another one.
+        ValueError: If the optimum is not finite or has another number of outputs, or the number of
+            ``axes`` is wrong.
     """
-    X, Y, pending, bounds = collection.X, collection.Y, collection.pending, collection.bounds
+    X, Y, pending = collection.X, collection.Y, collection.pending
     n, d, m = len(X), X.shape[-1], Y.shape[-1]
-    best = [] if optimum is None else checked_tensor("optimum", optimum).reshape(-1).tolist()
-    best = best * m if len(best) == 1 else best
+    best: list[float] = []
+    if optimum is not None:
+        best = checked_tensor("optimum", optimum).reshape(-1).tolist()
+    if len(best) == 1:
+        best = best * m
     if len(best) not in (0, m) or not all(map(math.isfinite, best)):
         raise ValueError(f"Expected optimum as {m} finite numbers, one of each output; got {best}.")
     rows = d + m + len(best)
@@ -47,24 +50,27 @@ def plot_collection(
         figure = plt.figure(figsize=(6, 1.6 * rows), layout="constrained")
         axes = figure.subplots(rows, 1, sharex=True, squeeze=False)
     axes = given_axes(axes, (rows,))
+    # Inputs first, with their bounds and pending points.
     numbers = torch.arange(1, n + len(pending) + 1)
     for i, ax in enumerate(axes[:d]):
-        for bound in bounds[:, i].tolist():
+        for bound in collection.bounds[:, i].tolist():
             ax.axhline(bound, color=GREY, lw=0.8, ls=":")
         ax.plot(numbers[:n], X[:, i], color=BLUE, **DOTS)
         ax.plot(numbers[n:], pending[:, i], color=BLUE, **DOTS | {"mfc": "none", "mec": BLUE})
     for values, ax in zip(Y.mT, axes[d : d + m], strict=True):
+        # A missing output is neither the lowest nor the highest.
         lowest = values.nan_to_num(nan=math.inf).cummin(0).values
         highest = values.nan_to_num(nan=-math.inf).cummax(0).values
         ax.plot(numbers[:n], values, color=GREY, **DOTS)
         for curve, color, label in ((highest, RED, "highest"), (lowest, BLUE, "lowest")):
             ax.step(numbers[:n], curve, where="post", color=color, label=f"{label} so far")
     for values, value, ax in zip(Y.mT, best, axes[d + m :], strict=False):
+        # min |y - optimum| so far
         regret = (values - value).abs().nan_to_num(nan=math.inf).cummin(0).values
         ax.step(numbers[:n], regret, where="post", color=BLUE)
         ax.set_yscale("log")
-    called = [*labels([f"x{i + 1}" for i in range(d)]), *labels([f"y{j + 1}" for j in range(m)])]
-    for ax, label in zip(axes, [*called, *(f"regret of {y}" for y in called[d:])], strict=False):
+    names = [*labels([f"x{i + 1}" for i in range(d)]), *labels([f"y{j + 1}" for j in range(m)])]
+    for ax, label in zip(axes, [*names, *(f"regret of {y}" for y in names[d:])], strict=False):
         ax.set_ylabel(label)
         tidy(ax)
     if m:

@@ -1,4 +1,4 @@
-"""The points to measure next: of a design, or of the highest acquisition value."""
+"""The next points: of a design, or with the highest value of an acquisition function."""
 
 from __future__ import annotations
 
@@ -14,38 +14,40 @@ from botorch.utils.sampling import draw_sobol_samples
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
-NEAR = 0.01  # of the bounds' widths: closer than this is the same point
-_OTHERS = 256  # points among which the best is taken in its place
+NEAR = 0.01  # of the bounds' widths: closer points count as the same
+_OTHERS = 256  # random points, of which the best replaces one too close to others
 
 
-def sobol_points(bounds: Tensor, q: int, known: Tensor, seed: int) -> Tensor:
-    """Return the next points of a scrambled Sobol sequence that are not known yet.
+def sobol_points(bounds: Tensor, q: int, earlier: Tensor, seed: int) -> Tensor:
+    """Return the next points of a scrambled Sobol sequence.
 
     Args:
         bounds: Bounds of the inputs, ``2 x d``.
         q: Number of points.
-        known: Points that are not wanted again, ``n x d``.
+        earlier: Points to leave out, ``n x d``.
         seed: Seed of the scrambling.
 
     Returns:
         The points, ``q x d``.
     """
     engine = SobolEngine(bounds.shape[-1], scramble=True, seed=seed)
-    drawn = engine.draw(len(known) + q, dtype=torch.float64)
-    points = bounds[0] + (bounds[1] - bounds[0]) * drawn
-    return points[~among(points, known)][:q]
+    # The earlier points may be those of the sequence, or any others.
+    unit = engine.draw(len(earlier) + q, dtype=torch.float64)
+    points = bounds[0] + (bounds[1] - bounds[0]) * unit
+    return points[~among(points, earlier)][:q]
 
 
 def among(points: Tensor, others: Tensor) -> Tensor:
-    """Mark each of ``n x d`` points that is one of the others, ``n``."""
+    """Return a mask of points ``n x d`` that are among the others, ``n``."""
     return (points.unsqueeze(-2) == others).all(-1).any(-1)
 
 
 def distances(points: Tensor, others: Tensor, bounds: Tensor) -> Tensor:
-    """Return distances of ``n x d`` points from others, the largest over the inputs: ``n x k``.
+    """Return distances of points ``n x d`` from others, ``n x k``, in the bounds' widths.
 
-    They are in units of the bounds' widths.
+    A distance is the largest difference of an input.
     """
+    # max_i |x_i - x'_i| / (b_i - a_i)
     gaps = (points.unsqueeze(-2) - others).abs() / (bounds[1] - bounds[0])
     return gaps.amax(-1)
 
@@ -65,62 +67,63 @@ def best_points(
         bounds: Bounds of the inputs, ``2 x d``.
         q: Number of points.
         pending: Points that are being measured, ``k x d``.
-        failed: Points where measuring failed, ``l x d``. They are taken as pending, so that the
-            function sees no more use in them, and none of the points is near one of them.
+        failed: Points of failed measurements, ``l x d``. The function considers them as pending,
+            so that their neighbourhood has no value, and no point is near one of them.
         options: Arguments of ``optimize_acqf`` other than those above.
 
     Returns:
         The points, ``q x d``.
     """
-    # A line search that rounding errors end has converged: no second try is needed.
+    # A line search that rounding errors end has converged: a second try is not needed.
     defaults = {"num_restarts": 8, "raw_samples": 128, "retry_on_optimization_warning": False}
-    taken = torch.cat([pending, failed])
-    with taken_as_pending(acquisition, taken) as counts:
-        away = failed if counts else taken  # others are to be kept from by hand
+    others = torch.cat([pending, failed])
+    with taken_as_pending(acquisition, others) as has_pending:
+        # A function without X_pending would return pending points again.
+        avoided = failed if has_pending else others
         points, _ = optimize_acqf(acquisition, bounds, q=q, **{**defaults, **options})
         points = points.detach()
         for i in range(q):
-            if _near(points[i : i + 1], away, bounds).any():
-                points[i] = _elsewhere(acquisition, points, i, away, bounds)
+            if _near(points[i : i + 1], avoided, bounds).any():
+                points[i] = _elsewhere(acquisition, points, i, avoided, bounds)
     return points
 
 
 @contextmanager
 def taken_as_pending(acquisition: AcquisitionFunction, points: Tensor) -> Iterator[bool]:
-    """Let an acquisition function count on pending points beside its own, if it does so at all.
-
-    It has its own alone again at the end. The value is whether it counts on them.
-    """
-    own, counts = getattr(acquisition, "X_pending", None), bool(len(points))
-    if counts:
+    """Add pending points to an acquisition function for a while; yield whether it takes any."""
+    before = getattr(acquisition, "X_pending", None)
+    has_pending = bool(len(points))
+    if has_pending:
+        pending = points if before is None else torch.cat([before, points])
         try:
-            acquisition.set_X_pending(points if own is None else torch.cat([own, points]))
+            acquisition.set_X_pending(pending)
         except UnsupportedError:
-            counts = False
+            has_pending = False
     try:
-        yield counts
+        yield has_pending
     finally:
-        if counts:
-            acquisition.set_X_pending(own)
+        if has_pending:
+            acquisition.set_X_pending(before)
 
 
 def _near(points: Tensor, others: Tensor, bounds: Tensor) -> Tensor:
-    """Mark each of ``n x d`` points near one of the others, ``n``."""
+    """Return a mask of points ``n x d`` near one of the others, ``n``."""
     return (distances(points, others, bounds) < NEAR).any(-1)
 
 
 def _elsewhere(
-    acquisition: AcquisitionFunction, points: Tensor, i: int, away: Tensor, bounds: Tensor
+    acquisition: AcquisitionFunction, points: Tensor, i: int, avoided: Tensor, bounds: Tensor
 ) -> Tensor:
-    """Return the best place for the i-th point among random ones that are not near others."""
+    """Return the best place for the i-th point among random ones away from others."""
     seed = int(torch.randint(2**31, (1,)))
-    drawn = draw_sobol_samples(bounds, n=_OTHERS, q=1, seed=seed).squeeze(-2)
-    drawn = drawn[~_near(drawn, away, bounds)]
-    if not len(drawn):
+    places = draw_sobol_samples(bounds, n=_OTHERS, q=1, seed=seed).squeeze(-2)
+    places = places[~_near(places, avoided, bounds)]
+    if not len(places):
         return points[i]
     if isinstance(acquisition, OneShotAcquisitionFunction):
-        return drawn[0]  # its value at a point is an optimisation in itself
-    batches = points.repeat(len(drawn), 1, 1)
-    batches[:, i] = drawn
+        return places[0]  # its value at a point is an optimisation in itself
+    # The value of the batch with each place for the i-th point.
+    batches = points.repeat(len(places), 1, 1)
+    batches[:, i] = places
     with torch.no_grad():
-        return drawn[acquisition(batches).argmax()]
+        return places[acquisition(batches).argmax()]

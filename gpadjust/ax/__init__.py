@@ -1,4 +1,4 @@
-"""The models in Ax, with a physics of the search space's parameters (the extra ``ax``)."""
+"""The models in Ax, with a physics of the parameters of a search space (the extra ``ax``)."""
 
 try:
     import ax as _  # noqa: F401
@@ -18,4 +18,4 @@ __all__ = [
     "generator_kwargs",
 ]
 
-surrogate.register()
+surrogate.register()  # Ax finds models, transforms and classes by registries

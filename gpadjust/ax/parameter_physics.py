@@ -15,21 +15,21 @@ from gpadjust.physics.import_path import import_path, physics_from_path
 
 
 class ParameterPhysics:
-    """A physics of the parameters of an Ax search space, as one keeps it in a ``ModelConfig``.
+    """A physics of the parameters of an Ax search space, for a ``ModelConfig``.
 
-    It is asked in the units of the search space and answers in those of its metric, whatever Ax
-    transforms before a model sees it (:class:`~gpadjust.ax.TellPhysics`). Ax saves it by its import
-    path. All that takes a physics in this room makes one of what it is given.
+    Its inputs have the units of the search space and its outputs those of its metric, whatever Ax
+    transforms before a model (:class:`~gpadjust.ax.TellPhysics`). Ax saves it by its import path.
+    Every function of this room with a physics as its argument makes one of it.
 
     Args:
-        physics: The physics f_p. A function whose arguments have names of parameters,
-            ``f_p(pressure, temperature)``, is given tensors of ``N`` values of these, whatever the
-            order of the search space. Any other function or :class:`~gpadjust.physics.Physics` is
-            given ``N x d`` rows, a column for each parameter, in the order of the search space. It
+        physics: The physics f_p. A function with parameters as its arguments,
+            ``f_p(pressure, temperature)``, gets tensors of ``N`` values of these, in any order of
+            the search space. Any other function or :class:`~gpadjust.physics.Physics` gets
+            ``N x d`` rows, a column for each parameter, in the order of the search space. It
             returns ``N`` values or ``N x 1``. Or an import path, ``"package.module:f_p"``.
 
     Raises:
-        TypeError: If it is no physics.
+        TypeError: If ``physics`` is not a physics.
         ValueError: If it is a path that cannot be imported.
 
     Example:
@@ -43,95 +43,100 @@ class ParameterPhysics:
     def __init__(self, physics: Any) -> None:
         path = None
         if isinstance(physics, ParameterPhysics):
-            path, physics = physics.path, physics.physics
+            path = physics.path
+            physics = physics.physics
         if isinstance(physics, str):
-            path, physics = physics, physics_from_path(physics)
+            path = physics
+            physics = physics_from_path(path)
             if type(physics) is FunctionPhysics:
-                physics = physics.function  # whose arguments may have names of parameters
-        as_physics(physics)  # says what is expected
+                physics = physics.function  # its arguments may have names of parameters
+        as_physics(physics)  # raises the error of anything else
         self._path = path
         self.physics: Physics | Callable[..., Tensor] = physics
-        self._made: dict[tuple[str, ...], Physics] = {}
+        self._by_names: dict[tuple[str, ...], Physics] = {}
 
     @property
     def name(self) -> str:
         """The name of the physics in messages."""
-        own = self.physics
-        return own.name if isinstance(own, Physics) else as_physics(own).name
+        return as_physics(self.physics).name
 
     @property
     def path(self) -> str | None:
-        """The import path by which it is saved; None if it has none, as a lambda."""
+        """The import path for saving; None without one, for example of a lambda."""
         return self._path or import_path(self.physics)
 
     def names_of(self, parameters: Sequence[str]) -> tuple[str, ...]:
-        """Return the parameters that it reads, in its order.
+        """Return the parameters that the physics reads, in its order.
 
         Args:
-            parameters: Those of the search space, in its order.
+            parameters: All parameters of the search space, in its order.
 
         Raises:
-            ValueError: If it is a function of several arguments that are not all parameters.
+            ValueError: If the physics has several arguments that are not all parameters.
         """
+        # Arguments without a default must be parameters; others may be.
         arguments = self._arguments()
         named = [name for name in arguments if name in parameters]
         needed = [name for name, default in arguments.items() if default is Parameter.empty]
         if named and set(needed) <= set(parameters):
             return tuple(named)
+        # One argument of another name is a tensor of all columns; several are a misspelling.
         if len(needed) > 1 or (named and len(arguments) > 1):
             raise ValueError(
                 f"The physics {self.name!r} takes {', '.join(arguments)}, but "
-                f"{', '.join(name for name in needed if name not in parameters)} is no parameter "
-                f"of the search space, which has {', '.join(parameters)}. Give its arguments the "
-                "names of parameters, or let it take one tensor with a column for each."
+                f"{', '.join(name for name in needed if name not in parameters)} is not a "
+                f"parameter of the search space, which has {', '.join(parameters)}. Give its "
+                "arguments the names of parameters, or let it take one tensor with a column for "
+                "each."
             )
         return tuple(parameters)
 
     def of(self, names: tuple[str, ...]) -> Physics:
-        """Return it as a physics of rows with the columns ``names``, those of :meth:`names_of`.
+        """Return the physics as one of rows with the columns ``names``, see :meth:`names_of`.
 
-        It is made once, so that what is remembered of f_p outlives a model.
+        Repeated calls return the same object, so that the memory of f_p outlives a model.
         """
-        if names not in self._made:
+        if names not in self._by_names:
             physics = self.physics
+            # A function of named arguments gets columns, any other one rows.
             if not isinstance(physics, Physics) and set(names) <= set(self._arguments()):
-                of_rows = partial(_of_columns, physics, names)
-                physics = FunctionPhysics(of_rows, name=self.name)
-            self._made[names] = as_physics(physics)
-        return self._made[names]
+                function = partial(_of_columns, physics, names)
+                physics = FunctionPhysics(function, name=self.name)
+            self._by_names[names] = as_physics(physics)
+        return self._by_names[names]
 
     def __repr__(self) -> str:
-        """Return its path, or the name of a physics without one."""
+        """Return the class with the path, or with the name of a physics without one."""
         return f"{type(self).__name__}({self.path or self.name!r})"
 
     def __eq__(self, other: object) -> bool:
-        """Return whether it is of the same physics."""
+        """Return whether another one has the same physics, by identity or by path."""
         return isinstance(other, ParameterPhysics) and (
             self.physics is other.physics or (self.path is not None and self.path == other.path)
         )
 
     def __hash__(self) -> int:
-        """Return the hash of its name, which may be that of another."""
+        """Return the hash of the name."""
         return hash(self.name)
 
     def __deepcopy__(self, memo: Any) -> Self:
-        """Return itself: Ax copies settings before each fit."""
+        """Return the same object: Ax copies settings before each fit."""
         return self
 
     def _arguments(self) -> dict[str, Any]:
         """Return the named arguments of a function, with their defaults."""
         if isinstance(self.physics, Module):
-            return {}
+            return {}  # called with one tensor
         try:
-            found = signature(self.physics).parameters
-        except ValueError:  # a builtin
+            parameters = signature(self.physics).parameters
+        except ValueError:  # a builtin function
             return {}
         kinds = (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)
-        return {name: p.default for name, p in found.items() if p.kind in kinds}
+        return {name: p.default for name, p in parameters.items() if p.kind in kinds}
 
 
 def parts_of(physics: Any) -> list[Any]:
-    """Return the physics of a metric: a list, tuple or dictionary of several; none of None."""
+    """Return a list of the physics of a metric: one, several, or none."""
     if isinstance(physics, Mapping):
         return [*physics.values()]
     if isinstance(physics, list | tuple):
@@ -140,7 +145,7 @@ def parts_of(physics: Any) -> list[Any]:
 
 
 def of_each(change: Callable[[Any], Any], physics: Any) -> Any:
-    """Return the physics of a metric, each changed, in the form in which they are given."""
+    """Return the result of a function for each physics of a metric, in the form of the physics."""
     if isinstance(physics, Mapping):
         return {name: change(part) for name, part in physics.items()}
     if isinstance(physics, list | tuple):
@@ -149,5 +154,5 @@ def of_each(change: Callable[[Any], Any], physics: Any) -> Any:
 
 
 def _of_columns(function: Callable[..., Tensor], names: tuple[str, ...], X: Tensor) -> Tensor:
-    """Return a function of named arguments at rows."""
+    """Return the values of a function of named arguments at rows."""
     return function(**dict(zip(names, X.unbind(-1), strict=True)))

@@ -21,8 +21,8 @@ from gpadjust.ax.tell_physics import TellPhysics
 from gpadjust.core import CKA, GP, ZeroMeanGP
 
 TRANSFORMS: list[type[Transform]] = [*MBM_X_trans, Derelativize, StandardizeY, TellPhysics]
-"""Ax's transforms of parameters; of metrics shift and scale alone, as others would bend what f_p
-says (``Winsorize``, ``BilogY``); and ``TellPhysics``."""
+"""Ax's transforms of parameters; for metrics only shift and scale, as others (``Winsorize``,
+``BilogY``) would distort the outputs of f_p; and ``TellPhysics``."""
 
 
 def generator_kwargs(
@@ -34,11 +34,11 @@ def generator_kwargs(
     """Return arguments of Ax's ``BOTORCH_MODULAR`` generator, for your own ``GeneratorSpec``.
 
     Args:
-        physics: For each metric that has one, its physics, as :class:`ParameterPhysics` takes it;
-            several of one metric as a list, or a dictionary with their names.
+        physics: The physics of metrics by the metrics' names, see :class:`ParameterPhysics`;
+            several for one metric as a list, or a dictionary with their names.
         model: The model of these metrics: a class, or ``functools.partial`` of one with further
-            arguments, of which numbers with units are in those after Ax's transforms. The other
-            metrics have a :class:`~gpadjust.ZeroMeanGP`.
+            arguments, whose units are those after Ax's transforms. The other metrics have a
+            :class:`~gpadjust.ZeroMeanGP`.
         fit_options: Arguments of :func:`gpadjust.fit`, such as ``{"method": "map"}``, for all
             metrics.
 
@@ -46,26 +46,28 @@ def generator_kwargs(
         ``surrogate_spec`` and ``transforms``.
 
     Raises:
-        TypeError: If ``physics`` is no mapping of metrics, or holds something else than physics, or
-            ``model`` is no such class.
+        TypeError: If ``physics`` is not a mapping of metrics to physics, or ``model`` is not such a
+            class.
     """
     if not isinstance(physics, Mapping) or not physics:
         raise TypeError(
             "Expected the physics of at least one metric by its name, {'cost': f_p}, found "
             f"{physics!r}."
         )
-    fitted = {"mll_options": dict(fit_options or {})}
+    mll_options = dict(fit_options or {})
     model_class, options = _class_of(model)
+    # One config for each metric with a physics, and one for all others.
     configs = {
         metric: ModelConfig(
             botorch_model_class=model_class,
-            model_options={**options, "physics": of_each(ParameterPhysics, given)},
+            model_options={**options, "physics": of_each(ParameterPhysics, part)},
             name=f"{model_class.__name__} of {metric}",
-            **fitted,
+            mll_options=mll_options,
         )
-        for metric, given in physics.items()
+        for metric, part in physics.items()
     }
-    other = ModelConfig(botorch_model_class=ZeroMeanGP, name="ZeroMeanGP", **fitted)
+    other = ModelConfig(botorch_model_class=ZeroMeanGP, name="ZeroMeanGP", mll_options=mll_options)
+    # Ax takes the model of a metric, or the general one.
     spec = SurrogateSpec(
         model_configs=[other],
         metric_to_model_configs={metric: [config] for metric, config in configs.items()},
@@ -80,23 +82,23 @@ def generation_strategy(
     fit_options: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> GenerationStrategy:
-    """Return Ax's default strategy, with models that adjust a physics in place of its own.
+    """Return Ax's default strategy, with models that adjust a physics in place of Ax's models.
 
-    Its first trials are Ax's, the center of the search space and Sobol points.
+    The first trials are those of Ax, the center of the search space and Sobol points.
 
     Args:
-        physics: As in :func:`generator_kwargs`, like the next two.
-        model: As there.
-        fit_options: As there.
-        options: Those of ``Client.configure_generation_strategy`` but ``method``, such as
+        physics: As in :func:`generator_kwargs`.
+        model: As in :func:`generator_kwargs`.
+        fit_options: As in :func:`generator_kwargs`.
+        options: Options of ``Client.configure_generation_strategy`` except ``method``, such as
             ``initialization_budget`` and ``initialization_random_seed``.
 
     Returns:
-        For ``client.set_generation_strategy``.
+        A strategy for ``client.set_generation_strategy``.
 
     Raises:
-        TypeError: As there.
-        ValueError: At the first trial of a model, if a physics reads what is no parameter, or text.
+        TypeError: As :func:`generator_kwargs`.
+        ValueError: At the first trial of a model, if a physics reads an unknown parameter, or text.
 
     Example:
         >>> from ax.api.client import Client
@@ -111,24 +113,27 @@ def generation_strategy(
         >>> strategy.name
         'Center+Sobol+MBM:CKA'
     """
-    own = generator_kwargs(physics, model=model, fit_options=fit_options)
+    kwargs = generator_kwargs(physics, model=model, fit_options=fit_options)
     struct = GenerationStrategyDispatchStruct(method="custom", **options)
+    # The config gives the strategy its name; its generator then gets ours.
     strategy = choose_generation_strategy(
         struct, model_config=ModelConfig(name=_class_of(model)[0].__name__)
     )
-    strategy.nodes_by_name["MBM"].generator_specs[0].generator_kwargs.update(own)
+    strategy.nodes_by_name["MBM"].generator_specs[0].generator_kwargs.update(kwargs)
     return strategy
 
 
 def _class_of(model: Any) -> tuple[type[GP], dict[str, Any]]:
-    """Return the class of a model factory, and the arguments that it adds."""
+    """Return the class of a model factory and its further arguments."""
+    # Ax makes a model by a class and keyword arguments.
     options: dict[str, Any] = {}
     factory = model
     if isinstance(model, partial) and not model.args:
-        factory, options = model.func, dict(model.keywords)
+        factory = model.func
+        options = dict(model.keywords)
     if not isinstance(factory, type) or not issubclass(factory, GP):
         raise TypeError(
             "Expected model as a class of models, such as CKA, or functools.partial of one with "
-            f"keyword arguments, as Ax makes models of classes, got {model!r}."
+            f"keyword arguments, as Ax needs a class, got {model!r}."
         )
     return factory, options

@@ -40,12 +40,14 @@ _PARTS = (
 
 
 def register() -> None:
-    """Enter functions, models, transform, node and physics where Ax looks for them."""
+    """Enter functions, models, transform and physics into Ax's registries."""
+    # Dispatch on the class of a model.
     submodel_input_constructor.register(GP)(model_inputs)
     fit_botorch_model.register(GP)(fit_model)
     for model in (CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP, CalibratedPhysics):
         register_model(model)
     register_transform(TellPhysics)
+    # Ax saves a ModelConfig as JSON.
     CORE_ENCODER_REGISTRY[ParameterPhysics] = as_dict
     CORE_DECODER_REGISTRY[ParameterPhysics.__name__] = ParameterPhysics
 
@@ -57,22 +59,23 @@ def model_inputs(
     search_space_digest: SearchSpaceDigest,
     surrogate: Surrogate,
 ) -> dict[str, Any]:
-    """Return the arguments of a model: the data as Ax transformed them, and ``model_options``.
+    """Return the arguments of a model: the data after Ax's transforms, and ``model_options``.
 
-    The models scale inputs and targets by themselves, so that Ax's default input transform is left
-    out. Other arguments are as of Ax.
+    The models scale inputs and targets themselves, without Ax's default input transform. Other
+    arguments are those of Ax.
 
     Raises:
-        ValueError: If a physics is not behind ``TellPhysics``, or if something is asked for that
-            these models do not have.
+        ValueError: If a physics is not behind ``TellPhysics``, or the config has options that these
+            models do not have.
     """
     name = botorch_model_class.__name__
-    found = [part for part in _PARTS if getattr(model_config, part) not in (None, [], DEFAULT)]
-    if found:
+    parts = [part for part in _PARTS if getattr(model_config, part) not in (None, [], DEFAULT)]
+    if parts:
         raise ValueError(
-            f"{name} makes its own parts; found {', '.join(found)} in ModelConfig. Put what the "
-            "model takes in model_options, such as {'delta_covar_module': ...}."
+            f"{name} makes its own parts; found {', '.join(parts)} in ModelConfig. Put arguments "
+            "of the model in model_options, such as {'delta_covar_module': ...}."
         )
+    # Columns that stand for a task or a fidelity need a kernel of their own.
     special = [
         kind
         for kind in ("task", "fidelity", "categorical")
@@ -84,34 +87,35 @@ def model_inputs(
             "OneHot (transforms=gpadjust.ax.TRANSFORMS), and give each task or fidelity a model of "
             "its own."
         )
-    for each in parts_of(model_config.model_options.get("physics")):
-        if not isinstance(each, PhysicsInUnits) or each.units.names != tuple(dataset.feature_names):
+    # Without TellPhysics f_p would get the inputs of the model, such as logarithms.
+    for part in parts_of(model_config.model_options.get("physics")):
+        if not isinstance(part, PhysicsInUnits) or part.units.names != tuple(dataset.feature_names):
             raise ValueError(
-                f"The physics of {', '.join(dataset.outcome_names)} was not told what Ax's "
-                "transforms do, and would be asked in other units than the search space's. Make "
-                "TellPhysics the last of them: generator_kwargs={'surrogate_spec': ..., "
-                "'transforms': gpadjust.ax.TRANSFORMS}; or let "
-                "gpadjust.ax.generation_strategy({'the metric': f_p}) do it."
+                f"The physics of {', '.join(dataset.outcome_names)} would get inputs after Ax's "
+                "transforms, in other units than the search space. Make TellPhysics the last "
+                "transform: generator_kwargs={'surrogate_spec': ..., 'transforms': "
+                "gpadjust.ax.TRANSFORMS}; or use gpadjust.ax.generation_strategy({'the metric': "
+                "f_p})."
             )
     return {**botorch_model_class.construct_inputs(dataset), **model_config.model_options}
 
 
 def fit_model(model: GP, mll_class: Any, mll_options: dict[str, Any] | None = None) -> None:
-    """Fit a model by :func:`gpadjust.fit`, whose options are ``mll_options``."""
+    """Fit a model by :func:`gpadjust.fit` with ``mll_options``."""
     fit(model, **(mll_options or {}))
 
 
 def as_dict(physics: ParameterPhysics) -> dict[str, Any]:
-    """Return a physics as Ax saves it: by its import path.
+    """Return a physics in Ax's format, by its import path.
 
     Raises:
-        JSONEncodeError: If it has none.
+        JSONEncodeError: If the physics has no import path.
     """
     if physics.path is None:
         raise JSONEncodeError(
-            f"Ax cannot save the physics {physics.name!r}: found a lambda or a function or object "
-            "inside of another, expected one with a name in a module. Write `def f_p(...)`, or "
+            f"Ax cannot save the physics {physics.name!r}: found a lambda, or a function or object "
+            "inside of another; expected a name in a module. Write `def f_p(...)`, or "
             "`f_p = BlackBoxPhysics(...)`, in a file that can be imported, and make the generation "
-            "strategy of that."
+            "strategy with it."
         )
     return {"__type": ParameterPhysics.__name__, "physics": physics.path}

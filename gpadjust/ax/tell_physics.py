@@ -1,4 +1,4 @@
-"""The transform by which a physics learns what Ax's transforms did."""
+"""The transform that gives each physics the effect of Ax's transforms."""
 
 from __future__ import annotations
 
@@ -20,17 +20,16 @@ from gpadjust.ax.units import PhysicsInUnits, Units
 
 
 class TellPhysics(Transform):
-    """The last of the transforms: it changes nothing, and tells each physics of the others.
+    """The last transform, which changes no data but gives each physics the effect of the others.
 
-    Ax transforms parameters and metrics before a model sees them: logarithms, codes, fixed
-    parameters that are left out, standardised metrics. A physics in a ``ModelConfig`` is then asked
-    in the units of the search space all the same, and what it answers, in the units of its metric,
-    goes through the same transforms as the metric's data.
+    Ax transforms parameters and metrics before a model: logarithms, codes, omitted fixed
+    parameters, standardised metrics. A physics in a ``ModelConfig`` still gets inputs in the units
+    of the search space, and its outputs, in the units of its metric, pass the same transforms as
+    the data of the metric.
 
     Raises:
-        ValueError: If it is not the last of the transforms; if there is one that a physics cannot
-            be asked behind; or if a physics is given for several metrics at once, or for none that
-            the experiment has.
+        ValueError: If this is not the last transform; if a transform is not supported; or if a
+            physics belongs to several metrics, or to none of the experiment.
     """
 
     no_op_for_experiment_data = True
@@ -43,49 +42,53 @@ class TellPhysics(Transform):
         config: Any = None,
     ) -> None:
         super().__init__(search_space, experiment_data, adapter, config)
+        # Ax builds transforms in other places, too, without data or for other generators.
         generator = getattr(adapter, "generator", None)
         if search_space is None or experiment_data is None or adapter is None:
             return
         if not isinstance(generator, BoTorchGenerator):
             return
+        # A later transform would change the columns of the model again.
         if adapter._raw_transforms[-1] is not TellPhysics:
             raise ValueError(
-                "Expected TellPhysics as the last of the transforms, found "
+                "Expected TellPhysics as the last transform, found "
                 f"{adapter._raw_transforms[-1].__name__} after it."
             )
-        before = [t for t in adapter.transforms.values() if not isinstance(t, TellPhysics)]
-        given = adapter.transforms["Cast"].search_space
-        if given.is_hierarchical:
+        transforms = [t for t in adapter.transforms.values() if not isinstance(t, TellPhysics)]
+        original = adapter.transforms["Cast"].search_space  # Cast is the first transform
+        if original.is_hierarchical:
             raise ValueError(
-                "A physics cannot be asked in a hierarchical search space; make one of parameters "
-                "that are always there."
+                "A physics needs a search space without a hierarchy, found a hierarchical one; "
+                "make one of parameters that are always there."
             )
+        # Plain values of the parameters before all transforms.
         ranges = {
             p.name: (float(p.lower), float(p.upper))
-            for p in given.parameters.values()
+            for p in original.parameters.values()
             if isinstance(p, RangeParameter)
         }
-        whole = [
-            name for name in ranges if given.parameters[name].parameter_type is ParameterType.INT
+        integers = [
+            name for name in ranges if original.parameters[name].parameter_type is ParameterType.INT
         ]
         choices = {
             p.name: [float(value) for value in p.values]
-            for p in given.parameters.values()
+            for p in original.parameters.values()
             if isinstance(p, ChoiceParameter) and p.is_numeric
         }
-        units = Units(before, [*search_space.parameters], ranges, whole, choices)
+        units = Units(transforms, [*search_space.parameters], ranges, integers, choices)
+        # Metrics may have no data yet, or data without being tracked.
         observed = set(experiment_data.metric_signatures)
-        metrics = observed | {each.signature for each in adapter._experiment.metrics.values()}
-        told = _Told(units, [*given.parameters], observed, metrics)
-        # The generator's own specification: the user's may belong to several.
+        metrics = observed | {metric.signature for metric in adapter._experiment.metrics.values()}
+        setter = _UnitsSetter(units, [*original.parameters], observed, metrics)
+        # The generator has a copy of the specification; the user's may serve several generators.
         if generator.surrogate_spec is not None:
-            generator.surrogate_spec = told.spec(generator.surrogate_spec)
+            generator.surrogate_spec = setter.spec(generator.surrogate_spec)
         if generator._surrogate is not None:
-            generator._surrogate.surrogate_spec = told.spec(generator._surrogate.surrogate_spec)
+            generator._surrogate.surrogate_spec = setter.spec(generator._surrogate.surrogate_spec)
 
 
-class _Told:
-    """Specifications of which each physics knows the units."""
+class _UnitsSetter:
+    """Copies of specifications in which each physics has its units."""
 
     def __init__(
         self, units: Units, parameters: list[str], observed: set[str], metrics: set[str]
@@ -94,36 +97,41 @@ class _Told:
         self.observed, self.metrics = observed, metrics
 
     def spec(self, spec: SurrogateSpec) -> SurrogateSpec:
-        own = spec.metric_to_model_configs
-        wrong = sorted(own.keys() - self.metrics)
-        if wrong:
+        """Return a specification with units."""
+        by_metric = spec.metric_to_model_configs
+        unknown = sorted(by_metric.keys() - self.metrics)
+        if unknown:
             raise ValueError(
-                f"A model is given for {', '.join(wrong)}, which is no metric of the experiment; "
-                f"expected some of {', '.join(sorted(self.metrics))}."
+                f"A model has the unknown metric {', '.join(unknown)}; expected some of "
+                f"{', '.join(sorted(self.metrics))}."
             )
-        others = sorted(self.observed - own.keys())
+        # The general configs serve all metrics without one of their own.
+        others = sorted(self.observed - by_metric.keys())
         return replace(
             spec,
-            model_configs=[self.config(each, others) for each in spec.model_configs],
+            model_configs=[self.config(config, others) for config in spec.model_configs],
             metric_to_model_configs={
-                metric: [self.config(each, [metric]) for each in configs]
-                for metric, configs in own.items()
+                metric: [self.config(config, [metric]) for config in configs]
+                for metric, configs in by_metric.items()
             },
         )
 
     def config(self, config: ModelConfig, metrics: list[str]) -> ModelConfig:
+        """Return the config of the model of some metrics, with units."""
         physics = config.model_options.get("physics")
         if physics is None or not metrics:
             return config
         if len(metrics) > 1:
             raise ValueError(
-                f"Expected a physics for one metric, found one for {', '.join(metrics)}. Say which "
-                "it is of: SurrogateSpec(metric_to_model_configs={'the metric': [ModelConfig(...)]"
+                f"Expected a physics for one metric, found one for {', '.join(metrics)}. Name its "
+                "metric: SurrogateSpec(metric_to_model_configs={'the metric': [ModelConfig(...)]"
                 "}), or gpadjust.ax.generation_strategy({'the metric': f_p})."
             )
-        told = of_each(partial(self.physics, metrics[0]), physics)
-        return replace(config, model_options={**config.model_options, "physics": told})
+        in_units = of_each(partial(self.physics, metrics[0]), physics)
+        return replace(config, model_options={**config.model_options, "physics": in_units})
 
     def physics(self, metric: str, physics: Any) -> PhysicsInUnits:
-        origin = physics.origin if isinstance(physics, PhysicsInUnits) else physics
-        return PhysicsInUnits(ParameterPhysics(origin), metric, self.units, self.parameters)
+        """Return a physics of a metric with units, which replace those of an earlier fit."""
+        if isinstance(physics, PhysicsInUnits):
+            physics = physics.origin
+        return PhysicsInUnits(ParameterPhysics(physics), metric, self.units, self.parameters)

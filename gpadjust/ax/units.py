@@ -1,4 +1,4 @@
-"""A physics behind Ax's transforms: what these did, undone and done in PyTorch."""
+"""A physics behind Ax's transforms, which are undone for inputs and repeated for outputs."""
 
 from __future__ import annotations
 
@@ -34,26 +34,25 @@ Columns = dict[str, Tensor]
 Step = Callable[[Columns], None]
 Change = Callable[[Tensor], Tensor]
 
-_NEXT_TO = 1e-6  # of a whole number
+_NEAR = 1e-6  # distance from an integer that is rounding
 
 
 class Units:
-    """Units of the search space from a model's inputs in Ax, and a model's units of the metrics.
+    """Conversions from a model's inputs in Ax to the search space, and of metrics to the model.
 
-    It is differentiable but for coded choices, and holds plain values, not Ax's objects, so
+    They are differentiable except for coded choices, and contain plain values, not Ax's objects, so
     that models can be copied and pickled.
 
     Args:
-        transforms: Ax's transforms, initialised, in the order in which they were applied.
-        names: The columns that the model sees.
-        ranges: Lower and upper bounds of parameters, within which a physics is asked: BoTorch also
-            looks around the data, beyond them.
-        whole: Those whose values are whole numbers, to which what is next to one is rounded: Ax and
-            the models scale them, so that 8 comes back as 7.999999999999999.
-        choices: The numbers of choices, of which a physics is asked the nearest.
+        transforms: Ax's transforms, initialised, in the order of their application.
+        names: The columns of the model.
+        ranges: Lower and upper bounds of parameters. A physics gets values within: BoTorch also
+            evaluates models around the data, outside of the bounds.
+        integers: Parameters with integers, to round: after scaling 8 may be 7.999999999999999.
+        choices: The numbers of choices, of which a physics gets the nearest.
 
     Raises:
-        ValueError: If there is a transform that it does not know.
+        ValueError: If a transform is not supported.
     """
 
     def __init__(
@@ -61,26 +60,29 @@ class Units:
         transforms: Sequence[Transform],
         names: Sequence[str],
         ranges: Mapping[str, tuple[float, float]],
-        whole: Collection[str] = (),
+        integers: Collection[str] = (),
         choices: Mapping[str, Sequence[float]] | None = None,
     ) -> None:
-        known = (*_BACK, *_FORTH, *_NEITHER)
-        unknown = [type(t).__name__ for t in transforms if type(t) not in known]
-        if unknown:
+        supported = (*_BACK, *_FORTH, *_NEITHER)
+        others = [type(t).__name__ for t in transforms if type(t) not in supported]
+        if others:
             raise ValueError(
-                f"A physics cannot be asked behind the transform(s) {', '.join(unknown)} of Ax; "
-                f"expected some of {', '.join(each.__name__ for each in known)}. Leave the others "
-                "out: transforms=gpadjust.ax.TRANSFORMS."
+                f"The transform(s) {', '.join(others)} of Ax are not supported with a physics; "
+                f"expected some of {', '.join(kind.__name__ for kind in supported)}. Leave the "
+                "others out: transforms=gpadjust.ax.TRANSFORMS."
             )
-        self.names, self.ranges = tuple(names), dict(ranges)
-        self.whole = frozenset(whole)
+        self.names = tuple(names)
+        self.ranges = dict(ranges)
+        self.integers = frozenset(integers)
         self.choices = {
             name: torch.tensor(values, dtype=torch.float64)
             for name, values in (choices or {}).items()
         }
+        # Inputs go back from the last transform to the first, metrics forth from the first.
         self._back: list[Step] = []
         for t in reversed(transforms):
-            self._back += _BACK[type(t)](t) if type(t) in _BACK else []
+            if type(t) in _BACK:
+                self._back += _BACK[type(t)](t)
         self._forth = [_FORTH[type(t)](t) for t in transforms if type(t) in _FORTH]
 
     def raw(self, X: Tensor, names: Sequence[str]) -> Tensor:
@@ -94,34 +96,36 @@ class Units:
             ``N x len(names)``.
 
         Raises:
-            ValueError: If the values of one of them are no numbers.
+            ValueError: If the values of a parameter are not numbers.
         """
         columns = dict(zip(self.names, X.unbind(-1), strict=True))
         for step in self._back:
-            step(columns)
-        lost = [name for name in names if name not in columns]
-        if lost:
+            step(columns)  # in place
+        missing = [name for name in names if name not in columns]
+        if missing:
             raise ValueError(
-                f"The physics reads the parameter(s) {', '.join(lost)}, which are text, derived, "
-                "or no part of the model. Make choices numbers, or let the physics name the "
-                "parameters that it reads as its arguments: def f_p(x1, x2)."
+                f"The physics reads the parameter(s) {', '.join(missing)}, which are text, "
+                "derived, or not in the model. Make choices numbers, or let the physics name its "
+                "parameters as its arguments: def f_p(x1, x2)."
             )
         return torch.stack([self._within(name, columns[name].expand(len(X))) for name in names], -1)
 
     def _within(self, name: str, values: Tensor) -> Tensor:
-        """Return the nearest values that a parameter can have, with their derivative."""
-        near = values.detach()
+        """Return the nearest possible values of a parameter, with the derivative of the values."""
+        nearest = values.detach()
         if name in self.choices:
-            listed = self.choices[name].to(near)
-            near = listed[(near.unsqueeze(-1) - listed).abs().argmin(-1)]
-        if name in self.whole:
-            near = near.where((near - near.round()).abs() > _NEXT_TO, near.round())
+            choices = self.choices[name].to(nearest)
+            nearest = choices[(nearest.unsqueeze(-1) - choices).abs().argmin(-1)]
+        if name in self.integers:
+            nearest = nearest.where((nearest - nearest.round()).abs() > _NEAR, nearest.round())
         if name in self.ranges:
-            near = near.clamp(*self.ranges[name])
-        return near + (values - values.detach())
+            nearest = nearest.clamp(*self.ranges[name])
+        # Straight-through: the value of `nearest`, the derivative of `values`.
+        return nearest + (values - values.detach())
 
     def metric(self, Y: Tensor, metric: str) -> Tensor:
-        """Return values of a metric in its units as the model gets them."""
+        """Return values of a metric in the units of the model."""
+        # Each transform has a function for the metrics that it changed.
         for steps in self._forth:
             if metric in steps:
                 Y = steps[metric](Y)
@@ -129,11 +133,11 @@ class Units:
 
 
 class PhysicsInUnits(Physics):
-    """A physics behind Ax's transforms: of what a model sees, in the units of what it learns.
+    """A physics behind Ax's transforms, with inputs and outputs in the units of a model.
 
     Args:
         origin: The user's physics.
-        metric: The metric that it predicts.
+        metric: The metric of its outputs.
         units: The effect of the transforms.
         parameters: The parameters of the search space, in its order.
     """
@@ -144,15 +148,16 @@ class PhysicsInUnits(Physics):
         reads = origin.names_of(parameters)
         inner = origin.of(reads)
         super().__init__(unknowns=dict(inner.unknowns.items()), name=inner.name)
-        self.origin, self.metric, self.units, self.reads = origin, metric, units, reads
+        self.origin, self.metric, self.units = origin, metric, units
+        self.reads = reads
         self.inner = inner
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """Return the physics in the search space's units, transformed as its metric is.
+        """Return the physics in the search space's units, with the transforms of its metric.
 
         Args:
-            X: ``N x d'``, as the model sees it.
-            parameters: Those that are unknown, if there are any.
+            X: Inputs of the model, ``N x d'``.
+            parameters: The unknown parameters, if there are any.
 
         Returns:
             ``N x 1``.
@@ -160,11 +165,12 @@ class PhysicsInUnits(Physics):
         Raises:
             PhysicsError: If the physics fails, or has several outputs.
         """
+        # f_p at the user's parameters; its memory and batches work on these rows.
         raw = self.units.raw(X, self.reads)
         try:
             Y = self.inner.of_rows(self.inner.read_rows(raw, *parameters))
         except PhysicsError as error:
-            error.partial = None  # it is in other units
+            error.partial = None  # its outputs have other units
             raise
         if Y.shape[-1] != 1:
             raise PhysicsError(
@@ -175,31 +181,35 @@ class PhysicsInUnits(Physics):
 
 
 def _change(function: Change, name: str, columns: Columns) -> None:
+    """Apply a function to a column."""
     if name in columns:
         columns[name] = function(columns[name])
 
 
 def _constant(name: str, value: float, columns: Columns) -> None:
+    """Add the column of a fixed parameter."""
     first = next(iter(columns.values()))
     columns[name] = first.new_tensor(value)
 
 
 def _value_of(name: str, values: Sequence[Any], one_hot: Sequence[str], columns: Columns) -> None:
-    """Set a choice, of its number or of a column for each value, of which the largest counts."""
-    if one_hot:
-        index = torch.stack([columns.pop(each) for each in one_hot], dim=-1).argmax(-1)
+    """Replace the number of a choice, or its columns by OneHot, by the value of the choice."""
+    if one_hot:  # between the corners of the cube the largest column decides
+        index = torch.stack([columns.pop(column) for column in one_hot], dim=-1).argmax(-1)
     else:
         index = columns.pop(name).round().long().clamp(0, len(values) - 1)
+    # Texts are left out: a physics that reads one gets an error.
     if _are_numbers(values):
         columns[name] = torch.tensor(values, dtype=torch.float64)[index]
 
 
 def _are_numbers(values: Sequence[Any]) -> bool:
-    """Return whether values of a parameter are numbers, as a physics reads them."""
+    """Return whether the values of a parameter are numbers, which a physics can take."""
     return all(isinstance(value, bool | int | float) for value in values)
 
 
 def _bent(bound: float, Y: Tensor) -> Tensor:
+    # b + sign(y - b) log(1 + |y - b|)
     return bound + (Y - bound).sign() * (Y - bound).abs().log1p()
 
 
@@ -212,6 +222,7 @@ def _unscaled(mean: float, sd: float, Y: Tensor) -> Tensor:
 
 
 def _fixed(t: RemoveFixed) -> list[Step]:
+    """Return the steps that add fixed parameters; derived ones have no value."""
     values: dict[str, Any] = {
         n: getattr(p, "value", None) for n, p in t.nontunable_parameters.items()
     }
@@ -219,21 +230,22 @@ def _fixed(t: RemoveFixed) -> list[Step]:
 
 
 def _number(t: ChoiceToNumericChoice) -> list[Step]:
+    """Return the steps that replace the numbers of choices by their values."""
     return [partial(_value_of, name, [*code], ()) for name, code in t.encoded_parameters.items()]
 
 
 _BACK: Mapping[type[Transform], Callable[[Any], list[Step]]] = {
-    Log: lambda t: [
+    Log: lambda t: [  # of base 10
         partial(_change, partial(torch.pow, 10), name) for name in t.transform_parameters
     ],
     Logit: lambda t: [partial(_change, torch.sigmoid, name) for name in t.transform_parameters],
-    UnitX: lambda t: [
+    UnitX: lambda t: [  # x = lower + (upper - lower) u
         partial(_change, partial(_unscaled, lower, upper - lower), name)
         for name, (lower, upper) in t.bounds.items()
     ],
     ChoiceToNumericChoice: _number,
     OrderedChoiceToIntegerRange: _number,
-    OneHot: lambda t: [
+    OneHot: lambda t: [  # a column for each value
         partial(_value_of, name, values, t.encoded_parameters[name])
         for name, values in t.encoded_values.items()
     ],
@@ -247,11 +259,11 @@ _FORTH: Mapping[type[Transform], Callable[[Any], dict[str, Change]]] = {
     BilogY: lambda t: {
         metric: partial(_bent, bound) for metric, bound in t.metric_to_bound.items()
     },
-    StandardizeY: lambda t: {
+    StandardizeY: lambda t: {  # (y - mean) / sd
         metric: partial(_scaled, float(mean), float(t.Ystd[metric]))
         for metric, mean in t.Ymean.items()
     },
 }
 """By transform, its effect on a metric."""
-# MapKeyToFloat adds a parameter, which the physics does not read, if there are learning curves.
+# No step for these. For learning curves MapKeyToFloat adds a parameter, which no physics reads.
 _NEITHER = (FillMissingParameters, Cast, IntToFloat, MapKeyToFloat, Derelativize)

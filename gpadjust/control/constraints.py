@@ -76,7 +76,7 @@ def margins(
 
 
 def _feedback(near: Linearised, slopes: Tensor, half_range: Tensor) -> Tensor:
-    """The linear-quadratic regulator of each constraint, ``T x c x action_dim x state_dim``.
+    """Return the linear-quadratic regulators, ``T x c x action_dim x state_dim``.
 
     Its deviation counts in that which it would have without, actions in half their range.
     """

@@ -1,7 +1,7 @@
 """The core: sums of Gaussian processes on a physics, with one table of unknown numbers.
 
 Read it in this order: ``unknowns``, ``data``, ``kernels``, ``terms``, ``noise``, ``gaussian``,
-``sample``, ``nuts``, ``fitting``, ``model``, ``structures``. What follows from these:
+``sample``, ``straight``, ``nuts``, ``fitting``, ``model``, ``structures``. What follows from these:
 ``posterior``, ``functions`` (samples of functions), ``summary``, ``views`` (the model for
 GPyTorch), ``stacked``, ``saving``, ``threads``.
 """

@@ -22,8 +22,10 @@ from gpadjust.core.sample import (
     maximise,
     sample,
 )
+from gpadjust.core.straight import Straight
 from gpadjust.core.threads import threads_for
 from gpadjust.core.unknowns import standard_normal
+from gpadjust.physics.least_squares import least_squares_fit
 from gpadjust.progress import long_work
 
 if TYPE_CHECKING:
@@ -31,10 +33,11 @@ if TYPE_CHECKING:
 
 _SMALL = 40  # points: up to these draws begin with the prior
 _MEDIUM, _SHARED = 100, 200  # up to these they are moved; the latter if outputs share numbers
+_FIRST = 4  # draws from Laplace's approximation for each one that is kept
 _SELDOM = 1e-3  # a nested model of less probability at its mode is not drawn from
-_MISSED = 1.0  # log evidence that draws from the prior miss if they have not found the posterior
 _OF_NUTS = 1000  # draws, a multiple of 16
 _SEARCHES = 4  # for the mode
+_STEPS, _PRECISE_STEPS = 2_000, 200  # of them; those of a precise one begin again where they end
 _NEAR = 0.3  # difference of all coordinates below which two searches have found the same mode
 _LESS_LIKELY = 5.0  # difference of log density from the best mode beyond which a mode is ignored
 _MIXED = 1.05  # R-hat below which chains agree
@@ -240,14 +243,39 @@ def _sampled(model: GP, number: int, seed: int) -> dict[int, Draws]:
     starts = {} if is_small and not model.table.shared else _starts(model, seed)
     sampled: dict[int, Draws] = {}
     for k in range(len(prior)) if is_small else starts:
-        draw = partial(sample, partial(model.log_likelihood, choice=k), like, number, seed)
-        ways = [draw()] if is_small else []
-        ways += [draw(starts[k], 4, has_moves)] if k in starts else []
-        # Draws from the prior may not arrive where the posterior is narrow; their evidence tells.
-        evidence = [float(way.log_evidence.mean(0).sum()) for way in ways]
-        draws = ways[-1] if evidence[-1] > evidence[0] + _MISSED else ways[0]
+        draw = partial(sample, like=like, number=number, seed=seed)
+        density = partial(model.log_likelihood, choice=k)
+        draws = draw(density) if is_small else None
+        if k in starts and model.table.shared:
+            straight, first = Straight(model, starts[k], k), draws
+            points = straight.points(_FIRST * number, seed)
+            draws = draw(
+                straight, start=straight.start, first=_FIRST, with_moves=has_moves, points=points
+            )
+            draws = draws._replace(u=straight.coordinates(draws.u))
+            draws = draws if first is None else _joined(draws, first, straight.misses(first.u))
+        elif draws is None:
+            draws = draw(density, start=starts[k], first=_FIRST, with_moves=has_moves)
         sampled[k] = draws._replace(u=model.table.with_choice(draws.u, k))
     return sampled
+
+
+def _joined(draws: Draws, others: Draws, is_missed: Tensor) -> Draws:
+    """Return draws of a part of the posterior of one problem, and the others from beyond it.
+
+    Each group of both has a share by its evidence, of the others by that of those missed ``N``.
+    """
+    parts, evidence = [], []
+    groups = (draws.u.chunk(GROUPS), others.u.chunk(GROUPS), is_missed.chunk(GROUPS))
+    for g, (u, v, missed) in enumerate(zip(*groups, strict=True)):
+        beyond = others.log_evidence[g] + missed.to(u).mean().log()
+        logs = torch.cat([draws.log_evidence[g], beyond])
+        counts = _counts(logs.softmax(0), len(u))
+        for each, count in zip((u, v[missed]), counts, strict=True):
+            at = (torch.arange(count) + 0.5) * len(each) / max(count, 1)
+            parts.append(each[at.long()])
+        evidence.append(logs.logsumexp(0, keepdim=True))
+    return Draws(torch.cat(parts), torch.stack(evidence), draws.effective)
 
 
 def _starts(model: GP, seed: int) -> dict[int, Normal]:
@@ -300,7 +328,10 @@ def modes(model: GP, choice: int, seed: int, is_precise: bool = False) -> Tensor
     u = standard_normal((number, *like.shape), generator, like)
     searches = _SEARCHES if choice == 0 else _SEARCHES // 2
     begins = torch.cat([_sorted(model, choice, u)[: searches - 1], torch.zeros_like(u[:1])])
-    ends = maximise(partial(model.log_likelihood, choice=choice), begins, is_precise)
+    if model.table.shared:
+        begins[-2] = _with_least_squares(model, choice, u)
+    most = _PRECISE_STEPS if is_precise else _STEPS
+    ends = maximise(partial(model.log_likelihood, choice=choice), begins, is_precise, most)
     ends = _sorted(model, choice, ends)
     density = _log_density(model, choice, ends)
     is_near = (ends - ends[0]).abs().amax(-1) < _NEAR
@@ -308,6 +339,22 @@ def modes(model: GP, choice: int, seed: int, is_precise: bool = False) -> Tensor
     if not (rival > density[0] - _LESS_LIKELY).any():
         return ends[:1]
     return torch.stack([ends[0], ends[second, torch.arange(len(like))]])
+
+
+def _with_least_squares(model: GP, choice: int, u: Tensor) -> Tensor:
+    """Return coordinates ``B x P`` with the parameters that fit targets best.
+
+    Others are in the middle of their priors; the search takes draws from these, ``N x B x P``.
+    """
+    p, targets = len(model.table.shared), model.targets().nan_to_num().flatten()
+    others = torch.zeros_like(u[:1, :, :-p])
+
+    def misfit(z: Tensor) -> Tensor:
+        at = torch.cat([others.expand(len(z), -1, -1), z.to(u).unsqueeze(1)], -1)
+        return (model.prior_mean(model.table.with_choice(at, choice)) - targets).cpu()
+
+    z = least_squares_fit(misfit, u[:, 0, -p:].cpu()).to(u)
+    return torch.cat([others[0], z.unsqueeze(0)], -1)
 
 
 def _sorted(model: GP, choice: int, u: Tensor) -> Tensor:

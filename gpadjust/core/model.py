@@ -46,8 +46,9 @@ from gpadjust.core.views import (
     squeezed,
 )
 from gpadjust.display import Display
-from gpadjust.physics import Physics, PhysicsError, Unknown, as_physics
+from gpadjust.physics import Physics, PhysicsError, as_physics
 from gpadjust.physics.parameters import PhysicsParameters
+from gpadjust.physics.unknown import NO_UNKNOWNS, Unknowns
 from gpadjust.progress import tick
 
 Slopes = dict[str, list[Tensor]]
@@ -227,8 +228,8 @@ class GP(gpytorch.models.GP, Predictive):
         self.settings = dict(settings or {})
         self._outputs: list[int] | None = None
         self._cached: tuple[Tensor, Conditioning] | None = None
-        has_unknowns = any(each.unknowns for each in self.physics)
-        self._unknowns = _unknowns_of(self.physics) if has_unknowns else {}
+        unknowns = [each.unknowns for each in self.physics] or [NO_UNKNOWNS]
+        self._unknowns = unknowns[0] if len(unknowns) == 1 else Unknowns.together(unknowns)
         self._f_train: list[Tensor] = []
         self.unit = Y.new_ones(1, 1)  # the user's, until the prior mean is known
         with torch.no_grad():  # a physics may have parameters, as a network does
@@ -288,7 +289,8 @@ class GP(gpytorch.models.GP, Predictive):
     def physics_parameters_at(self, u: Tensor) -> PhysicsParameters:
         """Return the unknown parameters of the physics at coordinates ``N x B x P``."""
         values = self.table.values(u)
-        draws = [p.value(values[f"physics.{n}"][..., 0]) for n, p in self._unknowns.items()]
+        z = [values[f"physics.{name}"] for name in self._unknowns]
+        draws = self._unknowns.at(torch.cat(z, -1)).unbind(-1) if z else []
         return PhysicsParameters(self._unknowns, draws)
 
     @property
@@ -361,6 +363,28 @@ class GP(gpytorch.models.GP, Predictive):
             value, gradient = value + ratio, gradient + by_ratio
         bad = ~(value.isfinite() & gradient.isfinite().all(-1))
         return value.masked_fill(bad, -torch.inf), gradient.masked_fill(bad.unsqueeze(-1), 0.0)
+
+    def prior_mean(self, u: Tensor) -> Tensor:
+        """Return the mean of the targets at coordinates ``S x B x P``, ``S x (m n)``, in units.
+
+        It is NaN where f_p fails, and 0 of missing targets.
+        """
+        total, _ = self._training_sum(u)
+        missing = self.targets().isnan()
+        return total.mean.expand(len(u), *missing.shape).masked_fill(missing, 0.0).flatten(1)
+
+    def precision_times(self, u: Tensor, v: Tensor) -> Tensor:
+        """Return the inverse covariance of the targets at ``S x B x P`` times ``S x (m n)``."""
+        (total, noise), missing = self._training_sum(u), self.targets().isnan()
+        v = v.reshape(len(u), *missing.shape)
+        return self.sum_likelihood(total, v, noise, ~missing, True).by_mean.flatten(1)
+
+    def _training_sum(self, u: Tensor) -> tuple[WeightedSum, Tensor]:
+        """Return the sum at the training inputs, and the noise's variances."""
+        values = self.table.values(u)
+        places = self.places(self.data.X, values, with_physics=False)
+        places = places._replace(f=self._physics_with_slopes(values, False)[0])
+        return self.term_sum.at(values, places), self.noise.variance(values, places, True)
 
     def sum_likelihood(
         self, train: WeightedSum, residual: Tensor, noise: Tensor, observed: Tensor,
@@ -923,19 +947,6 @@ def _with_kernel(term: Any) -> Term:
 def _of_data(term: Term, data: Data) -> Term:
     """Return a term whose kernel knows the names of the inputs."""
     return term if term.kernel is None else term._replace(kernel=term.kernel.of_data(data))
-
-
-def _unknowns_of(physics: Sequence[Physics]) -> dict[str, Unknown]:
-    """Return the unknown parameters of several physics; those of one name are one."""
-    unknowns: dict[str, Unknown] = {}
-    for each in physics:
-        for name, unknown in each.unknowns.items():
-            if unknowns.setdefault(name, unknown) != unknown:
-                raise ValueError(
-                    f"Expected one prior of the parameter {name!r} in all physics; found "
-                    f"{unknowns[name]!r} and {unknown!r}. Rename one of them."
-                )
-    return unknowns
 
 
 def _coordinates(model: GP) -> Tensor:

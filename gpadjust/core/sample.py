@@ -29,7 +29,7 @@ _ACCEPTED = 0.8  # share of moves that the length is adapted to
 _FAR = 60.0  # coordinates, prior standard deviations, beyond which no draw moves
 _SEARCHES = 3  # of a precise search, at most, each from the end of the last
 _GAIN = 0.01  # log density, of all searches together, below which there is no further one
-_WIDER = 1.5  # standard deviations of a start, in those of Laplace's approximation
+WIDER = 1.5  # standard deviations of a start, in those of Laplace's approximation
 _STEP = 0.1  # of differences for the Hessian, in standard deviations of the prior or posterior
 _PASSES = 3  # over the Hessian, each with steps by the last
 _REFINED = 10  # of a precise one, at most, until the evidence changes by less than
@@ -63,6 +63,7 @@ class Draws(NamedTuple):
 def sample(
     log_likelihood: LogLikelihood, like: Tensor, number: int, seed: int,
     start: Normal | None = None, first: int = 16, with_moves: bool = True,
+    points: Tensor | None = None,
 ) -> Draws:  # fmt: skip
     r"""Draw from :math:`N(u | 0, I) \, L(u)` by sequential Monte Carlo (Del Moral et al. 2006).
 
@@ -79,6 +80,7 @@ def sample(
         start: The start. Default: the prior.
         first: How many draws begin for each that is kept.
         with_moves: Whether draws are moved; without, they are weighted and resampled once.
+        points: Draws of the start from N(0, I), if not random ones, ``(first number) x B x P``.
     """
     generator, shape = torch.Generator().manual_seed(seed), like.shape
     eye = torch.eye(shape[1]).to(like).expand(shape[0], -1, -1)
@@ -92,7 +94,7 @@ def sample(
         (a, by_a), (b, by_b) = prior.log_density(u), start.log_density(u)
         return value + a - b, slope + by_a - by_b
 
-    u = standard_normal((first * number, *shape), generator, like)
+    u = standard_normal((first * number, *shape), generator, like) if points is None else points
     u = begin.mean + (begin.root @ u.unsqueeze(-1)).squeeze(-1)
     value, slope = ratio(u, False)
     power, evidence = like.new_zeros(shape[0]), like.new_zeros(GROUPS, shape[0])
@@ -112,7 +114,7 @@ def sample(
             with_moves = with_moves and (start is None or bool((effective < number).any()))
         is_done = bool((power >= 1).all()) or not with_moves
         # Resample, and move.
-        root = _root(u, weights, None if start is None else start.root / _WIDER)
+        root = _root(u, weights, None if start is None else start.root / WIDER)
         kept = _resampled(halves, number // GROUPS, generator)
         u, value, slope = u[kept, problems], value[kept, problems], slope[kept, problems]
         if is_first and with_moves:
@@ -281,8 +283,13 @@ def around_mode(
         evidence = value[0] + torch.linalg.slogdet(root).logabsdet
         if ((evidence - before).abs() < _SETTLED).all():
             break
-    lower = torch.linalg.qr(_WIDER * root.mT).R.mT  # by QR, as their product may lose all digits
-    return Normal(mode, lower * lower.diagonal(dim1=-1, dim2=-2).sign().unsqueeze(-2)), evidence
+    return Normal(mode, WIDER * lower_root(root)), evidence
+
+
+def lower_root(root: Tensor) -> Tensor:
+    """Return the lower root, with a positive diagonal, of the matrix that has another root."""
+    lower = torch.linalg.qr(root.mT).R.mT  # by QR, as their product may lose all digits
+    return lower * lower.diagonal(dim1=-1, dim2=-2).sign().unsqueeze(-2)
 
 
 def white_density(

@@ -30,13 +30,13 @@ from gpadjust.validation.scores import energy_score
 TransitionFunctions = Callable[[Tensor, Tensor], Tensor]
 """Functions from states and actions, ``k x N x ...``, to next states: a sample of the dynamics."""
 
-_ROWS = 1024  # whose noise is asked for at once
+_ROWS = 1024  # per call of noise_variance
 _AT_ONCE = 8  # windows whose particles move together: more leave the cache, at half the speed
 _NOT_SAVED = (
-    "{} cannot be saved or loaded. Give it state_dict() and load_state_dict(state), or do without "
-    "checkpoints and sensors."
+    "{} cannot be saved or loaded. Give it state_dict() and load_state_dict(state), or use no "
+    "checkpoints and no sensors."
 )
-_CERTAIN = 1e-9  # of how far the means range: a spread that is one of rounding errors
+_CERTAIN = 1e-9  # of the range of the means: a spread of rounding errors
 
 
 class Dynamics(ABC):
@@ -53,20 +53,20 @@ class Dynamics(ABC):
     @property
     @abstractmethod
     def is_fitted(self) -> bool:
-        """True once it can predict."""
+        """True if it can predict."""
 
     @property
     def has_learnt(self) -> bool:
-        """True once it has learnt from transitions, or if it has nothing to learn."""
+        """True after an update by transitions, or if there is nothing to update."""
         return self.is_fitted
 
     @abstractmethod
     def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
-        """Learn from further transitions, ``N`` rows each."""
+        """Update the dynamics by further transitions, ``N`` rows each."""
 
     @abstractmethod
     def predict(self, states: Tensor, actions: Tensor) -> Prediction:
-        """Return mean and variance of the next states, ``N x state_dim`` each, entry by entry."""
+        """Return mean and variance of each entry of the next states, ``N x state_dim`` each."""
 
     @abstractmethod
     def sample_functions(self, num_functions: int, seed: int | None = None) -> TransitionFunctions:
@@ -78,8 +78,8 @@ class Dynamics(ABC):
 
         Returns:
             A deterministic function of states ``k x N x state_dim`` and actions
-            ``k x N x action_dim`` to next states, each of the ``k`` blocks by its own draw. Later
-            updates leave it as it is.
+            ``k x N x action_dim`` to next states, with one draw for each of the ``k`` blocks. Later
+            updates do not change it.
         """
 
     def sample(self, states: Tensor, actions: Tensor) -> Tensor:
@@ -88,7 +88,7 @@ class Dynamics(ABC):
         return mean + variance.sqrt() * torch.randn_like(mean)
 
     def mean_function(self) -> TransitionFunctions:
-        """Return the mean of predictions, a function of any ``k`` blocks as a sampled one."""
+        """Return the mean of predictions as a function of any ``k`` blocks."""
         return lambda states, actions: self.predict(states, actions).mean
 
     def noise_variance(self, states: Tensor, actions: Tensor) -> Tensor:
@@ -96,30 +96,30 @@ class Dynamics(ABC):
         return torch.zeros_like(states)
 
     def noise_root(self) -> Tensor | None:
-        """Return a lower triangular root of the correlation of predicted states' noise, if any."""
+        """Return a lower triangular root of the noise correlation of predicted states, or None."""
         return None
 
     def before_data(self) -> Dynamics | None:
-        """Return dynamics to use before there are transitions; None if nothing is known."""
+        """Return dynamics to use before there are transitions, or None."""
         return self if self.is_fitted else self.physics_alone()
 
     def physics_alone(self) -> Dynamics | None:
-        """Return the physics by itself, whatever was learnt; by default, and of several, None."""
+        """Return the physics without corrections; None by default, and if there are several."""
         return None
 
     def try_physics(self, states: Tensor, actions: Tensor) -> None:
-        """Raise the error of a physics that is wrong, before there are transitions."""
+        """Evaluate the physics before there are transitions, to raise its errors early."""
         dynamics = self.before_data()
         if dynamics is not None:
             dynamics.predict(states, actions)
 
     def score(self, states: Tensor, actions: Tensor, next_states: Tensor) -> Scores:
-        r"""Judge the predictions by transitions that were not learnt from.
+        r"""Compare predictions with transitions that no update had.
 
         The outputs are the states that move, in the spec's order. The variance of an integrated
-        state is :math:`(h / 2)^2` times that of its velocity: the more certain the velocity, the
-        more the trapezoid's own error counts in its ``nlpd`` and ``coverage``. Of a state that has
-        a variance of zero, which says nothing of errors, there are ``rmse`` and ``median`` only.
+        state is :math:`(h / 2)^2` times the variance of its velocity: the more certain the
+        velocity, the more the error of the trapezoid rule counts in ``nlpd`` and ``coverage``. A
+        state with zero variance has only ``rmse`` and ``median``.
 
         Args:
             states: ``N x state_dim``.
@@ -127,8 +127,8 @@ class Dynamics(ABC):
             next_states: ``N x state_dim``; NaN where an entry was not measured.
 
         Raises:
-            RuntimeError: If nothing was learnt yet.
-            TypeError: If they are not float64 tensors.
+            RuntimeError: Before the first update.
+            TypeError: If the arguments are not float64 tensors.
             ValueError: If shapes disagree or values are not finite.
         """
         data = Trajectories.checked(self.spec, states, actions, next_states)
@@ -136,6 +136,7 @@ class Dynamics(ABC):
         mean, variance = self.predict(data.states, data.actions)
         measured = mean + self.spec.change(mean, data.next_states)  # angles the shortest way round
         mean, variance, measured = (part[:, moving] for part in (mean, variance, measured))
+        # A variance of zero has no density: NaN leaves such states out of nlpd and coverage.
         variance = variance.masked_fill((variance <= 0).any(0), torch.nan)
         names = [self.spec.states[i] for i in moving]
         return Scores.of(mean, variance, measured, output_names=names)
@@ -154,41 +155,41 @@ class Dynamics(ABC):
         state_bounds: Tensor | None = None,
         seed: int = 0,
     ) -> FreeRun:
-        """Follow actions from given states, without looking at what is measured on the way.
+        """Simulate sequences of actions from initial states, without measurements on the way.
 
-        Functions that are drawn from the dynamics follow the actions; see :class:`FreeRun`.
-        :meth:`Trajectories.windows` has both, and what ``score`` of the runs is to know.
+        Functions drawn from the dynamics follow the actions; see :class:`FreeRun`.
+        :meth:`Trajectories.windows` returns initial states, actions, and measured states for
+        :meth:`FreeRun.score`.
 
         Args:
             initial_states: ``w x state_dim``.
             actions: ``w x T x action_dim``.
-            num_functions: Number of functions, one for each particle: so many that the interval
-                has ends, 39 or more for 95 %.
+            num_functions: Number of functions, one for each particle: at least 39 for intervals of
+                95 %.
             level: The probability of the intervals.
-            noise: Standard deviations ``state_dim`` of the errors of measured states, of which
-                intervals and particles are; True for the noise that the dynamics learnt (of entries
-                that are clearly correlated, jointly), False for the states themselves.
+            noise: Standard deviations ``state_dim`` of the errors of measured states, included in
+                intervals and particles. True: the noise estimated by the dynamics (joint, for
+                clearly correlated entries). False: none, for the states themselves.
             start_noise: Standard deviations ``state_dim`` of the errors of the initial states.
-                ``"learnt"``: half of the variance of the learnt noise, which is right if that comes
-                of measuring both ends of a transition. Default: they are exact.
-            process_noise: Standard deviations ``state_dim`` of what each step adds to the state
-                itself, so that it is carried on. ``"learnt"``: the learnt noise, which is that if
-                they learnt from states without noise, such as :func:`smooth` draws. Default: none.
-            variation: Standard deviations by which the physics' unknown parameters differ in a run
-                from those that were learnt, one for each or one for all, in those of their priors:
+                ``"learnt"``: half of the variance of the estimated noise, which is right if the
+                noise comes from measuring both ends of a transition. Default: none.
+            process_noise: Standard deviations ``state_dim`` of disturbances of the state itself in
+                each step. ``"learnt"``: the estimated noise, which is right for updates by states
+                without noise, such as draws of :func:`smooth`. Default: none.
+            variation: Standard deviations of the physics' unknown parameters between runs, one for
+                each or one for all, in standard deviations of their priors:
                 ``smoothed.variation`` of :func:`smooth`; more for another machine. Each particle
-                keeps its own. Under actions beyond those that were learnt from they are larger:
-                three times, where it is by half of their range, but no more than half of the
-                prior's. Default: none.
+                has its own parameters. Beyond the actions of the updates the deviations grow,
+                threefold at half of their range, but to at most half of the prior's. Default: none.
             state_bounds: Lower and upper bounds, ``2 x state_dim``, as of a task: a particle that
-                would leave them stays where it is. Default: none.
-            seed: Seed of functions and noise; PyTorch's generator is left as it is.
+                would leave them stops. Default: none.
+            seed: Seed of functions and noise; PyTorch's generator is not changed.
 
         Raises:
-            RuntimeError: If nothing was learnt yet.
+            RuntimeError: Before the first update.
             TypeError: If states or actions are not float64 tensors.
             ValueError: If shapes disagree, values are not finite, or an option is out of range.
-            PhysicsError: If the physics fails and does not say where.
+            PhysicsError: If the physics fails, and its error does not have the rows.
         """
         spec = self.spec
         _check_start(spec, initial_states, actions)
@@ -198,9 +199,9 @@ class Dynamics(ABC):
         sensors = _checked_noise(spec, "noise", noise)
         if isinstance(sensors, str) and isinstance(process, str):
             raise ValueError(
-                "The learnt noise moves particles on (process_noise='learnt'), so that it is not "
-                "that of measurements as well; say the noise of these, such as "
-                "noise=smoothed.noise of smooth(records, physics), or noise=False."
+                "process_noise='learnt' needs another noise of measurements, as the learnt noise "
+                "already moves the particles; give noise=smoothed.noise of smooth(records, "
+                "physics), or noise=False."
             )
         low, high = -math.inf, math.inf
         if state_bounds is not None:
@@ -209,7 +210,7 @@ class Dynamics(ABC):
         generator = torch.Generator().manual_seed(seed)
 
         def scatter(noise: Tensor | str, states: Tensor, actions: Tensor) -> Tensor:
-            """Draw noise, given or learnt, at states ``... x state_dim`` for each particle."""
+            """Draw noise of the user or the model at states ``... x state_dim`` per particle."""
             if isinstance(noise, Tensor):
                 return _drawn(spec, noise.expand_as(states), num_functions, generator, None)
             rows = (part.flatten(0, -2).split(_ROWS) for part in (states, actions))
@@ -218,30 +219,34 @@ class Dynamics(ABC):
             sd = _with_lags(spec, variance.sqrt().view_as(states))
             return _drawn(spec, sd, num_functions, generator, self.noise_root())
 
-        def is_off(states: Tensor) -> Tensor:
+        def is_outside(states: Tensor) -> Tensor:
             return ~(states.isfinite() & (states >= low) & (states <= high)).all(-1)
 
-        # Dynamics of a user's may draw from PyTorch's generator all the same.
+        # Dynamics of a user may draw from PyTorch's generator, in spite of their seed.
         with torch.no_grad(), seeded(seed):
             functions = sample(num_functions, seed)
             particles = initial_states.expand(num_functions, -1, -1)
             if start is not None:
+                # The noise of a transition has two ends: one of them has half of the variance.
                 share = 1.0 if isinstance(start, Tensor) else 0.5
-                added = scatter(start, initial_states, actions[:, 0]).nan_to_num()
-                particles = particles + share**0.5 * added
-            lost = torch.zeros(particles.shape[:2], dtype=torch.bool)
-            path, lost_by_then = [], []
+                disturbance = scatter(start, initial_states, actions[:, 0]).nan_to_num()
+                particles = particles + share**0.5 * disturbance
+            is_lost = torch.zeros(particles.shape[:2], dtype=torch.bool)
+            path: list[Tensor] = []
+            lost: list[Tensor] = []
             for action in actions.unbind(1):
-                after = _moved(functions, particles, action)
-                lost = lost | is_off(after)
+                # s' = f_k(s, a) + process noise, unless the particle is lost
+                following = _moved(functions, particles, action)
+                is_lost = is_lost | is_outside(following)
                 if process is not None:
-                    added = scatter(process, _center(spec, particles), action).nan_to_num()
-                    after[..., spec.moving] += added[..., spec.moving]
-                    lost = lost | is_off(after)
-                particles = torch.where(lost.unsqueeze(-1), particles, after)
+                    disturbance = scatter(process, _center(spec, particles), action).nan_to_num()
+                    following[..., spec.moving] += disturbance[..., spec.moving]
+                    is_lost = is_lost | is_outside(following)
+                particles = torch.where(is_lost.unsqueeze(-1), particles, following)
                 path.append(particles)
-                lost_by_then.append(lost.double().mean(0))
+                lost.append(is_lost.double().mean(0))
             particles = torch.stack(path, dim=2)
+            # Moments and quantiles of angles need a center: distances from it are within a turn.
             center = _center(spec, particles)
             cloud = spec.change(center.expand_as(particles), particles)
             center = without_jumps(spec, initial_states, center)
@@ -250,16 +255,16 @@ class Dynamics(ABC):
                 before = torch.cat([initial_states.unsqueeze(1), mean[:, :-1]], dim=1)
                 cloud = cloud + scatter(sensors, before, actions)
         lower, upper = (center + end for end in central_interval(cloud, level))
-        shares = torch.stack(lost_by_then, 1)
+        shares = torch.stack(lost, 1)
         return FreeRun(mean, lower, upper, center + cloud, shares, spec, level, initial_states)
 
     def _varied(
         self, variation: Tensor | float
     ) -> Callable[[int, int | None], TransitionFunctions]:
-        """Return `sample_functions`, each function with parameters of its own."""
+        """Return `sample_functions` with varying parameters of the physics."""
         raise ValueError(
-            "Expected LearnedDynamics that learnt unknown parameters of one physics, which are to "
-            f"differ by variation={variation!r}; found {type(self).__name__}, or several physics."
+            f"variation={variation!r} needs LearnedDynamics with one physics and unknown "
+            f"parameters; found {type(self).__name__}, several physics or no unknown parameters."
         )
 
     def describe(self) -> dict[str, str]:
@@ -267,28 +272,28 @@ class Dynamics(ABC):
         return fingerprint(type(self), self.spec)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that was learnt, in tensors and plain values; without physics and spec.
+        """Return the results of all updates in tensors and plain values, without physics and spec.
 
-        A class of your own that does not implement it raises a NotImplementedError.
+        A class of your own without this method raises a NotImplementedError.
         """
         raise NotImplementedError(_NOT_SAVED.format(type(self).__name__))
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take back what :meth:`state_dict` gave; predictions and later fits are the same."""
+        """Load a result of :meth:`state_dict`; predictions and later fits are then the same."""
         raise NotImplementedError(_NOT_SAVED.format(type(self).__name__))
 
     def _checked(self, states: Tensor, actions: Tensor, next_states: Tensor) -> Trajectories:
-        """Return transitions that are what the spec says."""
+        """Return transitions that agree with the spec."""
         data = Trajectories.checked(self.spec, states, actions, next_states)
         self.spec.check_transitions(*data)
         return data
 
     def _check_blocks(self, states: Tensor, actions: Tensor, number: int | None = None) -> None:
-        """Raise an error unless states have actions, in as many blocks as there are functions."""
+        """Raise an error unless states have actions, and a block for each function."""
         check_doubles("states", states, self.spec.state_dim)
         check_columns("actions", actions, self.spec.action_dim)
-        lead = zip(reversed(actions.shape[:-1]), reversed(states.shape[:-1]), strict=False)
-        if actions.dim() > states.dim() or any(own not in (1, other) for own, other in lead):
+        sizes = zip(reversed(actions.shape[:-1]), reversed(states.shape[:-1]), strict=False)
+        if actions.dim() > states.dim() or any(size not in (1, other) for size, other in sizes):
             raise ValueError(
                 "Expected an action for each state, or one for all, got states of shape "
                 f"{tuple(states.shape)} and actions of shape {tuple(actions.shape)}."
@@ -301,27 +306,27 @@ class Dynamics(ABC):
 
 
 class FreeRun(NamedTuple):
-    r"""Predicted states along ``w`` sequences of ``T`` actions, each from its own state.
+    r"""Predicted states along ``w`` sequences of ``T`` actions, with an initial state each.
 
     Step t is the state after t + 1 actions. Each of the ``K`` particles follows one function drawn
-    from the dynamics. Noise is added to what is reported of each step, as to a measurement of it,
-    and moves nothing on; process noise moves the particles themselves. A particle that would leave
-    the bounds or the finite numbers, or meet a failure of the physics, is lost: it stays.
+    from the dynamics. Measurement noise is added to the reported states alone; process noise moves
+    the particles themselves. A particle that would leave the bounds or the finite numbers, or where
+    the physics fails, is lost: it stops.
 
-    The mean of an angle is that on the circle. It goes on from the initial state without jumps of
-    :math:`2 \pi`, and interval and particles of each step are about it: compare with what was
-    measured by ``spec.change(run.mean, measured)``.
+    The mean of an angle is the mean on the circle. It continues from the initial state without
+    jumps of :math:`2 \pi`, and interval and particles of each step are around it: compare with
+    measurements by ``spec.change(run.mean, measured)``.
 
     Args:
         mean: ``w x T x state_dim``.
-        lower: What a state is above with probability ``(1 + level) / 2``, ``w x T x state_dim``: an
-            order statistic of the particles, which holds for any distribution. NaN where the noise
-            is not known, as the physics fails at the mean before.
-        upper: What it is below with that probability.
+        lower: Quantile of the states at ``(1 - level) / 2``, ``w x T x state_dim``: an order
+            statistic of the particles, valid for any distribution. NaN where the noise is not
+            known, as the physics fails at the mean before.
+        upper: Quantile at ``(1 + level) / 2``.
         particles: ``K x w x T x state_dim``; without noise, an angle is within half a turn of the
             mean.
-        lost: Share of the particles that are lost by then, ``w x T``.
-        spec: What the entries of states are.
+        lost: Share of lost particles up to each step, ``w x T``.
+        spec: Names and kinds of the entries of states.
         level: The probability of the intervals.
         initial_states: Where the runs start, ``w x state_dim``.
 
@@ -351,37 +356,36 @@ class FreeRun(NamedTuple):
         horizons: Sequence[int] | None = None,
         units: Tensor | None = None,
     ) -> Scores:
-        """Judge the runs by what was measured of states that were not learnt from.
+        """Compare the runs with measured states that no update had.
 
-        Scores are over all windows, ``T x state_dim``; ``scores[t]`` are those after t + 1 steps.
-        Angles are compared the shortest way round. What was measured has noise: so should the
-        runs, as they do by default. The predicted distribution is the Gaussian with the particles'
-        mean and variance (with 39 particles its ``nlpd`` is some 0.03 nats too high), coverage that
-        of the interval. States in which the particles of a window have no spread, which says
-        nothing of errors, have ``rmse`` and ``median`` only. Of an unstable system a few runs that
-        fall to the other side make up most of a mean square: look at the median. ``energy`` is of
-        all states that move together.
+        Scores are over all windows, ``T x state_dim``; ``scores[t]`` is after t + 1 steps. Angles
+        are compared the shortest way round. As measurements have noise, so should the runs, which
+        is the default. The predicted distribution is the Gaussian with the particles' mean and
+        variance (with 39 particles its ``nlpd`` is some 0.03 nats too high), and coverage is that
+        of the interval. States without a spread of the particles in a window have only ``rmse`` and
+        ``median``. In an unstable system a few runs to the wrong side dominate a mean square: use
+        the median. ``energy`` is joint over all states that move.
 
         Args:
             measured: ``w x T x state_dim``, as ``measured`` of :meth:`Trajectories.windows`; NaN
                 where an entry was not measured.
-            horizons: After which numbers of steps, such as ``(1, 5, 15)``, from the least to the
-                greatest. Default: all, 1 to ``T``.
-            units: What states are measured in for the energy score, ``state_dim``. Default: the
-                root mean square of their changes in a step, in these windows.
+            horizons: Numbers of steps to score, such as ``(1, 5, 15)``. Default: all, 1 to ``T``.
+            units: Units of the states in the energy score, ``state_dim``. Default: the root mean
+                square of their changes in a step, in these windows.
 
         Raises:
-            TypeError: If it is no float64 tensor.
-            ValueError: If its shape is not that of the means, an entry is infinite, a unit is not
-                positive, or a horizon is none of the runs' steps.
+            TypeError: If ``measured`` is not a float64 tensor.
+            ValueError: If shapes differ, an entry is infinite, a unit is not positive, or a horizon
+                is not a step of the runs.
         """
-        spec, length = self.spec, self.mean.shape[1]
+        spec = self.spec
+        length = self.mean.shape[1]
         check_doubles("measured", measured, spec.state_dim)
         if measured.shape != self.mean.shape:
             raise ValueError(
-                f"Expected measured of shape w x T x state_dim {tuple(self.mean.shape)}, that of "
-                f"the runs' means, got {tuple(measured.shape)}; of `windows` that the runs start "
-                "from it is `windows.measured`."
+                f"Expected measured of shape w x T x state_dim {tuple(self.mean.shape)}, as the "
+                f"runs' means, got {tuple(measured.shape)}; take `windows.measured` of the windows "
+                "that the runs start from."
             )
         if measured.isinf().any():
             raise ValueError("Expected measured to be finite, or NaN where it was not measured.")
@@ -397,10 +401,11 @@ class FreeRun(NamedTuple):
         units = of_states(units, "units", (spec.state_dim,))
         if not (units.isfinite() & (units > 0)).all():
             raise ValueError(f"Expected units that are finite and positive, got {units.tolist()}.")
+        # Zero variance has no density: NaN leaves such states out of nlpd and coverage.
         variance = self.particles.var(0)
         range_of_means = self.mean.amax((0, 1)) - self.mean.amin((0, 1))
-        silent = (variance.sqrt() <= _CERTAIN * range_of_means).any(0)
-        variance = variance.masked_fill(silent, torch.nan)
+        is_certain = (variance.sqrt() <= _CERTAIN * range_of_means).any(0)
+        variance = variance.masked_fill(is_certain, torch.nan)
         measured = self.mean + spec.change(self.mean, measured)
         parts = self.mean, variance, measured, self.lower, self.upper, self.particles
         rows = torch.tensor(steps) - 1  # step by step: ... x H x w x state_dim
@@ -427,9 +432,9 @@ def step_or_nan(
     *,
     some_must_succeed: bool = False,
 ) -> Tensor:
-    """Return the next states ``N x state_dim``; not finite where the physics fails.
+    """Return the next states ``N x state_dim``; NaN where the physics fails.
 
-    A PhysicsError is raised if it does not say where, or everywhere and ``some_must_succeed``.
+    Raise a PhysicsError if it does not have the rows, or if all fail and ``some_must_succeed``.
     """
     states, actions = states.clone(), actions.clone()
     failed = torch.zeros(len(states), dtype=torch.bool)
@@ -437,16 +442,16 @@ def step_or_nan(
         try:
             following = move(states, actions)
         except PhysicsError as error:
-            known = failed.clone()
+            failed_before = failed.clone()
             failed[list(error.rows)] = True
-            if (failed == known).all() or (failed.all() and some_must_succeed):
-                raise  # it does not say where, or blames what has another place now
+            if (failed == failed_before).all() or (failed.all() and some_must_succeed):
+                raise  # it does not have the rows, or rows that have been replaced
             if failed.all():
                 return torch.full_like(states, torch.nan)
-            # They are evaluated with the others, at a place where the physics does not fail.
+            # Evaluate again, with failed rows replaced by one where the physics may not fail.
             working = int((~failed).nonzero()[0])
-            place = states[working].clone(), actions[working].clone()  # not of what is written
-            states[failed], actions[failed] = place
+            states[failed] = states[working].clone()
+            actions[failed] = actions[working].clone()
         else:
             return following.masked_fill(failed[:, None], torch.nan) if failed.any() else following
 
@@ -464,17 +469,19 @@ def _moved(functions: TransitionFunctions, particles: Tensor, actions: Tensor) -
 
 
 def _center(spec: StateSpec, particles: Tensor) -> Tensor:
-    """Return the mean of particles ``K x ... x state_dim``, of angles that on the circle."""
+    """Return the mean of particles ``K x ... x state_dim``, of angles on the circle."""
     center = particles.mean(0)
     for i in spec.angle_columns:
         angle = particles[..., i]
+        # the direction of the mean of the unit vectors
         center[..., i] = torch.atan2(angle.sin().mean(0), angle.cos().mean(0))
     return center
 
 
 def without_jumps(spec: StateSpec, initial_states: Tensor, path: Tensor) -> Tensor:
-    """Return a path ``w x T x state_dim`` whose angles go on from those of the initial states."""
-    path, angles = path.clone(), spec.angle_columns
+    """Return a path ``w x T x state_dim`` with angles that continue from the initial states."""
+    path = path.clone()
+    angles = spec.angle_columns
     before = torch.cat([initial_states.unsqueeze(1), path[:, :-1]], dim=1)
     change = spec.change(before, path)[..., angles]
     path[..., angles] = before[:, :1, angles] + change.cumsum(1)
@@ -482,22 +489,22 @@ def without_jumps(spec: StateSpec, initial_states: Tensor, path: Tensor) -> Tens
 
 
 def _with_lags(spec: StateSpec, noise: Tensor) -> Tensor:
-    """Return noise ``... x state_dim`` of measured states, whose lags were measured alike."""
+    """Return noise ``... x state_dim`` with that of each lag taken from its measured state."""
     noise = noise.clone()
-    for name, held in spec.previous.items():
-        while held in spec.previous:
-            held = spec.previous[held]
-        if held in spec.states:
-            noise[..., spec.states.index(name)] = noise[..., spec.states.index(held)]
+    for name, origin in spec.previous.items():
+        while origin in spec.previous:
+            origin = spec.previous[origin]
+        if origin in spec.states:
+            noise[..., spec.states.index(name)] = noise[..., spec.states.index(origin)]
     return noise
 
 
 def _drawn(
     spec: StateSpec, sd: Tensor, number: int, generator: torch.Generator, root: Tensor | None
 ) -> Tensor:
-    """Draw noise ``number x ... x state_dim``; an integrated state has that of its velocity."""
+    """Draw noise ``number x ... x state_dim``; an integrated state shares that of its velocity."""
     z = torch.randn(number, *sd.shape, generator=generator, dtype=torch.float64)
-    if root is not None:
+    if root is not None:  # correlation R = root root^T
         z[..., spec.predicted] = z[..., spec.predicted] @ root.mT
     for name, velocity in spec.integrated.items():
         z[..., spec.states.index(name)] = z[..., spec.states.index(velocity)]
@@ -507,10 +514,12 @@ def _drawn(
 def central_interval(sample: Tensor, level: float) -> tuple[Tensor, Tensor]:
     """Return the ends between which a further draw lies with this probability, of ``K x ...``.
 
-    It is below the i-th smallest of K with probability i / (K + 1), and linear in between.
+    It is below the i-th smallest of K with probability i / (K + 1), interpolated linearly.
     """
-    ordered, ends = sample.sort(0).values, []
+    ordered = sample.sort(0).values
+    ends = []
     for probability in ((1 - level) / 2, (1 + level) / 2):
+        # i = probability (K + 1), counted from 1
         place = probability * (len(sample) + 1) - 1
         below = min(max(int(place), 0), len(sample) - 2)
         share = min(max(place - below, 0.0), 1.0)
@@ -525,7 +534,7 @@ def typical_change(spec: StateSpec, states: Tensor, next_states: Tensor) -> Tens
 
 
 def _check_start(spec: StateSpec, initial_states: Tensor, actions: Tensor) -> None:
-    """Raise an error unless each state has a sequence of actions, all of them finite."""
+    """Raise an error unless each state has a sequence of actions, and all are finite."""
     check_doubles("initial_states", initial_states, spec.state_dim)
     check_doubles("actions", actions, spec.action_dim)
     fits = initial_states.dim() == 2 and actions.dim() == 3 and len(initial_states) == len(actions)
@@ -533,7 +542,7 @@ def _check_start(spec: StateSpec, initial_states: Tensor, actions: Tensor) -> No
         raise ValueError(
             f"Expected initial_states of shape w x {spec.state_dim} and actions of shape w x T x "
             f"{spec.action_dim}, one sequence of one or more actions for each state, got "
-            f"{tuple(initial_states.shape)} and {tuple(actions.shape)}; of a single run, use "
+            f"{tuple(initial_states.shape)} and {tuple(actions.shape)}; for a single run, use "
             "`initial_state.unsqueeze(0)` and `actions.unsqueeze(0)`."
         )
     check_finite("initial_states", initial_states)
@@ -541,44 +550,48 @@ def _check_start(spec: StateSpec, initial_states: Tensor, actions: Tensor) -> No
 
 
 def _check_enough(num_functions: int, level: float) -> None:
-    """Raise an error unless so many particles have an interval of this probability."""
+    """Raise an error if there are too few particles for an interval of this probability."""
     check_level(level)
-    least = math.ceil(round(2 / (1 - level), 9)) - 1  # whose outermost two are its ends
+    # The outermost particles are the ends: 1 / (K + 1) <= (1 - level) / 2
+    least = math.ceil(round(2 / (1 - level), 9)) - 1
     if checked_whole("num_functions", num_functions, 1) < least:
         raise ValueError(
-            f"Expected num_functions >= {least}, without which there are no ends of an "
-            f"interval of {100 * level:g} %, got {num_functions}."
+            f"Expected num_functions >= {least}, for an interval of {100 * level:g} %, got "
+            f"{num_functions}."
         )
 
 
 def _checked_noise(spec: StateSpec, name: str, noise: Any) -> Tensor | Literal["learnt"] | None:
     """Return standard deviations ``state_dim``, "learnt" or None."""
-    off, learnt = (False, True) if name == "noise" else (None, "learnt")
+    off: Any = None
+    learnt: Any = "learnt"
+    words = "'learnt'"
+    if name == "noise":  # a switch; the other options are None or "learnt"
+        off, learnt, words = False, True, "True or False"
     if noise is off:
         return None
     if isinstance(noise, str | bool):
         if noise == learnt:
             return "learnt"
-        words = f"{learnt!r} or {off}" if name == "noise" else repr(learnt)
         raise ValueError(f"Expected {name} as {words} or a tensor, got {noise!r}.")
     sd = of_states(noise, name, (spec.state_dim,))
     if not (sd.isfinite() & (sd >= 0)).all():
         raise ValueError(
-            f"Expected {name} of 0 or more, got {sd.tolist()}; of states that are never measured "
+            f"Expected {name} of 0 or more, got {sd.tolist()}; for states that are never measured "
             "`.nan_to_num()` makes it 0."
         )
     return sd
 
 
 def checked_horizons(horizons: Sequence[int]) -> tuple[int, ...]:
-    """Return numbers of steps in order; an error unless they are different, and at least 1."""
+    """Return numbers of steps in order; raise an error unless they differ, and are at least 1."""
     is_list = isinstance(horizons, Sequence) and len(horizons) > 0
     if not is_list or len({*horizons}) < len(horizons):
         raise ValueError(
             "Expected horizons as different numbers of steps, such as (1, 5, 15), got "
             f"{horizons!r}."
         )
-    return tuple(sorted(checked_whole("each horizon", each, 1) for each in horizons))
+    return tuple(sorted(checked_whole("each horizon", horizon, 1) for horizon in horizons))
 
 
 def of_states(values: Any, name: str, shape: tuple[int, ...]) -> Tensor:

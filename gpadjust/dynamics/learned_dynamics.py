@@ -1,4 +1,4 @@
-"""Dynamics learnt by a Gaussian process."""
+"""Dynamics by a Gaussian process."""
 
 from __future__ import annotations
 
@@ -37,22 +37,23 @@ from gpadjust.validation.leave_one_out import error_correlation
 
 _NUM_FEATURES = 1024  # by default
 _MEAN_ROWS = 200  # kernel rows of a mean: transitions times draws
-_BEYOND = 2.0  # times as much again, half a range of the actions beyond it
+_BEYOND = 2.0  # growth of a variation, per half range of the actions outside of the range
 _MOST = 0.5  # standard deviations of a parameter's prior
-_END = 8.0  # coordinate, beyond which there is nothing of a prior
+_END = 8.0  # largest coordinate; a prior has no mass beyond
 
 
 @dataclass(frozen=True, eq=False)
 class Learnt:
-    """Transitions, and the model of them; replaced as a whole, so that no error leaves half."""
+    """Transitions and their model, in one object, which an update replaces after it succeeds."""
 
     data: Trajectories
     model: GP
-    probes: list[PhysicsProbes]  # of each physics, by its first transitions
+    probes: list[PhysicsProbes]  # of each physics, at transitions of the first update
 
     @cached_property
     def with_few_draws(self) -> GP:
-        """The model with as many draws as keep means quick, two or more."""
+        """The model with two or more draws, so few that means are quick."""
+        # Evenly spaced draws, so that a group of draws (a nested model) has its share.
         u = self.model.u
         number = min(len(u), max(2, _MEAN_ROWS // len(self.data)))
         return self.model.subset_draws(((torch.arange(number) + 0.5) * len(u) / number).long())
@@ -65,40 +66,40 @@ class Learnt:
 
 
 class LearnedDynamics(Dynamics):
-    r"""Dynamics that a Gaussian process learns, as a rule by adjusting a physics of the system.
+    r"""Dynamics by a Gaussian process, usually one that adjusts a physics of the system.
 
-    Each state's change (or next value) is an independent output of one model, of the states that
-    move and the action, such as :math:`f_a = \rho f_p + \delta` of :class:`~gpadjust.CKA`.
-    Integrated states follow from their velocities, exogenous ones stay, and previous ones are what
-    they name: with earlier outputs and actions among the states that is an autoregressive model
-    (NARX), which :meth:`free_run` feeds with its own predictions.
+    One model has the change (or next value) of each state as an independent output, and the moving
+    states and the action as inputs, such as :math:`f_a = \rho f_p + \delta` of
+    :class:`~gpadjust.CKA`. Integrated states follow from their velocities, exogenous states do not
+    change, and previous ones repeat the states and actions that they name. With earlier outputs and
+    actions among the states this is an autoregressive model (NARX), and :meth:`free_run` feeds its
+    predictions back.
 
     Args:
-        spec: What the entries of states and actions are.
-        physics: The next values of the states that are neither exogenous nor previous values,
-            from the columns ``physics_reads`` of the spec, by default these states and the actions;
-            angles in rad, of which models read sine and cosine. Several: a list, or a dictionary
-            with their names. Default: none.
+        spec: Names and kinds of the entries of states and actions.
+        physics: The next values of the states that are neither exogenous nor previous values, from
+            the columns ``physics_reads`` of the spec, by default these states and the actions, with
+            angles in rad. Several: a list, or a dictionary with their names. Default: none.
         model: Makes the model from ``(X, Y, physics=...)``: a class of models such as
             :class:`~gpadjust.CKA` (without physics :class:`~gpadjust.ZeroMeanGP`), a
-            ``functools.partial`` of it with further arguments, or a function, which gets
-            ``input_transform``, too, where the state has angles.
-        target: What the model learns: the ``"difference"`` of next state and state, of an angle
-            the shortest way round, or the next state itself (``"absolute"``). A scaling of an
-            absolute position or angle depends on where its origin is; one of a change does not.
+            ``functools.partial`` of it with further arguments, or a function, which also gets
+            ``input_transform`` if the state has angles.
+        target: Outputs of the model: the ``"difference"`` of next state and state, for an angle the
+            shortest way round, or the next state (``"absolute"``). A scaling of an absolute
+            position or angle depends on its origin; a scaling of a change does not.
         fit_options: Options of :func:`gpadjust.fit`: ``method``, ``num_draws`` and ``seed``. By
-            default the hyper-parameters are drawn, and what is predicted has their uncertainty,
-            too; ``"map"`` takes the most likely ones.
-        num_features: Number of random features that stand for each kernel in sampled functions, an
-            even one. Fewer are faster: 256 for a policy search, whose functions are many.
+            default, predictions include the uncertainty of hyper-parameters; ``"map"`` takes the
+            most likely ones.
+        num_features: Number of random features of each kernel in sampled functions, even. Fewer
+            are faster: 256 for a policy search, which needs many functions.
         physics_error: Standard deviations of the error of a step of the physics, by the name of the
-            state, for which plans before the first transitions keep margins.
+            state, for margins of plans before the first transitions.
 
     Raises:
-        TypeError: If an argument is of another type, or ``model`` needs a physics (or another
-            argument) that is missing, or takes none that is given.
-        ValueError: If ``target`` or an option is unknown, a number is none of those above, or a
-            physics returns the change of the state.
+        TypeError: If an argument has another type, or ``model`` does not take the arguments, or
+            needs a physics that is missing.
+        ValueError: If ``target`` or an option is unknown, a number is out of range, or a physics
+            returns the change of the state.
 
     Example:
         >>> import torch
@@ -130,12 +131,16 @@ class LearnedDynamics(Dynamics):
         self.fit_options = {name: value for name, value in options.items() if value is not None}
         check_choice("method", self.fit_options.get("method", "bayes"), ("bayes", "map"))
         self.targets = Targets(spec, target)
-        self._parts = {} if physics is None else named_physics(physics, spec)
-        parts = {name: TargetPhysics(part, self.targets) for name, part in self._parts.items()}
-        self.physics = next(iter(self._parts.values())) if len(parts) == 1 else None
+        self._parts: dict[str, Physics] = {}
         self._options: dict[str, Any] = {}  # of the model
-        if parts:
-            self._options["physics"] = parts if len(parts) > 1 else next(iter(parts.values()))
+        self.physics: Physics | None = None
+        if physics is not None:
+            self._parts = named_physics(physics, spec)
+            parts = {name: TargetPhysics(part, self.targets) for name, part in self._parts.items()}
+            self._options["physics"] = parts
+            if len(parts) == 1:
+                (self.physics,) = self._parts.values()
+                (self._options["physics"],) = parts.values()
         if self.targets.angles:
             self._options["input_transform"] = AngleInput(self.targets.angles)
         check_factory(model, self._options)
@@ -147,46 +152,48 @@ class LearnedDynamics(Dynamics):
 
     @property
     def is_fitted(self) -> bool:
-        """True once it has learnt from transitions."""
+        """True after the first update."""
         return self._learnt is not None
 
     @property
     def model(self) -> GP:
-        """The model, whose targets are what ``target`` says of the predicted states."""
-        return self._known_so_far().model
+        """The model of the targets of the predicted states, see ``target``."""
+        return self._last_learnt().model
 
     @property
     def num_transitions(self) -> int:
-        """Number of transitions that it has learnt from."""
+        """Number of transitions of all updates."""
         return 0 if self._learnt is None else len(self._learnt.data)
 
     def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
-        """Learn from further transitions: fit all unknown numbers again to these and earlier ones.
+        """Fit all unknown numbers again, to these and all earlier transitions.
 
-        If this raises an error, what was learnt before stands; so it does in all methods below.
+        After an error, the dynamics are as before; this is so for all methods below.
 
         Args:
             states: ``N x state_dim``.
             actions: ``N x action_dim``.
-            next_states: ``N x state_dim``; NaN where an entry was not measured: each state is
-                learnt from its own rows.
+            next_states: ``N x state_dim``; NaN where an entry was not measured: the fit of each
+                state uses the rows where it was measured.
 
         Raises:
-            TypeError: If they are not float64 tensors.
+            TypeError: If the arguments are not float64 tensors.
             ValueError: If shapes disagree, values are not finite, a row of next states is NaN in
-                all that the model predicts, there are fewer than 2 rows of a state in all, or
-                states are not what the spec says (:meth:`StateSpec.check_transitions`).
+                all states that the model predicts, there are fewer than 2 rows of a state in all,
+                or transitions contradict the spec (:meth:`StateSpec.check_transitions`).
             PhysicsError: If the physics fails.
         """
-        data, before = self._checked(states, actions, next_states), self._learnt
-        if before is None:
-            probes = [PhysicsProbes.of(part, self.spec, data) for part in self._parts.values()]
+        data = self._checked(states, actions, next_states)
+        if self._learnt is None:
+            parts = self._parts.values()
+            probes = [PhysicsProbes.from_data(part, self.spec, data) for part in parts]
         else:
-            data, probes = before.data.append(data), before.probes
+            data = self._learnt.data.append(data)
+            probes = self._learnt.probes
         self._check_enough(data)
         with warnings.catch_warnings():
-            if before is not None:
-                warnings.simplefilter("ignore")  # the first update has given them
+            if self._learnt is not None:
+                warnings.simplefilter("ignore")  # the first update has issued them
             model = self._built(data)
         self.fit_result = fit(model, **self.fit_options)
         self._learnt = Learnt(data, model, probes)
@@ -194,16 +201,15 @@ class LearnedDynamics(Dynamics):
     def predict(
         self, states: Tensor, actions: Tensor, *, observation_noise: bool = True
     ) -> Prediction:
-        """Return mean and variance of the next states, ``... x state_dim`` each, entry by entry.
+        """Return mean and variance of each entry of the next states, ``... x state_dim`` each.
 
         Args:
-            states: ``... x state_dim``; angles of the mean are not wrapped, either.
+            states: ``... x state_dim``; angles of states and means are not wrapped.
             actions: ``... x action_dim``.
-            observation_noise: Whether the variance includes the noise that was learnt, by which
-                next states scatter about the mean.
+            observation_noise: If True, the variance includes the estimated noise of next states.
 
         Raises:
-            RuntimeError: If nothing was learnt yet.
+            RuntimeError: Before the first update.
             PhysicsError: If the physics fails.
         """
         following, variance = self._predict(states, actions, observation_noise)
@@ -212,17 +218,19 @@ class LearnedDynamics(Dynamics):
         )
 
     def physics_alone(self) -> Dynamics | None:
-        """Return the physics, with the guesses of unknown parameters; None unless it is one."""
+        """Return the physics with the guesses of unknown parameters; None unless there is one."""
         if self.physics is None:
             return None
         return PhysicsDynamics(self.spec, self.physics, physics_error=self.physics_error)
 
     def sample(self, states: Tensor, actions: Tensor) -> Tensor:
-        """Draw next states, noise included, row by row, from PyTorch's generator."""
+        """Draw next states of each row, noise included, from PyTorch's generator."""
         mean, variance = self._predict(states, actions, True)
-        drawn, root = torch.randn_like(mean), self.noise_root()
-        drawn = drawn if root is None else drawn @ root.mT
-        return self.spec.complete(states, actions, mean + variance.sqrt() * drawn)
+        z = torch.randn_like(mean)
+        root = self.noise_root()
+        if root is not None:  # correlation R = root root^T
+            z = z @ root.mT
+        return self.spec.complete(states, actions, mean + variance.sqrt() * z)
 
     def sample_functions(self, num_functions: int, seed: int | None = None) -> TransitionFunctions:
         """Draw transition functions from the posterior, without noise; see :class:`Dynamics`."""
@@ -232,18 +240,18 @@ class LearnedDynamics(Dynamics):
     def mean_function(self) -> TransitionFunctions:
         """Return the mean of the predictions, as a function of any ``k`` blocks, with gradients.
 
-        Of many transitions it is that of two or more of the draws, as many as keep it quick, which
-        differ less the more is known.
+        With many transitions it is the mean of fewer draws, two or more, for speed; draws differ
+        less the more transitions there are.
         """
-        model = self._known_so_far().with_few_draws
+        model = self._last_learnt().with_few_draws
         posterior = model.conditioning()
-        has_scale = type(model).marginals_of is not Predictive.marginals_of  # as of a link
+        has_scale = type(model).marginals_of is not Predictive.marginals_of  # a link has one
 
         def mean(inputs: Tensor) -> Tensor:
             X = inputs.flatten(0, -2)
             if has_scale:
                 values = model.predict(X).mean
-            else:  # without variances, which cost most
+            else:  # no variances, which cost most
                 means = posterior.mean_alone(model.at(X, posterior.train.values))
                 values = (means.mean(-3) * model.unit).mT
             return values.unflatten(0, inputs.shape[:-1])
@@ -251,20 +259,21 @@ class LearnedDynamics(Dynamics):
         return self._step(mean)
 
     def noise_variance(self, states: Tensor, actions: Tensor) -> Tensor:
-        """Return the variance of the learnt noise, ``N x state_dim``."""
-        noisy, without = (self._predict(states, actions, noise)[1] for noise in (True, False))
-        return self.spec.complete_variance((noisy - without).clamp_min(0.0))
+        """Return the variance of the estimated noise, ``N x state_dim``."""
+        with_noise, without = (self._predict(states, actions, noise)[1] for noise in (True, False))
+        return self.spec.complete_variance((with_noise - without).clamp_min(0.0))
 
     def noise_root(self) -> Tensor | None:
-        """Return a lower triangular root of the correlation of predicted states' noise, if any.
+        """Return a lower triangular root of the noise correlation of predicted states, or None.
 
-        It is that of left-out errors, shrunk, of states whose correlation these clearly show.
+        It is the correlation of left-out errors, shrunk, for states with a clear correlation.
         """
-        return self._known_so_far().noise_root
+        return self._last_learnt().noise_root
 
     def describe(self) -> dict[str, str]:
         """Return each setting of these dynamics as a text; of objects, the class."""
         parts = self._parts.values()
+        # States saved before an option existed have its default: leave defaults out.
         options = {
             "physics": [*self._parts] if len(parts) > 1 else None,
             "unknowns": {name: repr(u) for part in parts for name, u in part.unknowns.items()},
@@ -282,66 +291,70 @@ class LearnedDynamics(Dynamics):
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that was learnt, in tensors and plain values, and f_p at some rows."""
+        """Return transitions, model and f_p at some rows, in tensors and plain values."""
         if self._learnt is None:
             return {}
-        data, model = self._learnt.data, self._learnt.model
+        model = self._learnt.model
         settings = getattr(model.noise, "settings", {})
         return deepcopy(
             {
                 "fingerprint": self.describe(),
-                "transitions": columns_of(data),
-                "probes": [[*each] for each in self._learnt.probes],
+                "transitions": columns_of(self._learnt.data),
+                "probes": [[*probe] for probe in self._learnt.probes],
                 "model": dict(model.state_dict()),
                 "draws": model.draws,
-                # what a fit has learnt of single observations
+                # corrections of single observations, set by a fit
                 "noise": {name: v for name, v in settings.items() if isinstance(v, Tensor)},
             }
         )
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take back what :meth:`state_dict` gave; predictions and later fits are the same.
+        """Load a result of :meth:`state_dict`; predictions and later fits are then the same.
 
-        An empty state, that of dynamics that have learnt nothing, lets them forget. The physics is
-        compared at three of the transitions, and evaluated at all of them.
+        An empty state, that of dynamics before the first update, removes all transitions. The
+        physics is compared at three of the transitions, and evaluated at all of them.
 
         Raises:
-            TypeError: If it is not a dictionary.
-            RuntimeError: If it is of dynamics of other settings or another physics, or damaged.
+            TypeError: If the state is not a dictionary.
+            RuntimeError: If the state belongs to dynamics with other settings or another physics,
+                or is damaged.
             PhysicsError: If the physics fails.
         """
         if state == {}:
             self._learnt = self.fit_result = None
             return
         with loading(state, self.describe()) as copy, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the first update has given them
-            probes = [PhysicsProbes(*each) for each in copy["probes"]]
-            for part, each in zip(self._parts.values(), probes, strict=True):
-                each.check(part, self.spec)
+            warnings.simplefilter("ignore")  # the first update has issued them
+            probes = [PhysicsProbes(*columns) for columns in copy["probes"]]
+            for part, probe in zip(self._parts.values(), probes, strict=True):
+                probe.check(part, self.spec)
             check_numbers({**copy["model"], **copy["noise"], "draws": copy["draws"]})
             data = Trajectories.checked(self.spec, **copy["transitions"])
             model = self._built(data)
-            if copy["noise"]:
+            if copy["noise"]:  # a fit replaced the noise by one with corrections
                 noise: Any = model.noise
                 noise = type(noise)(**{**noise.settings, **copy["noise"]})
                 model = model.with_noise(noise.of_terms(model.term_sum))
             model.load_state_dict(copy["model"])
-            number, draws = len(model.u), copy["draws"]
+            draws = copy["draws"]
+            number = len(model.u)
             if draws.shape[1:] != model.u.shape[1:] or len(draws) < number:
                 raise ValueError(f"expected {number} or more draws, each like {model.u[0].shape}")
             model.set_draws(draws, number)
             learnt = Learnt(data, model.eval(), probes)
-        self._learnt, self.fit_result = learnt, None
+        self._learnt = learnt
+        self.fit_result = None
 
     def _check_enough(self, data: Trajectories) -> None:
         """Raise a ValueError unless each predicted state was measured in two rows or more."""
         least, i = (~data.next_states[:, self.spec.predicted].isnan()).sum(0).min(0)
         if least < 2:
-            name = self.spec.states[self.spec.predicted[i]]
-            of = "" if len(data) < 2 else f" with a measured {name!r}"
+            rows = str(int(least))
+            if len(data) >= 2:
+                rows += f" with a measured {self.spec.states[self.spec.predicted[i]]!r}"
             raise ValueError(
-                f"Expected at least 2 transitions to learn from, got {least}{of}: there is no "
-                "scale in fewer. Collect more before the first update."
+                f"Expected at least 2 transitions to learn from, got {rows}: fewer have no scale. "
+                "Collect more before the first update."
             )
 
     def _built(self, data: Trajectories) -> GP:
@@ -349,6 +362,7 @@ class LearnedDynamics(Dynamics):
         targets = self.targets
         X = targets.inputs(data.states, data.actions)
         Y = targets.encode(data.states, data.next_states)
+        # A model of tensors has no names: those of states and actions serve errors and summaries.
         model: GP = make_model(self.make_model, X, Y, kind=GP, **self._options)
         model.data = model.data._replace(
             input_names=targets.input_names, output_names=targets.output_names
@@ -358,12 +372,12 @@ class LearnedDynamics(Dynamics):
     def _varied(
         self, variation: Tensor | float
     ) -> Callable[[int, int | None], TransitionFunctions]:
-        """Return `sample_functions`, each function with parameters of its own."""
-        learnt = self._known_so_far()
+        """Return `sample_functions` with varying parameters of the physics."""
+        learnt = self._last_learnt()
         if self.physics is None or not self.physics.unknowns:
             return super()._varied(variation)
-        drawn = learnt.model.physics_parameters
-        vary = varying_parameters(self.physics, self.spec, drawn, learnt.data.actions, variation)
+        parameters, actions = learnt.model.physics_parameters, learnt.data.actions
+        vary = varying_parameters(self.physics, self.spec, parameters, actions, variation)
 
         def sample_functions(num_functions: int, seed: int | None = None) -> TransitionFunctions:
             functions = self.sample_functions(num_functions, seed)
@@ -372,7 +386,8 @@ class LearnedDynamics(Dynamics):
 
         return sample_functions
 
-    def _known_so_far(self) -> Learnt:
+    def _last_learnt(self) -> Learnt:
+        """Return the result of the last update."""
         if self._learnt is None:
             raise RuntimeError(
                 f"{type(self).__name__} has not learnt from transitions yet; call `update`."
@@ -380,13 +395,13 @@ class LearnedDynamics(Dynamics):
         return self._learnt
 
     def _step(
-        self, of_inputs: Callable[[Tensor], Tensor], num_functions: int | None = None
+        self, model: Callable[[Tensor], Tensor], num_functions: int | None = None
     ) -> TransitionFunctions:
-        """Return a step by targets as a function of the model's inputs."""
+        """Return the next state as a function of states and actions, by a function of inputs."""
 
         def step(states: Tensor, actions: Tensor) -> Tensor:
             self._check_blocks(states, actions, num_functions)
-            targets = of_inputs(self.targets.inputs(states, actions))
+            targets = model(self.targets.inputs(states, actions))
             return self.spec.complete(states, actions, self.targets.decode(states, targets))
 
         return step
@@ -400,27 +415,29 @@ class LearnedDynamics(Dynamics):
         with torch.no_grad():
             rows = X.reshape(-1, X.shape[-1])
             moments = self.model.predict(rows, observation_noise=observation_noise)
+        # Back to the shape of the states.
         mean, variance = (part.reshape(*X.shape[:-1], part.shape[-1]) for part in moments)
         return self.targets.decode(states, mean), variance
 
 
 def check_factory(make: Any, options: Mapping[str, Any]) -> None:
-    """Raise a TypeError unless a model can be made of inputs, targets and these options."""
-    keywords, made = getattr(make, "keywords", {}), getattr(make, "func", make)
-    own = {"physics", "input_transform", "train_X", "train_Y", "train_Yvar"} & {*keywords}
-    is_without = isinstance(made, type) and issubclass(made, ZeroMeanGP)
+    """Raise a TypeError unless a factory takes inputs, targets and these options."""
+    keywords = getattr(make, "keywords", {})
+    function = getattr(make, "func", make)
+    twice = {"physics", "input_transform", "train_X", "train_Y", "train_Yvar"} & {*keywords}
+    is_without = isinstance(function, type) and issubclass(function, ZeroMeanGP)
     try:
-        if own:
-            raise TypeError(f"{min(own)} comes from the dynamics; leave it out of the partial")
+        if twice:
+            raise TypeError(f"{min(twice)} comes from the dynamics; leave it out of the partial")
         if is_without and "physics" in options:
-            raise TypeError("it takes no physics; leave that out, or take model=CKA")
+            raise TypeError("it takes no physics; leave the physics out, or take model=CKA")
         signature(make).bind(None, None, **options)
     except TypeError as error:
         arguments = ", ".join(["X", "Y", *(f"{option}=..." for option in options)])
         raise TypeError(
-            f"Expected model as what makes one of ({arguments}): a class of gpadjust, such as CKA "
-            "or, without a physics, ZeroMeanGP, a functools.partial of it with further arguments, "
-            f"or a function; found {getattr(made, '__name__', repr(made))}: {error}."
+            f"Expected model as a factory of ({arguments}): a class of gpadjust, such as CKA or, "
+            "without a physics, ZeroMeanGP, a functools.partial of it with further arguments, or "
+            f"a function; found {getattr(function, '__name__', repr(function))}: {error}."
         ) from None
 
 
@@ -431,14 +448,20 @@ def varying_parameters(
     actions: Tensor,
     variation: Tensor | float,
 ) -> Callable[[int, int | None], TransitionFunctions]:
-    """Return changes of next states by parameters that differ, in each draw by numbers of its own.
+    """Return a sampler of changes of the next states by varying parameters of the physics.
 
-    They vary by standard deviations of their coordinates about those that were learnt, by more
-    beyond the actions that were learnt from, ``N x action_dim``. What is returned takes a number
-    ``k`` of draws and a seed, and returns a function of states and actions: by how much next states
-    ``k x N x state_dim`` are others than by what was learnt, NaN where the physics fails.
+    The sampler takes a number ``k`` of draws and a seed. It returns a function of states and
+    actions: the change of next states ``k x N x state_dim``, NaN where the physics fails.
+
+    Args:
+        physics: The physics.
+        spec: Names and kinds of the entries of states and actions.
+        learnt: Draws of the parameters.
+        actions: The actions of the updates, ``N x action_dim``, beyond which parameters vary more.
+        variation: Standard deviations of the coordinates, see :meth:`Dynamics.free_run`.
     """
-    unknowns, p = physics.unknowns, len(physics.unknowns)
+    unknowns = physics.unknowns
+    p = len(unknowns)
     sd = checked_tensor("variation", variation)
     if sd.shape not in ((), (p,)) or not (sd.isfinite() & (sd >= 0)).all():
         raise ValueError(
@@ -448,22 +471,26 @@ def varying_parameters(
     sd = sd.expand(p)
     center = unknowns.coordinates(learnt.draws).clamp(-_END, _END).mean(0)
     low, high = actions.amin(0), actions.amax(0)
-    # Of an action that never varied, its own size.
-    half = ((high - low) / 2).where(high > low, high.abs().where(high != 0, torch.ones_like(high)))
+    # Half of the range; for an action that never varied, its size.
+    size = high.abs().where(high != 0, torch.ones_like(high))
+    half = ((high - low) / 2).where(high > low, size)
 
     def changes(number: int, seed: int | None) -> TransitionFunctions:
-        seed = int(torch.randint(2**31, ())) if seed is None else seed
-        drawn = even_normal(number, p, seed).unsqueeze(1)  # number x 1 x p
+        if seed is None:
+            seed = int(torch.randint(2**31, ()))
+        normal = even_normal(number, p, seed).unsqueeze(1)  # number x 1 x p
 
         def change(states: Tensor, actions: Tensor) -> Tensor:
             actions = actions.expand(*states.shape[:-1], -1)
+            # sd (1 + 2 |distance from the range| / half range), at most max(sd, 0.5)
             beyond = (low - actions).clamp_min(0) + (actions - high).clamp_min(0)
             growth = 1 + _BEYOND * (beyond / half).norm(dim=-1, keepdim=True)
-            away = torch.minimum(sd * growth, sd.clamp_min(_MOST)) * drawn
+            deviation = torch.minimum(sd * growth, sd.clamp_min(_MOST)) * normal
             rows = spec.physics_inputs(states, actions).flatten(0, -2).unsqueeze(1)
+            # f_p(x; z + deviation) - f_p(x; z)
             ends = []
-            for coordinates in (center, center + away):
-                values = unknowns.at(coordinates.expand_as(away).flatten(0, -2))  # of each row
+            for coordinates in (center, center + deviation):
+                values = unknowns.at(coordinates.expand_as(deviation).flatten(0, -2))  # per row
                 end = states.clone()
                 end[..., spec.moving] = physics.or_nan(rows, values).view(*states.shape[:-1], -1)
                 ends.append(end)

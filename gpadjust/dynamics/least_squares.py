@@ -1,4 +1,4 @@
-"""Unknown parameters of a physics by least squares of its steps, of however many transitions."""
+"""Unknown parameters of a physics by least squares of its steps, for any number of transitions."""
 
 from __future__ import annotations
 
@@ -11,15 +11,20 @@ from torch import Tensor
 
 from gpadjust.dynamics.trajectories import Trajectories
 from gpadjust.physics import Physics, PhysicsWarning
+from gpadjust.physics.unknown import Unknowns
 from gpadjust.states import StateSpec
 
-_SEARCHED = 512  # transitions by which parameters are searched for; all of them refine the best
-_GUESSES, _STARTS = 512, 6  # draws from the prior, and how many of the best are started from
-_ROUNDS, _CALLS = 30, 6  # of least squares and variances by turns, and of the physics in each
-_ROUGH, _SETTLED = 0.1, 1e-4  # changes of the log of variances, below which a search ends
-_SILENT = 1e-14  # the mean square of errors, relative to that of the changes, that is none
+_SEARCHED = 512  # transitions of the search; all transitions refine the best result
+_GUESSES = 512  # draws from the prior
+_STARTS = 6  # best of the draws, from which searches start
+_ROUNDS = 30  # of least squares and variances by turns
+_CALLS = 6  # of the physics in each round
+_ROUGH = 0.1  # change of the log of variances below which a search ends
+_SETTLED = 1e-4  # change below which the refinement ends
+_SILENT = 1e-14  # smallest mean square of errors, relative to that of the changes
 _STEP = 1e-4  # of differences, in standard deviations of the prior
-_UNTOLD, _TAKES_PART = 0.15, 0.3  # precision next to nothing; cosine of a parameter with it
+_FLAT = 0.15  # precision of a direction that the transitions do not determine
+_TAKES_PART = 0.3  # cosine of a parameter with such directions
 _FAR = 3.0  # standard deviations of the prior
 
 
@@ -30,31 +35,36 @@ def most_likely(
     """Return the most likely parameters of a physics by transitions.
 
     Returns:
-        Coordinates ``p``; the precision of these by the transitions, ``p x p``, without the prior;
-        and mean squares of the errors, ``state_dim``, 0 of states that do not move.
+        Coordinates ``p``; their precision by the transitions, ``p x p``, without the prior; and
+        mean squares of the errors, ``state_dim``, 0 for states that do not move.
     """
-    unknowns, whole = physics.unknowns, _Errors(physics, spec, data)
+    unknowns = physics.unknowns
+    errors = StepErrors(physics, spec, data)
     guess = unknowns.coordinates(unknowns.guess)
-    if not whole.at(guess).isfinite().all():
-        physics(whole.inputs)  # which says where it fails
+    if not errors.evaluate(guess).isfinite().all():
+        physics(errors.inputs)  # raises an error that says where it fails
+    # Search: from the best draws of the prior, by some of the transitions.
     number = min(len(data), _SEARCHED)
     rows = torch.linspace(0, len(data) - 1, number, dtype=torch.float64).round().long()
-    some = _Errors(physics, spec, data.some(rows))
+    some = StepErrors(physics, spec, data.some(rows))
     starts = torch.cat([guess.unsqueeze(0), even_normal(_GUESSES, len(guess), seed=0)])
     best = some.loss(starts).nan_to_num(nan=torch.inf).argsort()[:_STARTS]
     ends = [some.descend(z, _ROUGH) for z in starts[best] if some.loss(z).isfinite()]
-    point = whole.descend(min([*ends, guess], key=whole.loss))
-    errors = whole.at(point)
-    weighted = whole.slopes(point) / whole.variances(errors).sqrt().unsqueeze(-1)
+    # Refinement: by all of them.
+    point = errors.descend(min([*ends, guess], key=errors.loss))
+    r = errors.evaluate(point)
+    # Gauss-Newton precision: sum_ij (dr_ij/dz) (dr_ij/dz)^T / sigma_i^2
+    weighted = errors.slopes(point) / errors.variances(r).sqrt().unsqueeze(-1)
     precision = torch.einsum("pmn,qmn->pq", weighted, weighted)
-    freedom = whole.count.sum() / (whole.count.sum() - len(unknowns)).clamp_min(1)
+    # The fit takes p degrees of freedom from the errors.
+    freedom = errors.count.sum() / (errors.count.sum() - len(unknowns)).clamp_min(1)
     noise = torch.zeros(spec.state_dim, dtype=torch.float64)
-    noise[spec.moving] = errors.square().sum(-1) / whole.count.clamp_min(1) * freedom
-    _warn_of_parameters([*unknowns], precision, point)
+    noise[spec.moving] = r.square().sum(-1) / errors.count.clamp_min(1) * freedom
+    _warn_of_parameters(unknowns, precision, point)
     return point, precision, noise
 
 
-class _Errors:
+class StepErrors:
     """Errors of a physics in one step, by the coordinates of its unknown parameters."""
 
     def __init__(self, physics: Physics, spec: StateSpec, data: Trajectories) -> None:
@@ -66,18 +76,20 @@ class _Errors:
         size = changes.square().nanmean(-1).nan_to_num()
         self.least = _SILENT * size + torch.finfo(changes.dtype).tiny
 
-    def at(self, z: Tensor) -> Tensor:
+    def evaluate(self, z: Tensor) -> Tensor:
         """Return next states less those of the physics, ``... x m x n``; infinite if it fails."""
         following = self.physics.or_nan(self.inputs, self.physics.unknowns.at(z))
         predicted = self.data.states.expand(*following.shape[:-1], -1).clone()
         predicted[..., self.spec.moving] = following
+        # r_ij = s'_ij - f_p(s_j, a_j)_i, with angles the shortest way round
         errors = self.spec.change(predicted, self.data.next_states)[..., self.spec.moving].mT
         return errors.masked_fill(~self.observed, 0.0).nan_to_num(nan=torch.inf)
 
     def slopes(self, z: Tensor) -> Tensor:
         """Return derivatives of the errors at ``p`` coordinates, ``p x m x n``."""
         steps = _STEP * torch.eye(len(z)).to(z)
-        up, down = self.at(torch.cat([z + steps, z - steps])).chunk(2)
+        up, down = self.evaluate(torch.cat([z + steps, z - steps])).chunk(2)
+        # central differences; 0 next to parameters at which the physics fails
         return ((up - down) / (2 * _STEP)).nan_to_num(0.0, 0.0, 0.0)
 
     def variances(self, errors: Tensor) -> Tensor:
@@ -85,47 +97,51 @@ class _Errors:
         return (errors.square().sum(-1) / self.count.clamp_min(1)).maximum(self.least)
 
     def loss(self, z: Tensor) -> Tensor:
-        """Return what is minimised, at coordinates ``... x p``."""
-        logs = self.variances(self.at(z)).log()
+        """Return the minimised function, at coordinates ``... x p``."""
+        # sum_i n_i / 2 log sigma_i^2 + |z|^2 / 2
+        logs = self.variances(self.evaluate(z)).log()
         return (0.5 * self.count * logs).sum(-1) + 0.5 * z.square().sum(-1)
 
     def descend(self, z: Tensor, settled: float = _SETTLED) -> Tensor:
-        """Return where least squares leads from coordinates ``p`` at which the physics works."""
-        variances = self.variances(self.at(z))
+        """Return a minimum by least squares from coordinates ``p`` at which the physics works."""
+        variances = self.variances(self.evaluate(z))
         for _ in range(_ROUNDS):
+            # Least squares for fixed variances, then the variances of the new errors.
             sd = variances.sqrt().unsqueeze(-1)
 
             def residuals(point: Any, sd: Tensor = sd) -> Any:
-                errors = self.at(torch.from_numpy(point)) / sd
+                errors = self.evaluate(torch.from_numpy(point)) / sd
                 return torch.cat([errors.flatten(), torch.from_numpy(point)]).numpy()
 
             def jacobian(point: Any, sd: Tensor = sd) -> Any:
                 slopes = (self.slopes(torch.from_numpy(point)) / sd).flatten(1).mT
                 return torch.cat([slopes, torch.eye(len(point)).double()]).numpy()
 
-            found = least_squares(residuals, z.numpy(), jacobian, max_nfev=_CALLS)
-            z, before = torch.from_numpy(found.x), variances
-            variances = self.variances(self.at(z))
-            if ((variances / before).log().abs() < settled).all():
+            z = torch.from_numpy(least_squares(residuals, z.numpy(), jacobian, max_nfev=_CALLS).x)
+            old_variances = variances
+            variances = self.variances(self.evaluate(z))
+            if ((variances / old_variances).log().abs() < settled).all():
                 break
         return z
 
 
-def _warn_of_parameters(names: list[str], precision: Tensor, point: Tensor) -> None:
-    """Warn of parameters of which transitions tell next to nothing, or that contradict a prior.
+def _warn_of_parameters(unknowns: Unknowns, precision: Tensor, point: Tensor) -> None:
+    """Warn of parameters that transitions do not determine, or that contradict their prior.
 
-    The first take part in directions in which the transitions have next to none of the prior's
-    precision, ``p x p``; the second are at coordinates far from its middle.
+    The former take part in directions with hardly any precision by the transitions, ``p x p``,
+    compared with the prior; the latter have coordinates far from its middle. Some values of an
+    unknown function always have hardly any precision.
     """
     values, vectors = torch.linalg.eigh(precision)
-    silent = vectors[:, values < _UNTOLD].norm(dim=-1) > _TAKES_PART
-    for which, message in (
-        (silent, "Transitions say next to nothing of {} of the physics: give narrower priors."),
-        (point.abs() > _FAR, "Transitions and prior disagree about {} of the physics: look at it."),
+    is_number = torch.tensor([not unknown.function_of for unknown in unknowns.values()])
+    is_flat = (vectors[:, values < _FLAT].norm(dim=-1) > _TAKES_PART) & is_number
+    for mask, message in (
+        (is_flat, "Transitions barely constrain {} of the physics: give narrower priors."),
+        (point.abs() > _FAR, "Transitions and prior disagree about {} of the physics: check both."),
     ):
-        told = ", ".join(name for name, is_one in zip(names, which, strict=True) if is_one)
-        if told:
-            warnings.warn(message.format(told), PhysicsWarning, stacklevel=5)
+        listed = ", ".join(name for name, is_one in zip(unknowns, mask, strict=True) if is_one)
+        if listed:
+            warnings.warn(message.format(listed), PhysicsWarning, stacklevel=5)
 
 
 def even_normal(number: int, p: int, seed: int) -> Tensor:

@@ -1,4 +1,4 @@
-"""Dynamics that are a physics alone, known or with unknown parameters."""
+"""Dynamics by a physics alone, with or without unknown parameters."""
 
 from __future__ import annotations
 
@@ -25,32 +25,32 @@ _DRAWS = 1024
 
 
 class PhysicsDynamics(Dynamics):
-    r"""The physics alone; of its unknown parameters, if it has any, the most likely ones.
+    r"""The physics alone, with the most likely values of its unknown parameters.
 
-    With the true system as physics it is the oracle that bounds what any model can do.
+    With the true system as physics it is the oracle that bounds any model.
 
-    Unknown parameters are fitted at each `update`, to all transitions so far, by least squares of
-    one step: they minimise
+    Each `update` fits unknown parameters to all transitions so far, by least squares of one step:
+    they minimise
 
     .. math:: \sum_i \tfrac{n_i}{2} \log \sum_j r_{ij}^2 + \tfrac12 |z|^2
 
     with the errors :math:`r_{ij}` of the :math:`n_i` measured next values of state i, so that each
     state counts in units of its own error, and the coordinates z of the parameters, which are
     standard normal by their prior (:class:`~gpadjust.physics.Unknown`). The search begins at the
-    best of the guesses and 512 draws from the prior. A parameter of which transitions tell nothing
-    stays in the middle of its prior, with a warning. The errors that are left are taken as the
-    noise of measured next states; the functions have none.
+    best of the guesses and 512 draws from the prior. A parameter that the transitions do not
+    determine stays in the middle of its prior, with a warning. The remaining errors are the noise
+    of measured next states; functions have no noise.
 
     Args:
-        spec: What the entries of states and actions are.
+        spec: Names and kinds of the entries of states and actions.
         physics: One physics, as of :class:`LearnedDynamics`.
         physics_error: Standard deviations of the error of a step of the physics, by the name of the
-            state; its variance until unknown parameters are fitted. Default: none.
+            state, for predictions before the first fit. Default: none.
 
     Raises:
-        TypeError: If ``spec`` is no :class:`StateSpec`, or the physics is not callable.
+        TypeError: If ``spec`` is not a :class:`StateSpec`, or the physics is not callable.
         ValueError: If there are several physics, one returns the change of the state, or
-            ``physics_error`` is of no state that moves, or negative.
+            ``physics_error`` names a state that does not move, or is negative.
 
     Example:
         >>> import torch
@@ -66,7 +66,7 @@ class PhysicsDynamics(Dynamics):
         tensor([0.3000], dtype=torch.float64)
     """
 
-    is_fitted = True  # as the guesses serve before there are transitions
+    is_fitted = True  # before transitions, by the guesses
 
     def __init__(
         self,
@@ -77,58 +77,61 @@ class PhysicsDynamics(Dynamics):
     ) -> None:
         super().__init__(spec)
         self.physics_error = checked_physics_error(spec, physics_error)
-        self.physics = one_physics(physics, spec, "LearnedDynamics learns the weights of several")
+        self.physics = one_physics(physics, spec, "LearnedDynamics takes several")
         self._probes: PhysicsProbes | None = None  # of the first transitions
         self._fitted: _Fitted | None = None
 
     @property
     def has_learnt(self) -> bool:
-        """True once unknown parameters are fitted, or if there are none."""
+        """True after a fit of the unknown parameters, or if there are none."""
         return self._fitted is not None or not self.physics.unknowns
 
     @property
     def physics_parameters(self) -> PhysicsParameters:
-        """Unknown parameters: 1024 draws about the fitted ones, or the guesses before.
+        """Unknown parameters: 1024 draws around the fit, or the guesses before a fit.
 
-        The draws of the coordinates z are normal, with the precision that the slopes of the physics
-        at the optimum and the prior have; their ``sd`` are the standard errors.
+        The draws of the coordinates z are normal, with the precision of the prior and of the slopes
+        of the physics at the optimum; their ``sd`` are the standard errors.
         """
         unknowns = self.physics.unknowns
         if self._fitted is None:
             return PhysicsParameters(unknowns, [*unknowns.guess.unsqueeze(-1)])
         point, precision = self._fitted.point, self._fitted.precision
-        spread = even_normal(_DRAWS, len(point), seed=0)
+        # z ~ N(point, (precision + I)^-1) = point + L^-T N(0, I)
         chol = torch.linalg.cholesky(precision + torch.eye(len(point)).to(precision))
-        away = torch.linalg.solve_triangular(chol.mT, spread.mT, upper=True).mT
-        return PhysicsParameters(unknowns, unknowns.at(point + away).unbind(-1))
+        normal = even_normal(_DRAWS, len(point), seed=0)
+        deviation = torch.linalg.solve_triangular(chol.mT, normal.mT, upper=True).mT
+        return PhysicsParameters(unknowns, unknowns.at(point + deviation).unbind(-1))
 
     def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
-        """Fit unknown parameters to these and all earlier transitions; a single row will do.
+        """Fit unknown parameters to these and all earlier transitions, one row or more.
 
         Errors are those of :meth:`LearnedDynamics.update`.
 
         Warns:
-            PhysicsWarning: If the transitions say next to nothing of a parameter, or contradict
-                its prior.
+            PhysicsWarning: If the transitions barely constrain a parameter, or contradict its
+                prior.
         """
         data = self._checked(states, actions, next_states)
-        probes = self._probes or PhysicsProbes.of(self.physics, self.spec, data)
+        probes = self._probes or PhysicsProbes.from_data(self.physics, self.spec, data)
         if self.physics.unknowns:
-            data = data if self._fitted is None else self._fitted.data.append(data)
+            if self._fitted is not None:
+                data = self._fitted.data.append(data)
             self._fitted = _Fitted(data, *most_likely(self.physics, self.spec, data))
-            self.physics.forget()
+            self.physics.forget()  # outputs at hundreds of parameters are of no further use
         self._probes = probes
 
     def predict(self, states: Tensor, actions: Tensor) -> Prediction:
-        """Return next states, and the variance of noise; before a fit, of the stated error."""
+        """Return next states and the variance of noise, before a fit by ``physics_error``."""
         with torch.no_grad():
             following = self._step(states, actions, self._values)
-        stated = [self.physics_error.get(name, 0.0) ** 2 for name in self.spec.states]
-        error = states.new_tensor(stated) if self._fitted is None else self._fitted.noise
-        return Prediction(following, error.expand_as(following))
+        if self._fitted is not None:
+            return Prediction(following, self._fitted.noise.expand_as(following))
+        variances = [self.physics_error.get(name, 0.0) ** 2 for name in self.spec.states]
+        return Prediction(following, states.new_tensor(variances).expand_as(following))
 
     def noise_variance(self, states: Tensor, actions: Tensor) -> Tensor:
-        """Return mean squares of the errors that the fitted parameters leave; else zero."""
+        """Return mean squares of the errors of the fitted parameters; zero before a fit."""
         if self._fitted is None:
             return torch.zeros_like(states)
         return self._fitted.noise.expand_as(states)
@@ -138,16 +141,17 @@ class PhysicsDynamics(Dynamics):
         return self
 
     def sample(self, states: Tensor, actions: Tensor) -> Tensor:
-        """Draw next states, with the noise or the stated error if there is any."""
-        is_noisy = self._fitted is not None or self.physics_error
-        return super().sample(states, actions) if is_noisy else self.predict(states, actions)[0]
+        """Draw next states, with the noise or the ``physics_error``."""
+        if self._fitted is None and not self.physics_error:
+            return self.predict(states, actions).mean  # no draw from the generator
+        return super().sample(states, actions)
 
     def mean_function(self) -> TransitionFunctions:
-        """Return the physics, with gradients as far as it has them."""
+        """Return the physics, with its gradients if it has some."""
         return partial(self._step, parameters=self._values)
 
     def sample_functions(self, num_functions: int, seed: int | None = None) -> TransitionFunctions:
-        """Return the physics, whatever the number, in the form of other dynamics."""
+        """Return the physics, for any number of functions, in the form of other dynamics."""
         checked_whole("num_functions", num_functions, 1)
         values = self._values
 
@@ -160,28 +164,30 @@ class PhysicsDynamics(Dynamics):
     def describe(self) -> dict[str, str]:
         """Return the settings, each as a text."""
         unknowns = {name: repr(u) for name, u in self.physics.unknowns.items()}
-        more = {"unknowns": unknowns, "physics_error": self.physics_error}
-        return fingerprint(type(self), self.spec, **{k: v for k, v in more.items() if v})
+        options = {"unknowns": unknowns, "physics_error": self.physics_error}
+        return fingerprint(type(self), self.spec, **{k: v for k, v in options.items() if v})
 
     def state_dict(self) -> dict[str, Any]:
         """Return settings, fitted values, and the physics' outputs at some transitions."""
-        probes, fitted = self._probes and [*self._probes], self._fitted and self._fitted._asdict()
+        probes = self._probes and [*self._probes]
+        fitted = self._fitted and self._fitted._asdict()
         if fitted is not None:
             fitted["transitions"] = columns_of(fitted.pop("data"))
         return deepcopy({"fingerprint": self.describe(), "probes": probes, "fitted": fitted})
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take back what :meth:`state_dict` gave; errors as of :class:`LearnedDynamics`.
+        """Load a result of :meth:`state_dict`; errors as of :class:`LearnedDynamics`.
 
-        The physics is asked about at most three transitions that the state holds.
+        The physics is compared at no more than three transitions of the state.
         """
-        if state == {}:  # of dynamics that have learnt nothing
+        if state == {}:  # before the first update
             state = {"fingerprint": self.describe(), "probes": None, "fitted": None}
         with loading(state, self.describe()) as copy:
             probes, fitted = copy["probes"], copy["fitted"]
             if fitted is not None:
                 data = Trajectories.checked(self.spec, **fitted.pop("transitions"))
                 fitted = _Fitted(data, **fitted)
+                # One number for each parameter, NaN if any entry is.
                 values = self.physics.unknowns.at(fitted.precision @ fitted.point)
                 check_numbers({"fitted": values, "noise": fitted.noise.view(self.spec.state_dim)})
             if probes is not None:
@@ -191,18 +197,19 @@ class PhysicsDynamics(Dynamics):
 
     @property
     def _values(self) -> Tensor | None:
-        """The parameters that it follows, None for the guesses or without any."""
+        """The fitted parameters; None for the guesses."""
         return None if self._fitted is None else self.physics.unknowns.at(self._fitted.point)
 
     def _step(self, states: Tensor, actions: Tensor, parameters: Tensor | None = None) -> Tensor:
+        """Return the next states by the physics."""
         self._check_blocks(states, actions)
         return next_values(self.physics, self.spec, states, actions, parameters)
 
 
 class _Fitted(NamedTuple):
-    """Parameters, and the transitions that they were fitted to."""
+    """Parameters, and the transitions of their fit."""
 
     data: Trajectories
     point: Tensor  # coordinates, p
-    precision: Tensor  # what the transitions say of these, p x p, without the prior
-    noise: Tensor  # mean squares of the errors, state_dim, 0 of states that do not move
+    precision: Tensor  # of the coordinates by the transitions, p x p, without the prior
+    noise: Tensor  # mean squares of the errors, state_dim, 0 for states that do not move

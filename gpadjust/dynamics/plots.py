@@ -1,4 +1,4 @@
-"""Figures of free runs beside what was measured.
+"""Figures of free runs with measured states.
 
 They need matplotlib, ``pip install gpadjust[plot]``.
 """
@@ -21,9 +21,9 @@ from gpadjust.validation.plots import BAND, BLUE, RED, axes_of, legend, tidy
 
 __all__ = ["plot_free_run"]
 
-_OTHERS = (RED, "#009E73", "#CC79A7")  # told apart by the colour-blind, too
-_SHOWN = 3  # windows, unless they are chosen
-_ROOM = 0.35  # of the range that is measured, above it and below
+_OTHERS = (RED, "#009E73", "#CC79A7")  # distinct for the colour-blind, too
+_SHOWN = 3  # windows by default
+_MARGIN = 0.35  # above and below, as a share of the measured range
 
 
 def plot_free_run(
@@ -37,35 +37,39 @@ def plot_free_run(
     units: Mapping[str, str] | None = None,
     axes: Any = None,
 ) -> Any:
-    """Draw free runs with their intervals beside what was measured: a column for each window.
+    """Draw free runs with their intervals and measured states, a column for each window.
 
-    Axes hold what was measured and the run's mean, with a third more; an interval that is wider,
-    and others' means, leave them. Angles begin within half a turn, and go on without jumps.
+    The axes cover measured states and the mean of the run, with a margin of a third. A wider
+    interval, and the means of others, may leave them. Angles begin within half a turn, and continue
+    without jumps.
 
     Args:
         run: Free runs of all the windows.
         windows: The windows, as of :meth:`Trajectories.windows`.
-        rows: The numbers of those to draw. Default: three, evenly spread.
+        rows: The numbers of the windows to draw. Default: three, evenly spaced.
         states: The names of the states to draw, a row of panels each. Default: all that move.
-        others: Free runs of other dynamics, by what the legend calls them: their means are drawn.
-        step: The time of a step. Default: that of the spec, and without one steps are counted.
+        others: Free runs of other dynamics, by their names in the legend, of which the means are
+            drawn.
+        step: The time of a step. Default: the step of the spec; without one, numbers of steps.
         units: Units for the labels, as of :func:`gpadjust.records.plots.plot_record`.
         axes: ``len(states) x len(rows)`` axes. Default: a new figure.
 
     Returns:
-        An array of these axes; show or save the figure with ``axes.flat[0].figure``.
+        An array of the axes; show or save the figure with ``axes.flat[0].figure``.
 
     Raises:
-        ValueError: If runs are not of these windows, a name is unknown, or the number of ``axes``
-            is another one.
-        IndexError: If there is no such window.
+        ValueError: If windows and runs do not agree, a name is unknown, or the number of ``axes``
+            is wrong.
+        IndexError: If a window does not exist.
     """
-    spec, shape, runs = run.spec, tuple(windows.measured.shape), {"free run": run, **(others or {})}
-    for name, each in runs.items():
-        if each.mean.shape != shape:
+    spec = run.spec
+    shape = tuple(windows.measured.shape)
+    runs = {"free run": run, **(others or {})}
+    for name, other in runs.items():
+        if other.mean.shape != shape:
             raise ValueError(
                 f"Expected {name} of these windows, w x T x state_dim {shape}, got runs of shape "
-                f"{tuple(each.mean.shape)}; pass windows and runs of all of them, and choose by "
+                f"{tuple(other.mean.shape)}; pass windows and runs of all of them, and choose by "
                 "`rows`."
             )
     if rows is None:
@@ -73,20 +77,22 @@ def plot_free_run(
     names = [spec.states[i] for i in spec.moving] if states is None else list(states)
     for name in names:
         check_choice("state", name, spec.states)
-    called, step = labels(spec, units), spec.step if step is None else step
+    step = step or spec.step
+    axis_labels = labels(spec, units)
     grid = axes_of(axes, len(names), len(rows), 2.5)
-    times = (1 if step is None else step) * np.arange(shape[1] + 1)
+    times = (step or 1) * np.arange(shape[1] + 1)
     for name, line in zip(names, grid, strict=True):
         i = spec.states.index(name)
-        line[0].set(ylabel=called[name])
+        line[0].set(ylabel=axis_labels[name])
         for row, ax in zip(rows, line, strict=True):
             recorded = windows.states[row, :, i]
             measured = going_on(recorded, i in spec.angle_columns)
+            # Runs and measurements of an angle begin in the same turn.
             low, high, *means = (
                 torch.cat([measured[:1], values[row, :, i] - recorded[0] + measured[0]])
-                for values in (run.lower, run.upper, *(each.mean for each in runs.values()))
+                for values in (run.lower, run.upper, *(other.mean for other in runs.values()))
             )
-            # Where particles start is not known here: the interval is that from step 1 on.
+            # The interval begins at step 1: a run does not have its particles at the start.
             label = f"{100 * run.level:g} %"
             ax.fill_between(times[1:], low[1:], high[1:], **BAND, label=label)
             ax.plot(times, means[0], color=BLUE, lw=1.5, label="free run")
@@ -94,19 +100,19 @@ def plot_free_run(
                 ax.plot(times, mean, "--", color=_OTHERS[k % len(_OTHERS)], lw=1.3, label=label)
             ax.plot(times, measured, "o", color="black", ms=3, label="measured")
             shown = torch.cat([means[0], measured[~measured.isnan()]])
-            room = float(_ROOM * (shown.max() - shown.min()))
-            if room > 0:
-                ax.set_ylim(float(shown.min()) - room, float(shown.max()) + room)
+            margin = float(_MARGIN * (shown.max() - shown.min()))
+            if margin > 0:
+                ax.set_ylim(float(shown.min()) - margin, float(shown.max()) + margin)
             tidy(ax)
     for ax in grid[-1]:
-        ax.set(xlabel="steps" if step is None else called["time"])
+        ax.set(xlabel=axis_labels["time"] if step else "steps")
     if axes is None:
         handles, texts = grid[0, 0].get_legend_handles_labels()
-        where: dict[str, Any] = {
+        place: dict[str, Any] = {
             "ncols": min(len(texts), 2 * len(rows)),
             "loc": "outside upper center",
         }
-        grid[0, 0].figure.legend(handles, texts, frameon=False, **where)
+        grid[0, 0].figure.legend(handles, texts, frameon=False, **place)
     else:
         legend(grid[0, 0])
     return grid
@@ -114,10 +120,11 @@ def plot_free_run(
 
 def going_on(values: Tensor, is_angle: bool) -> Tensor:
     """Return a state over time, ``n`` with NaN; an angle without jumps, from within half a turn."""
-    values, known = values.clone(), ~values.isnan()
-    if is_angle and known.any():
-        path = torch.from_numpy(np.unwrap(values[known].numpy()))
-        values[known] = path - 2 * math.pi * (path[0] / (2 * math.pi)).round()
+    values = values.clone()
+    is_measured = ~values.isnan()
+    if is_angle and is_measured.any():
+        path = torch.from_numpy(np.unwrap(values[is_measured].numpy()))
+        values[is_measured] = path - 2 * math.pi * (path[0] / (2 * math.pi)).round()
     return values
 
 

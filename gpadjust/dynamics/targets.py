@@ -23,21 +23,20 @@ Target = Literal["difference", "absolute"]
 class Targets:
     r"""Targets of a model that stand for next states.
 
-    They are the change of each predicted state, :math:`y = s' - s`, of an angle the shortest way
+    They are the change of each predicted state, :math:`y = s' - s`, for an angle the shortest way
     round; or with ``"absolute"`` its next value :math:`s + (s' - s)`, which is continuous along a
-    trajectory even where angles come wrapped.
+    trajectory even if angles are wrapped.
     """
 
     def __init__(self, spec: StateSpec, target: Target) -> None:
         check_choice("target", target, get_args(Target))
-        self.spec = spec
-        self.target = target
-        read = spec.model_columns  # which begin with the moving states
+        self.spec, self.target = spec, target
+        columns = spec.model_columns  # the moving states come first
         self.predicted = [spec.moving.index(i) for i in spec.predicted]
-        self.angles = [place for place, i in enumerate(read) if i in spec.angle_columns]
-        self.of_physics = [read.index(i) for i in spec.physics_columns]
+        self.angles = [place for place, i in enumerate(columns) if i in spec.angle_columns]
+        self.of_physics = [columns.index(i) for i in spec.physics_columns]
         names = (*spec.states, *spec.actions)
-        self.input_names = tuple(names[i] for i in read)
+        self.input_names = tuple(names[i] for i in columns)
         change = "change of " if target == "difference" else ""
         self.output_names = tuple(change + names[i] for i in spec.predicted)
 
@@ -49,7 +48,9 @@ class Targets:
         """Return targets ``... x m`` of transitions."""
         predicted = self.spec.predicted
         change = self.spec.change(states, next_states)[..., predicted]
-        return change if self.target == "difference" else states[..., predicted] + change
+        if self.target == "difference":
+            return change
+        return states[..., predicted] + change
 
     def decode(self, states: Tensor, targets: Tensor) -> Tensor:
         """Return next values of the predicted states, ``... x m``."""
@@ -59,48 +60,51 @@ class Targets:
 
 
 class TargetPhysics(Physics):
-    r"""Turns f_p, which returns next states, into a physics of the targets.
+    r"""The physics of the targets, by an f_p that returns next states.
 
-    Memory, batching and gradients are those of the physics itself.
+    Memory, batching and gradients are those of f_p.
     """
 
     def __init__(self, physics: Physics, targets: Targets) -> None:
         super().__init__(unknowns=physics.unknowns, name=physics.name)
-        self.physics = physics
-        self.targets = targets
+        self.physics, self.targets = physics, targets
         self.num_outputs = len(targets.predicted)
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """Return the targets that the physics stands for, ``N x m``."""
-        targets, num_states = self.targets, len(self.targets.spec.moving)
-        read = some_columns(X, targets.of_physics)
+        """Return the targets by the physics, ``N x m``."""
+        targets = self.targets
+        num_states = len(targets.spec.moving)
+        inputs = some_columns(X, targets.of_physics)
         try:
-            following = self.physics.of_rows(self.physics.read_rows(read, *parameters))
+            following = self.physics.of_rows(self.physics.read_rows(inputs, *parameters))
         except PhysicsError as error:
-            error.partial = None  # next states, which are no targets
+            error.partial = None  # it has next states, not targets
             raise
         check_next_values(self.physics, following, num_states)
-        change, columns = following - X[:, :num_states], []
+        change = following - X[:, :num_states]
+        columns = []
         for i in targets.predicted:
             column = change[:, i]
-            if i in targets.angles:
+            if i in targets.angles:  # the shortest way round
                 column = torch.atan2(column.sin(), column.cos())
-            columns.append(column if targets.target == "difference" else X[:, i] + column)
+            if targets.target == "absolute":
+                column = X[:, i] + column
+            columns.append(column)
         return torch.stack(columns, dim=-1)
 
     def forget(self) -> None:
-        """Forget what the physics remembers."""
+        """Clear the memory of the physics."""
         self.physics.forget()
 
     def extra_repr(self) -> str:
-        """Return the settings that ``repr`` shows."""
+        """Return the settings in ``repr``."""
         return f"target={self.targets.target!r}"
 
 
 class AngleInput(InputTransform):
-    r"""Replaces each angle :math:`\theta` in its place by :math:`\sin\theta, \cos\theta`.
+    r"""A transform of each angle :math:`\theta`, in its place, to :math:`\sin\theta, \cos\theta`.
 
-    A stationary kernel on the result has no seam where the angle wraps.
+    A stationary kernel on the result is continuous where the angle wraps.
 
     Args:
         columns: The columns of X that are angles in rad: one or more different numbers, from 0.
@@ -135,7 +139,7 @@ class AngleInput(InputTransform):
         return torch.stack(parts, dim=-1)
 
     def column_names(self, names: Sequence[str]) -> list[str]:
-        """Return the names of the columns of :meth:`transform`, of those of X."""
+        """Return the names of the columns of :meth:`transform`, by the names of those of X."""
         columns: list[str] = []
         for i, name in enumerate(names):
             columns += [f"sin({name})", f"cos({name})"] if i in self.columns else [name]
@@ -143,7 +147,7 @@ class AngleInput(InputTransform):
 
     @property
     def settings(self) -> dict[str, list[int]]:
-        """The arguments that make it again."""
+        """The arguments."""
         return {"columns": [*self.columns]}
 
     def equals(self, other: InputTransform) -> bool:
@@ -152,38 +156,38 @@ class AngleInput(InputTransform):
 
 
 def check_spec(spec: StateSpec) -> None:
-    """Raise a TypeError unless it is one."""
+    """Raise a TypeError unless ``spec`` is a StateSpec."""
     check_kind("spec", spec, StateSpec, "a StateSpec, such as StateSpec(['x', 'v'], ['force'])")
 
 
 def named_physics(physics: Any, spec: StateSpec) -> dict[str, Physics]:
-    """Return checked physics of next states by name: one, or those of a list or mapping."""
+    """Return checked physics of next states by name, from one, a list or a mapping."""
     named: Any = physics
     if not isinstance(named, Mapping):
         several = physics if isinstance(physics, list | tuple) else [physics]
-        named = {str(i + 1): each for i, each in enumerate(several)}
+        named = {str(i + 1): function for i, function in enumerate(several)}
     parts: dict[str, Physics] = {}
-    for name, each in named.items():
-        part = parts[name] = as_physics(each)
-        if isinstance(physics, Mapping) and part is not each:  # a wrapper of ours
+    for name, function in named.items():
+        part = parts[name] = as_physics(function)
+        if isinstance(physics, Mapping) and part is not function:  # not the user's object
             part.name = name
-        if not isinstance(part, ODEPhysics):
-            continue
-        if part.difference:
+        if isinstance(part, ODEPhysics) and part.difference:
             raise ValueError(
                 f"Physics {part.name!r} returns the change of the state (difference=True), but "
-                "dynamics take the next state from it; build it with difference=False."
+                "dynamics need the next state; build it with difference=False."
             )
-        if spec.step is not None and not math.isclose(part.step, spec.step, rel_tol=1e-6):
+        if part.step is None or spec.step is None:
+            continue
+        if not math.isclose(part.step, spec.step, rel_tol=1e-6):
             raise ValueError(
-                f"Physics {part.name!r} makes steps of {part.step:g}, but the spec says "
+                f"Physics {part.name!r} has steps of {part.step:g}, but the spec has "
                 f"{spec.step:g}; build it with step={spec.step:g}, or correct the spec."
             )
     return parts
 
 
 def one_physics(physics: Any, spec: StateSpec, otherwise: str) -> Physics:
-    """Return a physics of next states; a ValueError, with the way out, unless there is one."""
+    """Return a physics of next states; raise a ValueError, with the way out, unless it is one."""
     parts = [*named_physics(physics, spec).values()]
     if len(parts) != 1:
         names = ", ".join(repr(part.name) for part in parts)
@@ -194,16 +198,19 @@ def one_physics(physics: Any, spec: StateSpec, otherwise: str) -> Physics:
 def next_values(
     physics: Physics, spec: StateSpec, states: Tensor, actions: Tensor, parameters: Any = None
 ) -> Tensor:
-    """Return the next states ``... x state_dim`` by a physics, of which exogenous ones stay."""
-    inputs, following = spec.physics_inputs(states, actions), states.clone()
-    Y = physics(inputs if inputs.dim() > 1 else inputs.unsqueeze(0), parameters)
+    """Return the next states ``... x state_dim`` by a physics; exogenous states do not change."""
+    inputs = spec.physics_inputs(states, actions)
+    if inputs.dim() == 1:
+        inputs = inputs.unsqueeze(0)
+    Y = physics(inputs, parameters)
     check_next_values(physics, Y, len(spec.moving))
+    following = states.clone()
     following[..., spec.moving] = Y
     return spec.remember(following, states, actions)
 
 
 def check_next_values(physics: Physics, Y: Tensor, num_states: int) -> None:
-    """Raise a ValueError unless the physics has returned as many columns as there are states."""
+    """Raise a ValueError unless the physics returned a column for each state that moves."""
     if Y.shape[-1] != num_states:
         raise ValueError(
             f"Expected physics {physics.name!r} to return the next values of the {num_states} "
@@ -212,17 +219,19 @@ def check_next_values(physics: Physics, Y: Tensor, num_states: int) -> None:
 
 
 def warn_of_differences(name: str, spec: StateSpec, data: Trajectories, following: Tensor) -> None:
-    """Warn if what a physics returned is a third as far off as changes, in their units, or less."""
+    """Warn if outputs of a physics, read as changes, have at most a third of the error."""
+    # Errors in units of the changes, of the outputs as next states and as changes.
     scale = spec.change(data.states, data.next_states).square().nanmean(0).sqrt()
-    columns, errors = [i for i in spec.moving if scale[i] > 0], []
+    columns = [i for i in spec.moving if scale[i] > 0]
+    errors = []
     for predicted in (following, data.states + following):
         error = spec.change(data.next_states, predicted) / scale
         errors.append(float(error[:, columns].square().nansum().sqrt()))
     if errors[1] < errors[0] / 3:
         warnings.warn(
-            f"Physics {name!r} seems to return the change of the state, but dynamics take the next "
-            f"state from it. As a change, its error is {errors[1] / errors[0]:.2g} times that of "
-            "the next state. Let it return `next state = state + change`.",
+            f"Physics {name!r} seems to return the change of the state, but dynamics need the next "
+            f"state. Read as a change, its error is {errors[1] / errors[0]:.2g} times the error "
+            "as the next state. Let it return `next state = state + change`.",
             UserWarning,
             stacklevel=4,
         )
@@ -233,6 +242,6 @@ def checked_physics_error(spec: StateSpec, errors: Mapping[str, float] | None) -
     moving = [spec.states[i] for i in spec.moving]
     for name, sd in (errors or {}).items():
         if name not in moving:
-            raise ValueError(f"physics_error is of states among {moving}; found {name!r}.")
+            raise ValueError(f"physics_error names states among {moving}; found {name!r}.")
         checked_number(f"physics_error[{name!r}]", sd, least=0)
     return {**(errors or {})}

@@ -14,7 +14,7 @@ from gpadjust.states import StateSpec
 
 
 class Windows(NamedTuple):
-    """Parts of trajectories, of the same length, for free runs: ``w`` windows of ``T`` steps.
+    """Parts of trajectories with the same length, for free runs: ``w`` windows of ``T`` steps.
 
     Args:
         initial_states: ``w x state_dim``.
@@ -29,37 +29,36 @@ class Windows(NamedTuple):
 
     @property
     def states(self) -> Tensor:
-        """The initial states, then what was measured: ``w x (T + 1) x state_dim``."""
+        """The initial states, then the measured ones: ``w x (T + 1) x state_dim``."""
         return torch.cat([self.initial_states.unsqueeze(1), self.measured], dim=1)
 
     def some(self, rows: Tensor | list[int]) -> Windows:
-        """Return the windows of these numbers, or those where ``w`` booleans are true."""
+        """Return the windows by their numbers, or by a mask of ``w`` booleans."""
         return Windows(*(part[rows] for part in self))
 
     def spread(self, number: int, seed: int = 0) -> Windows:
-        """Draw a number of the windows evenly, as by :meth:`Trajectories.spread`."""
+        """Draw some windows evenly, as :meth:`Trajectories.spread` does."""
         return self.some(spread_rows(len(self.actions), number, seed))
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectories:
-    """Trajectories of a system: rows of transitions, and to which episode each belongs.
+    """Trajectories of a system: rows of transitions, each with the number of its episode.
 
-    The next state of a row is the state of the row after it if both are of the same episode. They
-    unpack to states, actions and next states, ``dynamics.update(*trajectories)``.
+    The next state of a row is the state of the row after it if both belong to the same episode.
+    They unpack to states, actions and next states, ``dynamics.update(*trajectories)``.
 
     Args:
         states: ``N x state_dim``.
         actions: ``N x action_dim``.
         next_states: ``N x state_dim``; NaN where an entry was not measured.
-        episode: ``N`` whole numbers; the rows of an episode follow each other. Default: each row is
-            an episode, as of transitions that were measured one by one.
+        episode: ``N`` whole numbers; the rows of an episode follow each other. Default: an episode
+            for each row, for transitions measured one by one.
         rewards: ``N``, of an agent's real steps. Default: none.
-        terminated: ``N`` booleans, whether the next state ended the episode. Default: none.
+        terminated: ``N`` booleans, True if the next state ended the episode. Default: none.
 
     Raises:
-        ValueError: If they differ in their numbers of rows, or an episode has rows of another one
-            between its own.
+        ValueError: If numbers of rows differ, or rows of another episode interrupt an episode.
 
     Example:
         >>> x = torch.arange(6, dtype=torch.float64).unsqueeze(-1)
@@ -80,17 +79,19 @@ class Trajectories:
     terminated: Tensor = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        """Number the episodes, and check the numbers of rows."""
-        given: Any = self.episode
-        episode = torch.arange(len(self.states)) if given is None else torch.as_tensor(given)
+        """Set the numbers of episodes, and check the numbers of rows."""
+        episode: Any = self.episode
+        if episode is None:
+            episode = torch.arange(len(self.states))
+        episode = torch.as_tensor(episode)
         if episode.is_floating_point() and (episode != episode.round()).any():
             raise ValueError(f"Expected episode as whole numbers, found {episode.tolist()[:5]}.")
         object.__setattr__(self, "episode", episode.long())
-        found = {name: len(tensor) for name, tensor in self._columns.items()}
-        if len({*found.values()}) > 1 or self.episode.dim() != 1:
+        lengths = {name: len(tensor) for name, tensor in self._columns.items()}
+        if len({*lengths.values()}) > 1 or self.episode.dim() != 1:
             raise ValueError(
-                f"Expected {', '.join(found)} with as many rows each, found "
-                f"{', '.join(f'{number} of {name}' for name, number in found.items())}."
+                f"Expected {', '.join(lengths)} with equally many rows, found "
+                f"{', '.join(f'{number} of {name}' for name, number in lengths.items())}."
             )
         if len(self.episode.unique_consecutive()) > len(self.episode.unique()):
             raise ValueError(
@@ -107,20 +108,21 @@ class Trajectories:
         next_states: Tensor,
         episode: Tensor | Sequence[int] | None = None,
     ) -> Trajectories:
-        """Take the user's tensors, copied.
+        """Return trajectories from copies of the user's tensors.
 
         Raises:
-            TypeError: If they are not float64 tensors.
-            ValueError: If shapes disagree, there are no rows, values are not finite, or nothing
-                was measured of a next state that a model predicts.
+            TypeError: If the arguments are not float64 tensors.
+            ValueError: If shapes disagree, there are no rows, values are not finite, or a row has
+                no measured entry that a model predicts.
         """
         named = {"states": states, "actions": actions, "next_states": next_states}
-        for name, tensor in named.items():
-            check_doubles(name, tensor, spec.action_dim if name == "actions" else spec.state_dim)
+        check_doubles("states", states, spec.state_dim)
+        check_doubles("actions", actions, spec.action_dim)
+        check_doubles("next_states", next_states, spec.state_dim)
         if states.dim() != 2 or len({t.shape[:-1] for t in named.values()}) > 1 or not len(states):
             raise ValueError(
-                "Expected states, actions and next_states with as many rows each, and at least "
-                f"one; got shapes {', '.join(str(tuple(t.shape)) for t in named.values())}."
+                "Expected states, actions and next_states with equally many rows, one or more; "
+                f"got shapes {', '.join(str(tuple(t.shape)) for t in named.values())}."
             )
         check_finite("states", states)
         check_finite("actions", actions)
@@ -131,7 +133,7 @@ class Trajectories:
         return cls(**copies, episode=episode)  # type: ignore[arg-type]
 
     def __iter__(self) -> Iterator[Tensor]:
-        """Yield states, actions and next states."""
+        """Return an iterator over states, actions and next states."""
         return iter((self.states, self.actions, self.next_states))
 
     def __len__(self) -> int:
@@ -150,6 +152,7 @@ class Trajectories:
 
     @property
     def _lengths(self) -> list[int]:
+        """The number of steps of each episode."""
         lengths: list[int] = self.episode.unique_consecutive(return_counts=True)[1].tolist()
         return lengths
 
@@ -158,55 +161,62 @@ class Trajectories:
         return {name: value for name, value in vars(self).items() if value is not None}
 
     def append(self, other: Trajectories) -> Trajectories:
-        """Return these trajectories, then others; no episode goes on in them."""
+        """Return these trajectories, then the episodes of others."""
         last = self.episode.max() if len(self) else -1
         first = other.episode.min() if len(other) else 0
-        parts = self._columns, other._columns
-        parts[1]["episode"] = other.episode - first + last + 1
-        names = parts[0].keys() & parts[1].keys()
-        return Trajectories(**{name: torch.cat([part[name] for part in parts]) for name in names})
+        ours, theirs = self._columns, other._columns
+        # The numbers of the other episodes begin after the last one here.
+        theirs["episode"] = other.episode - first + last + 1
+        names = ours.keys() & theirs.keys()
+        return Trajectories(**{name: torch.cat([ours[name], theirs[name]]) for name in names})
 
     def some(self, rows: Tensor | slice) -> Trajectories:
-        """Return the rows of these numbers, a slice, or those where ``N`` booleans are true.
+        """Return the rows by their numbers, a slice, or a mask of ``N`` booleans.
 
-        Episodes are numbered again: one ends wherever the row after it is left out.
+        Episodes get new numbers: one ends wherever the next row is left out.
         """
         numbers = torch.arange(len(self))[rows]
         columns = {name: column[numbers] for name, column in self._columns.items()}
+        # An episode begins after each gap of the row numbers, too.
         begins = (numbers.diff() != 1) | (columns["episode"].diff() != 0)
         columns["episode"][1:] = begins.cumsum(0)
         columns["episode"][:1] = 0
         return Trajectories(**columns)
 
     def episodes(self) -> list[Trajectories]:
-        """Return the episodes, each by itself."""
+        """Return a list of the episodes."""
         return [self.some(rows) for rows in torch.arange(len(self)).split(self._lengths)]
 
     def spread(self, number: int, seed: int = 0) -> Trajectories:
-        """Draw a number of the rows evenly: one of each of as many parts of the same length."""
+        """Draw some rows evenly: one from each of ``number`` parts of the same length."""
         return self.some(spread_rows(len(self), number, seed))
 
     def windows(self, length: int, stride: int | None = None) -> Windows:
         """Cut windows within episodes, to compare with :meth:`Dynamics.free_run`.
 
-        A window starts only at a state that was measured in full; else at the next one that was.
+        A window starts at a fully measured state; if a state is incomplete, at the next full one.
 
         Args:
             length: The number ``T`` of steps.
-            stride: Steps from the start of a window to that of the next. Default: ``length``.
+            stride: Steps between the starts of two windows. Default: ``length``.
 
         Raises:
-            ValueError: If no episode is as long, or a number is no positive whole one.
+            ValueError: If no episode is as long, or a number is not whole and positive.
         """
         checked_whole("length", length, 1)
-        stride = length if stride is None else checked_whole("stride", stride, 1)
-        complete, starts, end = (~self.states.isnan().any(-1)).tolist(), [], 0
+        stride = checked_whole("stride", length if stride is None else stride, 1)
+        is_complete = (~self.states.isnan().any(-1)).tolist()
+        starts: list[int] = []
+        end = 0
         for steps in self._lengths:
-            row, end = end, end + steps
+            row = end
+            end += steps
             while row + length <= end:
-                if complete[row]:
+                if is_complete[row]:
                     starts.append(row)
-                row += stride if complete[row] else 1
+                    row += stride
+                else:
+                    row += 1
         if not starts:
             raise ValueError(
                 f"Expected stretches of {length} steps from a state measured in full, found none; "
@@ -224,9 +234,10 @@ def check_doubles(name: str, tensor: Tensor, columns: int) -> None:
 
 
 def spread_rows(total: int, number: int, seed: int) -> Tensor:
-    """Draw from the numbers below ``total``, one of each of ``number`` parts of the same length."""
+    """Draw numbers below ``total``, one from each of ``number`` parts of the same length."""
     if checked_whole("number", number, 1) > total:
-        raise ValueError(f"Expected number <= {total}, that of all there are, got {number}.")
+        raise ValueError(f"Expected number <= {total}, the number of all rows, got {number}.")
+    # A random row within each of `number` equal parts.
     edges = torch.arange(number + 1) * total // number
     generator = torch.Generator().manual_seed(seed)
     share = torch.rand(number, generator=generator, dtype=torch.float64)

@@ -1,1 +1,1 @@
-"""Files: measured tables, read with errors that name line and column, and what is on the disk."""
+"""Files: measured tables, with errors that name line and column, and names on the disk."""

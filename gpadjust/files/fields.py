@@ -34,18 +34,21 @@ _COMMON_UNITS = frozenset(
 
 
 def number(text: str, decimal: str = ".", *, grouped: bool = False) -> float:
-    """Return the number of a field: NaN if it is missing, infinity if it is none.
+    """Return the number in a field: NaN if it is missing, infinity if the field is not a number.
 
-    Thousands may be apart by blanks or apostrophes; by the other mark, a point or comma, where the
-    decimal mark is there too, or if they are known to be ``grouped``.
+    Blanks or apostrophes may separate thousands. A point or comma separates them where the field
+    has the other mark, too, or if ``grouped``.
     """
     if text.lower() in MISSING or not text.strip("-"):
         return math.nan
-    text = text.replace("\u2212", "-")
+    text = text.replace("\u2212", "-")  # the minus sign of word processors
     match = _GROUPED.fullmatch(text)
-    mark = match[1] if match else decimal
-    if mark != decimal and (grouped or mark not in ".," or decimal in text or text.count(mark) > 1):
-        text = text.replace(mark, "")
+    if match and match[1] != decimal:
+        separator = match[1]
+        # One point or comma alone may be a decimal mark.
+        is_clear = separator not in ".," or decimal in text or text.count(separator) > 1
+        if grouped or is_clear:
+            text = text.replace(separator, "")
     if "_" in text or (decimal != "." and "." in text):
         return math.inf  # Python would take 1_000, and 1.000 may be a thousand there
     try:
@@ -60,21 +63,24 @@ def is_number(text: str) -> bool:
 
 
 def is_missing(text: str) -> bool:
-    """Return whether a field is empty, or says that nothing was measured."""
+    """Return whether a field is empty or has a word for a missing value."""
     return math.isnan(number(text))
 
 
 def decimal_of(fields: Sequence[str], delimiter: str) -> tuple[str, bool]:
-    """Return the decimal mark of a table's numbers, and whether the other one parts thousands.
+    """Return the decimal mark of a table, and whether the other mark separates thousands.
 
-    Where 1,234 may be either it is a point, and thousands are not parted.
+    If 1,234 is ambiguous in the table, the decimal mark is a point and thousands have no mark.
     """
     commas = [text for text in fields if "," in text and is_number(text)]
     both = [text for text in commas if "." in text]
     if both:  # 1,234.5 or 1.234,5
         return max(".,", key=both[0].rfind), True
-    may_part = (_GROUPED.fullmatch(text) and text.lstrip("+-")[0] != "0" for text in commas)
-    return (",", False) if commas and (delimiter == ";" or not all(may_part)) else (".", False)
+    # 0,123 and 12,34 cannot be thousands; a semicolon parts the fields of decimal commas.
+    are_thousands = (_GROUPED.fullmatch(text) and text.lstrip("+-")[0] != "0" for text in commas)
+    if commas and (delimiter == ";" or not all(are_thousands)):
+        return ",", False
+    return ".", False
 
 
 def is_moment(text: str) -> bool:
@@ -85,86 +91,99 @@ def is_moment(text: str) -> bool:
 def seconds_of(texts: Sequence[str]) -> list[float]:
     """Return dates and times of day as seconds since the first.
 
-    Dates are as of ISO 8601, ``2015-02-02 14:19:00``, or with points, ``2.2.2015 14:19``; with
-    strokes, too, if they are days before months, or months before days, in all rows or none.
+    Dates follow ISO 8601, ``2015-02-02 14:19:00``, or have points, ``2.2.2015 14:19``. Dates with
+    strokes need the same order of day and month in all rows.
 
     Raises:
-        ValueError: If one is none, or they may be read in two ways.
+        ValueError: If a text is not a date, or the order of day and month is ambiguous.
     """
     readings: list[list[float]] = []
     for day_first in (True, False):
         moments = [_moment(text.strip(), day_first) for text in texts]
-        known = [moment for moment in moments if moment is not None]
-        if len(known) < len(moments) or len({kind for kind, _ in known}) > 1:
+        parsed = [moment for moment in moments if moment is not None]
+        # All rows must be of one kind: a clock time has no date to subtract.
+        if len(parsed) < len(moments) or len({kind for kind, _ in parsed}) > 1:
             continue
-        seconds = [(since - known[0][1]).total_seconds() for _, since in known]
+        seconds = [(since - parsed[0][1]).total_seconds() for _, since in parsed]
         if seconds not in readings:
             readings.append(seconds)
     if len(readings) == 1:
         return readings[0]
     if readings:
         raise ValueError(
-            f"expected dates in one way, found {texts[0]!r}, whose day and month may be either; "
+            f"expected unambiguous dates, found {texts[0]!r}, whose day and month may be swapped; "
             "write dates as 2015-02-28"
         )
-    found = next((text for text in texts if not is_moment(text.strip())), texts[0])
+    wrong = next((text for text in texts if not is_moment(text.strip())), texts[0])
     raise ValueError(
-        "expected all as dates such as 2015-02-28 14:19:00, or all as times such as 14:19:00, "
-        f"found {found!r}"
+        "expected only dates such as 2015-02-28 14:19:00, or only times such as 14:19:00, "
+        f"found {wrong!r}"
     )
 
 
 def _moment(text: str, day_first: bool) -> tuple[str, timedelta] | None:
-    """Return the kind of a moment and its time since some beginning; None of another text."""
+    """Return the kind of a moment and its time since a fixed date; None for any other text."""
     match = _MOMENT.fullmatch(text)
     if not text or match is None:
         return None
     year, month, day, first, mark, second, last = match.groups()[:7]
-    hour, minute, of_minute, half, zone = match.groups()[7:]
+    hour, minute, clock_second, half, zone = match.groups()[7:]
     if first is not None:
         if len(last) == 2 and mark != ".":
-            return None
-        day, month = (first, second) if day_first or mark == "." else (second, first)
-        year = last if len(last) == 4 else f"20{last}"
+            return None  # 1/2/03 may begin with any of the three
+        day, month = second, first
+        if day_first or mark == ".":
+            day, month = first, second
+        year = f"20{last}"[-4:]
     clock = timedelta()
     if hour is not None:
-        hours = int(hour) % 12 + 12 * (half.lower() == "pm") if half else int(hour)
-        seconds = float((of_minute or "0").replace(",", "."))
+        hours = int(hour)
+        if half:  # 12 am is hour 0, 12 pm is hour 12
+            hours = hours % 12 + 12 * (half.lower() == "pm")
+        seconds = float((clock_second or "0").replace(",", "."))
         clock = timedelta(hours=hours, minutes=int(minute), seconds=seconds)
+    if year is None and clock_second is None:
+        return None  # 01:30 may be minutes
     if year is None:
-        return None if of_minute is None else ("clock", clock)  # 01:30 may be minutes
+        return "clock", clock
     try:
         date = datetime.fromisoformat(f"{year}-{month:0>2}-{day:0>2}T00:00:00{zone or '+00:00'}")
     except ValueError:
         return None
-    return "date" if zone is None else "zoned", date - _BEGINNING + clock
+    kind = "zoned" if zone else "date"
+    return kind, date - _BEGINNING + clock
 
 
 def split_unit(name: str) -> tuple[str, str]:
-    """Return ``"head"`` and ``"m"`` of ``"head [m]"`` or ``"head (m)"``; no unit if there is none.
+    """Return ``"head"`` and ``"m"`` of ``"head [m]"`` or ``"head (m)"``; ``""`` without a unit.
 
     Example:
         >>> split_unit("Servo 3 (us)"), split_unit("head")
         (('Servo 3', 'us'), ('head', ''))
     """
     match = _NAME.fullmatch(name.strip())
-    return (match[1], (match[2] or match[3] or "").strip()) if match else (name, "")
+    if not match:
+        return name, ""
+    return match[1], (match[2] or match[3] or "").strip()
 
 
 def is_unit(text: str) -> bool:
-    """Return whether a field is a unit, in brackets or of common ones, such as ``m/s``."""
+    """Return whether a field is a unit: in brackets, or made of common units, such as ``m/s``."""
     if text[:1] + text[-1:] in ("[]", "()"):
         return True
+    # "m/s^2" has the parts m and s.
     parts = re.split(r"[\s*/·^\d().-]+", normalize("NFKC", text).casefold())
     return all(part in _COMMON_UNITS for part in parts if part)
 
 
 def seconds_in(unit: str) -> float | None:
-    """Return the seconds in a unit of time; None of another unit."""
+    """Return the seconds in a unit of time; None for any other unit."""
     return _SECONDS.get(normalize("NFKC", unit).casefold())
 
 
 def time_unit_of(name: str) -> str:
-    """Return the unit of time that a name is or ends with, as ``time_ms`` or ``millis``, or ""."""
+    """Return the unit of time at the end of a name, as in ``time_ms`` or ``millis``, or ""."""
     last = re.split(r"[\s_.-]+", name.strip())[-1]
-    return last if seconds_in(last) is not None else ""
+    if seconds_in(last) is None:
+        return ""
+    return last

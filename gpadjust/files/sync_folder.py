@@ -7,9 +7,9 @@ from pathlib import Path
 
 
 def sync_folder(path: Path) -> None:
-    """Wait until the names of the files in a folder are on the disk, where the system supports it.
+    """Wait until the names of the files in a folder are on the disk, if the system supports it.
 
-    A file that was written and synchronised is else lost with its name when the power is cut.
+    Without this, a power cut may remove the name of a file whose content is on the disk.
     """
     if os.name == "posix":
         folder = os.open(path, os.O_RDONLY)

@@ -1,8 +1,9 @@
-"""Columns of a CSV file or a spreadsheet, read as they are."""
+"""Columns of a CSV file or a spreadsheet."""
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -16,39 +17,39 @@ from gpadjust.files.rows import is_value, numeric_columns, rows_of_sheet, rows_o
 from gpadjust.physics.formula import symbol
 
 LARGEST = 1e100
-"""The largest number that is read; squares of more are no numbers."""
-_OF_RECORDS = "Say which column it is, such as `states={'theta': 'q'}`."
+"""The largest number that is accepted; squares of larger ones may overflow."""
+_RECORDS_HINT = "Name its column, as in `states={'theta': 'q'}`; None, if a state was not measured."
 
 
 class Table:
     r"""The columns of a table by their names.
 
-    Delimiter, decimal mark and encoding are found, unless given. Names are in the line before the
-    first numbers, with units in brackets, ``[m]`` or ``(m)``, or in a line of their own; what is
-    before is not read. Where the names are one fewer than the fields of all lines, the first column
-    has the names of rows, as R writes them. Lines and columns are counted from 1, as editors do.
-    Lines of nothing but empty fields are left out.
+    Delimiter, decimal mark and encoding are inferred. Names are in the line before the first
+    numbers. Units are in brackets after the names, ``[m]`` or ``(m)``, or in a line below them.
+    Earlier lines are skipped, as are lines without a value. If each row has one field more than
+    there are names, the first column has the names of the rows, as R writes them. Lines and columns
+    are counted from 1, as in editors.
 
     Args:
-        file: The file: a CSV file, or a workbook, ``*.xlsx`` (the extra ``excel``).
-        delimiter: The mark between two fields of a CSV file. Default: the one that fits.
-        decimal: The decimal mark of its numbers, a point or a comma. Default: the one that fits.
-        names: The names of all columns, of a file without, or in place of its own.
+        file: A CSV file, or a workbook, ``*.xlsx`` (the extra ``excel``).
+        delimiter: The mark between two fields of a CSV file. Default: inferred.
+        decimal: The decimal mark of its numbers, a point or a comma. Default: inferred.
+        names: The names of all columns, which replace the names in the file.
         sheet: The sheet of a workbook that has more than one.
-        hint: The way out where a column is not there.
-        is_command: Whether errors name options as on a command line.
+        hint: The advice of the error on a missing column.
+        is_command: If True, errors name options as on a command line.
 
     Attributes:
         names: The names of all columns, without units.
-        units: Their units, empty where there is none.
-        lines: The line of each row, at which an editor shows its beginning.
-        remarks: Sentences on lines that are not read, and on a column that has no name.
+        units: The units of all columns, or "".
+        lines: The line in the file at which each row begins.
+        remarks: Sentences on skipped lines, and on a column without a name.
 
     Raises:
         OSError: If the file cannot be read.
         ImportError: If it is a workbook, and openpyxl is not installed.
-        ValueError: If it is no table, has no names, no rows or several sheets, or a row has not one
-            field for each name.
+        ValueError: If it is not a table, has no names, no rows or several sheets, or a row does not
+            have one field for each name.
 
     Example:
         >>> from pathlib import Path
@@ -71,10 +72,11 @@ class Table:
         decimal: str | None = None,
         names: Sequence[str] | None = None,
         sheet: str | None = None,
-        hint: str = _OF_RECORDS,
+        hint: str = _RECORDS_HINT,
         is_command: bool = False,
     ) -> None:
-        self.file, self._hint, self._is_command = str(file), hint, is_command
+        self.file = str(file)
+        self._hint, self._is_command = hint, is_command
         self._is_text = Path(file).suffix.lower() != ".xlsx"
         mark = ""
         if not self._is_text:
@@ -86,28 +88,37 @@ class Table:
         rows = [row for row in rows if any(row[1])]
         fields = [row for _, row in rows]
         header, units, first = _heads(fields, names is not None)
+        if not rows:
+            raise ValueError(
+                f"{file}: expected a line of names and then rows, found an empty file."
+            )
         if first >= len(rows):
-            what = "only a line of names" if rows else "an empty file"
-            raise ValueError(f"{file}: expected a line of names and then rows, found {what}.")
+            raise ValueError(
+                f"{file}: expected a line of names and then rows, found only a line of names."
+            )
         if header is None and names is None:
             shown = ", ".join(map(repr, fields[0][:5]))
             raise ValueError(
                 f"{file}, line {rows[0][0]}: expected a line of names before the numbers, found "
                 f"{shown}; give names of all columns by {self._option('names', ['a', 'b'])}."
             )
-        self._header, self._rows = rows[header or 0][0], rows[first:]
+        self._header = rows[header or 0][0]
+        self._rows = rows[first:]
         self.remarks: list[str] = []
         if header:
-            self.remarks.append(f"{file}: the names are in line {self._header}; not read before.")
-        self.headers = self._one_for_each_field([] if header is None else fields[header], names)
+            remark = f"{file}: the names are in line {self._header}; earlier lines are not read."
+            self.remarks.append(remark)
+        header_fields = [] if header is None else fields[header]
+        self.headers = self._header_of_each_field(header_fields, names)
         self.names, self.units = _names_and_units(self.headers, fields[units] if units else [])
         self.lines = tuple(line for line, _ in self._rows)
-        commas = [text for _, row in self._rows for text in row if "," in text]
-        self.decimal, self._has_groups = read.decimal_of(commas, mark)
-        if decimal is not None:
-            self.decimal, self._has_groups = decimal, True
         if not self._is_text:
-            self.decimal, self._has_groups = ".", False  # its numbers have none
+            self.decimal, self._has_groups = ".", False  # cells of a workbook are Python's numbers
+        elif decimal is not None:
+            self.decimal, self._has_groups = decimal, True
+        else:
+            commas = [text for _, row in self._rows for text in row if "," in text]
+            self.decimal, self._has_groups = read.decimal_of(commas, mark)
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -117,11 +128,11 @@ class Table:
         return self.names[self._column(name)]
 
     def unit(self, name: str) -> str:
-        """Return the unit of a column, empty if there is none."""
+        """Return the unit of a column, or ""."""
         return self.units[self._column(name)]
 
     def label(self, name: str) -> str:
-        """Return the name of a column with its unit, as ``head [m]``."""
+        """Return the name of a column with its unit, such as ``head [m]``."""
         return self._labels[self._column(name)]
 
     def texts(self, name: str) -> list[str]:
@@ -130,24 +141,23 @@ class Table:
         Raises:
             ValueError: If there is no such column, or several, or a field is empty.
         """
-        column, texts = self._column(name), []
+        column = self._column(name)
         for line, fields in self._rows:
-            texts.append(fields[column])
-            if not texts[-1]:
+            if not fields[column]:
                 self._refuse(line, column, "a text", "")
-        return texts
+        return [fields[column] for _, fields in self._rows]
 
     def categories(self, name: str) -> tuple[Tensor, tuple[float, ...] | tuple[str, ...]]:
-        """Return the categories of a column: numbers, ``N``, and the levels, sorted.
+        """Return the categories of a column: numbers, ``N``, and the sorted levels.
 
-        Where a field is no number the levels are the texts, and the numbers are theirs, from 0.
+        If a field is not a number, the levels are texts, numbered from 0.
 
         Raises:
             ValueError: If there is no such column, or several, or a field is empty.
         """
         texts = self.texts(name)
         values = [self._number(text) for text in texts]
-        if all(map(math.isfinite, values)):
+        if all(map(math.isfinite, values)):  # numbers are their own levels
             return torch.tensor(values, dtype=torch.float64), tuple(sorted({*values}))
         levels = tuple(sorted({*texts}))
         return torch.tensor([levels.index(t) for t in texts], dtype=torch.float64), levels
@@ -157,23 +167,24 @@ class Table:
 
         Args:
             name: The name of the column.
-            may_miss: Whether numbers may be missing: NaN, where a field is empty or says so.
+            may_miss: If True, return NaN for an empty field or a word for a missing value.
 
         Raises:
-            ValueError: If there is no such column, or several, or a field is no finite number, or
-                one beyond 1e100.
+            ValueError: If there is no such column, or several, or a field is not a finite number,
+                or one beyond 1e100.
         """
-        column, values = self._column(name), []
-        expected = "a number, or nothing where it was not measured" if may_miss else "a number"
+        column = self._column(name)
+        expected = "a number, or nothing if it was not measured"
+        if not may_miss:
+            expected = "a number"
+        values = []
         for line, fields in self._rows:
-            text = fields[column]
-            value = self._number(text)
+            value = self._number(fields[column])
             if not math.isfinite(value) and not (may_miss and math.isnan(value)):
-                self._refuse(line, column, expected, text)
+                self._refuse(line, column, expected, fields[column])
             if abs(value) > LARGEST:
-                self._refuse(
-                    line, column, f"a number between {-LARGEST:.0e} and {LARGEST:.0e}", text
-                )
+                limits = f"a number between {-LARGEST:.0e} and {LARGEST:.0e}"
+                self._refuse(line, column, limits, fields[column])
             values.append(value)
         return torch.tensor(values, dtype=torch.float64)
 
@@ -185,37 +196,43 @@ class Table:
         """Return the times of a column, ``N``, in a unit of time, by default in seconds.
 
         Dates and times of day become the time since the first. Numbers are in the unit of the
-        column's name, in brackets or as in ``time_ms``, and without one in ``unit``.
+        column, in brackets or as in ``time_ms``, or in ``unit`` if the column has no unit.
 
         Raises:
-            ValueError: If there is no such column, a field is no number, or is a date beside
-                numbers or one that may be read in two ways; if the column is in minutes, hours,
-                days or no unit of time, unless the unit of the result is given.
+            ValueError: If there is no such column, a field is not a number, dates are ambiguous or
+                mixed with numbers, or the column is in minutes, hours, days or not in a unit of
+                time, unless ``unit`` is given.
         """
         column = self._column(name)
         where = f"{self.file}, column {column + 1} ({self.headers[column]!r})"
-        size = read.seconds_in(unit or "s")
-        if size is None:
+        seconds_in_unit = read.seconds_in(unit or "s")
+        if seconds_in_unit is None:
             raise ValueError(f"Expected a unit of time, s, ms, us, min, h or d, found {unit!r}.")
         if self.has_dates(name):
             try:
                 seconds = read.seconds_of(self.texts(name))
             except ValueError as error:
                 raise ValueError(f"{where}: {error}.") from error
-            return torch.tensor(seconds, dtype=torch.float64) / size
-        own = self.units[column] or read.time_unit_of(self.names[column])
-        own_size = read.seconds_in(own or unit or "s")
-        if unit is None and (own_size is None or own_size > 1):
+            return torch.tensor(seconds, dtype=torch.float64) / seconds_in_unit
+        column_unit = self.units[column] or read.time_unit_of(self.names[column])
+        seconds_in_column = read.seconds_in(column_unit or unit or "s")
+        # A step of minutes or more may have rates per minute, too: the user decides.
+        if unit is None and (seconds_in_column is None or seconds_in_column > 1):
             in_s = self._option("time_unit", "s")
-            way = f"if the column is in seconds, {in_s}."
-            if own_size is not None:
-                per_own = self._option("time_unit", own)
-                way = f"if rates are per {own}, {per_own}; if per s, {in_s}, which converts it."
-            raise ValueError(f"{where}: expected a time in seconds, found {own!r}; {way}")
-        return self.numbers(name) * ((own_size or size) / size)
+            advice = f"if the column is in seconds, {in_s}."
+            if seconds_in_column is not None:
+                in_column_unit = self._option("time_unit", column_unit)
+                advice = (
+                    f"if rates are per {column_unit}, {in_column_unit}; if per s, {in_s}, which "
+                    "converts it."
+                )
+            raise ValueError(
+                f"{where}: expected a time in seconds, found {column_unit!r}; {advice}"
+            )
+        return self.numbers(name) * ((seconds_in_column or seconds_in_unit) / seconds_in_unit)
 
     def _number(self, text: str) -> float:
-        """Return a number; NaN for nothing, infinity for what is none."""
+        """Return the number in a field by the conventions of the table."""
         return read.number(text, self.decimal, grouped=self._has_groups)
 
     @property
@@ -224,79 +241,86 @@ class Table:
         return [f"{name} [{unit}]" if unit else name for name, unit in pairs]
 
     def _column(self, name: str) -> int:
-        """Return the place of a column: by its name as it is, without its unit, or as a symbol."""
+        """Return the place of a column: by its header, its name without the unit, or its symbol."""
         symbols = [*map(symbol, self.names)]
         places: list[int] = []
-        for known in (self.headers, self._labels, self.names, symbols):
-            places = [i for i, other in enumerate(known) if other == name]
-            if len(places) == 1:
-                return places[0]
+        # The first spelling that occurs decides, so that headers come before shorter forms.
+        for spellings in (self.headers, self._labels, self.names, symbols):
+            places = [i for i, spelling in enumerate(spellings) if spelling == name]
             if places:
                 break
+        if len(places) == 1:
+            return places[0]
         where = f"{self.file}, line {self._header}"
         if places:
             columns = " and ".join(str(place + 1) for place in places)
             raise ValueError(
                 f"{where}: expected one column {name!r}, found columns {columns}; "
-                "rename those that are not meant."
+                "rename all but one."
             )
-        found = ", ".join(map(repr, self.headers))
-        # Units and capitals are no part of a likeness.
+        listed = ", ".join(map(repr, self.headers))
+        # Names are compared without units and capitals.
         plain = dict(zip(map(str.casefold, self.names), self.headers, strict=True))
-        near = get_close_matches(read.split_unit(name)[0].casefold(), plain, n=1)
-        meant = f" Is it {plain[near[0]]!r}?" if near else ""
-        raise ValueError(f"{where}: expected a column {name!r}, found {found}.{meant} {self._hint}")
+        similar = get_close_matches(read.split_unit(name)[0].casefold(), plain, n=1)
+        question = "".join(f" Is it {plain[match]!r}?" for match in similar)
+        raise ValueError(
+            f"{where}: expected a column {name!r}, found {listed}.{question} {self._hint}"
+        )
 
-    def _one_for_each_field(
+    def _header_of_each_field(
         self, header: Sequence[str], names: Sequence[str] | None
     ) -> tuple[str, ...]:
-        """Return names of all columns; empty fields at the end of rows are left out."""
+        """Return names of all columns; drop empty fields at the end of rows."""
         width = max(len(fields) for _, fields in self._rows)
         while width > 1 and not any(field for _, row in self._rows for field in row[width - 1 :]):
             width -= 1
-        found = [name.lstrip("#%").strip() for name in header] if names is None else [*names]
-        while len(found) > width and not found[-1]:
-            found.pop()
-        if names is None and len(found) == width - 1 and self._begins_with_names(width):
-            found.insert(0, "")
-            self.remarks.append(f"{self.file}: the first column has no name, and those of rows.")
-        width = len(found)
+        headers = [name.lstrip("#%").strip() for name in header]  # a comment may have the names
+        if names is not None:
+            headers = [*names]
+        while len(headers) > width and not headers[-1]:
+            headers.pop()
+        if names is None and len(headers) == width - 1 and self._begins_with_names(width):
+            headers.insert(0, "")
+            self.remarks.append(f"{self.file}: the first column has no name; it names the rows.")
+        width = len(headers)
         for i, (line, fields) in enumerate(self._rows):
-            kept = fields[:width] if not any(fields[width:]) else fields
-            if len(kept) != width:
+            row = fields
+            if not any(fields[width:]):  # a delimiter at the end of a line
+                row = fields[:width]
+            if len(row) != width:
                 fields_s = "field" + "s" * (width != 1)
                 raise ValueError(
                     f"{self.file}, line {line}: expected {width} {fields_s}, one for each name, "
-                    f"found {len(kept)}; correct the line, or leave it out."
-                    f"{self._miscounted(found, kept)}"
+                    f"found {len(row)}; correct the line, or leave it out."
+                    f"{self._miscounted(headers, row)}"
                 )
-            self._rows[i] = line, kept
-        return tuple(found)
+            self._rows[i] = line, row
+        return tuple(headers)
 
     def _begins_with_names(self, width: int) -> bool:
-        """Return whether the first fields of all rows are 1, 2, 3 ..., or no numbers."""
+        """Return whether the first fields of all rows are 1, 2, 3 ..., or all texts."""
         texts = [fields[0] for _, fields in self._rows if len(fields) == width]
         are_numbered = texts == [str(i + 1) for i in range(len(texts))]
         return len(texts) == len(self) and (are_numbered or not any(map(is_value, texts)))
 
     def _miscounted(self, names: Sequence[str], fields: Sequence[str]) -> str:
-        """Return a hint why a row has other fields than there are names."""
+        """Return a hint why the numbers of fields and names differ, or ""."""
         if len(fields) == 2 * len(names) and all(map(read.is_number, fields)):
-            return " Are its commas decimal commas, too? Save it with semicolons in between."
+            return " Are its commas decimal commas, too? Save it with semicolons between fields."
         if len(fields) == len(names) + 1:
-            return " Has one of its columns no name? Give names of all: " + self._option(
-                "names", [*names, "other"]
-            )
+            option = self._option("names", [*names, "other"])
+            return f" Does a column have no name? Name all columns: {option}"
         return ""
 
     def _option(self, name: str, value: str | list[str]) -> str:
-        """Return an option as its user writes it."""
+        """Return an option in the syntax of Python or of the command line."""
         if not self._is_command:
             return f"`{name}={value!r}`"
         text = value if isinstance(value, str) else ",".join(value)
         return f"--{name.replace('_', '-')} {text!r}"
 
     def _refuse(self, line: int, column: int, expected: str, text: str) -> NoReturn:
+        """Raise the error of a field."""
         raise ValueError(
             f"{self.file}, line {line}, column {column + 1} ({self.headers[column]!r}): expected "
             f"{expected}, found {text!r}; correct the field, or leave the line out."
@@ -304,10 +328,10 @@ class Table:
         )
 
     def _cause(self, line: int, column: int, text: str) -> str:
-        """Return a hint why a field may be no number."""
+        """Return a hint why a field may not be a number, or ""."""
         value, _, unit = text.partition(" ")
         if read.is_moment(text):
-            return " Dates are read as the time of a log, and as inputs."
+            return " A date may be the time of a log, or an input."
         if value and unit and read.is_number(value):
             return f" Write its unit into the name, {self.names[column]} [{unit}]."
         if line == self.lines[0] and not any(map(is_value, self._rows[0][1])):
@@ -315,40 +339,43 @@ class Table:
         if not read.is_number(text):
             return ""
         if not self._is_text:
-            return " It is a text there, not a number."
-        other, name = (",", "comma") if self.decimal == "." else (".", "point")
-        way = f" If this {name} is a decimal {name}, say so by {self._option('decimal', other)}"
+            return " The cell is a text, not a number."
+        # The other mark is in the way: a decimal mark, or a separator of thousands.
+        other, name = {".": (",", "comma"), ",": (".", "point")}[self.decimal]
+        hint = f" If this {name} is a decimal {name}, use {self._option('decimal', other)}"
         if math.isfinite(read.number(text, self.decimal, grouped=True)):
-            way += f"; if it parts thousands, by {self._option('decimal', self.decimal)}"
-        return f"{way}."
+            hint += f"; if it separates thousands, {self._option('decimal', self.decimal)}"
+        return f"{hint}."
 
 
-def _heads(
-    rows: Sequence[Sequence[str]], names_are_given: bool
-) -> tuple[int | None, int | None, int]:
-    """Return the rows that have the names and the units, or None, and the first row of data.
+def _heads(rows: Sequence[Sequence[str]], has_names: bool) -> tuple[int | None, int | None, int]:
+    """Return the row of names and the row of units, or None, and the first row of data.
 
-    Names are words above columns of numbers, in the last row before the data. A row with numbers
-    there is one of names only if none are given.
+    Names are words above columns of numbers, in the last row before the data. A row of words and
+    numbers has the names only if the user gave none.
     """
-    numeric, width = numeric_columns(rows), max(map(len, rows), default=0)
-    heads = [] if numeric else [0]
+    numeric = numeric_columns(rows)
+    width = max(map(len, rows), default=0)
+    if not numeric:  # a table of texts: its first row has the names
+        return 0, None, 1
+    heads: list[int] = []
     first = 0
-    for i, row in enumerate(rows if numeric else ()):
+    for i, row in enumerate(rows):
         fields = [row[k] for k in numeric if k < len(row)]
-        has_words, has_values = any(map(_is_word, fields)), any(map(is_value, fields))
-        may_be_data = bool(heads) or names_are_given or not has_words
-        if has_values and may_be_data and len(row) >= width - 1:
+        has_words = any(map(_is_word, fields))
+        may_be_data = bool(heads) or has_names or not has_words
+        if may_be_data and any(map(is_value, fields)) and len(row) >= width - 1:
             first = i
             break
+        # A row of names may lack one name, but is not a remark of one field.
         if has_words and sum(map(bool, row)) >= min(width, max(2, width - 1)):
             heads.append(i)
     if not heads and first and any(map(_is_word, rows[first - 1])):
-        heads = [first - 1]  # of another number of fields, which is refused
+        heads = [first - 1]  # of another number of fields, which is an error
     if not heads:
         return None, None, first
-    *before, last = heads
-    if before and before[-1] == last - 1:
+    last = heads[-1]
+    if heads[-2:] == [last - 1, last]:  # two rows of words: the second may have the units
         marks = [rows[last][k] for k in numeric if k < len(rows[last]) and rows[last][k]]
         if all(map(read.is_unit, marks)):
             return last - 1, last, last + 1
@@ -362,12 +389,12 @@ def _is_word(field: str) -> bool:
 def _names_and_units(
     headers: Sequence[str], units: Sequence[str]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return names without units, and units; what is in brackets stays where names need it."""
+    """Return names without units, and units; keep brackets that distinguish two names."""
     if units:
         return tuple(headers), tuple(unit.strip("[]() ") for unit in units[: len(headers)])
     pairs = [read.split_unit(header) for header in headers]
-    short = [name for name, _ in pairs]
-    for i, header in enumerate(headers):
-        if short.count(short[i]) > 1:
-            pairs[i] = header, ""
+    counts = Counter(name for name, _ in pairs)
+    for i, (name, _) in enumerate(pairs):
+        if counts[name] > 1:  # x [m] and x [s] are two names
+            pairs[i] = headers[i], ""
     return tuple(name for name, _ in pairs), tuple(unit for _, unit in pairs)

@@ -18,23 +18,25 @@ from gpadjust.core.terms import Places
 from gpadjust.core.unknowns import Values
 from gpadjust.physics import as_physics
 
-_EXACT = 1e-6  # of the squared unit: the noise of a low level beside known variances of the high
+_EXACT = 1e-6  # noise of the low level, in its squared unit, if that of the high level is known
 
 
 class AR1(GP):
     r"""Auto-regressive co-kriging, :math:`f_2(x) = \rho f_1(x) + \delta(x)` with a constant rho.
 
     The classic of multi-fidelity modelling (Kennedy and O'Hagan 2000; Wannawas and Faisal 2023,
-    sec. 2.1.3), for comparison: a Gaussian process of the data and ``N_1`` samples of f_p, with one
-    noise level each, far from which it forgets the physics. Data, predictions and left-out targets
-    are of the high level. Args and errors as of :class:`~gpadjust.core.GP`, and:
+    sec. 2.1.3), for comparison: a Gaussian process of the data and ``N_1`` samples of f_p, each
+    with its own noise variance. Far from the samples it does not use the physics. Data, predictions
+    and left-out targets belong to the high level. Args and errors as of
+    :class:`~gpadjust.core.GP`, and:
 
     Args:
         physics: The low level f_p, sampled in ``bounds``.
         bounds: ``2 x d`` lower and upper bounds of the inputs.
         num_low: Number ``N_1`` of samples of f_p.
-        low_X: Instead of the three above, the inputs of the low level, ``n_1 x d``;
-        low_Y: and its values, ``n_1 x m``, NaN where one is missing (by default f_p's).
+        low_X: Inputs of the low level, ``n_1 x d``, in place of samples in ``bounds``.
+        low_Y: Values of the low level, ``n_1 x m``, NaN where one is missing. Default: f_p at
+            ``low_X``.
         low_covar_module: The kernel of the low level. Default: RBF.
         delta_covar_module: The kernel of delta. Default: RBF.
         seed: Seed of the (scrambled Sobol) samples.
@@ -43,7 +45,7 @@ class AR1(GP):
         ValueError: If neither ``physics`` with ``bounds`` nor ``low_X`` with its values is given.
     """
 
-    low: Any = None  # the data of the low level; not before units of the high one are known
+    low: Any = None  # the data of the low level; set after the units of the high level
 
     def __init__(
         self, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike = None, *,
@@ -58,15 +60,16 @@ class AR1(GP):
             )
         if low_X is None:
             d = as_tensor(train_X, "train_X").shape[-1]
-            number, box = checked_whole("num_low", num_low, 2), checked_bounds("bounds", bounds, d)
+            number = checked_whole("num_low", num_low, 2)
+            box = checked_bounds("bounds", bounds, d)
             low_X = draw_sobol_samples(box, n=number, q=1, seed=checked_whole("seed", seed))
             low_X = low_X.squeeze(-2)
         if low_Y is None:
             f_p = as_physics(physics)
             if f_p.unknowns:
                 raise ValueError(
-                    f"Expected a physics without unknown parameters, as it is sampled once; found "
-                    f"{', '.join(f_p.unknowns)} of {f_p.name!r}. CKA learns them."
+                    f"Expected a physics without unknown parameters, as AR1 samples it once; found "
+                    f"{', '.join(f_p.unknowns)} of {f_p.name!r}. CKA estimates them."
                 )
             with torch.no_grad():
                 low_Y = f_p(as_tensor(low_X, "low_X"))
@@ -74,9 +77,10 @@ class AR1(GP):
         sizes = [len(names_of(train_X, "x")), len(names_of(train_Y, "y"))]
         if sizes != [low.X.shape[-1], low.Y.shape[-1]]:
             raise ValueError(
-                f"Expected a low level of {sizes[0]} inputs and {sizes[1]} outputs, as the high "
-                f"one; found {low.X.shape[-1]} and {low.Y.shape[-1]}."
+                f"Expected a low level with {sizes[0]} inputs and {sizes[1]} outputs, as the high "
+                f"level; found {low.X.shape[-1]} and {low.Y.shape[-1]}."
             )
+        # f_l = b_low(l) g_low + b_delta(l) delta, with b_low = rho^l and b_delta = l
         terms = [
             Term("low", AtLevels(as_kernel(low_covar_module), low.X, has_rho=True)),
             Term("delta", AtLevels(as_kernel(delta_covar_module), low.X)),
@@ -92,13 +96,14 @@ class AR1(GP):
         self.low = low
 
     def kernel_inputs(self, X: Tensor) -> Tensor:
-        """Return inputs and their level, 1; before the training inputs those of level 0."""
+        """Return inputs with their level, 1; put inputs of level 0 before the training inputs."""
         x = self.data.kernel_inputs(X)
         high = torch.cat([x, torch.ones_like(x[..., :1])], -1)
         if self.low is None or X is not self.data.X:
             return high
-        x = self.data.kernel_inputs(self.low.X.to(X))
-        return appended(torch.cat([x, torch.zeros_like(x[..., :1])], -1), high)
+        low_x = self.data.kernel_inputs(self.low.X.to(X))
+        low = torch.cat([low_x, torch.zeros_like(low_x[..., :1])], -1)
+        return appended(low, high)
 
     def targets(self) -> Tensor:
         """Return the targets of both levels, each in its unit, ``... x m x (n_1 + n)``."""
@@ -109,15 +114,17 @@ class AR1(GP):
 
     def left_out(self) -> Marginals:
         """Return the distribution of each target of the high level given all others."""
-        return Marginals(*(each[..., len(self.low.X) :, :] for each in super().left_out()))
+        high = slice(len(self.low.X), None)
+        return Marginals(*(moment[..., high, :] for moment in super().left_out()))
 
     def left_out_at(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Return means and variances of targets of the high level, left out, at coordinates."""
+        """Return means and variances of left-out targets of the high level, at coordinates."""
+        high = slice(len(self.low.X), None)
         mean, variance = super().left_out_at(u)
-        return mean[..., len(self.low.X) :, :], variance[..., len(self.low.X) :, :]
+        return mean[..., high, :], variance[..., high, :]
 
     def subset_output(self, idcs: list[int]) -> Self:
-        """Return the model of some outputs; a ValueError if there are none of these numbers."""
+        """Return the model of some outputs; raise a ValueError for an unknown number."""
         new = super().subset_output(idcs)
         new.low = self.low.of_outputs(self.checked_outputs(idcs))
         return new
@@ -130,20 +137,20 @@ class AR1(GP):
 class AtLevels(Kernel):
     r"""The kernel :math:`b(l) \, (k(x, x') + \kappa) \, b(l')` of levels l, the last input.
 
-    b is :math:`\rho^l`, with a normal prior of rho in units of both levels, or l. Lengthscales are
-    to fit the inputs of the low level, too.
+    b is :math:`\rho^l`, with a normal prior of rho in units of both levels, or l. The priors of
+    lengthscales consider the inputs of the low level, too.
     """
 
     def __init__(self, kernel: Kernel, low_x: Tensor, has_rho: bool = False) -> None:
         self.kernel, self.low_x, self.has_rho = kernel, low_x, has_rho
 
     def of_data(self, data: Data) -> AtLevels:
-        """Return the kernel of transformed inputs, and with names."""
+        """Return the kernel of the transformed inputs of a model."""
         low_x = data.kernel_inputs(self.low_x.to(data.X))
         return AtLevels(self.kernel.of_data(data), low_x, self.has_rho)
 
     def rows(self, x: Tensor, num_outputs: int) -> list[Row]:
-        """Return the numbers of k, kappa and rho."""
+        """Return the rows of k, kappa and rho."""
         one = x.new_ones(num_outputs, 1)
         rows = self.kernel.rows(torch.cat([self.low_x, x]), num_outputs)
         rows += [Row.positive("constant", DELTA_CONSTANT.median * one, DELTA_CONSTANT.factor)]
@@ -151,24 +158,34 @@ class AtLevels(Kernel):
 
     def basis(self, own: Values, x: Tensor) -> Tensor:
         """Return b, ``... x S x m x n``."""
-        return 1 + x[..., -1] * (own["rho"] - 1) if self.has_rho else x[..., -1]
+        level = x[..., -1]
+        if not self.has_rho:
+            return level
+        return 1 + level * (own["rho"] - 1)  # rho^l for l in {0, 1}
 
     def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
         """Return the covariances of inputs with others, or with themselves."""
-        point = None if other is None else other[..., :-1]
-        k = self.kernel.covariance(own, x[..., :-1], point) + own["constant"].unsqueeze(-1)
-        left, right = (self.basis(own, each) for each in (x, x if other is None else other))
-        return left.unsqueeze(-1) * k * right.unsqueeze(-2)
+        left = self.basis(own, x)
+        if other is None:
+            k = self.kernel.covariance(own, x[..., :-1])
+            right = left
+        else:
+            k = self.kernel.covariance(own, x[..., :-1], other[..., :-1])
+            right = self.basis(own, other)
+        # b(l) (k + kappa) b(l')
+        return left.unsqueeze(-1) * (k + own["constant"].unsqueeze(-1)) * right.unsqueeze(-2)
 
     def with_pull_back(self, own: Values, x: Tensor) -> tuple[Tensor, PullBack]:
-        """Return the covariance, and what gives derivatives by the numbers."""
+        """Return the covariance, and the function of its derivatives by the parameters."""
         k, back = self.kernel.with_pull_back(own, x[..., :-1])
-        k, b = k + own["constant"].unsqueeze(-1), self.basis(own, x)
+        k = k + own["constant"].unsqueeze(-1)
+        b = self.basis(own, x)
 
         def pull_back(D: Tensor) -> Values:
+            # K_ij = b_i k_ij b_j, so that dL/dk_ij = b_i D_ij b_j
             by_k = b.unsqueeze(-1) * D * b.unsqueeze(-2)
             by = back(by_k) | {"constant": by_k.sum((-1, -2)).unsqueeze(-1)}
-            if self.has_rho:  # db_i / drho = l_i
+            if self.has_rho:  # dL/db_i = 2 sum_j D_ij k_ij b_j, and db_i/drho = l_i
                 by_b = 2 * ((D * k) @ b.unsqueeze(-1)).squeeze(-1)
                 by["rho"] = (x[..., -1] * by_b).sum(-1, keepdim=True)
             return by
@@ -176,35 +193,36 @@ class AtLevels(Kernel):
         return b.unsqueeze(-1) * k * b.unsqueeze(-2), pull_back
 
     def features(self, own: Values, number: int, generator: torch.Generator) -> Features:
-        """Return those of k and the constant, times b."""
-        of_k = self.kernel.features(own, number, generator)
+        """Return the features of k and the constant, times b."""
+        kernel_features = self.kernel.features(own, number, generator)
 
         def features(x: Tensor) -> Tensor:
-            phi, b = of_k(x[..., :-1]), self.basis(own, x).unsqueeze(-1)
-            one = own["constant"].sqrt().unsqueeze(-1).expand_as(phi[..., :1])
-            return torch.cat([phi, one], -1) * b
+            # b(l) [phi(x), sqrt(kappa)]
+            phi = kernel_features(x[..., :-1])
+            root = own["constant"].sqrt().unsqueeze(-1).expand_as(phi[..., :1])
+            return torch.cat([phi, root], -1) * self.basis(own, x).unsqueeze(-1)
 
         return features
 
 
 class LevelNoise(Noise):
-    """A learnt variance of each level."""
+    """A noise with one unknown variance for each level."""
 
     def shares(self, places: Places) -> Tensor:
-        """Return which of the two variances an input has, ``... x 1 x 1 x n x 2``."""
+        """Return the shares of both variances at each input, ``... x 1 x 1 x n x 2``."""
         level = places.x[..., -1]
         return torch.stack([1 - level, level], -1)
 
     def with_known(self, known: KnownNoise) -> Noise:
-        """Return noise of known variances of the high level, and a low one next to exact."""
+        """Return a noise with known variances of the high level."""
         return KnownAtHigh(known.known)
 
 
 class KnownAtHigh(KnownNoise):
-    """Known variances of the high level, and a low one next to exact."""
+    """Known variances of the high level, and a nearly exact low level."""
 
     def variance(self, values: Values, places: Places, is_training: bool = False) -> Tensor:
-        """Return the variances, of both levels at the training inputs."""
+        """Return the variances; at the training inputs those of both levels."""
         variances = super().variance(values, places, is_training)
         if not is_training:
             return variances

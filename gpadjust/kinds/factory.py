@@ -1,4 +1,4 @@
-"""Models made by a structure, such as CKA, or by a function of the user's own."""
+"""Models made by a structure, such as CKA, or by the user's function."""
 
 from __future__ import annotations
 
@@ -18,18 +18,21 @@ arguments, or a function."""
 
 
 def with_options(factory: ModelFactory, options: Mapping[str, Any]) -> ModelFactory:
-    """Return a factory with further arguments by name, except None and those that it has already.
+    """Return a factory with options as further arguments, if they are not None.
 
-    A ``link`` makes the structure :func:`~gpadjust.kinds.links.linked`.
+    Arguments of a ``functools.partial`` go before. A ``link`` makes the structure
+    :func:`~gpadjust.kinds.links.linked`.
 
     Raises:
         TypeError: If there is a link, and the factory is not a structure or a partial of one.
     """
     if not callable(factory):
-        return factory  # make_model says what it has to be
-    own = factory if isinstance(factory, partial) else partial(factory)
-    further = {n: v for n, v in options.items() if n not in own.keywords and v is not None}
-    make: Any = own.func
+        return factory  # make_model raises the error
+    base = partial(factory)  # of a partial, a partial of the same function
+    further = {n: v for n, v in options.items() if n not in base.keywords and v is not None}
+    if not further:
+        return factory
+    make: Any = base.func
     if "link" in further:
         is_structure = isinstance(make, type) and issubclass(make, GP)
         if not is_structure:
@@ -38,7 +41,7 @@ def with_options(factory: ModelFactory, options: Mapping[str, Any]) -> ModelFact
                 f"{factory!r}. Use the link in the function: LinkedCKA(X, Y, link=...)."
             )
         make = linked(make)
-    return partial(make, *own.args, **own.keywords, **further) if further else factory
+    return partial(make, *base.args, **base.keywords, **further)
 
 
 def make_model(
@@ -46,12 +49,12 @@ def make_model(
 ) -> Any:
     """Return a new model of inputs ``n x d`` and targets ``n x m``, made by a factory.
 
-    Further arguments, such as ``physics``, are left out if they are None. Those of a
+    Further arguments, such as ``physics``, are omitted if they are None. Arguments of a
     ``functools.partial`` other than a physics (kernels, a noise) are copied for each model.
 
     Raises:
-        TypeError: If the factory is not callable, does not take the arguments, or makes something
-            else than a ``kind``.
+        TypeError: If the factory is not callable, does not take the arguments, or does not return
+            a ``kind``.
     """
     if not callable(factory):
         raise TypeError(
@@ -59,8 +62,8 @@ def make_model(
             f"functools.partial(CKA, rho_mean=2.0); found {factory!r}."
         )
     if isinstance(factory, partial):
-        own = {n: v if n == "physics" else deepcopy(v) for n, v in factory.keywords.items()}
-        factory = partial(factory.func, *factory.args, **own)
+        copies = {n: deepcopy(v) for n, v in factory.keywords.items() if n != "physics"}
+        factory = partial(factory, **copies)
     model = factory(X, Y, **{name: v for name, v in arguments.items() if v is not None})
     if not isinstance(model, kind):
         raise TypeError(

@@ -18,20 +18,20 @@ from gpadjust.core.terms import Places, TermSum
 from gpadjust.core.unknowns import Values
 
 _SIZES = math.log(1e3)  # range of the logarithm of an outlier's standard deviation
-_NEAR = 3.0  # standard deviations, nearer than which outliers are no more likely than there
-_SUSPECT = 0.9  # of the largest of n standard normal numbers, for a row to be tried
-_PATIENCE = 3  # sets of outliers that are tried after the best one
-_MOST = 1 / 3  # of the observations are outliers
+_NEAR = 3.0  # standard deviations; the density of outliers is constant below
+_SUSPECT = 0.9  # threshold, as a share of the expected maximum of n standard normal numbers
+_PATIENCE = 3  # sets of outliers to try after the best one
+_MOST = 1 / 3  # largest share of outliers
 
 
 class RowNoise(Noise):
-    """Another noise, and what rough fits have learnt of training rows; later ones have its base.
+    """A noise with corrections for single training rows, found by rough fits.
 
     Args:
-        base: The noise of new observations. Default: one learnt variance of each output.
-        added: What is added to the variances of the training targets, ``m x n``, in their unit
-            squared.
-        moved: What is added to their means, ``m x n``, in their unit.
+        base: The noise of new observations. Default: one unknown variance for each output.
+        added: Corrections of the variances of the training targets, ``m x n``, in their squared
+            unit.
+        moved: Corrections of the means of the training targets, ``m x n``, in their unit.
     """
 
     of_targets = ("added", "moved")
@@ -39,47 +39,50 @@ class RowNoise(Noise):
     def __init__(
         self, base: Noise | None = None, added: Tensor | float = 0.0, moved: Tensor | float = 0.0
     ) -> None:
-        self.base = Noise() if base is None else base
-        if not isinstance(self.base, Noise):
+        if base is None:
+            base = Noise()
+        if not isinstance(base, Noise):
             raise TypeError(
                 f"Expected base as a noise, such as RelativeNoise(); found {base!r}. Known "
                 "variances are a model's train_Yvar."
             )
-        super().__init__(self.base.names, self.base.priors)
-        self.known, self.shift = self.base.known, self.base.shift + moved
+        super().__init__(base.names, base.priors)
+        self.base = base
+        self.known = base.known
+        self.shift = base.shift + moved
         self.added, self.moved = added, moved
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What builds it again; known variances are a model's train_Yvar."""
+        """The arguments; known variances are a model's train_Yvar, not a base."""
         is_default = type(self.base) is Noise and self.base.priors == Noise().priors
         base = None if is_default or isinstance(self.base, KnownNoise) else self.base
         return {"base": base, "added": self.added}
 
     def having(self, base: Noise, added: Tensor | float = 0.0, moved: Tensor | float = 0.0) -> Self:
-        """Return the noise with another base and other numbers of rows."""
+        """Return the noise with another base and other corrections."""
         new = copy(self)
         RowNoise.__init__(new, base, added, moved)
         return new
 
     def learnt(self, model: Any, fitted: Callable[[Noise], Any]) -> Self:
-        """Return the noise with what rough fits show of each row, of a base that does so first."""
+        """Return the noise with corrections by rough fits; estimate the base first."""
         zeros = torch.zeros_like(model.data.Y.mT)
         base = self.base.learnt(model, fitted)
         noise = self.having(base, zeros, zeros).refined(model, fitted)
         if base is self.base:
             return noise
-        # With what is now known of the rows, the base learns more of them, and so on.
+        # Outliers have distorted the base: estimate it again with the corrections, and then these.
         base = base.learnt(model, lambda b: fitted(noise.having(b, noise.added, noise.moved)))
         return self.having(base, zeros, zeros).refined(model, fitted)
 
     @abstractmethod
     def refined(self, model: Any, fitted: Callable[[Noise], Any]) -> Self:
-        """Return the noise with numbers of rows, by rough fits that begin with none."""
+        """Return the noise with corrections by rough fits, the first without corrections."""
 
     @property
     def has_shares(self) -> bool:
-        """Whether the variances of the base depend on x."""
+        """True if the variances of the base depend on x."""
         return self.base.has_shares
 
     @property
@@ -92,7 +95,7 @@ class RowNoise(Noise):
         return self.base.shares(places)
 
     def variance(self, values: Values, places: Places, is_training: bool = False) -> Tensor:
-        """Return the variances of the base; of training rows with what is added."""
+        """Return the variances of the base, corrected at training rows."""
         variance = self.base.variance(values, places, is_training)
         return variance + self.added if is_training else variance
 
@@ -105,37 +108,37 @@ class RowNoise(Noise):
         return self.mapped(lambda v: v, "of_terms", terms)
 
     def with_known(self, known: KnownNoise) -> Self:
-        """Return the noise with known variances in place of a learnt one."""
+        """Return the noise with known variances in place of an unknown one."""
         is_plain = type(self.base) in (Noise, KnownNoise)
         base = known if is_plain else self.base.with_known(known)
         return self.having(base, self.added, self.moved)
 
     def appended(self, variances: Tensor | None, num_points: int) -> Self:
-        """Return the noise of further rows, too."""
+        """Return the noise with further rows, which have no corrections."""
         return self.mapped(lambda v: pad(v, (0, num_points)), "appended", variances, num_points)
 
     def mapped(self, change: Callable[[Tensor], Tensor], method: str, *arguments: Any) -> Any:
-        """Return the noise with other numbers of rows and another base; None if that is None."""
+        """Return the noise with changed corrections and base; None if the base becomes None."""
         new = super().mapped(change, method, *arguments)
         return None if new.base is None else self.having(new.base, new.added, new.moved)
 
 
 class HeavyTails(RowNoise):
-    r"""Outliers among the observations: their noise is larger by any factor.
+    r"""Noise with outliers, whose errors are larger by any factor.
 
-    An observation is an outlier with a probability :math:`\pi`; the logarithm of the standard
-    deviation of its error is then uniform over three decades, so that the density of a residual r
-    from what the others predict is :math:`1 / (2 |r| \log 10^3)`. Which ones are outliers is
-    searched greedily by rough fits, as in relevance pursuit (Ament et al. 2024): the rows with the
-    largest left-out residuals are taken out, the other numbers fitted again, and of all sets so
-    found the likeliest is kept. In a fit outliers have variances by which their densities are
-    :math:`\pi` times the one above.
+    An observation is an outlier with the probability :math:`\pi`. The logarithm of the standard
+    deviation of its error is then uniform over three decades, so that a residual r from the
+    left-out prediction has the density :math:`1 / (2 |r| \log 10^3)`. A greedy search by rough
+    fits finds the outliers, as in relevance pursuit (Ament et al. 2024): it takes out the rows
+    with the largest left-out residuals, fits the other numbers again, and returns the likeliest of
+    all sets so far. In a fit, the variance of an outlier gives it :math:`\pi` times the density
+    above.
 
     Args:
         share: :math:`\pi`.
-        base: The noise of other observations. Default: one learnt variance of each output, or a
+        base: The noise of other observations. Default: one unknown variance for each output, or a
             model's ``train_Yvar``.
-        added: What a fit has learnt, variances ``m x n`` of the outliers.
+        added: Variances ``m x n`` of the outliers, set by a fit.
 
     Example:
         >>> import torch
@@ -157,82 +160,97 @@ class HeavyTails(RowNoise):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What builds it again."""
+        """The arguments."""
         return super().settings | {"share": self.share}
 
     @property
     def is_outlier(self) -> Tensor | None:
-        """Mask ``n x m`` of the training targets that the fit takes for outliers."""
+        """Mask ``n x m`` of the outliers among the training targets; None before a fit."""
         return (self.added > 0).mT if isinstance(self.added, Tensor) else None
 
     @torch.no_grad()
     def outliers(self, model: Any) -> Tensor:
         """Return the probability that each training target is an outlier, ``n x m``.
 
-        It is by what all others predict, over all draws of the fitted model; 0 of missing targets.
+        It compares left-out predictions over all draws of the model; a missing target has 0.
         """
-        found = self._left_out(model)
-        odds = found.tails.logsumexp(0) - found.normal.logsumexp(0)
+        left_out = self._left_out(model)
+        odds = left_out.tails.logsumexp(0) - left_out.normal.logsumexp(0)
         return odds.sigmoid().mT.masked_fill(model.data.Y.isnan(), 0.0)
 
     @torch.no_grad()
     def refined(self, model: Any, fitted: Callable[[Noise], Any]) -> Self:
-        """Return the noise with the likeliest outliers that a greedy search finds."""
-        noise, densities, tried = self, [], []
+        """Return the noise with the likeliest set of outliers of a greedy search."""
+        noise = self
+        densities: list[Tensor] = []
+        variances: list[Tensor] = []  # of the outliers of each set, 0 for other rows
         while True:
+            # Fit the other numbers, and score the set by its posterior density.
             model = fitted(noise)
-            found = noise._left_out(model)
+            left_out = noise._left_out(model)
             outlying = torch.as_tensor(noise.added > 0)
             density = model.log_likelihood(model.u, False)[0][0]
             density = density - 0.5 * model.u[0].square().sum(-1)
-            # The densities by the tails in place of those in the fit.
-            exchanged = ((found.tails - found.in_fit)[0] * outlying).sum(-1)
-            is_own = len(density) == len(outlying)  # else outputs share unknown numbers
-            density = density + (exchanged if is_own else exchanged.sum())
-            densities.append(density.expand(len(outlying)))
-            tried.append(outlying * found.spread[0])
-            best, sets = torch.stack(densities).argmax(0), torch.stack(tried) > 0
-            # Outliers that remain, and the rows that are farthest off: one, or a fourth of those
-            # that are likely, as neighbours of an outlier may seem so, too.
-            is_likely, z = (found.tails > found.normal)[0], found.z[0].masked_fill(outlying, 0.0)
+            # Outliers have the density of the tails, not that of the variance in the fit.
+            exchanged = ((left_out.tails - left_out.in_fit)[0] * outlying).sum(-1)
+            if len(density) != len(outlying):  # outputs share unknown numbers
+                exchanged = exchanged.sum()
+            densities.append((density + exchanged).expand(len(outlying)))
+            variances.append(outlying * left_out.spread[0])
+            best = torch.stack(densities).argmax(0)
+            sets = torch.stack(variances) > 0
+            # The next set has the outliers that are still likely, and the rows with the largest
+            # residuals: one, or a quarter of the likely ones. Not all, as the neighbours of an
+            # outlier may have large residuals, too.
+            is_likely = (left_out.tails > left_out.normal)[0]
+            z = left_out.z[0].masked_fill(outlying, 0.0)
+            # sqrt(2 log n) is the expected maximum of n standard normal numbers.
             is_suspect = z > _SUSPECT * math.sqrt(2 * math.log(z.shape[-1]))
             number = 1 + (is_likely & is_suspect).sum(-1, keepdim=True) // 4
             is_first = z.argsort(-1, descending=True).argsort(-1) < number
             following = (outlying & is_likely) | (is_suspect & is_first)
-            is_done = (sets == following).all(-1).any(0) | (len(tried) - best > _PATIENCE)
+            # An output is done if its set repeats, has not improved for a while, or is too large.
+            is_done = (sets == following).all(-1).any(0)
+            is_done |= len(variances) - best > _PATIENCE
             is_done |= following.sum(-1) > _MOST * following.shape[-1]
             if is_done.all():
-                chosen = torch.stack([tried[i][j] for j, i in enumerate(best.tolist())])
-                return self.having(self.base, chosen)
+                likeliest = torch.stack([variances[i][j] for j, i in enumerate(best.tolist())])
+                return self.having(self.base, likeliest)
             following = torch.where(is_done.unsqueeze(-1), outlying, following)
-            noise = self.having(self.base, following * found.spread[0])
+            noise = self.having(self.base, following * left_out.spread[0])
 
     def _left_out(self, model: Any) -> _LeftOut:
-        values, conditioning = model.values, model.conditioning()
+        """Return the left-out predictions of a model, with and without an outlier at each row."""
+        values = model.values
+        conditioning = model.conditioning()
         noise = self.base.variance(values, model.places(model.data.X, values), True)
         mean, in_fit = conditioning.left_out()
         residual = (conditioning.targets - mean).nan_to_num()
+        # The variance of the row if it is not an outlier; rounding may take off too much.
         variance = (in_fit - self.added).maximum(noise).nan_to_num(nan=1.0)
+        # Density of an outlier: pi / (2 |r| log 10^3).
         size = residual.abs().maximum(_NEAR * variance.sqrt())
-        inverse = 2 * _SIZES / self.share * size  # of the density of an outlier
+        inverse = 2 * _SIZES / self.share * size
         return _LeftOut(
             tails=-inverse.log(),
             normal=_log_normal(residual, variance) + math.log1p(-self.share),
             in_fit=_log_normal(residual, in_fit.nan_to_num(nan=1.0)),
             z=residual.abs() / variance.sqrt(),
+            # N(0, v) has at 0 the density 1 / sqrt(2 pi v), which is to be 1 / inverse.
             spread=inverse.square() / (2 * math.pi),
         )
 
 
 class _LeftOut(NamedTuple):
-    """Each training target by what all others predict, ``S x m x n``."""
+    """Left-out predictions of the training targets, ``S x m x n``."""
 
-    tails: Tensor  # log density, if it is an outlier
-    normal: Tensor  # and if it is not
-    in_fit: Tensor  # and with the variance that it has in the fit
+    tails: Tensor  # log density of an outlier
+    normal: Tensor  # log density of any other row
+    in_fit: Tensor  # log density with the variance in the fit
     z: Tensor  # residual in standard deviations
-    spread: Tensor  # variance of an outlier of the density by the tails
+    spread: Tensor  # variance of a normal distribution with the density of the tails
 
 
 def _log_normal(residual: Tensor, variance: Tensor) -> Tensor:
+    # log N(r; 0, v) = -(r^2 / v + log(2 pi v)) / 2
     return -0.5 * (residual.square() / variance + (2 * math.pi * variance).log())

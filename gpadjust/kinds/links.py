@@ -1,4 +1,4 @@
-"""Links: outputs with bounds, which a model without bounds is made of."""
+"""Links: models of outputs with bounds."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ _LOW, _HIGH = (NormalDist().cdf(z) for z in (-1.0, 1.0))  # the ends of 68.27 %
 class Link(NamedTuple):
     r"""The link :math:`g(y) = \log \frac{y - a}{b - y} - c` of an output between bounds a and b.
 
-    Without an upper bound it is :math:`\log(y - a) - c`. The location c of each output is the mean
-    of the targets' links, so that nothing depends on the unit of a positive output.
+    Without an upper bound, :math:`g(y) = \log(y - a) - c`. The location c of each output is the
+    mean of g at the targets, so that nothing depends on the unit of a positive output.
     """
 
     lower: float
@@ -46,24 +46,23 @@ class Link(NamedTuple):
     def of(cls, link: Any) -> Link:
         """Return the link of a name or of two bounds, without a location."""
         bounds: Any = NAMED.get(link) if isinstance(link, str) else link
-        types = [type(v) for v in bounds] if isinstance(bounds, tuple | list) else []
-        if len(types) != 2 or not {*types} <= {int, float}:
+        is_pair = isinstance(bounds, tuple | list) and len(bounds) == 2
+        if not is_pair or not {*map(type, bounds)} <= {int, float}:
             raise TypeError(f"Expected link as 'log', 'logit' or two bounds; found {link!r}.")
         lower, upper = map(float, bounds)
         if not (math.isfinite(lower) and lower < upper):
             raise ValueError(
                 f"Expected a finite lower bound below the upper one; found {lower:g} and {upper:g}."
-                " Of an output with an upper bound alone, model its distance from that."
+                " If an output has an upper bound only, model its distance from the bound."
             )
         return cls(lower, upper, torch.zeros((), dtype=torch.float64))
 
     @property
     def formula(self) -> str:
         """The link as a formula of y."""
-        above = f"y - {self.lower:g}" if self.lower else "y"
+        above = f"(y - {self.lower:g})" if self.lower else "y"
         if math.isinf(self.upper):
-            return f"log({above})"
-        above = f"({above})" if self.lower else above
+            return f"log({above.strip('()')})"
         return f"log({above} / ({self.upper:g} - y))"
 
     def holds(self, y: Tensor) -> Tensor:
@@ -71,27 +70,32 @@ class Link(NamedTuple):
         return ~((y <= self.lower) | (y >= self.upper))
 
     def logs(self, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Return log(y - a) and log(b - y), minus infinity beyond a bound; 0 without the upper."""
-        above, below = (v.clamp_min(0.0).log() for v in (y - self.lower, self.upper - y))
-        return above, torch.zeros_like(y) if math.isinf(self.upper) else below
+        """Return log(y - a) and log(b - y), minus infinity beyond a bound; 0 without an upper."""
+        above = (y - self.lower).clamp_min(0.0).log()
+        if math.isinf(self.upper):
+            return above, torch.zeros_like(y)
+        return above, (self.upper - y).clamp_min(0.0).log()
 
     def value(self, y: Tensor) -> Tensor:
-        """Return g of values ``... x m``: infinite at the bounds and beyond, NaN stays."""
+        """Return g of values ``... x m``: infinite at the bounds and beyond; NaN of NaN."""
         above, below = self.logs(y)
         return above - below - self.location.to(y)
 
     def log_slope(self, y: Tensor) -> Tensor:
         """Return the logarithm of the derivative of g."""
         above, below = self.logs(y)
-        size = 0.0 if math.isinf(self.upper) else math.log(self.upper - self.lower)
-        return size - above - below  # dg / dy = 1 / (y - a), or (b - a) / ((y - a) (b - y))
+        if math.isinf(self.upper):
+            return -above  # dg / dy = 1 / (y - a)
+        # dg / dy = (b - a) / ((y - a) (b - y))
+        return math.log(self.upper - self.lower) - above - below
 
     def inverse(self, z: Tensor) -> Tensor:
-        """Return y of values g, within the bounds and finite however large or small these are."""
+        """Return y of values of g, strictly within the bounds and finite despite rounding."""
         z = z + self.location.to(z)
         bounds = z.new_tensor([self.lower, min(self.upper, _LARGEST)])
         least, most = bounds.nextafter(bounds.flip(0)).tolist()
         is_open = math.isinf(self.upper)
+        # y = a + e^(g + c), or a + (b - a) / (1 + e^-(g + c))
         above = z.exp() if is_open else (self.upper - self.lower) * z.sigmoid()
         return (self.lower + above).clamp(least, most)
 
@@ -101,12 +105,12 @@ class Link(NamedTuple):
 
 
 class LinkedMarginals(Marginals):
-    """Mixtures of distributions at points by themselves that are Gaussian after a link."""
+    """Mixtures of distributions at single points, Gaussian after a link."""
 
     link: Link
 
     def __new__(cls, means: Tensor, variances: Tensor, link: Link) -> Self:
-        """Make one of means and variances of the components, ``... x S x q x m``, after a link."""
+        """Make mixtures from means and variances of components, ``... x S x q x m``, of g."""
         new = super().__new__(cls, means, variances)
         new.link = link
         return new
@@ -115,9 +119,10 @@ class LinkedMarginals(Marginals):
     def prediction(self) -> Prediction:
         """The median, and the square of half the width of the central 68.27 %, ``... x q x m``.
 
-        Moments would be those of rare values: of a wide mixture they may be infinite, and the mean
-        beyond the ends of every interval.
+        Rare values decide the moments: for a wide mixture these may be infinite, and the mean
+        outside of every interval.
         """
+        # The quantiles at -1 and 1 standard deviations of a Gaussian.
         sd = (self.quantile(_HIGH) - self.quantile(_LOW)) / 2
         return Prediction(self.quantile(0.5), sd.square())
 
@@ -130,7 +135,8 @@ class LinkedMarginals(Marginals):
         return Marginals(*self).probability(self.link.value(Y))
 
     def log_density(self, Y: Tensor) -> Tensor:
-        """Return the log density at values ``Y``, ``... x q x m``; NaN where they are."""
+        """Return the log density at values ``Y``, ``... x q x m``; NaN where ``Y`` is NaN."""
+        # p(y) = p(g(y)) dg/dy
         density = Marginals(*self).log_density(self.link.value(Y)) + self.link.log_slope(Y)
         return density.masked_fill(~self.link.holds(Y), -math.inf)
 
@@ -152,7 +158,7 @@ class LinkedPosterior(TransformedPosterior):
 
     @property
     def distribution(self) -> Any:
-        """An AttributeError for code that needs a Gaussian, such as entropy searches of BoTorch."""
+        """Raises an AttributeError for code that needs a Gaussian, such as BoTorch's entropy."""
         raise AttributeError(
             f"The model is Gaussian in {self.link.formula}, not in y. Take an acquisition function "
             "that needs the mean and variance alone, or samples: its name begins with qLog."
@@ -165,13 +171,14 @@ class LinkedPosterior(TransformedPosterior):
         They have the variances of the predictions, and the correlations of g(y).
         """
         K = self.mixture.covariance_matrix
+        # Cov_ij = sd_i corr_ij sd_j
         scale = (self.variance.squeeze(-1) / K.diagonal(dim1=-1, dim2=-2)).sqrt()
         return scale.unsqueeze(-1) * K * scale.unsqueeze(-2)
 
     def quantile(self, value: Tensor) -> Tensor:
-        """Return quantiles ``... x q x m``; those of several levels are in front."""
+        """Return quantiles ``... x q x m``; several levels are a further first dimension."""
         quantiles = [self.marginals.quantile(level) for level in value.flatten().tolist()]
-        return torch.stack(quantiles) if value.numel() > 1 else quantiles[0]
+        return torch.stack(quantiles) if len(quantiles) > 1 else quantiles[0]
 
     def density(self, value: Tensor) -> Tensor:
         """Return the density of each output at each point, at values ``... x q x m``."""
@@ -186,43 +193,46 @@ class LinkedPosterior(TransformedPosterior):
                 f"Expected the weight of one of {mean.shape[-2]} outputs with a link; found "
                 f"{weights.tolist()}. Sum samples: objective=LinearMCObjective(weights)."
             )
-        mixture, w = MixturePosterior(mean[..., outputs, :], K[..., outputs, :, :]), weights.sum()
-        own = LinkedPosterior(mixture, self.link.of_outputs(outputs))
+        w = weights.sum()
+        mixture = MixturePosterior(mean[..., outputs, :], K[..., outputs, :, :])
+        of_output = LinkedPosterior(mixture, self.link.of_outputs(outputs))
+        # w y + offset has the mean w E + offset and the variance w^2 Var
         return TransformedPosterior(
-            own, lambda y: w * y + offset,
+            of_output, lambda y: w * y + offset,
             lambda mean, _: w * mean + offset, lambda _, variance: w.square() * variance,
         )  # fmt: skip
 
 
 class NotGaussian(OutcomeTransform):
-    """A sign to BoTorch's lists of models that posteriors are not Gaussian; it changes nothing."""
+    """An identity transform, by which BoTorch's lists of models see non-Gaussian posteriors."""
 
     def forward(self, Y: Tensor, Yvar: Tensor | None = None, X: Tensor | None = None) -> Any:
-        """Return observations and variances as they are."""
+        """Return observations and variances without a change."""
         return Y, Yvar
 
 
 class Linked(GP):
-    r"""A structure of outputs with bounds: it is one of :math:`g(y)`, with the physics g(f_p).
+    r"""A structure for outputs with bounds: the structure of :math:`g(y)`, with the physics g(f_p).
 
     Data, predictions, intervals, samples and functions are in the user's units and within the
     bounds. A logarithm makes rho an exponent and errors relative. Predictions are medians, with the
-    square of half the width of the central 68.27 % as variance, see :class:`LinkedMarginals`. Known
-    variances are those of g(y) by the delta method. Acquisition functions by samples average these,
-    however rare the large ones; ``objective=GenericMCObjective(lambda Y, X=None: Y[..., 0].log())``
-    makes them search on the scale of g. ``term``, ``rho``, ``delta`` and the summary
-    are on the scale of g, and so are kernels and means that are given.
+    square of half the width of the central 68.27 % as variance, see :class:`LinkedMarginals`. The
+    delta method gives the variances of g(y) from known variances of y. Acquisition functions by
+    samples average y, however rare large values are;
+    ``objective=GenericMCObjective(lambda Y, X=None: Y[..., 0].log())`` makes them search on the
+    scale of g. ``term``, ``rho``, ``delta`` and the summary are on the scale of g, as are kernels
+    and means among the arguments.
 
     Args as of the structure, and:
 
     Args:
-        link: ``"log"`` of positive outputs, ``"logit"`` of shares between 0 and 1, or two bounds,
-            of which the upper one may be infinite.
+        link: ``"log"`` for positive outputs, ``"logit"`` for shares between 0 and 1, or two bounds;
+            the upper bound may be infinite.
 
     Raises:
         TypeError: If the link is something else.
-        ValueError: If a bound is, or targets are not within the bounds.
-        PhysicsError: If the physics is not.
+        ValueError: If bounds are not a finite and a larger number, or targets are outside of them.
+        PhysicsError: If the physics is outside of the bounds.
 
     Example:
         >>> import torch
@@ -249,11 +259,11 @@ class Linked(GP):
 
     @property
     def scale_formula(self) -> str:  # type: ignore[override]
-        """The link as a formula, and the location that is subtracted."""
+        """The link as a formula, with its location."""
         return f"{self.link.formula} - [{', '.join(f'{c:.6g}' for c in self.link.location)}]"
 
     def read_scale(self, Y: Tensor) -> None:
-        """Keep the mean of the targets' links."""
+        """Set the location to the mean of g at the targets."""
         self.link = self.link._replace(location=self.on_gaussian_scale(Y).nanmean(-2))
 
     def holds(self, Y: Tensor) -> Tensor:
@@ -261,16 +271,18 @@ class Linked(GP):
         return self.link.holds(Y)
 
     def on_gaussian_scale(self, Y: Tensor) -> Tensor:
-        """Return g of targets or outputs; a ValueError if some are not within the bounds."""
+        """Return g of targets or outputs; raise a ValueError outside of the bounds."""
         outside = ~self.holds(Y)
         if outside.any():
-            rows, b = marked_rows(outside.any(-1)), self.link.upper
-            upper = "" if math.isinf(b) else f" and below {b:g}"
+            rows = marked_rows(outside.any(-1))
+            limits = f"above {self.link.lower:g}"
+            if math.isfinite(self.link.upper):
+                limits += f" and below {self.link.upper:g}"
             raise ValueError(
-                f"Expected targets above {self.link.lower:g}{upper}, as {self.link.formula} is "
-                f"modelled; found {float(Y[outside][0]):.6g} in {len(rows)} row(s), the first row "
-                f"{rows[0]}. Correct them, make them NaN if they are missing, or give other "
-                "bounds: link=(lower, upper)."
+                f"Expected targets {limits} for the link {self.link.formula}; found "
+                f"{float(Y[outside][0]):.6g} in {len(rows)} row(s), the first row {rows[0]}. "
+                "Correct them, make them NaN if they are missing, or give other bounds: "
+                "link=(lower, upper)."
             )
         return self.link.value(Y)
 
@@ -280,7 +292,9 @@ class Linked(GP):
 
     def noise_in_units(self, Y: Tensor, Yvar: Tensor) -> Tensor:
         """Return known variances of targets by the delta method, ``... x m x n``, in units."""
+        # Var g(y) = (dg/dy)^2 Var y
         variances = super().noise_in_units(Y, Yvar) * (2 * self.link.log_slope(Y)).exp().mT
+        # A missing target has no slope: any variance will do.
         mean = variances.nanmean(-1, keepdim=True)
         return variances.where(~variances.isnan(), mean).nan_to_num(nan=1.0)
 
@@ -292,11 +306,11 @@ class Linked(GP):
         return variances * (-2 * self.link.log_slope(Y)).exp()
 
     def log_jacobian(self) -> Tensor:
-        """Return the log density of the targets, ``m``, in the user's units less the model's."""
+        """Return the log density of the targets in the user's units less that of g, ``m``."""
         return super().log_jacobian() + self.link.log_slope(self.data.Y).nansum(-2)
 
     def _noise_at(self, X: Tensor, asked: bool | Tensor) -> Tensor:
-        """Return variances of g, given ones by the delta method at predictions."""
+        """Return noise variances of g; the delta method at the median converts the user's."""
         if asked is True:
             return super()._noise_at(X, asked)
         variances = self.checked_noise(asked, X)
@@ -311,13 +325,13 @@ class Linked(GP):
         return LinkedPosterior(mixture, self.link.of_outputs(outputs))
 
     def subset_output(self, idcs: list[int]) -> Self:
-        """Return the model of some outputs; a ValueError if there are none of these numbers."""
+        """Return the model of some outputs; raise a ValueError for an unknown number."""
         new = super().subset_output(idcs)
         new.link = self.link.of_outputs(self.checked_outputs(idcs))
         return new
 
     def as_single_task_gp(self, draw: int | None = None) -> Any:
-        """Raise a TypeError, as BoTorch's SingleTaskGP has no such link."""
+        """Raise a TypeError: BoTorch's SingleTaskGP has no link."""
         raise TypeError(
             f"{type(self).__name__} is Gaussian in {self.link.formula}, not in y: give its "
             "posterior, samples or functions to code that takes a SingleTaskGP."
@@ -326,7 +340,7 @@ class Linked(GP):
 
 @cache
 def linked(structure: Any) -> type[Linked]:
-    """Return the class of a structure with a link; :func:`save` needs one of a module.
+    """Return the class of a structure with a link; :func:`save` needs a name in this module.
 
     Example:
         >>> linked(CKA).__name__
@@ -338,10 +352,9 @@ def linked(structure: Any) -> type[Linked]:
         return structure
     name = structure.__name__
     text = f":class:`~gpadjust.core.{name}` of outputs with bounds, see :class:`Linked`."
-    made: Any = type(
-        f"Linked{name}", (Linked, structure), {"__doc__": text, "__module__": __name__}
-    )
-    return made
+    members = {"__doc__": text, "__module__": __name__}
+    linked_structure: Any = type(f"Linked{name}", (Linked, structure), members)
+    return linked_structure
 
 
 LinkedCKA = linked(CKA)

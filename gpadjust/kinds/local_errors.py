@@ -1,4 +1,4 @@
-"""Larger variances near left-out observations that were missed by more than predicted."""
+"""Larger variances near left-out observations with larger errors than predicted."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from gpadjust.core.model import GP
 from gpadjust.core.posterior import MixturePosterior
 from gpadjust.core.stacked import Wrapper
 
-_EXPECTED = 1.0  # observations that err as predicted, besides those near a point
+_EXPECTED = 1.0  # a in the equation: observations with errors as predicted, added at each point
 _ROUNDING = 1e-6  # of the targets' spread
 
 
 class Widened(Wrapper):
-    """A model whose variances are multiplied by a factor, but for known ones of noise.
+    """A model whose variances, except known ones of noise, are multiplied by a factor.
 
-    A subclass has ``factors``, and the names of its buffers that are numbers of each output.
+    A subclass defines ``factors``, and in ``numbers`` the names of buffers with a row per output.
     """
 
     numbers: tuple[str, ...]
@@ -47,36 +47,41 @@ class Widened(Wrapper):
     ) -> tuple[Tensor, Tensor]:
         """Return means and variances of each draw, ``... x S x q x m``."""
         mean, variance = self.model.components(X, observation_noise)
-        own = variance if self._is_own(observation_noise) else self.model.components(X)[1]
+        scaled = variance
+        if not self._scales_noise(observation_noise):
+            scaled = self.model.components(X)[1]
+        # known noise + factor * variance of the function
         factors = self.factors(self.data.new_inputs(X))
-        return mean, variance + (factors - 1).unsqueeze(DRAWS) * own
+        return mean, variance + (factors - 1).unsqueeze(DRAWS) * scaled
 
     def mixture(
         self, X: ArrayLike, outputs: list[int] | slice, observation_noise: bool | Tensor
     ) -> MixturePosterior:
         """Return the joint posterior of some outputs."""
         mean, K = self.model.mixture(X, outputs, observation_noise).gaussians
-        is_own = self._is_own(observation_noise)
-        own = K if is_own else self.model.mixture(X, outputs, False).gaussians[1]
+        scaled = K
+        if not self._scales_noise(observation_noise):
+            scaled = self.model.mixture(X, outputs, False).gaussians[1]
+        # K_ij + (sqrt(c_i c_j) - 1) K_ij, with factors c
         root = self.factors(self.data.new_inputs(X))[..., outputs].sqrt().mT.unsqueeze(-3)
-        return MixturePosterior(mean, K + own * (root.unsqueeze(-1) * root.unsqueeze(-2) - 1))
+        return MixturePosterior(mean, K + scaled * (root.unsqueeze(-1) * root.unsqueeze(-2) - 1))
 
-    def _is_own(self, observation_noise: bool | Tensor) -> bool:
-        """Return whether variances are the function's alone, or with a noise that is learnt."""
-        is_learnt = observation_noise is True and self.model.noise.known is None
-        return observation_noise is False or is_learnt
+    def _scales_noise(self, observation_noise: bool | Tensor) -> bool:
+        """Return whether the factors apply to all of a variance, as it has no known noise."""
+        is_unknown = observation_noise is True and self.model.noise.known is None
+        return observation_noise is False or is_unknown
 
     def subset_output(self, idcs: list[int]) -> Self:
-        """Return the model of some outputs; a ValueError if there are none of these numbers."""
+        """Return the model of some outputs; raise a ValueError for an unknown number."""
         new = super().subset_output(idcs)
         for name in self.numbers:
             setattr(new, name, getattr(self, name)[idcs])
         return new
 
     def sample_functions(self, *_: Any, **__: Any) -> Any:
-        """Raise an error, as functions are those of a GP."""
+        """Raise an error: functions come from a GP alone."""
         raise NotImplementedError(
-            f"A {type(self).__name__} draws no functions; draw joint samples, "
+            f"A {type(self).__name__} cannot draw functions; draw joint samples, "
             "posterior(X).rsample(), or functions of its attribute model, without the factors."
         )
 
@@ -85,17 +90,18 @@ class Widened(Wrapper):
 
 
 class LocalErrors(Widened):
-    r"""A fitted model with larger variances near left-out observations that it has missed.
+    r"""A fitted model with larger variances near left-out observations with large errors.
 
-    Where a function has a kink or a jump, as by dry friction or an impact, a process with a
-    stationary kernel is too sure nearby. With :math:`z_i^2` the squared error of a left-out
+    Near a kink or a jump, as by dry friction or an impact, the variances of a process with a
+    stationary kernel are too small. With :math:`z_i^2` the squared error of a left-out
     observation over its predicted variance, variances at x are multiplied by
 
     .. math:: \max\Big(1, \frac{a + \sum_i k(x, x_i) z_i^2}{a + \sum_i k(x, x_i)}\Big),
 
-    with an RBF kernel k of the shortest lengthscale of all terms, input by input, and a = 1.
-    Locally weighted conformal prediction (Lei et al. 2018) has such a scale, too, by a model of
-    residuals. There is no guarantee here: left-out observations had their say in hyper-parameters.
+    with an RBF kernel k of the shortest lengthscale of all terms for each input, and a = 1.
+    Locally weighted conformal prediction (Lei et al. 2018) has such a scale, too, from a model of
+    residuals. Here there is no guarantee: left-out observations took part in the fit of
+    hyper-parameters.
 
     Args:
         model: The fitted model; each of its kernels has a lengthscale for each input.
@@ -103,7 +109,7 @@ class LocalErrors(Widened):
     Attributes:
         squares: :math:`z_i^2`, ``m x n``; 1 where an observation is missing.
         points: The inputs of kernels, ``n x d``.
-        lengthscale: That of k, ``m x 1 x d``.
+        lengthscale: The lengthscales of k, ``m x 1 x d``.
 
     Example:
         >>> from gpadjust.core import ZeroMeanGP
@@ -118,7 +124,8 @@ class LocalErrors(Widened):
     @torch.no_grad()
     def __init__(self, model: GP) -> None:
         super().__init__(model)
-        Y, d = model.on_gaussian_scale(self.data.Y), self.data.X.shape[-1]
+        Y = model.on_gaussian_scale(self.data.Y)
+        d = self.data.X.shape[-1]
         self.points = Buffer(model.kernel_inputs(self.data.X))
         scales = [v for name, v in model.values.items() if name.endswith(".kernel.lengthscale")]
         has_kernels = sum(term.kernel is not None for term in model.terms)
@@ -130,6 +137,7 @@ class LocalErrors(Widened):
         shortest = torch.stack(scales).amin(0).log().mean(0).exp()  # m x d
         self.lengthscale = Buffer(shortest.unsqueeze(-2))
         mean, variance = Marginals(*model.left_out()).prediction
+        # z_i^2 = (y_i - m_i)^2 / v_i, with a floor of v_i for data without noise
         spread = _ROUNDING * (Y - Y.nanmean(-2, keepdim=True)).square().nanmean(-2).sqrt()
         squares = (Y - mean).square() / variance.maximum(spread.square())
         self.squares = Buffer(squares.nan_to_num(nan=1.0, posinf=1.0).mT)
@@ -140,4 +148,5 @@ class LocalErrors(Widened):
         away = x.unsqueeze(-2) - (self.points / self.lengthscale).unsqueeze(-3)
         near = (-0.5 * away.square().sum(-1)).exp()  # ... x m x q x n
         total = (near @ self.squares.unsqueeze(-1)).squeeze(-1)
+        # max(1, (a + sum_i k_i z_i^2) / (a + sum_i k_i))
         return ((_EXPECTED + total) / (_EXPECTED + near.sum(-1))).clamp_min(1.0).mT

@@ -1,4 +1,4 @@
-"""Inputs that were measured with noise, which the slope of the function carries to the targets."""
+"""Inputs measured with noise, which the slope of the function carries to the targets."""
 
 from __future__ import annotations
 
@@ -16,39 +16,41 @@ from gpadjust.physics import PhysicsError
 
 Function = Callable[[Tensor], Tensor]
 
-_SPREAD = (3.0**0.5, 1.0, 0.5, 0.1)  # differences, in standard deviations of a true input
-_SETTLED = (0.05, 0.1)  # change of variances, relative, and of means, in standard deviations
+_WIDTHS = (3.0**0.5, 1.0, 0.5, 0.1)  # of differences, in standard deviations of a true input
+_VARIANCE_CHANGE = 0.05  # mean relative change at which the iteration ends
+_MEAN_CHANGE = 0.1  # largest change at which it ends, in standard deviations
 _ROUNDS = 8
 
 
 class NoisyInputs(RowNoise):
-    r"""Inputs that were measured with independent Gaussian errors of known variances S.
+    r"""Inputs measured with independent Gaussian errors of known variances S.
 
-    The true inputs of a column have the mean and variance of the measured ones, less S. Given a
-    measured input x, the true one then has the mean :math:`\hat x = \bar x + \lambda (x - \bar x)`
-    and the variance :math:`P = \lambda S`, with :math:`\lambda` the share of the variance that is
-    not error (regression calibration: Fuller 1987; Carroll et al. 2006). A model is one of
-    :math:`\hat x`, the attribute ``X``, and a target has, in addition to its noise,
+    The true inputs of a column have the mean of the measured inputs, and their variance less S.
+    Given a measured input x, the true one then has the mean
+    :math:`\hat x = \bar x + \lambda (x - \bar x)` and the variance :math:`P = \lambda S`, with
+    :math:`\lambda` the share of the variance that is not error (regression calibration: Fuller
+    1987; Carroll et al. 2006). Build a model of :math:`\hat x`, the attribute ``X``. A target then
+    has, in addition to its noise,
 
     .. math::
 
         \mathrm{E} = f(\hat x) + \tfrac12 \sum_j P_j \partial_j^2 f, \quad
-        \mathrm{Var} = \sum_j P_j (\partial_j f)^2 + \tfrac12 (P_j \partial_j^2 f)^2,
+        \mathrm{Var} = \sum_j P_j (\partial_j f)^2 + \tfrac12 (P_j \partial_j^2 f)^2.
 
-    of which the first part of the variance is that of McHutchon and Rasmussen (2011). The slopes
-    are of f_p at first, and then of the posterior mean of rough fits, by differences over
-    :math:`\pm \sqrt{3 P_j}`, which are exact up to the fifth order for both sums of each input.
-    Observations that are added later have exact inputs.
+    The first part of the variance is that of McHutchon and Rasmussen (2011). f is f_p at first,
+    and then the posterior mean of rough fits. Differences over :math:`\pm \sqrt{3 P_j}` give both
+    sums exactly up to the fifth order of each input. Later observations have exact inputs.
 
     Args:
         train_X: The measured inputs, ``n x d``: a float64 tensor, an array or a frame.
-        variances: S: one number, ``d``, or of the shape of the inputs; 0 of exact ones.
-        base: The noise of the targets. Default: one learnt variance of each output, or a model's
+        variances: S: one number, ``d``, or the shape of the inputs; 0 for exact inputs.
+        base: The noise of the targets. Default: one unknown variance for each output, or a model's
             ``train_Yvar``.
-        added: What a fit has learnt, variances ``m x n``, as ``moved``, means.
+        added: Variances ``m x n``, set by a fit.
+        moved: Means ``m x n``, set by a fit.
 
     Attributes:
-        X: The means of the true inputs, as ``train_X`` came: what a model is built with.
+        X: The means of the true inputs, of the type of ``train_X``, for the model.
 
     Example:
         >>> import torch
@@ -67,35 +69,39 @@ class NoisyInputs(RowNoise):
     ) -> None:  # fmt: skip
         super().__init__(base, added, moved)
         X = as_tensor(train_X, "train_X").reshape(len(train_X), -1)
-        S, names = variances_of(variances, X, "variances"), names_of(train_X, "x")
+        S = variances_of(variances, X, "variances")
+        names = names_of(train_X, "x")
         is_bad = (S.mean(-2) >= X.var(-2)) & (X.var(-2) > 0)
         if is_bad.any():
             raise ValueError(
-                f"Expected variances below that of the measured inputs themselves, {X.var(-2)}; "
-                f"found as large ones of {', '.join(names[i] for i in is_bad.nonzero())}. They are "
+                f"Expected variances below the variances of the measured inputs, {X.var(-2)}; "
+                f"found larger ones of {', '.join(names[i] for i in is_bad.nonzero())}. They are "
                 "in the square of the inputs' units, not standard deviations."
             )
-        mean, true = X.mean(-2), X.var(-2) - S.mean(-2)
-        share = (true / (true + S)).where(S > 0, 1.0)
+        # lambda = Var / (Var + S), with the variance Var of the true inputs
+        mean = X.mean(-2)
+        true_variance = X.var(-2) - S.mean(-2)
+        share = (true_variance / (true_variance + S)).where(S > 0, 1.0)
         self.inputs = (X, S)
         self.points = (mean + share * (X - mean)).where(S > 0, X)
-        self.spread = (share * S).sqrt()  # standard deviations of the true inputs
+        self.spread = (share * S).sqrt()  # sqrt(P)
         self.X = as_given(self.points, train_X, names)
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What builds it again."""
+        """The arguments."""
         X, S = self.inputs
         return super().settings | {"train_X": X, "variances": S, "moved": self.moved}
 
     @torch.no_grad()
     def refined(self, model: Any, fitted: Callable[[Noise], Any]) -> NoisyInputs:
         """Return the noise with the moments of the function over the errors of its inputs."""
-        n, X = len(self.points), model.data.X
+        X = model.data.X
+        n = len(self.points)
         if not torch.equal(X[:n], self.points.to(X)):
             raise ValueError(
                 f"Expected a model of the {n} inputs NoisyInputs.X; found others, such as the "
-                "measured ones. Build it with CKA(noisy.X, Y, physics=f_p, noise=noisy)."
+                "measured inputs. Build it with CKA(noisy.X, Y, physics=f_p, noise=noisy)."
             )
 
         def posterior_mean(X: Tensor) -> Tensor:
@@ -106,33 +112,41 @@ class NoisyInputs(RowNoise):
         mean, variance = _moments(lambda X: rough.at(X).mean[0], X, spread)
         if not variance.any():  # a prior mean without slope
             mean, variance = _moments(posterior_mean, X, spread)
-        for _ in range(_ROUNDS if variance.any() else 0):
-            before = torch.stack([variance, mean])
+        if not variance.any():
+            return self.having(self.base, variance, mean)
+        # The slopes depend on the fit, and the fit on the variances by the slopes: iterate.
+        for _ in range(_ROUNDS):
+            old_mean, old_variance = mean, variance
             rough = fitted(self.having(self.base, variance, mean))
             mean, variance = _moments(posterior_mean, X, spread)
-            noise = rough.conditioning().noise[0] - before[0]
-            off = (variance - before[0]).abs() / (before[0] + noise)  # 0 / 0 of exact rows
-            away = (mean - before[1]).abs() / (variance + noise).sqrt()
-            if off.nanmean() <= _SETTLED[0] and away.nan_to_num().max() <= _SETTLED[1]:
+            noise = rough.conditioning().noise[0] - old_variance
+            variance_change = (variance - old_variance).abs() / (old_variance + noise)
+            mean_change = (mean - old_mean).abs() / (variance + noise).sqrt()
+            # Rows with exact inputs and observations are 0 / 0.
+            is_settled = variance_change.nanmean() <= _VARIANCE_CHANGE
+            if is_settled and mean_change.nan_to_num().max() <= _MEAN_CHANGE:
                 break
         return self.having(self.base, variance, mean)
 
 
 def _moments(function: Function, X: Tensor, spread: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the means of a function, less its values at the points, and variances, ``m x n``."""
-    here = function(X)
-    mean, variance = torch.zeros_like(here), torch.zeros_like(here)
+    """Return E f - f and Var f over the errors of the inputs, ``m x n``."""
+    center = function(X)
+    mean, variance = torch.zeros_like(center), torch.zeros_like(center)
     for j in spread.any(0).nonzero().flatten().tolist():
         step = torch.zeros_like(X)
         step[:, j] = spread[:, j]
-        for width in _SPREAD:  # smaller where f_p fails
+        for width in _WIDTHS:  # a smaller one where f_p fails
             try:
-                up, down = (function(X + sign * width * step) - here for sign in (1, -1))
+                up, down = (function(X + sign * width * step) - center for sign in (1, -1))
                 break
             except PhysicsError:
-                if width == _SPREAD[-1]:
+                if width == _WIDTHS[-1]:
                     raise
+        # With h = w sqrt(P): up - down = 2 h f', up + down = h^2 f'', so that
+        # P f'' / 2 = (up + down) / (2 w^2)
         mean = mean + (up + down) / (2 * width**2)
+        # P f'^2 = (up - down)^2 / (4 w^2), and (P f'')^2 / 2 = (up + down)^2 / (2 w^4)
         variance = variance + (up - down).square() / (4 * width**2)
         variance = variance + (up + down).square() / (2 * width**4)
     return mean, variance

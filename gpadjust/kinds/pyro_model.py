@@ -20,14 +20,14 @@ def pyro_model(
 
     .. math:: y = f_p(x) + \varphi(x)^T \beta + \epsilon, \quad \beta \sim N(0, I).
 
-    Its sample sites are ``"weights"``, ``m x p``, and ``"Y"``, ``m x n``. Lengthscales, variances
-    and unknown parameters of the physics are those of a draw of the model. The posterior of the
-    weights is normal, ``Weights.of_model(model)`` of ``gpadjust.kinds.updates``.
+    Its sample sites are ``"weights"``, ``m x p``, and ``"Y"``, ``m x n``. A draw of the model gives
+    lengthscales, variances and unknown parameters of the physics. The posterior of the weights is
+    normal, ``Weights.of_model(model)`` of ``gpadjust.kinds.updates``.
 
     Args:
         model: An :class:`~gpadjust.core.RRA`, or another model whose kernels are ``Fourier``.
         X: Inputs, ``n x d``. Default: the training inputs, with the training targets.
-        Y: Observations, ``n x m``; None to sample them.
+        Y: Observations, ``n x m``. Default: none; Pyro samples them.
         draw: The number of the draw.
 
     Returns:
@@ -35,34 +35,41 @@ def pyro_model(
 
     Raises:
         ImportError: Without Pyro, ``pip install "gpadjust[pyro]"``.
-        ValueError: If there is no such draw, or ``Y`` without ``X``.
+        ValueError: If the draw does not exist, or ``Y`` comes without ``X``.
     """
     try:
-        import pyro  # here alone, as it takes a second
+        import pyro  # not at the top, as it takes a second
         import pyro.distributions as dist
     except ImportError as error:
         raise ImportError('pyro_model needs Pyro; run `pip install "gpadjust[pyro]"`.') from error
     if X is None and Y is not None:
-        raise ValueError("Expected X with Y, the inputs that it belongs to.")
+        raise ValueError("Expected X, the inputs of Y; found Y alone.")
     if checked_whole("draw", draw, 0) >= len(model.u):
         raise ValueError(f"Expected draw below {len(model.u)}, the number of draws; found {draw}.")
     one = model.subset_draws(torch.tensor([draw]))
     is_training = X is None
-    X = model.data.X if is_training else model.data.new_inputs(X)
+    targets = None
     with torch.no_grad():
         values = one.values
-        f, unit = one.at(X, values), one.unit
-        phi = design(f)[0] * unit.unsqueeze(-1)  # m x n x p
-        noise = one.noise.variance(values, one.places(X, values), is_training)[0]
-        sd = (noise.sqrt() * unit).expand(phi.shape[:-1])
-        mean = f.mean[0] * unit
-        obs = one.targets() * unit if is_training else None
+        if is_training:
+            X = model.data.X
+            targets = one.targets() * one.unit
+        else:
+            X = model.data.new_inputs(X)
         if Y is not None:
-            obs = model.on_gaussian_scale(as_tensor(Y, "Y")).mT
+            targets = model.on_gaussian_scale(as_tensor(Y, "Y")).mT
+        f = one.at(X, values)
+        phi = design(f)[0] * one.unit.unsqueeze(-1)  # m x n x p
+        noise = one.noise.variance(values, one.places(X, values), is_training)[0]
+        sd = (noise.sqrt() * one.unit).expand(phi.shape[:-1])
+        mean = f.mean[0] * one.unit
+    # y = f_p(x) + phi(x)^T beta + epsilon, beta ~ N(0, I)
     zero = torch.zeros_like(phi[:, 0])
     weights = pyro.sample("weights", dist.Normal(zero, torch.ones_like(zero)).to_event(2))
     function = mean + (phi @ weights.unsqueeze(-1)).squeeze(-1)
-    seen = torch.ones_like(function, dtype=torch.bool) if obs is None else ~obs.isnan()
-    observed = dist.Normal(function, sd).mask(seen).to_event(2)
-    pyro.sample("Y", observed, obs=None if obs is None else obs.nan_to_num())
+    noisy = dist.Normal(function, sd)
+    if targets is not None:  # a mask takes missing targets out of the density
+        noisy = noisy.mask(~targets.isnan())
+        targets = targets.nan_to_num()
+    pyro.sample("Y", noisy.to_event(2), obs=targets)
     return weights, function.mT

@@ -1,4 +1,4 @@
-"""Noise that grows with the size of what is measured."""
+"""Noise that grows with the size of the measured quantity."""
 
 from __future__ import annotations
 
@@ -13,24 +13,23 @@ from gpadjust.core import GP, Noise
 from gpadjust.core.kernels import exponents
 from gpadjust.core.terms import Places, TermSum
 
-_FLOOR = 1e-3  # of the largest size, that a size is at least
-_NEAR = 0.5  # of the shortest lengthscale, within which sizes are alike
-_FAR = 1e-6  # weight of the mean of all sizes, which counts far from all points
-_STILL = 0.2  # change of the logarithm of a size that needs no other fit
+_FLOOR = 1e-3  # smallest size, as a share of the largest
+_NEAR = 0.5  # lengthscale of the sizes, as a share of the shortest lengthscale
+_FAR = 1e-6  # weight of the mean of all log sizes, which decides far from the data
+_SETTLED = 0.2  # change of a log size at which the iteration ends
 _ROUNDS = 4
 
 
 class RelativeNoise(Noise):
-    r"""Noise of the variance :math:`s_0 + s_1 g(x)^2`, both numbers learnt.
+    r"""Noise of the variance :math:`s_0 + s_1 g(x)^2`, with both numbers unknown.
 
-    The size g is that of the physics (of several, of their sum with the prior means of the rhos),
-    over its root mean square at the training inputs. Of a model without physics it is that of the
-    posterior mean by rough fits: at the training inputs, and between them by a weighted mean of
-    its logarithms, with an RBF kernel of half the shortest lengthscale. The numbers have the names
-    ``noise.constant`` and ``noise.relative``.
+    The size g is the physics (the sum of several, with the prior means of the rhos) over its root
+    mean square at the training inputs. In a model without physics, g is the posterior mean of rough
+    fits at the training inputs; between them, an RBF kernel of half the shortest lengthscale
+    averages the logarithms of g. The numbers are named ``noise.constant`` and ``noise.relative``.
 
     Args:
-        sizes: What a fit without physics has learnt: training inputs ``m x n x d``, log sizes
+        sizes: Results of a fit without physics: training inputs ``m x n x d``, log sizes
             ``m x n``, lengthscales ``m x 1 x d``, and root mean squares ``m x 1``.
 
     Example:
@@ -48,12 +47,12 @@ class RelativeNoise(Noise):
     def __init__(self, sizes: Sequence[Tensor] | None = None) -> None:
         super().__init__(("constant", "relative"))
         self.sizes = None if sizes is None else tuple(sizes)
-        self.means: list[tuple[int, float]] = []  # of each physics in g, times the size
-        self.size: Tensor | float = 1.0 if sizes is None else sizes[-1]  # of g where it is 1
+        self.means: list[tuple[int, float]] = []  # number and prior mean of rho of each physics
+        self.size: Tensor | float = 1.0 if sizes is None else sizes[-1]  # root mean square of g
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What builds it again."""
+        """The arguments."""
         return {"sizes": self.sizes}
 
     def of_terms(self, terms: TermSum) -> RelativeNoise:
@@ -75,10 +74,11 @@ class RelativeNoise(Noise):
         elif self.sizes is not None:
             points, logs, lengths, _ = self.sizes
             middle = points.mean(-2, keepdim=True)
+            # log g(x) = (sum_i k(x, x_i) log g_i + c mean_i log g_i) / (sum_i k(x, x_i) + c)
             near = exponents((places.x - middle) / lengths, (points - middle) / lengths).exp()
-            known = (near @ logs.unsqueeze(-1)).squeeze(-1)
+            total = (near @ logs.unsqueeze(-1)).squeeze(-1)
             mean = logs.mean(-1, keepdim=True)
-            squares = (2 * (known + _FAR * mean) / (near.sum(-1) + _FAR)).exp()
+            squares = (2 * (total + _FAR * mean) / (near.sum(-1) + _FAR)).exp()
         return torch.stack([torch.ones_like(squares), squares], -1)
 
     @torch.no_grad()
@@ -86,33 +86,38 @@ class RelativeNoise(Noise):
         """Return the noise with the sizes of the posterior mean, if there is no physics."""
         if type(model).on_gaussian_scale is not GP.on_gaussian_scale:
             raise ValueError(
-                "Expected no link beside RelativeNoise: noise is then that of g(y), relative "
-                "already for a logarithm. Leave one of them out."
+                "Expected RelativeNoise without a link: with one, noise is that of g(y), which a "
+                "logarithm makes relative already. Leave one of them out."
             )
         if self.means:
             return self
-        noise, x = RelativeNoise(), model.data.kernel_inputs(model.data.X)
+        noise = RelativeNoise()
+        x = model.data.kernel_inputs(model.data.X)
+        old_logs = x.new_zeros(())
         ranges = (x.amax(-2) - x.amin(-2)).expand(model.num_outputs, -1)
         for _ in range(_ROUNDS):
             rough = fitted(noise)
             mean, _ = rough.conditioning().mean(rough.at(model.data.X))
+            # g is the absolute posterior mean, with a floor near its zeros.
             sizes = mean[0].abs().maximum(_FLOOR * mean[0].abs().amax(-1, keepdim=True))
             size = sizes.square().mean(-1, keepdim=True).sqrt()
             logs = (sizes / size).log()
             values = rough.values.items()
             lengths = [v[0].detach() for name, v in values if name.endswith("kernel.lengthscale")]
             shortest = torch.stack(lengths or [ranges]).amin(0).unsqueeze(-2)
-            before = torch.zeros_like(logs) if noise.sizes is None else noise.sizes[1]
             noise = RelativeNoise((x.expand(len(logs), -1, -1), logs, _NEAR * shortest, size))
-            if (logs - before).abs().amax() <= _STILL:
+            if (logs - old_logs).abs().amax() <= _SETTLED:
                 break
+            old_logs = logs
         return noise
 
     def standard_deviations(self, model: Any) -> tuple[Tensor, Tensor]:
-        """Return draws ``N x m`` of the constant one, in the user's units, and the relative one."""
-        values, unit = model.table.values(model.draws), model.unit.squeeze(-1)
+        """Return draws ``N x m`` of the constant, in the user's units, and of the relative one."""
+        values = model.table.values(model.draws)
         constant, relative = (values[f"noise.{name}"].squeeze(-1).sqrt() for name in self.names)
-        return constant * unit, relative / torch.as_tensor(self.size).squeeze(-1)
+        # s_1 belongs to g = f_p / size, the user's share to f_p.
+        share = relative / torch.as_tensor(self.size).squeeze(-1)
+        return constant * model.unit.squeeze(-1), share
 
     def of_outputs(self, outputs: Sequence[int]) -> RelativeNoise:
         """Return the noise of some outputs."""
@@ -123,7 +128,10 @@ class RelativeNoise(Noise):
         return self._changed(lambda v: v.to(like))
 
     def _changed(self, change: Callable[[Tensor], Tensor]) -> RelativeNoise:
+        """Return the noise with changed tensors."""
         new = copy(self)
-        new.sizes = None if self.sizes is None else tuple(map(change, self.sizes))
-        new.size = self.size if isinstance(self.size, float) else change(self.size)
+        if self.sizes is not None:
+            new.sizes = tuple(map(change, self.sizes))
+        if isinstance(self.size, Tensor):
+            new.size = change(self.size)
         return new

@@ -1,4 +1,4 @@
-"""Observations that come one after the other, at a constant cost."""
+"""Updates of a fitted model by single observations, at a constant cost."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from gpadjust.core.gaussian import Marginals
 from gpadjust.core.terms import WeightedSum
 from gpadjust.kinds.local_errors import Widened
 
-_EXPECTED = 10.0  # observations that err as predicted, besides those that came
+_EXPECTED = 10.0  # a in the equation: observations with errors as predicted, from the start
 
 
 class Updated(Widened):
-    r"""A fitted model that takes observations; its unknown numbers stay as they are.
+    r"""A fitted model that takes observations, with the unknown numbers of the fit.
 
-    Variances follow recent errors: with :math:`z_i^2` the squared error over the predicted variance
-    of what came, :math:`\lambda = e^{-1 / \tau}` and ages k, they are multiplied by
+    Variances follow recent errors. With :math:`z_k^2` the squared error of the observation of age k
+    over its predicted variance, and :math:`\lambda = e^{-1 / \tau}`, they are multiplied by
 
     .. math:: \max\Big(1, \frac{a + \sum_k \lambda^k z_k^2}{a + \sum_k \lambda^k}\Big), \quad
         a = 10.
 
     Attributes:
-        recent: The two sums, ``m x 2``.
+        recent: Both sums, ``m x 2``.
     """
 
     numbers = ("recent",)
@@ -43,20 +43,21 @@ class Updated(Widened):
 
     def factors(self, X: Tensor) -> Tensor:
         """Return the factors of all inputs, ``1 x m``."""
+        # max(1, (a + sum_k lambda^k z_k^2) / (a + sum_k lambda^k))
         errors, number = self.recent.unbind(-1)
         return ((_EXPECTED + errors) / (_EXPECTED + number)).clamp_min(1.0).unsqueeze(0)
 
     @torch.no_grad()
     def update(self, X: ArrayLike, Y: ArrayLike, noise: Tensor | None = None) -> Self:
-        """Take observations ``k x d`` and ``k x m``, the last of which is the newest.
+        """Update the model by observations, the newest last.
 
         Args:
-            X: Inputs, as the model's training inputs.
-            Y: Observations, a tensor or as them; NaN where one is missing.
-            noise: Their variances, of a model with known ones.
+            X: Inputs ``k x d``, of the type of the training inputs.
+            Y: Observations ``k x m``; NaN where one is missing.
+            noise: Variances of the observations, if the model has known ones.
 
         Raises:
-            ValueError: If the model refuses them; nothing has changed then.
+            ValueError: If the data are invalid; the model is then as before.
         """
         X = self.data.new_inputs(X)
         if X.dim() != 2 or not len(X):
@@ -64,32 +65,35 @@ class Updated(Widened):
         more = self.models[-1].condition_on_observations(X, Y, noise)
         if more.batch_shape:
             raise ValueError(f"Expected Y of shape k x m; found a batch {tuple(more.batch_shape)}.")
-        late, given = slice(-len(X), None), more.conditioning()
-        f, variances = given.train.of_rows(late), given.noise[..., late]
-        targets = given.targets[0, ..., late]
-        new = self._updated(more, f, variances, targets)
-        means, own = self.model.conditioning().marginals(f)
-        mean, variance = Marginals(means.mT, (own + variances).mT).prediction
-        for z in ((targets - mean.mT).square() / variance.mT).unbind(-1):
-            last = torch.stack([z.nan_to_num(nan=0.0), (~z.isnan()).to(z)], -1)
+        late = slice(-len(X), None)
+        conditioning = more.conditioning()
+        f = conditioning.train.of_rows(late)
+        noises = conditioning.noise[..., late]
+        targets = conditioning.targets[0, ..., late]
+        new = self._updated(more, f, noises, targets)
+        # z^2 of each observation, by the model before the update
+        means, variances = self.model.conditioning().marginals(f)
+        mean, variance = Marginals(means.mT, (variances + noises).mT).prediction
+        for squares in ((targets - mean.mT).square() / variance.mT).unbind(-1):
+            last = torch.stack([squares.nan_to_num(nan=0.0), (~squares.isnan()).to(squares)], -1)
             self.recent = math.exp(-1 / self.forget) * self.recent + last
         self.models[0] = new
         return self
 
     @abstractmethod
     def _updated(self, more: GP, f: WeightedSum, noise: Tensor, targets: Tensor) -> GP:
-        """Return the model with the last rows of another, where it has a function, and targets."""
+        """Return the updated model; ``more`` has the new rows, with f, noise and targets there."""
 
 
 class Window(Updated):
-    """A model that keeps its last observations.
+    """A model of the last observations.
 
-    The unknown numbers and units are those of the fit. Its attribute ``model`` is the model of the
-    rows that are kept, for all else that one asks.
+    The unknown numbers and units come from the fit. The attribute ``model`` is the model of the
+    last rows, with all its methods.
 
     Args:
-        model: Any fitted model with an exact posterior, whose noise can do with other rows.
-        size: Number of rows. Default: as many as the model has.
+        model: Any fitted model with an exact posterior and a noise without corrections of rows.
+        size: Number of rows. Default: the number of rows of the model.
 
     Example:
         >>> from gpadjust.core import ZeroMeanGP
@@ -101,7 +105,7 @@ class Window(Updated):
 
     def __init__(self, model: GP, size: int | None = None) -> None:
         super().__init__(model)
-        self.size = len(model.data.X) if size is None else checked_whole("size", size, 2)
+        self.size = checked_whole("size", len(model.data.X) if size is None else size, 2)
         self.forget = self.size
 
     def _updated(self, more: GP, f: WeightedSum, noise: Tensor, targets: Tensor) -> GP:
@@ -109,43 +113,45 @@ class Window(Updated):
 
 
 class Kalman(Updated):
-    r"""A ridge regression adjustment whose weights take observations, of which it keeps none.
+    r"""A ridge regression adjustment with recursive updates of its weights.
 
-    The posterior of the weights of the features, in units of their prior N(0, I), is known by its
-    precision :math:`\Lambda` and h, of the mean :math:`\Lambda^{-1} h`. An observation
-    :math:`y = \varphi^T \beta + \epsilon` adds to both; before, with
-    :math:`\lambda = e^{-1 / \tau}`, what was observed fades, the prior does not (stabilised
+    The posterior of the weights of the features, in units of their prior N(0, I), has the
+    precision :math:`\Lambda` and the mean :math:`\Lambda^{-1} h`. An observation
+    :math:`y = \varphi^T \beta + \epsilon` adds to both. Before, with
+    :math:`\lambda = e^{-1 / \tau}`, old observations fade, but not the prior (stabilised
     forgetting, Kulhavy and Zarrop 1993):
 
     .. math:: \Lambda \leftarrow \lambda \Lambda + (1 - \lambda) I + \varphi \varphi^T / \sigma^2,
         \quad h \leftarrow \lambda h + \varphi y / \sigma^2.
 
-    It is a Kalman filter in its information form, for each draw of the model. An observation of
+    This is a Kalman filter in information form, for each draw of the model. An observation of
     :math:`k` steps ago counts as one with the noise :math:`\sigma^2 e^{k / \tau}`; no variance
-    grows beyond the prior's.
+    grows beyond the prior's. Observations are not stored.
 
     Args:
         model: A fitted :class:`~gpadjust.RRA`, or another model whose kernels are ``Fourier``.
-        forget: :math:`\tau`, in observations; infinite for never.
+        forget: :math:`\tau`, in observations; infinity, the default, forgets nothing.
 
     Attributes:
-        model: The model with the posterior of the weights, of the same data.
+        model: The model with the posterior of the weights, and the data of the fit.
     """
 
     def __init__(self, model: GP, forget: float = math.inf) -> None:
         super().__init__(model)
-        self.forget = forget if forget == math.inf else checked_number("forget", forget, above=0)
+        if forget != math.inf:
+            checked_number("forget", forget, above=0)
+        self.forget = forget
         kernels = [term.kernel for term in model.terms if term.kernel is not None]
         if not all(isinstance(kernel, Fourier) for kernel in kernels):
             raise TypeError(f"Expected an RRA; found kernels {kernels}. Take Window(model, size).")
         self._weights = Weights.of_model(model)
-        self.models.append(_of_rows(model, torch.arange(2)))  # it checks and reads observations
+        self.models.append(_of_rows(model, torch.arange(2)))  # checks and scales observations
 
     @property
     def model(self) -> GP:
-        """The model with the posterior of the weights, which it loses when it moves to a device."""
-        if not isinstance(self.models[0].conditioning(), Weights):
-            self._weights = self._weights.of(self.models[0])
+        """The model with the posterior of the weights."""
+        if not isinstance(self.models[0].conditioning(), Weights):  # lost by a move to a device
+            self._weights = self._weights.moved_to(self.models[0])
             self.models[0] = self.models[0].with_conditioning(self._weights)
         return super().model
 
@@ -156,19 +162,19 @@ class Kalman(Updated):
         return weights
 
     def term(self, name: str, X: ArrayLike) -> MixturePosterior:
-        """Return the joint posterior of a term's process at ``X``, as of a GP."""
+        """Return the joint posterior of a term's process at ``X``, as :meth:`GP.term` does."""
         return self.model.term(name, X)
 
     def condition_on_observations(
         self, X: ArrayLike, Y: ArrayLike, noise: Tensor | None = None, **_: Any
     ) -> Self:
-        """Return a copy that has taken observations ``k x d`` and ``k x m``."""
+        """Return a copy, updated by observations ``k x d`` and ``k x m``."""
         return deepcopy(self).update(X, Y, noise)
 
     def subset_output(self, idcs: list[int]) -> Self:
-        """Return the model of some outputs; a ValueError if there are none of these numbers."""
+        """Return the model of some outputs; raise a ValueError for an unknown number."""
         new = super().subset_output(idcs)
-        new._weights = self.weights.of(new.models[0], idcs)
+        new._weights = self.weights.moved_to(new.models[0], idcs)
         return new
 
     def _updated(self, more: GP, f: WeightedSum, noise: Tensor, targets: Tensor) -> GP:
@@ -177,15 +183,18 @@ class Kalman(Updated):
 
 
 class Weights:
-    r"""The posterior of the weights of Fourier features, which conditions a model.
+    r"""The posterior of the weights of Fourier features, as the conditioning of a model.
 
-    It has the function at the training inputs of the model, the precision :math:`\Lambda`,
-    ``S x m x p x p``, and the pull h, ``S x m x p``.
+    Args:
+        train: The function at the training inputs of the model.
+        precision: :math:`\Lambda`, ``S x m x p x p``.
+        pull: h, ``S x m x p``.
     """
 
     def __init__(self, train: WeightedSum, precision: Tensor, pull: Tensor) -> None:
         self.train, self.precision, self.pull = train, precision, pull
-        self.alpha = pull  # a model asks whether it has a graph
+        self.alpha = pull  # a model reads whether it has a graph
+        # Lambda^-1 = R R^T, with R = L^-T and Lambda = L L^T; the mean is R R^T h.
         chol = torch.linalg.cholesky(precision)
         eye = torch.eye(chol.shape[-1]).to(chol).expand_as(chol)
         self.root = torch.linalg.solve_triangular(chol, eye, upper=False).mT
@@ -194,7 +203,7 @@ class Weights:
     @classmethod
     @torch.no_grad()
     def of_model(cls, model: GP) -> Self:
-        """Return the weights given the data of a model."""
+        """Return the weights conditioned on the data of a model."""
         data = model.conditioning()
         residual = data.targets - data.train.mean
         lead = (*data.noise.shape[:-1], design(data.train).shape[-1])  # S x m x p
@@ -203,19 +212,26 @@ class Weights:
         return prior.updated(data.train, data.noise, residual, math.inf)
 
     def updated(self, f: WeightedSum, noise: Tensor, residual: Tensor, forget: float) -> Self:
-        """Return the weights given observations of a sum, too, the last of which is the newest.
+        r"""Return the weights conditioned on further observations of a sum, the newest last.
 
-        Variances of their noise are ``S x m x k``, and so are residuals, targets less their prior
-        mean; NaN where one is missing.
+        Args:
+            f: The sum at the inputs.
+            noise: Variances, ``S x m x k``.
+            residual: Targets less their prior mean, ``S x m x k``; NaN where one is missing.
+            forget: :math:`\tau`.
         """
-        k, phi = residual.shape[-1], design(f)
-        left = torch.arange(k - 1, -1, -1).to(noise).div(-forget).exp()
-        weight = (left / noise).masked_fill(residual.isnan(), 0.0)
-        kept = math.exp(-k / forget)
+        k = residual.shape[-1]
+        phi = design(f)
+        # Of k observations the first has the weight lambda^(k - 1) / sigma^2, the last 1 / sigma^2.
+        fading = torch.arange(k - 1, -1, -1).to(noise).div(-forget).exp()
+        weight = (fading / noise).masked_fill(residual.isnan(), 0.0)
         weighted = (phi * weight.unsqueeze(-1)).mT
-        precision = kept * self.precision + weighted @ phi
-        precision.diagonal(dim1=-1, dim2=-2).add_(1 - kept)
-        pull = kept * self.pull + (weighted @ residual.nan_to_num().unsqueeze(-1)).squeeze(-1)
+        # Lambda <- lambda^k Lambda + (1 - lambda^k) I + sum_i w_i phi_i phi_i^T
+        share = math.exp(-k / forget)
+        precision = share * self.precision + weighted @ phi
+        precision.diagonal(dim1=-1, dim2=-2).add_(1 - share)
+        # h <- lambda^k h + sum_i w_i phi_i r_i
+        pull = share * self.pull + (weighted @ residual.nan_to_num().unsqueeze(-1)).squeeze(-1)
         return type(self)(self.train, precision, pull)
 
     def marginals(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
@@ -230,23 +246,26 @@ class Weights:
         return self.marginals(sought)[0], root @ root.mT
 
     @torch.no_grad()
-    def of(self, model: GP, outputs: Any = slice(None)) -> Self:
-        """Return the weights of a model on another device, or of some outputs."""
-        parts = (each[:, outputs].to(model.u) for each in (self.precision, self.pull))
-        return type(self)(model.at(model.data.X), *parts)
+    def moved_to(self, model: GP, outputs: Any = slice(None)) -> Self:
+        """Return the weights for a model on another device, or of some outputs."""
+        precision, pull = self.precision[:, outputs].to(model.u), self.pull[:, outputs].to(model.u)
+        return type(self)(model.at(model.data.X), precision, pull)
 
 
 def design(f: WeightedSum) -> Tensor:
-    """Return the kernels' own features of a sum, ``... x S x m x n x p``, for weights N(0, I)."""
-    generator = torch.Generator()  # not used, as these are not random
-    kernels = {term.name: term.kernel for term in f.terms if term.kernel is not None}
-    own = {term.name: f.own(term) for term in f.terms}
-    return f.features({n: k.features(own[n], 0, generator) for n, k in kernels.items()})
+    """Return the features of a sum by its kernels, ``... x S x m x n x p``, for weights N(0, I)."""
+    generator = torch.Generator()  # not used: Fourier kernels have fixed frequencies
+    features = {
+        term.name: term.kernel.features(f.own(term), 0, generator)
+        for term in f.terms
+        if term.kernel is not None
+    }
+    return f.features(features)
 
 
 def _of_rows(model: GP, rows: Tensor) -> GP:
-    """Return the model of some rows, if its noise can do with them."""
+    """Return the model of some rows; raise a ValueError if its noise belongs to all rows."""
     new = model.subset_rows(rows)
     if new is None:
-        raise ValueError(f"Expected a noise that can do with other rows; found {model.noise}.")
+        raise ValueError(f"Expected a noise without corrections of rows; found {model.noise}.")
     return new

@@ -1,4 +1,4 @@
-"""Kernels of processes that are zero at places that the user names, where the formula is right."""
+"""Kernels of processes that are zero at places of the user, where the formula is right."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from gpadjust.core.kernels import Features, Kernel, as_kernel
 from gpadjust.core.terms import Term
 from gpadjust.core.unknowns import LogNormal, Row, Values
 
-_ROUNDING = 1e-10  # of the variance at places, of which there are several
+_ROUNDING = 1e-10  # of the variance, added at several places, which may be close to each other
 
 
 class Vanishing(Kernel):
-    r"""The kernel of a process that is zero wherever some inputs have given values.
+    r"""The kernel of a process that is zero wherever some inputs have certain values.
 
-    As the kernel of delta the formula is right there; as that of rho, rho is its mean there. With a
-    product :math:`k = k_S(x_S, x'_S) \, k_R(x_R, x'_R)` over the inputs S that the values V are of,
-    and all others R, it is that of :math:`g \sim GP(0, k)` given that :math:`g(x) = 0` for each x
-    with :math:`x_S \in V`, whatever :math:`x_R`:
+    As the kernel of delta, it makes the formula right there; as the kernel of rho, it makes rho its
+    mean there. The kernel is a product :math:`k = k_S(x_S, x'_S) \, k_R(x_R, x'_R)` over the
+    inputs S with values V and all others R. Given :math:`g(x) = 0` for each x with
+    :math:`x_S \in V`, whatever :math:`x_R`, the process :math:`g \sim GP(0, k)` has the kernel
 
     .. math:: k_R(x_R, x'_R) \, [k_S(x_S, x'_S) - k_S(x_S, V) \, k_S(V, V)^{-1} k_S(V, x'_S)]
 
-    (conditioning, Rasmussen and Williams 2006, eq. 2.19). One input makes V hyperplanes, all inputs
-    points. Unknown parameters of the physics are then those that agree with the observations there,
-    and with a process that is smooth towards them.
+    (conditioning, Rasmussen and Williams 2006, eq. 2.19). Values of one input are hyperplanes,
+    values of all inputs points. The observations there determine unknown parameters of the physics.
 
     Args:
-        where: Values of columns, by name or number: ``{"valve": 1.0}``, ``{"valve": [0.0, 1.0]}``
-            for either, ``{"valve": 1.0, "flow": 0.0}`` for both at once. Or points, ``p x d``, or a
-            frame with some of the columns. In the user's units; the numbers of categories' levels.
+        where: Values of columns, by name or number, in the user's units: ``{"valve": 1.0}``,
+            ``{"valve": [0.0, 1.0]}`` for either, ``{"valve": 1.0, "flow": 0.0}`` for both at once.
+            Or points, ``p x d``, or a frame with some of the columns. For a category, the numbers
+            of its levels.
         kernel: k, of this library or GPyTorch. Default: RBF.
 
     Raises:
-        ValueError: If it is empty, not finite or of another shape. When a model is built, if it
-            names no column of the inputs, a transform of the inputs mixes columns, or k is not a
-            product over S and R.
+        ValueError: If ``where`` is empty, not finite or of another shape. When a model is built, if
+            a column does not exist, a transform of the inputs mixes columns, or k is not a product
+            over S and R.
 
     Example:
         >>> import torch
@@ -73,56 +73,59 @@ class Vanishing(Kernel):
                 )
             where = dict(enumerate(points.mT))
         try:
-            each = [torch.as_tensor(v, dtype=torch.float64).reshape(-1) for v in where.values()]
-            self.values = torch.stack(torch.broadcast_tensors(*each), -1)
-            self.values[0]  # an error if there is none
+            columns = [torch.as_tensor(v, dtype=torch.float64).reshape(-1) for v in where.values()]
+            self.values = torch.stack(torch.broadcast_tensors(*columns), -1)
+            self.values[0]  # an IndexError if there is no value
         except (TypeError, ValueError, RuntimeError, IndexError) as error:
             raise ValueError(
-                "Expected `where` with a number for each column, or as many numbers for each (for "
-                "a category the number of its level, from 0 in the order of the alphabet); found "
+                "Expected `where` with a number for each column, or equally many numbers for each "
+                "(for a category the number of its level, from 0 in alphabetical order); found "
                 f"{where!r}."
             ) from error
         self.columns: list[str | int] = [*where]
         check_finite("where", self.values)
-        self.places = self.values  # in the columns that kernels read; NaN in those that are free
+        self.places = self.values  # in `of_data` the inputs of kernels, NaN in the columns R
 
     @property
     def settings(self) -> dict[str, Any]:
         """The arguments."""
-        where = dict(zip(self.columns, self.values.mT.tolist(), strict=True))
-        return {"where": self.values.tolist() if self.is_points else where, "kernel": self.kernel}
+        by_column = dict(zip(self.columns, self.values.mT.tolist(), strict=True))
+        where = self.values.tolist() if self.is_points else by_column
+        return {"where": where, "kernel": self.kernel}
 
     def of_term(self, outputscale: LogNormal) -> Vanishing:
-        """Return the kernel whose k has the prior variance of a term, if it has none."""
+        """Return the kernel for a term, whose prior variance is the default of k."""
         new = copy(self)
         new.kernel = as_kernel(self.kernel, outputscale)
         return new
 
     def of_data(self, data: Data) -> Vanishing:
-        """Return the kernel on the columns that kernels of a model read."""
-        new, d, found = copy(self), data.X.shape[-1], len(self.columns)
-        if self.is_points and found != d:
+        """Return the kernel for a model's data, on the inputs of its kernels."""
+        new = copy(self)
+        d = data.X.shape[-1]
+        if self.is_points and len(self.columns) != d:
             raise ValueError(
-                f"Expected `where` as points of {d} columns; found {found}. Give values of some "
-                "columns as a dictionary."
+                f"Expected `where` as points of {d} columns; found {len(self.columns)}. Give "
+                "values of some columns as a dictionary."
             )
         places = data.X.new_full((len(self.values), d), torch.nan)
         places[:, columns_of(data.input_names, self.columns, "`where`")] = self.values.to(places)
-        free = places.isnan()
+        is_free = places.isnan()  # columns R
         terms = getattr(data.transform, "terms", lambda terms: terms)
         new.kernel = terms([Term("k", self.kernel)])[0].kernel.of_data(data)
+        # A transform of single columns leaves S where it is, whatever R: compare both ends of R.
         ends = torch.stack([data.X.amin(-2), data.X.amax(-2)])
-        moved = ends.where(free.unsqueeze(-2), places.unsqueeze(-2))  # p x 2 x d
-        read = data.kernel_inputs(moved)
-        if read.shape != moved.shape or not torch.equal(read[:, 0][~free], read[:, 1][~free]):
+        moved = ends.where(is_free.unsqueeze(-2), places.unsqueeze(-2))  # p x 2 x d
+        first, second = (data.kernel_inputs(moved[:, i]) for i in range(2))
+        if first.shape != places.shape or not torch.equal(first[~is_free], second[~is_free]):
             raise ValueError(
                 "Expected an input transform that treats each column by itself, as Normalize, with "
                 "Vanishing; found one that mixes columns, or makes others."
             )
-        check_finite("where, after the transform,", read[:, 0][~free])
-        new.places = read[:, 0].masked_fill(free, torch.nan)
+        check_finite("where, after the transform,", first[~is_free])
+        new.places = first.masked_fill(is_free, torch.nan)
         x = data.kernel_inputs(data.X[:40])
-        if free.any() and not new._is_product(torch.cat([x, x.where(free[0], read[0, 0])])):
+        if is_free.any() and not new._is_product(torch.cat([x, x.where(is_free[0], first[0])])):
             raise ValueError(
                 "Expected a kernel that is a product over the inputs in `where` and all others, as "
                 f"RBF; found {self.kernel}. With values of all inputs any kernel will do."
@@ -136,68 +139,69 @@ class Vanishing(Kernel):
 
     def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
         """Return the covariances of inputs with others, or with themselves; NaN if impossible."""
-        left = self._along(own, x)[0]
-        right = left if other is None else self._along(own, other)[0]
-        zero = self._of(own, x, other, True) - left @ right.mT
+        # k_R (k_S - k_S(x, V) k_S(V, V)^-1 k_S(V, x')); the second factor has the variance twice.
+        left = self._whitened(own, x)[0]
+        right = left if other is None else self._whitened(own, other)[0]
+        conditioned = self._factor(own, x, other, True) - left @ right.mT
         if not self.places.isnan().any():
-            return zero
+            return conditioned
         origin = torch.zeros_like(x[..., :1, :])
-        return zero * self._of(own, x, other, False) / self.kernel.covariance(own, origin)
+        rest = self._factor(own, x, other, False)
+        return conditioned * rest / self.kernel.covariance(own, origin)
 
     def variance(self, own: Values, x: Tensor) -> Tensor:
         """Return the prior variances, ``... x S x m x n``."""
         k = self.kernel.variance
-        zero = k(own, self._part(x, True)) - self._along(own, x)[0].square().sum(-1)
-        return zero.clamp_min(0.0) * k(own, self._part(x, False)) / k(own, torch.zeros_like(x))
+        conditioned = k(own, self._part(x, True)) - self._whitened(own, x)[0].square().sum(-1)
+        rest = k(own, self._part(x, False))
+        return conditioned.clamp_min(0.0) * rest / k(own, torch.zeros_like(x))
 
     def features(self, own: Values, number: int, generator: torch.Generator) -> Features:
-        r"""Return features of k, less what is known of them:
+        r"""Return features of k, less their projection onto the features at the places:
 
         .. math:: \varphi(x) - \sum_{ij} k_S(x_S, V_i) [k_S(V, V)^{-1}]_{ij} \varphi(V_j, x_R).
         """
-        free = self.kernel.features(own, number, generator)
+        base = self.kernel.features(own, number, generator)
 
         def features(x: Tensor) -> Tensor:
             places = self.places.to(x).reshape(-1, *[1] * (x.dim() - 1), x.shape[-1])
-            there = free(x.where(places.isnan(), places))  # p x ... x n x D
-            along, root = self._along(own, x)
-            weights = torch.linalg.solve_triangular(root.mT, along.mT, upper=True)
-            return free(x) - (weights.movedim(-2, 0).unsqueeze(-1) * there).sum(0)
+            at_places = base(x.where(places.isnan(), places))  # p x ... x n x D
+            # k_S(x, V) k_S(V, V)^-1 = (k_S(x, V) L^-T) L^-1
+            whitened, root = self._whitened(own, x)
+            weights = torch.linalg.solve_triangular(root.mT, whitened.mT, upper=True)
+            return base(x) - (weights.movedim(-2, 0).unsqueeze(-1) * at_places).sum(0)
 
         return features
 
-    def _part(self, x: Tensor, is_given: bool) -> Tensor:
+    def _part(self, x: Tensor, is_S: bool) -> Tensor:
         """Return inputs with 0 in the columns R, or in S."""
-        return x.where((self.places[0].isfinite() == is_given).to(x.device), 0.0)
+        return x.where((self.places[0].isfinite() == is_S).to(x.device), 0.0)
 
-    def _of(self, own: Values, x: Tensor, other: Tensor | None, is_given: bool) -> Tensor:
+    def _factor(self, own: Values, x: Tensor, other: Tensor | None, is_S: bool) -> Tensor:
         """Return k_S, or k_R, times the variance."""
-        other = None if other is None else self._part(other, is_given)
-        K: Tensor = self.kernel.covariance(own, self._part(x, is_given), other)
+        other = None if other is None else self._part(other, is_S)
+        K: Tensor = self.kernel.covariance(own, self._part(x, is_S), other)
         return K
 
-    def _along(self, own: Values, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the covariances of x_S with what is zero, whitened: ``... x n x p``.
-
-        And the root that whitens, the Cholesky factor of what is zero; NaN if it has none.
-        """
-        zeros = self.places.to(x).nan_to_num()[None, None]
-        K = self._of(own, zeros, None, True)
-        rounding = _ROUNDING if K.shape[-1] > 1 else 0.0
-        K = K + rounding * torch.diag_embed(K.diagonal(dim1=-1, dim2=-2))
+    def _whitened(self, own: Values, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Return k_S(x, V) L^-T, ``... x n x p``, and L with k_S(V, V) = L L^T; NaN if none."""
+        places = self.places.to(x).nan_to_num()[None, None]
+        K = self._factor(own, places, None, True)
+        if K.shape[-1] > 1:
+            K = K + _ROUNDING * torch.diag_embed(K.diagonal(dim1=-1, dim2=-2))
         root, failed = torch.linalg.cholesky_ex(K)
         root = root.masked_fill(failed[..., None, None] > 0, torch.nan)
-        cross = self._of(own, x, zeros, True)
+        cross = self._factor(own, x, places, True)
         return torch.linalg.solve_triangular(root, cross.mT, upper=False).mT, root
 
     def _is_product(self, x: Tensor) -> bool:
-        """Return whether k(x, x') k(0, 0) is k_S k_R, at the middle of the prior."""
-        own = {row.name: row.value(x.new_zeros(1)) for row in self.kernel.rows(x, 1)}
-        own = {name: value.unsqueeze(0) for name, value in own.items()}
+        """Return whether k(x, x') k(0, 0) = k_S k_R, at the middle of the prior."""
+        rows = self.kernel.rows(x, 1)
+        middle = {row.name: row.value(x.new_zeros(1)).unsqueeze(0) for row in rows}
         x = x[None, None]
-        whole = self.kernel.covariance(own, x) * self.kernel.covariance(own, 0 * x)
-        parts = self._of(own, x, None, True) * self._of(own, x, None, False)
-        return torch.allclose(whole, parts, rtol=1e-8, atol=1e-12)
+        joint = self.kernel.covariance(middle, x) * self.kernel.covariance(middle, 0 * x)
+        product = self._factor(middle, x, None, True) * self._factor(middle, x, None, False)
+        return torch.allclose(joint, product, rtol=1e-8, atol=1e-12)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.kernel})"

@@ -1,4 +1,4 @@
-"""The evidence of many rows by inducing points, a lower bound, and its derivatives in blocks."""
+"""A lower bound of the evidence of many rows, by inducing points, with its derivatives."""
 
 from __future__ import annotations
 
@@ -12,20 +12,21 @@ from torch import Tensor
 from gpadjust.core.gaussian import SumLikelihood, add_noise
 from gpadjust.core.terms import WeightedSum
 
-_NUGGET = 1e-8  # of inducing values, in their mean variance: sums over rows divide errors by it
-_AT_ONCE = 2**20  # covariances of inducing values with rows that are in memory
+_NUGGET = 1e-8  # of the mean variance of inducing values; sums over rows divide rounding by it
+_AT_ONCE = 2**20  # covariances of inducing values with rows to have in memory
 
 
 def at_points(total: WeightedSum, points: Tensor) -> WeightedSum:
     """Return a sum over all rows at inducing points: row numbers of each output, ``m x M``."""
-    m, outputs = len(points), torch.arange(len(points), device=points.device).unsqueeze(-1)
+    m = len(points)
+    outputs = torch.arange(m, device=points.device).unsqueeze(-1)
 
-    def of_points(v: Tensor) -> Tensor:
+    def select(v: Tensor) -> Tensor:
         return v.expand(*v.shape[:-2], m, v.shape[-1])[..., outputs, points]
 
-    weights = {n: of_points(w) for n, w in total.weights.items()}
+    weights = {n: select(w) for n, w in total.weights.items()}
     x = total.x.expand(*total.x.shape[:-3], m, *total.x.shape[-2:])[..., outputs, points, :]
-    return WeightedSum(total.terms, total.values, x, of_points(total.mean), weights)
+    return WeightedSum(total.terms, total.values, x, select(total.mean), weights)
 
 
 def part_of(total: WeightedSum, name: str, is_in: bool) -> WeightedSum:
@@ -35,7 +36,7 @@ def part_of(total: WeightedSum, name: str, is_in: bool) -> WeightedSum:
 
 
 def root_of(inducing: WeightedSum) -> Tensor:
-    """Return the Cholesky factor of the covariance of inducing values, NaN if it has none."""
+    """Return the Cholesky factor of the covariance of inducing values, NaN if it fails."""
     K = inducing.cross(inducing)
     nugget = _NUGGET * K.diagonal(dim1=-1, dim2=-2).mean(-1, keepdim=True)
     root, info = torch.linalg.cholesky_ex(add_noise(K, nugget))
@@ -43,7 +44,7 @@ def root_of(inducing: WeightedSum) -> Tensor:
 
 
 def blocks(number: int, root: Tensor) -> Iterator[slice]:
-    """Return slices of rows, as many at once as memory is to hold."""
+    """Return slices of rows whose covariances with inducing values fit into memory."""
     size = max(1, _AT_ONCE // root[..., 0].numel())
     return (slice(i, min(i + size, number)) for i in range(0, number, size))
 
@@ -56,11 +57,13 @@ class Sums(NamedTuple):
     cross: Tensor  # sum_i w_i r_i v_i, S x m x M
 
     @classmethod
-    def of(cls, total: WeightedSum, points: Tensor, residual: Tensor, weight: Tensor) -> Sums:
+    def over_rows(
+        cls, total: WeightedSum, points: Tensor, residual: Tensor, weight: Tensor
+    ) -> Sums:
         """Return the sums of residuals and weights ``S x m x n``, without a graph.
 
-        Sums of k k^T would be faster, but their rounding errors, divided by the nugget, are larger
-        than what the points show where variances are far above the noise.
+        Sums of k k^T would be faster, but the nugget divides their rounding errors, which are then
+        larger than the information of the points where variances are far above the noise.
         """
         with torch.no_grad():
             inducing = at_points(total, points)
@@ -95,54 +98,57 @@ def bound(
         total: The sum that the inducing points stand for, at the rows.
         points: The numbers of the rows that are inducing points, ``m x M``.
         rest: A further sum, which is noise to the inducing values.
-        residual: The targets less their means, ``S x m x n``; 0 where one is not observed.
+        residual: The targets less their means, ``S x m x n``; 0 for a missing target.
         noise: The variances of the noise, ``S x m x n`` (or 1).
-        observed: Which targets there are, ``m x n``.
-        with_gradient: Whether the derivatives are asked for.
+        observed: False for missing targets, ``m x n``.
+        with_gradient: If True, compute the derivatives.
     """
     values = {name: v.detach().clone().requires_grad_() for name, v in total.values.items()}
     weights = {n: w.detach().expand(residual.shape).clone() for n, w in total.weights.items()}
     leaves = {f"{n}.weight": w.requires_grad_() for n, w in weights.items()}
-    own = WeightedSum(total.terms, values, total.x, total.mean.detach(), weights)
+    leaf_sum = WeightedSum(total.terms, values, total.x, total.mean.detach(), weights)
     with torch.enable_grad():
         rest_variance = WeightedSum(rest.terms, values, rest.x, rest.mean, rest.weights).variance()
-        variance = own.variance()
+        variance = leaf_sum.variance()
     sigma2 = (noise + rest_variance.detach()).expand(residual.shape)
     weight = observed / sigma2
-    root, square, cross = Sums.of(total, points, residual, weight)
+    root, square, cross = Sums.over_rows(total, points, residual, weight)
     eye = torch.eye(square.shape[-1]).to(square)
     chol, info = torch.linalg.cholesky_ex(eye + square)
     best = torch.cholesky_solve(cross.unsqueeze(-1), chol)  # Lambda^-1 c, S x m x M x 1
+    # sum_i log(2 pi / w_i), and log |Lambda|
     size = ((2 * math.pi * sigma2).log() * observed).sum(-1)
     log_det = 2 * chol.diagonal(dim1=-1, dim2=-2).log().sum(-1)
+    # sum_i w_i r_i^2 - c^T Lambda^-1 c, and sum_i w_i (k_ii - v_i^T v_i)
     misfit = (weight * residual.square()).sum(-1) - (cross * best.squeeze(-1)).sum(-1)
-    unseen = (weight * variance.detach()).sum(-1) - square.diagonal(dim1=-1, dim2=-2).sum(-1)
-    value = -0.5 * (size + log_det + misfit + unseen)
+    trace = (weight * variance.detach()).sum(-1) - square.diagonal(dim1=-1, dim2=-2).sum(-1)
+    value = -0.5 * (size + log_det + misfit + trace)
     value = value.masked_fill(info > 0, -torch.inf)
     if not with_gradient or not value.isfinite().any():
         return SumLikelihood(value, {}, torch.zeros_like(residual), torch.zeros_like(residual))
-    # By the sums: 2 G = I - Lambda^-1 - Lambda^-1 c c^T Lambda^-1, and Lambda^-1 c.
+    # Derivatives by the sums: 2 G = I - Lambda^-1 - Lambda^-1 c c^T Lambda^-1, and Lambda^-1 c.
     by_square = eye - torch.cholesky_inverse(chol) - best @ best.mT
-    # By v_i it is w_i (2 G v_i + r_i Lambda^-1 c), by k_i = L v_i that solved with L^T.
+    # By v_i: w_i (2 G v_i + r_i Lambda^-1 c); by k_i = L v_i the same, solved with L^T.
     solved = torch.linalg.solve_triangular(root.mT, torch.cat([by_square, best], -1), upper=True)
     by_weight, by_residual = torch.zeros_like(residual), torch.zeros_like(residual)
     for rows in blocks(residual.shape[-1], root):
         r, w = residual[..., rows], weight[..., rows]
         with torch.enable_grad():
-            k = at_points(own, points).cross(own.of_rows(rows))
+            k = at_points(leaf_sum, points).cross(leaf_sum.of_rows(rows))
         v = torch.linalg.solve_triangular(root, k.detach(), upper=False)
-        by_v, mean = solved[..., :-1] @ v, (best.mT @ v).squeeze(-2)
+        by_v = solved[..., :-1] @ v
+        mean = (best.mT @ v).squeeze(-2)
         quadratic = (k.detach() * by_v).sum(-2) / 2  # v^T G v
         by_weight[..., rows] = quadratic + r * mean
         by_residual[..., rows] = w * (mean - r)
         by_k = w.unsqueeze(-2) * by_v + solved[..., -1:] * (w * r).unsqueeze(-2)
         torch.autograd.backward([k], [by_k])
     by_weight = by_weight - 0.5 * (residual.square() + variance.detach() - sigma2)
-    by_noise = -by_weight * weight.square()  # of w = 1 / sigma^2; 0 where not observed
-    # All rows at once have -L^-T (by v) v^T by L.
+    by_noise = -by_weight * weight.square()  # dw / dsigma^2 = -w^2; 0 for a missing target
+    # By L, of all rows at once: -L^-T (by v) v^T
     by_root = solved[..., :-1] @ square + solved[..., -1:] * cross.unsqueeze(-2)
     with torch.enable_grad():
-        inducing_root = root_of(at_points(own, points))
+        inducing_root = root_of(at_points(leaf_sum, points))
     torch.autograd.backward([inducing_root, variance], [-by_root.tril(), -0.5 * weight])
     if rest_variance.requires_grad:
         rest_variance.backward(by_noise.sum_to_size(rest_variance.shape))

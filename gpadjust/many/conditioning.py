@@ -15,9 +15,9 @@ from gpadjust.many.bound import Sums, at_points, blocks
 
 
 class SparseConditioning(Conditioning):
-    r"""The posterior of weighted sums, given many observations of one, by inducing values u.
+    r"""The posterior of weighted sums, given many observations of one sum, by inducing values u.
 
-    A basis E makes their prior white and the information of the rows diagonal,
+    A basis E whitens their prior and makes the information of the rows diagonal,
     :math:`E K E^T = I` and :math:`E K_{uf} W K_{fu} E^T = D`. With :math:`e = E k(Z, x)`, means are
     :math:`\bar f + e^T (I + D)^{-1} E K_{uf} W r` and variances
     :math:`k(x, x) - e^T D (I + D)^{-1} e`.
@@ -27,7 +27,7 @@ class SparseConditioning(Conditioning):
         points: The numbers of the rows that are inducing points, ``m x M``.
         prior: The variances of the observed sum at all rows, ``S x m x n``.
         noise: The variances of the noise.
-        rest: The variances of what is noise to the inducing values but a function to others.
+        rest: The variances of the further sum that is noise to the inducing values.
         targets: The observations, ``1 x m x n``; NaN where one is missing.
     """
 
@@ -35,21 +35,24 @@ class SparseConditioning(Conditioning):
         self, total: WeightedSum, points: Tensor, prior: Tensor, noise: Tensor, rest: Tensor,
         targets: Tensor,
     ) -> None:  # fmt: skip
-        self.total, self.prior, self.targets = total, prior, targets
-        self.num_rows, self.rest = targets.shape[-1], rest
+        self.total, self.prior, self.targets, self.rest = total, prior, targets, rest
+        self.num_rows = targets.shape[-1]
         shape = torch.broadcast_shapes(prior.shape, noise.shape, targets.shape)
-        self.noise, is_seen = noise.expand(shape), ~targets.isnan()
-        self.weight = (is_seen / (noise + rest)).expand(shape)
-        self.residual = ((targets - total.mean).nan_to_num() * is_seen).expand(shape)
-        self.chol, square, cross = Sums.of(total, points, self.residual, self.weight)
+        self.noise = noise.expand(shape)
+        is_observed = ~targets.isnan()
+        self.weight = (is_observed / (noise + rest)).expand(shape)
+        self.residual = ((targets - total.mean).nan_to_num() * is_observed).expand(shape)
+        self.chol, square, cross = Sums.over_rows(total, points, self.residual, self.weight)
         if not self.chol.isfinite().all():
             raise ValueError(
-                "Expected numbers of kernels at which covariances of inducing values have a "
-                "Cholesky factor; found others. Fit the model anew, with fewer inducing points."
+                "Expected kernel parameters at which covariances of inducing values have a "
+                "Cholesky factor; found others. Fit the model again, with fewer inducing points."
             )
+        # L^-1 K_uf W K_fu L^-T = Q D Q^T, so that E = Q^T L^-1
         self.gain, vectors = torch.linalg.eigh(square)
-        self.gain = self.gain.clamp_min(0.0)
+        self.gain = self.gain.clamp_min(0.0)  # D
         self.basis = torch.linalg.solve_triangular(self.chol.mT, vectors, upper=True).mT
+        # (I + D)^-1 E K_uf W r
         self.white_mean = (vectors.mT @ cross.unsqueeze(-1)).squeeze(-1) / (1 + self.gain)
         self.alpha = (self.basis.mT @ self.white_mean.unsqueeze(-1)).squeeze(-1)
         self.inverse = (self.gain / (1 + self.gain)).sqrt().unsqueeze(-1) * self.basis
@@ -59,47 +62,47 @@ class SparseConditioning(Conditioning):
     def bound(self) -> Tensor:
         """Return the lower bound of the log likelihood, ``S x m``; see :func:`~.bound`."""
         sizes = (2 * math.pi / self.weight).log().masked_fill(self.weight == 0, 0.0).sum(-1)
-        seen = (self.weight * (self.residual.square() + self.prior - self.rest)).sum(-1)
+        misfits = (self.weight * (self.residual.square() + self.prior - self.rest)).sum(-1)
         by_points = (1 + self.gain).log() - self.gain - (1 + self.gain) * self.white_mean.square()
-        return -0.5 * (sizes + seen + by_points.sum(-1))
+        return -0.5 * (sizes + misfits + by_points.sum(-1))
 
     def inverse_factor(self) -> Tensor:
-        """Return what makes :math:`k(x, x) - |F k|^2` of covariances k with inducing values."""
+        """Return F, with variances :math:`k(x, x) - |F k|^2` by covariances k with u."""
         return self.inverse
 
     def update(self, prior: Tensor, generator: torch.Generator) -> Tensor:
-        """Return what gives functions from the prior inducing values from the posterior."""
+        """Return weights that move inducing values of the prior to values of the posterior."""
         noise = standard_normal(prior.shape, generator, prior)
+        # E u ~ N(white mean, (I + D)^-1)
         white = (self.basis @ (prior - self.train.mean).unsqueeze(-1)).squeeze(-1)
-        away = self.white_mean + (1 + self.gain).rsqrt() * noise - white
-        return (self.basis.mT @ away.unsqueeze(-1)).squeeze(-1)
+        move = self.white_mean + (1 + self.gain).rsqrt() * noise - white
+        return (self.basis.mT @ move.unsqueeze(-1)).squeeze(-1)
 
     def at_rows(self, rows: slice) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the mean, the variance by the inducing values, and their prior's, at some rows."""
+        """Return mean, posterior and prior variance of the function of inducing values, at rows."""
         e = self.basis @ self.train.cross(self.total.of_rows(rows))
         mean = self.total.mean[..., rows] + (self.white_mean.unsqueeze(-2) @ e).squeeze(-2)
-        known = e.square()
-        return mean, (known / (1 + self.gain).unsqueeze(-1)).sum(-2), known.sum(-2)
+        squares = e.square()
+        return mean, (squares / (1 + self.gain).unsqueeze(-1)).sum(-2), squares.sum(-2)
 
     def leverage(self) -> tuple[Tensor, Tensor, Tensor]:
-        r"""Return means, conditional variances and leverages :math:`w h` at all rows."""
+        """Return means, variances given the inducing values, and variances h by these, at rows."""
         parts = [self.at_rows(rows) for rows in blocks(self.targets.shape[-1], self.chol)]
-        mean, own, known = (torch.cat(each, -1) for each in zip(*parts, strict=True))
-        return mean, (self.prior - known).clamp_min(0.0), own
+        mean, h, explained = (torch.cat(part, -1) for part in zip(*parts, strict=True))
+        return mean, (self.prior - explained).clamp_min(0.0), h
 
     def left_out(self) -> tuple[Tensor, Tensor]:
         r"""Return means and variances of each observation given all others, noise included.
 
         In the linear model of the inducing values a row has a variance h and a leverage
-        :math:`H = w h`; without it the residual is :math:`(y - m) / (1 - H)`, h is
+        :math:`H = w h`. Without the row, the residual is :math:`(y - m) / (1 - H)` and the variance
         :math:`h / (1 - H)`.
         """
-        mean, unseen, own = self.leverage()
-        kept = (1 - self.weight * own).clamp_min(1e-9)
-        variance = unseen + own / kept + self.noise
-        return self.targets - (self.targets - mean) / kept, variance.masked_fill(
-            self.targets.isnan(), torch.nan
-        )
+        mean, conditional, h = self.leverage()
+        free = (1 - self.weight * h).clamp_min(1e-9)  # 1 - H
+        variance = conditional + h / free + self.noise
+        left_out_mean = self.targets - (self.targets - mean) / free
+        return left_out_mean, variance.masked_fill(self.targets.isnan(), torch.nan)
 
 
 class LaterConditioning(Conditioning):
@@ -121,35 +124,40 @@ class LaterConditioning(Conditioning):
         noise: Tensor,
         targets: Tensor,
     ) -> None:
-        self.old, self.train = old, joined(old.train, late)
+        self.old = old
+        self.train = joined(old.train, late)
         self.num_rows: int = old.num_rows + targets.shape[-1]
-        K, K21, seen = late.cross(late), late.cross(old.train), ~targets.isnan()
-        while seen.dim() > K.dim() - 1 and bool((seen == seen[0]).all()):
-            seen = seen[0]  # fantasies of the same points share a factor
-        K21 = K21 * seen.unsqueeze(-1) * old.observed.unsqueeze(-2)
+        K = late.cross(late)
+        observed = ~targets.isnan()
+        while observed.dim() > K.dim() - 1 and bool((observed == observed[0]).all()):
+            observed = observed[0]  # fantasies of the same points share a factor
+        K21 = late.cross(old.train) * observed.unsqueeze(-1) * old.observed.unsqueeze(-2)
+        # The covariance of the late rows given the old ones is K - B B^T + noise = R R^T.
         B = old.white(K21)
         noise = noise.expand(torch.broadcast_shapes(noise.shape, K.shape[:-1]))
-        self.root = factor(K - B @ B.mT, noise, seen)
-        lead, k = self.root.shape[:-2], self.root.shape[-1]
+        self.root = factor(K - B @ B.mT, noise, observed)
+        *lead, _, k = self.root.shape
         # The inverse factor [[F, 0], [-R^-1 B F, R^-1]].
         upper = old.inverse_factor().expand(*lead, -1, -1)
         right = torch.cat([-B @ upper, torch.eye(k).to(K).expand(*lead, k, k)], -1)
         self.below = torch.linalg.solve_triangular(self.root, right, upper=False)
         zero = upper.new_zeros(*upper.shape[:-1], k)
         self.inverse = torch.cat([torch.cat([upper, zero], -1), self.below], -2)
-        self.chol = self.inverse  # for its size
-        self.noise, self.targets, self.seen, self.K21 = noise, targets, seen, K21
+        self.chol = self.inverse  # callers read its size
+        self.noise, self.targets = noise, targets
+        self.is_late = observed
+        self.K21 = K21
         mean = late.mean + (K21 @ old.alpha.unsqueeze(-1)).squeeze(-1)
         self.alpha = self.later(old.alpha, targets - mean)
-        self.observed = appended(old.observed, seen, -1)
+        self.observed = appended(old.observed, observed, -1)
 
     def inverse_factor(self) -> Tensor:
-        """Return what makes :math:`k(x, x) - |F k|^2` of covariances k with all that is known."""
+        """Return F, with variances :math:`k(x, x) - |F k|^2` by covariances k with all rows."""
         return self.inverse
 
     def later(self, weights: Tensor, residual: Tensor) -> Tensor:
-        """Return weights ``... x M`` of the old rows, and of late ones for their residuals."""
-        residual = (residual.nan_to_num() * self.seen).unsqueeze(-1)
+        """Return weights ``... x M`` of the old rows, and of late rows by their residuals."""
+        residual = (residual.nan_to_num() * self.is_late).unsqueeze(-1)
         white = torch.linalg.solve_triangular(self.root, residual, upper=False)
         added = (self.below.mT @ white).squeeze(-1)
         lead = torch.broadcast_shapes(added.shape[:-1], weights.shape[:-1])
@@ -157,7 +165,7 @@ class LaterConditioning(Conditioning):
         return old + added
 
     def update(self, prior: Tensor, generator: torch.Generator) -> Tensor:
-        """Return what makes functions from the prior meet the observations."""
+        """Return weights that move functions from the prior onto the observations."""
         M = self.K21.shape[-1]
         old = self.old.update(prior[..., :M], generator)
         value = prior[..., M:] + (self.K21 @ old.unsqueeze(-1)).squeeze(-1)
@@ -165,17 +173,16 @@ class LaterConditioning(Conditioning):
         return self.later(old, self.targets - value - noise)
 
     def left_out(self) -> tuple[Tensor, Tensor]:
-        """Refuse, as there is no formula for the first rows."""
+        """Raise an error: the formula does not cover the rows of the fit."""
         raise NotImplementedError(
-            "Expected a model without observations since its fit; found "
-            f"{self.targets.shape[-1]}. Build it of all data and fit it: then there are left-out "
-            "predictions."
+            "Left-out predictions need a model without observations since its fit; found "
+            f"{self.targets.shape[-1]}. Build a model of all data and fit it."
         )
 
 
 def joined(old: WeightedSum, late: WeightedSum) -> WeightedSum:
-    """Return a sum at the places of two; terms that the old one has not have no weight there."""
-    none = torch.zeros_like(old.mean)
-    weights = {n: appended(old.weights.get(n, none), w, -1) for n, w in late.weights.items()}
-    x, mean = appended(old.x, late.x), appended(old.mean, late.mean, -1)
-    return WeightedSum(late.terms, late.values, x, mean, weights)
+    """Return a sum at the places of two; terms of the late one alone have no weight at the old."""
+    zero = torch.zeros_like(old.mean)
+    weights = {n: appended(old.weights.get(n, zero), w, -1) for n, w in late.weights.items()}
+    mean = appended(old.mean, late.mean, -1)
+    return WeightedSum(late.terms, late.values, appended(old.x, late.x), mean, weights)

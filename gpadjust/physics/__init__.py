@@ -6,6 +6,7 @@ from gpadjust.physics.error import PhysicsError, PhysicsWarning
 from gpadjust.physics.fmu_physics import FMUPhysics
 from gpadjust.physics.formula import FormulaPhysics
 from gpadjust.physics.function import FunctionPhysics, as_physics
+from gpadjust.physics.mujoco import MujocoPhysics
 from gpadjust.physics.ode import ODEPhysics
 from gpadjust.physics.parameters import ParameterValues, PhysicsParameters
 from gpadjust.physics.subprocess_physics import SubprocessPhysics
@@ -16,6 +17,7 @@ __all__ = [
     "FMUPhysics",
     "FormulaPhysics",
     "FunctionPhysics",
+    "MujocoPhysics",
     "ODEPhysics",
     "ParameterValues",
     "Physics",

@@ -59,6 +59,8 @@ class ODEPhysics(Physics):
         tensor([[0.3679]], dtype=torch.float64)
     """
 
+    step: float
+
     def __init__(
         self,
         rhs: Callable[..., Tensor],

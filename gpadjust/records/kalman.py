@@ -94,7 +94,7 @@ def draw_paths(
 def measure(
     mean: Array, covariance: Array, outputs: Array, measured: Array, noise: Array
 ) -> tuple[Array, Array, float]:
-    """A state by outputs of it, ``m x D`` times the state, that were measured (Kalman 1960).
+    """Return a state updated by measured outputs, ``m x D`` times the state (Kalman 1960).
 
     What was not measured is NaN; the noise is variances ``m`` of independent errors.
 
@@ -337,7 +337,7 @@ def _gain(covariance: Array, crossed: Array) -> Array:
 
 
 def _normal(mean: Array, covariance: Array, rng: np.random.Generator) -> Array:
-    """A draw, also where there is no variance in some directions."""
+    """Draw from a normal distribution, with zero variance in some directions or not."""
     values, vectors = np.linalg.eigh(covariance)
     found: Array = mean + vectors @ (np.sqrt(values.clip(0)) * rng.standard_normal(len(mean)))
     return found

@@ -23,7 +23,7 @@ from gpadjust.checks import check_kind, checked_whole, finite_array
 from gpadjust.dynamics.base import of_states
 from gpadjust.dynamics.least_squares import even_normal
 from gpadjust.dynamics.targets import check_next_values, one_physics
-from gpadjust.physics import ODEPhysics, Physics, PhysicsError
+from gpadjust.physics import Physics, PhysicsError
 from gpadjust.physics.parameters import PhysicsParameters
 from gpadjust.progress import long_work, tick
 from gpadjust.records import kalman
@@ -197,7 +197,7 @@ def smooth(
     steps = _with_known_inputs(control_steps(records, step))
     spec, length = records.spec, steps.records[0].sampling_step
     f_p = one_physics(physics, spec, "smooth by one of them")
-    if isinstance(f_p, ODEPhysics) and abs(f_p.step - length) > _SAME * length:
+    if f_p.step is not None and abs(f_p.step - length) > _SAME * length:
         raise ValueError(
             f"Physics {f_p.name!r} makes steps of {f_p.step:g}, but the control step of the "
             f"records is {length:g}; pass step={f_p.step:g}, or build it with step={length:g}."

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gpadjust.core import CKA, Noise, fit
 from gpadjust.kinds import Categories, HeavyTails, NoisyInputs, RelativeNoise, with_options
-from gpadjust.physics import ODEPhysics, PhysicsError, PhysicsWarning
+from gpadjust.physics import PhysicsError, PhysicsWarning
 from gpadjust.progress import progress_bar
 from gpadjust.records import Identification, Records, identify
 from gpadjust.report import inputs as read
@@ -232,7 +232,7 @@ def _of_log(arguments: Namespace) -> Job:
         step = float(f"{whole.records[0].sampling_step:.{_DIGITS}g}")
     given = read.motion(arguments.physics, *names, unknowns, step)
     physics = given.physics
-    if isinstance(physics, ODEPhysics):
+    if physics.step is not None:
         step = physics.step
     if arguments.step not in (None, step):
         raise ValueError(

@@ -39,26 +39,26 @@ from gpadjust.rl.options import DynaOptions
 class Dyna(OffPolicyAlgorithm, Display):
     r"""A base for off-policy learners, which then train on real episodes and in a model.
 
-    After each real episode it updates on what it has, as the learner does; teaches the real
-    transitions to the dynamics of its task; and runs ``model_episodes`` episodes of particles in
-    the model, with ``updates_per_model_step`` gradient steps for each step of each particle. Real
-    and model experience lie in one :class:`MixedReplayBuffer` (Sutton 1990; Wannawas and Faisal
-    2023, sec. 2.3). Model steps do not count as time steps. All else is the learner's: callbacks,
-    ``VecNormalize``, schedules, ``predict``, and ``save`` and ``load``, which keep the learner
-    alone: an :class:`~gpadjust.control.EpisodeCheckpoint` keeps all of a run. Errors and steps that
-    fail lose nothing, as of :class:`gpadjust.control.Agent`; where the environment was wrong,
-    ``agent.replay_buffer.reset()`` forgets what it said.
+    After each real episode, the agent updates on all experience, as the learner does; updates the
+    dynamics of its task by the real transitions; and runs ``model_episodes`` episodes of particles
+    in the model, with ``updates_per_model_step`` gradient steps for each step of each particle.
+    Real and model experience are in one :class:`MixedReplayBuffer` (Sutton 1990; Wannawas and
+    Faisal 2023, sec. 2.3). Model steps do not count as time steps. Everything else belongs to the
+    learner: callbacks, ``VecNormalize``, schedules, ``predict``, and ``save`` and ``load``, which
+    save the learner alone; an :class:`~gpadjust.control.EpisodeCheckpoint` saves a run. After
+    errors and failed steps the experience remains, as in :class:`gpadjust.control.Agent`; after
+    wrong data of an environment, call ``agent.replay_buffer.reset()``.
 
-    A learner of Stable-Baselines3 becomes one of this family as
-    ``class DynaTD3(Dyna, TD3): ...``, if it is off-policy and its ``train`` samples from
-    ``replay_buffer``. Other bases are a TypeError where the class is defined.
+    Any off-policy learner of Stable-Baselines3 whose ``train`` samples from ``replay_buffer`` can
+    be a base, as in ``class DynaTD3(Dyna, TD3): ...``. Other bases raise a TypeError at the
+    definition of the class.
 
     Args:
         policy: As in the learner.
-        env: The real environment; observations are those of the spec of the dynamics.
-        task: What is known of the system.
-        options: How the model is used.
-        buffer_size: Real transitions that the learner keeps.
+        env: The real environment; its observations follow the spec of the dynamics.
+        task: The task.
+        options: Options of the model.
+        buffer_size: Number of real transitions in the buffer.
         learning_starts: As in the learner. Default: the untrained policy acts in the first episode.
         train_freq: As in the learner. Default: after each episode; with several environments give a
             number of steps. The model is fitted after updates at which an episode has ended.
@@ -66,16 +66,16 @@ class Dyna(OffPolicyAlgorithm, Display):
         kwargs: Further arguments of the learner.
 
     Attributes:
-        num_episodes: Real episodes that have ended and were learnt from.
+        num_episodes: Number of real episodes that have ended and were used.
         task: The task; to change a part of it, set another one.
         wall_time: Seconds spent on ``"fit"``, ``"rollout"`` and ``"update"``.
         notes: As of :class:`gpadjust.control.Agent`.
 
     Raises:
-        ValueError: As :class:`gpadjust.control.Agent`, and if there is no task, or n-step returns
-            are asked for.
-        TypeError: If task or options are of another kind.
-        AssertionError: By Stable-Baselines3, if the actions are no box.
+        ValueError: As :class:`gpadjust.control.Agent`, and if there is no task, or ``n_steps`` is
+            not 1.
+        TypeError: If task or options have another type.
+        AssertionError: By Stable-Baselines3, if the action space is not a box.
     """
 
     not_saved: ClassVar[tuple[str, ...]] = (
@@ -86,11 +86,12 @@ class Dyna(OffPolicyAlgorithm, Display):
     observation_space: spaces.Box
     action_space: spaces.Box
     _custom_logger = False
-    _random_state: Any = None  # of a run that goes on, until `learn`
+    _random_state: Any = None  # of a resumed run, until `learn`
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Refuse a class that is made of other bases than Dyna and an off-policy learner."""
+        """Check that the bases are Dyna, then an off-policy learner."""
         super().__init_subclass__(**options)
+        # Dyna must override methods of the learner.
         mro = cls.__mro__
         for base in mro[: mro.index(BaseAlgorithm)]:
             is_off_policy = issubclass(base, OffPolicyAlgorithm)
@@ -117,15 +118,17 @@ class Dyna(OffPolicyAlgorithm, Display):
         if kwargs.get("n_steps", 1) != 1:
             raise ValueError(f"Dyna has no n-step returns; found n_steps={kwargs['n_steps']}.")
         if gradient_steps == 0:
-            raise ValueError("gradient_steps must be 1 or more, or -1, for the model to learn.")
+            raise ValueError(
+                "gradient_steps must be 1 or more, or -1, as the model is fitted after them."
+            )
         self.task: Any = task
         self.options = DynaOptions() if options is None else options
         self.num_episodes = 0
-        self.owed_updates = 0.0  # of steps in the model
+        self.owed_updates = 0.0  # fraction of an update, of earlier steps in the model
         self.wall_time = dict.fromkeys(("fit", "rollout", "update"), 0.0)
         self.notes: dict[str, Any] = {}
         self.model_hooks: list[DynaCallback] = []
-        if kwargs.get("_init_setup_model", True):
+        if kwargs.get("_init_setup_model", True):  # `load` sets the task afterwards
             self._check_task()
         super().__init__(
             policy,
@@ -146,12 +149,12 @@ class Dyna(OffPolicyAlgorithm, Display):
         super()._setup_model()
 
     def _check_task(self) -> None:
-        """Raise an error if the agent could not learn with its task and options."""
+        """Raise an error if task or options are missing or not supported."""
         name = type(self).__name__
         if self.task is None:
             raise ValueError(
                 f"{name} needs a task to learn; found None. Pass task=Task(dynamics, reward, ...) "
-                f"to {name} or, as it is not saved, to {name}.load."
+                f"to {name}, or to {name}.load, as `save` does not save it."
             )
         check_kind("task", self.task, Task, "a Task(dynamics, reward, ...)")
         check_kind("options", self.options, DynaOptions, "DynaOptions(...)")
@@ -161,31 +164,33 @@ class Dyna(OffPolicyAlgorithm, Display):
     # One iteration
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """Update on what there is, learn the dynamics, train in them; SB3 calls this."""
+        """Update on all experience, update the dynamics, train in them; SB3 calls this."""
         buffer, options, dynamics = self.replay_buffer, self.options, self.task.dynamics
         if not buffer.size():
             return  # all steps failed
         last = options.last_model_episode
         uses_model = last is None or self.num_episodes < last
-        known = self.recorded_episodes()
-        new = known.some(slice(buffer.num_learnt, None))
-        data = new if dynamics.has_learnt else known
-        is_enough = len(new) and len(data) >= (1 if dynamics.is_fitted else 2)
+        # New real episodes; the first update of the dynamics has all of them.
+        recorded = self.recorded_episodes()
+        new = recorded.some(slice(buffer.num_learnt, None))
+        data = new if dynamics.has_learnt else recorded
+        is_enough = len(new) and len(data) >= 2 - dynamics.is_fitted  # two rows have a scale
         if is_enough and uses_model and options.reward_tolerance is not None:
             real.check_functions(self.task, data, options.reward_tolerance)
-        # Update on real transitions, and on those that earlier models made
+        # Update on real transitions, and on transitions of earlier models.
         buffer.mix = uses_model
         with real.timed(self.wall_time, "update"):
             super().train(gradient_steps, batch_size)
         if not is_enough:
             return
-        # Learn the dynamics from the new episodes
+        # Update the dynamics by the new episodes.
         metrics: dict[str, float] = {}
         if uses_model:
             with real.timed(self.wall_time, "fit"):
-                how = data, known, options.score_horizons
-                metrics = real.learn_dynamics(self.model_task(), *how)
-        buffer.num_learnt, num_ended = len(known), int((new.steps == 1).sum())
+                horizons = options.score_horizons
+                metrics = real.learn_dynamics(self.model_task(), data, recorded, horizons)
+        buffer.num_learnt = len(recorded)
+        num_ended = int((new.steps == 1).sum())
         self.num_episodes += num_ended
         for name, value in {**metrics, "real_reward": float(new.rewards.mean())}.items():
             self.logger.record(f"model/{name}", value)
@@ -193,20 +198,22 @@ class Dyna(OffPolicyAlgorithm, Display):
             return
         for hook in self.model_hooks:
             hook.on_model_fit(metrics)
-        # Train in the newest model
+        # Train in the newest model.
         self._train_in_model(options.model_episodes * num_ended, batch_size)
         total = sum(self.wall_time.values())
         for name, seconds in self.wall_time.items():
             self.logger.record(f"model/share_{name}", seconds / total)
 
     def _train_in_model(self, num_episodes: int, batch_size: int) -> None:
-        """Run model episodes, side by side, with updates at each step."""
+        """Run parallel model episodes, with updates at each step."""
         if not num_episodes:
             return
         at_once = self.options.num_particles or num_episodes
-        # SB3 counts the updates between two of the target networks from each call of train().
-        together = getattr(self, "target_update_interval", 1)
-        all_returns, num_left, num_steps = [], 0, 0
+        # SB3 counts updates between two target updates from each call of train(): call it with
+        # multiples of this interval.
+        interval = getattr(self, "target_update_interval", 1)
+        all_returns: list[np.ndarray] = []
+        num_left, num_steps = 0, 0
         for start in range(0, num_episodes, at_once):
             env = self.model_env(min(num_episodes - start, at_once))
             noise = self._model_noise(env.num_envs)
@@ -214,25 +221,34 @@ class Dyna(OffPolicyAlgorithm, Display):
                 if start == 0 and self.options.refresh_model_data:
                     env.refresh(self.replay_buffer.model_buffer)
                 obs = env.reset()
-            returns, running = np.zeros(env.num_envs), np.ones(env.num_envs, dtype=bool)
+            returns = np.zeros(env.num_envs)
+            running = np.ones(env.num_envs, dtype=bool)
             while running.any():
                 with real.timed(self.wall_time, "rollout"):
+                    # One step of the particles whose episode has not ended, into the buffer.
                     ahead = env.steps_ahead()
                     actions = self._act_in_model(obs, noise)
                     step = env.transition(actions)
-                    rows = (obs, step.observations, self.policy.scale_action(actions), step.rewards)
-                    ends = (step.terminated | step.truncated, step.truncated)
-                    kept = (values[running] for values in (*rows, *ends))
-                    self.replay_buffer.add_model_rows(*kept)
-                    # Of an episode that left the bounds the rest counts as the worst that was seen.
+                    done = step.terminated | step.truncated
+                    columns = (
+                        obs,
+                        step.observations,
+                        self.policy.scale_action(actions),
+                        step.rewards,
+                        done,
+                        step.truncated,
+                    )
+                    self.replay_buffer.add_model_rows(*(column[running] for column in columns))
+                    # A particle outside of the bounds gets the worst reward for all further steps.
                     lost = np.minimum(env.worst_reward * ahead, env.worst_reward)
                     returns += np.where(step.left_bounds, lost, step.rewards) * running
                     num_left += int((step.left_bounds & running).sum())
                     num_steps += int(running.sum())
                     self.owed_updates += self.options.updates_per_model_step * int(running.sum())
-                    running &= ~ends[0]
+                    running &= ~done
                     obs = step.observations
-                updates = int(self.owed_updates + 1e-9) // together * together  # 10 * 0.3 are 3
+                # Despite rounding, 10 * 0.3 are 3 updates.
+                updates = int(self.owed_updates + 1e-9) // interval * interval
                 self.owed_updates -= updates
                 if updates:
                     with real.timed(self.wall_time, "update"):
@@ -244,8 +260,9 @@ class Dyna(OffPolicyAlgorithm, Display):
         self.logger.record("model/left_bounds", num_left)
         if num_steps == num_left == self.replay_buffer.model_buffer.size():
             warnings.warn(
-                "All model episodes left the bounds of the states at once: the agent has learnt "
-                "nothing of use from them. Check the task's initial_states, or pass state_bounds.",
+                "All model episodes left the bounds of the states in the first step, so that the "
+                "agent cannot learn from them. Check the task's initial_states, or pass "
+                "state_bounds.",
                 UserWarning,
                 stacklevel=2,
             )
@@ -253,27 +270,30 @@ class Dyna(OffPolicyAlgorithm, Display):
     def _act_in_model(self, observations: np.ndarray, noise: ActionNoise | None) -> np.ndarray:
         """Sample the policy's actions at observations ``N x observation_dim``, not normalised."""
         self.policy.set_training_mode(False)
-        normaliser = self._vec_normalize_env
-        seen = observations if normaliser is None else normaliser.normalize_obs(observations)
-        actions = self.predict(seen, deterministic=False)[0]
+        inputs: Any = observations
+        if self._vec_normalize_env is not None:
+            inputs = self._vec_normalize_env.normalize_obs(observations)
+        actions = self.predict(inputs, deterministic=False)[0]
         if noise is None:
             return actions
+        # SB3 adds noise to actions in [-1, 1].
         scaled = np.clip(self.policy.scale_action(actions) + noise(), -1, 1)
         return self.policy.unscale_action(scaled).astype(actions.dtype)
 
     def _model_noise(self, num_envs: int) -> ActionNoise | None:
-        """Return action noise as the real steps have it, begun again for each particle."""
+        """Return the action noise of the real steps, started again for each particle."""
         if self.action_noise is None:
             return None
-        base = getattr(self.action_noise, "base_noise", self.action_noise)  # of a vectorised one
+        # SB3 vectorises noise for several environments.
+        base = getattr(self.action_noise, "base_noise", self.action_noise)
         noise = VectorizedActionNoise(base, num_envs)
         noise.reset()
         return noise
 
-    # What it knows
+    # Model and data
 
     def model_env(self, num_envs: int) -> ModelVecEnv:
-        """Return the dynamics, as they stand, as an environment of ``num_envs`` particles."""
+        """Return the present dynamics as an environment of ``num_envs`` particles."""
         rewards = self.replay_buffer.episodes.rewards
         return ModelVecEnv(
             self.model_task(),
@@ -285,16 +305,16 @@ class Dyna(OffPolicyAlgorithm, Display):
         )
 
     def model_task(self) -> Task:
-        """Return the task, with length, starts and bounds of environment and episodes."""
+        """Return the task, with missing length, starts and bounds by environment and episodes."""
         return real.completed(self.task, self.recorded_episodes(), self.env)
 
     def recorded_episodes(self, newest: int | None = None) -> Trajectories:
-        """Return the real steps of episodes that have ended; or the newest steps only."""
+        """Return the real steps of episodes that have ended, or only the newest steps."""
         data = real.decoded(self.task.dynamics.spec, self.replay_buffer.episodes)
         return real.newest(data, newest)
 
     def __repr__(self) -> str:
-        """Name the agent, its environment and dynamics, what it has done, and its last reward."""
+        """Return a text on the agent, its environment, dynamics, progress and last reward."""
         return real.described(self)
 
     def _repr_html_(self) -> str:
@@ -303,16 +323,18 @@ class Dyna(OffPolicyAlgorithm, Display):
     # The loop of Stable-Baselines3
 
     def learn(self, total_timesteps: int, callback: Any = None, *args: Any, **kwargs: Any) -> Self:
-        """Learn; callbacks may be, or hold, an ``EpisodeCheckpoint`` and ``print_progress``."""
-        given = callback if isinstance(callback, list) else [callback]
-        given = callback.callbacks if isinstance(callback, CallbackList) else given
-        if self.use_sde and any(isinstance(each, EpisodeCheckpoint) for each in given):
+        """Learn; callbacks may include an ``EpisodeCheckpoint`` and ``print_progress``."""
+        callbacks = callback if isinstance(callback, list) else [callback]
+        if isinstance(callback, CallbackList):
+            callbacks = callback.callbacks
+        if self.use_sde and any(isinstance(part, EpisodeCheckpoint) for part in callbacks):
             # SB3 draws noise before it calls callbacks, and again after resume.
             raise ValueError("EpisodeCheckpoint cannot resume use_sde=True exactly; use False.")
-        known = [AgentCallback.around(each) for each in given]
-        with locked(given):
-            known = known[0] if len(known) == 1 else known
-            return super().learn(total_timesteps, known, *args, **kwargs)
+        adapted: Any = [AgentCallback.around(part) for part in callbacks]
+        if len(adapted) == 1:
+            adapted = adapted[0]
+        with locked(callbacks):
+            return super().learn(total_timesteps, adapted, *args, **kwargs)
 
     def _setup_learn(
         self,
@@ -321,35 +343,38 @@ class Dyna(OffPolicyAlgorithm, Display):
         reset_num_timesteps: bool = True,
         *args: Any,
     ) -> tuple[int, BaseCallback]:
-        """Refuse to spend a real episode on an agent that could not learn from it."""
+        """Check task and functions before the first real step."""
         self._check_task()
         if reset_num_timesteps or self._last_obs is None:  # SB3 ends the episodes under way
             self.replay_buffer.end_episodes()
-        self.model_hooks = []  # callbacks that have some add themselves
-        noise = deepcopy(self.action_noise)  # which SB3 resets
+        self.model_hooks = []  # callbacks with hooks add themselves
+        noise = deepcopy(self.action_noise)  # SB3 resets it
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args)
-        seen: Any = self._last_obs if self._vec_normalize_env is None else self._last_original_obs
-        real.try_task(self.task, seen, self.env)
-        if self._random_state is not None:  # a run that goes on
+        observations: Any = self._last_obs
+        if self._vec_normalize_env is not None:
+            observations = self._last_original_obs
+        real.try_task(self.task, observations, self.env)
+        if self._random_state is not None:  # a resumed run continues its random numbers
             real.set_generators(self._random_state)
-            self._random_state, self.action_noise = None, noise
+            self._random_state = None
+            self.action_noise = noise
         return result
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
-        """Collect; if it ends within an episode, the next `learn` resets the environments."""
+        """Collect real steps; if they stop within an episode, `learn` resets the environments."""
         try:
             result = super().collect_rollouts(*args, **kwargs)
         except BaseException:
             self._last_obs = None
             raise
-        if not result.continue_training:  # a callback stopped it at a step, which SB3 did not store
+        if not result.continue_training:  # a callback stopped it at a step that SB3 did not store
             self._last_obs = None
         return result
 
     def predict(
         self, observation: Any, *args: Any, **kwargs: Any
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Choose actions as the learner does; a ValueError if an observation cannot be data."""
+        """Return the actions of the learner; raise a ValueError for an invalid observation."""
         check_observation(observation)
         return super().predict(observation, *args, **kwargs)
 
@@ -358,7 +383,7 @@ class Dyna(OffPolicyAlgorithm, Display):
         wrapped = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         inner = _layers(wrapped)[-1]
         if isinstance(inner, DummyVecEnv):
-            inner.envs = [StepGuard.around(each) for each in inner.envs]
+            inner.envs = [StepGuard.around(single) for single in inner.envs]
         return wrapped
 
     # Checkpoints
@@ -372,21 +397,23 @@ class Dyna(OffPolicyAlgorithm, Display):
         return cls._wrap_env(env)
 
     def environment_state(self) -> Any:
-        """Return the states of the wrappers, and the environments, if these can be pickled."""
+        """Return the states of the wrappers, and the environments if they can be pickled."""
         *wrappers, inner = _layers(self.env)
-        is_here = isinstance(inner, DummyVecEnv)  # or PyTorch does not pickle its processes
-        content = (_state(inner), inner.envs) if is_here else inner
-        return [_state(each) for each in wrappers], pickled_environment(content)
+        content = inner
+        if isinstance(inner, DummyVecEnv):  # others have processes, which cannot be pickled
+            content = _state(inner), inner.envs
+        return [_state(layer) for layer in wrappers], pickled_environment(content)
 
     def go_on(self, env: VecEnv, task: Task, environment: Any) -> None:
-        """Take environment and task, after the attributes of a checkpoint."""
-        self.env, self.task, self.model_hooks = env, task, []
+        """Set environment and task, after the attributes of a checkpoint."""
+        self.env, self.task = env, task
+        self.model_hooks = []
         self._vec_normalize_env = unwrap_vec_normalize(env)
         *wrappers, inner = _layers(env)
         for layer, state in zip(wrappers, environment[0], strict=True):
             vars(layer).update(state)
         if environment[1] is None:
-            self._last_obs = None  # the environments are reset
+            self._last_obs = None  # `learn` resets the environments
         else:
             state, envs = cloudpickle.loads(environment[1])
             vars(inner).update(state, envs=envs)
@@ -396,19 +423,23 @@ _OF_ALL = ("venv", "envs", "class_attributes", "observation_space", "action_spac
 
 
 def _state(layer: VecEnv) -> dict[str, Any]:
+    """Return the attributes of a layer, without those that every layer makes itself."""
     return {name: value for name, value in vars(layer).items() if name not in _OF_ALL}
 
 
 def _layers(env: Any) -> list[Any]:
-    """Return a vectorised environment and what it wraps, from the outside."""
-    return [env, *(_layers(env.venv) if isinstance(env, VecEnvWrapper) else [])]
+    """Return a vectorised environment and those inside of it, from the outside."""
+    layers = [env]
+    while isinstance(layers[-1], VecEnvWrapper):
+        layers.append(layers[-1].venv)
+    return layers
 
 
 class DynaSAC(Dyna, SAC):
     """Soft actor-critic that also trains inside a dynamics model, see :class:`Dyna`.
 
-    One whose model never serves (``DynaOptions(last_model_episode=0)``) is Stable-Baselines3's
-    ``SAC``, bit for bit.
+    Without its model (``DynaOptions(last_model_episode=0)``) it is Stable-Baselines3's ``SAC``,
+    bit for bit.
 
     Example:
         >>> from gpadjust.rl import DynaOptions, DynaSAC
@@ -423,8 +454,8 @@ class DynaSAC(Dyna, SAC):
 class DynaTD3(Dyna, TD3):
     """TD3 that also trains inside a dynamics model, see :class:`Dyna`.
 
-    Its policy is deterministic: pass ``action_noise``, without which it explores neither the real
-    system nor the model. Particles have noise of their own.
+    Its policy is deterministic: pass ``action_noise``, to explore the real system and the model.
+    Each particle has its own noise.
 
     Example:
         >>> import numpy as np

@@ -12,32 +12,31 @@ from gpadjust.rl.model_vec_env import Sampling
 
 @dataclass(frozen=True, kw_only=True)
 class DynaOptions:
-    """Options of a Dyna agent's learning and of its model.
+    """Options of a Dyna agent and its model.
 
     Args:
-        model_episodes: Model episodes for each real one.
+        model_episodes: Number of model episodes for each real one.
         updates_per_model_step: Gradient steps for each model step; may be fractional, such as 0.5.
         last_model_episode: Number of real episodes after which the model is neither fitted nor run,
-            and its experience is kept out of the batches; 0 never uses the model. Default: it
-            always serves.
-        refresh_model_data: Whether the transitions that earlier models made are made again by the
-            newest one, from the same states and actions, as soon as it is fitted. What the first
-            models got wrong would mislead the agent for long. It costs a prediction of the whole
-            model buffer after each real episode. (The paper does not have it.)
+            and batches have real samples only; 0 never uses the model. Default: no limit.
+        refresh_model_data: If True, the model predicts the transitions of earlier models again,
+            from the same states and actions, after each fit: errors of the first models would
+            mislead the agent for long. This costs a prediction of the model buffer after each real
+            episode. (The paper does not have it.)
         real_fraction: Share of real transitions in a batch, see :class:`MixedReplayBuffer`. By
-            default one for ten of the model, twice as many as a uniform draw from both buffers
-            would have with ``model_episodes=20``. (MBPO has 1/20; Janner et al. 2019.)
-        model_buffer_size: Number of model transitions that are kept. Default: as ``buffer_size``.
-        num_particles: Model episodes that run side by side. Default: all.
-        sampling: How they are sampled, by ``"step"`` or ``"trajectory"``, see
+            default one for ten of the model, twice as many as in a uniform draw from both buffers
+            with ``model_episodes=20``. (MBPO has 1/20; Janner et al. 2019.)
+        model_buffer_size: Capacity for model transitions. Default: as ``buffer_size``.
+        num_particles: Number of parallel model episodes. Default: all.
+        sampling: Sampling of model episodes, ``"step"`` or ``"trajectory"``, see
             :class:`ModelVecEnv`.
         reward_tolerance: As of :class:`gpadjust.control.Agent`.
         score_horizons: As of :class:`gpadjust.control.Agent`; the log has the scores
             (``model/coverage_15``).
 
     Raises:
-        TypeError: If something is of another kind.
-        ValueError: If something is out of range.
+        TypeError: If an option has another type.
+        ValueError: If an option is out of range.
     """
 
     model_episodes: int = 20
@@ -52,10 +51,11 @@ class DynaOptions:
     score_horizons: tuple[int, ...] = (1, 5, 15)
 
     def __post_init__(self) -> None:
-        """Check them."""
+        """Check the options."""
+        checked_whole("model_episodes", self.model_episodes, 0)
         least = {"last_model_episode": 0, "model_buffer_size": 1, "num_particles": 1}
-        for name, number in {"model_episodes": 0, **least}.items():
-            if name not in least or getattr(self, name) is not None:
+        for name, number in least.items():
+            if getattr(self, name) is not None:
                 checked_whole(name, getattr(self, name), number)
         checked_number("updates_per_model_step", self.updates_per_model_step, least=0)
         checked_number("real_fraction", self.real_fraction, least=0, most=1)

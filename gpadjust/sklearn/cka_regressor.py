@@ -52,18 +52,20 @@ MODELS: dict[str, type[Predictive]] = {
 class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     r"""A physics adjusted to data, in the conventions of ``GaussianProcessRegressor``.
 
-    It is :class:`~gpadjust.CKA`, or another model of this library, behind ``fit`` and ``predict``
-    of NumPy arrays and frames, for pipelines, ``cross_val_score`` and ``GridSearchCV``. The
+    This is :class:`~gpadjust.CKA`, or another model of this library, behind ``fit`` and ``predict``
+    with NumPy arrays and frames, for pipelines, ``cross_val_score`` and ``GridSearchCV``. The
     fitted ``model_`` has all methods of a model, such as ``model_.rho`` and ``model_.summary()``.
-    The model finds its own scales of inputs and targets; it needs no scaler.
+    The model estimates the scales of inputs and targets; it needs no scaler.
 
-    *The physics reads* the X that the regressor is given, columns by their order, as arrays. After
-    a ``StandardScaler`` in a pipeline, that is the scaled X: undo it in the physics, or scale
-    inside of the model, by ``model_options={"input_transform": Normalize(d)}`` of BoTorch. The
-    physics must return what y is in: ``TransformedTargetRegressor`` transforms y, not the physics.
+    *The inputs of the physics* are the X of the regressor, as arrays with the columns in their
+    order. After a ``StandardScaler`` in a pipeline, that is the scaled X: undo it in the physics,
+    or scale inside of the model, by ``model_options={"input_transform": Normalize(d)}`` of BoTorch.
+    The physics must return values in the units of y: ``TransformedTargetRegressor`` transforms y,
+    not the physics.
 
-    *NumPy or torch.* Any function of rows will do. One that returns a tensor, or takes nothing
-    else, is a torch function; others get NumPy arrays. ``fit`` finds out, by the first row of X.
+    *NumPy or torch.* The physics may be any function of rows. A function that returns a tensor, or
+    takes only tensors, is a torch function; others get NumPy arrays. ``fit`` tries the first row
+    of X.
 
     It passes scikit-learn's ``check_estimator``; with a physics all but
     ``check_regressor_multioutput``, whose targets have more columns than the physics.
@@ -74,24 +76,24 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             ``BlackBoxPhysics(function, batched=False)`` of single rows, or one with unknown
             parameters. Several: a list, or a dictionary with their names. None: no physics; the
             model is then :class:`~gpadjust.ZeroMeanGP`.
-        model: ``"cka"``, ``"variational"`` (of very many rows), ``"rra"``, ``"physics_mean"``,
-            ``"scale"``, ``"calibrated_physics"``, ``"zero_mean"`` (which leaves the physics out, to
-            compare with), or a callable that makes a model of X and y, with the keyword
+        model: ``"cka"``, ``"variational"`` (for very many rows), ``"rra"``, ``"physics_mean"``,
+            ``"scale"``, ``"calibrated_physics"``, ``"zero_mean"`` (without the physics, for
+            comparison), or a callable that makes a model of X and y, with the keyword
             ``physics`` if there is one: a class of models, or ``functools.partial`` of one with
             further arguments, such as ``partial(CKA, center=0.0)``, or
             ``partial(CKA, train_Yvar=0.01)`` for noise of known variance. Each fit takes a copy.
-        model_options: The kind of data: ``noise``, ``link``, ``input_transform`` and others that
-            all models share, such as ``{"link": "log"}``. Each fit takes copies.
+        model_options: Options that all models share: ``noise``, ``link``, ``input_transform`` and
+            others, such as ``{"link": "log"}``. Each fit takes copies.
         fit_method: ``"bayes"`` or ``"map"``, as in :func:`gpadjust.fit`.
         num_draws: As in :func:`gpadjust.fit`.
         random_state: The seed of the fit; a ``RandomState``, or None for NumPy's, draws it.
 
     Attributes:
-        model_: The fitted model; its own methods return what they are given, frames, arrays or
+        model_: The fitted model; its methods return the type of their arguments, frames, arrays or
             tensors.
         fit_result_: The result of :func:`gpadjust.fit`.
         physics_parameters_: The :class:`~gpadjust.physics.parameters.PhysicsParameters`, draws of
-            the unknown parameters of the physics by their names. Only if it has some.
+            the unknown parameters of the physics by their names, if there are some.
         n_features_in_: The number ``d`` of columns of X.
         feature_names_in_: Their names, if X was a frame.
 
@@ -133,32 +135,33 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Build the model on the data, and fit it.
 
         Args:
-            X: Inputs, ``n x d``, ``n >= 2``, in the units that the physics reads. The columns of a
-                frame that are texts are categories; the physics reads the numbers of their levels.
-            y: Targets, ``n`` or ``n x m``, in the units that it returns. Several columns make
+            X: Inputs, ``n x d``, ``n >= 2``, in the units of the physics. Columns of texts in a
+                frame are categories; the physics gets the numbers of their levels.
+            y: Targets, ``n`` or ``n x m``, in the units of the physics. Several columns are
                 independent outputs.
             train_Yvar: Known variances of the observations, of the shape of y, as in
-                :class:`~gpadjust.CKA`; scikit-learn takes it apart with the rows, as
+                :class:`~gpadjust.CKA`; scikit-learn splits them with the rows, as in
                 ``cross_val_score(..., params={"train_Yvar": variances})``.
 
         Returns:
             The regressor.
 
         Warns:
-            PhysicsWarning: If the physics is obviously off at X, as after a scaler.
+            PhysicsWarning: If the physics is obviously wrong at X, as after a scaler.
 
         Raises:
-            ValueError: If data are masked, not finite real numbers, or shapes disagree
-                (scikit-learn says it); or if the model's name is unknown. Of outputs that are
-                missing in some rows, take the models of this library.
-            TypeError: If the physics is none, an option has a wrong type, or the model none; if
-                data are dates or times.
+            ValueError: If data are masked, not finite real numbers, or shapes disagree (by
+                scikit-learn); or if the model's name is unknown. For outputs that are missing in
+                some rows, use the models of this library.
+            TypeError: If physics, model or an option has a wrong type, or data are dates or times.
             PhysicsError: If the physics fails, or returns NaN or a wrong shape.
         """
         _check_measured(y=y)
-        options, output_names = _checked(self.model_options), column_names(y)
+        options = _checked(self.model_options)
+        output_names = column_names(y)  # scikit-learn drops them
         if _has_texts(X):
             options.setdefault("input_transform", Categories())
+        # scikit-learn checks numbers: texts as the numbers of their levels.
         numbers = _in_numbers(X, deepcopy(options.get("input_transform")))
         _check_measured(X=numbers)
         rows, y = validate_data(
@@ -168,9 +171,10 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         targets = np.asarray(y, dtype=np.float64).reshape(len(y), -1)
         if train_Yvar is not None:
             train_Yvar = np.asanyarray(train_Yvar)
-            is_column = train_Yvar.shape == (len(y),)
-            options["train_Yvar"] = train_Yvar.reshape(-1, 1) if is_column else train_Yvar
-        # A model reads the texts of a frame by itself.
+            if train_Yvar.shape == (len(y),):
+                train_Yvar = train_Yvar.reshape(-1, 1)
+            options["train_Yvar"] = train_Yvar
+        # A model reads the texts of a frame by itself; the physics gets rows of numbers.
         model = self._build(rows if numbers is X else X, rows, targets, options)
         input_names = tuple(getattr(self, "feature_names_in_", model.data.input_names))
         names = {
@@ -178,11 +182,14 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             "output_names": output_names or model.data.output_names,
         }
         model.data = model.data._replace(**names)
+        # A new seed, drawn or the user's.
         seed = _seed(self.random_state)
         self.fit_result_ = fit(model, self.fit_method, num_draws=self.num_draws, seed=seed)
+        # Such as inputs in other units.
         for text in faults(model):
             warnings.warn(text, PhysicsWarning, stacklevel=2)
         self.model_ = model
+        # An earlier fit may have had a physics with parameters.
         self.__dict__.pop("physics_parameters_", None)
         if len(model.physics_parameters):
             self.physics_parameters_ = model.physics_parameters
@@ -199,19 +206,19 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         Args:
             X: Inputs, ``q x d``.
-            return_std: Whether to return standard deviations, too.
-            return_cov: Whether to return the covariances of the points, too.
-            observation_noise: If True, predict observations instead of the function without noise.
+            return_std: If True, return standard deviations, too.
+            return_cov: If True, return the covariances of the points, too.
+            observation_noise: If True, include observation noise.
 
         Returns:
-            The means, ``q`` or, of several outputs, ``q x m``. With ``return_std`` also standard
+            The means, ``q`` or, for several outputs, ``q x m``. With ``return_std`` also standard
             deviations of the same shape; with ``return_cov`` also covariances, ``q x q`` or
-            ``q x q x m``. All are those of the mixture over draws.
+            ``q x q x m``. They are moments of the mixture over draws.
 
         Raises:
             NotFittedError: If the regressor was not fitted.
-            RuntimeError: If both standard deviations and covariances are asked for.
-            ValueError: If X is not finite, or has not the columns that the regressor was fitted to.
+            RuntimeError: If both ``return_std`` and ``return_cov`` are True.
+            ValueError: If X is not finite, or its columns differ from those of the fit.
             PhysicsError: If the physics fails at X.
         """
         if return_std and return_cov:
@@ -224,7 +231,9 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             mean, variance = self.model_.predict(inputs, observation_noise)
             if return_cov:
                 return _array(mean), _array(self._covariance(inputs, observation_noise))
-        return (_array(mean), _array(variance.sqrt())) if return_std else _array(mean)
+        if return_std:
+            return _array(mean), _array(variance.sqrt())
+        return _array(mean)
 
     def sample_y(
         self,
@@ -239,10 +248,10 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             X: Inputs, ``q x d``.
             n_samples: The number of draws.
             random_state: The seed; a ``RandomState``, or None for NumPy's, draws it.
-            observation_noise: Whether to draw observations instead of the function.
+            observation_noise: If True, include observation noise.
 
         Returns:
-            ``q x n_samples`` or, of several outputs, ``q x m x n_samples``.
+            ``q x n_samples`` or, for several outputs, ``q x m x n_samples``.
 
         Raises:
             NotFittedError: If the regressor was not fitted.
@@ -250,13 +259,14 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         checked_whole("n_samples", n_samples, 1)
         inputs = self._inputs(X)
+        # PyTorch's generator is afterwards as before.
         with torch.no_grad(), seeded(_seed(random_state)):
             posterior = self.model_.posterior(inputs, observation_noise=observation_noise)
             draws = posterior.rsample(Size([int(n_samples)]))
         return _array(draws.permute(1, 2, 0), dim=1)
 
     def _build(self, X: Any, rows: Array, Y: Array, options: dict[str, Any]) -> Any:
-        """Return the model that the parameters say, with further options."""
+        """Return the model of the regressor's parameters, with further options."""
         factory: Any = self.model
         if isinstance(factory, str):
             if factory not in MODELS:
@@ -266,7 +276,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 )
             factory = MODELS[factory]
             if self.physics is None and factory is CKA:
-                factory = ZeroMeanGP
+                factory = ZeroMeanGP  # the default regressor must work without a physics
             if self.physics is None and factory is not ZeroMeanGP:
                 raise ValueError(
                     f"Expected a physics for the model {self.model!r}, got None; without one take "
@@ -275,6 +285,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         physics = None
         if self.physics is not None and factory is not ZeroMeanGP:
             physics = _physics_of_arrays(self.physics, rows)
+        # Fits change kernels and noises, but scikit-learn forbids changes of parameters.
         factory = with_options(deepcopy(factory), options)
         return make_model(factory, X, Y, kind=Predictive, physics=physics)
 
@@ -284,10 +295,11 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         numbers = _in_numbers(X, self.model_.data.transform)
         _check_measured(X=numbers)
         rows = validate_data(self, numbers, dtype=np.float64, reset=False)
-        return torch.tensor(np.ascontiguousarray(rows))  # others may run backwards
+        return torch.tensor(np.ascontiguousarray(rows))  # torch has no negative strides
 
     def _covariance(self, X: Tensor, observation_noise: bool) -> Tensor:
         """Return the covariances of the points, ``q x q x m``."""
+        # One output at a time: the joint covariance would have m^2 as many entries.
         covariances = []
         for output in range(self.model_.num_outputs):
             posterior = self.model_.posterior(X, [output], observation_noise)
@@ -296,17 +308,17 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
 
 def _check_measured(**data: Any) -> None:
-    """Raise an error of masked values and times, which scikit-learn would turn into numbers."""
+    """Raise an error for masked values and times, which scikit-learn would turn into numbers."""
     for name, values in data.items():
-        array = (
-            np.asanyarray(values) if hasattr(values, "dtype") or hasattr(values, "dtypes") else 0
-        )
-        if isinstance(array, np.ndarray) and (array.dtype.kind in "mM" or np.ma.is_masked(array)):
-            as_tensor(array, name)
+        if not hasattr(values, "dtype") and not hasattr(values, "dtypes"):
+            continue  # neither an array nor a frame
+        array = np.asanyarray(values)
+        if array.dtype.kind in "mM" or np.ma.is_masked(array):
+            as_tensor(array, name)  # raises the error
 
 
 def _physics_of_arrays(physics: Any, X: Array) -> Any:
-    """Return a physics, or several in their form, of NumPy or torch functions."""
+    """Return physics of NumPy or torch functions, in the form of the argument."""
     if isinstance(physics, dict):
         return {name: array_physics(part, X) for name, part in physics.items()}
     if isinstance(physics, list | tuple):
@@ -318,12 +330,13 @@ def _has_texts(X: Any) -> bool:
     """Return whether X is a frame with a column of texts."""
     if not hasattr(X, "iloc") or not hasattr(X, "columns"):
         return False
+    # The dtype of texts depends on the version of pandas.
     columns = (X.iloc[:, i].tolist() for i in range(X.shape[1]))
     return any(all(isinstance(value, str) for value in column) for column in columns if column)
 
 
 def _in_numbers(X: Any, transform: Any) -> Any:
-    """Return a frame with numbers where a transform makes numbers of it; anything else as it is."""
+    """Return a frame with numbers in place of texts; without a transform of texts, X itself."""
     if not hasattr(transform, "coded") or not hasattr(X, "iloc"):
         return X
     numbers = np.asarray(transform.coded(X), dtype=np.float64)
@@ -331,7 +344,7 @@ def _in_numbers(X: Any, transform: Any) -> Any:
 
 
 def _checked(options: Any) -> dict[str, Any]:
-    """Return the options of a model by their names; a TypeError if they are something else."""
+    """Return a copy of the options of a model; raise a TypeError for anything else."""
     if options is not None and not isinstance(options, dict):
         raise TypeError(
             "Expected model_options as a dictionary of arguments that models share, such as "
@@ -340,19 +353,19 @@ def _checked(options: Any) -> dict[str, Any]:
     for name in ("train_X", "train_Y", "physics"):
         if name in (options or {}):
             raise TypeError(
-                f"Found {name!r} in model_options, where it is an argument of its own, expected "
-                "what models share, such as 'link'."
+                f"Expected model_options as options that models share, such as 'link', found "
+                f"{name!r}, which is an argument of the regressor."
             )
     return {**(options or {})}
 
 
 def _array(values: Tensor, dim: int = -1) -> Array:
-    """Return an array without the dimension of outputs if there is one output."""
+    """Return an array, without the dimension of outputs if there is one."""
     return np.asarray(values.squeeze(dim).numpy())
 
 
 def _seed(random_state: int | np.random.RandomState | None) -> int:
-    """Return an integer as it is, so that results are those of the library with that seed."""
-    if isinstance(random_state, Integral):
+    """Return a seed by scikit-learn's convention."""
+    if isinstance(random_state, Integral):  # the same seed as in `gpadjust.fit`
         return int(random_state)
     return int(check_random_state(random_state).randint(2**31 - 1))

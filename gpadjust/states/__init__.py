@@ -1,4 +1,4 @@
-"""Names and kinds of the entries of state and action, and what is measured of them."""
+"""Names and kinds of the entries of state and action, and the measured outputs."""
 
 from gpadjust.states.sensors import Sensors
 from gpadjust.states.state_spec import StateSpec

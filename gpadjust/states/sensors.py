@@ -1,4 +1,4 @@
-"""What is measured of a state."""
+"""Measured outputs of a state."""
 
 from __future__ import annotations
 
@@ -15,21 +15,22 @@ from gpadjust.states.state_spec import StateSpec, checked_names
 
 @dataclass(frozen=True, eq=False)
 class Sensors:
-    """The outputs of a state that are measured, with noise; the rest of the state is hidden.
+    """The measured outputs of a state, with noise; the rest of the state is hidden.
 
     Args:
-        outputs: The names of the states that are measured, angles as their sine and cosine; or
-            those of what ``function`` returns.
+        outputs: The names of the measured states, angles as their sine and cosine; or the names of
+            the outputs of ``function``.
         function: Outputs ``N x len(outputs)`` of states ``N x state_dim``, in PyTorch. Default: the
-            states of these names.
-        noise: Guesses of the standard deviations of the noise, by the name of the output, each as
-            good as ten measurements. Default: at first a tenth of what an output changes by in a
-            step, then what was learnt.
+            states with the names ``outputs``.
+        noise: Guesses of the standard deviations of the noise, by the name of the output, each with
+            the weight of ten measurements. Default: at first a tenth of the change of an output in
+            a step, then an estimate.
 
     Raises:
-        TypeError: If names are not strings, or ``function`` is none.
-        ValueError: If there is no output, or a guess is of no output or not positive; later, if
-            a function returns another shape, or an output is no state and there is no function.
+        TypeError: If names are not strings, or ``function`` is not a function.
+        ValueError: If there is no output, or a guess has an unknown name or is not positive; later,
+            if a function returns another shape, or an output is not a state and there is no
+            function.
 
     Example:
         >>> import torch
@@ -54,6 +55,7 @@ class Sensors:
         object.__setattr__(self, "outputs", checked_names("outputs", self.outputs))
         if not self.outputs:
             raise ValueError("outputs must be one or more different names; found none.")
+        # The class is frozen: attributes are set by the base class.
         if self.function is not None:
             check_kind("function", self.function, Callable, "a function of states")
         object.__setattr__(self, "noise", dict(self.noise))
@@ -62,15 +64,16 @@ class Sensors:
             check_choice("output", name, self.outputs)
 
     def spec(self, spec: StateSpec) -> StateSpec:
-        """Return the outputs as a spec, which says how they are observed."""
+        """Return a spec with the outputs as its states."""
         if self.function is not None:
             return StateSpec(self.outputs, spec.actions)
         for name in self.outputs:
             if name not in spec.states:
                 raise ValueError(
-                    f"Sensors: there is no state {name!r}; the states are {spec.states}. Of other "
-                    "outputs say the function, Sensors(names, function)."
+                    f"Sensors: there is no state {name!r}; the states are {spec.states}. For other "
+                    "outputs give a function, Sensors(names, function)."
                 )
+        # A measured angle is observed by its sine and cosine, as is the state.
         angles = [name for name in self.outputs if name in spec.angles]
         return StateSpec(self.outputs, spec.actions, angles=angles)
 
@@ -78,7 +81,7 @@ class Sensors:
         """Return outputs ``N x len(outputs)`` of states ``N x state_dim``, without noise."""
         if self.function is None:
             return states[:, [spec.states.index(name) for name in self.outputs]]
-        values: Any = self.function(states)
+        values: Any = self.function(states)  # of the user: anything
         shape = len(states), len(self.outputs)
         if not isinstance(values, Tensor) or values.shape != shape:
             raise ValueError(
@@ -88,6 +91,8 @@ class Sensors:
         return values
 
     def describe(self) -> dict[str, Any]:
-        """Return the sensors in plain values: of the function, whether there is one."""
-        guesses = {"noise": self.noise} if self.noise else {}
-        return {"outputs": [*self.outputs], "function": self.function is not None, **guesses}
+        """Return the sensors in plain values, with True for a function."""
+        settings = {"outputs": [*self.outputs], "function": self.function is not None}
+        if self.noise:  # left out by default, as in older files
+            settings["noise"] = self.noise
+        return settings

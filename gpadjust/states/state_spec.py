@@ -12,12 +12,11 @@ from torch import Tensor
 
 from gpadjust.checks import check_columns, check_kind, checked_number
 
-_OFF_CIRCLE = 0.3  # of a sine and cosine that noisy sensors show
+_OFF_CIRCLE = 0.3  # largest distance from the circle by noisy sensors
 _PREDICTS = "so that the model predicts it"
-_EXOGENOUS = (
-    "be exogenous, which stays as it is during an episode",
-    "Of a set-point that moves give the task its `reference`; else take it out of `exogenous`, "
-    f"{_PREDICTS}, or leave out transitions from one episode into the next.",
+_EXOGENOUS_ADVICE = (
+    "If a set-point moves, give the task its `reference`; else take it out of `exogenous`, "
+    f"{_PREDICTS}, or leave out transitions from one episode into the next."
 )
 
 
@@ -25,35 +24,35 @@ _EXOGENOUS = (
 class StateSpec:
     r"""Names and kinds of the entries of a system's state and action.
 
-    A *state* is a row of physical quantities; an *observation* is what a policy sees: the state
+    A *state* is a row of physical quantities. An *observation* is the input of a policy: the state
     with each angle :math:`\theta` replaced, in its place, by :math:`\sin\theta, \cos\theta`.
 
     Args:
         states: The names of the state's entries.
         actions: The names of the action's entries.
-        angles: The states that are angles in rad. Policy and model see their sine and cosine, and
+        angles: The states that are angles in rad. Policy and model get their sine and cosine, and
             changes are the shortest way round the circle.
-        exogenous: The states that stay as they are during an episode, such as a target, or follow
-            the ``reference`` of a task. Policies see them; models and physics only if
+        exogenous: The states that are constant during an episode, such as a target, or follow the
+            ``reference`` of a task. Policies get them; models and physics only if
             ``physics_reads`` names them.
-        integrated: For states that a model need not predict, the states that are their
-            velocities: :math:`q' = q + h (v + v') / 2`.
+        integrated: The velocities of states that follow from them without a prediction, by the
+            names of these states: :math:`q' = q + h (v + v') / 2`.
         step: The time step :math:`h`, in the time unit of the velocities; needed by ``integrated``.
-        previous: For states that hold what another entry was a step before, the name of that
-            action or state: ``{"last_force": "force"}``, or ``{"x_1": "x", "x_2": "x_1"}`` for two
-            steps back, as in an autoregressive model (NARX). Policy and models see them, and models
-            need not predict them. What holds an angle is an angle.
-        physics_reads: The columns of the physics: names of states and actions in its order, such
-            as ``["x", "v", "last_force"]`` of a system that follows its force a step late. Models
-            read them, too. Default: the states that are neither exogenous nor ``previous``, then
+        previous: The origins of states that repeat another entry a step later, an action or a
+            state, by the names of these states: ``{"last_force": "force"}``, or
+            ``{"x_1": "x", "x_2": "x_1"}`` for two steps, as in an autoregressive model (NARX).
+            Policy and models get them without predicting them. A repeated angle is an angle.
+        physics_reads: The inputs of the physics: names of states and actions in its order, such
+            as ``["x", "v", "last_force"]`` for a system that follows its force a step later. Models
+            get them, too. Default: the states that are neither exogenous nor ``previous``, then
             the actions.
 
     Raises:
-        TypeError: If names are not strings, ``integrated`` or ``previous`` is no mapping or
-            ``step`` no number.
-        ValueError: If a name is unknown, repeated or two things that exclude each other,
-            ``previous`` goes round in a circle, no state is left to predict, or ``step`` is missing
-            or not positive.
+        TypeError: If names are not strings, ``integrated`` or ``previous`` is not a mapping or
+            ``step`` not a number.
+        ValueError: If a name is unknown, repeated or has two roles that exclude each other,
+            ``previous`` is circular, no state is left to predict, or ``step`` is missing or not
+            positive.
 
     Example:
         >>> import torch
@@ -93,12 +92,11 @@ class StateSpec:
             object.__setattr__(self, argument, dict(mapping))
         if self.step is not None:
             object.__setattr__(self, "step", checked_number("step", self.step, above=0))
-        mistake = next(self._mistakes(), None)
-        if mistake is not None:
+        for mistake in self._mistakes():  # the first one
             raise ValueError(mistake)
 
     def _mistakes(self) -> Iterator[str]:
-        """Yield contradictions between the names, each as a message."""
+        """Yield messages of contradictions between the names."""
         states, actions, angles, previous = self.states, self.actions, self.angles, self.previous
         for argument in ("states", "actions"):
             if not getattr(self, argument):
@@ -107,34 +105,38 @@ class StateSpec:
         for name in (*angles, *fixed, *self.integrated.values()):
             if name not in states:
                 yield f"There is no state {name!r}; the states are {states}."
+        # A name of a state and an action, or of neither, is ambiguous.
         entries = [("previous", name) for name in previous.values()]
-        for argument, name in (*entries, *(("physics_reads", name) for name in self.physics_reads)):
+        entries += [("physics_reads", name) for name in self.physics_reads]
+        for argument, name in entries:
             if (name in states) == (name in actions):
+                count = "both" if name in states else "neither"
                 yield (
-                    f"{argument} must name states or actions; found {name!r}, which is "
-                    f"{'both' if name in states else 'neither'}: the states are {states}, the "
-                    f"actions are {actions}."
+                    f"{argument} must name states or actions; found {name!r}, which is {count}: "
+                    f"the states are {states}, the actions are {actions}."
                 )
         for name, other in previous.items():
             if (name in angles) != (other in angles and other in states):
-                one, another = (name, other) if name in angles else (other, name)
+                angle, number = (name, other) if name in angles else (other, name)
                 yield (
-                    f"State {name!r} holds the earlier value of {other!r}, but {one!r} is one of "
-                    f"the angles and {another!r} is not; put both into `angles`, or neither."
+                    f"State {name!r} repeats {other!r}, but {angle!r} is one of the angles and "
+                    f"{number!r} is not; put both into `angles`, or neither."
                 )
+            # Follow the origins until the first that is not a previous value.
             chain = [name, other]
             while chain[-1] in previous and chain[-1] not in chain[:-1]:
                 chain.append(previous[chain[-1]])
             if chain[-1] in chain[:-1]:
                 yield (
-                    f"previous goes round in a circle, {' -> '.join(chain)}; let it end at an "
-                    "action, or at a state that is not in `previous`."
+                    f"previous is circular, {' -> '.join(chain)}; let it end at an action, or at "
+                    "a state that is not in `previous`."
                 )
+        # A velocity is predicted, so that it has no other role.
         twice = [name for name in fixed if fixed.count(name) > 1]
         for name in (*twice, *(v for v in self.integrated.values() if v in fixed)):
             yield (
-                f"State {name!r} is said to be two things: exogenous, integrated, a velocity and a "
-                "previous value exclude each other."
+                f"State {name!r} has two roles: exogenous, integrated, a velocity and a previous "
+                "value exclude each other."
             )
         if {*fixed} == {*states}:
             yield "No state is left to predict; all are exogenous, integrated or previous values."
@@ -157,6 +159,7 @@ class StateSpec:
         return len(self.states) + len(self.angles)
 
     def _columns(self, names: Iterable[str]) -> list[int]:
+        """Return the numbers of some states, in order."""
         return [i for i, name in enumerate(self.states) if name in names]
 
     @cached_property
@@ -176,28 +179,28 @@ class StateSpec:
 
     @cached_property
     def moving(self) -> list[int]:
-        """The states that the physics moves, neither exogenous nor previous values."""
+        """The states that the physics changes, neither exogenous nor previous values."""
         still = {*self.exogenous_columns, *self.previous_columns}
         return [i for i in range(self.state_dim) if i not in still]
 
     @cached_property
     def predicted(self) -> list[int]:
-        """The states that a model predicts, those that move and are not integrated."""
+        """The states that a model predicts: moving, but not integrated."""
         return [i for i in self.moving if self.states[i] not in self.integrated]
 
     @cached_property
     def physics_columns(self) -> list[int]:
-        """The columns that the physics reads, of states and actions side by side."""
+        """The inputs of the physics, as columns of states and actions side by side."""
         names = (*self.states, *self.actions)
-        read = [names.index(name) for name in self.physics_reads]
-        return read or [*self.moving, *range(self.state_dim, len(names))]
+        columns = [names.index(name) for name in self.physics_reads]
+        return columns or [*self.moving, *range(self.state_dim, len(names))]
 
     @cached_property
     def model_columns(self) -> list[int]:
-        """The columns that models read: moving, actions, previous, and what f_p reads besides."""
+        """The inputs of models: moving states, actions, previous values, and others of f_p."""
         actions = range(self.state_dim, self.state_dim + self.action_dim)
-        read = (*self.moving, *actions, *self.previous_columns, *self.physics_columns)
-        return [*dict.fromkeys(read)]
+        columns = (*self.moving, *actions, *self.previous_columns, *self.physics_columns)
+        return [*dict.fromkeys(columns)]  # without repetitions, in order
 
     def physics_inputs(self, states: Tensor, actions: Tensor) -> Tensor:
         """Return the inputs of the physics at states ``... x state_dim``: ``... x d``."""
@@ -206,19 +209,24 @@ class StateSpec:
     def observe(self, states: Tensor) -> Tensor:
         """Return observations ``... x observation_dim`` of states ``... x state_dim``."""
         check_columns("states", states, self.state_dim)
-        columns = []
+        columns: list[Tensor] = []
         for name, column in zip(self.states, states.unbind(-1), strict=True):
-            columns += [column.sin(), column.cos()] if name in self.angles else [column]
+            if name in self.angles:
+                columns += [column.sin(), column.cos()]
+            else:
+                columns.append(column)
         return torch.stack(columns, dim=-1)
 
     def decode(self, observations: Tensor) -> Tensor:
         r"""Return states ``... x state_dim`` of observations; angles in :math:`(-\pi, \pi]`."""
         check_columns("observations", observations, self.observation_dim)
-        rest = iter(observations.unbind(-1))
-        columns = [
-            torch.atan2(next(rest), next(rest)) if name in self.angles else next(rest)
-            for name in self.states
-        ]
+        entries = iter(observations.unbind(-1))
+        columns = []
+        for name in self.states:
+            column = next(entries)
+            if name in self.angles:  # theta = atan2(sin theta, cos theta)
+                column = torch.atan2(column, next(entries))
+            columns.append(column)
         return torch.stack(columns, dim=-1)
 
     @property
@@ -230,9 +238,9 @@ class StateSpec:
         return entries
 
     def check_observations(self, observations: Tensor) -> None:
-        """Raise a ValueError if there are more or fewer entries, or pairs far from the circle.
+        """Raise a ValueError if the number of entries is wrong, or pairs are far from the circle.
 
-        Observations ``... x observation_dim`` may be those of noisy sensors.
+        Observations ``... x observation_dim`` may have the noise of sensors.
         """
         entries = self.observations
         try:
@@ -242,69 +250,76 @@ class StateSpec:
         for name in self.angles:
             first = entries.index(f"sin {name}")
             pairs = observations[..., first : first + 2].reshape(-1, 2)
-            off = (pairs.norm(dim=-1) - 1).abs()
-            if len(off) and off.max() > _OFF_CIRCLE:
-                pair = ", ".join(f"{value:.3g}" for value in pairs[int(off.argmax())])
+            distance = (pairs.norm(dim=-1) - 1).abs()  # sin^2 + cos^2 = 1
+            if len(distance) and distance.max() > _OFF_CIRCLE:
+                pair = ", ".join(f"{value:.3g}" for value in pairs[int(distance.argmax())])
                 raise ValueError(
                     f"Entries {first} and {first + 1} of an observation must be sine and cosine of "
                     f"the angle {name!r}, found {pair}. Correct the order of the states of the "
-                    "StateSpec, or which of them are angles; or wrap the environment so that it "
-                    "observes what the spec says."
+                    "StateSpec, or its angles; or wrap the environment so that its observations "
+                    "agree with the spec."
                 )
 
     def change(self, states: Tensor, next_states: Tensor) -> Tensor:
-        """Return the change ``... x state_dim``, of angles the shortest way round."""
+        """Return the change ``... x state_dim``, for angles the shortest way round."""
         change = next_states - states
         for i in self.angle_columns:
-            angle = change[..., i].clone()  # not a view of what is written, for autograd
+            angle = change[..., i].clone()  # autograd needs the value before the change in place
             change[..., i] = torch.atan2(angle.sin(), angle.cos())
         return change
 
     def check_transitions(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
-        r"""Check what is declared against transitions of the system.
+        r"""Compare the roles of states with transitions of the system.
 
-        An exogenous state may change, and a previous state differ from that state, by no more than
-        the rounding of single precision; a previous action from that action by a thousandth of the
+        An exogenous state may change, and a previous state differ from its origin, by no more than
+        the rounding of single precision; a previous action from its origin by a thousandth of the
         largest one. An integrated state follows its velocity as :math:`q' - q = b\, h (v + v') / 2`
-        on a way :math:`w`, the larger of :math:`\sum h (|v| + |v'|) / 2` and
-        :math:`\sum |q' - q|`. It is an error if the least squares estimate of :math:`b` is so far
-        from 1 that this makes up more than :math:`0.1\, w` beside three of its standard errors, as
-        with a wrong ``step``, and a warning if the discrepancies sum up to more than
-        :math:`0.5\, w`, as with another state's velocity or noisy sensors at rest. The trapezoid
-        itself errs by less than a tenth if an oscillation is sampled six times a period.
+        on a path of length :math:`w`, the larger of :math:`\sum h (|v| + |v'|) / 2` and
+        :math:`\sum |q' - q|`. An error is raised if the least squares estimate of :math:`b` differs
+        from 1 by more than three standard errors and :math:`0.1\, w`, as with a wrong ``step``. A
+        warning is issued if the sum of discrepancies exceeds :math:`0.5\, w`, as with another
+        state's velocity or noisy sensors at rest. The trapezoid rule has an error below a tenth
+        with six samples in a period of an oscillation.
 
         Args:
             states: ``N x state_dim``.
             actions: ``N x action_dim``.
-            next_states: ``N x state_dim``; an entry that was not measured (NaN) is not checked.
+            next_states: ``N x state_dim``; entries that were not measured (NaN) are not checked.
 
         Raises:
-            ValueError: If a state, which is named, is not what it is said to be.
+            ValueError: If a state contradicts its role.
 
         Warns:
-            UserWarning: If an integrated state is far from what its velocity says.
+            UserWarning: If an integrated state does not follow its velocity.
         """
+        # Environments report states in single precision.
         size = torch.maximum(states.abs(), next_states.abs())
         size[:, self.angle_columns] = size[:, self.angle_columns].clamp_min(1)
         rounding = 4 * torch.finfo(torch.float32).eps * size
         expected = self.remember(states.clone(), states, actions)
         gap = self.change(expected, next_states).abs()
         for name in (*self.exogenous, *self.previous):
-            i, other = self.states.index(name), self.previous.get(name)
-            is_action = other in self.actions
-            limit = 1e-3 * expected[:, i].abs().amax() if is_action else rounding[:, i]
+            i = self.states.index(name)
+            other = self.previous.get(name)
+            limit = rounding[:, i]
+            role = "exogenous, which is constant during an episode"
+            advice = _EXOGENOUS_ADVICE
+            if other is not None:
+                role = f"the previous state {other!r}"
+                advice = (
+                    f"Correct `previous`, or take {name!r} out of it, {_PREDICTS}; or leave out "
+                    "transitions from one episode into the next (reset() where one begins)."
+                )
+            if other in self.actions:  # an environment may clip or round an action
+                limit = 1e-3 * expected[:, i].abs().amax()
+                role = f"the previous action {other!r}"
             rows = (gap[:, i] > limit).nonzero()
             if len(rows):
-                row, said, advice = int(rows[0]), *_EXOGENOUS
-                if other is not None:
-                    said = f"hold the previous {'action' if is_action else 'state'} {other!r}"
-                    advice = (
-                        f"Correct `previous`, or take {name!r} out of it, {_PREDICTS}; or leave "
-                        "out transitions from one episode into the next (reset() where one begins)."
-                    )
+                row = int(rows[0])
                 raise ValueError(
-                    f"State {name!r} is said to {said}, but is {float(next_states[row, i]):.6g} "
-                    f"where {float(expected[row, i]):.6g} was expected in row {row}. {advice}"
+                    f"State {name!r} is declared as {role}, but is "
+                    f"{float(next_states[row, i]):.6g} where {float(expected[row, i]):.6g} was "
+                    f"expected in row {row}. {advice}"
                 )
         for name in self.integrated:
             self._check_integrated(name, states, next_states, rounding)
@@ -313,50 +328,58 @@ class StateSpec:
         self, name: str, states: Tensor, next_states: Tensor, rounding: Tensor
     ) -> None:
         """Raise an error if a state follows its velocity at another rate; warn of noise."""
-        i, velocity = self.states.index(name), self.integrated[name]
+        i = self.states.index(name)
+        velocity = self.integrated[name]
         trapezoid = self._trapezoid(name, states, next_states)
         moved = states.clone()
         moved[:, i] += trapezoid
-        discrepancy = self.change(moved, next_states)[:, i]
-        known = ~discrepancy.isnan()
-        trapezoid, discrepancy = trapezoid[known], discrepancy[known]
-        way = self._trapezoid(name, states.abs(), next_states.abs())[known].sum()
-        way = torch.maximum(way, (trapezoid + discrepancy).abs().sum())
-        square, length = trapezoid.square().sum(), trapezoid.abs().sum()
+        discrepancy = self.change(moved, next_states)[:, i]  # q' - q - h (v + v') / 2
+        is_measured = ~discrepancy.isnan()
+        trapezoid, discrepancy = trapezoid[is_measured], discrepancy[is_measured]
+        # w = max(sum h (|v| + |v'|) / 2, sum |q' - q|)
+        path = self._trapezoid(name, states.abs(), next_states.abs())[is_measured].sum()
+        path = torch.maximum(path, (trapezoid + discrepancy).abs().sum())
+        # Least squares of discrepancy = (b - 1) trapezoid: NaN for one row or without movement,
+        # so that the comparison below is false.
+        square = trapezoid.square().sum()
         excess = (trapezoid * discrepancy).sum() / square
         scatter = (discrepancy - excess * trapezoid).square().sum() / (len(discrepancy) - 1)
-        # Both are nan, and the comparison false, of one row or without any movement.
-        systematic = (excess.abs() - 3 * (scatter / square).sqrt()) * length
-        unavoidable, total = rounding[known, i].sum(), discrepancy.abs().sum()
+        systematic = (excess.abs() - 3 * (scatter / square).sqrt()) * trapezoid.abs().sum()
+        total = discrepancy.abs().sum()
+        tolerance = rounding[is_measured, i].sum()
         rate = f" but moves {1 + float(excess):.3g} times as far" if square > 0 else ""
         message = (
-            f"State {name!r} is said to be integrated, as {name}' = {name} + step ({velocity} + "
+            f"State {name!r} is declared as integrated, {name}' = {name} + step ({velocity} + "
             f"{velocity}') / 2 with step={self.step:g},{rate} and differs by {total:.3g} in all, "
-            f"on a way of {way:.3g}. Mend `step` or `integrated`, or take {name!r} out of "
+            f"on a path of {path:.3g}. Correct `step` or `integrated`, or take {name!r} out of "
             f"`integrated`, {_PREDICTS}."
         )
-        if systematic > 0.1 * way + unavoidable:
+        if systematic > 0.1 * path + tolerance:
             raise ValueError(message)
-        if total > 0.5 * way + unavoidable:
-            warnings.warn(f"{message} Noisy sensors look the same.", UserWarning, stacklevel=5)
+        if total > 0.5 * path + tolerance:
+            text = f"{message} Noisy sensors have the same effect."
+            warnings.warn(text, UserWarning, stacklevel=5)
 
     def _trapezoid(self, name: str, states: Tensor, next_states: Tensor) -> Tensor:
         """Return the change of an integrated state, by the trapezoid rule."""
         v = self.states.index(self.integrated[name])
-        return (self.step or 0.0) * (states[..., v] + next_states[..., v]) / 2
+        return (self.step or 0.0) * (states[..., v] + next_states[..., v]) / 2  # h (v + v') / 2
 
     def remember(self, next_states: Tensor, states: Tensor, actions: Tensor) -> Tensor:
-        """Write states and actions, ``... x dim``, into the next states as previous ones."""
+        """Write states and actions, ``... x dim``, into the next states as previous values."""
         for name, other in self.previous.items():
-            is_state = other in self.states
-            names, values = (self.states, states) if is_state else (self.actions, actions)
-            next_states[..., self.states.index(name)] = values[..., names.index(other)]
+            if other in self.states:
+                origin = states[..., self.states.index(other)]
+            else:
+                origin = actions[..., self.actions.index(other)]
+            next_states[..., self.states.index(name)] = origin
         return next_states
 
     def complete(self, states: Tensor, actions: Tensor, predicted: Tensor) -> Tensor:
-        """Return next states, of which a model knows ``predicted``, ``... x len(predicted)``."""
+        """Return next states with the predicted ones ``... x len(predicted)`` of a model."""
         if len(self.predicted) == self.state_dim:
             return predicted
+        # Exogenous states do not change here; a task may set them afterwards.
         following = states.expand(*predicted.shape[:-1], self.state_dim).clone()
         following[..., self.predicted] = predicted
         self.remember(following, states, actions)
@@ -368,14 +391,16 @@ class StateSpec:
         """Return the variance of all states by that of the predicted ones; see `complete`."""
         full = variance.new_zeros(*variance.shape[:-1], self.state_dim)
         full[..., self.predicted] = variance
+        # q' = q + h (v + v') / 2: Var q' = (h / 2)^2 Var v'
+        share = ((self.step or 0.0) / 2) ** 2
         for name, velocity in self.integrated.items():
-            share = ((self.step or 0.0) / 2) ** 2
             full[..., self.states.index(name)] = share * full[..., self.states.index(velocity)]
         return full
 
 
 def checked_names(argument: str, names: Sequence[str]) -> tuple[str, ...]:
     """Return different names as a tuple."""
+    # A string is a sequence of letters.
     if isinstance(names, str) or not isinstance(names, Sequence):
         raise TypeError(f"{argument} must be a sequence of names; found {names!r}.")
     for name in names:
@@ -386,10 +411,12 @@ def checked_names(argument: str, names: Sequence[str]) -> tuple[str, ...]:
 
 
 def side_by_side(states: Tensor, actions: Tensor) -> Tensor:
-    """Return states ``... x state_dim`` and actions in one row; one action may be for all."""
+    """Return states ``... x state_dim`` and actions in one row; one action may serve all."""
     return torch.cat([states, actions.expand(*states.shape[:-1], -1)], dim=-1)
 
 
 def some_columns(rows: Tensor, columns: list[int]) -> Tensor:
-    """Return some columns of rows ``... x d``; the rows themselves if these are all, in order."""
-    return rows if columns == [*range(rows.shape[-1])] else rows[..., columns]
+    """Return some columns of rows ``... x d``."""
+    if columns == [*range(rows.shape[-1])]:
+        return rows  # all of them: no copy
+    return rows[..., columns]

@@ -1,11 +1,11 @@
-"""Systems to control: each an environment, and what is known of it, in one object.
+"""Systems to control: environment, physics and task in one object.
 
-To import this package registers the environment with Gymnasium; ``gym.make`` imports it by itself
-where the id names it, as in ``gym.make("gpadjust.systems:gpadjust/CartPoleSwingUp-v0")``.
+The import of this package registers the environment with Gymnasium; ``gym.make`` imports it if the
+id has its name, as in ``gym.make("gpadjust.systems:gpadjust/CartPoleSwingUp-v0")``.
 
-A step that failed, as where a simulator could not integrate, truncates the episode and says
-``info["step_failed"] = True``: its observation and reward are no data, and no learner of this
-library takes them as such. Environments of your own may say so, too.
+A failed step, for example of a simulator that could not integrate, truncates the episode and sets
+``info["step_failed"] = True``: no learner of this library uses its observation and reward.
+Environments of your own may set it, too.
 """
 
 try:

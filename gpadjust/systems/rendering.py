@@ -1,4 +1,4 @@
-"""Environments that have pictures, and their colours."""
+"""The base of environments with frames, and their colours."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     import pygame
 
-SMOOTH = 2  # drawn so many times larger, then scaled down, for smooth edges
+SMOOTH = 2  # scale of the drawing before it is scaled down, for smooth edges
 
 RENDER_MODES = ["rgb_array"]
 
@@ -22,17 +22,17 @@ BLUE, RED, GREEN = (31, 79, 130), (204, 77, 77), (44, 140, 68)
 
 
 class ViewedEnv(gym.Env[Array, Array]):
-    """The base of environments whose ``state`` can be seen.
+    """The base of environments with frames of their ``state``.
 
-    A subclass says in ``size`` (width and height in pixels) and :meth:`_draw` how, and has
-    ``metadata`` with ``RENDER_MODES`` and ``"render_fps"``.
+    A subclass defines ``size`` (width and height in pixels), :meth:`_draw`, and ``metadata`` with
+    ``RENDER_MODES`` and ``"render_fps"``.
 
     Args:
         render_mode: With ``"rgb_array"`` ``render`` returns a frame, which
             ``gymnasium.wrappers.HumanRendering`` shows in a window.
 
     Raises:
-        ValueError: If it is another one.
+        ValueError: If the mode is neither this nor None.
     """
 
     size: tuple[int, int]
@@ -51,7 +51,7 @@ class ViewedEnv(gym.Env[Array, Array]):
 
         Raises:
             gymnasium.error.DependencyNotInstalled: If ``pygame-ce`` is missing.
-            gymnasium.error.ResetNeeded: If no episode was started.
+            gymnasium.error.ResetNeeded: Before the first episode.
         """
         if self.render_mode is None:
             gym.logger.warn("There is no frame without render_mode='rgb_array'.")
@@ -59,7 +59,7 @@ class ViewedEnv(gym.Env[Array, Array]):
         if self.state is None:
             raise gym.error.ResetNeeded("Call reset before render.")
         try:
-            import pygame
+            import pygame  # not at the top: environments run without it
         except ImportError as error:
             raise DependencyNotInstalled(
                 "Rendering needs pygame-ce; run `pip install pygame-ce`."
@@ -67,6 +67,7 @@ class ViewedEnv(gym.Env[Array, Array]):
         canvas = pygame.Surface((SMOOTH * self.size[0], SMOOTH * self.size[1]))
         self._draw(canvas, self.state)
         frame = pygame.transform.smoothscale(canvas, self.size)
+        # pygame has columns first, images have rows first.
         return np.ascontiguousarray(pygame.surfarray.array3d(frame).swapaxes(0, 1))
 
     def _draw(self, canvas: pygame.Surface, state: NDArray[np.float64]) -> None:

@@ -1,4 +1,4 @@
-"""The swing-up of a cart-pole: its equation of motion and physics, its environment, the system."""
+"""The swing-up of a cart-pole: equation of motion, physics, environment and system."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from gpadjust.systems.rendering import RENDER_MODES, ViewedEnv
 from gpadjust.systems.system import System
 
 TIME_STEP = 0.1
-SUBSTEP = 0.02  # s, the longest: a single Euler step of 0.1 s errs by 0.3 rad/s
-START_MEAN = (0.0, math.pi, 0.0, 0.0)
+SUBSTEP = 0.02  # s, the longest: one Euler step of 0.1 s has an error of 0.3 rad/s
+START_MEAN = (0.0, math.pi, 0.0, 0.0)  # hanging, at rest
 START_STD = 0.2
 MAX_FORCE = 10.0  # N
-MAX_START = 100.0  # far beyond what forces do; the equation can be integrated there
+MAX_START = 100.0  # far beyond reachable states; the equation can be integrated there
 _SOFT = 0.05  # m/s: the speed over which dry friction changes its sign
 
 CART_POLE_SPEC = StateSpec(
@@ -44,7 +44,7 @@ CART_POLE_SPEC = StateSpec(
 
 
 def cart_pole_spec(encode_angle: bool = True, time_step: float = TIME_STEP) -> StateSpec:
-    """Return the spec of these options of the environment."""
+    """Return the spec for options of the environment."""
     step = checked_number("time_step", time_step, above=0)
     return replace(CART_POLE_SPEC, angles=("theta",) if encode_angle else (), step=step)
 
@@ -63,22 +63,23 @@ class CartPoleEquation:
             + 6 (a - b \dot{x}) \cos\theta}{l (4 M - 3 m_p \cos^2\theta)}.
 
     This is the system of Deisenroth, "Efficient Reinforcement Learning using Gaussian Processes",
-    2010, Appendix C, with the angle taken from upright. Its tip is at
-    :math:`(x - l \sin\theta, l \cos\theta)`. Dry friction takes :math:`d \tanh(\dot{x} / 0.05)`
-    from the force, drag turns the pole by :math:`-k \dot\theta |\dot\theta|`.
+    2010, Appendix C, with the angle from upright. The tip of the pole is at
+    :math:`(x - l \sin\theta, l \cos\theta)`. Dry friction reduces the force by
+    :math:`d \tanh(\dot{x} / 0.05)`; drag is a torque :math:`-k \dot\theta |\dot\theta|` on the
+    pole.
 
     Args:
         cart_mass: The mass :math:`m_c` of the cart, in kg.
         pole_mass: The mass :math:`m_p` of the pole, in kg.
         pole_length: The length :math:`l` of the pole, in m.
         damping: The friction :math:`b` between cart and track, in N s/m.
-        gravity: The acceleration :math:`g` of gravity, in m/s²; as Deisenroth has it, 9.82.
+        gravity: The acceleration :math:`g` of gravity, in m/s². Default: Deisenroth's 9.82.
         dry: The dry friction d of the cart, in N.
         drag: The drag k of the pole, in N m s²/rad².
 
     Raises:
-        TypeError: If one of them is no number.
-        ValueError: If a mass, the length or the gravity is not positive, or another one negative.
+        TypeError: If a parameter is not a number.
+        ValueError: If a mass, the length or the gravity is not positive, or a friction negative.
 
     Example:
         >>> equation = CartPoleEquation(0.5, 0.5, 0.6, 0.1)
@@ -97,15 +98,15 @@ class CartPoleEquation:
     def __post_init__(self) -> None:
         """Check the parameters."""
         for entry in fields(self):
-            friction = entry.name in ("damping", "dry", "drag")
-            limits = {"least": 0} if friction else {"above": 0}
+            is_friction = entry.name in ("damping", "dry", "drag")
+            limits = {"least": 0} if is_friction else {"above": 0}
             checked_number(entry.name, getattr(self, entry.name), **limits)
 
     def __call__(self, state: Tensor, action: Tensor, p: Mapping[str, Any] | None = None) -> Tensor:
         """Return the time derivative ``... x 4`` of states ``... x 4`` under forces ``... x 1``.
 
-        States are position, angle, velocity and angular velocity, in m, rad and s, the force in N;
-        ``p`` has other values of some parameters by name, ``...`` each.
+        States are position, angle, velocity and angular velocity, in m, rad and s, the force is in
+        N; ``p`` has other values of some parameters by name, ``...`` each.
 
         Raises:
             ValueError: If the last dimensions are not 4 and 1.
@@ -115,38 +116,46 @@ class CartPoleEquation:
                 "Expected states ... x 4 (x, theta, x_dot, theta_dot) and actions ... x 1 (force), "
                 f"got {tuple(state.shape)} and {tuple(action.shape)}."
             )
-        mass, half_moment, swung_mass, gravity, arm, damping, dry, drag = (
-            self._own if p is None else _numbers({**vars(self), **p})
-        )
+        coefficients = self._coefficients
+        if p is not None:
+            coefficients = _coefficients({**vars(self), **p})
+        mass, half_moment, swung_mass, gravity, arm, damping, dry, drag = coefficients
         _, theta, x_dot, theta_dot = state.unbind(-1)
         sin, cos = theta.sin(), theta.cos()
+        # a - b x' - d tanh(x' / 0.05)
         force = action[..., 0]
         if dry is not None:
             force = force - dry * (x_dot / _SOFT).tanh()
         if damping is not None:
             force = force - damping * x_dot
-        # The fraction of x_ddot is divided by 4; with it, the pole turns about its moving hinge.
+        # a - m l / 2 theta'^2 sin theta
         net = torch.addcmul(force, theta_dot * theta_dot, half_moment * sin, value=-1)
-        tilt, swung = gravity * sin, swung_mass * cos
+        # g sin theta - 2 k / (m l) theta' |theta'|
+        tilt = gravity * sin
         if drag is not None:
             tilt = tilt - drag / half_moment * theta_dot * theta_dot.abs()
+        # The fraction of x'' over 4: (net + 3/4 m cos theta tilt) / (M - 3/4 m cos^2 theta)
+        swung = swung_mass * cos
         x_ddot = torch.addcmul(net, swung, tilt) / torch.addcmul(mass, swung, cos, value=-1)
+        # The pole about its moving hinge: 2/3 l theta'' = tilt + cos theta x''
         theta_ddot = torch.addcmul(tilt, cos, x_ddot) / arm
         return torch.stack([x_dot, theta_dot, x_ddot, theta_ddot], dim=-1)
 
     @cached_property
-    def _own(self) -> tuple[Any, ...]:
-        return _numbers(vars(self))
+    def _coefficients(self) -> tuple[Any, ...]:
+        return _coefficients(vars(self))
 
 
 REAL_CART_POLE = CartPoleEquation(cart_mass=0.5, pole_mass=0.5, pole_length=0.6, damping=0.1)
 """The system to control."""
 
 
-def _numbers(values: Mapping[str, Any]) -> tuple[Any, ...]:
-    """Return what the equation multiplies by, as tensors; None for a friction of zero."""
+def _coefficients(values: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Return the coefficients of the equation as tensors; None for a friction of zero."""
     m, length = values["pole_mass"], values["pole_length"]
+    # M, m l / 2, 3/4 m, g, 2/3 l
     numbers = [values["cart_mass"] + m, m * length / 2, 0.75 * m, values["gravity"], length / 1.5]
+    # Unknown parameters are tensors, which may be zero in some rows.
     friction = [values[name] for name in ("damping", "dry", "drag")]
     numbers += [v if torch.is_tensor(v) or v != 0 else None for v in friction]
     return tuple(v if v is None else torch.as_tensor(v, dtype=torch.float64) for v in numbers)
@@ -157,9 +166,9 @@ def equation_physics(
     time_step: float = TIME_STEP,
     unknowns: Mapping[str, Unknown] | None = None,
 ) -> ODEPhysics:
-    """Return the state of a cart-pole a time step (in s) later, under a force that is held.
+    """Return the physics of the next state of a cart-pole, after a time step (in s) at one force.
 
-    It does not limit the force, as the environment does. It integrates by Runge-Kutta of order four
+    Unlike the environment, it does not limit the force. It integrates by Runge-Kutta of order four
     with substeps of at most 0.02 s. Some parameters of the equation may be unknown.
 
     Example:
@@ -168,24 +177,24 @@ def equation_physics(
         tensor([[0.0081, 0.0206, 0.1627, 0.4233]], dtype=torch.float64)
     """
     checked_number("time_step", time_step, above=0)
-    substeps = math.ceil(round(time_step / SUBSTEP, 6))
+    substeps = math.ceil(round(time_step / SUBSTEP, 6))  # 0.1 / 0.02 may be above 5
     return ODEPhysics(
         equation, time_step, state_dim=4, substeps=substeps, unknowns=unknowns, name="cart_pole"
     )
 
 
 def believed_cart_pole(seed: int) -> CartPoleEquation:
-    """Return the cart-pole that someone believes in who has not measured it, without friction."""
+    """Return a cart-pole with roughly known masses and length, without friction."""
     random = np.random.default_rng(checked_whole("seed", seed, 0))
-    drawn = random.uniform([0.4, 0.5, 0.5], [0.6, 0.7, 0.7])
-    cart_mass, pole_mass, pole_length = map(float, drawn)
+    values = random.uniform([0.4, 0.5, 0.5], [0.6, 0.7, 0.7])
+    cart_mass, pole_mass, pole_length = map(float, values)
     return CartPoleEquation(cart_mass, pole_mass, pole_length, damping=0.0)
 
 
 def cart_pole_cost(states: Tensor, pole_length: float = REAL_CART_POLE.pole_length) -> Tensor:
     r"""Return the cost, in [0, 1], of states ``... x 4``, by the distance d of the tip of the pole.
 
-    The goal of the tip is where it is when the pole stands upright over the origin:
+    The goal of the tip is its place above the origin with the pole upright:
 
     .. math:: c = 1 - \exp(-2 d^2), \qquad
         d^2 = (x - l \sin\theta)^2 + (l \cos\theta - l)^2.
@@ -194,6 +203,7 @@ def cart_pole_cost(states: Tensor, pole_length: float = REAL_CART_POLE.pole_leng
     x, theta = states[..., 0], states[..., 1]
     across = x - pole_length * theta.sin()
     up = pole_length * (theta.cos() - 1)
+    # 1 - exp(-2 d^2)
     return -torch.expm1(-2 * (across.square() + up.square()))
 
 
@@ -212,25 +222,25 @@ def cart_pole_start(n: int) -> Tensor:
 class CartPoleSwingUpEnv(ViewedEnv):
     r"""Swing up the pole of a cart-pole and balance it, by pushing the cart.
 
-    The pole hangs at first. The action, a force in [-10, 10] N, is held for a time step; stronger
-    forces are clipped. The observation is
+    The pole hangs at first. The action, a force in [-10, 10] N, is constant for a time step;
+    stronger forces are clipped. The observation is
     :math:`[x, \sin\theta, \cos\theta, \dot{x}, \dot\theta]`, with the angle from upright;
-    ``state`` has the true state in float64. The reward is minus the cost
-    of the state that was reached, in [-1, 0], by the distance of the tip from its goal; the
-    ``info`` of a step has the ``"cost"``. An episode does not terminate; ``gym.make`` truncates it
-    after 25 steps. Environments can be pickled at any time and go on as they were.
+    ``state`` has the true state in float64. The reward is minus the cost of the next state, in
+    [-1, 0], by the distance of the tip from its goal; the ``info`` of a step has the ``"cost"``.
+    An episode does not terminate; ``gym.make`` truncates it after 25 steps. Environments can be
+    pickled at any time.
 
     Args:
         render_mode: ``"rgb_array"`` lets ``render`` return a frame, which needs ``pygame-ce``;
             ``gymnasium.wrappers.HumanRendering`` shows them in a window.
         encode_angle: If False, the observation is the state
-            :math:`[x, \theta, \dot{x}, \dot\theta]`, the angle not wrapped.
-        equation: The system. Default: the real one.
-        time_step: In s.
+            :math:`[x, \theta, \dot{x}, \dot\theta]`, with the angle not wrapped.
+        equation: The system. Default: ``REAL_CART_POLE``.
+        time_step: Duration of a step, in s.
 
     Raises:
-        TypeError: If an argument is of another type.
-        ValueError: If there is no such render mode, or ``time_step`` is not positive.
+        TypeError: If an argument has another type.
+        ValueError: If the render mode is unknown, or ``time_step`` is not positive.
 
     Example:
         >>> import gymnasium
@@ -262,6 +272,7 @@ class CartPoleSwingUpEnv(ViewedEnv):
         self.metadata = {**self.metadata, "render_fps": max(round(1 / time_step), 1)}
         self.state_spec = cart_pole_spec(encode_angle, time_step)
         high = [np.inf, 1.0, 1.0, np.inf, np.inf] if encode_angle else [np.inf] * 4
+        # Sine and cosine have bounds, positions and velocities have none.
         bound = np.array(high, dtype=np.float32)
         self.observation_space = gym.spaces.Box(-bound, bound, dtype=np.float32)
         self.action_space = gym.spaces.Box(-MAX_FORCE, MAX_FORCE, (1,), dtype=np.float32)
@@ -272,23 +283,23 @@ class CartPoleSwingUpEnv(ViewedEnv):
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Start an episode, by default from N([0, pi, 0, 0], 0.2²), around hanging at rest.
 
-        With ``options={"state": [x, theta, x_dot, theta_dot]}`` it starts there.
+        With ``options={"state": [x, theta, x_dot, theta_dot]}`` it starts at this state.
 
         Raises:
-            TypeError: If ``options`` is no dictionary.
+            TypeError: If ``options`` is not a dictionary.
             ValueError: If ``options`` has another key, or the state is not four numbers of
                 magnitude at most 100.
         """
         super().reset(seed=seed)
         options = checked_options("options", options, ("state",))
         if "state" in options:
-            given = finite_array(options["state"], (4,))
-            if given is None or (np.abs(given) > MAX_START).any():
+            state = finite_array(options["state"], (4,))
+            if state is None or (np.abs(state) > MAX_START).any():
                 raise ValueError(
                     "options['state'] must be four finite numbers, x, theta, x_dot and theta_dot, "
                     f"of magnitude at most {MAX_START:g}; found {options['state']!r}."
                 )
-            self.state = given
+            self.state = state
         else:
             self.state = self.np_random.normal(START_MEAN, START_STD)
         self._force = 0.0
@@ -301,7 +312,7 @@ class CartPoleSwingUpEnv(ViewedEnv):
 
         Raises:
             ValueError: If the action is not one finite number.
-            gymnasium.error.ResetNeeded: If no episode was started.
+            gymnasium.error.ResetNeeded: Before the first episode.
         """
         if self.state is None:
             raise gym.error.ResetNeeded("Call reset before the first step.")
@@ -311,6 +322,7 @@ class CartPoleSwingUpEnv(ViewedEnv):
                 f"The action must be one finite force, of shape (1,); found {action!r}."
             )
         force = force.clip(-MAX_FORCE, MAX_FORCE)
+        # The physics of the real parameters is the simulator.
         with torch.no_grad():
             row = torch.from_numpy(np.concatenate([self.state, force]))
             state = self.physics(row.unsqueeze(0)).squeeze(0)
@@ -321,6 +333,7 @@ class CartPoleSwingUpEnv(ViewedEnv):
 
     def _draw(self, canvas: Any, state: NDArray[np.float64]) -> None:
         x, theta = map(float, state[:2])
+        # The largest force has an arrow of 0.6 m.
         reach = 0.6 * self._force / MAX_FORCE
         draw_cart_pole(canvas, x, theta, self.equation.pole_length, reach)
 
@@ -344,15 +357,15 @@ def cart_pole(
     Its physics has other masses, another length and no friction.
 
     Args:
-        seed: Of the physics, whose masses are drawn from U(0.4, 0.6) kg for the cart and
-            U(0.5, 0.7) kg for the pole, the length from U(0.5, 0.7) m.
-        dry: Dry friction of the real cart, in N, which no parameter of the physics describes.
-        drag: Drag of the real pole, in N m s²/rad², likewise.
+        seed: Seed of the physics, with masses from U(0.4, 0.6) kg for the cart and U(0.5, 0.7) kg
+            for the pole, and a length from U(0.5, 0.7) m.
+        dry: Dry friction of the real cart, in N, which the physics does not have.
+        drag: Drag of the real pole, in N m s²/rad², which the physics does not have.
         noise: Standard deviations of the sensors' noise, by the name of the state.
         unknowns: If True, masses, length and damping of the physics are unknown parameters.
         encode_angle: As of the environment.
-        time_step: In s.
-        episode_length: In steps.
+        time_step: Duration of a step, in s.
+        episode_length: Number of steps of an episode.
 
     Example:
         >>> from gpadjust import systems
@@ -360,20 +373,27 @@ def cart_pole(
         '0 to 1'
     """
     check_switch("unknowns", unknowns)
-    believed, named = believed_cart_pole(seed), None
-    if unknowns:
-        named = {
+    believed = believed_cart_pole(seed)
+    parameters: dict[str, Unknown] | None = None
+    if unknowns:  # factors that cover the real values
+        parameters = {
             "cart_mass": Unknown(believed.cart_mass, factor=1.5, unit="kg"),
             "pole_mass": Unknown(believed.pole_mass, factor=1.5, unit="kg"),
             "pole_length": Unknown(believed.pole_length, factor=1.5, unit="m"),
             "damping": Unknown(0.05, bounds=(0.0, 1.0), unit="N s/m"),
         }
-    real: dict[str, Any] = {"encode_angle": encode_angle, "time_step": time_step}
-    real["equation"] = replace(REAL_CART_POLE, dry=dry, drag=drag)
+    make = partial(
+        gym.make,
+        "gpadjust/CartPoleSwingUp-v0",
+        max_episode_steps=episode_length,
+        encode_angle=encode_angle,
+        time_step=time_step,
+        equation=replace(REAL_CART_POLE, dry=dry, drag=drag),
+    )
     return System(
-        partial(gym.make, "gpadjust/CartPoleSwingUp-v0", max_episode_steps=episode_length, **real),
+        make,
         cart_pole_spec(encode_angle, time_step),
-        equation_physics(believed, time_step, named),
+        equation_physics(believed, time_step, parameters),
         cart_pole_reward,
         start=cart_pole_start,
         episode_length=episode_length,

@@ -1,4 +1,4 @@
-"""A system to control: its environment and what is known of it, in one object."""
+"""A system to control: environment, physics and task in one object."""
 
 from __future__ import annotations
 
@@ -21,35 +21,35 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """A system to control: the real one as an environment, and what is known of it.
+    """A system to control: the real one as an environment, its physics, reward and task.
 
     Args:
         env: Makes the environment, such as its class; it gets the keyword arguments of
             :meth:`make`.
         spec: The entries of states and actions.
         physics: f_p, the next values of the states that are neither exogenous nor previous values,
-            from these and the actions, or from what ``spec.physics_reads`` names; possibly with
-            unknown parameters.
-        reward: Known rewards ``N`` of states ``N x state_dim``, actions ``N x action_dim`` and next
-            states ``N x state_dim``.
-        start: Draws ``n`` states at which episodes start, ``n x state_dim``. Default: those at
-            which real episodes started.
+            from these and the actions, or from ``spec.physics_reads``; unknown parameters are
+            possible.
+        reward: A function of states ``N x state_dim``, actions ``N x action_dim`` and next states
+            ``N x state_dim`` to rewards ``N``.
+        start: Draws ``n`` initial states of episodes, ``n x state_dim``. Default: the initial
+            states of real episodes.
         terminated: A function of states ``N x state_dim`` to ``N`` booleans: the end of an episode.
-        episode_length: Steps after which an episode is truncated; an environment's own time limit
-            may only be longer. Default: the time limit of the environment.
+        episode_length: Steps after which an episode is truncated, at most the time limit of the
+            environment. Default: the time limit of the environment.
         state_bounds, reference, constraints, probability, action_rate: As of a
             :class:`~gpadjust.control.Task`.
-        physics_error: As of :class:`~gpadjust.dynamics.LearnedDynamics`, of the dynamics that
-            :meth:`task` makes.
+        physics_error: As of :class:`~gpadjust.dynamics.LearnedDynamics`, for the dynamics of
+            :meth:`task`.
         noise: Standard deviations of the sensors' noise, by the name of the state or output, which
-            :class:`NoisySensors` adds to what the environment observes.
-        sensors: The outputs that are measured, as of a :class:`~gpadjust.control.Task`. ``env``
-            observes the states, of which :meth:`make` shows the outputs, or the outputs alone.
-            Default: all of the states.
+            :class:`NoisySensors` adds to the observations.
+        sensors: The measured outputs, as of a :class:`~gpadjust.control.Task`. ``env`` observes the
+            states, from which :meth:`make` computes the outputs, or the outputs alone. Default: all
+            states.
 
     Raises:
         TypeError: If ``env``, ``physics`` or ``reward`` is not callable, or ``spec``, ``sensors``
-            or ``physics_error`` is of another kind.
+            or ``physics_error`` has another type.
 
     Example:
         >>> from gpadjust import systems
@@ -79,13 +79,13 @@ class System:
     def __post_init__(self) -> None:
         """Check the parts that a task does not check."""
         check_kind("spec", self.spec, StateSpec, "a StateSpec")
-        for name in ("env", "reward"):
+        for name, hint in (("env", ", its class or `lambda: env`"), ("reward", "")):
             if not callable(getattr(self, name)):
-                hint = ", its class or `lambda: env`" if name == "env" else ""
                 raise TypeError(f"{name} must be a function{hint}; found {getattr(self, name)!r}.")
-        check_kind("sensors", self.sensors, Sensors | None, 'Sensors(["x", "theta"]), say')
+        check_kind("sensors", self.sensors, Sensors | None, 'such as Sensors(["x", "theta"])')
         expected = "standard deviations by the name of the state"
         check_kind("physics_error", self.physics_error, Mapping | None, expected)
+        # A function becomes a Physics, so that tasks share its memory.
         object.__setattr__(self, "physics", as_physics(self.physics))
 
     @property
@@ -100,46 +100,48 @@ class System:
             options: Keyword arguments of ``env``, such as ``render_mode="rgb_array"``.
 
         Raises:
-            ValueError: If the environment's own time limit is less than ``episode_length``, or it
-                observes neither the states nor what the sensors measure.
+            ValueError: If the time limit of the environment is less than ``episode_length``, or
+                its observations are neither the states nor the outputs of the sensors.
         """
         env = self.env(**options)
         limit = env.spec and env.spec.max_episode_steps
         if self.episode_length is not None and limit and limit < self.episode_length:
             raise ValueError(
                 f"episode_length must be at most the environment's own time limit, {limit} steps; "
-                f"found {self.episode_length}. Raise that, as in `gymnasium.make(..., "
+                f"found {self.episode_length}. Raise the limit, as in `gymnasium.make(..., "
                 "max_episode_steps=...)`, or leave episode_length out."
             )
         if self.episode_length not in (None, limit):
             env = gym.wrappers.TimeLimit(env, self.episode_length)
         if self.sensors is None and not self.noise:
             return env
-        shape, states = env.observation_space.shape, self.spec.observation_dim
+        # Observations are the states, or already the outputs of the sensors.
+        states = self.spec.observation_dim
+        shape = env.observation_space.shape
         if self.sensors is not None and shape != (states,):
             outputs = self.sensors.spec(self.spec).observation_dim
             if shape == (outputs,) and not self.noise:
                 return env
             raise ValueError(
-                f"The environment must observe the states ({states} entries), of which "
-                f"`system.make()` shows what the sensors measure, or that alone ({outputs} "
-                f"entries), without `noise`; found {env.observation_space}."
+                f"The environment must observe the states ({states} entries), from which "
+                f"`system.make()` computes the outputs of the sensors, or without `noise` the "
+                f"outputs alone ({outputs} entries); found {env.observation_space}."
             )
         return NoisySensors(env, self.spec, self.noise or {}, self.sensors)
 
     def task(self, dynamics: Dynamics | None = None) -> Task:
-        """Return the task that agents and planners take.
+        """Return the task for agents and planners.
 
-        The dynamics are the model of the system, which learns: make others for another run. By
-        default they are :class:`~gpadjust.dynamics.LearnedDynamics` with the physics. Errors are
-        those of a :class:`~gpadjust.control.Task`.
+        Updates change the dynamics: each run needs new ones. By default they are
+        :class:`~gpadjust.dynamics.LearnedDynamics` with the physics. Errors are those of a
+        :class:`~gpadjust.control.Task`.
         """
+        # Not at the top: an environment alone is quick to import.
         from gpadjust.control import Task
         from gpadjust.dynamics import LearnedDynamics
 
         if dynamics is None:
-            error = self.physics_error
-            dynamics = LearnedDynamics(self.spec, self.physics, physics_error=error)
+            dynamics = LearnedDynamics(self.spec, self.physics, physics_error=self.physics_error)
         return Task(
             dynamics,
             self.reward,

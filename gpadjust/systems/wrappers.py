@@ -1,4 +1,4 @@
-"""Environments with previous actions, or as sensors show them."""
+"""Wrappers of environments: previous actions, and noisy sensors."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ Array = NDArray[np.float32]
 
 
 class RememberAction(gym.Wrapper[Array, Array, Array, Array], gym.utils.RecordConstructorArgs):
-    """Appends the last actions to the observation, the newest first; at first they are zeros.
+    """Appends the last actions to the observation, the newest first, beginning with zeros.
 
-    Where a system follows its actions with a delay that the observation does not show, such as the
+    If a system follows its actions with a delay that is not in the observation, such as the
     activation of muscles, the next observation depends on earlier actions. A
     :class:`~gpadjust.states.StateSpec` declares them in ``previous``, such as
-    ``{"force_1": "force", "force_2": "force_1"}`` of two steps. Actions are clipped to their space,
-    as the environments of this library take them.
+    ``{"force_1": "force", "force_2": "force_1"}`` for two steps. Actions are clipped to their
+    space, as in the environments of this library.
 
     Args:
-        env: An environment whose observations and actions are boxes of one dimension; zero is an
-            action.
+        env: An environment whose observations and actions are boxes of one dimension, with zero as
+            an action.
         steps: The number of actions.
 
     Raises:
-        TypeError: If ``steps`` is no whole number.
-        ValueError: If spaces or ``steps`` are others.
+        TypeError: If ``steps`` is not a whole number.
+        ValueError: If ``steps`` is not positive, or a space is not as above.
 
     Example:
         >>> import gymnasium
@@ -48,24 +48,25 @@ class RememberAction(gym.Wrapper[Array, Array, Array, Array], gym.utils.RecordCo
         gym.utils.RecordConstructorArgs.__init__(self, steps=steps)
         gym.Wrapper.__init__(self, env)
         checked_whole("steps", steps, 1)
-        seen: Any = env.observation_space
-        taken: Any = env.action_space
-        for name, space in (("observation", seen), ("action", taken)):
+        observations: Any = env.observation_space
+        actions: Any = env.action_space
+        for name, space in (("observation", observations), ("action", actions)):
             if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
                 raise ValueError(
                     f"RememberAction needs an {name} space that is a Box of one dimension; found "
                     f"{space}. Put gymnasium.wrappers.FlattenObservation or RescaleAction inside."
                 )
-        self._taken = taken
-        self._last = np.zeros((steps, *taken.shape), dtype=taken.dtype)
-        if not taken.contains(self._last[0]):
+        self._actions = actions
+        self._last = np.zeros((steps, *actions.shape), dtype=actions.dtype)
+        if not actions.contains(self._last[0]):
             raise ValueError(
-                f"RememberAction starts from the action zero, which is not in {taken}. Put "
+                f"RememberAction starts from the action zero, which is not in {actions}. Put "
                 "gymnasium.wrappers.RescaleAction inside."
             )
-        dtype = np.result_type(seen.dtype, taken.dtype).type
-        low = np.concatenate([seen.low, np.tile(taken.low, steps)], dtype=dtype)
-        high = np.concatenate([seen.high, np.tile(taken.high, steps)], dtype=dtype)
+        # The space of the observation, followed by that of the actions.
+        dtype = np.result_type(observations.dtype, actions.dtype).type
+        low = np.concatenate([observations.low, np.tile(actions.low, steps)], dtype=dtype)
+        high = np.concatenate([observations.high, np.tile(actions.high, steps)], dtype=dtype)
         self.observation_space = gym.spaces.Box(low, high, dtype=dtype)
 
     def reset(
@@ -73,14 +74,15 @@ class RememberAction(gym.Wrapper[Array, Array, Array, Array], gym.utils.RecordCo
     ) -> tuple[Array, dict[str, Any]]:
         """Start an episode; its first observation ends with zeros."""
         observation, info = self.env.reset(seed=seed, options=options)
+        # No action precedes an episode.
         self._last = np.zeros_like(self._last)
         return self._extended(observation), info
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Take an action; the observation ends with it, clipped, and those before it."""
+        """Take an action; the observation ends with the clipped action and earlier ones."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        taken = np.clip(action, self._taken.low, self._taken.high)
-        self._last = np.concatenate([taken[None], self._last[:-1]]).astype(self._last.dtype)
+        clipped = np.clip(action, self._actions.low, self._actions.high)
+        self._last = np.concatenate([clipped[None], self._last[:-1]]).astype(self._last.dtype)
         return self._extended(observation), float(reward), terminated, truncated, info
 
     def _extended(self, observation: Array) -> Array:
@@ -89,17 +91,17 @@ class RememberAction(gym.Wrapper[Array, Array, Array, Array], gym.utils.RecordCo
 
 
 class NoisySensors(gym.ObservationWrapper[Array, Array, Array], gym.utils.RecordConstructorArgs):
-    """Shows what sensors measure of the states, with normal noise; rewards are of the true state.
+    """Observations by sensors with normal noise; rewards are those of the true state.
 
     Args:
-        env: The environment, which observes the states of the spec.
-        spec: The states; an angle gets its noise before its sine and cosine are taken.
+        env: The environment, whose observations are the states of the spec.
+        spec: The states; noise is added to an angle, not to its sine and cosine.
         sd: Standard deviations by the name of the state or output; the others have no noise.
-        sensors: The outputs that are measured. Default: all of the states.
+        sensors: The measured outputs. Default: all states.
 
     Raises:
-        TypeError: If a standard deviation is no number.
-        ValueError: If one is negative, or there is no such state or output.
+        TypeError: If a standard deviation is not a number.
+        ValueError: If one is negative, or a state or output does not exist.
 
     Example:
         >>> from gpadjust import systems
@@ -118,27 +120,29 @@ class NoisySensors(gym.ObservationWrapper[Array, Array, Array], gym.utils.Record
         gym.ObservationWrapper.__init__(self, env)
         self.spec_of_states = spec
         self.sensors = Sensors(spec.states) if sensors is None else sensors
-        self._seen = self.sensors.spec(spec)
+        self._outputs = self.sensors.spec(spec)
         for name, value in sd.items():
             checked_number(f"The noise of {name!r}", value, least=0)
             if name not in self.sensors.outputs:
-                what = "state" if sensors is None else "output"
+                noun = "state" if sensors is None else "output"
                 raise ValueError(
-                    f"There is no {what} {name!r}; the {what}s are {self.sensors.outputs}."
+                    f"There is no {noun} {name!r}; the {noun}s are {self.sensors.outputs}."
                 )
-        each = [sd.get(name, 0.0) for name in self.sensors.outputs]
-        self._sd = torch.tensor(each, dtype=torch.float64)
-        if sensors is not None:
+        values = [sd.get(name, 0.0) for name in self.sensors.outputs]
+        self._sd = torch.tensor(values, dtype=torch.float64)
+        if sensors is not None:  # a space without the hidden states
             dtype: Any = env.observation_space.dtype
-            shape = (self._seen.observation_dim,)
+            shape = (self._outputs.observation_dim,)
             self.observation_space = gym.spaces.Box(-np.inf, np.inf, shape, dtype)
 
     def observation(self, observation: Array) -> Array:
-        """Measure, and add the noise by the environment's generator."""
+        """Return the measured outputs, with noise from the environment's generator."""
+        # From sine and cosine back to angles, for the noise.
         states = self.spec_of_states.decode(torch.from_numpy(observation.astype(np.float64)))
         values = self.sensors.measure(self.spec_of_states, states.unsqueeze(0)).squeeze(0)
-        noisy = self._sd > 0
-        noise = torch.from_numpy(self.unwrapped.np_random.normal(size=int(noisy.sum())))
+        # Outputs without noise draw no number.
+        is_noisy = self._sd > 0
+        noise = torch.from_numpy(self.unwrapped.np_random.normal(size=int(is_noisy.sum())))
         values = values.clone()
-        values[noisy] += self._sd[noisy] * noise
-        return self._seen.observe(values).numpy().astype(observation.dtype)
+        values[is_noisy] += self._sd[is_noisy] * noise
+        return self._outputs.observe(values).numpy().astype(observation.dtype)

@@ -32,6 +32,7 @@ def to_arviz(*models: GP, chains: int = 1, seed: int = 0) -> Any:
 
     Raises:
         ImportError: Without ArviZ, ``pip install "gpadjust[arviz]"``.
+        TypeError: If a model is a stack of several.
         ValueError: If the models have different data or numbers of draws.
 
     Example:
@@ -47,6 +48,12 @@ def to_arviz(*models: GP, chains: int = 1, seed: int = 0) -> Any:
         from arviz_base import from_dict
     except ImportError as error:
         raise ImportError('to_arviz needs ArviZ; run `pip install "gpadjust[arviz]"`.') from error
+    for each in models:
+        if not isinstance(each, GP):
+            raise TypeError(
+                f"Expected models of gpadjust.core; found {type(each).__name__}. Of a model of "
+                "several, as `gpadjust report` saves it, give one of its `models`."
+            )
     if not models or any(
         each.draws.shape != models[0].draws.shape
         or len(each.draws) % chains

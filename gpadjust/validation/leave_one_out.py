@@ -173,7 +173,7 @@ def _mixed(model: StackedGP, parts: list[Marginals]) -> Tensor:
 
 
 def error_correlation(model: Any) -> Tensor | None:
-    r"""The correlation of outputs by a model's left-out errors, ``m x m``; None if none is clear.
+    r"""Return the correlation of outputs by left-out errors, ``m x m``; None if none is clear.
 
     A correlation r of n pairs has the standard error :math:`(1 - r^2) / \sqrt n`. It counts where
     :math:`|r| \sqrt n` is more than 3.5, and is shrunk by the share of its square that is chance

@@ -344,14 +344,14 @@ class TestResuming:
     def test_a_log_that_does_not_belong(self, laboratory, tmp_path, bounds):
         path = tmp_path / "log.jsonl"
         collect(**laboratory(log=path, budget=2))
-        with pytest.raises(ValueError, match=r"log\.jsonl is of measurements within the bounds"):
+        with pytest.raises(ValueError, match=r"log\.jsonl has measurements within the bounds"):
             collect(**laboratory(log=path, bounds=2 * bounds))
         with pytest.raises(ValueError, match="within the bounds"):
             collect(**laboratory(log=path, bounds=bounds[:, :1]))
         with pytest.raises(ValueError, match=r"Line 3 of the log .* 2 inputs and 2 outputs"):
             collect(**laboratory(log=path, num_outputs=2))
         path.write_text('{"loss": 1.0}\n')
-        with pytest.raises(ValueError, match=r"log\.jsonl is no log of measurements"):
+        with pytest.raises(ValueError, match=r"log\.jsonl is not a log of measurements"):
             collect(**laboratory(log=path))
 
     def test_a_log_is_free_when_it_is_done(self, laboratory, tmp_path):

@@ -122,7 +122,7 @@ def test_some_of_the_outputs(make, tmp_path, missing):
         assert torch.equal(each.Y.isnan(), torch.tensor([[False, True]]))
         assert torch.equal(each.failed_X, X[1:])
         assert len(each.pending) == each.num_observed == 0
-        with pytest.raises(RuntimeError, match="2 measurements of each output, there are 0"):
+        with pytest.raises(RuntimeError, match="2 measurements of each output, found 0"):
             each.model  # noqa: B018
 
 
@@ -234,7 +234,7 @@ def test_what_cannot_be_logged_is_not_taken(make, tmp_path, monkeypatch):
     ]
     for call in calls:
         monkeypatch.setattr(os, "fsync", full)
-        with pytest.raises(LogError, match=r"No space left .* is not on the disk, and the coll"):
+        with pytest.raises(LogError, match=r"No space left .* neither on the disk nor in the coll"):
             call()
         monkeypatch.undo()
         assert path.read_bytes() == before

@@ -255,17 +255,17 @@ LAW = FunctionPhysics(
     lambda X, p: p.a[:, None] * crude(X)[..., :1], unknowns={"a": Unknown(1.0, sd=1.0)}
 )
 REFUSED = [
-    (lambda: made(PhysicsMeanGP), "rho", TypeError, "PhysicsMeanGP has no unknown rho; ask about"),
+    (lambda: made(PhysicsMeanGP), "rho", TypeError, "PhysicsMeanGP has no unknown rho; use about"),
     (lambda: made(ScaleGP), "delta", TypeError, "ScaleGP has no unknown delta"),
     (lambda: made(ZeroMeanGP), "both", TypeError, "rho or delta.* found ZeroMeanGP"),
     (lambda: made(CalibratedPhysics, physics=LAW), "both", TypeError, "has neither rho nor delta"),
-    (lambda: made(center=True), "delta", ValueError, "ask about 'rho' or 'both', .* center=0"),
-    (lambda: made(center=2.0), "delta", ValueError, "ask about 'rho' or 'both', .* center=0"),
+    (lambda: made(center=True), "delta", ValueError, "use about='rho' or 'both', .* center=0"),
+    (lambda: made(center=2.0), "delta", ValueError, "use about='rho' or 'both', .* center=0"),
     (
         lambda: made(VariationalCKA, num_inducing=5),
         "rho",
         TypeError,
-        "if rho were known: ask about 'both'",
+        "given rho: use about='both'",
     ),
     (made, "epsilon", ValueError, r"about='epsilon'; expected 'rho'"),
     (lambda: ModelListGP(made()), "both", TypeError, "found ModelListGP"),

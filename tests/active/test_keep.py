@@ -107,7 +107,7 @@ def test_where_nothing_is_safe_it_says_so():
         keep=below,
         fit=lambda model: None,
     )
-    with pytest.raises(RuntimeError, match=r"0 of \d+ points as safe with a probability of 0\.95"):
+    with pytest.raises(RuntimeError, match=r"0 of \d+ points are safe with a probability of 0\.95"):
         collection.ask()
 
 
@@ -162,5 +162,5 @@ def test_first_points_are_to_be_told_first():
     collection = Collection(ZeroMeanGP, BOUNDS, PosteriorStandardDeviation, **options)
     X = collection.ask(2)
     collection.tell(X[:1], steep(X[:1]))
-    with pytest.raises(RuntimeError, match=r"1 of them are pending: tell\(\) these first"):
+    with pytest.raises(RuntimeError, match=r"1 of them are pending: tell\(\) their results first"):
         collection.ask()

@@ -29,7 +29,9 @@ def test_arguments_with_names_of_parameters_are_these():
     ):
         assert ParameterPhysics(physics).names_of(PARAMETERS) == names
     for physics in (lambda x1, z: x1, lambda a, b: a, lambda x1, z, *, y=0: x1):
-        with pytest.raises(ValueError, match=r"no parameter of the search space, which has x1, x2"):
+        with pytest.raises(
+            ValueError, match=r"not a parameter of the search space, which has x1, x2"
+        ):
             ParameterPhysics(physics).names_of(PARAMETERS)
 
 

@@ -235,19 +235,19 @@ def test_a_second_experiment_leaves_the_units_of_the_first():
 
 
 def test_a_plain_model_config_says_what_is_missing():
-    with pytest.raises(ValueError, match=r"was not told what Ax's transforms do.*TellPhysics"):
+    with pytest.raises(ValueError, match=r"would get inputs after Ax's transforms.*TellPhysics"):
         adapter(experiment(), Recorded(), [*MBM_X_trans, *Y_trans])
 
 
 LATE, LOGGED = [*TRANSFORMS, UnitX], [*MBM_X_trans, LogY, TellPhysics]
 REFUSED = [
     ({"transforms": LATE}, "TellPhysics as the last.*found UnitX after it"),
-    ({"transforms": LOGGED}, r"behind the transform\(s\) LogY"),
+    ({"transforms": LOGGED}, r"transform\(s\) LogY of Ax are not supported"),
     ({"transforms": [*Mixed_transforms, TellPhysics]}, "no kernel for categorical"),
     ({"config": {"input_transform_classes": [Normalize]}}, "makes its own parts"),
-    ({"metrics": ["costs"]}, "for costs, which is no metric.*some of cost, load"),
+    ({"metrics": ["costs"]}, "unknown metric costs; expected some of cost, load"),
     ({"physics": lambda X: X[:, 0]}, r"reads the parameter\(s\) glue, which are text"),
-    ({"physics": lambda rate, speed: rate}, "but speed is no parameter"),
+    ({"physics": lambda rate, speed: rate}, "but speed is not a parameter"),
     ({"physics": lambda rate: torch.stack([rate, rate], -1)}, "2 columns for the me"),
 ]
 

@@ -117,7 +117,7 @@ TASKS = [
     ),
     (
         lambda at: PhysicsDynamics(POINT_SPEC, at.step, physics_error={"y": 0.1}),
-        r"physics_error is of states among .'x'.; found 'y'",
+        r"physics_error names states among .'x'.; found 'y'",
     ),
     (
         lambda at: PhysicsDynamics(POINT_SPEC, at.step, physics_error={"x": -1}),

@@ -115,7 +115,7 @@ def test_dynamics_of_another_physics_are_refused(learnt):
         known = {"fit_options": FEW} if isinstance(one, LearnedDynamics) else {}
         other = type(one)(SPEC, stronger, **known)
         with pytest.raises(
-            RuntimeError, match=r"another physics than 'stronger'.* of 'v', this one"
+            RuntimeError, match=r"another physics than 'stronger'.* for 'v', this one"
         ):
             other.load_state_dict(one.state_dict())
         type(one)(SPEC, push, **known).load_state_dict(one.state_dict())
@@ -247,7 +247,7 @@ REFUSED = [
     ({"model": ZeroMeanGP}, TypeError, "found ZeroMeanGP: it takes no physics.*model=CKA"),
     ({"model": "CKA"}, TypeError, "class of gpadjust,.*found 'CKA'"),
     ({"model": SingleTaskGP}, TypeError, "found SingleTaskGP: .*'physics'"),
-    ({"model": lambda X, Y: None}, TypeError, r"one of \(X, Y, physics=...\).*'physics'"),
+    ({"model": lambda X, Y: None}, TypeError, r"a factory of \(X, Y, physics=...\).*'physics'"),
     ({"model": partial(CKA, physics=None)}, TypeError, "physics comes from the dynamics"),
     ({"model": partial(CKA, train_Yvar=1)}, TypeError, "train_Yvar comes from the dynamics"),
     ({"fit_options": {"method": "gibbs"}}, ValueError, "Unknown method 'gibbs'"),

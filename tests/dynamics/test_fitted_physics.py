@@ -121,7 +121,7 @@ def test_a_parameter_of_which_nothing_is_known_stays_where_it_was():
     unknowns = {**swing().unknowns, "buoyancy": Unknown(2.0, sd=0.5)}
     physics = ODEPhysics(pendulum, 0.1, 2, substeps=4, unknowns=unknowns)
     dynamics = PhysicsDynamics(PENDULUM, physics)
-    with pytest.warns(PhysicsWarning, match="next to nothing of .*buoyancy"):
+    with pytest.warns(PhysicsWarning, match="barely constrain .*buoyancy"):
         dynamics.update(states, actions, following)
     assert found(dynamics)["buoyancy"] == pytest.approx(2.0, abs=0.01)
     assert dynamics.physics_parameters.sd[2] == pytest.approx(0.5, rel=0.02)

@@ -246,7 +246,7 @@ def test_runs_are_the_same_again_and_draw_from_no_generator(monkeypatch):
 
 
 REFUSED = [
-    ((STATES[0], ACTIONS[0]), {}, ValueError, r"\(1,\) and \(6, 1\); of a single run, use `in"),
+    ((STATES[0], ACTIONS[0]), {}, ValueError, r"\(1,\) and \(6, 1\); for a single run, use `in"),
     ((STATES, ACTIONS[:1]), {}, ValueError, r"got \(2, 1\) and \(1, 6, 1\)"),
     ((STATES, ACTIONS[:, :0]), {}, ValueError, "one or more actions for each state"),
     ((STATES.repeat(1, 2), ACTIONS), {}, ValueError, r"initial_states of shape \.\.\. x 1"),
@@ -255,7 +255,7 @@ REFUSED = [
     ((STATES, ACTIONS), {"start_noise": "known"}, ValueError, "as .learnt. or a tensor"),
     ((STATES, ACTIONS), {"start_noise": -torch.ones(1)}, ValueError, "start_noise of 0 or"),
     ((STATES, ACTIONS), {"process_noise": STATES[:1, 0] / 0}, ValueError, "process_.*nan_to_num"),
-    ((STATES, ACTIONS), {"process_noise": "learnt"}, ValueError, "such as noise=smoothed.noise"),
+    ((STATES, ACTIONS), {"process_noise": "learnt"}, ValueError, "give noise=smoothed.noise"),
     ((STATES, ACTIONS), {"noise": "learnt"}, ValueError, "noise as True or False or a tensor"),
     ((STATES, ACTIONS), {"state_bounds": torch.ones(2)}, ValueError, "state_bounds of shape 2 x 1"),
 ]

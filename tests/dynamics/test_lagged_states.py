@@ -76,7 +76,7 @@ def test_physics_knows_the_present_only_and_a_model_both():
         assert torch.equal(moved[:, 1:], torch.cat([states[:, :1], actions[:, 0]], -1))
     assert (dynamics.predict(states, actions[:, 0]).variance[:, 1:] == 0).all()
     assert (dynamics.noise_variance(states, actions[:, 0])[:, 1:] == 0).all()
-    with pytest.raises(ValueError, match="'y_1' is said to hold the previous state 'y'"):
+    with pytest.raises(ValueError, match="'y_1' is declared as the previous state 'y'"):
         dynamics.update(states, actions[:, 0], following[:, 0].flip(0))
 
 

@@ -284,7 +284,7 @@ def test_bad_data_are_refused_and_what_was_learnt_stands(cart_pole_system, make)
         ((states, actions, broken), ValueError, r"next_states to be finite.*row 4"),
         ((broken, actions, following), ValueError, r"states to be finite.*row 4"),
         ((states, actions.float(), following), TypeError, r"actions in float64, got torch\.float3"),
-        ((states, actions[:3], following), ValueError, "as many rows each"),
+        ((states, actions[:3], following), ValueError, "equally many rows"),
     ):
         with pytest.raises(error, match=words):
             dynamics.update(*rows)

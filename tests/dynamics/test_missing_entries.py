@@ -87,11 +87,11 @@ def test_declared_states_are_checked_where_they_were_measured():
     dynamics.update(states, actions, following)
     wrong = following.clone()
     wrong[:, 0] = states[:, 0] + 3 * (following[:, 0] - states[:, 0])
-    with pytest.raises(ValueError, match="'q' is said to be integrated"):
+    with pytest.raises(ValueError, match="'q' is declared as integrated"):
         dynamics.update(states, actions, wrong)
     wrong = following.clone()
     wrong[5, 2] += 1
-    with pytest.raises(ValueError, match=r"'goal' is said to be exogenous.*row 5"):
+    with pytest.raises(ValueError, match=r"'goal' is declared as exogenous.*row 5"):
         dynamics.update(states, actions, wrong)
     following[6, 1] = math.nan  # all that the model predicts
     with pytest.raises(ValueError, match=r"predicted entries of next_states.*row 6"):

@@ -52,10 +52,10 @@ def test_all_dynamics_are_scored():
 
 def test_states_that_are_not_as_declared_are_named():
     for make, declared, words in (
-        (PhysicsDynamics, {"previous": {"x": "a"}}, "'x' is said to hold the previous action 'a'"),
-        (LearnedDynamics, {"exogenous": ["x"]}, "'x' is said to be exogenous"),
-        (PhysicsDynamics, {"exogenous": ["x"]}, "'x' is said to be exogenous"),
-        (PhysicsDynamics, {"integrated": {"x": "v"}, "step": 0.3}, "'x' is said to be integrated"),
+        (PhysicsDynamics, {"previous": {"x": "a"}}, "'x' is declared as the previous action 'a'"),
+        (LearnedDynamics, {"exogenous": ["x"]}, "'x' is declared as exogenous"),
+        (PhysicsDynamics, {"exogenous": ["x"]}, "'x' is declared as exogenous"),
+        (PhysicsDynamics, {"integrated": {"x": "v"}, "step": 0.3}, "'x' is declared as integrated"),
     ):
         dynamics = make(StateSpec(["x", "v"], ["a"], **declared), push)
         with pytest.raises(ValueError, match=words):
@@ -89,7 +89,7 @@ def test_bad_input_is_refused():
     with pytest.raises(ValueError, match="difference=False"):
         PhysicsDynamics(SPEC, ODEPhysics(lambda x, a: x, 0.1, 2, difference=True))
     timed = StateSpec(["x", "v"], ["push"], step=0.1)
-    with pytest.raises(ValueError, match=r"steps of 0.05, but the spec says 0.1; .*step=0\.1"):
+    with pytest.raises(ValueError, match=r"steps of 0.05, but the spec has 0.1; .*step=0\.1"):
         PhysicsDynamics(timed, ODEPhysics(lambda x, a: x, 0.05, 2))
     dynamics = PhysicsDynamics(SPEC, lambda X: X)
     with pytest.raises(ValueError, match=r"next values of the 2 states .*got 3 columns"):

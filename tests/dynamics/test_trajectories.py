@@ -72,7 +72,7 @@ def test_episodes_and_lengths_that_are_none():
     for episode, words in (
         ([0, 1, 0], "rows of another episode between"),
         ([0, 0], "3 of next_states, 2 of episode"),
-        ([[0, 0, 0]] * 3, "as many rows each"),
+        ([[0, 0, 0]] * 3, "equally many rows"),
         ([0.5, 0.75, 0.75], r"whole numbers, found \[0.5, 0.75"),
     ):
         with pytest.raises(ValueError, match=words):

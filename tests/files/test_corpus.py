@@ -152,7 +152,7 @@ REFUSED = {
     ),
     "thousands, or decimals": case(
         made("time,u,T", temperatures=["20", "21", "", '"1,021"']),
-        refused="found '1,021'.*comma, say so by --decimal ','; if it parts thousands, by --dec",
+        refused="found '1,021'.*comma, use --decimal ','; if it separates thousands, --dec",
     ),
     "decimal commas between commas": case(
         "time,u,T\n0,0,50,0,20,5\n0,5,20,0,20,75\n", refused="found 6.*Save it with semicolons"
@@ -167,7 +167,7 @@ REFUSED = {
     "dates of two readings": case(
         made("date,u,T", times=["2/3/2015", "3/3/2015", "4/3/2015", "5/3/2015"]),
         {"time": "date"},
-        refused="'2/3/2015', whose day and month may be either; write dates as 2015-02-28",
+        refused="'2/3/2015', whose day and month may be swapped; write dates as 2015-02-28",
     ),
     "hours and minutes, or minutes": case(
         made("clock,u,T", times=["14:19", "14:20", "14:21", "14:22"]),

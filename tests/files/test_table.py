@@ -33,9 +33,9 @@ def test_decimal_marks_and_what_is_no_number(columns):
         table = columns(f"x;y\n{text};0\n", decimal=decimal)
         assert table.numbers("x").tolist() == [value]
     for decimal, text, hint in (
-        (".", "1,5", "If this comma is a decimal comma, say so by `decimal=','`."),
-        (",", "1.5", "If this point is a decimal point, say so by `decimal='.'`."),
-        (",", "1,234.5", "If this point is a decimal point, say so by `decimal='.'`."),
+        (".", "1,5", "If this comma is a decimal comma, use `decimal=','`."),
+        (",", "1.5", "If this point is a decimal point, use `decimal='.'`."),
+        (",", "1,234.5", "If this point is a decimal point, use `decimal='.'`."),
         (".", "1_000", "leave the line out."),
         (".", "1,5 m", "Write its unit into the name, x [m]."),
     ):
@@ -80,7 +80,9 @@ def test_what_comes_before_the_data(columns):
     table = columns("0,error\n1,2\n2,3\n", names=["t", "x"])  # the first row is no line of names
     with pytest.raises(ValueError, match=r"line 1, column 2 \('x'\): .*found 'error'"):
         table.numbers("x")
-    assert columns("Logger\n\na,b\n1,2\n").remarks[0].endswith("line 3; not read before.")
+    assert (
+        columns("Logger\n\na,b\n1,2\n").remarks[0].endswith("line 3; earlier lines are not read.")
+    )
     with pytest.raises(ValueError, match="only a line of names"):
         columns("a,b\n")
 
@@ -89,7 +91,7 @@ def test_rows_of_another_length(columns):
     for text, words in (
         ("a,b\n0,1\n2\n", "line 3: expected 2 fields, one for each name, found 1"),
         ("a,b\n0,1\n1,2,3\n", "line 3: expected 2 fields, one for each name, found 3"),
-        ("a,b\n0,1,7\n1,2,7\n", "line 2: .* Give names of all: `names=\\['a', 'b', 'other'\\]`"),
+        ("a,b\n0,1,7\n1,2,7\n", "line 2: .* Name all columns: `names=\\['a', 'b', 'other'\\]`"),
     ):
         with pytest.raises(ValueError, match=words):
             columns(text)

@@ -427,7 +427,11 @@ def test_rows_of_frames():
 
 BAD = {
     "targets": ({"train_Y": Y - 10}, ValueError, "targets above 0.*found .* the first row 0"),
-    "shares": ({"link": "logit"}, ValueError, r"above 0 and below 1, as log\(y / \(1 - y\)\)"),
+    "shares": (
+        {"link": "logit"},
+        ValueError,
+        r"above 0 and below 1 for the link log\(y / \(1 - y\)\)",
+    ),
     "name": ({"link": "logarithm"}, TypeError, "Expected link as 'log', 'logit'"),
     "a bound": ({"link": (1.0,)}, TypeError, "two bounds"),
     "texts": ({"link": ("a", 1.0)}, TypeError, "two bounds"),

@@ -135,7 +135,7 @@ BAD = {
             X, decades(X), terms=[Term("rho", mean=1.0, physics=0)],
             physics=[lambda X: 2 + decades(X)], noise=RelativeNoise(),
         )),
-        "no link",
+        "without a link",
     ),
 }  # fmt: skip
 

@@ -180,7 +180,7 @@ def test_bad_places_kernels_and_transforms():
         ({}, "number for each column"),
         ({"valve": []}, "number for each column"),
         (np.zeros((0, 2)), "number for each column"),
-        ({"valve": [0.0, 1.0], "flow": [1.0, 2.0, 3.0]}, "as many numbers for each"),
+        ({"valve": [0.0, 1.0], "flow": [1.0, 2.0, 3.0]}, "equally many numbers for each"),
         ({"valve": float("nan")}, "finite"),
         (np.zeros(3), r"points p x d.*\(3,\)"),
         ({"metal": "steel"}, "category.*level"),

@@ -135,7 +135,7 @@ def test_later_rows_are_observed_exactly(model, close, has_rest):
     torch.testing.assert_close(draws.std(0), later.predict(Z).variance.sqrt(), rtol=0.3, atol=0)
     fantasies = model.condition_on_observations(X, torch.stack([Y, Y + 1, Y - 1]))
     close(fantasies.predict(Z).mean[0], later.predict(Z).mean, 1e-6)
-    refused(NotImplementedError, "Build it of all data", later.left_out)
+    refused(NotImplementedError, "Build a model of all data", later.left_out)
 
 
 def test_shapes_and_gradients(model, close, gradient_is_right):

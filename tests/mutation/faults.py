@@ -207,25 +207,25 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/kinds/categories.py",
-        "self.kernel.frequencies = own.where((sizes > 1)[self.groups].unsqueeze(-1), w)",
+        "self.kernel.frequencies = fresh.where((sizes > 1)[self.groups].unsqueeze(-1), w)",
         "self.kernel.frequencies = w",
         "Levels of a category share frequencies: functions from an RRA know their order.",
     ),
     Fault(
         "gpadjust/kinds/updates.py",
-        "precision.diagonal(dim1=-1, dim2=-2).add_(1 - kept)",
+        "precision.diagonal(dim1=-1, dim2=-2).add_(1 - share)",
         "precision.diagonal(dim1=-1, dim2=-2).add_(0.0)",
         "Forgetting forgets the prior, too: variances grow without end.",
     ),
     Fault(
         "gpadjust/kinds/vanishing.py",
-        "zero = k(own, self._part(x, True)) - self._along(own, x)[0].square().sum(-1)",
-        "zero = k(own, self._part(x, True))",
+        "conditioned = k(own, self._part(x, True)) - self._whitened(own, x)[0].square().sum(-1)",
+        "conditioned = k(own, self._part(x, True))",
         "Marginal prior variances are not zero where the function is.",
     ),
     Fault(
         "gpadjust/kinds/ar1.py",
-        "return mean[..., len(self.low.X) :, :], variance[..., len(self.low.X) :, :]",
+        "return mean[..., high, :], variance[..., high, :]",
         "return mean[..., : len(self.data.X), :], variance[..., : len(self.data.X), :]",
         "Left-out predictions of AR1 are those of the low level.",
     ),
@@ -237,14 +237,14 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/many/bound.py",
-        "value = -0.5 * (size + log_det + misfit + unseen)",
+        "value = -0.5 * (size + log_det + misfit + trace)",
         "value = -0.5 * (size + log_det + misfit)",
         "The bound forgets what inducing values do not specify: it is no bound any more.",
     ),
     Fault(
         "gpadjust/many/conditioning.py",
-        "kept = (1 - self.weight * own).clamp_min(1e-9)",
-        "kept = torch.ones_like(own)",
+        "free = (1 - self.weight * h).clamp_min(1e-9)",
+        "free = torch.ones_like(h)",
         "Left-out residuals of a sparse model are those of the fit.",
     ),
     Fault(
@@ -255,8 +255,8 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/active/points.py",
-        "acquisition.set_X_pending(points if own is None else torch.cat([own, points]))",
-        "acquisition.set_X_pending(points)",
+        "pending = points if before is None else torch.cat([before, points])",
+        "pending = points",
         "Pending points of the acquisition function's own are lost.",
     ),
     Fault(
@@ -267,14 +267,14 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/systems/wrappers.py",
-        "taken = np.clip(action, self._taken.low, self._taken.high)",
-        "taken = action",
+        "clipped = np.clip(action, self._actions.low, self._actions.high)",
+        "clipped = action",
         "The action that is remembered is not the one that was taken.",
     ),
     Fault(
         "gpadjust/rl/dyna.py",
-        "ends = (step.terminated | step.truncated, step.truncated)",
-        "ends = (step.terminated | step.truncated, step.terminated)",
+        "                        step.truncated,",
+        "                        step.terminated,",
         "Terminations count as time limits and the other way round: wrong targets of the critics.",
     ),
     Fault(
@@ -360,5 +360,23 @@ FAULTS = (
         "variance[j] += (spread[g] + off * off) / DRAWS;",
         "variance[j] += spread[g] / DRAWS;",
         "The variance in C forgets that the means of the draws differ.",
+    ),
+    Fault(
+        "gpadjust/physics/unknown.py",
+        "coordinates[..., columns] = coordinates[..., columns] @ unknown.root.mT.to(coordinates)",
+        "coordinates[..., columns] = coordinates[..., columns] @ unknown.root.to(coordinates)",
+        "The values of an unknown function do not have its prior.",
+    ),
+    Fault(
+        "gpadjust/dynamics/identified.py",
+        "told = precision + J @ J.mT",
+        "told = J @ J.mT",
+        "Dynamics that learn on forget the log.",
+    ),
+    Fault(
+        "gpadjust/export/c_equations.py",
+        "z += weights[i] * (1.0 + r + r * r / 3.0) * exp(-r);",
+        "z += weights[i] * (1.0 + r) * exp(-r);",
+        "An unknown function in C is of a rougher kernel than that of its weights.",
     ),
 )

@@ -18,7 +18,7 @@ from paper.functions.functions import data_of
 from paper.functions.problems import PROBLEMS, _branin
 from paper.machines.networks import NetworkDynamics
 from paper.machines.pendulums import DOUBLE_PENDULUM, PENDULUM
-from paper.machines.records import DATA, REAL
+from paper.machines.records import REAL, folder_of
 from paper.machines.tanks_systems import FIXED, UNKNOWNS, rates
 from paper.parameters import TEXTBOOK, Parameters
 from paper.parameters.laws import PROBLEMS as LAWS
@@ -166,7 +166,7 @@ def test_physics_of_records_returns_next_states(record):
 @pytest.mark.parametrize("name", REAL)
 def test_tests_are_of_other_records_in_which_the_machine_moves(name):
     known = REAL[name]
-    assert (DATA / known.folder / "LICENSE").is_file()
+    assert (folder_of(known.folder) / "LICENSE").is_file()
     for test, given in known.tests.items():
         assert not {*given} & {*known.train}
         windows = known.windows(test, 40, 7)

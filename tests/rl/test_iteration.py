@@ -176,7 +176,7 @@ def test_model_episodes_that_teach_nothing_are_warned_of(point_agent):
         dynamics=PhysicsDynamics(StateSpec(["x"], ["v"]), lambda X: X[:, :1] + 5),
         reward_tolerance=None,
     )
-    with pytest.warns(UserWarning, match="has learnt nothing of use from them"):
+    with pytest.warns(UserWarning, match="cannot learn from them"):
         agent.learn(5)
 
 

@@ -432,7 +432,7 @@ REFUSED = [
     ({"model": partial(CKA, centre=0)}, TypeError, "option 'centre' of CKA"),
     ({"physics": None, "model": CKA}, TypeError, "argument: 'physics'"),
     ({"model_options": ["log"]}, TypeError, "Expected model_options as a dictionary"),
-    ({"model_options": {"physics": wave}}, TypeError, "an argument of its own"),
+    ({"model_options": {"physics": wave}}, TypeError, "an argument of the regressor"),
     ({"random_state": "seed"}, ValueError, "cannot be used to seed"),
 ]
 

@@ -83,10 +83,10 @@ REFUSED = [
     ({"previous": {"y": "a"}}, ValueError, "There is no state 'y'"),
     ({"previous": {"x": "b"}}, ValueError, r"'b', which is neither: .* actions are \('a',\)"),
     ({"previous": {"x": "v"}, "actions": ["a", "v"]}, ValueError, "'v', which is both"),
-    ({"previous": {"x": "v", "v": "x"}}, ValueError, "circle, x -> v -> x"),
+    ({"previous": {"x": "v", "v": "x"}}, ValueError, "circular, x -> v -> x"),
     ({"previous": {"x": "v"}, "angles": ["x"]}, ValueError, "'x' is one .* and 'v' is not"),
     ({"previous": {"x": "v"}, "angles": ["v"]}, ValueError, "'v' is one .* and 'x' is not"),
-    ({"previous": {"x": "a"}, "exogenous": ["x"]}, ValueError, "'x' is said to be two things"),
+    ({"previous": {"x": "a"}, "exogenous": ["x"]}, ValueError, "'x' has two roles"),
     ({"previous": {"x": "a"}, "angles": ["x"]}, ValueError, "'x' is one .* and 'a' is not"),
     ({"step": "fast"}, TypeError, "step must be a number; found 'fast'"),
 ]
@@ -132,7 +132,7 @@ def test_the_velocity_of_another_state_is_warned_of():
     states, following = swing(25)
     other = swing(25, rate=5.0)
     states[:, 2], following[:, 2] = 0.3 * other[0][:, 2], 0.3 * other[1][:, 2]
-    with pytest.warns(UserWarning, match="'q' is said to be integrated"):
+    with pytest.warns(UserWarning, match="'q' is declared as integrated"):
         check(ARM, states, following)
 
 
@@ -141,7 +141,7 @@ def test_noise_in_motion_passes_and_at_rest_is_no_error():
     noise[..., 0] = 0
     states, following = swing(25)
     check(ARM, states + noise[0], following + noise[1])
-    with pytest.warns(UserWarning, match="Noisy sensors look the same"):
+    with pytest.warns(UserWarning, match="Noisy sensors have the same"):
         check(ARM, noise[0], noise[1])
 
 
@@ -215,6 +215,6 @@ def test_what_is_no_previous_state_is_named():
     for column, name, other in ((1, "y_1", "y"), (3, "q_1", "q")):
         wrong = following.clone()
         wrong[3, column] += 0.01  # little beside the state, much beside its changes
-        message = f"'{name}' is said to hold the previous state '{other}', but is .* in row 3"
+        message = f"'{name}' is declared as the previous state '{other}', but is .* in row 3"
         with pytest.raises(ValueError, match=message):
             check(spec, states, wrong)

@@ -1,0 +1,419 @@
+"""A MuJoCo model as physics, held against equations and against MJCFs compiled again."""
+
+import copy
+import pickle
+import threading
+import time
+from _thread import interrupt_main
+
+import numpy as np
+import pytest
+import torch
+
+from gpadjust import CKA, ODEPhysics, PhysicsError, Unknown, fit, load, save
+from gpadjust.control import MPC, Planner, Task
+from gpadjust.dynamics import PhysicsDynamics
+from gpadjust.physics import MujocoPhysics
+from gpadjust.records import Record, Records, identify
+from tests.systems import normal, refused, same
+
+mujoco = pytest.importorskip("mujoco", "3.5", reason="the extra `mujoco` is not installed")
+
+M, RADIUS, LENGTH, G = 0.7, 0.05, 0.4, 9.81  # a ball on a massless rod
+INERTIA = M * (LENGTH**2 + 0.4 * RADIUS**2)
+
+
+def pendulum(mass=M, length=LENGTH, damping=0.0, dry=0.0, option='integrator="RK4"'):
+    return f"""<mujoco><option timestep="0.002" {option}/><worldbody><body name="rod">
+    <joint name="hinge" axis="0 1 0" damping="{damping}" frictionloss="{dry}"/>
+    <geom name="ball" type="sphere" size="{RADIUS}" pos="0 0 {-length}" mass="{mass}"/>
+    </body></worldbody><actuator><motor name="torque" joint="hinge"/></actuator></mujoco>"""
+
+
+def arm(damping=0.05, size="0.2 0.1 0.05", mass=1.3, pos="0.2 0 0", gear=2.0, kp=3.0, tip=0.3):
+    """Two links, a motor and a position servo with a lag, dry friction, a tendon, sensors."""
+    return f"""<mujoco model="arm"><option timestep="0.002"/><worldbody>
+    <body name="link1">
+      <joint name="shoulder" axis="0 1 0" damping="{damping}" frictionloss="0.02"/>
+      <geom type="box" size="{size}" pos="{pos}" mass="{mass}"/>
+      <body name="link2" pos="0.4 0 0">
+        <joint name="elbow" axis="0 0 1" range="-90 90" armature="0.001"/>
+        <geom type="capsule" fromto="0 0 0 {tip} 0 0" size="0.02" mass="0.5"/>
+        <site name="tip" pos="0.3 0 0"/>
+    </body></body></worldbody>
+    <tendon><fixed name="belt" stiffness="0.5"><joint joint="shoulder" coef="1"/>
+      <joint joint="elbow" coef="-1"/></fixed></tendon>
+    <actuator><motor name="motor" joint="shoulder" gear="{gear}"/>
+      <position name="servo" joint="elbow" kp="{kp}" kv="0.2" timeconst="0.05"/></actuator>
+    <sensor><jointpos name="encoder" joint="shoulder" noise="0.01"/>
+      <framepos name="camera" objtype="site" objname="tip"/>
+      <accelerometer name="imu" site="tip"/></sensor></mujoco>"""
+
+
+def rows(n, d, seed=0):
+    return normal(n, d, seed=seed)
+
+
+def test_a_pendulum_moves_as_its_equation():
+    def rates(state, action):
+        angle, rate = state.unbind(-1)
+        torque = action[:, 0] - 0.1 * rate - M * G * LENGTH * angle.sin()
+        return torch.stack([rate, torque / INERTIA], dim=-1)
+
+    ours = MujocoPhysics(pendulum(damping=0.1), step=0.02)
+    X = rows(9, 3)
+    X.requires_grad_(True)
+    exact = ODEPhysics(rates, 0.02, 2)
+    same([ours(X)], [exact(X)], rtol=0, atol=1e-7)
+    weights = rows(9, 2, seed=1)
+    found = [torch.autograd.grad((weights * f(X)).sum(), X)[0] for f in (ours, exact)]
+    same(found[:1], found[1:], rtol=0, atol=1e-6)
+
+
+def test_a_cart_pole_moves_as_its_equations():
+    xml = """<mujoco><option timestep="0.002" integrator="RK4"/><worldbody>
+    <body name="cart"><joint name="x" type="slide" axis="1 0 0" damping="0.3"/>
+      <geom type="box" size="0.1 0.1 0.1" mass="1"/>
+      <body name="pole"><joint name="theta" axis="0 1 0"/>
+        <geom type="sphere" size="0.05" pos="0 0 0.5" mass="0.2"/>
+    </body></body></worldbody><actuator><motor name="force" joint="x"/></actuator></mujoco>"""
+
+    def rates(state, action):
+        _, theta, v, omega = state.unbind(-1)
+        s, c, m, h, own = theta.sin(), theta.cos(), 0.2, 0.5, 0.4 * 0.2 * 0.05**2
+        # M(q) q'' = forces, of the cart and about the joint of the pole
+        push = action[:, 0] - 0.3 * v + m * h * s * omega**2
+        a, b, d, turn = 1.2, m * h * c, m * h**2 + own, m * G * h * s
+        determinant = a * d - b**2
+        acceleration = (d * push - b * turn) / determinant
+        return torch.stack([v, omega, acceleration, (a * turn - b * push) / determinant], -1)
+
+    ours = MujocoPhysics(xml, step=0.02)
+    X = rows(9, 5)
+    same([ours(X)], [ODEPhysics(rates, 0.02, 4, substeps=20)(X)], rtol=0, atol=1e-6)
+    spec = ours.spec
+    assert (spec.states, spec.angles) == (("x", "theta", "x_dot", "theta_dot"), ("theta",))
+
+
+def test_energy_stays_without_damping():
+    ours = MujocoPhysics(pendulum(), step=0.02)
+    state = torch.tensor([[2.5, 1.0]]).double()
+    energies = []
+    for _ in range(200):
+        energies.append(INERTIA * state[0, 1] ** 2 / 2 - M * G * LENGTH * state[0, 0].cos())
+        state = ours(torch.cat([state, torch.zeros(1, 1).double()], -1))
+    assert torch.stack(energies).std() < 1e-6
+
+
+def sliding(spec, p):
+    """Writes what no name of a parameter does."""
+    spec.option.gravity = [0.0, 0.0, -p["planet.g"]]
+    spec.geoms[1].fromto = [0.0, 0.0, 0.0, p["link2.length"], 0.0, 0.0]
+
+
+CHANGES = {  # parameters, and the MJCF with these numbers
+    "mass": ({"link1.mass": 2.1}, arm(mass=2.1)),
+    "damping": ({"shoulder.damping": 0.3}, arm(damping=0.3)),
+    "friction": (
+        {"shoulder.frictionloss": 0.2, "elbow.armature": 0.01},
+        arm().replace('frictionloss="0.02"', 'frictionloss="0.2"').replace("0.001", "0.01"),
+    ),
+    "drives": ({"motor.gear": -1.5, "servo.kp": 7.0}, arm(gear=-1.5, kp=7.0)),
+    "servo": ({"servo.kv": 0.5}, arm().replace('kv="0.2"', 'kv="0.5"')),
+    "tendon": ({"belt.stiffness": 2.0}, arm().replace('stiffness="0.5"', 'stiffness="2"')),
+    "spring": (
+        {"elbow.stiffness": 2.0},
+        arm().replace('armature="0.001"', 'armature="0.001" stiffness="2"'),
+    ),
+    "shape": (
+        {"link1.stretch_x": 1.2, "link1.stretch_z": 0.5, "link1.com_y": 0.04, "link1.mass": 2.1},
+        arm(size="0.24 0.1 0.025", pos="0.2 0.04 0", mass=2.1),
+    ),
+    "edit": (
+        {"planet.g": 1.62, "link2.length": 0.2, "shoulder.damping": 0.3},
+        arm(tip=0.2, damping=0.3).replace("<option", '<option gravity="0 0 -1.62"'),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CHANGES)
+def test_parameters_are_those_of_an_mjcf_that_is_compiled_again(case):
+    values, xml = CHANGES[case]
+    unknowns = {name: Unknown(value, sd=1.0) for name, value in values.items()}
+    unknowns |= {
+        name: Unknown(value, factor=2.0)
+        for name, value in values.items()
+        if value > 0 and "com" not in name
+    }
+    edit = sliding if case == "edit" else None
+    ours = MujocoPhysics(arm(), step=0.01, unknowns=unknowns, edit=edit)
+    X = rows(5, 7)
+    again = MujocoPhysics(xml, step=0.01)(X)
+    same([ours(X)], [again], rtol=0, atol=1e-9)
+    assert (again - MujocoPhysics(arm(), step=0.01)(X)).abs().max() > 1e-5
+    other = ours(X, 1.1 * ours.unknowns.guess)
+    assert (other - again).abs().max() > 1e-6
+    both = ours(X[:1], torch.stack([ours.unknowns.guess, 1.1 * ours.unknowns.guess]))
+    same([both[:, 0]], [torch.stack([again[0], other[0]])])
+
+
+def test_sheared_mass_is_that_of_moved_points():
+    points = np.random.default_rng(0).normal(scale=0.2, size=(6, 3))
+    A = np.array([[1.3, 0.4, -0.2], [0.0, 0.8, 0.3], [0.0, 0.0, 1.1]])
+
+    def cloud(places, fixed=""):
+        balls = "".join(
+            f'<geom type="sphere" size="1e-4" mass="{0.1 + 0.1 * i}" pos="{x} {y} {z}"/>'
+            for i, (x, y, z) in enumerate(places.tolist())
+        )
+        joints = "".join(f'<joint name="j{a}" axis="{a}"/>' for a in ("1 0 0", "0 1 0", "0 0 1"))
+        return (
+            f'<mujoco>{fixed}<worldbody><body name="b">{joints}{balls}</body></worldbody></mujoco>'
+        )
+
+    weights = 0.1 + 0.1 * np.arange(6)
+    center = weights @ points / weights.sum()
+    moved = center + (points - center) @ A.T
+    names = ("stretch_x", "shear_xy", "shear_xz", "stretch_y", "shear_yz", "stretch_z")
+    numbers = A[np.triu_indices(3)].tolist()
+    unknowns = {
+        f"b.{n}": Unknown(v, factor=2.0) if v > 0 else Unknown(v, sd=1.0)
+        for n, v in zip(names, numbers, strict=True)
+    }
+    geoms = '<compiler inertiafromgeom="true"/>'
+    ours = MujocoPhysics(cloud(points, geoms), unknowns=unknowns)
+    X = rows(5, 6)
+    same([ours(X)], [MujocoPhysics(cloud(moved))(X)], rtol=0, atol=1e-6)
+    # Any numbers are of a body: MuJoCo's compiler refuses others.
+    wild = torch.cat([3 * rows(200, 6).abs()])
+    wild[:, [1, 2, 4]] *= rows(200, 3, seed=1).sign()
+    assert ours(X[:1], wild).isfinite().all()
+
+
+def test_rows_depend_neither_on_others_nor_on_threads():
+    one, two = (MujocoPhysics(arm(), step=0.01, threads=n) for n in (1, 2))
+    X = rows(400, 7)
+    order = torch.randperm(400)
+    Y = one(X)
+    assert torch.equal(two(X[order]), Y[order])
+    assert len(two._data) == 2
+    alone = [MujocoPhysics(arm(), step=0.01)(x[None]) for x in X[:20]]
+    assert torch.equal(torch.cat(alone), Y[:20])
+
+
+def test_a_row_is_a_loop_of_mujocos_steps():
+    ours, X = MujocoPhysics(arm(), step=0.02), rows(3, 7)
+    for row, Y in zip(X.numpy(), ours(X), strict=True):
+        data = mujoco.MjData(ours.model)
+        data.qpos, data.qvel, data.act, data.ctrl = np.split(row, [2, 4, 5])
+        mujoco.mj_step(ours.model, data, 10)
+        assert Y.tolist() == [*data.qpos, *data.qvel, *data.act]
+
+
+def test_names_of_states_actions_and_sensors():
+    ours = MujocoPhysics(arm(), step=0.01)
+    spec = ours.spec
+    assert spec.states == ("shoulder", "elbow", "shoulder_dot", "elbow_dot", "servo_act")
+    assert (spec.actions, spec.angles, spec.step) == (("motor", "servo"), ("shoulder",), 0.01)
+    sensors, states = ours.sensors(), rows(4, 5)
+    assert sensors.outputs == ("encoder", "camera_0", "camera_1", "camera_2")
+    assert sensors.noise == {"encoder": 0.01}
+    seen = sensors.measure(spec, states)
+    assert torch.equal(seen[:, 0], states[:, 0])  # now, not a step late
+    a, b = states[:, 0], states[:, 1]
+    # Along the links, which turn about y and, within the first, about z.
+    x = 0.4 + 0.3 * b.cos()
+    tip = torch.stack([x * a.cos(), 0.3 * b.sin(), -x * a.sin()], -1)
+    same([seen[:, 1:]], [tip])
+    assert ours.sensors(["camera"]).measure(spec, states).shape == (4, 3)
+    few = MujocoPhysics(arm(), states=["a", "b", "v", "w", "lag"], actions=["servo"])
+    assert (few.spec.states[0], few.spec.actions) == ("a", ("servo",))
+    X = rows(3, 7)
+    X[:, 5] = 0.0
+    assert torch.equal(few(X[:, [0, 1, 2, 3, 4, 6]]), MujocoPhysics(arm())(X))
+
+
+def test_pickles_copies_and_saved_models(tmp_path):
+    (tmp_path / "arm.xml").write_text(arm())
+    text = arm()
+    X = rows(6, 7)
+    unknowns = {"link1.mass": Unknown(1.3, factor=2.0)}
+    Y = MujocoPhysics(text, step=0.01)(X)
+    sources = [tmp_path / "arm.xml", str(tmp_path / "arm.xml"), text]
+    sources += [mujoco.MjModel.from_xml_string(text)]
+    for source in [*sources, mujoco.MjSpec.from_string(text)]:
+        ours = MujocoPhysics(source, step=0.01, unknowns=unknowns)
+        same([ours(X)], [Y])
+        assert copy.deepcopy(ours) is ours
+        if source in sources:
+            assert torch.equal(pickle.loads(pickle.dumps(ours))(X), ours(X))
+        else:
+            refused(TypeError, r"MjSpec cannot be pickled.*to_xml\(\)", pickle.dumps, ours)
+    ours, X = MujocoPhysics(pendulum()), rows(6, 3)
+    model = CKA(X, 1.1 * ours(X), physics=ours)
+    fit(model, "map")
+    with pytest.warns(UserWarning, match="Other programs cannot import the physics"):
+        save(model, tmp_path / "model.pt")
+    again = load(tmp_path / "model.pt", physics=MujocoPhysics(pendulum()))
+    same([again.predict(X).mean], [model.predict(X).mean])
+
+
+def test_unstable_rows_are_named_and_nothing_is_printed(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    said = []
+    mujoco.set_mju_user_warning(said.append)
+    try:
+        for step in (0.002, 0.02):  # MuJoCo resets at the first step, or later
+            ours, X = MujocoPhysics(arm(), step=step, threads=2), rows(5, 7)
+            good = ours(X)
+            X[1, 2], X[3, 0] = 1e11, torch.nan
+            with pytest.raises(PhysicsError, match=r"unstable.*in 2 of.*time step") as error:
+                ours(X)
+            assert error.value.rows == (1, 3)
+            found = ours.or_nan(X)
+            assert found[[1, 3]].isnan().all()
+            assert torch.equal(found[[0, 2, 4]], good[[0, 2, 4]])
+        assert not said
+        text = (
+            pendulum(option="").replace("0.002", "0.5").replace('damping="0.0"', 'stiffness="1e4"')
+        )
+        refused(PhysicsError, "unstable", MujocoPhysics(text, step=50.0), rows(1, 3))
+        assert mujoco.get_mju_user_warning() == said.append
+    finally:
+        mujoco.set_mju_user_warning(None)
+    assert capfd.readouterr() == ("", "")
+    assert not [*tmp_path.iterdir()]
+
+
+def test_an_interrupt_ends_a_long_call():
+    ours, X = MujocoPhysics(arm(), step=1.0), rows(20_000, 7)  # minutes
+    threading.Timer(0.3, interrupt_main).start()
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        ours(X)
+    assert time.monotonic() - began < 10
+    assert mujoco.get_mju_user_warning() is None
+    assert ours(X[:2]).isfinite().all()
+
+
+BALL = """<mujoco><worldbody><body><joint name="b" type="ball"/><geom size="1"/></body>
+</worldbody></mujoco>"""
+LATE = arm().replace('gear="2.0"', 'delay="0.01" nsample="6"')
+EMPTY = pendulum().partition("<actuator>")[0] + "</mujoco>"
+TWO = arm().replace("belt", "elbow")  # a joint and a tendon of this name
+
+
+def slower(spec, p):
+    spec.option.timestep *= 1 + p["a.b"]
+
+
+def longer(spec, p):
+    spec.bodies[int(p["a.b"])].add_joint()
+
+
+def fuller(spec, p):
+    spec.bodies[1].add_geom(size=[p["a.b"], 0, 0])
+
+
+def made(model=None, **options):
+    return lambda: MujocoPhysics(model or arm(), **options)
+
+
+def of(name, model=None, edit=None, **prior):
+    prior = Unknown(1.0, **(prior or {"factor": 2.0}))
+    return lambda: MujocoPhysics(model or arm(), unknowns={name: prior}, edit=edit)
+
+
+COMPILED = mujoco.MjModel.from_xml_string(arm())
+REFUSED = {
+    "kind": (TypeError, "model must be the path.*found 3", made(3)),
+    "file": (ValueError, "cannot read the model.*none.xml", made("none.xml")),
+    "text": (ValueError, "cannot read the model: ValueError: XML", made("<a>")),
+    "ball": (ValueError, "'b' is a ball or free joint.*hinges", made(BALL)),
+    "delay": (ValueError, "state besides qpos.*previous=", made(LATE)),
+    "step": (ValueError, "multiple of.*0.002 s; found 0.003", made(step=3e-3)),
+    "short": (ValueError, "multiple of", made(step=1e-4)),
+    "states": (ValueError, r"names for.*servo_act.*found \('a',\)", made(states=["a"])),
+    "actions": (ValueError, r"no actuator 'm'.*'motor', 'servo'", made(actions=["m"])),
+    "actuator": (ValueError, "no actuator.*<motor>", lambda: MujocoPhysics(EMPTY).spec),
+    "threads": (ValueError, "threads must be at least 1", made(threads=0)),
+    "sensor": (ValueError, r"'camera'\]; found 'imu'", lambda: made()().sensors(["imu"])),
+    "name": (ValueError, "'mass'; expected 'element.parameter'", of("mass")),
+    "field": (ValueError, "'link1.weight'; expected 'element.*armature", of("link1.weight")),
+    "element": (ValueError, "'link3.mass' to name one body, of link1, link2", of("link3.mass")),
+    "both": (ValueError, "one joint or tendon.*found 2", of("elbow.damping", TWO)),
+    "sign": (ValueError, "negative.*sd=1.0.*factor, or bounds", of("elbow.damping", sd=1.0)),
+    "servo": (ValueError, "'motor.kp': the actuator is no servo", of("motor.kp")),
+    "geoms": (ValueError, "edit has changed.*ngeom", of("a.b", edit=fuller)),
+    "massless": (ValueError, "body has no mass", of("world.mass")),
+    "compiled": (ValueError, "needs the MJCF", of("link1.stretch_x", COMPILED)),
+    "edited": (ValueError, "not an MjModel", made(COMPILED, edit=print)),
+    "unread": (ValueError, "not read 'link1.weight'", of("link1.weight", edit=lambda spec, p: 0)),
+    "time": (ValueError, "edit has changed the time step;", of("a.b", edit=slower)),
+    "joints": (ValueError, "edit has changed.*njnt.*nq", of("a.b", edit=longer)),
+    "columns": (PhysicsError, "'motor', 'servo'.*found 3 c", lambda: made()()(rows(2, 3))),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refusals_name_the_way_out(case):
+    refused(*REFUSED[case])
+
+
+def log_of(machine, sd, num_rows=400):
+    """A log of random torques, each held for 25 rows; the rate is not measured."""
+    actions = 0.8 * rows(num_rows // 25, 1).repeat_interleave(25, 0)
+    states = [torch.tensor([[0.5, 0.0]]).double()]
+    for action in actions[:-1, None]:
+        states.append(machine(torch.cat([states[-1], action], -1)))
+    measured = torch.cat(states) + sd * rows(num_rows, 2, seed=1)
+    times = machine.step * torch.arange(num_rows, dtype=torch.float64)
+    return Records(Record(times, measured, actions), machine.spec)
+
+
+@pytest.mark.slow
+def test_a_log_tells_mass_and_damping():
+    machine = MujocoPhysics(pendulum(damping=0.05, option=""), step=0.01)
+    unknowns = {
+        "rod.mass": Unknown(1.0, factor=1.5, unit="kg"),
+        "hinge.damping": Unknown(0.1, factor=2.0, unit="N m s"),
+    }
+    ours = MujocoPhysics(pendulum(mass=1.0, option=""), step=0.01, unknowns=unknowns)
+    found = identify(log_of(machine, torch.tensor([0.005, 0.02]).double()), ours)
+    truth = torch.tensor([M, 0.05]).double()
+    mean, sd = found.parameters.mean, found.parameters.sd
+    assert ((mean - truth).abs() < 4 * sd).all()
+    assert (sd < 0.005 * truth).all()
+    assert found.errors["identified"][0] < 0.007 < found.errors["guesses"][0]
+    wrong = MujocoPhysics(pendulum(), step=0.02)
+    refused(ValueError, "makes steps of 0.02.*says 0.01", identify, log_of(machine, 0.01), wrong)
+
+
+@pytest.mark.slow
+def test_a_set_point_is_held_after_a_trial():
+    machine = MujocoPhysics(pendulum(damping=0.1, option=""), step=0.05)
+    unknowns = {
+        "rod.mass": Unknown(1.0, factor=1.5),
+        "hinge.damping": Unknown(0.05, factor=2.0),
+    }
+    ours = MujocoPhysics(pendulum(option=""), step=0.05, unknowns=unknowns)
+
+    def reward(states, actions, next_states):
+        return -(next_states[:, 0] - 1.0).square() - 0.01 * next_states[:, 1].square()
+
+    task = Task(PhysicsDynamics(ours.spec, ours), reward, episode_length=20)
+    plan = Planner(horizon=0.4, rounds=2)
+    controller, errors = MPC(task, [[-4.0], [4.0]], plan, first=plan), []
+    for _ in range(2):
+        controller.reset()
+        state = torch.zeros(1, 2, dtype=torch.float64)
+        for _ in range(20):
+            action = controller.step(ours.spec.observe(state)[0].numpy())
+            state = machine(torch.cat([state, torch.as_tensor(action)[None]], -1))
+        controller.observe(ours.spec.observe(state)[0].numpy())
+        controller.learn()
+        errors.append(abs(float(state[0, 0]) - 1.0))
+    truth = torch.tensor([M, 0.1]).double()
+    same([task.dynamics.physics_parameters.mean], [truth], rtol=1e-3, atol=0)
+    assert errors[1] < 0.03
+    assert errors[1] < errors[0]
