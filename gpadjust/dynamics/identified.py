@@ -19,8 +19,8 @@ from gpadjust.physics import Physics
 from gpadjust.physics.parameters import PhysicsParameters
 from gpadjust.states import StateSpec
 
-_SOME = 32  # draws, by which parameters widen a prediction
-_ROUNDS = 5  # of Gauss and Newton
+_DRAWS = 32  # of the parameters, for the variance of a prediction
+_ROUNDS = 5  # of the Gauss-Newton method
 _FARTHEST = 8.0  # coordinate of a draw; at a bound it is infinite
 
 
@@ -63,7 +63,8 @@ class IdentifiedDynamics(Dynamics):
         super().__init__(spec)
         self.physics = physics
         self.physics_parameters = parameters
-        self.noise, self.process_noise = noise, process_noise
+        self.noise = noise
+        self.process_noise = process_noise
 
     def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
         r"""Learn the parameters further, from transitions whose states were measured.
@@ -79,18 +80,25 @@ class IdentifiedDynamics(Dynamics):
         unknowns = self.physics.unknowns
         if not unknowns:
             return
-        before = unknowns.coordinates(self.physics_parameters.draws).clamp(-_FARTHEST, _FARTHEST)
-        z = mean = before.mean(0)
-        precision = told = torch.linalg.inv(before.mT.cov().reshape(len(z), len(z)))
+        # The prior N(m, P): mean and precision of the draws, in coordinates.
+        draws = unknowns.coordinates(self.physics_parameters.draws).clamp(-_FARTHEST, _FARTHEST)
+        z = mean = draws.mean(0)
+        prior_precision = torch.linalg.inv(draws.mT.cov().reshape(len(z), len(z)))
+        precision = prior_precision
         errors = StepErrors(self.physics, self.spec, data)
-        least = (self.process_noise**2 + 2 * self.noise**2)[self.spec.moving]
+        # Both measured states of a step have the noise of the sensor: S >= q^2 + 2 r^2.
+        least_variances = (self.process_noise**2 + 2 * self.noise**2)[self.spec.moving]
         for _ in range(_ROUNDS):
             e = errors.evaluate(z)
-            sd = errors.variances(e).maximum(least).sqrt().unsqueeze(-1)
-            J, e = (errors.slopes(z) / sd).flatten(1), (e / sd).flatten()
-            told = precision + J @ J.mT
-            z = z - torch.linalg.solve(told, J @ e + precision @ (z - mean))
-        spread = even_normal(len(before), len(z), seed=0) @ torch.linalg.cholesky(told).inverse()
+            sd = errors.variances(e).maximum(least_variances).sqrt().unsqueeze(-1)
+            e = (e / sd).flatten()
+            J = (errors.slopes(z) / sd).flatten(1)
+            # z <- z - (P^-1 + J^T S^-1 J)^-1 (J^T S^-1 e + P^-1 (z - m))
+            precision = prior_precision + J @ J.mT
+            z = z - torch.linalg.solve(precision, J @ e + prior_precision @ (z - mean))
+        # Draws of N(z, P'), with P' = L^-T L^-1 of the Cholesky factor L of its inverse.
+        L = torch.linalg.cholesky(precision)
+        spread = even_normal(len(draws), len(z), seed=0) @ L.inverse()
         self.physics_parameters = PhysicsParameters(unknowns, unknowns.at(z + spread).unbind(-1))
 
     def predict(self, states: Tensor, actions: Tensor) -> Prediction:
@@ -98,14 +106,16 @@ class IdentifiedDynamics(Dynamics):
 
         The variance is that of process noise, and of the next states by 32 draws.
         """
-        draws = self.physics_parameters.draws[:_SOME]
+        draws = self.physics_parameters.draws[:_DRAWS]
         rows = states.expand(len(draws), *[1] * (2 - states.dim()), *states.shape)
         values = draws.view(len(draws), *[1] * (rows.dim() - 3), -1)
         with torch.no_grad():
             mean = self._follow(states, actions, self.physics_parameters.mean)
             paths = self._follow(rows, actions, values)
-            off = self.spec.change(mean.expand_as(paths), paths).square().mean(0).view_as(mean)
-        return Prediction(mean, off + self.noise_variance(states, actions))
+            # The mean square of the changes from the mean path, of angles the shorter way round.
+            changes = self.spec.change(mean.expand_as(paths), paths)
+            variance = changes.square().mean(0).view_as(mean)
+        return Prediction(mean, variance + self.noise_variance(states, actions))
 
     def mean_function(self) -> TransitionFunctions:
         """Return the physics with the parameters' means, with gradients as far as it has them."""
@@ -135,10 +145,9 @@ class IdentifiedDynamics(Dynamics):
 
     def state_dict(self) -> dict[str, Any]:
         """Return settings, draws of the parameters and noises."""
-        names = ("noise", "process_noise")
-        own = {name: getattr(self, name) for name in names}
         draws = self.physics_parameters.draws
-        return deepcopy({"fingerprint": self.describe(), "draws": draws, **own})
+        noises = {"noise": self.noise, "process_noise": self.process_noise}
+        return deepcopy({"fingerprint": self.describe(), "draws": draws, **noises})
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take back what :meth:`state_dict` gave; errors as of :class:`LearnedDynamics`."""
@@ -147,7 +156,8 @@ class IdentifiedDynamics(Dynamics):
             check_numbers(copy)
             draws = copy["draws"].unbind(-1)
             parameters = PhysicsParameters(self.physics.unknowns, draws)
-            self.noise, self.process_noise = copy["noise"], copy["process_noise"]
+            self.noise = copy["noise"]
+            self.process_noise = copy["process_noise"]
         self.physics_parameters = parameters
 
     def _follow(self, states: Tensor, actions: Tensor, values: Tensor) -> Tensor:

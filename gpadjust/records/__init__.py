@@ -1,5 +1,6 @@
 """Records of machines: read, resampled, smoothed, and cut into windows."""
 
+from gpadjust.records.check import Direction, check_log
 from gpadjust.records.identification import Combination, Identification, identify
 from gpadjust.records.lack import Lack
 from gpadjust.records.records import Record, Records
@@ -7,12 +8,14 @@ from gpadjust.records.smoothing import SmoothedRecords, SmoothingWarning, smooth
 
 __all__ = [
     "Combination",
+    "Direction",
     "Identification",
     "Lack",
     "Record",
     "Records",
     "SmoothedRecords",
     "SmoothingWarning",
+    "check_log",
     "identify",
     "smooth",
 ]

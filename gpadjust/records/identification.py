@@ -20,9 +20,9 @@ from gpadjust.dynamics import FreeRun, IdentifiedDynamics, PhysicsDynamics, Wind
 from gpadjust.dynamics.targets import one_physics
 from gpadjust.physics import Physics
 from gpadjust.physics.parameters import PhysicsParameters
-from gpadjust.records.lack import Lack, clearest_lack
+from gpadjust.records.lack import Lack, clearest_lack, robust_moments
 from gpadjust.records.records import Records, control_steps
-from gpadjust.records.smoothing import SmoothedRecords, smooth
+from gpadjust.records.smoothing import SmoothedRecords, drawn_parameters, smooth
 from gpadjust.states import Sensors, StateSpec
 from gpadjust.words import number, percent
 
@@ -37,6 +37,8 @@ _TOLD = 0.15  # of the least standard deviation of the two: their combination's 
 _POWERS = ((1, -1), (1, 1), (1, -2), (1, 2), (2, -1), (2, 1))
 _BLOCKS = 5  # of a window, whose errors are compared
 _LARGE = 2.0  # times the noise of the sensor: an error that something missing may have made
+_WIDER = 1.5  # an interval that allows for missing forces, in place of the one that does not
+_UNSURE = 0.05  # of a prior's standard deviation: uncertainty that matters
 _MOVES = 0.01  # of a state's changes in a step: process noise that matters
 
 _OTHERS = {GUESSES: "the guesses do", PERSISTENCE: "a state that stays"}
@@ -74,7 +76,8 @@ class Identification(Display):
             stretch.
         runs: Free runs along the windows: ``"identified"``, and ``"guesses"`` by the parameters
             that were guessed, if there are any.
-        step: The control step, in the unit of the times.
+        step: The step of the dynamics, in the unit of the times: the control step, or that of a
+            physics which makes several of them in a control step.
         remarks: Sentences on the log itself: gaps, actions that vary within a step, angles that
             jump.
     """
@@ -122,6 +125,20 @@ class Identification(Display):
         """The posterior of the physics' unknown parameters; None if it has none."""
         return self.smoothed.physics_parameters if GUESSES in self.runs else None
 
+    @cached_property
+    def robust_parameters(self) -> PhysicsParameters | None:
+        """The posterior that allows for smooth forces the equations lack; None without parameters.
+
+        White process noise averages out, what equations lack does not: with dry friction missing,
+        the damping stands for it, and its interval is too narrow. Here each equation also has a
+        function of each state, twice as large as its process noise. Of right equations this is 0,
+        and the posterior that of :attr:`parameters`. A prior of the missing force, not a fact.
+        """
+        if self.parameters is None:
+            return None
+        chain, estimate = self.smoothed._chain, self.smoothed._estimate
+        return drawn_parameters(chain.physics, *robust_moments(chain, estimate, self._control_step))
+
     @property
     def hidden(self) -> list[str]:
         """The states that were not measured."""
@@ -156,7 +173,11 @@ class Identification(Display):
 
         Takes some seconds for thousands of steps, once.
         """
-        return clearest_lack(self.smoothed._chain, self.smoothed._estimate, self.step)
+        return clearest_lack(self.smoothed._chain, self.smoothed._estimate, self._control_step)
+
+    @property
+    def _control_step(self) -> float:
+        return self.smoothed.records.records[0].sampling_step
 
     @property
     def combinations(self) -> list[Combination]:
@@ -215,6 +236,7 @@ class Identification(Display):
         """Sentences on the log, on parameters, and on errors that are too large."""
         sentences = [*self.remarks, *_of_parameters(self.parameters)]
         sentences += map(str, self.combinations)
+        sentences += self._of_forces()
         if self.lack is not None:
             sentences.append(str(self.lack))
         sentences += self._of_noise()
@@ -234,6 +256,22 @@ class Identification(Display):
                         f"{name} than {words}."
                     )
         return sentences
+
+    def _of_forces(self) -> list[str]:
+        """Return a sentence on parameters that a force which may be missing makes uncertain."""
+        if self.parameters is None or self.robust_parameters is None:
+            return []
+        (low, high), wider = self.robust_parameters.interval(), []
+        times = self.robust_parameters.sd / self.parameters.sd
+        for i, name in enumerate(self.parameters):
+            known = self.parameters.unknowns[name].coordinate(self.robust_parameters[name])
+            if times[i] > _WIDER and known.std() > _UNSURE:
+                wider.append(f"{name} {low[i]:.3g} to {high[i]:.3g} ({times[i]:.2g} times as wide)")
+        return wider and [
+            "The intervals of parameters take errors of the equations for noise of each step. If "
+            "they lack a force that depends on the states, as large as the process noise, the log "
+            f"tells {', '.join(wider)}. Dry friction, say, is hard to tell from damping."
+        ]
 
     def _of_noise(self) -> list[str]:
         """Return sentences on process noise that is larger than the noise of the sensor."""
@@ -348,20 +386,28 @@ def identify(
         )
     held = max(1, int(share * longest))
     f_p = one_physics(physics, spec, "identify one of them")
-    beginnings, ends, actions, measured = [], [], [], []
+    beginnings, ends = [], list[int]()
     for i, stretch in enumerate(steps):
         end = len(stretch.times)
         if end - 1 >= 2 * held:
             end -= held
             ends.append(i)
-            actions.append(stretch.actions[end - 1 : -1])
-            measured.append(stretch.states[end:])
         beginnings.append(stretch.part(slice(end)))
     learnt_from = Records(beginnings, spec)
     smoothed = smooth(learnt_from, f_p, start=start, num_starts=num_starts)
     last = torch.stack([smoothed.records.records[i].states[-1] for i in ends])
+    within = smoothed._chain.within.shape[1]  # steps of the physics in a control step
+    actions, measured = [], []
+    for i in ends:
+        stretch = steps.records[i]
+        each = stretch.within if within > 1 else stretch.actions.unsqueeze(1)
+        actions.append(each[-held - 1 : -1].flatten(0, 1))
+        states = torch.full((held * within, spec.state_dim), torch.nan, dtype=torch.float64)
+        states[within - 1 :: within] = stretch.states[-held:]
+        measured.append(states)
     windows = Windows(last, torch.stack(actions), torch.stack(measured))
-    length = steps.records[0].sampling_step
+    length = steps.records[0].sampling_step / within
+    spec = replace(spec, step=length)
     options: dict[str, Any] = {
         "start_noise": torch.stack([smoothed.sd[i][-1] for i in ends]).square().mean(0).sqrt(),
         "noise": smoothed.noise.nan_to_num(),
@@ -371,14 +417,12 @@ def identify(
     if f_p.unknowns:
         guesses = PhysicsDynamics(spec, f_p)
         runs[GUESSES] = guesses.free_run(last, windows.actions, **options)
+    # A control step adds the process noise of its steps of the physics.
+    process_noise = smoothed.process_noise / math.sqrt(within)
     dynamics = IdentifiedDynamics(
-        replace(spec, step=length),
-        f_p,
-        smoothed.physics_parameters,
-        options["noise"],
-        smoothed.process_noise,
+        spec, f_p, smoothed.physics_parameters, options["noise"], process_noise
     )
-    options |= {"process_noise": smoothed.process_noise, "num_functions": 199}
+    options |= {"process_noise": process_noise, "num_functions": 199}
     runs = {IDENTIFIED: dynamics.free_run(last, windows.actions, **options), **runs}
     gaps = [f"Gaps part the log into {len(steps)} stretches, each smoothed by itself."]
     remarks = gaps if len(steps) > len(records) else []
@@ -396,7 +440,8 @@ def _of_actions(records: Records, step: float) -> list[str]:
         return []
     return [
         f"The actions vary within a step of {size} samples, over which they are averaged: "
-        "parameters and their intervals may be off. Take a shorter step and compare."
+        "parameters and their intervals may be off. Give an ODEPhysics the step of the samples, "
+        "which follows each action, or take a shorter step and compare."
     ]
 
 

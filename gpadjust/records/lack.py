@@ -23,6 +23,8 @@ _AGAIN = 2.0  # standard deviations, by which either half tells what the other d
 _FEW_BINS, _BINS, _IN_BIN = 4, 8, 8  # of a test and a figure; the fewest steps in one of them
 _LAGS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # steps
 _WIDE = 10.0  # times the changes per time: what may be missing
+_FORCE = 2.0  # times the process noise: a force that may be missing
+_LENGTH, _SMOOTH = 0.5, 4  # of a force that may be missing: lengthscale in ranges, functions
 _ROUNDS = 20  # of expectation maximisation
 _KINEMATIC = 0.03  # of a state's changes, by which they differ from the integral of another
 _BOTH_SIGNS = 0.05  # the least share of either sign
@@ -109,6 +111,41 @@ def clearest_lack(chain: Chain, estimate: Estimate, step: float) -> Lack | None:
     if found.chance + math.log(len(candidates)) > math.log(_CHANCE) or found.again < _AGAIN:
         return None
     return search.described(best, found.gain)
+
+
+def robust_moments(chain: Chain, estimate: Estimate, step: float) -> tuple[Array, Array]:
+    r"""Return mean and covariance of the parameters, allowing for forces that the equations lack.
+
+    Equation i, unless it only says that a state is the rate of another, has the further rate
+
+    .. math:: \sum_j g_{ij}(x_j), \quad g_{ij} \sim GP(0, 4 Q_i / h^2 \, k),
+
+    of each state, with an RBF kernel k whose lengthscale is half the range of the state: twice as
+    large in a step h as the process noise Q of the chain, which is 0 where the equations are right.
+    """
+    search = _Search(chain, estimate, step)
+    added, states = list[list[Array]](), search.middle.T
+    for i in search.equations:
+        size = _FORCE * math.sqrt(search.variances[1, i]) / step
+        for values in states:
+            columns = _bins(values, _BINS)
+            middles = columns.T @ values / columns.sum(0)
+            off = (middles[:, None] - middles) / (_LENGTH * max(np.ptp(middles), 1e-300))
+            # k = V diag(w) V', of which a few columns V sqrt(w) are nearly all
+            w, V = np.linalg.eigh(np.exp(-0.5 * off**2))
+            root = V[:, -_SMOOTH:] * np.sqrt(w[-_SMOOTH:].clip(0))
+            added.append(search._added(i, size * columns @ root))
+    d, p = chain.d, chain.num_parameters
+    if not added:
+        moments = estimate.stretches[0].states
+        return moments.means[0, d:], moments.covariances[0, d:, d:]
+    whole = [np.concatenate(parts, -1) for parts in zip(*added, strict=True)]
+    K = whole[0].shape[-1]
+    starts = [(np.append(x, np.zeros(K)), _beside(spread, np.eye(K))) for x, spread in chain.starts]
+    links = [_with(*pair) for pair in zip(search.links, whole, strict=True)]
+    found, _ = kalman.smooth_chain(links, starts, *search.variances)
+    mean, covariance = (part[0] for part in found[0].states)
+    return mean[d : d + p], covariance[d : d + p, d : d + p]
 
 
 class _Test(NamedTuple):

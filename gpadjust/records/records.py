@@ -73,6 +73,7 @@ class Record:
         self.times = self._numbers(_in_seconds(times), "times", 1)
         self.states = self._numbers(states, "states", 2)
         self.actions = self._numbers(actions, "actions", 2)
+        self.within = self.actions.unsqueeze(1)  # N x k x action_dim: of the samples of a step
         labels: Any = segments.tolist() if hasattr(segments, "tolist") else segments
         self.segments = tuple([0] * len(self.times) if labels is None else labels)
         rows = {name: len(getattr(self, name)) for name in ("times", "states", "actions")}
@@ -114,7 +115,9 @@ class Record:
     def part(self, rows: slice) -> Record:
         """Return some rows, as a record of the same name."""
         times, states, actions = self.times[rows], self.states[rows], self.actions[rows]
-        return Record(times, states, actions, self.segments[rows], self.name)
+        part = Record(times, states, actions, self.segments[rows], self.name)
+        part.within = self.within[rows]
+        return part
 
     def stretches(self) -> list[slice]:
         """Return the rows that follow each other without a gap, stretch by stretch."""
@@ -390,10 +393,13 @@ def control_steps(records: Records, step: float | None) -> Records:
             states = record.states[rows.start : end + 1 : every].clone()
             if every > 1:  # recorded ones are of a row before, not of a step
                 states[0, spec.previous_columns] = math.nan
-            actions = record.actions[rows.start : end].unflatten(0, (number, every)).mean(1)
-            actions = torch.cat([actions, actions[-1:]])  # the last: not read
+            within = record.within[rows.start : end].unflatten(0, (number, every)).flatten(1, 2)
+            within = torch.cat([within, within[-1:]])  # the last: not read
+            actions = within.mean(1)
             remember(states, actions, spec)
-            steps.append(Record(times, states, actions, name=record.name))
+            stretch = Record(times, states, actions, name=record.name)
+            stretch.within = within
+            steps.append(stretch)
     if not steps:
         raise ValueError(
             f"Expected a stretch as long as a control step, {step:.4g}, found none of {short}; "

@@ -78,14 +78,9 @@ class SmoothedRecords:
     @property
     def physics_parameters(self) -> PhysicsParameters:
         """The posterior of the unknown parameters of the physics; empty if it has none."""
-        unknowns, d = self._chain.physics.unknowns, self._chain.d
-        if not unknowns:
-            return PhysicsParameters({}, [])
-        moments = self._estimate.stretches[0].states
-        mean = torch.from_numpy(moments.means[0, d:].copy())
-        values, vectors = torch.linalg.eigh(torch.from_numpy(moments.covariances[0, d:, d:].copy()))
-        spread = even_normal(_DRAWS, len(unknowns), seed=0) * values.clamp_min(0).sqrt()
-        return PhysicsParameters(unknowns, unknowns.at(mean + spread @ vectors.mT).unbind(-1))
+        d, moments = self._chain.d, self._estimate.stretches[0].states
+        mean, covariance = moments.means[0, d:], moments.covariances[0, d:, d:]
+        return drawn_parameters(self._chain.physics, mean, covariance)
 
     @cached_property
     def variation(self) -> Tensor:
@@ -152,7 +147,9 @@ def smooth(
         records: The records. A state that is NaN throughout is hidden.
         physics: The next values of the states that are neither exogenous nor previous actions,
             from these and the actions, as of :class:`LearnedDynamics`.
-        step: The control step, as of :meth:`Records.trajectories`.
+        step: The control step, as of :meth:`Records.trajectories`. If it has several samples, a
+            physics whose step is that of the samples follows the action of each; any other one is
+            given their mean.
         start: Of states by name, mean and standard deviation at the beginning of each stretch;
             needed of hidden ones. Default: about the first that was measured.
         noise: Standard deviations ``state_dim`` of the measurements' errors; NaN for those to be
@@ -194,17 +191,13 @@ def smooth(
         True
     """
     checked_whole("max_rounds", max_rounds, 1)
-    steps = _with_known_inputs(control_steps(records, step))
+    steps = with_known_inputs(control_steps(records, step))
     spec, length = records.spec, steps.records[0].sampling_step
     f_p = one_physics(physics, spec, "smooth by one of them")
-    if f_p.step is not None and abs(f_p.step - length) > _SAME * length:
-        raise ValueError(
-            f"Physics {f_p.name!r} makes steps of {f_p.step:g}, but the control step of the "
-            f"records is {length:g}; pass step={f_p.step:g}, or build it with step={length:g}."
-        )
+    substeps = substeps_of(f_p, steps, length)
     known = {"noise": noise, "process_noise": process_noise}
     variances = np.stack([_variances(sd, name, spec) for name, sd in known.items()])
-    chain = Chain(f_p, steps, variances, _starts(start, spec))
+    chain = Chain(f_p, steps, variances, first_moments(start, spec), substeps)
     if num_starts is None:
         num_starts = 4 if chain.hidden.any() and f_p.unknowns else 1
     checked_whole("num_starts", num_starts, 1)
@@ -226,6 +219,31 @@ def smooth(
     )
 
 
+def substeps_of(f_p: Physics, steps: Records, length: float) -> int:
+    """Return how many steps of the physics make a control step: 1, or as many as it has samples."""
+    if f_p.step is None or abs(f_p.step - length) <= _SAME * length:
+        return 1
+    samples, spec = steps.records[0].within.shape[1], steps.spec
+    if len(spec.moving) == spec.state_dim and abs(f_p.step * samples - length) <= _SAME * length:
+        return samples
+    raise ValueError(
+        f"Physics {f_p.name!r} makes steps of {f_p.step:g}, but the control step of the "
+        f"records is {length:g}; pass step={f_p.step:g}, or build it with step={length:g}, or, for "
+        f"states that all move, with the step of the samples, {length / samples:g}."
+    )
+
+
+def drawn_parameters(physics: Physics, mean: Array, covariance: Array) -> PhysicsParameters:
+    """Draw parameters from a normal distribution of their coordinates; none if there are none."""
+    unknowns = physics.unknowns
+    if not unknowns:
+        return PhysicsParameters({}, [])
+    values, vectors = torch.linalg.eigh(torch.from_numpy(covariance.copy()))
+    spread = even_normal(_DRAWS, len(unknowns), seed=0) * values.clamp_min(0).sqrt()
+    at = unknowns.at(torch.from_numpy(mean.copy()) + spread @ vectors.mT)
+    return PhysicsParameters(unknowns, at.unbind(-1))
+
+
 def _of_all_states(moving: Array, spec: StateSpec) -> Tensor:
     """Return rows of all states, from those that the physics moves; 0 of the others."""
     rows = torch.zeros(len(moving), spec.state_dim, dtype=torch.float64)
@@ -245,7 +263,7 @@ def _with_states(steps: Records, path: Array) -> Records:
     return Records(records, steps.spec)
 
 
-def _with_known_inputs(steps: Records) -> Records:
+def with_known_inputs(steps: Records) -> Records:
     """Return stretches from where all inputs of the physics that do not move are known."""
     spec, records = steps.spec, []
     beside = [i for i in spec.physics_columns if i < spec.state_dim and i not in spec.moving]
@@ -284,7 +302,7 @@ def _variances(sd: Tensor | None, name: str, spec: StateSpec) -> Array:
     return variances
 
 
-def _starts(start: Mapping[str, tuple[float, float]] | None, spec: StateSpec) -> Array:
+def first_moments(start: Mapping[str, tuple[float, float]] | None, spec: StateSpec) -> Array:
     """Return means and standard deviations, ``2 x d``, of first states; NaN if they are unknown."""
     names = [spec.states[i] for i in spec.moving]
     start = {} if start is None else start
@@ -443,7 +461,14 @@ class Chain:
     or a hidden state has no start.
     """
 
-    def __init__(self, physics: Physics, steps: Records, variances: Array, start: Array) -> None:
+    def __init__(
+        self,
+        physics: Physics,
+        steps: Records,
+        variances: Array,
+        start: Array,
+        substeps: int = 1,
+    ) -> None:
         self.physics, self.spec = physics, steps.spec
         moving = self.spec.moving
         self.d, self.num_parameters = len(moving), len(physics.unknowns)
@@ -456,6 +481,9 @@ class Chain:
         states = torch.cat([record.states for record in steps])
         actions = torch.cat([record.actions for record in steps])
         self.recorded = side_by_side(states, actions)  # of which f_p reads what does not move
+        self.within = actions.unsqueeze(1)  # of the steps of f_p in a control step
+        if substeps > 1:
+            self.within = torch.cat([record.within for record in steps])
         y = self.measured = states[:, moving].numpy()
         for rows in self.stretches:
             for i in self.angles:  # go on without jumps
@@ -614,11 +642,14 @@ class Chain:
         Rows ``n`` have the actions, and the states that do not move, which f_p reads.
         """
         inputs = self.recorded[rows].expand(*states.shape[:-1], -1).clone()
-        inputs[..., self.spec.moving] = torch.from_numpy(np.ascontiguousarray(states))
+        following = torch.from_numpy(np.ascontiguousarray(states))
         unknowns = self.physics.unknowns
         values = unknowns.at(torch.from_numpy(parameters)) if unknowns else None
-        following = self.physics.or_nan(inputs[..., self.spec.physics_columns], values)
-        check_next_values(self.physics, following, states.shape[-1])
+        for actions in self.within[rows].unbind(1):
+            inputs[..., self.spec.moving] = following
+            inputs[..., self.spec.state_dim :] = actions
+            following = self.physics.or_nan(inputs[..., self.spec.physics_columns], values)
+            check_next_values(self.physics, following, states.shape[-1])
         return self.near(following.numpy(), states)
 
     def near(self, states: Array, others: Array) -> Array:

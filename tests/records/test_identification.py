@@ -108,6 +108,23 @@ def test_a_physics_without_unknowns_is_judged_too():
     assert found.hidden == []
 
 
+def test_a_step_of_many_samples_follows_the_action_of_each():
+    """Force that changes within a step; its mean alone would give another stiffness."""
+    record = oscillation(201, noise=0.002)
+    records = Records(record, StateSpec(["x", "v"], ["u"]))
+    found = quickly(records, spring(Unknown(2.0, factor=1.2)), 5 * STEP, held_out=0.2)
+    low, high = found.parameters.interval(0.99)
+    assert low < TRUE < high
+    assert high - low < 0.05
+    assert float(found.smoothed.noise[0]) == pytest.approx(0.002, rel=0.35)
+    assert found.step == pytest.approx(STEP)
+    assert found.windows.actions.shape == (1, 40, 1)
+    known = ~found.windows.measured[0, :, 0].isnan()
+    assert known.nonzero().flatten().tolist() == [*range(4, 40, 5)]
+    assert found.errors["identified"][0] < 0.01
+    assert not any("averaged" in each for each in found.advice)
+
+
 def test_advice_on_parameters():
     def of_two(X, p):
         x, v, u = X.unbind(-1)

@@ -93,6 +93,17 @@ def test_dry_friction_is_found_over_the_rate(dry):
     assert (lack.means[clear].abs() > 3 * lack.sd[clear]).all()
 
 
+def test_intervals_that_allow_for_a_missing_force_hold_the_damping(dry, right):
+    """The damping stands for the friction; of right equations nothing changes."""
+    low, high = dry.parameters.interval()
+    wide_low, wide_high = dry.robust_parameters.interval()
+    assert not low[1] < 0.3 < high[1]
+    assert wide_low[0] < 4 < wide_high[0]
+    assert wide_low[1] < 0.3 < wide_high[1]
+    assert any("c " in each and "Dry friction, say, is hard to tell" in each for each in dry.advice)
+    assert right.robust_parameters.sd[1] < 0.1 * dry.robust_parameters.sd[1]
+
+
 def test_a_lag_is_found_with_what_to_do(lagging):
     assert lagging.lack.over == "heater"
     assert 0.5 * TAU < lagging.lack.lag < 2 * TAU

@@ -1,0 +1,174 @@
+"""Check before a fit: the directions of the parameters that a log tells, and better inputs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from copy import copy
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gpadjust.dynamics.targets import one_physics
+from gpadjust.physics import Physics, PhysicsError
+from gpadjust.records import kalman
+from gpadjust.records.kalman import Array
+from gpadjust.records.records import Records, control_steps
+from gpadjust.records.smoothing import Chain, first_moments, substeps_of, with_known_inputs
+from gpadjust.states.state_spec import side_by_side
+
+_WEAK = 1.0  # a singular value: the log halves the variance of the prior
+_SHARE = 0.2  # the least weight that is named
+_PERIODS = (4, 16, 64)  # half periods of an input that is tried, in parts of the log
+_LONGEST = 500  # steps of an input that is tried
+
+
+class Direction(NamedTuple):
+    """A direction of the parameters, and how clearly a log tells it."""
+
+    weights: dict[str, float]  # in standard deviations of the priors, of norm 1
+    value: float  # errors of the sensors by which one standard deviation moves all measurements
+    input: str  # the input that would tell it best, and the value with it; empty if told
+
+    def __str__(self) -> str:
+        """Return the direction, its value and the input in a sentence."""
+        named = [f"{w:+.2f} {name}" for name, w in self.weights.items() if abs(w) > _SHARE]
+        text = " ".join(named).removeprefix("+")
+        if self.value >= _WEAK:
+            return f"The log tells {text} (singular value {self.value:.3g})."
+        return f"The log cannot tell {text} (singular value {self.value:.2g}). {self.input}"
+
+
+def check_log(
+    records: Records,
+    physics: Physics | Callable[[Tensor], Tensor],
+    step: float | None = None,
+    *,
+    start: Mapping[str, tuple[float, float]] | None = None,
+) -> list[Direction]:
+    r"""Check which directions of the unknown parameters a log can tell, before a fit.
+
+    With J the sensitivities of a free run to the parameters, at their guesses and in standard
+    deviations of their priors, first states unknown, and R the variance of the sensors' noise, as
+    large as the log is rough at most, these are the eigenvectors of :math:`J^\top R^{-1} J`, and
+    the singular values the roots of its eigenvalues. One below 1 leaves the prior nearly as it is.
+    f_p is evaluated some :math:`2 (d + p) + 2` times a row, for d states and p parameters.
+
+    Args:
+        records: The records, as of :func:`smooth`.
+        physics: The next states, with unknown parameters.
+        step: The control step, as of :func:`smooth`.
+        start: Of hidden states by name, mean and standard deviation at the beginning.
+
+    Returns:
+        The directions, the clearest first. Of those that the log does not tell, each names the
+        square wave of an action, as large as those recorded, that would tell it best.
+
+    Raises:
+        ValueError: If the physics has no unknown parameters; and as :func:`smooth`, as are other
+            errors.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust.physics import FormulaPhysics, ODEPhysics, Unknown
+        >>> from gpadjust.records import Record, Records, check_log
+        >>> from gpadjust.states import StateSpec
+        >>> t = 0.1 * torch.arange(60, dtype=torch.float64)
+        >>> x = t.cos().unsqueeze(-1) + 0.01 * torch.randn(60, 1, dtype=torch.float64)
+        >>> unknowns = {"a": Unknown(1.0, factor=2.0), "b": Unknown(1.0, factor=2.0)}
+        >>> rate = FormulaPhysics("b * u - a * x", ["x", "u"], unknowns=unknowns)
+        >>> log = Records(Record(t, x, torch.zeros_like(x)), StateSpec(["x"], ["u"]))
+        >>> print(check_log(log, ODEPhysics(rate, 0.1, 1))[-1])  # doctest: +ELLIPSIS
+        The log cannot tell 1.00 b (singular value 0). A square wave of u between ...
+    """
+    steps = with_known_inputs(control_steps(records, step))
+    f_p = one_physics(physics, steps.spec, "check one of them")
+    if not f_p.unknowns:
+        raise ValueError("Expected a physics with unknown parameters; found none, to check.")
+    chain = _chain(f_p, steps, first_moments(start, steps.spec))
+    noise = np.maximum(_roughness(chain), chain.least)
+    values, vectors = np.linalg.eigh(_information(chain, noise))
+    directions = []
+    for value, vector in zip(np.sqrt(values.clip(0))[::-1], vectors.T[::-1], strict=True):
+        vector = vector * np.sign(vector[np.abs(vector).argmax()])
+        weights = dict(zip(f_p.unknowns, vector.tolist(), strict=True))
+        text = _best_input(chain, steps, noise, vector) if value < _WEAK else ""
+        directions.append(Direction(weights, float(value), text))
+    return directions
+
+
+def _chain(f_p: Physics, steps: Records, start: Array) -> Chain:
+    length = steps.records[0].sampling_step
+    unknown = np.full((2, len(steps.spec.moving)), math.nan)
+    return Chain(f_p, steps, unknown, start, substeps_of(f_p, steps, length))
+
+
+def _roughness(chain: Chain) -> Array:
+    """Return variances of white noise by third differences, which are 20 times as large."""
+    differences = [np.diff(chain.measured[rows], 3, axis=0) for rows in chain.stretches]
+    squares = np.concatenate(differences) ** 2
+    number = (~np.isnan(squares)).sum(0)
+    variances: Array = np.nansum(squares, 0) / (20 * number.clip(1))
+    return variances
+
+
+def _information(chain: Chain, noise: Array, seen: Array | None = None) -> Array:
+    """Return the information of all stretches on the parameters, ``p x p``: J' J / R.
+
+    ``seen`` is in the place of the measurements, NaN where there is none; it has no other effect.
+    """
+    d, p = chain.d, chain.num_parameters
+    path, whole = chain.first_path(np.zeros(p)), np.zeros((p, p))
+    for link, start in zip(chain.linearised(path), chain.starts, strict=True):
+        link = (
+            link if seen is None else link._replace(measured=np.tile(seen, (len(link.measured), 1)))
+        )
+        (alone,), _ = kalman.smooth_chain([link], [start], noise, chain.least)
+        whole += np.linalg.inv(alone.states.covariances[0, d:, d:]) - np.eye(p)
+    even: Array = (whole + whole.T) / 2
+    return even
+
+
+def _best_input(chain: Chain, steps: Records, noise: Array, vector: Array) -> str:
+    """Return a sentence on the square wave, of one action, that tells a direction best."""
+    spec, best = steps.spec, (0.0, "")
+    if len(spec.moving) < spec.state_dim:
+        return "Other inputs are tried for states that all move only."
+    length = min(max(len(record.times) for record in steps), _LONGEST)
+    recorded = torch.cat([record.actions for record in steps])
+    low, high = recorded.aminmax(dim=0)
+    low, high = torch.where(low == high, low - 1, low), torch.where(low == high, high + 1, high)
+    times = steps.records[0].sampling_step * torch.arange(length, dtype=torch.float64)
+    for j, name in enumerate(spec.actions):
+        for parts in _PERIODS:
+            half = max(1, length // parts)
+            actions = recorded.mean(0).repeat(length, 1)
+            is_high = torch.arange(length) // half % 2 == 0
+            actions[:, j] = torch.where(is_high, high[j], low[j])
+            other = _under(chain, actions)
+            seen = np.where(chain.hidden, math.nan, 0.0)
+            try:
+                told = vector @ _information(other, noise, seen) @ vector
+            except (PhysicsError, np.linalg.LinAlgError):
+                continue
+            value = math.sqrt(max(float(told), 0.0))
+            if value > best[0]:
+                wave = f"between {low[j]:.3g} and {high[j]:.3g} with half a period of "
+                seconds = f"{half * float(times[1]):.3g}"
+                best = value, f"A square wave of {name} {wave}{seconds} would: {value:.3g}."
+    return best[1] or "None of the inputs that were tried does."
+
+
+def _under(chain: Chain, actions: Tensor) -> Chain:
+    """Return the chain of a single stretch under other actions, of which nothing is measured."""
+    other, length = copy(chain), len(actions)
+    other.lengths, other.firsts = np.array([length]), np.array([0])
+    other.stretches, other.now = [slice(0, length)], np.arange(length - 1)
+    states = torch.zeros(length, chain.spec.state_dim, dtype=torch.float64)
+    other.recorded = side_by_side(states, actions)
+    other.within = actions.unsqueeze(1).expand(-1, chain.within.shape[1], -1)
+    other.measured = np.full((length, chain.d), math.nan)
+    other.first, other.starts = chain.first[:1], chain.starts[:1]
+    return other
