@@ -369,8 +369,8 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/dynamics/identified.py",
-        "told = precision + J @ J.mT",
-        "told = J @ J.mT",
+        "precision = prior_precision + J @ J.mT",
+        "precision = J @ J.mT",
         "Dynamics that learn on forget the log.",
     ),
     Fault(
