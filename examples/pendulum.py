@@ -3,7 +3,7 @@
 Measured at DFKI (BSD 3-Clause): see ../paper/machines/data/README.md.
 """
 
-from pathlib import Path
+from importlib.resources import files
 
 import matplotlib.pyplot as plt
 import torch
@@ -13,7 +13,7 @@ from gpadjust.dynamics import LearnedDynamics
 from gpadjust.records import Records
 from gpadjust.states import StateSpec
 
-DATA = Path(__file__).parents[1] / "paper/machines/data/pendulum"
+DATA = files("gpadjust.records") / "pendulum"
 
 
 def frictionless(state, action, p):

@@ -40,6 +40,7 @@ Other physics, with unknown parameters or without::
     FMUPhysics("tank.fmu", ["T", "P"], ["T"], times=60)    # a model of Modelica or Simulink
     law = FunctionPhysics(lambda X, p: p.gain * X[:, 0], unknowns={"gain": Unknown(1.0, factor=2)})
     CalibratedPhysics(X, Y, physics=law)         # the law alone
+    Unknown(0.1, factor=2, function_of="v", between=(0, 9))   # a function in the law, friction(v)
 
 Each object draws itself, and is a table in a notebook::
 
@@ -49,7 +50,7 @@ Each object draws itself, and is a table in a notebook::
     parameters.plot()                            # model.physics_parameters: posterior and prior
     leave_one_out(model).plot()                  # left-out predictions, and their residuals
     collection.plot()                            # of collect: path and best so far; or regret
-    identification.plot()                        # of identify: free runs
+    identification.plot()                        # of identify: free runs; .lack.plot()
     agent.plot()                                 # its rewards, and the last episode
 
 Beyond the models::

@@ -19,6 +19,7 @@ FIGURES = {
     "Comparison": "validation.plots.plot_comparison",
     "Collection": "active.plots.plot_collection",
     "Identification": "records.plots.plot_identification",
+    "Lack": "records.plots.plot_lack",
     "Agent": "control.plots.plot_agent",
     "Dyna": "control.plots.plot_agent",
 }

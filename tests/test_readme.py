@@ -20,7 +20,7 @@ from tests.fmus import fmu
 from tests.systems import line
 
 ROOT = Path(__file__).parents[1]
-BELOW = {"control", "do_mpc", "export", "records", "saving"}  # pages that are tested below
+BELOW = {"control", "do_mpc", "export", "log", "records", "saving"}  # pages that are tested below
 FOLDERS = [ROOT / "docs" / "guide", ROOT / "docs" / "coming_from"]
 GUIDE = [p for folder in FOLDERS for p in sorted(folder.rglob("*.md")) if p.stem not in BELOW]
 FIRST = [ROOT / "docs" / f"{name}.md" for name in ("start", "install", "choose")]
@@ -221,3 +221,21 @@ def test_do_mpc_controls_the_tanks_by_the_exported_dynamics(tmp_path):
     assert upper.max() < 9
     assert (names["path"][-1, 1] - 8).abs() > 0.5  # f_p alone
     assert "tanks_step" in names["code"]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::UserWarning", "ignore::FutureWarning")  # of do-mpc's
+@apart
+def test_a_log_leads_to_controllers(tmp_path):
+    os.chdir(tmp_path)
+    names = {}
+    for block in blocks("docs/guide/control/log.md"):
+        exec(block, names)
+    assert abs(names["levels"][1] - 8) < 0.1  # by `MPC`
+    assert max(upper for upper, _ in names["made"]) < 9
+    upper, lower = names["identified"].T  # by do-mpc
+    assert abs(lower[-6:] - 8).max() < 0.05
+    assert upper.max() < 9.02
+    guesses = names["paths"]["guesses"]
+    assert abs(guesses[-1, 1] - 8) > 0.5
+    assert "tanks_step(const double *state, const double *action, double *mean)" in names["code"]

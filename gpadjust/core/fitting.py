@@ -37,7 +37,7 @@ _FIRST = 4  # draws from Laplace's approximation for each one that is kept
 _SELDOM = 1e-3  # a nested model of less probability at its mode is not drawn from
 _OF_NUTS = 1000  # draws, a multiple of 16
 _SEARCHES = 4  # for the mode
-_STEPS, _PRECISE_STEPS = 2_000, 200  # of them; those of a precise one begin again where they end
+_STEPS, _STEPS_OF_SHARED = 2_000, 200  # the latter with a fit by least squares, and begun again
 _NEAR = 0.3  # difference of all coordinates below which two searches have found the same mode
 _LESS_LIKELY = 5.0  # difference of log density from the best mode beyond which a mode is ignored
 _MIXED = 1.05  # R-hat below which chains agree
@@ -330,7 +330,7 @@ def modes(model: GP, choice: int, seed: int, is_precise: bool = False) -> Tensor
     begins = torch.cat([_sorted(model, choice, u)[: searches - 1], torch.zeros_like(u[:1])])
     if model.table.shared:
         begins[-2] = _with_least_squares(model, choice, u)
-    most = _PRECISE_STEPS if is_precise else _STEPS
+    most = _STEPS_OF_SHARED if is_precise and model.table.shared else _STEPS
     ends = maximise(partial(model.log_likelihood, choice=choice), begins, is_precise, most)
     ends = _sorted(model, choice, ends)
     density = _log_density(model, choice, ends)

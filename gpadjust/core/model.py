@@ -46,8 +46,9 @@ from gpadjust.core.views import (
     squeezed,
 )
 from gpadjust.display import Display
-from gpadjust.physics import Physics, PhysicsError, Unknown, as_physics
+from gpadjust.physics import Physics, PhysicsError, as_physics
 from gpadjust.physics.parameters import PhysicsParameters
+from gpadjust.physics.unknown import NO_UNKNOWNS, Unknowns
 from gpadjust.progress import tick
 
 Slopes = dict[str, list[Tensor]]
@@ -227,8 +228,8 @@ class GP(gpytorch.models.GP, Predictive):
         self.settings = dict(settings or {})
         self._outputs: list[int] | None = None
         self._cached: tuple[Tensor, Conditioning] | None = None
-        has_unknowns = any(each.unknowns for each in self.physics)
-        self._unknowns = _unknowns_of(self.physics) if has_unknowns else {}
+        unknowns = [each.unknowns for each in self.physics] or [NO_UNKNOWNS]
+        self._unknowns = unknowns[0] if len(unknowns) == 1 else Unknowns.together(unknowns)
         self._f_train: list[Tensor] = []
         self.unit = Y.new_ones(1, 1)  # the user's, until the prior mean is known
         with torch.no_grad():  # a physics may have parameters, as a network does
@@ -288,7 +289,8 @@ class GP(gpytorch.models.GP, Predictive):
     def physics_parameters_at(self, u: Tensor) -> PhysicsParameters:
         """Return the unknown parameters of the physics at coordinates ``N x B x P``."""
         values = self.table.values(u)
-        draws = [p.value(values[f"physics.{n}"][..., 0]) for n, p in self._unknowns.items()]
+        z = [values[f"physics.{name}"] for name in self._unknowns]
+        draws = self._unknowns.at(torch.cat(z, -1)).unbind(-1) if z else []
         return PhysicsParameters(self._unknowns, draws)
 
     @property
@@ -945,19 +947,6 @@ def _with_kernel(term: Any) -> Term:
 def _of_data(term: Term, data: Data) -> Term:
     """Return a term whose kernel knows the names of the inputs."""
     return term if term.kernel is None else term._replace(kernel=term.kernel.of_data(data))
-
-
-def _unknowns_of(physics: Sequence[Physics]) -> dict[str, Unknown]:
-    """Return the unknown parameters of several physics; those of one name are one."""
-    unknowns: dict[str, Unknown] = {}
-    for each in physics:
-        for name, unknown in each.unknowns.items():
-            if unknowns.setdefault(name, unknown) != unknown:
-                raise ValueError(
-                    f"Expected one prior of the parameter {name!r} in all physics; found "
-                    f"{unknowns[name]!r} and {unknown!r}. Rename one of them."
-                )
-    return unknowns
 
 
 def _coordinates(model: GP) -> Tensor:

@@ -283,7 +283,7 @@ def around_mode(
         evidence = value[0] + torch.linalg.slogdet(root).logabsdet
         if ((evidence - before).abs() < _SETTLED).all():
             break
-    return Normal(mode, WIDER * lower_root(root)), evidence
+    return Normal(mode, lower_root(WIDER * root)), evidence
 
 
 def lower_root(root: Tensor) -> Tensor:

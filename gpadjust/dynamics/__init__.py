@@ -1,6 +1,7 @@
 """Distributions of the next state of a system, by the models of this library."""
 
 from gpadjust.dynamics.base import Dynamics, FreeRun, TransitionFunctions
+from gpadjust.dynamics.identified import IdentifiedDynamics
 from gpadjust.dynamics.learned_dynamics import LearnedDynamics
 from gpadjust.dynamics.physics_dynamics import PhysicsDynamics
 from gpadjust.dynamics.targets import AngleInput
@@ -11,6 +12,7 @@ __all__ = [
     "AngleInput",
     "Dynamics",
     "FreeRun",
+    "IdentifiedDynamics",
     "LearnedDynamics",
     "PhysicsDynamics",
     "StateSpec",

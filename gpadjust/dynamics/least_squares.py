@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gpadjust.dynamics.trajectories import Trajectories
 from gpadjust.physics import Physics, PhysicsWarning
+from gpadjust.physics.unknown import Unknowns
 from gpadjust.states import StateSpec
 
 _SEARCHED = 512  # transitions of the search; all transitions refine the best result
@@ -38,14 +39,14 @@ def most_likely(
         mean squares of the errors, ``state_dim``, 0 for states that do not move.
     """
     unknowns = physics.unknowns
-    errors = _Errors(physics, spec, data)
+    errors = StepErrors(physics, spec, data)
     guess = unknowns.coordinates(unknowns.guess)
     if not errors.evaluate(guess).isfinite().all():
         physics(errors.inputs)  # raises an error that says where it fails
     # Search: from the best draws of the prior, by some of the transitions.
     number = min(len(data), _SEARCHED)
     rows = torch.linspace(0, len(data) - 1, number, dtype=torch.float64).round().long()
-    some = _Errors(physics, spec, data.some(rows))
+    some = StepErrors(physics, spec, data.some(rows))
     starts = torch.cat([guess.unsqueeze(0), even_normal(_GUESSES, len(guess), seed=0)])
     best = some.loss(starts).nan_to_num(nan=torch.inf).argsort()[:_STARTS]
     ends = [some.descend(z, _ROUGH) for z in starts[best] if some.loss(z).isfinite()]
@@ -59,11 +60,11 @@ def most_likely(
     freedom = errors.count.sum() / (errors.count.sum() - len(unknowns)).clamp_min(1)
     noise = torch.zeros(spec.state_dim, dtype=torch.float64)
     noise[spec.moving] = r.square().sum(-1) / errors.count.clamp_min(1) * freedom
-    _warn_of_parameters([*unknowns], precision, point)
+    _warn_of_parameters(unknowns, precision, point)
     return point, precision, noise
 
 
-class _Errors:
+class StepErrors:
     """Errors of a physics in one step, by the coordinates of its unknown parameters."""
 
     def __init__(self, physics: Physics, spec: StateSpec, data: Trajectories) -> None:
@@ -124,19 +125,21 @@ class _Errors:
         return z
 
 
-def _warn_of_parameters(names: list[str], precision: Tensor, point: Tensor) -> None:
+def _warn_of_parameters(unknowns: Unknowns, precision: Tensor, point: Tensor) -> None:
     """Warn of parameters that transitions do not determine, or that contradict their prior.
 
     The former take part in directions with hardly any precision by the transitions, ``p x p``,
-    compared with the prior; the latter have coordinates far from its middle.
+    compared with the prior; the latter have coordinates far from its middle. Some values of an
+    unknown function always have hardly any precision.
     """
     values, vectors = torch.linalg.eigh(precision)
-    is_flat = vectors[:, values < _FLAT].norm(dim=-1) > _TAKES_PART
+    is_number = torch.tensor([not unknown.function_of for unknown in unknowns.values()])
+    is_flat = (vectors[:, values < _FLAT].norm(dim=-1) > _TAKES_PART) & is_number
     for mask, message in (
         (is_flat, "Transitions barely constrain {} of the physics: give narrower priors."),
         (point.abs() > _FAR, "Transitions and prior disagree about {} of the physics: check both."),
     ):
-        listed = ", ".join(name for name, is_one in zip(names, mask, strict=True) if is_one)
+        listed = ", ".join(name for name, is_one in zip(unknowns, mask, strict=True) if is_one)
         if listed:
             warnings.warn(message.format(listed), PhysicsWarning, stacklevel=5)
 

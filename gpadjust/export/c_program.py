@@ -12,6 +12,14 @@ from torch import Tensor
 
 from gpadjust.core import GP
 from gpadjust.dynamics import LearnedDynamics
+from gpadjust.export.c_equations import equations_source, physics_lines
+from gpadjust.export.equations import (
+    Equations,
+    OfPhysics,
+    equations_within,
+    own_dynamics,
+    refuse_parameters,
+)
 from gpadjust.export.finite_sum import Column, FiniteSum, finite_sum, model_of
 from gpadjust.export.transition import next_state, next_variance, target_columns
 
@@ -90,32 +98,44 @@ _MIXED_VARIANCE = """\
 
 
 def c_source(
-    fitted: GP | LearnedDynamics,
+    fitted: Any,
     name: str,
     *,
     variance: bool = True,
     observation_noise: bool = False,
+    parameters: bool = False,
 ) -> str:
-    r"""Return a fitted model as a file of C99, which needs ``math.h`` alone and allocates nothing.
+    r"""Return a fitted model or a physics as a file of C99.
+
+    It needs ``math.h`` alone and allocates nothing.
 
     Of a model it has ``void NAME_predict(const double *x, const double *f_p, double *mean, double
     *variance)``, which is :meth:`~gpadjust.CKA.predict` at one point. Of dynamics it has ``void
     NAME_step(const double *state, const double *action, const double *f_p, double *mean, double
-    *variance)``, which is :meth:`LearnedDynamics.predict`; ``mean`` may be ``state`` itself. The
-    physics stays yours: ``f_p`` is what it returns there, of several physics side by side; without
-    physics it is no argument. A ``variance`` that is ``NULL`` is not computed, which is faster. The
-    same model makes the same file.
+    *variance)``, which is :meth:`LearnedDynamics.predict`; ``mean`` may be ``state`` itself.
+    ``f_p`` is what the physics returns there, of several physics side by side. It is no argument
+    without physics, and of a :class:`FormulaPhysics`, or an :class:`ODEPhysics` of one with a fixed
+    step: these are in the file. A ``variance`` that is ``NULL`` is not computed, which is faster.
+    The same model makes the same file.
+
+    Of such a physics itself it has ``void NAME_predict(const double *x, double *mean)``; of
+    dynamics that are one, such as :func:`~gpadjust.records.identify` finds, ``void
+    NAME_step(const double *state, const double *action, double *mean)``.
 
     Args:
-        fitted: The model, or dynamics that have learnt.
-        name: What the names of functions begin with.
+        fitted: The model, dynamics that have learnt, an identification, or a physics.
+        name: What the names of functions begin with. One unit of compilation takes several files.
         variance: Whether there is a variance. Its tables are the most of the file: the square of
             the number of points or features, for each output and draw.
         observation_noise: If True, the variance includes that of the noise.
+        parameters: Of a physics, or dynamics that are one: if True, its unknown parameters are an
+            argument, ``const double *parameters`` before ``mean``, in the order of the physics.
+            Default: they are at their posterior means, of a physics itself at the guesses.
 
     Raises:
-        TypeError: If it is neither.
-        ValueError: If ``name`` is none in C, or the model is no finite sum; with the way out.
+        TypeError: If it is none of these, or a physics that is not written in formulas.
+        ValueError: If ``name`` is none in C, the model is no finite sum, or ``parameters`` are not
+            for it; with the way out.
         RuntimeError: If the dynamics have learnt nothing yet.
 
     Example:
@@ -129,16 +149,25 @@ def c_source(
     """
     if not (isinstance(name, str) and name.isidentifier() and name.isascii()):
         raise ValueError(f"Expected name as one of C, such as 'pump', got {name!r}.")
+    fitted = own_dynamics(fitted)
+    if isinstance(fitted, OfPhysics):
+        return "\n".join(equations_source(fitted, name, parameters)) + "\n"
+    refuse_parameters(parameters)
     model = model_of(fitted)
     found, data = finite_sum(model, variance, observation_noise), model.data
     is_step, body = isinstance(fitted, LearnedDynamics), "".join(_body(found, variance))
     tables = {n: t for n, t in _tables(found).items() if re.search(rf"\b{n}\[", body)}
-    given = ["const double *f_p"] * bool(found.num_physics) + ["double *mean"]
-    given += ["double *variance"] * variance
+    within = equations_within(model)
+    values = ["double *mean", *["double *variance"] * variance]
+    f_p, written = ["const double *f_p"], ["", *_written(within or [], name)]
+    given = f_p * (within is None or (is_step and bool(within))) + values
+    if within and not is_step:
+        body = "".join(f"    {line}\n" for line in _own_f_p(within, name, "x")) + body
     about = [
         f"{model!r}. Made by gpadjust; numbers are in the units of the data.",
         f"x: {', '.join(data.input_names)}.",
-        f"f_p: {found.num_physics} values that the physics returns at x.",
+        f"f_p: {found.num_physics} values that the physics returns at x"
+        f"{', which is in this file' * bool(within)}.",
         *_told(fitted, model),
         f"mean: {', '.join(data.output_names)}.",
         "variance: in their square, "
@@ -156,8 +185,22 @@ def c_source(
     code = re.sub(rf"(?<!_)\b({own})\b", rf"{name}_\1", "\n".join(lines))
     more = []
     if isinstance(fitted, LearnedDynamics):
-        more = ["", *_step(fitted, name, given, found.num_physics)]
-    return "\n".join([*head, "#include <math.h>", "", code, *more]) + "\n"
+        given = f_p * (within is None) + values
+        more = ["", *_step(fitted, name, given, found.num_physics, within or [])]
+    return "\n".join([*head, "#include <math.h>", *written, code, *more]) + "\n"
+
+
+def _written(within: list[Equations], name: str) -> Iterator[str]:
+    """Yield functions of the physics that are written in formulas, ``NAME_f_p0`` and so on."""
+    for i, each in enumerate(within):
+        yield from physics_lines(each, f"{name}_f_p{i}")
+
+
+def _own_f_p(within: list[Equations], name: str, x: str) -> Iterator[str]:
+    """Yield lines that call them."""
+    size = len(within[0].formula.outputs)
+    yield f"double f_p[{size * len(within)}];"
+    yield from (f"{name}_f_p{i}({x}, f_p + {i * size});" for i in range(len(within)))
 
 
 def _told(fitted: GP | LearnedDynamics, model: GP) -> Iterator[str]:
@@ -247,7 +290,11 @@ def _braces(values: list[Any]) -> str:
 
 
 def _step(
-    dynamics: LearnedDynamics, name: str, given: list[str], num_physics: int
+    dynamics: LearnedDynamics,
+    name: str,
+    given: list[str],
+    num_physics: int,
+    within: list[Equations],
 ) -> Iterator[str]:
     """Return the function of dynamics, which calls that of their model."""
     spec, m = dynamics.spec, dynamics.model.num_outputs
@@ -258,6 +305,10 @@ def _step(
     yield "{"
     x, arguments = [(*state, *action)[i] for i in spec.model_columns], ["x"]
     yield f"    const double x[{len(x)}] = {{{', '.join(x)}}};"
+    if within:
+        read = [(*state, *action)[i] for i in spec.physics_columns]
+        yield f"    const double read[{len(read)}] = {{{', '.join(read)}}};"
+        yield from (f"    {line}" for line in _own_f_p(within, name, "read"))
     if num_physics:
         f_p = _entries("f_p", num_physics // m * len(spec.moving))
         columns = target_columns(dynamics, state, f_p, _wrapped)

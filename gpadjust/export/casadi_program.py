@@ -8,8 +8,14 @@ from typing import Any
 
 from torch import Tensor
 
-from gpadjust.core import GP
 from gpadjust.dynamics import LearnedDynamics
+from gpadjust.export.casadi_equations import equations_function, physics_function
+from gpadjust.export.equations import (
+    OfPhysics,
+    equations_within,
+    own_dynamics,
+    refuse_parameters,
+)
 from gpadjust.export.finite_sum import FiniteSum, finite_sum, model_of
 from gpadjust.export.transition import next_state, next_variance, target_columns
 
@@ -18,33 +24,41 @@ _TINY = 1e-30  # of a squared distance, at which its root has a derivative
 
 
 def casadi_function(
-    fitted: GP | LearnedDynamics,
+    fitted: Any,
     name: str = "predict",
     *,
     physics: Callable[[Any], Any] | None = None,
     variance: bool = True,
     observation_noise: bool = False,
+    parameters: bool = False,
 ) -> Any:
-    """Return a fitted model as a ``casadi.Function``, with derivatives, for optimal control.
+    """Return a fitted model or a physics as a ``casadi.Function``, with derivatives.
 
     Of a model it maps columns ``x`` and ``f_p`` to ``mean`` and ``variance``, those of
     :meth:`~gpadjust.CKA.predict`; of dynamics ``state``, ``action`` and ``f_p`` to those of
-    :meth:`LearnedDynamics.predict`. The physics stays yours: ``f_p`` is what it returns there, of
-    several physics below each other; without physics it is no argument.
+    :meth:`LearnedDynamics.predict`. ``f_p`` is what the physics returns there, of several physics
+    below each other. It is no argument without physics, and of a :class:`FormulaPhysics`, or an
+    :class:`ODEPhysics` of one with a fixed step: these are in the function.
+
+    Of such a physics itself it maps ``x`` to ``mean``; of dynamics that are one, such as
+    :func:`~gpadjust.records.identify` finds, ``state`` and ``action`` to ``mean``.
 
     Args:
-        fitted: The model, or dynamics that have learnt.
+        fitted: The model, dynamics that have learnt, an identification, or a physics.
         name: The name of the function.
         physics: f_p in CasADi, to take the place of that argument: a ``casadi.Function``, or one of
             Python, from the column of what f_p reads to the column of what it returns.
         variance: Whether there is a variance.
         observation_noise: If True, the variance includes that of the noise.
+        parameters: Of a physics, or dynamics that are one: if True, its unknown parameters are the
+            last argument, ``parameters``, in the order of the physics. Default: they are at their
+            posterior means, of a physics itself at the guesses.
 
     Raises:
         ImportError: Without CasADi.
-        TypeError: If ``fitted`` is neither.
-        ValueError: If the model is no finite sum, with the way out; or if ``physics`` returns
-            another number of values than the model's physics.
+        TypeError: If ``fitted`` is none of these, or a physics that is not written in formulas.
+        ValueError: If the model is no finite sum, or ``parameters`` are not for it, with the way
+            out; or if ``physics`` returns another number of values than the model's physics.
         RuntimeError: If the dynamics have learnt nothing yet.
 
     Example:
@@ -56,8 +70,17 @@ def casadi_function(
         >>> casadi_function(model, physics=lambda x: x)  # doctest: +SKIP
         Function(predict:(x)->(mean,variance) MXFunction)
     """
-    model = model_of(fitted)
-    found, m = finite_sum(model, variance, observation_noise), model.num_outputs
+    fitted = own_dynamics(fitted)
+    is_physics = isinstance(fitted, OfPhysics)
+    if is_physics and physics is not None:
+        raise ValueError(
+            "physics=... takes the place of f_p in a model; found a physics, or dynamics that are "
+            "one, which have nothing else. Leave it out, or use that function itself."
+        )
+    if not is_physics:
+        refuse_parameters(parameters)
+        model = model_of(fitted)
+        found, m = finite_sum(model, variance, observation_noise), model.num_outputs
     global ca
     try:
         import casadi as ca
@@ -65,6 +88,11 @@ def casadi_function(
         raise ImportError(
             'casadi_function needs CasADi; run `pip install "gpadjust[export]"`.'
         ) from error
+    if is_physics:
+        return equations_function(fitted, name, parameters)
+    if physics is None and (within := equations_within(model)):
+        parts = [physics_function(each, "f_p") for each in within]
+        physics = lambda read: ca.vertcat(*(part(read) for part in parts))  # noqa: E731
     dynamics = fitted if isinstance(fitted, LearnedDynamics) else None
     if dynamics is None:
         given = {"x": ca.MX.sym("x", len(model.data.input_names))}

@@ -111,8 +111,8 @@ def model_of(fitted: Any) -> GP:
     model = fitted.model if isinstance(fitted, LearnedDynamics) else fitted
     if not isinstance(model, GP):
         raise TypeError(
-            "Expected a CKA, RRA, PhysicsMeanGP, ScaleGP or ZeroMeanGP, or LearnedDynamics of one; "
-            f"found {type(model).__name__}."
+            "Expected a CKA, RRA, PhysicsMeanGP, ScaleGP or ZeroMeanGP, or LearnedDynamics of one, "
+            f"a physics of formulas, or what identify returns; found {type(model).__name__}."
         )
     return model
 

@@ -11,13 +11,14 @@ import sys
 from pathlib import Path
 from string import Template
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
 from gpadjust.core import GP
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.export.c_program import c_source
+from gpadjust.export.equations import own_dynamics
 from gpadjust.export.finite_sum import model_of
 
 _SYSTEMS = {"linux": ("linux", ".so"), "darwin": ("darwin", ".dylib"), "win32": ("win", ".dll")}
@@ -195,7 +196,7 @@ class _Variables(NamedTuple):
 
 
 def export_fmu(
-    fitted: GP | LearnedDynamics,
+    fitted: Any,
     path: str | Path,
     *,
     physics: str | None = None,
@@ -213,10 +214,10 @@ def export_fmu(
       outputs the states, whose start values can be set, and the standard deviations of that step.
 
     What f_p returns is a further input of each output, ``f_p_NAME``: connect your model to it, or
-    give f_p in C.
+    give f_p in C. It is within where :func:`c_source` has it.
 
     Args:
-        fitted: The model, or dynamics that have learnt.
+        fitted: The model, dynamics that have learnt, or an identification.
         path: The file, ``NAME.fmu``, with a name of C.
         physics: f_p in C, to take the place of its inputs: statements that set ``f_p[0]`` and so
             on, from the columns ``x[0]`` and so on that the physics reads. ``math.h`` is there.
@@ -238,7 +239,7 @@ def export_fmu(
         >>> export_fmu(model, "pump.fmu", physics="f_p[0] = x[0];")  # doctest: +SKIP
         PosixPath('pump.fmu')
     """
-    path = Path(path)
+    path, fitted = Path(path), own_dynamics(fitted)
     name = path.stem
     code = c_source(fitted, name, variance=variance, observation_noise=observation_noise)
     kind, arguments = _signature(code, name)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from gpadjust.dynamics import LearnedDynamics
+from gpadjust.states import StateSpec
 
 Scalars = Sequence[Any]
 
@@ -31,13 +32,28 @@ def next_state(
     spec, found = dynamics.spec, [*state]
     for i, value in zip(spec.predicted, learnt, strict=True):
         found[i] = state[i] + value if dynamics.targets.target == "difference" else value
-    before = dict(zip((*spec.states, *spec.actions), (*state, *action), strict=True))
-    for name, other in spec.previous.items():
-        found[spec.states.index(name)] = before[other]
+    found = _remembered(spec, state, action, found)
     for name, velocity in spec.integrated.items():
         i, v = spec.states.index(name), spec.states.index(velocity)
         found[i] = state[i] + (spec.step or 0.0) / 2 * (state[v] + found[v])
     return found
+
+
+def following(spec: StateSpec, state: Scalars, action: Scalars, f_p: Scalars) -> list[Any]:
+    """Return the next state by a physics alone, as :func:`next_values` makes it."""
+    found = [*state]
+    for i, value in zip(spec.moving, f_p, strict=True):
+        found[i] = value
+    return _remembered(spec, state, action, found)
+
+
+def _remembered(spec: StateSpec, state: Scalars, action: Scalars, found: list[Any]) -> list[Any]:
+    """Return a next state in which previous values are those of the state and action."""
+    before = dict(zip((*spec.states, *spec.actions), (*state, *action), strict=True))
+    return [
+        before[spec.previous[n]] if n in spec.previous else found[i]
+        for i, n in enumerate(spec.states)
+    ]
 
 
 def next_variance(dynamics: LearnedDynamics, learnt: Scalars, zero: Any) -> list[Any]:

@@ -15,9 +15,7 @@ from torch import Tensor
 from gpadjust.checks import checked_whole
 from gpadjust.physics.error import PhysicsError, described
 from gpadjust.physics.parameters import ParameterValues
-from gpadjust.physics.unknown import Unknown, Unknowns
-
-_NONE = Unknowns({})
+from gpadjust.physics.unknown import NO_UNKNOWNS, Unknown, Unknowns
 
 
 class Physics(torch.nn.Module, ABC):
@@ -62,7 +60,7 @@ class Physics(torch.nn.Module, ABC):
         name: str | None = None,
     ) -> None:
         super().__init__()
-        self.unknowns = _NONE if unknowns is None else Unknowns(unknowns)
+        self.unknowns = NO_UNKNOWNS if unknowns is None else Unknowns(unknowns)
         self.inputs = None if inputs is None else tuple(checked_whole("inputs", i) for i in inputs)
         if self.inputs == ():
             raise ValueError("inputs is empty; name at least one column of X, or None for all.")
@@ -191,7 +189,7 @@ class Physics(torch.nn.Module, ABC):
 
     def extra_repr(self) -> str:
         """Return the settings that ``repr`` shows."""
-        return f"name={self.name!r}, inputs={self.inputs}, unknowns={dict(self.unknowns)!r}"
+        return f"name={self.name!r}, inputs={self.inputs}, unknowns={self.unknowns.declared!r}"
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         if not [*self.parameters(), *self.buffers()]:

@@ -7,7 +7,9 @@ import math
 import operator
 import re
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from keyword import iskeyword, kwlist
+from typing import Any
 from unicodedata import normalize
 
 import torch
@@ -18,19 +20,30 @@ from gpadjust.physics.base import Physics
 from gpadjust.physics.parameters import ParameterValues
 from gpadjust.physics.unknown import Unknown
 
+Functions = Mapping[str, Callable[..., Any]]
+"""Functions of a formula, by their names, and those of operators by their names in a tree."""
+
 _LONGEST = 2000  # characters
 # Parts of a tree, and the functions of the module operator.
-_PAIRS = "Add:add Sub:sub Mult:mul Div:truediv Pow:pow USub:neg UAdd:pos Lt:lt LtE:le Gt:gt GtE:ge"
-_OPERATORS: dict[str, Callable[..., Tensor]] = {
+_PAIRS = "Add:add Sub:sub Mult:mul Div:truediv Pow:pow USub:neg UAdd:pos"
+ARITHMETIC: Functions = {
     part: getattr(operator, name) for part, name in (pair.split(":") for pair in _PAIRS.split())
 }
-_OF_TORCH = "sin cos tan asin acos atan atan2 sinh cosh tanh exp log log10 sqrt abs sign"
-_FUNCTIONS: dict[str, Callable[..., Tensor]] = {
-    **{name: getattr(torch, name) for name in _OF_TORCH.split()},
+NAMES = (
+    *("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh"),
+    *("exp", "log", "log10", "sqrt", "abs", "sign", "ln", "min", "max", "pow", "where"),
+)
+_OF_TORCH: Functions = {
+    **ARITHMETIC,
+    **{name: getattr(torch, name) for name in NAMES if hasattr(torch, name)},
+    # A comparison is one or zero.
+    "Lt": lambda x, y: (x < y).to(x),
+    "LtE": lambda x, y: (x <= y).to(x),
+    "Gt": lambda x, y: (x > y).to(x),
+    "GtE": lambda x, y: (x >= y).to(x),
     "ln": torch.log,
     "min": torch.minimum,
     "max": torch.maximum,
-    "pow": torch.pow,
     "where": lambda c, x, y: torch.where(c != 0, x, y),
 }
 _OF_SHEETS = {"wurzel": "sqrt", "power": "pow", "potenz": "pow", "if": "where", "wenn": "where"}
@@ -42,7 +55,7 @@ _SIGNS = str.maketrans({"\u2212": "-", "\u00b7": "*", "\u00d7": "*", "\u00f7": "
 _WORDS = re.compile(rf"\b({'|'.join({*kwlist} - {'True', 'False', 'None'})})\b")
 _GRAMMAR = (
     "Formulas have numbers, names, pi, + - * / and ** or ^, brackets, comparisons of two values "
-    f"such as a < b, and the functions {', '.join(_FUNCTIONS)}, such as max(a, b) and "
+    f"such as a < b, and the functions {', '.join(NAMES)}, such as max(a, b) and "
     "where(a < b, x, y). Commas part the outputs. There are no units, and water flow is water_flow."
 )
 
@@ -62,7 +75,10 @@ class FormulaPhysics(Physics):
         columns: The names of the columns of X, ``d`` of them, without units and with ``_`` for
             other marks: "air flow [m3/h]" is ``air_flow``. "lambda" is ``lambda`` or ``lambda_``,
             as all words of Python; a column "pi" is ``pi_``.
-        unknowns, name: As of :class:`Physics`.
+        unknowns, name: As of :class:`Physics`. A function has in the formula its value in each row.
+
+    Attributes:
+        outputs: The outputs as syntax trees, for :func:`value_of`.
 
     Example:
         >>> power = FormulaPhysics("U * I", ["U [V]", "I [A]"])
@@ -82,11 +98,12 @@ class FormulaPhysics(Physics):
         super().__init__(unknowns=unknowns, name=name or " ".join(formula.split()))
         self.formula = formula
         self.columns = tuple(map(symbol, columns))
-        known = [*self.columns, *self.unknowns]
+        declared = self.unknowns.declared
+        known = [*self.columns, *declared]
         if len({*known}) < len(known) or "pi" in known:
             raise ValueError(f"Expected different names, and none 'pi'; found {known}.")
-        self._outputs = parse(formula)
-        absent = sorted(_names(self._outputs) - {*known, "pi"})
+        self.outputs = parse(formula)
+        absent = sorted(_names(self.outputs) - {*known, "pi"})
         if has_pi(formula) and "pi_" in known:
             raise ValueError(
                 f"The formula {formula!r} has pi, which is 3.14159, and there is a column 'pi', "
@@ -97,7 +114,16 @@ class FormulaPhysics(Physics):
                 f"The formula {formula!r} has {absent[0]!r}; expected one of its names: "
                 f"{', '.join(known)}. Give its value as a number, or add it to unknowns."
             )
-        self.num_outputs = len(self._outputs)
+        self.num_outputs = len(self.outputs)
+        self.variables = {}
+        numbers = [name for name in known if name in self.columns or name in self.unknowns]
+        for name in self.unknowns.functions:
+            (self.variables[name],) = variable = parse(declared[name].function_of)
+            if absent := sorted(_names(variable) - {*numbers, "pi"}):
+                raise ValueError(
+                    f"{name} is a function of {declared[name].function_of!r}, which has "
+                    f"{absent[0]!r}; expected one of {', '.join(numbers)}, or a formula of these."
+                )
 
     def check_names(self, names: Sequence[str]) -> None:
         """Raise a ValueError if these are the names of the columns in another order."""
@@ -113,12 +139,25 @@ class FormulaPhysics(Physics):
         """Return the values of the formula, ``N x m``."""
         if X.shape[-1] != len(self.columns):
             raise ValueError(f"the formula has columns {self.columns}, and X has {X.shape[-1]}")
-        values = dict(zip(self.columns, X.unbind(-1), strict=True))
-        values["pi"] = X.new_tensor(math.pi)
-        for own in parameters:
-            values |= own
-        outputs = [_value(node, values, X) for node in self._outputs]
+        own = parameters[0] if parameters else {}
+        curves = parameters[0].functions if parameters else {}
+        outputs = self.values_at(X.unbind(-1), own, curves, _OF_TORCH, X.new_tensor)
         return torch.stack([Y.expand(len(X)) for Y in outputs], dim=-1)
+
+    def values_at(
+        self,
+        columns: Sequence[Any],
+        parameters: Mapping[str, Any],
+        curves: Mapping[str, Callable[[Any], Any]],
+        functions: Functions,
+        number: Callable[[float], Any],
+    ) -> list[Any]:
+        """Return the outputs in tensors or numbers of another kind, as of :func:`value_of`."""
+        values = dict(zip(self.columns, columns, strict=True)) | dict(parameters)
+        value = partial(value_of, values=values, functions=functions, number=number)
+        for name, variable in self.variables.items():
+            values[name] = curves[name](value(variable))
+        return [value(output) for output in self.outputs]
 
 
 def symbol(name: str) -> str:
@@ -172,7 +211,7 @@ def _parsed(text: str, of_sheet: bool) -> list[ast.expr]:
         raise ValueError("a formula with = in front has one output")
     one = torch.ones(())
     for output in outputs:
-        _value(output, dict.fromkeys(_names(outputs), one), one)
+        value_of(output, dict.fromkeys(_names(outputs), one), _OF_TORCH, one.new_tensor)
         for node in ast.walk(output):
             if isinstance(node, ast.Call):
                 name = ast.unparse(node.func)
@@ -205,27 +244,41 @@ def _names(outputs: Sequence[ast.expr]) -> set[str]:
     return {node.id for node in nodes if isinstance(node, ast.Name) and node not in functions}
 
 
-def _value(node: ast.expr, values: Mapping[str, Tensor], like: Tensor) -> Tensor:
-    """Return the value of a part of a formula, ``N`` or one number, in the dtype of ``like``."""
-    function: Callable[..., Tensor] | None = None
+def value_of(
+    node: ast.expr,
+    values: Mapping[str, Any],
+    functions: Functions,
+    number: Callable[[float], Any],
+) -> Any:
+    """Return the value of a part of a formula, in tensors or in numbers of another kind.
+
+    Args:
+        node: The part.
+        values: Those of names but ``pi``.
+        functions: Functions of such numbers.
+        number: Makes such a number.
+    """
+    function: Callable[..., Any] | None = None
     match node:
+        case ast.Name(id="pi"):
+            return number(math.pi)
         case ast.Name(id=name):
             return values[name]
         case ast.Constant(value=int() | float() as value) if type(value) is not bool:
-            return like.new_tensor(float(value))
+            return number(float(value))
         case ast.UnaryOp(op=op, operand=operand):
-            function, parts = _OPERATORS.get(type(op).__name__), [operand]
+            function, parts = functions.get(type(op).__name__), [operand]
         case (
             ast.BinOp(op=op, left=left, right=right)
             | ast.Compare(ops=[op], left=left, comparators=[right])
         ):
-            function, parts = _OPERATORS.get(type(op).__name__), [left, right]
+            function, parts = functions.get(type(op).__name__), [left, right]
         case ast.Call(func=ast.Name(id=name), args=[], keywords=[]) if name.lower() == "pi":
-            return like.new_tensor(math.pi)
+            return number(math.pi)
         case ast.Call(func=ast.Name(id=name), args=parts, keywords=[]):
             short = name.lower().rstrip("_")
-            function = _FUNCTIONS.get(name) or _FUNCTIONS.get(_OF_SHEETS.get(short, short))
+            name = name if name in NAMES else _OF_SHEETS.get(short, short)
+            function = functions.get(name) if name in NAMES else None
     if function is None:
         raise ValueError(f"{ast.unparse(node)!r} is not a part of a formula")
-    # A comparison is one or zero.
-    return function(*(_value(part, values, like) for part in parts)).to(like)
+    return function(*(value_of(part, values, functions, number) for part in parts))

@@ -34,7 +34,7 @@ def import_path(physics: Physics | Callable[[Tensor], Tensor]) -> str | None:
         ('gpadjust.physics.import_path:physics_from_path', None)
     """
     if type(physics) is FormulaPhysics:
-        unknowns = {name: asdict(unknown) for name, unknown in physics.unknowns.items()}
+        unknowns = {name: asdict(unknown) for name, unknown in physics.unknowns.declared.items()}
         settings = {"formula": physics.formula, "columns": physics.columns, "name": physics.name}
         return f"{_FORMULA}{json.dumps({**settings, 'unknowns': unknowns})}"
     path = _path_of(physics)

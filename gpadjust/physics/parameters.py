@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gpadjust.checks import check_level
 from gpadjust.display import Display, html_table
-from gpadjust.physics.unknown import Unknown
+from gpadjust.physics.unknown import Curve, Unknown, Unknowns
 
 _AS_WIDE = 0.8  # of a prior's standard deviation, or more
 _AS_FAR = 0.3  # standard deviations of a prior, or less from its middle
@@ -19,17 +19,32 @@ _AS_FAR = 0.3  # standard deviations of a prior, or less from its middle
 class ParameterValues(dict[str, Any]):
     """Values of parameters by their names, as items or attributes: ``p["mass"]``, ``p.mass``.
 
-    All are ``rows``, ``N x p`` or ``p`` of a single row; each name has ``N``, or a number.
+    All are ``rows``, ``N x p`` or ``p`` of a single row; each name has ``N``, or a number. A
+    function is called, ``p.friction(speed)``, with ``N`` values or one.
     """
 
     def __init__(self, names: Iterable[str], rows: Any) -> None:
         super().__init__((name, rows[..., i]) for i, name in enumerate(names))
         self.rows = rows
+        self.functions = dict[str, Curve]()
+        if names and isinstance(names, Unknowns):
+            for name, (unknown, columns) in names.functions.items():
+                self.functions[name] = Curve(unknown, self._of_function(columns))
+
+    def _of_function(self, columns: list[int]) -> Any:
+        """Return a function's values at its knots, which broadcast with its argument."""
+        return self.rows[..., columns]
+
+    def __missing__(self, name: str) -> Any:
+        return self.__dict__.get("functions", {})[name]
 
     def __getattr__(self, name: str) -> Any:
-        if name in self:
+        try:
             return self[name]
-        raise AttributeError(f"Unknown parameter {name!r}; expected one of {', '.join(self)}.")
+        except KeyError:
+            names = ", ".join([*self, *self.__dict__.get("functions", ())])
+            message = f"Unknown parameter {name!r}; expected one of {names}."
+            raise AttributeError(message) from None
 
 
 class PhysicsParameters(ParameterValues, Display):
@@ -37,6 +52,7 @@ class PhysicsParameters(ParameterValues, Display):
 
     It maps names to ``K`` draws each, of ``draws``, ``K x p``: one, the value itself, after a point
     fit (``"map"``) or before any. Conditioning on further observations leaves them as they are.
+    A function is called with ``n`` points: ``parameters.friction(speeds)`` is ``K x n``.
 
     Example:
         >>> g = Unknown(9.0, sd=1.0, unit="m/s²")
@@ -47,8 +63,12 @@ class PhysicsParameters(ParameterValues, Display):
 
     def __init__(self, unknowns: Mapping[str, Unknown], draws: Sequence[Tensor]) -> None:
         self.draws = torch.stack([*draws], -1) if unknowns else torch.empty(1, 0)
-        self.unknowns = unknowns
-        super().__init__(unknowns, self.draws)
+        self.unknowns = unknowns if isinstance(unknowns, Unknowns) else Unknowns(unknowns)
+        super().__init__(self.unknowns, self.draws)
+
+    def _of_function(self, columns: list[int]) -> Tensor:
+        """Return a function's values at its knots, ``K x 1 x k``."""
+        return self.draws[:, columns].unsqueeze(1)
 
     @property
     def mean(self) -> Tensor:

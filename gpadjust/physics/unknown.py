@@ -3,28 +3,39 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
 from keyword import iskeyword
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.special import ndtr, ndtri
 
-from gpadjust.checks import checked_number
+from gpadjust.checks import check_kind, checked_number
 
 _LARGEST = 8.0  # coordinate, beyond which float64 knows no mass of the normal distribution
 _UNBOUNDED = (-math.inf, math.inf)
+_KNOTS = 3.0  # of a function, in a lengthscale
+_MOST_KNOTS = 60
+_OF_RANGE = 0.25  # a lengthscale, by default
+_NUGGET = 1e-10
+_FARTHEST = 40.0  # coordinate of a value; at a bound it is infinite
 
 
 @dataclass(frozen=True, repr=False)
 class Unknown:
-    r"""An unknown parameter of a physics, and its prior.
+    r"""An unknown parameter of a physics, and its prior; a number, or a function.
 
     Its prior is one of three: :math:`N(\text{guess}, \text{sd}^2)`; a log-normal one, of which
     ``factor`` is one standard deviation (1.5: two thirds to one and a half times the guess are
     likely); or, with neither, the uniform one between ``bounds``, which cut off the other two.
+
+    A function of one variable, such as friction of speed, has this prior at each point. Its
+    coordinates are a Gaussian process along the variable, with a Matern kernel (5/2); beyond
+    ``between`` it stays as it is at the end. Models learn its values at knots, ``friction(0)`` and
+    so on, three in a lengthscale. A function of torch calls it, ``p.friction(speed)``.
 
     Args:
         guess: The value that the physics has where nothing was learnt; inside the bounds.
@@ -32,10 +43,22 @@ class Unknown:
         factor: What a log-normal prior multiplies or divides the guess by, above 1.
         bounds: The least and the largest possible value.
         unit: Its unit, for tables and figures.
+        function_of: The variable of a function. A :class:`FormulaPhysics` reads it, as a formula of
+            its columns and numbers: ``"speed"`` or ``"abs(speed)"``. Default: a number.
+        between: The least and the largest value of that variable; needed of a function.
+        lengthscale: Distance along the variable over which a function changes. Default: a quarter
+            of the range.
+
+    Raises:
+        ValueError: If guess, bounds and prior do not suit each other, or only some of the arguments
+            of a function are there.
 
     Example:
         >>> Unknown(9.81, sd=0.1, unit="m/s²"), Unknown(0.2, bounds=(0.0, 1.0)).prior_text
         (Unknown(9.81, sd=0.1, unit='m/s²'), '0 to 1')
+        >>> friction = Unknown(0.1, factor=2.0, function_of="speed", between=(0.0, 12.0))
+        >>> friction.knots[:4].tolist()
+        [0.0, 1.0, 2.0, 3.0]
     """
 
     guess: float
@@ -43,6 +66,9 @@ class Unknown:
     factor: float | None = None
     bounds: tuple[float, float] = _UNBOUNDED
     unit: str = ""
+    function_of: str = ""
+    between: tuple[float, float] | None = None
+    lengthscale: float | None = None
 
     def __post_init__(self) -> None:
         checked_number("guess", self.guess)
@@ -59,6 +85,28 @@ class Unknown:
                 "Expected a guess inside of the bounds, above 0 with a factor, and one prior: sd, "
                 f"factor, or two finite bounds; found {self!r}."
             )
+        self._check_function()
+
+    def _check_function(self) -> None:
+        """Raise an error unless all arguments of a function are there, or none."""
+        check_kind("function_of", self.function_of, str, "the name of a variable")
+        if not self.function_of and (self.between, self.lengthscale) == (None, None):
+            return
+        low, high = map(float, self.between or (0.0, 0.0))
+        if not (self.function_of and low < high and math.isfinite(high - low)):
+            raise ValueError(
+                'Expected of a function its variable and the range of that, function_of="speed", '
+                f"between=(0.0, 20.0); found {self!r}."
+            )
+        scale = _OF_RANGE * (high - low) if self.lengthscale is None else self.lengthscale
+        scale = checked_number("lengthscale", scale, above=0)
+        if (high - low) / scale > _MOST_KNOTS / _KNOTS:
+            raise ValueError(
+                f"Expected a lengthscale of {_KNOTS / _MOST_KNOTS:g} of the range or more, found "
+                f"{scale:g} of {high - low:g}: take a larger one, or a shorter range."
+            )
+        object.__setattr__(self, "between", (low, high))
+        object.__setattr__(self, "lengthscale", scale)
 
     def __repr__(self) -> str:
         # The code that makes it, without defaults.
@@ -83,7 +131,7 @@ class Unknown:
         """Return the value at a coordinate, which is standard normal by the prior."""
         low, high = self.bounds
         below, above = self._tails
-        if self._tails != (0.0, 1.0):
+        if self.is_cut:
             z = ndtri(below + (above - below) * ndtr(z.clamp(-_LARGEST, _LARGEST)))
         if self.sd is not None:
             value = self.guess + self.sd * z
@@ -93,11 +141,16 @@ class Unknown:
             value = low + (high - low) * ndtr(z.clamp(-_LARGEST, _LARGEST))
         return value.clamp(low, high)  # beyond there are rounding errors
 
+    @property
+    def is_cut(self) -> bool:
+        """Whether the bounds cut off the normal or log-normal prior."""
+        return self._tails != (0.0, 1.0)
+
     def coordinate(self, value: Tensor) -> Tensor:
         """Return the coordinate at which :meth:`value` is this one."""
         below, above = self._tails
         z = self._without_bounds(value)
-        return z if self._tails == (0.0, 1.0) else ndtri((ndtr(z) - below) / (above - below))
+        return z if not self.is_cut else ndtri((ndtr(z) - below) / (above - below))
 
     def _without_bounds(self, value: Tensor) -> Tensor:
         """Return the coordinate by the prior that bounds do not cut off."""
@@ -115,9 +168,81 @@ class Unknown:
         # Unlike those of ndtr, tiny ones are 0: such bounds cut off nothing.
         return tuple((0.5 * (1 + torch.erf(z / math.sqrt(2)))).tolist())
 
+    # Of a function
+
+    @cached_property
+    def knots(self) -> Tensor:
+        """Points at which the values of a function are learnt, ``k``; none of a number."""
+        if self.between is None or self.lengthscale is None:
+            return torch.empty(0, dtype=torch.float64)
+        low, high = self.between
+        number = 1 + math.ceil(_KNOTS * (high - low) / self.lengthscale - 1e-9)
+        return torch.linspace(low, high, number, dtype=torch.float64)
+
+    @cached_property
+    def root(self) -> Tensor:
+        """L of :math:`L L^T = k(Z, Z)`, the correlation of coordinates at the knots, ``k x k``."""
+        eye = torch.eye(len(self.knots)).to(self.knots)
+        return torch.linalg.cholesky(self._correlation(self.knots) + _NUGGET * eye)
+
+    @cached_property
+    def precision(self) -> Tensor:
+        """The inverse of :math:`k(Z, Z)`, ``k x k``."""
+        return torch.cholesky_inverse(self.root)
+
+    def weights(self, x: Tensor) -> Tensor:
+        """Return the weights of the coordinates at the knots in those at ``x``, ``... x k``.
+
+        :math:`k(x, Z) k(Z, Z)^{-1}`, the mean of a Gaussian process given its values at Z.
+        """
+        low, high = self.between or (0.0, 0.0)
+        return self._correlation(x.clamp(low, high)) @ self.precision.to(x)
+
+    def _correlation(self, x: Tensor) -> Tensor:
+        """Return the correlation of coordinates at ``x`` and at the knots, ``... x k``."""
+        r = math.sqrt(5) * (x.unsqueeze(-1) - self.knots.to(x)).abs() / (self.lengthscale or 1.0)
+        return (1 + r + r.square() / 3) * (-r).exp()
+
+
+@dataclass(frozen=True, repr=False)
+class Knot(Unknown):
+    """The value of an unknown function at one of its knots: a number of a table of its own.
+
+    Args:
+        function: The name of the function.
+        at: The knot.
+    """
+
+    function: str = ""
+    at: float = 0.0
+
+
+class Curve:
+    """An unknown function by its values at the knots.
+
+    Args:
+        unknown: Its prior.
+        values: ``... x k``, a tensor or an array.
+    """
+
+    def __init__(self, unknown: Unknown, values: Any) -> None:
+        self.unknown, self.values = unknown, values
+
+    def __call__(self, x: Any) -> Any:
+        """Return the function at ``x``, whose shape broadcasts with that of the rows of values."""
+        values = torch.as_tensor(self.values)
+        at = torch.as_tensor(x).to(values)
+        # value(k(x, Z) k(Z, Z)^-1 z), z the coordinates of the values
+        z = self.unknown.coordinate(values).clamp(-_FARTHEST, _FARTHEST)
+        found = self.unknown.value((self.unknown.weights(at) * z).sum(-1))
+        return found if isinstance(self.values, Tensor) else found.numpy()
+
 
 class Unknowns(dict[str, Unknown]):
-    """The unknown parameters of a physics, by name, and their coordinates."""
+    """The unknown parameters of a physics, by name, and their coordinates.
+
+    Of a function there is a :class:`Knot` for each value, ``p`` parameters in all.
+    """
 
     def __init__(self, unknowns: Mapping[str, Unknown]) -> None:
         is_mapping = isinstance(unknowns, Mapping)
@@ -125,7 +250,11 @@ class Unknowns(dict[str, Unknown]):
             raise TypeError(
                 f"unknowns must map names to Unknown(guess, sd=...); found {unknowns!r}."
             )
-        for name in unknowns:
+        super().__init__()
+        for name, unknown in unknowns.items():
+            if isinstance(unknown, Knot):
+                self[name] = unknown
+                continue
             is_path = isinstance(name, str) and ("." in name.strip(".") or "[" in name)
             is_word = isinstance(name, str) and name.isidentifier() and not iskeyword(name)
             is_attribute = is_word and not name.startswith("_") and name != "rows"
@@ -134,7 +263,49 @@ class Unknowns(dict[str, Unknown]):
                     "Expected a name that can be an attribute, or one with a point or bracket, "
                     f"such as 'link1.mass' or 'wall[1].G', found {name!r}."
                 )
-        super().__init__(unknowns)
+            if not unknown.function_of:
+                self[name] = unknown
+            own = {f.name: getattr(unknown, f.name) for f in fields(unknown)}
+            for at, text in zip(unknown.knots.tolist(), _different(unknown.knots), strict=True):
+                self[f"{name}({text})"] = Knot(**own, function=name, at=at)
+
+    @classmethod
+    def together(cls, several: Iterable[Unknowns]) -> Unknowns:
+        """Return those of several physics, of which those of one name are one.
+
+        Raises:
+            ValueError: If priors of one name differ.
+        """
+        found: dict[str, Unknown] = {}
+        for unknowns in several:
+            for name, unknown in unknowns.items():
+                if found.setdefault(name, unknown) != unknown:
+                    raise ValueError(
+                        f"Expected one prior of the parameter {name!r} in all physics; found "
+                        f"{found[name]!r} and {unknown!r}. Rename one of them."
+                    )
+        return cls(found)
+
+    @cached_property
+    def functions(self) -> dict[str, tuple[Unknown, list[int]]]:
+        """The functions: their priors, and the columns of their values."""
+        found: dict[str, tuple[Unknown, list[int]]] = {}
+        for i, knot in enumerate(self.values()):
+            if isinstance(knot, Knot):
+                found.setdefault(knot.function, (knot, []))[1].append(i)
+        return found
+
+    @property
+    def declared(self) -> dict[str, Unknown]:
+        """The parameters as the user named them, a function as one."""
+        found = {}
+        for name, unknown in self.items():
+            if isinstance(unknown, Knot):
+                name = unknown.function
+                own = {f.name: getattr(unknown, f.name) for f in fields(Unknown)}
+                unknown = Unknown(**own)
+            found[name] = unknown
+        return found
 
     @property
     def guess(self) -> Tensor:
@@ -143,10 +314,31 @@ class Unknowns(dict[str, Unknown]):
 
     def at(self, coordinates: Tensor) -> Tensor:
         """Return values ``... x p`` at coordinates ``... x p``, standard normal by the prior."""
+        for unknown, columns in self.functions.values():
+            coordinates = coordinates.clone()
+            coordinates[..., columns] = coordinates[..., columns] @ unknown.root.mT.to(coordinates)
         pairs = zip(self.values(), coordinates.unbind(-1), strict=True)
         return torch.stack([u.value(z) for u, z in pairs], dim=-1)
 
     def coordinates(self, values: Tensor) -> Tensor:
         """Return the coordinates ``... x p`` of values ``... x p``."""
         pairs = zip(self.values(), values.unbind(-1), strict=True)
-        return torch.stack([u.coordinate(value) for u, value in pairs], dim=-1)
+        z = torch.stack([u.coordinate(value) for u, value in pairs], dim=-1)
+        for unknown, columns in self.functions.values():
+            root = unknown.root.to(z)
+            z[..., columns] = torch.linalg.solve_triangular(
+                root, z[..., columns].unsqueeze(-1), upper=False
+            ).squeeze(-1)
+        return z
+
+
+NO_UNKNOWNS = Unknowns({})
+
+
+def _different(values: Tensor) -> list[str]:
+    """Return texts of increasing values, of as few digits as make them different."""
+    for digits in range(3, 18):
+        texts = [f"{value:.{digits}g}" for value in values.tolist()]
+        if len({*texts}) == len(texts):
+            break
+    return texts

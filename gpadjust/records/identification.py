@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from importlib import import_module
 from itertools import combinations
 from typing import Any, NamedTuple
 
@@ -14,17 +15,15 @@ from scipy.stats import t
 from torch import Tensor
 
 from gpadjust.checks import checked_number, checked_whole
-from gpadjust.core import Prediction
 from gpadjust.display import Display, html_table
-from gpadjust.dynamics import Dynamics, FreeRun, PhysicsDynamics, Windows
-from gpadjust.dynamics.base import TransitionFunctions
+from gpadjust.dynamics import FreeRun, IdentifiedDynamics, PhysicsDynamics, Windows
 from gpadjust.dynamics.targets import one_physics
 from gpadjust.physics import Physics
 from gpadjust.physics.parameters import PhysicsParameters
 from gpadjust.records.lack import Lack, clearest_lack, robust_moments
 from gpadjust.records.records import Records, control_steps
 from gpadjust.records.smoothing import SmoothedRecords, drawn_parameters, smooth
-from gpadjust.states import StateSpec
+from gpadjust.states import Sensors, StateSpec
 from gpadjust.words import number, percent
 
 GUESSES, IDENTIFIED, PERSISTENCE = "guesses", "identified", "persistence"
@@ -84,11 +83,37 @@ class Identification(Display):
     """
 
     smoothed: SmoothedRecords
-    dynamics: Dynamics
+    dynamics: IdentifiedDynamics
     windows: Windows
     runs: Mapping[str, FreeRun]
     step: float
     remarks: tuple[str, ...] = ()
+
+    def task(self, reward: Callable[[Tensor, Tensor, Tensor], Tensor], **options: Any) -> Any:
+        """Return a task in these dynamics, for :class:`~gpadjust.control.MPC` or an agent.
+
+        Plans follow the parameters' means, or draws of them (``Planner(num_functions=20)``).
+        Margins of constraints allow for the parameters and for process noise.
+
+        Args:
+            reward: As of :class:`~gpadjust.control.Task`.
+            options: The other arguments of a task. ``state_bounds`` are by default the range of the
+                states in the log, and as much again on either side; angles have none. If states
+                are hidden, ``sensors`` are by default those of the log, with its noise, and
+                ``initial_states`` any states of the log.
+        """
+        states = torch.cat([record.states for record in self.smoothed.records])
+        low, high = states.amin(0), states.amax(0)
+        bounds = torch.stack([2 * low - high, 2 * high - low])
+        bounds[:, self.spec.angle_columns] = torch.tensor([[-math.inf], [math.inf]]).to(bounds)
+        defaults: dict[str, Any] = {"state_bounds": bounds}
+        if self.hidden:
+            pairs = zip(self.spec.states, self.smoothed.noise.tolist(), strict=True)
+            noise = {name: sd for name, sd in pairs if name not in self.hidden}
+            defaults["sensors"] = Sensors([*noise], noise=noise)
+            defaults["initial_states"] = lambda n: states[torch.randint(len(states), (n,))]
+        tasks = import_module("gpadjust.control")  # a room above this one
+        return tasks.Task(self.dynamics, reward, **defaults | options)
 
     @property
     def spec(self) -> StateSpec:
@@ -333,7 +358,7 @@ def identify(
         >>> import torch
         >>> from gpadjust.records import Record, Records, identify
         >>> from gpadjust.physics import FormulaPhysics, ODEPhysics, Unknown
-        >>> from gpadjust.states import StateSpec
+        >>> from gpadjust.states import Sensors, StateSpec
         >>> t = 0.1 * torch.arange(60, dtype=torch.float64)
         >>> states = torch.stack([(1.5 * t).cos(), -1.5 * (1.5 * t).sin()], dim=-1)
         >>> states += 0.01 * torch.randn(60, 2, dtype=torch.float64)
@@ -382,56 +407,26 @@ def identify(
         measured.append(states)
     windows = Windows(last, torch.stack(actions), torch.stack(measured))
     length = steps.records[0].sampling_step / within
-    if within > 1:
-        spec = replace(spec, step=length)
+    spec = replace(spec, step=length)
     options: dict[str, Any] = {
         "start_noise": torch.stack([smoothed.sd[i][-1] for i in ends]).square().mean(0).sqrt(),
         "noise": smoothed.noise.nan_to_num(),
         "seed": seed,
     }
-    dynamics: Dynamics = PhysicsDynamics(spec, f_p)
     runs = {}
     if f_p.unknowns:
-        runs[GUESSES] = dynamics.free_run(last, windows.actions, **options)
-        dynamics = _Drawn(spec, f_p, smoothed.physics_parameters)
-    options |= {"process_noise": smoothed.process_noise / math.sqrt(within), "num_functions": 199}
+        guesses = PhysicsDynamics(spec, f_p)
+        runs[GUESSES] = guesses.free_run(last, windows.actions, **options)
+    process_noise = smoothed.process_noise / math.sqrt(within)
+    dynamics = IdentifiedDynamics(
+        spec, f_p, smoothed.physics_parameters, options["noise"], process_noise
+    )
+    options |= {"process_noise": process_noise, "num_functions": 199}
     runs = {IDENTIFIED: dynamics.free_run(last, windows.actions, **options), **runs}
     gaps = [f"Gaps part the log into {len(steps)} stretches, each smoothed by itself."]
     remarks = gaps if len(steps) > len(records) else []
     remarks += [*_of_actions(records, length), *_of_jumps(records)]
     return Identification(smoothed, dynamics, windows, runs, length, tuple(remarks))
-
-
-class _Drawn(Dynamics):
-    """A physics of which each sampled function has parameters drawn from their posterior."""
-
-    is_fitted = True
-
-    def __init__(self, spec: StateSpec, physics: Physics, parameters: PhysicsParameters) -> None:
-        super().__init__(spec)
-        self.physics = physics
-        self.physics_parameters = parameters
-
-    def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
-        """Refuse: parameters are learnt from records alone."""
-        raise RuntimeError("These dynamics learn by `identify` alone; call it with more records.")
-
-    def predict(self, states: Tensor, actions: Tensor) -> Prediction:
-        """Return the next states by the parameters' means, and no variance."""
-        following = self._follow(states, actions, self.physics_parameters.mean)
-        return Prediction(following, torch.zeros_like(following))
-
-    def sample_functions(self, num_functions: int, seed: int | None = None) -> TransitionFunctions:
-        """Return the physics with draws of the parameters, the same ones for the same seed."""
-        checked_whole("num_functions", num_functions, 1)
-        generator = torch.Generator().manual_seed(0 if seed is None else seed)
-        draws = self.physics_parameters.draws
-        order = torch.randperm(len(draws), generator=generator)
-        values = draws[order[torch.arange(num_functions) % len(draws)]]
-        return lambda states, actions: self._follow(states, actions, values)
-
-    def _follow(self, states: Tensor, actions: Tensor, values: Tensor) -> Tensor:
-        return self.physics(self.spec.physics_inputs(states, actions), values)
 
 
 def _of_actions(records: Records, step: float) -> list[str]:
@@ -481,7 +476,8 @@ def _of_parameters(parameters: PhysicsParameters | None) -> list[str]:
 def _told_together(parameters: PhysicsParameters) -> list[Combination]:
     """Return the best-told combination of parameters that are only known together, tree by tree."""
     found = []
-    names = [name for name in parameters if (parameters[name] > 0).all()]
+    numbers = [name for name, each in parameters.unknowns.items() if not each.function_of]
+    names = [name for name in numbers if (parameters[name] > 0).all()]
     for first, second in combinations(names, 2):
         logs = torch.stack([parameters[first], parameters[second]]).log()
         sd = logs.std(1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -11,9 +12,11 @@ import torch
 from scipy.stats import chi2
 from torch import Tensor
 
+from gpadjust.display import Display
 from gpadjust.records import kalman
 from gpadjust.records.kalman import Array, Link
 from gpadjust.records.smoothing import Chain, Estimate
+from gpadjust.states import StateSpec
 
 _CHANCE = 0.01  # that a right equation lacks something
 _AGAIN = 2.0  # standard deviations, by which either half tells what the other does
@@ -39,13 +42,16 @@ _TERMS = {
 _KINDS = {("sign", True): "dry friction", ("drag", True): "drag"}
 
 
-class Lack(NamedTuple):
+@dataclass(frozen=True, repr=False, eq=False)
+class Lack(Display):
     """The residual of a state's equation over what it depends on most clearly.
 
     It is what the rate of change of the smoothed states has beyond the equation, in the unit of
     that derivative, with its process noise: a dot for each of ``N`` steps, and means in ``K`` bins.
+    ``plot()`` draws it (:func:`~gpadjust.records.plots.plot_lack`).
     """
 
+    spec: StateSpec
     state: str
     over: str  # a state or an action
     term: str  # such as "-0.12*sign(rate)"; empty if none of a few simple ones tells it
@@ -57,7 +63,7 @@ class Lack(NamedTuple):
     means: Tensor  # K
     sd: Tensor  # K, of the means
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         """Return a sentence on the missing effect."""
         if self.lag is not None:
             return (
@@ -289,7 +295,7 @@ class _Search:
         term = f"{factor:.2g}{_TERMS.get(shape, '').format(name)}" if shape in _TERMS else ""
         numbers = (at, residual, middles, mean, np.sqrt(np.diag(covariance)))
         state = self.chain.spec.states[self.chain.spec.moving[i]]
-        return Lack(state, name, term, shape, lag, *map(torch.from_numpy, numbers))
+        return Lack(self.chain.spec, state, name, term, shape, lag, *map(torch.from_numpy, numbers))
 
     def _terms(self, of: _Candidate) -> Iterator[tuple[str, Array]]:
         """Yield names and values of simple terms, ``N``, of which one may be what is missing."""

@@ -89,20 +89,18 @@ def plot_identification(identification: Identification, **options: Any) -> Any:
     return plot_free_run(run, identification.windows, **defaults | options)
 
 
-def plot_lack(
-    lack: Lack, spec: StateSpec, *, units: Mapping[str, str] | None = None, ax: Any = None
-) -> Any:
+def plot_lack(lack: Lack, *, units: Mapping[str, str] | None = None, ax: Any = None) -> Any:
     """Draw the residual of an equation over what it depends on, with its means in bins.
 
     Args:
         lack: What the equations lack, as of :attr:`Identification.lack`.
-        spec: The entries of the states and actions of the records.
         units: Units for the labels, as of :func:`plot_record`.
         ax: Axes to draw on. Default: a new figure.
 
     Returns:
         The axes.
     """
+    spec = lack.spec
     called, units = labels(spec, units), {**dict.fromkeys(spec.angles, "rad"), **(units or {})}
     unit, time = units.get(lack.state, ""), units.get("time", "s")
     rate = f"{unit}²" if unit.endswith(f"/{time}") else f"{unit or 1}/{time}"

@@ -126,7 +126,7 @@ def _residual(found: Identification, units: Mapping[str, str]) -> list[Markup]:
     if found.lack is None:
         return []
     figure = html.new_figure(_HEIGHT)
-    plot_lack(found.lack, found.spec, units=units, ax=figure.subplots())
+    plot_lack(found.lack, units=units, ax=figure.subplots())
     alt = f"residual of {found.lack.state}' over {found.lack.over}, and its means"
     return [html.image(figure, alt)]
 

@@ -54,7 +54,8 @@ from gpadjust.checks import (
 )
 from gpadjust.core.gaussian import Marginals
 from gpadjust.kinds.categories import on_levels
-from gpadjust.physics import PhysicsParameters
+from gpadjust.physics import PhysicsParameters, Unknown
+from gpadjust.physics.unknown import Curve
 from gpadjust.validation.comparison import Comparison
 from gpadjust.validation.leave_one_out import LeaveOneOut
 from gpadjust.validation.scores import Scores
@@ -283,32 +284,55 @@ def plot_comparison(comparison: Comparison, *, output: int = 0, axes: Any = None
 def plot_parameters(parameters: PhysicsParameters, *, axes: Any = None) -> Any:
     """Draw the draws of each unknown parameter of a physics, and its prior.
 
-    A point fit is a line. Return an array of axes, one for each parameter.
+    A point fit is a line. Of a function there are its mean and its band of 95 %, over what it
+    depends on, and dotted the band of its prior. Return an array of axes, one for each parameter.
     """
     if not parameters:
         raise ValueError("Expected parameters to draw; the physics has no unknown ones.")
-    axes = axes_of(axes, 1, len(parameters), 2.6)[0]
-    for ax, (name, unknown) in zip(axes, parameters.unknowns.items(), strict=True):
-        draws = parameters[name].detach().double()
-        low, high = draws.min(), draws.max()
-        if low < high:
-            style: dict[str, Any] = {"color": BLUE, "alpha": 0.75, "ec": "white"}
-            ax.hist(draws.numpy(), "auto", density=True, label="posterior", **style)
-            low, high = 1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low
-        else:
-            ax.axvline(float(low), color=BLUE, label="value")
-            ends = unknown.value(torch.tensor([-3.0, 3.0]).double())
-            low, high = low.minimum(ends[0]), high.maximum(ends[1])
-        x = torch.linspace(float(low), float(high), _POINTS).double()
-        (density,) = torch.gradient(torch.special.ndtr(unknown.coordinate(x)), spacing=(x,))
-        ax.plot(x, density, color=GREY, ls="--", lw=1.2, label="prior")
+    declared = parameters.unknowns.declared
+    axes = axes_of(axes, 1, len(declared), 2.6)[0]
+    for ax, (name, unknown) in zip(axes, declared.items(), strict=True):
         unit = f" [{unknown.unit}]" if unknown.unit else ""
-        ax.set(xlabel=labels([name])[0] + unit, yticks=[])
-        ax.set_ylim(0, 1.4 * ax.dataLim.y1)  # room for the legend
+        if unknown.between is None:
+            _plot_density(ax, parameters[name].detach().double(), unknown)
+            ax.set(xlabel=labels([name])[0] + unit, yticks=[])
+            ax.set_ylim(0, 1.4 * ax.dataLim.y1)  # room for the legend
+            ax.set_ylabel("density" if ax is axes[0] else "")
+        else:
+            _plot_curve(ax, parameters[name], unknown)
+            ax.set(xlabel=unknown.function_of, ylabel=labels([name])[0] + unit)
         tidy(ax)
-    axes[0].set_ylabel("density")
     legend(axes[0])
     return axes
+
+
+def _plot_density(ax: Axes, draws: Tensor, unknown: Unknown) -> None:
+    """Draw the draws of a number, and its prior."""
+    low, high = draws.min(), draws.max()
+    if low < high:
+        style: dict[str, Any] = {"color": BLUE, "alpha": 0.75, "ec": "white"}
+        ax.hist(draws.numpy(), "auto", density=True, label="posterior", **style)
+        low, high = 1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low
+    else:
+        ax.axvline(float(low), color=BLUE, label="value")
+        ends = unknown.value(torch.tensor([-3.0, 3.0]).double())
+        low, high = low.minimum(ends[0]), high.maximum(ends[1])
+    x = torch.linspace(float(low), float(high), _POINTS).double()
+    (density,) = torch.gradient(torch.special.ndtr(unknown.coordinate(x)), spacing=(x,))
+    ax.plot(x, density, color=GREY, ls="--", lw=1.2, label="prior")
+
+
+def _plot_curve(ax: Axes, curve: Curve, unknown: Unknown) -> None:
+    """Draw an unknown function with its band of 95 %, and the band of its prior."""
+    low, high = unknown.between or (0.0, 1.0)
+    x = torch.linspace(low, high, _POINTS).double()
+    draws = curve(x)
+    ends = draws.quantile(draws.new_tensor([0.025, 0.975]), dim=0)
+    ax.fill_between(x, *ends, color=BLUE, alpha=0.25, lw=0, label="95 %")
+    ax.plot(x, draws.mean(0), color=BLUE, label="mean")
+    half = quantile(0.95)
+    for end in unknown.value(torch.tensor([-half, half]).double()).tolist():
+        ax.axhline(end, color=GREY, ls=":", lw=1.0)
 
 
 def plot_priors(priors: Priors, *, axes: Any = None) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +20,19 @@ _LENGTH = 10  # transitions of a stretch
 _MOVES = 0.3  # rad/s: of the pendulum's tests only what is measured to be faster somewhere counts
 
 
+def folder_of(machine: str) -> Path:
+    """Return where the records of a machine are; those of the pendulum are in the library."""
+    own = files("gpadjust.records") / "pendulum"
+    return Path(str(own)) if machine == "pendulum" else DATA / machine
+
+
 @dataclass(frozen=True)
 class System:
     """Records of a machine, of which some are learnt from and others are tested at.
 
     Args:
         machine: The machine.
-        folder: Where the files are in ``DATA``.
+        folder: The machine, of :func:`folder_of`.
         train: Files that are learnt from, without their endings.
         tests: Files of each test, by its name.
         actions: Columns of the actions that are called otherwise there.
@@ -90,7 +97,7 @@ class System:
         return (rates.abs() >= self.moves).any(-1)
 
     def _records(self, files: tuple[str, ...]) -> Records:
-        paths = [DATA / self.folder / f"{file}.csv" for file in files]
+        paths = [folder_of(self.folder) / f"{file}.csv" for file in files]
         spec = self.machine.spec
         return Records.read_csv(paths, spec, actions=self.actions, segment=self.segment)
 

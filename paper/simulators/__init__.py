@@ -28,6 +28,8 @@ class Simulators(Experiment):
 
     runs: int = 40
     """logs of each machine"""
+    seed: int = 100
+    """the first seed; those below, and from 1000 on, served to write the code"""
     out: Path = Path("results/simulators")
     settings: SimulatorsSettings = field(default_factory=SimulatorsSettings)
 

@@ -20,7 +20,7 @@ from gpadjust.systems.swing_up import CART_POLE_SPEC
 from paper.arm.system import MuscleArmEnv, arm
 from paper.arm.system.reaching import ARM_SPEC
 from paper.machines.pendulums import Rates, double_pendulum, pendulum, sums_of_masses
-from paper.machines.records import DATA
+from paper.machines.records import folder_of
 from paper.structures import ARM, SIMULATED
 
 CONTROL_STEP = 0.04  # s
@@ -106,7 +106,8 @@ def recorded(name: str, numbers: tuple[str, ...]) -> Trajectories:
     """
     pendulum = name == "pendulum"
     file = "{}.csv" if pendulum else "A0_20220815_{}.csv"
-    files = [DATA / name.replace("-", "_") / file.format(number) for number in numbers]
+    folder = folder_of(name.replace("-", "_"))
+    files = [folder / file.format(number) for number in numbers]
     records = Records.read_csv(files, _SPECS[name], segment="segment" if pendulum else None)
     return records.trajectories(CONTROL_STEP)
 

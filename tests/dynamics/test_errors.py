@@ -77,8 +77,8 @@ def damaged(change):
 
 
 DAMAGES = [
-    (lambda state: None, TypeError, "dictionary that `state_dict` gave, found None"),
-    (lambda state: {"weights": 1}, RuntimeError, "does not say of what dynamics"),
+    (lambda state: None, TypeError, "dictionary from `state_dict`, found None"),
+    (lambda state: {"weights": 1}, RuntimeError, "from `state_dict`, with a 'fingerprint'"),
     *(
         (damaged(change), RuntimeError, words)
         for change, words in (
@@ -90,7 +90,7 @@ DAMAGES = [
             (lambda s: s["model"]["u"].fill_(math.nan), "damaged.*'u' without NaN"),
             (lambda s: s.update(draws=s["draws"][:1]), "or more draws"),
             (lambda s: s.update(probes=[]), "damaged"),
-            (lambda s: s["probes"][0][2].mul_(1.1), "another physics than 'push' .* not determin"),
+            (lambda s: s["probes"][0][2].mul_(1.1), "another physics than 'push' .* a deterministic"),
         )
     ),
 ]

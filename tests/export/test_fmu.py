@@ -15,6 +15,7 @@ from gpadjust.export import fmu as module
 from gpadjust.states import StateSpec
 from tests.export.conftest import fitted
 from tests.export.test_dynamics import SPEC, learnt, pushed
+from tests.export.test_equations import dynamics as identified
 from tests.export.test_models import POINTS, arguments
 from tests.systems import normal, uniform
 
@@ -183,7 +184,7 @@ REFUSED = [
         ValueError,
         "cannot compile the program: .*head",
     ),
-    (lambda: None, {}, "x.fmu", TypeError, "LearnedDynamics of one; found"),
+    (lambda: None, {}, "x.fmu", TypeError, "or what identify returns; found"),
 ]
 
 
@@ -197,3 +198,28 @@ def test_without_a_compiler_there_is_a_way_out(tmp_path, monkeypatch):
     monkeypatch.setattr(module.shutil, "which", lambda name: None)
     with pytest.raises(OSError, match=r"no C compiler was found.*or take c_source"):
         export_fmu(fitted("CKA"), tmp_path / "pump.fmu")
+
+
+def test_identified_dynamics_are_simulated_beside_torch(tmp_path):
+    from fmpy.validation import validate_fmu
+
+    own = identified("curves")
+    path = export_fmu(own, tmp_path / "arm.fmu")
+    assert validate_fmu(str(path)) == []
+    state, pushes = uniform(4, low=-1.0, high=1.0), normal(5, 1)
+    signal = np.array(
+        [(0.1 * k, u) for k, (u,) in enumerate(pushes.tolist())],
+        dtype=[("time", float), ("u", float)],
+    )
+    found = fmpy.simulate_fmu(
+        str(path),
+        start_values=dict(zip(own.spec.states, state.tolist(), strict=True)),
+        input=signal,
+        stop_time=0.4,
+        output_interval=0.1,
+        output=[*own.spec.states],
+    )
+    for k in range(4):
+        state = own.predict(state[None], pushes[k][None]).mean[0]
+        row = [found[each][k + 1] for each in own.spec.states]
+        np.testing.assert_allclose(row, state.numpy(), rtol=1e-10, atol=1e-10)

@@ -55,7 +55,7 @@ def test_what_is_no_finite_sum_is_refused_with_the_way_out():
 
 def test_what_is_no_model_of_terms_is_refused():
     for wrong in (None, lambda X: X):
-        with pytest.raises(TypeError, match="or LearnedDynamics of one; found"):
+        with pytest.raises(TypeError, match="or what identify returns; found"):
             c_source(wrong, "f")
     with pytest.raises(RuntimeError, match="has not learnt"):
         c_source(LearnedDynamics(StateSpec(["x"], ["u"]), lambda X: X[:, :1]), "f")

@@ -361,4 +361,22 @@ FAULTS = (
         "variance[j] += spread[g] / DRAWS;",
         "The variance in C forgets that the means of the draws differ.",
     ),
+    Fault(
+        "gpadjust/physics/unknown.py",
+        "coordinates[..., columns] = coordinates[..., columns] @ unknown.root.mT.to(coordinates)",
+        "coordinates[..., columns] = coordinates[..., columns] @ unknown.root.to(coordinates)",
+        "The values of an unknown function do not have its prior.",
+    ),
+    Fault(
+        "gpadjust/dynamics/identified.py",
+        "told = precision + J @ J.mT",
+        "told = J @ J.mT",
+        "Dynamics that learn on forget the log.",
+    ),
+    Fault(
+        "gpadjust/export/c_equations.py",
+        "z += weights[i] * (1.0 + r + r * r / 3.0) * exp(-r);",
+        "z += weights[i] * (1.0 + r) * exp(-r);",
+        "An unknown function in C is of a rougher kernel than that of its weights.",
+    ),
 )

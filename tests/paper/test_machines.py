@@ -25,7 +25,7 @@ from paper.machines.learners import train
 from paper.machines.networks import NetworkDynamics
 from paper.machines.pendulums import DOUBLE_PENDULUM, PENDULUM
 from paper.machines.real import load
-from paper.machines.records import DATA, REAL
+from paper.machines.records import DATA, REAL, folder_of
 from paper.machines.tanks import Start, blocks, chosen, follow, without
 from paper.machines.tanks import load as tanks_load
 from paper.machines.tanks_systems import FIXED, UNKNOWNS, measured, physics, rates
@@ -169,7 +169,7 @@ def test_networks_learn_and_stop_early():
 
 def test_data_are_small_and_have_their_licences():
     for folder in ("double_pendulum", "pendulum", "tanks"):
-        assert (DATA / folder / "LICENSE").is_file()
+        assert (folder_of(folder) / "LICENSE").is_file()
     assert all(file.stat().st_size < 1e6 for file in DATA.rglob("*.csv"))
 
 

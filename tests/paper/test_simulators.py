@@ -31,11 +31,11 @@ def test_logs_are_of_the_model_and_of_its_friction(name):
 @pytest.mark.slow
 def test_a_log_of_each_method(ran):
     pytest.importorskip("mujoco.sysid._src.optimize", reason="mujoco[sysid] is not installed")
-    runs, tables = ran("simulators", "--only", "pendulum")
-    assert len(runs) == 2 * 2 * len(Simulators.axes["method"])
+    options = ["--seed", "1000", "--rows", "200", "--ahead", "20"]
+    runs, tables = ran("simulators", "--only", "pendulum", "right", *options)
+    assert len(runs) == 2 * len(Simulators.axes["method"])
     assert "| mujoco.sysid | link.mass | 2 |" in tables
     for run in runs:
         assert run["free_run"] < run["free_run_guesses"]
-        if run["friction"] == "right":
-            for name, true in run["true"].items():
-                assert run["estimates"][name][0] == pytest.approx(true, rel=0.02)
+        for name, true in run["true"].items():
+            assert run["estimates"][name][0] == pytest.approx(true, rel=0.1)

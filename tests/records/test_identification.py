@@ -6,6 +6,7 @@ from functools import partial
 import pytest
 import torch
 
+from gpadjust.control import MPC, Planner
 from gpadjust.physics import FormulaPhysics, FunctionPhysics, ODEPhysics, Unknown
 from gpadjust.records import Record, Records, identify
 from gpadjust.records.identification import _of_jumps
@@ -162,3 +163,30 @@ def test_an_angle_that_jumps_by_a_turn_is_said():
         records = Records(Record(t, states, torch.zeros_like(states[:, :1])), SPEC)
         assert _of_jumps(records) == [f"x jumps by a turn: if it is an angle, {way} (`angles`)."]
         assert not _of_jumps(Records(records.records, angled))
+
+
+@pytest.mark.slow
+def test_its_task_has_the_step_and_the_range_of_the_log(found):
+    def reward(states, actions, following):
+        return -following[:, 0].square()
+
+    task = found.task(reward, episode_length=40)
+    assert task.dynamics is found.dynamics
+    assert (task.dynamics.spec.step, task.episode_length) == (STEP, 40)
+    (record,) = found.smoothed.records
+    low, high = record.states.amin(0), record.states.amax(0)
+    torch.testing.assert_close(task.state_bounds, torch.stack([2 * low - high, 2 * high - low]))
+    assert found.task(reward, state_bounds=None).state_bounds is None
+    planner = Planner(num_functions=8, horizon=3 * STEP, num_random=16)
+    torch.manual_seed(0)
+    plan = planner.plan(task, record.states[0], [[-2.0], [2.0]])
+    assert plan.actions.shape == (3, 1)
+    # The rate is hidden from the controller, too.
+    assert (task.sensors.outputs, [*task.sensors.noise]) == (("x",), ["x"])
+    controller = MPC(task, [[-2.0], [2.0]], Planner(horizon=5 * STEP, num_random=32))
+    state, path = torch.tensor([[0.5, 0.0]], dtype=torch.float64), []
+    for _ in range(40):
+        force = torch.as_tensor(controller.step(state[0, :1]))
+        state = spring()(torch.cat([state, force[None]], -1))
+        path.append(float(state[0, 0]))
+    assert max(map(abs, path[-10:])) < 0.1

@@ -10,7 +10,6 @@ import torch
 
 from gpadjust.physics import FormulaPhysics, ODEPhysics, Unknown
 from gpadjust.records import Record, Records, identify
-from gpadjust.records.plots import plot_lack
 from gpadjust.report import report
 from gpadjust.states import StateSpec
 
@@ -162,11 +161,11 @@ def test_better_than_the_guesses_by_chance_is_no_yes(right):
 
 
 def test_the_figure_of_a_residual(dry, lagging):
-    ax = plot_lack(dry.lack, SWING, units={"rate": "rad/s"})
+    ax = dry.lack.plot(units={"rate": "rad/s"})
     assert ax.get_ylabel() == "rate' lacks, in rad/s²"
     assert ax.get_xlabel() == "rate in rad/s"
     assert len(ax.lines[0].get_xdata()) == len(dry.lack.at)
-    late = plot_lack(lagging.lack, HEATED)
+    late = lagging.lack.plot()
     assert late.get_xlabel().startswith("heater, ")
     assert late.get_ylabel() == "T' lacks, in 1/s"
 

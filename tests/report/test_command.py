@@ -99,7 +99,7 @@ BAD_TABLES = {
     "time,head\n0,1\n1,two\n": r"line 3, column 2 \('head'\): expected a number, or nothing",
     "time,head\n0,1\n,2\n": r"line 3, column 1 \('time'\): expected a number, found ''",
     "time,head\n0,inf\n1,2\n": r"line 2, column 2 \('head'\): .*found 'inf'",
-    'time,head\n0,"1,500"\n1,2\n': "If this comma is a decimal comma, say so by --decimal ','",
+    'time,head\n0,"1,500"\n1,2\n': "If this comma is a decimal comma, use --decimal ','",
     "time,head\n0,1\n1,2,3\n": "line 3: expected 2 fields, one for each name, found 3",
     "time,head\n0,1\n1,1e300\n": r"line 3, column 2 .*between -1e\+100 and 1e\+100, found '1e300'",
     "time,head\n0,1,5\n1,2,5\n": "expected 2 fields, .* found 3; .* --names 'time,head,other'",

@@ -1,0 +1,211 @@
+"""Programs of a physics that is written in formulas."""
+
+import functools
+
+import pytest
+import torch
+
+from gpadjust import CKA
+from gpadjust.dynamics import IdentifiedDynamics, LearnedDynamics, PhysicsDynamics
+from gpadjust.export import c_source, casadi_function
+from gpadjust.physics import (
+    BlackBoxPhysics,
+    FormulaPhysics,
+    FunctionPhysics,
+    ODEPhysics,
+    PhysicsParameters,
+    Unknown,
+)
+from gpadjust.states import StateSpec
+from tests.export.apart import apart
+from tests.export.conftest import called, compiled
+from tests.systems import normal, uniform
+
+EVERYTHING = (
+    "sin(x) + cos(x) * tan(x) - asin(x / 4) + acos(x / 4) / (2 + atan(v)) + atan2(v, x), "
+    "sinh(x) - cosh(v) + tanh(x) * exp(-v) + log(x * x) - ln(v ** 2) + log10(abs(v)) + pi, "
+    "sqrt(abs(x)) ** 3 - sign(x * v) + sign(0 * x) + max(x, v) * min(x, -v) + pow(2.5e-7, -0.1), "
+    "where(x < v, x, 1 / v) + (x <= v) + 2 * (x > 0) + 3 * (x >= v) + +x + PI() * IF(v, 7, 8), 3"
+)
+NUMBERS = {
+    "k": Unknown(2.0, factor=1.5),
+    "c": Unknown(-0.1, sd=0.1),
+    "unused": Unknown(1.0, sd=1.0),
+}
+SPRING = FormulaPhysics("v, u - k * sin(x) - c * v", ["x", "v", "u"], unknowns=NUMBERS)
+OVER_V = {"function_of": "abs(v)", "between": (0.0, 2.0)}
+CURVES = {
+    "dry": Unknown(0.3, factor=1.5, **OVER_V),
+    "drag": Unknown(-0.1, sd=0.3, **OVER_V, lengthscale=1.0),
+    "share": Unknown(0.5, bounds=(0.0, 1.0), function_of="x + u", between=(-1.0, 1.0)),
+}
+CURVED = FormulaPhysics("v, u * share - dry * sign(v) - drag * v", ["x", "v", "u"], unknowns=CURVES)
+PHYSICS = {
+    "everything": FormulaPhysics(EVERYTHING, ["x", "v"]),
+    "spring": SPRING,
+    "rk4": ODEPhysics(SPRING, 0.1, 2, substeps=3),
+    "midpoint, change": ODEPhysics(SPRING, 0.1, 2, substeps=2, method="midpoint", difference=True),
+    "euler, columns": ODEPhysics(SPRING, 0.1, 2, method="euler", inputs=[2, 0, 1]),
+    "curves": ODEPhysics(CURVED, 0.1, 2, substeps=2),
+}
+SPEC = StateSpec(
+    ["goal", "x", "v", "last"],
+    ["u"],
+    angles=["x"],
+    exogenous=["goal"],
+    previous={"last": "u"},
+    step=0.1,
+)
+
+
+def points(physics):
+    """Points beyond the range of curves, too."""
+    d = len(getattr(physics, "rhs", physics).columns)
+    return uniform(6, d, low=-3.0, high=3.0)
+
+
+def same(found, expected):
+    torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
+
+
+@functools.cache
+def dynamics(name):
+    """Dynamics with draws of the parameters, as a log would identify."""
+    physics = PHYSICS[name]
+    values = physics.unknowns.at(0.7 * normal(9, len(physics.unknowns), seed=2))
+    parameters = PhysicsParameters(physics.unknowns, values.unbind(-1))
+    noises = torch.full((2, 4), 0.1, dtype=torch.float64)
+    return IdentifiedDynamics(SPEC, physics, parameters, *noises)
+
+
+@pytest.mark.parametrize("name", PHYSICS)
+def test_c_says_what_the_physics_says(name, tmp_path):
+    physics = PHYSICS[name]
+    X = points(physics)
+    program = compiled(c_source(physics, "law"), tmp_path)
+    for x, y in zip(X, physics(X), strict=True):
+        (found,) = called(program.law_predict, y.shape, x)
+        same(found, y)
+
+
+@pytest.mark.parametrize("name", PHYSICS)
+@apart
+def test_casadi_says_what_the_physics_says(name):
+    physics = PHYSICS[name]
+    X, function = points(physics), casadi_function(physics)
+    assert (function.name_in(), function.name_out()) == (["x"], ["mean"])
+    for x, y in zip(X, physics(X), strict=True):
+        same(torch.tensor(function(x.numpy()).full()[:, 0]), y)
+
+
+@pytest.mark.parametrize("name", ["rk4", "curves"])
+@apart
+def test_programs_of_identified_dynamics_say_their_mean(name, tmp_path):
+    own = dynamics(name)
+    states, actions = uniform(4, 4, low=-2.0, high=2.0), uniform(4, 1, seed=1)
+    program = compiled(c_source(own, "arm"), tmp_path)
+    function = casadi_function(own, "step")
+    for state, action, mean in zip(states, actions, own.predict(states, actions).mean, strict=True):
+        (found,) = called(program.arm_step, (4,), state, action)
+        same(found, mean)
+        same(torch.tensor(function(state.numpy(), action.numpy()).full()[:, 0]), mean)
+
+
+@apart
+def test_parameters_may_be_an_argument(tmp_path):
+    own, free = dynamics("rk4"), {"parameters": True}
+    state, action, values = normal(4), normal(1, seed=1), own.physics_parameters.draws[3]
+    expected = own.sample_functions(9, seed=0)  # of all draws, in another order
+    function = casadi_function(own, **free)
+    assert function.name_in() == ["state", "action", "parameters"]
+    found = torch.tensor(function(*(each.numpy() for each in (state, action, values))).full()[:, 0])
+    paths = expected(state.expand(9, 1, 4), action.expand(9, 1, 1))[:, 0]
+    assert ((paths - found).abs().amax(-1) < 1e-10).sum() == 1
+    program = compiled(c_source(own, "arm", **free), tmp_path)
+    same(called(program.arm_step, (4,), state, action, values)[0], found)
+    law = casadi_function(SPRING, **free)
+    x = normal(3, seed=4)
+    same(torch.tensor(law(x.numpy(), values.numpy()).full()[:, 0]), SPRING(x[None], values)[0])
+
+
+def test_one_unit_may_contain_several_programs(tmp_path):
+    code = c_source(PHYSICS["curves"], "a") + c_source(dynamics("rk4"), "b")
+    program = compiled(code + c_source(PHYSICS["everything"], "c"), tmp_path)
+    for name, physics in (("a", PHYSICS["curves"]), ("c", PHYSICS["everything"])):
+        x = points(physics)[:1]
+        (found,) = called(getattr(program, f"{name}_predict"), physics(x)[0].shape, x[0])
+        same(found, physics(x)[0])
+
+
+@functools.cache
+def learnt():
+    """Dynamics and a model whose physics is written, and what they predict."""
+    unknowns = {"k": Unknown(2.0, factor=1.5)}
+    rates = FormulaPhysics("v, u - k * sin(x)", ["x", "v", "u"], unknowns=unknowns)
+    spec = StateSpec(["x", "v"], ["u"], angles=["x"])
+    states, actions = 2 * normal(20, 2), normal(20, 1, seed=1)
+    physics = ODEPhysics(rates, 0.1, 2, substeps=2)
+    moved = physics(torch.cat([states, actions], -1)) - 0.02 * states
+    found = LearnedDynamics(spec, physics, fit_options={"method": "map"})
+    found.update(states, actions, moved + 1e-3 * normal(20, 2, seed=2))
+    X = uniform(12, 1)
+    line = FormulaPhysics("2 * x", ["x"])
+    square = FormulaPhysics("x ** 2", ["x"])
+    model = CKA(X, X.exp(), physics={"line": line, "square": square})
+    return found, model
+
+
+@apart
+def test_a_model_has_its_written_physics_within(tmp_path):
+    found, model = learnt()
+    x, state, action = uniform(1, 1, seed=3), normal(1, 2, seed=3), normal(1, 1, seed=4)
+    program = compiled(c_source(model, "m") + c_source(found, "d"), tmp_path)
+    for name, own, given in (
+        ("m_predict", model, [x]),
+        ("d_step", found, [state, action]),
+    ):
+        options = {} if own is model else {"observation_noise": False}
+        mean, variance = (part[0] for part in own.predict(*given, **options))
+        rows = [each[0] for each in given]
+        in_c = called(getattr(program, name), (mean.numel(), mean.numel()), *rows)
+        in_casadi = casadi_function(own)(*(row.numpy() for row in rows))
+        for values in (in_c, [torch.tensor(each.full()[:, 0]) for each in in_casadi]):
+            torch.testing.assert_close(values[0], mean, rtol=1e-9, atol=1e-9)
+            torch.testing.assert_close(values[1], variance, rtol=1e-7, atol=1e-9)
+
+
+class Found:
+    """What has dynamics, as an identification."""
+
+    dynamics = PhysicsDynamics(StateSpec(["x", "v"], ["u"]), PHYSICS["rk4"])
+
+
+def test_of_an_identification_the_dynamics_are_exported():
+    assert c_source(Found(), "a") == c_source(Found.dynamics, "a")
+
+
+def pushed(x, u):
+    return u
+
+
+CUT = {"a": Unknown(1.0, sd=1.0, bounds=(0.0, 2.0), function_of="x", between=(0.0, 1.0))}
+REFUSED = [
+    (FunctionPhysics(pushed), {}, TypeError, "'pushed', a FunctionPhysics: expected equations"),
+    (BlackBoxPhysics(pushed), {}, TypeError, "BlackBoxPhysics: expected equations"),
+    (ODEPhysics(pushed, 0.1, 1), {}, TypeError, "ODEPhysics by 'rk4': expected equations"),
+    (FormulaPhysics("a * x", ["x"], unknowns=CUT), {}, ValueError, "bounds cut off its prior"),
+    (FormulaPhysics("x", ["x"]), {"parameters": True}, ValueError, "found none. Leave it out"),
+    (PHYSICS["curves"], {"parameters": True}, ValueError, "found dry, drag, share"),
+]
+
+
+def test_what_is_not_written_is_refused_with_the_way_out():
+    for physics, options, kind, words in REFUSED:
+        with pytest.raises(kind, match=words):
+            c_source(physics, "f", **options)
+    with pytest.raises(ValueError, match="that it was learnt with: leave it out"):
+        c_source(learnt()[1], "f", parameters=True)
+    with pytest.raises(ValueError, match="which have nothing else"):
+        casadi_function(PHYSICS["rk4"], physics=pushed)
+    with pytest.raises(TypeError, match="or what identify returns; found int"):
+        c_source(3, "f")
