@@ -81,7 +81,7 @@ class BlackBoxPhysics(Physics):
             return torch.from_numpy(real_array(self.function(*self._arguments(rows))))
         from joblib import Parallel, delayed  # slow to import
 
-        call = delayed(_call_row)
+        call = delayed(call_row)
         results = Parallel()(call(self.function, *self._arguments(row)) for row in rows)
         return self._gathered(results)
 
@@ -248,7 +248,7 @@ class FiniteDifferences(torch.autograd.Function):
         return pad(gradient, (0, p)), None, None, None
 
 
-def _call_row(function: Callable[..., ArrayLike], *row: Any) -> NDArray[np.float64] | PhysicsError:
+def call_row(function: Callable[..., ArrayLike], *row: Any) -> NDArray[np.float64] | PhysicsError:
     """Return a function's outputs ``(m,)`` at a row, or an error."""
     try:
         y = np.atleast_1d(real_array(function(*row)))

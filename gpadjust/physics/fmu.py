@@ -1,33 +1,40 @@
-"""An FMU that is unpacked in this process: its variables, and simulations in its instances."""
+"""An FMU that is unpacked in this process: its variables, and simulations by FMPy."""
 
 from __future__ import annotations
 
-import atexit
 import os
-import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from collections import deque
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from copy import copy
+from ctypes import c_double
 from difflib import get_close_matches
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
-from threading import Lock, local
-from types import SimpleNamespace
+from tempfile import TemporaryDirectory
+from threading import Lock
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+Array = NDArray[np.float64]
 KINDS = ("CoSimulation", "ModelExchange")
-_MOST_EVENTS = 100_000
-_MOST_STEPS = 100_000  # of CVode, between two points in time
+_SAME = 1e-9  # share within which two times are one, also of FMPy
 _FATAL = 4  # the status after which no function of an instance may be called
-_thread = local()
+# CVode calls these, and passes over an error in Python.
+_IN_SOLVER = {"SetTime", "SetContinuousStates", "GetEventIndicators"}
+_IN_SOLVER |= {"GetDerivatives", "GetContinuousStateDerivatives"}
+# By model exchange FMPy permits 500 steps of CVode in each interval, none of which may be longer
+# than a 50th of the simulation: of the limited steps finite differences are rough.
+_INTERVALS, _LONGER = 5, 50
+_lock = Lock()  # one simulation at a time in a process
+_messages: deque[str] = deque(maxlen=5)
 _kept: list[Any] = []
 
 
 class FMU:
-    """An FMU, unpacked into a temporary folder, with instances that wait for their next simulation.
+    """An FMU, unpacked into a temporary folder, with one instance, which is reset between uses.
 
     Args:
         path: The file.
@@ -48,10 +55,9 @@ class FMU:
             platforms = fmpy.supported_platforms(path)
         except Exception as error:
             raise ValueError(f"Expected {path} as an FMU; it cannot be read: {error}") from error
-        self.version = int(description.fmiVersion[0])
         kinds = dict(zip(KINDS, (description.coSimulation, description.modelExchange), strict=True))
         has = [name for name, interface in kinds.items() if interface is not None]
-        if self.version not in (2, 3) or not has or kind not in (None, *has):
+        if description.fmiVersion[0] not in "23" or not has or kind not in (None, *has):
             raise ValueError(
                 f"Expected {path.name} of FMI 2 or 3 with {kind or ' or '.join(KINDS)}; found FMI "
                 f"{description.fmiVersion} with {' and '.join(has) or 'neither'}."
@@ -64,21 +70,19 @@ class FMU:
             )
         self.name = path.name
         self.kind: str = kind or has[0]
-        self.interface: Any = kinds[self.kind]
         self.variables = {each.name: each for each in description.modelVariables}
         self.states: list[str] = [u.variable.derivative.name for u in description.derivatives]
-        self.folder = fmpy.extract(path)
-        self._process = os.getpid()
-        self._free: list[_Instance] = []
-        self._loading = Lock()  # as FMPy changes the working directory for a moment
-        is_single = self.interface.canBeInstantiatedOnlyOncePerProcess
-        self._turn = Lock() if is_single else nullcontext()
-        atexit.register(self._close)
+        step = getattr(description.coSimulation, "fixedInternalStepSize", None)
+        self.step = float(step or getattr(description.defaultExperiment, "stepSize", None) or 0.0)
+        self._instance: Any = None
+        self._errors: list[Exception] = []  # the first one of the instance
+        self._folder = TemporaryDirectory(ignore_cleanup_errors=True)
+        fmpy.extract(path, self._folder.name)
 
     def variable(self, name: str) -> Any:
         """Return the description of a scalar number, or raise a ValueError."""
         if name not in self.variables:
-            close = get_close_matches(str(name), self.variables, 5, 0.5) or [*self.variables][:5]
+            close = get_close_matches(name, self.variables, 5, 0.5) or [*self.variables][:5]
             raise ValueError(
                 f"{self.name} has no variable {name!r}; expected one such as {', '.join(close)}."
             )
@@ -93,101 +97,183 @@ class FMU:
         from fmpy.simulation import settable_in_initialization_mode, settable_in_instantiated
 
         variable = self.variable(name)
+        is_settable = settable_in_instantiated(variable) or settable_in_initialization_mode(
+            variable
+        )
         is_state = self.kind == "ModelExchange" and name in self.states
-        if not (
-            is_state
-            or settable_in_instantiated(variable)
-            or settable_in_initialization_mode(variable)
-        ):
+        if not is_state and not is_settable:
             raise ValueError(
-                f"{self.name} permits no start value of {name!r}: it has causality "
-                f"{variable.causality!r}, variability {variable.variability!r} and initial "
+                f"{self.name} permits no start value of {name!r}, which has initial="
                 f"{variable.initial!r}. Name the parameter of its start value, or export the FMU "
                 "with initial='exact' for it, or for model exchange, whose states can be set."
             )
 
-    @property
-    def step(self) -> float | None:
-        """The communication step that the FMU names."""
-        experiment = self.description.defaultExperiment
-        step = getattr(self.interface, "fixedInternalStepSize", None)
-        step = step or getattr(experiment, "stepSize", None)
-        return None if step is None else float(step)
-
-    def unit(self, name: str) -> str:
-        """Return the unit of a variable, or an empty text."""
-        variable = self.variable(name)
-        return variable.unit or getattr(variable.declaredType, "unit", None) or ""
-
     def simulate(
         self,
         values: Mapping[str, float],
-        points: NDArray[np.float64],
-        held: Sequence[Mapping[str, float]],
-        tolerance: float,
+        start: float,
+        times: Array,
         outputs: Sequence[str],
-        found: dict[int, Any],
-    ) -> None:
-        """Simulate from the first of the ``points`` in time to the last, and store outputs.
+        signals: Mapping[str, Array],
+        step: float | None,
+        tolerance: float,
+    ) -> Array:
+        """Return outputs ``N x m`` at the times.
 
         Args:
             values: Start values and parameters by name.
-            points: Ascending times.
-            held: Values of inputs from each point to the next, for all points; empty for none.
-            tolerance: The relative tolerance of the integration.
-            outputs: The variables to read.
-            found: Numbers of points, to which it adds the values of the outputs there; after an
-                error those after it are None.
+            start: The time at which the simulation begins.
+            times: ``N`` times from the start on, in any order.
+            outputs: The names of the outputs.
+            signals: Inputs by name with their ``"time"``; each holds until the next.
+            step: The communication step of co-simulation. None: the FMU's own, or none.
+            tolerance: The relative tolerance.
         """
-        times: list[float] = points.tolist()
-        with self._instance() as instance:
-            instance.begin(values, times[0], times[-1], tolerance)
-            if self.kind == "CoSimulation":
-                run = instance.steps(times, held)
-            else:
-                states = {name: values[name] for name in self.states if name in values}
-                run = instance.integrate(times, held, tolerance, states)
-            for i, _ in enumerate(run):
-                if i == 0:
-                    instance.check(values)
-                if i in found:
-                    found[i] = [instance.get(name) for name in outputs]
-            instance.fmu.terminate()
+        from fmpy import simulate_fmu
 
-    @contextmanager
-    def _instance(self) -> Iterator[_Instance]:
-        """Lend an instance, as if it were new; after an error it is not used again."""
-        with self._turn:
-            _written().clear()
-            instance = self._ready()
+        changes, end = signals["time"], float(times.max())
+        points = np.unique([start, *times, *changes[(start < changes) & (changes < end)]])
+        step, stop = step or self.step or end - start or 1.0, end
+        if self.kind == "ModelExchange":
+            step, stop = (end - start) / _INTERVALS or 1.0, start + _LONGER * (end - start)
+        names = {*values, *outputs, *signals}
+        description = copy(self.description)  # FMPy goes through all variables of one
+        description.modelVariables = [v for v in self.variables.values() if v.name in names]
+
+        def go_on(time: float, recorder: Any) -> bool:
+            if time < end - _SAME * (end - start):
+                return True
+            recorder.sample(time)
+            return False
+
+        with _lock:
+            _messages.clear()
             try:
-                yield instance
+                found = simulate_fmu(
+                    self._folder.name,
+                    model_description=description,
+                    fmu_instance=self._begun(values),
+                    fmi_type=self.kind,
+                    validate=False,
+                    start_time=start,
+                    stop_time=stop,
+                    set_stop_time=stop == end,
+                    step_finished=go_on,
+                    output_interval=step,
+                    relative_tolerance=tolerance,
+                    start_values=dict(values),
+                    input=self._input(values, points, signals),
+                    output=names,
+                )
             except BaseException as error:
-                instance.close(getattr(error, "status", None) == _FATAL)
-                error.stderr = "; ".join(_written())  # type: ignore[attr-defined]
+                failure = self._errors[0] if self._errors else error
+                self._free()
+                failure.stderr = "; ".join(_messages)  # type: ignore[attr-defined]
+                raise failure from None
+        for name, value in values.items():
+            first = float(found[name][0])
+            if not abs(first - value) <= 1e-6 * max(1.0, abs(value)):
+                raise ValueError(
+                    f"{name!r} is {first:g} after its start value was set to {value:g}: the FMU "
+                    "computes it or rounds it. Name the parameter of its start value, or take "
+                    "model exchange, whose states can be set"
+                )
+        missing = points[~np.isclose(found["time"][_places(found, points)], points, _SAME, 0)]
+        if len(missing):
+            raise RuntimeError(
+                f"no step ends at t = {missing[0]:g}, the last one at {found['time'][-1]:g}. The "
+                "FMU ended the simulation, or takes steps of one length alone: give a "
+                "communication_step of which the times, also of signals, are multiples"
+            )
+        place = _places(found, times)
+        return np.stack([found[name][place].astype(float) for name in outputs], axis=-1)
+
+    def _input(
+        self,
+        values: Mapping[str, float],
+        points: Array,
+        signals: Mapping[str, Array],
+    ) -> NDArray[np.void] | None:
+        """Return inputs as FMPy takes them: two rows at each point, which make it stop there."""
+        if len(signals) == 1 and len(points) <= 2:
+            return None  # nothing changes before the end
+        last = [np.searchsorted(signals["time"], points, side) for side in ("left", "right")]
+        place = np.stack(last, axis=-1).clip(min=1) - 1
+        place[0] = place[0, 1]
+        columns = {"time": np.repeat(points, 2)}
+        columns |= {name: of[place].ravel() for name, of in signals.items() if name != "time"}
+        for name, value in values.items():
+            if self.variables[name].causality == "input":  # or FMPy prints a warning
+                columns[name] = np.full(place.size, value)
+        rows = [*zip(*columns.values(), strict=True)]
+        return np.array(rows, [(name, float) for name in columns])
+
+    def _begun(self, values: Mapping[str, float]) -> Any:
+        """Return the instance as if it were new; model exchange will set its states, too."""
+        try:
+            if self._instance is not None:
+                self._instance.reset()
+        except Exception:
+            self._free()
+        if self._instance is None:
+            self._instance = self._made()
+        if self.kind == "ModelExchange" and values.keys() & {*self.states}:
+            self._set_states_at_first_update(values)
+        return self._instance
+
+    def _made(self) -> Any:
+        """Return an instance that keeps its first error, even one that CVode passes over."""
+        from fmpy import instantiate_fmu
+
+        fmu = instantiate_fmu(self._folder.name, self.description, self.kind, logger=_log)
+        # For FMI 2 FMPy has one logger for all FMUs, that of the last instance, alive or not.
+        _kept.append(fmu.callbacks)
+        call, errors = fmu._call, self._errors
+
+        def guarded(name: str, *arguments: Any) -> Any:
+            try:
+                if errors:
+                    raise errors[0]
+                return call(name, *arguments)
+            except Exception as error:
+                errors[:] = [error]
+                if name[4:] in _IN_SOLVER:
+                    return 0
                 raise
-            self._free.append(instance)
 
-    def _ready(self) -> _Instance:
-        """Return an instance that waited, reset, or a new one."""
-        with suppress(IndexError):
-            while True:
-                instance = self._free.pop()
-                try:
-                    instance.fmu.reset()
-                    return instance
-                except Exception:
-                    instance.close()
-        with self._loading:
-            return _Instance(self)
+        fmu._call = guarded
+        return fmu
 
-    def _close(self) -> None:
-        """Free all instances, and remove the folder."""
-        if os.getpid() != self._process:
-            return
-        for instance in self._free:
-            instance.close()
-        shutil.rmtree(self.folder, ignore_errors=True)
+    def _set_states_at_first_update(self, values: Mapping[str, float]) -> None:
+        """Let the first update of discrete states set continuous states by name, too."""
+        fmu, n = self._instance, len(self.states)
+        function = (
+            "newDiscreteStates" if hasattr(fmu, "newDiscreteStates") else "updateDiscreteStates"
+        )
+        update = getattr(fmu, function)
+
+        def first() -> Any:
+            delattr(fmu, function)
+            while update()[0]:
+                pass
+            fmu.enterContinuousTimeMode()
+            x = (c_double * n)()
+            fmu.getContinuousStates(x, n)
+            x[:] = [values.get(name, x[i]) for i, name in enumerate(self.states)]
+            fmu.setContinuousStates(x, n)
+            fmu.enterEventMode()
+            return update()
+
+        setattr(fmu, function, first)
+
+    def _free(self) -> None:
+        """Free the instance, unless it is dead."""
+        is_dead = any(getattr(error, "status", None) == _FATAL for error in self._errors)
+        self._errors.clear()
+        if self._instance is not None and not is_dead:
+            with suppress(Exception):
+                self._instance.freeInstance()
+        self._instance = None
 
 
 @cache
@@ -200,204 +286,12 @@ def opened(path: Path, kind: str | None = None) -> FMU:
     return _opened(path, kind, path.stat().st_mtime, os.getpid())
 
 
-def _written() -> list[str]:
-    """Return the last messages that FMUs wrote in this thread."""
-    if not hasattr(_thread, "messages"):
-        _thread.messages = []
-    return _thread.messages
-
-
 def _log(*message: Any) -> None:
     """Keep a message, whose text is the last argument."""
-    _written()[:-4] = []
-    _written().append(message[-1].decode(errors="replace").strip())
+    _messages.append(message[-1].decode(errors="replace").strip())
 
 
-class _Instance:
-    """An instance of an FMU."""
-
-    def __init__(self, owner: FMU) -> None:
-        from fmpy import instantiate_fmu
-
-        self.owner = owner
-        self._solver: Any = None
-        self._error: Exception | None = None
-        try:
-            self.fmu = instantiate_fmu(owner.folder, owner.description, owner.kind, logger=_log)
-        except Exception as error:
-            error.stderr = "; ".join(_written())  # type: ignore[attr-defined]
-            raise
-        # For FMI 2 FMPy has one logger for all FMUs, that of the last instance, alive or not.
-        _kept.append(self.fmu.callbacks)
-
-    def begin(
-        self, values: Mapping[str, float], start: float, stop: float, tolerance: float
-    ) -> None:
-        """Initialise at a time, with the values that can be set before."""
-        from fmpy.simulation import settable_in_initialization_mode, settable_in_instantiated
-
-        fmu, is_2 = self.fmu, self.owner.version == 2
-        experiment = {"tolerance": tolerance, "startTime": start}
-        if stop > start:
-            experiment["stopTime"] = stop
-        if is_2:
-            fmu.setupExperiment(**experiment)
-        left = self.set(values, settable_in_instantiated)
-        fmu.enterInitializationMode(**({} if is_2 else experiment))
-        self.set(left, settable_in_initialization_mode)
-        fmu.exitInitializationMode()
-
-    def get(self, name: str) -> float:
-        """Return the present value of a variable."""
-        variable = self.owner.variables[name]
-        kind = variable.type
-        if kind == "Enumeration":
-            kind = "Integer" if self.owner.version == 2 else "Int64"
-        return float(getattr(self.fmu, f"get{kind}")([variable.valueReference])[0])
-
-    def set(
-        self, values: Mapping[str, float], settable: Callable[[Any], bool] | None = None
-    ) -> dict[str, float]:
-        """Set the values of variables that can be set now; return the others."""
-        from fmpy.simulation import apply_start_values
-
-        description = SimpleNamespace(  # as FMPy goes through all variables of one
-            modelVariables=[self.owner.variables[name] for name in values],
-            unitDefinitions=[],
-            fmiVersion=self.owner.description.fmiVersion,
-        )
-        return apply_start_values(self.fmu, description, dict(values), settable)
-
-    def check(self, values: Mapping[str, float]) -> None:
-        """Raise a ValueError if a variable is not at the value to which it was set."""
-        for name, value in values.items():
-            found = self.get(name)
-            if not abs(found - value) <= 1e-6 * max(1.0, abs(value)):
-                raise ValueError(
-                    f"{name!r} is {found:g} after its start value was set to {value:g}: the FMU "
-                    "computes it or rounds it. Take a variable that is free, such as the parameter "
-                    "of its start value"
-                )
-
-    def steps(self, times: list[float], held: Sequence[Mapping[str, float]]) -> Iterator[None]:
-        """Co-simulation from time to time, by steps of the FMU's own solver."""
-        if held:
-            self.set(held[0])
-        yield
-        for i, (time, following) in enumerate(pairwise(times)):
-            if held:
-                self.set(held[i])
-            ended = self.fmu.doStep(time, following - time)  # a status of FMI 3
-            if ended and any(ended[1:3]):
-                raise RuntimeError(f"the FMU ended the simulation at t = {ended[3]:g}")
-            yield
-
-    def integrate(
-        self,
-        times: list[float],
-        held: Sequence[Mapping[str, float]],
-        tolerance: float,
-        states: Mapping[str, float],
-    ) -> Iterator[None]:
-        """Model exchange from time to time, by FMPy's CVode, with events."""
-        fmu, time, num_events = self.fmu, times[0], 0
-        if held:
-            self.set(held[0])
-        next_event = self._update()
-        if any(self.get(name) != value for name, value in states.items()):
-            self._set_states(states)
-            fmu.enterEventMode()
-            next_event = self._update()
-        solver = self._solver_of(tolerance, time)
-        yield
-        for i, following in enumerate(times[1:]):
-            if held and held[i] != held[i - 1]:
-                fmu.enterEventMode()
-                self.set(held[i])
-                next_event = self._update()
-                solver.reset(time)
-            while following - time > 1e-12 * max(1.0, abs(following)):
-                try:
-                    is_event, _, time = solver.step(time, min(following, next_event))
-                finally:
-                    if self._error is not None:
-                        raise self._error
-                fmu.setTime(time)
-                if self.owner.interface.needsCompletedIntegratorStep:
-                    is_own, is_end = fmu.completedIntegratorStep()
-                    if is_end:
-                        raise RuntimeError(f"the FMU ended the simulation at t = {time:g}")
-                    is_event = is_event or is_own
-                if is_event or time >= next_event:
-                    num_events += 1
-                    if num_events > _MOST_EVENTS:
-                        raise RuntimeError(f"more than {_MOST_EVENTS} events until t = {time:g}")
-                    fmu.enterEventMode()
-                    next_event = self._update()
-                    solver.reset(time)
-            yield
-
-    def close(self, is_dead: bool = False) -> None:
-        """Free the instance, unless it is dead."""
-        if not is_dead:
-            with suppress(Exception):
-                self.fmu.freeInstance()
-
-    def _update(self) -> float:
-        """Iterate discrete states until they stay; return the time of the next event."""
-        fmu = self.fmu
-        update = fmu.newDiscreteStates if self.owner.version == 2 else fmu.updateDiscreteStates
-        is_needed = True
-        while is_needed:
-            is_needed, is_end, _, _, is_defined, next_time = update()
-            if is_end:
-                raise RuntimeError("the FMU ended the simulation at an event")
-        fmu.enterContinuousTimeMode()
-        return float(next_time) if is_defined else float("inf")
-
-    def _set_states(self, values: Mapping[str, float]) -> None:
-        """Set continuous states by name."""
-        from ctypes import c_double
-
-        x = (c_double * len(self.owner.states))()
-        self.fmu.getContinuousStates(x, len(x))
-        for name, value in values.items():
-            x[self.owner.states.index(name)] = value
-        self.fmu.setContinuousStates(x, len(x))
-
-    def _kept(self, function: Callable[..., Any]) -> Callable[..., None]:
-        """Return a function whose first error is kept, as CVode passes over an error in Python."""
-
-        def call(*arguments: Any) -> None:
-            try:
-                if self._error is None:
-                    function(*arguments)
-            except Exception as error:
-                self._error = error
-
-        return call
-
-    def _solver_of(self, tolerance: float, time: float) -> Any:
-        """Return CVode at the present states."""
-        from fmpy.simulation import Input
-        from fmpy.sundials import CVodeSolver
-
-        fmu, description = self.fmu, self.owner.description
-        rates = "getDerivatives" if self.owner.version == 2 else "getContinuousStateDerivatives"
-        if self._solver is None or self._solver.reltol != tolerance:
-            self._solver = CVodeSolver(
-                nx=description.numberOfContinuousStates,
-                nz=description.numberOfEventIndicators,
-                get_x=fmu.getContinuousStates,
-                set_x=self._kept(fmu.setContinuousStates),
-                get_dx=self._kept(getattr(fmu, rates)),
-                get_z=self._kept(fmu.getEventIndicators),
-                get_nominals=fmu.getNominalsOfContinuousStates,
-                set_time=self._kept(fmu.setTime),
-                input=Input(fmu, description, None),
-                startTime=time,
-                relativeTolerance=tolerance,
-                maxNumSteps=_MOST_STEPS,
-            )
-        self._solver.reset(time)
-        return self._solver
+def _places(found: Any, times: Array) -> NDArray[np.int64]:
+    """Return the places of the first results at times, but for rounding errors."""
+    places = np.searchsorted(found["time"], times - _SAME * np.abs(times))
+    return places.clip(max=len(found) - 1)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,13 +12,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gpadjust.checks import check_choice, checked_number, real_array
-from gpadjust.physics.black_box import BlackBoxPhysics
-from gpadjust.physics.error import PhysicsError, described
+from gpadjust.physics.black_box import BlackBoxPhysics, call_row
+from gpadjust.physics.error import PhysicsError
 from gpadjust.physics.fmu import FMU, KINDS, opened
 from gpadjust.physics.parameters import ParameterValues
 from gpadjust.physics.unknown import Unknown
-
-_SAME = 1e-9  # share of the duration within which two points in time are one
 
 
 class FMUPhysics(BlackBoxPhysics):
@@ -32,11 +29,12 @@ class FMUPhysics(BlackBoxPhysics):
     - Dynamics: inputs are states and actions, outputs the states, ``times`` the control step. A
       state can be set if its start value can, or by model exchange.
     - Values over time: one of the inputs is ``"time"``, the FMU's independent variable. Rows that
-      differ in it alone share a simulation; they agree with single ones within the tolerance.
+      differ in it alone share a simulation, and fail together; they agree with single ones within
+      the tolerance.
 
-    Names are those of the FMU, such as ``"wall[1].T"``. An instance that has finished is reset for
-    the next row. Rows run in parallel and are remembered as of a
-    :class:`~gpadjust.BlackBoxPhysics`; a process has one instance of an FMU that permits no more.
+    Names are those of the FMU, such as ``"wall[1].T"``. A process has one instance, which is reset
+    for the next row. Rows run in parallel, in processes, and are remembered as of a
+    :class:`~gpadjust.BlackBoxPhysics`.
 
     Args:
         fmu: The file.
@@ -94,7 +92,7 @@ class FMUPhysics(BlackBoxPhysics):
     ) -> None:
         path = Path(fmu).resolve()
         super().__init__(
-            self.simulate,  # type: ignore[arg-type]  # which evaluate calls, of several rows
+            self.simulate,
             unknowns=unknowns,
             batched=False,
             gradient=gradient,
@@ -103,22 +101,27 @@ class FMUPhysics(BlackBoxPhysics):
             name=name or path.stem,
         )
         check_choice("kind", kind, (*KINDS, None))
+        if isinstance(inputs, str) or isinstance(outputs, str) or not inputs or not outputs:
+            raise TypeError(
+                f"Expected lists of names of variables; found {inputs!r} and {outputs!r}."
+            )
+        if ("time" in inputs) is not (times is None):
+            raise ValueError(
+                "Expected the times at which outputs are read, such as times=10.0, or 'time' as "
+                f"one of the inputs, and not both; found inputs {inputs} and times={times!r}."
+            )
+        if communication_step is not None:
+            checked_number("communication_step", communication_step, above=0)
+        numbers = [] if times is None else np.atleast_1d(real_array(times)).tolist()
         self.path, self.kind = path, kind
-        self.input_names, self.output_names = _names("inputs", inputs), _names("outputs", outputs)
+        self.input_names, self.output_names = tuple(inputs), tuple(outputs)
         self.start_values = {k: checked_number(k, v) for k, v in (start_values or {}).items()}
         self.signals = _signals(signals)
         self.start_time = checked_number("start_time", start_time)
+        self.times = tuple(checked_number("times", t, least=self.start_time) for t in numbers)
+        self.communication_step = communication_step
         self.tolerance = checked_number("tolerance", tolerance, above=0, below=1)
-        self.times = self._checked_times(times)
-        unpacked = opened(path, kind)
-        step = unpacked.step if communication_step is None else communication_step
-        self.communication_step = (
-            None if step is None else checked_number("communication_step", step, above=0)
-        )
-        self._check(unpacked)
-        for each, unknown in self.unknowns.items():
-            if not unknown.unit:
-                self.unknowns[each] = replace(unknown, unit=unpacked.unit(each))
+        self._check(opened(path, kind))
         self.num_outputs = len(self.output_names) * max(1, len(self.times))
 
     def check_names(self, names: Sequence[str]) -> None:
@@ -130,20 +133,15 @@ class FMUPhysics(BlackBoxPhysics):
                 f"{', '.join(names)}: name the inputs in the order of the data."
             )
 
-    def read(self, X: Tensor) -> Tensor:
-        """Return the columns of ``X`` (``... x n x d``) that are inputs of the FMU, checked."""
-        columns = super().read(X)
-        if columns.shape[-1] != len(self.input_names):
-            raise ValueError(
-                f"Physics {self.name!r} has the inputs {', '.join(self.input_names)}; expected a "
-                f"column for each of them, or columns=, found {columns.shape[-1]} column(s)."
-            )
-        return columns
-
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """Return the outputs of simulations; an error of single rows contains those of others."""
         from joblib import Parallel, delayed  # slow to import
 
+        if X.shape[-1] != len(self.input_names):
+            raise ValueError(
+                f"expected a column of X for each of the inputs {', '.join(self.input_names)}, or "
+                f"columns=; found {X.shape[-1]}"
+            )
         rows = self._table(X, *parameters)
         place = np.arange(len(rows))
         if "time" in self.input_names:
@@ -151,97 +149,50 @@ class FMUPhysics(BlackBoxPhysics):
             place = np.unique(others, axis=0, return_inverse=True)[1].ravel()
         order = np.argsort(place, kind="stable")
         groups = np.split(order, np.cumsum(np.bincount(place))[:-1])
-        found = Parallel()(delayed(self.simulate)(rows[group]) for group in groups)
-        results = dict(zip(order.tolist(), chain(*found), strict=True))
+        found = Parallel()(delayed(call_row)(self.simulate, rows[group]) for group in groups)
+        results = dict[int, NDArray[np.float64] | PhysicsError]()
+        for group, y in zip(groups, found, strict=True):
+            parts = [y] * len(group) if isinstance(y, PhysicsError) else np.split(y, len(group))
+            results |= dict(zip(group.tolist(), parts, strict=True))
         return self._gathered([results[i] for i in range(len(rows))])
 
-    def simulate(self, rows: NDArray[np.float64]) -> list[NDArray[np.float64] | PhysicsError]:
-        """Return outputs ``(m,)`` or the error of each of ``N x (d + p)`` rows of one simulation.
-
-        The rows differ in time alone.
-        """
+    def simulate(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the outputs, ``N m``, of ``N x (d + p)`` rows that differ in time alone."""
         values = dict(zip((*self.input_names, *self.unknowns), rows[0].tolist(), strict=True))
-        times = np.array([self.times] * len(rows))
+        times = np.tile(self.times, (len(rows), 1))
         if values.pop("time", None) is not None:
             times = rows[:, [self.input_names.index("time")]]
-        found = dict[int, Any]()
-        failure = PhysicsError("")
-        try:
-            points = self._points(times)
-            read = _last(points, times, points)
-            found = dict.fromkeys(read.ravel().tolist())
-            opened(self.path, self.kind).simulate(
-                self.start_values | values,
-                points,
-                self._held(points),
-                self.tolerance,
-                self.output_names,
-                found,
-            )
-        except Exception as error:
-            failure = PhysicsError(described(error))
-            failure.__cause__ = error
-            if not any(found.values()):
-                return [failure] * len(rows)
-        parts = [[found[i] for i in own] for own in read.tolist()]
-        return [failure if None in own else np.concatenate(own) for own in parts]
-
-    def _points(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return all times at which a simulation stops, from its start to the last output."""
-        fmu, start, end = opened(self.path, self.kind), self.start_time, float(times.max())
-        if times.min() < start:
-            raise ValueError(f"expected times from start_time={start:g} on, found {times.min():g}")
-        is_stepped = fmu.kind == "CoSimulation"
-        grid = np.empty(0)
-        if is_stepped and self.communication_step is not None:
-            grid = np.arange(start, end, self.communication_step)
-        points = np.sort(np.concatenate([[start], times.ravel(), self.signals["time"], grid]))
-        points = points[(points >= start) & (points <= end)]
-        points = points[np.diff(points, prepend=-np.inf) > _SAME * (end - start)]
-        steps = np.diff(points)
-        is_even = len(steps) == 0 or np.ptp(steps) <= _SAME * (end - start)
-        if is_stepped and not is_even and not fmu.interface.canHandleVariableCommunicationStepSize:
-            raise ValueError(
-                f"{fmu.name} takes communication steps of one length, found steps from "
-                f"{steps.min():g} to {steps.max():g}: take a communication_step of which the "
-                "times, also of signals, are multiples"
-            )
-        return points
-
-    def _held(self, points: NDArray[np.float64]) -> list[dict[str, float]]:
-        """Return the values of signals from each point on; nothing if there are none."""
-        names = [name for name in self.signals if name != "time"]
-        place = _last(self.signals["time"], points, points).clip(0)
-        return [{n: float(self.signals[n][i]) for n in names} for i in place if names]
-
-    def _checked_times(self, times: float | Sequence[float] | None) -> tuple[float, ...]:
-        """Return the times of outputs, none if they are a column of X."""
-        if ("time" in self.input_names) is not (times is None):
-            raise ValueError(
-                "Expected the times at which outputs are read, such as times=10.0, or 'time' as "
-                f"one of the inputs, and not both; found inputs {', '.join(self.input_names)} and "
-                f"times={times!r}."
-            )
-        numbers = [] if times is None else np.atleast_1d(real_array(times)).tolist()
-        return tuple(checked_number("times", t, least=self.start_time) for t in numbers)
+        if times.min() < self.start_time:
+            raise ValueError(f"expected times from start_time={self.start_time:g} on")
+        found = opened(self.path, self.kind).simulate(
+            self.start_values | values,
+            self.start_time,
+            times.ravel(),
+            self.output_names,
+            self.signals,
+            self.communication_step,
+            self.tolerance,
+        )
+        return found.ravel()
 
     def _check(self, fmu: FMU) -> None:
-        """Raise a ValueError if variables are not in the FMU or cannot be set."""
+        """Raise a ValueError if variables are not in the FMU; take the units of parameters."""
         moving = [name for name in self.signals if name != "time"]
         values = [name for name in self.input_names if name != "time"]
         given = [*values, *self.unknowns, *self.start_values, *moving]
-        twice = sorted({name for name in given if given.count(name) > 1})
-        if twice:
-            raise ValueError(
-                f"{twice[0]!r} is given twice: in inputs, unknowns, start_values or signals."
-            )
-        for name in (*values, *self.unknowns, *self.start_values):
-            fmu.check_settable(name)
-        for name in moving:
-            if fmu.variable(name).causality != "input":
+        for name in (*given, *self.output_names):
+            variable = fmu.variable(name)
+            if given.count(name) > 1:
+                raise ValueError(
+                    f"{name!r} is given twice: in inputs, unknowns, start_values or signals."
+                )
+            if name in given and name not in moving:
+                fmu.check_settable(name)
+            if name in moving and variable.causality != "input":
                 raise ValueError(f"Expected signals of inputs of {fmu.name}; {name!r} is not one.")
-        for name in self.output_names:
-            fmu.variable(name)
+            if name in self.unknowns and not self.unknowns[name].unit:
+                unit = variable.unit or getattr(variable.declaredType, "unit", None) or ""
+                self.unknowns[name] = replace(self.unknowns[name], unit=unit)
         left = [name for name in fmu.states if name not in given]
         if left and self.times and {*values} & {*self.output_names} & {*fmu.states}:
             raise ValueError(
@@ -251,29 +202,14 @@ class FMUPhysics(BlackBoxPhysics):
             )
 
 
-def _names(argument: str, names: Sequence[str]) -> tuple[str, ...]:
-    """Return names of variables, checked."""
-    if isinstance(names, str) or not names or not all(isinstance(n, str) for n in names):
-        raise TypeError(f"{argument} must be a list of names of variables; found {names!r}.")
-    return tuple(names)
-
-
-def _last(
-    of: NDArray[np.float64], until: NDArray[np.float64], points: NDArray[np.float64]
-) -> NDArray[np.int64]:
-    """Return the places of the last times that are not after others, but for rounding errors."""
-    return np.searchsorted(of, until + _SAME * np.ptp(points), side="right") - 1
-
-
 def _signals(signals: Any) -> dict[str, NDArray[np.float64]]:
     """Return signals by name, with their times."""
     if signals is None:
-        return {"time": np.empty(0)}
-    found = {str(name): np.atleast_1d(real_array(signals[name])) for name in signals}
-    times = found.get("time", np.empty(0))
-    is_table = times.ndim == 1 and all(each.shape == times.shape for each in found.values())
-    if len(found) < 2 or not is_table or not len(times) or (np.diff(times) <= 0).any():
-        shapes = {name: each.shape for name, each in found.items()}
+        return {"time": np.array([-np.inf])}  # nothing changes
+    found = {str(name): real_array(signals[name]) for name in signals}
+    shapes = {name: each.shape for name, each in found.items()}
+    is_table = "time" in found and len(found) > 1 and len({*shapes.values()}) == 1
+    if not is_table or found["time"].ndim != 1 or not (np.diff(found["time"]) > 0).all():
         raise ValueError(
             "Expected signals as columns of one length, 'time', ascending, and one or more inputs; "
             f"found {shapes}."

@@ -417,6 +417,7 @@ def identify(
     if f_p.unknowns:
         guesses = PhysicsDynamics(spec, f_p)
         runs[GUESSES] = guesses.free_run(last, windows.actions, **options)
+    # A control step adds the process noise of its steps of the physics.
     process_noise = smoothed.process_noise / math.sqrt(within)
     dynamics = IdentifiedDynamics(
         spec, f_p, smoothed.physics_parameters, options["noise"], process_noise

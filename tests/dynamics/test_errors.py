@@ -90,7 +90,10 @@ DAMAGES = [
             (lambda s: s["model"]["u"].fill_(math.nan), "damaged.*'u' without NaN"),
             (lambda s: s.update(draws=s["draws"][:1]), "or more draws"),
             (lambda s: s.update(probes=[]), "damaged"),
-            (lambda s: s["probes"][0][2].mul_(1.1), "another physics than 'push' .* a deterministic"),
+            (
+                lambda s: s["probes"][0][2].mul_(1.1),
+                "another physics than .push. .* a deterministic",
+            ),
         )
     ),
 ]

@@ -137,12 +137,11 @@ def test_a_state_is_kept_and_comes_back(tmp_path):
     fmu.setReal(places, [0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
     fmu.exitInitializationMode()
     kept = fmu.getFMUState()
-    bytes_of = fmu.serializeFMUState(kept)
     ends = []
     for _ in range(2):
         fmu.doStep(0.0, 0.1)
         ends.append(fmu.getReal(places))
-        fmu.setFMUState(kept if len(ends) == 1 else fmu.deserializeFMUState(bytes_of))
+        fmu.setFMUState(kept)
     assert ends[0] == ends[1]
     assert fmu.getReal(places) == [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
     with pytest.raises(Exception, match="fmi2DoStep failed with status 3"):
