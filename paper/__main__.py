@@ -1,4 +1,4 @@
-"""Run one of the paper's experiments, or one of ours; `python -m paper report` fills the pages.
+"""Run one of the paper's experiments, or one of ours.
 
 Each says its options: `python -m paper forrester --help`.
 """
@@ -7,24 +7,22 @@ from __future__ import annotations
 
 import sys
 import warnings
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from pkgutil import resolve_name
 
 CHAPTERS = {
     "forrester": ("Forrester",),
-    "structures": ("Structures",),
-    "parameters": ("Parameters", "Nuts"),
-    "measuring": ("Active", "Misled"),
     "cartpole": ("CartPole", "Planning"),
     "arm": ("Arm", "Reaching"),
-    "laboratory": (
-        *("Balldrop", "Categories", "Drift", "Emulated", "Links"),
-        *("Noisyinputs", "Outliers", "Relative", "Vanishing"),
-    ),
-    "control": ("Known", "First"),
-    "published": ("Masses", "Uci", "Emps", "Freeruns", "Formula", "Nist"),
+    "functions": ("Functions",),
+    "published": ("Masses", "Steels", "Uci", "Emps", "Freeruns", "Nist"),
     "machines": ("Real", "Tanks"),
+    "parameters": ("Parameters", "Nuts"),
+    "kinds": ("Kinds",),
+    "control": ("Known", "First"),
+    "misled": ("Misled",),
     "simulators": ("Simulators",),
 }
 """Folders, and the classes of the experiments that they declare."""
@@ -32,9 +30,13 @@ EXPERIMENTS = {
     kind.lower(): f"paper.{chapter}:{kind}" for chapter, kinds in CHAPTERS.items() for kind in kinds
 }
 """Classes of the experiments, by their names."""
+FIGURES = {"figure1": "forrester", "figure2": "cartpole", "figure3": "arm"}
+"""The paper's figures, and the experiments that draw them."""
 _OTHER = {
-    "all": "run what is missing of every experiment, with --out paper/results/NAME, then report",
+    **{name: f"the paper's, of {of}; --quick: of two runs" for name, of in FIGURES.items()},
+    "all": "run what is missing of every experiment, with --out paper/results, then report",
     "report": "copy the results that are committed into the pages",
+    "check": "make a cheap case of each learner again; --write says in tables which are stale",
 }
 
 
@@ -43,19 +45,23 @@ def main() -> None:
     name, *arguments = sys.argv[1:] or ["--help"]
     if name in EXPERIMENTS:
         _run(name, arguments)
+    elif name in FIGURES and {*arguments} <= {"--quick"}:
+        _figure(FIGURES[name], quick=bool(arguments))
     elif name == "all" and {*arguments} <= {"--only-tables"}:
         refused = []
         for each in EXPERIMENTS:
             print(f"\n{each}: {_about(each)}")
             try:
-                _run(each, ["--out", f"{Path(__file__).parent}/results/{each}", *arguments])
+                _run(each, ["--out", f"{Path(__file__).parent}/results", *arguments])
             except SystemExit as error:
                 refused.append(f"{each}: {error}")
-        import_module("paper.report").report()
+        import_module("paper.pages").report()
         if refused:
             raise SystemExit("\nNothing was run of these:\n" + "\n".join(refused))
     elif name == "report" and not arguments:
-        import_module("paper.report").report()
+        import_module("paper.pages").report()
+    elif name == "check" and {*arguments} <= {"--write"}:
+        import_module("paper.check").main(EXPERIMENTS, write=bool(arguments))
     else:
         lines = [f"  {known:<15}{_about(known)}" for known in EXPERIMENTS]
         lines += [f"  {known:<15}{what}" for known, what in _OTHER.items()]
@@ -64,8 +70,7 @@ def main() -> None:
             print(usage)
             raise SystemExit(0)
         if name in _OTHER:
-            known = "none but --only-tables" if name == "all" else "no options"
-            raise SystemExit(f"{name} takes {known}; found {' '.join(arguments)}.")
+            raise SystemExit(f"{name}: unknown options {' '.join(arguments)}; see --help.")
         raise SystemExit(f"{usage}\n\nThere is no experiment {name!r}.")
 
 
@@ -74,12 +79,27 @@ def _about(name: str) -> str:
     return str(resolve_name(EXPERIMENTS[name]).__doc__).partition("\n")[0]
 
 
+def _figure(name: str, quick: bool) -> None:
+    """Draw a figure of the committed runs, or of two new ones of each curve in ten minutes."""
+    kind = resolve_name(EXPERIMENTS[name])
+    if quick:
+        quicker = replace(kind(), runs=2, out=Path("results/quick"), only=kind.curves)
+        _main(quicker.changed(kind.quick))
+        return
+    experiment = kind(out=Path(__file__).parent / "results")
+    runs = import_module("paper.common.runner").runs_file(experiment).read()
+    print(*experiment.draw([*runs.values()]), sep="\n")
+
+
 def _run(name: str, arguments: list[str]) -> None:
     import tyro
 
     kind = resolve_name(EXPERIMENTS[name])
-    config = [tyro.conf.FlagCreatePairsOff, *([tyro.conf.OmitArgPrefixes] if kind.flat else [])]
-    experiment = tyro.cli(kind, prog=f"python -m paper {name}", args=arguments, config=config)
+    config = [tyro.conf.FlagCreatePairsOff]
+    _main(tyro.cli(kind, prog=f"python -m paper {name}", args=arguments, config=config))
+
+
+def _main(experiment: object) -> None:
     runner = import_module("paper.common.runner")
     # joblib's word on an interruption, of which the user knows.
     warnings.filterwarnings("ignore", ".*still being processed by the workers.*")

@@ -201,7 +201,7 @@ def csv_to_free_run(file):
     spec = StateSpec(["x", "v"], ["force"], step=0.1)
     records = Records.read_csv(file, spec)
     states = smooth(records, oscillator).draw()
-    dynamics = LearnedDynamics(spec, oscillator, fit_options={"method": "map"})
+    dynamics = LearnedDynamics(spec, oscillator)
     dynamics.update(*states.trajectories())
     windows = states.windows(10)
     return dynamics.free_run(windows.initial_states, windows.actions).score(windows.measured)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from paper.cartpole import Control, ControlSettings, Scenario, scenario
+from paper.cartpole import Control, Scenario, scenario
 from paper.common.experiment import Axes, Experiment
 from paper.common.learners import labels
 
@@ -15,27 +14,6 @@ if TYPE_CHECKING:
     from paper.cartpole.control import Setup
 
 
-@dataclass(frozen=True, kw_only=True)
-class Settings(ControlSettings):
-    """Settings that decide the numbers, for all learners, unless one says otherwise."""
-
-    episodes: int = 30
-    episode_length: int = 15
-    last_model_episode: int = 30
-    later_updates: int = 15
-    evaluate_every: int = 3
-    """episodes between two evaluations; the first is before all"""
-    map_after: int = 9
-    """episodes after which, as at the end, the errors at each target are kept"""
-    strength: float = 0.5
-    """of the muscles; a healthy arm's is 1"""
-    memory: bool = False
-    """whether policy and model see the previous action"""
-    black_box: bool = False
-    """whether OpenSim computes f_p, row by row, in place of the equation of motion"""
-
-
-_MEMORY = {"memory": True}
 SCENARIOS = {
     "mf": scenario("mf", "model-free"),
     # Per episode; the best of 30, 100, 300.
@@ -44,10 +22,7 @@ SCENARIOS = {
     "gp": scenario("gp"),
     "cka": scenario("cka"),
     "rra": scenario("rra"),
-    "mf-memory": scenario("mf", "model-free, memory", _MEMORY, 3),
-    "gp-memory": scenario("gp", "Dyna-GP, memory", _MEMORY, 3),
-    "cka-memory": scenario("cka", "Dyna-CKA, memory", _MEMORY),
-    "cka-opensim": scenario("cka", "Dyna-CKA, f_p a simulator", {"black_box": True}, 1),
+    "cka-memory": scenario("cka", "Dyna-CKA, memory", {"memory": True}),
 }
 PAPER = ("mf", "phy", "gp", "cka", "rra")  # those that the paper compares
 
@@ -62,11 +37,26 @@ def _check_opensim() -> None:
 class Arm(Control):
     """Learners reach with an arm of six muscles, computed by OpenSim."""
 
-    out: Path = Path("results/arm")
-    settings: Settings = field(default_factory=Settings)
+    episodes: int = 30
+    episode_length: int = 15
+    last_model_episode: int = 30
+    later_updates: int = 15
+    evaluate_every: int = 3
+    """episodes between two evaluations; the first is before all"""
+    map_after: int = 9
+    """episodes after which, as at the end, the errors at each target are kept"""
+    strength: float = 0.5
+    """of the muscles; a healthy arm's is 1"""
+    memory: bool = False
+    """whether policy and model see the previous action"""
 
     axes: ClassVar[Axes] = {"scenario": {name: each.label for name, each in SCENARIOS.items()}}
     packages: ClassVar[tuple[str, ...]] = (*Control.packages, "opensim")
+    cheap: ClassVar[Mapping[str, Any]] = {"episodes": 2, "evaluate_every": 1000}
+    curves: ClassVar[tuple[str, ...]] = PAPER
+    quick: ClassVar[Mapping[str, Any]] = {
+        "episodes": 12, "model_episodes": 10, "evaluate_every": 4, "map_after": 4,
+    }  # fmt: skip
     known: ClassVar[Mapping[str, Scenario]] = SCENARIOS
     rmses: ClassVar[Mapping[str, str]] = {
         "theta_s": "theta_s, rad",
@@ -95,13 +85,15 @@ filtered."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReachingSettings:
-    """Settings that decide the numbers; found with other seeds, of 20 and more."""
+class Reaching(Experiment):
+    """An arm of six muscles reaches after a few trials, computed by OpenSim.
 
+    Settings were found with other seeds, of 20 and more.
+    """
+
+    runs: int = 3
     trials: int = 4
     """real trials of a run"""
-    long_trials: int = 10
-    """of CKA on the paper's arm"""
     episode_length: int = 15
     """steps of 0.2 s"""
     updates: int = 150
@@ -121,18 +113,6 @@ class ReachingSettings:
     strength: float = 0.5
     """of the muscles; a healthy arm's is 1"""
 
-
-SLOW: dict[str, Any] = {"updates": 100, "starts": 96, "learning_rate": 3e-3}
-"""Settings of the learner that searches at the library's learning rate."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Reaching(Experiment):
-    """An arm of six muscles reaches after a few trials, computed by OpenSim."""
-
-    out: Path = Path("results/reaching")
-    settings: ReachingSettings = field(default_factory=ReachingSettings)
-
     axes: ClassVar[Axes] = {
         "system": {
             "plain": "as the paper's",
@@ -140,36 +120,22 @@ class Reaching(Experiment):
             "sensors": "noisy sensors",
             "strength": "f_p twice as strong",
         },
-        "learner": labels("cka", "phymean", "phy", "fitted", "gp")
-        | {"ensemble": "f_p and an ensemble of networks", "cka-slow": "CKA, rate 0.003"},
+        "learner": labels("cka", "phymean", "phy", "fitted", "gp"),
     }
     packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "stable_baselines3", "opensim")
     calls: ClassVar[tuple[str, ...]] = (
         "gpadjust.dynamics.LearnedDynamics",
         "gpadjust.control.PolicySearch",
     )
+    cheap: ClassVar[Mapping[str, Any]] = {"trials": 1}
 
     def check(self) -> None:
         """Refuse a machine without OpenSim."""
         _check_opensim()
 
-    def seeds_of(self, *kind: Any) -> Sequence[int]:
-        """All seeds; none of the slow learner on other arms than the paper's."""
-        system, learner = kind
-        return self.seeds if learner != "cka-slow" or system == "plain" else ()
-
-    def settings_of(self, system: str, learner: str) -> ReachingSettings:
-        """The settings of a run."""
-        settings = self.settings
-        if system == "plain" and learner in ("cka", "cka-slow"):
-            settings = replace(settings, trials=settings.long_trials)
-        return replace(settings, **SLOW) if learner == "cka-slow" else settings
-
     def describe(self, *kind: Any) -> dict[str, Any]:
         """The settings, and what the arm has beside."""
         system, learner = kind
-        settings = asdict(self.settings_of(system, learner))
-        del settings["long_trials"]
         more: dict[str, Any] = {"sensors": SENSORS} if system == "sensors" else {}
         more |= {"fitted_by": "PhysicsDynamics"} if learner == "fitted" else {}
-        return {**settings, "bounds": BOUNDS, **more}
+        return {**self.settings, "bounds": BOUNDS, **more}

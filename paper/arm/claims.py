@@ -24,7 +24,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from paper.arm import PAPER, SCENARIOS, Settings
+from paper.arm import PAPER, SCENARIOS, Arm
 from paper.arm.system.reaching import START_MEAN, arm_targets, hand_position
 from paper.common.verdicts import (
     Claim,
@@ -42,7 +42,7 @@ from paper.common.verdicts import (
 LOW = 10.0  # cm: what is called a low error at a target
 STEADY = 5.0  # cm: the standard deviation over runs that is called low
 NEAR, FAR = 20.0, 40.0  # cm from where the hand starts
-LAST, MAP_AFTER = Settings().episodes, Settings().map_after
+LAST, MAP_AFTER = Arm.episodes, Arm.map_after
 
 
 def distance_from_start() -> np.ndarray:

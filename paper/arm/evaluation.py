@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from paper.arm import Settings
+from paper.arm import Arm
 from paper.arm.system import arm, hand_distance_cm
 from paper.arm.system.opensim import MUSCLES, REST_ACTIVATION, ArmSimulation, build_muscle_arm
 from paper.arm.system.reaching import START_MEAN, arm_reward, arm_targets
@@ -24,12 +24,11 @@ NUM_LAST_STEPS = 5  # of the second score
 ACCURACY = 1e-5  # the environment's
 
 
-def setup(scenario: Scenario, settings: Settings) -> Setup:
+def setup(scenario: Scenario, settings: Arm) -> Setup:
     """A run's arm, its task, and its recorder."""
     system = arm(
         strength=settings.strength,
         memory=settings.memory,
-        opensim=settings.black_box,
         episode_length=settings.episode_length,
     )
     physics: Any = system.physics
@@ -48,7 +47,7 @@ class Policy(Protocol):
         ...
 
 
-def reach(policy: Policy, settings: Settings) -> NDArray[np.float64]:
+def reach(policy: Policy, settings: Arm) -> NDArray[np.float64]:
     """The distance of the hand, ``121 x episode_length`` in cm, by the deterministic policy.
 
     The real arm starts at rest at 35° and 65° for each target. All go a step at a time, so that the
@@ -141,7 +140,7 @@ class ArmRecorder(Recorder):
         for name, value in row.items():
             self.log["evaluations"].setdefault(name, []).append(value)
         if episode in (self.settings.map_after, self.settings.episodes):
-            maps = {name: errors.tolist() for name, errors in by_target.items()}
+            maps = {name: errors.round(2).tolist() for name, errors in by_target.items()}
             self.log["maps"][f"{episode}"] = maps
 
     def _on_rollout_start(self) -> None:

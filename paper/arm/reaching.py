@@ -21,17 +21,15 @@ from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.physics import as_physics
 from gpadjust.states import StateSpec
 from gpadjust.systems import System
-from paper.arm import BOUNDS, SENSORS, Reaching, ReachingSettings
-from paper.arm import Settings as ArmSettings
+from paper.arm import BOUNDS, SENSORS, Arm, Reaching
 from paper.arm.evaluation import reach, score
 from paper.arm.system import arm
 from paper.cartpole.planning import trials_table
 from paper.common.experiment import Run, Table
 from paper.common.learners import LEARNERS
 from paper.common.tables import frame
-from paper.machines.networks import NetworkDynamics
 
-MAPPED = (1, 3, 9)
+MAPPED = (1, 3)
 """Trials after which the errors at each target are kept."""
 
 _GAINS = {"strength": (16.0, 8.0)}  # the torques that f_p believes in, where not the usual ones
@@ -49,7 +47,7 @@ def run(experiment: Reaching, system: str, learner: str, seed: int) -> Run:
     warnings.simplefilter("ignore", SamplingWarning)
     warnings.filterwarnings("ignore", message="A step of the last real episode")
     warnings.filterwarnings("ignore", message=".* of the episodes of the policy left the bounds")
-    settings = experiment.settings_of(system, learner)
+    settings = experiment
     agent = make_agent(experiment, system, learner, seed)
     rows, maps = [], {}
     for trial in range(1, settings.trials + 1):
@@ -67,13 +65,13 @@ def run(experiment: Reaching, system: str, learner: str, seed: int) -> Run:
             }
         )
         if trial in MAPPED:
-            maps[f"{trial}"] = errors["all_steps"].tolist()
+            maps[f"{trial}"] = errors["all_steps"].round(2).tolist()
     return {"trials": {name: [row[name] for row in rows] for name in rows[0]}, "maps": maps}
 
 
-def evaluate(agent: Any, system: str, settings: ReachingSettings, seed: int) -> dict[str, Any]:
+def evaluate(agent: Any, system: str, settings: Reaching, seed: int) -> dict[str, Any]:
     """The hand's error at each target, in cm: root mean squares over all and the last steps."""
-    arm = ArmSettings(
+    arm = Arm(
         strength=settings.strength,
         memory=system == "memory",
         episode_length=settings.episode_length,
@@ -104,7 +102,7 @@ class NoisyPolicy:
 
 def make_agent(experiment: Reaching, system: str, learner: str, seed: int) -> PolicySearchAgent:
     """The agent of a run, at its start."""
-    settings = experiment.settings_of(system, learner)
+    settings = experiment
     known = system_of(system, settings)
     task = replace(known.task(dynamics(settings, system, learner)), state_bounds=bounds(known.spec))
     search = PolicySearch(
@@ -127,7 +125,7 @@ def make_agent(experiment: Reaching, system: str, learner: str, seed: int) -> Po
     )
 
 
-def system_of(name: str, settings: ReachingSettings, **options: Any) -> System:
+def system_of(name: str, settings: Reaching, **options: Any) -> System:
     """An arm, and what is known of it."""
     return arm(
         strength=settings.strength,
@@ -149,22 +147,19 @@ def bounds(spec: StateSpec) -> Tensor:
     return limits
 
 
-def dynamics(settings: ReachingSettings, system: str, learner: str) -> Dynamics:
+def dynamics(settings: Reaching, system: str, learner: str) -> Dynamics:
     """The model in which the policy is trained, at its start."""
     arm = system_of(system, settings, unknowns=learner == "fitted")
     spec, physics = arm.spec, as_physics(arm.physics)
     if learner in ("phy", "fitted"):
         return PhysicsDynamics(spec, physics)
-    if learner == "ensemble":
-        options: dict[str, Any] = {"number": 6, "folds": False, "hidden": 64, "steps": 800}
-        return NetworkDynamics(spec, physics, **options, rate=3e-3, decay=1e-2, seed=None)
-    known = LEARNERS[learner.removesuffix("-slow")]
+    known = LEARNERS[learner]
     return LearnedDynamics(spec, physics if known.adjusts else None, model=known.make)
 
 
 def tables(runs: Sequence[Run], experiment: Reaching) -> dict[str, Table]:
     """All tables, by name."""
-    trials, last, found = frame(_trials(runs), "trials"), experiment.settings.trials, {}
+    trials, last, found = frame(_trials(runs), "trials"), experiment.trials, {}
     for system, label in _SYSTEMS.items():
         own = trials[trials["system"] == system]
         shown = [trial for trial in (1, 2, 3, 4, 6, 10) if trial <= own["episode"].max()]

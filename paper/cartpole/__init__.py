@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from paper.common.experiment import Axes, Experiment
@@ -14,63 +13,6 @@ if TYPE_CHECKING:
     from paper.cartpole.control import Setup
 
 NUM_STARTS = 20  # of the evaluation
-
-
-@dataclass(frozen=True, kw_only=True)
-class ControlSettings:
-    """Settings that decide the numbers, for all learners, unless one says otherwise.
-
-    SAC's were tuned on the cart-pole with its true dynamics as the model.
-    """
-
-    episodes: int
-    """real episodes of a run"""
-    episode_length: int
-    """steps of an episode"""
-    model_episodes: int = 20
-    """episodes in the model after each of the first real ones"""
-    last_model_episode: int
-    """real episodes after which the model is no longer used"""
-    updates_per_model_step: float = 2
-    """gradient steps for each step in the model"""
-    num_particles: int = 5
-    """model episodes side by side"""
-    refresh_model_data: bool = True
-    """whether each new model predicts the earlier ones' transitions again (the paper does not)"""
-    updates: int | None = None
-    """gradient steps after each episode of a model-free learner; default: as many as the others"""
-    later_updates: int
-    """gradient steps after each episode without a model"""
-    learning_rate: float = 3e-3
-    """of SAC"""
-    gamma: float = 0.95
-    """of SAC"""
-    tau: float = 0.02
-    """of SAC"""
-    batch_size: int = 256
-    """of SAC"""
-    net_arch: tuple[int, ...] = (128, 128)
-    """of SAC"""
-    ent_coef: str = "auto_0.3"
-    """of SAC"""
-    target_entropy: str | float = "auto"
-    """of SAC"""
-    target: str = "difference"
-    """the targets of dynamics: differences of states, or next states ("absolute")"""
-    num_features: int = 128
-    """of RRA"""
-
-    def updates_after(self, episode: int, model_free: bool) -> int:
-        """Gradient steps after a real episode (from 1), without those within the model."""
-        if model_free and self.updates is not None:
-            return self.updates
-        if episode > self.last_model_episode:
-            return self.later_updates
-        return self.episode_length + (self.updates_in_model() if model_free else 0)
-
-    def updates_in_model(self) -> int:
-        """Gradient steps within the model after a real episode."""
-        return round(self.updates_per_model_step * self.model_episodes * self.episode_length)
 
 
 @dataclass(frozen=True)
@@ -108,9 +50,47 @@ def scenario(
 
 @dataclass(frozen=True, kw_only=True)
 class Control(Experiment):
-    """Learners of one task."""
+    """Learners of one task; settings are shared, unless a learner says otherwise.
 
-    settings: ControlSettings
+    SAC's were tuned on the cart-pole with its true dynamics as the model.
+    """
+
+    episodes: int = 50
+    """real episodes of a run"""
+    episode_length: int = 25
+    """steps of an episode"""
+    model_episodes: int = 20
+    """episodes in the model after each of the first real ones"""
+    last_model_episode: int = 25
+    """real episodes after which the model is no longer used"""
+    updates_per_model_step: float = 2
+    """gradient steps for each step in the model"""
+    num_particles: int = 5
+    """model episodes side by side"""
+    refresh_model_data: bool = True
+    """whether each new model predicts the earlier ones' transitions again (the paper does not)"""
+    updates: int | None = None
+    """gradient steps after each episode of a model-free learner; default: as many as the others"""
+    later_updates: int = 100
+    """gradient steps after each episode without a model"""
+    learning_rate: float = 3e-3
+    """of SAC"""
+    gamma: float = 0.95
+    """of SAC"""
+    tau: float = 0.02
+    """of SAC"""
+    batch_size: int = 256
+    """of SAC"""
+    net_arch: tuple[int, ...] = (128, 128)
+    """of SAC"""
+    ent_coef: str = "auto_0.3"
+    """of SAC"""
+    target_entropy: str | float = "auto"
+    """of SAC"""
+    target: str = "difference"
+    """the targets of dynamics: differences of states, or next states ("absolute")"""
+    num_features: int = 128
+    """of RRA"""
 
     packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "stable_baselines3")
     calls: ClassVar[tuple[str, ...]] = (
@@ -119,6 +99,7 @@ class Control(Experiment):
         "gpadjust.rl.DynaOptions",
         "stable_baselines3.SAC",
     )
+    cheap: ClassVar[Mapping[str, Any]] = {"episodes": 2}
     known: ClassVar[Mapping[str, Scenario]]
     """all learners"""
     rmses: ClassVar[Mapping[str, str]]
@@ -128,14 +109,26 @@ class Control(Experiment):
         """The real system, what is known of it, and who writes down what happens, for a run."""
         raise NotImplementedError
 
+    def updates_after(self, episode: int, model_free: bool) -> int:
+        """Gradient steps after a real episode (from 1), without those within the model."""
+        if model_free and self.updates is not None:
+            return self.updates
+        if episode > self.last_model_episode:
+            return self.later_updates
+        return self.episode_length + (self.updates_in_model() if model_free else 0)
+
+    def updates_in_model(self) -> int:
+        """Gradient steps within the model after a real episode."""
+        return round(self.updates_per_model_step * self.model_episodes * self.episode_length)
+
     @property
     def labels(self) -> dict[str, str]:
         """The names of the learners in tables and figures."""
         return {name: scenario.label for name, scenario in self.known.items()}
 
     def settings_of(self, name: str) -> Any:
-        """The settings of a learner."""
-        return replace(self.settings, **self.known[name].changes)
+        """The experiment with the settings of a learner."""
+        return self.changed(self.known[name].changes)
 
     def seeds_of(self, *kind: Any) -> Sequence[int]:
         """Some learners have few seeds."""
@@ -143,7 +136,7 @@ class Control(Experiment):
 
     def describe(self, *kind: Any) -> dict[str, Any]:
         """The settings of the learner, and the task with its dynamics, if it has a model."""
-        name, settings = kind[0], asdict(self.settings_of(kind[0]))
+        name, settings = kind[0], self.settings_of(kind[0]).settings
         if self.known[name].kind == "none":
             return settings
         task = self.setup(name, 0).task.describe()
@@ -157,23 +150,10 @@ class Control(Experiment):
         return run(self, *case)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Settings(ControlSettings):
-    """Settings that decide the numbers, for all learners, unless one says otherwise."""
-
-    episodes: int = 50
-    episode_length: int = 25
-    last_model_episode: int = 25
-    later_updates: int = 100
-    encode_angle: bool = True
-    """whether policy and model see sine and cosine of the angle"""
-
-
 # Per episode, of all episodes; the best of 25, 50, 100, 200.
 _FEWER: Mapping[str, Any] = {"updates": 100}
 _PAPER_GP = {"target": "absolute", "encode_angle": False}
 _PAPER_RRA = {"target": "absolute"}
-_STALE = {"refresh_model_data": False}
 SCENARIOS = {
     "mf": scenario("mf", "model-free"),
     "mf-best": scenario("mf", "model-free, fewer updates", _FEWER),
@@ -184,15 +164,7 @@ SCENARIOS = {
     "rra": scenario("rra"),
     "rra-paper": scenario("rra-paper", "Dyna-RRA, paper", _PAPER_RRA),
     "oracle": scenario("oracle", "oracle"),
-    "gp-absolute": scenario("gp", "Dyna-GP, absolute", {"target": "absolute"}, 4),
     "cka-absolute": scenario("cka", "Dyna-CKA, absolute", {"target": "absolute"}, 4),
-    "cka-1": scenario("cka", "Dyna-CKA, 1 update a step", {"updates_per_model_step": 1}, 4),
-    "cka-4": scenario("cka", "Dyna-CKA, 4 updates a step", {"updates_per_model_step": 4}, 4),
-    "cka-stale": scenario("cka", "Dyna-CKA, not refreshed", _STALE, 3),
-    "gp-paper-stale": scenario("gp", "Dyna-GP, paper, not refreshed", {**_PAPER_GP, **_STALE}, 3),
-    "rra-paper-stale": scenario(
-        "rra-paper", "Dyna-RRA, paper, not refreshed", {**_PAPER_RRA, **_STALE}, 3
-    ),
 }
 
 
@@ -200,10 +172,12 @@ SCENARIOS = {
 class CartPole(Control):
     """Learners swing up and balance the pole of a cart-pole."""
 
-    out: Path = Path("results/cartpole")
-    settings: Settings = field(default_factory=Settings)
+    encode_angle: bool = True
+    """whether policy and model see sine and cosine of the angle"""
 
     axes: ClassVar[Axes] = {"scenario": {name: each.label for name, each in SCENARIOS.items()}}
+    curves: ClassVar[tuple[str, ...]] = ("mf", "phy", "gp-paper", "cka", "rra-paper")
+    quick: ClassVar[Mapping[str, Any]] = {"episodes": 25, "model_episodes": 10}
     known: ClassVar[Mapping[str, Scenario]] = SCENARIOS
     rmses: ClassVar[Mapping[str, str]] = {
         "x": "x, m",
@@ -239,12 +213,13 @@ MC_PILCO: Mapping[str, Any] = {
 SMALL_NOISE = 0.01
 """In that protocol, the standard deviation of the noise of all sensors, and of the starts."""
 
-_OF_A_SEARCH = ("updates", "starts", "learning_rate", "guides")
-
 
 @dataclass(frozen=True, kw_only=True)
-class PlanningSettings:
-    """Settings that decide the numbers; found with the true system and other seeds (100 to 111)."""
+class Planning(Experiment):
+    """Cart-poles that are swung up by planning, with several models of them.
+
+    Settings were found with the true system and other seeds (100 to 111).
+    """
 
     trials: int = 5
     """real trials of a run, the first of which goes by f_p"""
@@ -270,22 +245,6 @@ class PlanningSettings:
     """of these"""
     correlation: float = 0.5
     """of deviations of a step and the next"""
-    updates: int = 150
-    """of the policy, after each trial, where one is searched for"""
-    starts: int = 192
-    """of an update"""
-    learning_rate: float = 3e-3
-    """at the start of the updates"""
-    guides: int = 32
-    """planned episodes that the policy imitates at first"""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Planning(Experiment):
-    """Cart-poles that are swung up by planning, with several models of them."""
-
-    out: Path = Path("results/planning")
-    settings: PlanningSettings = field(default_factory=PlanningSettings)
 
     axes: ClassVar[Axes] = {
         "system": {
@@ -300,29 +259,31 @@ class Planning(Experiment):
             "fitted": "f_p and viscous friction, fitted",
             "structured": "f_p with dry friction and drag, fitted",
         }
-        | labels("gp", "rra")
-        | {"search": "CKA, policy search"}
-        | labels("oracle"),
+        | labels("gp", "oracle"),
     }
-    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "stable_baselines3")
     calls: ClassVar[tuple[str, ...]] = (
         "gpadjust.dynamics.LearnedDynamics",
         "gpadjust.control.Planner",
-        "gpadjust.control.PolicySearch",
     )
+    cheap: ClassVar[Mapping[str, Any]] = {"trials": 1}
 
-    def settings_of(self, system: str) -> PlanningSettings:
-        """The settings for a system."""
-        return replace(self.settings, **MC_PILCO) if system == "mc-pilco" else self.settings
+    def settings_of(self, system: str) -> Planning:
+        """The experiment with the settings for a system."""
+        return self.changed({**MC_PILCO, **self._fewer()}) if system == "mc-pilco" else self
+
+    def _fewer(self) -> dict[str, int]:
+        """The trials of MC-PILCO's protocol, if fewer are asked for."""
+        return {"trials": self.trials} if self.trials < Planning.trials else {}
 
     def describe(self, *kind: Any) -> dict[str, Any]:
         """The settings, and what the system has that f_p lacks."""
         system, learner = kind
-        settings = asdict(self.settings_of(system))
-        if learner != "search":
-            settings = {k: each for k, each in settings.items() if k not in _OF_A_SEARCH}
         more: dict[str, Any] = {"friction": FRICTIONS[system]} if system in FRICTIONS else {}
         more |= {"sensors": SENSORS} if system == "sensors" else {}
         more |= {"small_noise": SMALL_NOISE} if system == "mc-pilco" else {}
         more |= {"fitted_by": "PhysicsDynamics"} if learner in ("fitted", "structured") else {}
-        return {**settings, **more}
+        return {**self.settings_of(system).settings, **more}
+
+    def seeds_of(self, *kind: Any) -> Sequence[int]:
+        """Ten of the paper's system and of friction; three of the others."""
+        return self.seeds if kind[0] in ("plain", "friction") else self.seeds[:3]

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
-from paper.cartpole import Control
-from paper.cartpole.claims import CLAIMS
+from paper.cartpole import CartPole, Control
+from paper.cartpole.claims import CLAIMS, LAST
 from paper.cartpole.control import foresight, load
 from paper.cartpole.planning import trials_table
 from paper.common.experiment import Run, Table
+from paper.common.figures import curves
 from paper.common.tables import claims_table
 from paper.common.verdicts import Curves, judge
 
@@ -16,12 +18,15 @@ MEASURES = {"cost": "sampled", "evaluation": "deterministic"}
 
 
 def tables(runs: Sequence[Run], experiment: Control) -> dict[str, Table]:
-    """All tables, by name."""
+    """All tables, by name; claims are judged of runs as long as the paper's."""
     episodes = load(runs, "episodes", experiment)
-    last = experiment.settings.episodes
-    of = {measure: Curves(episodes, measure) for measure in MEASURES}
-    judged = {f"{MEASURES[m]} actions": judge(CLAIMS, of[m], last) for m in MEASURES}
-    found = {"claims": Table("Claims", claims_table("claim", judged))}
+    last, found = experiment.episodes, {}
+    if last >= LAST:
+        judged = {
+            f"{actions} actions": judge(CLAIMS, Curves(episodes, measure), last)
+            for measure, actions in MEASURES.items()
+        }
+        found["claims"] = Table("Claims", claims_table("claim", judged))
     for measure, actions in MEASURES.items():
         shown = [trial for trial in (1, 3, 6, 12, 25, 50) if trial <= last]
         text = trials_table(
@@ -30,3 +35,14 @@ def tables(runs: Sequence[Run], experiment: Control) -> dict[str, Table]:
         found[actions] = Table(f"Cost, {actions} actions", text)
     found["model"] = Table("How well models foresaw trials", foresight(episodes, experiment))
     return found
+
+
+def draw(runs: Sequence[Run], experiment: CartPole) -> list[Path]:
+    """Draw the paper's figure 2: mean and standard deviation of five learners' costs."""
+    episodes = load(runs, "episodes", experiment)
+    known = {name: experiment.known[name] for name in experiment.curves}
+    lines = {name: (of.label, of.color) for name, of in known.items()}
+    parts = {f"{actions} actions": episodes.assign(cost=episodes[measure])
+             for measure, actions in MEASURES.items()}  # fmt: skip
+    labels = ("trial", "cost, mean ± standard deviation over runs")
+    return [curves(experiment.folder / "figure2.png", parts, "cost", lines, labels=labels)]

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from scipy import stats
 
-from paper.cartpole import SCENARIOS, Settings
+from paper.cartpole import SCENARIOS, CartPole
 from paper.common.verdicts import (
     Claim,
     Curves,
@@ -26,7 +26,7 @@ from paper.common.verdicts import (
     within,
 )
 
-LAST, SERVES = Settings().episodes, Settings().last_model_episode
+LAST, SERVES = CartPole.episodes, CartPole.last_model_episode
 
 
 def _model_free(curves: Curves) -> Finding:

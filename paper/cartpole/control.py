@@ -17,7 +17,7 @@ from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.physics import Physics
 from gpadjust.rl import DynaCallback, DynaOptions, DynaSAC
 from gpadjust.states import StateSpec
-from paper.cartpole import Control, ControlSettings, Scenario
+from paper.cartpole import Control, Scenario
 from paper.common.experiment import Run
 from paper.common.tables import numbers
 
@@ -37,7 +37,7 @@ class Setup(NamedTuple):
 
 
 def dynamics(
-    scenario: Scenario, settings: ControlSettings, spec: StateSpec, physics: Physics, truth: Physics
+    scenario: Scenario, settings: Control, spec: StateSpec, physics: Physics, truth: Physics
 ) -> Dynamics:
     """The model of a learner; a model-free one does not use it."""
     if scenario.kind != "learnt":
@@ -67,7 +67,7 @@ def run(experiment: Control, name: str, seed: int) -> Run:
 
 
 def _options(experiment: Control, name: str) -> DynaOptions:
-    settings: ControlSettings = experiment.settings_of(name)
+    settings: Control = experiment.settings_of(name)
     model_free = experiment.known[name].kind == "none"
     return DynaOptions(
         model_episodes=settings.model_episodes,
@@ -81,7 +81,7 @@ def _options(experiment: Control, name: str) -> DynaOptions:
 
 def _arguments(experiment: Control, name: str) -> dict[str, Any]:
     """The arguments of SAC that the settings decide."""
-    settings: ControlSettings = experiment.settings_of(name)
+    settings: Control = experiment.settings_of(name)
     named = ("learning_rate", "gamma", "tau", "batch_size", "ent_coef", "target_entropy")
     policy = {"net_arch": list(settings.net_arch), "optimizer_kwargs": {"fused": True}}
     return {
@@ -107,7 +107,7 @@ class Recorder(DynaCallback):
 
     model: DynaSAC
 
-    def __init__(self, settings: ControlSettings, model_free: bool) -> None:
+    def __init__(self, settings: Control, model_free: bool) -> None:
         super().__init__()
         self.settings: Any = settings
         self.model_free = model_free

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,19 +14,10 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 import torch
-from matplotlib.axes import Axes
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
-from gpadjust.control import (
-    MPCAgent,
-    Planner,
-    PolicySearch,
-    PolicySearchAgent,
-    Rollouts,
-    SearchResult,
-    Task,
-)
+from gpadjust.control import MPCAgent, Planner
 from gpadjust.core import SamplingWarning
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.physics import Unknown
@@ -45,7 +36,6 @@ from paper.cartpole import (
     SMALL_NOISE,
     CartPole,
     Planning,
-    PlanningSettings,
 )
 from paper.common.experiment import Run, Table
 from paper.common.figures import curves as draw_curves
@@ -60,7 +50,6 @@ FRICTION_UNKNOWNS = {
 }
 """The terms that f_p lacks on the systems with friction, for the baseline that is told of them."""
 
-_BOUND = 50.0  # of all entries of the state, in m, rad and s, where a policy is searched for
 _LEARNERS, _SYSTEMS = Planning.axes["learner"], Planning.axes["system"]
 
 
@@ -92,9 +81,7 @@ def run(experiment: Planning, system: str, learner: str, seed: int) -> Run:
     return {"trials": {name: [row[name] for row in rows] for name in rows[0]}}
 
 
-def make_agent(
-    experiment: Planning, system: str, learner: str, seed: int
-) -> MPCAgent | PolicySearchAgent:
+def make_agent(experiment: Planning, system: str, learner: str, seed: int) -> MPCAgent:
     """The agent of a run, at its start."""
     settings = experiment.settings_of(system)
     env, length = environment(system, settings), settings.episode_length
@@ -102,70 +89,16 @@ def make_agent(
     task = system_of(system, settings).task(dynamics(settings, system, learner, seed))
     if system == "mc-pilco":
         task = replace(task, reward=mc_pilco_reward)
-    if learner == "search":
-        task = replace(task, state_bounds=torch.tensor([[-_BOUND] * 4, [_BOUND] * 4]))
     common: dict[str, Any] = {
         "reward_tolerance": None,
         "score_horizons": (),
         "random_steps": settings.random_trials * length,
         "seed": seed,
     }
-    if learner != "search":
-        return MPCAgent(env, task, each_step, first=first, **common)
-    search = GuidedSearch(
-        updates=settings.updates,
-        num_starts=settings.starts,
-        num_functions=None,
-        learning_rate=settings.learning_rate,
-        guide=first,
-        num_guides=settings.guides,
-    )
-    return PolicySearchAgent(env, task, search=search, **common)
+    return MPCAgent(env, task, each_step, first=first, **common)
 
 
-@dataclass(frozen=True)
-class GuidedSearch(PolicySearch):
-    """A policy search that begins with a policy which imitates plans of some episodes.
-
-    Of a swing-up gradients find nothing by themselves, as at first no action of the policy matters.
-    """
-
-    _: KW_ONLY
-    guide: Planner = field(default_factory=Planner)
-    num_guides: int = 16
-    begun: set[int] = field(default_factory=set)  # policies that have imitated them
-
-    def improve(self, policy: Any, task: Task, **options: Any) -> SearchResult:
-        """Imitate plans, if it is the first time, and improve the policy."""
-        if id(policy) not in self.begun:
-            _imitate(policy, *self.plans(task, policy.action_bounds))
-            self.begun.add(id(policy))
-        return super().improve(policy, task, **options)
-
-    def plans(self, task: Task, action_bounds: Tensor) -> tuple[Tensor, Tensor]:
-        """States ``N x state_dim`` and actions ``N x action_dim`` of episodes by the guide."""
-        rollouts, parts = Rollouts(task, None), []
-        for start in task.draw_initial_states(self.num_guides):
-            plan = self.guide.plan(task, start, action_bounds)
-            with torch.no_grad():
-                rollout = rollouts.follow(start, plan.actions.unsqueeze(0))
-            parts.append([part[rollout.made] for part in (rollout.states, rollout.actions)])
-        states, actions = (torch.cat(column) for column in zip(*parts, strict=True))
-        return states, actions
-
-
-def _imitate(policy: nn.Module, states: Tensor, actions: Tensor) -> None:
-    """Fit a policy to actions ``N x action_dim`` at states ``N x state_dim``, by least squares."""
-    scale = actions.std(0, correction=0).clamp_min(1e-12)
-    optimizer = torch.optim.Adam(policy.parameters(), lr=5e-3)
-    for _ in range(400):
-        loss = ((policy(states) - actions) / scale).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-
-
-def planners(settings: PlanningSettings) -> tuple[Planner, Planner]:
+def planners(settings: Planning) -> tuple[Planner, Planner]:
     """The planner of each step, and that of a trial that begins."""
     search: dict[str, Any] = {"num_elites": settings.elites, "correlation": settings.correlation}
     each_step = Planner(
@@ -179,14 +112,14 @@ def planners(settings: PlanningSettings) -> tuple[Planner, Planner]:
     return each_step, first
 
 
-def system_of(name: str, settings: PlanningSettings, seed: int = 0, **options: Any) -> System:
+def system_of(name: str, settings: Planning, seed: int = 0, **options: Any) -> System:
     """A cart-pole, and what is known of it."""
     dry, drag = FRICTIONS.get(name, (0.0, 0.0))
     given: dict[str, Any] = {"time_step": settings.time_step, **options}
     return cart_pole(seed, dry=dry, drag=drag, episode_length=settings.episode_length, **given)
 
 
-def dynamics(settings: PlanningSettings, system: str, learner: str, seed: int) -> Dynamics:
+def dynamics(settings: Planning, system: str, learner: str, seed: int) -> Dynamics:
     """The model that is planned in, at its start."""
     if learner == "oracle":
         dry, drag = FRICTIONS.get(system, (0.0, 0.0))
@@ -200,7 +133,7 @@ def dynamics(settings: PlanningSettings, system: str, learner: str, seed: int) -
         return PhysicsDynamics(known.spec, physics)
     if learner in ("phy", "fitted"):
         return PhysicsDynamics(known.spec, known.physics)
-    made = LEARNERS["cka" if learner == "search" else learner]
+    made = LEARNERS[learner]
     return LearnedDynamics(known.spec, known.physics if made.adjusts else None, model=made.make)
 
 
@@ -243,7 +176,7 @@ class Watched(gym.Wrapper[Any, Any, Any, Any]):
         return result
 
 
-def environment(system: str, settings: PlanningSettings) -> Watched:
+def environment(system: str, settings: Planning) -> Watched:
     """The real system."""
     env: gym.Env[Any, Any] = system_of(system, settings).make()
     if system == "sensors":
@@ -266,7 +199,7 @@ def mc_pilco_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Ten
 
 def tables(runs: Sequence[Run], experiment: Planning) -> dict[str, Table]:
     """All tables, by name."""
-    trials, last = frame(runs, "trials"), experiment.settings.trials
+    trials, last = frame(runs, "trials"), experiment.trials
     by_system = {system: trials[trials["system"] == system] for system in _SYSTEMS}
     found = {}
     for system, own in by_system.items():
@@ -304,7 +237,7 @@ def _short(trials: pd.DataFrame, last: int) -> str:
 
 def _of_dyna(experiment: Planning, last: int) -> str:
     """Rows of the learners of the cart-pole's own experiment that have a model, if it was run."""
-    other = CartPole(out=experiment.out.parent / CartPole.name)
+    other = CartPole(out=experiment.out)
     runs, rows = runs_file(other).read().values(), []
     for name in ("cka", "phy", "gp"):
         costs = np.array([r["episodes"]["cost"] for r in runs if r["scenario"] == name])
@@ -362,31 +295,15 @@ def trials_table(
     return table(groups(own, "learner", labels), {**columns, "less CKA's": gap})
 
 
-def _ticks(ax: Axes, title: str, own: pd.DataFrame) -> None:
-    ax.set_xticks(range(1, own["episode"].max() + 1))
-
-
 def draw(runs: Sequence[Run], experiment: Planning) -> list[Path]:
     """Draw the cost of the trials, models over each other, a panel for each system."""
     trials = frame(runs, "trials")
-
-    def title(system: str, own: pd.DataFrame) -> str:
-        seeds = own.groupby("learner")["seed"].nunique()
-        few, many = seeds.min(), seeds.max()
-        return f"{system} ({few if few == many else f'{few} to {many}'} runs)"
-
-    parts = {title(label, own): own for label, own in groups(trials, "system", _SYSTEMS).items()}
-    colors = {name: known.color for name, known in LEARNERS.items()}
-    colors |= {"search": "tab:cyan", "structured": "tab:olive"}
+    parts = {
+        f"{label} ({own['seed'].nunique()} runs)": own
+        for label, own in groups(trials, "system", _SYSTEMS).items()
+    }
+    colors = {name: known.color for name, known in LEARNERS.items()} | {"structured": "tab:olive"}
     lines = {name: (label, colors[name]) for name, label in _LEARNERS.items()}
-    return [
-        draw_curves(
-            experiment.out / "planning.png",
-            parts,
-            "cost",
-            lines,
-            labels=("trial", "cost, median and quartiles"),
-            share=False,
-            finish=_ticks,
-        )
-    ]
+    labels = ("trial", "cost, mean ± standard deviation")
+    path = experiment.folder / "planning.png"
+    return [draw_curves(path, parts, "cost", lines, labels=labels, share=False)]

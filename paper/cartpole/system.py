@@ -21,11 +21,11 @@ from gpadjust.systems.swing_up import (
     cart_pole_reward,
     equation_physics,
 )
-from paper.cartpole import NUM_STARTS, Scenario, Settings
+from paper.cartpole import NUM_STARTS, CartPole, Scenario
 from paper.cartpole.control import Recorder, Setup, dynamics
 
 
-def setup(scenario: Scenario, settings: Settings, seed: int) -> Setup:
+def setup(scenario: Scenario, settings: CartPole, seed: int) -> Setup:
     """A run's cart-pole, its task, and its recorder."""
     length, encode = settings.episode_length, settings.encode_angle
     system = cart_pole(seed, encode_angle=encode, episode_length=length)
@@ -47,7 +47,7 @@ def fixed_starts(n: int) -> Tensor:
     return (torch.tensor(START_MEAN, dtype=torch.float64) + START_STD * noise)[:n]
 
 
-def evaluate(agent: DynaSAC, settings: Settings) -> float:
+def evaluate(agent: DynaSAC, settings: CartPole) -> float:
     """The mean cost of the deterministic policy over the fixed starts; draws no random number."""
     system = cart_pole(encode_angle=settings.encode_angle, episode_length=settings.episode_length)
     task = replace(
@@ -73,7 +73,7 @@ class CartPoleRecorder(Recorder):
         seed: Of f_p.
     """
 
-    def __init__(self, settings: Settings, model_free: bool, seed: int) -> None:
+    def __init__(self, settings: CartPole, model_free: bool, seed: int) -> None:
         super().__init__(settings, model_free)
         self.seed = seed
 

@@ -1,4 +1,4 @@
-"""What an experiment is; its fields are its command line."""
+"""What an experiment is; its fields are its command line, and those of its own its settings."""
 
 from __future__ import annotations
 
@@ -6,18 +6,19 @@ import inspect
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from importlib import import_module
 from itertools import product
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 Case = tuple[Any, ...]
 """What is run once: a value of each axis, and a seed."""
 Run = dict[str, Any]
-"""A case that was run: its values by name, what identifies the run, and what it found."""
+"""A case that was run: its values by name, what identifies the run, and its results."""
 Axes = Mapping[str | tuple[str, ...], Mapping[Any, str]]
+_Self = TypeVar("_Self", bound="Experiment")
 
 
 class Table(NamedTuple):
@@ -32,13 +33,13 @@ class Experiment:
     """Runs that do not depend on each other, and what is made of them.
 
     A chapter is a folder of `paper/`. Its ``__init__.py`` declares its experiments: subclasses with
-    ``axes``, and with settings as further fields; it imports nothing slow, because the command line
-    is made of it. Beside it lies a module with the ``name`` of each experiment, which has
+    ``axes``, whose further fields are their settings; it imports nothing slow, because the command
+    line is made of it. Beside it lies a module with the ``name`` of each experiment, which has
 
-    - ``run(experiment, *case)``: runs a case with one thread; returns what it found, for JSON.
+    - ``run(experiment, *case)``: runs a case with one thread; returns its results, for JSON.
     - ``tables(runs, experiment)``: tables of all runs, by name.
     - ``first_look(runs)``, if wanted: a short table of the first runs, None if they are too few.
-    - ``draw(runs, experiment)``, if there are figures: draws them into ``experiment.out`` and
+    - ``draw(runs, experiment)``, if there are figures: draws them into ``experiment.folder`` and
       returns their files.
     """
 
@@ -52,29 +53,35 @@ class Experiment:
     jobs: int = field(default_factory=lambda: os.cpu_count() or 1)
     """parallel processes"""
     out: Path = Path("results")
-    """folder of the results"""
+    """folder of the results, with a folder for each experiment"""
     only_tables: bool = False
     """run nothing; make tables and figures of the runs that are there"""
 
     name: ClassVar[str]
-    """on the command line, and in the markers of the pages: that of the class in lower case"""
+    """on the command line, and in the markers of the pages: the class's in lower case"""
     axes: ClassVar[Axes]
-    """by the name of each axis, its values and their labels; if values have several parts, the
-    name is a tuple of theirs and each value a tuple"""
+    """by the name of each axis, its values and their labels; the last axis has the learners. If
+    values have several parts, the name is a tuple of theirs and each value a tuple"""
     key: ClassVar[tuple[str, ...]]
     """the names of the parts of a case: those of the axes, and ``"seed"``"""
-    calls: ClassVar[tuple[str, ...]] = ()
-    """the calls of the library that decide the numbers, such as ``"gpadjust.fit"``: the defaults
-    of their arguments are part of what identifies a run"""
-    flat: ClassVar[bool] = True
-    """whether options of nested settings have the names of these alone"""
+    calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA")
+    """the calls of the library that decide the numbers: the defaults of their arguments are part of
+    what identifies a run"""
     packages: ClassVar[tuple[str, ...]] = ("torch", "gpytorch", "botorch", "numpy")
-    """whose versions decide the numbers; of the library itself the commit is said"""
+    """whose versions decide the numbers; of the library itself the commit is recorded"""
+    cheap: ClassVar[Mapping[str, Any]] = {}
+    """settings with which `python -m paper check` makes the beginning of a long run again"""
 
     def __init_subclass__(cls) -> None:
         cls.name = cls.__name__.lower()
         if "axes" in cls.__dict__:
-            cls.key = (*_flat(cls.axes), "seed")
+            parts = [name if isinstance(name, tuple) else (name,) for name in cls.axes]
+            cls.key = (*sum(parts, ()), "seed")
+
+    @property
+    def folder(self) -> Path:
+        """Where its results are."""
+        return self.out / self.name
 
     @property
     def seeds(self) -> range:
@@ -101,32 +108,35 @@ class Experiment:
             for name, values in self.axes.items()
         ]
         kinds = [tuple(sum(kind, ())) for kind in product(*parts)]
-        known = [{str(kind[i]) for kind in kinds} for i in range(len(self.key) - 1)]
-        unknown = [name for name in self.only if not any(name in names for names in known)]
-        if unknown:
+        names = [dict.fromkeys(str(kind[i]) for kind in kinds) for i in range(len(self.key) - 1)]
+        for unknown in {*self.only}.difference(*names):
             there = "; ".join(
-                f"{name}: {', '.join(dict.fromkeys(str(kind[i]) for kind in kinds))}"
-                for i, name in enumerate(self.key[:-1])
+                f"{axis}: {', '.join(of)}" for axis, of in zip(self.key, names, strict=False)
             )
-            raise ValueError(f"--only: there is no {unknown[0]!r}, but there are, by axis, {there}")
-        wanted = [names & {*self.only} or names for names in known]
-        found = []
-        outer = len(kinds[0]) - len(parts[-1][0])
+            raise ValueError(f"--only: there is no {unknown!r}, but there are, by axis, {there}")
+        wanted = [{*of} & {*self.only} or {*of} for of in names]
+        kinds = [k for k in kinds if all(str(v) in w for v, w in zip(k, wanted, strict=True))]
+        outer = len(self.key) - 1 - len(parts[-1][0])
+        cases = []
         for first in dict.fromkeys(kind[:outer] for kind in kinds):
-            seeds = {
-                kind: self.seeds_of(*kind)
-                for kind in kinds
-                if kind[:outer] == first
-                and all(str(value) in names for value, names in zip(kind, wanted, strict=True))
-            }
-            every = dict.fromkeys(seed for own in seeds.values() for seed in own)
-            found += [(*k, seed) for seed in every for k, own in seeds.items() if seed in own]
-        return found
+            seeds = {kind: self.seeds_of(*kind) for kind in kinds if kind[:outer] == first}
+            every = dict.fromkeys(seed for of_kind in seeds.values() for seed in of_kind)
+            cases += [(*k, seed) for seed in every for k, those in seeds.items() if seed in those]
+        return cases
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The fields of its own."""
+        common = {entry.name for entry in fields(Experiment)}
+        return {e.name: getattr(self, e.name) for e in fields(self) if e.name not in common}
+
+    def changed(self: _Self, changes: Mapping[str, Any]) -> _Self:
+        """The experiment with other settings."""
+        return replace(self, **changes)
 
     def describe(self, *kind: Any) -> dict[str, Any]:
         """The settings that decide the numbers of a kind of cases; all of them, by default."""
-        settings = getattr(self, "settings", None)
-        return {} if settings is None else asdict(settings)
+        return self.settings
 
     def defaults(self) -> dict[str, dict[str, Any]]:
         """The defaults of the arguments of ``calls``, as JSON has them."""
@@ -134,8 +144,8 @@ class Experiment:
 
     def run(self, *case: Any) -> Run:
         """Run a case."""
-        found: Run = self._module().run(self, *case)
-        return found
+        results: Run = self._module().run(self, *case)
+        return results
 
     def first_look(self, runs: Sequence[Run]) -> str | None:
         """A short table of the first few runs, if the experiment has one and they are enough."""
@@ -145,8 +155,8 @@ class Experiment:
 
     def tables(self, runs: Sequence[Run]) -> dict[str, Table]:
         """The tables of all runs, by name."""
-        found: dict[str, Table] = self._module().tables(runs, self)
-        return found
+        tables: dict[str, Table] = self._module().tables(runs, self)
+        return tables
 
     def draw(self, runs: Sequence[Run]) -> list[Path]:
         """Draw the figures, if there are any, and return their files."""
@@ -160,16 +170,8 @@ class Experiment:
 
 def defaults_of(call: Any) -> dict[str, Any]:
     """The arguments of a call that have a default, as JSON has them; others by their names."""
-    found = {
-        parameter.name: parameter.default
-        for parameter in inspect.signature(call).parameters.values()
-        if parameter.default is not inspect.Parameter.empty
-    }
-    plain: dict[str, Any] = json.loads(
-        json.dumps(found, default=lambda value: getattr(value, "__qualname__", None) or repr(value))
-    )
+    parameters = inspect.signature(call).parameters.values()
+    defaults = {p.name: p.default for p in parameters if p.default is not inspect.Parameter.empty}
+    text = json.dumps(defaults, default=lambda v: getattr(v, "__qualname__", None) or repr(v))
+    plain: dict[str, Any] = json.loads(text)
     return plain
-
-
-def _flat(axes: Axes) -> list[str]:
-    return [part for name in axes for part in (name if isinstance(name, tuple) else (name,))]

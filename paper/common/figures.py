@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from io import BytesIO
 from pathlib import Path
 
 import matplotlib as mpl
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from PIL import Image
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write a figure to a file; return it."""
-    with mpl.rc_context({"savefig.dpi": 110}):
-        figure.savefig(path)
+    """Write a figure to a file of few colors, which is small; return it."""
+    drawn = BytesIO()
+    with mpl.rc_context({"savefig.dpi": 100}):
+        figure.savefig(drawn)
+    Image.open(drawn).convert("RGB").quantize(96, dither=Image.Dither.NONE).save(
+        path, optimize=True
+    )
     return path
 
 
@@ -50,22 +56,6 @@ def panels(
     return figure, list(axes[: len(titles)])
 
 
-def draw_quartiles(
-    ax: Axes,
-    records: pd.DataFrame,
-    measure: str,
-    *,
-    by: str = "episode",
-    color: str,
-    label: str,
-) -> None:
-    """Draw the median over runs, and the quartiles as a band; they hold where one run fails."""
-    values = records.groupby(by)[measure]
-    low, middle, high = (values.quantile(q) for q in (0.25, 0.5, 0.75))
-    ax.fill_between(middle.index, low, high, color=color, alpha=0.15, lw=0)
-    ax.plot(middle.index, middle, color=color, lw=1.5, label=label)
-
-
 def one_legend(figure: Figure, axes: Iterable[Axes], ncols: int = 3) -> None:
     """A legend above a figure, of the lines in any of its panels, of which not all have all."""
     handles = {
@@ -82,44 +72,33 @@ def curves(
     value: str,
     lines: Mapping[str, tuple[str, str]],
     *,
-    x: str = "episode",
     labels: tuple[str, str],
-    columns: int = 2,
-    size: tuple[float, float] = (4.2, 3.0),
     share: bool = True,
-    logarithmic: bool = False,
-    finish: Callable[[Axes, str, pd.DataFrame], object] | None = None,
+    finish: Callable[[Axes], object] | None = None,
 ) -> Path:
-    """Draw median and quartiles of a measure over trials, a panel for each part of the runs.
+    """Draw mean and standard deviation of a measure over trials, a panel for each part of the runs.
 
     Args:
         path: The file.
-        parts: Runs by the title of their panel, a row for each run and trial.
+        parts: Runs by the title of their panel, a row for each run and ``episode``.
         value: The column that is drawn.
         lines: Label and color of the learners that are drawn.
-        x: The column of the trials.
         labels: What stands below and beside all panels.
-        columns: Panels in a row.
-        size: Of a panel, in inches.
         share: Whether all panels have the same axes.
-        logarithmic: Whether the measure has a logarithmic axis.
-        finish: Adds to a panel, given its axes, its title and its runs.
-
-    Returns:
-        The file.
+        finish: Adds to a panel.
     """
-    figure, axes = panels([*parts], columns, size, share=share, width=8.0)
-    for ax, (title, runs) in zip(axes, parts.items(), strict=True):
+    figure, axes = panels([*parts], 2, (4.2, 3.0), share=share, width=8.0)
+    for ax, runs in zip(axes, parts.values(), strict=True):
         for name, (label, color) in lines.items():
-            own = runs[runs["learner"] == name]
-            if len(own):
-                draw_quartiles(ax, own, value, by=x, color=color, label=label)
-        if logarithmic:
-            ax.set_yscale("log")
+            values = runs[runs["learner"] == name].groupby("episode")[value]
+            mean, sd = values.mean(), values.std()
+            if len(mean):
+                ax.fill_between(mean.index, mean - sd, mean + sd, color=color, alpha=0.12, lw=0)
+                ax.plot(mean.index, mean, color=color, lw=1.5, label=label)
         ax.grid(axis="y", color="0.9", lw=0.6)
         ax.set_axisbelow(True)
         if finish:
-            finish(ax, title, runs)
+            finish(ax)
     figure.supxlabel(labels[0], fontsize="medium")
     figure.supylabel(labels[1], fontsize="medium")
     one_legend(figure, axes, ncols=4)

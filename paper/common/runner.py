@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,7 @@ from tqdm import tqdm
 
 from paper.common.experiment import Case, Experiment, Run, Table
 from paper.common.runs import RunsFile, commit_of, differences, rounded, versions
-from paper.common.tables import aligned, as_document, settings_table
+from paper.common.tables import aligned, as_document, markdown
 
 
 class Refused(ValueError):  # noqa: N818 - it is no error of the program
@@ -25,12 +27,14 @@ class Refused(ValueError):  # noqa: N818 - it is no error of the program
 
 RUNS = "runs.jsonl"
 TABLES = "tables.md"
-_ROOT = Path(__file__).parents[2]
+PAPER = Path(__file__).parents[1]
+STALE = PAPER / "stale.txt"
+"""Learners whose runs today's code does not make again, a line each: experiment and learner."""
 
 
 def runs_file(experiment: Experiment) -> RunsFile:
     """Where the runs of an experiment are."""
-    return RunsFile(experiment.out / RUNS, experiment.key)
+    return RunsFile(experiment.folder / RUNS, experiment.key)
 
 
 def main(experiment: Experiment) -> None:
@@ -52,26 +56,59 @@ def main(experiment: Experiment) -> None:
             raise Refused(str(error)) from error
         run_missing(experiment)
     done = file.read()
-    runs = list(done.values())
-    if not runs:
-        raise Refused(f"There are no results in {experiment.out}.")
+    if not done:
+        raise Refused(f"There are no results in {experiment.folder}.")
     if experiment.only_tables:
         with suppress(ImportError):  # of a simulator that tables do not need
             check_settings(file.path, done, experiment)
-    tables = tables_of(experiment, runs)
+    tables = tables_of(experiment, [*done.values()])
     for table in tables.values():
         print(f"\n{table.title}\n\n{aligned(table.text)}")
-    (experiment.out / TABLES).write_text(as_document(tables))
-    print(experiment.out / TABLES, *experiment.draw(runs), sep="\n")
+    path = write_tables(experiment, tables)
+    print(path, *experiment.draw([*done.values()]), sep="\n")
+
+
+def write_tables(experiment: Experiment, tables: Mapping[str, Table]) -> Path:
+    """Write the file of an experiment's tables."""
+    path = experiment.folder / TABLES
+    path.write_text(as_document(tables))
+    return path
 
 
 def tables_of(experiment: Experiment, runs: Sequence[Run]) -> dict[str, Table]:
-    """Settings and results, by the names of their markers in the pages."""
-    found = experiment.tables(runs)
-    settings = getattr(experiment, "settings", None)
-    if settings is not None:
-        found["settings"] = Table("Settings", settings_table({"value": asdict(settings)}))
-    return {f"{experiment.name}:{name}": table for name, table in found.items()}
+    """Settings and results, by the names of their markers in the pages, each with its stamp."""
+    tables = experiment.tables(runs)
+    if experiment.settings:
+        rows = [[f"`{name}`", f"{value}"] for name, value in experiment.settings.items()]
+        tables["settings"] = Table("Settings", markdown(["setting", "value"], rows))
+    below = stamp(experiment, runs)
+    return {
+        f"{experiment.name}:{name}": table._replace(text=f"{table.text}\n\n{below}")
+        for name, table in tables.items()
+    }
+
+
+def stamp(experiment: Experiment, runs: Sequence[Run]) -> str:
+    """The commits that made the runs, with dates, and which of them are stale."""
+    made = Counter((run.get("date") or "", (run.get("commit") or "")[:8]) for run in runs)
+    parts = [
+        f"{number} by {commit} of {date}" if commit else f"{number} by unrecorded code"
+        for (date, commit), number in sorted(made.items(), reverse=True)
+    ]
+    learners = dict.fromkeys(str(run[experiment.key[-2]]) for run in runs)
+    is_committed = experiment.out.resolve() == STALE.parent / "results"
+    listed = stale_list() if is_committed else set()
+    stale = [learner for learner in learners if f"{experiment.name} {learner}" in listed]
+    text = f"Runs: {'; '.join(parts[:3])}{'; others earlier' * (len(parts) > 3)}."
+    if stale:
+        which = "" if len(stale) == len(learners) else f" ({', '.join(stale)})"
+        text += f" Stale: today's code gives other numbers{which}."
+    return f"*{text}*"
+
+
+def stale_list() -> set[str]:
+    """Lines of ``STALE``."""
+    return {*STALE.read_text().splitlines()} if STALE.exists() else set()
 
 
 def run_missing(experiment: Experiment) -> None:
@@ -85,7 +122,7 @@ def run_missing(experiment: Experiment) -> None:
     done, cases = file.read(), experiment.cases()
     check_settings(file.path, done, experiment)
     missing = [case for case in cases if case not in done]
-    others = [differ for run in done.values() if (differ := _made_otherwise(run, experiment))]
+    others = [differ for run in done.values() if (differ := made_otherwise(run, experiment))]
     if missing and others:
         raise Refused(
             f"{file.path} has runs that differ from those to come: {others[0]}. Choose another "
@@ -105,14 +142,19 @@ def run_missing(experiment: Experiment) -> None:
 def run_one(experiment: Experiment, case: Case) -> Case:
     """Run a case and add it to the file; return it."""
     torch.set_num_threads(1)
+    commit, date = commit_of(PAPER.parent) or (None, None)
     made_by = {
         "settings": _described(experiment, case[:-1]),
         "defaults": experiment.defaults(),
         "versions": versions(experiment.packages),
-        "commit": commit_of(_ROOT),
+        "commit": commit,
+        "date": date,
     }
-    found = rounded(experiment.run(*case))
-    runs_file(experiment).append(dict(zip(experiment.key, case, strict=True)) | made_by | found)
+    start = time.process_time()
+    results = rounded(experiment.run(*case))
+    took = {"took": rounded(time.process_time() - start)}
+    named = dict(zip(experiment.key, case, strict=True))
+    runs_file(experiment).append(named | made_by | results | took)
     return case
 
 
@@ -132,10 +174,10 @@ def check_settings(path: Path, done: Mapping[Case, Run], experiment: Experiment)
             )
 
 
-def _made_otherwise(run: Run, experiment: Experiment) -> str:
+def made_otherwise(run: Run, experiment: Experiment) -> str:
     """The first package or default in which a run differs; empty if there is none."""
     if experiment.calls and not run.get("defaults"):
-        return "the defaults of the library are not said of them"
+        return "the defaults of the library are not recorded with them"
     now = {"versions": versions(experiment.packages), "defaults": experiment.defaults()}
     return differences({name: run.get(name, {}) for name in now}, now)
 

@@ -8,21 +8,18 @@ import math
 import os
 import platform
 import subprocess
-import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from filelock import FileLock
 
-from gpadjust.core import SamplingWarning
 from paper.common.experiment import Case, Run
 
-_Fitted = TypeVar("_Fitted")
-IDENTIFYING = ("settings", "defaults", "versions", "commit")
+IDENTIFYING = ("settings", "defaults", "versions", "commit", "date")
 """Entries of a run that say how it was made."""
 
 
@@ -80,7 +77,7 @@ class RunsFile:
         """
         if not self.path.exists():
             return {}
-        found: dict[Case, Run] = {}
+        runs: dict[Case, Run] = {}
         made: dict[str, Run] = {}
         lines = self.path.read_bytes()[: self._whole()].splitlines()
         for number, line in enumerate(lines, start=1):
@@ -97,8 +94,8 @@ class RunsFile:
                     f"Expected a run in each line of {self.path}, found {line[:40]!r} in line "
                     f"{number}. Remove that line, or name another folder."
                 ) from error
-            found[case] = run
-        return found
+            runs[case] = run
+        return runs
 
     def _whole(self) -> int:
         """The length of the file without a torn last line."""
@@ -109,15 +106,10 @@ def _line(entries: Run) -> bytes:
     return json.dumps(entries, separators=(",", ":")).encode() + b"\n"
 
 
-def differences(found: Mapping[str, Any], expected: Mapping[str, Any]) -> str:
-    """The first entry that both have and that differs, in words; empty if there is none.
-
-    Args:
-        found: Of a run.
-        expected: As it would be now.
-    """
-    for name in (name for name in found if name in expected):
-        was, now = found[name], expected[name]
+def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
+    """The first entry that both have and that differs, in words; empty if there is none."""
+    for name in (name for name in old if name in new):
+        was, now = old[name], new[name]
         if isinstance(was, dict) and isinstance(now, dict):
             inner = differences(was, now)
             if inner:
@@ -130,11 +122,11 @@ def differences(found: Mapping[str, Any], expected: Mapping[str, Any]) -> str:
 @cache
 def versions(packages: Sequence[str]) -> dict[str, str]:
     """Of Python and of what the numbers come from."""
-    found = {"python": platform.python_version()}
+    numbers = {"python": platform.python_version()}
     for name in packages:
         with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
+            numbers[name] = version(name)
+    return numbers
 
 
 def rounded(value: Any) -> Any:
@@ -148,31 +140,12 @@ def rounded(value: Any) -> Any:
     return value
 
 
-def timed(fitted: Callable[[], _Fitted], clock: Callable[[], float]) -> tuple[_Fitted, Run]:
-    """The result of a fit; its ``"seconds"`` and whether it ``"warned"`` of samples, for a run.
-
-    Args:
-        fitted: Fits; warnings of other kinds are shown.
-        clock: Of the seconds.
-    """
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        start = clock()
-        result = fitted()
-        seconds = clock() - start
-    for each in caught:
-        if not issubclass(each.category, SamplingWarning):
-            warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
-    warned = any(issubclass(each.category, SamplingWarning) for each in caught)
-    return result, {"seconds": seconds, "warned": warned}
-
-
 @cache
-def commit_of(root: Path) -> str | None:
-    """The hash of a repository's current commit, read once per process.
+def commit_of(root: Path) -> tuple[str, str] | None:
+    """The hash of a repository's current commit and its date, read once per process.
 
-    A ``"+"`` follows it if tracked files differ from it. Those in ``paper/results`` do not count,
-    which runs themselves change.
+    A ``"+"`` follows the hash if tracked files differ from it. Those in ``paper/results`` do not
+    count, which runs themselves change.
 
     Args:
         root: The root of the repository.
@@ -180,13 +153,12 @@ def commit_of(root: Path) -> str | None:
     Returns:
         None if it is none (as in an unpacked archive), has no commit yet, or git does not answer.
     """
-    found = _git(root, "rev-parse", "HEAD")
-    if found is None or not (root / ".git").exists():  # ours is but a folder of another's
+    shown = _git(root, "show", "--no-patch", "--format=%H %cs", "HEAD")
+    if shown is None or not (root / ".git").exists():  # ours is but a folder of another's
         return None
-    changed = _git(
-        root, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!paper/results"
-    )
-    return found.strip() + "+" * bool(changed)
+    command = ("status", "--porcelain", "--untracked-files=no", "--", ".", ":!paper/results")
+    commit, date = shown.split()
+    return commit + "+" * bool(_git(root, *command)), date
 
 
 def _git(root: Path, *command: str) -> str | None:

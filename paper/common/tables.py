@@ -17,6 +17,7 @@ Cell = Callable[[pd.DataFrame], Any]
 """What a cell shows of the runs of its row."""
 
 _START, _END = r"<!-- (?!end)(\S+) -->\n", "<!-- end -->"
+NOT_RUN = "*Not run yet.*"
 _FRAGMENT = re.compile(_START + r"((?:(?!<!-- ).*\n)*?)" + _END)
 
 
@@ -135,6 +136,13 @@ def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
+def with_rows(text: str, rows: Iterable[Sequence[str]]) -> str:
+    """A table with further rows, such as published numbers; cells that they lack are empty."""
+    width = text.partition("\n")[0].count(" | ") + 1
+    lines = [[*row, *[""] * (width - len(row))] for row in rows]
+    return "\n".join([text, *("| " + " | ".join(line) + " |" for line in lines)])
+
+
 def aligned(text: str) -> str:
     """A text whose tables have columns of equal width, as a terminal shows them."""
     return re.sub(r"^\|.*\|(\n\|.*\|)*$", _aligned, text, flags=re.MULTILINE)
@@ -166,19 +174,21 @@ def fragments(text: str) -> dict[str, str]:
     return {name: content.rstrip("\n") for name, content in _FRAGMENT.findall(text)}
 
 
-def filled(text: str, found: Mapping[str, str]) -> str:
+def filled(text: str, tables: Mapping[str, str]) -> str:
     """Replace what stands between the markers of a text.
 
     Raises:
-        ValueError: If there is nothing for one of them, or one has no end.
+        ValueError: If there is nothing for one of them, or one has no end. Of an experiment without
+            any table it is said that it was not run.
     """
     _check_markers(text)
+    ran = {name.partition(":")[0] for name in tables}
 
     def fragment(match: re.Match[str]) -> str:
         name = match[1]
-        if name not in found:
-            raise ValueError(f"No result is called {name!r}; there are {sorted(found)}.")
-        return f"<!-- {name} -->\n{found[name]}\n<!-- end -->"
+        if name not in tables and name.partition(":")[0] in ran:
+            raise ValueError(f"No result is called {name!r}; there are {sorted(tables)}.")
+        return f"<!-- {name} -->\n{tables.get(name, NOT_RUN)}\n<!-- end -->"
 
     return _FRAGMENT.sub(fragment, text)
 
@@ -203,13 +213,6 @@ def numbers(table: pd.DataFrame, header: Sequence[str], form: str) -> str:
         for label, values in zip(table.index, table.to_numpy(), strict=True)
     ]
     return markdown(header, rows)
-
-
-def settings_table(columns: Mapping[str, Mapping[str, Any]]) -> str:
-    """A row for each setting, a column for each of what they are of."""
-    names = list(next(iter(columns.values())))
-    rows = [[f"`{name}`", *(f"{of[name]}" for of in columns.values())] for name in names]
-    return markdown(["setting", *columns], rows)
 
 
 def claims_table(kind: str, parts: Mapping[str, Sequence[Judged]]) -> str:

@@ -81,14 +81,3 @@ def tanks(state: Tensor, action: Tensor, p: Parameters) -> Tensor:
     outflow = p["lower_outflow"] * lower.sqrt()
     rates = torch.stack([inflow - between, between - outflow], dim=-1)
     return rates - p["overflow"] * (level - BRIM).clamp_min(0)
-
-
-def drives(state: Tensor, action: Tensor, p: Parameters) -> Tensor:
-    """Two joints, each turned by its own drive, beside whose inertia that of the links is nothing.
-
-    In Reacher-v5 the drives have 1 kg m², the links less than 0.001.
-    """
-    rates = state[:, 2:].unbind(-1)
-    pairs = zip(rates, action.unbind(-1), strict=True)
-    accelerations = [(p["gain"] * a - p["viscous"] * rate) / p["inertia"] for rate, a in pairs]
-    return torch.stack([*rates, *accelerations], dim=-1)

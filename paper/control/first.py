@@ -27,7 +27,7 @@ def run(experiment: First, model: str, seed: int) -> Run:
         task = system.task(PhysicsDynamics(spec, physics))
     agent = MPCAgent(env, task, seed=seed)
     length, costs, promises = agent.episode_length(), list[float](), list[float]()
-    for _ in range(experiment.settings.trials):
+    for _ in range(experiment.trials):
         agent.learn(length)
         costs.append(-agent.recorded_episodes(newest=length).rewards.mean().item())
         promised = agent.promised_reward
@@ -46,7 +46,7 @@ def tables(runs: Sequence[Run], experiment: First) -> dict[str, Table]:
         "promised": of("promised", "mean", ".3f"),
     }
     parts = []
-    for trial in range(1, experiment.settings.trials + 1):
+    for trial in range(1, experiment.trials + 1):
         own = trials[trials["trial"] == trial]
         labels = {k: f"{v}, trial {trial}" for k, v in experiment.axes["model"].items()}
         parts.append(table(groups(own, "model", labels), columns, "model").splitlines())

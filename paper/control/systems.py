@@ -6,11 +6,9 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.envs.classic_control.pendulum import PendulumEnv
-from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -239,74 +237,11 @@ def tanks(physics: Physics = "crude") -> System:
     return TANKS.system(physics)
 
 
-_EFFORT = 0.1  # Reacher-v5's own, 1, is up to ten times the distance
-
-
-def reacher_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
-    """Reacher-v5's: the fingertip's distance from the target in m, and a tenth of the effort."""
-    first, both = next_states[:, 0], next_states[:, :2].sum(-1)
-    x = 0.1 * first.cos() + 0.11 * both.cos() - next_states[:, 4]
-    y = 0.1 * first.sin() + 0.11 * both.sin() - next_states[:, 5]
-    return -(x.square() + y.square()).sqrt() - _EFFORT * actions.square().sum(-1)
-
-
-REACHER = Machine(
-    StateSpec(
-        ["q1", "q2", "dq1", "dq2", "x", "y"],
-        ["drive_1", "drive_2"],
-        angles=["q1", "q2"],
-        exogenous=["x", "y"],
-        step=0.02,
-    ),
-    equations.drives,
-    true={"gain": 200.0, "inertia": 1.0, "viscous": 1.0},
-    believed={
-        "gain": Unknown(140.0, factor=1.5, unit="N m"),
-        "inertia": Unknown(1.0, factor=1.1, unit="kg m²"),
-    },
-    reward=reacher_reward,
-    actions=([-1.0, -1.0], [1.0, 1.0]),
-    starts=([-0.1, -0.1, 0.0, 0.0, -0.14, -0.14], [0.1, 0.1, 0.0, 0.0, 0.14, 0.14]),
-    episode_length=50,
-    substeps=1,
-)
-
-
-class ReacherStates(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):
-    """Reacher-v5 that observes the states of a spec."""
-
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        RecordConstructorArgs.__init__(self)
-        super().__init__(env)
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (8,), np.float64)
-
-    def observation(self, observation: NDArray[Any]) -> NDArray[Any]:
-        """Sine and cosine of each joint, the rates, and the target."""
-        return observation[[2, 0, 3, 1, 6, 7, 4, 5]]
-
-
-def _reacher_env(**options: Any) -> gym.Env[Any, Any]:
-    try:
-        env = gym.make("Reacher-v5", reward_control_weight=_EFFORT, **options)
-    except gym.error.DependencyNotInstalled as error:
-        raise ImportError("The reacher needs MuJoCo: pip install mujoco imageio.") from error
-    return ReacherStates(env)
-
-
-def reacher(physics: Physics = "crude") -> System:
-    """MuJoCo's Reacher-v5: two joints reach for a target; f_p lacks damping, its drives are weak.
-
-    Drives in [-1, 1], held for 0.02 s, an episode of 1 s. It needs MuJoCo.
-    """
-    return REACHER.system(physics, _reacher_env)
-
-
 SYSTEMS: Mapping[str, Callable[[Physics], System]] = {
     "pendulum": pendulum,
     "furuta": furuta,
     "quadrotor": quadrotor,
     "double_pendulum": double_pendulum,
     "tanks": tanks,
-    "reacher": reacher,
 }
 """The systems, by their names."""

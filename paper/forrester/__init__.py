@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from paper.common.experiment import Axes, Experiment
@@ -16,9 +15,11 @@ OTHER = "other settings"  # the paper's protocol with other steps of Adam and no
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings:
-    """What decides the numbers."""
+class Forrester(Experiment):
+    """Seven models learn Forrester's function (figure 1), by two protocols of training."""
 
+    runs: int = 100
+    """data sets; the number is the seed"""
     observations: int = 8
     """noise-free observations of a data set"""
     noise: float = 0.01
@@ -32,18 +33,10 @@ class Settings:
     ridges: tuple[float, ...] = (1e-6, 1e-4, 1e-2, 1.0)
     """of the literal closed form of RRA, on a grid"""
 
-
-@dataclass(frozen=True, kw_only=True)
-class Forrester(Experiment):
-    """Seven models learn Forrester's function (figure 1), by two protocols of training."""
-
-    runs: int = 100
-    """data sets; the number is the seed"""
-    out: Path = Path("results/forrester")
-    settings: Settings = field(default_factory=Settings)
-
     axes: ClassVar[Axes] = {"reading": READINGS, "protocol": PROTOCOLS | {GRID: GRID, OTHER: OTHER}}
     calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA", "gpadjust.RRA")
+    curves: ClassVar[tuple[str, ...]] = ("B", "paper")
+    quick: ClassVar[Mapping[str, Any]] = {}
 
     def seeds_of(self, *kind: Any) -> Sequence[int]:
         """All, but that the grids are of reading B alone."""

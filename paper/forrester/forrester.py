@@ -43,7 +43,7 @@ from paper.common.figures import save, strips
 from paper.common.learners import LEARNERS, LITERAL
 from paper.common.tables import across, claims_table, frame, groups, markdown, of, table
 from paper.common.verdicts import Difference, Judged, Verdict, all_of, bootstrap, reproduced, within
-from paper.forrester import GRID, OTHER, PROTOCOLS, READINGS, Forrester, Settings
+from paper.forrester import GRID, OTHER, PROTOCOLS, READINGS, Forrester
 from paper.forrester.paper_rra import PaperRRA
 from paper.forrester.problem import CRUDE, LOWER, POINTS, UPPER, observations, truth
 
@@ -66,7 +66,7 @@ _STEPS, _NOISES = (25, 50, 100), (1e-4, 1e-2)  # of the other settings
 
 
 @cache
-def _prepare(settings: Settings) -> None:
+def _prepare(settings: Forrester) -> None:
     """Set a process up: one fit that is not timed."""
     trained("CKA", "gpadjust", "B", *observations(0, settings.observations), settings)
 
@@ -77,7 +77,7 @@ def run(experiment: Forrester, reading: str, protocol: str, seed: int) -> Run:
     Returns:
         For each model, and for f_p, its name, its scores and the seconds that it took.
     """
-    settings = experiment.settings
+    settings = experiment
     _prepare(settings)
     X, Y = observations(seed, settings.observations)
     y = truth(POINTS)
@@ -89,13 +89,14 @@ def run(experiment: Forrester, reading: str, protocol: str, seed: int) -> Run:
         with torch.no_grad():
             posterior = model.posterior(POINTS, observation_noise=True)
             scores = Scores.of(posterior.mean, posterior.variance, y)
-        judged = {each: getattr(scores, each).item() for each in ("rmse", *_SCORES)}
+        shown = ("rmse", *_SCORES) if protocol in PROTOCOLS else ("rmse",)
+        judged = dict.fromkeys(_SCORES) | {name: getattr(scores, name).item() for name in shown}
         rows.append({"model": name, **judged, "seconds": seconds})
     return {column: [row[column] for row in rows] for column in rows[0]}
 
 
 def _models(
-    reading: str, protocol: str, X: Tensor, Y: Tensor, settings: Settings
+    reading: str, protocol: str, X: Tensor, Y: Tensor, settings: Forrester
 ) -> Iterator[tuple[str, Model, float]]:
     """Each model of a protocol, its name first, and the seconds that it took."""
     if protocol == GRID:
@@ -129,7 +130,7 @@ def closed_form(
 
 
 def trained(
-    name: str, protocol: str, reading: str, X: Tensor, Y: Tensor, settings: Settings
+    name: str, protocol: str, reading: str, X: Tensor, Y: Tensor, settings: Forrester
 ) -> Model:
     """Build one of the models and train it by a protocol."""
     if protocol == "paper":
@@ -141,7 +142,7 @@ def trained(
     return model
 
 
-def _by_gpytorch(name: str, reading: str, X: Tensor, Y: Tensor, settings: Settings) -> Model:
+def _by_gpytorch(name: str, reading: str, X: Tensor, Y: Tensor, settings: Forrester) -> Model:
     """Train a model of plain GPyTorch: its initial values, y as it is."""
     one, other = (ScaleKernel(RBFKernel()) for _ in range(2))
     if name == "RRA":
@@ -432,7 +433,7 @@ def draw(runs: Sequence[Run], experiment: Forrester) -> list[Path]:
     )
     names = [name for name in NAMES if name != "GP-bias"]
     for letter, name in zip("abcdef", names, strict=True):
-        _fit_panel(axes[letter], name, "paper", experiment.settings)
+        _fit_panel(axes[letter], name, "paper", experiment)
         axes[letter].set_title(f"({letter}) {name}", loc="left")
         axes[letter].set(xlabel="x" * (letter in "def"), ylabel="y" * (letter in "ad"))
     figure.legend(*axes["a"].get_legend_handles_labels(), loc="outside lower center", ncols=5)
@@ -442,10 +443,10 @@ def draw(runs: Sequence[Run], experiment: Forrester) -> list[Path]:
     axes["g"].xaxis.set_minor_formatter(NullFormatter())
     axes["g"].set_xlabel("RMSE; each run, median and quartiles")
     axes["g"].set_title(f"(g) {own['seed'].nunique()} runs", loc="left")
-    return [save(figure, experiment.out / "forrester_paper.png")]
+    return [save(figure, experiment.folder / "forrester_paper.png")]
 
 
-def _fit_panel(ax: Axes, name: str, protocol: str, settings: Settings, seed: int = 3) -> None:
+def _fit_panel(ax: Axes, name: str, protocol: str, settings: Forrester, seed: int = 3) -> None:
     """Draw one model of the data set of a seed."""
     x = torch.linspace(LOWER, UPPER, 200, dtype=torch.float64).unsqueeze(-1)
     X, Y = observations(seed, settings.observations)

@@ -40,16 +40,15 @@ class Networks(nn.Module):
 class NetworkDynamics(Dynamics):
     """Networks that predict the change of the state, or what f_p lacks of it.
 
-    They are trained from new weights at each update, full batch, by Adam with weight decay. A
-    sampled function is one of the networks (as in MBPO: Janner et al. 2019).
+    They are trained from new weights at each update, full batch, by Adam with weight decay. Each
+    learns from all transitions but its fold, and keeps the weights with which it was best there;
+    the mean square of the errors there is the noise. A sampled function is one of the networks (as
+    in MBPO: Janner et al. 2019).
 
     Args:
         spec: What the entries of states are.
         physics: f_p; None for networks alone.
         number: How many networks.
-        folds: Whether each network learns from all transitions but its fold, keeps the weights with
-            which it was best there, and the mean square of the errors there is the noise. If not,
-            each learns from a bootstrap sample to the end, and there is no noise.
         hidden: The width of both hidden layers.
         steps: The most steps of Adam.
         rate: Its learning rate.
@@ -63,7 +62,6 @@ class NetworkDynamics(Dynamics):
         physics: Physics | None = None,
         *,
         number: int = 10,
-        folds: bool = True,
         hidden: int = 32,
         steps: int = 1500,
         rate: float = 5e-3,
@@ -72,7 +70,7 @@ class NetworkDynamics(Dynamics):
     ) -> None:
         super().__init__(spec)
         self.known = None if physics is None else PhysicsDynamics(spec, physics)
-        self.number, self.folds, self.hidden, self.steps = number, folds, hidden, steps
+        self.number, self.hidden, self.steps = number, hidden, steps
         self.rate, self.decay, self.seed = rate, decay, seed
         self._read = [i for i, name in enumerate(spec.states) if name not in spec.exogenous]
         self._data: Trajectories | None = None
@@ -100,12 +98,8 @@ class NetworkDynamics(Dynamics):
             self._units = X.mean(0), X.std(0).clamp_min(1e-6)
             self._shift, self._scale = rest.mean(0), rest.std(0).clamp_min(1e-9)
             networks = Networks(self.number, X.shape[-1], self.hidden, rest.shape[-1])
-            if self.folds:
-                fold = torch.randperm(n) % self.number
-                shares = (fold != torch.arange(self.number)[:, None]).to(X)
-            else:
-                drawn = torch.randint(n, (self.number, n))
-                shares = nn.functional.one_hot(drawn, n).sum(1).to(X)
+            fold = torch.randperm(n) % self.number
+            shares = (fold != torch.arange(self.number)[:, None]).to(X)
         error = self._train(networks, X, (rest - self._shift) / self._scale, shares)
         self._noise = error * self._scale.square()
         self._networks = networks.requires_grad_(False)
@@ -120,7 +114,7 @@ class NetworkDynamics(Dynamics):
         each = self._of_all(states, actions)
         following = each[torch.randint(self.number, (len(states),)), torch.arange(len(states))]
         noise = self.noise_variance(states, actions)
-        return following + noise.sqrt() * torch.randn_like(following) if self.folds else following
+        return following + noise.sqrt() * torch.randn_like(following)
 
     def sample_functions(self, num_functions: int, seed: int | None = None) -> TransitionFunctions:
         """Networks, in a random order."""
@@ -150,9 +144,9 @@ class NetworkDynamics(Dynamics):
         lowest = torch.full((self.number,), torch.inf, dtype=torch.float64)
         errors = torch.zeros_like(Y)
         kept = [weight.detach().clone() for weight in networks.parameters()]
-        for step in range(self.steps + self.folds):
+        for step in range(self.steps + 1):
             squares = (networks(Z) - Y).square()
-            if self.folds and step % _LOOK == 0:
+            if step % _LOOK == 0:
                 found = squares.detach()
                 by_fold = (found.mean(-1) * held_out).sum(1) / held_out.sum(1)
                 better = by_fold < lowest
@@ -165,10 +159,9 @@ class NetworkDynamics(Dynamics):
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
-        if self.folds:
-            with torch.no_grad():
-                for old, weight in zip(kept, networks.parameters(), strict=True):
-                    weight.copy_(old)
+        with torch.no_grad():
+            for old, weight in zip(kept, networks.parameters(), strict=True):
+                weight.copy_(old)
         return errors.mean(0)
 
     def _inputs(self, states: Tensor, actions: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,6 @@ class System:
         folder: The machine, of :func:`folder_of`.
         train: Files that are learnt from, without their endings.
         tests: Files of each test, by its name.
-        actions: Columns of the actions that are called otherwise there.
         segment: The column of segments.
         moves: A rate in rad/s that what is tested at reaches.
     """
@@ -44,7 +43,6 @@ class System:
     folder: str
     train: tuple[str, ...]
     tests: Mapping[str, tuple[str, ...]]
-    actions: Mapping[str, str] = field(default_factory=dict)
     segment: str | None = None
     moves: float = 0.0
 
@@ -55,19 +53,17 @@ class System:
             "substeps": SUBSTEPS,
             "train": list(self.train),
             "tests": {name: list(files) for name, files in self.tests.items()},
-            "actions": dict(self.actions),
             "moves": self.moves,
             **{name: dict(parameters) for name, parameters in self.machine.known.items()},
         }
 
     def drawn(self, n: int, seed: int) -> Trajectories:
-        """``n`` transitions to learn from, spread over the records; of 0 none.
+        """``n`` transitions to learn from, spread over the records.
 
         Raises:
             ValueError: If the records have fewer.
         """
-        known = self._records(self.train).trajectories(STEP)
-        return known.spread(n, seed) if n else known.some(slice(0))
+        return self._records(self.train).trajectories(STEP).spread(n, seed)
 
     def stretches(self, n: int, seed: int) -> Records:
         """``n`` transitions in stretches of ten, or as many as divide ``n``, spread alike.
@@ -99,7 +95,7 @@ class System:
     def _records(self, files: tuple[str, ...]) -> Records:
         paths = [folder_of(self.folder) / f"{file}.csv" for file in files]
         spec = self.machine.spec
-        return Records.read_csv(paths, spec, actions=self.actions, segment=self.segment)
+        return Records.read_csv(paths, spec, segment=self.segment)
 
 
 def _a(*numbers: str) -> tuple[str, ...]:
@@ -120,15 +116,6 @@ REAL = {
         _a("00", "02", "03"),
         {"near": _a("01", "12", "13"), "far": _a("04", "05")},
     ),
-    "double-pendulum-harder": System(
-        DOUBLE_PENDULUM,
-        _DOUBLE,
-        _a("01", "02", "03"),
-        {"harder": _a("00", "12", "13")},
-    ),
     "pendulum": System(PENDULUM, **_PENDULUM, tests={"sac": ("sac",)}),
-    "pendulum-measured": System(
-        PENDULUM, **_PENDULUM, tests={"ddp": ("ddp",)}, actions={"u": "tau_meas"}
-    ),
 }
 """The systems of the experiment ``real``, by name."""

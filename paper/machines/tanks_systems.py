@@ -12,7 +12,6 @@ from torch import Tensor
 from gpadjust.dynamics import StateSpec
 from gpadjust.physics import ODEPhysics, Unknown
 from gpadjust.records import Record, Records
-from paper.machines import STRUCTURES
 from paper.machines.records import DATA
 
 STEP = 4.0  # s
@@ -42,7 +41,6 @@ what it says of an empty tank, and its form.
 _STRAIGHT = {"kink": 0.0, "place": 5.3, "width": 0.5}
 FIXED: dict[str, dict[str, float]] = {
     "overflow": {"empty": 0.0, "power": 1.0, **_STRAIGHT},
-    "sensor": {"power": 0.5, **_STRAIGHT},
     "kink": {},
 }
 """The parameters that a structure has for known."""
@@ -83,15 +81,6 @@ def physics(structure: str, values: Mapping[str, float] | None = None) -> ODEPhy
     )
 
 
-def narx_spec(lags: int) -> StateSpec:
-    """The level with so many values of level and pump, the newest included."""
-    previous = {}
-    for name in ("lower", "pump"):
-        for k in range(1, lags):
-            previous[f"{name}_{k}"] = f"{name}_{k - 1}" if k > 1 else name
-    return StateSpec(["lower", *previous], ["pump"], previous=previous)
-
-
 def measured(part: str, samples: int) -> tuple[Tensor, Tensor]:
     """Actions and levels of a record, ``samples`` each; of ``"Est"`` or ``"Val"``."""
     spec = StateSpec(["lower"], ["pump"])
@@ -109,16 +98,11 @@ def levels(actions: Tensor, lower: Tensor) -> Records:
     return Records([Record(times, states, actions.unsqueeze(-1), name="tanks")], SPEC)
 
 
-def outputs(actions: Tensor, lower: Tensor, lags: int) -> Records:
-    """A record of the lower tank alone, as the sensor says."""
-    spec = narx_spec(lags)
+def outputs(actions: Tensor, lower: Tensor) -> Records:
+    """A record of the lower tank alone, as the sensor says, with the level and action before."""
+    previous = {"lower_1": "lower", "pump_1": "pump"}
+    spec = StateSpec(["lower", *previous], ["pump"], previous=previous)
     states = torch.full((len(lower), spec.state_dim), torch.nan, dtype=torch.float64)
     states[:, 0] = lower
     times = STEP * torch.arange(len(lower), dtype=torch.float64)
     return Records([Record(times, states, actions.unsqueeze(-1), name="tanks")], spec)
-
-
-def describe() -> dict[str, Any]:
-    """Priors and fixed values of all structures, in plain values."""
-    priors = {name: known.prior_text for name, known in UNKNOWNS.items()}
-    return {"priors": priors, "fixed": {name: FIXED[name] for name in STRUCTURES}}

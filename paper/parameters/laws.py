@@ -79,13 +79,13 @@ class Case:
         return dict(zip(unknowns, found.x.tolist(), strict=True))
 
 
-def case(name: str, seed: int) -> Case:
-    """The case of a problem that a seed draws."""
+def case(name: str, seed: int, number: int | None = None, places: int | None = None) -> Case:
+    """The case of a problem that a seed draws, with another number of inputs, at other places."""
     problem = PROBLEMS[name]
     generator = torch.Generator().manual_seed(seed)
     low, high = torch.tensor(problem.box, dtype=torch.float64)
-    engine = SobolEngine(len(low), scramble=True, seed=seed)
-    X = low + engine.draw(problem.number, dtype=torch.float64) * (high - low)
+    engine = SobolEngine(len(low), scramble=True, seed=seed if places is None else places)
+    X = low + engine.draw(number or problem.number, dtype=torch.float64) * (high - low)
     physics = FunctionPhysics(problem.law, unknowns=problem.unknowns, name=name)
     z = torch.randn(len(problem.unknowns), generator=generator, dtype=torch.float64)
     true = physics.unknowns.at(z)

@@ -64,7 +64,7 @@ def run(experiment: Nuts, problem: str, method: str, seed: int) -> Run:
     warnings.simplefilter("ignore")
     model = model_for(problem)
     begin = time.perf_counter()
-    draws = experiment.settings.num_draws if method == "nuts" else None
+    draws = experiment.num_draws if method == "nuts" else None
     result = fit(model, method, num_draws=draws, seed=seed)
     seconds = time.perf_counter() - begin
     levels = torch.tensor(LEVELS, dtype=torch.float64)
@@ -164,7 +164,7 @@ def draw(runs: Sequence[Run], experiment: Nuts) -> list[Path]:
                 label = None
         row[2].set_title("95 % bands less the mean of NUTS", fontsize=8, loc="left")
     axes[2].legend(fontsize=7)
-    return [save(figure, experiment.out / "nuts.png")]
+    return [save(figure, experiment.folder / "nuts.png")]
 
 
 def _density(ax: Any, x: np.ndarray, colour: str) -> None:

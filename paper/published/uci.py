@@ -11,10 +11,8 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import pandas as pd
 import torch
 from botorch.exceptions.warnings import OptimizationWarning
@@ -25,21 +23,11 @@ from gpadjust.core import SamplingWarning
 from gpadjust.physics import Physics, PhysicsWarning
 from gpadjust.validation import score
 from paper.common.experiment import Run, Table
-from paper.common.figures import one_legend, panels, save
-from paper.common.tables import frame, groups, markdown, number
+from paper.common.tables import Cell, frame, groups, markdown, number, table
 from paper.common.verdicts import Difference, paired
 from paper.published import TABLES, Uci
 from paper.published.rivals import RIVALS, Predict
 from paper.published.uci_tables import physics, split
-
-_COLORS = {
-    "formula": "tab:orange",
-    "phymean": "tab:purple",
-    "cka": "navy",
-    "gp": "tab:red",
-    "boosting": "tab:green",
-    "ensemble": "tab:pink",
-}
 
 
 class Row(NamedTuple):
@@ -100,15 +88,15 @@ def ours(method: str, X: Tensor, Y: Tensor, physics: Physics, *, seed: int) -> P
     return lambda test: model.posterior(test, observation_noise=True)
 
 
-def run(experiment: Uci, table: str, share: float, method: str, seed: int) -> Run:
+def run(experiment: Uci, name: str, share: float, method: str, seed: int) -> Run:
     """Fit a method to the training rows of a split; return its scores on the test rows."""
     for category in (SamplingWarning, PhysicsWarning, OptimizationWarning):
         warnings.simplefilter("ignore", category)
-    X, Y, test_X, test_Y = split(table, share, seed)
+    X, Y, test_X, test_Y = split(name, share, seed)
     shift = Y.mean() if method == "gp" else torch.zeros(())
     fitted = RIVALS.get(method, partial(ours, method))
     begin = time.perf_counter()
-    predict = fitted(X, Y - shift, physics(table), seed=seed)
+    predict = fitted(X, Y - shift, physics(name), seed=seed)
     seconds = time.perf_counter() - begin
     with torch.no_grad():
         scores = score(predict(test_X), test_Y - shift)
@@ -124,41 +112,59 @@ def run(experiment: Uci, table: str, share: float, method: str, seed: int) -> Ru
 def tables(runs: Sequence[Run], experiment: Uci) -> dict[str, Table]:
     """All tables, by name."""
     found = frame(runs)
+    cells = {
+        f"{table}, {label}": found[(found["table"] == table) & (found["share"] == share)]
+        for table in TABLES
+        for share, label in experiment.axes["share"].items()
+    }
+    methods = groups(found, "method", experiment.axes["method"])
+
+    def by_cell(show: Callable[[pd.DataFrame, str], str]) -> dict[str, Cell]:
+        return {cell: _restricted(own, show) for cell, own in cells.items()}
+
+    def of_gp(own: pd.DataFrame, method: str) -> str:
+        return paired(own, "rmse", "method", method, "gp", ratio=True).ratio()
+
+    def hold(own: pd.DataFrame, method: str) -> str:
+        return number(own[own["method"] == method]["coverage"].mean(), ".2f")
+
+    def seconds(own: pd.DataFrame, method: str) -> str:
+        return number(own[own["method"] == method]["seconds"].median(), ".2g")
+
+    def rmse(own: pd.DataFrame, method: str) -> str:
+        return _mean(own[own["method"] == method], "rmse", ".3g")
+
     return {
         "published": Table(
             "RMSE and log likelihood by nine tenths of the rows, beside published ones",
             _beside_published(found, experiment),
         ),
         "rivals": Table(
-            "RMSE by a tenth, a quarter and nine tenths of the rows", _by_share(found, experiment)
+            "RMSE by a tenth and nine tenths of the rows", table(methods, by_cell(rmse), "method")
         ),
         "gp": Table(
             "RMSE in that of the GP, geometric mean and 95 % interval over the splits",
-            _of_gp(found, experiment),
+            table(methods, by_cell(of_gp), "method"),
         ),
-        "coverage": Table(
-            "95 % hold, and seconds of a fit by nine tenths of the rows",
-            _intervals(found, experiment),
-        ),
+        "coverage": Table("95 % hold", table(methods, by_cell(hold), "method")),
+        "seconds": Table("Seconds of a fit", table(methods, by_cell(seconds), "method")),
     }
 
 
-def _methods(found: pd.DataFrame, experiment: Uci) -> dict[str, pd.DataFrame]:
-    return groups(found, "method", experiment.axes["method"])
+def _restricted(own: pd.DataFrame, show: Callable[[pd.DataFrame, str], str]) -> Cell:
+    return lambda part: show(own, part["method"].iloc[0])
 
 
 def _mean(part: pd.DataFrame, column: str, form: str) -> str:
+    """The mean with its standard error, and the number of splits."""
     of = Difference.of(part[column])
-    if not of.n:
-        return ""
-    count = "" if of.n == 20 else f" ({of.n})"
-    return f"{of.mean:{form}} ± {of.error:{form}}{count}" if of.n > 1 else f"{of.mean:{form}}"
+    return "" if not of.n else f"{of.mean:{form}} ± {of.error:{form}} ({of.n})"
 
 
 def _beside_published(found: pd.DataFrame, experiment: Uci) -> str:
     full = found[found["share"] == 0.9]
     rows = []
-    for label, part in _methods(full, experiment).items():
+    for label, part in groups(full, "method", experiment.axes["method"]).items():
         each = [part[part["table"] == table] for table in TABLES]
         cells = [_mean(own, "rmse", ".3f") for own in each]
         rows.append([label, *cells, *(_mean(own, "density", ".2f") for own in each), "this run"])
@@ -167,71 +173,3 @@ def _beside_published(found: pd.DataFrame, experiment: Uci) -> str:
         rows.append([label, *numbers, row.source])
     header = [f"RMSE, {name}" for name in TABLES] + [f"log likelihood, {name}" for name in TABLES]
     return markdown(["method", *header, "source"], rows)
-
-
-def _cells(found: pd.DataFrame, experiment: Uci) -> dict[str, pd.DataFrame]:
-    return {
-        f"{table}, {label}": found[(found["table"] == table) & (found["share"] == share)]
-        for table in TABLES
-        for share, label in experiment.axes["share"].items()
-    }
-
-
-def _by_share(found: pd.DataFrame, experiment: Uci) -> str:
-    cells = _cells(found, experiment)
-    rows = [
-        [label, *(_mean(part[part["method"] == name], "rmse", ".3g") for part in cells.values())]
-        for name, label in experiment.axes["method"].items()
-    ]
-    return markdown(["method", *cells], rows)
-
-
-def _of_gp(found: pd.DataFrame, experiment: Uci) -> str:
-    cells = _cells(found, experiment)
-    rows = [
-        [label, *(_ratio(part, name).ratio() for part in cells.values())]
-        for name, label in experiment.axes["method"].items()
-        if name != "gp"
-    ]
-    return markdown(["method", *cells], rows)
-
-
-def _ratio(part: pd.DataFrame, method: str, other: str = "gp") -> Difference:
-    """Differences of logarithms of errors on the same splits."""
-    return paired(part, "rmse", "method", method, other, ratio=True)
-
-
-def _intervals(found: pd.DataFrame, experiment: Uci) -> str:
-    cells = _cells(found, experiment)
-    rows = []
-    for name, label in experiment.axes["method"].items():
-        parts = {cell: part[part["method"] == name] for cell, part in cells.items()}
-        held = [number(part["coverage"].mean(), ".2f") for part in parts.values()]
-        times = [number(parts[f"{t}, 90 %"]["seconds"].median(), ".2g") for t in TABLES]
-        rows.append([label, *held, *times])
-    seconds = [f"seconds, {table}" for table in TABLES]
-    return markdown(["method", *(f"hold, {cell}" for cell in cells), *seconds], rows)
-
-
-def draw(runs: Sequence[Run], experiment: Uci) -> list[Path]:
-    """Draw errors by the share of the rows."""
-    found = frame(runs)
-    figure, axes = panels([*TABLES], 3, (3.6, 3.0), share=False)
-    for ax, table in zip(axes, TABLES, strict=True):
-        for name, label in experiment.axes["method"].items():
-            part = found[(found["table"] == table) & (found["method"] == name)]
-            if name not in _COLORS or not len(part):
-                continue
-            middle = part.groupby("rows")["rmse"].mean()
-            ax.plot(middle.index, middle, "o-", ms=3, color=_COLORS[name], label=label)
-        best = min(row.rmse[[*TABLES].index(table)] or np.inf for row in PUBLISHED.values())
-        ax.axhline(best, color="0.6", ls=":", lw=1, label="least published error")
-        ax.set(xscale="log", yscale="log", xlabel="training rows")
-        rows = sorted({*found[found["table"] == table].groupby("share")["rows"].max()})
-        ax.set_xticks(rows, rows)
-        ax.set_xticks([], minor=True)
-        ax.yaxis.set_major_formatter("{x:g}")
-        ax.yaxis.set_minor_formatter("{x:g}")
-    axes[0].set_ylabel("RMSE on the test rows")
-    one_legend(figure, axes, ncols=4)
-    return [save(figure, experiment.out / "uci.png")]

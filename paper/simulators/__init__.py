@@ -2,24 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib import import_module
-from pathlib import Path
 from typing import ClassVar
 
 from paper.common.experiment import Axes, Experiment
-
-
-@dataclass(frozen=True, kw_only=True)
-class SimulatorsSettings:
-    """Settings that decide the numbers."""
-
-    rows: int = 500
-    """of the log, every 0.01 s"""
-    ahead: int = 200
-    """rows of the free run after it"""
-    starts: int = 1
-    """starts of our search; mujoco.sysid has one"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,8 +17,12 @@ class Simulators(Experiment):
     """logs of each machine"""
     seed: int = 100
     """the first seed; those below, and from 1000 on, served to write the code"""
-    out: Path = Path("results/simulators")
-    settings: SimulatorsSettings = field(default_factory=SimulatorsSettings)
+    rows: int = 500
+    """of the log, every 0.01 s"""
+    ahead: int = 200
+    """rows of the free run after it"""
+    starts: int = 1
+    """starts of our search; mujoco.sysid has one"""
 
     axes: ClassVar[Axes] = {
         "machine": {

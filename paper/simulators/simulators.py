@@ -32,7 +32,7 @@ _RANGE = 8.0  # times the guess, and a part of it: bounds of mujoco.sysid
 
 def run(experiment: Simulators, machine: str, friction: str, method: str, seed: int) -> Run:
     """Identify a machine by its log; run the model of the estimates freely from the true state."""
-    settings, known = experiment.settings, MACHINES[machine]
+    settings, known = experiment, MACHINES[machine]
     rows, ahead = settings.rows, settings.ahead
     log = log_of(known, friction == "lacking", rows + ahead, seed)
     begin = time.process_time()
@@ -65,7 +65,7 @@ def by_identify(
     machine: Machine, log: Log, experiment: Simulators, *, is_advised: bool
 ) -> tuple[Ends, dict[str, Unknown]]:
     """Return intervals by the log but for its last rows; with friction, if that is the advice."""
-    settings, spec = experiment.settings, log.records.spec
+    settings, spec = experiment, log.records.spec
     first = [*machine.start, *[0.0] * len(machine.start)]
     start = {name: (x, _AT_REST) for name, x in zip(spec.states, first, strict=True)}
 

@@ -15,8 +15,8 @@ def ran(tmp_path, monkeypatch):
         given = [name, "--runs", "2", "--jobs", "1", "--out", str(tmp_path), *options]
         monkeypatch.setattr("sys.argv", ["paper", *given])
         main()
-        lines = (tmp_path / "runs.jsonl").read_text().splitlines()
+        lines = (tmp_path / name / "runs.jsonl").read_text().splitlines()
         runs = [run for run in map(json.loads, lines) if "identifying" not in run]
-        return runs, (tmp_path / "tables.md").read_text()
+        return runs, (tmp_path / name / "tables.md").read_text()
 
     return command

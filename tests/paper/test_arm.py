@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gpadjust.control.episodes import generators
-from paper.arm import SLOW, Arm, Reaching, ReachingSettings, Settings, evaluation
+from paper.arm import Arm, Reaching, evaluation
 from paper.arm.arm import load_maps
 from paper.arm.claims import claims as arm_claims
 from paper.arm.claims import distance_from_start
@@ -18,7 +18,7 @@ from paper.common.runner import main, runs_file
 from paper.common.runs import rounded
 from paper.common.verdicts import Curves, judge
 
-TINY_ARM = Settings(
+TINY_ARM = Arm(
     episodes=2,
     episode_length=5,
     model_episodes=2,
@@ -29,7 +29,7 @@ TINY_ARM = Settings(
     evaluate_every=1,
     map_after=1,
 )
-FEW = ReachingSettings(trials=1, long_trials=1, updates=2, starts=3)
+FEW = {"trials": 1, "updates": 2, "starts": 3}
 
 
 @pytest.fixture
@@ -60,7 +60,7 @@ class TestArm:
         distances = reach(policy, settings)
         assert torch.equal(generators()[2], before[2])
         assert distances.shape == (4, 5)
-        env = Arm(settings=settings).setup("cka-memory", 0).env
+        env = settings.setup("cka-memory", 0).env
         target = evaluation.arm_targets()[1].tolist()
         start = [*np.radians([35.0, 65.0]), 0.0, 0.0]
         seen, _ = env.reset(seed=0, options={"state": start, "target": target})
@@ -79,11 +79,18 @@ class TestArm:
     @pytest.mark.slow
     @pytest.mark.usefixtures("_few_targets")
     def test_smoke(self, tmp_path, capsys):
-        settings = replace(TINY_ARM, episodes=2, evaluate_every=2, map_after=9)
-        experiment = Arm(out=tmp_path, runs=2, jobs=1, only=("cka", "mf"), settings=settings)
+        experiment = replace(
+            TINY_ARM,
+            evaluate_every=2,
+            map_after=9,
+            out=tmp_path,
+            runs=2,
+            jobs=1,
+            only=("cka", "mf"),
+        )
         main(experiment)
-        assert "A4   Dyna-CKA" in capsys.readouterr().out
-        assert (tmp_path / "curves.png").stat().st_size > 5_000
+        assert "Hand's error in cm" in capsys.readouterr().out
+        assert (tmp_path / "arm" / "figure3.png").stat().st_size > 5_000
         record = runs_file(experiment).read()["cka", 1]
         assert record["evaluations"]["episode"] == [0, 2]
         assert len(record["maps"]["2"]["last_five"]) == 4
@@ -128,7 +135,7 @@ def arm_verdicts(**curves):
 
 @pytest.mark.slow
 def test_reaching_runs_and_their_tables(tmp_path):
-    experiment = Reaching(out=tmp_path, runs=1, settings=FEW)
+    experiment = Reaching(out=tmp_path, runs=1, **FEW)
     experiment.check()
     records = []
     for system, learner in (("sensors", "gp"), ("plain", "cka")):
@@ -142,15 +149,7 @@ def test_reaching_runs_and_their_tables(tmp_path):
     }
 
 
-def test_the_slow_learner_is_told_apart_by_its_settings():
-    experiment = Reaching(runs=2, settings=FEW)
-    slow = [case for case in experiment.cases() if case[1] == "cka-slow"]
-    assert slow == [("plain", "cka-slow", 0), ("plain", "cka-slow", 1)]
-    told = experiment.describe("plain", "cka-slow")
-    assert told == {**experiment.describe("plain", "cka"), **SLOW}
-
-
 @pytest.mark.parametrize("learner", Reaching.axes["learner"])
 @pytest.mark.parametrize("system", Reaching.axes["system"])
 def test_all_models_are_known(system, learner):
-    assert dynamics(FEW, system, learner).spec.states[0] == "theta_s"
+    assert dynamics(Reaching(), system, learner).spec.states[0] == "theta_s"

@@ -4,8 +4,6 @@ import os
 import pickle
 import subprocess
 import sys
-from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 
 import gymnasium as gym
@@ -14,15 +12,11 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-from gpadjust.control import Task
-from gpadjust.dynamics import LearnedDynamics
-from gpadjust.rl import DynaOptions, DynaSAC
 from paper.arm import system
 from paper.arm.system import MuscleArmEnv, hand_distance_cm, hand_position
 from paper.arm.system.opensim import MUSCLES, load_opensim
-from paper.arm.system.reaching import ARM_MEMORY_SPEC, ARM_SPEC, arm_reward
+from paper.arm.system.reaching import ARM_MEMORY_SPEC, arm_reward
 
 ROOT = Path(__file__).parents[2]
 ID = "paper.arm.system:MuscleArm-v0"
@@ -263,30 +257,7 @@ def test_random_trials_do_not_fail(arm):
             assert arm.observation_space.contains(observation)
 
 
-@pytest.mark.slow
-def test_resets_do_not_leak_memory(arm):
-    def resident():
-        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-
-    def trial():
-        arm.reset()
-        arm.step(GENTLE)
-
-    for _ in range(50):
-        trial()
-    before = resident()
-    for _ in range(1000):
-        trial()
-    assert resident() - before < 1e7
-
-
-BLUE, RED, GREEN, GREY, LIGHT = (
-    (31, 79, 130),
-    (204, 77, 77),
-    (44, 140, 68),
-    (110, 110, 110),
-    (215, 215, 215),
-)
+GREEN, LIGHT = (44, 140, 68), (215, 215, 215)
 
 
 def near(frame, place, colour, margin):
@@ -329,31 +300,6 @@ def test_frame_shows_the_target_where_it_is(frame):
         assert near(shown, hand_position(torch.tensor(START[:2])), GREEN, 2) == (25, 25)
 
 
-def test_frame_shows_the_links_where_they_are(frame):
-    for shoulder, elbow in ((0.6, 1.1), (0.3, 0.8)):
-        shown = frame((shoulder, elbow), (0.0, 0.0))
-        upper = 0.309 * np.array([np.cos(shoulder), np.sin(shoulder)])
-        fore = 0.333 * np.array([np.cos(shoulder + elbow), np.sin(shoulder + elbow)])
-        for middle in (upper / 2, upper + fore / 2):
-            assert near(shown, middle, GREY, 1) == (9, 9)
-
-
-@pytest.mark.parametrize("muscle", range(6))
-def test_frame_shows_how_active_each_muscle_is(frame, muscle):
-    rest, active = (
-        frame(START[:2], TARGET, share * np.eye(6)[muscle]).astype(int) for share in (0.0, 1.0)
-    )
-
-    def count(picture, colour):
-        return (np.abs(picture - colour).sum(-1) < 60).sum()
-
-    assert count(rest, RED) == 0
-    assert count(active, RED) > 50
-    assert 0 < count(active, BLUE) < count(rest, BLUE) - 20
-    half = frame(START[:2], TARGET, 0.5 * np.eye(6)[muscle])
-    assert count(half.astype(int), np.mean([BLUE, RED], axis=0)) > 30
-
-
 @pytest.mark.slow
 def test_nothing_is_printed_and_no_log_is_written(tmp_path):
     code = (
@@ -369,25 +315,6 @@ def test_nothing_is_printed_and_no_log_is_written(tmp_path):
     run = python(code, tmp_path)
     assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.slow
-def test_without_opensim_its_environment_and_its_black_box_are_missing(tmp_path):
-    """And an id with the package needs no import of it."""
-    code = (
-        "import sys; sys.modules['opensim'] = None\n"
-        "import gymnasium\n"
-        f"makers = [lambda: gymnasium.make('{ID}'), "
-        "lambda: sys.modules['paper.arm.system'].arm(opensim=True)]\n"
-        "for make in makers:\n"
-        "    try: make()\n"
-        "    except ImportError as error: print(error)\n"
-        "sys.modules['paper.arm.system'].arm().physics\n"
-    )
-    run = python(code, tmp_path)
-    assert run.returncode == 0, run.stderr
-    message = 'The muscle arm needs OpenSim; run `pip install "gpadjust[arm]"`.'
-    assert run.stdout.splitlines() == [message, message]
 
 
 @pytest.mark.parametrize(
@@ -408,52 +335,6 @@ def test_a_broken_opensim_says_so_itself(tmp_path, monkeypatch, content, message
     assert "pip install" not in str(error.value)
 
 
-@pytest.mark.slow
-def test_child_processes_load_libraries_of_their_own(tmp_path):
-    if find_spec("casadi") is None:  # imported here, it would meet OpenSim's libraries
-        pytest.skip("there is no CasADi")
-    code = (
-        "import subprocess, sys\n"
-        "from paper.arm.system.opensim import load_opensim\n"
-        "load_opensim()\n"
-        "subprocess.run([sys.executable, '-c', 'import casadi; print(casadi.SX(2))'], check=True)\n"
-    )
-    run = python(code, tmp_path)
-    assert run.returncode == 0, run.stderr
-    assert run.stdout.strip() == "2"
-
-
-def test_the_logger_is_switched_off_once():
-    opensim = load_opensim()
-    opensim.Logger.setLevelString("critical")
-    try:
-        MuscleArmEnv()
-        assert opensim.Logger.getLevelString().lower() == "critical"
-    finally:
-        opensim.Logger.setLevelString("off")
-
-
-@pytest.mark.slow
-def test_arms_in_processes_of_their_own_are_the_same():
-    make = [partial(gym.make, ID)] * 2
-    here, there = DummyVecEnv(make), SubprocVecEnv(make)
-    try:
-        for envs in (here, there):
-            envs.seed(3)
-        assert np.array_equal(here.reset(), there.reset())
-        actions = np.random.default_rng(0).uniform(0, 1, (16, 2, 4)).astype(np.float32)
-        for action in actions:  # beyond the end of an episode
-            states, rewards, ends, _ = there.step(action)
-            expected = here.step(action)
-            assert np.array_equal(states, expected[0])
-            assert np.array_equal(
-                rewards.astype(np.float32), expected[1]
-            )  # as DummyVecEnv has them
-            assert np.array_equal(ends, expected[2])
-    finally:
-        there.close()
-
-
 def test_the_system_with_memory_and_noise():
     reaching = system.arm(memory=True, noise={"theta_s": 0.01}, strength=0.3)
     assert reaching.spec is ARM_MEMORY_SPEC
@@ -465,13 +346,3 @@ def test_the_system_with_memory_and_noise():
     reaching.task().draw_initial_states(2)
     excite = np.array([0.0, 0.0, 0.5, 0.0], dtype=np.float32)
     assert env.step(excite)[0][6:].tolist() == [0.0, 0.0, 0.5, 0.0]
-
-
-@pytest.mark.slow
-def test_a_learner_takes_the_environment_and_the_physics():
-    task = Task(LearnedDynamics(ARM_SPEC, system.arm().physics), arm_reward)
-    small = {"batch_size": 8, "policy_kwargs": {"net_arch": [8]}, "seed": 0, "device": "cpu"}
-    options = DynaOptions(model_episodes=2)
-    agent = DynaSAC("MlpPolicy", gym.make(ID), task, options, **small).learn(30)
-    assert agent.num_episodes == 2
-    assert agent.replay_buffer.model_buffer.size() == 2 * 2 * 15

@@ -3,8 +3,8 @@
 import math
 import pickle
 from dataclasses import replace
+from functools import partial
 
-import joblib
 import numpy as np
 import pytest
 import sympy
@@ -13,6 +13,7 @@ import torch
 from gpadjust.dynamics import PhysicsDynamics
 from gpadjust.physics import ODEPhysics
 from paper.arm.system import ArmEquation, arm, hand_distance_cm, hand_position
+from paper.arm.system.opensim import ArmSimulation, build_torque_arm
 from paper.arm.system.reaching import ARM_SPEC, arm_reward, arm_start, arm_targets
 from paper.arm.system.torque_arm import REAL_ARM, believed_arm
 
@@ -109,8 +110,6 @@ def test_other_columns_and_impossible_parameters_are_refused():
             function(torch.zeros(2, columns))
     with pytest.raises(ValueError, match="n must be at least 0; found -1"):
         arm_start(-1)
-    with pytest.raises(ValueError, match="no unknown parameters"):
-        arm(opensim=True, unknowns=True)
 
 
 def test_torque_arm_is_a_tenth_too_heavy_and_takes_any_gains():
@@ -121,44 +120,21 @@ def test_torque_arm_is_a_tenth_too_heavy_and_takes_any_gains():
     assert believed_arm([5, 2.5]).gains == (5.0, 2.5)
 
 
-@pytest.mark.parametrize("gains", [(8.0, 4.0), (5.0, 2.5), (1.0, 9.0)])
-def test_ode_agrees_with_opensim(states_and_actions, gains):
-    X = torch.cat(states_and_actions(100), dim=-1)
-    ours, theirs = (arm(gains=gains, opensim=opensim).physics(X) for opensim in (False, True))
-    gap = (ours - theirs).abs()
-    assert gap[:, :2].max() < 1e-5
-    assert gap[:, 2:].max() < 1e-4
+def test_ode_agrees_with_opensim(states_and_actions):
+    states, actions = states_and_actions(20)
+    equation = believed_arm((5.0, 2.5))
+    simulation = ArmSimulation(partial(build_torque_arm, equation), accuracy=1e-6)
+    a1, a2, a3, a4 = actions.numpy().T
+    torques = np.array(equation.gains) * np.stack([a3 - a4, a1 - a2], -1)
+    rows = [simulation.step(*row) for row in zip(states.numpy(), torques, strict=True)]
+    ours = arm(gains=(5.0, 2.5)).physics(torch.cat([states, actions], -1))
+    np.testing.assert_allclose(ours, np.stack(rows), rtol=0, atol=1e-4)
 
 
 def test_substeps_are_enough(states_and_actions):
     X = torch.cat(states_and_actions(100), dim=-1)
     fine = ODEPhysics(believed_arm(), step=0.2, state_dim=4, substeps=400)
     torch.testing.assert_close(arm().physics(X), fine(X), rtol=0, atol=2e-5)
-
-
-def test_gradients_of_the_two_physics_agree(states_and_actions):
-    X = torch.cat(states_and_actions(3), dim=-1).requires_grad_()
-    (exact,) = torch.autograd.grad(arm().physics(X).sum(), X)
-    (differences,) = torch.autograd.grad(arm(opensim=True).physics(X).sum(), X)
-    torch.testing.assert_close(differences, exact, rtol=1e-3, atol=1e-3)
-
-
-def test_opensim_physics_has_a_memo_and_a_light_pickle(states_and_actions):
-    X = torch.cat(states_and_actions(4), dim=-1)
-    physics = arm(opensim=True).physics
-    Y = physics(X)
-    copy = pickle.loads(pickle.dumps(physics))
-    copy.forget()
-    assert torch.equal(copy(X), Y)
-    physics.function = None
-    assert torch.equal(physics(X), Y)
-
-
-def test_threads_take_turns_in_opensim(states_and_actions):
-    X = torch.cat(states_and_actions(12), dim=-1)
-    expected = arm(opensim=True).physics(X)
-    with joblib.parallel_config(backend="threading", n_jobs=3):
-        assert torch.equal(arm(opensim=True).physics(X), expected)
 
 
 def test_torque_arm_physics_can_be_pickled(states_and_actions):

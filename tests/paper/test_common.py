@@ -37,7 +37,7 @@ from paper.common.verdicts import (
     reproduced,
     within,
 )
-from paper.report import PAGES, PAPER, results
+from paper.pages import PAGES, PAPER, results
 
 
 def curves(**runs):
@@ -180,7 +180,7 @@ def test_pages_show_the_committed_results():
 def committed(name):
     """An experiment, and its runs that are committed."""
     kind = resolve_name(EXPERIMENTS[name])
-    experiment = kind(out=PAPER / "results" / name)
+    experiment = kind(out=PAPER / "results")
     return experiment, runs_file(experiment).read()
 
 
@@ -201,12 +201,7 @@ def test_tables_are_those_of_the_committed_runs(name):
     if not runs:
         pytest.skip("it was not run yet")
     shown = results(PAPER / "results")
-    # Old records have no commit, new ones have, or None outside a repository.
-    records = [
-        record | [{}, {"commit": "f" * 40}, {"commit": None}][number % 3]
-        for number, record in enumerate(runs.values())
-    ]
-    for marker, found in tables_of(experiment, records).items():
+    for marker, found in tables_of(experiment, [*runs.values()]).items():
         assert shown[marker] == found.text
 
 
@@ -219,6 +214,7 @@ def test_markers_keep_what_is_between_them():
     )
     assert fragments(whole) == found
     with pytest.raises(ValueError, match="No result is called 'two:y'"):
-        filled(text, {"one:x": "| 1 |"})
+        filled(text, {"one:x": "| 1 |", "two:z": ""})
+    assert "<!-- two:y -->\n*Not run yet.*\n<!-- end -->" in filled(text, {"one:x": "| 1 |"})
     with pytest.raises(ValueError, match="<!-- one:x --> has no <!-- end -->"):
         filled("<!-- one:x -->\nprose\n<!-- two:y -->\n<!-- end -->\n", found)

@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from paper.common.runner import runs_file
-from paper.forrester import Forrester, Settings
+from paper.forrester import Forrester
 from paper.forrester.forrester import NAMES, judge
 from paper.forrester.problem import CRUDE, POINTS, observations, truth
-from paper.report import PAPER
+from paper.pages import PAPER
 
 RESULTS = PAPER / "results"
 
@@ -30,8 +30,7 @@ def test_readings_of_the_crude_function():
 @pytest.mark.slow
 def test_smoke(tmp_path):
     """One data set for each protocol; the tables of the runs that are committed."""
-    settings = Settings(steps=2, lengthscales=(0.5, 1.0), ridges=(0.01,))
-    experiment = Forrester(out=tmp_path, settings=settings)
+    experiment = Forrester(out=tmp_path, steps=2, lengthscales=(0.5, 1.0), ridges=(0.01,))
     found = {
         protocol: experiment.run("B", protocol, 1)
         for protocol in ("gpadjust", "paper", "closed form")
@@ -40,7 +39,7 @@ def test_smoke(tmp_path):
     error = dict(zip(found["gpadjust"]["model"], found["gpadjust"]["rmse"], strict=True))
     assert error["CKA"] < 0.05 < error["Phy-mean GP"]
     assert error["Phy-mean GP"] == error["GP-bias"]
-    records = list(runs_file(Forrester(out=RESULTS / "forrester")).read().values())[:50]
+    records = list(runs_file(Forrester(out=RESULTS)).read().values())[:50]
     assert "F7 | RRA about 50 %" in experiment.tables(records)["claims-B"].text
     assert "CKA | " in experiment.first_look(records)
 

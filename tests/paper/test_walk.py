@@ -5,18 +5,17 @@ from pathlib import Path
 
 import pytest
 
-import paper.laboratory.drift  # not while files are counted  # noqa: F401
+import paper.kinds.kinds  # not while files are counted  # noqa: F401
 from paper.common.runner import main
-from paper.laboratory import Drift, DriftSettings
-from paper.report import PAPER
+from paper.kinds import Kinds
+from paper.pages import PAPER
 
-FILES, OF_PAPER = 35, 7  # of the library and of paper/ in a run of point fits, its tables included
+FILES, OF_PAPER = 35, 7  # of the library and of paper/ in a run, its tables included
 
 
 @pytest.mark.slow
 def test_one_experiment_passes_few_files(tmp_path):
-    settings = DriftSettings(steps=60, first=24)
-    experiment = Drift(out=tmp_path, runs=2, jobs=1, only=("never",), settings=settings)
+    experiment = Kinds(out=tmp_path, runs=2, jobs=1, only=("vanishing", "plain"))
     files = set()
 
     def record(frame, event, argument):

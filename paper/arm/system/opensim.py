@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from threading import Lock
 from types import ModuleType
 from typing import Any
@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpadjust.checks import checked_number
-from gpadjust.physics import BlackBoxPhysics
-from paper.arm.system.torque_arm import ARM_TIME_STEP, ArmEquation, believed_arm
+from paper.arm.system.torque_arm import ARM_TIME_STEP, ArmEquation
 
 JOINTS = ("shoulder", "elbow")
 LIMITS = ((-20.0, 125.0), (-5.0, 145.0))  # degrees, of shoulder and elbow
@@ -57,7 +56,6 @@ MUSCLES = (
 Actions excite the first four, in this order; the last two are passive.
 """
 NUM_EXCITED = 4
-FD_STEP = 1e-3  # in rad, rad/s and 1: far above the error of the integration
 
 
 @lru_cache(maxsize=1)
@@ -220,6 +218,7 @@ class ArmSimulation:
         accuracy: The relative accuracy of the integrator, in (0, 1).
 
     Example:
+        >>> from functools import partial
         >>> from paper.arm.system.torque_arm import REAL_ARM
         >>> simulation = ArmSimulation(partial(build_torque_arm, REAL_ARM), accuracy=1e-6)
         >>> simulation.step(np.array([0.6, 1.1, 0.0, 0.0]), np.zeros(2)).round(6)
@@ -276,35 +275,3 @@ class ArmSimulation:
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._start_anew()
-
-
-def opensim_arm_physics(gains: tuple[float, float] = (8.0, 4.0)) -> BlackBoxPhysics:
-    """The torque arm's physics, computed by OpenSim, a row at a time.
-
-    It agrees with the equation of motion to 1e-5 rad. In parallel it runs in processes
-    (``joblib``'s ``loky``): threads take turns.
-
-    Example:
-        >>> import torch
-        >>> physics = opensim_arm_physics()
-        >>> physics(torch.tensor([[0.6, 1.1, 0.0, 0.0, 0.0, 0.0, 0.2, 0.0]], dtype=torch.float64))
-        tensor([[ 0.6902,  1.0405,  0.7442, -0.2988]], dtype=torch.float64)
-    """
-    equation = believed_arm(gains)
-    _simulation(equation)  # a missing OpenSim is found now
-    step = partial(_torque_step, equation)
-    return BlackBoxPhysics(step, batched=False, fd_step=FD_STEP, name="opensim_arm")
-
-
-def _torque_step(equation: ArmEquation, row: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A step of one row; a light pickle, as each process keeps the models it has built."""
-    if row.shape != (8,):
-        raise ValueError(f"expected rows of 4 states and 4 actions; found shape {row.shape}")
-    a1, a2, a3, a4 = row[4:]
-    torques = np.array(equation.gains) * (a3 - a4, a1 - a2)
-    return _simulation(equation).step(row[:4], torques)
-
-
-@lru_cache(maxsize=8)
-def _simulation(equation: ArmEquation) -> ArmSimulation:
-    return ArmSimulation(partial(build_torque_arm, equation), accuracy=1e-6)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.checks import check_columns, check_switch, checked_whole
-from gpadjust.physics import ODEPhysics, Physics, Unknown
+from gpadjust.physics import ODEPhysics, Unknown
 from gpadjust.states import StateSpec
 from gpadjust.systems.system import System
 from gpadjust.systems.wrappers import RememberAction
@@ -140,7 +140,6 @@ def arm(
     memory: bool = False,
     noise: Mapping[str, float] | None = None,
     unknowns: bool = False,
-    opensim: bool = False,
     substeps: int = SUBSTEPS,
     gradient: Literal["autograd", "finite-difference"] = "autograd",
     episode_length: int = 15,
@@ -161,17 +160,13 @@ def arm(
         noise: Standard deviations of the sensors' noise, by the name of the state.
         unknowns: Whether the physics has four unknown parameters: ``forearm`` (a factor on its mass
             and inertia), ``damping``, ``shoulder_gain``, ``elbow_gain``.
-        opensim: Whether OpenSim computes the physics, as a black box, a row at a time. The two
-            agree to 1e-5 rad.
         substeps: Integration steps, of 5 ms by default. With 8 (which err by 2e-4 rad) and
             ``gradient="finite-difference"`` a gradient along an episode takes a tenth of the time.
         gradient: As of :class:`~gpadjust.physics.ODEPhysics`.
         episode_length: In steps of 0.2 s.
 
     Raises:
-        ImportError: If ``opensim`` is asked for and missing.
-        ValueError: If an option is out of range, or ``opensim`` is asked for with ``unknowns``,
-            ``substeps`` or ``gradient``.
+        ValueError: If an option is out of range.
 
     Example:
         >>> import torch
@@ -180,35 +175,25 @@ def arm(
         >>> physics(torch.tensor([[0.6, 1.1, 0.0, 0.0, 0.0, 0.0, 0.2, 0.0]], dtype=torch.float64))
         tensor([[ 0.6902,  1.0405,  0.7442, -0.2988]], dtype=torch.float64)
     """
-    for name, switch in {"memory": memory, "unknowns": unknowns, "opensim": opensim}.items():
+    for name, switch in {"memory": memory, "unknowns": unknowns}.items():
         check_switch(name, switch)
+    believed = believed_arm(gains)
+    named = {
+        "forearm": Unknown(1.0, factor=1.5),
+        "damping": Unknown(believed.damping, factor=2.0, unit="N m s/rad"),
+        "shoulder_gain": Unknown(max(believed.gains[0], 0.1), factor=2.0, unit="N m"),
+        "elbow_gain": Unknown(max(believed.gains[1], 0.1), factor=2.0, unit="N m"),
+    }
+    physics = ODEPhysics(
+        believed,
+        step=ARM_TIME_STEP,
+        state_dim=4,
+        substeps=substeps,
+        name="torque_arm",
+        gradient=gradient,
+        unknowns=named if unknowns else None,
+    )
     spec = ARM_MEMORY_SPEC if memory else ARM_SPEC
-    physics: Physics
-    if opensim:
-        from paper.arm.system.opensim import opensim_arm_physics
-
-        if unknowns:
-            raise ValueError("The physics by OpenSim has no unknown parameters; use opensim=False.")
-        if (substeps, gradient) != (SUBSTEPS, "autograd"):
-            raise ValueError("OpenSim takes no substeps and gradient; use opensim=False.")
-        physics = opensim_arm_physics(gains)
-    else:
-        believed = believed_arm(gains)
-        named = {
-            "forearm": Unknown(1.0, factor=1.5),
-            "damping": Unknown(believed.damping, factor=2.0, unit="N m s/rad"),
-            "shoulder_gain": Unknown(max(believed.gains[0], 0.1), factor=2.0, unit="N m"),
-            "elbow_gain": Unknown(max(believed.gains[1], 0.1), factor=2.0, unit="N m"),
-        }
-        physics = ODEPhysics(
-            believed,
-            step=ARM_TIME_STEP,
-            state_dim=4,
-            substeps=substeps,
-            name="torque_arm",
-            gradient=gradient,
-            unknowns=named if unknowns else None,
-        )
     return System(
         partial(_make, memory, strength=strength, max_episode_steps=episode_length),
         spec,

@@ -1,0 +1,205 @@
+"""Errors of functions by few observations: CKA, what it contains, and the formula that is fitted.
+
+An error is that of the function without noise, in its standard deviation, at points that all share.
+The formula has what may be fitted: a factor and an offset by least squares, or its unknown
+parameters by their priors. A cell is a problem with a number of observations.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from gpadjust import CalibratedPhysics, fit
+from gpadjust.core import SamplingWarning
+from gpadjust.validation import score
+from paper.common.experiment import Run, Table
+from paper.common.figures import panels, save
+from paper.common.learners import LEARNERS
+from paper.common.tables import Cell, groups, number, table
+from paper.common.verdicts import Difference, paired
+from paper.functions import GROUPS, Functions
+from paper.functions.problems import PROBLEMS
+from paper.parameters.laws import case
+
+MOST, TOO_MUCH = 1.05, 1.3  # of the formula's error
+_CELL = ["group", "problem", "n"]
+
+
+class Data(NamedTuple):
+    """Observations, a formula, and points where the truth is known, with new observations."""
+
+    X: Tensor
+    Y: Tensor
+    physics: Any
+    points: Tensor
+    truth: Tensor
+    new: Tensor
+
+
+def data_of(group: str, name: str, n: int, num_test: int, seed: int) -> Data:
+    """The data set that a seed draws."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def noisy(f: Tensor, sd: Any) -> Tensor:
+        return f + sd * torch.randn(f.shape, generator=generator, dtype=torch.float64)
+
+    if group == "law":
+        drawn, test = case(name, seed, n), case(name, seed, num_test, places=1)
+        physics, noise = drawn.physics, drawn.noise
+        return Data(drawn.X, drawn.Y, physics, test.X, test.system, noisy(test.system, noise))
+    problem = PROBLEMS[name]
+    X, points = problem.points(n, seed), problem.points(num_test, 1)
+    truth = problem.truth(points)
+    sd = problem.noise * truth.std()
+    Y = noisy(problem.truth(X), sd)
+    return Data(X, Y, problem.physics, points, truth, noisy(truth, sd))
+
+
+def run(experiment: Functions, group: str, problem: str, n: int, learner: str, seed: int) -> Run:
+    """Fit a learner to a data set; return its error, its density and what its intervals hold."""
+    warnings.simplefilter("ignore", SamplingWarning)
+    data = data_of(group, problem, n, experiment.num_test, seed)
+    sd, begin = data.truth.std(), time.perf_counter()
+    if learner == "formula" and group != "law":
+        error = _least_squares(data) - data.truth
+        seconds = time.perf_counter() - begin
+        return {"error": (error.square().mean().sqrt() / sd).item(), "seconds": seconds}
+    make: Any = CalibratedPhysics if learner == "formula" else LEARNERS[learner].make
+    model = make(data.X, data.Y, physics=data.physics)
+    fit(model)
+    seconds = time.perf_counter() - begin
+    with torch.no_grad():
+        mean, (low, high) = model.predict(data.points).mean, model.interval(data.points)
+        scores = score(model.posterior(data.points, observation_noise=True), data.new)
+    inside = (low <= data.truth) & (data.truth <= high)
+    return {
+        "error": ((mean - data.truth).square().mean().sqrt() / sd).item(),
+        "nlpd": (scores.nlpd - sd.log()).item(),
+        "coverage": scores.coverage.item(),
+        "of_function": inside.double().mean().item(),
+        "seconds": seconds,
+    }
+
+
+def _least_squares(data: Data) -> Tensor:
+    """The formula with a factor and an offset, at the points."""
+    f_p, at = data.physics(data.X), data.physics(data.points)
+    columns = torch.cat([f_p, torch.ones_like(f_p)], -1)
+    found = torch.linalg.lstsq(columns, data.Y, driver="gelsd").solution
+    return torch.cat([at, torch.ones_like(at)], -1) @ found
+
+
+def tables(runs: Sequence[Run], experiment: Functions) -> dict[str, Table]:
+    """All tables, by name."""
+    found = pd.DataFrame(runs)
+    parts = groups(found, "group", GROUPS) | {"all": found}
+    worse = {
+        "cells": lambda part: len(_ratios(part, "formula")),
+        "error, CKA / formula fitted": lambda part: _pooled(part, "formula"),
+        "median cell": lambda part: _median(part, "formula"),
+        f"cells at most {MOST}": lambda part: _share(part, "formula", MOST),
+        f"cells above {TOO_MUCH}": lambda part: sum(
+            each.mean > math.log(TOO_MUCH) for each in _ratios(part, "formula").values()
+        ),
+        "worst cell": _worst,
+    }
+    learners = experiment.axes["learner"]
+    each = {
+        f"{label}: {what}": _of(name, column, how, form)
+        for column, what, how, form in (
+            ("error", "median error / sd", "median", ".2g"),
+            ("coverage", "95 % hold", "mean", ".3f"),
+            ("nlpd", "median NLPD", "median", ".2f"),
+            ("seconds", "s", "median", ".1f"),
+        )
+        for name, label in learners.items()
+        if name != "formula" or column in ("error", "seconds")
+    }
+    rho: dict[str, Cell] = {
+        "cells": lambda part: len(_ratios(part, "phymean")),
+        "CKA better": lambda part: sum(e.high < 0 for e in _ratios(part, "phymean").values()),
+        "CKA worse": lambda part: sum(e.low > 0 for e in _ratios(part, "phymean").values()),
+        "error, CKA / physics mean": lambda part: _pooled(part, "phymean"),
+        "median cell": lambda part: _median(part, "phymean"),
+        "error, CKA / GP": lambda part: _pooled(part, "gp"),
+        "median cell, GP": lambda part: _median(part, "gp"),
+    }
+    single: dict[str, Cell] = {
+        **{f"CKA / {learners[name]}": _beside(name) for name in ("formula", "phymean", "gp")},
+        "error / sd": _of("cka", "error", "median", ".2g"),
+        "95 % hold": _of("cka", "coverage", "mean", ".2f"),
+    }
+    cells = groups(found, _CELL, lambda group, name, n: f"{name}, {n}")
+    return {
+        "formula": Table("CKA beside its formula, fitted", table(parts, worse, "the formula is")),
+        "learners": Table("All learners", table(parts, each, "the formula is")),
+        "rho": Table("CKA beside delta alone, and a GP", table(parts, rho, "the formula is")),
+        "cells": Table("Each cell, medians over data sets", table(cells, single, "problem, n")),
+    }
+
+
+def _of(learner: str, column: str, how: str, form: str) -> Cell:
+    return lambda part: number(part[part["learner"] == learner][column].agg(how), form)
+
+
+def _beside(other: str) -> Cell:
+    return lambda part: paired(part, "error", "learner", "cka", other, ratio=True).ratio()
+
+
+def _ratios(part: pd.DataFrame, other: str) -> dict[tuple[Any, ...], Difference]:
+    """Logarithms of errors, CKA's over another's, cell by cell, paired by data set."""
+    cells = {
+        cell: paired(own, "error", "learner", "cka", other, ratio=True)
+        for cell, own in part.groupby(_CELL, sort=False)
+    }
+    return {cell: each for cell, each in cells.items() if each.n}
+
+
+def _pooled(part: pd.DataFrame, other: str) -> str:
+    return Difference.of([each.mean for each in _ratios(part, other).values()]).ratio()
+
+
+def _median(part: pd.DataFrame, other: str) -> str:
+    middle = np.median([each.mean for each in _ratios(part, other).values()] or [np.nan])
+    return number(math.exp(middle), ".2f")
+
+
+def _share(part: pd.DataFrame, other: str, most: float) -> str:
+    held = [each.mean <= math.log(most) for each in _ratios(part, other).values()]
+    return f"{sum(held)} of {len(held)}"
+
+
+def _worst(part: pd.DataFrame) -> str:
+    found = _ratios(part, "formula")
+    if not found:
+        return ""
+    cell = max(found, key=lambda cell: found[cell].mean)
+    return f"{math.exp(found[cell].mean):.2f}, {cell[1]}, n = {cell[2]}"
+
+
+def draw(runs: Sequence[Run], experiment: Functions) -> list[Path]:
+    """Draw the ratio of each cell to the formula, sorted, with its interval, by group."""
+    found = pd.DataFrame(runs)
+    parts = groups(found, "group", GROUPS)
+    figure, axes = panels([*parts], 3, (3.2, 2.8))
+    for ax, part in zip(axes, parts.values(), strict=True):
+        order = sorted(_ratios(part, "formula").values(), key=lambda each: each.mean)
+        middle = np.exp([each.mean for each in order])
+        ends = [np.exp([each.low for each in order]), np.exp([each.high for each in order])]
+        ax.vlines(range(len(order)), *ends, color="0.7", lw=1.5)
+        ax.plot(range(len(order)), middle, ".", color="navy", ms=4)
+        ax.axhline(1, color="0.3", lw=0.8)
+        ax.axhline(TOO_MUCH, color="tab:red", lw=0.8, ls=":")
+        ax.set(yscale="log", xlabel="cells, sorted", xticks=[])
+    axes[0].set_ylabel("error, CKA / formula fitted")
+    return [save(figure, experiment.folder / "functions.png")]

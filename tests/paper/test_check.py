@@ -1,0 +1,151 @@
+"""What keeps the numbers true: quotes are those of their tables, and runs can be made again."""
+
+from dataclasses import dataclass
+from pkgutil import resolve_name
+from typing import ClassVar
+
+import pytest
+
+from paper import check
+from paper.__main__ import EXPERIMENTS
+from paper.check import difference
+from paper.common import runner
+from paper.common.experiment import Axes, Experiment, Table
+from paper.common.runner import main, runs_file, stale_list, stamp
+from paper.pages import PAPER, QUOTING, results, wrong_quotes
+
+TABLE = """| model, n | RMSE, m | held |
+| --- | --- | --- |
+| CKA, 5 | 0.274 ± 0.02 (3) | 0.943 |
+| **GP, 5** | **1,234.5** | 41 of 48 |
+| GP, 9 |  | 0.5 |"""
+
+
+def quoted(text, place):
+    link = f'[{text}](x/tables.md#toy:all "{place}")' if place else f"[{text}](x/tables.md#toy:all)"
+    return wrong_quotes(f"It is {link}.", {"toy:All": TABLE})
+
+
+@pytest.mark.parametrize(
+    ("text", "place"),
+    [
+        ("0.27", "CKA, 5 :: RMSE, m"),
+        ("0.274 ± 0.02", "CKA, 5 :: RMSE, m"),
+        ("94 %", "CKA, 5 :: held"),
+        ("1,234", "GP, 5 :: RMSE, m"),
+        ("41 of 48", "GP, 5 :: held"),
+        ("all errors", ""),
+    ],
+)
+def test_a_number_is_quoted_as_it_is_or_rounded(text, place):
+    assert quoted(text, place) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "place", "words"),
+    [
+        ("0.28", "CKA, 5 :: RMSE, m", "the table has '0.274"),
+        ("0.02 ± 0.274", "CKA, 5 :: RMSE, m", "the table has"),
+        ("40 of 48", "GP, 5 :: held", "the table has"),
+        ("0.27", "", "no title with a place"),
+        ("0.27", "CKA :: RMSE, m", "there are 0 cells"),
+        ("0.27", "CKA, 5 :: RMSE", "there are 0 cells"),
+    ],
+)
+def test_another_number_and_a_place_that_is_not_there_are_wrong(text, place, words):
+    (found,) = quoted(text, place)
+    assert words in found
+
+
+def test_a_table_that_is_not_there_is_wrong():
+    assert "no such table" in wrong_quotes("[x](a/tables.md#toy:none)", {"toy:all": TABLE})[0]
+
+
+def test_documents_quote_their_tables():
+    """If this fails, a table has changed: quote it anew, or drop what it no longer shows."""
+    tables = results(PAPER / "results")
+    wrong = {path.name: wrong_quotes(path.read_text(), tables) for path in QUOTING}
+    assert {name: quotes for name, quotes in wrong.items() if quotes} == {}
+
+
+def test_differences_of_runs():
+    old = {"a": 1.0, "list": [1.0, 2.0, 3.0], "seconds": 9.0, "none": None, "x": {"y": [0.5]}}
+    assert difference(old, {**old, "seconds": 1.0, "a": 1.0001}) == ""
+    assert difference(old, {"list": [1.0, 2.0]}) == ""  # a cheaper case is shorter
+    assert difference(old, {"list": [1.0, 2.1]}) == "list[1] was 2.0 and is now 2.1"
+    assert difference(old, {"x": {"y": [0.6]}}) == "x.y[0] was 0.5 and is now 0.6"
+    assert difference(old, {"none": 1.0}) == "none was None and is now 1.0"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Squares(Experiment):
+    """Squares, by code whose factor may change."""
+
+    runs: int = 2
+    jobs: int = 1
+    factor: ClassVar[float] = 1.0
+    axes: ClassVar[Axes] = {"learner": {"a": "the first", "b": "the second"}}
+    calls: ClassVar[tuple[str, ...]] = ()
+
+    def run(self, *case):
+        return {"value": self.factor * (case[1] + 1.0) * (case[0] == "a")}
+
+    def first_look(self, runs):
+        return None
+
+    def tables(self, runs):
+        return {"runs": Table("Runs", f"{len(runs)}")}
+
+    def draw(self, runs):
+        return []
+
+
+@pytest.fixture
+def squares(tmp_path, monkeypatch):
+    """An experiment whose runs are there, as `check` sees it."""
+    monkeypatch.setattr(runner, "commit_of", lambda root: ("f" * 40, "2026-01-01"))
+    experiment = Squares(out=tmp_path / "results")
+    main(experiment)
+    monkeypatch.setattr(check, "PAPER", tmp_path)
+    monkeypatch.setattr(runner, "STALE", tmp_path / "stale.txt")
+    monkeypatch.setattr("os.cpu_count", lambda: 1)
+    return experiment, {"squares": f"{__name__}:Squares"}
+
+
+def test_a_change_of_the_code_makes_a_learner_stale(squares, monkeypatch):
+    experiment, known = squares
+    runs = [*runs_file(experiment).read().values()]
+    assert check.check(known) == {}
+    assert stamp(experiment, runs) == "*Runs: 4 by ffffffff of 2026-01-01.*"
+    monkeypatch.setattr(Squares, "factor", 2.0)
+    assert [*check.check(known)] == ["squares a"]
+    runner.STALE.write_text("squares a\n")
+    assert check.check(known, known=False) == {}
+    assert stamp(experiment, runs).endswith(" Stale: today's code gives other numbers (a).*")
+
+
+def test_runs_of_unrecorded_code_are_stale_without_being_made_again(squares):
+    experiment, known = squares
+    file = runs_file(experiment)
+    runs = [{**run, "commit": None} for run in file.read().values()]
+    file.path.unlink()
+    for run in runs:
+        file.append(run)
+    assert check.check(known) == dict.fromkeys(
+        ["squares a", "squares b"], "its commit is not recorded"
+    )
+
+
+@pytest.mark.slow
+def test_committed_numbers_are_made_again_or_called_stale():
+    """If this fails, `python -m paper check --write` says in the tables what is stale."""
+    assert check.check(EXPERIMENTS, known=False) == {}
+
+
+def test_the_list_of_stale_learners_is_of_those_that_there_are():
+    there = {
+        f"{name} {learner}"
+        for name, kind in EXPERIMENTS.items()
+        for learner, *_ in check.cheapest(resolve_name(kind)(out=PAPER / "results"))
+    }
+    assert stale_list() <= there

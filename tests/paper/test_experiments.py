@@ -1,0 +1,81 @@
+"""A small run of each experiment, and the data that they read."""
+
+import pytest
+
+from paper.__main__ import EXPERIMENTS
+from paper.published import Uci
+from paper.published.steels import ELEMENTS
+from paper.published.steels import split as steels_split
+
+SMALL = {  # options, the number of runs, and a word of the tables
+    "forrester": (["--only", "B", "paper", "--steps", "2"], 2, "F7"),
+    "functions": (["--only", "wave", "5", "--num-test", "20"], 8, "CKA / formula fitted"),
+    "kinds": (["--only", "relative", "noisy_inputs"], 8, "`noise=RelativeNoise()`"),
+    "misled": (["--only", "unrelated", "--trials", "2", "--mc-samples", "8"], 8, "median regret"),
+    "parameters": (["--only", "smooth", "focus", "physics", "free"], 6, "free delta, slope"),
+    "steels": (["--only", "formula", "gp"], 4, "TPOT-Mat, published"),
+    "uci": (["--only", "yacht", "0.1", "gp", "feature", "boosting"], 6, "WGBoost"),
+    "nist": (["--only", "DanWood"], 4, "| within both limits | 1 |"),
+    "masses": (["--only", "fold", "drop", "none", "alone", "gp", "--stride", "12"], 4, "valence"),
+    "emps": (["--rows", "600", "--every", "20", "--rounds", "5"], 8, "dynoNet"),
+    "freeruns": (
+        ["--only", "furnace", "--transitions", "20", "--rounds", "5", "--starts", "1"],
+        7,
+        "PR-SSM, published",
+    ),
+    "real": (["--only", "pendulum", "100", "phy", "fitted", "gp", "--windows", "2"], 5, "sac"),
+    "tanks": (
+        ["--only", "kink", "fitted", "delta", "--samples", "80", "--rounds", "3", "--starts", "1"],
+        3,
+        "CT-SUBNET",
+    ),
+    "known": (
+        ["--only", "tanks", "phy", "gp", "--trials", "2", "--sequences", "8", "--elites", "2"],
+        4,
+        "two tanks (2 runs)",
+    ),
+    "first": (["--only", "truth", "--trials", "1"], 2, "the true system, trial 1"),
+    "planning": (
+        [
+            *("--only", "sensors", "phy", "gp", "--trials", "2", "--episode-length", "10"),
+            *("--sequences", "12", "--elites", "3", "--first-sequences", "12"),
+            *("--rounds", "0", "--first-rounds", "0"),
+        ],
+        4,
+        "median of a trial",
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", SMALL)
+def test_a_small_run(name, ran):
+    options, number, word = SMALL[name]
+    runs, tables = ran(name, *options)
+    assert len(runs) == number
+    assert word in tables
+    assert "*Runs: " in tables
+
+
+def test_each_experiment_has_a_small_run():
+    """The others have one beside their own tests."""
+    assert EXPERIMENTS.keys() - SMALL == {"arm", "cartpole", "reaching", "nuts", "simulators"}
+
+
+def test_steels_are_in_five_folds():
+    sizes = []
+    for fold in range(5):
+        X, Y, test, _ = steels_split(fold)
+        sizes.append(len(test))
+        assert len(X) + len(test) == 312
+        assert X.shape[1] == len(ELEMENTS)
+        assert (X.sum(1) < 0.5).all()  # iron is the rest
+        assert 1000 < Y.median() < 2000
+    assert max(sizes) - min(sizes) <= 1
+
+
+@pytest.mark.parametrize(("options", "words"), [({"runs": 2, "seed": 19}, "twenty splits")])
+def test_splits_that_there_are_not(options, words):
+    with pytest.raises(ValueError, match=words):
+        Uci(**options).check()
