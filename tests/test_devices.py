@@ -20,7 +20,6 @@ ALLOWED = {
         "core/fitting.py modes",
         "core/functions.py __init__",
         "core/model.py log_likelihood",
-        "core/nuts.py nuts",
         "core/nuts.py proposed",
         "physics/formula.py _parsed",
         "core/saving.py _built_with",

@@ -35,7 +35,7 @@ _SMALL = 40  # points: up to these draws begin with the prior
 _MEDIUM, _SHARED = 100, 200  # up to these they are moved; the latter if outputs share numbers
 _FIRST = 4  # draws from Laplace's approximation for each one that is kept
 _SELDOM = 1e-3  # a nested model of less probability at its mode is not drawn from
-_OF_NUTS = 1000  # draws, a multiple of 16
+_OF_NUTS = 640  # draws, a multiple of 16
 _BEFORE_NUTS = 512  # draws of the default fit, around which chains jump
 _SEARCHES = 4  # for the mode
 _STEPS, _STEPS_OF_SHARED = 2_000, 200  # the latter with a fit by least squares, and begun again
@@ -123,7 +123,7 @@ def fit(
         num_draws: Number of draws, a multiple of 4 (of NUTS from 16 on); predictions average over a
             quarter of them. Default: 80, 32 (of more than 40 points) or 16 (of more than 100), or
             256, 128 or 64 if outputs share unknown numbers, as parameters of a physics; predictions
-            then average over 16, 8 or 4 of them. Of NUTS 1,000, after half as many that are not
+            then average over 16, 8 or 4 of them. Of NUTS 640, after half as many that are not
             kept.
         seed: Seed.
 

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 CHAINS = 4
 _DEPTH = 5  # of a trajectory, 32 steps at most
 _WARMING = 2  # draws of a chain that are kept for each step before, which adapts
-_JUMPS = 16  # proposals after each trajectory
-_WIDTH = 0.5  # of a proposal around a draw, in standard deviations of all draws
+_JUMPS = 32  # proposals after each trajectory
+_WIDTH, _TAIL = 0.5, 3  # of proposals around a draw, Student's t: scale and degrees of freedom
 _FROM_PRIOR = 0.1  # share of proposals, so that densities are bounded by those of proposals
 
 
@@ -27,9 +27,9 @@ def nuts(model: GP, draws: Tensor, number: int, seed: int) -> tuple[Tensor, floa
 
     Chains move in coordinates in which draws of the default fit, ``N x B x P``, are white. After
     each trajectory of NUTS come jumps from mode to mode: Metropolis steps whose proposals are
-    points around these draws, or from the prior (an independence sampler, Tierney 1994). The
-    draws decide how soon chains agree, not the density that chains draw from. R-hat compares
-    halves of the chains (Gelman et al. 2013).
+    points around these draws and, after warm-up, those of all chains, or from the prior (an
+    independence sampler, Tierney 1994). They decide how soon chains agree, not the density that
+    chains draw from. R-hat compares halves of the chains (Gelman et al. 2013).
 
     Raises:
         ImportError: Without Pyro, ``pip install "gpadjust[pyro]"``.
@@ -45,26 +45,26 @@ def nuts(model: GP, draws: Tensor, number: int, seed: int) -> tuple[Tensor, floa
     def potential(v: dict[str, Tensor]) -> Tensor:
         return _Potential.apply(v["v"], jumps.density)
 
-    chains = []
+    def chain(kernel: NUTS, v: Tensor, steps: int) -> Tensor:
+        """Return the states after each of some steps."""
+        states = []
+        for _ in range(steps):
+            v = jumps.moved(kernel.sample({"v": v})["v"].detach())
+            kernel.clear_cache()
+            states.append(v)
+        return torch.stack(states)
+
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
+        kernels = []
         for _ in range(CHAINS):
-            proposed = jumps.proposed((warm + size) * _JUMPS)
-            ratios = jumps.log_ratio(proposed).unflatten(0, (-1, _JUMPS))
-            proposed = proposed.unflatten(0, (-1, _JUMPS))
-            # The chain starts with the first possible proposal, wider than the posterior.
-            possible = ratios[0].isfinite().to(torch.int8).argmax(0)
-            v = proposed[0, possible, torch.arange(len(possible))]
             kernel = NUTS(potential_fn=potential, full_mass=True, max_tree_depth=_DEPTH)
-            kernel.initial_params = {"v": v}
+            kernel.initial_params = {"v": jumps.start()}
             kernel.setup(warm)
-            chain = []
-            for others, by in zip(proposed, ratios, strict=True):
-                v = kernel.sample({"v": v})["v"].detach()
-                v = jumps.moved(v, others, by)
-                kernel.clear_cache()
-                chain.append(v)
-            chains.append(torch.stack(chain[warm:]))
+            kernels.append(kernel)
+        warmed = [chain(kernel, kernel.initial_params["v"], warm) for kernel in kernels]
+        jumps.add(torch.cat(warmed))
+        chains = [chain(kernel, v[-1], size) for kernel, v in zip(kernels, warmed, strict=True)]
     u = jumps.coordinates(torch.stack(chains))
     used = u.std((0, 1)) > 0
     return u.flatten(0, 1), float(split_gelman_rubin(u, 0, 1)[used].max())
@@ -80,32 +80,47 @@ class _Jumps:
         self.density = partial(white_density, model.log_likelihood, self.mean, self.root)
         self.draws = self._white(draws)
 
+    def add(self, v: Tensor) -> None:
+        """Propose points around other draws, too: as many of them, evenly."""
+        every = max(1, len(v) // len(self.draws))
+        self.draws = torch.cat([self.draws, v[::every]])
+
     def coordinates(self, v: Tensor) -> Tensor:
         """Return u = mean + root v, ``... x B x P``."""
         return self.mean + (self.root @ v.unsqueeze(-1)).squeeze(-1)
 
-    def proposed(self, number: int) -> Tensor:
-        """Return proposals v, ``number x B x P``."""
-        z = torch.randn(number, *self.mean.shape, dtype=self.mean.dtype).to(self.mean)
-        near = self.draws[torch.randint(len(self.draws), (number,))] + _WIDTH * z
-        is_prior = torch.rand(number, 1, 1).to(z) < _FROM_PRIOR
+    def proposed(self) -> Tensor:
+        """Return proposals v, ``J x B x P``."""
+        z = torch.randn(_JUMPS, *self.mean.shape, dtype=self.mean.dtype).to(self.mean)
+        size = torch.randn(_JUMPS, 1, 1, _TAIL).square().mean(-1).sqrt().to(z)
+        near = self.draws[torch.randint(len(self.draws), (_JUMPS,))] + _WIDTH * z / size
+        is_prior = torch.rand(_JUMPS, 1, 1).to(z) < _FROM_PRIOR
         return torch.where(is_prior, self._white(z), near)
+
+    def start(self) -> Tensor:
+        """Return the first possible proposal, ``B x P``, which are wider than the posterior."""
+        v = self.proposed()
+        first = self.log_ratio(v).isfinite().to(torch.int8).argmax(0)
+        return v.take_along_dim(first[None, :, None], 0)[0]
 
     @torch.no_grad()
     def log_ratio(self, v: Tensor) -> Tensor:
         """Return the log density less that of the proposals at v, ``N x B``, but for a constant."""
+        # q(v) = (1 - a) mean_i t(v; v_i, h^2 I) + a N(u; 0, I) |root|, times (2 pi)^(P / 2).
+        p, total = v.shape[-1], _TAIL + v.shape[-1]
         distances = torch.cdist(v.movedim(1, 0), self.draws.movedim(1, 0)).movedim(0, 1)
-        # q(v) = (1 - a) mean_i N(v; v_i, h^2 I) + a N(u; 0, I) |root|
-        near = (-0.5 * (distances / _WIDTH).square()).logsumexp(-1) - math.log(len(self.draws))
-        near = near - self.mean.shape[-1] * math.log(_WIDTH) + math.log(1 - _FROM_PRIOR)
-        log_det = self.root.diagonal(dim1=-1, dim2=-2).log().sum(-1)
-        prior = log_det - 0.5 * self.coordinates(v).square().sum(-1) + math.log(_FROM_PRIOR)
+        near = -0.5 * total * ((distances / _WIDTH).square() / _TAIL).log1p()
+        size = math.lgamma(total / 2) - math.lgamma(_TAIL / 2) - 0.5 * p * math.log(_TAIL / 2)
+        size = size - p * math.log(_WIDTH) - math.log(len(self.draws) / (1 - _FROM_PRIOR))
+        log_det = self.root.diagonal(dim1=-1, dim2=-2).log().sum(-1) + math.log(_FROM_PRIOR)
+        prior = log_det - 0.5 * self.coordinates(v).square().sum(-1)
         value = self.density(v, False)[0] - 0.5 * v.square().sum(-1)
-        return (value - torch.logaddexp(near, prior)).nan_to_num(nan=-math.inf)
+        return (value - torch.logaddexp(near.logsumexp(-1) + size, prior)).nan_to_num(nan=-math.inf)
 
-    def moved(self, v: Tensor, others: Tensor, ratios: Tensor) -> Tensor:
-        """Return v ``B x P`` after jumps to others, ``J x B x P``, by ratios ``J x B``."""
-        here = self.log_ratio(v.unsqueeze(0))[0]
+    def moved(self, v: Tensor) -> Tensor:
+        """Return v ``B x P`` after Metropolis steps."""
+        others = self.proposed()
+        here, *ratios = self.log_ratio(torch.cat([v.unsqueeze(0), others]))
         for other, ratio in zip(others, ratios, strict=True):
             taken = torch.rand(len(v)).to(v) < (ratio - here).exp()
             v = torch.where(taken.unsqueeze(-1), other, v)

@@ -53,7 +53,7 @@ class Nuts(Experiment):
 
     runs: int = 2
     """seeds of each fit"""
-    num_draws: int = 1000
+    num_draws: int = 640
     """of NUTS, in four chains, after half as many that are not kept"""
 
     axes: ClassVar[Axes] = {
