@@ -112,7 +112,7 @@ def _beside(runs: Sequence[Run], method: str) -> Mapping[str, str]:
     first = min(seed for _, seed in by)
     reference = by.get(("nuts", first))
     own = [run for (name, seed), run in by.items() if name == method]
-    others = own[1:] if method == "nuts" else own
+    others = [run for run in own if run is not reference]
     if reference is None or not others:
         return {}
     off, wide, mean_off, band = [], [], [], []
