@@ -264,6 +264,8 @@ def test_a_formula_names_its_inputs_and_is_in_the_file(folder, read, capsys, und
     page = read(folder / "report.html")
     assert "The file holds the formula." in page.text
     assert "your formula, with fitted parameters" in page.text
+    assert "(with the parameters fitted together with the correction) is off by" in page.text
+    assert "Each dot is a measurement less the formula, at its own values" in page.text
     (code,) = [text for text in page.codes if "load(" in text]
     assert "load('report.pt')" in code
     names = {}
