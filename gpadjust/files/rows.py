@@ -126,7 +126,8 @@ def rows_of_sheet(
             raise ValueError(f"{file}: expected a workbook, *.xlsx, but {error}.") from error
         names = [worksheet.title for worksheet in book.worksheets]
         if sheet is None and len(names) > 1:  # spreadsheets of old made three sheets
-            names = [each.title for each in formulas.worksheets if _has_values(each)] or names[:1]
+            filled = filter(_has_values, formulas.worksheets)
+            names = [worksheet.title for worksheet in filled] or names[:1]
         if sheet not in names and (sheet is not None or len(names) != 1):
             listed = ", ".join(map(repr, names))
             expected = "one sheet" if sheet is None else f"a sheet {sheet!r}"
