@@ -119,9 +119,9 @@ class Table:
         else:
             marked = [text for _, row in self._rows for text in row if {*text} & {*".,"}]
             self.decimal, self._has_groups = read.decimal_of(marked, mark)
-            whole = [text for text in marked if "," not in text and read.is_number(text)]
-            if whole and (self.decimal, self._has_groups) == (",", True):
-                self.remarks.append(f"{file}: points separate thousands, as in {whole[0]!r}.")
+            pointed = [text for text in marked if "," not in text and read.is_number(text)]
+            if pointed and (self.decimal, self._has_groups) == (",", True):
+                self.remarks.append(f"{file}: points separate thousands, as in {pointed[0]!r}.")
 
     def __len__(self) -> int:
         return len(self._rows)
