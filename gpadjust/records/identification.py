@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib import import_module
@@ -113,7 +114,8 @@ class Identification(Display):
             defaults["sensors"] = Sensors([*noise], noise=noise)
             defaults["initial_states"] = lambda n: states[torch.randint(len(states), (n,))]
         tasks = import_module("gpadjust.control")  # a room above this one
-        return tasks.Task(self.dynamics, reward, **defaults | options)
+        # An update sets attributes, so that a shallow copy leaves the identification as it is.
+        return tasks.Task(copy(self.dynamics), reward, **defaults | options)
 
     @property
     def spec(self) -> StateSpec:

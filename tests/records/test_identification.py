@@ -171,7 +171,6 @@ def test_its_task_has_the_step_and_the_range_of_the_log(found):
         return -following[:, 0].square()
 
     task = found.task(reward, episode_length=40)
-    assert task.dynamics is found.dynamics
     assert (task.dynamics.spec.step, task.episode_length) == (STEP, 40)
     (record,) = found.smoothed.records
     low, high = record.states.amin(0), record.states.amax(0)
@@ -190,3 +189,13 @@ def test_its_task_has_the_step_and_the_range_of_the_log(found):
         state = spring()(torch.cat([state, force[None]], -1))
         path.append(float(state[0, 0]))
     assert max(map(abs, path[-10:])) < 0.1
+
+
+def test_what_a_task_learns_leaves_the_identification():
+    found = quickly(Records(oscillation(61, known=("x", "v")), SPEC), spring(Unknown(1.5, sd=0.5)))
+    before = found.parameters.mean.clone()
+    task = found.task(lambda states, actions, following: -following[:, 0].square())
+    states, actions = found.windows.initial_states.repeat(9, 1), torch.zeros(9, 1).double()
+    task.dynamics.update(states, actions, states + 0.5)
+    assert not torch.equal(task.dynamics.physics_parameters.mean, before)
+    assert torch.equal(found.dynamics.physics_parameters.mean, before)
