@@ -42,6 +42,10 @@ _WIDER = 1.5  # an interval that allows for missing forces, in place of the one 
 _UNSURE = 0.05  # of a prior's standard deviation: uncertainty that matters
 _MOVES = 0.01  # of a state's changes in a step: process noise that matters
 
+_UNSETTLED = (
+    "The search for states and parameters did not settle, so that all of this may change: raise "
+    "num_starts, give narrower priors, or a start of hidden states."
+)
 _OTHERS = {GUESSES: "the guesses do", PERSISTENCE: "a state that stays"}
 
 
@@ -191,9 +195,9 @@ class Identification(Display):
         """Whether the physics follows the log, by each state that was measured, and why.
 
         ``"Yes"`` if the free run errs less than the guesses' and than a state that stays, both by
-        more than chance, the intervals hold, and no error that is more than the sensor's has a
-        cause that :attr:`lack` shows. ``"No"`` if it errs no less than a state that stays, or
-        more than the guesses' by more than chance; else ``"In part"``.
+        more than chance, the intervals hold, the search settled, and no error that is more than
+        the sensor's has a cause that :attr:`lack` shows. ``"No"`` if it errs no less than a state
+        that stays, or more than the guesses' by more than chance; else ``"In part"``.
         """
         verdicts, errors, shares = {}, self.errors, self.coverage.tolist()
         for i, name in enumerate(self.spec.states):
@@ -203,6 +207,9 @@ class Identification(Display):
             reasons = [f"Intervals of 95 % hold {percent(shares[i])} of {name} there."]
             if shares[i] < FEW:
                 answer = "In part"
+            if not self.smoothed.is_settled:
+                answer = "In part"
+                reasons.append(_UNSETTLED)
             if self.lack is not None and own > _LARGE * self.smoothed.noise[i]:
                 answer = "In part"
                 reasons.append(str(self.lack))
@@ -236,7 +243,8 @@ class Identification(Display):
     @property
     def advice(self) -> list[str]:
         """Sentences on the log, on parameters, and on errors that are too large."""
-        sentences = [*self.remarks, *_of_parameters(self.parameters)]
+        unsettled = [] if self.smoothed.is_settled else [_UNSETTLED]
+        sentences = [*unsettled, *self.remarks, *_of_parameters(self.parameters)]
         sentences += map(str, self.combinations)
         sentences += self._of_forces()
         if self.lack is not None:

@@ -1,6 +1,7 @@
 """A machine by its log: what is held out, what is compared with it, and what is said of it."""
 
 import math
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -189,6 +190,15 @@ def test_its_task_has_the_step_and_the_range_of_the_log(found):
         state = spring()(torch.cat([state, force[None]], -1))
         path.append(float(state[0, 0]))
     assert max(map(abs, path[-10:])) < 0.1
+
+
+@pytest.mark.slow
+def test_a_search_that_did_not_settle_is_never_yes(found):
+    assert found.smoothed.is_settled
+    assert found.verdicts["x"][0] == "Yes"
+    other = replace(found, smoothed=replace(found.smoothed, is_settled=False))
+    assert other.advice[0].startswith("The search for states and parameters did not settle")
+    assert other.verdicts["x"] == ("In part", [*found.verdicts["x"][1], other.advice[0]])
 
 
 def test_what_a_task_learns_leaves_the_identification():
