@@ -177,6 +177,7 @@ class FMUPhysics(BlackBoxPhysics):
 
     def _check(self, fmu: FMU) -> None:
         """Raise a ValueError if variables are not in the FMU; take the units of parameters."""
+        self.unknowns.refuse_functions()
         moving = [name for name in self.signals if name != "time"]
         values = [name for name in self.input_names if name != "time"]
         given = [*values, *self.unknowns, *self.start_values, *moving]

@@ -308,6 +308,15 @@ class Unknowns(dict[str, Unknown]):
                 found.setdefault(knot.function, (knot, []))[1].append(i)
         return found
 
+    def refuse_functions(self) -> None:
+        """Raise a ValueError if one of them is a function."""
+        if self.functions:
+            raise ValueError(
+                f"The unknown {min(self.functions)!r} is a function. A parameter here is a number; "
+                "functions are for FormulaPhysics, ODEPhysics and Python "
+                "functions. Leave out function_of and between."
+            )
+
     @property
     def declared(self) -> dict[str, Unknown]:
         """The parameters as the user named them, a function as one."""

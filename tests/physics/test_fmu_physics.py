@@ -261,6 +261,11 @@ REFUSED = [
         ValueError,
         "'loss' is given twice",
     ),
+    (
+        {"unknowns": {"C": Unknown(1.0, sd=1.0, function_of="T", between=(0.0, 1.0))}},
+        ValueError,
+        "'C' is a function. A parameter here is a number",
+    ),
     ({"times": None}, ValueError, "times at which outputs are read"),
     ({"times": -1.0}, ValueError, "times must be finite and at least 0"),
     ({"inputs": ["time"]}, ValueError, "and not both"),
