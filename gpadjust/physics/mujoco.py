@@ -109,9 +109,9 @@ class MujocoPhysics(BlackBoxPhysics):
         is_path = isinstance(model, Path | str) and not str(model).lstrip().startswith("<")
         is_compiled = isinstance(model, mujoco.MjModel)
         # Copies, as the caller may change an MjModel or an MjSpec later.
-        own_source = model.copy() if isinstance(model, mujoco.MjSpec) else copy(model)
-        self.source: Any = Path(model).absolute() if is_path else own_source
-        self.model = self.source if is_compiled else _compiled(self.source)
+        own_model = model.copy() if isinstance(model, mujoco.MjSpec) else copy(model)
+        self.source = Path(model).absolute() if is_path else own_model
+        self.model = own_model if is_compiled else _compiled(self.source)
         spec = None if is_compiled else partial(_read, self.source)
         own = _state_names(self.model)
         self.unknowns.refuse_functions()
