@@ -158,7 +158,11 @@ class FMUPhysics(BlackBoxPhysics):
 
     def simulate(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the outputs, ``N m``, of ``N x (d + p)`` rows that differ in time alone."""
-        values = dict(zip((*self.input_names, *self.unknowns), rows[0].tolist(), strict=True))
+        names = (*self.input_names, *self.unknowns)
+        for name, column in zip(names, rows.T, strict=True):
+            if not np.isfinite(column).all():
+                raise ValueError(f"expected finite numbers for {name!r}, found {column.tolist()}")
+        values = dict(zip(names, rows[0].tolist(), strict=True))
         times = np.tile(self.times, (len(rows), 1))
         if values.pop("time", None) is not None:
             times = rows[:, [self.input_names.index("time")]]
