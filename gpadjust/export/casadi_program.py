@@ -59,7 +59,8 @@ def casadi_function(
         ImportError: Without CasADi.
         TypeError: If ``fitted`` is none of these, or a physics that is not written in formulas.
         ValueError: If ``name`` is none in C, the model is no finite sum, or ``parameters`` are not
-            for it, with the way out; or if ``physics`` returns another number of values than the model's physics.
+            for it, with the way out; or if ``physics`` returns another number of values than the
+            model's physics.
         RuntimeError: If the dynamics have learnt nothing yet.
 
     Example:
