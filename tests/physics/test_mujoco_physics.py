@@ -417,7 +417,7 @@ def test_a_log_tells_mass_and_damping():
     assert (sd < 0.005 * truth).all()
     assert found.errors["identified"][0] < 0.007 < found.errors["guesses"][0]
     wrong = MujocoPhysics(pendulum(), step=0.02)
-    refused(ValueError, "makes steps of 0.02.*says 0.01", identify, log_of(machine, 0.01), wrong)
+    refused(ValueError, "steps of 0.02.*spec has 0.01", identify, log_of(machine, 0.01), wrong)
 
 
 @pytest.mark.slow
