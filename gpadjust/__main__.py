@@ -72,7 +72,8 @@ data: the table: a CSV file, or *.xlsx (the extra excel)
 """
 _OPTIONS_OF_LOGS = """\
 data: the log: CSV files or *.xlsx, a record each
---time t: the column of times or dates (%(default)s), or a number: the time from row to row
+--time t: the column of times or dates (%(default)s, or the only column of dates), or a number: the
+    time from row to row
 --time-unit h: the unit of rates, steps and times, to which the column is converted: s, ms, us, min,
     h or d; seconds by default
 --states a,b: the states, columns of the log; or a=q, where a's column is q

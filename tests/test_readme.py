@@ -232,6 +232,7 @@ def test_a_log_leads_to_controllers(tmp_path):
     for block in blocks("docs/guide/control/log.md"):
         exec(block, names)
     assert abs(names["levels"][1] - 8) < 0.1  # by `MPC`
+    assert 0.0 < names["pump"] <= 1.5  # of the longer step
     assert max(upper for upper, _ in names["made"]) < 9
     upper, lower = names["identified"].T  # by do-mpc
     assert abs(lower[-6:] - 8).max() < 0.05

@@ -907,7 +907,7 @@ class GP(gpytorch.models.GP, Predictive):
     def __repr__(self) -> str:
         n, m = self.data.Y.shape[-2:]
         d = self.data.X.shape[-1]
-        counts = {"point": n, "input": d, "output": m, "draw": len(self.u)}
+        counts = {"point": n, "input": d, "output": m, "draw": len(self.draws)}
         return f"{type(self).__name__}({counted(counts)})"
 
     def _repr_html_(self) -> str:

@@ -141,7 +141,8 @@ class IdentifiedDynamics(Dynamics):
     def describe(self) -> dict[str, str]:
         """Return the settings, each as a text."""
         unknowns = {name: repr(u) for name, u in self.physics.unknowns.declared.items()}
-        return fingerprint(type(self), self.spec, unknowns=unknowns)
+        # The name of a formula is its text.
+        return fingerprint(type(self), self.spec, physics=self.physics.name, unknowns=unknowns)
 
     def state_dict(self) -> dict[str, Any]:
         """Return settings, draws of the parameters and noises."""

@@ -103,8 +103,8 @@ def physics_lines(
     formula, curves = found.formula, list[str]()
 
     def curve(function: str, unknown: Unknown, weights: Tensor) -> Callable[[str], str]:
-        curves.append(_curve(f"{name}_{function}", unknown, weights))
-        return lambda x: f"{name}_{function}({x})"
+        curves.append(_curve(f"{name}_of_{function}", unknown, weights))
+        return lambda x: f"{name}_of_{function}({x})"
 
     columns = [f"x[{i}]" for i in range(len(formula.columns))]
     values = [

@@ -16,6 +16,7 @@ from gpadjust.export.c_equations import equations_source, physics_lines
 from gpadjust.export.equations import (
     Equations,
     OfPhysics,
+    check_name,
     equations_within,
     own_dynamics,
     refuse_parameters,
@@ -147,8 +148,7 @@ def c_source(
         >>> "void pump_predict(const double *x, const double *f_p, double *mean" in code
         True
     """
-    if not (isinstance(name, str) and name.isidentifier() and name.isascii()):
-        raise ValueError(f"Expected name as one of C, such as 'pump', got {name!r}.")
+    check_name(name)
     fitted = own_dynamics(fitted)
     if isinstance(fitted, OfPhysics):
         return "\n".join(equations_source(fitted, name, parameters)) + "\n"

@@ -12,6 +12,7 @@ from gpadjust.dynamics import LearnedDynamics
 from gpadjust.export.casadi_equations import equations_function, physics_function
 from gpadjust.export.equations import (
     OfPhysics,
+    check_name,
     equations_within,
     own_dynamics,
     refuse_parameters,
@@ -57,8 +58,9 @@ def casadi_function(
     Raises:
         ImportError: Without CasADi.
         TypeError: If ``fitted`` is none of these, or a physics that is not written in formulas.
-        ValueError: If the model is no finite sum, or ``parameters`` are not for it, with the way
-            out; or if ``physics`` returns another number of values than the model's physics.
+        ValueError: If ``name`` is none in C, the model is no finite sum, or ``parameters`` are not
+            for it, with the way out; or if ``physics`` returns another number of values than the
+            model's physics.
         RuntimeError: If the dynamics have learnt nothing yet.
 
     Example:
@@ -70,6 +72,7 @@ def casadi_function(
         >>> casadi_function(model, physics=lambda x: x)  # doctest: +SKIP
         Function(predict:(x)->(mean,variance) MXFunction)
     """
+    check_name(name)
     fitted = own_dynamics(fitted)
     is_physics = isinstance(fitted, OfPhysics)
     if is_physics and physics is not None:

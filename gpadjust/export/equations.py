@@ -119,6 +119,12 @@ def equations_within(model: GP) -> list[Equations] | None:
     return found
 
 
+def check_name(name: Any) -> None:
+    """Raise a ValueError unless a program may have this name."""
+    if not (isinstance(name, str) and name.isidentifier() and name.isascii()):
+        raise ValueError(f"Expected name as one of C, such as 'pump', got {name!r}.")
+
+
 def own_dynamics(fitted: Any) -> Any:
     """Return a fitted object; of an identification its dynamics."""
     is_known = isinstance(fitted, GP | Physics | Dynamics)

@@ -21,6 +21,7 @@ from gpadjust.dynamics import Dynamics
 from gpadjust.export.c_program import c_source
 from gpadjust.export.equations import own_dynamics
 from gpadjust.export.finite_sum import model_of
+from gpadjust.physics import Physics
 
 _SYSTEMS = {"linux": ("linux", ".so"), "darwin": ("darwin", ".dylib"), "win32": ("win", ".dll")}
 
@@ -64,9 +65,9 @@ def export_fmu(
         observation_noise: If True, these include the noise.
 
     Raises:
-        TypeError, ValueError, RuntimeError: As :func:`c_source`; a ValueError also if dynamics have
-            no step, the model has no physics, names are not different, or the code cannot be
-            compiled.
+        TypeError, ValueError, RuntimeError: As :func:`c_source`; a TypeError also of a physics
+            itself, whose outputs have no names; a ValueError also if dynamics have no step, the
+            model has no physics, names are not different, or the code cannot be compiled.
         OSError: If there is no C compiler, or the file cannot be written.
 
     Example:
@@ -79,6 +80,12 @@ def export_fmu(
         PosixPath('pump.fmu')
     """
     path, fitted = Path(path), own_dynamics(fitted)
+    if isinstance(fitted, Physics):
+        raise TypeError(
+            f"The physics {fitted.name!r} has no names of outputs, which an FMU needs: give it "
+            "some, as a step of PhysicsDynamics(StateSpec(states, actions, step=...), physics), or "
+            "take c_source."
+        )
     name = path.stem
     code = c_source(fitted, name, variance=variance, observation_noise=observation_noise)
     signature = rf"^void {name}_(predict|step)\(([^)]*)\)"

@@ -9,7 +9,10 @@ from datetime import UTC, datetime, timedelta
 from unicodedata import normalize
 
 _BEGINNING = datetime(2000, 1, 1, tzinfo=UTC)
-MISSING = {"", "na", "n/a", "#n/a", "#nv", "nan", "null", "none", "?"}
+MISSING = {
+    *("", "na", "n/a", "#n/a", "#nv", "nan", "null", "none", "?"),
+    *("#div/0!", "#value!", "#wert!", "#ref!", "#bezug!", "#name?", "#num!", "#zahl!", "#null!"),
+}  # the second line: errors of spreadsheets
 _GROUPED = re.compile(r"[+-]?\d{1,3}(?:([ \xa0\u202f'\u2019.,])\d{3})(?:\1\d{3})*(?:[.,]\d+)?")
 _NAME = re.compile(r"(.*\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))", flags=re.DOTALL)
 _MOMENT = re.compile(
@@ -29,7 +32,7 @@ _SECONDS = {
 _COMMON_UNITS = frozenset(
     """s sec ms us \u03bcs ns min h hr d m mm cm km um \u03bcm nm in ft n kn mn pa kpa mpa gpa hpa
     bar mbar psi k c f \u00b0c \u00b0f degc v mv kv a ma w kw mw hz khz mhz rpm rad deg \u00b0 % g
-    kg mg t l ml j kj mol ppm db ohm \u03c9 lux""".split()  # noqa: SIM905
+    kg mg t l ml j kj mol ppm db ohm \u03c9 lux ncm nmm knm knmm wh kwh ws ah mah va kva""".split()  # noqa: SIM905
 )
 
 
@@ -77,10 +80,16 @@ def decimal_of(fields: Sequence[str], delimiter: str) -> tuple[str, bool]:
     if both:  # 1,234.5 or 1.234,5
         return max(".,", key=both[0].rfind), True
     # 0,123 and 12,34 cannot be thousands; a semicolon parts the fields of decimal commas.
-    are_thousands = (_GROUPED.fullmatch(text) and text.lstrip("+-")[0] != "0" for text in commas)
-    if commas and (delimiter == ";" or not all(are_thousands)):
-        return ",", False
+    if commas and (delimiter == ";" or not all(map(_has_thousands, commas))):
+        # 70.000 beside 2,66: all points may separate thousands.
+        points = [text for text in fields if "." in text and is_number(text)]
+        return ",", bool(points) and all(map(_has_thousands, points))
     return ".", False
+
+
+def _has_thousands(text: str) -> bool:
+    """Return whether marks of a number may separate thousands, as in 1,234, but not in 0,123."""
+    return bool(_GROUPED.fullmatch(text)) and text.lstrip("+-")[0] != "0"
 
 
 def is_moment(text: str) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import codecs
 import csv
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from datetime import timedelta
 from io import StringIO
@@ -103,8 +103,13 @@ def _delimiter(text: str) -> str:
     return best_mark
 
 
-def rows_of_sheet(file: str | Path, sheet: str | None) -> list[Row]:
-    """Return the rows of a sheet of a workbook as texts, all of one width."""
+def rows_of_sheet(
+    file: str | Path, sheet: str | None, option: Callable[[str, str], str]
+) -> list[Row]:
+    """Return the rows of a sheet of a workbook as texts, all of one width.
+
+    Sheets without a value need no choice. ``option`` writes the option ``sheet`` in errors.
+    """
     try:
         from openpyxl import load_workbook
     except ImportError as error:
@@ -120,10 +125,14 @@ def rows_of_sheet(file: str | Path, sheet: str | None) -> list[Row]:
         except Exception as error:  # of zip, XML and more
             raise ValueError(f"{file}: expected a workbook, *.xlsx, but {error}.") from error
         names = [worksheet.title for worksheet in book.worksheets]
+        if sheet is None and len(names) > 1:  # spreadsheets of old made three sheets
+            filled = filter(_has_values, formulas.worksheets)
+            names = [worksheet.title for worksheet in filled] or names[:1]
         if sheet not in names and (sheet is not None or len(names) != 1):
             listed = ", ".join(map(repr, names))
             expected = "one sheet" if sheet is None else f"a sheet {sheet!r}"
-            raise ValueError(f"{file}: expected {expected}, found {listed}; choose one by `sheet`.")
+            way = option("sheet", names[0])
+            raise ValueError(f"{file}: expected {expected}, found {listed}; choose one: {way}.")
         rows: list[Row] = []
         values = book[sheet or names[0]].iter_rows()
         sources = formulas[sheet or names[0]].iter_rows()
@@ -142,6 +151,11 @@ def rows_of_sheet(file: str | Path, sheet: str | None) -> list[Row]:
     # The rows of a sheet are as long as their last cell.
     width = max((len(fields) for _, fields in rows), default=0)
     return [(line, fields + [""] * (width - len(fields))) for line, fields in rows]
+
+
+def _has_values(worksheet: Any) -> bool:
+    """Return whether a sheet has a cell that is not empty."""
+    return any(value is not None for row in worksheet.iter_rows(values_only=True) for value in row)
 
 
 def _text(cell: Any) -> str:

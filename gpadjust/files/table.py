@@ -35,7 +35,7 @@ class Table:
         delimiter: The mark between two fields of a CSV file. Default: inferred.
         decimal: The decimal mark of its numbers, a point or a comma. Default: inferred.
         names: The names of all columns, which replace the names in the file.
-        sheet: The sheet of a workbook that has more than one.
+        sheet: The sheet of a workbook in which more than one has cells.
         hint: The advice of the error on a missing column.
         is_command: If True, errors name options as on a command line.
 
@@ -43,7 +43,7 @@ class Table:
         names: The names of all columns, without units.
         units: The units of all columns, or "".
         lines: The line in the file at which each row begins.
-        remarks: Sentences on skipped lines, and on a column without a name.
+        remarks: Sentences on skipped lines, a column without a name, and points of thousands.
 
     Raises:
         OSError: If the file cannot be read.
@@ -80,7 +80,7 @@ class Table:
         self._is_text = Path(file).suffix.lower() != ".xlsx"
         mark = ""
         if not self._is_text:
-            rows = rows_of_sheet(file, sheet)
+            rows = rows_of_sheet(file, sheet, self._option)
         elif sheet is not None:
             raise ValueError(f"{file}: expected a workbook, *.xlsx, to have a sheet {sheet!r}.")
         else:
@@ -117,8 +117,11 @@ class Table:
         elif decimal is not None:
             self.decimal, self._has_groups = decimal, True
         else:
-            commas = [text for _, row in self._rows for text in row if "," in text]
-            self.decimal, self._has_groups = read.decimal_of(commas, mark)
+            marked = [text for _, row in self._rows for text in row if {*text} & {*".,"}]
+            self.decimal, self._has_groups = read.decimal_of(marked, mark)
+            pointed = [text for text in marked if "," not in text and read.is_number(text)]
+            if pointed and (self.decimal, self._has_groups) == (",", True):
+                self.remarks.append(f"{file}: points separate thousands, as in {pointed[0]!r}.")
 
     def __len__(self) -> int:
         return len(self._rows)

@@ -158,7 +158,11 @@ class FMUPhysics(BlackBoxPhysics):
 
     def simulate(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the outputs, ``N m``, of ``N x (d + p)`` rows that differ in time alone."""
-        values = dict(zip((*self.input_names, *self.unknowns), rows[0].tolist(), strict=True))
+        names = (*self.input_names, *self.unknowns)
+        for name, column in zip(names, rows.T, strict=True):
+            if not np.isfinite(column).all():
+                raise ValueError(f"expected finite numbers for {name!r}, found {column.tolist()}")
+        values = dict(zip(names, rows[0].tolist(), strict=True))
         times = np.tile(self.times, (len(rows), 1))
         if values.pop("time", None) is not None:
             times = rows[:, [self.input_names.index("time")]]
@@ -177,6 +181,7 @@ class FMUPhysics(BlackBoxPhysics):
 
     def _check(self, fmu: FMU) -> None:
         """Raise a ValueError if variables are not in the FMU; take the units of parameters."""
+        self.unknowns.refuse_functions()
         moving = [name for name in self.signals if name != "time"]
         values = [name for name in self.input_names if name != "time"]
         given = [*values, *self.unknowns, *self.start_values, *moving]

@@ -53,6 +53,8 @@ _OTHERWISE = {  # in spreadsheets than here, and the way out
 }
 _SIGNS = str.maketrans({"\u2212": "-", "\u00b7": "*", "\u00d7": "*", "\u00f7": "/", "^": "**"})
 _WORDS = re.compile(rf"\b({'|'.join({*kwlist} - {'True', 'False', 'None'})})\b")
+_ASSIGNED = re.compile(r"[^\W\d]\w*\s*=(?!=)")  # k = at the beginning
+_RAISED = re.compile(r"([^\W\u00b2\u00b3]*)([\u00b2\u00b3])")  # b with a small 2 or 3
 _GRAMMAR = (
     "Formulas have numbers, names, pi, + - * / and ** or ^, brackets, comparisons of two values "
     f"such as a < b, and the functions {', '.join(NAMES)}, such as max(a, b) and "
@@ -100,6 +102,11 @@ class FormulaPhysics(Physics):
         self.columns = tuple(map(symbol, columns))
         declared = self.unknowns.declared
         known = [*self.columns, *declared]
+        if both := [name for name in declared if name in self.columns]:
+            raise ValueError(
+                f"{both[0]!r} is a column and an unknown parameter in {formula!r}: give the "
+                "unknown parameter another name."
+            )
         if len({*known}) < len(known) or "pi" in known:
             raise ValueError(f"Expected different names, and none 'pi'; found {known}.")
         self.outputs = parse(formula)
@@ -194,9 +201,14 @@ def parse(formula: str) -> list[ast.expr]:
         except Exception as error:  # of reading, or of the trial
             errors.append(error)
     cause = errors[-1 if ";" in text else 0]
+    message = getattr(cause, "msg", cause)
+    if match := _ASSIGNED.match(text):
+        message = f"leave out {match[0]!r}"
+    elif match := _RAISED.search(text):
+        message = f"write '{match[1]}^{normalize('NFKC', match[2])}'"
     raise ValueError(
         f"Expected a formula such as 'force * length**3 / (3 * E * I)', found {formula!r}: "
-        f"{getattr(cause, 'msg', cause)}. {_GRAMMAR}"
+        f"{message}. {_GRAMMAR}"
     ) from cause
 
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from functools import partial
 from pathlib import Path
@@ -14,10 +13,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gpadjust.checks import check_kind, checked_number, checked_whole
+from gpadjust.checks import check_kind, checked_number, checked_tensor, checked_whole
 from gpadjust.physics.black_box import BlackBoxPhysics
 from gpadjust.physics.error import PhysicsError, described
-from gpadjust.physics.mujoco_parameters import LOCK, Edit, ModelParameters, names_of
+from gpadjust.physics.mujoco_parameters import Edit, ModelParameters, names_of, silenced
 from gpadjust.physics.parameters import ParameterValues
 from gpadjust.physics.unknown import Unknown
 from gpadjust.states import Sensors, StateSpec
@@ -108,11 +107,14 @@ class MujocoPhysics(BlackBoxPhysics):
             "the path of an MJCF, its text, an MjSpec or an MjModel",
         )
         is_path = isinstance(model, Path | str) and not str(model).lstrip().startswith("<")
-        self.source = Path(model).absolute() if is_path else model
         is_compiled = isinstance(model, mujoco.MjModel)
-        self.model = model if is_compiled else _compiled(self.source)
+        # Copies, as the caller may change an MjModel or an MjSpec later.
+        own_model = model.copy() if isinstance(model, mujoco.MjSpec) else copy(model)
+        self.source = Path(model).absolute() if is_path else own_model
+        self.model = own_model if is_compiled else _compiled(self.source)
         spec = None if is_compiled else partial(_read, self.source)
         own = _state_names(self.model)
+        self.unknowns.refuse_functions()
         self._models = ModelParameters(self.model, spec, self.unknowns, edit)
         self.states = tuple(own if states is None else states)
         self.num_outputs = len(own)
@@ -155,9 +157,18 @@ class MujocoPhysics(BlackBoxPhysics):
         """Return a ``mujoco.MjModel`` with these values of the parameters, ``p``, or the guesses.
 
         It is for viewers, environments and ``mujoco.mj_saveModel``.
+
+        Raises:
+            ValueError: If it is another number of values.
         """
-        values = self.unknowns.guess if parameters is None else parameters
-        return copy(self._models.compiled(values.detach().cpu().double().numpy()))
+        guess = self.unknowns.guess
+        values = guess if parameters is None else checked_tensor("parameters", parameters)
+        if values.shape != guess.shape:
+            raise ValueError(
+                f"parameters: expected a value of each of {', '.join(self.unknowns) or 'none'}, of "
+                f"shape {tuple(guess.shape)}; found {tuple(values.shape)}."
+            )
+        return copy(self._models.compiled(values.numpy()))
 
     def sensors(self, names: Sequence[str] | None = None) -> Sensors:
         """Return sensors of the model as outputs of the state, with parameters at their guesses.
@@ -245,7 +256,7 @@ class MujocoPhysics(BlackBoxPhysics):
         threads = min(threads, 1 + n * num_steps // _WORTH)
         pool = Rollout(nthread=threads if threads > 1 else 0)
         at_once = max(1, _AT_ONCE // num_steps)
-        with LOCK, _without_warnings(), pool:
+        with silenced(), pool:
             self._data += [MjData(self.model) for _ in range(threads - len(self._data))]
             for first in range(0, n, at_once):
                 part = slice(first, first + at_once)
@@ -268,18 +279,6 @@ def _mujoco() -> Any:
     return mujoco
 
 
-@contextmanager
-def _without_warnings() -> Iterator[None]:
-    """Keep MuJoCo from printing and logging what a PhysicsError says."""
-    mujoco = _mujoco()
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda text: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(before)
-
-
 def _read(source: Any) -> Any:
     """Return a new MjSpec."""
     spec = _mujoco().MjSpec
@@ -291,7 +290,8 @@ def _read(source: Any) -> Any:
 def _compiled(source: Any) -> Any:
     """Return the compiled model."""
     try:
-        return _read(source).compile()
+        with silenced():
+            return _read(source).compile()
     except Exception as error:  # of the parser and of the compiler
         raise ValueError(f"MuJoCo cannot read the model: {described(error)}.") from error
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from copy import copy
-from threading import Lock
+from threading import RLock
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,10 +31,23 @@ FIELDS = {
 _SIGNED = {*_CENTER, *_SHEAR, "gear"}
 _MOST_MODELS, _MOST_BYTES = 1024, 2**28  # that are remembered
 
-LOCK = Lock()
-"""Of data, and of MuJoCo's handler of warnings, of which there is one for all threads."""
+_LOCK = RLock()  # of data, and of MuJoCo's handler of warnings: there is one for all threads
 
 Edit = Callable[[Any, ParameterValues], object]
+
+
+@contextmanager
+def silenced() -> Iterator[None]:
+    """Keep MuJoCo from printing and logging what an error says, and other threads out."""
+    import mujoco
+
+    with _LOCK:
+        before = mujoco.get_mju_user_warning()
+        mujoco.set_mju_user_warning(lambda text: None)
+        try:
+            yield
+        finally:
+            mujoco.set_mju_user_warning(before)
 
 
 class Place(NamedTuple):
@@ -74,7 +88,8 @@ class ModelParameters:
                 self.places[name] = place
         if edit is not None:
             read = _Read(unknowns, np.array([unknown.guess for unknown in unknowns.values()]))
-            self._edited(read)
+            with silenced():
+                self._edited(read)
             if unread := {*unknowns} - {*self.places} - read.names:
                 raise ValueError(
                     f"edit does not read {min(unread)!r}, and {_expected()}; found neither."
@@ -83,7 +98,7 @@ class ModelParameters:
     def compiled(self, values: Array) -> Any:
         """Return the model with these values of the parameters, ``p``."""
         key = values.tobytes()
-        with LOCK:
+        with silenced():
             if key not in self._models:
                 if len(self._models) >= min(_MOST_MODELS, _MOST_BYTES // self.model.nbuffer):
                     self._models.clear()

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.special import ndtr, ndtri
 
-from gpadjust.checks import check_kind, checked_number
+from gpadjust.checks import check_kind, checked_number, real_array
 
 _LARGEST = 8.0  # coordinate, beyond which float64 knows no mass of the normal distribution
 _UNBOUNDED = (-math.inf, math.inf)
@@ -22,6 +22,17 @@ _MOST_KNOTS = 60
 _OF_RANGE = 0.25  # a lengthscale, by default
 _NUGGET = 1e-10
 _FARTHEST = 40.0  # coordinate of a value; at a bound it is infinite
+
+
+def _pair(name: str, pair: Any) -> tuple[float, float]:
+    """Return the least and the largest value as floats, or raise a ValueError."""
+    try:
+        low, high = real_array(pair).tolist()
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"Expected {name} as two numbers, such as (0.0, 20.0); found {pair!r}."
+        ) from error
+    return low, high
 
 
 @dataclass(frozen=True, repr=False)
@@ -71,11 +82,13 @@ class Unknown:
     lengthscale: float | None = None
 
     def __post_init__(self) -> None:
-        checked_number("guess", self.guess)
+        # Plain floats, as programs and fingerprints have their repr, not that of NumPy's numbers.
+        object.__setattr__(self, "guess", checked_number("guess", self.guess))
         for name, least in (("sd", 0.0), ("factor", 1.0)):
             if getattr(self, name) is not None:
-                checked_number(name, getattr(self, name), above=least)
-        low, high = map(float, self.bounds)
+                value = checked_number(name, getattr(self, name), above=least)
+                object.__setattr__(self, name, value)
+        low, high = _pair("bounds", self.bounds)
         object.__setattr__(self, "bounds", (low, high))
         spreads = (self.sd is not None) + (self.factor is not None)
         is_one_prior = spreads == 1 or (spreads == 0 and math.isfinite(high - low))
@@ -92,7 +105,7 @@ class Unknown:
         check_kind("function_of", self.function_of, str, "the name of a variable")
         if not self.function_of and (self.between, self.lengthscale) == (None, None):
             return
-        low, high = map(float, self.between or (0.0, 0.0))
+        low, high = (0.0, 0.0) if self.between is None else _pair("between", self.between)
         if not (self.function_of and low < high and math.isfinite(high - low)):
             raise ValueError(
                 'Expected of a function its variable and the range of that, function_of="speed", '
@@ -294,6 +307,15 @@ class Unknowns(dict[str, Unknown]):
             if isinstance(knot, Knot):
                 found.setdefault(knot.function, (knot, []))[1].append(i)
         return found
+
+    def refuse_functions(self) -> None:
+        """Raise a ValueError if one of them is a function."""
+        if self.functions:
+            raise ValueError(
+                f"The unknown {min(self.functions)!r} is a function. A parameter here is a number; "
+                "functions are for FormulaPhysics, ODEPhysics and Python "
+                "functions. Leave out function_of and between."
+            )
 
     @property
     def declared(self) -> dict[str, Unknown]:

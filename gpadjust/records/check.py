@@ -34,11 +34,19 @@ class Direction(NamedTuple):
 
     def __str__(self) -> str:
         """Return the direction, its value and the input in a sentence."""
-        named = [f"{w:+.2f} {name}" for name, w in self.weights.items() if abs(w) > _SHARE]
-        text = " ".join(named).removeprefix("+")
         if self.value >= _WEAK:
-            return f"The log tells {text} (singular value {self.value:.3g})."
-        return f"The log cannot tell {text} (singular value {self.value:.2g}). {self.input}"
+            return f"The log tells {self._text} (singular value {self.value:.3g})."
+        return f"The log cannot tell {self._text} (singular value {self.value:.2g}). {self.input}"
+
+    def __repr__(self) -> str:
+        # Short, as a list of them is printed.
+        return f"Direction({self._text}: {self.value:.3g})"
+
+    @property
+    def _text(self) -> str:
+        """The large weights: 0.71 a -0.71 b."""
+        named = [f"{w:+.2f} {name}" for name, w in self.weights.items() if abs(w) > _SHARE]
+        return " ".join(named).removeprefix("+")
 
 
 def check_log(

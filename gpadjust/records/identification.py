@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib import import_module
@@ -38,9 +39,15 @@ _POWERS = ((1, -1), (1, 1), (1, -2), (1, 2), (2, -1), (2, 1))
 _BLOCKS = 5  # of a window, whose errors are compared
 _LARGE = 2.0  # times the noise of the sensor: an error that something missing may have made
 _WIDER = 1.5  # an interval that allows for missing forces, in place of the one that does not
+_OUTLYING = 20.0  # robust standard deviations of changes, by which a row is off both neighbours
+_NAMED = 5  # rows in a sentence
 _UNSURE = 0.05  # of a prior's standard deviation: uncertainty that matters
 _MOVES = 0.01  # of a state's changes in a step: process noise that matters
 
+_UNSETTLED = (
+    "The search for states and parameters did not settle, so that all of this may change: raise "
+    "num_starts, give narrower priors, or a start of hidden states."
+)
 _OTHERS = {GUESSES: "the guesses do", PERSISTENCE: "a state that stays"}
 
 
@@ -113,7 +120,8 @@ class Identification(Display):
             defaults["sensors"] = Sensors([*noise], noise=noise)
             defaults["initial_states"] = lambda n: states[torch.randint(len(states), (n,))]
         tasks = import_module("gpadjust.control")  # a room above this one
-        return tasks.Task(self.dynamics, reward, **defaults | options)
+        # An update sets attributes, so that a shallow copy leaves the identification as it is.
+        return tasks.Task(copy(self.dynamics), reward, **defaults | options)
 
     @property
     def spec(self) -> StateSpec:
@@ -189,9 +197,9 @@ class Identification(Display):
         """Whether the physics follows the log, by each state that was measured, and why.
 
         ``"Yes"`` if the free run errs less than the guesses' and than a state that stays, both by
-        more than chance, the intervals hold, and no error that is more than the sensor's has a
-        cause that :attr:`lack` shows. ``"No"`` if it errs no less than a state that stays, or
-        more than the guesses' by more than chance; else ``"In part"``.
+        more than chance, the intervals hold, the search settled, and no error that is more than
+        the sensor's has a cause that :attr:`lack` shows. ``"No"`` if it errs no less than a state
+        that stays, or more than the guesses' by more than chance; else ``"In part"``.
         """
         verdicts, errors, shares = {}, self.errors, self.coverage.tolist()
         for i, name in enumerate(self.spec.states):
@@ -201,6 +209,9 @@ class Identification(Display):
             reasons = [f"Intervals of 95 % hold {percent(shares[i])} of {name} there."]
             if shares[i] < FEW:
                 answer = "In part"
+            if not self.smoothed.is_settled:
+                answer = "In part"
+                reasons.append(_UNSETTLED)
             if self.lack is not None and own > _LARGE * self.smoothed.noise[i]:
                 answer = "In part"
                 reasons.append(str(self.lack))
@@ -234,7 +245,8 @@ class Identification(Display):
     @property
     def advice(self) -> list[str]:
         """Sentences on the log, on parameters, and on errors that are too large."""
-        sentences = [*self.remarks, *_of_parameters(self.parameters)]
+        unsettled = [] if self.smoothed.is_settled else [_UNSETTLED]
+        sentences = [*unsettled, *self.remarks, *_of_parameters(self.parameters)]
         sentences += map(str, self.combinations)
         sentences += self._of_forces()
         if self.lack is not None:
@@ -426,7 +438,7 @@ def identify(
     runs = {IDENTIFIED: dynamics.free_run(last, windows.actions, **options), **runs}
     gaps = [f"Gaps part the log into {len(steps)} stretches, each smoothed by itself."]
     remarks = gaps if len(steps) > len(records) else []
-    remarks += [*_of_actions(records, length), *_of_jumps(records)]
+    remarks += [*_of_actions(records, length), *_of_jumps(records), *_of_outliers(records)]
     return Identification(smoothed, dynamics, windows, runs, length, tuple(remarks))
 
 
@@ -455,6 +467,31 @@ def _of_jumps(records: Records) -> list[str]:
             jumps = ((moves / turn - 1).abs() < _NEAR_A_TURN).any()
             if name not in records.spec.angles and jumps and moves.median() < 0.1 * turn:
                 sentences.append(f"{name} jumps by a turn: if it is an angle, {way} (`angles`).")
+    return sentences
+
+
+def _of_outliers(records: Records) -> list[str]:
+    """Return sentences on rows that are far off both neighbours, on the same side."""
+    spec, sentences = records.spec, []
+    moves = [spec.change(record.states[:-1], record.states[1:]) for record in records]
+    together = torch.cat(moves)
+    # Robust standard deviations of the changes: 1.4826 medians of their sizes
+    far = _OUTLYING * 1.4826 * together.abs().nanmedian(0).values
+    for i, name in enumerate(spec.states):
+        rows = []
+        for record, move in zip(records, moves, strict=True):
+            there, back = move[:-1, i], -move[1:, i]
+            # The nearer neighbour is `far` below, or above
+            off = torch.minimum(there, back).maximum(-torch.maximum(there, back))
+            places = (off > far[i]).nonzero().flatten() + 1
+            rows += [f"{row} of {record.name!r}" for row in places.tolist()]
+        if rows and far[i] > 0:
+            more = f" and {len(rows) - _NAMED} more" if len(rows) > _NAMED else ""
+            sentences.append(
+                f"{name} is far off both neighbours, by more than {_OUTLYING:g} times its usual "
+                f"change, in row {', '.join(rows[:_NAMED])}{more}: one such outlier can spoil all "
+                "estimates. If the sensor failed there, make it NaN."
+            )
     return sentences
 
 

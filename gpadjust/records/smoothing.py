@@ -65,6 +65,7 @@ class SmoothedRecords:
             0 of those that the physics does not move.
         process_noise: Standard deviations of what a step adds to the physics, ``state_dim``.
         log_density: Of the measurements, near these states.
+        is_settled: Whether the search ended; if not, a SmoothingWarning said so.
     """
 
     records: Records
@@ -72,6 +73,7 @@ class SmoothedRecords:
     noise: Tensor
     process_noise: Tensor
     log_density: float
+    is_settled: bool
     _chain: Chain
     _estimate: Estimate
 
@@ -201,7 +203,7 @@ def smooth(
     if num_starts is None:
         num_starts = 4 if chain.hidden.any() and f_p.unknowns else 1
     checked_whole("num_starts", num_starts, 1)
-    estimate = _estimate(chain, max_rounds, num_starts)
+    estimate, is_settled = _estimate(chain, max_rounds, num_starts)
     covariances = np.concatenate([part.states.covariances for part in estimate.stretches])
     sd = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)[:, : chain.d].clip(0))
     noises = np.sqrt(estimate.variances)
@@ -214,6 +216,7 @@ def smooth(
         sd_of_noise,
         sd_of_process,
         estimate.log_density,
+        is_settled,
         chain,
         estimate,
     )
@@ -334,8 +337,8 @@ class Estimate(NamedTuple):
     log_density: float  # of the measurements
 
 
-def _estimate(chain: Chain, max_rounds: int, num_starts: int) -> Estimate:
-    """Find the most likely states, parameters of the physics and variances from several starts."""
+def _estimate(chain: Chain, max_rounds: int, num_starts: int) -> tuple[Estimate, bool]:
+    """Find the most likely states, parameters and variances, and whether the search settled."""
     ends = list[tuple[Estimate, float]]()
     with long_work("smooth", "rounds", total=num_starts * max_rounds):
         for i, (coordinates, known_at_once) in enumerate(chain.starts_of_search(num_starts)):
@@ -357,15 +360,17 @@ def _estimate(chain: Chain, max_rounds: int, num_starts: int) -> Estimate:
         end for end in ends if np.array_equal(end[0].variances, chain.checked(end[0].variances))
     ]
     best, gained = max(arrived or ends, key=lambda end: end[0].log_density)
-    if not arrived or abs(gained) > _STILL:
+    is_settled = bool(arrived) and abs(gained) <= _STILL
+    if not is_settled:
         warnings.warn(
-            f"The states did not settle in {max_rounds} rounds. Raise max_rounds, say more of what "
-            "is known (noise, process_noise, start), or look whether the physics is defined, and "
-            "without jumps, about these states.",
+            f"The states did not settle in {max_rounds} rounds. Raise num_starts, say more of what "
+            "is known (start, narrower priors), or look whether the physics is defined, and "
+            "without jumps, about these states. `smooth` also has max_rounds, noise and "
+            "process_noise.",
             SmoothingWarning,
             stacklevel=3,
         )
-    return best
+    return best, is_settled
 
 
 def _search(

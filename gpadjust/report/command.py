@@ -207,7 +207,7 @@ def _of_log(arguments: Namespace) -> Job:
     """Read the log and the equations of ``gpadjust identify``."""
     hidden = read.hidden_of(arguments.hidden)
     unknowns = read.unknowns_of(arguments.unknown)
-    way = " A state that was not measured: --hidden 'rate=0 +- 1'."
+    way = " A state that was not measured: --hidden 'rate=0 +- 1'. Other times: --time Zeit."
     tables = [read.open_table(file, arguments, way) for file in arguments.data]
     log = listed(read.digest_of(file) for file in arguments.data)
     own_units = {name: prior.unit for name, prior in hidden.items()}

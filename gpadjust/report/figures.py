@@ -146,7 +146,8 @@ def corrections(subject: Subject, output: int, inputs: list[int]) -> list[Markup
         dots = (y - data) * sizes[1]
         ax.plot(subject.X[:, i], dots, color=RED, **DOTS | {"ms": 3})
         ax.set_ylim(*_limits(torch.cat([curve, dots[~dots.isnan()], 0 * x[:is_correction]])))
-        ax.set(xlim=(float(x[0]), float(x[-1])), xlabel=labels(subject.inputs)[i])
+        room = 0.03 * float(x[-1] - x[0])  # for whole dots at the ends
+        ax.set(xlim=(float(x[0]) - room, float(x[-1]) + room), xlabel=labels(subject.inputs)[i])
         ax.set_ylabel(f"{label} [{unit}]" if unit and is_correction else label)
         tidy(ax)
         figures.append(image(figure, f"{label} of {name} over {subject.inputs[i]}, with the data"))
@@ -212,6 +213,9 @@ def _words(subject: Subject, output: int) -> list[str]:
     words = []
     has_unknowns = any(physics.unknowns for physics in subject.physics.values())
     is_it = "with fitted parameters" if has_unknowns else "as it is"
+    if has_unknowns and any(term.kernel is not None for term in shown.model.terms):
+        # The formula calibrated by itself, above, has others.
+        is_it = "with the parameters fitted together with the correction"
     for physics, values in subject.physics_at(subject.X, output).items():
         off = subject.judged[:, output] - values
         rms, mean = number(off.square().nanmean().sqrt()), number(off.nanmean())
@@ -222,7 +226,7 @@ def _words(subject: Subject, output: int) -> list[str]:
     if len(subject.physics) > 1:
         return [*words, f"The figures show the prediction. {_BANDS}"]
     words.append(
-        "The figures show what the prediction adds to it along each input; dots are what each "
-        "observation lies above it, at all values of the other inputs."
+        "The lines show by how much the model corrects the formula along each input. Each dot is a "
+        "measurement less the formula, at its own values of the other inputs."
     )
     return [*words, _BANDS]

@@ -191,15 +191,16 @@ def log_columns(
     named = pairs(arguments.states, "--states", short=True)
     check_names(hidden, "--hidden", named, "--states")
     has_times = math.isnan(number_of(arguments.time))
+    time = _time_column(table, arguments.time)
     if not arguments.actions and not has_times:
         raise ValueError("Expected --actions, as there is no column of times to stand for them.")
-    acting = {"time": arguments.time}
+    acting = {"time": time}
     if arguments.actions:
         acting = pairs(arguments.actions, "--actions", short=True)
     columns = {
         "states": {name: None if name in hidden else column for name, column in named.items()},
         "actions": acting,
-        "time": arguments.time if has_times else float(arguments.time),
+        "time": time if has_times else float(time),
         "time_unit": arguments.time_unit,
         "segment": arguments.segment,
     }
@@ -207,6 +208,17 @@ def log_columns(
     units = {name: hidden[name] if name in hidden else table.unit(own[name]) for name in own}
     units["time"] = arguments.time_unit or "s"
     return columns, {name: unit for name, unit in units.items() if unit}
+
+
+def _time_column(table: Table, name: str) -> str:
+    """Return the column of times: the only one of dates where no column has the default name."""
+    headers = [header for header in table.headers if table.headers.count(header) == 1]
+    dates = [header for header in headers if table.has_dates(header)]
+    if name != "time" or len(dates) != 1 or name in {*table.headers, *table.names}:
+        return name
+    (column,) = map(table.bare, dates)
+    table.remarks.append(f"{table.file}: the times are in its only column of dates, {column!r}.")
+    return column
 
 
 class GivenPhysics(NamedTuple):

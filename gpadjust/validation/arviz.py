@@ -22,7 +22,7 @@ def to_arviz(*models: GP, chains: int = 1, seed: int = 0) -> Any:
     log_likelihood, posterior_predictive and observed_data (of each output, at its training rows).
     The log likelihood is that of each observation given all others, which ``az.loo`` needs of a
     Gaussian process (Buerkner, Gabry and Vehtari 2021). A number that a nested model lacks is drawn
-    from its prior there.
+    from its prior there. A ``DataTree`` has no names with ``/``: ``N/mm`` is ``N∕mm``.
 
     Args:
         models: The model, fitted several times by different seeds: a chain each.
@@ -78,9 +78,19 @@ def to_arviz(*models: GP, chains: int = 1, seed: int = 0) -> Any:
     dims, coords, groups["observed_data"] = {}, {}, {}
     for j, name in enumerate(first.data.output_names):
         rows = ~first.data.Y[:, j].isnan()
-        dims[name], coords[f"{name} row"] = [f"{name} row"], rows.nonzero().flatten().numpy()
+        row = _node(f"{name} row")
+        dims[_node(name)], coords[row] = [row], rows.nonzero().flatten().numpy()
         groups["observed_data"][name] = first.data.Y[rows, j].numpy()
+    groups = {
+        group: {_node(name): values for name, values in variables.items()}
+        for group, variables in groups.items()
+    }
     return from_dict(groups, dims=dims, coords=coords)
+
+
+def _node(name: str) -> str:
+    """Return a name of a ``DataTree``, whose paths have ``/`` between names: with U+2215 for it."""
+    return name.replace("/", "\u2215")
 
 
 def _groups(model: GP, generator: torch.Generator) -> _Groups:

@@ -509,8 +509,18 @@ def draw_left_out(
     bars = torch.stack([mean - low, high - mean]).clamp_min(0.0)
     how: dict[str, Any] = {"color": BLUE, "elinewidth": 0.8, "alpha": 0.85, **DOTS}
     ax.errorbar(mean, y, xerr=bars, label=f"{name}, {100 * level:g} %", **how)
+    if is_log:  # an interval that goes far below the dots would take decades
+        shown = low.maximum(0.5 * drawn.min())
+        ax.set(xlim=_log_limits(torch.cat([drawn, shown, high])), ylim=_log_limits(y))
     ax.set(xlabel=f"predicted {labels(loo.output_names)[output]}", ylabel="measured")
     return ax
+
+
+def _log_limits(values: Tensor) -> tuple[float, float]:
+    """Return limits of a logarithmic axis around some values."""
+    low, high = float(values.min()), float(values.max())
+    room = (high / low) ** 0.05
+    return low / room, high * room
 
 
 def _draw_ticks(ax: Axes, model: Any, output: int, i: int) -> None:

@@ -56,6 +56,9 @@ def test_of_draws_that_contain_the_process():
     model = CKA(X, Y, physics=physics)
     u = torch.randn(8, 2, model.table.size, generator=torch.Generator().manual_seed(0)).double()
     parts = [model.table.with_choice(u[i::4], k) for i, k in ((0, 0), (1, 0), (2, 1), (3, 2))]
+    model.set_draws(torch.cat(parts), number=2)  # of which predictions average over two
+    assert ", 8 draws\n" in model.summary().replace(", not fitted", "")
+    assert ", 8 draws)" in repr(model)
     model.set_draws(torch.cat(parts))
     text = model.summary()
     expected = (

@@ -75,6 +75,9 @@ def test_it_is_saved_and_loaded():
     )
     with pytest.raises(RuntimeError, match="unknowns is"):
         made(None, unknowns={}).load_state_dict(dynamics.state_dict())
+    other.physics = FormulaPhysics("x + a * a * u", ["x", "u"], unknowns={"a": PRIOR})
+    with pytest.raises(RuntimeError, match=r"physics is 'x \+ a \* u' in the state"):
+        other.load_state_dict(dynamics.state_dict())
 
 
 def test_a_controller_plans_in_it_and_learns_on():

@@ -128,6 +128,16 @@ def test_parameters_may_be_an_argument(tmp_path):
     same(torch.tensor(law(x.numpy(), values.numpy()).full()[:, 0]), SPRING(x[None], values)[0])
 
 
+def test_curves_may_have_the_names_of_other_functions(tmp_path):
+    curves = {name: Unknown(0.3, factor=2.0, **OVER_V) for name in ("rates", "sign", "step")}
+    law = FormulaPhysics("u - (rates + sign) * sign(v) - step * v", ["v", "u"], unknowns=curves)
+    for name, physics in (("law", law), ("step", ODEPhysics(law, 0.1, 1))):
+        x = points(physics)[0]
+        program = compiled(c_source(physics, "law"), tmp_path, name)
+        (found,) = called(program.law_predict, (1,), x)
+        same(found, physics(x[None])[0])
+
+
 def test_one_unit_may_contain_several_programs(tmp_path):
     code = c_source(PHYSICS["curves"], "a") + c_source(dynamics("rk4"), "b")
     program = compiled(code + c_source(PHYSICS["everything"], "c"), tmp_path)

@@ -15,6 +15,7 @@ from gpadjust.export import fmu as module
 from gpadjust.states import StateSpec
 from tests.export.conftest import fitted
 from tests.export.test_dynamics import SPEC, learnt, pushed
+from tests.export.test_equations import SPRING
 from tests.export.test_equations import dynamics as identified
 from tests.export.test_models import POINTS, arguments
 from tests.systems import normal, uniform
@@ -183,6 +184,7 @@ REFUSED = [
         ValueError,
         "cannot compile the program: .*head",
     ),
+    (lambda: SPRING, {}, "x.fmu", TypeError, "no names of outputs.*PhysicsDynamics"),
     (lambda: None, {}, "x.fmu", TypeError, "or what identify returns; found"),
 ]
 

@@ -63,8 +63,9 @@ def test_what_is_no_model_of_terms_is_refused():
 
 def test_a_name_that_c_has_not_is_refused():
     for name in ("", "a b", "2f", "pumpe_ä", None):
-        with pytest.raises(ValueError, match="one of C"):
-            c_source(fitted("CKA"), name)
+        for export in (c_source, casadi_function):
+            with pytest.raises(ValueError, match="one of C"):
+                export(fitted("CKA"), name)
 
 
 def test_the_same_model_makes_the_same_file():

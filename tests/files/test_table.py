@@ -1,5 +1,6 @@
 """Columns of CSV files as they come; what reads records is in tests/records/test_records.py."""
 
+import openpyxl
 import pytest
 
 from gpadjust.files.table import Table
@@ -45,6 +46,35 @@ def test_decimal_marks_and_what_is_no_number(columns):
         assert str(error.value).endswith(hint)
 
 
+def test_points_of_thousands_beside_decimal_commas(columns):
+    table = columns("G;d\n70.000;2,66\n1.081.500;3,99\n")
+    assert table.numbers("G").tolist() == [70_000, 1_081_500]
+    assert table.numbers("d").tolist() == [2.66, 3.99]
+    assert table.remarks[0].endswith("points separate thousands, as in '70.000'.")
+    with pytest.raises(ValueError, match="If this point is a decimal point"):
+        columns("G;d\n70.000;2,66\n81.50;3,99\n").numbers("G")
+
+
+def test_errors_of_spreadsheets_are_missing(columns):
+    table = columns("a;b\n1;#DIV/0!\n2;#N/A\n3;#NV\n4;#WERT!\n5;6,5\n")
+    assert table.numbers("b", may_miss=True).isnan().tolist() == [True] * 4 + [False]
+
+
+def test_sheets_without_a_value_need_no_choice(tmp_path):
+    book = openpyxl.Workbook()
+    for row in (("a", "b"), (1, 2), (3, 4)):
+        book.active.append(row)
+    book.create_sheet("Tabelle2")
+    book.save(tmp_path / "table.xlsx")
+    assert Table(tmp_path / "table.xlsx").numbers("b").tolist() == [2, 4]
+    book["Tabelle2"]["A1"] = "notes"
+    book.save(tmp_path / "table.xlsx")
+    with pytest.raises(ValueError, match=r"'Sheet', 'Tabelle2'; choose one: `sheet='Sheet'`"):
+        Table(tmp_path / "table.xlsx")
+    with pytest.raises(ValueError, match="choose one: --sheet 'Sheet'"):
+        Table(tmp_path / "table.xlsx", is_command=True)
+
+
 def test_a_column_that_is_not_there_has_the_likest_name(columns):
     table = columns("Flow [m3/h],head\n1,2\n")
     for near in ("flow", "Flow [l/s]", "flw"):
@@ -77,6 +107,8 @@ def test_what_comes_before_the_data(columns):
     assert (table.lines, table.units) == ((2, 3, 4), ("", ""))
     table = columns("t,s\ns,m\n1,2\n")
     assert (table.names, table.units) == (("t", "s"), ("s", "m"))
+    table = columns("a;b;c\nmm;N;Nmm\n4,378;4,032;19,415\n2,6;2;6\n")
+    assert (table.names, table.units) == (("a", "b", "c"), ("mm", "N", "Nmm"))
     table = columns("0,error\n1,2\n2,3\n", names=["t", "x"])  # the first row is no line of names
     with pytest.raises(ValueError, match=r"line 1, column 2 \('x'\): .*found 'error'"):
         table.numbers("x")

@@ -143,6 +143,16 @@ def test_a_simulation_that_breaks_off_fails_in_all_its_rows(fmi, kind):
     assert physics(rows[2:]).isfinite().all()
 
 
+def test_rows_that_are_not_finite_are_refused_before_a_simulation():
+    physics = FMUPhysics(fmu(), **STEP)
+    rows = X.clone()
+    rows[1, 2], rows[2, 0] = torch.nan, torch.inf
+    with pytest.raises(PhysicsError, match=r"finite numbers for 'heater', found \[nan\]") as caught:
+        physics(rows)
+    assert caught.value.rows == (1, 2)
+    assert torch.equal(physics.or_nan(rows)[:1], FMUPhysics(fmu(), **STEP)(X)[:1])
+
+
 @pytest.mark.parametrize("only_one", [False, True])
 def test_threads_and_processes_have_instances_of_their_own(only_one):
     def made():
@@ -260,6 +270,11 @@ REFUSED = [
         {"inputs": ["loss"], "unknowns": {"loss": Unknown(10.0, sd=1.0)}},
         ValueError,
         "'loss' is given twice",
+    ),
+    (
+        {"unknowns": {"C": Unknown(1.0, sd=1.0, function_of="T", between=(0.0, 1.0))}},
+        ValueError,
+        "'C' is a function. A parameter here is a number",
     ),
     ({"times": None}, ValueError, "times at which outputs are read"),
     ({"times": -1.0}, ValueError, "times must be finite and at least 0"),

@@ -285,6 +285,33 @@ def test_unstable_rows_are_named_and_nothing_is_printed(tmp_path, monkeypatch, c
     assert not [*tmp_path.iterdir()]
 
 
+def test_nothing_is_printed_of_a_model_that_is_not_read_or_singular(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    refused(ValueError, "cannot read the model", MujocoPhysics, "no_file")
+    WITH_ONE.mj_model([torch.nan])
+    heavy = MujocoPhysics(arm(), unknowns={"link1.mass": Unknown(1.0, factor=2.0)})
+    heavy.mj_model([torch.nan])
+    assert capfd.readouterr() == ("", "")
+    assert not [*tmp_path.iterdir()]
+
+
+def test_a_model_that_the_caller_changes_later_is_a_copy():
+    model, X = mujoco.MjModel.from_xml_string(arm()), rows(2, 7)
+    spec = mujoco.MjSpec.from_string(arm())
+    ours = [MujocoPhysics(model), MujocoPhysics(spec, unknowns=WITH_ONE.unknowns)]
+    before = [physics(X) for physics in ours]
+    model.opt.gravity[2] = 0.0
+    spec.option.gravity[2] = 0.0
+    fresh = torch.tensor([[1.1]]).double()
+    for physics in ours:
+        physics.forget()
+    same([physics(X) for physics in ours], before)
+    moved = ours[1](X, fresh.expand(2, 1)) - MujocoPhysics(arm(), unknowns=WITH_ONE.unknowns)(
+        X, fresh.expand(2, 1)
+    )
+    assert moved.abs().max() == 0
+
+
 def test_an_interrupt_ends_a_long_call():
     ours, X = MujocoPhysics(arm(), step=1.0), rows(20_000, 7)  # minutes
     threading.Timer(0.3, interrupt_main).start()
@@ -324,6 +351,8 @@ def of(name, model=None, edit=None, **prior):
     return lambda: MujocoPhysics(model or arm(), unknowns={name: prior}, edit=edit)
 
 
+OF = {"factor": 2.0, "function_of": "v", "between": (0.0, 1.0)}
+WITH_ONE = MujocoPhysics(arm(), unknowns={"elbow.damping": Unknown(1.0, factor=2.0)})
 COMPILED = mujoco.MjModel.from_xml_string(arm())
 REFUSED = {
     "kind": (TypeError, "model must be the path.*found 3", made(3)),
@@ -351,6 +380,8 @@ REFUSED = {
     "unread": (ValueError, "not read 'link1.weight'", of("link1.weight", edit=lambda spec, p: 0)),
     "time": (ValueError, "edit has changed the time step;", of("a.b", edit=slower)),
     "joints": (ValueError, "edit has changed.*njnt.*nq", of("a.b", edit=longer)),
+    "function": (ValueError, "'elbow.damping' is a function. A.*number", of("elbow.damping", **OF)),
+    "values": (ValueError, r"expected.* shape \(1,\)", lambda: WITH_ONE.mj_model(torch.zeros(3))),
     "columns": (PhysicsError, "'motor', 'servo'.*found 3 c", lambda: made()()(rows(2, 3))),
 }
 
@@ -386,7 +417,7 @@ def test_a_log_tells_mass_and_damping():
     assert (sd < 0.005 * truth).all()
     assert found.errors["identified"][0] < 0.007 < found.errors["guesses"][0]
     wrong = MujocoPhysics(pendulum(), step=0.02)
-    refused(ValueError, "makes steps of 0.02.*says 0.01", identify, log_of(machine, 0.01), wrong)
+    refused(ValueError, "steps of 0.02.*spec has 0.01", identify, log_of(machine, 0.01), wrong)
 
 
 @pytest.mark.slow

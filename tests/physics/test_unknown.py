@@ -128,8 +128,8 @@ BAD = [
     (("one",), {"sd": 1.0}, TypeError, "guess must be a number; found 'one'"),
     ((1.0,), {"sd": True}, TypeError, "sd must be a number; found True"),
     ((1.0,), {"factor": torch.ones(())}, TypeError, "factor must be a number"),
-    ((1.0,), {"bounds": 3.0}, TypeError, "not iterable"),
-    ((1.0,), {"bounds": (0, 1, 2)}, ValueError, "too many values"),
+    ((1.0,), {"bounds": 3.0}, ValueError, "bounds as two numbers.*found 3.0"),
+    ((1.0,), {"bounds": (0, 1, 2)}, ValueError, r"bounds as two numbers.*found \(0, 1, 2\)"),
     ((3.0,), {"bounds": (0, 2)}, ValueError, r"inside of the bounds.*found Unknown\(3.0, bo"),
     ((0.0,), {"sd": 1, "bounds": (0, 2)}, ValueError, "inside of the bounds"),
     ((math.nan,), {"sd": 1.0}, ValueError, "guess must be finite"),
@@ -144,6 +144,16 @@ BAD = [
 def test_what_is_no_prior():
     for guess, options, error, message in BAD:
         refused(error, message, Unknown, *guess, **options)
+
+
+def test_numbers_of_numpy_are_plain_ones():
+    """A program or a fingerprint has their repr."""
+    plain = {"factor": 1.5, "function_of": "v", "between": (0.0, 3.0), "lengthscale": 1.0}
+    one = np.float64
+    others = {"factor": one(1.5), "between": (one(0), np.int64(3)), "lengthscale": np.int64(1)}
+    assert repr(Unknown(one(0.3), **plain | others)) == repr(Unknown(0.3, **plain))
+    bounded = Unknown(np.int64(1), sd=one(0.1), bounds=np.array([0.0, 2.0]))
+    assert repr(bounded) == "Unknown(1.0, sd=0.1, bounds=(0.0, 2.0))"
 
 
 def test_names_and_priors_that_are_none():

@@ -165,6 +165,8 @@ TABLE = [
     ({"between": (0.0, 1.0)}, "Expected of a function its variable and the range"),
     ({"function_of": "v", "between": (1.0, 1.0)}, "the range of that"),
     ({"function_of": "v", "between": (0.0, float("inf"))}, "the range of that"),
+    ({"function_of": "v", "between": (0, 1, 2)}, r"between as two numbers.*found \(0, 1, 2\)"),
+    ({"function_of": "v", "between": "01"}, "between as two numbers.*found '01'"),
     ({**OVER, "lengthscale": 0.1}, "0.05 of the range or more, found 0.1 of 6"),
     ({**OVER, "lengthscale": -1.0}, "lengthscale"),
 ]

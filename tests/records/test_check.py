@@ -7,6 +7,7 @@ import pytest
 
 from gpadjust.physics import FormulaPhysics, FunctionPhysics, ODEPhysics, Unknown
 from gpadjust.records import Record, Records, check_log
+from gpadjust.records.check import Direction
 from gpadjust.states import StateSpec
 
 STEP, ROWS = 0.1, 60
@@ -22,6 +23,12 @@ def log(actions, seed=0):
         x = 0.9 * x + 0.5 * u
     times = STEP * np.arange(len(actions))
     return Records(Record(times, np.array(states)[:, None], actions[:, None]), SPEC)
+
+
+def test_a_list_of_directions_is_short():
+    weights = {"a": 0.8, "b": -0.6, **{f"c{i}": 0.01 for i in range(50)}}
+    directions = [Direction(weights, 12.345, ""), Direction(weights, 0.1, "A square wave.")]
+    assert str(directions) == "[Direction(0.80 a -0.60 b: 12.3), Direction(0.80 a -0.60 b: 0.1)]"
 
 
 def driven(X, p):

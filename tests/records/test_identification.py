@@ -1,6 +1,7 @@
 """A machine by its log: what is held out, what is compared with it, and what is said of it."""
 
 import math
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -9,7 +10,7 @@ import torch
 from gpadjust.control import MPC, Planner
 from gpadjust.physics import FormulaPhysics, FunctionPhysics, ODEPhysics, Unknown
 from gpadjust.records import Record, Records, identify
-from gpadjust.records.identification import _of_jumps
+from gpadjust.records.identification import _of_jumps, _of_outliers
 from gpadjust.states import StateSpec
 
 STEP, TRUE = 0.1, 2.25
@@ -165,13 +166,32 @@ def test_an_angle_that_jumps_by_a_turn_is_said():
         assert not _of_jumps(Records(records.records, angled))
 
 
+def test_a_row_that_is_far_off_both_neighbours_is_said():
+    (good,) = Records(oscillation(121, known=("x", "v")), SPEC)
+    states = good.states.clone()
+    states[7, 0] += 50.0
+    states[9:, 1] += 50.0  # a jump, which stays, and a gap
+    states[20, 1] = torch.nan
+    records = Records(Record(good.times, states, good.actions, name="arm"), SPEC)
+    (sentence,) = _of_outliers(records)
+    assert sentence.startswith("x is far off both neighbours")
+    assert "in row 7 of 'arm': one such" in sentence
+    assert not _of_outliers(Records(good, SPEC))
+    # Counts of an encoder that stand still most of the time; an angle, at half a turn.
+    counts = states.new_zeros(121, 2)
+    counts[::10, 0] = 1.0
+    counts[:, 1] = math.pi - 0.01
+    counts[::2, 1] *= -1
+    angled = StateSpec(["x", "v"], ["u"], angles=["v"], step=STEP)
+    assert not _of_outliers(Records(Record(good.times, counts, good.actions), angled))
+
+
 @pytest.mark.slow
 def test_its_task_has_the_step_and_the_range_of_the_log(found):
     def reward(states, actions, following):
         return -following[:, 0].square()
 
     task = found.task(reward, episode_length=40)
-    assert task.dynamics is found.dynamics
     assert (task.dynamics.spec.step, task.episode_length) == (STEP, 40)
     (record,) = found.smoothed.records
     low, high = record.states.amin(0), record.states.amax(0)
@@ -190,3 +210,22 @@ def test_its_task_has_the_step_and_the_range_of_the_log(found):
         state = spring()(torch.cat([state, force[None]], -1))
         path.append(float(state[0, 0]))
     assert max(map(abs, path[-10:])) < 0.1
+
+
+@pytest.mark.slow
+def test_a_search_that_did_not_settle_is_never_yes(found):
+    assert found.smoothed.is_settled
+    assert found.verdicts["x"][0] == "Yes"
+    other = replace(found, smoothed=replace(found.smoothed, is_settled=False))
+    assert other.advice[0].startswith("The search for states and parameters did not settle")
+    assert other.verdicts["x"] == ("In part", [*found.verdicts["x"][1], other.advice[0]])
+
+
+def test_what_a_task_learns_leaves_the_identification():
+    found = quickly(Records(oscillation(61, known=("x", "v")), SPEC), spring(Unknown(1.5, sd=0.5)))
+    before = found.parameters.mean.clone()
+    task = found.task(lambda states, actions, following: -following[:, 0].square())
+    states, actions = found.windows.initial_states.repeat(9, 1), torch.zeros(9, 1).double()
+    task.dynamics.update(states, actions, states + 0.5)
+    assert not torch.equal(task.dynamics.physics_parameters.mean, before)
+    assert torch.equal(found.dynamics.physics_parameters.mean, before)

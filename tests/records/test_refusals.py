@@ -163,8 +163,9 @@ def test_what_cannot_be_smoothed():
     ):
         given = {"records": records, "physics": physics, **options}
         refused([(partial(smooth, **given), error, words)])
-    with pytest.warns(SmoothingWarning, match="did not settle in 2 rounds"):
+    with pytest.warns(SmoothingWarning, match="did not settle in 2 rounds. Raise num_starts"):
         smoothed = smooth(records, body, max_rounds=2)
+    assert not smoothed.is_settled
     refused(
         [
             (partial(smoothed.draw, 1.5), TypeError, "seed must be a whole number"),

@@ -145,6 +145,8 @@ BAD_FORMULAS = {
     "a * -time^2": r"'-time \*\* 2' has two meanings: spreadsheets take .* write brackets",
     "a * B2": "found 'B2' .* B2 seems to be a cell: write the name of its column",
     "a, time": r"expected 1 column, one for each of --outputs",
+    "head = a * time": "leave out 'head ='",
+    "a * time²": r"write 'time\^2'",
     "log(time - 0.55 * a)": r"NaN or inf in 5 of 9 row.*\n  line 2: time \[s\] = 0",
 }
 
@@ -157,6 +159,8 @@ def test_what_is_wrong_is_said_and_nothing_is_written(folder, capsys):
         _fails(capsys, [*COMMAND, *WAVE, *options], words)
     for physics, words in BAD_FORMULAS.items():
         _fails(capsys, ["report", "data.csv", "--physics", physics, *FORMULA[2:]], words)
+    given = ["report", "data.csv", "--physics", "2 * time", "--outputs", "head"]
+    _fails(capsys, [*given, "--unknown", "time=2 +- 1"], "'time' is a column and an unknown")
     given = ["report", "data.csv", "--outputs", "head", *WAVE]
     _fails(capsys, given, "Expected --inputs, the columns that hill:wave reads")
     for text, words in BAD_TABLES.items():
@@ -264,6 +268,8 @@ def test_a_formula_names_its_inputs_and_is_in_the_file(folder, read, capsys, und
     page = read(folder / "report.html")
     assert "The file holds the formula." in page.text
     assert "your formula, with fitted parameters" in page.text
+    assert "(with the parameters fitted together with the correction) is off by" in page.text
+    assert "Each dot is a measurement less the formula, at its own values" in page.text
     (code,) = [text for text in page.codes if "load(" in text]
     assert "load('report.pt')" in code
     names = {}
@@ -313,16 +319,16 @@ def test_a_workbook_is_as_a_csv_file(folder, read, capsys, undrawn):
     assert main(["report", "data.xlsx", "--fit", "map", *FORMULA]) == 0
     model = load("report.pt")
     assert model.data.Y.flatten().tolist() == [y for _, y in ROWS]
-    book.create_sheet("other")
+    book.create_sheet("other")["A1"] = "notes"
     book.save(folder / "data.xlsx")
     capsys.readouterr()
-    words = "expected one sheet, found 'Sheet', 'other'; say which, by `sheet`"
+    words = "expected one sheet, found 'Sheet', 'other'; choose one: --sheet 'Sheet'"
     _fails(capsys, ["report", "data.xlsx", *FORMULA], words)
     assert main(["report", "data.xlsx", "--fit", "map", *FORMULA, "--sheet", "Sheet"]) == 0
     book["Sheet"]["B3"] = "=1+1"
     book.save(folder / "data.xlsx")
     capsys.readouterr()
-    words = "line 3: a formula has no value in the file; open"
+    words = "line 3: expected a value, found a formula without one; open"
     _fails(capsys, ["report", "data.xlsx", *FORMULA, "--sheet", "Sheet"], words)
     (folder / "data.xlsx").write_text(TABLE)
     _fails(capsys, ["report", "data.xlsx", *FORMULA], r"expected a workbook, \*.xlsx, but")

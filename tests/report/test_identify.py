@@ -163,6 +163,7 @@ BAD_LOGS = {
     "time,angle,torque\n0,1,0\n0,1,0\n": "expected times that rise, found 0 after 0",
     "time,angle,torque\n0,1,0\n1,1,\n": r"column 3 \('torque'\): expected a number",
     "time,angle,torque\n0,1,0\n1,x,0\n": r"column 2 \('angle'\): expected a number, or nothing",
+    "Zeit,angle,torque\n0,1,0\n1,1,0\n2,1,0\n": "column 'time', .*Other times: --time Zeit",
     "time,angle,torque\n0,1,0\n1,1,0\n2,1,0\n": "8 control steps or more",
 }
 
@@ -195,16 +196,17 @@ def test_a_column_pi_is_never_the_constant(folder, capsys):
     _fails(folder, capsys, [*given, "--physics", "pi = T"], "an equation for each of T")
 
 
-def test_a_log_with_dates_other_names_and_units_in_round_brackets(folder, read, undrawn):
+def test_a_log_with_dates_other_names_and_units_in_round_brackets(folder, read, capsys, undrawn):
     time = [f"{13 + k // 60}:{k % 60:02}" for k in range(0, 96, 4)]
     speeds = [f"{1000 * 0.9**k:.6f}".replace(".", ",") for k in range(24)]
     rows = [f"13.02.2015 {t};{speed}" for t, speed in zip(time, speeds, strict=True)]
     text = "\n".join(["Datum;Motor Optical Speed (RPM)", *rows, ""])
     (folder / "log.csv").write_text(text)
-    given = ["--time", "Datum", "--time-unit", "h", "--states", "in=Motor Optical Speed"]
+    given = ["--time-unit", "h", "--states", "in=Motor Optical Speed"]  # dates are the time
     command = ["identify", "log.csv", *given, "--physics", "in' = -lambda * in"]
     assert main([*command, "--unknown", "lambda [1/h] = 1 */ 3"]) == 0
     page = read(folder / "identify.html")
+    assert "the times are in its only column of dates, 'Datum'." in capsys.readouterr().err
     (row,) = page.tables["Parameters by what was learnt from"][1:]
     assert float(row[1]) == pytest.approx(1.5803, rel=1e-3)  # ln(10 / 9) in four minutes
     assert dict(page.tables["How this page came about"])["step"] == "0.0666667 h"

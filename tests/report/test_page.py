@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from gpadjust.core import CKA, ZeroMeanGP, fit, load
 from gpadjust.physics import FunctionPhysics, PhysicsError
-from gpadjust.report import report
-from gpadjust.report.markup import beside, failure, table, tag
+from gpadjust.report import figures, report
+from gpadjust.report.markup import Markup, beside, failure, table, tag
 from gpadjust.report.page import cards, headline
 from gpadjust.report.subject import subject_of
 from gpadjust.validation import Verdict
@@ -186,6 +186,23 @@ def test_inputs_are_drawn_in_double_precision():
     fit(model, "map")
     ((_, drawn),) = lines_along(model)
     assert len(drawn.unique()) == len(drawn) > 9
+
+
+def test_dots_at_the_ends_of_a_figure_are_whole(monkeypatch):
+    X = torch.linspace(0, 1, 7, dtype=torch.float64).unsqueeze(-1)
+    model = CKA(X, X.sin(), physics=lambda X: X)
+    fit(model, "map")
+    figures_drawn = []
+
+    def image(figure, text):
+        figures_drawn.append(figure)
+        return Markup(text)
+
+    monkeypatch.setattr(figures, "image", image)
+    figures.corrections(subject_of(model), 0, [0])
+    low, high = figures_drawn[0].axes[0].get_xlim()
+    assert low < -0.02
+    assert high > 1.02
 
 
 def test_where_a_physics_fails_is_told_in_a_line():

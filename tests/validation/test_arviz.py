@@ -4,6 +4,7 @@ import sys
 
 import matplotlib
 import matplotlib.pyplot
+import pandas
 import pytest
 import torch
 
@@ -71,6 +72,16 @@ def test_outputs_and_missing_targets():
     assert "y2: noise standard deviation" in tree.posterior
     assert tree.log_likelihood["y1"].shape == (2, len(model.draws) // 2, 10)
     assert tree.observed_data["y2"].shape == (9,)
+
+
+def test_names_with_a_stroke():
+    X = line(8)
+    frames = [pandas.DataFrame({"v [m/s]": X[:, 0]}), pandas.DataFrame({"k [N/mm]": wave(X)[:, 0]})]
+    (model,) = fitted(ZeroMeanGP, *frames, seeds=[0])
+    tree = to_arviz(model)
+    assert tree.observed_data["k [N\u2215mm]"].dims == ("k [N\u2215mm] row",)
+    assert {*tree.log_likelihood.data_vars} == {"k [N\u2215mm]"}
+    assert any("v [m\u2215s]" in name for name in tree.posterior.data_vars)
 
 
 def test_refused(models, monkeypatch):

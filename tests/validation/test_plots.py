@@ -157,6 +157,16 @@ def test_leave_one_out(plane):
     np.testing.assert_allclose(drawn, torch.stack([loo.mean, loo.residuals], dim=-1)[:, 1])
 
 
+def test_logarithmic_axes_end_near_the_dots():
+    X = torch.linspace(0, 1, 12, dtype=torch.float64).unsqueeze(-1)
+    ax = plot_leave_one_out(leave_one_out(ZeroMeanGP(X, 1.6 * 10 ** (1.2 * X))))[0]
+    assert ax.get_xscale() == "log"
+    dots = ax.containers[0][0].get_xydata()
+    for (low, high), values in zip((ax.get_xlim(), ax.get_ylim()), dots.T, strict=True):
+        assert 0.4 * dots.min() < low < values.min()
+        assert values.max() < high < 3 * dots.max()
+
+
 def test_given_axes_are_drawn_on(line, forrester):
     ax, axes = Figure().subplots(), Figure().subplots(2)
     assert plot_prediction(line, forrester.test_X, ax=ax) is ax
