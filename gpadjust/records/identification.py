@@ -24,7 +24,7 @@ from gpadjust.records.lack import Lack, clearest_lack, robust_moments
 from gpadjust.records.records import Records, control_steps
 from gpadjust.records.smoothing import SmoothedRecords, drawn_parameters, smooth
 from gpadjust.states import Sensors, StateSpec
-from gpadjust.words import number, percent
+from gpadjust.words import listed, number, percent
 
 GUESSES, IDENTIFIED, PERSISTENCE = "guesses", "identified", "persistence"
 FEW = 0.9  # of measurements in intervals of 95 %
@@ -74,8 +74,9 @@ class Identification(Display):
         dynamics: The physics, whose sampled functions have parameters drawn from their posterior.
         windows: The last part, held out: one window from the last smoothed state of each long
             stretch.
-        runs: Free runs along the windows: ``"identified"``, and ``"guesses"`` by the parameters
-            that were guessed, if there are any.
+        runs: Free runs along the windows: ``"identified"``, whose ``mean`` is the path by
+            ``parameters.center`` without noise, and ``"guesses"`` by the parameters that were
+            guessed, if there are any.
         step: The step of the dynamics, in the unit of the times: the control step, or that of a
             physics which makes several of them in a control step.
         remarks: Sentences on the log itself: gaps, actions that vary within a step, angles that
@@ -92,7 +93,7 @@ class Identification(Display):
     def task(self, reward: Callable[[Tensor, Tensor, Tensor], Tensor], **options: Any) -> Any:
         """Return a task in these dynamics, for :class:`~gpadjust.control.MPC` or an agent.
 
-        Plans follow the parameters' means, or draws of them (``Planner(num_functions=20)``).
+        Plans follow the parameters' center, or draws of them (``Planner(num_functions=20)``).
         Margins of constraints allow for the parameters and for process noise.
 
         Args:
@@ -241,13 +242,18 @@ class Identification(Display):
             sentences.append(str(self.lack))
         sentences += self._of_noise()
         errors, shares = self.errors, self.coverage.tolist()
+        untold = listed([] if self.parameters is None else self.parameters.untold)
         for i, name in enumerate(self.spec.states):
             if shares[i] < FEW:
+                cause = (
+                    "the physics lacks something whose errors last longer than process noise (dry "
+                    "friction, an input), or has a sign or unit wrong"
+                )
+                if self.lack is None and untold:
+                    cause = f"the log shows no lack of the physics, and does not tell {untold}"
                 sentences.append(
                     f"Of {name} the intervals of 95 % hold {100 * shares[i]:.0f} % of what was "
-                    "held out: the physics lacks something whose errors last longer than process "
-                    "noise (dry friction, an input), or has a sign or unit wrong. Rely neither on "
-                    "them nor on those of the parameters."
+                    f"held out: {cause}. Rely neither on them nor on those of the parameters."
                 )
             for other, words in _OTHERS.items():
                 if other in errors and errors[other][i] <= errors[IDENTIFIED][i]:
@@ -422,8 +428,13 @@ def identify(
     dynamics = IdentifiedDynamics(
         spec, f_p, smoothed.physics_parameters, options["noise"], process_noise
     )
+    # Paths of a skewed posterior are skewed about the one by its center, which judges.
+    center = PhysicsParameters(f_p.unknowns, [*dynamics.physics_parameters.center.unsqueeze(-1)])
+    at_center = IdentifiedDynamics(spec, f_p, center, options["noise"], process_noise)
+    path = at_center.free_run(last, windows.actions, noise=False).mean
     options |= {"process_noise": process_noise, "num_functions": 199}
-    runs = {IDENTIFIED: dynamics.free_run(last, windows.actions, **options), **runs}
+    run = dynamics.free_run(last, windows.actions, **options)._replace(mean=path)
+    runs = {IDENTIFIED: run, **runs}
     gaps = [f"Gaps part the log into {len(steps)} stretches, each smoothed by itself."]
     remarks = gaps if len(steps) > len(records) else []
     remarks += [*_of_actions(records, length), *_of_jumps(records)]

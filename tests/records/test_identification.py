@@ -1,6 +1,7 @@
 """A machine by its log: what is held out, what is compared with it, and what is said of it."""
 
 import math
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -132,10 +133,33 @@ def test_advice_on_parameters():
 
     unknowns = {"k": Unknown(1.0, factor=1.2), "idle": Unknown(1.0, sd=1.0)}
     physics = FunctionPhysics(of_two, unknowns=unknowns)
-    told = " ".join(quickly(Records(oscillation(80), SPEC), physics).advice)
+    found = quickly(Records(oscillation(80), SPEC), physics)
+    told = " ".join(found.advice)
     assert "next to nothing of idle" in told
     assert "k is" in told
     assert "standard deviations of its prior from its guess" in told
+    # Where a parameter is not told, and no lack is shown, low coverage has no other cause.
+    assert found.lack is None
+    shifted = found.windows._replace(measured=found.windows.measured + 1.0)
+    told = " ".join(replace(found, windows=shifted).advice)
+    assert "shows no lack of the physics, and does not tell idle" in told
+    assert "sign or unit wrong" not in told
+
+
+def test_the_center_of_a_ridge_judges():
+    """Only the product of two parameters is known: the run by their means is far off."""
+    unknowns = {"a": Unknown(1.0, factor=3.0), "b": Unknown(1.0, factor=3.0)}
+    rates = FormulaPhysics("v, u - a * b * x", ["x", "v", "u"], unknowns=unknowns)
+    found = quickly(Records(oscillation(80), SPEC), ODEPhysics(rates, STEP, 2))
+    parameters, run = found.parameters, found.runs["identified"]
+    assert parameters.mean.prod() > 1.5 * TRUE
+    assert parameters.center.prod() == pytest.approx(TRUE, rel=0.05)
+    state, path = found.windows.initial_states, []
+    for action in found.windows.actions.unbind(1):
+        state = found.dynamics.predict(state, action).mean
+        path.append(state)
+    torch.testing.assert_close(run.mean, torch.stack(path, 1))
+    assert found.errors["identified"][0] < 0.04
 
 
 @pytest.mark.slow
