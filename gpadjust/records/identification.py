@@ -460,13 +460,26 @@ def _of_jumps(records: Records) -> list[str]:
     """Return sentences on states that jump by a turn."""
     sentences = []
     for i, name in enumerate(records.spec.states):
-        moves = torch.cat([record.states[:, i].diff() for record in records])
-        moves = moves[~moves.isnan()].abs()
+        if name in records.spec.angles:
+            continue
+        values = torch.cat([record.states[:, i] for record in records])
+        values = values[~values.isnan()]
+        moves = [record.states[:, i].diff() for record in records]
         for turn, way in ((2 * math.pi, "say so"), (360.0, "convert it to rad, and say so")):
-            jumps = ((moves / turn - 1).abs() < _NEAR_A_TURN).any()
-            if name not in records.spec.angles and jumps and moves.median() < 0.1 * turn:
+            # An angle that is wrapped has values within a turn, and jumps back as it moves on.
+            if len(values) == 0 or values.max() - values.min() > (1 + _NEAR_A_TURN) * turn:
+                continue
+            is_slow = torch.cat(moves).abs().nanmedian() < 0.1 * turn
+            if is_slow and sum(_returns(each, turn) for each in moves) > 0:
                 sentences.append(f"{name} jumps by a turn: if it is an angle, {way} (`angles`).")
     return sentences
+
+
+def _returns(moves: Tensor, turn: float) -> float:
+    """Return by how much the moves beside jumps by a turn go against these."""
+    jumps = moves.sign().where((moves.abs() / turn - 1).abs() < _NEAR_A_TURN, 0.0)
+    moves = moves.nan_to_num()
+    return -float((jumps[1:] * moves[:-1]).sum() + (jumps[:-1] * moves[1:]).sum())
 
 
 def _of_parameters(parameters: PhysicsParameters | None) -> list[str]:

@@ -189,6 +189,17 @@ def test_an_angle_that_jumps_by_a_turn_is_said():
         assert not _of_jumps(Records(records.records, angled))
 
 
+def test_a_speed_that_steps_by_360_has_no_turns():
+    t = 0.1 * torch.arange(100).double()
+    rises = 400.0 * (1 - (-(t - 2).clamp_min(0.0) / 0.05).exp())  # by 346 in a step, and on
+    swings = 1500 * (2 * torch.pi * t / 3.9).sin()  # by 240 in a step; one step of 360
+    swings[50:] += 360 - (swings[50] - swings[49])
+    for speed in (rises, swings):
+        assert ((speed.diff().abs() / 360 - 1).abs() < 0.12).any()
+        states = torch.stack([speed, torch.full_like(t, torch.nan)], -1)
+        assert not _of_jumps(Records(Record(t, states, torch.zeros_like(states[:, :1])), SPEC))
+
+
 @pytest.mark.slow
 def test_its_task_has_the_step_and_the_range_of_the_log(found):
     def reward(states, actions, following):
