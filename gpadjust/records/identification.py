@@ -224,7 +224,9 @@ class Identification(Display):
         for each in (own, path):
             squares = self.spec.change(each, measured)[..., i].square()
             blocks = squares.tensor_split(min(_BLOCKS, squares.shape[1]), 1)
-            logs.append(torch.cat([block.nanmean(1) for block in blocks]).clamp_min(1e-300).log())
+            logs.append(
+                torch.cat([block.nanmean(1) for block in blocks]).clamp(1e-300, 1e300).log()
+            )
         gains = sign * (logs[1] - logs[0])
         gains = gains[~gains.isnan()]
         if len(gains) < 2:
