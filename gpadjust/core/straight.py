@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from gpadjust.core.model import GP
 
 _STEP = 0.02  # of differences, in standard deviations of the posterior
-_NEWTON = 20  # steps to a solution
+_CHORD = 10  # steps to a solution with the derivatives at the mode, which cost nothing
+_NEWTON = 20  # further steps, with those at the point
 _SOLVED, _FOUND = 1e-5, 1e-3  # standard deviations that it may be away, and another one is away
 
 
@@ -43,8 +44,9 @@ class Straight:
         p = len(model.table.shared)
         # White coordinates w of the parameters: u = u_0 + R w.
         self.root = lower_root(start.root[0, -p:])
-        self.mean, slopes = self._mean(self.mode.new_zeros(1, p))
-        J = slopes[0].nan_to_num().mT  # p x m n
+        mode = self.mode.new_zeros(1, p)
+        self.mean = self._mean(mode)
+        J = self._mean_slopes(mode)[0].nan_to_num().mT  # p x m n
         self.by = model.precision_times(self.mode.expand(p, 1, -1), J)
         self.within = self.root.mT @ self.root
         self.inverse = torch.linalg.inv(self.by @ J.mT + self.within)
@@ -56,7 +58,10 @@ class Straight:
     def __call__(self, u: Tensor, with_gradient: bool = True) -> tuple[Tensor, Tensor]:
         """Return log densities at s, here named u, over N(s | 0, I), ``N x B``, and gradients."""
         s = u
-        u, slopes, log_det = self._solution(s)
+        w, is_solved = self._solution(s)
+        u = self._at(w, s)
+        slopes = self._slopes(w).nan_to_num()
+        log_det = torch.linalg.slogdet(slopes).logabsdet.masked_fill(~is_solved, math.inf)
         value, slope = self.model.log_likelihood(u, with_gradient, choice=self.choice)
         value = value + 0.5 * (s.square() - u.square()).sum(-1) - log_det.unsqueeze(-1)
         p = self.root.shape[-1]
@@ -68,7 +73,7 @@ class Straight:
 
     def coordinates(self, s: Tensor) -> Tensor:
         """Return u at s, ``N x B x P``."""
-        return self._solution(s)[0]
+        return self._at(self._solution(s)[0], s)
 
     def points(self, number: int, seed: int) -> Tensor:
         """Return ``number x B x P`` draws from N(0, I) that are spread evenly, by Sobol in groups.
@@ -89,7 +94,7 @@ class Straight:
     def misses(self, u: Tensor) -> Tensor:
         """Return which of u, ``N x B x P``, are not the coordinates of any s: ``N``."""
         w = self._white(u)
-        s = self._at(self._straight(w)[0], u)
+        s = self._at(self._straight(w), u)
         away = self._white(self.coordinates(s)) - w
         return ~(away.norm(dim=-1) < _FOUND)
 
@@ -99,44 +104,51 @@ class Straight:
         away = (u[:, 0, -p:] - self.mode[:, -p:]).mT
         return torch.linalg.solve_triangular(self.root, away, upper=False).mT
 
-    def _solution(self, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return u, derivatives dt / dw and log |det|, infinite without a solution, by Newton."""
-        N, p = len(s), self.root.shape[-1]
+    def _solution(self, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return w at s, ``N x p``, and of which the equation t(w) = R^-1 (s - u_0) is solved."""
         goal = self._white(s)
         w, trial, step = goal.clone(), goal.clone(), torch.zeros_like(goal)
-        slopes = torch.eye(p).to(s).repeat(N, 1, 1)
-        error, share = s.new_full((N,), math.inf), s.new_ones(N)
-        left = torch.arange(N, device=s.device)
-        for _ in range(_NEWTON):
-            t, by = self._straight(trial[left])
-            away = goal[left] - t
+        error, share = s.new_full((len(s),), math.inf), s.new_ones(len(s))
+        left = torch.arange(len(s), device=s.device)
+        for i in range(_CHORD + _NEWTON):
+            if i == _CHORD:  # Newton's method begins where the chords have led
+                trial[left] = w[left]
+                error[left], share[left] = math.inf, 1.0
+            away = goal[left] - self._straight(trial[left])
             closer = away.norm(dim=-1) < error[left]
             at, back = left[closer], left[~closer]
-            w[at], slopes[at], error[at] = trial[at], by[closer], away[closer].norm(dim=-1)
-            whole, _ = torch.linalg.solve_ex(by[closer], away[closer].unsqueeze(-1))
-            step[at], share[at] = whole[..., 0].nan_to_num(), (4 * share[at]).clamp_max(1.0)
+            w[at], error[at] = trial[at], away[closer].norm(dim=-1)
+            # w <- w + share (dt / dw)^-1 (goal - t), where dt / dw = I at the mode.
+            step[at] = away[closer]
+            if i >= _CHORD:
+                whole, _ = torch.linalg.solve_ex(self._slopes(w[at]), step[at].unsqueeze(-1))
+                step[at] = whole[..., 0].nan_to_num()
+            share[at] = (4 * share[at]).clamp_max(1.0)
             share[back] /= 4
             left = left[error[left] > _SOLVED]
             if not len(left):
                 break
             trial[left] = w[left] + share[left].unsqueeze(-1) * step[left]
-        log_det = torch.linalg.slogdet(slopes).logabsdet
-        return self._at(w, s), slopes, log_det.masked_fill(error > _SOLVED, math.inf)
+        return w, error <= _SOLVED
 
-    def _straight(self, w: Tensor) -> tuple[Tensor, Tensor]:
-        """Return t, of which s = u_0 + R t, at ``N x p``, and its derivatives ``N x p x p``."""
-        f, slopes = self._mean(w)
-        t = ((f - self.mean) @ self.by.mT + w @ self.within) @ self.inverse
-        return t, self.inverse @ (self.by @ slopes + self.within)
+    def _straight(self, w: Tensor) -> Tensor:
+        """Return t, of which s = u_0 + R t, at ``N x p``."""
+        return ((self._mean(w) - self.mean) @ self.by.mT + w @ self.within) @ self.inverse
 
-    def _mean(self, w: Tensor) -> tuple[Tensor, Tensor]:
-        """Return f at ``N x p``, and its derivatives ``N x m n x p``, by central differences."""
-        p = w.shape[-1]
-        steps = _STEP * torch.eye(p).to(w).unsqueeze(1)
-        moved = torch.cat([w.unsqueeze(0), w + steps, w - steps]).flatten(0, 1)
-        u = self._at(moved, self.mode.expand(len(moved), 1, -1))
-        f = self.model.prior_mean(u).unflatten(0, (2 * p + 1, len(w)))
-        return f[0], ((f[1 : p + 1] - f[p + 1 :]) / (2 * _STEP)).movedim(0, -1)
+    def _slopes(self, w: Tensor) -> Tensor:
+        """Return the derivatives dt / dw, ``N x p x p``, at ``N x p``."""
+        return self.inverse @ (self.by @ self._mean_slopes(w) + self.within)
+
+    def _mean(self, w: Tensor) -> Tensor:
+        """Return f at ``N x p``, as ``N x m n``."""
+        return self.model.prior_mean(self._at(w, self.mode.expand(len(w), 1, -1)))
+
+    def _mean_slopes(self, w: Tensor) -> Tensor:
+        """Return the derivatives of f at ``N x p``, ``N x m n x p``, by central differences."""
+        steps = _STEP * torch.eye(w.shape[-1]).to(w).unsqueeze(1)
+        f = self._mean(torch.cat([w + steps, w - steps]).flatten(0, 1))
+        above, below = f.unflatten(0, (2, w.shape[-1], len(w)))
+        return ((above - below) / (2 * _STEP)).movedim(0, -1)
 
     def _at(self, w: Tensor, other: Tensor) -> Tensor:
         """Return u at ``N x p``, with other coordinates than parameters of ``N x B x P``."""

@@ -161,7 +161,7 @@ def _noise_of(
     first, *_ = kinds
     best = max(kinds, key=lambda kind: float(densities[kind].sum()))
     gain, se = difference(densities[best], densities[first])
-    if gain <= max(1.0, 2 * se):
+    if gain <= max(1.0, se):
         return {}
     _say(f"Assumed: {best}, which predicts left-out observations better; else --noise constant.")
     return kinds[best]

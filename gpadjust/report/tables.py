@@ -88,7 +88,8 @@ def structures(subject: Subject) -> Markup:
             weight = "-" if math.isnan(row.weight) else f"{row.weight:.2f}"
             elpd = [f"{row.elpd:.4g}", f"{row.elpd_diff:.3g}", f"{row.se_diff:.2g}", weight]
             rmse = [number(row.error), f"{row.rmse:.3g}", percent(row.coverage)]
-            rows.append([row.structure, *elpd, *rmse])
+            of_use = "-" if math.isnan(row.of_use) else f"{row.of_use:.2f}"
+            rows.append([row.structure, *elpd, *rmse, of_use])
             names[row.structure] = None
         parts.append(table(f"Left-out predictions of {output}, best first", head, rows, marked=0))
     terms = [join([tag("dt", name), tag("dd", described(name))]) for name in names]

@@ -494,7 +494,8 @@ def _physics_alone(
 ) -> dict[str, LeaveOneOut]:
     r"""Return left-out predictions by each physics as it is, with noise of an unknown variance.
 
-    Nothing is fitted, :math:`y_i = f_p(x_i) + \epsilon_i`. With a prior of the variance that does
+    Nothing is fitted, :math:`y_i = f_p(x_i) + s_i \epsilon_i`, with :math:`s_i = 1` or
+    :math:`|f_p(x_i)|`, whichever predicts an output better. With a prior of the variance that does
     not depend on units, an observation that is left out has Student's distribution about f_p with
     the mean square error at the others and ``n - 1`` degrees of freedom (Gelman et al. 2013,
     section 3.2); with known variances it is Gaussian. Physics with unknown parameters are left out:
@@ -511,18 +512,28 @@ def _physics_alone(
             variance = data.Yvar.maximum(least)
             density = Normal(mean, variance.sqrt(), False).log_prob(Y)
         else:
-            squares = (Y - mean).square()
-            freedom = (~Y.isnan()).sum(0) - 1
-            others = squares.nansum(0) - squares.nan_to_num(nan=0.0)
-            scale = (others.clamp_min(0) / freedom).maximum(least).sqrt()
-            student = StudentT(freedom.to(mean), mean, scale, validate_args=False)
-            variance = student.variance.nan_to_num(nan=torch.inf)
-            density = student.log_prob(Y)
+            variance, density = _with_noise(Y, mean, torch.ones_like(mean), least)
+            sizes = mean.abs()
+            relative = _with_noise(Y, mean, sizes, least / sizes.square())
+            is_relative = relative[1].nansum(0) > density.nansum(0)  # not if f_p is 0 somewhere
+            variance = torch.where(is_relative, relative[0], variance)
+            density = torch.where(is_relative, relative[1], density)
         pit = torch.special.ndtr((Y - mean) / variance.sqrt())
         alone[f"{ALONE} of {name}" if name else ALONE] = LeaveOneOut(
             X, Y, mean, variance, density, pit, data.output_names, is_outlier
         )
     return alone
+
+
+def _with_noise(Y: Tensor, mean: Tensor, sizes: Tensor, least: Tensor) -> tuple[Tensor, Tensor]:
+    """Return variances and log densities, ``n x m``, of noise in proportion to sizes ``n x m``."""
+    # (y - f) / s has Student's distribution, and y the density of that over s.
+    squares = ((Y - mean) / sizes).square()
+    freedom = (~Y.isnan()).sum(0) - 1
+    others = squares.nansum(0) - squares.nan_to_num(nan=0.0)
+    scale = sizes * (others.clamp_min(0) / freedom).maximum(least).sqrt()
+    student = StudentT(freedom.to(mean), mean, scale, validate_args=False)
+    return student.variance.nan_to_num(nan=torch.inf), student.log_prob(Y)
 
 
 def _densities(left_out: Mapping[str, LeaveOneOut], output: int) -> dict[str, Tensor]:

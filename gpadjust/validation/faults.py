@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -25,6 +27,8 @@ _LIKE = 0.8  # of the error is left by the opposite, at most
 _FOLLOWS = 0.5  # correlation of a physics that has anything to do with the targets
 _TIGHT = 0.9  # correlation that shows what the size of the error does not
 _SHOWN = 3.0  # standard errors of a correlation
+_OF_UNITS = (25.4, 57.3, 60.0, 100.0, 1e3, 1e4, 1e6, 1e9)  # factors of units and angles
+_NEARLY = 0.15  # of a factor, in logarithms
 _ROUNDING = 1e-9  # relative; less is rounding
 _STANDARD = 1e-6  # of means and standard deviations that a scaler made
 
@@ -126,9 +130,14 @@ def rms(values: Tensor) -> float:
 
 
 def _times(factor: float) -> str:
-    """Return a text for a factor, too large or too small."""
-    size = "large" if abs(factor) >= 1 else "small"
-    return f"about {float(f'{max(abs(factor), 1 / abs(factor)):.2g}'):,g} times too {size}"
+    """Return a text for a factor, too large or too small, by the nearest one of units."""
+    size = max(abs(factor), 1 / abs(factor))
+    nearest = min(_OF_UNITS, key=lambda known: abs(math.log(size / known)))
+    if abs(math.log(size / nearest)) < _NEARLY:
+        text = f"{nearest:,g}"
+    else:
+        text = f"{float(f'{size:.2g}'):,g}"
+    return f"about {text} times too {'large' if abs(factor) >= 1 else 'small'}"
 
 
 def _units(data: Data, output: int) -> str:
@@ -137,4 +146,8 @@ def _units(data: Data, output: int) -> str:
     name, unit = name_and_unit(data.output_names[output])
     if not units or not unit:
         return "are its units those of the targets?"
-    return f"does it give {name} in {unit}, and read {listed(units)}?"
+    unnamed = [name for name in data.input_names if "[" not in name]
+    question = f"does it give {name} in {unit}, and read {listed(units)}?"
+    if unnamed:
+        question += f" In which unit is {listed(unnamed)}?"
+    return question

@@ -26,6 +26,7 @@ _LEAST = 1.0  # nats; a smaller difference says nothing
 _SURELY = 0.95  # probability with which nested models decide
 _EVEN = 0.5  # probability below which a correction is not believed for a smaller error alone
 _LARGER = 1.1  # times as large; by less, errors are equal
+_HARDLY = 10.0  # times the error of the data alone: a formula that hardly describes them
 _TINY_SHARE = 0.05  # of the median size of f_p: less is too little for a share of it
 _POINTS = 256  # among which the next observation is looked for
 _APART_BY = 0.3  # standard deviations: predictions that are nearer are the same
@@ -180,7 +181,16 @@ def verdict_on(e: Evidence, correction: str, next_point: str) -> Verdict:
             line += f" {sign} {error(abs(e.offset))}"
         reason = f"Take {line}: its error is {error(e.line)}, as it is {error(e.alone)}, corrected"
         return Verdict(AS_IS, [f"{reason} {error(e.adjusted)}."], e.factor, e.offset)
+    if e.alone > _HARDLY * e.data and e.line > _LARGER * e.data:
+        alone = f"By itself your formula is off by {error(e.alone)}, the data alone {error(e.data)}"
+        input_only = f"As an input of a model it lowers the error to {error(e.adjusted)}"
+        return Verdict(OPEN, [f"{alone}. {input_only}; look whether it is the right formula."])
     falls = f"Errors fall from {error(e.alone)} to {error(e.adjusted)}"
+    if e.adjusted >= e.alone:
+        falls = (
+            f"The error is {error(e.adjusted)}, as it is {error(e.alone)}, but most observations "
+            "are predicted better with the correction"
+        )
     if math.isnan(e.alone):
         falls = f"The error is {error(e.adjusted)}, of the data alone {error(e.data)}"
     reasons = [f"{falls}{'; ' * bool(correction)}{correction}."]

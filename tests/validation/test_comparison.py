@@ -22,6 +22,7 @@ from gpadjust.validation.comparison import (
     _densities,
     _known,
     _physics_alone,
+    _with_noise,
 )
 from gpadjust.validation.verdict import Evidence, straight_line, unsampled, verdict_on
 
@@ -133,21 +134,30 @@ class TestPhysicsAlone:
         assert alone.elpd_diff == pytest.approx(alone.elpd - best.elpd)
         assert math.isnan(alone.weight)
 
-    def test_its_densities_are_those_of_an_unknown_variance(self, X, noise):
-        Y = torch.cat([crude(X) + noise, 2 * crude(X)], -1)
+    @pytest.mark.parametrize("is_relative", [False, True])
+    def test_its_densities_are_those_of_an_unknown_variance(self, X, noise, is_relative):
+        f = crude(X) + 3
+        sizes = f.abs() if is_relative else torch.ones_like(f)
+        Y = f + sizes * noise
         Y[3, 0] = torch.nan
-        data = Data.of(X, Y, None, None)
-        (loo,) = _physics_alone(_by_name(lambda X: crude(X).expand(-1, 2)), data).values()
+        variance, log_density = _with_noise(Y, f, sizes, torch.zeros(1).double())
         rest = [i for i in range(8) if i not in (3, 5)]
-        errors = (Y - crude(X))[:, 0]
+        errors = ((Y - f) / sizes)[:, 0]
         scales = torch.linspace(-8, 2, 4001, dtype=torch.float64).exp()  # even in their logarithm
         weight = torch.distributions.Normal(0.0, scales).log_prob(errors[rest, None]).sum(0)
         weight = weight.softmax(0)
-        density = torch.distributions.Normal(0.0, scales).log_prob(errors[5]).exp()
-        torch.testing.assert_close(loo.log_density[5, 0].exp(), weight @ density)
-        torch.testing.assert_close(loo.variance[5, 0], weight @ scales.square())
-        assert loo.log_density[3, 0].isnan()
-        assert loo.log_density[:, 1].isfinite().all()
+        density = torch.distributions.Normal(0.0, scales * sizes[5]).log_prob((Y - f)[5]).exp()
+        torch.testing.assert_close(log_density[5, 0].exp(), weight @ density)
+        torch.testing.assert_close(variance[5, 0], weight @ (scales * sizes[5]).square())
+        assert log_density[3, 0].isnan()
+
+    def test_its_noise_is_relative_where_that_predicts_better(self, X, noise):
+        f = (4 * X).exp()
+        Y = torch.cat([f + 0.2 * noise, f * (1 + 0.2 * noise)], -1)
+        data = Data.of(X, Y, None, None)
+        (loo,) = _physics_alone(_by_name(lambda X: (4 * X).exp().expand(-1, 2)), data).values()
+        spread = loo.variance.amax(0) / loo.variance.amin(0)
+        assert spread[0] < 10 < 1000 < spread[1]
 
     def test_an_exact_physics_of_any_number_of_points(self, X):
         for n in (2, 3, 8):
@@ -254,7 +264,12 @@ GOOD = Evidence(
         (
             {"alone": 0.1, "line": 0.1, "is_surpassed": True},
             "Use it corrected",
-            "from 0.1 N to 0.1",
+            "0.1 N, as it is 0.1 N, but most observations are predicted better",
+        ),
+        (
+            {"alone": 4.0, "line": 0.4},
+            "These data do not tell",
+            "By itself your formula is off by 4",
         ),
         ({"correction_needed": 0.4}, "Use your formula as it is", "Its error is 0.5 N"),
         ({"correction_needed": 0.4, "is_surpassed": True}, "Use it corrected", "from 0.5 N to 0.1"),
