@@ -21,7 +21,6 @@ from gpadjust.states import StateSpec
 
 _DRAWS = 32  # of the parameters, for the variance of a prediction
 _ROUNDS = 5  # of the Gauss-Newton method
-_FARTHEST = 8.0  # coordinate of a draw; at a bound it is infinite
 
 
 class IdentifiedDynamics(Dynamics):
@@ -47,7 +46,7 @@ class IdentifiedDynamics(Dynamics):
         >>> noises = torch.full((2, 1), 0.01, dtype=torch.float64)
         >>> dynamics = IdentifiedDynamics(StateSpec(["v"], ["force"]), physics, parameters, *noises)
         >>> dynamics.predict(torch.ones(1, 1).double(), torch.zeros(1, 1).double()).mean
-        tensor([[0.7000]], dtype=torch.float64)
+        tensor([[0.7042]], dtype=torch.float64)
     """
 
     is_fitted = True
@@ -81,7 +80,7 @@ class IdentifiedDynamics(Dynamics):
         if not unknowns:
             return
         # The prior N(m, P): mean and precision of the draws, in coordinates.
-        draws = unknowns.coordinates(self.physics_parameters.draws).clamp(-_FARTHEST, _FARTHEST)
+        draws = self.physics_parameters.coordinates
         z = mean = draws.mean(0)
         prior_precision = torch.linalg.inv(draws.mT.cov().reshape(len(z), len(z)))
         precision = prior_precision
@@ -102,7 +101,7 @@ class IdentifiedDynamics(Dynamics):
         self.physics_parameters = PhysicsParameters(unknowns, unknowns.at(z + spread).unbind(-1))
 
     def predict(self, states: Tensor, actions: Tensor) -> Prediction:
-        """Return the next states by the parameters' means, and their variance.
+        """Return the next states by the parameters' center, and their variance.
 
         The variance is that of process noise, and of the next states by 32 draws.
         """
@@ -110,16 +109,16 @@ class IdentifiedDynamics(Dynamics):
         rows = states.expand(len(draws), *[1] * (2 - states.dim()), *states.shape)
         values = draws.view(len(draws), *[1] * (rows.dim() - 3), -1)
         with torch.no_grad():
-            mean = self._follow(states, actions, self.physics_parameters.mean)
+            mean = self._follow(states, actions, self.physics_parameters.center)
             paths = self._follow(rows, actions, values)
-            # The mean square of the changes from the mean path, of angles the shorter way round.
+            # The mean square of the changes from the center's path, of angles the shorter way.
             changes = self.spec.change(mean.expand_as(paths), paths)
             variance = changes.square().mean(0).view_as(mean)
         return Prediction(mean, variance + self.noise_variance(states, actions))
 
     def mean_function(self) -> TransitionFunctions:
-        """Return the physics with the parameters' means, with gradients as far as it has them."""
-        return partial(self._follow, values=self.physics_parameters.mean)
+        """Return the physics with the parameters' center, with gradients as far as it has them."""
+        return partial(self._follow, values=self.physics_parameters.center)
 
     def noise_variance(self, states: Tensor, actions: Tensor) -> Tensor:
         """Return the variance of process noise."""

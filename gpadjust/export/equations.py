@@ -87,7 +87,7 @@ def equations_of(fitted: OfPhysics, free: bool) -> Equations:
         physics, found = fitted, written(fitted)
     else:
         physics = fitted.physics
-        found = written(physics, fitted.physics_parameters.mean)
+        found = written(physics, fitted.physics_parameters.center)
     if found is None:
         method = f" by {physics.method!r}" if isinstance(physics, ODEPhysics) else ""
         raise TypeError(

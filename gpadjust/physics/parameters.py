@@ -13,6 +13,7 @@ from gpadjust.display import Display, html_table
 from gpadjust.physics.unknown import Curve, Unknown, Unknowns
 
 _AS_WIDE = 0.8  # of a prior's standard deviation, or more
+_FARTHEST = 8.0  # coordinate of a draw at a bound, in place of infinity
 _AS_FAR = 0.3  # standard deviations of a prior, or less from its middle
 
 
@@ -74,6 +75,23 @@ class PhysicsParameters(ParameterValues, Display):
     def mean(self) -> Tensor:
         """Means, ``p``, in the parameters' units."""
         return self.draws.mean(0)
+
+    @property
+    def coordinates(self) -> Tensor:
+        """Coordinates of the draws, ``K x p``, standard normal by the prior."""
+        z = self.unknowns.coordinates(self.draws)
+        return z.nan_to_num(nan=torch.nan, posinf=_FARTHEST, neginf=-_FARTHEST)
+
+    @property
+    def center(self) -> Tensor:
+        """Values at the mean of the coordinates, ``p``: of factors the geometric mean.
+
+        Of parameters of which the data tell only a product or ratio, this keeps to it as the draws
+        do; the mean does not.
+        """
+        if not self.unknowns:
+            return self.mean
+        return self.unknowns.at(self.coordinates.mean(0))
 
     @property
     def sd(self) -> Tensor:

@@ -25,7 +25,7 @@ from gpadjust.records.lack import Lack, clearest_lack, robust_moments
 from gpadjust.records.records import Records, control_steps
 from gpadjust.records.smoothing import SmoothedRecords, drawn_parameters, smooth
 from gpadjust.states import Sensors, StateSpec
-from gpadjust.words import number, percent
+from gpadjust.words import listed, number, percent
 
 GUESSES, IDENTIFIED, PERSISTENCE = "guesses", "identified", "persistence"
 FEW = 0.9  # of measurements in intervals of 95 %
@@ -81,8 +81,9 @@ class Identification(Display):
         dynamics: The physics, whose sampled functions have parameters drawn from their posterior.
         windows: The last part, held out: one window from the last smoothed state of each long
             stretch.
-        runs: Free runs along the windows: ``"identified"``, and ``"guesses"`` by the parameters
-            that were guessed, if there are any.
+        runs: Free runs along the windows: ``"identified"``, whose ``mean`` is the path by
+            ``parameters.center`` without noise, and ``"guesses"`` by the parameters that were
+            guessed, if there are any.
         step: The step of the dynamics, in the unit of the times: the control step, or that of a
             physics which makes several of them in a control step.
         remarks: Sentences on the log itself: gaps, actions that vary within a step, angles that
@@ -99,7 +100,7 @@ class Identification(Display):
     def task(self, reward: Callable[[Tensor, Tensor, Tensor], Tensor], **options: Any) -> Any:
         """Return a task in these dynamics, for :class:`~gpadjust.control.MPC` or an agent.
 
-        Plans follow the parameters' means, or draws of them (``Planner(num_functions=20)``).
+        Plans follow the parameters' center, or draws of them (``Planner(num_functions=20)``).
         Margins of constraints allow for the parameters and for process noise.
 
         Args:
@@ -234,7 +235,9 @@ class Identification(Display):
         for each in (own, path):
             squares = self.spec.change(each, measured)[..., i].square()
             blocks = squares.tensor_split(min(_BLOCKS, squares.shape[1]), 1)
-            logs.append(torch.cat([block.nanmean(1) for block in blocks]).clamp_min(1e-300).log())
+            logs.append(
+                torch.cat([block.nanmean(1) for block in blocks]).clamp(1e-300, 1e300).log()
+            )
         gains = sign * (logs[1] - logs[0])
         gains = gains[~gains.isnan()]
         if len(gains) < 2:
@@ -253,13 +256,18 @@ class Identification(Display):
             sentences.append(str(self.lack))
         sentences += self._of_noise()
         errors, shares = self.errors, self.coverage.tolist()
+        untold = listed([] if self.parameters is None else self.parameters.untold)
         for i, name in enumerate(self.spec.states):
             if shares[i] < FEW:
+                cause = (
+                    "the physics lacks something whose errors last longer than process noise (dry "
+                    "friction, an input), or has a sign or unit wrong"
+                )
+                if self.lack is None and untold:
+                    cause = f"the log shows no lack of the physics, and does not tell {untold}"
                 sentences.append(
                     f"Of {name} the intervals of 95 % hold {100 * shares[i]:.0f} % of what was "
-                    "held out: the physics lacks something whose errors last longer than process "
-                    "noise (dry friction, an input), or has a sign or unit wrong. Rely neither on "
-                    "them nor on those of the parameters."
+                    f"held out: {cause}. Rely neither on them nor on those of the parameters."
                 )
             for other, words in _OTHERS.items():
                 if other in errors and errors[other][i] <= errors[IDENTIFIED][i]:
@@ -434,8 +442,13 @@ def identify(
     dynamics = IdentifiedDynamics(
         spec, f_p, smoothed.physics_parameters, options["noise"], process_noise
     )
+    # Paths of a skewed posterior are skewed about the one by its center, which judges.
+    center = PhysicsParameters(f_p.unknowns, [*dynamics.physics_parameters.center.unsqueeze(-1)])
+    at_center = IdentifiedDynamics(spec, f_p, center, options["noise"], process_noise)
+    path = at_center.free_run(last, windows.actions, noise=False).mean
     options |= {"process_noise": process_noise, "num_functions": 199}
-    runs = {IDENTIFIED: dynamics.free_run(last, windows.actions, **options), **runs}
+    run = dynamics.free_run(last, windows.actions, **options)._replace(mean=path)
+    runs = {IDENTIFIED: run, **runs}
     gaps = [f"Gaps part the log into {len(steps)} stretches, each smoothed by itself."]
     remarks = gaps if len(steps) > len(records) else []
     remarks += [*_of_actions(records, length), *_of_jumps(records), *_of_outliers(records)]
@@ -461,11 +474,17 @@ def _of_jumps(records: Records) -> list[str]:
     """Return sentences on states that jump by a turn."""
     sentences = []
     for i, name in enumerate(records.spec.states):
-        moves = torch.cat([record.states[:, i].diff() for record in records])
-        moves = moves[~moves.isnan()].abs()
+        if name in records.spec.angles:
+            continue
+        values = torch.cat([record.states[:, i] for record in records])
+        values = values[~values.isnan()]
+        moves = [record.states[:, i].diff() for record in records]
         for turn, way in ((2 * math.pi, "say so"), (360.0, "convert it to rad, and say so")):
-            jumps = ((moves / turn - 1).abs() < _NEAR_A_TURN).any()
-            if name not in records.spec.angles and jumps and moves.median() < 0.1 * turn:
+            # An angle that is wrapped has values within a turn, and jumps back as it moves on.
+            if len(values) == 0 or values.max() - values.min() > (1 + _NEAR_A_TURN) * turn:
+                continue
+            is_slow = torch.cat(moves).abs().nanmedian() < 0.1 * turn
+            if is_slow and sum(_returns(each, turn) for each in moves) > 0:
                 sentences.append(f"{name} jumps by a turn: if it is an angle, {way} (`angles`).")
     return sentences
 
@@ -493,6 +512,13 @@ def _of_outliers(records: Records) -> list[str]:
                 "estimates. If the sensor failed there, make it NaN."
             )
     return sentences
+
+
+def _returns(moves: Tensor, turn: float) -> float:
+    """Return by how much the moves beside jumps by a turn go against these."""
+    jumps = moves.sign().where((moves.abs() / turn - 1).abs() < _NEAR_A_TURN, 0.0)
+    moves = moves.nan_to_num()
+    return -float((jumps[1:] * moves[:-1]).sum() + (jumps[:-1] * moves[1:]).sum())
 
 
 def _of_parameters(parameters: PhysicsParameters | None) -> list[str]:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from gpadjust.dynamics.plots import going_on, labels, plot_free_run
+from gpadjust.physics import PhysicsParameters
 from gpadjust.records import Identification
 from gpadjust.records.identification import GUESSES, IDENTIFIED, PERSISTENCE
 from gpadjust.records.plots import plot_lack
@@ -21,6 +22,8 @@ _NAMES = {
     PERSISTENCE: "a state that stays",
 }
 _PARAMETERS = (
+    "Values are means on the scale of what was known before (of a factor, geometric means): the "
+    "free run by them is the one that is judged. "
     "Intervals are of what is known if the physics is right but for these numbers. Where the "
     "intervals of the free run hold far less than 95 %, it is not, and they are too narrow."
 )
@@ -45,6 +48,7 @@ _LACK = (
 )
 _HEIGHT = 2.6  # inches of a figure
 _WINDOWS = 3  # that are drawn
+_DIVERGING = 1e30  # an error in any unit, or more
 
 
 def page(found: Identification, title: str | None, origin: Origin) -> Page:
@@ -80,7 +84,9 @@ def page(found: Identification, title: str | None, origin: Origin) -> Page:
     lines = []
     for verdict in answers:
         each = "; ".join(f"{by}: {error}" for by, error in verdict.errors.items())
-        lines.append(f"{verdict.name}: {each}.")
+        lines.append(f"{verdict.name}: {verdict.answer}. Errors of the free run, {each}.")
+        lines += [f"  {reason}" for reason in verdict.reasons if verdict.answer != "Yes"]
+    lines += _values(found.parameters)
     title = title or f"Log of {listed(spec.states)}"
     question, settings = "Does the physics follow the log?", {**origin.settings}
     return Page(title, lead, question, answers, "\n".join(lines), sections, settings)
@@ -98,13 +104,30 @@ def _judged(
         unit = units.get(name, "")
         rmse = {by: float(found.errors[by][i]) for by in _NAMES if by in found.errors}
         answer, reasons = found.verdicts[name]
-        errors = {_NAMES[by]: f"{number(error)} {unit}".strip() for by, error in rmse.items()}
+        errors = {_NAMES[by]: _error(error, unit) for by, error in rmse.items()}
         color = {"Yes": "yes", "No": "no"}.get(answer, "open")
         answers.append(Card(name, errors, note, answer, reasons, color))
         for by, error in rmse.items():
             held = share if by == IDENTIFIED else "-"
-            rows.append([_NAMES[by], name, number(error), unit or "-", held])
+            rows.append([_NAMES[by], name, _error(error), unit or "-", held])
     return answers, rows
+
+
+def _error(error: float, unit: str = "") -> str:
+    """Return an error in its unit, or a word of a run that diverges."""
+    return f"{number(error)} {unit}".strip() if error < _DIVERGING else "diverging"
+
+
+def _values(parameters: PhysicsParameters | None) -> list[str]:
+    """Return a line for each parameter, such as ``K = 185.1 (185 to 185.2) rpm/V``."""
+    if parameters is None:
+        return []
+    numbers = (parameters.center, *parameters.interval())
+    values, low, high = ([number(value, 4) for value in each] for each in numbers)
+    return [
+        f"{name} = {values[i]} ({low[i]} to {high[i]}) {unknown.unit}".strip()
+        for i, (name, unknown) in enumerate(parameters.unknowns.items())
+    ]
 
 
 def _combinations(found: Identification) -> Markup:

@@ -136,9 +136,9 @@ def parameter_table(caption: str, parameters: PhysicsParameters) -> Markup:
         if parameters.sd[i] > 0:  # not of a point fit
             interval = f"{number(low[i], 4)} to {number(high[i], 4)}"
             spread = [number(parameters.sd[i]), interval]
-        mean = number(parameters.mean[i], 4)
-        rows.append([name, mean, *spread, unknown.prior_text, unknown.unit or "-"])
-    head = ["parameter", "mean", "sd", "95 % interval", "known before", "unit"]
+        value = number(parameters.center[i], 4)
+        rows.append([name, value, *spread, unknown.prior_text, unknown.unit or "-"])
+    head = ["parameter", "value", "sd", "95 % interval", "known before", "unit"]
     return table(caption, head, rows)
 
 

@@ -46,10 +46,11 @@ _COVERAGE = (
     "U is too sure, a hill too careful."
 )
 _PARAMETERS = (
+    "Values are means on the scale of what was known before (of a factor, geometric means). "
     "A bias that is free to vary leaves open which values are the true ones: these describe the "
     "system best together with it."
 )
-_UNTOLD = "The data say next to nothing of {}, which {} as known before."
+_UNTOLD = "By {}, the data say next to nothing of {}, which {} as known before."
 _SUMMARY = (
     "In the units of the data; of samples the median, and the range of 95 % of them. A lengthscale "
     "is the distance over which a function changes, sd how much. Means are those of the prior; "
@@ -165,18 +166,18 @@ def coverage(subject: Subject) -> Markup:
 def parameters(subject: Subject) -> Markup:
     """Return prior and posterior of the physics' unknown parameters; nothing if it has none."""
     by, shown = "Parameters of the physics, by {}".format, [own for own in subject.adjusted if own]
-    known = {by(own.structure): own.model.physics_parameters for own in shown}
+    known = {by(own.structure): (own.structure, own.model.physics_parameters) for own in shown}
     for name, model in ({} if subject.comparison is None else subject.comparison.models).items():
         if isinstance(model, CalibratedPhysics) and by(name) not in known:
             caption = f"Parameters of the physics by itself, with noise ({name})"
-            known[caption] = model.physics_parameters
+            known[caption] = name, model.physics_parameters
     parts: list[Markup] = []
-    for caption, own in known.items():
+    for caption, (structure, own) in known.items():
         if own:
             parts += [html.parameter_table(caption, own), figures.densities(own)]
             if own.untold:
                 stay = "stays" if len(own.untold) == 1 else "stay"
-                parts.append(tag("p", _UNTOLD.format(listed(own.untold), stay)))
+                parts.append(tag("p", _UNTOLD.format(structure, listed(own.untold), stay)))
     return join([*parts, tag("p", _PARAMETERS)]) if parts else Markup()
 
 

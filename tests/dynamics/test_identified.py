@@ -96,3 +96,29 @@ def test_a_controller_plans_in_it_and_learns_on():
     controller.learn()
     assert abs(x - 1) < 0.1
     assert dynamics.physics_parameters["a"].mean() == pytest.approx(1.3, abs=0.02)
+
+
+def test_it_predicts_by_the_center_of_a_ridge():
+    """Of b and c only the product is known, 2; the mean of b times that of c is far from it."""
+    unknowns = {"b": Unknown(1.0, factor=3.0), "c": Unknown(2.0, factor=3.0)}
+    b = normal(400).exp()
+    parameters = PhysicsParameters(unknowns, [b, 2.0 / b])
+    assert parameters.mean.prod() > 4.0
+    torch.testing.assert_close(
+        parameters.center, torch.stack([b.log().mean().exp(), 2.0 / b.log().mean().exp()])
+    )
+    physics = FormulaPhysics("x + b * c * u", ["x", "u"], unknowns=unknowns)
+    noises = (torch.tensor([0.0, sd]).double() for sd in (R, Q))
+    dynamics = IdentifiedDynamics(SPEC, physics, parameters, *noises)
+    states, actions, _ = moves()
+    mean, variance = dynamics.predict(states, actions)
+    torch.testing.assert_close(mean[:, 1:], states[:, 1:] + 2.0 * actions)
+    torch.testing.assert_close(variance[:, 1], torch.full((30,), Q**2).double())
+    same = dynamics.mean_function()(states[None], actions[None])[0]
+    torch.testing.assert_close(same, mean)
+
+
+def test_a_draw_at_a_bound_has_a_center():
+    share = Unknown(0.5, bounds=(0.0, 1.0))
+    center = PhysicsParameters({"share": share}, [torch.tensor([0.0, 0.5, 1.0]).double()]).center
+    torch.testing.assert_close(center, torch.tensor([0.5]).double())

@@ -133,10 +133,33 @@ def test_advice_on_parameters():
 
     unknowns = {"k": Unknown(1.0, factor=1.2), "idle": Unknown(1.0, sd=1.0)}
     physics = FunctionPhysics(of_two, unknowns=unknowns)
-    told = " ".join(quickly(Records(oscillation(80), SPEC), physics).advice)
+    found = quickly(Records(oscillation(80), SPEC), physics)
+    told = " ".join(found.advice)
     assert "next to nothing of idle" in told
     assert "k is" in told
     assert "standard deviations of its prior from its guess" in told
+    # Where a parameter is not told, and no lack is shown, low coverage has no other cause.
+    assert found.lack is None
+    shifted = found.windows._replace(measured=found.windows.measured + 1.0)
+    told = " ".join(replace(found, windows=shifted).advice)
+    assert "shows no lack of the physics, and does not tell idle" in told
+    assert "sign or unit wrong" not in told
+
+
+def test_the_center_of_a_ridge_judges():
+    """Only the product of two parameters is known: the run by their means is far off."""
+    unknowns = {"a": Unknown(1.0, factor=3.0), "b": Unknown(1.0, factor=3.0)}
+    rates = FormulaPhysics("v, u - a * b * x", ["x", "v", "u"], unknowns=unknowns)
+    found = quickly(Records(oscillation(80), SPEC), ODEPhysics(rates, STEP, 2))
+    parameters, run = found.parameters, found.runs["identified"]
+    assert parameters.mean.prod() > 1.5 * TRUE
+    assert parameters.center.prod() == pytest.approx(TRUE, rel=0.05)
+    state, path = found.windows.initial_states, []
+    for action in found.windows.actions.unbind(1):
+        state = found.dynamics.predict(state, action).mean
+        path.append(state)
+    torch.testing.assert_close(run.mean, torch.stack(path, 1))
+    assert found.errors["identified"][0] < 0.04
 
 
 @pytest.mark.slow
@@ -184,6 +207,17 @@ def test_a_row_that_is_far_off_both_neighbours_is_said():
     counts[::2, 1] *= -1
     angled = StateSpec(["x", "v"], ["u"], angles=["v"], step=STEP)
     assert not _of_outliers(Records(Record(good.times, counts, good.actions), angled))
+
+
+def test_a_speed_that_steps_by_360_has_no_turns():
+    t = 0.1 * torch.arange(100).double()
+    rises = 400.0 * (1 - (-(t - 2).clamp_min(0.0) / 0.05).exp())  # by 346 in a step, and on
+    swings = 1500 * (2 * torch.pi * t / 3.9).sin()  # by 240 in a step; one step of 360
+    swings[50:] += 360 - (swings[50] - swings[49])
+    for speed in (rises, swings):
+        assert ((speed.diff().abs() / 360 - 1).abs() < 0.12).any()
+        states = torch.stack([speed, torch.full_like(t, torch.nan)], -1)
+        assert not _of_jumps(Records(Record(t, states, torch.zeros_like(states[:, :1])), SPEC))
 
 
 @pytest.mark.slow

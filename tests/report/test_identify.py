@@ -2,6 +2,7 @@
 
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -70,7 +71,7 @@ def test_a_page_of_true_parameters_noise_and_a_free_run(folder, read, capsys):
     assert identified < 1.3 * NOISE < 5 * NOISE < min(guesses, still)
     assert errors["identified"][1] == "rad"
     assert int(errors["identified"][2].removesuffix(" %")) >= 90
-    assert "Advice" not in page.text
+    assert "lack" not in page.text.partition("Advice")[2].partition("Parameters")[0]
     assert [each["alt"].partition(",")[0] for each in page.images] == [
         "free run of angle with intervals",
         "free run of rate with intervals",
@@ -103,14 +104,35 @@ def test_a_physics_of_a_module_has_a_step_of_its_own(folder, read, undrawn):
     assert "physics = swing.physics" in page.codes[0]
 
 
-def test_without_actions_there_is_the_time_and_next_values_are_equations_too(folder, undrawn):
+def test_without_actions_there_is_the_time_and_next_values_are_equations_too(
+    folder, undrawn, capsys
+):
     rows = "".join(f"{k},{k / 2},{5 * 0.9**k}\n" for k in range(24))
     (folder / "cooling.csv").write_text(f"n,t [s],excess [K]\n{rows}")
     given = ["--time", "t", "--states", "T=excess", "--physics", "T = q * T + 0 * time"]
-    assert main(["identify", "cooling.csv", *given, "--unknown", "q = 0.5 .. 1"]) == 0
+    assert main(["identify", "cooling.csv", *given, "--unknown", "q [1/s] = 0.5 .. 1"]) == 0
+    first, *_, value, wrote = capsys.readouterr().out.splitlines()
+    assert first.startswith("T: Yes. Errors of the free run, your equations with the guesses: ")
+    assert value == "q = 0.9 (0.9 to 0.9) 1/s"
+    assert wrote == "Wrote identify.html."
     text = (folder / "identify.html").read_text()
     assert "0.9 to 0.9" in text
     assert "ODEPhysics" not in text
+
+
+def test_guesses_that_diverge_are_beaten_and_have_no_number(folder, read, undrawn):
+    from tests.records.test_identification import SPEC, Unknown, oscillation, quickly, spring
+
+    found = quickly(Records(oscillation(80), SPEC), spring(Unknown(1.5, factor=1.5)))
+    guesses = found.runs["guesses"]
+    diverging = guesses._replace(mean=torch.full_like(guesses.mean, 1e200))
+    found = replace(found, runs={**found.runs, "guesses": diverging})
+    assert found.errors["guesses"][0].isinf()
+    answer, reasons = found.verdicts["x"]
+    assert (answer, len(reasons)) == ("Yes", 1)
+    page = read(report(found, folder / "diverging.html"))
+    errors = {row[0]: row[2] for row in page.tables["Errors of the free run"][1:]}
+    assert errors["your equations with the guesses"] == "diverging"
 
 
 @pytest.mark.slow
