@@ -37,7 +37,7 @@ Other physics, with unknown parameters or without::
     FormulaPhysics("1 + x", ["x"])               # a formula as text, or a spreadsheet's
     BlackBoxPhysics(simulator)                   # NumPy code; SubprocessPhysics: a program
     ODEPhysics(rate, step=0.1, state_dim=1)      # a differential equation
-    FMUPhysics("tank.fmu", ["T", "P"], ["T"], times=60)    # a model of Modelica or Simulink
+    FMUPhysics("tank.fmu", ["heater"], ["tank.T"], times=60)   # a model of Modelica or Simulink
     law = FunctionPhysics(lambda X, p: p.gain * X[:, 0], unknowns={"gain": Unknown(1.0, factor=2)})
     CalibratedPhysics(X, Y, physics=law)         # the law alone
     Unknown(0.1, factor=2, function_of="v", between=(0, 9))   # a function in the law, friction(v)

@@ -4,6 +4,7 @@ import inspect
 import os
 import pickle
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -22,6 +23,7 @@ import gpadjust
 from gpadjust import RRA
 from gpadjust.kinds import pyro_model
 from gpadjust.physics import MujocoPhysics
+from tests.fmus import fmu
 from tests.systems import line
 from tests.test_display import OBJECTS
 
@@ -114,6 +116,7 @@ def f_p(X):
 @pytest.mark.slow
 def test_each_line_of_the_cheat_sheet_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    shutil.copy(fmu("tank"), "tank.fmu")
     X = line(6)
     names = {name: getattr(gpadjust, name) for name in gpadjust.__all__}
     names |= {"X": X, "Y": 2 * f_p(X) + 0.1 * X.sin(), "f_p": f_p, "g_p": torch.exp}
