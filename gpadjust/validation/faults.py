@@ -149,5 +149,6 @@ def _units(data: Data, output: int) -> str:
     unnamed = [name for name in data.input_names if "[" not in name]
     question = f"does it give {name} in {unit}, and read {listed(units)}?"
     if unnamed:
-        question += f" In which unit is {listed(unnamed)}?"
+        units_are = "units are" if len(unnamed) > 1 else "unit is"
+        question += f" In which {units_are} {listed(unnamed)}?"
     return question
