@@ -28,14 +28,17 @@ def test_formulas_and_certified_values_agree(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["Misra1a", "DanWood", "Eckerle4", "MGH10", "Chwirut2", "Rat43"])
+@pytest.mark.parametrize(
+    "name", ["Misra1a", "DanWood", "Eckerle4", "MGH10", "BoxBOD", "Chwirut2", "Rat43"]
+)
 @pytest.mark.parametrize("start", [1, 2])
 def test_values_and_intervals_are_the_certified_ones(name, start):
     data, found = reference(name), run(Nist(), name, start, 0)
     assert ((torch.tensor(found["mean"]) - data.value).abs() < data.sd).all()
     widths = torch.tensor(found["half"]) / 1.96 / data.sd
     assert (widths > 1 / WIDE).all()
-    assert (widths < WIDE).all()
+    # Six rows and two parameters: a t distribution of four degrees of freedom is 1.4 times as wide.
+    assert (widths < (1.4 * WIDE if name == "BoxBOD" else WIDE)).all()
 
 
 @pytest.mark.slow

@@ -134,12 +134,15 @@ def covers(parameters):
 @pytest.mark.slow
 @pytest.mark.parametrize("structure", [CalibratedPhysics, PhysicsMeanGP])
 def test_a_model_finds_it(structure, tmp_path):
-    X, Y = measured()
-    model = structure(X, Y, physics=FORMULA)
-    fit(model)
-    share, width = covers(model.physics_parameters)
-    assert share >= 0.8  # neighbouring points go together; of eight data sets it is 0.96 on average
-    assert width < (0.05 if structure is CalibratedPhysics else 0.3)
+    shares = []
+    for seed in (0, 10, 20, 30):
+        X, Y = measured(seed=seed)
+        model = structure(X, Y, physics=FORMULA)
+        fit(model)
+        share, width = covers(model.physics_parameters)
+        shares.append(share)
+        assert width < (0.05 if structure is CalibratedPhysics else 0.3)
+    assert sum(shares) / len(shares) >= 0.9
     assert "friction(4)" in str(model.summary())
     save(model, tmp_path / "model.pt")
     again = load(tmp_path / "model.pt")

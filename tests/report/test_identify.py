@@ -71,7 +71,13 @@ def test_a_page_of_true_parameters_noise_and_a_free_run(folder, read, capsys):
     assert identified < 1.3 * NOISE < 5 * NOISE < min(guesses, still)
     assert errors["identified"][1] == "rad"
     assert int(errors["identified"][2].removesuffix(" %")) >= 90
-    assert "lack" not in page.text.partition("Advice")[2].partition("Parameters")[0]
+    # The only advice is that a product is told better than its factors.
+    advice = page.text.rpartition("Advice")[2].partition("Go on in Python")[0]
+    told = (
+        r"The log tells c\*F, [^;:]*, and hardly c and F each\. "
+        "Measure one of them, and the other follows\\."
+    )
+    assert re.fullmatch(told, advice.strip())
     assert [each["alt"].partition(",")[0] for each in page.images] == [
         "free run of angle with intervals",
         "free run of rate with intervals",
