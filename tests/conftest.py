@@ -1,5 +1,6 @@
 """Settings, data and the models under test, shared by all tests."""
 
+import sys
 from collections import defaultdict
 from itertools import combinations
 
@@ -10,6 +11,14 @@ from tests import systems
 from tests.systems import truth
 
 torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True)
+def close_figures():
+    """Close the figures of a test, of which Matplotlib keeps every one until then."""
+    yield
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")
 
 
 def pytest_ignore_collect(collection_path, config):
@@ -70,15 +79,6 @@ def pytest_terminal_summary(terminalreporter, config):
 @pytest.fixture(autouse=True)
 def _seed():
     torch.manual_seed(0)
-
-
-@pytest.fixture
-def closed_figures():
-    """Leaves no figure open."""
-    yield
-    import matplotlib.pyplot as plt
-
-    plt.close("all")
 
 
 @pytest.fixture

@@ -24,7 +24,6 @@ from tests.point import POINT_SPEC, Point
 from tests.systems import line, wave
 
 mpl.use("Agg")
-pytestmark = pytest.mark.usefixtures("closed_figures")
 X = line(8)
 Y = 2 * wave(X) + X + 0.05 * (40 * X).sin()
 

@@ -4,7 +4,6 @@ import re
 import runpy
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -23,7 +22,6 @@ def test_an_example_runs_and_prints_what_the_gallery_shows(example, capsys, tmp_
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "Agg")
     runpy.run_path(str(example), run_name="__main__")
-    plt.close("all")
     assert (tmp_path / f"{example.stem}.png").stat().st_size > 5000
     section = GALLERY.partition(f"../examples/{example.name}\n")[2]
     shown = re.search(r"```text\n(.*?)```", section, flags=re.DOTALL)[1]

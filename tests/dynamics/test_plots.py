@@ -11,7 +11,6 @@ from gpadjust.dynamics import PhysicsDynamics, StateSpec, Windows
 from gpadjust.dynamics.plots import plot_free_run
 
 mpl.use("Agg")
-pytestmark = pytest.mark.usefixtures("closed_figures")
 SPEC = StateSpec(["theta", "v"], ["u"], angles=["theta"])
 
 

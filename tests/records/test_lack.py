@@ -14,7 +14,7 @@ from gpadjust.report import report
 from gpadjust.states import StateSpec
 
 mpl.use("Agg")
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("closed_figures")]
+pytestmark = pytest.mark.slow
 STEP, ROWS, FINE = 0.1, 300, 20
 SWING = StateSpec(["angle", "rate"], ["torque"], angles=["angle"], step=STEP)
 HEATED = StateSpec(["T"], ["heater"], step=STEP)

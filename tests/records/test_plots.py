@@ -12,7 +12,6 @@ from gpadjust.records.plots import plot_record
 from gpadjust.states import StateSpec
 
 mpl.use("Agg")
-pytestmark = pytest.mark.usefixtures("closed_figures")
 SPEC = StateSpec(["theta", "v"], ["u"], angles=["theta"])
 
 

@@ -60,7 +60,6 @@ def test_arviz_works_on_it(models):
     lppd = float(left_out.log_density(models[0].data.Y).sum())
     assert loo.elpd + loo.p == pytest.approx(lppd, abs=2)
     assert "noise standard deviation" in summary.index
-    matplotlib.pyplot.close("all")
 
 
 def test_outputs_and_missing_targets():

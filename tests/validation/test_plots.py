@@ -41,7 +41,6 @@ def plane(data):
 def _leave_pyplot_alone():
     settings = dict(mpl.rcParams)
     yield
-    plt.close("all")
     assert dict(mpl.rcParams) == settings
 
 

@@ -14,7 +14,6 @@ from gpadjust.validation.trust import prior_mean
 from tests.systems import crude
 
 mpl.use("Agg")
-pytestmark = pytest.mark.usefixtures("closed_figures")
 
 
 def line(low, high, n):
