@@ -3,7 +3,6 @@
 import sys
 
 import matplotlib
-import matplotlib.pyplot
 import pandas
 import pytest
 import torch
