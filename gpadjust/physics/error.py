@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
+import torch
 from torch import Tensor
 
 _SHOWN = 5
-_LONGEST = 500  # characters of what a subprocess wrote
+_LONGEST = 500  # characters of a subprocess's stderr
 
 
 class PhysicsError(RuntimeError):
-    """A physics failed, or gave something other than one finite row of outputs per input row.
+    """A physics failed, or returned something other than one finite row of outputs per input row.
 
     Its ``inputs``, ``len(rows) x (d + p)``, are columns and parameters of the rows, or None.
 
     Args:
-        message: What was found, what was expected, and the way out.
-        rows: The failing rows, counted over the flattened leading dimensions of X; none if unknown.
+        message: The problem, the expectation, and the way out.
+        rows: The failing rows, counted over the flattened leading dimensions of X; empty if they
+            are unknown.
         partial: ``N x m`` outputs when only some rows failed, NaN in those.
 
     Example:
@@ -55,5 +58,12 @@ class PhysicsWarning(UserWarning):
 def described(error: Exception) -> str:
     """Return the type and message of an error, and the end of a subprocess's stderr."""
     written = str(getattr(error, "stderr", None) or "").strip()
-    tail = f"; it wrote: {written[-_LONGEST:]}" if written else ""
+    tail = f"; it wrote: {written[-_LONGEST:]}" * bool(written)
     return f"{type(error).__name__}: {str(error).rstrip('.')}{tail}"
+
+
+def outline(value: Any) -> str:
+    """Return dtype and shape of a tensor, or the type of another value, for messages."""
+    if torch.is_tensor(value):
+        return f"{value.dtype}, {tuple(value.shape)}"
+    return type(value).__name__

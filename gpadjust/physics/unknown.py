@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from keyword import iskeyword
 from typing import Any
@@ -15,13 +15,13 @@ from torch.special import ndtr, ndtri
 
 from gpadjust.checks import check_kind, checked_number, real_array
 
-_LARGEST = 8.0  # coordinate, beyond which float64 knows no mass of the normal distribution
+LARGEST = 8.0  # coordinate, beyond which float64 knows no mass of the normal distribution
 _UNBOUNDED = (-math.inf, math.inf)
 _KNOTS = 3.0  # of a function, in a lengthscale
 _MOST_KNOTS = 60
 _OF_RANGE = 0.25  # a lengthscale, by default
 _NUGGET = 1e-10
-_FARTHEST = 40.0  # coordinate of a value; at a bound it is infinite
+_AT_BOUND = 40.0  # coordinate of a knot, in place of infinity
 
 
 def _pair(name: str, pair: Any) -> tuple[float, float]:
@@ -49,9 +49,9 @@ class Unknown:
     so on, three in a lengthscale. A function of torch calls it, ``p.friction(speed)``.
 
     Args:
-        guess: The value that the physics has where nothing was learnt; inside the bounds.
+        guess: The value before a fit; inside the bounds.
         sd: Standard deviation of a normal prior, in the parameter's unit.
-        factor: What a log-normal prior multiplies or divides the guess by, above 1.
+        factor: Factor of one standard deviation of a log-normal prior, above 1.
         bounds: The least and the largest possible value.
         unit: Its unit, for tables and figures.
         function_of: The variable of a function. A :class:`FormulaPhysics` reads it, as a formula of
@@ -98,13 +98,12 @@ class Unknown:
                 "Expected a guess inside of the bounds, above 0 with a factor, and one prior: sd, "
                 f"factor, or two finite bounds; found {self!r}."
             )
-        self._check_function()
+        check_kind("function_of", self.function_of, str, "the name of a variable")
+        if (self.function_of, self.between, self.lengthscale) != ("", None, None):
+            self._check_function()
 
     def _check_function(self) -> None:
-        """Raise an error unless all arguments of a function are there, or none."""
-        check_kind("function_of", self.function_of, str, "the name of a variable")
-        if not self.function_of and (self.between, self.lengthscale) == (None, None):
-            return
+        """Raise an error unless the arguments of a function suit each other."""
         low, high = (0.0, 0.0) if self.between is None else _pair("between", self.between)
         if not (self.function_of and low < high and math.isfinite(high - low)):
             raise ValueError(
@@ -123,7 +122,7 @@ class Unknown:
 
     def __repr__(self) -> str:
         # The code that makes it, without defaults.
-        options = [(each.name, getattr(self, each.name), each.default) for each in fields(self)[1:]]
+        options = [(f.name, getattr(self, f.name), f.default) for f in fields(self)[1:]]
         texts = [f"{name}={value!r}" for name, value, default in options if value != default]
         return f"Unknown({', '.join([repr(self.guess), *texts])})"
 
@@ -132,12 +131,16 @@ class Unknown:
         """The prior, for tables."""
         low, high = self.bounds
         limits = f"{low:g} to {high:g}"
-        if math.inf in (high, -low):
-            limits = f"above {low:g}" if high == math.inf else f"below {high:g}"
-        if self.sd is None and self.factor is None:
+        if high == math.inf:
+            limits = f"above {low:g}"
+        elif low == -math.inf:
+            limits = f"below {high:g}"
+        if self.sd is not None:
+            text = f"{self.guess:g} ± {self.sd:g}"
+        elif self.factor is not None:
+            text = f"{self.guess:g}, factor {self.factor:g}"
+        else:
             return limits
-        spread = f" ± {self.sd:g}" if self.factor is None else f", factor {self.factor:g}"
-        text = f"{self.guess:g}{spread}"
         return text if self.bounds == _UNBOUNDED else f"{text}, {limits}"
 
     def value(self, z: Tensor) -> Tensor:
@@ -145,14 +148,22 @@ class Unknown:
         low, high = self.bounds
         below, above = self._tails
         if self.is_cut:
-            z = ndtri(below + (above - below) * ndtr(z.clamp(-_LARGEST, _LARGEST)))
-        if self.sd is not None:
-            value = self.guess + self.sd * z
-        elif self.factor is not None:
-            value = self.guess * (math.log(self.factor) * z).exp()
-        else:
-            value = low + (high - low) * ndtr(z.clamp(-_LARGEST, _LARGEST))
+            # The prior between the bounds: its quantile at the probability of z.
+            z = ndtri(below + (above - below) * ndtr(z.clamp(-LARGEST, LARGEST)))
+        value: Tensor = self.quantile(z, torch.exp, lambda z: ndtr(z.clamp(-LARGEST, LARGEST)))
         return value.clamp(low, high)  # beyond there are rounding errors
+
+    def quantile(self, z: Any, exp: Callable[[Any], Any], cdf: Callable[[Any], Any]) -> Any:
+        """Return the value at a coordinate by the prior that bounds do not cut off.
+
+        The functions, of numbers of any kind, are the exponential and the normal distribution's.
+        """
+        if self.sd is not None:
+            return self.guess + self.sd * z  # N(guess, sd^2)
+        if self.factor is not None:
+            return self.guess * exp(math.log(self.factor) * z)  # guess factor^z
+        low, high = self.bounds
+        return low + (high - low) * cdf(z)  # uniform between the bounds
 
     @property
     def is_cut(self) -> bool:
@@ -213,6 +224,7 @@ class Unknown:
 
     def _correlation(self, x: Tensor) -> Tensor:
         """Return the correlation of coordinates at ``x`` and at the knots, ``... x k``."""
+        # k(x, x') = (1 + r + r^2 / 3) exp(-r), r = sqrt(5) |x - x'| / lengthscale
         r = math.sqrt(5) * (x.unsqueeze(-1) - self.knots.to(x)).abs() / (self.lengthscale or 1.0)
         return (1 + r + r.square() / 3) * (-r).exp()
 
@@ -244,11 +256,11 @@ class Curve:
     def __call__(self, x: Any) -> Any:
         """Return the function at ``x``, whose shape broadcasts with that of the rows of values."""
         values = torch.as_tensor(self.values)
-        at = torch.as_tensor(x).to(values)
+        points = torch.as_tensor(x).to(values)
         # value(k(x, Z) k(Z, Z)^-1 z), z the coordinates of the values
-        z = self.unknown.coordinate(values).clamp(-_FARTHEST, _FARTHEST)
-        found = self.unknown.value((self.unknown.weights(at) * z).sum(-1))
-        return found if isinstance(self.values, Tensor) else found.numpy()
+        z = self.unknown.coordinate(values).clamp(-_AT_BOUND, _AT_BOUND)
+        curve = self.unknown.value((self.unknown.weights(points) * z).sum(-1))
+        return curve if isinstance(self.values, Tensor) else curve.numpy()
 
 
 class Unknowns(dict[str, Unknown]):
@@ -278,35 +290,35 @@ class Unknowns(dict[str, Unknown]):
                 )
             if not unknown.function_of:
                 self[name] = unknown
-            own = {f.name: getattr(unknown, f.name) for f in fields(unknown)}
-            for at, text in zip(unknown.knots.tolist(), _different(unknown.knots), strict=True):
-                self[f"{name}({text})"] = Knot(**own, function=name, at=at)
+            knots = unknown.knots.tolist()
+            for knot, text in zip(knots, _different(knots), strict=True):
+                self[f"{name}({text})"] = Knot(**asdict(unknown), function=name, at=knot)
 
     @classmethod
     def together(cls, several: Iterable[Unknowns]) -> Unknowns:
-        """Return those of several physics, of which those of one name are one.
+        """Return the parameters of several physics; equal names mean one parameter.
 
         Raises:
             ValueError: If priors of one name differ.
         """
-        found: dict[str, Unknown] = {}
+        union: dict[str, Unknown] = {}
         for unknowns in several:
             for name, unknown in unknowns.items():
-                if found.setdefault(name, unknown) != unknown:
+                if union.setdefault(name, unknown) != unknown:
                     raise ValueError(
                         f"Expected one prior of the parameter {name!r} in all physics; found "
-                        f"{found[name]!r} and {unknown!r}. Rename one of them."
+                        f"{union[name]!r} and {unknown!r}. Rename one of them."
                     )
-        return cls(found)
+        return cls(union)
 
     @cached_property
     def functions(self) -> dict[str, tuple[Unknown, list[int]]]:
         """The functions: their priors, and the columns of their values."""
-        found: dict[str, tuple[Unknown, list[int]]] = {}
+        functions: dict[str, tuple[Unknown, list[int]]] = {}
         for i, knot in enumerate(self.values()):
             if isinstance(knot, Knot):
-                found.setdefault(knot.function, (knot, []))[1].append(i)
-        return found
+                functions.setdefault(knot.function, (knot, []))[1].append(i)
+        return functions
 
     def refuse_functions(self) -> None:
         """Raise a ValueError if one of them is a function."""
@@ -320,34 +332,36 @@ class Unknowns(dict[str, Unknown]):
     @property
     def declared(self) -> dict[str, Unknown]:
         """The parameters as the user named them, a function as one."""
-        found = {}
+        declared = {}
         for name, unknown in self.items():
             if isinstance(unknown, Knot):
-                name = unknown.function
-                own = {f.name: getattr(unknown, f.name) for f in fields(Unknown)}
-                unknown = Unknown(**own)
-            found[name] = unknown
-        return found
+                settings = {f.name: getattr(unknown, f.name) for f in fields(Unknown)}
+                declared[unknown.function] = Unknown(**settings)
+            else:
+                declared[name] = unknown
+        return declared
 
     @property
     def guess(self) -> Tensor:
         """The guesses, ``p``."""
         return torch.tensor([u.guess for u in self.values()], dtype=torch.float64)
 
-    def at(self, coordinates: Tensor) -> Tensor:
+    def to_values(self, coordinates: Tensor) -> Tensor:
         """Return values ``... x p`` at coordinates ``... x p``, standard normal by the prior."""
         for unknown, columns in self.functions.values():
             coordinates = coordinates.clone()
+            # L z, whose covariance is k(Z, Z)
             coordinates[..., columns] = coordinates[..., columns] @ unknown.root.mT.to(coordinates)
         pairs = zip(self.values(), coordinates.unbind(-1), strict=True)
         return torch.stack([u.value(z) for u, z in pairs], dim=-1)
 
-    def coordinates(self, values: Tensor) -> Tensor:
+    def to_coordinates(self, values: Tensor) -> Tensor:
         """Return the coordinates ``... x p`` of values ``... x p``."""
         pairs = zip(self.values(), values.unbind(-1), strict=True)
         z = torch.stack([u.coordinate(value) for u, value in pairs], dim=-1)
         for unknown, columns in self.functions.values():
             root = unknown.root.to(z)
+            # L^-1 z
             z[..., columns] = torch.linalg.solve_triangular(
                 root, z[..., columns].unsqueeze(-1), upper=False
             ).squeeze(-1)
@@ -357,10 +371,10 @@ class Unknowns(dict[str, Unknown]):
 NO_UNKNOWNS = Unknowns({})
 
 
-def _different(values: Tensor) -> list[str]:
+def _different(values: list[float]) -> list[str]:
     """Return texts of increasing values, of as few digits as make them different."""
     for digits in range(3, 18):
-        texts = [f"{value:.{digits}g}" for value in values.tolist()]
+        texts = [f"{value:.{digits}g}" for value in values]
         if len({*texts}) == len(texts):
             break
     return texts

@@ -72,7 +72,7 @@ def same(found, expected):
 def dynamics(name):
     """Dynamics with draws of the parameters, as a log would identify."""
     physics = PHYSICS[name]
-    values = physics.unknowns.at(0.7 * normal(9, len(physics.unknowns), seed=2))
+    values = physics.unknowns.to_values(0.7 * normal(9, len(physics.unknowns), seed=2))
     parameters = PhysicsParameters(physics.unknowns, values.unbind(-1))
     noises = torch.full((2, 4), 0.1, dtype=torch.float64)
     return IdentifiedDynamics(SPEC, physics, parameters, *noises)

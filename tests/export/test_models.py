@@ -16,7 +16,7 @@ POINTS = torch.cat([uniform(4, 2, low=-0.5, high=1.5, seed=1), uniform(1, 2), 50
 def arguments(model, X):
     """What a program is given: the inputs, and f_p where there is a physics."""
     values = [
-        each(X, *([each.unknowns.at(model.u[0, :, -1:])] if each.unknowns else []))
+        each(X, *([each.unknowns.to_values(model.u[0, :, -1:])] if each.unknowns else []))
         for each in model.physics
     ]
     values = [value.detach().reshape(len(X), -1) for value in values]
