@@ -490,7 +490,9 @@ def varying_parameters(
             # f_p(x; z + deviation) - f_p(x; z)
             ends = []
             for coordinates in (center, center + deviation):
-                values = unknowns.to_values(coordinates.expand_as(deviation).flatten(0, -2))  # per row
+                values = unknowns.to_values(
+                    coordinates.expand_as(deviation).flatten(0, -2)
+                )  # per row
                 end = states.clone()
                 end[..., spec.moving] = physics.or_nan(rows, values).view(*states.shape[:-1], -1)
                 ends.append(end)

@@ -32,9 +32,8 @@ class FMUPhysics(BlackBoxPhysics):
       differ in it alone share a simulation, and fail together; they agree with single ones within
       the tolerance.
 
-    Names are those of the FMU, such as ``"wall[1].T"``. A process has one instance, which is reset
-    for the next row. Rows run in parallel, in processes, and are remembered as of a
-    :class:`~gpadjust.BlackBoxPhysics`.
+    Names are those of the FMU, such as ``"wall[1].T"``. Rows run in parallel, in processes, and are
+    remembered as of a :class:`~gpadjust.BlackBoxPhysics`.
 
     Args:
         fmu: The file.
@@ -48,7 +47,7 @@ class FMUPhysics(BlackBoxPhysics):
         unknowns: Unknown parameters by their names in the FMU, whose units they take.
         start_time: The time at which simulations begin.
         communication_step: The steps of co-simulation, which end at ``times`` and ``signals``, too.
-            Default: the step that the FMU names, or none between these times.
+            Default: the step that the FMU proposes, or none between these times.
         tolerance: The relative tolerance of model exchange; a wish to the FMU in co-simulation.
         kind: ``"CoSimulation"`` or ``"ModelExchange"``. Default: the first that the FMU has.
         columns: The columns of X to read, one for each of the inputs. Default: all.
@@ -112,13 +111,15 @@ class FMUPhysics(BlackBoxPhysics):
             )
         if communication_step is not None:
             checked_number("communication_step", communication_step, above=0)
-        numbers = [] if times is None else np.atleast_1d(real_array(times)).tolist()
         self.path, self.kind = path, kind
         self.input_names, self.output_names = tuple(inputs), tuple(outputs)
         self.start_values = {k: checked_number(k, v) for k, v in (start_values or {}).items()}
         self.signals = _signals(signals)
         self.start_time = checked_number("start_time", start_time)
-        self.times = tuple(checked_number("times", t, least=self.start_time) for t in numbers)
+        self.times: tuple[float, ...] = ()
+        if times is not None:
+            numbers = np.atleast_1d(real_array(times)).tolist()
+            self.times = tuple(checked_number("times", t, least=self.start_time) for t in numbers)
         self.communication_step = communication_step
         self.tolerance = checked_number("tolerance", tolerance, above=0, below=1)
         self._check(opened(path, kind))
@@ -143,15 +144,14 @@ class FMUPhysics(BlackBoxPhysics):
                 f"columns=; found {X.shape[-1]}"
             )
         rows = self._table(X, *parameters)
-        place = np.arange(len(rows))
+        number = np.arange(len(rows))  # of the simulation of a row
         if "time" in self.input_names:
             others = np.delete(rows, self.input_names.index("time"), axis=1)
-            place = np.unique(others, axis=0, return_inverse=True)[1].ravel()
-        order = np.argsort(place, kind="stable")
-        groups = np.split(order, np.cumsum(np.bincount(place))[:-1])
-        found = Parallel()(delayed(call_row)(self.simulate, rows[group]) for group in groups)
+            number = np.unique(others, axis=0, return_inverse=True)[1].ravel()
+        groups = [np.flatnonzero(number == i) for i in range(number.max() + 1)]
+        outputs = Parallel()(delayed(call_row)(self.simulate, rows[group]) for group in groups)
         results = dict[int, NDArray[np.float64] | PhysicsError]()
-        for group, y in zip(groups, found, strict=True):
+        for group, y in zip(groups, outputs, strict=True):
             parts = [y] * len(group) if isinstance(y, PhysicsError) else np.split(y, len(group))
             results |= dict(zip(group.tolist(), parts, strict=True))
         return self._gathered([results[i] for i in range(len(rows))])
@@ -168,7 +168,7 @@ class FMUPhysics(BlackBoxPhysics):
             times = rows[:, [self.input_names.index("time")]]
         if times.min() < self.start_time:
             raise ValueError(f"expected times from start_time={self.start_time:g} on")
-        found = opened(self.path, self.kind).simulate(
+        outputs = opened(self.path, self.kind).simulate(
             self.start_values | values,
             self.start_time,
             times.ravel(),
@@ -177,31 +177,31 @@ class FMUPhysics(BlackBoxPhysics):
             self.communication_step,
             self.tolerance,
         )
-        return found.ravel()
+        return outputs.ravel()
 
     def _check(self, fmu: FMU) -> None:
         """Raise a ValueError if variables are not in the FMU; take the units of parameters."""
         self.unknowns.refuse_functions()
+        inputs = [name for name in self.input_names if name != "time"]
         moving = [name for name in self.signals if name != "time"]
-        values = [name for name in self.input_names if name != "time"]
-        given = [*values, *self.unknowns, *self.start_values, *moving]
-        for name in (*given, *self.output_names):
+        names = [*inputs, *self.unknowns, *self.start_values, *moving]
+        for name in (*names, *self.output_names):
             variable = fmu.variable(name)
-            if given.count(name) > 1:
+            if names.count(name) > 1:
                 raise ValueError(
                     f"{name!r} is given twice: in inputs, unknowns, start_values or signals."
                 )
-            if name in given and name not in moving:
-                fmu.check_settable(name)
             if name in moving and variable.causality != "input":
                 raise ValueError(f"Expected signals of inputs of {fmu.name}; {name!r} is not one.")
+            if name in names and name not in moving:
+                fmu.check_settable(name)
             if name in self.unknowns and not self.unknowns[name].unit:
                 unit = variable.unit or getattr(variable.declaredType, "unit", None) or ""
                 self.unknowns[name] = replace(self.unknowns[name], unit=unit)
-        left = [name for name in fmu.states if name not in given]
-        if left and self.times and {*values} & {*self.output_names} & {*fmu.states}:
+        hidden = [name for name in fmu.states if name not in names]
+        if hidden and self.times and {*inputs} & {*self.output_names} & {*fmu.states}:
             raise ValueError(
-                f"The inputs and outputs are states of a step, and {', '.join(left)} of "
+                f"The inputs and outputs are states of a step, and {', '.join(hidden)} of "
                 f"{fmu.name} would begin each step at its start value: add it to inputs and "
                 "outputs, or, if it does not matter, to start_values."
             )
@@ -211,12 +211,12 @@ def _signals(signals: Any) -> dict[str, NDArray[np.float64]]:
     """Return signals by name, with their times."""
     if signals is None:
         return {"time": np.array([-np.inf])}  # nothing changes
-    found = {str(name): real_array(signals[name]) for name in signals}
-    shapes = {name: each.shape for name, each in found.items()}
-    is_table = "time" in found and len(found) > 1 and len({*shapes.values()}) == 1
-    if not is_table or found["time"].ndim != 1 or not (np.diff(found["time"]) > 0).all():
+    columns = {str(name): real_array(signals[name]) for name in signals}
+    shapes = {name: column.shape for name, column in columns.items()}
+    is_table = "time" in columns and len(columns) > 1 and len({*shapes.values()}) == 1
+    if not is_table or columns["time"].ndim != 1 or not (np.diff(columns["time"]) > 0).all():
         raise ValueError(
             "Expected signals as columns of one length, 'time', ascending, and one or more inputs; "
             f"found {shapes}."
         )
-    return found
+    return columns

@@ -12,7 +12,7 @@ from torch import Tensor
 from gpadjust.checks import check_choice, checked_number, checked_whole
 from gpadjust.physics.base import Physics, name_of
 from gpadjust.physics.black_box import FiniteDifferences
-from gpadjust.physics.error import PhysicsError
+from gpadjust.physics.error import PhysicsError, outline
 from gpadjust.physics.formula import FormulaPhysics
 from gpadjust.physics.parameters import ParameterValues
 from gpadjust.physics.unknown import Unknown
@@ -48,7 +48,7 @@ class ODEPhysics(Physics):
             ``"dopri5"``. These control one step size for all rows of a batch, on which a row's
             result then depends within their tolerances. They fail if ``rhs`` is stiff, for all
             rows: use ``"rk4"`` with many substeps.
-        difference: Whether the output is the change of the state instead of the new state.
+        difference: If True, the output is the change of the state instead of the new state.
         gradient: Source of the gradient in X: ``"autograd"``, or ``"finite-difference"``, without
             second derivatives, which is several times faster if there are many substeps.
         unknowns, inputs, name: As of :class:`Physics`.
@@ -76,7 +76,8 @@ class ODEPhysics(Physics):
         name: str | None = None,
     ) -> None:
         if isinstance(rhs, FormulaPhysics):
-            unknowns, name = rhs.unknowns, name or rhs.name
+            unknowns = rhs.unknowns
+            name = name or rhs.name
         super().__init__(unknowns=unknowns, inputs=inputs, name=name_of(rhs, name, "rhs"))
         check_choice("method", method, (*FIXED_STEP, *ADAPTIVE_STEP))
         if method in ADAPTIVE_STEP and find_spec("torchdiffeq") is None:
@@ -107,11 +108,10 @@ class ODEPhysics(Physics):
                 rate = self.rhs(state, action, *parameters)
             shape = (len(X), self.state_dim)
             if not torch.is_tensor(rate) or rate.shape != shape or rate.is_complex():
-                found = tuple(rate.shape) if torch.is_tensor(rate) else type(rate).__name__
                 raise PhysicsError(
-                    f"The rhs of physics {self.name!r} returned {found}, expected a real tensor of "
-                    f"shape {shape}: a time derivative of each state. Correct it, or state_dim, or "
-                    f"inputs; state and action have {X.shape[1]} column(s)."
+                    f"The rhs of physics {self.name!r} returned {outline(rate)}, expected a real "
+                    f"tensor of shape {shape}: a time derivative of each state. Correct it, or "
+                    f"state_dim, or inputs; state and action have {X.shape[1]} column(s)."
                 )
             return rate
 
@@ -120,12 +120,10 @@ class ODEPhysics(Physics):
         else:
             from torchdiffeq import odeint  # slow to import
 
-            times, options = (
-                torch.tensor([0.0, self.step]).to(state),
-                {"max_num_steps": _MOST_STEPS},
-            )
+            times = torch.tensor([0.0, self.step]).to(state)
+            limits = {"max_num_steps": _MOST_STEPS}
             _, end = odeint(
-                lambda _, s: derivative(s), state, times, method=self.method, options=options
+                lambda _, s: derivative(s), state, times, method=self.method, options=limits
             )
         return end - state if self.difference else end
 
@@ -140,15 +138,15 @@ class ODEPhysics(Physics):
 def _fixed(
     derivative: Callable[[Tensor], Tensor], state: Tensor, h: float, number: int, method: str
 ) -> Tensor:
-    r"""Return the state after a number of steps h of a Runge-Kutta method.
+    """Return the state after a number of steps h of a Runge-Kutta method.
 
-    With its weights a (Hairer, Norsett and Wanner 1993, section II.1) a step is
-
-    .. math:: k_i = g\Bigl(s + h \sum_{j < i} a_{i j} k_j\Bigr), \quad s + h \sum_i a_i k_i.
+    Source: Hairer, Norsett and Wanner (1993), section II.1.
     """
     for _ in range(number):
-        point, slopes = state, list[Tensor]()
+        point = state
+        slopes = list[Tensor]()
         for weights in FIXED_STEP[method]:
+            # k_i = g(s + h sum_{j < i} a_ij k_j); the last weights are those of the step
             slopes.append(derivative(point))
             point = state
             for weight, slope in zip(weights, slopes, strict=True):

@@ -226,8 +226,8 @@ def test_names_of_states_actions_and_sensors():
     tip = torch.stack([x * a.cos(), 0.3 * b.sin(), -x * a.sin()], -1)
     same([seen[:, 1:]], [tip])
     assert ours.sensors(["camera"]).measure(spec, states).shape == (4, 3)
-    few = MujocoPhysics(arm(), states=["a", "b", "v", "w", "lag"], actions=["servo"])
-    assert (few.spec.states[0], few.spec.actions) == ("a", ("servo",))
+    few = MujocoPhysics(arm(), actions=["servo"])
+    assert few.spec.actions == ("servo",)
     X = rows(3, 7)
     X[:, 5] = 0.0
     assert torch.equal(few(X[:, [0, 1, 2, 3, 4, 6]]), MujocoPhysics(arm())(X))
@@ -362,7 +362,6 @@ REFUSED = {
     "delay": (ValueError, "state besides qpos.*previous=", made(LATE)),
     "step": (ValueError, "multiple of.*0.002 s; found 0.003", made(step=3e-3)),
     "short": (ValueError, "multiple of", made(step=1e-4)),
-    "states": (ValueError, r"names for.*servo_act.*found \('a',\)", made(states=["a"])),
     "actions": (ValueError, r"no actuator 'm'.*'motor', 'servo'", made(actions=["m"])),
     "actuator": (ValueError, "no actuator.*<motor>", lambda: MujocoPhysics(EMPTY).spec),
     "threads": (ValueError, "threads must be at least 1", made(threads=0)),
