@@ -19,7 +19,7 @@ MakeCurve = Callable[[str, Unknown, Tensor], Callable[[Any], Any]]
 """Makes an unknown function of its name, its prior and the weights of its knots, ``k``."""
 
 OfPhysics = Physics | IdentifiedDynamics | PhysicsDynamics
-"""What has equations alone."""
+"""Objects that have equations alone."""
 
 
 class Equations(NamedTuple):
@@ -53,13 +53,14 @@ class Equations(NamedTuple):
         unknowns = self.formula.unknowns
         curves = {}
         for name, (unknown, places) in unknowns.functions.items():
+            # k(Z, Z)^-1 z, so that the coordinate at x is k(x, Z) times the weights
             weights = unknown.precision @ unknown.coordinate(self.parameters[places])
             curves[name] = curve(name, unknown, weights)
         named = dict(zip(unknowns, parameters, strict=True))
         return self.formula.values_at(columns, named, curves, functions, number)
 
 
-def written(physics: Physics, parameters: Tensor | None = None) -> Equations | None:
+def _equations(physics: Physics, parameters: Tensor | None = None) -> Equations | None:
     """Return the equations of a physics with these parameters, ``p``; None if it has none."""
     ode = physics if isinstance(physics, ODEPhysics) else None
     formula = physics if ode is None else ode.rhs
@@ -83,12 +84,11 @@ def equations_of(fitted: OfPhysics, free: bool) -> Equations:
         TypeError: If it is not written in formulas, with the way out.
         ValueError: If parameters are to be free, and there is none, or one is a function.
     """
-    if isinstance(fitted, Physics):
-        physics, found = fitted, written(fitted)
-    else:
-        physics = fitted.physics
-        found = written(physics, fitted.physics_parameters.center)
-    if found is None:
+    physics, parameters = fitted, None
+    if not isinstance(fitted, Physics):
+        physics, parameters = fitted.physics, fitted.physics_parameters.center
+    equations = _equations(physics, parameters)
+    if equations is None:
         method = f" by {physics.method!r}" if isinstance(physics, ODEPhysics) else ""
         raise TypeError(
             f"Cannot export the physics {physics.name!r}, a {type(physics).__name__}{method}: "
@@ -100,41 +100,38 @@ def equations_of(fitted: OfPhysics, free: bool) -> Equations:
             "parameters=True is for unknown parameters that are numbers; found "
             f"{', '.join(physics.unknowns.declared) or 'none'}. Leave it out."
         )
-    return found
+    return equations
 
 
 def equations_within(model: GP) -> list[Equations] | None:
     """Return the equations of the physics of a model; None unless all of them are written."""
-    found = []
-    for each in model.physics:
-        physics = getattr(each, "physics", each)  # without the targets of dynamics
+    within = []
+    for term_physics in model.physics:
+        physics = getattr(term_physics, "physics", term_physics)  # without targets of dynamics
         parameters = None
         if physics.unknowns:
             draws = model.physics_parameters_at(model.u)
             parameters = torch.stack([draws[name] for name in physics.unknowns], -1).mean(0)
-        equations = written(physics, parameters)
+        equations = _equations(physics, parameters)
         if equations is None:
             return None
-        found.append(equations)
-    return found
+        within.append(equations)
+    return within
 
 
-def check_name(name: Any) -> None:
-    """Raise a ValueError unless a program may have this name."""
+def exportable(fitted: Any, name: Any, free: bool = False) -> Any:
+    """Return a fitted object, of an identification its dynamics.
+
+    Raises:
+        ValueError: If a program cannot have the name, or parameters of a model are to be free.
+    """
     if not (isinstance(name, str) and name.isidentifier() and name.isascii()):
         raise ValueError(f"Expected name as one of C, such as 'pump', got {name!r}.")
-
-
-def own_dynamics(fitted: Any) -> Any:
-    """Return a fitted object; of an identification its dynamics."""
-    is_known = isinstance(fitted, GP | Physics | Dynamics)
-    return fitted if is_known else getattr(fitted, "dynamics", fitted)
-
-
-def refuse_parameters(free: bool) -> None:
-    """Raise a ValueError if the parameters of a model are to be free."""
-    if free:
+    if not isinstance(fitted, GP | Physics | Dynamics):
+        fitted = getattr(fitted, "dynamics", fitted)
+    if free and not isinstance(fitted, OfPhysics):
         raise ValueError(
-            "parameters=True is for a physics, and for dynamics that are one. What a Gaussian "
-            "process has learnt is right for the parameters that it was learnt with: leave it out."
+            "parameters=True is for a physics, and for dynamics that are one. The Gaussian "
+            "process was fitted with these values of the parameters: leave it out."
         )
+    return fitted
