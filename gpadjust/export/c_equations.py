@@ -154,9 +154,7 @@ def physics_lines(
         return
     yield f"static void {name}_rates({declared}, double *rates)\n{{"
     yield from (*_assigned("rates", outputs, free), "}\n", head)
-    x = columns
-    if equations.inputs is not None:
-        x = [Text(f"x[{i}]") for i in equations.inputs]
+    x = [f"x[{i}]" for i in equations.inputs]
     stages = FIXED_STEP[ode.method]
     weights = [[*row, *[0.0] * (len(stages) - len(row))] for row in stages]
     yield _STEPS.substitute(
@@ -226,4 +224,5 @@ def _curve(name: str, unknown: Unknown, weights: Tensor) -> str:
 
 def _number(value: float) -> str:
     """Return a number, in brackets if it is negative."""
-    return f"({value!r})" if value < 0 else repr(value)
+    text = repr(value)
+    return f"({text})" if value < 0 else text

@@ -213,7 +213,7 @@ def _about(
         lines.append(parameters_text(model.physics_parameters, means))
     if dynamics is not None and dynamics.spec.step is not None:
         lines.append(f"A step lasts {dynamics.spec.step!r}.")
-    noise = "with" if observation_noise else "without"
+    noise = "with" * observation_noise or "without"
     return [
         *lines,
         f"mean: {', '.join(model.data.output_names)}.",
@@ -251,7 +251,9 @@ def _body(s: FiniteSum, variance: bool) -> Iterator[str]:
     yield _BEGIN.substitute(spread=spread, prior=", prior = 0.0" * has_prior)
     first = 0
     for t, term in enumerate(s.terms):
-        basis = "1.0" if term.column is None else f"f_p[column{t}[g % OUTPUTS]] / unit{t}[g]"
+        basis = "1.0"
+        if term.column is not None:
+            basis = f"f_p[column{t}[g % OUTPUTS]] / unit{t}[g]"
         yield _TERM.substitute(t=t, basis=basis, name=term.name.replace("*/", "* /"))
         if has_prior:
             yield _PRIOR.substitute(t=t)
@@ -266,8 +268,10 @@ def _body(s: FiniteSum, variance: bool) -> Iterator[str]:
             yield _KERNEL.substitute(t=t, kernel=_KERNELS[term.kind])
     yield _MEAN
     if variance:
-        left = f"fmax(prior - squares, {s.least} * prior)" if s.is_remainder else "squares"
         yield _SOLVED if s.is_solved else _MULTIPLIED
+        left = "squares"
+        if s.is_remainder:
+            left = f"fmax(prior - squares, {s.least} * prior)"
         yield _SPREAD.substitute(left=left)
     yield _MIXED
     if variance:
@@ -279,8 +283,9 @@ def _input(column: Column) -> str:
     value = f"x[{column.source}]"
     if column.function:
         value = f"{column.function}({value})"
-    is_plain = (column.offset, column.size) == (0.0, 1.0)
-    return value if is_plain else f"({value} - {column.offset!r}) / {column.size!r}"
+    if (column.offset, column.size) == (0.0, 1.0):
+        return value
+    return f"({value} - {column.offset!r}) / {column.size!r}"
 
 
 def _declared(name: str, table: Tensor) -> str:

@@ -27,7 +27,8 @@ def equations_function(fitted: OfPhysics, name: str, free: bool) -> Any:
         return physics_function(equations, name, free)
     spec = fitted.spec
     sizes = {"state": spec.state_dim, "action": spec.action_dim}
-    sizes |= {"parameters": len(equations.parameters)} if free else {}
+    if free:
+        sizes["parameters"] = len(equations.parameters)
     arguments = {entry: ca.SX.sym(entry, size) for entry, size in sizes.items()}
     state, action, *parameters = arguments.values()
     entries = [*ca.vertsplit(state), *ca.vertsplit(action)]
@@ -43,9 +44,9 @@ def physics_function(equations: Equations, name: str, free: bool = False) -> Any
     """Return a physics as a function of x, and of its parameters if they are free."""
     import casadi as ca
 
-    formula, ode = equations.formula, equations.ode
-    size = len(formula.columns) if equations.inputs is None else 1 + max(equations.inputs)
-    x, parameters = ca.SX.sym("x", size), ca.SX(equations.parameters.tolist())
+    ode = equations.ode
+    x = ca.SX.sym("x", 1 + max(equations.inputs))
+    parameters = ca.SX(equations.parameters.tolist())
     arguments = {"x": x}
     if free:
         arguments["parameters"] = parameters = ca.SX.sym("parameters", parameters.numel())
@@ -54,7 +55,7 @@ def physics_function(equations: Equations, name: str, free: bool = False) -> Any
         values = ca.vertsplit(parameters) if parameters.numel() else []
         return ca.vertcat(*equations.values(columns, values, _functions(ca), ca.SX, _curve))
 
-    columns = equations.read(ca.vertsplit(x))
+    columns = [x[i] for i in equations.inputs]
     if ode is None:
         mean = outputs(columns)
     else:
@@ -69,7 +70,8 @@ def physics_function(equations: Equations, name: str, free: bool = False) -> Any
                 mean = begin
                 for weight, slope in zip(weights, slopes, strict=True):
                     mean = mean + ode.step / ode.substeps * weight * slope
-        mean = mean - start if ode.difference else mean
+        if ode.difference:
+            mean = mean - start
     return ca.Function(name, [*arguments.values()], [mean], [*arguments], ["mean"])
 
 

@@ -132,7 +132,9 @@ def _moments(s: FiniteSum, m: int, x: list[Any], f_p: list[Any]) -> tuple[list[A
     """Return the mean and variance of each of ``m`` outputs."""
     inputs = []
     for source, function, offset, size in s.columns:
-        value = getattr(ca, function)(x[source]) if function else x[source]
+        value = x[source]
+        if function:
+            value = getattr(ca, function)(value)
         inputs.append((value - offset) / size)
     z = ca.horzcat(*inputs)
     means, variances = list[Any](), list[Any]()
@@ -159,11 +161,14 @@ def _moments(s: FiniteSum, m: int, x: list[Any], f_p: list[Any]) -> tuple[list[A
 
 def _features(s: FiniteSum, g: int, j: int, z: Any, f_p: list[Any]) -> tuple[Any, Any, Any]:
     """Return the features of a Gaussian of output j, its prior mean, and its prior variance."""
-    kernels = mean = variance = 0.0
+    kernels: Any = 0.0
+    mean = variance = 0.0
     waves = list[Any]()
     for term in s.terms:
         amplitude, constant = float(term.amplitude[g]), float(term.constant[g])
-        f = 1.0 if term.column is None else f_p[int(term.column[j])] / float(term.unit[g])
+        f = 1.0
+        if term.column is not None:
+            f = f_p[int(term.column[j])] / float(term.unit[g])
         basis = f - float(term.center[g])  # b(x)
         mean = mean + f * float(term.mean[g])
         variance = variance + basis * basis * (amplitude + constant)
@@ -178,7 +183,9 @@ def _features(s: FiniteSum, g: int, j: int, z: Any, f_p: list[Any]) -> tuple[Any
             squares = _squares(s.points[j % len(s.points)], term.rate[g], z)
             kernel = amplitude * _kernel(term.kind, squares) + constant
             kernels = kernels + basis * _matrix(term.at_points[g]) * kernel
-    return (ca.vertcat(*waves) if waves else kernels), mean, variance
+    if waves:
+        return ca.vertcat(*waves), mean, variance
+    return kernels, mean, variance
 
 
 def _squares(points: Tensor, rate: Tensor, z: Any) -> Any:

@@ -29,17 +29,13 @@ class Equations(NamedTuple):
         formula: The formula.
         parameters: Values of its ``p`` unknown parameters.
         ode: The equation of motion; None of a formula alone.
-        inputs: The columns of x that it reads; None for all.
+        inputs: The columns of x that it reads.
     """
 
     formula: FormulaPhysics
     parameters: Tensor
     ode: ODEPhysics | None
-    inputs: Sequence[int] | None
-
-    def read(self, x: Sequence[Any]) -> list[Any]:
-        """Return the columns of x that the formula reads."""
-        return [*x] if self.inputs is None else [x[i] for i in self.inputs]
+    inputs: Sequence[int]
 
     def values(
         self,
@@ -62,10 +58,12 @@ class Equations(NamedTuple):
 
 def _equations(physics: Physics, parameters: Tensor | None = None) -> Equations | None:
     """Return the equations of a physics with these parameters, ``p``; None if it has none."""
-    ode = physics if isinstance(physics, ODEPhysics) else None
-    formula = physics if ode is None else ode.rhs
-    is_fixed = ode is None or ode.method in FIXED_STEP
-    if not isinstance(formula, FormulaPhysics) or not is_fixed:
+    formula: Any = physics
+    ode = None
+    if isinstance(physics, ODEPhysics) and physics.method in FIXED_STEP:
+        formula = physics.rhs
+        ode = physics
+    if not isinstance(formula, FormulaPhysics):
         return None
     for name, (unknown, _) in formula.unknowns.functions.items():
         if unknown.is_cut:
@@ -73,8 +71,15 @@ def _equations(physics: Physics, parameters: Tensor | None = None) -> Equations 
                 f"Cannot export the function {name!r}, whose bounds cut off its prior: leave out "
                 "bounds, or sd and factor."
             )
-    values = formula.unknowns.guess if parameters is None else parameters.detach()
-    return Equations(formula, values, ode, physics.inputs)
+    inputs = physics.inputs or range(len(formula.columns))
+    if min(inputs) < 0:
+        raise ValueError(
+            f"Cannot export columns that are counted from the end, inputs={physics.inputs}: count "
+            "them from the first, 0."
+        )
+    if parameters is None:
+        parameters = formula.unknowns.guess
+    return Equations(formula, parameters.detach(), ode, inputs)
 
 
 def equations_of(fitted: OfPhysics, free: bool) -> Equations:
@@ -89,9 +94,10 @@ def equations_of(fitted: OfPhysics, free: bool) -> Equations:
         physics, parameters = fitted.physics, fitted.physics_parameters.center
     equations = _equations(physics, parameters)
     if equations is None:
-        method = f" by {physics.method!r}" if isinstance(physics, ODEPhysics) else ""
+        method = getattr(physics, "method", "")
+        by_method = f" by {method!r}" * bool(method)
         raise TypeError(
-            f"Cannot export the physics {physics.name!r}, a {type(physics).__name__}{method}: "
+            f"Cannot export the physics {physics.name!r}, a {type(physics).__name__}{by_method}: "
             'expected equations that are a text, FormulaPhysics("v, u - k * x", ["x", "v", "u"]), '
             'or an ODEPhysics of these with method="rk4", "midpoint" or "euler".'
         )

@@ -107,7 +107,9 @@ class FiniteSum(NamedTuple):
 
 def model_of(fitted: Any) -> GP:
     """Return a model, or that of dynamics; a TypeError if it is neither."""
-    model = fitted.model if isinstance(fitted, LearnedDynamics) else fitted
+    model = fitted
+    if isinstance(fitted, LearnedDynamics):
+        model = fitted.model
     if not isinstance(model, GP):
         raise TypeError(
             "Expected a CKA, RRA, PhysicsMeanGP, ScaleGP or ZeroMeanGP, or LearnedDynamics of one, "
@@ -211,20 +213,26 @@ def _tables(term: Term, model: GP, conditioning: Conditioning, is_remainder: boo
     at_points = weight.expand(S, m, n) * conditioning.observed
     if not is_remainder:
         at_points = at_points[..., :0]
-    column = None
+    column: Tensor | None = None
     unit: Any = 1.0
+    center: Any = 0.0
+    constant: Any = 0.0
     if term.physics is not None:
         column = torch.arange(m) + m * term.physics
         unit = model.unit
+    if term.has_center:
+        center = model.term_sum.center(term, train.values)
+    if term.constant is not None:
+        constant = train.values[f"{term.name}.constant"]
     return TermTables(
         name=term.name,
         column=column,
         unit=repeat(unit),
-        center=repeat(model.term_sum.center(term, train.values) if term.has_center else 0.0),
+        center=repeat(center),
         mean=repeat(model.term_sum.mean_of(term, train.values)),
         kind=kind,
         amplitude=repeat(amplitude),
-        constant=repeat(0.0 if term.constant is None else train.values[f"{term.name}.constant"]),
+        constant=repeat(constant),
         rate=rate.reshape(-1, d),
         at_points=at_points.reshape(S * m, -1),
         frequencies=frequencies,
@@ -273,11 +281,9 @@ def _columns(transform: Any, num_inputs: int) -> list[Column]:
     for part in parts:
         is_plain = [column[1:] == Column(0)[1:] for column in columns]
         if isinstance(part, AngleInput) and all(is_plain[i] for i in part.columns):
-            columns = [
-                column._replace(function=function)
-                for i, column in enumerate(columns)
-                for function in (("sin", "cos") if i in part.columns else (column.function,))
-            ]
+            pairs = [[c._replace(function=name) for name in ("sin", "cos")] for c in columns]
+            both = [pairs[i] if i in part.columns else [c] for i, c in enumerate(columns)]
+            columns = [column for several in both for column in several]
         elif type(part) in (AffineInputTransform, Normalize, InputStandardize):
             offset = torch.zeros(len(columns), dtype=torch.float64)
             size = torch.ones_like(offset)

@@ -92,8 +92,8 @@ def export_fmu(
     signature = rf"^void {name}_(predict|step)\(([^)]*)\)"
     ((function, text),) = re.findall(signature, code, re.MULTILINE)
     arguments = re.findall(r"\*(\w+)", text)
-    spec = fitted.spec if isinstance(fitted, Dynamics) else None
-    step = spec.step if spec else None
+    spec = getattr(fitted, "spec", None)  # of dynamics
+    step = getattr(spec, "step", None)
     if spec and step is None:
         raise ValueError("Expected the duration of a step: StateSpec(..., step=0.1).")
     if physics is not None and "f_p" not in arguments:
@@ -159,26 +159,28 @@ def _variables(fitted: Any, arguments: list[str], has_physics: bool) -> dict[str
         inputs, outputs = data.input_names, data.output_names
         start = data.X[0].tolist()
         returned = [*outputs]
-    f_p = list[str]()
+    groups = {
+        "x": [_variable(name, "input", value) for name, value in zip(inputs, start, strict=True)],
+        "f_p": [],
+        "mean": [_variable(name, "output", first) for name in outputs],
+        "variance": [],
+    }
     if "f_p" in arguments:
         number = len(model_of(fitted).physics)
         heads = [f"f_p{i + 1}" for i in range(number)] if number > 1 else ["f_p"]
-        f_p = [f"{head}_{output}" for head in heads for output in returned]
-    computed = ("local", None) if has_physics else ("input", 0.0)
-    sd = outputs if "variance" in arguments else ()
-    return {
-        "x": [_variable(name, "input", value) for name, value in zip(inputs, start, strict=True)],
-        "f_p": [_variable(name, *computed) for name in f_p],
-        "mean": [_variable(name, "output", first) for name in outputs],
-        "variance": [_variable(name, "output", None, "_sd") for name in sd],
-    }
+        kind = ("local", None) if has_physics else ("input", 0.0)
+        groups["f_p"] = [_variable(f"{h}_{output}", *kind) for h in heads for output in returned]
+    if "variance" in arguments:
+        groups["variance"] = [_variable(name, "output", None, "_sd") for name in outputs]
+    return groups
 
 
 def _variable(name: str, causality: str, start: float | None, suffix: str = "") -> _Variable:
     """Return a variable of data, whose name may end with a unit in brackets."""
     match = re.fullmatch(r"\s*(.*\S)\s*\[(.*)\]\s*", name)
-    bare, unit = match.groups() if match else (name, "")
-    return _Variable(bare + suffix, unit, causality, start)
+    if match is None:
+        return _Variable(name + suffix, "", causality, start)
+    return _Variable(match[1] + suffix, match[2], causality, start)
 
 
 def _description(name: str, guid: str, variables: list[_Variable], step: float | None) -> bytes:
@@ -197,16 +199,18 @@ def _description(name: str, guid: str, variables: list[_Variable], step: float |
     if step is not None:
         SubElement(root, "DefaultExperiment", startTime="0", stepSize=repr(step))
     listed = SubElement(root, "ModelVariables")
-    variability = "continuous" if step is None else "discrete"
+    is_continuous = step is None
     for i, variable in enumerate(variables):
         about = {"name": variable.name, "valueReference": str(i), "causality": variable.causality}
         value = {"unit": variable.unit} if variable.unit else {}
+        initial = "calculated"
         if variable.start is not None:
             value["start"] = repr(variable.start)
+            initial = "exact"
         if variable.causality != "input":
-            about["initial"] = "calculated" if variable.start is None else "exact"
-        entry = SubElement(listed, "ScalarVariable", about, variability=variability)
-        SubElement(entry, "Real", value)
+            about["initial"] = initial
+        about["variability"] = "continuous" if is_continuous else "discrete"
+        SubElement(SubElement(listed, "ScalarVariable", about), "Real", value)
     structure = SubElement(root, "ModelStructure")
     outputs = [i for i, variable in enumerate(variables) if variable.causality == "output"]
     computed = [i for i in outputs if variables[i].start is None]

@@ -22,7 +22,9 @@ def target_columns(
             change = f_p[first + place] - state[i]
             if spec.states[i] in spec.angles:
                 change = wrap(change)
-            columns.append(change if targets.target == "difference" else state[i] + change)
+            if targets.target != "difference":
+                change = state[i] + change
+            columns.append(change)
     return columns
 
 
@@ -33,7 +35,9 @@ def next_state(
     spec = dynamics.spec
     following = [*state]
     for i, value in zip(spec.predicted, outputs, strict=True):
-        following[i] = state[i] + value if dynamics.targets.target == "difference" else value
+        following[i] = value
+        if dynamics.targets.target == "difference":
+            following[i] = state[i] + value
     following = _remembered(spec, state, action, following)
     for name, velocity in spec.integrated.items():
         i, v = spec.states.index(name), spec.states.index(velocity)
@@ -53,8 +57,8 @@ def following_state(spec: StateSpec, state: Scalars, action: Scalars, f_p: Scala
 def _remembered(spec: StateSpec, state: Scalars, action: Scalars, following: Scalars) -> list[Any]:
     """Return a next state whose previous values are those of the state and action."""
     before = dict(zip((*spec.states, *spec.actions), (*state, *action), strict=True))
-    pairs = zip(spec.states, following, strict=True)
-    return [before[spec.previous[n]] if n in spec.previous else value for n, value in pairs]
+    after = dict(zip(spec.states, following, strict=True))
+    return [*(after | {name: before[source] for name, source in spec.previous.items()}).values()]
 
 
 def next_variance(dynamics: LearnedDynamics, outputs: Scalars, zero: Any) -> list[Any]:
