@@ -12,7 +12,7 @@ from gpadjust.dynamics import Dynamics
 from gpadjust.export.equations import Equations, OfPhysics, equations_of
 from gpadjust.export.transition import following_state
 from gpadjust.physics.formula import NAMES, Functions
-from gpadjust.physics.ode import FIXED_STEP
+from gpadjust.physics.ode import METHODS
 from gpadjust.physics.unknown import Unknown
 
 _OTHER_NAMES = {"abs": "fabs", "ln": "log", "min": "fmin", "max": "fmax"}  # in C
@@ -155,7 +155,7 @@ def physics_lines(
     yield f"static void {name}_rates({declared}, double *rates)\n{{"
     yield from (*_assigned("rates", outputs, free), "}\n", head)
     x = [f"x[{i}]" for i in equations.inputs]
-    stages = FIXED_STEP[ode.method]
+    stages = METHODS[ode.method]
     weights = [[*row, *[0.0] * (len(stages) - len(row))] for row in stages]
     yield _STEPS.substitute(
         stages=len(stages),

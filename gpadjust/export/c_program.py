@@ -116,9 +116,8 @@ def c_source(
     NAME_step(const double *state, const double *action, const double *f_p, double *mean, double
     *variance)``, which is :meth:`LearnedDynamics.predict`; ``mean`` may be ``state`` itself.
     ``f_p`` are the values of the physics there, of several physics side by side. There is no such
-    argument without physics, and of a :class:`FormulaPhysics`, or an :class:`ODEPhysics` of one
-    with a fixed step: these are in the file. A ``variance`` that is ``NULL`` is not computed, which
-    is faster.
+    argument without physics, and of a :class:`FormulaPhysics`, or an :class:`ODEPhysics` of one:
+    these are in the file. A ``variance`` that is ``NULL`` is not computed, which is faster.
 
     Of such a physics itself it has ``void NAME_predict(const double *x, double *mean)``; of
     dynamics that are one, such as :func:`~gpadjust.records.identify` finds, ``void

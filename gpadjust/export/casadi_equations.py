@@ -12,7 +12,7 @@ from gpadjust.dynamics import Dynamics
 from gpadjust.export.equations import Equations, OfPhysics, equations_of
 from gpadjust.export.transition import following_state
 from gpadjust.physics.formula import ARITHMETIC, NAMES, Functions
-from gpadjust.physics.ode import FIXED_STEP
+from gpadjust.physics.ode import METHODS
 from gpadjust.physics.unknown import Unknown
 
 _OTHER_NAMES = {"abs": "fabs", "ln": "log", "min": "fmin", "max": "fmax", "pow": "power"}
@@ -64,7 +64,7 @@ def physics_function(equations: Equations, name: str, free: bool = False) -> Any
         for _ in range(ode.substeps):
             begin = mean
             slopes = list[Any]()
-            for weights in FIXED_STEP[ode.method]:
+            for weights in METHODS[ode.method]:
                 # k_i = g(s + h sum_{j < i} a_ij k_j), as in ODEPhysics
                 slopes.append(outputs([*ca.vertsplit(mean), *action]))
                 mean = begin

@@ -33,7 +33,7 @@ def casadi_function(
     :meth:`~gpadjust.CKA.predict`; of dynamics ``state``, ``action`` and ``f_p`` to those of
     :meth:`LearnedDynamics.predict`. ``f_p`` are the values of the physics there, of several physics
     below each other. There is no such argument without physics, and of a :class:`FormulaPhysics`,
-    or an :class:`ODEPhysics` of one with a fixed step: these are in the function.
+    or an :class:`ODEPhysics` of one: these are in the function.
 
     Of such a physics itself it maps ``x`` to ``mean``; of dynamics that are one, such as
     :func:`~gpadjust.records.identify` finds, ``state`` and ``action`` to ``mean``.

@@ -12,7 +12,6 @@ from gpadjust.core import GP
 from gpadjust.dynamics import Dynamics, IdentifiedDynamics, PhysicsDynamics
 from gpadjust.physics import FormulaPhysics, ODEPhysics, Physics
 from gpadjust.physics.formula import Functions
-from gpadjust.physics.ode import FIXED_STEP
 from gpadjust.physics.unknown import Unknown
 
 MakeCurve = Callable[[str, Unknown, Tensor], Callable[[Any], Any]]
@@ -23,7 +22,7 @@ OfPhysics = Physics | IdentifiedDynamics | PhysicsDynamics
 
 
 class Equations(NamedTuple):
-    """A formula, or the fixed steps of an equation of motion whose right-hand side is one.
+    """A formula, or the steps of an equation of motion whose right-hand side is one.
 
     Args:
         formula: The formula.
@@ -60,7 +59,7 @@ def _equations(physics: Physics, parameters: Tensor | None = None) -> Equations 
     """Return the equations of a physics with these parameters, ``p``; None if it has none."""
     formula: Any = physics
     ode = None
-    if isinstance(physics, ODEPhysics) and physics.method in FIXED_STEP:
+    if isinstance(physics, ODEPhysics):
         formula = physics.rhs
         ode = physics
     if not isinstance(formula, FormulaPhysics):
@@ -94,12 +93,10 @@ def equations_of(fitted: OfPhysics, free: bool) -> Equations:
         physics, parameters = fitted.physics, fitted.physics_parameters.center
     equations = _equations(physics, parameters)
     if equations is None:
-        method = getattr(physics, "method", "")
-        by_method = f" by {method!r}" * bool(method)
         raise TypeError(
-            f"Cannot export the physics {physics.name!r}, a {type(physics).__name__}{by_method}: "
-            'expected equations that are a text, FormulaPhysics("v, u - k * x", ["x", "v", "u"]), '
-            'or an ODEPhysics of these with method="rk4", "midpoint" or "euler".'
+            f"Cannot export the physics {physics.name!r}, a {type(physics).__name__}: expected "
+            'equations that are a text, FormulaPhysics("v, u - k * x", ["x", "v", "u"]), or an '
+            "ODEPhysics of these."
         )
     if free and (physics.unknowns.functions or not physics.unknowns):
         raise ValueError(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from importlib.util import find_spec
 from typing import Literal
 
 import torch
@@ -17,14 +16,13 @@ from gpadjust.physics.formula import FormulaPhysics
 from gpadjust.physics.parameters import ParameterValues
 from gpadjust.physics.unknown import Unknown
 
-# Runge-Kutta methods of a fixed step: the weights of slopes in each further stage, and in the step.
-FIXED_STEP: dict[str, tuple[tuple[float, ...], ...]] = {
+# Runge-Kutta methods: the weights a of slopes in each further stage, and b in the step (Hairer,
+# Norsett and Wanner 1993, section II.1).
+METHODS: dict[str, tuple[tuple[float, ...], ...]] = {
     "euler": ((1.0,),),
     "midpoint": ((0.5,), (0.0, 1.0)),
     "rk4": ((1 / 3,), (-1 / 3, 1.0), (1.0, -1.0, 1.0), (0.125, 0.375, 0.375, 0.125)),
 }
-ADAPTIVE_STEP = ("dopri5", "dopri8", "bosh3", "fehlberg2", "adaptive_heun")
-_MOST_STEPS = 10_000  # of an adaptive method
 
 
 class ODEPhysics(Physics):
@@ -42,12 +40,9 @@ class ODEPhysics(Physics):
             Or a :class:`FormulaPhysics` of state and action, with its unknown parameters.
         step: The duration of the step, in the time unit of ``rhs``.
         state_dim: The number of leading columns that contain the state; the action follows.
-        substeps: Integration steps within the step, for the fixed-step methods.
-        method: ``"euler"``, ``"midpoint"`` or ``"rk4"`` (Kutta's 3/8 rule), of fixed steps, or an
-            adaptive one of ``torchdiffeq.odeint`` (``pip install "gpadjust[ode]"``), such as
-            ``"dopri5"``. These control one step size for all rows of a batch, on which a row's
-            result then depends within their tolerances. They fail if ``rhs`` is stiff, for all
-            rows: use ``"rk4"`` with many substeps.
+        substeps: Integration steps within the step.
+        method: ``"euler"``, ``"midpoint"`` or ``"rk4"`` (Kutta's 3/8 rule). An adaptive method is
+            ``torchdiffeq.odeint`` in a :class:`FunctionPhysics`.
         difference: If True, the output is the change of the state instead of the new state.
         gradient: Source of the gradient in X: ``"autograd"``, or ``"finite-difference"``, without
             second derivatives, which is several times faster if there are many substeps.
@@ -79,12 +74,7 @@ class ODEPhysics(Physics):
             unknowns = rhs.unknowns
             name = name or rhs.name
         super().__init__(unknowns=unknowns, inputs=inputs, name=name_of(rhs, name, "rhs"))
-        check_choice("method", method, (*FIXED_STEP, *ADAPTIVE_STEP))
-        if method in ADAPTIVE_STEP and find_spec("torchdiffeq") is None:
-            raise ImportError(
-                f'The method {method!r} needs torchdiffeq; run `pip install "gpadjust[ode]"`, or '
-                'take "rk4".'
-            )
+        check_choice("method", method, tuple(METHODS))
         check_choice("gradient", gradient, ("autograd", "finite-difference"))
         self.rhs, self.method, self.gradient = rhs, method, gradient
         self.step = checked_number("step", step, above=0)
@@ -115,16 +105,19 @@ class ODEPhysics(Physics):
                 )
             return rate
 
-        if self.method in FIXED_STEP:
-            end = _fixed(derivative, state, self.step / self.substeps, self.substeps, self.method)
-        else:
-            from torchdiffeq import odeint  # slow to import
-
-            times = torch.tensor([0.0, self.step]).to(state)
-            limits = {"max_num_steps": _MOST_STEPS}
-            _, end = odeint(
-                lambda _, s: derivative(s), state, times, method=self.method, options=limits
-            )
+        end = state
+        h = self.step / self.substeps
+        for _ in range(self.substeps):
+            # k_i = g(s + h sum_{j < i} a_ij k_j), and the new s = s + h sum_i b_i k_i
+            point = start = end
+            slopes = list[Tensor]()
+            for weights in METHODS[self.method]:
+                slopes.append(derivative(point))
+                point = start
+                for weight, slope in zip(weights, slopes, strict=True):
+                    if weight:
+                        point = point.add(slope, alpha=h * weight)
+            end = point
         return end - state if self.difference else end
 
     def of_rows(self, rows: Tensor) -> Tensor:
@@ -133,24 +126,3 @@ class ODEPhysics(Physics):
         if self.gradient == "autograd" or learns or not rows.requires_grad:
             return super().of_rows(rows)
         return FiniteDifferences.apply(rows, super().of_rows(rows.detach()), self)
-
-
-def _fixed(
-    derivative: Callable[[Tensor], Tensor], state: Tensor, h: float, number: int, method: str
-) -> Tensor:
-    """Return the state after a number of steps h of a Runge-Kutta method.
-
-    Source: Hairer, Norsett and Wanner (1993), section II.1.
-    """
-    for _ in range(number):
-        point = state
-        slopes = list[Tensor]()
-        for weights in FIXED_STEP[method]:
-            # k_i = g(s + h sum_{j < i} a_ij k_j); the last weights are those of the step
-            slopes.append(derivative(point))
-            point = state
-            for weight, slope in zip(weights, slopes, strict=True):
-                if weight:
-                    point = point.add(slope, alpha=h * weight)
-        state = point
-    return state

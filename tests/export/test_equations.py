@@ -202,7 +202,7 @@ CUT = {"a": Unknown(1.0, sd=1.0, bounds=(0.0, 2.0), function_of="x", between=(0.
 REFUSED = [
     (FunctionPhysics(pushed), {}, TypeError, "'pushed', a FunctionPhysics: expected equations"),
     (BlackBoxPhysics(pushed), {}, TypeError, "BlackBoxPhysics: expected equations"),
-    (ODEPhysics(pushed, 0.1, 1), {}, TypeError, "ODEPhysics by 'rk4': expected equations"),
+    (ODEPhysics(pushed, 0.1, 1), {}, TypeError, "ODEPhysics: expected equations"),
     (FormulaPhysics("a * x", ["x"], unknowns=CUT), {}, ValueError, "bounds cut off its prior"),
     (FormulaPhysics("x", ["x"]), {"parameters": True}, ValueError, "found none. Leave it out"),
     (PHYSICS["curves"], {"parameters": True}, ValueError, "found dry, drag, share"),
@@ -213,7 +213,7 @@ def test_what_is_not_written_is_refused_with_the_way_out():
     for physics, options, kind, words in REFUSED:
         with pytest.raises(kind, match=words):
             c_source(physics, "f", **options)
-    with pytest.raises(ValueError, match="that it was learnt with: leave it out"):
+    with pytest.raises(ValueError, match="fitted with these values of the parameters: leave it out"):
         c_source(learnt()[1], "f", parameters=True)
     with pytest.raises(ValueError, match="which have nothing else"):
         casadi_function(PHYSICS["rk4"], physics=pushed)

@@ -47,7 +47,9 @@ def test_at_each_point_it_has_its_prior(prior):
     coordinates = PRIORS[prior].coordinate(draws.friction(torch.tensor([0.0, 3.3, 4.0, 50.0])))
     torch.testing.assert_close(coordinates.mean(0), torch.zeros(4).double(), atol=0.06, rtol=0)
     torch.testing.assert_close(coordinates.std(0), torch.ones(4).double(), atol=0.06, rtol=0)
-    torch.testing.assert_close(unknowns.to_coordinates(unknowns.to_values(z)), z, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(
+        unknowns.to_coordinates(unknowns.to_values(z)), z, rtol=1e-6, atol=1e-6
+    )
 
 
 def test_between_the_knots_it_is_a_gaussian_process():
