@@ -17,7 +17,7 @@ from gpadjust.physics import (
     Unknown,
 )
 from gpadjust.states import StateSpec
-from tests.systems import normal, uniform
+from tests.systems import normal, refused, uniform
 
 OVER = {"function_of": "abs(v)", "between": (0.0, 6.0)}
 PRIORS = {
@@ -165,25 +165,24 @@ def test_least_squares_find_it():
     assert width < 0.05
 
 
-TABLE = [
-    ({"function_of": "v"}, "Expected of a function its variable and the range"),
+V = {"function_of": "v"}
+REFUSED = [
+    (V, "Expected of a function its variable and the range"),
     ({"between": (0.0, 1.0)}, "Expected of a function its variable and the range"),
-    ({"function_of": "v", "between": (1.0, 1.0)}, "the range of that"),
-    ({"function_of": "v", "between": (0.0, float("inf"))}, "the range of that"),
-    ({"function_of": "v", "between": (0, 1, 2)}, r"between as two numbers.*found \(0, 1, 2\)"),
-    ({"function_of": "v", "between": "01"}, "between as two numbers.*found '01'"),
+    ({**V, "between": (1.0, 1.0)}, "the range of that"),
+    ({**V, "between": (0.0, float("inf"))}, "the range of that"),
+    ({**V, "between": (0, 1, 2)}, r"between as two numbers.*found \(0, 1, 2\)"),
+    ({**V, "between": "01"}, "between as two numbers.*found '01'"),
     ({**OVER, "lengthscale": 0.1}, "0.05 of the range or more, found 0.1 of 6"),
     ({**OVER, "lengthscale": -1.0}, "lengthscale"),
 ]
 
 
 def test_bad_input_is_refused_with_the_way_out():
-    for options, words in TABLE:
-        with pytest.raises(ValueError, match=words):
-            Unknown(0.3, sd=0.1, **options)
-    with pytest.raises(TypeError, match="the name of a variable"):
-        Unknown(0.3, sd=0.1, function_of=3, between=(0.0, 1.0))
+    for options, words in REFUSED:
+        refused(ValueError, words, Unknown, 0.3, sd=0.1, **options)
+    refused(TypeError, "the name of a variable", Unknown, 0.3, sd=0.1, function_of=3)
     for variable in ("speed", "friction", "v +"):
         unknowns = {"friction": Unknown(0.3, sd=0.1, function_of=variable, between=(0.0, 1.0))}
-        with pytest.raises(ValueError, match=r"expected one of v, u|Expected a formula"):
-            FormulaPhysics("u - friction", ["v", "u"], unknowns=unknowns)
+        words = r"expected one of v, u|Expected a formula"
+        refused(ValueError, words, FormulaPhysics, "u - friction", ["v", "u"], unknowns=unknowns)
