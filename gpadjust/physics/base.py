@@ -96,17 +96,19 @@ class Physics(torch.nn.Module, ABC):
                 columns = columns.narrow(dim, 0, min(1, X.shape[dim]))
         if self.unknowns or parameters is not None:
             columns = self._with_parameters(columns, parameters)
-        shape = np.broadcast_shapes(X.shape[:-1], columns.shape[:-1])
-        rows = columns.flatten(0, -2)
+        shape = np.broadcast_shapes(X.shape[:-1], columns.shape[:-1])  # batch_shape x n
+        rows = columns.flatten(0, -2)  # N x (d + p)
         try:
             Y = self.of_rows(rows)
         except PhysicsError as error:
             if error.inputs is None:  # else the rows are those of a physics that this one calls
+                # The row that was evaluated for each one of X, of which some may be copies.
                 number = torch.arange(len(rows)).reshape(columns.shape[:-1]).expand(shape).flatten()
                 failed = {*error.rows}
                 error.rows = tuple(i for i, row in enumerate(number.tolist()) if row in failed)
                 error.inputs = rows.detach()[number[[*error.rows]]]
             raise
+        # The graph ends in the function, without which an optimiser would stay where it is.
         is_cut = rows.requires_grad and torch.is_grad_enabled() and not Y.requires_grad
         if is_cut and len(Y) and not self._has_warned:
             self._has_warned = True
@@ -129,7 +131,7 @@ class Physics(torch.nn.Module, ABC):
         columns = self._with_parameters(self.read(X), parameters)
         with torch.no_grad():
             Y = self._or_nan(columns)
-        Y = Y.where(Y.isfinite().all(-1, keepdim=True), torch.nan)
+        Y = Y.where(Y.isfinite().all(-1, keepdim=True), torch.nan)  # all outputs of a row, or none
         return Y.reshape(*columns.shape[:-1], Y.shape[-1])
 
     def read(self, X: Tensor) -> Tensor:
@@ -163,6 +165,7 @@ class Physics(torch.nn.Module, ABC):
         """Return :meth:`of_rows` without the memory, checked, in the dtype of the rows."""
         n = len(rows)
         try:
+            # Without parameters no frame for the arguments: f_p is called in loops.
             Y = self.evaluate(*(self._arguments(rows) if self.unknowns else (rows,)))
         except PhysicsError as error:
             if error.partial is not None:
@@ -194,7 +197,7 @@ class Physics(torch.nn.Module, ABC):
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         if not [*self.parameters(), *self.buffers()]:
-            return self
+            return self  # nothing that a fit could change
         memo[id(self)] = duplicate = copy(self)
         duplicate.__dict__.update(deepcopy(self.__dict__, memo))
         return duplicate
@@ -209,7 +212,9 @@ class Physics(torch.nn.Module, ABC):
     def _with_parameters(self, columns: Tensor, parameters: Tensor | None) -> Tensor:
         """Return ``... x n x (d + p)``, with parameters ``... x p`` at the end of each row."""
         p = len(self.unknowns)
-        values = torch.as_tensor(self.unknowns.guess if parameters is None else parameters)
+        if parameters is None:
+            parameters = self.unknowns.guess
+        values = torch.as_tensor(parameters)
         if values.shape[-1:] != (p,):
             raise ValueError(
                 f"Physics {self.name!r} has {p} unknown parameter(s) {', '.join(self.unknowns)}; "

@@ -93,7 +93,7 @@ class BlackBoxPhysics(Physics):
     def _gathered(self, results: list[NDArray[np.float64] | PhysicsError]) -> Tensor:
         """Return the outputs of rows ``(m,)`` as ``N x m``; raise an error if some rows failed."""
         m = next((len(y) for y in results if isinstance(y, np.ndarray)), 1)
-        Y = np.full((len(results), m), np.nan)
+        Y = np.full((len(results), m), np.nan)  # NaN where a row fails
         errors = dict[int, PhysicsError]()
         for i, y in enumerate(results):
             if isinstance(y, PhysicsError):
@@ -135,8 +135,7 @@ class BlackBoxPhysics(Physics):
 class RowMemo:
     """A dictionary of at most ``capacity`` input rows to output rows, which threads may share.
 
-    When new rows do not fit, it forgets all and begins again with these. Two threads may evaluate
-    the same row at the same moment. Copies and pickles of it are empty.
+    When new rows do not fit, it forgets all and begins again with these. Copies are empty.
     """
 
     def __init__(self, capacity: int = 100_000) -> None:
@@ -151,13 +150,10 @@ class RowMemo:
         return RowMemo, (self.capacity,)
 
     def recall(self, rows: Tensor, evaluate: Callable[[Tensor], Tensor]) -> Tensor:
-        """Return the values of rows ``N x d``, by a function of distinct rows if not remembered.
-
-        After a ``PhysicsError`` of it, the finite rows of the ``partial`` result are remembered.
-        """
+        """Return the values of rows ``N x d``, by a function of distinct rows if not remembered."""
         keys = row_keys(rows)
         if not keys:
-            return evaluate(rows)
+            return evaluate(rows)  # which sets the number of outputs
         remembered = self._rows  # to which other threads only add
         outputs = {key: remembered[key] for key in keys if key in remembered}
         places = {key: i for i, key in enumerate(keys) if key not in outputs}
@@ -166,7 +162,7 @@ class RowMemo:
             try:
                 values = evaluate(rows[[*places.values()]])
             except PhysicsError as error:
-                if error.partial is not None:
+                if error.partial is not None:  # rows that did not fail are remembered
                     good = error.partial.isfinite().all(-1)
                     self._store([new[i] for i in good.nonzero()], error.partial[good])
                 error.partial = None  # it has the distinct rows alone
@@ -183,7 +179,7 @@ class RowMemo:
         values = values.detach().clone()
         with self._lock:
             if len(self._rows) + len(keys) > self.capacity:
-                self._rows = {}
+                self._rows = {}  # a new dictionary, as other threads may read the old one
             self._rows.update(zip(keys[: self.capacity], values[: self.capacity], strict=True))
 
 
@@ -202,8 +198,7 @@ class FiniteDifferences(torch.autograd.Function):
         \frac{f_k(x + h_j e_j) - f_k(x - h_j e_j)}{2 h_j}
 
     ``FiniteDifferences.apply(rows, Y, physics, step)`` returns ``N x m`` outputs Y of the rows
-    ``N x (d + p)``, columns of X and parameters; the gradient is 0 by the latter. An error names
-    the rows around which the physics fails.
+    ``N x (d + p)``, columns of X and parameters; the gradient is 0 by the latter.
     """
 
     @staticmethod

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-_SHOWN = 5
+_SHOWN = 5  # rows
 _LONGEST = 500  # characters of a subprocess's stderr
 
 
@@ -32,7 +32,7 @@ class PhysicsError(RuntimeError):
     def __init__(
         self, message: str, rows: Iterable[int] = (), *, partial: Tensor | None = None
     ) -> None:
-        super().__init__(message)
+        super().__init__(message)  # alone, so that the error can be pickled
         self.rows: tuple[int, ...] = tuple(rows)
         self.inputs: Tensor | None = None
         self.partial = partial
@@ -40,8 +40,9 @@ class PhysicsError(RuntimeError):
     def __str__(self) -> str:
         lines = [str(self.args[0])]
         for position, row in enumerate(self.rows[:_SHOWN]):
-            values = "" if self.inputs is None else f": {self.inputs[position].tolist()}"
-            lines.append(f"  row {row}{values}")
+            lines.append(f"  row {row}")
+            if self.inputs is not None:
+                lines[-1] += f": {self.inputs[position].tolist()}"
         if len(self.rows) > _SHOWN:
             lines.append(f"  and {len(self.rows) - _SHOWN} more")
         return "\n".join(lines)
@@ -50,8 +51,8 @@ class PhysicsError(RuntimeError):
 class PhysicsWarning(UserWarning):
     """A physics is obviously off at five or more observations: a factor, sign, offset, or scaling.
 
-    ``gpadjust.validation.compare``, the report and ``CKARegressor`` give it, except of a physics
-    with unknown parameters; fits of dynamics, if the transitions do not determine one of these.
+    Comparisons, the report and ``CKARegressor`` give it, except of a physics with unknown
+    parameters; fits of dynamics, if the transitions do not determine one of these.
     """
 
 

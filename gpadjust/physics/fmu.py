@@ -34,16 +34,7 @@ _callbacks: list[Any] = []
 
 
 class FMU:
-    """An FMU, unpacked into a temporary folder, with one instance, which is reset between uses.
-
-    Args:
-        path: The file.
-        kind: ``"CoSimulation"``, ``"ModelExchange"``, or None for the first that it has.
-
-    Raises:
-        ImportError: Without FMPy.
-        ValueError: If it is not an FMU of FMI 2 or 3, of this kind and this platform.
-    """
+    """An FMU, unpacked into a temporary folder, with one instance, which is reset between uses."""
 
     def __init__(self, path: Path, kind: str | None) -> None:
         try:
@@ -71,6 +62,7 @@ class FMU:
         self.name = path.name
         self.kind: str = kind or kinds[0]
         self.variables = {variable.name: variable for variable in description.modelVariables}
+        # The derivatives name the states that they are of.
         self.states: list[str] = [u.variable.derivative.name for u in description.derivatives]
         step = getattr(description.coSimulation, "fixedInternalStepSize", None)
         self.step = float(step or getattr(description.defaultExperiment, "stepSize", None) or 0.0)
@@ -120,23 +112,13 @@ class FMU:
         step: float | None,
         tolerance: float,
     ) -> Array:
-        """Return outputs ``N x m`` at the times.
-
-        Args:
-            values: Start values and parameters by name.
-            start: The time at which the simulation begins.
-            times: ``N`` times from the start on, in any order.
-            outputs: The names of the outputs.
-            signals: Inputs by name with their ``"time"``; each holds until the next.
-            step: The communication step of co-simulation. None: the FMU's own, or none.
-            tolerance: The relative tolerance.
-        """
+        """Return outputs ``N x m`` at ``N`` times, given start values, parameters and signals."""
         from fmpy import simulate_fmu
 
         changes = signals["time"]
-        end = stop = float(times.max())
+        end = stop = float(times.max())  # the latter limits the steps of a solver
         points = np.unique([start, *times, *changes[(start < changes) & (changes < end)]])
-        step = step or self.step or end - start or 1.0
+        step = step or self.step or end - start or 1.0  # of one moment any step will do
         if self.kind == "ModelExchange":
             step = (end - start) / _INTERVALS or 1.0
             stop = start + _LONGER * (end - start)
@@ -170,13 +152,13 @@ class FMU:
                     output=names,
                 )
             except BaseException as error:
-                failure = self._errors[0] if self._errors else error
+                failure = [*self._errors, error][0]
                 self._free()
                 failure.stderr = "; ".join(_messages)  # type: ignore[attr-defined]
                 raise failure from None
         for name, value in values.items():
             first = float(results[name][0])
-            if not abs(first - value) <= 1e-6 * max(1.0, abs(value)):
+            if not abs(first - value) <= 1e-6 * max(1.0, abs(value)):  # NaN is refused, too
                 raise ValueError(
                     f"{name!r} is {first:g} after its start value was set to {value:g}: the FMU "
                     "computes it or rounds it. Name the parameter of its start value, or take "
@@ -215,7 +197,7 @@ class FMU:
         try:
             if self._instance is not None:
                 self._instance.reset()
-        except Exception:
+        except Exception:  # an FMU may not be able to
             self._free()
         if self._instance is None:
             self._instance = self._instantiated()
@@ -255,12 +237,14 @@ class FMU:
     def _set_states_at_first_update(self, values: Mapping[str, float]) -> None:
         """Let the first update of discrete states set continuous states by name, too."""
         fmu = self._instance
-        name = "newDiscreteStates" if hasattr(fmu, "newDiscreteStates") else "updateDiscreteStates"
+        name = "newDiscreteStates"  # of FMI 2
+        if not hasattr(fmu, name):
+            name = "updateDiscreteStates"
         update = getattr(fmu, name)
 
         def first() -> Any:
             delattr(fmu, name)
-            while update()[0]:
+            while update()[0]:  # until discrete states stay as they are
                 pass
             fmu.enterContinuousTimeMode()
             x = (c_double * len(self.states))()

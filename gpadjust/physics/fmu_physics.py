@@ -148,10 +148,12 @@ class FMUPhysics(BlackBoxPhysics):
         if "time" in self.input_names:
             others = np.delete(rows, self.input_names.index("time"), axis=1)
             number = np.unique(others, axis=0, return_inverse=True)[1].ravel()
+        # Rows of each simulation.
         groups = [np.flatnonzero(number == i) for i in range(number.max() + 1)]
         outputs = Parallel()(delayed(call_row)(self.simulate, rows[group]) for group in groups)
         results = dict[int, NDArray[np.float64] | PhysicsError]()
         for group, y in zip(groups, outputs, strict=True):
+            # N m outputs, the m of each row in turn
             parts = [y] * len(group) if isinstance(y, PhysicsError) else np.split(y, len(group))
             results |= dict(zip(group.tolist(), parts, strict=True))
         return self._gathered([results[i] for i in range(len(rows))])
@@ -163,7 +165,7 @@ class FMUPhysics(BlackBoxPhysics):
             if not np.isfinite(column).all():
                 raise ValueError(f"expected finite numbers for {name!r}, found {column.tolist()}")
         values = dict(zip(names, rows[0].tolist(), strict=True))
-        times = np.tile(self.times, (len(rows), 1))
+        times = np.tile(self.times, (len(rows), 1))  # N x times of a row
         if values.pop("time", None) is not None:
             times = rows[:, [self.input_names.index("time")]]
         if times.min() < self.start_time:
@@ -198,6 +200,7 @@ class FMUPhysics(BlackBoxPhysics):
             if name in self.unknowns and not self.unknowns[name].unit:
                 unit = variable.unit or getattr(variable.declaredType, "unit", None) or ""
                 self.unknowns[name] = replace(self.unknowns[name], unit=unit)
+        # A step that forgets a state is not a step of the system.
         hidden = [name for name in fmu.states if name not in names]
         if hidden and self.times and {*inputs} & {*self.output_names} & {*fmu.states}:
             raise ValueError(

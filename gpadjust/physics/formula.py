@@ -124,6 +124,7 @@ class FormulaPhysics(Physics):
             )
         self.variables = {}
         numbers = [*self.columns, *(name for name in declared if name in self.unknowns)]
+        # The variable of a function is a formula, too, of numbers alone.
         for function in self.unknowns.functions:
             text = declared[function].function_of
             (self.variables[function],) = variable = parse(text)
@@ -171,7 +172,8 @@ def symbol(name: str) -> str:
     """Return the name of a column in a formula: without its unit, and ``_`` for other marks."""
     name = normalize("NFKC", name.partition("[")[0].strip())  # as Python does with names
     bare = re.sub(r"\W+", "_", name).strip("_")
-    bare = f"{bare}_" if iskeyword(bare) or bare == "pi" else bare
+    if iskeyword(bare) or bare == "pi":
+        return f"{bare}_"
     return f"_{bare}" if bare[:1].isdigit() else bare
 
 
@@ -192,6 +194,7 @@ def parse(formula: str) -> list[ast.expr]:
     """
     of_sheet = formula.strip().startswith("=")
     text = formula.strip().removeprefix("=").strip()
+    # 0,5*MAX(a;b) is 0.5*MAX(a,b)
     continental = re.sub(r"(?<=\d),(?=\d)", ".", text).replace(";", ",")
     errors: list[Exception] = []
     for reading in dict.fromkeys((text, continental)):
@@ -222,6 +225,7 @@ def _parsed(text: str, of_sheet: bool) -> list[ast.expr]:
         raise ValueError("a formula with = in front has one output")
     one = torch.ones(())
     for output in outputs:
+        # A trial with ones finds parts that are not allowed, and wrong numbers of arguments.
         value_of(output, dict.fromkeys(_names(outputs), one), _OF_TORCH, one.new_tensor)
         for node in ast.walk(output):
             if isinstance(node, ast.Call):
@@ -263,11 +267,7 @@ def value_of(
 ) -> Any:
     """Return the value of a part of a formula, in tensors or in numbers of another kind.
 
-    Args:
-        node: The part.
-        values: Values of the names except ``pi``.
-        functions: Functions of such numbers.
-        number: Makes such a number.
+    ``number`` makes such a number of a float, ``functions`` are of such numbers.
     """
     function: Callable[..., Any] | None = None
     match node:
@@ -288,8 +288,10 @@ def value_of(
             return number(math.pi)
         case ast.Call(func=ast.Name(id=name), args=parts, keywords=[]):
             short = name.lower().rstrip("_")
-            name = name if name in NAMES else _OF_SHEETS.get(short, short)
-            function = functions.get(name) if name in NAMES else None
+            if name not in NAMES:
+                name = _OF_SHEETS.get(short, short)
+            if name in NAMES:
+                function = functions.get(name)
     if function is None:
         raise ValueError(f"{ast.unparse(node)!r} is not a part of a formula")
     return function(*(value_of(part, values, functions, number) for part in parts))

@@ -38,6 +38,7 @@ def import_path(physics: Physics | Callable[[Tensor], Tensor]) -> str | None:
         settings = {"formula": physics.formula, "columns": physics.columns, "name": physics.name}
         return f"{_FORMULA}{json.dumps({**settings, 'unknowns': unknowns})}"
     path = _path_of(physics)
+    # Settings of a FunctionPhysics would be lost with the path of its function.
     if path or type(physics) is not FunctionPhysics or physics.unknowns or physics.inputs:
         return path
     return _path_of(physics.function)
@@ -58,7 +59,7 @@ def physics_from_path(path: str) -> Physics:
         try:
             settings = json.loads(path.removeprefix(_FORMULA))
             unknowns = {name: Unknown(**prior) for name, prior in settings["unknowns"].items()}
-            return FormulaPhysics(**{**settings, "unknowns": unknowns})
+            return FormulaPhysics(**{**settings, "unknowns": unknowns})  # which checks all of it
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"Found {path!r} as a formula, which is damaged: {error}") from error
     module, _, name = path.partition(":")

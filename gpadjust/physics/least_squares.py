@@ -27,10 +27,8 @@ def least_squares_fit(misfit: Callable[[Tensor], Tensor], draws: Tensor) -> Tens
     would fit best if it were linear. While such draws promise a better fit, further fits begin
     with the best parameters so far, except for coordinates of a draw that are far from the middle.
 
-    Args:
-        misfit: Residuals ``k x n`` at coordinates ``k x p``, N(0, I) by the prior; NaN where the
-            physics fails.
-        draws: Draws from the prior, ``N x p``.
+    ``misfit`` returns residuals ``k x n`` at coordinates ``k x p``, N(0, I) by the prior, NaN where
+    the physics fails; ``draws`` are from the prior, ``N x p``.
     """
     ranked = draws[_linear_misfit(misfit, draws).argsort()]
     begins = torch.cat([torch.zeros_like(draws[:1]), ranked[: _FITS - 1]])
@@ -40,10 +38,11 @@ def least_squares_fit(misfit: Callable[[Tensor], Tensor], draws: Tensor) -> Tens
         for begin in begins:
             z, left = _fit(misfit, begin)
             # Minus the log density, n log(noise) + |z|^2 / 2.
-            size = math.log(max(left, 1e-12)) if left < math.inf else math.inf
+            size = math.log(max(left, 1e-12))
             cost = misfit(z.unsqueeze(0)).numel() * size + 0.5 * float(z.square().sum())
             if cost < lowest:
                 best, lowest, least = z, cost, left
+        # Far coordinates of a draw, near ones of the best fit.
         mixed = torch.where(draws.abs() < _MIDDLE, best, draws)
         promised = _linear_misfit(misfit, mixed)
         number = int((promised < _PROMISING * least).sum())
@@ -56,7 +55,7 @@ def _slopes(misfit: Callable[[Tensor], Tensor], z: Tensor) -> Tensor:
     steps = _DIFFERENCE * torch.eye(z.shape[-1]).to(z)
     moved = torch.cat([z.unsqueeze(1) + steps, z.unsqueeze(1) - steps], 1)
     up, down = misfit(moved.flatten(0, 1)).unflatten(0, moved.shape[:2]).chunk(2, 1)
-    return ((up - down) / (2 * _DIFFERENCE)).mT
+    return ((up - down) / (2 * _DIFFERENCE)).mT  # (r(z + h e_j) - r(z - h e_j)) / (2 h)
 
 
 def _linear_misfit(misfit: Callable[[Tensor], Tensor], z: Tensor) -> Tensor:
@@ -91,7 +90,9 @@ def _fit(misfit: Callable[[Tensor], Tensor], z: Tensor) -> tuple[Tensor, float]:
         return torch.cat([slopes.nan_to_num() / noise, eye]).numpy()
 
     noise = noise_at(z)
-    for _ in range(_ROUNDS if 0 < noise < math.inf else 0):
+    if not 0 < noise < math.inf:
+        return z, noise
+    for _ in range(_ROUNDS):
         options = {"args": (_FIRM * noise,), "max_nfev": _STEPS, "ftol": 1e-4, "xtol": 1e-6}
         z = torch.as_tensor(least_squares(residuals, z.numpy(), jacobian, **options).x)
         before = noise

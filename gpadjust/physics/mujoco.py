@@ -116,13 +116,17 @@ class MujocoPhysics(BlackBoxPhysics):
         actuators = names_of(self.model, "actuator")
         controls = getattr(self.model, "actuator_ctrlnum", np.ones(len(actuators), int))
         drives = _parts(actuators, controls, "actuator")
-        self.actions = tuple(drives if actions is None else actions)
+        if actions is None:
+            actions = drives
+        self.actions = tuple(actions)
         for action in self.actions:
             if action not in drives:
                 raise ValueError(f"There is no actuator {action!r}; expected some of {drives}.")
         self._driven = [drives.index(action) for action in self.actions]
         length = float(self.model.opt.timestep)
-        self.step = length if step is None else checked_number("step", step, above=0)
+        self.step = length
+        if step is not None:
+            self.step = checked_number("step", step, above=0)
         self.num_steps = round(self.step / length)
         if self.num_steps < 1 or abs(self.step / length - self.num_steps) > 1e-6:
             raise ValueError(f"step must be a multiple of the model's {length:g} s; found {step}.")
@@ -141,6 +145,7 @@ class MujocoPhysics(BlackBoxPhysics):
                 "The model has no actuator, and a StateSpec has an action: add a <motor> to the "
                 "MJCF, and let its action be zero."
             )
+        # A hinge that turns all around has the same state after a turn.
         is_hinge = self.model.jnt_type == int(_mujoco().mjtJoint.mjJNT_HINGE)
         is_angle = is_hinge & (self.model.jnt_limited == 0)
         angles = [name for name, turns in zip(self.states, is_angle, strict=False) if turns]
@@ -154,8 +159,9 @@ class MujocoPhysics(BlackBoxPhysics):
         Raises:
             ValueError: If it is another number of values.
         """
-        guess = self.unknowns.guess
-        values = guess if parameters is None else checked_tensor("parameters", parameters)
+        guess = values = self.unknowns.guess
+        if parameters is not None:
+            values = checked_tensor("parameters", parameters)
         if values.shape != guess.shape:
             raise ValueError(
                 f"parameters: expected a value of each of {', '.join(self.unknowns) or 'none'}, of "
@@ -179,7 +185,8 @@ class MujocoPhysics(BlackBoxPhysics):
         all_names = names_of(self.model, "sensor")
         stages = self.model.sensor_needstage
         of_states = [name for name, s in zip(all_names, stages, strict=True) if s < with_forces]
-        names = of_states if names is None else names
+        if names is None:
+            names = of_states
         for name in names:
             if name not in of_states:
                 raise ValueError(
@@ -211,6 +218,7 @@ class MujocoPhysics(BlackBoxPhysics):
                 f"{rows.shape[1]} column(s)"
             )
         values = parameters[0].rows if parameters else np.empty((len(rows), 0))
+        # Rows of the same parameters share a compiled model.
         distinct, number = np.unique(values, axis=0, return_inverse=True)
         compiled = [self._models.compiled(value) for value in distinct]
         models = [compiled[i] for i in number.ravel()]
@@ -251,6 +259,7 @@ class MujocoPhysics(BlackBoxPhysics):
         threads = self.threads or torch.get_num_threads()
         threads = min(threads, 1 + n * num_steps // _WORTH)
         pool = Rollout(nthread=threads if threads > 1 else 0)
+        # Rows in a call of the pool, which Ctrl-C cannot end.
         at_once = max(1, _AT_ONCE // num_steps)
         with silenced(), pool:
             self._data += [MjData(self.model) for _ in range(threads - len(self._data))]
@@ -261,6 +270,7 @@ class MujocoPhysics(BlackBoxPhysics):
                     nstep=num_steps,
                 )
                 ends[part], sensors[part] = path[:, -1], readings[:, -1]
+        # Time began at one step, and would have counted all of them.
         ends[ends[:, 0] < (num_steps + 0.5) * length] = np.nan
         return ends[:, 1:], sensors
 

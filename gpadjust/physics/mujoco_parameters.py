@@ -63,11 +63,7 @@ class Place(NamedTuple):
 class ModelParameters:
     """The unknown parameters of a model, and the compiled model of some values.
 
-    Args:
-        model: The compiled model of the MJCF as it is.
-        spec: Makes a new ``MjSpec`` of the MJCF; None if there is no MJCF.
-        unknowns: The unknown parameters.
-        edit: As of :class:`~gpadjust.physics.MujocoPhysics`.
+    ``spec`` makes a new ``MjSpec`` of the MJCF; it is None if there is no MJCF.
     """
 
     def __init__(
@@ -84,7 +80,7 @@ class ModelParameters:
         self._data: Any = None  # slower to make than a model
         self.places: dict[str, Place] = {}
         for name, unknown in unknowns.items():
-            place = self._place(name)
+            place = self._place(name)  # None of one that the edit reads
             if place is not None:
                 self._check(name, place, unknown)
                 self.places[name] = place
@@ -98,7 +94,7 @@ class ModelParameters:
 
     def compiled(self, values: Array) -> Any:
         """Return the model with these values of the parameters, ``p``."""
-        key = values.tobytes()
+        key = values.tobytes()  # equal parameters alone are equal bytes
         with silenced():
             if key not in self._models:
                 if len(self._models) >= min(_MOST_MODELS, _MOST_BYTES // self.model.nbuffer):
@@ -135,7 +131,7 @@ class ModelParameters:
         spec = self.spec()
         if self.edit is not None:
             self.edit(spec, named)
-        model = spec.compile()
+        model = spec.compile()  # which computes the inertia of geoms
         if shapes:
             _deform(spec, model, shapes)
             model = spec.compile()
@@ -178,6 +174,7 @@ class ModelParameters:
             raise ValueError(f"{name!r} needs the MJCF or an MjSpec; found an MjModel.")
         if place.kind == "body" and element.mass[0] == 0:
             raise ValueError(f"{name!r}: the body has no mass in the MJCF; give it some.")
+        # A servo's force has its gains in the bias, - kp q - kv v.
         feedback = {"kp": slice(1, 2), "kv": slice(1, 3)}.get(place.field)
         if feedback is not None and not element.biasprm[feedback].any():
             raise ValueError(f"{name!r}: the actuator is no servo of that; its gain is its gear.")

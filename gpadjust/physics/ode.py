@@ -122,6 +122,7 @@ class ODEPhysics(Physics):
 
     def of_rows(self, rows: Tensor) -> Tensor:
         """Return the outputs of rows, with the gradient in X by differences if that was chosen."""
+        # Differences in X would cut off the gradient of the parameters of a module.
         learns = any(p.requires_grad for p in self.parameters())
         if self.gradient == "autograd" or learns or not rows.requires_grad:
             return super().of_rows(rows)

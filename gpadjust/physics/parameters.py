@@ -27,7 +27,7 @@ class ParameterValues(dict[str, Any]):
         super().__init__((name, rows[..., i]) for i, name in enumerate(names))
         self.rows = rows
         self.functions = dict[str, Curve]()
-        if names and isinstance(names, Unknowns):
+        if names and isinstance(names, Unknowns):  # a function has no row of its own
             for name, (unknown, columns) in names.functions.items():
                 self.functions[name] = Curve(unknown, self._of_function(columns))
 
@@ -111,6 +111,7 @@ class PhysicsParameters(ParameterValues, Display):
         return [
             name
             for name, z in coordinates.items()
+            # N(0, 1) by the prior
             if z.std(correction=0) > _AS_WIDE and z.mean().abs() < _AS_FAR
         ]
 

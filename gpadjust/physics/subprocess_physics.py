@@ -68,6 +68,7 @@ class SubprocessPhysics(BlackBoxPhysics):
         super().__init__(
             self._run, unknowns=unknowns, batched=False, gradient=None, inputs=inputs, name=name
         )
+        # A part is a text, and the name and format of a placeholder or None.
         parts = [part for text in (*command, stdin) for part in Formatter().parse(text)]
         fields = {field for _, field, _, _ in parts if field is not None}
         unclear = {field for field in fields if not field.isdigit()} - {*names, *self.unknowns}
@@ -86,7 +87,7 @@ class SubprocessPhysics(BlackBoxPhysics):
 
     def _run(self, row: NDArray[np.float64], *parameters: Mapping[str, float]) -> ArrayLike:
         """Return the outputs at a row of inputs."""
-        values = row.tolist()
+        values = row.tolist()  # whose texts have all digits
         if self.names and len(self.names) != len(values):
             raise ValueError(f"expected names of all columns, or inputs=, found {self.names}")
         named = dict(zip(self.names, values, strict=False))
@@ -126,7 +127,7 @@ def _printed(command: list[str], stdin: str, timeout: float | None) -> str:
         try:
             printed, written = process.communicate(stdin, timeout)
         except BaseException:
-            if os.name == "posix":  # with all that it has started
+            if os.name == "posix":  # with all that it has started, as one session
                 with suppress(ProcessLookupError):
                     os.killpg(process.pid, signal.SIGKILL)
             process.kill()

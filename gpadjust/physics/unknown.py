@@ -90,6 +90,7 @@ class Unknown:
                 object.__setattr__(self, name, value)
         low, high = _pair("bounds", self.bounds)
         object.__setattr__(self, "bounds", (low, high))
+        # sd, factor or two finite bounds: one of them is the prior.
         spreads = (self.sd is not None) + (self.factor is not None)
         is_one_prior = spreads == 1 or (spreads == 0 and math.isfinite(high - low))
         is_positive = self.factor is None or self.guess > 0
@@ -110,8 +111,9 @@ class Unknown:
                 'Expected of a function its variable and the range of that, function_of="speed", '
                 f"between=(0.0, 20.0); found {self!r}."
             )
-        scale = _OF_RANGE * (high - low) if self.lengthscale is None else self.lengthscale
-        scale = checked_number("lengthscale", scale, above=0)
+        scale = _OF_RANGE * (high - low)
+        if self.lengthscale is not None:
+            scale = checked_number("lengthscale", self.lengthscale, above=0)
         if (high - low) / scale > _MOST_KNOTS / _KNOTS:
             raise ValueError(
                 f"Expected a lengthscale of {_KNOTS / _MOST_KNOTS:g} of the range or more, found "
@@ -141,7 +143,7 @@ class Unknown:
             text = f"{self.guess:g}, factor {self.factor:g}"
         else:
             return limits
-        return text if self.bounds == _UNBOUNDED else f"{text}, {limits}"
+        return text + f", {limits}" * (self.bounds != _UNBOUNDED)
 
     def value(self, z: Tensor) -> Tensor:
         """Return the value at a coordinate, which is standard normal by the prior."""
@@ -154,10 +156,7 @@ class Unknown:
         return value.clamp(low, high)  # beyond there are rounding errors
 
     def quantile(self, z: Any, exp: Callable[[Any], Any], cdf: Callable[[Any], Any]) -> Any:
-        """Return the value at a coordinate by the prior that bounds do not cut off.
-
-        The functions, of numbers of any kind, are the exponential and the normal distribution's.
-        """
+        """Return the value at a coordinate of any kind of number, by the prior without a cut."""
         if self.sd is not None:
             return self.guess + self.sd * z  # N(guess, sd^2)
         if self.factor is not None:
@@ -174,7 +173,9 @@ class Unknown:
         """Return the coordinate at which :meth:`value` is this one."""
         below, above = self._tails
         z = self._without_bounds(value)
-        return z if not self.is_cut else ndtri((ndtr(z) - below) / (above - below))
+        if self.is_cut:
+            z = ndtri((ndtr(z) - below) / (above - below))
+        return z
 
     def _without_bounds(self, value: Tensor) -> Tensor:
         """Return the coordinate by the prior that bounds do not cut off."""
@@ -200,6 +201,7 @@ class Unknown:
         if self.between is None or self.lengthscale is None:
             return torch.empty(0, dtype=torch.float64)
         low, high = self.between
+        # Rounding would add a knot to a range of whole lengthscales.
         number = 1 + math.ceil(_KNOTS * (high - low) / self.lengthscale - 1e-9)
         return torch.linspace(low, high, number, dtype=torch.float64)
 
@@ -215,10 +217,7 @@ class Unknown:
         return torch.cholesky_inverse(self.root)
 
     def weights(self, x: Tensor) -> Tensor:
-        """Return the weights of the coordinates at the knots in those at ``x``, ``... x k``.
-
-        :math:`k(x, Z) k(Z, Z)^{-1}`, the mean of a Gaussian process given its values at Z.
-        """
+        """Return :math:`k(x, Z) k(Z, Z)^{-1}`, weights of the coordinates at knots Z, at ``x``."""
         low, high = self.between or (0.0, 0.0)
         return self._correlation(x.clamp(low, high)) @ self.precision.to(x)
 
@@ -231,24 +230,14 @@ class Unknown:
 
 @dataclass(frozen=True, repr=False)
 class Knot(Unknown):
-    """The value of an unknown function at one of its knots: a number of a table of its own.
-
-    Args:
-        function: The name of the function.
-        at: The knot.
-    """
+    """The value of an unknown function, by its name, at one of its knots: a number of a table."""
 
     function: str = ""
     at: float = 0.0
 
 
 class Curve:
-    """An unknown function by its values at the knots.
-
-    Args:
-        unknown: Its prior.
-        values: ``... x k``, a tensor or an array.
-    """
+    """An unknown function by its prior and its values at the knots, ``... x k``."""
 
     def __init__(self, unknown: Unknown, values: Any) -> None:
         self.unknown, self.values = unknown, values
@@ -264,10 +253,7 @@ class Curve:
 
 
 class Unknowns(dict[str, Unknown]):
-    """The unknown parameters of a physics, by name, and their coordinates.
-
-    Of a function there is a :class:`Knot` for each value, ``p`` parameters in all.
-    """
+    """The ``p`` unknown parameters of a physics, by name; of a function a :class:`Knot` each."""
 
     def __init__(self, unknowns: Mapping[str, Unknown]) -> None:
         is_mapping = isinstance(unknowns, Mapping)
@@ -280,6 +266,7 @@ class Unknowns(dict[str, Unknown]):
             if isinstance(unknown, Knot):
                 self[name] = unknown
                 continue
+            # "link1.mass" of a simulator is an item, "mass" an attribute, too.
             is_path = isinstance(name, str) and ("." in name.strip(".") or "[" in name)
             is_word = isinstance(name, str) and name.isidentifier() and not iskeyword(name)
             is_attribute = is_word and not name.startswith("_") and name != "rows"
@@ -296,11 +283,7 @@ class Unknowns(dict[str, Unknown]):
 
     @classmethod
     def together(cls, several: Iterable[Unknowns]) -> Unknowns:
-        """Return the parameters of several physics; equal names mean one parameter.
-
-        Raises:
-            ValueError: If priors of one name differ.
-        """
+        """Return the parameters of several physics, one for each name, or raise a ValueError."""
         union: dict[str, Unknown] = {}
         for unknowns in several:
             for name, unknown in unknowns.items():
@@ -325,8 +308,8 @@ class Unknowns(dict[str, Unknown]):
         if self.functions:
             raise ValueError(
                 f"The unknown {min(self.functions)!r} is a function. A parameter here is a number; "
-                "functions are for FormulaPhysics, ODEPhysics and Python "
-                "functions. Leave out function_of and between."
+                "functions are for FormulaPhysics, ODEPhysics and Python functions. Leave out "
+                "function_of and between."
             )
 
     @property
