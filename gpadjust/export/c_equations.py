@@ -16,6 +16,7 @@ from gpadjust.physics.ode import METHODS
 from gpadjust.physics.unknown import Unknown
 
 _OTHER_NAMES = {"abs": "fabs", "ln": "log", "min": "fmin", "max": "fmax"}  # in C
+# z(x) = sum_i w_i k(x, x_i) with Matern's kernel (5/2), and the value at this coordinate.
 _CURVE = Template("""\
 static double $name(double x)
 {
@@ -30,7 +31,9 @@ static double $name(double x)
     return $value;
 }
 """)
+# C has no function of this name; 0 has the sign 0.
 _SIGN = "static double {}_sign(double x) {{ return (x > 0.0) - (x < 0.0); }}\n"
+# Stage k ends at s + h sum_{j <= k} a_kj g_j, the last one is the step.
 _STEPS = Template("""\
     static const double weights[$stages][$stages] = $weights;
     double at[] = $x, start[$states], slopes[$stages][$states];
@@ -133,7 +136,7 @@ def physics_lines(
     If its parameters are free, it is ``NAME(x, parameters, mean)``.
     """
     formula, ode = equations.formula, equations.ode
-    curves = list[str]()
+    curves = list[str]()  # functions of C, of unknown functions
 
     def curve(function: str, unknown: Unknown, weights: Tensor) -> Callable[[str], str]:
         curves.append(_curve(f"{name}_of_{function}", unknown, weights))
@@ -144,7 +147,7 @@ def physics_lines(
     if not free:
         values = [*map(_number, equations.parameters.tolist())]
     outputs = equations.values(columns, values, _functions(name), _number, curve)
-    yield from curves
+    yield from curves  # before the function that calls them
     if any(f"{name}_sign(" in output for output in outputs):
         yield _SIGN.format(name)
     declared = "const double *x" + ", const double *parameters" * free
@@ -156,6 +159,7 @@ def physics_lines(
     yield from (*_assigned("rates", outputs, free), "}\n", head)
     x = [f"x[{i}]" for i in equations.inputs]
     stages = METHODS[ode.method]
+    # A table of C is a rectangle.
     weights = [[*row, *[0.0] * (len(stages) - len(row))] for row in stages]
     yield _STEPS.substitute(
         stages=len(stages),

@@ -32,16 +32,20 @@ _KERNELS = {  # of r, the squared distance in lengthscales
     "matern5/2": "(1.0 + sqrt(5.0 * r) + 5.0 / 3.0 * r) * exp(-sqrt(5.0 * r))",
     "constant": "0.0",
 }
+# Of each Gaussian g: its features phi, and the sum of its mean.
 _BEGIN = Template("""\
     double each[DRAWS * OUTPUTS]$spread;
     for (int g = 0; g < DRAWS * OUTPUTS; g++) {
         double phi[FEATURES] = {0.0}, sum = 0.0$prior;
 """)
+# f m_g, and the basis b = f - center
 _TERM = Template("""\
         const double f$t = $basis, b$t = f$t - center$t[g]; /* $name */
         sum += f$t * mean$t[g];
 """)
+# b^2 (a + c), as k(x, x) = 1
 _PRIOR = Template("        prior += b$t * b$t * (amplitude$t[g] + constant$t[g]);\n")
+# phi_i = b(x) b(x_i) (a k(x, x_i) + c)
 _KERNEL = Template("""\
         for (int i = 0; i < FEATURES; i++) {
             double r = 0.0;
@@ -52,6 +56,7 @@ _KERNEL = Template("""\
             phi[i] += b$t * at_points$t[g][i] * (amplitude$t[g] * $kernel + constant$t[g]);
         }
 """)
+# phi = b sqrt(2 a / D) (cos w^T x, sin w^T x), D / 2 frequencies
 _WAVES = Template("""\
         for (int i = 0; i < $half; i++) {
             double angle = 0.0;
@@ -60,10 +65,12 @@ _WAVES = Template("""\
             phi[$first + $half + i] = b$t * sqrt(amplitude$t[g] / $half) * sin(angle);
         }
 """)
+# scale (prior mean + phi^T w)
 _MEAN = """\
         for (int i = 0; i < FEATURES; i++) sum += phi[i] * weights[g][i];
         each[g] = scale[g] * sum;
 """
+# |L^-1 phi|^2, by columns of L
 _SOLVED = """\
         if (!variance) continue;
         const double *column = lower[g];
@@ -74,6 +81,7 @@ _SOLVED = """\
             for (int i = 0; i < FEATURES - k; i++) phi[k + i] -= column[i] * u;
         }
 """
+# |R phi|^2, by columns of R
 _MULTIPLIED = """\
         if (!variance) continue;
         const double *column = lower[g];
@@ -83,6 +91,7 @@ _MULTIPLIED = """\
         for (int i = 0; i < FEATURES; i++) squares += u[i] * u[i];
 """
 _SPREAD = Template("        spread[g] = scale[g] * scale[g] * ($left + noise[g]);\n")
+# The mean of a mixture, and its variance: the mean variance, and the variance of the means.
 _MIXED = """\
     }
     for (int j = 0; j < OUTPUTS; j++) {
@@ -248,7 +257,7 @@ def _body(s: FiniteSum, variance: bool) -> Iterator[str]:
     has_prior = variance and s.is_remainder
     spread = ", spread[DRAWS * OUTPUTS]" * variance
     yield _BEGIN.substitute(spread=spread, prior=", prior = 0.0" * has_prior)
-    first = 0
+    first = 0  # feature of a term of waves
     for t, term in enumerate(s.terms):
         basis = "1.0"
         if term.column is not None:
@@ -298,6 +307,7 @@ def _braces(values: list[Any]) -> str:
     """Return nested numbers in C, a few in a line."""
     if isinstance(values[0], list):
         return "{" + ",\n".join(map(_braces, values)) + "}"
+    # repr has all digits of a float64
     parts = [", ".join(map(repr, values[i : i + 6])) for i in range(0, len(values), 6)]
     return "{" + ",\n ".join(parts) + "}"
 
@@ -318,7 +328,7 @@ def _step(
     yield "{"
     x = [(*state, *action)[i] for i in spec.model_columns]
     yield f"    const double x[{len(x)}] = {braced(x)};"
-    values = ["x"]
+    values = ["x"]  # arguments of the model's function
     if within:
         read = [(*state, *action)[i] for i in spec.physics_columns]
         yield f"    const double read[{len(read)}] = {braced(read)};"

@@ -46,7 +46,7 @@ def physics_function(equations: Equations, name: str, free: bool = False) -> Any
 
     ode = equations.ode
     x = ca.SX.sym("x", 1 + max(equations.inputs))
-    parameters = ca.SX(equations.parameters.tolist())
+    parameters = ca.SX(equations.parameters.tolist())  # numbers, unless they are free
     arguments = {"x": x}
     if free:
         arguments["parameters"] = parameters = ca.SX.sym("parameters", parameters.numel())

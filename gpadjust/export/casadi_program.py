@@ -89,7 +89,7 @@ def casadi_function(
     dynamics = fitted if isinstance(fitted, LearnedDynamics) else None
     if dynamics is None:
         arguments = {"x": ca.MX.sym("x", len(model.data.input_names))}
-        x = read = ca.vertsplit(arguments["x"])
+        x = read = ca.vertsplit(arguments["x"])  # inputs of the model, and of f_p
     else:
         spec = dynamics.spec
         sizes = {"state": spec.state_dim, "action": spec.action_dim}
@@ -97,7 +97,7 @@ def casadi_function(
         state, action = map(ca.vertsplit, arguments.values())
         x = [(*state, *action)[i] for i in spec.model_columns]
         read = [(*state, *action)[i] for i in spec.physics_columns]
-        count = count // m * len(spec.moving)
+        count = count // m * len(spec.moving)  # f_p moves states that the model does not predict
     if physics is None and (within := equations_within(model)):
         parts = [physics_function(equations, "f_p") for equations in within]
         values = ca.vertcat(*(part(ca.vertcat(*read)) for part in parts))
@@ -138,7 +138,7 @@ def _moments(s: FiniteSum, m: int, x: list[Any], f_p: list[Any]) -> tuple[list[A
         inputs.append((value - offset) / size)
     z = ca.horzcat(*inputs)
     means, variances = list[Any](), list[Any]()
-    for g in range(len(s.weights)):
+    for g in range(len(s.weights)):  # output g % m of draw g // m
         scale = float(s.scale[g])
         features, start, prior = _features(s, g, g % m, z, f_p)
         means.append(scale * (start + ca.dot(_matrix(s.weights[g]), features)))

@@ -22,19 +22,12 @@ OfPhysics = Physics | IdentifiedDynamics | PhysicsDynamics
 
 
 class Equations(NamedTuple):
-    """A formula, or the steps of an equation of motion whose right-hand side is one.
-
-    Args:
-        formula: The formula.
-        parameters: Values of its ``p`` unknown parameters.
-        ode: The equation of motion; None of a formula alone.
-        inputs: The columns of x that it reads.
-    """
+    """A formula, or the steps of an equation of motion whose right-hand side is one."""
 
     formula: FormulaPhysics
-    parameters: Tensor
-    ode: ODEPhysics | None
-    inputs: Sequence[int]
+    parameters: Tensor  # values of its p unknown parameters
+    ode: ODEPhysics | None  # None of a formula alone
+    inputs: Sequence[int]  # the columns of x that it reads
 
     def values(
         self,
@@ -82,13 +75,8 @@ def _equations(physics: Physics, parameters: Tensor | None = None) -> Equations 
 
 
 def equations_of(fitted: OfPhysics, free: bool) -> Equations:
-    """Return the equations of a physics, or of dynamics that are one.
-
-    Raises:
-        TypeError: If it is not written in formulas, with the way out.
-        ValueError: If parameters are to be free, and there is none, or one is a function.
-    """
-    physics, parameters = fitted, None
+    """Return the equations of a physics, or of dynamics that are one, or raise an error."""
+    physics, parameters = fitted, None  # a physics itself is at its guesses
     if not isinstance(fitted, Physics):
         physics, parameters = fitted.physics, fitted.physics_parameters.center
     equations = _equations(physics, parameters)
@@ -123,11 +111,7 @@ def equations_within(model: GP) -> list[Equations] | None:
 
 
 def exportable(fitted: Any, name: Any, free: bool = False) -> Any:
-    """Return a fitted object, of an identification its dynamics.
-
-    Raises:
-        ValueError: If a program cannot have the name, or parameters of a model are to be free.
-    """
+    """Return a fitted object, of an identification its dynamics, or raise a ValueError."""
     if not (isinstance(name, str) and name.isidentifier() and name.isascii()):
         raise ValueError(f"Expected name as one of C, such as 'pump', got {name!r}.")
     if not isinstance(fitted, GP | Physics | Dynamics):

@@ -37,33 +37,19 @@ class TermTables(NamedTuple):
     Its basis b is 1, or a column of f_p over a unit, less a center. Its features are :math:`b(x)
     \, b(x_i) (a\, k(x, x_i) + c)` at points :math:`x_i`; or, of waves, :math:`b(x) \sqrt{2 a / D}`
     times cosines and sines, and :math:`b(x) \sqrt c`.
-
-    Args:
-        name: As of :meth:`~gpadjust.CKA.term`.
-        column: The column of f_p that is the basis of each output, ``m``; None for 1.
-        unit, center: Of the basis, ``G``.
-        mean: The prior mean of g, ``G``.
-        kind: ``"rbf"``, ``"matern1/2"``, ``"matern3/2"``, ``"matern5/2"``, ``"waves"``, or
-            ``"constant"`` without a kernel; empty of a term without features.
-        amplitude: a, ``G``.
-        constant: c, the prior variance of an unknown constant, ``G``.
-        rate: One over the lengthscales, ``G x d``.
-        at_points: The basis at the points, ``G x P``; of waves ``G x 0``.
-        frequencies: Of waves, ``D/2 x d``; else None.
-        has_constant: If True, there is an unknown constant.
     """
 
     name: str
-    column: Tensor | None
-    unit: Tensor
-    center: Tensor
-    mean: Tensor
-    kind: str
-    amplitude: Tensor
-    constant: Tensor
-    rate: Tensor
-    at_points: Tensor
-    frequencies: Tensor | None
+    column: Tensor | None  # of f_p, the basis of each output, m; None for 1
+    unit: Tensor  # of the basis, G
+    center: Tensor  # of the basis, G
+    mean: Tensor  # of g by the prior, G
+    kind: str  # a name of _PROFILES, "waves", "constant", or nothing without features
+    amplitude: Tensor  # a, G
+    constant: Tensor  # c, the prior variance of an unknown constant, G
+    rate: Tensor  # one over the lengthscales, G x d
+    at_points: Tensor  # b(x_i), G x P; of waves G x 0
+    frequencies: Tensor | None  # of waves, D/2 x d
     has_constant: bool
 
 
@@ -74,30 +60,18 @@ class FiniteSum(NamedTuple):
     :math:`\varphi(x)` of all terms, the mean of one is that of the prior, plus :math:`\varphi^T w`.
     With :math:`u = L^{-1} \varphi`, or :math:`u = R \varphi` of a model of inducing points, its
     variance is that of the prior, less :math:`|u|^2`; of waves it is :math:`|u|^2` itself.
-
-    Args:
-        columns: The ``d`` inputs of the kernels.
-        num_physics: Number of columns of f_p.
-        terms: The terms.
-        scale: The unit of the targets, ``G``.
-        noise: The variance of the noise in the model's units, ``G``.
-        points: Points of the kernels, ``1 x P x d``, or those of each output, ``m x P x d``.
-        weights: w, ``G x P``.
-        lower: L, or R, lower triangles ``G x P x P``, or None.
-        is_solved: If True, ``lower`` is L.
-        is_remainder: If True, the variance is that of the prior, less :math:`|u|^2`.
     """
 
-    columns: list[Column]
-    num_physics: int
+    columns: list[Column]  # the d inputs of the kernels
+    num_physics: int  # columns of f_p
     terms: list[TermTables]
-    scale: Tensor
-    noise: Tensor
-    points: Tensor
-    weights: Tensor
-    lower: Tensor | None
-    is_solved: bool
-    is_remainder: bool
+    scale: Tensor  # the unit of the targets, G
+    noise: Tensor  # its variance in the model's units, G
+    points: Tensor  # of the kernels, 1 x P x d, or m x P x d of each output
+    weights: Tensor  # w, G x P
+    lower: Tensor | None  # L or R, lower triangles G x P x P; None without variance
+    is_solved: bool  # lower is L
+    is_remainder: bool  # the variance is that of the prior, less |u|^2
 
     @property
     def least(self) -> float:
@@ -124,8 +98,8 @@ def finite_sum(model: GP, variance: bool, observation_noise: bool) -> FiniteSum:
     if model.batch_shape:
         raise ValueError("Cannot export fantasies, a batch of models: export each of them.")
     conditioning = model.conditioning()
-    X = model.data.X[:2]
-    shape, values = conditioning.alpha.shape[:-1], conditioning.train.values
+    X = model.data.X[:2]  # enough to see whether the noise depends on x
+    shape, values = conditioning.alpha.shape[:-1], conditioning.train.values  # S x m
     places = model.places(X, values)
     noise = model.noise.variance(values, places)
     obstacle = _obstacle(model, places.f, noise, observation_noise)
@@ -186,7 +160,7 @@ def _tables(term: Term, model: GP, conditioning: Conditioning, is_remainder: boo
         """Return a number of each Gaussian, ``G``."""
         return (one * number).reshape(-1)
 
-    kind = ""
+    kind = ""  # no features
     amplitude: Tensor = 0.0 * one
     rate, frequencies = one.expand(-1, -1, d), None
     if term.kernel is not None:
@@ -210,7 +184,7 @@ def _tables(term: Term, model: GP, conditioning: Conditioning, is_remainder: boo
     if weight is None:  # inducing points do not show the term
         kind = ""
         weight = one
-    at_points = weight.expand(S, m, n) * conditioning.observed
+    at_points = weight.expand(S, m, n) * conditioning.observed  # 0 where an output is missing
     if not is_remainder:
         at_points = at_points[..., :0]
     column: Tensor | None = None
@@ -218,7 +192,7 @@ def _tables(term: Term, model: GP, conditioning: Conditioning, is_remainder: boo
     center: Any = 0.0
     constant: Any = 0.0
     if term.physics is not None:
-        column = torch.arange(m) + m * term.physics
+        column = torch.arange(m) + m * term.physics  # of all physics side by side
         unit = model.unit
     if term.has_center:
         center = model.term_sum.center(term, train.values)

@@ -31,7 +31,7 @@ class _Variable(NamedTuple):
 
     name: str
     unit: str
-    causality: str
+    causality: str  # "input", "output" or "local"
     start: float | None  # of what can be set
 
 
@@ -90,6 +90,7 @@ def export_fmu(
         )
     code = c_source(fitted, name, variance=variance, observation_noise=observation_noise)
     signature = rf"^void {name}_(predict|step)\(([^)]*)\)"
+    # The arguments of the program are the groups of variables.
     ((function, text),) = re.findall(signature, code, re.MULTILINE)
     arguments = re.findall(r"\*(\w+)", text)
     spec = getattr(fitted, "spec", None)  # of dynamics
@@ -109,10 +110,11 @@ def export_fmu(
             raise ValueError(
                 f"Expected different names of inputs and outputs; found two {variable!r}."
             )
-    read = [*range(places["f_p"])]
+    read = [*range(places["f_p"])]  # places that f_p reads
     if spec:
         read = [*range(places["mean"], places["variance"]), *read]
         read = [read[i] for i in spec.physics_columns]
+    # The same model has the same identity, which a simulator compares with that of the library.
     guid = hashlib.sha256(f"{code}{physics}".encode()).hexdigest()[:32]
     interface = files("gpadjust.export").joinpath("fmu.c").read_text(encoding="utf-8")
     code += Template(interface).substitute(
@@ -191,6 +193,7 @@ def _description(name: str, guid: str, variables: list[_Variable], step: float |
     able["canHandleVariableCommunicationStepSize"] = str(step is None).lower()
     interface = SubElement(root, "CoSimulation", able, modelIdentifier=name)
     SubElement(SubElement(interface, "SourceFiles"), "File", name=f"{name}.c")
+    # FMI 2.0, section 2.2: units, variables, and the dependencies of outputs.
     units = sorted({variable.unit for variable in variables} - {""})
     if units:
         defined = SubElement(root, "UnitDefinitions")

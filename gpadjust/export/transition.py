@@ -17,12 +17,12 @@ def target_columns(
     """Return columns of f_p in the model, made of next values as by :class:`TargetPhysics`."""
     spec, targets = dynamics.spec, dynamics.targets
     columns = []
-    for first in range(0, len(f_p), len(spec.moving)):
+    for first in range(0, len(f_p), len(spec.moving)):  # of each physics
         for i, place in zip(spec.predicted, targets.predicted, strict=True):
             change = f_p[first + place] - state[i]
             if spec.states[i] in spec.angles:
                 change = wrap(change)
-            if targets.target != "difference":
+            if targets.target != "difference":  # the next value, in the turn of the state
                 change = state[i] + change
             columns.append(change)
     return columns
@@ -33,7 +33,7 @@ def next_state(
 ) -> list[Any]:
     """Return the next state by the model, as :meth:`StateSpec.complete` makes it."""
     spec = dynamics.spec
-    following = [*state]
+    following = [*state]  # exogenous entries stay
     for i, value in zip(spec.predicted, outputs, strict=True):
         following[i] = value
         if dynamics.targets.target == "difference":
@@ -64,7 +64,7 @@ def _remembered(spec: StateSpec, state: Scalars, action: Scalars, following: Sca
 def next_variance(dynamics: LearnedDynamics, outputs: Scalars, zero: Any) -> list[Any]:
     """Return the variance of the next state, as :meth:`StateSpec.complete_variance` makes it."""
     spec = dynamics.spec
-    variances = [zero] * spec.state_dim
+    variances = [zero] * spec.state_dim  # of entries that the action or the state determine
     for i, variance in zip(spec.predicted, outputs, strict=True):
         variances[i] = variance
     for name, velocity in spec.integrated.items():
