@@ -35,15 +35,6 @@ SMALL = {  # options, the number of runs, and a word of the tables
         "two tanks (2 runs)",
     ),
     "first": (["--only", "truth", "--trials", "1"], 2, "the true system, trial 1"),
-    "planning": (
-        [
-            *("--only", "sensors", "phy", "gp", "--trials", "2", "--episode-length", "10"),
-            *("--sequences", "12", "--elites", "3", "--first-sequences", "12"),
-            *("--rounds", "0", "--first-rounds", "0"),
-        ],
-        4,
-        "median of a trial",
-    ),
 }
 
 
@@ -60,7 +51,7 @@ def test_a_small_run(name, ran):
 
 def test_each_experiment_has_a_small_run():
     """The others have one beside their own tests."""
-    assert EXPERIMENTS.keys() - SMALL == {"arm", "cartpole", "reaching", "nuts", "simulators"}
+    assert EXPERIMENTS.keys() - SMALL == {"arm", "cartpole", "nuts", "simulators"}
 
 
 def test_steels_are_in_five_folds():
