@@ -76,10 +76,12 @@ def _equations(physics: Physics, parameters: Tensor | None = None) -> Equations 
 
 def equations_of(fitted: OfPhysics, free: bool) -> Equations:
     """Return the equations of a physics, or of dynamics that are one, or raise an error."""
-    physics, parameters = fitted, None  # a physics itself is at its guesses
-    if not isinstance(fitted, Physics):
-        physics, parameters = fitted.physics, fitted.physics_parameters.center
-    equations = _equations(physics, parameters)
+    if isinstance(fitted, Physics):
+        physics = fitted
+        equations = _equations(physics)
+    else:
+        physics = fitted.physics
+        equations = _equations(physics, fitted.physics_parameters.center)
     if equations is None:
         raise TypeError(
             f"Cannot export the physics {physics.name!r}, a {type(physics).__name__}: expected "

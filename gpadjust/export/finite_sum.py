@@ -255,9 +255,11 @@ def _columns(transform: Any, num_inputs: int) -> list[Column]:
     for part in parts:
         is_plain = [column[1:] == Column(0)[1:] for column in columns]
         if isinstance(part, AngleInput) and all(is_plain[i] for i in part.columns):
-            pairs = [[c._replace(function=name) for name in ("sin", "cos")] for c in columns]
-            both = [pairs[i] if i in part.columns else [c] for i, c in enumerate(columns)]
-            columns = [column for several in both for column in several]
+            replaced = list[Column]()
+            for i, column in enumerate(columns):
+                functions = ("sin", "cos") if i in part.columns else (column.function,)
+                replaced += [column._replace(function=function) for function in functions]
+            columns = replaced
         elif type(part) in (AffineInputTransform, Normalize, InputStandardize):
             offset = torch.zeros(len(columns), dtype=torch.float64)
             size = torch.ones_like(offset)
