@@ -39,23 +39,18 @@ def casadi_function(
     :func:`~gpadjust.records.identify` finds, ``state`` and ``action`` to ``mean``.
 
     Args:
-        fitted: The model, dynamics that have learnt, an identification, or a physics.
+        fitted: As of :func:`c_source`.
         name: The name of the function.
         physics: f_p in CasADi, to take the place of that argument: a ``casadi.Function``, or one of
             Python, from the column of the inputs of f_p to the column of its outputs.
         variance: If True, there is a variance.
         observation_noise: If True, the variance includes that of the noise.
-        parameters: Of a physics, or dynamics that are one: if True, its unknown parameters are the
-            last argument, ``parameters``, in the order of the physics. Default: they are at their
-            posterior means, of a physics itself at the guesses.
+        parameters: As of :func:`c_source`; they are the last argument.
 
     Raises:
         ImportError: Without CasADi.
-        TypeError: If ``fitted`` is another object, or a physics that is not written in formulas.
-        ValueError: If C cannot have the ``name``, the model is not a finite sum, or ``parameters``
-            are not for it, with the way out; or if ``physics`` returns another number of values
-            than the model's physics.
-        RuntimeError: If the dynamics have learnt nothing yet.
+        TypeError, ValueError, RuntimeError: As :func:`c_source`; a ValueError also if ``physics``
+            returns another number of values than the model's physics.
 
     Example:
         >>> import torch

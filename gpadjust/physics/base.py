@@ -147,8 +147,19 @@ class Physics(torch.nn.Module, ABC):
             )
         return X if self.inputs is None else X[..., list(self.inputs)]
 
+    @property
+    def column_names(self) -> Sequence[str]:
+        """Names of the columns of X, if the physics has some."""
+        return ()
+
     def check_names(self, names: Sequence[str]) -> None:
-        """Raise a ValueError if the physics names its columns, and the data have other names."""
+        """Raise a ValueError if data have columns of these names in another order."""
+        places = {name: i for i, name in enumerate(self.column_names)}
+        if any(places.get(name, i) != i for i, name in enumerate(names)):
+            raise ValueError(
+                f"Physics {self.name!r} has the columns {', '.join(places)}, and the data have "
+                f"{', '.join(names)}: give it the columns in the order of the data."
+            )
 
     def read_rows(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """Return rows for :meth:`of_rows` of rows ``N x d`` and values that contain its own."""

@@ -23,14 +23,13 @@ class FMUPhysics(BlackBoxPhysics):
     r"""Physics given as an FMU of FMI 2 or 3, the file in which simulation programs export a model.
 
     Each row is a simulation by `FMPy <https://github.com/CATIA-Systems/FMPy>`_ from ``start_time``
-    to the last of the ``times``, with the row's inputs as start values and the outputs at the end:
+    to the last of the ``times``, with the row's inputs as start values:
 
     - A simulator: inputs are parameters and constant inputs of the FMU.
     - Dynamics: inputs are states and actions, outputs the states, ``times`` the control step. A
       state can be set if its start value can, or by model exchange.
-    - Values over time: one of the inputs is ``"time"``, the FMU's independent variable. Rows that
-      differ in it alone share a simulation, and fail together; they agree with single ones within
-      the tolerance.
+    - Values over time: one of the inputs is ``"time"``. Rows that differ in it alone share a
+      simulation, and fail together; they agree with single ones within the tolerance.
 
     Names are those of the FMU, such as ``"wall[1].T"``. Rows run in parallel, in processes, and are
     remembered as of a :class:`~gpadjust.BlackBoxPhysics`.
@@ -40,7 +39,7 @@ class FMUPhysics(BlackBoxPhysics):
         inputs: The variable of each column of X, or ``"time"``.
         outputs: The variables that are the outputs.
         times: When outputs are read, in the FMU's time; of several times all outputs at the first,
-            then at the second. Not with ``"time"``.
+            then at the second.
         start_values: Values of further variables, at the beginning.
         signals: Inputs of the FMU over time: a frame or mapping with ``"time"``, ascending, and a
             column for each of them. A value holds until the next, and the first before.
@@ -125,14 +124,10 @@ class FMUPhysics(BlackBoxPhysics):
         self._check(opened(path, kind))
         self.num_outputs = len(self.output_names) * max(1, len(self.times))
 
-    def check_names(self, names: Sequence[str]) -> None:
-        """Raise a ValueError if data have columns of these names in another order."""
-        places = {name: i for i, name in enumerate(self.input_names)}
-        if self.inputs is None and any(places.get(n, i) != i for i, n in enumerate(names)):
-            raise ValueError(
-                f"{self.path.name} has the inputs {', '.join(self.input_names)}, and the data have "
-                f"{', '.join(names)}: name the inputs in the order of the data."
-            )
+    @property
+    def column_names(self) -> Sequence[str]:
+        """Names of the columns of X, unless it reads some of them."""
+        return self.input_names if self.inputs is None else ()
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """Return the outputs of simulations; an error of single rows contains those of others."""

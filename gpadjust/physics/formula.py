@@ -134,15 +134,14 @@ class FormulaPhysics(Physics):
                     f"{', '.join(numbers)}, or a formula of these."
                 )
 
+    @property
+    def column_names(self) -> Sequence[str]:
+        """Names of the columns of X."""
+        return self.columns
+
     def check_names(self, names: Sequence[str]) -> None:
         """Raise a ValueError if these are the names of the columns in another order."""
-        symbols = tuple(map(symbol, names))
-        places = {name: i for i, name in enumerate(self.columns)}
-        if any(places.get(name, i) != i for i, name in enumerate(symbols)):
-            raise ValueError(
-                f"The formula {self.formula!r} has the columns {', '.join(self.columns)}, and the "
-                f"data have {', '.join(symbols)}: give it the columns in the order of the data."
-            )
+        super().check_names([*map(symbol, names)])
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """Return the values of the formula, ``N x m``."""

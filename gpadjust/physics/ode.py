@@ -83,7 +83,7 @@ class ODEPhysics(Physics):
         self.difference = difference
 
     def check_names(self, names: Sequence[str]) -> None:
-        """Raise a ValueError if the equations are a text, and data have other columns."""
+        """Raise a ValueError if the equations are a text, and data have another order."""
         if isinstance(self.rhs, FormulaPhysics):
             self.rhs.check_names(names)
 

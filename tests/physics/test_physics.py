@@ -259,75 +259,42 @@ def test_functions_of_numpy_and_torch_are_told_apart():
     assert array_physics(physics, ARRAY) is physics
 
 
-def no_argument(X):
-    raise KeyError("no array") if isinstance(X, np.ndarray) else IndexError("no tensor")
+def test_refusals():
+    def no_argument(X):
+        raise KeyError("no array") if isinstance(X, np.ndarray) else IndexError("no tensor")
 
-
-REFUSED = [
-    *(
-        (TypeError, f"inputs must be a whole number; found {inputs[0]!r}", {"inputs": inputs})
-        for inputs in ([0.5], "a")
-    ),
-    (ValueError, "inputs is empty", {"inputs": []}),
-    *(
-        (ValueError, "Unknown gradient", {"gradient": gradient})
-        for gradient in ("autograd", 1, square)
-    ),
-    *(
-        (ValueError, "fd_step must be finite and above 0", {"fd_step": step})
-        for step in (0.0, -1.0, float("nan"))
-    ),
-    (TypeError, "callable; found list", {"function": []}),
-    *(
-        (TypeError, rf"floating-point.*found {found}", lambda X=X: FunctionPhysics(square)(X))
-        for X, found in (([[1.0]], "list"), (torch.tensor([[1]]), "torch.int64"))
-    ),
-    *(
-        (
-            ValueError,
-            re.escape(f"batch_shape x n x d; found torch.float64, {shape}"),
-            lambda shape=shape: FunctionPhysics(square)(normal(*shape)),
-        )
-        for shape in ((3,), (3, 0))
-    ),
-    *(
-        (
-            ValueError,
-            rf"inputs=\(0, {i}\); found torch.float64, \(5, 2\)",
-            lambda i=i: FunctionPhysics(square, inputs=[0, i])(normal(5, 2)),
-        )
-        for i in (2, -3)
-    ),
-    (TypeError, "abstract", Physics),
-    (TypeError, "callable; found float", lambda: FunctionPhysics(1.0)),
-    *(
-        (
-            TypeError,
-            f"found {found}.*torch function.*ODEPhysics.*BlackBoxPhysics",
-            lambda thing=thing: as_physics(thing),
-        )
-        for thing, found in (
-            (3.0, "a float"),
-            ([torch.sin], "a list"),
-            (None, "a NoneType"),
-            (torch.nn.Tanh, "a type, <class.*Tanh"),
-        )
-    ),
-    *(
-        (TypeError, "Physics or a callable", lambda thing=thing: array_physics(thing, ARRAY))
-        for thing in (3, "cka", CalibratedPhysics)
-    ),
-    (
-        PhysicsError,
-        r"(?s)'no_argument'.*KeyError: 'no array'.*IndexError: no ten",
-        lambda: array_physics(no_argument, ARRAY),
-    ),
-]
-
-
-@pytest.mark.parametrize(("error", "words", "call"), REFUSED)
-def test_refusals(error, words, call):
-    if isinstance(call, dict):
-        refused(error, words, BlackBoxPhysics, **{"function": square, **call})
-    else:
-        refused(error, words, call)
+    plain = FunctionPhysics(square)
+    for options, error, says in (
+        ({"inputs": [0.5]}, TypeError, "inputs must be a whole number; found 0.5"),
+        ({"inputs": "a"}, TypeError, "inputs must be a whole number; found 'a'"),
+        ({"inputs": []}, ValueError, "inputs is empty"),
+        *(({"gradient": g}, ValueError, "Unknown gradient") for g in ("autograd", 1, square)),
+        *(
+            ({"fd_step": step}, ValueError, "fd_step must be finite and above 0")
+            for step in (0.0, -1.0, float("nan"))
+        ),
+        ({"function": []}, TypeError, "callable; found list"),
+    ):
+        refused(error, says, BlackBoxPhysics, **{"function": square, **options})
+    for X in ([[1.0]], torch.tensor([[1]])):
+        refused(TypeError, r"floating-point.*found (list|torch.int64)", plain, X)
+    for shape in ((3,), (3, 0)):
+        says = re.escape(f"batch_shape x n x d; found torch.float64, {shape}")
+        refused(ValueError, says, plain, normal(*shape))
+    for column in (2, -3):
+        says = rf"inputs=\(0, {column}\); found torch.float64, \(5, 2\)"
+        refused(ValueError, says, FunctionPhysics(square, inputs=[0, column]), normal(5, 2))
+    refused(TypeError, "abstract", Physics)
+    refused(TypeError, "callable; found float", FunctionPhysics, 1.0)
+    for thing, found in (
+        (3.0, "a float"),
+        ([torch.sin], "a list"),
+        (None, "a NoneType"),
+        (torch.nn.Tanh, "a type, <class.*Tanh"),
+    ):
+        says = f"found {found}.*torch function.*ODEPhysics.*BlackBoxPhysics"
+        refused(TypeError, says, as_physics, thing)
+    for thing in (3, "cka", CalibratedPhysics):
+        refused(TypeError, "Physics or a callable", array_physics, thing, ARRAY)
+    says = r"(?s)'no_argument'.*KeyError: 'no array'.*IndexError: no ten"
+    refused(PhysicsError, says, array_physics, no_argument, ARRAY)
