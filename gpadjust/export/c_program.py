@@ -166,7 +166,8 @@ def c_source(
     is_argument = within is None  # f_p of the function
     within = within or []
     dynamics = fitted if isinstance(fitted, LearnedDynamics) else None
-    about = _about(model, terms, bool(within), dynamics, observation_noise)
+    spec = getattr(dynamics, "spec", None)
+    about = [*_about(model, terms.num_physics, bool(within), spec, observation_noise)]
     outputs = ["double *mean", *["double *variance"] * variance]
     f_p = ["const double *f_p"] * (is_argument or (bool(within) and dynamics is not None))
     body = "".join(_body(terms, variance))
@@ -174,7 +175,13 @@ def c_source(
         body = "".join(f"    {line}\n" for line in _own_f_p(within, name, "x")) + body
     tables = {n: t for n, t in _tables(terms).items() if re.search(rf"\b{n}\[", body)}
     about.append(f"Numbers in tables: {sum(table.numel() for table in tables.values())}.")
-    sizes = _sizes(terms, model.num_outputs)
+    sizes = {
+        "INPUTS": len(terms.columns),
+        "OUTPUTS": model.num_outputs,
+        "DRAWS": len(terms.weights) // model.num_outputs,
+        "FEATURES": terms.weights.shape[-1],
+        "POINT_SETS": len(terms.points),
+    }
     static = "static " * (dynamics is not None)
     lines = [
         f"enum {{ {', '.join(f'{n} = {size}' for n, size in sizes.items())} }};",
@@ -202,42 +209,20 @@ def _own_f_p(within: list[Equations], name: str, x: str) -> Iterator[str]:
     yield from (f"{name}_f_p{i}({x}, f_p + {i * size});" for i in range(len(within)))
 
 
-def _about(
-    model: GP,
-    terms: FiniteSum,
-    is_within: bool,
-    dynamics: LearnedDynamics | None,
-    observation_noise: bool,
-) -> list[str]:
-    """Return lines on the content of the file."""
+def _about(model: GP, num_physics: int, is_within: bool, spec: Any, noise: bool) -> Iterator[str]:
+    """Yield lines on the content of the file."""
     place = ", which is in this file" * is_within
-    lines = [
-        f"{model!r}. Made by gpadjust; numbers are in the units of the data.",
-        f"x: {', '.join(model.data.input_names)}.",
-        f"f_p: {terms.num_physics} values that the physics returns at x{place}.",
-    ]
+    yield f"{model!r}. Made by gpadjust; numbers are in the units of the data."
+    yield f"x: {', '.join(model.data.input_names)}."
+    yield f"f_p: {num_physics} values that the physics returns at x{place}."
     if model.physics_parameters:
         means = model.physics_parameters.mean.tolist()
-        lines.append(parameters_text(model.physics_parameters, means))
-    if dynamics is not None and dynamics.spec.step is not None:
-        lines.append(f"A step lasts {dynamics.spec.step!r}.")
-    noise = "with" * observation_noise or "without"
-    return [
-        *lines,
-        f"mean: {', '.join(model.data.output_names)}.",
-        f"variance: in their square, {noise} the noise; NULL if it is not wanted.",
-    ]
-
-
-def _sizes(s: FiniteSum, num_outputs: int) -> dict[str, int]:
-    """Return the sizes of the tables."""
-    return {
-        "INPUTS": len(s.columns),
-        "OUTPUTS": num_outputs,
-        "DRAWS": len(s.weights) // num_outputs,
-        "FEATURES": s.weights.shape[-1],
-        "POINT_SETS": len(s.points),
-    }
+        yield parameters_text(model.physics_parameters, means)
+    if spec is not None and spec.step is not None:
+        yield f"A step lasts {spec.step!r}."
+    yield f"mean: {', '.join(model.data.output_names)}."
+    with_noise = "with" * noise or "without"
+    yield f"variance: in their square, {with_noise} the noise; NULL if it is not wanted."
 
 
 def _tables(s: FiniteSum) -> dict[str, Tensor]:
@@ -335,7 +320,8 @@ def _step(
         yield from (f"    {line}" for line in _own_f_p(within, name, "read"))
     if num_physics:
         f_p = entries("f_p", num_physics // m * len(spec.moving))
-        columns = target_columns(dynamics, state, f_p, _wrapped)
+        wrap = lambda angle: Text(f"atan2(sin{angle}, cos{angle})")  # noqa: E731
+        columns = target_columns(dynamics, state, f_p, wrap)
         yield f"    const double columns[{num_physics}] = {braced(columns)};"
         values.append("columns")
     has_variance = "double *variance" in arguments
@@ -351,7 +337,3 @@ def _step(
         variances = next_variance(dynamics, entries("spread", m), Text("0.0"))
         yield from (f"    variance[{i}] = {value};" for i, value in enumerate(variances))
     yield "}"
-
-
-def _wrapped(angle: Text) -> Text:
-    return Text(f"atan2(sin{angle}, cos{angle})")

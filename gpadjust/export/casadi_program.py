@@ -175,18 +175,16 @@ def _features(s: FiniteSum, g: int, j: int, z: Any, f_p: list[Any]) -> tuple[Any
             waves += [basis * math.sqrt(constant)] * term.has_constant
         elif term.kind:
             # b(x) b(x_i) (a k(x, x_i) + c)
-            squares = _squares(s.points[j % len(s.points)], term.rate[g], z)
+            points = s.points[j % len(s.points)]
+            rate = term.rate[g]
+            # squared distances in lengthscales, a column
+            u = _matrix(points * rate) - ca.repmat(z * _matrix(rate).T, len(points), 1)
+            squares = ca.sum2(u**2)
             kernel = amplitude * _kernel(term.kind, squares) + constant
             kernels = kernels + basis * _matrix(term.at_points[g]) * kernel
     if waves:
         return ca.vertcat(*waves), mean, variance
     return kernels, mean, variance
-
-
-def _squares(points: Tensor, rate: Tensor, z: Any) -> Any:
-    """Return squared distances to points ``P x d``, in lengthscales, a column."""
-    u = _matrix(points * rate) - ca.repmat(z * _matrix(rate).T, len(points), 1)
-    return ca.sum2(u**2)
 
 
 def _kernel(kind: str, squares: Any) -> Any:

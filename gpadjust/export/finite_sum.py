@@ -81,9 +81,7 @@ class FiniteSum(NamedTuple):
 
 def model_of(fitted: Any) -> GP:
     """Return a model, or that of dynamics; a TypeError if it is neither."""
-    model = fitted
-    if isinstance(fitted, LearnedDynamics):
-        model = fitted.model
+    model = fitted.model if isinstance(fitted, LearnedDynamics) else fitted
     if not isinstance(model, GP):
         raise TypeError(
             "Expected a CKA, RRA, PhysicsMeanGP, ScaleGP or ZeroMeanGP, or LearnedDynamics of one, "

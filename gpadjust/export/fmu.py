@@ -189,8 +189,8 @@ def _description(name: str, guid: str, variables: list[_Variable], step: float |
     """Return modelDescription.xml."""
     about = {"modelName": name, "guid": guid, "generationTool": "gpadjust"}
     root = Element("fmiModelDescription", about, fmiVersion="2.0")
-    able = {"canGetAndSetFMUstate": "true"}
-    able["canHandleVariableCommunicationStepSize"] = str(step is None).lower()
+    any_step = {"canHandleVariableCommunicationStepSize": str(step is None).lower()}
+    able = {"canGetAndSetFMUstate": "true", **any_step}
     interface = SubElement(root, "CoSimulation", able, modelIdentifier=name)
     SubElement(SubElement(interface, "SourceFiles"), "File", name=f"{name}.c")
     # FMI 2.0, section 2.2: units, variables, and the dependencies of outputs.
@@ -202,7 +202,7 @@ def _description(name: str, guid: str, variables: list[_Variable], step: float |
     if step is not None:
         SubElement(root, "DefaultExperiment", startTime="0", stepSize=repr(step))
     listed = SubElement(root, "ModelVariables")
-    is_continuous = step is None
+    variability = "discrete" if step else "continuous"
     for i, variable in enumerate(variables):
         about = {"name": variable.name, "valueReference": str(i), "causality": variable.causality}
         value = {"unit": variable.unit} if variable.unit else {}
@@ -212,8 +212,8 @@ def _description(name: str, guid: str, variables: list[_Variable], step: float |
             initial = "exact"
         if variable.causality != "input":
             about["initial"] = initial
-        about["variability"] = "continuous" if is_continuous else "discrete"
-        SubElement(SubElement(listed, "ScalarVariable", about), "Real", value)
+        entry = SubElement(listed, "ScalarVariable", about, variability=variability)
+        SubElement(entry, "Real", value)
     structure = SubElement(root, "ModelStructure")
     outputs = [i for i, variable in enumerate(variables) if variable.causality == "output"]
     computed = [i for i in outputs if variables[i].start is None]
