@@ -86,22 +86,6 @@ class FMU:
             )
         return variable
 
-    def check_settable(self, name: str) -> None:
-        """Raise a ValueError if a simulation cannot begin at a value of this variable."""
-        from fmpy.simulation import settable_in_initialization_mode, settable_in_instantiated
-
-        variable = self.variable(name)
-        is_state = self.kind == "ModelExchange" and name in self.states
-        is_settable = settable_in_instantiated(variable) or settable_in_initialization_mode(
-            variable
-        )
-        if not is_state and not is_settable:
-            raise ValueError(
-                f"{self.name} permits no start value of {name!r}, which has initial="
-                f"{variable.initial!r}. Name the parameter of its start value, or export the FMU "
-                "with initial='exact' for it, or for model exchange, whose states can be set."
-            )
-
     def simulate(
         self,
         values: Mapping[str, float],
@@ -161,8 +145,8 @@ class FMU:
             if not abs(first - value) <= 1e-6 * max(1.0, abs(value)):  # NaN is refused, too
                 raise ValueError(
                     f"{name!r} is {first:g} after its start value was set to {value:g}: the FMU "
-                    "computes it or rounds it. Name the parameter of its start value, or take "
-                    "model exchange, whose states can be set"
+                    "permits none, computes it or rounds it. Name the parameter of its start "
+                    "value, or take model exchange, whose states can be set"
                 )
         ends = results["time"]
         missing = points[~np.isclose(ends[_places(ends, points)], points, _SAME, 0)]

@@ -57,8 +57,9 @@ class FMUPhysics(BlackBoxPhysics):
     Raises:
         ImportError: Without FMPy (``pip install "gpadjust[fmu]"``).
         OSError: If there is no such file.
-        ValueError: If the FMU has no such variable, kind, or binary for this platform, a variable
-            cannot be set, or a state of the FMU is not in a step of dynamics.
+        ValueError: If the FMU has no such variable, kind, or binary for this platform, or a state
+            of the FMU is not in a step of dynamics.
+        PhysicsError: When called, if a simulation fails, or a variable has not its start value.
 
     Example:
         >>> tank = FMUPhysics(  # doctest: +SKIP
@@ -190,8 +191,6 @@ class FMUPhysics(BlackBoxPhysics):
                 )
             if name in moving and variable.causality != "input":
                 raise ValueError(f"Expected signals of inputs of {fmu.name}; {name!r} is not one.")
-            if name in names and name not in moving:
-                fmu.check_settable(name)
             if name in self.unknowns and not self.unknowns[name].unit:
                 unit = variable.unit or getattr(variable.declaredType, "unit", None) or ""
                 self.unknowns[name] = replace(self.unknowns[name], unit=unit)
