@@ -137,7 +137,7 @@ def c_source(
         name: The beginning of the names of functions. One unit of compilation takes several files.
         variance: If True, there is a variance. Its tables are the most of the file: the square of
             the number of points or features, for each output and draw.
-        observation_noise: If True, the variance includes that of the noise.
+        observation_noise: If True, the variance includes the noise.
         parameters: Of a physics, or dynamics that are one: if True, its unknown parameters are an
             argument, ``const double *parameters`` before ``mean``, in the order of the physics.
             Default: they are at their posterior means, of a physics itself at the guesses.

@@ -29,8 +29,8 @@ def casadi_function(
 ) -> Any:
     """Return a fitted model or a physics as a ``casadi.Function``, with derivatives.
 
-    Of a model it maps columns ``x`` and ``f_p`` to ``mean`` and ``variance``, those of
-    :meth:`~gpadjust.CKA.predict`; of dynamics ``state``, ``action`` and ``f_p`` to those of
+    Of a model it maps columns ``x`` and ``f_p`` to ``mean`` and ``variance``, as of
+    :meth:`~gpadjust.CKA.predict`; of dynamics ``state``, ``action`` and ``f_p`` as of
     :meth:`LearnedDynamics.predict`. ``f_p`` are the values of the physics there, of several physics
     below each other. There is no such argument without physics, and of a :class:`FormulaPhysics`,
     or an :class:`ODEPhysics` of one: these are in the function.
@@ -44,7 +44,7 @@ def casadi_function(
         physics: f_p in CasADi, to take the place of that argument: a ``casadi.Function``, or one of
             Python, from the column of the inputs of f_p to the column of its outputs.
         variance: If True, there is a variance.
-        observation_noise: If True, the variance includes that of the noise.
+        observation_noise: If True, the variance includes the noise.
         parameters: As of :func:`c_source`; they are the last argument.
 
     Raises:

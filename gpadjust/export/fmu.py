@@ -32,7 +32,7 @@ class _Variable(NamedTuple):
     name: str
     unit: str
     causality: str  # "input", "output" or "local"
-    start: float | None  # of what can be set
+    start: float | None  # None if it is computed
 
 
 def export_fmu(

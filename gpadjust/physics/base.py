@@ -33,7 +33,7 @@ class Physics(torch.nn.Module, ABC):
         unknowns: The ``p`` unknown parameters, such as ``{"mass": Unknown(1.0, factor=1.5)}``. The
             last argument of a function contains their values, ``p.mass`` or ``p["mass"]``.
         inputs: The columns of X to read, in order; negative ones from the end. Default: all.
-        name: The name in messages. Default: that of the function, or of the class.
+        name: The name in messages. Default: the name of the function or class.
 
     Attributes:
         num_outputs: ``m``; None until the first call if it is not known before.
@@ -124,7 +124,7 @@ class Physics(torch.nn.Module, ABC):
     def or_nan(self, X: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Return the outputs without gradient, NaN in rows at which the physics fails.
 
-        The arguments are those of :meth:`forward`. If its error has no ``partial`` result, all rows
+        Takes the arguments of :meth:`forward`. If its error has no ``partial`` result, all rows
         of the same ``parameters`` are NaN; one that names no rows, or occurs before the number of
         outputs is known, is raised.
         """

@@ -74,7 +74,7 @@ class BlackBoxPhysics(Physics):
         self.forget()
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """Return the function's outputs; an error of single rows contains those of the others."""
+        """Return the function's outputs; an error of single rows contains the other outputs."""
         rows = self._table(X, *parameters)
         if self.batched:
             return torch.from_numpy(real_array(self.function(*self._arguments(rows))))

@@ -52,7 +52,7 @@ class FMUPhysics(BlackBoxPhysics):
         columns: The columns of X to read, one for each of the inputs. Default: all.
         gradient, fd_step: As of :class:`~gpadjust.BlackBoxPhysics`. A step should exceed the
             tolerance by far.
-        name: As of :class:`Physics`. Default: that of the file.
+        name: As of :class:`Physics`. Default: the name of the file.
 
     Raises:
         ImportError: Without FMPy (``pip install "gpadjust[fmu]"``).
@@ -131,7 +131,7 @@ class FMUPhysics(BlackBoxPhysics):
         return self.input_names if self.inputs is None else ()
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """Return the outputs of simulations; an error of single rows contains those of others."""
+        """Return the outputs of simulations; an error of single rows contains the other outputs."""
         from joblib import Parallel, delayed  # slow to import
 
         if X.shape[-1] != len(self.input_names):

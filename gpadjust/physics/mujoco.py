@@ -61,7 +61,7 @@ class MujocoPhysics(BlackBoxPhysics):
             parameters, ``p["pole.length"]``. The result is compiled for each value.
         actions: The names of the actuators that the action drives, in its order; others get zero.
             Default: all.
-        threads: The most threads. Default: those of PyTorch.
+        threads: The most threads. Default: as many as PyTorch has.
         name: As of :class:`Physics`.
 
     Raises:
@@ -172,7 +172,7 @@ class MujocoPhysics(BlackBoxPhysics):
     def sensors(self, names: Sequence[str] | None = None) -> Sensors:
         """Return sensors of the model as outputs of the state, with parameters at their guesses.
 
-        Guesses of the noise are those of the MJCF.
+        The noise of the MJCF is the guess of their noise.
 
         Args:
             names: The names of the sensors. Default: all that states determine.

@@ -177,7 +177,7 @@ class ModelParameters:
         # A servo's force has its gains in the bias, - kp q - kv v.
         feedback = {"kp": slice(1, 2), "kv": slice(1, 3)}.get(place.field)
         if feedback is not None and not element.biasprm[feedback].any():
-            raise ValueError(f"{name!r}: the actuator is no servo of that; its gain is its gear.")
+            raise ValueError(f"{name!r}: the actuator is not a servo with it; a motor has a gear.")
 
 
 class _Read(ParameterValues):

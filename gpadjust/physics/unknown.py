@@ -15,7 +15,7 @@ from torch.special import ndtr, ndtri
 
 from gpadjust.checks import check_kind, checked_number, real_array
 
-LARGEST = 8.0  # coordinate, beyond which float64 knows no mass of the normal distribution
+LARGEST = 8.0  # coordinate, beyond which float64 has no mass of the normal distribution
 _UNBOUNDED = (-math.inf, math.inf)
 _KNOTS = 3.0  # of a function, in a lengthscale
 _MOST_KNOTS = 60

@@ -351,7 +351,7 @@ REFUSED = {
     "element": (ValueError, "'link3.mass' to name one body, of link1, link2", of("link3.mass")),
     "both": (ValueError, "one joint or tendon.*found 2", of("elbow.damping", TWO)),
     "sign": (ValueError, "negative.*sd=1.0.*factor, or bounds", of("elbow.damping", sd=1.0)),
-    "servo": (ValueError, "'motor.kp': the actuator is no servo", of("motor.kp")),
+    "servo": (ValueError, "'motor.kp': the actuator is not a servo", of("motor.kp")),
     "geoms": (ValueError, "edit has changed.*ngeom", of("a.b", edit=fuller)),
     "massless": (ValueError, "body has no mass", of("world.mass")),
     "compiled": (ValueError, "needs the MJCF", of("link1.stretch_x", COMPILED)),
