@@ -45,16 +45,6 @@ def test_c_says_what_the_model_predicts(name, tmp_path):
         agrees(model, called(program.f_predict, sizes, *given), (mean, variance))
 
 
-def test_one_unit_may_contain_several_models(tmp_path):
-    code = "".join(c_source(fitted(name), f"m{i}") for i, name in enumerate(("CKA", "RRA")))
-    program = compiled(code, tmp_path)
-    for i, name in enumerate(("CKA", "RRA")):
-        model = fitted(name)
-        given = [each[0] for each in arguments(model, POINTS)]
-        one = called(getattr(program, f"m{i}_predict"), 2 * (model.num_outputs,), *given)
-        agrees(model, one, [each[0] for each in model.predict(POINTS)])
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 @apart

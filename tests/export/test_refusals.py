@@ -87,11 +87,6 @@ def test_what_is_refused_with_the_way_out():
             refused(ValueError, "one of C", export, fitted("CKA"), name)
 
 
-def test_the_same_model_makes_the_same_file():
-    once, again = (c_source(CKA(X, Y, physics=crude), "f") for _ in range(2))
-    assert once == again
-
-
 def test_a_file_without_variance_is_small():
     model = fitted("CKA")
     whole, mean = c_source(model, "f"), c_source(model, "f", variance=False)
