@@ -51,6 +51,7 @@ class Physics(torch.nn.Module, ABC):
     advice: str = "NumPy code is BlackBoxPhysics(function), of a single row batched=False."
     """The last sentence of an error in ``evaluate``."""
     step: float | None = None
+    column_names: Sequence[str] = ()  # of X, of a physics that names them
 
     def __init__(
         self,
@@ -146,11 +147,6 @@ class Physics(torch.nn.Module, ABC):
                 "torch.float64); a single point is X.unsqueeze(0)."
             )
         return X if self.inputs is None else X[..., list(self.inputs)]
-
-    @property
-    def column_names(self) -> Sequence[str]:
-        """Names of the columns of X, if the physics has some."""
-        return ()
 
     def check_names(self, names: Sequence[str]) -> None:
         """Raise a ValueError if data have columns of these names in another order."""

@@ -122,13 +122,10 @@ class FMUPhysics(BlackBoxPhysics):
             self.times = tuple(checked_number("times", t, least=self.start_time) for t in numbers)
         self.communication_step = communication_step
         self.tolerance = checked_number("tolerance", tolerance, above=0, below=1)
+        if self.inputs is None:
+            self.column_names = self.input_names
         self._check(opened(path, kind))
         self.num_outputs = len(self.output_names) * max(1, len(self.times))
-
-    @property
-    def column_names(self) -> Sequence[str]:
-        """Names of the columns of X, unless it reads some of them."""
-        return self.input_names if self.inputs is None else ()
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """Return the outputs of simulations; an error of single rows contains the other outputs."""

@@ -99,7 +99,7 @@ class FormulaPhysics(Physics):
         check_kind("formula", formula, str, "a text")
         super().__init__(unknowns=unknowns, name=name or " ".join(formula.split()))
         self.formula = formula
-        self.columns = tuple(map(symbol, columns))
+        self.columns = self.column_names = tuple(map(symbol, columns))
         declared = self.unknowns.declared
         names = [*self.columns, *declared]
         for name in declared:
@@ -133,11 +133,6 @@ class FormulaPhysics(Physics):
                     f"{function} is a function of {text!r}, which has {name!r}; expected one of "
                     f"{', '.join(numbers)}, or a formula of these."
                 )
-
-    @property
-    def column_names(self) -> Sequence[str]:
-        """Names of the columns of X."""
-        return self.columns
 
     def check_names(self, names: Sequence[str]) -> None:
         """Raise a ValueError if these are the names of the columns in another order."""
