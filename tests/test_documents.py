@@ -153,7 +153,10 @@ def test_the_tools_come_with_the_extra_dev_and_are_pinned():
 
 
 def test_tox_asks_for_the_lowest_versions_and_tests_that_there_are():
-    tox = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["tox"]["env_run_base"]
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["tox"]
+    tests = yaml.safe_load((ROOT / ".github" / "workflows" / "tests.yml").read_text())["jobs"]
+    assert tests["core"]["strategy"]["matrix"]["env"] == settings["env_list"]
+    tox = settings["env_run_base"]
     lists = (PROJECT["dependencies"], *PROJECT["optional-dependencies"].values())
     assert {*tox["deps"]} <= {requirement for each in lists for requirement in each}
     folders = [part for part in tox["commands"][0] if part.startswith("tests/")]
