@@ -385,3 +385,17 @@ def test_capacity_copies_and_pickles_of_the_memo():
     assert len(memo) == 3
     for empty in (copy.deepcopy(memo), pickle.loads(pickle.dumps(memo))):
         assert (len(empty), empty.capacity) == (0, 3)
+
+
+def test_forget_holds_for_rows_under_evaluation():
+    rows, X = [], normal(3, 1)
+
+    def simulate(X):
+        rows.append(len(X))
+        physics.forget()  # as another thread may
+        return X
+
+    physics = BlackBoxPhysics(simulate)
+    for _ in range(2):
+        assert torch.equal(physics(X), X)
+    assert rows == [3, 3]
