@@ -226,7 +226,7 @@ def _built_with(model: GP, n: int) -> dict[str, Tensor]:
     """Return numbers at the first n inputs and the prior's middle, which tell models apart."""
     values = model.table.values(torch.zeros_like(model.u[:1]))
     places = model.places(model.data.X[:n], values)
-    total = model.term_sum.at(values, places)
+    total = model.term_sum.evaluate(values, places)
     noise = model.noise.of_rows(torch.arange(n)) or model.noise
     numbers = {f"physics {i + 1}": f * model.unit for i, f in enumerate(places.f)}
     numbers["mean"] = total.mean * model.unit

@@ -1,10 +1,11 @@
-"""The structures: each a list of terms. Their arguments and errors are as of GP, and their own."""
+"""The structures: each a list of terms. Other arguments, and errors, are as of :class:`GP`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from gpadjust.checks import checked_number
 from gpadjust.core.data import ArrayLike, names_of
 from gpadjust.core.kernels import DELTA, RHO, Fourier, as_kernel
 from gpadjust.core.model import GP
@@ -23,12 +24,9 @@ class CKA(GP):
         \rho \sim GP(1, k_\rho), \quad \delta \sim GP(0, k_\delta),
 
     so that :math:`f_a \sim GP(f_p, F_p k_\rho F_p^T + k_\delta)`: where there are no data, the
-    model falls back to the physics. Both processes contain an unknown constant with a variance of
-    its own, and with ``nested`` the model is averaged with its constants alone,
-    :math:`a f_p + b`, and with :math:`\delta` alone, which ignores the physics; a physics with
-    unknown parameters also with :math:`f_p` as it is.
-
-    Args as of :class:`GP`, and:
+    model falls back to the physics. Both processes contain an unknown constant with its own
+    variance, and with ``nested`` the model is averaged with its constants alone, :math:`a f_p + b`,
+    and with :math:`\delta` alone; a physics with unknown parameters also with :math:`f_p` as it is.
 
     Args:
         physics: The physics f_p, a function of ``n x d`` to ``n x m`` (or ``n``) or a
@@ -36,8 +34,7 @@ class CKA(GP):
             then :math:`f_a = \sum_i \rho_i f_i + \delta`.
         rho_covar_module: :math:`k_\rho`, a kernel of this library or of GPyTorch. Default: RBF.
         delta_covar_module: :math:`k_\delta`. Default: RBF.
-        rho_mean: The prior mean of rho; of several physics one for each. Default: 1, of k physics
-            1 / k.
+        rho_mean: The prior mean of rho, one of each physics. Default: 1, of k physics 1 / k.
         delta_mean: The prior mean of delta, in the user's units.
         center: Whether the kernel of rho is scaled by f_p - c with an unknown c, or the number c;
             the paper's model has 0, as has one whose delta cannot contain a constant.
@@ -46,7 +43,7 @@ class CKA(GP):
             targets.
         nested: Whether nested models are averaged over, with constants and one physics; or the
             nested models.
-        extra_terms: Further terms, which the formula as it is does not have.
+        extra_terms: Further terms.
 
     Example:
         >>> import torch
@@ -65,12 +62,6 @@ class CKA(GP):
         center: bool | float = True, constants: bool | Mapping[str, LogNormal] = True,
         nested: bool | Sequence[Choice] = True, extra_terms: Sequence[Term] = (), **options: Any,
     ) -> None:  # fmt: skip
-        for name, value in {"rho_mean": rho_mean, "delta_mean": delta_mean}.items():
-            if isinstance(value, str):
-                raise TypeError(
-                    f"Expected {name} as a number; found {value!r}. Constants of rho and delta are "
-                    "unknown by default."
-                )
         if not isinstance(center, bool | int | float):
             raise TypeError(f"Expected center True (unknown), False or a number; found {center!r}.")
         settings = options | {
@@ -81,6 +72,7 @@ class CKA(GP):
         rhos, functions = _scalings(physics, rho_mean)
         kernel = as_kernel(rho_covar_module, RHO)
         constant = _constant(constants, "rho", RHO_CONSTANT)
+        delta_mean = checked_number("delta_mean", delta_mean)
         delta = _delta(delta_covar_module, constants)._replace(mean=delta_mean)
         delta_has_constant = as_kernel(delta.kernel).has_constant
         if center is True and kernel.has_constant and not delta_has_constant:
@@ -100,9 +92,7 @@ class RRA(CKA):
     r"""Ridge regression adjustment: CKA on finitely many random Fourier features.
 
     rho and delta are Bayesian linear models (Wannawas and Faisal 2023, section 2.2), which tend to
-    those of :class:`CKA` as features grow.
-
-    Args as of :class:`CKA` but for its kernels, and:
+    those of :class:`CKA` with more features. Other arguments as of :class:`CKA` but for kernels.
 
     Args:
         num_features: Number of features of each of the two, an even one.
@@ -129,8 +119,8 @@ class RRA(CKA):
 class PhysicsMeanGP(GP):
     r"""A Gaussian process with the physics as its mean, :math:`f_a = f_p + \delta`.
 
-    Args as of :class:`GP`; physics and constants as of :class:`CKA`. ``covar_module`` is the kernel
-    of delta, by default RBF.
+    Physics and constants as of :class:`CKA`; ``covar_module`` is the kernel of delta, by default
+    RBF.
     """
 
     def __init__(
@@ -149,8 +139,8 @@ class PhysicsMeanGP(GP):
 class ScaleGP(GP):
     r"""An adjustment by a scaling alone, :math:`f_a = \rho f_p`, :math:`\rho \sim GP(1, k)`.
 
-    It cannot adjust where f_p is zero. Args as of :class:`GP`; one physics, and constants, as of
-    :class:`CKA`. ``covar_module`` is the kernel of rho, by default RBF.
+    It cannot adjust where f_p is zero. One physics, and constants, as of :class:`CKA`;
+    ``covar_module`` is the kernel of rho, by default RBF.
     """
 
     def __init__(
@@ -168,10 +158,9 @@ class ScaleGP(GP):
 
 
 class ZeroMeanGP(GP):
-    r"""A Gaussian process without physics, around an unknown constant.
+    """A Gaussian process without physics, of a kernel ``covar_module``, by default RBF.
 
-    Args as of :class:`GP`; constants as of :class:`CKA`. ``covar_module`` is the kernel, by default
-    RBF.
+    It varies around an unknown constant; ``constants`` as of :class:`CKA`.
     """
 
     def __init__(
@@ -186,8 +175,8 @@ class ZeroMeanGP(GP):
 class CalibratedPhysics(GP):
     r"""The physics and noise alone, :math:`y = f_p(x; \theta) + \epsilon`: nonlinear regression.
 
-    Where the physics is wrong, intervals of its parameters are too narrow: compare it with
-    :class:`CKA` of the same physics. Args as of :class:`GP`; one physics, with unknown parameters.
+    Where the physics, one with unknown parameters, is wrong, intervals of these are too narrow:
+    compare it with :class:`CKA` of the same physics.
     """
 
     def __init__(
@@ -208,17 +197,20 @@ class CalibratedPhysics(GP):
 def _scalings(physics: Any, means: Any = None) -> tuple[list[Term], list[Any]]:
     """Return a scaling of each physics by its prior mean, and the physics."""
     functions = [*physics] if isinstance(physics, list | tuple) else [physics]
-    names = [f"rho{i + 1}" for i in range(len(functions))] if len(functions) > 1 else ["rho"]
+    names = ["rho"] if len(functions) == 1 else [f"rho{i + 1}" for i in range(len(functions))]
     if isinstance(physics, Mapping):
-        names, functions = [f"rho_{name}" for name in physics], [*physics.values()]
+        functions = [*physics.values()]
+        names = [f"rho_{name}" for name in physics]
     number = len(functions)
     if not number:
         raise ValueError("Expected at least one physics; found none. Without, take ZeroMeanGP.")
-    means = 1.0 / number if means is None else means
-    means = [means] * number if isinstance(means, int | float) else [*means]
+    if means is None:
+        means = 1.0 / number
+    means = [*means] if isinstance(means, list | tuple) else [means] * number
     if len(means) != number:
         raise ValueError(f"Expected rho_mean for each of {number} physics; found {means}.")
-    return [Term(names[i], mean=float(means[i]), physics=i) for i in range(number)], functions
+    means = [checked_number("rho_mean", mean) for mean in means]
+    return [Term(names[i], mean=means[i], physics=i) for i in range(number)], functions
 
 
 def _constant(
@@ -231,8 +223,10 @@ def _constant(
 
 
 def _plain(constants: bool | Mapping[str, LogNormal]) -> Any:
-    """Return constants as a file can hold them."""
-    return {k: (*v,) for k, v in constants.items()} if isinstance(constants, Mapping) else constants
+    """Return constants as values of a file."""
+    if isinstance(constants, Mapping):
+        return {name: tuple(prior) for name, prior in constants.items()}
+    return constants
 
 
 def _delta(kernel: Any, constants: bool | Mapping[str, LogNormal], name: str = "delta") -> Term:
@@ -241,11 +235,7 @@ def _delta(kernel: Any, constants: bool | Mapping[str, LogNormal], name: str = "
 
 
 def _nested(rho: str, extra_terms: Sequence[Term], physics: Any) -> list[Choice]:
-    """Return the nested models and their prior probabilities.
-
-    A physics with unknown parameters may also be right as it is, which tells these much more of
-    them than a physics up to a factor and an offset does.
-    """
+    """Return the nested models and their prior probabilities."""
     constants = [f"{rho}.constant", "delta.constant"]
     processes = [f"{name}.process" for name in (rho, "delta", *(t.name for t in extra_terms))]
     processes += [f"{t.name}.constant" for t in extra_terms if t.constant is not None]
@@ -255,6 +245,6 @@ def _nested(rho: str, extra_terms: Sequence[Term], physics: Any) -> list[Choice]
         Choice("as it is up to a factor and an offset", 0.175, tuple(processes)),
         Choice("of no use", 0.2, (f"{rho}.mean", f"{rho}.constant", f"{rho}.process")),
     ]
-    if not getattr(physics, "unknowns", None):
+    if not getattr(physics, "unknowns", None):  # which "as it is" determines much better
         choices[1:3] = [choices[2]._replace(probability=0.35)]
     return choices

@@ -41,11 +41,11 @@ def _lines(model: Any) -> list[str]:
     """Return what the model is, and the numbers of each output."""
     values, X = model.table.values(model.draws), model.data.X
     variance = model.noise.variance(values, model.places(X, values, model.noise.has_shares), True)
-    n, d = X.shape[-2:]
-    counts = {"point": n, "input": d, "output": model.num_outputs, "draw": len(model.draws)}
-    parts = [counted(counts)]
-    parts += [] if model.is_fitted else ["not fitted"]
-    parts += [f"of {model.scale_formula}"] if model.scale_formula else []
+    parts = [counted(model)]
+    if not model.is_fitted:
+        parts.append("not fitted")
+    if model.scale_formula:
+        parts.append(f"of {model.scale_formula}")
     lines = [f"{type(model).__name__}: {', '.join(parts)}"]
     for j, name in enumerate(model.data.output_names):
         own = {key: v[:, j] if v.dim() == 3 else v for key, v in values.items()}
@@ -61,8 +61,10 @@ def _lines(model: Any) -> list[str]:
     return lines
 
 
-def counted(counts: dict[str, int]) -> str:
-    """Return numbers of things by their nouns, such as "8 points, 1 input"."""
+def counted(model: Any) -> str:
+    """Return the sizes of a model, such as "8 points, 1 input, 1 output, 16 draws"."""
+    n, d = model.data.X.shape[-2:]
+    counts = {"point": n, "input": d, "output": model.num_outputs, "draw": len(model.draws)}
     return ", ".join(f"{n} {noun}" + "s" * (n != 1) for noun, n in counts.items())
 
 

@@ -252,7 +252,7 @@ class LearnedDynamics(Dynamics):
             if has_scale:
                 values = model.predict(X).mean
             else:  # no variances, which cost most
-                means = posterior.mean_alone(model.at(X, posterior.train.values))
+                means = posterior.mean_alone(model.evaluate(X, posterior.train.values))
                 values = (means.mean(-3) * model.unit).mT
             return values.unflatten(0, inputs.shape[:-1])
 

@@ -77,7 +77,7 @@ def test_shapes_seeds_and_gradients(data, drawn, uniform):
     assert values.shape == (3, 2, 6, 5, 2)
     torch.testing.assert_close(functions(Z[1, 4]), values[:, 1, 4])
     torch.testing.assert_close(
-        functions.each(Z[1, :3]), torch.stack([values[i, 1, i] for i in range(3)])
+        functions.evaluate_each(Z[1, :3]), torch.stack([values[i, 1, i] for i in range(3)])
     )
     state = torch.get_rng_state()
     assert torch.equal(model.sample_functions(3, seed=1)(Z), values)
@@ -130,5 +130,5 @@ def test_each_function_is_evaluated_at_its_own_points_only(data, uniform):
     points = uniform(6, 4, 2, high=2.0, seed=1)
     expected = torch.stack([functions(points[i])[i] for i in range(6)])
     asked.clear()
-    torch.testing.assert_close(functions.each(points), expected)
+    torch.testing.assert_close(functions.evaluate_each(points), expected)
     assert sum(asked) == 6 * 4

@@ -198,7 +198,7 @@ def test_it_reads_as_a_gpytorch_model(models, uniform):
         # rho's part of equation 2 is the kernel of rho, scaled by f_p - c on both sides.
         values = model.values
         f = physics(Z).mT - model.term_sum.center(model.terms[0], values) * model.unit
-        own = model.at(Z).own(model.terms[0])
+        own = model.evaluate(Z).own(model.terms[0])
         k = model.terms[0].kernel.covariance(own, Z) * values.get(
             "rho.process", torch.ones(1)
         ).unsqueeze(-1)

@@ -89,7 +89,7 @@ def test_covariance_and_gradient(data, name):
     delta = KERNELS[name]()
     model = CKA(X, Y, physics=wave, delta_covar_module=delta, noise=noise, nested=False)
     term = model.terms[1]
-    own = model.at(X).own(term)
+    own = model.evaluate(X).own(term)
     with torch.no_grad():
         K = term.kernel.covariance(own, X.expand(1, 1, 9, 2)).squeeze()
         kernel = deepcopy(term.kernel.kernel)

@@ -78,7 +78,7 @@ def test_the_physics_far_from_the_data_and_before_them(cls, pair, close, Z):
     far = torch.tensor([[500.0, -300.0], [-400.0, 100.0]], dtype=torch.float64)
     close(model.posterior(far).mean, crude(far), 1e-10)
     close(model.mean_module(Z).reshape(2, 6).mT, crude(Z), 1e-12)
-    variance = model.at(far).variance().squeeze(0).mT * model.unit.square().mT
+    variance = model.evaluate(far).variance().squeeze(0).mT * model.unit.square().mT
     close(model.predict(far).variance, variance, 1e-10)
 
 

@@ -74,7 +74,7 @@ def test_means_alone_are_those_with_covariances(name, gaps, drawn, close, unifor
     for each in (model, pickle.loads(pickle.dumps(model))):
         given = each.conditioning()
         for X in (Z[0], Z, Z.clone().requires_grad_()):
-            close(given.mean_alone(each.at(X)), given.mean(each.at(X))[0])
+            close(given.mean_alone(each.evaluate(X)), given.mean(each.evaluate(X))[0])
 
 
 def test_left_out_predictions_are_missing_too(gaps, drawn):

@@ -147,7 +147,7 @@ def test_functions_are_of_each_model_in_proportion(weights):
     assert values.shape == (16, 2, 2)
     torch.testing.assert_close(functions(Z[:2].expand(3, 2, 1))[:, 1], values)
     points = torch.stack([Z[i % 3 : i % 3 + 2] for i in range(16)])
-    each = functions.each(points)
+    each = functions.evaluate_each(points)
     for i in range(16):
         torch.testing.assert_close(each[i], functions(points[i])[i])
     shares = torch.tensor(weights).reshape(2, -1).expand(2, 2)

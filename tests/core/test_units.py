@@ -128,7 +128,7 @@ def test_inputs_come_back_as_they_came(data, drawn, uniform):
         assert model.posterior(Z.numpy()).mean.shape == (4, 2)
         functions = model.sample_functions(2, seed=0)
         assert torch.equal(functions(Z.numpy()), functions(Z))
-        assert functions.each(Z.expand(2, 4, 2).numpy()).shape == (2, 4, 2)
+        assert functions.evaluate_each(Z.expand(2, 4, 2).numpy()).shape == (2, 4, 2)
         later = model.condition_on_observations(*(values[:2] + 0.1 for values in train))
         assert later.predict(Z).mean.shape == (4, 2)
     frame = pd.DataFrame(Z.numpy(), columns=["a", "b"], index=[3, 5, 7, 9])

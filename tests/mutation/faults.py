@@ -63,8 +63,8 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/core/gaussian.py",
-        "return Prediction(center, variances.mean(DRAWS) + between)",
-        "return Prediction(center, variances.mean(DRAWS))",
+        "return Prediction(center, self.variances.mean(DRAWS) + between)",
+        "return Prediction(center, self.variances.mean(DRAWS))",
         "The variance forgets that the means of the draws differ.",
     ),
     Fault(
@@ -129,8 +129,8 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/core/sample.py",
-        "generator, shape = torch.Generator().manual_seed(seed), like.shape",
-        "generator, shape = torch.Generator().manual_seed(0), like.shape",
+        "    shape = like.shape\n    generator = torch.Generator().manual_seed(seed)",
+        "    shape = like.shape\n    generator = torch.Generator().manual_seed(0)",
         "The seed of a fit is ignored.",
     ),
     Fault(
@@ -147,8 +147,8 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/core/fitting.py",
-        "difference = (predicted[0][0].mean(0) - predicted[1][0].mean(0)) / 2",
-        "difference = (predicted[0][0].mean(0) - predicted[1][0].mean(0)) / 20",
+        "difference = (means[0].mean(0) - means[1].mean(0)) / 2",
+        "difference = (means[0].mean(0) - means[1].mean(0)) / 20",
         "The error of a fit by few draws is never large enough for its warning.",
     ),
     Fault(
