@@ -52,8 +52,8 @@ class Data(NamedTuple):
                 )
         if len(X) != len(Y) or X.shape[-1] < 1 or Y.shape[-1] < 1:
             raise ValueError(
-                "Expected a row of targets for each row of inputs, and a column of both; found "
-                f"train_X of shape {tuple(X.shape)} and train_Y of {tuple(Y.shape)}."
+                "Expected as many rows of targets as of inputs, and columns of both; found train_X "
+                f"of shape {tuple(X.shape)} and train_Y of {tuple(Y.shape)}."
             )
         if len(X) < 2:
             raise ValueError(
@@ -101,8 +101,8 @@ class Data(NamedTuple):
     def appended(self, X: Tensor, Y: Tensor) -> Data:
         """Return the data with further rows; Y may have more dimensions in front than X."""
         inputs = appended(self.X, X)
-        Y = Y.expand(*torch.broadcast_shapes(inputs.shape[:-2], Y.shape[:-2]), *Y.shape[-2:])
-        return self._replace(X=inputs, Y=appended(self.Y, Y))
+        lead = torch.broadcast_shapes(inputs.shape[:-2], Y.shape[:-2])
+        return self._replace(X=inputs, Y=appended(self.Y, Y.expand(*lead, *Y.shape[-2:])))
 
     def of_outputs(self, outputs: Sequence[int]) -> Data:
         """Return the data of some outputs."""
@@ -200,7 +200,9 @@ def variances_of(values: ArrayLike, Y: Tensor, name: str = "train_Yvar") -> Tens
 
 def _coded(X: ArrayLike, transform: Any) -> ArrayLike:
     """Return inputs with numbers in place of what a transform makes numbers of."""
-    return transform.coded(X) if hasattr(transform, "coded") else X
+    if hasattr(transform, "coded"):
+        return transform.coded(X)
+    return X
 
 
 def names_of(values: ArrayLike, letter: str) -> tuple[str, ...]:
@@ -209,8 +211,9 @@ def names_of(values: ArrayLike, letter: str) -> tuple[str, ...]:
     if names is not None:
         return names
     shape = [*getattr(values, "shape", ())]
-    number = int(shape[-1]) if len(shape) > 1 else 1
-    return (letter,) if number == 1 else tuple(f"{letter}{i + 1}" for i in range(number))
+    if len(shape) < 2 or shape[-1] == 1:
+        return (letter,)
+    return tuple(f"{letter}{i + 1}" for i in range(int(shape[-1])))
 
 
 def columns_of(names: Sequence[str], asked: Any, what: str) -> list[int]:
@@ -246,7 +249,9 @@ def as_given(values: Tensor, X: ArrayLike, names: Sequence[str]) -> Any:
     library = type(X).__module__.partition(".")[0]
     if library == "pandas":
         return type(X)(array, index=X.index, columns=list(names))
-    return type(X)(array, schema=list(names)) if library == "polars" else array
+    if library == "polars":
+        return type(X)(array, schema=list(names))
+    return array
 
 
 def _warn_of_copies(X: Tensor, Y: Tensor) -> None:
@@ -255,8 +260,8 @@ def _warn_of_copies(X: Tensor, Y: Tensor) -> None:
     copies = len(rows) - len(rows.unique(dim=0))
     if copies:
         warnings.warn(
-            f"{copies} of {len(rows)} rows equal an earlier row in all inputs and outputs. If the "
-            "same measurements are in the data twice, the noise comes out too small: drop them, "
-            "`frame.drop_duplicates()`. Repeats that are equal by rounding may stay.",
+            f"{copies} of {len(rows)} rows equal an earlier row in all inputs and outputs. If they "
+            "are the same measurements, drop them, `frame.drop_duplicates()`: the noise would be "
+            "too small. Repeats that are equal by rounding may stay.",
             stacklevel=4,
         )

@@ -80,8 +80,8 @@ class FitResult:
         outputs = [*zip(*self.probabilities.values(), strict=True)]
         for j, shares in enumerate(outputs):
             parts = [f"{text} {p:.2f}" for text, p in zip(self.probabilities, shares, strict=True)]
-            which = f" (output {j + 1})" if len(outputs) > 1 else ""
-            lines.append(f"Probabilities{which}: {', '.join(parts)}.")
+            output = f" (output {j + 1})" * (len(outputs) > 1)
+            lines.append(f"Probabilities{output}: {', '.join(parts)}.")
         if self.method == "map":
             lines.append("Point fit: intervals ignore the uncertainty of the hyper-parameters.")
         elif self.method == "nuts":
@@ -240,14 +240,15 @@ def _sampled(model: GP, number: int, seed: int) -> dict[int, Draws]:
     sampled: dict[int, Draws] = {}
     for k in range(len(model.table.log_prior)) if is_small else starts:
         density = partial(model.log_likelihood, choice=k)
-        draws = draw(density) if is_small else None
+        if is_small:
+            draws = draw(density)
         if is_shared and k in starts:
             straight = Straight(model, starts[k], k)
             points = straight.points(_FIRST * number, seed)
             around = late(straight, start=straight.start, points=points)
             around = around._replace(u=straight.coordinates(around.u))
-            draws = around if draws is None else _joined(around, draws, straight.misses(draws.u))
-        elif draws is None:
+            draws = _joined(around, draws, straight.misses(draws.u)) if is_small else around
+        elif not is_small:
             draws = late(density, start=starts[k])
         sampled[k] = draws._replace(u=model.table.with_choice(draws.u, k))
     return sampled
@@ -320,7 +321,7 @@ def modes(model: GP, choice: int, seed: int, is_precise: bool = False) -> Tensor
     number = max(16, 6400 // max(len(model.data.Y), 25))
     generator = torch.Generator().manual_seed(seed)
     u = standard_normal((number, *like.shape), generator, like)
-    searches = _SEARCHES if choice == 0 else _SEARCHES // 2
+    searches = _SEARCHES // (1 + (choice > 0))
     begins = torch.cat([_sorted(model, choice, u)[: searches - 1], torch.zeros_like(u[:1])])
     if model.table.shared:
         begins[-2] = _with_least_squares(model, choice, u)
@@ -379,7 +380,9 @@ def _evidence(model: GP, sampled: dict[int, Draws]) -> Tensor:
     logs = torch.stack([prior[k] + draws.log_evidence for k, draws in sampled.items()])
     total = logs.logsumexp(0).logsumexp(0) - math.log(GROUPS)
     units = model.log_jacobian()
-    return total + (units if len(total) > 1 else units.sum())
+    if len(total) == 1:
+        units = units.sum()
+    return total + units
 
 
 def _pooled(

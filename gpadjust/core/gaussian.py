@@ -128,9 +128,11 @@ class Conditioning:
     ) -> None:
         self.train = train
         self.targets = targets
-        late = train if old is None else train.of_rows(slice(old.chol.shape[-1], None))
+        late, batch = train, torch.Size()
+        if old is not None:
+            late = train.of_rows(slice(old.chol.shape[-1], None))
+            batch = old.chol.shape[:-2]
         K = late.cross(late)
-        batch = old.chol.shape[:-2] if old is not None else ()
         lead = torch.broadcast_shapes(K.shape[:-2], noise.shape[:-1], batch)
         self.noise = noise.expand(*lead, train.x.shape[-2])
         observed = ~targets.isnan()
@@ -222,6 +224,7 @@ class Conditioning:
         mean, cross = self.mean(sought)
         white = self.white(cross)
         prior = sought.cross(sought)
+        # k(x, x') - k(x, X) K^-1 k(X, x')
         K = prior - white @ white.mT
         least = 4 * self.chol.shape[-1] * _EPS * prior.diagonal(dim1=-1, dim2=-2)
         raised = (least - K.diagonal(dim1=-1, dim2=-2)).clamp_min(0.0)
@@ -242,7 +245,7 @@ class Conditioning:
 
         (Rasmussen and Williams 2006, eqs. 5.10 to 5.12).
         """
-        precision = self.inverse_factor().square().sum(-2)
+        precision = self.inverse_factor().square().sum(-2)  # [K^-1]_ii
         variance = precision.reciprocal().masked_fill(~self.observed, math.nan)
         return self.targets - self.alpha * variance, variance
 
@@ -303,16 +306,19 @@ class Marginals(NamedTuple):
             middle = (low + high) / 2
         if not ends.requires_grad:
             return middle
+        # q - (F(q) - p) / F'(q), of which the value is q
         below = self.probability(middle)
         slope = self.log_density(middle).exp().detach()
         return middle - (below - below.detach()) / slope.clamp_min(1e-300)
 
     def probability(self, Y: Tensor) -> Tensor:
         """Return the probability of values below ``Y``, ``... x q x m``."""
+        # mean_s Phi((y - mu_s) / sd_s)
         return torch.special.ndtr((Y.unsqueeze(DRAWS) - self.means) / self._sd).mean(DRAWS)
 
     def log_density(self, Y: Tensor) -> Tensor:
         """Return the log density at values ``Y``, ``... x q x m``; NaN where they are."""
+        # log mean_s N(y | mu_s, sd_s^2)
         z = (Y.unsqueeze(DRAWS) - self.means) / self._sd
         log_densities = -0.5 * z.square() - self._sd.log() - 0.5 * math.log(2 * math.pi)
         return log_densities.logsumexp(DRAWS) - math.log(self.means.shape[DRAWS])

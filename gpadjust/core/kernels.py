@@ -15,7 +15,7 @@ from gpytorch.kernels import Kernel as AnyGPyTorchKernel
 from torch import Tensor
 from torch.func import functional_call
 
-from gpadjust.core.unknowns import LogNormal, Row, Values
+from gpadjust.core.unknowns import LogNormal, Row, Values, standard_normal
 
 PullBack = Callable[[Tensor], Values]
 Features = Callable[[Tensor], Tensor]
@@ -103,7 +103,7 @@ def _matern(p: int) -> Profile:
 
 def _matern_value(p: int, e: Tensor) -> Tensor:
     t = (-2 * (2 * p + 1) * e).clamp_min(1e-30).sqrt()  # sqrt(2 nu) r
-    return (1.0, 1 + t, 1 + t + t.square() / 3)[p] * (-t).exp()
+    return (1.0, 1 + t, 1 + t + t.square() / 3)[p] * (-t).exp()  # exp(-t), (1 + t) exp(-t), ...
 
 
 def _matern_slope(p: int, e: Tensor) -> Tensor:
@@ -180,10 +180,12 @@ class Stationary(Kernel):
         """Return ``s k(|(x - x') / l|)``."""
         length = own["lengthscale"].unsqueeze(-2)
         # Without a shift distances of large inputs, as of years, would lose digits.
-        shift = (x if other is None else other).detach().mean(-2, keepdim=True)
-        z = (x - shift) / length
-        others = None if other is None else (other - shift) / length
-        return self._scaled(exponents(z, others), own["outputscale"])
+        if other is None:
+            z = (x - x.detach().mean(-2, keepdim=True)) / length
+            return self._scaled(exponents(z), own["outputscale"])
+        shift = other.detach().mean(-2, keepdim=True)
+        e = exponents((x - shift) / length, (other - shift) / length)
+        return self._scaled(e, own["outputscale"])
 
     def _scaled(self, e: Tensor, outputscale: Tensor) -> Tensor:
         """Return ``s k(e)``; without a graph in place, which takes half the time."""
@@ -256,12 +258,13 @@ class Stationary(Kernel):
         degrees = self.profile.degrees
         if degrees is None:
             return super().features(own, number, generator)
-        S, d = own["lengthscale"].shape[0], own["lengthscale"].shape[-1]
-        half = number // 2
-        w = _normal((S, 1, d, half), generator)  # each function has other frequencies
+        length = own["lengthscale"]
+        shape = (len(length), 1, length.shape[-1], number // 2)  # each function has others
+        w = standard_normal(shape, generator, length)
         # A Student t is normal / sqrt(chi^2 / degrees); chi^2 is a sum of squares.
         if math.isfinite(degrees):
-            chi2 = _normal((S, 1, int(degrees), half), generator).square().sum(-2, keepdim=True)
+            shape = (len(length), 1, int(degrees), number // 2)
+            chi2 = standard_normal(shape, generator, length).square().sum(-2, keepdim=True)
             w = w * (degrees / chi2).sqrt()
         return lambda x: _fourier(own, x, w)
 
@@ -269,12 +272,9 @@ class Stationary(Kernel):
         return f"{type(self).__name__}({self.profile.name})"
 
 
-def _normal(shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
-    return torch.randn(shape, generator=generator, dtype=torch.float64)
-
-
 def _fourier(own: Values, x: Tensor, w: Tensor) -> Tensor:
     """Return sines and cosines of frequencies ``d x D/2``."""
+    # sqrt(s / n) (sin a, cos a), a = w x / l, of n frequencies
     a = (x / own["lengthscale"].unsqueeze(-2)) @ w.to(x)
     size = (own["outputscale"] / w.shape[-1]).sqrt().unsqueeze(-1)
     return size * torch.cat([a.sin(), a.cos()], -1)
@@ -292,7 +292,8 @@ class Fourier(Stationary):
         super().__init__(RBF, outputscale)
         self.seed = seed
         generator = torch.Generator().manual_seed(seed)
-        self.frequencies = _normal((num_inputs, num_features // 2), generator)
+        shape = (num_inputs, num_features // 2)
+        self.frequencies = torch.randn(shape, generator=generator, dtype=torch.float64)
 
     def of_data(self, data: Any) -> Fourier:
         """Return the kernel of as many inputs as an input transform makes."""
@@ -303,8 +304,10 @@ class Fourier(Stationary):
 
     def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
         """Return the inner products of the features."""
-        phi = _fourier(own, x, self.frequencies)
-        return phi @ (phi if other is None else _fourier(own, other, self.frequencies)).mT
+        phi = phi_other = _fourier(own, x, self.frequencies)
+        if other is not None:
+            phi_other = _fourier(own, other, self.frequencies)
+        return phi @ phi_other.mT
 
     def with_pull_back(self, own: Values, x: Tensor) -> tuple[Tensor, PullBack]:
         """Return K and its derivatives in closed form."""
@@ -320,6 +323,7 @@ class Fourier(Stationary):
             # df / da = cos(a) df / dsin - sin(a) df / dcos, and a = w x / l
             by_phi = 2 * scale * D @ phi
             by_angle = by_phi[..., :half] * phi[..., half:] - by_phi[..., half:] * phi[..., :half]
+            # da / dl = -w x / l^2
             by_length = -((by_angle @ w.mT) * z).sum(-2) / own["lengthscale"]
             return {"lengthscale": by_length, "outputscale": (D * k).sum((-1, -2)).unsqueeze(-1)}
 
@@ -359,14 +363,19 @@ class OfGPyTorch(Kernel):
         priors = {}
         for _, module, prior, closure, _ in self.kernel.named_priors():
             for name, parameter in self.kernel.named_parameters():
-                if _reads(closure, module, parameter):
-                    priors[name] = prior
+                with torch.enable_grad():  # a prior is of the parameter that its value depends on
+                    parameter.requires_grad_(True)
+                    if closure(module).requires_grad:
+                        priors[name] = prior
+                    parameter.requires_grad_(False)
         rows = []
         for name, (raw, constraint) in self._raw_parameters.items():
-            value = raw if constraint is None else constraint.transform(raw)
-            value = value.reshape(-1)
-            is_positive = constraint is not None and bool((constraint.lower_bound >= 0).all())
-            factor = _LENGTH_FACTOR if is_positive else math.e
+            value, factor, is_positive = raw, math.e, False
+            if constraint is not None:
+                value = constraint.transform(raw)
+                is_positive = bool((constraint.lower_bound >= 0).all())
+            if is_positive:
+                factor = _LENGTH_FACTOR
             prior = priors.get(name)
             density = prior and partial(_log_density, prior, raw.shape)
             if prior is None and name.endswith("raw_outputscale"):
@@ -374,7 +383,7 @@ class OfGPyTorch(Kernel):
                 factor = self.outputscale.factor
             if is_positive:
                 value = value.clamp_min(1e-12).log()
-            location = value.expand(num_outputs, -1)
+            location = value.reshape(-1).expand(num_outputs, -1)
             rows.append(Row(name, location, math.log(factor), is_positive, log_density=density))
         return rows
 
@@ -383,8 +392,10 @@ class OfGPyTorch(Kernel):
         lead = next((value.shape[:-1] for value in own.values()), torch.Size([1, 1]))
         if self._as_batch is None:
             self._as_batch = self._is_the_same_as_a_batch(own, x, lead)
+        if other is None:
+            other = x
         evaluate = self._of_batch if self._as_batch else self._one_by_one
-        return evaluate(own, x, x if other is None else other, lead)
+        return evaluate(own, x, other, lead)
 
     @property
     def _raw_parameters(self) -> dict[str, tuple[Tensor, Any]]:
@@ -440,7 +451,7 @@ class OfGPyTorch(Kernel):
 
 
 class _Dense(torch.nn.Module):
-    """A kernel whose matrix is computed at the call, and so with the parameters of the call."""
+    """A kernel whose matrix is computed at the call, with the parameters of the call."""
 
     def __init__(self, kernel: AnyGPyTorchKernel) -> None:
         super().__init__()
@@ -448,15 +459,6 @@ class _Dense(torch.nn.Module):
 
     def forward(self, x: Tensor, other: Tensor) -> Tensor:
         return self.kernel(x, other).to_dense()
-
-
-def _reads(closure: Callable[..., Tensor], module: Any, parameter: Tensor) -> bool:
-    """Return whether a prior's value depends on a parameter, of which no graph is recorded."""
-    with torch.enable_grad():
-        parameter.requires_grad_(True)
-        reads = bool(closure(module).requires_grad)
-        parameter.requires_grad_(False)
-    return reads
 
 
 def _log_density(prior: Any, shape: torch.Size, theta: Tensor) -> Tensor:

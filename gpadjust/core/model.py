@@ -38,7 +38,7 @@ from gpadjust.core.posterior import MixturePosterior
 from gpadjust.core.summary import counted, summary, summary_html
 from gpadjust.core.terms import Places, Term, TermSum, WeightedSum
 from gpadjust.core.unknowns import Choice, Row, Table, Values
-from gpadjust.core.views import MeanView, OtherPriors, kernel_view, likelihood_view, squeezed
+from gpadjust.core.views import MeanView, NoiseView, OtherPriors, TermView, squeezed
 from gpadjust.display import Display
 from gpadjust.physics import Physics, PhysicsError, as_physics
 from gpadjust.physics.parameters import PhysicsParameters
@@ -213,7 +213,9 @@ class GP(gpytorch.models.GP, Predictive):
         self._outputs: list[int] | None = None
         self._cached: tuple[Tensor, Conditioning] | None = None
         unknowns = [f_p.unknowns for f_p in self.physics] or [NO_UNKNOWNS]
-        self._unknowns = unknowns[0] if len(unknowns) == 1 else Unknowns.together(unknowns)
+        self._unknowns = unknowns[0]
+        if len(unknowns) > 1:
+            self._unknowns = Unknowns.together(unknowns)
         # f_p at the training inputs, and the unit of the targets by it.
         self._f_train: list[Tensor] = []
         self.unit = Y.new_ones(1, 1)  # the user's, until the prior mean is known
@@ -498,6 +500,7 @@ class GP(gpytorch.models.GP, Predictive):
 
     def log_jacobian(self) -> Tensor:
         """Return the log density of the targets, ``m``, in the user's units less the model's."""
+        # log p(y) = log p(y / unit) - n log unit
         return -(~self.data.Y.isnan()).sum(-2) * self.unit.squeeze(-1).log()
 
     def targets(self) -> Tensor:
@@ -524,7 +527,7 @@ class GP(gpytorch.models.GP, Predictive):
         X = self.data.X
         names = [*self._unknowns]
         z = torch.cat([values[f"physics.{name}"] for name in names], -1)  # S x p
-        p = len(names) if with_slopes else 0
+        p = len(names) * with_slopes
         steps = _STEP * torch.eye(p, len(names)).to(z).unsqueeze(1)
         # Central differences, by one call: (1 + 2 p) x S x p.
         shifted = torch.cat([z.unsqueeze(0), z + steps, z - steps])
@@ -535,7 +538,7 @@ class GP(gpytorch.models.GP, Predictive):
             Y = self._in_units(Y.masked_fill(~self.holds(Y), torch.nan))
             Y = Y.expand(len(shifted) * len(z), -1, -1).unflatten(0, shifted.shape[:2])
             f.append(Y[0])
-            slopes.append((Y[1 : p + 1] - Y[p + 1 :]) / (2 * _STEP))
+            slopes.append((Y[1 : p + 1] - Y[p + 1 :]) / (2 * _STEP))  # df / dz
         return f, {name: [slope[i] for slope in slopes] for i, name in enumerate(names[:p])}
 
     # Predictions.
@@ -556,7 +559,8 @@ class GP(gpytorch.models.GP, Predictive):
 
     def evaluate(self, X: Tensor, values: Values | None = None) -> WeightedSum:
         """Return the function at ``... x n x d``, at the draws ``u`` unless values are given."""
-        values = self.values if values is None else values
+        if values is None:
+            values = self.values
         return self.term_sum.evaluate(values, self.places(X, values))
 
     def evaluate_each(self, X: Tensor, values: Values) -> WeightedSum:
@@ -586,6 +590,7 @@ class GP(gpytorch.models.GP, Predictive):
         return self._left_out(self._conditioned_at(u))
 
     def _left_out(self, conditioning: Conditioning) -> tuple[Tensor, Tensor]:
+        # Targets are y / unit - shift.
         mean, variance = conditioning.left_out()
         mean = mean + self.noise.shift
         return (mean * self.unit).mT, (variance * self.unit.square()).mT
@@ -687,10 +692,11 @@ class GP(gpytorch.models.GP, Predictive):
         is_right = shape[-2:-1] in ((1,), (q,)) and shape[-1] in (1, m)
         if isinstance(noise, Tensor) and is_right and (noise >= 0).all():
             return noise.expand(*shape[:-2], q, m)
-        found = shape if isinstance(noise, Tensor) else repr(noise)
+        if not isinstance(noise, Tensor):
+            shape = noise
         raise ValueError(
             f"Expected noise as True, False or variances ... x {q} x {m}, not negative or NaN; "
-            f"found {found}. Known noise belongs to the model, in train_Yvar."
+            f"found {shape!r}. Known noise belongs to the model, in train_Yvar."
         )
 
     # Other data, outputs and draws.
@@ -716,7 +722,7 @@ class GP(gpytorch.models.GP, Predictive):
         old, new = self.conditioning(), self._copy()
         new.data = self.data.appended(X, Y)
         is_usual = noise is None
-        noise = self.usual_noise(Y) if noise is None else as_tensor(noise, "noise")
+        noise = self.usual_noise(Y) if is_usual else as_tensor(noise, "noise")
         if noise is not None and self.noise.known is not None:
             is_unused = noise.isnan() & Y.isnan()
             if is_unused.any():
@@ -814,12 +820,15 @@ class GP(gpytorch.models.GP, Predictive):
     @property
     def covar_module(self) -> AdditiveKernel:
         """The prior covariance: the sum of the kernels of rho, scaled by f_p - c, and of delta."""
-        return kernel_view(self)
+        terms = [term for term in self.terms if term.varies] or self.terms[:1]  # of zeros
+        return AdditiveKernel(*(TermView(self, term.name) for term in terms))
 
     @property
     def likelihood(self) -> GaussianLikelihood:
         """The Gaussian likelihood with the model's noise."""
-        return likelihood_view(self)
+        likelihood = GaussianLikelihood()
+        likelihood.noise_covar = NoiseView(self)
+        return likelihood
 
     @property
     def batch_shape(self) -> Size:
@@ -913,7 +922,9 @@ def _with_kernel(term: Any) -> Term:
     if term.kernel is None:
         return term
     kernel = as_kernel(term.kernel, DELTA if term.physics is None else RHO)
-    return term._replace(kernel=kernel, constant=term.constant if kernel.has_constant else None)
+    if not kernel.has_constant:
+        term = term._replace(constant=None)
+    return term._replace(kernel=kernel)
 
 
 def _coordinates(model: GP) -> Tensor:

@@ -159,7 +159,9 @@ class KnownNoise(Noise):
     def variance(self, values: Values, places: Places, is_training: bool = False) -> Tensor:
         """Return the known variances; at other places their mean in each output."""
         variances = self.known.unsqueeze(-3)  # ... x 1 x m x n
-        return variances if is_training else variances.mean(-1, keepdim=True)
+        if is_training:
+            return variances
+        return variances.mean(-1, keepdim=True)
 
     def appended(self, variances: Tensor | None, num_points: int) -> Self:
         """Return the noise of further rows, too: of given variances or the mean of those known."""

@@ -13,6 +13,7 @@ from gpadjust.core.gaussian import Marginals
 
 def correlation_root(K: Tensor) -> Tensor:
     """Return a lower root of covariances, with a jitter relative to each variance."""
+    # K = D R D, and R = L L^T: D L is the root.
     sd = K.diagonal(dim1=-1, dim2=-2).clamp_min(1e-300).sqrt()
     R = K / (sd.unsqueeze(-1) * sd.unsqueeze(-2))
     eye = torch.eye(K.shape[-1]).to(K)
@@ -140,6 +141,7 @@ class MixturePosterior(GPyTorchPosterior):
         if weights.shape != (m,):
             raise ValueError(f"Expected weights of {m} outputs; found {tuple(weights.shape)}.")
         w = weights.to(mean).unsqueeze(-1)
+        # sum_j w_j y_j has the variance sum_j w_j^2 K_j.
         total = (w * mean).sum(-2, keepdim=True) + offset
         return MixturePosterior(total, (w.square().unsqueeze(-1) * K).sum(-3, keepdim=True))
 

@@ -163,8 +163,8 @@ def _move(
         new = (new + leap * (root @ p.unsqueeze(-1)).squeeze(-1)).clamp(-_FAR, _FAR)
         new_value, new_slope = ratio(new)
         prior, by_prior = begin.log_density(new)
-        half = 0.5 if i + 1 == _LEAPS else 1.0
-        p = p + half * leap * force(new_slope, by_prior)
+        share = 0.5 if i + 1 == _LEAPS else 1.0
+        p = p + share * leap * force(new_slope, by_prior)
     after = power * new_value + prior - 0.5 * p.square().sum(-1)
     chance = (after - energy).exp().nan_to_num(nan=0.0).clamp_max(1.0)
     taken = torch.rand(chance.shape, generator=generator, dtype=u.dtype).to(u) < chance
@@ -252,7 +252,7 @@ def maximise(
     options: dict[str, float] = {"maxiter": most}
     if not is_precise:
         options["ftol"] = 1e-5
-    for _ in range(_SEARCHES if is_precise else 1):
+    for _ in range(max(1, _SEARCHES * is_precise)):
         before = float(top.nan_to_num(neginf=-1e10).sum())
         start = best.flatten().cpu().numpy()
         minimize(negative, start, jac=True, method="L-BFGS-B", options=options)
@@ -287,7 +287,7 @@ def around_mode(
     root = _whitening(hessian, torch.eye(p).to(mode).expand_as(hessian), is_precise)
     # log Z = log L(mode) - |mode|^2 / 2 + log |root|
     evidence = value[0] - 0.5 * mode.square().sum(-1) + torch.linalg.slogdet(root).logabsdet
-    for _ in range(_REFINED if is_precise else 0):
+    for _ in range(_REFINED * is_precise):
         before = evidence
         white = partial(white_density, log_likelihood, mode, root)
         step = maximise(white, torch.zeros_like(here), True)[0]

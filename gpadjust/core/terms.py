@@ -90,7 +90,7 @@ class WeightedSum:
             if term.kernel is not None:
                 variance = term.kernel.variance(self.own(term), self.x)
                 k = k + self._process(term, variance.unsqueeze(-1)).squeeze(-1)
-            total = total + k * weight.square()
+            total = total + k * weight.square()  # w^2 (k + kappa)
         return total
 
     def cross(self, other: WeightedSum) -> Tensor:
@@ -104,8 +104,9 @@ class WeightedSum:
                 continue
             k = self._constant(term).unsqueeze(-1)
             if term.kernel is not None:
-                point = None if other is self else other.x
-                k = k + self._process(term, term.kernel.covariance(self.own(term), self.x, point))
+                points = (self.x,) if other is self else (self.x, other.x)
+                k = k + self._process(term, term.kernel.covariance(self.own(term), *points))
+            # w (k + kappa) w'
             total = total + k * weight.unsqueeze(-1) * other.weights[term.name].unsqueeze(-2)
         return total
 
@@ -194,7 +195,9 @@ class WeightedSum:
     def _process(self, term: Term, K: Tensor) -> Tensor:
         """Return covariances of a term's process, 0 for draws of nested models without it."""
         process = self.values.get(f"{term.name}.process")
-        return K if process is None else K * process.unsqueeze(-1)
+        if process is None:
+            return K
+        return K * process.unsqueeze(-1)
 
     def _constant(self, term: Term) -> Tensor:
         """Return kappa, ``S x m x 1``."""
@@ -250,6 +253,7 @@ class TermSum:
         if term.has_center is not True:
             return term.has_center / self.unit
         i = term.physics or 0
+        # c = mean of f_p + 3 sd u
         return self.middle[i] + self.spread[i] * values[f"{term.name}.center"]
 
     def mean_of(self, term: Term, values: Values) -> Tensor | float:
@@ -257,9 +261,9 @@ class TermSum:
 
         There delta has c in the place of f_p: a model without physics keeps its constant.
         """
-        mean = term.mean / (self.unit if term.physics is None else 1.0)
         if term.physics is not None:
-            return mean * values.get(f"{term.name}.mean", 1.0)
+            return term.mean * values.get(f"{term.name}.mean", 1.0)
+        mean = term.mean / self.unit
         if term.name == self.plain:
             for other in self.terms:
                 if (factor := values.get(f"{other.name}.mean")) is not None:
@@ -273,7 +277,7 @@ class TermSum:
             mean = self.mean_of(term, values)
             if term.physics is not None:
                 mean = mean * places.f[term.physics]
-            total = total + mean
+            total = total + mean  # b times the mean of g
         return total
 
     def evaluate(self, values: Values, places: Places) -> WeightedSum:
@@ -282,7 +286,7 @@ class TermSum:
         for term in self.terms:
             b = torch.ones_like(places.x[..., 0])
             if term.physics is not None:
-                b = places.f[term.physics] - self.center(term, values)
+                b = places.f[term.physics] - self.center(term, values)  # f_p - c
             weights[term.name] = b
         return WeightedSum(self.terms, values, places.x, self.mean(values, places), weights)
 

@@ -50,13 +50,16 @@ class Row(NamedTuple):
 
     def value(self, u: Tensor) -> Tensor:
         """Return the numbers at coordinates ``S x m x k`` (of a shared row ``S x k``)."""
-        theta = self.location + self.scale * u
-        return theta.exp() if self.is_positive else theta
+        theta = self.location + self.scale * u  # a + b u
+        if self.is_positive:
+            theta = theta.exp()
+        return theta
 
     def coordinate(self, value: Tensor) -> Tensor:
         """Return the coordinates of numbers."""
-        theta = value.log() if self.is_positive else value
-        return (theta - self.location) / self.scale
+        if self.is_positive:
+            value = value.log()
+        return (value - self.location) / self.scale  # u = (theta - a) / b
 
     def slope(self, value: Tensor) -> Tensor | float:
         """Return the derivatives of the numbers by their coordinates."""
@@ -79,11 +82,10 @@ class Choice(NamedTuple):
 class Table:
     r"""All unknown numbers of a model, and vectors of their coordinates.
 
-    Vectors u are ``S x B x P``: ``S`` draws of the coordinates of ``B`` independent problems.
-    Outputs are problems of their own, ``B = m``; where they share numbers, there is one problem of
-    all outputs, ``B = 1``. With choices, the last coordinate of each output selects the nested
-    model: an interval of ``|u|``, of which the first choice has the lowest. It has no gradient;
-    :meth:`with_choice` sets it.
+    Vectors u are ``S x B x P``: ``S`` draws of the coordinates of ``B`` independent problems, ``B =
+    m`` outputs, or 1 if these share numbers. With choices, the last coordinate of each output
+    selects the nested model: an interval of ``|u|``, of which the first choice has the lowest. It
+    has no gradient; :meth:`with_choice` sets it.
 
     Attributes:
         problems: ``B``.
@@ -120,21 +122,21 @@ class Table:
 
     def values(self, u: Tensor) -> Values:
         """Return all numbers at coordinates ``S x B x P``."""
-        parts = [*self._of_outputs(u).split(self._sizes[: len(self.own)], -1)] if self.own else []
+        parts = self._parts(u)
         if self.shared:
             parts += u[:, 0, self._own_size :].split(self._sizes[len(self.own) :], -1)
         values = {row.name: row.value(z) for row, z in zip(self.rows, parts, strict=True)}
         if self.choices:
             chosen = self.chosen(values).unsqueeze(-1)
-            for k, choice in enumerate(self.choices):
-                for name in choice.zeros if (chosen == k).any() else ():
+            for k in chosen.unique().tolist():
+                for name in self.choices[k].zeros:
                     value = values.get(name, torch.ones_like(values[_CHOICE]))
                     values[name] = value.masked_fill(chosen == k, 0.0)
         return values
 
     def with_values(self, u: Tensor, values: Values) -> Tensor:
         """Return coordinates ``S x B x P`` by which numbers of outputs have these values."""
-        parts = [*self._of_outputs(u).split(self._sizes[: len(self.own)], -1)]
+        parts = self._parts(u)
         for i, row in enumerate(self.own):
             if row.name in values:
                 parts[i] = row.coordinate(values[row.name]).expand_as(parts[i])
@@ -144,6 +146,10 @@ class Table:
     def _of_outputs(self, u: Tensor) -> Tensor:
         """Return the coordinates of each output, ``S x m x k``."""
         return u[..., : self._own_size].reshape(len(u), self.num_outputs, self._width)
+
+    def _parts(self, u: Tensor) -> list[Tensor]:
+        """Return the coordinates of each row of outputs, ``S x m x k``."""
+        return [*self._of_outputs(u).split(self._sizes[: len(self.own)], -1)] if self.own else []
 
     def gradient(self, by: Values, values: Values) -> Tensor:
         """Return derivatives by u, ``S x B x P``, of derivatives by the numbers."""
@@ -176,7 +182,9 @@ class Table:
                 size = size + math.log(row.scale) + 0.5 * z.square() + 0.5 * math.log(2 * math.pi)
                 part = row.log_density(theta) + size.sum(-1)
                 part = part.reshape(len(u), -1)  # S x m, or S x 1 of a shared row
-                total = total + (part if self.problems > 1 else part.sum(-1, keepdim=True))
+                if self.problems == 1:
+                    part = part.sum(-1, keepdim=True)
+                total = total + part
         return total
 
     def prior_draws(self, number: int, seed: int) -> Tensor:
@@ -222,8 +230,9 @@ class Table:
         """Return coordinates with the given choice for all outputs."""
         if not self.choices:
             return u
-        # The middle of the choice's interval of |u|, by probability.
-        ends = [0.5, *torch.special.ndtr(self._ends).tolist(), 1.0]
-        middle = NormalDist().inv_cdf((ends[number] + ends[number + 1]) / 2) if number else 0.0
+        middle = 0.0
+        if number:  # the middle of the choice's interval of |u|, by probability
+            ends = [0.5, *torch.special.ndtr(self._ends).tolist(), 1.0]
+            middle = NormalDist().inv_cdf((ends[number] + ends[number + 1]) / 2)
         columns = torch.arange(self._width - 1, self._own_size, self._width, device=u.device)
         return u.index_fill(-1, columns, middle)

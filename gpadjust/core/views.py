@@ -10,8 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from gpytorch.kernels import AdditiveKernel, Kernel
-from gpytorch.likelihoods import GaussianLikelihood
+from gpytorch.kernels import Kernel
 from gpytorch.likelihoods.noise_models import Noise as NoiseModule
 from gpytorch.means import Mean
 from gpytorch.mlls import AddedLossTerm
@@ -71,12 +70,6 @@ class TermView(_View, Kernel):
         return _of_all(one.cross(other) * model.unit.square().unsqueeze(-1), model, -3)
 
 
-def kernel_view(model: Any) -> AdditiveKernel:
-    """Return the prior covariance of a model: the sum of its terms' scaled kernels."""
-    terms = [term for term in model.terms if term.varies] or model.terms[:1]  # of zeros
-    return AdditiveKernel(*(TermView(model, term.name) for term in terms))
-
-
 class NoiseView(_View, NoiseModule):
     """The noise of a model's observations."""
 
@@ -106,13 +99,6 @@ class NoiseView(_View, NoiseModule):
         if is_training:
             v = v + _MISSING * model.data.Y.isnan().mT
         return v.expand(*v.shape[:-1], X.shape[-2]) * model.unit.square()
-
-
-def likelihood_view(model: Any) -> GaussianLikelihood:
-    """Return a Gaussian likelihood whose noise is the model's."""
-    likelihood = GaussianLikelihood()
-    likelihood.noise_covar = NoiseView(model)
-    return likelihood
 
 
 class OtherPriors(_View, AddedLossTerm):

@@ -141,8 +141,8 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/core/fitting.py",
-        "return total + (units if len(total) > 1 else units.sum())",
-        "return total + units",
+        "        units = units.sum()\n",
+        "        units = units\n",
         "The evidence of outputs that share parameters counts units once, not for each output.",
     ),
     Fault(
