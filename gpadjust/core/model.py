@@ -743,6 +743,15 @@ class GP(gpytorch.models.GP, Predictive):
         new._cached = (self.u.detach().clone(), conditioning)
         return new.eval()
 
+    def get_fantasy_model(self, inputs: Any, targets: Tensor, **options: Any) -> Self:
+        """Condition on targets ``... x (m) x k``, as GPyTorch's lists of models do."""
+        X = inputs if isinstance(inputs, Tensor) else inputs[0]
+        noise = options.get("noise")
+        if self.num_outputs > 1:
+            return self.condition_on_observations(X, targets.mT, noise)
+        noise = None if noise is None else noise.unsqueeze(-1)
+        return self.condition_on_observations(X, targets.unsqueeze(-1), noise)
+
     def subset_output(self, idcs: list[int]) -> Self:
         """Return the model of some outputs; a ValueError if there are none of these numbers."""
         idcs = self.checked_outputs(idcs)

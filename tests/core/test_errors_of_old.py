@@ -1,71 +1,19 @@
 """What was silently wrong once, or failed, in a former core."""
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 from botorch.acquisition import PosteriorMean
 from botorch.acquisition.multi_objective.logei import qLogNoisyExpectedHypervolumeImprovement
 from botorch.models import ModelListGP, SingleTaskGP
 
-from gpadjust import compare
-from gpadjust.core import CKA, RRA, PhysicsMeanGP, ZeroMeanGP, fit, save
-from gpadjust.kinds import Categories, HeavyTails, LinkedCKA, NoisyInputs, RelativeNoise
+from gpadjust.core import CKA, PhysicsMeanGP, ZeroMeanGP, fit
+from gpadjust.kinds import LinkedCKA
 from gpadjust.physics import FormulaPhysics
-from tests.systems import line, normal, refused, same, uniform, wave
+from tests.systems import line, normal, same, uniform, wave
 
 X = line(12)
 Y = 1.3 * wave(X) + X + 0.05 * normal(12, 1)
-
-
-def noisy_inputs():
-    noisy = NoisyInputs(X, 0.01**2)
-    return CKA(noisy.X, Y, physics=wave, noise=noisy)
-
-
-@pytest.mark.parametrize("make", [
-    lambda: LinkedCKA(X, Y.exp(), physics=lambda X: wave(X).exp()),
-    lambda: RRA(X, Y, physics=wave, num_features=16),
-    lambda: ZeroMeanGP(X, Y, noise=RelativeNoise()),
-    noisy_inputs,
-], ids=["link", "RRA", "relative noise", "noisy inputs"])  # fmt: skip
-def test_a_second_fit_is_the_first(make):
-    """A search once began where the last fit had ended."""
-    model = make()
-    fit(model, num_draws=16)
-    once = model.predict(X)
-    fit(model, num_draws=16)
-    assert all(map(torch.equal, once, model.predict(X)))
-
-
-@pytest.mark.parametrize(("options", "words"), [
-    ({"likelihood": "relative"}, r"option 'likelihood' of CKA; expected noise=HeavyTails\(\)"),
-    ({"categorical": ["m"]}, r"Categories\(\[column\]\) of gpadjust.kinds"),
-    ({"batch": "m"}, "Categories"),
-    ({"link": "log"}, "LinkedCKA"),
-    ({"train_Xvar": 0.1}, "NoisyInputs"),
-    ({"kernel": None}, "'kernel' of CKA; expected some of center, .*, rho_mean. See CHANGELOG"),
-    ({"rho_mean": "learn"}, "unknown by default"),
-    ({"delta_mean": "learn"}, "unknown by default"),
-    ({"center": "learn"}, r"True \(unknown\)"),
-    ({"noise": HeavyTails}, r"noise as an instance, HeavyTails\(\)"),
-    ({"input_transform": Categories}, r"input_transform as an instance, Categories\(\)"),
-])  # fmt: skip
-def test_options_of_earlier_versions(options, words):
-    refused(TypeError, words, CKA, X, Y, physics=wave, **options)
-
-
-def test_the_way_out_of_data_and_files(tmp_path):
-    refused(ValueError, "LinkedCKA", CKA, X, Y, physics=wave, outcome_transform="log")
-    frame = pd.DataFrame({"a": X[:, 0], "m": ["steel", "brass"] * 6})
-    refused(TypeError, r"Categories\(\)", CKA, frame, Y, physics=wave)
-    refused(TypeError, "comparison.recommended", save, "a comparison", tmp_path / "model.pt")
-    refused(TypeError, "'likelihood' of ZeroMeanGP", compare, X, Y, wave, likelihood="relative")
-    assert repr(ZeroMeanGP(X, Y)) == "ZeroMeanGP(12 points, 1 input, 1 output, 1 draw)"
-
-
-def test_a_term_that_a_model_has_not():
-    refused(ValueError, "Unknown term 'rho'; expected one of f", ZeroMeanGP(X, Y).rho, X)
 
 
 def test_beyond_the_data_a_link_predicts_within_its_interval():
@@ -100,21 +48,6 @@ def test_a_link_and_other_models_in_a_list(order):
         with torch.no_grad():
             gain = qLogNoisyExpectedHypervolumeImprovement(several, [0.0, 0.0], X)
             assert gain(Z.unsqueeze(1)).isfinite().all()
-
-
-def test_a_series_of_targets():
-    """The commonest line of pandas; the advice was a method that a Series has not."""
-    frame = pd.DataFrame({"a": X[:, 0], "y": Y[:, 0]}, index=range(5, 17))
-    model = CKA(frame[["a"]], frame["y"], physics=wave)
-    assert model.data.output_names == ("y",)
-    assert (model.predict(frame[["a"]]).mean.index == frame.index).all()
-    same([model.data.Y], [Y])
-
-
-@pytest.mark.slow
-def test_a_series_is_compared():
-    frame = pd.DataFrame({"a": X[:, 0], "y": Y[:, 0]})
-    assert list(compare(frame[["a"]], frame["y"], wave, structures=["CKA"]).table) == ["y"]
 
 
 def test_a_fitted_model_is_a_physics_by_its_predictions():

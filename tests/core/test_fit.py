@@ -5,11 +5,11 @@ import warnings
 
 import pytest
 import torch
-from botorch.sampling import SobolQMCNormalSampler
 
 from gpadjust.core import (
     CKA,
     GP,
+    RRA,
     Choice,
     LogNormal,
     Noise,
@@ -20,11 +20,9 @@ from gpadjust.core import (
     fit,
 )
 from gpadjust.core.sample import around_mode
+from gpadjust.kinds import LinkedCKA, NoisyInputs, RelativeNoise
 from gpadjust.physics import FunctionPhysics, Unknown
-
-
-def wave(X):
-    return torch.sin(6 * X[..., :1])
+from tests.systems import wave
 
 
 def noisy(n, seed=0, noise=0.05):
@@ -88,18 +86,29 @@ def test_probabilities_of_nested_models(n):
     assert 1 - chosen == pytest.approx(result.probabilities["some"][0], abs=0.01)
 
 
-@pytest.mark.parametrize("n", [12, 60])
-def test_fitted_twice_is_fitted_once(n):
+def noisy_inputs(X, Y):
+    noisy = NoisyInputs(X, 0.01**2)
+    return CKA(noisy.X, Y, physics=wave, noise=noisy)
+
+
+TWICE = {
+    "CKA": lambda X, Y: CKA(X, Y, physics=wave),
+    "RRA": lambda X, Y: RRA(X, Y, physics=wave, num_features=16),
+    "link": lambda X, Y: LinkedCKA(X, Y.exp(), physics=lambda X: wave(X).exp()),
+    "relative noise": lambda X, Y: ZeroMeanGP(X, Y, noise=RelativeNoise()),
+    "noisy inputs": noisy_inputs,
+}
+
+
+@pytest.mark.parametrize(("kind", "n"), [*((kind, 12) for kind in TWICE), ("CKA", 60)])
+def test_fitted_twice_is_fitted_once(kind, n):
     X, e = noisy(n)
-    Y = 1.3 * wave(X) + X[:, 1:] + e
-    model = CKA(X, Y, physics=wave)
+    model = TWICE[kind](X, 1.3 * wave(X) + X[:, 1:] + e)
     first = fit(model, seed=3)
     once = model.predict(X)
     fit(model, "map")
     second = fit(model, seed=3)
-    twice = model.predict(X)
-    assert torch.equal(once.mean, twice.mean)
-    assert torch.equal(once.variance, twice.variance)
+    assert all(map(torch.equal, once, model.predict(X)))
     assert torch.equal(first.log_evidence, second.log_evidence)
 
 
@@ -197,14 +206,11 @@ def test_evidence_of_targets_in_another_unit():
     X, e = noisy(6)
     Y = torch.cat([1.2 * wave(X) + e, 2.4 * wave(X) - e], 1)
     Y[2, 1] = torch.nan
-    found = []
+    found, unknowns = [], {"a": Unknown(1.0, sd=0.5)}
+    both = lambda X: torch.cat([wave(X), 2 * wave(X)], -1)  # noqa: E731
     for size in (1.0, 1024.0):  # without rounding
-        physics = FunctionPhysics(
-            lambda X, p, size=size: (
-                size * p.a.unsqueeze(-1) * torch.cat([wave(X), 2 * wave(X)], -1)
-            ),
-            unknowns={"a": Unknown(1.0, sd=0.5)},
-        )
+        law = lambda X, p, size=size: size * p.a.unsqueeze(-1) * both(X)  # noqa: E731
+        physics = FunctionPhysics(law, unknowns=unknowns)
         model = PhysicsMeanGP(X, size * Y, physics=physics)
         with warnings.catch_warnings(action="ignore", category=SamplingWarning):
             found.append(fit(model, num_draws=16).log_evidence)
@@ -254,18 +260,3 @@ def test_convergence_is_judged_by_predictions(n, noise):
         errors.append(result.error)
     moved = torch.stack(means).std(0) / model.predict(Z).variance.sqrt()
     assert moved.square().mean().sqrt() < max(0.35, 4 * max(errors))
-
-
-def test_what_is_refused():
-    X, e = noisy(6)
-    model = ZeroMeanGP(X, e)
-    for arguments, words in (
-        ({"method": "vi"}, "Unknown method 'vi'"),
-        ({"num_draws": 6}, "multiple of 4"),
-        ({"num_draws": 0}, "multiple of 4"),
-    ):
-        with pytest.raises(ValueError, match=words):
-            fit(model, **arguments)
-    fantasy = model.fantasize(X[:2].expand(3, 2, 2), SobolQMCNormalSampler(torch.Size([2])))
-    with pytest.raises(ValueError, match="one data set"):
-        fit(fantasy)

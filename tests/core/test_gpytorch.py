@@ -24,13 +24,10 @@ from gpytorch.mlls import ExactMarginalLogLikelihood, SumMarginalLogLikelihood
 from gpadjust.core import CKA, CalibratedPhysics, fit
 from gpadjust.gpytorch import PhysicsMean, PhysicsScaledKernel
 from gpadjust.physics import FunctionPhysics, Unknown
+from tests.systems import wave
 
 BOUNDS = torch.tensor([[0.0, 0.0], [1.0, 1.0]], dtype=torch.float64)
 SEARCH = {"num_restarts": 2, "raw_samples": 8, "options": {"maxiter": 5}}
-
-
-def wave(X):
-    return torch.sin(6 * X[..., :1])
 
 
 def both(X):
@@ -261,15 +258,3 @@ def test_as_single_task_gp(models, uniform):
             torch.testing.assert_close(
                 single.posterior(Z).variance, expected.variance, rtol=1e-4, atol=1e-7
             )
-    with pytest.raises(ValueError, match="Expected one output"):
-        models[1].as_single_task_gp()
-
-
-def test_what_training_mode_refuses(data):
-    X, Y = data
-    model = CKA(X, Y, physics=both)
-    with pytest.raises(RuntimeError, match="call the model on its training inputs"):
-        model(X[:3])
-    model.set_draws(model.u.detach().expand(4, -1, -1))
-    with pytest.raises(RuntimeError, match="The model holds 4 draws"):
-        model(X)

@@ -8,7 +8,6 @@ import torch
 from gpadjust import CKA, CalibratedPhysics, FunctionPhysics, Unknown, fit
 from gpadjust.core import SamplingWarning
 from gpadjust.core.nuts import nuts
-from gpadjust.many import VariationalCKA
 from tests.systems import line, refused, wave
 
 pytestmark = pytest.mark.filterwarnings("ignore:Chains do not agree")
@@ -97,11 +96,6 @@ def test_chains_that_do_not_agree_warn():
     assert not result.converged
 
 
-def test_refused(monkeypatch):
-    X = line(9)
-    refused(ValueError, "nested=False", fit, CKA(X, wave(X), physics=wave), "nuts")
-    few = VariationalCKA(X, wave(X), physics=wave, num_inducing=4)
-    refused(ValueError, "from 16 on; found 8", fit, linear(), "nuts", num_draws=8)
-    refused(ValueError, "no density", fit, few, "nuts")
+def test_pyro_is_needed(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyro.infer", None)
     refused(ImportError, r"gpadjust\[pyro\]", fit, linear(), "nuts")

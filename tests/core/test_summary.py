@@ -1,14 +1,30 @@
-"""The text of a summary."""
+"""The text of a summary, and the table of priors."""
 
 import re
 
+import gpytorch
 import pytest
 import torch
 from botorch.models.transforms import Normalize
 from gpytorch.kernels import PeriodicKernel, RBFKernel, ScaleKernel
+from gpytorch.priors import LogNormalPrior
 
-from gpadjust.core import CKA, GP, KnownNoise, LogNormal, Noise, Stationary, Term, ZeroMeanGP
+from gpadjust.core import (
+    CKA,
+    GP,
+    KnownNoise,
+    LogNormal,
+    Noise,
+    Stationary,
+    Term,
+    ZeroMeanGP,
+    fit,
+    load,
+    save,
+)
 from gpadjust.physics import FunctionPhysics, Unknown
+from tests.core.noises import Relative
+from tests.systems import line, wave
 
 X = torch.linspace(0, 2, 7, dtype=torch.float64).unsqueeze(-1) * torch.tensor([1.0, -2.0])
 Y = 50 * torch.cat([X[:, :1].sin(), X[:, 1:].cos()], -1)
@@ -88,8 +104,8 @@ def test_of_physics_kernels_and_transforms():
     model = CKA(X, Y, physics=own, **options)
     model.set_draws(torch.randn(5, *model.u.shape[1:]).double())
     numbers = lines(model)
-    for line in repr(model.physics_parameters).splitlines():
-        assert f"\n  {line}\n" in model.summary()
+    for row in repr(model.physics_parameters).splitlines():
+        assert f"\n  {row}\n" in model.summary()
     sd = (
         model.values["delta.kernel.kernels.0.raw_outputscale"][:, 1].sqrt() * model.unit[1]
     ).median()
@@ -100,20 +116,20 @@ def test_of_physics_kernels_and_transforms():
     assert "lengthscale of x2 after the transform" in numbers
 
 
-class Relative(Noise):
-    """Noise with a share of f_p."""
+class OfPhysics(Relative):
+    """Noise that is a share of f_p alone."""
 
     def __init__(self):
-        super().__init__(("relative",), [LogNormal(0.01, 10.0)])
+        Noise.__init__(self, ("relative",), [LogNormal(0.01, 10.0)])
 
     def shares(self, places):
-        return places.f[0].square().unsqueeze(-1)
+        return super().shares(places)[..., 1:]
 
 
 @pytest.mark.parametrize("fantasies", [False, True])
 def test_of_noise(fantasies):
     terms = [Term("f", Stationary()), Term("g", physics=0, mean=1.0)]
-    model = GP(X, Y, terms=terms, physics=[physics], noise=Relative())
+    model = GP(X, Y, terms=terms, physics=[physics], noise=OfPhysics())
     model.set_draws(torch.zeros(3, *model.u.shape[1:]).double())
     sd = 0.1 * physics(X)[:, 1].abs()
     expected = (
@@ -134,3 +150,61 @@ def test_without_constants():
     assert "constant" not in text
     assert "    lengthscale of x: 2\n" in text
     assert "probabilities" not in text
+
+
+def table(model):
+    return model.priors().set_index("name")
+
+
+def of_waves(**options):
+    X = 5 * line(9)
+    return CKA(X, 20 * wave(X) + 3 * X, physics=wave, **options)
+
+
+def test_priors_are_in_the_users_units_and_stay_after_a_fit():
+    one = of_waves()
+    rows = table(one)
+    assert rows.loc["delta lengthscale of x", "median"] == pytest.approx(5.0)
+    unit = float(one.unit)
+    assert rows.loc["noise standard deviation", "median"] == pytest.approx(0.01 * unit)
+    assert rows.loc["delta standard deviation", "97.5 %"] == pytest.approx(
+        unit * (0.1 * 1000**1.96) ** 0.5, rel=1e-3
+    )
+    fit(one)
+    assert one.priors().equals(of_waves().priors())
+
+
+RHO = Stationary(outputscale=LogNormal(0.04, 2.0))
+DELTA = Stationary(lengthscale=LogNormal(0.5, 2.0))
+
+
+@pytest.mark.parametrize(("options", "name", "median"), [
+    ({"constants": {"rho": LogNormal(0.25, 2.0)}}, "rho standard deviation of the constant", 0.5),
+    ({"rho_covar_module": RHO}, "rho standard deviation", 0.2),
+    ({"delta_covar_module": DELTA}, "delta lengthscale of x", 2.5),
+])  # fmt: skip
+def test_each_prior_is_replaced_by_one_argument(options, name, median, tmp_path):
+    changed, usual = table(of_waves(**options)), table(of_waves())
+    assert changed.loc[name, "median"] == pytest.approx(median)
+    others = changed.index != name
+    assert changed.loc[others].equals(usual.loc[others])
+    saved = save(one := of_waves(**options), tmp_path / "model.pt")
+    given = {name: options[name] for name in saved.missing}  # kernels of one's own
+    again = load(tmp_path / "model.pt", physics=wave, **given)
+    assert again.priors().equals(one.priors())
+
+
+def test_noise_unknowns_and_priors_of_gpytorch():
+    one = of_waves(noise=Noise(priors=[LogNormal(0.04, 2.0)]))
+    found = table(one).loc["noise standard deviation", "median"]
+    assert found == pytest.approx(0.2 * float(one.unit))
+    physics = FunctionPhysics(
+        lambda X, p: p.k * X[:, 0], unknowns={"k": Unknown(3.0, sd=1.0, unit="N/m")}
+    )
+    X = line(6)
+    row = table(CKA(X, X, physics=physics)).loc["k"]
+    assert row["2.5 %"] == pytest.approx(3 - 1.96, abs=1e-2)
+    assert "N/m" in row["meaning"]
+    kernel = gpytorch.kernels.RBFKernel(lengthscale_prior=LogNormalPrior(1.0, 0.1))
+    row = table(ZeroMeanGP(X, X, covar_module=kernel)).filter(like="lengthscale", axis=0)
+    assert row["median"].item() == pytest.approx(torch.e, rel=0.05)

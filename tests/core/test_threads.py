@@ -1,18 +1,18 @@
-"""Conditioning in one thread, while another asks the same model."""
+"""Small problems in one thread, the user's number elsewhere, and one model in two threads."""
 
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from threading import Event
 
 import pytest
 import torch
+from threadpoolctl import threadpool_info
 
-from gpadjust.core import CKA, RRA, StackedGP, ZeroMeanGP
+from gpadjust.core import CKA, RRA, StackedGP, ZeroMeanGP, fit
+from gpadjust.core.threads import threads_for
 from gpadjust.kinds import AR1, LinkedCKA
+from gpadjust.physics import FunctionPhysics, Unknown
 from tests.systems import ripple, uniform
-
-
-def first(X):
-    return ripple(X)[..., :1]
 
 
 def stacked(X, Y, physics):
@@ -31,6 +31,9 @@ MODELS = {
 
 @pytest.mark.parametrize("name", MODELS)
 def test_conditioning_leaves_the_model_whole_also_in_another_thread(name, drawn):
+    def first(X):
+        return ripple(X)[..., :1]
+
     X = uniform(9, 2)
     model = MODELS[name](X, 1.2 * first(X) + X[:, 1:], physics=first)
     for each in getattr(model, "models", [model]):
@@ -62,3 +65,104 @@ def test_conditioning_leaves_the_model_whole_also_in_another_thread(name, drawn)
         for parameter in new.parameters():
             parameter.add_(1.0)
     torch.testing.assert_close(model.predict(Z), expected)
+
+
+def of_a_new_thread():
+    """The number of threads that PyTorch uses in a thread that begins now."""
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(torch.get_num_threads).result()
+
+
+def of_blas():
+    return {each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"}
+
+
+@pytest.fixture(autouse=True)
+def _two():
+    """The user's setting is 2, before and after; that of BLAS stays, too."""
+    before, blas = torch.get_num_threads(), of_blas()
+    torch.set_num_threads(2)
+    yield
+    assert (torch.get_num_threads(), of_a_new_thread()) == (2, 2)
+    assert of_blas() == blas
+    torch.set_num_threads(before)
+
+
+def test_one_within_none_of_large_problems_and_after_an_error():
+    with threads_for(12):
+        assert (torch.get_num_threads(), of_blas()) == (1, {1})
+    before = of_blas()
+    with threads_for(1000):
+        assert (torch.get_num_threads(), of_blas()) == (2, before)
+    with pytest.raises(KeyboardInterrupt), threads_for(12):
+        raise KeyboardInterrupt
+    with threads_for(12):
+        with threads_for(20):
+            assert (torch.get_num_threads(), of_blas()) == (1, {1})
+        assert (torch.get_num_threads(), of_blas()) == (1, {1})
+
+
+def test_threads_that_begin_meanwhile_and_those_with_a_setting_of_their_own():
+    with threads_for(12), ThreadPoolExecutor(1) as pool:
+        assert pool.submit(torch.get_num_threads).result() == 2
+        pool.submit(lambda: torch.rand(9, 9) @ torch.rand(9, 9)).result()
+
+    def work():
+        torch.set_num_threads(3)
+        with threads_for(12):
+            inside = torch.get_num_threads()
+        return inside, torch.get_num_threads()
+
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(work).result() == (1, 3)
+    assert (torch.get_num_threads(), of_a_new_thread()) == (2, 3)
+    torch.set_num_threads(2)
+
+
+@pytest.mark.parametrize("first_out", [0, 1])
+def test_sections_that_overlap_in_two_threads(first_out):
+    """The second thread begins, and computes, while the first is in its section."""
+    seen = {}
+    with ThreadPoolExecutor(1) as one, ThreadPoolExecutor(1) as other:
+        threads, sections = [one, other], [ExitStack(), ExitStack()]
+
+        def enter(i):
+            sections[i].enter_context(threads_for(12))
+            return torch.get_num_threads()
+
+        def leave(i):
+            sections[i].close()
+            return torch.get_num_threads()
+
+        assert [threads[i].submit(enter, i).result() for i in (0, 1)] == [1, 1]
+        assert (of_a_new_thread(), of_blas()) == (2, {1})
+        last = 1 - first_out
+        seen[first_out] = threads[first_out].submit(leave, first_out).result()
+        assert threads[last].submit(torch.get_num_threads).result() == 1
+        seen[last] = threads[last].submit(leave, last).result()
+    assert seen == {0: 2, 1: 2}
+
+
+def test_predictions_leave_threads_alone(uniform, monkeypatch):
+    """The setting is of all threads that begin: a limit for each prediction would reach them."""
+    X = uniform(8, 1)
+    model = CKA(X, X.sin(), physics=lambda X: X).eval()
+    monkeypatch.setattr(torch, "set_num_threads", lambda n: pytest.fail(f"set to {n}"))
+    model.predict(X)
+    model.posterior(X).rsample()
+
+
+def test_a_fit_has_one_thread_and_leaves_the_setting(uniform):
+    seen = set()
+
+    def physics(X):
+        seen.add(torch.get_num_threads())
+        return X
+
+    X = uniform(8, 1)
+    noisy = CKA(X, X.sin(), physics=FunctionPhysics(
+        lambda X, p: p.a[:, None] * physics(X), unknowns={"a": Unknown(1.0, sd=0.5)}))  # fmt: skip
+    seen.clear()
+    fit(noisy, "map")
+    assert seen == {1}
+    assert torch.get_num_threads() == 2
