@@ -52,22 +52,17 @@ class Data(NamedTuple):
                 )
         if len(X) != len(Y) or X.shape[-1] < 1 or Y.shape[-1] < 1:
             raise ValueError(
-                "Expected as many rows of targets as of inputs, and columns of both; found train_X "
-                f"of shape {tuple(X.shape)} and train_Y of {tuple(Y.shape)}."
+                "Expected as many rows of train_Y as of train_X, and columns of both; found shapes "
+                f"{tuple(X.shape)} and {tuple(Y.shape)}."
             )
         if len(X) < 2:
-            raise ValueError(
-                f"Expected at least 2 points in train_X; found {len(X)}. Use the physics alone "
-                "until there are two."
-            )
+            raise ValueError(f"Expected at least 2 points in train_X; found {len(X)}.")
         check_finite("train_X", X)
         check_observed("train_Y", Y)
         is_seldom = (~Y.isnan()).sum(-2) < 2
         if is_seldom.any():
-            raise ValueError(
-                "Expected at least 2 observations of each output, but train_Y has fewer in "
-                f"column(s) {marked_rows(is_seldom)}; leave these out."
-            )
+            columns = marked_rows(is_seldom)
+            raise ValueError(f"Expected at least 2 targets of each output; leave out {columns}.")
         X = X.detach().clone()
         Y = Y.detach().clone()
         Yvar = None if train_Yvar is None else variances_of(train_Yvar, Y)
@@ -147,14 +142,11 @@ def as_tensor(values: ArrayLike, name: str) -> Tensor:
         values = values.to_frame()
     array = getattr(values, "to_numpy", lambda: values)()
     if not isinstance(array, np.ndarray):
-        raise TypeError(
-            f"Expected {name} as a torch tensor, a NumPy array or a DataFrame; found "
-            f"{type(values).__name__}. Convert it with `torch.tensor({name}, dtype=torch.float64)`."
-        )
+        kind = type(values).__name__
+        raise TypeError(f"Expected {name} as a tensor, an array or a frame; found {kind}.")
     if np.ma.is_masked(array):
         raise ValueError(
-            f"Expected {name} without masked values; found {np.ma.count_masked(array)}. Leave out "
-            f"their rows, or make targets NaN, `{name}.filled(np.nan)`."
+            f"Expected {name} unmasked; take `{name}.filled(np.nan)`, or leave out rows."
         )
     types = {array.dtype.type}
     if array.dtype.kind == "O":
@@ -186,10 +178,8 @@ def variances_of(values: ArrayLike, Y: Tensor, name: str = "train_Yvar") -> Tens
     if variances.shape == (m, 1) != Y.shape:
         variances = variances.flatten()
     if variances.shape != Y.shape and variances.shape not in ((), (1,), (m,)):
-        raise ValueError(
-            f"Expected {name} (known variances) as one number, {m} (one for each column), or of "
-            f"the data's shape {tuple(Y.shape)}; found {tuple(variances.shape)}."
-        )
+        shapes = f"one number, {m}, or of the shape {tuple(Y.shape)} of the data"
+        raise ValueError(f"Expected {name} as {shapes}; found {tuple(variances.shape)}.")
     variances = variances.expand(Y.shape).masked_fill(Y.isnan(), torch.nan)
     variances = variances.where(~Y.isnan(), variances.nanmean(-2, keepdim=True))
     check_finite(name, variances)
@@ -223,10 +213,8 @@ def columns_of(names: Sequence[str], asked: Any, what: str) -> list[int]:
     several = [asked] if isinstance(asked, str | int) else [*asked]
     unknown = [column for column in several if column not in numbers]
     if unknown:
-        raise ValueError(
-            f"Expected {what} by names or numbers of the inputs {', '.join(names)}; found "
-            f"{unknown[0]!r}."
-        )
+        expected = f"{what} by names or numbers of the inputs {', '.join(names)}"
+        raise ValueError(f"Expected {expected}; found {unknown[0]!r}.")
     return [numbers[column] for column in several]
 
 

@@ -140,15 +140,10 @@ def fit(
     if method not in ("bayes", "map", "nuts"):
         raise ValueError(f"Unknown method {method!r}; expected 'bayes', 'map' or 'nuts'.")
     if method == "nuts" and not model.has_density:
-        raise ValueError(
-            f"{type(model).__name__} has no density of its unknown numbers, which NUTS needs; take "
-            "a model of gpadjust.core with fewer rows."
-        )
+        kind = type(model).__name__
+        raise ValueError(f"{kind} has no density for NUTS; take a model of fewer rows.")
     if method == "nuts" and model.table.choices:
-        raise ValueError(
-            "NUTS does not draw from several nested models; build the model with nested=False, and "
-            "compare with the default fit of that."
-        )
+        raise ValueError("NUTS does not draw from nested models; build it with nested=False.")
     least = 4 * CHAINS if method == "nuts" else 4  # R-hat needs four draws a chain
     if num_draws is not None and (num_draws < least or num_draws % 4):
         raise ValueError(

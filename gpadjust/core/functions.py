@@ -59,10 +59,8 @@ class Functions(torch.nn.Module):
         """Return the values ``k x q x m`` of each function at other points, ``k x q x d``."""
         X = self.model.data.new_inputs(X)
         if X.dim() != 3 or len(X) != self.number:
-            raise ValueError(
-                f"Expected points for each of {self.number} functions, {self.number} x q x d; "
-                f"found {tuple(X.shape)}."
-            )
+            expected = f"points for each of {self.number} functions, {self.number} x q x d"
+            raise ValueError(f"Expected {expected}; found {tuple(X.shape)}.")
         return self._values(self.model.evaluate_each(X, self.data.train.values))
 
     def _values(self, f: WeightedSum) -> Tensor:

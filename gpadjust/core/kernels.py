@@ -350,8 +350,7 @@ class OfGPyTorch(Kernel):
             )
         if kernel.batch_shape:
             raise ValueError(
-                "Expected a kernel without batch shape, which draws and outputs add; found "
-                f"{tuple(kernel.batch_shape)}."
+                f"Expected a kernel without batch shape; found {tuple(kernel.batch_shape)}."
             )
         self.outputscale = outputscale
         self.kernel = deepcopy(kernel).double()

@@ -183,9 +183,7 @@ class GP(gpytorch.models.GP, Predictive):
         for name, option in {"noise": noise, "input_transform": input_transform}.items():
             if isinstance(option, type):
                 kind = option.__name__
-                raise TypeError(
-                    f"Expected {name} as an instance, {kind}(); found the class {kind}."
-                )
+                raise TypeError(f"Expected {name} as an instance, {kind}(); found the class.")
         if outcome_transform is not None and not isinstance(outcome_transform, Standardize):
             raise ValueError(
                 "Expected outcome_transform=None or Standardize, which has no effect; found "
@@ -226,9 +224,7 @@ class GP(gpytorch.models.GP, Predictive):
         self._f_train = [f / self.unit for f in places.f]
         self.term_sum = TermSum(terms, self._f_train, self.unit)
         if noise is not None and not isinstance(noise, Noise):
-            raise TypeError(
-                f"Expected noise as a Noise; found {noise!r}. A variance is train_Yvar."
-            )
+            raise TypeError(f"Expected noise as a Noise, not {noise!r}; variances are train_Yvar.")
         if self.data.Yvar is not None:
             known_noise = KnownNoise(self.noise_in_units(Y, self.data.Yvar))
             noise = known_noise if noise is None else noise.with_known(known_noise)
@@ -242,7 +238,7 @@ class GP(gpytorch.models.GP, Predictive):
         unknown = {name for choice in choices for name in choice.zeros} - names
         if unknown:
             raise ValueError(
-                f"Unknown numbers {sorted(unknown)} in choices; expected some of {sorted(names)}."
+                f"Unknown numbers {sorted(unknown)}; expected some of {sorted(names)}."
             )
         self.u = torch.nn.Parameter(Y.new_zeros(1, self.table.problems, self.table.size))
         self._draws = self.u.detach()
@@ -294,10 +290,8 @@ class GP(gpytorch.models.GP, Predictive):
         """
         shape = torch.Size([self.table.problems, self.table.size])
         if draws.shape[1:] != shape or not len(draws) or not (draws < torch.inf).all():
-            raise ValueError(
-                f"Expected finite coordinates of shape N x {shape[0]} x {shape[1]}; found "
-                f"{tuple(draws.shape)}."
-            )
+            shapes = f"N x {shape[0]} x {shape[1]}; found {tuple(draws.shape)}"
+            raise ValueError(f"Expected finite coordinates of shape {shapes}.")
         step = max(1, len(draws) // (number or len(draws)))
         self._draws = draws.detach()
         self.u = torch.nn.Parameter(self._draws[step // 2 :: step].clone())
@@ -714,10 +708,8 @@ class GP(gpytorch.models.GP, Predictive):
         """
         X, Y = self.data.new_inputs(X), as_tensor(Y, "Y")
         if Y.shape[-2:] != (X.shape[-2], self.num_outputs) or Y.isinf().any():
-            raise ValueError(
-                f"Expected finite Y of shape ... x {X.shape[-2]} x {self.num_outputs}, or NaN "
-                f"where an output is missing; found {tuple(Y.shape)}."
-            )
+            shape = f"... x {X.shape[-2]} x {self.num_outputs}"
+            raise ValueError(f"Expected finite Y of shape {shape}, or NaN; found {tuple(Y.shape)}.")
         self.on_gaussian_scale(Y)  # an error if targets cannot have such values
         old, new = self.conditioning(), self._copy()
         new.data = self.data.appended(X, Y)
@@ -866,10 +858,8 @@ class GP(gpytorch.models.GP, Predictive):
             lazy = to_linear_operator(squeezed(K, -3))
             return MultivariateNormal(squeezed(mean * self.unit, -2), lazy)
         if len(self.u) > 1:
-            raise RuntimeError(
-                f"The model holds {len(self.u)} draws of its unknown numbers, a loss needs one: "
-                "build a new model for a point fit, or call model.set_draws(model.u[:1])."
-            )
+            few = "call model.set_draws(model.u[:1])"
+            raise RuntimeError(f"The model holds {len(self.u)} draws, a loss needs one: {few}.")
         if x.shape != self.data.X.shape or not torch.equal(x, self.data.X):
             raise RuntimeError("In training mode call the model on its training inputs.")
         return self.forward(self.data.X)

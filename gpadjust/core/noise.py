@@ -102,10 +102,7 @@ class Noise:
     def appended(self, variances: Tensor | None, num_points: int) -> Noise:
         """Return the noise of further rows, too; a ValueError of variances of a learnt one."""
         if variances is not None:
-            raise ValueError(
-                "Expected no noise, as the model learns it; build the model with train_Yvar to "
-                "give the variances of observations."
-            )
+            raise ValueError("Expected no noise, as the model learns it without train_Yvar.")
         return self
 
     def learnt(self, model: Any, fitted: Callable[[Noise], Any]) -> Noise:

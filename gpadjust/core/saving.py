@@ -144,8 +144,7 @@ def _content(model: GP) -> dict[str, Any]:
     data, n = model.data, model.rows_of_fit
     if model.batch_shape or model._outputs is not None or n > len(data.Y):
         raise ValueError(
-            "Expected a model of one data set and all its outputs; found fantasies, or a part of "
-            "the rows or outputs. Save the model that it was made from."
+            "Expected a model of one data set and all its outputs, not fantasies or a part of it."
         )
     parameters = signature(type(model)).parameters.values()
     takes_physics = any(p.name == "physics" or p.kind is p.VAR_KEYWORD for p in parameters)
@@ -239,10 +238,8 @@ def _built_with(model: GP, n: int) -> dict[str, Tensor]:
 def _loaded(content: dict[str, Any], objects: dict[str, Any], trusted: bool) -> Any:
     """Return the model or mixture of a file, with the objects that are given."""
     if content["format"] != _FORMAT:
-        raise ValueError(
-            f"expected format {_FORMAT}; found {content['format']}, of another version of gpadjust:"
-            " fit the model and save it with this version again."
-        )
+        version = f"found {content['format']}, of another version of gpadjust"
+        raise ValueError(f"expected format {_FORMAT}; {version}: fit the model and save it again.")
     contents = content["models"].values()
     missing = {name for part in contents for name in part["missing"]}
     possible = missing | {"physics" for part in contents if part["physics"]}
@@ -296,8 +293,8 @@ def _model(content: dict[str, Any], objects: dict[str, Any], trusted: bool) -> G
         is_same = ours.shape == theirs.shape
         if not is_same or not torch.allclose(theirs, ours, 1e-6, 1e-9 * float(ours.abs().max())):
             raise ValueError(
-                f"it was saved with another {name}: numbers at the training inputs differ. Pass "
-                "what the model was built with (several physics in the same order)."
+                f"it was saved with another {name}; pass what the model was built with, several "
+                "physics in the same order."
             )
     model.set_draws(content["u"])
     u = model.u

@@ -189,8 +189,8 @@ class CalibratedPhysics(GP):
         )  # fmt: skip
         if not self.physics[0].unknowns:
             raise ValueError(
-                "Expected a physics with unknown parameters; found none in "
-                f"{self.physics[0].name!r}. Name them: unknowns={{'mass': Unknown(1.0, sd=0.5)}}."
+                "Expected a physics with unknown parameters, such as "
+                "unknowns={'mass': Unknown(1.0, sd=0.5)}."
             )
 
 

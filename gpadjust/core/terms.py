@@ -219,8 +219,7 @@ class TermSum:
         for term in terms:
             if term.physics is not None and not 0 <= term.physics < len(f):
                 raise ValueError(
-                    f"Term {term.name!r} has physics number {term.physics} of {len(f)}; pass it "
-                    "in physics=[...]."
+                    f"Term {term.name!r} has physics number {term.physics} of {len(f)} in physics=."
                 )
         self.terms = tuple(
             term._replace(has_center=term.physics is not None and term.has_center) for term in terms

@@ -112,10 +112,8 @@ class Table:
         shares = torch.tensor([c.probability for c in self.choices] or [1.0], dtype=torch.float64)
         is_single = len(self.choices) == 1
         if is_single or abs(shares.sum() - 1) > 1e-9 or (shares <= 0).any():
-            raise ValueError(
-                "Expected no choices, or several whose probabilities are positive and sum to 1; "
-                f"found {shares.tolist()}."
-            )
+            expected = "several choices with positive probabilities that sum to 1"
+            raise ValueError(f"Expected {expected}; found {shares.tolist()}.")
         self.log_prior = shares.log()
         # P(|u| < end) is the probability of the choices up to one.
         self._ends = torch.special.ndtri((1 + shares.cumsum(0)[:-1]) / 2)
