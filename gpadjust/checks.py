@@ -1,7 +1,7 @@
 """Checks of the numbers, shapes and options that a user gives, and seeds, for all rooms.
 
-``check_...`` returns nothing, ``checked_...`` the value in the form that is worked with. The name of
-the argument comes first. A wrong kind is a TypeError, a wrong value or shape a ValueError; both
+``check_...`` returns nothing, ``checked_...`` the value in its final form. The name of the argument
+comes first. A wrong kind is a TypeError, a wrong value or shape a ValueError; both
 name the value and the expected one.
 """
 
@@ -218,10 +218,8 @@ def _check_rows(name: str, is_wrong: Tensor, expected: str) -> None:
     if is_wrong.any():
         rows = marked_rows(is_wrong)
         first = ", ".join([*map(str, rows[:5]), *["..."] * (len(rows) > 5)])
-        raise ValueError(
-            f"Expected {name} {expected} in {len(rows)} of {is_wrong.shape[-1]} rows (row {first}); "
-            "remove these points."
-        )
+        rows_of = f"{len(rows)} of {is_wrong.shape[-1]} rows (row {first})"
+        raise ValueError(f"Expected {name} {expected} in {rows_of}; remove these points.")
 
 
 def marked_rows(marked: Tensor) -> list[int]:
