@@ -21,8 +21,8 @@ ArrayLike = Any
 _FAINT = 1e-6  # of the size of the targets: their unit where the prior mean meets them
 
 # Types that NumPy would turn into numbers.
-_NO_NUMBERS = (str, bytes, complex, np.complexfloating, np.datetime64, np.timedelta64)
-_NO_NUMBERS += (date, time, timedelta)
+_DATES = (date, time, timedelta, np.datetime64, np.timedelta64)
+_NO_NUMBERS: tuple[type, ...] = (str, bytes, complex, np.complexfloating, *_DATES)
 
 
 class Data(NamedTuple):
@@ -57,8 +57,10 @@ class Data(NamedTuple):
             )
         if len(X) < 2:
             raise ValueError(f"Expected at least 2 points in train_X; found {len(X)}.")
-        check_finite("train_X", X)
-        check_observed("train_Y", Y)
+        if not X.isfinite().all():
+            check_finite("train_X", X)
+        if not Y.isfinite().all():
+            check_observed("train_Y", Y)
         is_seldom = (~Y.isnan()).sum(-2) < 2
         if is_seldom.any():
             columns = marked_rows(is_seldom)
@@ -75,7 +77,9 @@ class Data(NamedTuple):
 
     def new_inputs(self, X: ArrayLike) -> Tensor:
         """Return checked inputs ``... x q x d`` of a call."""
-        names = column_names(X)
+        names = None
+        if not isinstance(X, Tensor):
+            names = column_names(X)
         if names is not None and names != self.input_names and {*names} & {*self.input_names}:
             raise ValueError(f"Expected columns {self.input_names}, in this order; found {names}.")
         X = as_tensor(_coded(X, self.transform), "X")
@@ -197,8 +201,7 @@ def _coded(X: ArrayLike, transform: Any) -> ArrayLike:
 
 def names_of(values: ArrayLike, letter: str) -> tuple[str, ...]:
     """Return the names of columns, ``x`` or ``x1`` and so on if they have none."""
-    names = column_names(values)
-    if names is not None:
+    if not isinstance(values, Tensor) and (names := column_names(values)) is not None:
         return names
     shape = [*getattr(values, "shape", ())]
     if len(shape) < 2 or shape[-1] == 1:

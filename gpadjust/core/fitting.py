@@ -156,16 +156,16 @@ def fit(
         result: FitResult | None = model.fit_itself(method, num_draws, seed)
         if result is None:
             result = _fitted(model, method, num_draws, seed)
-    more = f"num_draws={4 * len(model.draws)}"
     if result.rhat > _MIXED:
         warnings.warn(
             f"Chains do not agree, split R-hat is {result.rhat:.2f}. Draw more: "
-            f"fit(model, 'nuts', {more}).", SamplingWarning, stacklevel=2,
+            f"fit(model, 'nuts', num_draws={4 * len(model.draws)}).",
+            SamplingWarning, stacklevel=2,
         )  # fmt: skip
     if result.error > _MOVED:
         warnings.warn(
             f"Predictions depend on the seed: another one would move them by {result.error:.2f} of "
-            f"their standard deviation. Draw more: fit(model, {more}).",
+            f"their standard deviation. Draw more: fit(model, num_draws={4 * len(model.draws)}).",
             SamplingWarning, stacklevel=2,
         )  # fmt: skip
     return result
@@ -196,6 +196,7 @@ def _fitted(model: GP, method: str, num_draws: int | None, seed: int) -> FitResu
     half = number // GROUPS
     slices = [slice(g * half, (g + 1) * half) for g in range(GROUPS)]
     groups = [_pooled(sampled, weights[:, g], half, slices[g]) for g in range(GROUPS)]
+    has_unknowns = any(f_p.unknowns for f_p in model.physics)
     choices = zip(model.table.choices, shares.expand(-1, len(model.unit)).tolist(), strict=False)
     return FitResult(
         method,
@@ -204,7 +205,7 @@ def _fitted(model: GP, method: str, num_draws: int | None, seed: int) -> FitResu
         min(float(draws.effective.min()) for draws in sampled.values()),
         _error(model, groups) * math.sqrt(number / averaged),
         len(model.u),
-        _parameter_error(model, groups),
+        _parameter_error(model, groups) if has_unknowns else math.nan,
     )
 
 
@@ -415,8 +416,6 @@ def _error(model: GP, groups: list[Tensor]) -> float:
 
 def _parameter_error(model: GP, groups: list[Tensor]) -> float:
     """Return the largest change of the mean of a parameter by another seed, in posterior sd."""
-    if not any(f_p.unknowns for f_p in model.physics):
-        return math.nan
     one, other = (model.physics_parameters_at(u).mean for u in groups)
     error = (one - other).abs() / (2 * model.physics_parameters_at(torch.cat(groups)).sd)
     return float(error.nan_to_num().max())  # 0 / 0 where all draws are the same

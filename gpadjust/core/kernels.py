@@ -192,11 +192,7 @@ class Stationary(Kernel):
         scale = outputscale.unsqueeze(-1)
         if e.requires_grad or scale.requires_grad:
             return scale * self.profile.value(e)
-        return self._value_of(e).mul_(scale)
-
-    def _value_of(self, e: Tensor) -> Tensor:
-        """Return k(e), in the place of e if possible."""
-        return e.exp_() if self.profile is RBF else self.profile.value(e)
+        return (e.exp_() if self.profile is RBF else self.profile.value(e)).mul_(scale)
 
     def toward(self, own: Values, other: Tensor) -> Callable[[Tensor], Tensor]:
         r"""Return covariances by one product of all draws, :math:`e = (x, x^2, 1) \cdot A`."""
@@ -237,10 +233,11 @@ class Stationary(Kernel):
         """
         length = own["lengthscale"].unsqueeze(-2)
         z = (x - x.mean(-2, keepdim=True)) / length
-        scale = own["outputscale"].unsqueeze(-1)
         e = exponents(z)
-        K = self._value_of(e).mul_(scale)
-        slope = K if self.profile is RBF else self.profile.slope(e).mul_(scale)
+        K = self._scaled(e, own["outputscale"])
+        slope = K  # of RBF k is dk / de
+        if self.profile is not RBF:
+            slope = self.profile.slope(e).mul_(own["outputscale"].unsqueeze(-1))
 
         def pull_back(D: Tensor) -> Values:
             M = D * slope

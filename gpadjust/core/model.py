@@ -71,9 +71,10 @@ class Predictive(Model, FantasizeMixin, Display):
         Returns:
             Mean and variance, ``... x q x m``: tensors, arrays or frames, as ``X``.
         """
-        mean, variance = self.marginals(X, observation_noise).prediction
-        names = self.data.output_names
-        return Prediction(as_given(mean, X, names), as_given(variance, X, names))
+        prediction = self.marginals_of(*self.components(X, observation_noise)).prediction
+        if isinstance(X, Tensor):
+            return prediction
+        return Prediction(*(as_given(part, X, self.data.output_names) for part in prediction))
 
     @torch.no_grad()
     def interval(
@@ -328,7 +329,11 @@ class GP(gpytorch.models.GP, Predictive):
     ) -> tuple[Tensor, Tensor]:
         """Return the same of few draws, with f_p and its derivatives if it has parameters."""
         values, y = self.table.values(u), self.targets()
-        places, total, noise = self._at_data(values, f)
+        places = self.places(self.data.X, values, with_physics=f is None)
+        if f is not None:
+            places = places._replace(f=f)
+        total = self.term_sum.evaluate(values, places)
+        noise = self.noise.variance(values, places, True)
         observed = ~y.isnan()
         residual = (y - total.mean).expand(len(u), *y.shape).masked_fill(~observed, 0.0)
         result = self.sum_likelihood(total, residual, noise, observed, with_gradient)
@@ -350,31 +355,24 @@ class GP(gpytorch.models.GP, Predictive):
 
         It is NaN where f_p fails, and 0 of missing targets.
         """
-        total, _ = self._prior_at_data(u)
+        total, _ = self._prior(u)
         missing = self.targets().isnan()
         return total.mean.expand(len(u), *missing.shape).masked_fill(missing, 0.0).flatten(1)
 
     def precision_times(self, u: Tensor, v: Tensor) -> Tensor:
         """Return the inverse covariance of the targets at ``S x B x P`` times ``S x (m n)``."""
-        total, noise = self._prior_at_data(u)
+        total, noise = self._prior(u)
         missing = self.targets().isnan()
         v = v.reshape(len(u), *missing.shape)
         return self.sum_likelihood(total, v, noise, ~missing, True).by_mean.flatten(1)
 
-    def _prior_at_data(self, u: Tensor) -> tuple[WeightedSum, Tensor]:
+    def _prior(self, u: Tensor) -> tuple[WeightedSum, Tensor]:
         """Return the sum at the training inputs, NaN where f_p fails, and the noise's variances."""
         values = self.table.values(u)
-        return self._at_data(values, self._physics_with_slopes(values, False)[0])[1:]
-
-    def _at_data(
-        self, values: Values, f: list[Tensor] | None = None
-    ) -> tuple[Places, WeightedSum, Tensor]:
-        """Return the training inputs with outputs f of each physics, the sum, and the noise."""
-        places = self.places(self.data.X, values, with_physics=f is None)
-        if f is not None:
-            places = places._replace(f=f)
+        places = self.places(self.data.X, values, with_physics=False)
+        places = places._replace(f=self._physics_with_slopes(values, False)[0])
         noise = self.noise.variance(values, places, True)
-        return places, self.term_sum.evaluate(values, places), noise
+        return self.term_sum.evaluate(values, places), noise
 
     def sum_likelihood(
         self, train: WeightedSum, residual: Tensor, noise: Tensor, observed: Tensor,
@@ -566,26 +564,27 @@ class GP(gpytorch.models.GP, Predictive):
     def conditioning(self) -> Conditioning:
         """Return the posterior given the data, without a graph of the draws; cached for these."""
         if self._cached is None or not torch.equal(self._cached[0], self.u):
-            self._cached = (self.u.detach().clone(), self._conditioned_at(self.u))
+            with torch.no_grad():
+                conditioning = self.conditioned(*self._observed(self.table.values(self.u)))
+            self._cached = (self.u.detach().clone(), conditioning)
         return self._cached[1]
 
-    @torch.no_grad()
-    def _conditioned_at(self, u: Tensor) -> Conditioning:
-        """Return the posterior given the data, at coordinates ``S x B x P``."""
-        _, total, noise = self._at_data(self.table.values(u))
-        return self.conditioned(total, noise, self.targets().unsqueeze(-3))
+    def _observed(self, values: Values) -> tuple[WeightedSum, Tensor, Tensor]:
+        """Return the function at the training inputs, the variances of the noise, and targets."""
+        places = self.places(self.data.X, values)
+        noise = self.noise.variance(values, places, True)
+        return self.term_sum.evaluate(values, places), noise, self.targets().unsqueeze(-3)
 
     def left_out(self) -> Marginals:
         """Return the distribution of each target given all others, with noise; NaN if missing."""
-        return self.marginals_of(*self._left_out(self.conditioning()))
+        mean, variance = self.conditioning().left_out()
+        mean = mean + self.noise.shift  # targets are y / unit - shift
+        return self.marginals_of((mean * self.unit).mT, (variance * self.unit.square()).mT)
 
+    @torch.no_grad()
     def left_out_at(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Return means and variances of left-out targets at coordinates ``S x B x P``."""
-        return self._left_out(self._conditioned_at(u))
-
-    def _left_out(self, conditioning: Conditioning) -> tuple[Tensor, Tensor]:
-        # Targets are y / unit - shift.
-        mean, variance = conditioning.left_out()
+        mean, variance = self.conditioned(*self._observed(self.table.values(u))).left_out()
         mean = mean + self.noise.shift
         return (mean * self.unit).mT, (variance * self.unit.square()).mT
 
@@ -595,7 +594,8 @@ class GP(gpytorch.models.GP, Predictive):
         """Return means and variances of each draw, ``... x S x q x m``, in the user's units."""
         X, conditioning = self.data.new_inputs(X), self.conditioning()
         with self._graph_for(X):
-            f = self.evaluate(X, conditioning.train.values)
+            values = conditioning.train.values
+            f = self.term_sum.evaluate(values, self.places(X, values))
             mean, variance = conditioning.marginals(f)
             if observation_noise is not False:
                 variance = variance + self._noise_at(X, observation_noise)
@@ -730,8 +730,7 @@ class GP(gpytorch.models.GP, Predictive):
             if not self._unknowns:  # f_p is called at the new points only
                 pairs = zip(self._f_train, self._physics_at(X.unsqueeze(-3), values), strict=True)
                 new._f_train = [appended(f, f_new, -1) for f, f_new in pairs]
-            _, total, variances = new._at_data(values)
-            conditioning = new.conditioned(total, variances, new.targets().unsqueeze(-3), old)
+            conditioning = new.conditioned(*new._observed(values), old)
         new._cached = (self.u.detach().clone(), conditioning)
         return new.eval()
 
@@ -795,8 +794,8 @@ class GP(gpytorch.models.GP, Predictive):
         """Move the model to a device, with its data."""
         super().to(*args, **options)
         parts = {name: getattr(self.data, name) for name in ("X", "Y", "Yvar", "transform")}
-        parts = {name: part.to(self.u) for name, part in parts.items() if part is not None}
-        self.data = self.data._replace(**parts)
+        moved = {name: part.to(self.u) for name, part in parts.items() if part is not None}
+        self.data = self.data._replace(**moved)
         self.unit = self.unit.to(self.u)
         self._draws = self._draws.to(self.u)
         self._f_train = [f.to(self.u) for f in self._f_train]

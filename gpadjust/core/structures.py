@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from gpadjust.checks import checked_number
 from gpadjust.core.data import ArrayLike, names_of
 from gpadjust.core.kernels import DELTA, RHO, Fourier, as_kernel
 from gpadjust.core.model import GP
@@ -62,8 +61,9 @@ class CKA(GP):
         center: bool | float = True, constants: bool | Mapping[str, LogNormal] = True,
         nested: bool | Sequence[Choice] = True, extra_terms: Sequence[Term] = (), **options: Any,
     ) -> None:  # fmt: skip
-        if not isinstance(center, bool | int | float):
-            raise TypeError(f"Expected center True (unknown), False or a number; found {center!r}.")
+        for name, value in {"center": center, "delta_mean": delta_mean}.items():
+            if isinstance(value, str | None):
+                raise TypeError(f"Expected {name} as a number, or center=True; found {value!r}.")
         settings = options | {
             "rho_covar_module": rho_covar_module, "delta_covar_module": delta_covar_module,
             "rho_mean": rho_mean, "delta_mean": delta_mean, "center": center,
@@ -72,7 +72,6 @@ class CKA(GP):
         rhos, functions = _scalings(physics, rho_mean)
         kernel = as_kernel(rho_covar_module, RHO)
         constant = _constant(constants, "rho", RHO_CONSTANT)
-        delta_mean = checked_number("delta_mean", delta_mean)
         delta = _delta(delta_covar_module, constants)._replace(mean=delta_mean)
         delta_has_constant = as_kernel(delta.kernel).has_constant
         if center is True and kernel.has_constant and not delta_has_constant:
@@ -112,6 +111,7 @@ class RRA(CKA):
             delta_covar_module=Fourier(d, num_features, 2 * seed + 1, DELTA),
             **options,
         )  # fmt: skip
+        # The kernels are made of these.
         del self.settings["rho_covar_module"], self.settings["delta_covar_module"]
         self.settings |= {"num_features": num_features, "seed": seed}
 
@@ -197,7 +197,9 @@ class CalibratedPhysics(GP):
 def _scalings(physics: Any, means: Any = None) -> tuple[list[Term], list[Any]]:
     """Return a scaling of each physics by its prior mean, and the physics."""
     functions = [*physics] if isinstance(physics, list | tuple) else [physics]
-    names = ["rho"] if len(functions) == 1 else [f"rho{i + 1}" for i in range(len(functions))]
+    names = [f"rho{i + 1}" for i in range(len(functions))]
+    if len(functions) == 1:
+        names = ["rho"]
     if isinstance(physics, Mapping):
         functions = [*physics.values()]
         names = [f"rho_{name}" for name in physics]
@@ -207,10 +209,9 @@ def _scalings(physics: Any, means: Any = None) -> tuple[list[Term], list[Any]]:
     if means is None:
         means = 1.0 / number
     means = [*means] if isinstance(means, list | tuple) else [means] * number
-    if len(means) != number:
-        raise ValueError(f"Expected rho_mean for each of {number} physics; found {means}.")
-    means = [checked_number("rho_mean", mean) for mean in means]
-    return [Term(names[i], mean=means[i], physics=i) for i in range(number)], functions
+    if len(means) != number or any(isinstance(mean, str) for mean in means):
+        raise ValueError(f"Expected rho_mean as numbers, of {number} physics; found {means}.")
+    return [Term(names[i], mean=float(means[i]), physics=i) for i in range(number)], functions
 
 
 def _constant(

@@ -120,7 +120,9 @@ class Table:
 
     def values(self, u: Tensor) -> Values:
         """Return all numbers at coordinates ``S x B x P``."""
-        parts = self._parts(u)
+        parts: list[Tensor] = []
+        if self.own:
+            parts += self._of_outputs(u).split(self._sizes[: len(self.own)], -1)
         if self.shared:
             parts += u[:, 0, self._own_size :].split(self._sizes[len(self.own) :], -1)
         values = {row.name: row.value(z) for row, z in zip(self.rows, parts, strict=True)}
@@ -134,7 +136,7 @@ class Table:
 
     def with_values(self, u: Tensor, values: Values) -> Tensor:
         """Return coordinates ``S x B x P`` by which numbers of outputs have these values."""
-        parts = self._parts(u)
+        parts = [*self._of_outputs(u).split(self._sizes[: len(self.own)], -1)]
         for i, row in enumerate(self.own):
             if row.name in values:
                 parts[i] = row.coordinate(values[row.name]).expand_as(parts[i])
@@ -144,10 +146,6 @@ class Table:
     def _of_outputs(self, u: Tensor) -> Tensor:
         """Return the coordinates of each output, ``S x m x k``."""
         return u[..., : self._own_size].reshape(len(u), self.num_outputs, self._width)
-
-    def _parts(self, u: Tensor) -> list[Tensor]:
-        """Return the coordinates of each row of outputs, ``S x m x k``."""
-        return [*self._of_outputs(u).split(self._sizes[: len(self.own)], -1)] if self.own else []
 
     def gradient(self, by: Values, values: Values) -> Tensor:
         """Return derivatives by u, ``S x B x P``, of derivatives by the numbers."""
