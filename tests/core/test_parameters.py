@@ -12,7 +12,7 @@ from tests.systems import line, normal
 
 def power(factor=10.0):
     X = 1.3 + 0.3 * line(8)
-    noise = torch.randn(X.shape, generator=torch.Generator().manual_seed(0), dtype=X.dtype)
+    noise = normal(*X.shape)
     unknowns = {name: Unknown(1.0, factor=factor) for name in ("a", "b")}
     physics = FormulaPhysics("a * x**(5 * b)", ["x"], unknowns=unknowns)
     return CalibratedPhysics(X, 0.7 * X**3.8 + 0.01 * noise, physics=physics)
@@ -152,9 +152,8 @@ def test_optima_of_either_sign_are_found(seed):
 def test_draws_go_beyond_a_fold():
     """Of a square of which the data say that it is small: the root has either sign."""
     X = line(12, 0.1, 2.0)
-    physics = FunctionPhysics(
-        lambda X, p: p.a.square() * X[:, 0], unknowns={"a": Unknown(0.3, sd=1.0)}
-    )
+    unknowns = {"a": Unknown(0.3, sd=1.0)}
+    physics = FunctionPhysics(lambda X, p: p.a.square() * X[:, 0], unknowns=unknowns)
     Y = 0.01 * X + 0.1 * normal(12, 1, seed=1)
     model = CalibratedPhysics(X, Y, 0.1**2, physics=physics)
     fit(model)

@@ -52,14 +52,16 @@ def test_of_one_draw_in_the_units_of_the_user():
     text, values, unit = model.summary(), model.values, float(model.unit)
     rho, delta = text.index("  rho: prior mean 1\n"), text.index("  delta: prior mean 2\n")
     for place, name, size in ((rho, "rho", 1.0), (delta, "delta", unit)):
-        own = text[place:].splitlines()[1:5]
-        length = values[f"{name}.kernel.lengthscale"][0, 0]
-        assert own[0] == f"    lengthscale of time [s]: {three(length[0])}"
-        assert own[1] == f"    lengthscale of force [N]: {three(length[1])}"
-        sd = values[f"{name}.kernel.outputscale"].sqrt() * size
-        assert own[2] == f"    standard deviation: {three(sd)}"
-        sd = values[f"{name}.constant"].sqrt() * size
-        assert own[3] == f"    standard deviation of the constant: {three(sd)}"
+        time, force = values[f"{name}.kernel.lengthscale"][0, 0]
+        sds = [
+            values[f"{name}.{part}"].sqrt() * size for part in ("kernel.outputscale", "constant")
+        ]
+        assert text[place:].splitlines()[1:5] == [
+            f"    lengthscale of time [s]: {three(time)}",
+            f"    lengthscale of force [N]: {three(force)}",
+            f"    standard deviation: {three(sds[0])}",
+            f"    standard deviation of the constant: {three(sds[1])}",
+        ]
     center = model.term_sum.center(model.terms[0], values) * unit
     assert f"    center: {three(center)}\n" in text
     noise = values["noise.variance"].sqrt() * unit
@@ -77,11 +79,8 @@ def test_of_draws_that_contain_the_process():
     assert ", 8 draws)" in repr(model)
     model.set_draws(torch.cat(parts))
     text = model.summary()
-    expected = (
-        "  probabilities: your formula corrected 50%, as it is up to a factor and an offset 25%, "
-        "of no use 25%\n"
-    )
-    assert text.count(expected) == 2
+    shares = "your formula corrected 50%, as it is up to a factor and an offset 25%, of no use 25%"
+    assert text.count(f"  probabilities: {shares}\n") == 2
     assert text.count("  rho: prior mean 1, varies in 4 of 8 draws\n") == 2
     assert text.count("  delta: prior mean 0, varies in 6 of 8 draws\n") == 2
     values, numbers = model.values, lines(model)
@@ -96,9 +95,8 @@ def test_of_draws_that_contain_the_process():
 
 
 def test_of_physics_kernels_and_transforms():
-    own = FunctionPhysics(
-        lambda X, p: p.g[:, None] * physics(X), unknowns={"g": Unknown(1.0, sd=0.2, unit="m/s²")}
-    )
+    unknowns = {"g": Unknown(1.0, sd=0.2, unit="m/s²")}
+    own = FunctionPhysics(lambda X, p: p.g[:, None] * physics(X), unknowns=unknowns)
     kernel = ScaleKernel(RBFKernel()) + PeriodicKernel()
     options = {"delta_covar_module": kernel, "input_transform": Normalize(2), "nested": False}
     model = CKA(X, Y, physics=own, **options)
@@ -106,9 +104,8 @@ def test_of_physics_kernels_and_transforms():
     numbers = lines(model)
     for row in repr(model.physics_parameters).splitlines():
         assert f"\n  {row}\n" in model.summary()
-    sd = (
-        model.values["delta.kernel.kernels.0.raw_outputscale"][:, 1].sqrt() * model.unit[1]
-    ).median()
+    variance = model.values["delta.kernel.kernels.0.raw_outputscale"][:, 1]
+    sd = (variance.sqrt() * model.unit[1]).median()
     assert numbers["kernels.0.standard deviation"].startswith(three(sd))
     period = model.values["delta.kernel.kernels.1.raw_period_length"][:, 1].median()
     assert numbers["kernels.1.period_length"].startswith(three(period))
@@ -132,10 +129,8 @@ def test_of_noise(fantasies):
     model = GP(X, Y, terms=terms, physics=[physics], noise=OfPhysics())
     model.set_draws(torch.zeros(3, *model.u.shape[1:]).double())
     sd = 0.1 * physics(X)[:, 1].abs()
-    expected = (
-        f"standard deviation {three(sd.square().mean().sqrt())}, from {three(sd.min())} to "
-        f"{three(sd.max())} at the training inputs"
-    )
+    ends = f"from {three(sd.min())} to {three(sd.max())} at the training inputs"
+    expected = f"standard deviation {three(sd.square().mean().sqrt())}, {ends}"
     assert lines(model)["noise"] == expected
     known = GP(X, Y, torch.tensor([4.0, 9.0]).double(), terms=terms, physics=[physics])
     if fantasies:
@@ -167,9 +162,8 @@ def test_priors_are_in_the_users_units_and_stay_after_a_fit():
     assert rows.loc["delta lengthscale of x", "median"] == pytest.approx(5.0)
     unit = float(one.unit)
     assert rows.loc["noise standard deviation", "median"] == pytest.approx(0.01 * unit)
-    assert rows.loc["delta standard deviation", "97.5 %"] == pytest.approx(
-        unit * (0.1 * 1000**1.96) ** 0.5, rel=1e-3
-    )
+    upper = unit * (0.1 * 1000**1.96) ** 0.5
+    assert rows.loc["delta standard deviation", "97.5 %"] == pytest.approx(upper, rel=1e-3)
     fit(one)
     assert one.priors().equals(of_waves().priors())
 
@@ -198,9 +192,8 @@ def test_noise_unknowns_and_priors_of_gpytorch():
     one = of_waves(noise=Noise(priors=[LogNormal(0.04, 2.0)]))
     found = table(one).loc["noise standard deviation", "median"]
     assert found == pytest.approx(0.2 * float(one.unit))
-    physics = FunctionPhysics(
-        lambda X, p: p.k * X[:, 0], unknowns={"k": Unknown(3.0, sd=1.0, unit="N/m")}
-    )
+    unknowns = {"k": Unknown(3.0, sd=1.0, unit="N/m")}
+    physics = FunctionPhysics(lambda X, p: p.k * X[:, 0], unknowns=unknowns)
     X = line(6)
     row = table(CKA(X, X, physics=physics)).loc["k"]
     assert row["2.5 %"] == pytest.approx(3 - 1.96, abs=1e-2)

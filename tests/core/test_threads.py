@@ -12,7 +12,7 @@ from gpadjust.core import CKA, RRA, StackedGP, ZeroMeanGP, fit
 from gpadjust.core.threads import threads_for
 from gpadjust.kinds import AR1, LinkedCKA
 from gpadjust.physics import FunctionPhysics, Unknown
-from tests.systems import ripple, uniform
+from tests.systems import ripple, same, uniform
 
 
 def stacked(X, Y, physics):
@@ -36,13 +36,10 @@ def test_conditioning_leaves_the_model_whole_also_in_another_thread(name, drawn)
 
     X = uniform(9, 2)
     model = MODELS[name](X, 1.2 * first(X) + X[:, 1:], physics=first)
-    for each in getattr(model, "models", [model]):
-        drawn(each)
+    for part in getattr(model, "models", [model]):
+        drawn(part)
     Z, more = uniform(6, 2, seed=1), uniform(2, 2, seed=5)
     observed = first(more)
-    with torch.no_grad():
-        expected = model.predict(Z)
-        conditioned = model.condition_on_observations(more, observed).predict(Z)
     done = Event()
 
     def condition():
@@ -52,33 +49,37 @@ def test_conditioning_leaves_the_model_whole_also_in_another_thread(name, drawn)
         return found
 
     with torch.no_grad(), ThreadPoolExecutor(1) as pool:
+        expected = model.predict(Z)
+        conditioned = model.condition_on_observations(more, observed).predict(Z)
         others = pool.submit(condition)
         try:
             found = [model.predict(Z) for _ in range(10)]
         finally:
             done.set()
-    for right, many in ((expected, found), (conditioned, others.result())):
-        for one in many:
-            torch.testing.assert_close(one, right)
-    new = model.condition_on_observations(more, observed)
-    with torch.no_grad():
-        for parameter in new.parameters():
+        for prediction in found:
+            same(prediction, expected)
+        for prediction in others.result():
+            same(prediction, conditioned)
+        for parameter in model.condition_on_observations(more, observed).parameters():
             parameter.add_(1.0)
-    torch.testing.assert_close(model.predict(Z), expected)
+        same(model.predict(Z), expected)
+
+
+# The numbers of threads.
 
 
 def of_a_new_thread():
-    """The number of threads that PyTorch uses in a thread that begins now."""
+    """Return the number of threads that PyTorch uses in a thread that begins now."""
     with ThreadPoolExecutor(1) as pool:
         return pool.submit(torch.get_num_threads).result()
 
 
 def of_blas():
-    return {each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"}
+    return {part["num_threads"] for part in threadpool_info() if part["user_api"] == "blas"}
 
 
-@pytest.fixture(autouse=True)
-def _two():
+@pytest.fixture
+def two():
     """The user's setting is 2, before and after; that of BLAS stays, too."""
     before, blas = torch.get_num_threads(), of_blas()
     torch.set_num_threads(2)
@@ -88,21 +89,22 @@ def _two():
     torch.set_num_threads(before)
 
 
+@pytest.mark.usefixtures("two")
 def test_one_within_none_of_large_problems_and_after_an_error():
-    with threads_for(12):
-        assert (torch.get_num_threads(), of_blas()) == (1, {1})
     before = of_blas()
     with threads_for(1000):
         assert (torch.get_num_threads(), of_blas()) == (2, before)
     with pytest.raises(KeyboardInterrupt), threads_for(12):
         raise KeyboardInterrupt
     with threads_for(12):
+        assert (torch.get_num_threads(), of_blas()) == (1, {1})
         with threads_for(20):
             assert (torch.get_num_threads(), of_blas()) == (1, {1})
         assert (torch.get_num_threads(), of_blas()) == (1, {1})
 
 
-def test_threads_that_begin_meanwhile_and_those_with_a_setting_of_their_own():
+@pytest.mark.usefixtures("two")
+def test_threads_that_begin_meanwhile_and_those_with_another_setting():
     with threads_for(12), ThreadPoolExecutor(1) as pool:
         assert pool.submit(torch.get_num_threads).result() == 2
         pool.submit(lambda: torch.rand(9, 9) @ torch.rand(9, 9)).result()
@@ -119,10 +121,10 @@ def test_threads_that_begin_meanwhile_and_those_with_a_setting_of_their_own():
     torch.set_num_threads(2)
 
 
+@pytest.mark.usefixtures("two")
 @pytest.mark.parametrize("first_out", [0, 1])
 def test_sections_that_overlap_in_two_threads(first_out):
     """The second thread begins, and computes, while the first is in its section."""
-    seen = {}
     with ThreadPoolExecutor(1) as one, ThreadPoolExecutor(1) as other:
         threads, sections = [one, other], [ExitStack(), ExitStack()]
 
@@ -137,32 +139,28 @@ def test_sections_that_overlap_in_two_threads(first_out):
         assert [threads[i].submit(enter, i).result() for i in (0, 1)] == [1, 1]
         assert (of_a_new_thread(), of_blas()) == (2, {1})
         last = 1 - first_out
-        seen[first_out] = threads[first_out].submit(leave, first_out).result()
+        assert threads[first_out].submit(leave, first_out).result() == 2
         assert threads[last].submit(torch.get_num_threads).result() == 1
-        seen[last] = threads[last].submit(leave, last).result()
-    assert seen == {0: 2, 1: 2}
+        assert threads[last].submit(leave, last).result() == 2
 
 
-def test_predictions_leave_threads_alone(uniform, monkeypatch):
+@pytest.mark.usefixtures("two")
+def test_a_fit_has_one_thread_and_predictions_leave_the_setting(monkeypatch):
     """The setting is of all threads that begin: a limit for each prediction would reach them."""
-    X = uniform(8, 1)
-    model = CKA(X, X.sin(), physics=lambda X: X).eval()
-    monkeypatch.setattr(torch, "set_num_threads", lambda n: pytest.fail(f"set to {n}"))
-    model.predict(X)
-    model.posterior(X).rsample()
+    numbers = set()
 
-
-def test_a_fit_has_one_thread_and_leaves_the_setting(uniform):
-    seen = set()
-
-    def physics(X):
-        seen.add(torch.get_num_threads())
-        return X
+    def law(X, p):
+        numbers.add(torch.get_num_threads())
+        return p.a[:, None] * X
 
     X = uniform(8, 1)
-    noisy = CKA(X, X.sin(), physics=FunctionPhysics(
-        lambda X, p: p.a[:, None] * physics(X), unknowns={"a": Unknown(1.0, sd=0.5)}))  # fmt: skip
-    seen.clear()
-    fit(noisy, "map")
-    assert seen == {1}
+    physics = FunctionPhysics(law, unknowns={"a": Unknown(1.0, sd=0.5)})
+    model = CKA(X, X.sin(), physics=physics)
+    numbers.clear()
+    fit(model, "map")
+    assert numbers == {1}
     assert torch.get_num_threads() == 2
+    with monkeypatch.context() as patch:
+        patch.setattr(torch, "set_num_threads", lambda n: pytest.fail(f"set to {n}"))
+        model.predict(X)
+        model.posterior(X).rsample()

@@ -12,7 +12,7 @@ from gpadjust.core import CKA, GP, RRA, PhysicsMeanGP, ScaleGP, Term, ZeroMeanGP
 from gpadjust.physics import FormulaPhysics
 from gpadjust.records import Record
 from gpadjust.sklearn import CKARegressor
-from tests.systems import crude
+from tests.systems import crude, line
 
 SIZES = [1e-12, 1e-6, 1e6, 1e12]
 LEVELS = torch.tensor([0.025, 0.5, 0.975], dtype=torch.float64)
@@ -197,3 +197,9 @@ def test_times_of_a_record_are_dates_in_texts():
     assert record.times.tolist() == [*range(9)]
     with pytest.raises(TypeError, match=r"Convert numbers in text with `.astype\(float\)`"):
         Record(pd.Series(["1", "2"]), FRAME[["y"]][:2], FRAME[["b"]][:2])
+
+
+def test_a_column_with_the_name_of_a_word_of_python():
+    x = line(5)
+    for formula in ("2 * lambda", "2 * lambda_"):
+        assert torch.equal(FormulaPhysics(formula, ["lambda"])(x), 2 * x)
