@@ -365,7 +365,7 @@ class OfGPyTorch(Kernel):
                         priors[name] = prior
                     parameter.requires_grad_(False)
         rows = []
-        for name, (raw, constraint) in self._raw_parameters.items():
+        for name, raw, constraint in self.kernel.named_parameters_and_constraints():
             value, factor, is_positive = raw, math.e, False
             if constraint is not None:
                 value = constraint.transform(raw)
@@ -393,16 +393,10 @@ class OfGPyTorch(Kernel):
         evaluate = self._of_batch if self._as_batch else self._one_by_one
         return evaluate(own, x, other, lead)
 
-    @property
-    def _raw_parameters(self) -> dict[str, tuple[Tensor, Any]]:
-        """Raw parameters and their constraints by name."""
-        named = self.kernel.named_parameters_and_constraints()
-        return {name: (raw, constraint) for name, raw, constraint in named}
-
     def _dense(self, kernel: AnyGPyTorchKernel, values: Values, x: Tensor, other: Tensor) -> Tensor:
         """Return covariances of a kernel at values of its parameters."""
         raw = {}
-        for name, (old, constraint) in self._raw_parameters.items():
+        for name, old, constraint in self.kernel.named_parameters_and_constraints():
             value = values[name].reshape((*values[name].shape[:-1], *old.shape))
             if constraint is not None:
                 low, high = constraint.lower_bound.to(value), constraint.upper_bound.to(value)

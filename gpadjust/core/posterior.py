@@ -37,14 +37,6 @@ class _MultitaskNormal(MultitaskMultivariateNormal, _Normal):
     """The same of several outputs."""
 
 
-def _joint(mean: Tensor, K: Tensor) -> MultivariateNormal:
-    """Return the distribution of means ``... x m x q`` and a covariance ``... x m q x m q``."""
-    lazy = to_linear_operator(K)  # without a factor until one is asked for
-    if mean.shape[-2] == 1:
-        return _Normal(mean.squeeze(-2), lazy)
-    return _MultitaskNormal(mean.mT, lazy, interleaved=False)
-
-
 def _block_diagonal(K: Tensor) -> Tensor:
     """Return ``... x m q x m q`` of covariances ``... x m x q x q``."""
     if K.shape[-3] == 1:
@@ -70,7 +62,12 @@ class MixturePosterior(GPyTorchPosterior):
         center = mean.mean(-3)
         away = (mean - center.unsqueeze(-3)).flatten(-2)  # ... x S x m q
         between = away.mT @ away / away.shape[-2]
-        super().__init__(_joint(center, _block_diagonal(covariance.mean(-4)) + between))
+        # Without a factor until one is read.
+        lazy = to_linear_operator(_block_diagonal(covariance.mean(-4)) + between)
+        if center.shape[-2] == 1:
+            super().__init__(_Normal(center.squeeze(-2), lazy))
+        else:
+            super().__init__(_MultitaskNormal(center.mT, lazy, interleaved=False))
 
     @property
     def base_sample_shape(self) -> Size:
