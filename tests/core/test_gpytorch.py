@@ -1,7 +1,6 @@
 """What users of GPyTorch and BoTorch write runs on the core's models unchanged."""
 
 import gpytorch
-import numpy as np
 import pytest
 import torch
 from botorch import acquisition
@@ -18,7 +17,6 @@ from gpytorch.mlls import ExactMarginalLogLikelihood, SumMarginalLogLikelihood
 
 from gpadjust.core import CKA, CalibratedPhysics, PhysicsMeanGP, fit
 from gpadjust.gpytorch import PhysicsMean, PhysicsScaledKernel
-from gpadjust.kinds import LinkedCKA
 from gpadjust.physics import FunctionPhysics, Unknown
 from tests.systems import normal, uniform, wave
 
@@ -247,42 +245,6 @@ def test_as_single_task_gp(models):
             found = single.posterior(Z)
             torch.testing.assert_close(found.mean, expected.mean)
             torch.testing.assert_close(found.variance, expected.variance, rtol=1e-4, atol=1e-7)
-
-
-@pytest.mark.parametrize("order", [1, -1])
-def test_a_link_and_other_models_in_a_list(order):
-    """After the default fit, by which a linked posterior once had a dimension for draws."""
-    X, Z = uniform(12, 1), uniform(5, 1, seed=3)
-    Y = 1.3 * wave(X) + X + 0.05 * normal(12, 1, seed=1)
-    linked = LinkedCKA(X, Y.exp(), physics=lambda X: wave(X).exp())
-    plain = CKA(X, Y, physics=wave)
-    for model in (linked, plain):
-        fit(model, num_draws=16)
-    for models in ([linked, plain], [linked, SingleTaskGP(X, Y)]):
-        several = ModelListGP(*models[::order])
-        posterior = several.posterior(Z)
-        assert posterior.rsample(torch.Size([4])).shape == (4, 5, 2)
-        means = [m.posterior(Z).mean[:, 0] for m in models[::order]]
-        torch.testing.assert_close([*posterior.mean.unbind(-1)], means)
-        with torch.no_grad():
-            gain = qLogNoisyExpectedHypervolumeImprovement(several, [0.0, 0.0], X)
-            assert gain(Z.unsqueeze(1)).isfinite().all()
-
-
-def test_beyond_the_data_a_link_predicts_within_its_interval():
-    """Moments of a mixture of log-normal distributions were 1e12 times the truth."""
-    generator = np.random.default_rng(3)
-    x = np.sort(generator.uniform(0, 1, 14))[:, None]
-    y = np.exp(3 * x + 0.3 * generator.normal(size=x.shape))
-    model = LinkedCKA(x, y, physics=lambda X: torch.exp(2 * X))
-    fit(model)
-    beyond = np.array([[1.25], [1.5], [3.0]])
-    mean, variance = model.predict(beyond)
-    lower, upper = model.interval(beyond)
-    assert ((lower < mean) & (mean < upper) & np.isfinite(variance)).all()
-    assert np.abs(np.log(mean / np.exp(3 * beyond)))[:2].max() < 1
-    best = acquisition.PosteriorMean(model)(torch.as_tensor(beyond).unsqueeze(1))
-    torch.testing.assert_close(best, torch.as_tensor(mean[:, 0]))
 
 
 def test_a_fitted_model_is_a_physics_by_its_predictions():
