@@ -101,12 +101,10 @@ class Predictive(Model, FantasizeMixin, Display):
         return mixture
 
     def posterior(
-        self,
-        X: ArrayLike,
-        output_indices: list[int] | None = None,
+        self, X: ArrayLike, output_indices: list[int] | None = None,
         observation_noise: bool | Tensor = False,
         posterior_transform: PosteriorTransform | None = None,
-    ) -> Any:
+    ) -> Any:  # fmt: skip
         """Return BoTorch's joint posterior at ``X``, of a mean ``... x q x m``."""
         self.eval()
         outputs: list[int] | slice = slice(None)
@@ -902,9 +900,8 @@ def _draw_matheron_paths(model: Any, *, sample_shape: Size, **_: Any) -> Paths:
 def _unknown_option(structure: type[GP], name: str) -> TypeError:
     """Return the error of an option that a structure does not have."""
     classes = [kind for kind in structure.__mro__ if issubclass(kind, GP)]
-    parameters = [
-        p for kind in classes[:-1] or classes for p in signature(kind).parameters.values()
-    ]
+    signatures = map(signature, classes[:-1] or classes)
+    parameters = [p for one in signatures for p in one.parameters.values()]
     names = {p.name for p in parameters if p.kind is p.KEYWORD_ONLY} - {"settings"}
     return TypeError(
         f"Unknown option {name!r} of {structure.__name__}; expected some of "

@@ -4,17 +4,8 @@ import pytest
 import torch
 from botorch.models.transforms import Normalize
 
-from gpadjust.core import (
-    CKA,
-    MATERN12,
-    MATERN32,
-    MATERN52,
-    RRA,
-    PhysicsMeanGP,
-    ScaleGP,
-    Stationary,
-    ZeroMeanGP,
-)
+from gpadjust import core
+from gpadjust.core import CKA, MATERN12, MATERN32, MATERN52, RRA, PhysicsMeanGP, Stationary
 from tests.systems import crude
 
 
@@ -30,8 +21,8 @@ MODELS = {
     "Matern": (CKA, dict(zip(KERNELS, map(Stationary, (MATERN12, MATERN32)), strict=True))),
     "RRA": (RRA, {"num_features": 20}),
     "PhysicsMeanGP": (PhysicsMeanGP, {"covar_module": Stationary(MATERN52)}),
-    "ScaleGP": (ScaleGP, {}),
-    "ZeroMeanGP": (ZeroMeanGP, {}),
+    "ScaleGP": (core.ScaleGP, {}),
+    "ZeroMeanGP": (core.ZeroMeanGP, {}),
     "two physics": (CKA, {"rho_mean": [0.7, 0.2]}),
 }
 

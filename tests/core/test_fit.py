@@ -6,19 +6,8 @@ import warnings
 import pytest
 import torch
 
-from gpadjust.core import (
-    CKA,
-    GP,
-    RRA,
-    Choice,
-    LogNormal,
-    Noise,
-    PhysicsMeanGP,
-    SamplingWarning,
-    Term,
-    ZeroMeanGP,
-    fit,
-)
+from gpadjust import core
+from gpadjust.core import CKA, GP, Choice, LogNormal, SamplingWarning, Term, ZeroMeanGP, fit
 from gpadjust.core.sample import around_mode
 from gpadjust.kinds import LinkedCKA, NoisyInputs, RelativeNoise
 from gpadjust.physics import FunctionPhysics, Unknown
@@ -48,7 +37,7 @@ def integral(model):
 def test_evidence_and_draws(n):
     """Of noise alone, with its variance as the only unknown number."""
     X, Y = noisy(n)
-    noise = Noise(priors=[LogNormal(1e-3, 55.0)])
+    noise = core.Noise(priors=[LogNormal(1e-3, 55.0)])
     model = GP(X, Y, terms=[Term("f")], noise=noise)
     assert model.table.size == 1
     expected, mean, sd = integral(model)
@@ -93,7 +82,7 @@ def noisy_inputs(X, Y):
 
 TWICE = {
     "CKA": lambda X, Y: CKA(X, Y, physics=wave),
-    "RRA": lambda X, Y: RRA(X, Y, physics=wave, num_features=16),
+    "RRA": lambda X, Y: core.RRA(X, Y, physics=wave, num_features=16),
     "link": lambda X, Y: LinkedCKA(X, Y.exp(), physics=lambda X: wave(X).exp()),
     "relative noise": lambda X, Y: ZeroMeanGP(X, Y, noise=RelativeNoise()),
     "noisy inputs": noisy_inputs,
@@ -210,7 +199,7 @@ def test_evidence_of_targets_in_another_unit():
     for size in (1.0, 1024.0):  # without rounding
         law = lambda X, p, size=size: size * p.a.unsqueeze(-1) * both(X)  # noqa: E731
         physics = FunctionPhysics(law, unknowns=unknowns)
-        model = PhysicsMeanGP(X, size * Y, physics=physics)
+        model = core.PhysicsMeanGP(X, size * Y, physics=physics)
         with warnings.catch_warnings(action="ignore", category=SamplingWarning):
             found.append(fit(model, num_draws=16).log_evidence)
     assert found[0].shape == (1,)

@@ -7,30 +7,18 @@ from gpytorch.priors import GammaPrior
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gpadjust.core import (
-    CKA,
-    MATERN12,
-    MATERN32,
-    MATERN52,
-    RRA,
-    CalibratedPhysics,
-    Kernel,
-    PhysicsMeanGP,
-    Row,
-    ScaleGP,
-    Stationary,
-    ZeroMeanGP,
-)
+from gpadjust import core
+from gpadjust.core import CKA, MATERN12, MATERN32, MATERN52, RRA, Stationary
 from gpadjust.physics import FunctionPhysics, Unknown
 from tests.core.noises import Relative
 from tests.systems import crude, normal, same, slopes, truth, uniform
 
 
-class Own(Kernel):
+class Own(core.Kernel):
     """A rational quadratic kernel, without derivatives by hand."""
 
     def rows(self, x, num_outputs):
-        return [Row.positive("size", x.new_ones(num_outputs, 1), 2.0)]
+        return [core.Row.positive("size", x.new_ones(num_outputs, 1), 2.0)]
 
     def covariance(self, own, x, other=None):
         other = x if other is None else other
@@ -66,17 +54,17 @@ BOUNDED = known({"w": Unknown(3.0, bounds=(2.0, 4.0))})
 MODELS = {
     "CKA": of(CKA, physics=crude),
     "RRA": of(RRA, physics=crude, num_features=12),
-    "PhysicsMeanGP, known noise": of(PhysicsMeanGP, 0.01, physics=crude),
-    "ScaleGP": of(ScaleGP, physics=crude),
-    "ZeroMeanGP": of(ZeroMeanGP),
+    "PhysicsMeanGP, known noise": of(core.PhysicsMeanGP, 0.01, physics=crude),
+    "ScaleGP": of(core.ScaleGP, physics=crude),
+    "ZeroMeanGP": of(core.ZeroMeanGP),
     "two physics": of(CKA, physics=[crude, lambda X: crude(X).sin()], rho_mean=[0.7, 0.1]),
     "given numbers": of(CKA, physics=crude, center=0.7, rho_mean=1.5, delta_mean=-2.0),
     "no constants": of(CKA, physics=crude, constants=False, center=False),
     "unknown parameters": of(CKA, physics=UNKNOWN),
     "two physics with the same parameters": of(CKA, physics=[UNKNOWN, OTHER]),
     "known and unknown": of(CKA, physics=[crude, BOUNDED]),
-    "calibrated": of(CalibratedPhysics, physics=UNKNOWN),
-    "calibrated, known noise": of(CalibratedPhysics, 0.01, physics=UNKNOWN),
+    "calibrated": of(core.CalibratedPhysics, physics=UNKNOWN),
+    "calibrated, known noise": of(core.CalibratedPhysics, 0.01, physics=UNKNOWN),
     "relative noise": of(CKA, physics=crude, noise=Relative()),
     "relative noise of unknown parameters": of(CKA, physics=UNKNOWN, noise=Relative()),
     "Matern 1/2": delta(Stationary(MATERN12)),
@@ -195,7 +183,7 @@ def test_near_duplicate_inputs(profile, gap):
     """Distances of 1e-8 have half of the digits."""
     X, Y = problem()
     X, Y = torch.cat([X, X[:3] + gap]), torch.cat([Y, Y[:3] + 1e-3])
-    model = ZeroMeanGP(X, Y, covar_module=Stationary(profile))
+    model = core.ZeroMeanGP(X, Y, covar_module=Stationary(profile))
     assert_right(model, coordinates(model), 1e-4)
 
 

@@ -11,20 +11,8 @@ from gpytorch.kernels import RBFKernel, ScaleKernel
 from gpytorch.likelihoods import GaussianLikelihood
 from gpytorch.priors import GammaPrior, LogNormalPrior, UniformPrior
 
-from gpadjust.core import (
-    CKA,
-    GP,
-    MATERN32,
-    Choice,
-    Kernel,
-    LogNormal,
-    Noise,
-    Row,
-    Stationary,
-    Term,
-    ZeroMeanGP,
-    fit,
-)
+from gpadjust import core
+from gpadjust.core import CKA, GP, Kernel, Noise, Stationary, Term, ZeroMeanGP, fit
 from gpadjust.physics import FunctionPhysics, Unknown
 from tests.systems import wave
 
@@ -40,8 +28,8 @@ def test_choices_of_any_probability(data, probabilities):
     """The first choice contains u = 0, each can be asked for, and the prior draws them so."""
     zeros = [(), ("g.process",), ("g.process", "f.process")]
     pairs = zip(probabilities, zeros, strict=False)
-    choices = [Choice(f"{k}", p, names) for k, (p, names) in enumerate(pairs)]
-    terms = [Term("f", Stationary()), Term("g", Stationary(MATERN32))]
+    choices = [core.Choice(f"{k}", p, names) for k, (p, names) in enumerate(pairs)]
+    terms = [Term("f", Stationary()), Term("g", Stationary(core.MATERN32))]
     model = GP(*data, terms=terms, choices=choices)
     assert model.table.chosen(model.values).item() == 0
     u = torch.randn(4000, 1, model.table.size, dtype=torch.float64)
@@ -88,7 +76,7 @@ class Brownian(Kernel):
     """min(x, x') of the first input."""
 
     def rows(self, x, num_outputs):
-        return [Row.positive("scale", x.new_ones(num_outputs, 1), 3.0)]
+        return [core.Row.positive("scale", x.new_ones(num_outputs, 1), 3.0)]
 
     def covariance(self, own, x, other=None):
         other = x if other is None else other
@@ -240,7 +228,7 @@ def test_covariance_and_gradient(centered, name):
     if name == "hamming":
         first = (X[:, :1] > 0).double()
         X = torch.cat([first, 1 - first], -1)  # one letter of two
-    noise = Noise(priors=[LogNormal(1e-3, 55.0)])  # differences round off where it is lower
+    noise = Noise(priors=[core.LogNormal(1e-3, 55.0)])  # differences round off where it is lower
     delta = KERNELS[name]()
     model = CKA(X, Y, physics=wave, delta_covar_module=delta, noise=noise, nested=False)
     term = model.terms[1]

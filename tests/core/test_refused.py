@@ -7,22 +7,8 @@ from botorch.models import SingleTaskGP
 from botorch.sampling import SobolQMCNormalSampler
 from gpytorch.kernels import RBFKernel
 
-from gpadjust import compare
-from gpadjust.core import (
-    CKA,
-    GP,
-    MATERN32,
-    RRA,
-    Choice,
-    Noise,
-    OfGPyTorch,
-    StackedGP,
-    Stationary,
-    Term,
-    ZeroMeanGP,
-    fit,
-    save,
-)
+from gpadjust import compare, core
+from gpadjust.core import CKA, GP, MATERN32, RRA, Noise, OfGPyTorch, Term, ZeroMeanGP, fit
 from gpadjust.kinds import Categories, HeavyTails
 from gpadjust.many import VariationalCKA
 from gpadjust.physics import FormulaPhysics
@@ -57,7 +43,9 @@ def fantasy():
 
 
 def choices(*parts):
-    return GP(X, Y, terms=[Term("f", Stationary())], choices=[Choice(*part) for part in parts])
+    return GP(
+        X, Y, terms=[Term("f", core.Stationary())], choices=[core.Choice(*part) for part in parts]
+    )
 
 
 def cka(**options):
@@ -65,7 +53,7 @@ def cka(**options):
 
 
 def stacked(models, weights, *number):
-    return StackedGP(models, weights, *number)
+    return core.StackedGP(models, weights, *number)
 
 
 PAIR = {"a": MODEL, "b": ZERO}
@@ -96,7 +84,7 @@ REFUSED = [
         "in the order of",
     ),
     (lambda: ZERO.rho(X), ValueError, "Unknown term 'rho'; expected one of f"),
-    (lambda: save("a comparison", "model.pt"), TypeError, "comparison.recommended"),
+    (lambda: core.save("a comparison", "model.pt"), TypeError, "comparison.recommended"),
     (lambda: NAMED.predict(pd.DataFrame({"a": [0.1], "b": [0.2]})), ValueError, "columns"),
     (lambda: NAMED.predict(pd.DataFrame({"b": [0.1], "c": [0.2]})), ValueError, "columns"),
     (lambda: MODEL.interval(X, 95), ValueError, "between 0 and 1"),

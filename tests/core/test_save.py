@@ -13,19 +13,7 @@ from gpytorch.kernels import MaternKernel, ScaleKernel
 from torch.nn.functional import relu, silu
 
 from gpadjust import core
-from gpadjust.core import (
-    CKA,
-    GP,
-    MATERN52,
-    KnownNoise,
-    LogNormal,
-    Noise,
-    Stationary,
-    Term,
-    ZeroMeanGP,
-    load,
-    save,
-)
+from gpadjust.core import CKA, GP, MATERN52, KnownNoise, Stationary, ZeroMeanGP, load, save
 from gpadjust.core.saving import _built_with
 from gpadjust.physics import FormulaPhysics, FunctionPhysics, Unknown
 from tests.core.noises import Relative
@@ -76,7 +64,10 @@ def path(tmp_path):
 
 
 def terms():
-    return [Term("f", Stationary(MATERN52), 0.2, LogNormal(1.0, 10.0)), Term("g", physics=0)]
+    return [
+        core.Term("f", Stationary(MATERN52), 0.2, core.LogNormal(1.0, 10.0)),
+        core.Term("g", physics=0),
+    ]
 
 
 CHOICES = [core.Choice("all", 0.5), core.Choice("no f", 0.5, ("f.process", "f.constant"))]
@@ -219,12 +210,12 @@ def test_a_file_of_code_is_not_executed(path):
 
 
 SILU = partial(CKA, X, Y, physics=silu)
-KERNEL = {"delta_covar_module": Stationary(MATERN52), "noise": Noise()}
-OTHER_KERNEL = {"delta_covar_module": Stationary(core.MATERN32), "noise": Noise()}
+KERNEL = {"delta_covar_module": Stationary(MATERN52), "noise": core.Noise()}
+OTHER_KERNEL = {"delta_covar_module": Stationary(core.MATERN32), "noise": core.Noise()}
 KNOWN = {"terms": terms(), "noise": KnownNoise(torch.ones_like(Y.mT))}
 CHOSEN = {"terms": terms(), "choices": CHOICES}
 OTHER = [CHOICES[0]._replace(probability=0.6), CHOICES[1]._replace(probability=0.4)]
-WIDER = [terms()[0]._replace(constant=LogNormal(1.0, 11.0)), terms()[1]]
+WIDER = [terms()[0]._replace(constant=core.LogNormal(1.0, 11.0)), terms()[1]]
 OF_RELU = partial(GP, X, Y, physics=[relu])
 # A model, the objects that it is loaded with, and the words of the error.
 WRONG_OBJECTS = [

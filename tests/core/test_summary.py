@@ -9,19 +9,8 @@ from botorch.models.transforms import Normalize
 from gpytorch.kernels import PeriodicKernel, RBFKernel, ScaleKernel
 from gpytorch.priors import LogNormalPrior
 
-from gpadjust.core import (
-    CKA,
-    GP,
-    KnownNoise,
-    LogNormal,
-    Noise,
-    Stationary,
-    Term,
-    ZeroMeanGP,
-    fit,
-    load,
-    save,
-)
+from gpadjust import core
+from gpadjust.core import CKA, GP, LogNormal, Noise, Stationary, Term, ZeroMeanGP
 from gpadjust.physics import FunctionPhysics, Unknown
 from tests.core.noises import Relative
 from tests.systems import line, wave
@@ -135,7 +124,7 @@ def test_of_noise(fantasies):
     known = GP(X, Y, torch.tensor([4.0, 9.0]).double(), terms=terms, physics=[physics])
     if fantasies:
         known = known.condition_on_observations(X[:2].expand(3, 2, 2) + 0.1, Y[:2])
-    assert isinstance(known.noise, KnownNoise)
+    assert isinstance(known.noise, core.KnownNoise)
     assert lines(known)["noise"] == "standard deviation 3"
     assert lines(known)["g"] == "prior mean 1"
 
@@ -164,7 +153,7 @@ def test_priors_are_in_the_users_units_and_stay_after_a_fit():
     assert rows.loc["noise standard deviation", "median"] == pytest.approx(0.01 * unit)
     upper = unit * (0.1 * 1000**1.96) ** 0.5
     assert rows.loc["delta standard deviation", "97.5 %"] == pytest.approx(upper, rel=1e-3)
-    fit(one)
+    core.fit(one)
     assert one.priors().equals(of_waves().priors())
 
 
@@ -182,9 +171,9 @@ def test_each_prior_is_replaced_by_one_argument(options, name, median, tmp_path)
     assert changed.loc[name, "median"] == pytest.approx(median)
     others = changed.index != name
     assert changed.loc[others].equals(usual.loc[others])
-    saved = save(one := of_waves(**options), tmp_path / "model.pt")
+    saved = core.save(one := of_waves(**options), tmp_path / "model.pt")
     given = {name: options[name] for name in saved.missing}  # kernels of one's own
-    again = load(tmp_path / "model.pt", physics=wave, **given)
+    again = core.load(tmp_path / "model.pt", physics=wave, **given)
     assert again.priors().equals(one.priors())
 
 
