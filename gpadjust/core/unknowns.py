@@ -174,7 +174,7 @@ class Table:
                 if row.is_positive:
                     size = a_plus_bu = theta.log()
                 z = (a_plus_bu - row.location) / row.scale
-                # log p(theta) + log |d theta / du| - log N(u | 0, 1), where d theta / du is b theta or b
+                # log p(theta) + log |d theta / du| - log N(u | 0, 1), d theta / du = b theta or b
                 size = size + math.log(row.scale) + 0.5 * z.square() + 0.5 * math.log(2 * math.pi)
                 part = row.log_density(theta) + size.sum(-1)
                 part = part.reshape(len(u), -1)  # S x m, or S x 1 of a shared row
