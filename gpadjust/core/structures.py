@@ -26,6 +26,7 @@ class CKA(GP):
     model falls back to the physics. Both processes contain an unknown constant with its own
     variance, and with ``nested`` the model is averaged with its constants alone, :math:`a f_p + b`,
     and with :math:`\delta` alone; a physics with unknown parameters also with :math:`f_p` as it is.
+    Other arguments as of :class:`GP`.
 
     Args:
         physics: The physics f_p, a function of ``n x d`` to ``n x m`` (or ``n``) or a
@@ -119,8 +120,8 @@ class RRA(CKA):
 class PhysicsMeanGP(GP):
     r"""A Gaussian process with the physics as its mean, :math:`f_a = f_p + \delta`.
 
-    Physics and constants as of :class:`CKA`; ``covar_module`` is the kernel of delta, by default
-    RBF.
+    Physics and constants as of :class:`CKA`, others as of :class:`GP`; ``covar_module`` is the
+    kernel of delta, by default RBF.
     """
 
     def __init__(
@@ -139,8 +140,8 @@ class PhysicsMeanGP(GP):
 class ScaleGP(GP):
     r"""An adjustment by a scaling alone, :math:`f_a = \rho f_p`, :math:`\rho \sim GP(1, k)`.
 
-    It cannot adjust where f_p is zero. One physics, and constants, as of :class:`CKA`;
-    ``covar_module`` is the kernel of rho, by default RBF.
+    It cannot adjust where f_p is zero. One physics, and constants, as of :class:`CKA`, others as of
+    :class:`GP`; ``covar_module`` is the kernel of rho, by default RBF.
     """
 
     def __init__(
@@ -160,7 +161,7 @@ class ScaleGP(GP):
 class ZeroMeanGP(GP):
     """A Gaussian process without physics, of a kernel ``covar_module``, by default RBF.
 
-    It varies around an unknown constant; ``constants`` as of :class:`CKA`.
+    It varies around an unknown constant; ``constants`` as of :class:`CKA`, others as of :class:`GP`.
     """
 
     def __init__(
@@ -176,7 +177,7 @@ class CalibratedPhysics(GP):
     r"""The physics and noise alone, :math:`y = f_p(x; \theta) + \epsilon`: nonlinear regression.
 
     Where the physics, one with unknown parameters, is wrong, intervals of these are too narrow:
-    compare it with :class:`CKA` of the same physics.
+    compare it with :class:`CKA` of the same physics. Other arguments as of :class:`GP`.
     """
 
     def __init__(
