@@ -161,7 +161,7 @@ class ScaleGP(GP):
 class ZeroMeanGP(GP):
     """A Gaussian process without physics, of a kernel ``covar_module``, by default RBF.
 
-    It varies around an unknown constant; ``constants`` as of :class:`CKA`, others as of :class:`GP`.
+    It varies around an unknown constant, as of :class:`CKA`. Other arguments as of :class:`GP`.
     """
 
     def __init__(
