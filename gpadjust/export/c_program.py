@@ -320,8 +320,9 @@ def _step(
         yield from (f"    {line}" for line in _own_f_p(within, name, "read"))
     if num_physics:
         f_p = entries("f_p", num_physics // m * len(spec.moving))
-        wrap = lambda angle: Text(f"atan2(sin{angle}, cos{angle})")  # noqa: E731
-        columns = target_columns(dynamics, state, f_p, wrap)
+        columns = target_columns(
+            dynamics, state, f_p, lambda angle: Text(f"atan2(sin{angle}, cos{angle})")
+        )
         yield f"    const double columns[{num_physics}] = {braced(columns)};"
         values.append("columns")
     has_variance = "double *variance" in arguments
