@@ -67,9 +67,6 @@ class Agent(ABC, Display):
         env: The real environment, of Gymnasium, with boxes of observations and actions as in the
             spec of the dynamics; the attribute has a :class:`StepGuard` around.
         task: The dynamics of the system, its reward and goal.
-        action_noise: Returns noise for each action, ``action_dim`` numbers in halves of its range,
-            such as Stable-Baselines3's ``NormalActionNoise``.
-        random_steps: Episodes that begin before so many real steps have random actions.
         reward_tolerance: Largest error of the task's rewards, relative to the largest real one of
             an episode; None to check neither rewards nor terminations.
         score_horizons: Numbers of steps over which each new episode is predicted, open loop along
@@ -107,8 +104,6 @@ class Agent(ABC, Display):
         env: Any,
         task: Task,
         *,
-        action_noise: Callable[[], NDArray[Any]] | None = None,
-        random_steps: int = 0,
         reward_tolerance: float | None = 1e-3,
         score_horizons: Sequence[int] = (1, 5, 15),
         seed: int | None = None,
@@ -118,8 +113,6 @@ class Agent(ABC, Display):
         check_kind("env", env, gym.Env, expected)
         task.check_spaces(env.observation_space, env.action_space)
         self.env = self.wrapped(env)
-        self.action_noise = action_noise
-        self.random_steps = checked_whole("random_steps", random_steps, 0)
         if reward_tolerance is not None:
             checked_number("reward_tolerance", reward_tolerance, least=0)
         self.reward_tolerance = reward_tolerance
@@ -216,21 +209,14 @@ class Agent(ABC, Display):
 
     def _check(self) -> None:
         """Find errors before they cost a real step."""
-        task, rate = self.task, self.task.rate
-        is_limited = rate is not None and rate.most is not None
-        if self.action_noise is not None and (is_limited or task.sensors is not None):
-            raise ValueError(
-                "action_noise may exceed the limit of action_rate, and misleads the estimate of "
-                "hidden states; leave action_noise out, or limit and sensors."
-            )
-        if task.sensors is not None:
-            task.dynamics.state_dict()  # or an error: they learn all episodes again
+        if self.task.sensors is not None:
+            self.task.dynamics.state_dict()  # or an error: they learn all episodes again
             if self.known_task() is None:
                 raise ValueError(
                     "The estimate of hidden states needs a model; give the dynamics a physics, or "
                     "leave the sensors out."
                 )
-        episodes.try_task(task, np.atleast_2d(self._reset()), self.env)
+        episodes.try_task(self.task, np.atleast_2d(self._reset()), self.env)
 
     def _reset(self) -> NDArray[Any]:
         """Return the first observation of the next episode."""
@@ -249,7 +235,6 @@ class Agent(ABC, Display):
         is_random = self.model is None
         random_actions = self._random_actions()
         rows: list[episodes.Row] = []
-        getattr(self.action_noise, "reset", lambda: None)()
         try:
             while True:
                 if is_random:
@@ -262,8 +247,6 @@ class Agent(ABC, Display):
                         self._check_result("promise", promises, dict, "a dictionary of numbers")
                         self.tell("plan", {**promises, "seconds": time.perf_counter() - asked})
                 space: Any = self.env.action_space
-                if self.action_noise is not None:
-                    action = action + self.action_noise() * (space.high - space.low) / 2
                 action = np.clip(action, space.low, space.high).astype(space.dtype)
                 following, reward, terminated, truncated, info = self.env.step(action)
                 self.num_timesteps += 1
@@ -351,10 +334,8 @@ class Agent(ABC, Display):
         self.tell("fit", values)
 
     def _improve(self) -> None:
-        """Improve in the newest model, if there is one and actions are not to be random."""
-        if self._can_act is not None or self.num_timesteps < self.random_steps:
-            return
-        task = self.known_task()
+        """Improve in the newest model, if there is one."""
+        task = self.known_task() if self._can_act is None else None
         if task is None:
             return
         with episodes.timed(self.wall_time, "update"):

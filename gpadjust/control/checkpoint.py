@@ -18,7 +18,7 @@ from typing import Any
 import cloudpickle
 from filelock import FileLock, Timeout
 
-from gpadjust.checks import check_kind, checked_whole
+from gpadjust.checks import check_kind
 from gpadjust.control.episodes import generators
 from gpadjust.control.summary import layer_names
 from gpadjust.control.task import Task
@@ -37,10 +37,8 @@ class EpisodeCheckpoint:
 
     Args:
         path: The file.
-        every: Number of episodes between two checkpoints (of Dyna: of rollouts).
 
     Raises:
-        ValueError: If ``every`` is not positive.
         RuntimeError: When learning starts, if another run writes to this file.
 
     Example:
@@ -49,10 +47,8 @@ class EpisodeCheckpoint:
         >>> # agent.learn(1250 - agent.num_timesteps, checkpoint)
     """
 
-    def __init__(self, path: str | Path, every: int = 1) -> None:
+    def __init__(self, path: str | Path) -> None:
         self.path = Path(path).absolute()
-        self.every = checked_whole("every", every, 1)
-        self._episodes = 0
 
     def __call__(self, agent: Any, event: str, values: Any = None) -> None:
         """Write the file before and after an episode, and at the end of the run."""
@@ -60,10 +56,8 @@ class EpisodeCheckpoint:
             raise TypeError(
                 "EpisodeCheckpoint is for learners with a model, such as MPCAgent and DynaSAC."
             )
-        is_due = event in ("episode", "trial") and self._episodes % self.every == 0
-        if event == "done" or is_due:
+        if event in ("episode", "trial", "done"):
             self._write(agent)
-        self._episodes += event == "episode"
 
     def write(self, agent: Any) -> None:
         """Write the state of a run; an error if another run writes, or a pickle is impossible."""

@@ -20,7 +20,6 @@ from gpadjust.control.task import Task
 from gpadjust.progress import tick
 from gpadjust.states import StateSpec
 
-_NEAR = 0.95  # of the way to a bound: beyond, the tanh has hardly any slope
 _GENTLE = 0.1  # factor of the last weights at the start
 _REDRAW_EVERY = 5  # updates between two tests of the policy, and between draws of functions
 _MAX_GRAD_NORM = 1.0
@@ -38,11 +37,6 @@ class BoundedPolicy(nn.Module):
         spec: The names of states and actions.
         action_bounds: Lower and upper bounds l and h of the actions, ``2 x action_dim``.
         net_arch: The widths of the hidden layers; () for a linear function.
-        first_actions: Actions of the untrained policy, ``action_dim`` numbers within the bounds.
-            Default: the middle.
-
-    Raises:
-        ValueError: If ``first_actions`` are beyond the bounds, or their number is wrong.
 
     Example:
         >>> import torch
@@ -58,23 +52,10 @@ class BoundedPolicy(nn.Module):
     unit: Tensor
 
     def __init__(
-        self,
-        spec: StateSpec,
-        action_bounds: ArrayLike,
-        net_arch: Sequence[int] = (64, 64),
-        first_actions: Sequence[float] | None = None,
+        self, spec: StateSpec, action_bounds: ArrayLike, net_arch: Sequence[int] = (64, 64)
     ) -> None:
         super().__init__()
         bounds = checked_bounds("action_bounds", action_bounds, spec.action_dim)
-        low, high = bounds
-        first = (low + high) / 2
-        if first_actions is not None:
-            first = torch.tensor(first_actions).double()
-        if first.shape != low.shape or not ((first >= low) & (first <= high)).all():
-            raise ValueError(
-                f"first_actions must be {len(low)} numbers within {low.tolist()} and "
-                f"{high.tolist()}; found {first.tolist()}."
-            )
         self.spec = spec
         self.register_buffer("action_bounds", bounds)
         self.register_buffer("origin", torch.zeros(spec.observation_dim, dtype=torch.float64))
@@ -86,7 +67,7 @@ class BoundedPolicy(nn.Module):
         last: Any = self.body[-1]
         with torch.no_grad():
             last.weight.mul_(_GENTLE)
-            last.bias.copy_(((2 * first - low - high) / (high - low)).clamp(-_NEAR, _NEAR).atanh())
+            last.bias.zero_()  # the middle of the bounds
 
     def forward(self, states: Tensor) -> Tensor:
         """Return actions ``N x action_dim`` at states ``N x state_dim``."""

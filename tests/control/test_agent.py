@@ -11,7 +11,6 @@ import pytest
 import torch
 from gymnasium.wrappers import TransformObservation
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.noise import NormalActionNoise
 
 from gpadjust import ZeroMeanGP, progress
 from gpadjust.control import Agent, MPCAgent, PolicySearchAgent, Task, print_progress
@@ -55,14 +54,6 @@ def test_without_a_physics_the_first_episode_is_random(make_agent, kind):
     assert agent.promised_reward is None
     assert agent.model is not None
     assert len(agent.learn(5).recorded_episodes()) == 10
-
-
-@pytest.mark.slow
-def test_the_first_episodes_can_be_random(make_agent, kind):
-    """Two episodes of five steps begin before the sixth step; the third is brought home."""
-    agent = make_agent(kind, random_steps=6).learn(15)
-    rewards = agent.recorded_episodes().rewards.reshape(3, 5).sum(1)
-    assert rewards[:2].max() < -2 < rewards[2]
 
 
 class Farthest(Agent):
@@ -131,13 +122,6 @@ def test_scores_of_each_new_episode_are_told(make_agent):
     assert {*log[0]} == {"fit_seconds", "real_reward"}
     assert {"nlpd", "coverage", "rmse/x", "energy_2", "coverage_4"} <= {*log[1]}
     assert all(np.isfinite([*each.values()]).all() for each in log)
-
-
-def test_noise_explores(make_agent):
-    noise = NormalActionNoise(np.zeros(1), 0.5 * np.ones(1))
-    plain, noisy = (make_agent(MPCAgent, action_noise=each).learn(5) for each in (None, noise))
-    assert not torch.equal(plain.recorded_episodes().actions, noisy.recorded_episodes().actions)
-    assert noisy.recorded_episodes().actions.abs().max() <= 2
 
 
 def test_episodes_end_at_the_tasks_length_or_that_of_the_environment(make_agent, point_env):

@@ -111,13 +111,13 @@ def test_what_was_resumed_is_saved_again_as_it_was(make_agent, again, path):
     assert expected["counts"][-1] == {"costs": [1.0]}
 
 
-def test_checkpoints_come_every_so_many_episodes(make_agent, path, monkeypatch):
+def test_checkpoints_come_before_and_after_each_episode(make_agent, path, monkeypatch):
     saved = []
     monkeypatch.setattr(
         EpisodeCheckpoint, "_write", lambda self, agent: saved.append(agent.num_timesteps)
     )
-    make_agent(MPCAgent).learn(15, EpisodeCheckpoint(path, every=2))
-    assert saved == [0, 10, 10, 15]
+    make_agent(MPCAgent).learn(10, EpisodeCheckpoint(path))
+    assert saved == [0, 5, 5, 10, 10]
 
 
 def test_an_environment_that_cannot_be_pickled_is_reset(make_agent, point_env, again, path):

@@ -12,7 +12,6 @@ from gpadjust import ZeroMeanGP
 from gpadjust.control import (
     MPC,
     ActionRate,
-    BoundedPolicy,
     EpisodeCheckpoint,
     MPCAgent,
     Objective,
@@ -134,11 +133,6 @@ POLICIES = [
         lambda at: improve(at, reward=lambda s, a, n: n[:, 0].detach(), initial_states=near_one),
         "Write the reward in torch",
     ),
-    (
-        lambda at: BoundedPolicy(POINT_SPEC, BOUNDS, first_actions=[3.0]),
-        r"1 numbers within \[-1.0\] and \[2.0\]; found \[3",
-    ),
-    (lambda at: EpisodeCheckpoint("run.ckpt", every=0), "every must be at least 1; found 0"),
     (lambda at: EpisodeCheckpoint("run.ckpt")({}, {}), "for learners with a model"),
 ]
 AGENTS = [
@@ -149,7 +143,6 @@ AGENTS = [
     (lambda at: at.planner(reward_tolerance="no"), "reward_tolerance must be a number"),
     (lambda at: at.planner(score_horizons=(0,)), "horizon"),
     (lambda at: at.planner(learning_rate=1.0), "learning_rate"),
-    (lambda at: at.planner(random_steps=-1), "random_steps must be"),
     (lambda at: MPCAgent(at.env(), at.task()).learn("x"), "total_timesteps must be a whole number"),
     (lambda at: MPCAgent(None, at.task()), "env must be an environment of Gymnasium"),
     (lambda at: MPCAgent("CartPole-v1", at.task()), "env must be an environment of Gymnasium"),
@@ -181,14 +174,6 @@ AGENTS = [
 LATER = [  # at `learn`, before the first real step
     (lambda at: at.searcher(constraints=wall), "PolicySearch .* constraints; MPCAgent can"),
     (lambda at: at.searcher(action_rate=0.5), "PolicySearch .* action_rate; MPCAgent can"),
-    (
-        lambda at: at.planner(action_noise=lambda: np.ones(1), action_rate=0.25),
-        "limit of action_rate.*leave action_noise out",
-    ),
-    (
-        lambda at: at.planner(action_noise=partial(np.zeros, 1), sensors=X),
-        "leave action_noise out",
-    ),
     (lambda at: at.planner(dynamics=BLIND, sensors=X), "give the dynamics a physics"),
     (
         lambda at: at.planner(at.env().unwrapped, episode_length=None),
