@@ -307,6 +307,7 @@ class Agent(ABC, Display):
                 self._filter, self._estimated = smooth_episodes(
                     newest, self.filter, self._observed, seed=len(self._promises)
                 )
+        # Fresh dynamics learn all episodes.
         data = self.recorded_episodes()
         is_new = data.episode >= self.num_episodes
         new = data.some(is_new) if dynamics.has_learnt else data
@@ -319,6 +320,7 @@ class Agent(ABC, Display):
         with episodes.timed(self.wall_time, "fit"):
             complete = episodes.completed(task, data, self.env)
             values = learn_dynamics(complete, new, data, self.score_horizons)
+        # The agent improves in the new model before it acts.
         promises = self._promises[self.num_episodes :]
         self.num_episodes = len(self._promises)
         self.model = None
@@ -335,7 +337,9 @@ class Agent(ABC, Display):
 
     def _improve(self) -> None:
         """Improve in the newest model, if there is one."""
-        task = self.known_task() if self._can_act is None else None
+        if self._can_act is not None:
+            return
+        task = self.known_task()
         if task is None:
             return
         with episodes.timed(self.wall_time, "update"):

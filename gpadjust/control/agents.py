@@ -42,7 +42,6 @@ class MPCAgent(Agent):
         options: Further arguments of :class:`Agent`, which also has the errors.
 
     Example:
-        >>> from gpadjust.control import MPCAgent, Planner
         >>> from gpadjust.systems import cart_pole
         >>> system = cart_pole()
         >>> quick = Planner(rounds=1, horizon=0.3, num_random=16)  # or leave it out
@@ -135,8 +134,6 @@ class PolicySearchAgent(Agent):
 
     Example:
         >>> from dataclasses import replace
-        >>> import torch
-        >>> from gpadjust.control import PolicySearch, PolicySearchAgent
         >>> from gpadjust.systems import cart_pole
         >>> wide = torch.tensor([[-50.0] * 4, [50.0] * 4])  # for two quick updates
         >>> system = replace(cart_pole(), state_bounds=wide)

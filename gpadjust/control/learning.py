@@ -46,6 +46,7 @@ def check_functions(task: Task, data: Trajectories, tolerance: float = 1e-3) -> 
         parts = ("states", "actions", "next_states")
         return ", ".join(f"{part}[{i}] = {getattr(data, part)[i].tolist()}" for part in parts)
 
+    # |r - r'| <= tolerance max |r'|
     rewards = task.rewards(*data).double()
     error = (rewards - data.rewards).abs()
     if (error > tolerance * data.rewards.abs().max().clamp_min(1e-6)).any():
@@ -119,7 +120,8 @@ def warn_of_delay(dynamics: Dynamics, data: Trajectories, num_new: int) -> None:
 
 def warn_of_promise(values: dict[str, float], rewards: Tensor) -> None:
     """Warn if a real step gave less than promised by a quarter of the range of all rewards."""
-    real, promised = values["real_reward"], values["promised_reward"]
+    real = values["real_reward"]  # of a step
+    promised = values["promised_reward"]
     if promised - real <= (max(float(rewards.max()), promised) - float(rewards.min())) / 4:
         return
     message = (
@@ -166,6 +168,7 @@ def _score(
     numbers = {"nlpd": float(score.nlpd.mean()), "coverage": float(score.coverage.mean())}
     names = [f"rmse/{spec.states[i]}" for i in spec.moving]
     numbers |= dict(zip(names, score.rmse.tolist(), strict=True))
+    # Open loop, from a few states
     horizons = [k for k in horizons if k <= new.longest]
     if not horizons:
         return numbers

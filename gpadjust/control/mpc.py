@@ -48,9 +48,8 @@ class MPC:
         ValueError: If a horizon is shorter than a step, or ``action_bounds`` are not bounds.
 
     Example:
-        >>> import numpy as np
-        >>> from gpadjust.control import MPC, Task
-        >>> from gpadjust.dynamics import LearnedDynamics, StateSpec
+        >>> from gpadjust.dynamics import LearnedDynamics
+        >>> from gpadjust.states import StateSpec
         >>> spec = StateSpec(["level"], ["pump"])
         >>> dynamics = LearnedDynamics(spec, lambda X: X[:, :1] + X[:, 1:])
         >>> task = Task(dynamics, lambda states, actions, following: -following[:, 0].abs())

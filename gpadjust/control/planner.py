@@ -98,9 +98,7 @@ class Planner:
         ValueError: If a number is out of range.
 
     Example:
-        >>> import torch
-        >>> from gpadjust.control import Planner, Task
-        >>> from gpadjust.dynamics import PhysicsDynamics, StateSpec
+        >>> from gpadjust.dynamics import PhysicsDynamics
         >>> point = PhysicsDynamics(StateSpec(["x"], ["v"]), lambda X: X[:, :1] + X[:, 1:])
         >>> task = Task(point, lambda states, actions, next_states: -next_states[:, 0].abs())
         >>> plan = Planner().plan(task, torch.ones(1).double(), [[-1.0], [1.0]], num_steps=3)
@@ -173,7 +171,7 @@ class Planner:
             num_steps: Number of steps before the end. Default: the episode length of the task.
             earlier: A plan to begin with; its last action is held where it is shorter.
             moment: The point of the episode. Default: its beginning.
-            covariance: Covariance of an estimated state, ``state_dim x state_dim``.
+            covariance: Covariance of the state, ``state_dim x state_dim``. Default: zero.
             deadline: Time limit by ``time.perf_counter``. Default: after ``seconds``.
 
         Raises:

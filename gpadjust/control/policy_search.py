@@ -39,9 +39,6 @@ class BoundedPolicy(nn.Module):
         net_arch: The widths of the hidden layers; () for a linear function.
 
     Example:
-        >>> import torch
-        >>> from gpadjust.control import BoundedPolicy
-        >>> from gpadjust.states import StateSpec
         >>> policy = BoundedPolicy(StateSpec(["x"], ["force"]), [[-2.0], [2.0]])
         >>> policy(torch.zeros(3, 1, dtype=torch.float64)).shape
         torch.Size([3, 1])
@@ -154,18 +151,14 @@ class PolicySearch:
             task.refuse(type(self).__name__, part, "MPCAgent can")
 
     def improve(self, policy: nn.Module, task: Task) -> SearchResult:
-        """Improve a policy; the randomness is PyTorch's global generator.
+        """Improve a policy, from states ``N x state_dim`` to actions ``N x action_dim``.
 
-        Args:
-            policy: A module from states ``N x state_dim`` to actions ``N x action_dim``; an error
-                leaves its parameters as they were.
-            task: The task, with fitted dynamics, episode length and starts.
+        The randomness is PyTorch's global generator. An error leaves the policy as it was.
 
         Raises:
             TypeError: If the policy is not a module with parameters.
             ValueError: If the task lacks a part.
-            RuntimeError: If the dynamics are not fitted, or no gradient flows from the rewards to
-                the policy.
+            RuntimeError: If the dynamics are not fitted, or no gradient flows to the policy.
             PhysicsError: If the physics fails at all starts.
         """
         if not isinstance(policy, nn.Module) or not [*policy.parameters()]:
@@ -212,8 +205,7 @@ class PolicySearch:
                 value = compute_score(rollouts.act(drawn, policy, length)).mean() / length
                 if not value.requires_grad:
                     raise RuntimeError(
-                        "No gradient flows from the rewards to the policy: the task's reward or "
-                        "the dynamics are computed without PyTorch's autograd. Write the reward in "
+                        "No gradient flows from the rewards to the policy. Write the reward in "
                         "torch, without .detach() and .numpy()."
                     )
                 optimizer.zero_grad()

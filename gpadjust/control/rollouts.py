@@ -21,18 +21,11 @@ _BACK = 10.0  # price of the overshoot, in largest rewards: its gradient outweig
 
 
 class Rollouts:
-    """Runs episodes of a task, each in ``k`` functions of its dynamics.
+    """Runs episodes of a task, each in ``k`` functions drawn from its dynamics, or in their mean.
 
     An episode ends in a terminal state, or before a step that would leave the bounds or the finite
-    numbers or meet a failure of the physics. Gradients flow from the rewards to the actions; a
-    gradient that is not finite counts as zero.
-
-    Args:
-        task: The task, with fitted dynamics.
-        num_functions: Number ``k`` of functions, drawn from PyTorch's generator; None for the mean
-            of the dynamics, as a single one.
-        moment: The point of an episode at which all begin. Default: its start.
-        deadline: Time limit by ``time.perf_counter`` for all steps but the first.
+    numbers or meet a failure of the physics; all end at the deadline, by ``time.perf_counter``.
+    Gradients flow from the rewards to the actions; one that is not finite counts as zero.
     """
 
     def __init__(
@@ -118,6 +111,7 @@ def _limit_gradient(rows: Tensor) -> Tensor:
         return rows
 
     def limit(gradient: Tensor) -> Tensor:
+        # No longer than 30 medians of the lengths
         gradient = torch.where(gradient.isfinite().all(-1, keepdim=True), gradient, 0.0)
         lengths = gradient.norm(dim=-1, keepdim=True)
         if not lengths.any():

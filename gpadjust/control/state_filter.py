@@ -113,20 +113,11 @@ class StateFilter(NamedTuple):
 def smooth_episodes(
     task: Task, state_filter: StateFilter, observed: Trajectories, seed: int
 ) -> tuple[StateFilter, Trajectories]:
-    """Estimate the states behind episodes, and both noises.
+    """Estimate the states behind episodes of observations, and both noises.
 
     An iterated extended Kalman smoother with expectation maximisation, as of
-    :func:`~gpadjust.records.smooth`, with the mean of the task's dynamics in place of f_p.
-
-    Args:
-        task: The task in the newest model.
-        state_filter: The filter of the episodes.
-        observed: The episodes, with observations in place of states.
-        seed: Seed of the draw.
-
-    Returns:
-        The filter with the most likely noises, and the episodes with states drawn from their
-        posterior: as rough as the true ones.
+    :func:`~gpadjust.records.smooth`, with the mean of the task's dynamics in place of f_p. Return
+    the filter with the most likely noises, and a draw of the states, as rough as the true ones.
     """
     spec, sensors, episodes = task.dynamics.spec, task.sensors, observed.episodes()
     assert sensors is not None, "checked before"

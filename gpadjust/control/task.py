@@ -40,7 +40,6 @@ class ActionRate:
         ValueError: If ``most`` is not positive, or ``price`` negative.
 
     Example:
-        >>> import torch
         >>> ActionRate(most=0.25).limited(torch.tensor([1.0, -0.1]), torch.zeros(2))
         tensor([ 0.2500, -0.1000])
     """
@@ -151,9 +150,7 @@ class Task:
         ValueError: If a number or the bounds are out of range, or parts contradict each other.
 
     Example:
-        >>> import torch
-        >>> from gpadjust.control import Task
-        >>> from gpadjust.dynamics import LearnedDynamics, StateSpec
+        >>> from gpadjust.dynamics import LearnedDynamics
         >>> dynamics = LearnedDynamics(StateSpec(["x"], ["v"]), lambda X: X[:, :1] + 0.1 * X[:, 1:])
         >>> task = Task(dynamics, lambda states, actions, next_states: -next_states[:, 0].square())
     """
@@ -238,19 +235,14 @@ class Task:
         move: Callable[[Tensor, Tensor], Tensor] | None = None,
         some_must_succeed: bool = False,
     ) -> Steps:
-        """Take actions ``N x action_dim`` at states ``N x state_dim`` of the model.
+        """Take actions ``N x action_dim`` at states ``N x state_dim``, at a moment of an episode.
 
-        This is the one place where action rate, set-points, bounds and constraints act.
-
-        Args:
-            states: The states.
-            actions: The chosen actions.
-            moment: The point of the episode. Default: its beginning.
-            move: Returns next states. Default: ``dynamics.sample``.
-            some_must_succeed: If True, a physics that fails for all rows is an error.
+        This is the one place where action rate, set-points, bounds and constraints act. ``move``
+        returns the next states, by default a draw of the dynamics.
 
         Raises:
-            PhysicsError: If the physics fails everywhere, or does not report where.
+            PhysicsError: If the physics does not report where it fails, or fails for all rows and
+                ``some_must_succeed``.
         """
         moment = moment or Moment()
         zeros = torch.zeros(len(states), dtype=torch.float64)
@@ -381,9 +373,8 @@ class Task:
                 )
         if not np.isfinite([action_space.low, action_space.high]).all():
             raise ValueError(
-                "Actions must have finite bounds, for plans and policies; found "
-                f"{action_space}. Set env.action_space = gymnasium.spaces.Box(low, high) with "
-                "the bounds of the machine."
+                f"Actions must have finite bounds, for plans and policies; found {action_space}. "
+                "Set env.action_space = gymnasium.spaces.Box(low, high)."
             )
 
     def refuse(self, learner: str, name: str, way_out: str) -> None:

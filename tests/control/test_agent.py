@@ -208,13 +208,20 @@ def test_what_cannot_be_trusted_is_told(make_agent, kind, parts, message):
 
 
 @pytest.mark.slow
-def test_an_error_loses_no_episode(make_agent, kind, point_reward):
+def test_an_error_loses_no_episode_nor_is_one_learnt_twice(make_agent, kind, point_reward):
+    def full(agent, event, values):
+        if event == "fit":
+            raise OSError("full")
+
     agent = make_agent(kind, reward=lambda s, a, n: -3 * n[:, 0].square())
     with pytest.raises(ValueError, match="is not the environment's"):
         agent.learn(5)
     agent.task = replace(agent.task, reward=point_reward)
+    with pytest.raises(OSError, match="full"):
+        agent.learn(5, full)
     assert agent.learn(5).task.dynamics.num_transitions == 10
     assert agent.num_episodes == 2
+    assert agent.model is not None
 
 
 class Jams(gymnasium.Wrapper):
@@ -274,19 +281,6 @@ def test_a_physics_that_is_to_be_fitted_learns_all_episodes(make_agent, point_ta
     found = agent.task.dynamics.physics_parameters.mean
     assert len(agent.task.dynamics.state_dict()["fitted"]["transitions"]["states"]) == 15
     assert abs(float(found) - 0.5) < 0.05
-
-
-@pytest.mark.slow
-def test_a_callback_that_raises_lets_nothing_be_learnt_twice(make_agent, kind):
-    def full(agent, event, values):
-        if event == "fit":
-            raise OSError("full")
-
-    agent = make_agent(kind)
-    with pytest.raises(OSError, match="full"):
-        agent.learn(5, full)
-    assert agent.learn(5).task.dynamics.num_transitions == 10
-    assert agent.model is not None
 
 
 def test_a_physics_that_fails_for_a_while_loses_no_transition(make_agent, crude_dynamics):

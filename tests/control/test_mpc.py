@@ -31,16 +31,6 @@ def task():
     return point_of(episode_length=6)
 
 
-def test_it_reaches_a_goal_and_stays(task):
-    planner = Planner(rounds=3, horizon=3, num_random=64, max_hold=2)
-    mpc = MPC(task, BOUNDS, planner, first=planner)
-    x, plan = np.zeros(1), None
-    for _ in range(6):
-        action, plan = mpc.predict(x, plan)
-        x = x + 0.5 * action
-    assert abs(x - 1) < 0.1
-
-
 def test_a_loop_of_the_users_learns_and_goes_on_in_the_newest_model():
     """The plant moves half as far as f_p says."""
     dynamics = LearnedDynamics(POINT_SPEC, full_step, **QUICK)

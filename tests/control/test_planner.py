@@ -127,13 +127,6 @@ def test_all_episodes_may_end_at_once_but_not_at_the_start():
 # Plans
 
 
-def test_a_known_sequence_is_kept_if_nothing_is_better():
-    options = Planner(Return(), rounds=2, num_elites=2, num_random=4)
-    known = torch.tensor([[2.0], [0.0], [0.0], [0.0]], dtype=torch.float64)  # at 1, and stays
-    earlier = options.plan(point_of(), ZERO, BOUNDS, 4)._replace(actions=known)
-    assert torch.equal(options.plan(point_of(), ZERO, BOUNDS, 4, earlier=earlier).actions, known)
-
-
 def test_plans_are_those_of_the_generator_with_a_limit_of_time_or_without(known_left):
     plans = []
     for seed, seconds in ((0, None), (0, 1e3), (1, None)):
@@ -163,15 +156,6 @@ def test_staying_is_better_than_leaving_however_few_the_sequences(seed):
 
 
 # Returns
-
-
-def test_a_plan_of_the_greatest_return():
-    """From x = 0 the way to x = 1 and to stay there, by steps of v / 2 with v at most 2."""
-    search = {"num_elites": 8, "correlation": 0.0, "num_random": 200, "max_hold": 1}
-    plan = Planner(Return(), rounds=12, **search).plan(point_of(), ZERO, BOUNDS, 4)
-    assert plan.value > -0.1
-    reached = (plan.actions[:, 0] / 2).cumsum(0)
-    torch.testing.assert_close(reached, torch.ones(4).double(), atol=0.05, rtol=0)
 
 
 def test_a_return_is_the_sum_of_the_rewards_that_are_made():
