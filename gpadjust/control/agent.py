@@ -282,10 +282,8 @@ class Agent(ABC, Display):
             action = np.asarray(result[0])
             if action.shape == shape and np.isfinite(action).all():
                 return action, result[1]
-        raise ValueError(
-            f"{type(self).__name__}.predict must return the action, finite and of shape {shape}, "
-            f"and the state for the next call; found {result!r}."
-        )
+        expected = f"must return the action, finite and of shape {shape}, and the next state"
+        raise ValueError(f"{type(self).__name__}.predict {expected}; found {result!r}.")
 
     def _random_actions(self) -> Iterator[NDArray[Any]]:
         """Yield random actions, held for some steps, for the episode and beyond."""

@@ -200,14 +200,11 @@ class Task:
             )
         if self.sensors is not None and self.initial_states is None:
             yield (
-                "Hidden states need known starts of episodes: give initial_states, or start of a "
-                "System, in addition to sensors."
+                "Hidden states need known starts of episodes: give initial_states (of a System, "
+                "start) in addition to sensors."
             )
         if self.sensors is not None and self.reference is not None:
-            yield (
-                "The estimate of hidden states needs constant set-points: give reference or "
-                "sensors, not both."
-            )
+            yield "Hidden states need constant set-points: give reference or sensors, not both."
         if self.rate is not None and len(self.rate.limits) not in (0, 1, spec.action_dim):
             yield (
                 f"action_rate must have one limit, or one for each of {spec.action_dim} actions; "
@@ -362,10 +359,9 @@ class Task:
         """Raise a ValueError unless the spaces are boxes of observations and actions."""
         spec = self.observed
         owner = "dynamics" if self.sensors is None else "sensors"
-        for name, space, size in (
-            ("observation", observation_space, spec.observation_dim),
-            ("action", action_space, spec.action_dim),
-        ):
+        spaces = {"observation": observation_space, "action": action_space}
+        sizes = (spec.observation_dim, spec.action_dim)
+        for (name, space), size in zip(spaces.items(), sizes, strict=True):
             if not hasattr(space, "high") or space.shape != (size,):
                 raise ValueError(
                     f"By the spec of the {owner} the {name} has {size} entries (sine and cosine of "
