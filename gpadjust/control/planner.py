@@ -30,16 +30,16 @@ from gpadjust.states import StateSpec
 class Plan(NamedTuple):
     """Actions for the steps ahead of an episode, with values averaged over the functions."""
 
-    actions: Tensor  # T x action_dim
-    next_states: Tensor  # T x state_dim
-    value: float  # score of the objective
-    rewards: Tensor  # of the steps, T; 0 after the end of the episode
-    reward: float  # their mean over the steps that are made, at the last plan to the end
-    left_bounds: float  # share of the functions that leave the bounds, or where the physics fails
-    violation: float  # of the constraints with their margins in the worst step; 0 if none
-    moment: Moment  # the point of the episode before the first step
-    promised: Tensor = torch.zeros(0)  # rewards of all steps, by the last plan to the end
-    estimate: Estimate | None = None  # the state by sensors, with the action there
+    actions: Tensor  #: T x action_dim
+    next_states: Tensor  #: T x state_dim
+    value: float  #: score of the objective
+    rewards: Tensor  #: of the steps, T; 0 after the end of the episode
+    reward: float  #: their mean over the steps that are made, at the last plan to the end
+    left_bounds: float  #: share of the functions that leave the bounds, or where the physics fails
+    violation: float  #: of the constraints with their margins in the worst step; 0 if none
+    moment: Moment  #: the point of the episode before the first step
+    promised: Tensor = torch.zeros(0)  #: rewards of all steps, by the last plan to the end
+    estimate: Estimate | None = None  #: the state by sensors, with the action there
 
     @classmethod
     def select(cls, rollout: Steps, n: int, value: float, moment: Moment) -> Plan:

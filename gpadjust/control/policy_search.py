@@ -87,9 +87,9 @@ class BoundedPolicy(nn.Module):
 class SearchResult(NamedTuple):
     """Result of a search."""
 
-    values: Tensor  # of the objective in each update, for drawn functions and starts
-    reward: float  # mean reward of a step of the best policy, in held-out functions and starts
-    left_bounds: float  # share of the held-out episodes that left the bounds
+    values: Tensor  #: of the objective in each update, for drawn functions and starts
+    reward: float  #: mean reward of a step of the best policy, in held-out functions and starts
+    left_bounds: float  #: share of the held-out episodes that left the bounds
     seconds: float
 
 

@@ -34,9 +34,9 @@ _TINY = 1e-300  # in place of a variance of zero
 class Estimate(NamedTuple):
     """An estimate of a state, and the action there."""
 
-    mean: Tensor  # state_dim
-    covariance: Tensor  # state_dim x state_dim
-    action: Tensor | None = None  # action_dim
+    mean: Tensor  #: state_dim
+    covariance: Tensor  #: state_dim x state_dim
+    action: Tensor | None = None  #: action_dim
 
 
 class StateFilter(NamedTuple):
@@ -46,9 +46,9 @@ class StateFilter(NamedTuple):
     in f_p.
     """
 
-    start: Estimate  # where episodes start
-    noise: Tensor  # sd of the sensors' noise, one for each output
-    process_noise: Tensor  # sd of the error of the mean of the dynamics in a step, state_dim
+    start: Estimate  #: where episodes start
+    noise: Tensor  #: sd of the sensors' noise, one for each output
+    process_noise: Tensor  #: sd of the error of the mean of the dynamics in a step, state_dim
 
     @classmethod
     def guessed(cls, task: Task, action_bounds: Tensor) -> Self:

@@ -77,8 +77,8 @@ class Moment(NamedTuple):
     further steps; see :func:`~gpadjust.control.constraints.margins`.
     """
 
-    steps_done: Any = 0  # number of earlier steps, N
-    action: Tensor | None = None  # the last one, N x action_dim; None at the start
+    steps_done: Any = 0  #: number of earlier steps, N
+    action: Tensor | None = None  #: the last one, N x action_dim; None at the start
     margins: Tensor | None = None
 
     def after(self, actions: Tensor) -> Moment:
@@ -98,16 +98,16 @@ class Steps(NamedTuple):
     halves of their width summed over the states, has a gradient that leads back.
     """
 
-    states: Tensor  # at which actions were taken, ... x state_dim
-    actions: Tensor  # within the limits of the action rate, ... x action_dim
-    next_states: Tensor  # ... x state_dim
-    rewards: Tensor  # ..., as all that follow
-    made: Tensor  # True if the step was made
-    terminated: Tensor  # True if the next state ends the episode
-    left_bounds: Tensor  # True if it would have left the bounds
-    overshoot: Tensor  # 0 where it is not finite
-    violation: Tensor  # sum over the constraints with their margins; 0 if they hold
-    price: Tensor  # of the change of the action
+    states: Tensor  #: at which actions were taken, ... x state_dim
+    actions: Tensor  #: within the limits of the action rate, ... x action_dim
+    next_states: Tensor  #: ... x state_dim
+    rewards: Tensor  #: ..., as all that follow
+    made: Tensor  #: True if the step was made
+    terminated: Tensor  #: True if the next state ends the episode
+    left_bounds: Tensor  #: True if it would have left the bounds
+    overshoot: Tensor  #: 0 where it is not finite
+    violation: Tensor  #: sum over the constraints with their margins; 0 if they hold
+    price: Tensor  #: of the change of the action
 
 
 @dataclass(frozen=True, eq=False)
