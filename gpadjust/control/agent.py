@@ -327,7 +327,7 @@ class Agent(ABC, Display):
                 )
         known = self.recorded_episodes()
         is_new = known.episode >= self.num_episodes
-        new = known.some(is_new) if dynamics.has_learnt else known
+        new = known.subset(is_new) if dynamics.has_learnt else known
         if len(new) < (1 if dynamics.is_fitted else 2):  # a first fit needs two
             self._can_act = None if len(new) else self._can_act  # there is another start
             return

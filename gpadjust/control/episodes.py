@@ -58,7 +58,7 @@ def decoded(spec: StateSpec, data: Trajectories) -> Trajectories:
 
 def newest(data: Trajectories, steps: int | None) -> Trajectories:
     """Return the newest steps; None for all."""
-    return data if steps is None else data.some(slice(max(len(data) - steps, 0), None))
+    return data if steps is None else data.subset(slice(max(len(data) - steps, 0), None))
 
 
 def action_bounds(env: Any) -> Tensor:
@@ -297,7 +297,7 @@ def learnable(dynamics: Dynamics, data: Trajectories) -> Trajectories:
     while True:
         try:
             dynamics.try_physics(data.states[works], data.actions[works])
-            return data.some(works)
+            return data.subset(works)
         except PhysicsError as error:
             rows = works.nonzero().flatten()[list(error.rows)]
             if not len(rows) or len(rows) == works.sum():
@@ -340,7 +340,7 @@ def warn_of_delay(dynamics: Dynamics, known: Trajectories, num_new: int) -> None
     """Warn of a delay that was not told, after the episodes that have shown it first."""
     physics = dynamics.physics_alone()
     delay = None if physics is None else find_delay(physics, known)
-    if delay and physics and find_delay(physics, known.some(slice(len(known) - num_new))) is None:
+    if delay and physics and find_delay(physics, known.subset(slice(len(known) - num_new))) is None:
         warnings.warn(delay, UserWarning, stacklevel=4)
 
 
@@ -383,7 +383,7 @@ def learn_dynamics(
             windows = data.windows(horizons[-1], stride=1)
             last = len(windows.actions) - 1
             few = torch.linspace(0, last, min(last + 1, _WINDOWS)).round().long()
-            windows, bounds = windows.some(few), task.widened(data.states).state_bounds
+            windows, bounds = windows.subset(few), task.widened(data.states).state_bounds
             try:
                 start_at = windows.initial_states, windows.actions
                 run = dynamics.free_run(*start_at, state_bounds=bounds)

@@ -454,7 +454,7 @@ class MPC:
                 )
             # The states behind all measurements of sensors are known better by now.
             known = self._states_of(self._steps)
-            data = known if hidden else known.some(slice(self._num_learnt, None))
+            data = known if hidden else known.subset(slice(self._num_learnt, None))
             warn_of_delay(self.task.dynamics, known, number - self._num_learnt)
         teach(self.task, data)
         self._num_learnt = number

@@ -154,9 +154,9 @@ def test_windows_of_records_are_chosen_and_scored():
     spec, x = StateSpec(["x"], ["u"]), torch.arange(13, dtype=torch.float64).unsqueeze(-1)
     windows = Records(Record(x[:, 0], x, torch.ones_like(x)), spec).windows(3)
     assert windows.states[..., 0].tolist() == [[3.0 * w + t for t in range(4)] for w in range(4)]
-    late = windows.some(windows.states[:, 0, 0] > 4)
+    late = windows.subset(windows.states[:, 0, 0] > 4)
     assert late.initial_states.flatten().tolist() == [6, 9]
-    assert torch.equal(windows.some(torch.tensor([3, 2])).measured, late.measured.flip(0))
+    assert torch.equal(windows.subset(torch.tensor([3, 2])).measured, late.measured.flip(0))
     slow = PhysicsDynamics(spec, lambda X: X[:, :1] + 0.9 * X[:, 1:])
     scores = slow.free_run(late.initial_states, late.actions).score(late.measured)
     np.testing.assert_allclose(scores.rmse[:, 0], [0.1, 0.2, 0.3])

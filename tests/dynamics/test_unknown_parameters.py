@@ -5,7 +5,7 @@ import torch
 
 from gpadjust import CKA, CalibratedPhysics, ODEPhysics, Unknown
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
-from gpadjust.dynamics.targets import TargetPhysics, Targets
+from gpadjust.dynamics.learned_dynamics import TargetPhysics, Targets
 from gpadjust.physics import FunctionPhysics
 
 SPEC = StateSpec(["q", "dq"], ["u"], angles=["q"])

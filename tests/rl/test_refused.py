@@ -29,7 +29,6 @@ OPTIONS = [
     ({"optimize_memory_usage": True}, "optimize_memory_usage"),
     ({"real_fraction": 2}, "real_fraction must be .*; found 2"),
     ({"updates_per_model_step": float("inf")}, "updates_per_model_step must be .*; found inf"),
-    ({"model_buffer_size": 0}, "model_buffer_size must be at least 1; found 0"),
     ({"model_episodes": 2.5}, "model_episodes must be a whole number; found 2.5"),
     ({"last_model_episode": -1}, "last_model_episode must be at least 0; found -1"),
     ({"num_particles": 0}, "num_particles must be at least 1; found 0"),
