@@ -73,12 +73,6 @@ def test_callbacks_of_stable_baselines(point_agent, normalised, point_env, tmp_p
     } <= names
 
 
-def test_progress_bar(point_agent, capsys):
-    with pytest.warns(match="rich is experimental"):
-        point_agent().learn(10, progress_bar=True)
-    assert "10/10" in capsys.readouterr().out
-
-
 class Watch(DynaCallback):
     def __init__(self):
         super().__init__()
@@ -135,8 +129,10 @@ def test_scores_of_trajectories_are_logged_and_change_nothing(
     assert_same(one, other)
 
 
-def test_progress_is_printed(point_agent, capsys):
-    point_agent().learn(10, [print_progress])
+def test_callbacks_of_agents_are_called(point_agent, capsys):
+    events = []
+    point_agent().learn(10, [print_progress, lambda agent, event, values: events.append(event)])
+    assert events == [*["episode", "trial", "fit"] * 2, "done"]
     lines = capsys.readouterr().out.splitlines()
     assert [line.partition(" ")[0] for line in lines] == ["trial:", "fit:"] * 2
     assert re.match(r"trial: number 2, steps 5, reward -\d\S*, seconds ", lines[2])

@@ -60,14 +60,6 @@ def test_with_its_buffer_a_loaded_agent_goes_on_and_its_dynamics_learn_all(
     assert loaded.num_episodes == 3
 
 
-def test_a_wrong_reward_is_found_after_loading_too(saved, point_env, learnt_dynamics, point_task):
-    _, path = saved
-    task = point_task(dynamics=learnt_dynamics(), reward=lambda s, a, n: s[:, 0])
-    loaded = DynaSAC.load(path, env=point_env(), task=task)
-    with pytest.raises(ValueError, match="is not the environment's"):
-        loaded.learn(5)
-
-
 def test_the_file_holds_neither_physics_nor_functions_nor_environment(
     point_agent, point_env, tmp_path
 ):
