@@ -77,29 +77,15 @@ def pushed(n=20, seed=0):
 
 
 FEW = {"num_draws": 8}
-_MODELS = {
-    "GP": ZeroMeanGP,
-    "PhysicsMean": PhysicsMeanGP,
-    "Scale": ScaleGP,
-    "CKA": CKA,
-    "RRA": RRA,
-}
-
-
-@pytest.fixture(params=_MODELS)
-def kind(request):
-    """The name of each model, for `make`."""
-    return request.param
-
-
-_QUICK = ["GP", "CKA"]
+_MODELS = {"PhysicsMean": PhysicsMeanGP, "Scale": ScaleGP, "RRA": RRA}
+_MODELS = {"GP": ZeroMeanGP, "CKA": CKA, **_MODELS}
 
 
 @pytest.fixture(
-    params=[pytest.param(k, marks=() if k in _QUICK else pytest.mark.slow) for k in _MODELS]
+    params=["GP", "CKA", *(pytest.param(k, marks=pytest.mark.slow) for k in [*_MODELS][2:])]
 )
 def costly_kind(request):
-    """As `kind`, for what takes long."""
+    """The name of each model, for `make`."""
     return request.param
 
 
