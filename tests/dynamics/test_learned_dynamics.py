@@ -31,28 +31,6 @@ def test_physics_that_is_the_truth_is_left_alone(cart_pole_system, make):
         torch.testing.assert_close(mean, next_states, rtol=0, atol=1e-6)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["CKA", "RRA", "GP", "PhysicsMean", "Scale"])
-def test_learning_lowers_the_error_of_the_physics(cart_pole_system, make, kind):
-    system = cart_pole_system
-    dynamics = make(kind, system.spec, system.crude)
-    assert not dynamics.is_fitted
-    for seed in range(2):
-        dynamics.update(*system.trial(seed))
-    assert dynamics.is_fitted
-    assert dynamics.num_transitions == 50
-    states, actions, next_states = system.trial(7)
-    scores = dynamics.score(states, actions, next_states)
-    for value in (scores.rmse, scores.median, scores.nlpd, scores.crps, scores.coverage):
-        assert value.shape == (4,)
-        assert value.isfinite().all()
-    physics_error = system.crude(torch.cat([states, actions], -1)) - next_states
-    if kind not in ("GP", "Scale"):
-        ratio = (scores.rmse / physics_error.square().mean(0).sqrt())[2:]
-        # Random features are seen through a few frequencies only.
-        assert (ratio.log().mean() if kind == "RRA" else ratio.log().max()) < 0
-
-
 def test_scores_are_those_of_the_predictions(cart_pole_system, learnt_cart_pole):
     dynamics = learnt_cart_pole
     states, actions, next_states = cart_pole_system.trial(0)
