@@ -41,8 +41,6 @@ def test_a_state_is_of_the_same_physics_in_the_same_order(cart_pole_system, make
 
 def test_each_part_is_checked(cart_pole_system, make, still):
     system = cart_pole_system
-    with pytest.raises(ValueError, match="Expected one physics to follow"):
-        PhysicsDynamics(system.spec, [system.crude, still])
     assert PhysicsDynamics(system.spec, {"still": still}).is_fitted
     parts = {"rod": system.crude, "late": lambda X: system.crude(X) - X[:, :4]}
     with pytest.warns(UserWarning, match="'late' seems to return the change"):

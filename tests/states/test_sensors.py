@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from gpadjust.states import Sensors, StateSpec
+from tests.systems import refused
 
 SPEC = StateSpec(["x", "theta", "omega"], ["force"], angles=["theta"])
 STATE = torch.tensor([[1.0, 0.5, 2.0]]).double()
@@ -31,16 +32,18 @@ def test_outputs_are_any_function():
     assert guessed.describe() == {**sensors.describe(), "noise": {"height": 0.1}}
 
 
-def test_bad_sensors_are_told():
-    pair = Sensors(["a", "b"], lambda states: states[:, 0])
-    for call, error, words in (
-        (lambda: Sensors([]), ValueError, "one or more"),
-        (lambda: Sensors("x"), TypeError, "sequence of names"),
-        (lambda: Sensors(["x"], 3), TypeError, "function of states; found 3"),
-        (lambda: Sensors(["x"], noise={"v": 1.0}), ValueError, "Unknown output 'v'"),
-        (lambda: Sensors(["x"], noise={"x": 0.0}), ValueError, "above 0"),
-        (lambda: Sensors(["height"]).spec(SPEC), ValueError, r"no state 'height'.*Sensors\(names"),
-        (lambda: pair.measure(SPEC, STATE), ValueError, r"shape 1 x 2.*found \(1,\)"),
-    ):
-        with pytest.raises(error, match=words):
-            call()
+PAIR = Sensors(["a", "b"], lambda states: states[:, 0])
+REFUSED = [
+    (ValueError, "one or more", Sensors, []),
+    (TypeError, "sequence of names", Sensors, "x"),
+    (TypeError, "function of states; found 3", Sensors, ["x"], 3),
+    (ValueError, "Unknown output 'v'", lambda: Sensors(["x"], noise={"v": 1.0})),
+    (ValueError, "above 0", lambda: Sensors(["x"], noise={"x": 0.0})),
+    (ValueError, r"no state 'height'.*Sensors\(names", Sensors(["height"]).spec, SPEC),
+    (ValueError, r"shape 1 x 2.*found \(1,\)", PAIR.measure, SPEC, STATE),
+]
+
+
+def test_bad_sensors_are_refused():
+    for error, words, *call in REFUSED:
+        refused(error, words, *call)

@@ -92,8 +92,7 @@ def test_copy_goes_on_as_the_original(duplicate):
     assert np.array_equal(duplicate(env).reset(seed=0)[0], first)
     assert same(rollout(env, 5), rollout(twin, 5))
     assert np.array_equal(env.reset()[0], twin.reset()[0])
-    if render_mode == "rgb_array":
-        assert np.array_equal(env.render(), twin.render())
+    assert np.array_equal(env.render(), twin.render())
 
 
 def test_frame_shows_pole_goal_and_force():
@@ -146,19 +145,14 @@ def starting(state):
 
 
 REFUSED = [
-    *(
-        (ValueError, "four finite numbers", starting(s))
-        for s in ([0.0, 1.0], "up", [0, 0, 1e39, 0])
-    ),
+    (ValueError, "four finite numbers", starting([0.0, 1.0])),
+    (ValueError, "four finite numbers", starting("up")),
+    (ValueError, "four finite numbers", starting([0, 0, 1e39, 0])),
     (ValueError, "four finite numbers", starting([0, math.nan, 0, 0])),
     (ValueError, "'start'", lambda: upright().reset(options={"start": [0.0] * 4})),
     (TypeError, r"must be a dictionary.*found \['s'\]", lambda: upright().reset(options=["s"])),
     (ValueError, "'human'.*HumanRendering", CartPoleSwingUpEnv, "human"),
-    (
-        TypeError,
-        "encode_angle must be True or False; found 'no'",
-        lambda: upright(encode_angle="no"),
-    ),
+    (TypeError, "encode_angle must be True or .*'no'", lambda: upright(encode_angle="no")),
     (gym.error.ResetNeeded, "reset", lambda: CartPoleSwingUpEnv().step(PUSH)),
     (gym.error.ResetNeeded, "reset", lambda: CartPoleSwingUpEnv("rgb_array").render()),
 ]

@@ -162,8 +162,8 @@ def test_no_system_hides_a_module():
 def test_each_row_has_the_parameters_that_it_is_given():
     system = pickle.loads(pickle.dumps(systems.cart_pole(noise={"x": 0.1}, unknowns=True)))
     assert system.make().reset(seed=0)[0].shape == (5,)
-    X, guesses = normal(20, 5), {name: u.guess for name, u in system.unknowns.items()}
-    several = [[0.5, 0.5, 0.6, 0.1], [0.4, 0.7, 0.5, 0.3], [*guesses.values()][:3] + [0.0]]
+    X, guesses = normal(20, 5), [u.guess for u in system.unknowns.values()]
+    several = [[0.5, 0.5, 0.6, 0.1], [0.4, 0.7, 0.5, 0.3], [*guesses[:3], 0.0]]
     several = torch.tensor(several, dtype=torch.float64)
     for values, outputs in zip(several, system.physics(X, several), strict=True):
         equation = systems.CartPoleEquation(*values.tolist())
