@@ -25,8 +25,7 @@ from gpadjust.checks import (
 )
 from gpadjust.physics import ODEPhysics, Unknown
 from gpadjust.states import StateSpec
-from gpadjust.systems.cart_pole_view import SIZE, draw_cart_pole
-from gpadjust.systems.rendering import RENDER_MODES, ViewedEnv
+from gpadjust.systems.rendering import RENDER_MODES, SIZE, ViewedEnv, draw_cart_pole
 from gpadjust.systems.system import System
 
 TIME_STEP = 0.1
@@ -63,8 +62,7 @@ class CartPoleEquation:
             + 6 (a - b \dot{x}) \cos\theta}{l (4 M - 3 m_p \cos^2\theta)}.
 
     This is the system of Deisenroth, "Efficient Reinforcement Learning using Gaussian Processes",
-    2010, Appendix C, with the angle from upright. The tip of the pole is at
-    :math:`(x - l \sin\theta, l \cos\theta)`. Dry friction reduces the force by
+    2010, Appendix C, with the angle from upright. Dry friction reduces the force by
     :math:`d \tanh(\dot{x} / 0.05)`; drag is a torque :math:`-k \dot\theta |\dot\theta|` on the
     pole.
 
@@ -78,8 +76,8 @@ class CartPoleEquation:
         drag: The drag k of the pole, in N m s²/rad².
 
     Raises:
-        TypeError: If a parameter is not a number.
-        ValueError: If a mass, the length or the gravity is not positive, or a friction negative.
+        TypeError, ValueError: If a mass, the length or the gravity is not a positive number, or a
+            friction is negative.
 
     Example:
         >>> equation = CartPoleEquation(0.5, 0.5, 0.6, 0.1)
@@ -107,9 +105,6 @@ class CartPoleEquation:
 
         States are position, angle, velocity and angular velocity, in m, rad and s, the force is in
         N; ``p`` has other values of some parameters by name, ``...`` each.
-
-        Raises:
-            ValueError: If the last dimensions are not 4 and 1.
         """
         if state.shape[-1] != 4 or action.shape[-1] != 1:
             raise ValueError(
@@ -168,8 +163,7 @@ def equation_physics(
 ) -> ODEPhysics:
     """Return the physics of the next state of a cart-pole, after a time step (in s) at one force.
 
-    Unlike the environment, it does not limit the force. It integrates by Runge-Kutta of order four
-    with substeps of at most 0.02 s. Some parameters of the equation may be unknown.
+    It integrates by Runge-Kutta of order four with substeps of at most 0.02 s.
 
     Example:
         >>> physics = equation_physics(REAL_CART_POLE)  # of columns x, theta, their rates, force
@@ -213,7 +207,7 @@ def cart_pole_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Te
 
 
 def cart_pole_start(n: int) -> Tensor:
-    """Draw start states ``n x 4`` from N([0, pi, 0, 0], 0.2²), by PyTorch's generator."""
+    """Draw start states ``n x 4`` from N([0, pi, 0, 0], 0.2²)."""
     checked_whole("n", n, 0)
     mean = torch.tensor(START_MEAN, dtype=torch.float64)
     return mean + START_STD * torch.randn(n, 4, dtype=torch.float64)
@@ -227,20 +221,17 @@ class CartPoleSwingUpEnv(ViewedEnv):
     :math:`[x, \sin\theta, \cos\theta, \dot{x}, \dot\theta]`, with the angle from upright;
     ``state`` has the true state in float64. The reward is minus the cost of the next state, in
     [-1, 0], by the distance of the tip from its goal; the ``info`` of a step has the ``"cost"``.
-    An episode does not terminate; ``gym.make`` truncates it after 25 steps. Environments can be
-    pickled at any time.
+    ``gym.make`` truncates an episode after 25 steps.
 
     Args:
-        render_mode: ``"rgb_array"`` lets ``render`` return a frame, which needs ``pygame-ce``;
-            ``gymnasium.wrappers.HumanRendering`` shows them in a window.
+        render_mode: ``"rgb_array"`` lets ``render`` return a frame, which needs ``pygame-ce``.
         encode_angle: If False, the observation is the state
             :math:`[x, \theta, \dot{x}, \dot\theta]`, with the angle not wrapped.
         equation: The system. Default: ``REAL_CART_POLE``.
         time_step: Duration of a step, in s.
 
     Raises:
-        TypeError: If an argument has another type.
-        ValueError: If the render mode is unknown, or ``time_step`` is not positive.
+        TypeError, ValueError: If an argument has another type, or is out of range.
 
     Example:
         >>> import gymnasium
@@ -281,14 +272,10 @@ class CartPoleSwingUpEnv(ViewedEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Start an episode, by default from N([0, pi, 0, 0], 0.2²), around hanging at rest.
-
-        With ``options={"state": [x, theta, x_dot, theta_dot]}`` it starts at this state.
+        """Start an episode from N([0, pi, 0, 0], 0.2²), or at ``options={"state": ...}``.
 
         Raises:
-            TypeError: If ``options`` is not a dictionary.
-            ValueError: If ``options`` has another key, or the state is not four numbers of
-                magnitude at most 100.
+            ValueError: If the state is not four numbers of magnitude at most 100.
         """
         super().reset(seed=seed)
         options = checked_options("options", options, ("state",))
@@ -308,19 +295,12 @@ class CartPoleSwingUpEnv(ViewedEnv):
     def step(
         self, action: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Push the cart for a time step by a force in N, of shape ``(1,)``.
-
-        Raises:
-            ValueError: If the action is not one finite number.
-            gymnasium.error.ResetNeeded: Before the first episode.
-        """
+        """Push the cart for a time step by a force in N, of shape ``(1,)``."""
         if self.state is None:
             raise gym.error.ResetNeeded("Call reset before the first step.")
         force = finite_array(action, (1,))
         if force is None:
-            raise ValueError(
-                f"The action must be one finite force, of shape (1,); found {action!r}."
-            )
+            raise ValueError(f"Expected one finite force as action, (1,); found {action!r}.")
         force = force.clip(-MAX_FORCE, MAX_FORCE)
         # The physics of the real parameters is the simulator.
         with torch.no_grad():
