@@ -30,6 +30,8 @@ from gpadjust.validation.scores import energy_score
 TransitionFunctions = Callable[[Tensor, Tensor], Tensor]
 """Functions from states and actions, ``k x N x ...``, to next states: a sample of the dynamics."""
 
+Sampler = Callable[[int, int | None], TransitionFunctions]  # of a number of functions, and a seed
+
 _ROWS = 1024  # per call of noise_variance
 _AT_ONCE = 8  # windows whose particles move together: more leave the cache, at half the speed
 _CERTAIN = 1e-9  # of the range of the means: a spread of rounding errors
@@ -251,9 +253,7 @@ class Dynamics(ABC):
         shares = torch.stack(lost, 1)
         return FreeRun(mean, lower, upper, center + cloud, shares, spec, level, initial_states)
 
-    def _varied(
-        self, variation: Tensor | float
-    ) -> Callable[[int, int | None], TransitionFunctions]:
+    def _varied(self, variation: Tensor | float) -> Sampler:
         """Return `sample_functions` with varying parameters of the physics."""
         raise ValueError(
             f"variation={variation!r} needs LearnedDynamics with one physics and unknown "

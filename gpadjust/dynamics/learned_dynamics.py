@@ -17,7 +17,7 @@ from torch import Tensor
 from gpadjust.checks import check_choice, check_kind, checked_options, checked_whole
 from gpadjust.core import CKA, GP, FitResult, Prediction, ZeroMeanGP, fit
 from gpadjust.core.model import Predictive
-from gpadjust.dynamics.base import Dynamics, TransitionFunctions
+from gpadjust.dynamics.base import Dynamics, Sampler, TransitionFunctions
 from gpadjust.dynamics.physics_dynamics import (
     PhysicsDynamics,
     PhysicsProbes,
@@ -362,9 +362,7 @@ class LearnedDynamics(Dynamics):
         )
         return model
 
-    def _varied(
-        self, variation: Tensor | float
-    ) -> Callable[[int, int | None], TransitionFunctions]:
+    def _varied(self, variation: Tensor | float) -> Sampler:
         """Return `sample_functions` with varying parameters of the physics."""
         learnt = self._last_learnt()
         if self.physics is None or not self.physics.unknowns:
@@ -422,10 +420,11 @@ def error_correlation(model: Any) -> Tensor | None:
     if model.num_outputs < 2 or not isinstance(model, GP):
         return None
     errors = model.data.Y - model.left_out().prediction.mean
-    seen = ~errors.isnan()
-    errors, seen = errors.nan_to_num(nan=0.0), seen.double()
-    number = (seen.mT @ seen).clamp_min(1.0)
-    size = (errors.square().mT @ seen).clamp_min(torch.finfo(errors.dtype).tiny)
+    is_observed = (~errors.isnan()).double()
+    errors = errors.nan_to_num(nan=0.0)
+    number = (is_observed.mT @ is_observed).clamp_min(1.0)
+    size = (errors.square().mT @ is_observed).clamp_min(torch.finfo(errors.dtype).tiny)
+    # r_ij = sum_k e_ki e_kj / sqrt(sum_k e_ki^2 sum_k e_kj^2), over the rows k with both
     r = (errors.mT @ errors) / (size * size.mT).sqrt()
     clear = r.abs() * number.sqrt() > _CLEAR
     chance = (1 - r.square()).square() / (number * r.square().clamp_min(1e-12))
@@ -434,7 +433,7 @@ def error_correlation(model: Any) -> Tensor | None:
     if not (r - torch.eye(len(r))).any():
         return None
     values, vectors = torch.linalg.eigh(r)
-    if values[0] < _LEAST:  # pairs that are seen together in other rows than others
+    if values[0] < _LEAST:  # pairs are observed together in different rows
         r = vectors * values.clamp_min(_LEAST) @ vectors.mT
         sd = r.diagonal().sqrt()
         r = r / sd / sd.unsqueeze(-1)

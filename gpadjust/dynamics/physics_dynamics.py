@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gpadjust.checks import checked_number, checked_tensor, checked_whole
 from gpadjust.core import Prediction
-from gpadjust.dynamics.base import Dynamics, TransitionFunctions
+from gpadjust.dynamics.base import Dynamics, Sampler, TransitionFunctions
 from gpadjust.dynamics.least_squares import even_normal, most_likely
 from gpadjust.dynamics.state import check_numbers, columns_of, fingerprint, loading
 from gpadjust.dynamics.trajectories import Trajectories
@@ -360,7 +360,7 @@ def varying_parameters(
     learnt: PhysicsParameters,
     actions: Tensor,
     variation: Tensor | float,
-) -> Callable[[int, int | None], TransitionFunctions]:
+) -> Sampler:
     """Return a sampler of changes of the next states by varying parameters of the physics.
 
     The sampler takes a number ``k`` of draws and a seed. It returns a function of states and

@@ -80,7 +80,9 @@ class Trajectories:
 
     def __post_init__(self) -> None:
         """Set the numbers of episodes, and check the numbers of rows."""
-        episode: Any = range(len(self.states)) if self.episode is None else self.episode
+        episode: Any = self.episode
+        if episode is None:
+            episode = range(len(self.states))
         episode = torch.as_tensor(episode)
         if episode.is_floating_point() and (episode != episode.round()).any():
             raise ValueError(f"Expected episode as whole numbers, found {episode.tolist()[:5]}.")
@@ -206,8 +208,11 @@ class Trajectories:
             row = end
             end += steps
             while row + length <= end:
-                starts += [row] * is_complete[row]
-                row += stride if is_complete[row] else 1
+                if is_complete[row]:
+                    starts.append(row)
+                    row += stride
+                else:
+                    row += 1
         if not starts:
             raise ValueError(
                 f"Expected stretches of {length} steps from a state measured in full, found none; "

@@ -383,7 +383,10 @@ def with_sine_and_cosine(rows: Tensor, angles: Sequence[int]) -> Tensor:
     """Return rows ``... x d`` with each angle replaced by its sine and cosine."""
     columns: list[Tensor] = []
     for i, column in enumerate(rows.unbind(-1)):
-        columns += [column.sin(), column.cos()] if i in angles else [column]
+        if i in angles:
+            columns += [column.sin(), column.cos()]
+        else:
+            columns.append(column)
     return torch.stack(columns, dim=-1)
 
 
