@@ -1,17 +1,15 @@
 """What an iteration of Dyna does: real steps, updates, model, model episodes."""
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
 
 from gpadjust.dynamics import PhysicsDynamics, StateSpec
 from gpadjust.rl import DynaSAC, DynaTD3
-from tests.rl.conftest import model_rows
+from tests.rl.conftest import COLUMNS, model_rows
 
 
 @pytest.mark.slow
@@ -44,11 +42,8 @@ def test_model_rows_are_transitions_of_the_model(point_agent):
     assert agent.num_timesteps == agent.replay_buffer.size() == 10
     assert agent.num_episodes == 2
     assert model_rows(agent) == 2 * 2 * 5
-    n = rows.size()
-    obs, following, actions, rewards, dones, timeouts = (
-        getattr(rows, name)[:n, 0]
-        for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
-    )
+    columns = (getattr(rows, name)[: rows.size(), 0] for name in COLUMNS)
+    obs, following, actions, rewards, dones, timeouts = columns
     np.testing.assert_allclose(following, obs + 0.5 * 2.0 * actions, atol=1e-5)
     np.testing.assert_allclose(rewards, -(following[:, 0] ** 2), atol=1e-5)
     starts = agent.replay_buffer.observations[[0, 5], 0, 0]
@@ -80,17 +75,9 @@ def test_a_trivial_task_is_improved(point_agent, algorithm):
         return float(((x + 0.5 * action) ** 2).mean())
 
     noise = NormalActionNoise(np.zeros(1), np.full(1, 0.3)) if algorithm is DynaTD3 else None
-    agent = point_agent(
-        algorithm=algorithm,
-        action_noise=noise,
-        learning_rate=1e-2,
-        model_episodes=10,
-        batch_size=32,
-        gamma=0.5,
-        tau=0.05,
-        policy_kwargs={"net_arch": [16]},
-        updates_per_model_step=1,
-    )
+    options = {"model_episodes": 10, "updates_per_model_step": 1, "action_noise": noise}
+    options |= {"learning_rate": 1e-2, "batch_size": 32, "gamma": 0.5, "tau": 0.05}
+    agent = point_agent(algorithm=algorithm, policy_kwargs={"net_arch": [16]}, **options)
     before = cost(agent)
     agent.learn(30)
     assert cost(agent) < 0.2 * before
@@ -203,29 +190,3 @@ def test_the_policy_gets_normalised_observations_and_the_dynamics_raw_ones(
     raw = agent.recorded_episodes()
     assert torch.allclose(raw.next_states, raw.states + 0.5 * raw.actions, atol=0.1)
     assert torch.isin(torch.from_numpy(start).double(), raw.states).all()
-
-
-def pendulum_step(X):
-    """Gymnasium's Pendulum-v1."""
-    theta, speed, torque = X.unbind(-1)
-    speed = (speed + (15 * theta.sin() + 3 * torque) * 0.05).clamp(-8, 8)
-    return torch.stack([theta + speed * 0.05, speed], dim=-1)
-
-
-def test_a_system_with_an_angle_of_another_order(point_agent):
-    class SineFirst(gymnasium.ObservationWrapper):
-        def observation(self, observation):
-            return observation[[1, 0, 2]]
-
-    def reward(states, actions, next_states):
-        theta, speed = states.unbind(-1)
-        theta = torch.atan2(theta.sin(), theta.cos())
-        return -(theta.square() + 0.1 * speed.square() + 0.001 * actions[:, 0].square())
-
-    env = SineFirst(gymnasium.make("Pendulum-v1", max_episode_steps=8))
-    env.observation_space = spaces.Box(-8, 8, (3,))
-    spec = StateSpec(["theta", "speed"], ["torque"], angles=["theta"])
-    agent = point_agent(
-        env, dynamics=PhysicsDynamics(spec, pendulum_step), reward=reward, episode_length=None
-    ).learn(16)
-    assert model_rows(agent) == 2 * 2 * 8

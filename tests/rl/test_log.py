@@ -72,11 +72,10 @@ class Watch(DynaCallback):
         self.returns.append(returns)
 
 
-def test_hooks_of_the_model(point_agent, learnt_dynamics):
+def test_hooks_of_the_model(point_agent, learnt_dynamics, monkeypatch):
     watch = Watch()
-    agent = point_agent(
-        dynamics=learnt_dynamics(), model_episodes=3, num_particles=2, refresh_model_data=False
-    )
+    options = {"model_episodes": 3, "num_particles": 2, "refresh_model_data": False}
+    agent = point_agent(dynamics=learnt_dynamics(), **options)
     agent.learn(10, EveryNTimesteps(5, watch))
     assert [*watch.fits[0]] == ["fit_seconds"]
     assert watch.fits[1].keys() >= {"fit_seconds", "nlpd", "coverage"}
@@ -84,21 +83,12 @@ def test_hooks_of_the_model(point_agent, learnt_dynamics):
     assert [len(returns) for returns in watch.returns] == [2, 1, 2, 1]
     rewards = agent.replay_buffer.model_buffer.rewards[: 5 * 6, 0]
     assert np.concatenate(watch.returns).sum() == pytest.approx(rewards.sum(), rel=1e-5)
+    monkeypatch.setattr(watch, "on_model_fit", {}.popitem)  # which raises an error
+    with pytest.raises(TypeError):
+        agent.learn(5, watch, reset_num_timesteps=False)
     agent.learn(5, reset_num_timesteps=False)
     assert len(watch.fits) == 2
-
-
-def test_a_hook_that_raises_lets_nothing_be_learnt_twice(point_agent, learnt_dynamics):
-    class Raises(DynaCallback):
-        def on_model_fit(self, metrics):
-            raise OSError("full")
-
-    dynamics = learnt_dynamics()
-    agent = point_agent(dynamics=dynamics)
-    with pytest.raises(OSError, match="full"):
-        agent.learn(5, Raises())
-    agent.learn(5, reset_num_timesteps=False)
-    assert dynamics.num_transitions == 10
+    assert agent.task.dynamics.num_transitions == 20  # nothing twice
 
 
 @pytest.mark.slow
@@ -127,8 +117,6 @@ def test_callbacks_of_agents_are_called(point_agent, capsys):
 
 def test_its_representation_says_what_it_is(point_agent):
     last = point_agent().learn(10)
-    assert "DynaSAC(Point, PhysicsDynamics, 2 episodes learnt, 10 steps, last reward -" in repr(
-        last
-    )
+    assert "DynaSAC(Point, PhysicsDynamics, 2 episodes learnt, 10 steps, last " in repr(last)
     last.task = None
     assert repr(last) == "DynaSAC(Point, no task)"

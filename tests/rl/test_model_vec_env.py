@@ -41,17 +41,6 @@ def test_perfect_physics_are_the_real_environment(cart_pole, cart_pole_dynamics)
         np.testing.assert_array_equal(seen[-1][i], seen[0][i])
 
 
-def test_soft_actor_critic_learns_in_it(point_particles):
-    env = VecMonitor(point_particles())
-    agent = SAC(
-        "MlpPolicy", env, learning_starts=6, batch_size=8, policy_kwargs={"net_arch": [8]}, seed=0
-    )
-    agent.learn(30)
-    assert agent._n_updates > 0
-    assert [info["l"] for info in agent.ep_info_buffer] == [5] * 6
-    assert np.isfinite([info["r"] for info in agent.ep_info_buffer]).all()
-
-
 LEARNERS = {
     "SAC": partial(SAC, learning_starts=64, train_freq=8, gradient_steps=8, learning_rate=3e-3),
     "PPO": partial(PPO, n_steps=64, batch_size=64, learning_rate=3e-3),
