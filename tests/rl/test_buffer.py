@@ -10,6 +10,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from gpadjust.rl import MixedReplayBuffer
+from tests.point import assert_equal
 from tests.rl.conftest import COLUMNS
 
 OBSERVATIONS = spaces.Box(-np.inf, np.inf, (2,))
@@ -108,17 +109,14 @@ def test_add_rows_keeps_the_newest_rows_in_order(buffer, chunks):
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda made: pickle.loads(pickle.dumps(made))])
 def test_a_copy_goes_on_as_the_buffer_would(buffer, num_rows, copied):
     made = buffer(num_rows, num_rows, real_fraction=0.3)
-    again = copied(made)
-    for side in (made, again):
+    content = []
+    for side in (made, copied(made)):
         side.add(*real_row(99))
         side.add_model_rows(*rows(np.array([-98, -99])))
         np.random.seed(1)  # noqa: NPY002
-        side.batch = side.sample(40)
-    for one, other in zip(made.batch[:-1], again.batch[:-1], strict=True):
-        np.testing.assert_array_equal(one, other)
-    for one, other in [(made, again), (made.model_buffer, again.model_buffer)]:
-        assert (one.pos, one.full) == (other.pos, other.full)
-        np.testing.assert_array_equal(one.observations, other.observations)
+        parts = [(each.pos, each.full, each.observations) for each in (side, side.model_buffer)]
+        content.append([*side.sample(40)[:-1], parts])
+    assert_equal(*content)
 
 
 def test_samples_are_normalised(buffer, point_env):

@@ -43,10 +43,7 @@ OPTIONS = [
 ]
 CALLS = [
     (lambda at: DynaSAC("MlpPolicy", at.env(), at.task().dynamics), r"must be a Task\(dynamics,"),
-    (
-        lambda at: DynaSAC("MlpPolicy", at.env(), at.task(), model_episodes=2),
-        "unexpected keyword argument 'model_episodes'",
-    ),
+    (lambda at: DynaSAC("MlpPolicy", at.env(), at.task(), model_episodes=2), "'model_episodes'"),
     (lambda at: type("Other", (TD3, Dyna), {}), r"Dyna first .* class Other\(Dyna, .* found TD3"),
     (lambda at: type("Other", (Dyna, PPO), {}), "then an off-policy learner, .* found PPO"),
     (lambda at: at.agent(at.env().unwrapped, episode_length=None).learn(5), "no time limit"),
@@ -54,19 +51,16 @@ CALLS = [
     (lambda at: at.sac().learn(5, at.checkpoint), "is for learners with a model"),
     (lambda at: at.sac().learn(5, DynaCallback()), "DynaCallback is for Dyna agents.*found SAC"),
     (lambda at: at.agent().model_env(3), "initial_states"),
-    (
-        lambda at: at.agent().predict(np.array([np.nan], dtype=np.float32)),
-        "No action can be chosen: entry 0 of the observation is",
-    ),
+    (lambda at: at.agent().predict(np.array([np.nan], dtype=np.float32)), "No action can be chos"),
+    (lambda at: at.particles(observation_space=PLANE), "observation has 1 entries"),
+    (lambda at: at.particles(observation_space=spaces.Discrete(2)), "observation has 1 entries"),
+    (lambda at: at.particles(num_envs=0), "num_envs must be at least 1; found 0"),
+    (lambda at: at.particles(sampling="swarm"), "Unknown sampling 'swarm'"),
+    (lambda at: at.particles(initial_states=None), "needs a task with initial_states"),
 ]
 FUNCTIONS = [
     ({"initial_states": lambda n: torch.ones(n)}, r"initial_states\(2\) must return .* 2 x 1"),
-    (
-        {"initial_states": lambda n: torch.full((n, 1), torch.nan)},
-        r"initial_states\(2\) returned .*expected finite",
-    ),
     ({"reward": lambda s, a, n: n}, r"reward must return one value per row, shape \(2,\)"),
-    ({"terminated": lambda s: s}, r"terminated must return one value per row"),
     ({"dynamics": LearnedDynamics(POINT_SPEC, lambda X: X)}, "1 states .* got 2 columns"),
 ]
 
@@ -78,15 +72,13 @@ def test_an_option_is_refused(point_agent, options, words):
 
 
 @pytest.mark.parametrize(("call", "words"), CALLS)
-def test_a_call_is_refused(point_agent, point_env, point_task, tmp_path, call, words):
+def test_a_call_is_refused(
+    point_agent, point_env, point_task, point_particles, tmp_path, call, words
+):
     path = tmp_path / "run.ckpt"
-    at = SimpleNamespace(
-        agent=point_agent,
-        env=point_env,
-        task=point_task,
-        checkpoint=EpisodeCheckpoint(path),
-        sac=lambda: SAC("MlpPolicy", point_env(), policy_kwargs={"net_arch": [8]}),
-    )
+    at = SimpleNamespace(agent=point_agent, env=point_env, task=point_task)
+    at.particles, at.checkpoint = point_particles, EpisodeCheckpoint(path)
+    at.sac = lambda: SAC("MlpPolicy", point_env(), policy_kwargs={"net_arch": [8]})
     with pytest.raises((TypeError, ValueError), match=words):
         call(at)
     assert not path.exists()
@@ -116,25 +108,3 @@ def test_noisy_rewards_may_be_tolerated(point_agent, point_reward):
         point_agent(reward=noisy).learn(5)
     for tolerance in (0.1, None):
         assert point_agent(reward=noisy, reward_tolerance=tolerance).learn(5).num_episodes == 1
-
-
-PARTICLES = [
-    ({"observation_space": PLANE}, "observation has 1 entries"),
-    ({"observation_space": spaces.Discrete(2)}, "observation has 1 entries"),
-    ({"num_envs": 0}, "num_envs must be at least 1; found 0"),
-    ({"sampling": "swarm"}, "Unknown sampling 'swarm'"),
-    ({"initial_states": None}, "needs a task with initial_states"),
-    ({"initial_states": torch.zeros}, r"initial_states\(3\) must return .* 3 x 1; found \(3,\)"),
-    ({"reward": lambda s, a, n: n[:, 0] / 0}, "reward.*inf"),
-]
-
-
-@pytest.mark.parametrize(("options", "words"), PARTICLES)
-def test_particles_are_refused(point_particles, options, words, rise):
-    def step():
-        particles = point_particles(**options)
-        particles.reset()
-        particles.step(rise(3))
-
-    with pytest.raises(ValueError, match=words):
-        step()
