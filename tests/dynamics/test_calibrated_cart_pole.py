@@ -6,8 +6,9 @@ import torch
 
 from gpadjust import CKA, CalibratedPhysics, PhysicsMeanGP, Unknown
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
-from gpadjust.systems import CartPoleSwingUpEnv
 from gpadjust.systems.swing_up import CART_POLE_SPEC, CartPoleEquation, equation_physics
+from tests.dynamics.conftest import trial_of
+from tests.systems import normal
 
 UNKNOWNS = {
     "cart_mass": Unknown(0.6, factor=1.5, unit="kg"),
@@ -24,18 +25,10 @@ def physics():
 
 
 def trial(seed, noise=0.0):
-    """Transitions under random forces."""
-    env, draw = CartPoleSwingUpEnv(), np.random.default_rng(seed)
-    env.reset(seed=seed)
-    states, actions = [env.unwrapped.state], []
-    for _ in range(25):
-        actions.append(draw.uniform(-1, 1, 1).astype(np.float32) * env.action_space.high)
-        env.step(actions[-1])
-        states.append(env.unwrapped.state)
-    states = torch.tensor(np.stack(states), dtype=torch.float64)
-    generator = torch.Generator().manual_seed(seed)
-    states = states + noise * torch.randn(states.shape, generator=generator, dtype=torch.float64)
-    return states[:-1], torch.tensor(np.stack(actions), dtype=torch.float64), states[1:]
+    """Transitions under random forces, with noise of the sensors."""
+    path, actions = trial_of(seed, 25)
+    path = path + noise * normal(26, 4, seed=seed)
+    return path[:-1], actions, path[1:]
 
 
 def error(dynamics):

@@ -8,7 +8,7 @@ import torch
 from gpadjust import ZeroMeanGP
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.records import Record, Records
-from tests.systems import normal, same
+from tests.systems import normal
 
 QUICK = {"method": "map"}
 LAGS = {"y_1": "y", "u_1": "u"}
@@ -75,22 +75,6 @@ def test_physics_knows_the_present_only_and_a_model_both():
     assert (dynamics.noise_variance(states, actions[:, 0])[:, 1:] == 0).all()
     with pytest.raises(ValueError, match="'y_1' is declared as the previous state 'y'"):
         dynamics.update(states, actions[:, 0], following[:, 0].flip(0))
-
-
-def test_what_was_learnt_is_of_the_same_previous_values():
-    dynamics = learnt(NARX, model=ZeroMeanGP)
-    states, actions, _ = records_of(NARX, 45, 1).windows(1)
-    turned = dict([*LAGS.items()][::-1])
-    again = LearnedDynamics(
-        StateSpec(NARX.states, ["u"], previous=turned), model=ZeroMeanGP, fit_options=QUICK
-    )
-    again.load_state_dict(dynamics.state_dict())
-    both = (each.predict(states, actions[:, 0]) for each in (again, dynamics))
-    same(*both, rtol=0, atol=0)
-    further = StateSpec(NARX.states, ["u"], previous={"y_1": "y", "u_1": "y_1"})
-    other = LearnedDynamics(further, model=ZeroMeanGP, fit_options=QUICK)
-    with pytest.raises(RuntimeError, match=r"previous is {'u_1': 'u', .* in the state"):
-        other.load_state_dict(dynamics.state_dict())
 
 
 def test_a_model_reads_the_point_of_the_circle_of_an_earlier_angle(uniform):

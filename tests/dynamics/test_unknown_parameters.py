@@ -7,6 +7,7 @@ from gpadjust import CKA, CalibratedPhysics, ODEPhysics, Unknown
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.dynamics.learned_dynamics import TargetPhysics, Targets
 from gpadjust.physics import FunctionPhysics
+from tests.systems import same, uniform
 
 SPEC = StateSpec(["q", "dq"], ["u"], angles=["q"])
 UNKNOWNS = {"k": Unknown(1.0, factor=2.0), "c": Unknown(0.2, bounds=(0.0, 1.0))}
@@ -27,21 +28,16 @@ def make(model=CalibratedPhysics, **changes):
     return LearnedDynamics(SPEC, make_physics(**changes), model=model, fit_options=FEW)
 
 
-@pytest.fixture
-def transitions(uniform):
-    """Makes transitions of a pendulum with k = 1.7 and c = 0.5."""
-
-    def transitions(n, seed=0):
-        rows = uniform(n, 3, low=-2.0, high=2.0, seed=seed)
-        truth = make_physics()(rows, torch.tensor([1.7, 0.5], dtype=torch.float64))
-        return rows[:, :2], rows[:, 2:], truth + 1e-4 * uniform(n, 2, low=-1.0, seed=seed + 1)
-
-    return transitions
+def transitions(n, seed=0):
+    """Transitions of a pendulum with k = 1.7 and c = 0.5."""
+    rows = uniform(n, 3, low=-2.0, high=2.0, seed=seed)
+    truth = make_physics()(rows, torch.tensor([1.7, 0.5], dtype=torch.float64))
+    return rows[:, :2], rows[:, 2:], truth + 1e-4 * uniform(n, 2, low=-1.0, seed=seed + 1)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", [CalibratedPhysics, CKA])
-def test_are_learnt_kept_and_used(model, transitions, uniform):
+def test_are_learnt_kept_and_used(model):
     dynamics, (states, actions, after) = make(model), transitions(8, seed=5)
     first = transitions(12)
     dynamics.update(*first)
@@ -54,10 +50,7 @@ def test_are_learnt_kept_and_used(model, transitions, uniform):
 
     again = make(model)
     again.load_state_dict(dynamics.state_dict())
-    for found, expected in zip(
-        again.predict(states, actions), dynamics.predict(states, actions), strict=True
-    ):
-        torch.testing.assert_close(found, expected)
+    same(again.predict(states, actions), dynamics.predict(states, actions))
     assert torch.equal(again.model.physics_parameters.draws, parameters.draws)
 
     blocks = [t.expand(4, *t.shape) for t in (states, actions)]
@@ -71,7 +64,7 @@ def test_are_learnt_kept_and_used(model, transitions, uniform):
     assert dynamics.num_transitions == 16
 
 
-def test_a_state_of_other_priors_is_refused(transitions):
+def test_a_state_of_other_priors_is_refused():
     dynamics = make()
     dynamics.update(*transitions(6))
     other = make(k=Unknown(1.0, factor=1.9))  # the same guess
@@ -80,7 +73,7 @@ def test_a_state_of_other_priors_is_refused(transitions):
     assert "unknowns" not in LearnedDynamics(SPEC, lambda X: X[:, :2]).describe()
 
 
-def test_without_learning_they_are_the_guesses(transitions):
+def test_without_learning_they_are_the_guesses():
     states, actions, _ = transitions(5)
     mean, _ = PhysicsDynamics(SPEC, make_physics()).predict(states, actions)
     guess = torch.tensor([1.0, 0.2], dtype=torch.float64)
@@ -88,7 +81,7 @@ def test_without_learning_they_are_the_guesses(transitions):
     torch.testing.assert_close(mean, expected)
 
 
-def test_targets_of_a_physics_at_parameters(uniform):
+def test_targets_of_a_physics_at_parameters():
     def turn(X, p):
         """NaN where it turns too far."""
         moved = X[:, :2] + p.speed[:, None]
