@@ -8,14 +8,9 @@ from gpadjust.dynamics.trajectories import Trajectories, Windows
 from gpadjust.states import StateSpec
 
 __all__ = [
-    "AngleInput",
     "Dynamics",
-    "FreeRun",
     "IdentifiedDynamics",
     "LearnedDynamics",
     "PhysicsDynamics",
-    "StateSpec",
     "Trajectories",
-    "TransitionFunctions",
-    "Windows",
 ]
