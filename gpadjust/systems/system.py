@@ -59,7 +59,7 @@ class System:
 
     Example:
         >>> from gpadjust import systems
-        >>> cart_pole = systems.cart_pole(dry=0.5)
+        >>> cart_pole = systems.cart_pole()
         >>> env, task = cart_pole.make(), cart_pole.task()
         >>> task.dynamics.spec.states
         ('x', 'theta', 'x_dot', 'theta_dot')

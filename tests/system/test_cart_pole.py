@@ -77,17 +77,6 @@ def test_step_agrees_with_scipy(states_and_forces):
     torch.testing.assert_close(fine(X), expected, rtol=0, atol=1e-8)
 
 
-def test_time_steps_can_be_others(states_and_forces):
-    X = torch.cat(states_and_forces(10), dim=-1)
-    for time_step in (0.01, 0.05, 0.13):
-        fine = ODEPhysics(REAL_CART_POLE, step=time_step, state_dim=4, substeps=100)
-        physics = equation_physics(REAL_CART_POLE, time_step)
-        torch.testing.assert_close(physics(X), fine(X), rtol=0, atol=2e-3)
-        assert physics.step / physics.substeps <= 0.02 + 1e-12
-        believed = cart_pole(3, time_step=time_step).physics
-        assert (believed.step, believed.rhs) == (time_step, cart_pole(3).physics.rhs)
-
-
 def test_equation_takes_any_batch_and_is_differentiable(states_and_forces):
     states, forces = states_and_forces(6)
     blocks = REAL_CART_POLE(states.view(2, 3, 4), forces.view(2, 3, 1))

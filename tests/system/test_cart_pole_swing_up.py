@@ -71,17 +71,6 @@ def test_start_is_drawn_around_hanging():
     np.testing.assert_allclose(np.std(states, axis=0), 0.2, atol=0.02)
 
 
-def test_another_time_step_is_seen_in_steps_and_frames():
-    whole, halves = CartPoleSwingUpEnv(), CartPoleSwingUpEnv(time_step=0.05)
-    assert (whole.metadata["render_fps"], halves.metadata["render_fps"]) == (10, 20)
-    for env in (whole, halves):
-        env.reset(options={"state": [0.0, 3.0, 0.1, 0.0]})
-    push = np.array([4.0], dtype=np.float32)
-    for env in (whole, halves, halves):
-        env.step(push)
-    np.testing.assert_allclose(halves.state, whole.state, atol=1e-5)
-
-
 @pytest.mark.parametrize("duplicate", [lambda env: pickle.loads(pickle.dumps(env)), copy.deepcopy])
 def test_copy_goes_on_as_the_original(duplicate):
     env = gym.make(ID, render_mode="rgb_array")
