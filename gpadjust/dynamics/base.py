@@ -69,16 +69,11 @@ class Dynamics(ABC):
 
     @abstractmethod
     def sample_functions(self, num_functions: int, seed: int | None = None) -> TransitionFunctions:
-        """Draw transition *functions*, so that particles stay consistent along a trajectory.
+        """Draw ``k`` transition *functions*, so that particles stay consistent along a trajectory.
 
-        Args:
-            num_functions: Number ``k`` of functions.
-            seed: Seed of the draw. Default: go on with PyTorch's generator.
-
-        Returns:
-            A deterministic function of states ``k x N x state_dim`` and actions
-            ``k x N x action_dim`` to next states, one draw for each block, which later updates do
-            not change.
+        They are one deterministic function of states ``k x N x state_dim`` and actions
+        ``k x N x action_dim`` to next states, a draw for each block, which later updates do not
+        change. Without a seed PyTorch's generator goes on.
         """
 
     def sample(self, states: Tensor, actions: Tensor) -> Tensor:
@@ -123,10 +118,6 @@ class Dynamics(ABC):
             states: ``N x state_dim``.
             actions: ``N x action_dim``.
             next_states: ``N x state_dim``; NaN where an entry was not measured.
-
-        Raises:
-            RuntimeError: Before the first update.
-            TypeError, ValueError: As :meth:`Trajectories.checked`.
         """
         data = Trajectories.checked(self.spec, states, actions, next_states)
         moving = self.spec.moving
@@ -182,8 +173,8 @@ class Dynamics(ABC):
 
         Raises:
             RuntimeError: Before the first update.
-            TypeError: If states or actions are not float64 tensors.
-            ValueError: If shapes disagree, values are not finite, or an option is out of range.
+            TypeError, ValueError: If shapes disagree, values are not finite float64 tensors, or an
+                option is out of range.
             PhysicsError: If the physics fails, and its error does not have the rows.
         """
         spec = self.spec
@@ -369,9 +360,8 @@ class FreeRun(NamedTuple):
                 square of their changes in a step, in these windows.
 
         Raises:
-            TypeError: If ``measured`` is not a float64 tensor.
-            ValueError: If shapes differ, an entry is infinite, a unit is not positive, or a horizon
-                is not a step of the runs.
+            TypeError, ValueError: If ``measured`` is not a float64 tensor of the runs' shape, an
+                entry is infinite, a unit is not positive, or a horizon is not a step of the runs.
         """
         spec = self.spec
         length = self.mean.shape[1]
@@ -428,7 +418,7 @@ def step_or_nan(
 ) -> Tensor:
     """Return the next states ``N x state_dim``; NaN where the physics fails.
 
-    Raise a PhysicsError if it does not have the rows, or if all fail and ``some_must_succeed``.
+    A PhysicsError without rows is raised, and one of all rows if ``some_must_succeed``.
     """
     states, actions = states.clone(), actions.clone()
     failed = torch.zeros(len(states), dtype=torch.bool)

@@ -92,10 +92,10 @@ class LearnedDynamics(Dynamics):
             state, for margins of plans before the first transitions.
 
     Raises:
-        TypeError: If an argument has another type, or ``model`` does not take the arguments, or
-            needs a physics that is missing.
-        ValueError: If ``target`` or an option is unknown, a number is out of range, or a physics
-            returns the change of the state.
+        TypeError, ValueError: If an argument has another type or is out of range, ``model`` does
+            not take the arguments, or a physics returns the change of the state.
+        RuntimeError: By methods that predict, before the first update.
+        PhysicsError: By methods, if the physics fails.
 
     Example:
         >>> import torch
@@ -203,10 +203,6 @@ class LearnedDynamics(Dynamics):
             states: ``... x state_dim``; angles of states and means are not wrapped.
             actions: ``... x action_dim``.
             observation_noise: If True, the variance includes the estimated noise of next states.
-
-        Raises:
-            RuntimeError: Before the first update.
-            PhysicsError: If the physics fails.
         """
         following, variance = self._predict(states, actions, observation_noise)
         return Prediction(
@@ -311,7 +307,6 @@ class LearnedDynamics(Dynamics):
             TypeError: If the state is not a dictionary.
             RuntimeError: If the state belongs to dynamics with other settings or another physics,
                 or is damaged.
-            PhysicsError: If the physics fails.
         """
         if state == {}:
             self._learnt = self.fit_result = None

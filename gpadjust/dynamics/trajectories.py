@@ -109,9 +109,8 @@ class Trajectories:
         """Return trajectories from copies of the user's tensors.
 
         Raises:
-            TypeError: If the arguments are not float64 tensors.
-            ValueError: If shapes disagree, there are no rows, values are not finite, or a row has
-                no measured entry that a model predicts.
+            TypeError, ValueError: If the arguments are not finite float64 tensors of ``N`` rows, or
+                a row has no measured entry that a model predicts.
         """
         columns = {"states": states, "actions": actions, "next_states": next_states}
         for name, column in columns.items():
@@ -184,7 +183,7 @@ class Trajectories:
         return [self.subset(rows) for rows in torch.arange(len(self)).split(self._lengths)]
 
     def spread(self, number: int, seed: int = 0) -> Trajectories:
-        """Draw some rows evenly: one from each of ``number`` parts of the same length."""
+        """Draw a row from each of ``number`` parts of the same length."""
         return self.subset(_spread_rows(len(self), number, seed))
 
     def windows(self, length: int, stride: int | None = None) -> Windows:

@@ -90,6 +90,8 @@ def test_what_is_as_declared_passes():
         check(ARM, states, following)
         check(ARM, states.float().double(), following.float().double())
         check(ARM, states, following - turn)
+        following[-1, :2] = math.nan  # not measured
+        check(ARM, states, following)
     still = torch.tensor([[0.3, 1.0, 0.0]], dtype=torch.float64).repeat(5, 1)
     check(ARM, still, still)
 
@@ -97,6 +99,7 @@ def test_what_is_as_declared_passes():
 def test_an_exogenous_state_that_moves_is_named():
     states, following = swing(10)
     following[4, 0] += 0.01
+    following[2] = math.nan
     with pytest.raises(ValueError, match=r"'goal' .* 0\.31 where 0\.3 .* row 4"):
         check(ARM, states, following)
 
@@ -104,6 +107,7 @@ def test_an_exogenous_state_that_moves_is_named():
 def test_a_wrong_step_is_found():
     for factor in (0.5, 0.8, 1.25, 2.0, -1.0):
         states, following = swing(25, step=0.1 * abs(factor))
+        following[7, 1] = math.nan
         if factor < 0:
             states[:, 2], following[:, 2] = -states[:, 2], -following[:, 2]
         with pytest.raises(ValueError, match=rf"step=0.1.* {factor:.2g}"):
