@@ -12,24 +12,18 @@ SPEC = StateSpec(["x", "theta", "omega"], ["force"], angles=["theta"])
 STATE = torch.tensor([[1.0, 0.5, 2.0]]).double()
 
 
-def test_states_are_measured_by_name_and_in_the_order_of_the_sensors():
+def test_outputs_are_states_by_name_or_any_function():
     sensors = Sensors(["theta", "x"])
     values = sensors.measure(SPEC, STATE)
     assert values.tolist() == [[0.5, 1.0]]
-    seen = sensors.spec(SPEC)
-    assert seen.observation_dim == 3
-    torch.testing.assert_close(
-        seen.observe(values), torch.tensor([[math.sin(0.5), math.cos(0.5), 1.0]]).double()
-    )
-
-
-def test_outputs_are_any_function():
-    sensors = Sensors(["height"], lambda states: states[:, 1:2].cos())
-    assert sensors.measure(SPEC, STATE).item() == pytest.approx(math.cos(0.5))
-    assert sensors.spec(SPEC).angles == ()
-    assert sensors.describe() == {"outputs": ["height"], "function": True}
-    guessed = Sensors(["height"], sensors.function, noise={"height": 0.1})
-    assert guessed.describe() == {**sensors.describe(), "noise": {"height": 0.1}}
+    expected = torch.tensor([[math.sin(0.5), math.cos(0.5), 1.0]]).double()
+    torch.testing.assert_close(sensors.spec(SPEC).observe(values), expected)
+    height = Sensors(["height"], lambda states: states[:, 1:2].cos())
+    assert height.measure(SPEC, STATE).item() == pytest.approx(math.cos(0.5))
+    assert height.spec(SPEC).angles == ()
+    assert height.describe() == {"outputs": ["height"], "function": True}
+    guessed = Sensors(["height"], height.function, noise={"height": 0.1})
+    assert guessed.describe() == {**height.describe(), "noise": {"height": 0.1}}
 
 
 PAIR = Sensors(["a", "b"], lambda states: states[:, 0])
