@@ -73,7 +73,7 @@ class Dynamics(ABC):
 
         They are one deterministic function of states ``k x N x state_dim`` and actions
         ``k x N x action_dim`` to next states, a draw for each block, which later updates do not
-        change. Without a seed PyTorch's generator goes on.
+        change. Without a seed they are of PyTorch's generator.
         """
 
     def sample(self, states: Tensor, actions: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -87,9 +87,9 @@ class CartPoleEquation:
 
     def __post_init__(self) -> None:
         """Check the parameters."""
-        for entry in fields(self):
-            limits = {"least": 0} if entry.name == "damping" else {"above": 0}
-            checked_number(entry.name, getattr(self, entry.name), **limits)
+        for name in ("cart_mass", "pole_mass", "pole_length", "gravity"):
+            checked_number(name, getattr(self, name), above=0)
+        checked_number("damping", self.damping, least=0)
 
     def __call__(self, state: Tensor, action: Tensor, p: Mapping[str, Any] | None = None) -> Tensor:
         """Return the time derivative ``... x 4`` of states ``... x 4`` under forces ``... x 1``.
@@ -114,6 +114,7 @@ class CartPoleEquation:
             force = force - damping * x_dot
         # a - m l / 2 theta'^2 sin theta
         net = torch.addcmul(force, theta_dot * theta_dot, half_moment * sin, value=-1)
+        # g sin theta
         tilt = gravity * sin
         # The fraction of x'' over 4: (net + 3/4 m cos theta tilt) / (M - 3/4 m cos^2 theta)
         swung = swung_mass * cos
