@@ -82,7 +82,7 @@ class AgentCallback(DynaCallback):
             return callback
         try:
             inspect.signature(callback).bind("agent", "event", "values")
-        except TypeError:  # a function of SB3, of locals and globals
+        except (TypeError, ValueError):  # a function of SB3, of locals and globals
             return callback
         return AgentCallback(callback)
 
