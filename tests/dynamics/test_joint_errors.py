@@ -8,7 +8,6 @@ import torch
 
 from gpadjust.dynamics import LearnedDynamics, StateSpec
 from gpadjust.dynamics.learned_dynamics import error_correlation
-from tests.systems import normal, uniform
 
 SPEC = StateSpec(["angle", "rate"], ["torque"])
 SD = torch.tensor([0.02, 0.05], dtype=torch.float64)
@@ -22,7 +21,9 @@ def pendulum(X):
 @cache
 def learnt(correlation, n=120, seed=0):
     """Dynamics of a pendulum, whose angle and rate are shaken together."""
-    X, white = uniform(n, 3, low=-1, seed=seed), normal(n, 2, seed=seed + 1)
+    generator = torch.Generator().manual_seed(seed)
+    X = 2 * torch.rand(n, 3, generator=generator, dtype=torch.float64) - 1
+    white = torch.randn(n, 2, generator=generator, dtype=torch.float64)
     white[:, 1] = correlation * white[:, 0] + math.sqrt(1 - correlation**2) * white[:, 1]
     following = pendulum(X) + 0.02 * X[:, :1].sin() + SD * white
     dynamics = LearnedDynamics(SPEC, pendulum, fit_options={"num_draws": 8})
