@@ -169,7 +169,7 @@ def test_texts_of_a_table_are_escaped():
 
 def test_an_agent_without_episodes_has_nothing_to_draw():
     found = agent()
-    found._observed = found._observed.some(slice(0))
+    found._observed = found._observed.subset(slice(0))
     assert "best" not in found._repr_html_()
     with pytest.raises(ValueError, match="real episodes to draw, found none"):
         found.plot()

@@ -308,7 +308,7 @@ class Agent(ABC, Display):
         # Fresh dynamics learn all episodes.
         data = self.recorded_episodes()
         is_new = data.episode >= self.num_episodes
-        new = data.some(is_new) if dynamics.has_learnt else data
+        new = data.subset(is_new) if dynamics.has_learnt else data
         if len(new) < 2 - dynamics.is_fitted:  # a first fit needs two
             if len(new):
                 self._can_act = None  # there is another start

@@ -78,7 +78,7 @@ def decoded(spec: StateSpec, data: Trajectories) -> Trajectories:
 
 def newest(data: Trajectories, steps: int | None) -> Trajectories:
     """Return the newest steps; None for all."""
-    return data if steps is None else data.some(slice(max(len(data) - steps, 0), None))
+    return data if steps is None else data.subset(slice(max(len(data) - steps, 0), None))
 
 
 # What environment and episodes add to a task

@@ -72,7 +72,7 @@ def learnable(dynamics: Dynamics, data: Trajectories) -> Trajectories:
     while True:
         try:
             dynamics.try_physics(data.states[works], data.actions[works])
-            return data.some(works)
+            return data.subset(works)
         except PhysicsError as error:
             rows = works.nonzero().flatten()[list(error.rows)]
             if not len(rows) or len(rows) == works.sum():
@@ -114,7 +114,7 @@ def warn_of_delay(dynamics: Dynamics, data: Trajectories, num_new: int) -> None:
     if physics is None:
         return
     message = find_delay(physics, data)
-    if message and find_delay(physics, data.some(slice(len(data) - num_new))) is None:
+    if message and find_delay(physics, data.subset(slice(len(data) - num_new))) is None:
         warnings.warn(message, UserWarning, stacklevel=4)
 
 
@@ -174,7 +174,7 @@ def _score(
         return numbers
     windows = new.windows(horizons[-1], stride=1)
     last = len(windows.actions) - 1
-    windows = windows.some(torch.linspace(0, last, min(last + 1, _WINDOWS)).round().long())
+    windows = windows.subset(torch.linspace(0, last, min(last + 1, _WINDOWS)).round().long())
     bounds = task.widened(new.states).state_bounds
     try:
         run = dynamics.free_run(windows.initial_states, windows.actions, state_bounds=bounds)

@@ -200,7 +200,7 @@ class MPC:
             seed = len(observed.episodes())
             self.filter, states = smooth_episodes(self.model, self.filter, observed, seed)
         warn_of_delay(self.task.dynamics, states, len(self._steps) - self._num_learnt)
-        return states.some(new)
+        return states.subset(new)
 
     def __repr__(self) -> str:
         """Name the dynamics, and the number of their transitions."""

@@ -53,7 +53,7 @@ def plot_agent(agent: Any, *, axes: Any = None) -> Any:
     axes[0].xaxis.get_major_locator().set_params(integer=True)
     legend(axes[0])
     # The last episode; its last action is held
-    last = data.some(data.episode == data.episode[-1])
+    last = data.subset(data.episode == data.episode[-1])
     states = torch.cat([last.states, last.next_states[-1:]])
     actions = torch.cat([last.actions, last.actions[-1:]])
     times = (spec.step or 1.0) * torch.arange(len(states)).double()

@@ -46,7 +46,7 @@ def most_likely(
     # Search: from the best draws of the prior, by some of the transitions.
     number = min(len(data), _SEARCHED)
     rows = torch.linspace(0, len(data) - 1, number, dtype=torch.float64).round().long()
-    some = StepErrors(physics, spec, data.some(rows))
+    some = StepErrors(physics, spec, data.subset(rows))
     starts = torch.cat([guess.unsqueeze(0), even_normal(_GUESSES, len(guess), seed=0)])
     best = some.loss(starts).nan_to_num(nan=torch.inf).argsort()[:_STARTS]
     ends = [some.descend(z, _ROUGH) for z in starts[best] if some.loss(z).isfinite()]

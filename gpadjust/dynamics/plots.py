@@ -111,10 +111,7 @@ def plot_free_run(
         ax.set(xlabel=axis_labels["time"] if step else "steps")
     if axes is None:
         handles, texts = grid[0, 0].get_legend_handles_labels()
-        place: dict[str, Any] = {
-            "ncols": min(len(texts), 2 * len(rows)),
-            "loc": "outside upper center",
-        }
+        place: Any = {"ncols": min(len(texts), 2 * len(rows)), "loc": "outside upper center"}
         grid[0, 0].figure.legend(handles, texts, frameon=False, **place)
     else:
         legend(grid[0, 0])

@@ -16,7 +16,7 @@ from torch import Tensor
 from gpadjust.core import GP, Fourier, Stationary, Term
 from gpadjust.core.gaussian import Conditioning
 from gpadjust.dynamics import LearnedDynamics
-from gpadjust.dynamics.targets import AngleInput
+from gpadjust.dynamics.learned_dynamics import AngleInput
 from gpadjust.many import VariationalCKA
 
 _PROFILES = ("rbf", "matern1/2", "matern3/2", "matern5/2")

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpadjust.dynamics.targets import one_physics
+from gpadjust.dynamics.physics_dynamics import one_physics
 from gpadjust.physics import Physics, PhysicsError
 from gpadjust.records import kalman
 from gpadjust.records.kalman import Array

@@ -16,7 +16,6 @@ from torch import Tensor
 from gpadjust.checks import check_finite, check_kind, checked_number
 from gpadjust.core.data import ArrayLike, as_tensor
 from gpadjust.dynamics import Trajectories, Windows
-from gpadjust.dynamics.targets import check_spec
 from gpadjust.files.fields import is_moment, seconds_of
 from gpadjust.files.table import Table
 from gpadjust.states import StateSpec
@@ -200,7 +199,7 @@ class Records:
     """
 
     def __init__(self, records: Record | Iterable[Record], spec: StateSpec) -> None:
-        check_spec(spec)
+        check_kind("spec", spec, StateSpec, "a StateSpec, such as StateSpec(['x', 'v'], ['force'])")
         self.records = (records,) if isinstance(records, Record) else tuple(records)
         self.spec = spec
         if not self.records:
@@ -268,7 +267,7 @@ class Records:
                 time is in minutes, hours or days, and no ``time_unit`` given; and as
                 :class:`Record`.
         """
-        check_spec(spec)
+        check_kind("spec", spec, StateSpec, "a StateSpec, such as StateSpec(['x', 'v'], ['force'])")
         columns: dict[str, Any] = {"states": states or {}, "actions": actions or {}}
         for argument, given in columns.items():
             check_kind(argument, given, Mapping, "a dictionary from names of the spec to columns")
@@ -333,7 +332,7 @@ class Records:
         """
         data = _transitions(control_steps(self, step))
         complete = ~data.states.isnan().any(-1)
-        kept = data.some(complete & ~data.next_states[:, self.spec.predicted].isnan().all(-1))
+        kept = data.subset(complete & ~data.next_states[:, self.spec.predicted].isnan().all(-1))
         if not len(kept.states):
             raise ValueError(
                 f"Expected steps from a state that was measured in full, found none of "

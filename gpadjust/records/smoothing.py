@@ -22,7 +22,7 @@ from torch import Tensor
 from gpadjust.checks import check_kind, checked_whole, finite_array
 from gpadjust.dynamics.base import of_states
 from gpadjust.dynamics.least_squares import even_normal
-from gpadjust.dynamics.targets import check_next_values, one_physics
+from gpadjust.dynamics.physics_dynamics import check_next_values, one_physics
 from gpadjust.physics import Physics, PhysicsError
 from gpadjust.physics.parameters import PhysicsParameters
 from gpadjust.progress import long_work, tick
