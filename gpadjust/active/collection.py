@@ -45,8 +45,7 @@ class MeasurementWarning(UserWarning):
 class CollectionError(RuntimeError):
     """A run stopped before its budget was spent.
 
-    Args:
-        message: The cause.
+    Attributes:
         collection: The collection so far.
         X: The points of the last call of the oracle, ``q x d``.
         result: The values of the oracle, if the collection could not take them.
@@ -72,8 +71,8 @@ class Collection(Measurements, Display):
     :meth:`ask` writes its points before it returns them. A new collection with the same log and the
     same seed continues where the last one stopped, with the same next and pending points. One
     collection at a time holds a log, until :meth:`close` (or the end of
-    ``with Collection(...) as collection:``), until it is out of scope, or until its process ends.
-    Nothing in a log is executed or unpickled: a log from a stranger may be wrong, but is harmless.
+    ``with Collection(...) as collection:``), or until it is out of scope. Nothing in a log is
+    executed or unpickled.
 
     Args:
         model_factory: A callable that makes a new model of ``X``, ``n x d``, and ``Y``, ``n x m``,
@@ -86,10 +85,9 @@ class Collection(Measurements, Display):
             points, ``k x d``, all different, in place of Sobol's. Default: ``2 (d + 1)``.
         data: Earlier measurements ``(X, Y)``. They are not logged: pass them each time.
         keep: Limits of the outputs: a function of outputs ``... x m`` to numbers ``... x c``, each
-            at most 0 if permitted, such as ``lambda Y: Y - 3`` for outputs below 3. Points are then
-            limited to those that keep all limits with ``probability`` by the model. The first
-            points, in ``initial`` or ``data``, must be safe by other knowledge, such as f_p; they
-            are not checked. Default: no limits.
+            at most 0 if permitted, such as ``lambda Y: Y - 3`` for outputs below 3. Points then
+            keep all limits with ``probability`` by the model. The first points, in ``initial`` or
+            ``data``, must be safe by other knowledge, such as f_p. Default: no limits.
         probability: Probability of a measurement within the limits of ``keep``, noise included.
         num_outputs: Number ``m`` of outputs. Default: by the first measurement.
         fit: Fits a new model, in place. Default: :func:`gpadjust.fit`, for models of this library.
@@ -99,8 +97,7 @@ class Collection(Measurements, Display):
             random state does not change.
 
     Raises:
-        TypeError: If ``model_factory``, ``acquisition`` or ``fit`` is not callable, or another
-            argument has a wrong type.
+        TypeError: If an argument has a wrong type.
         ValueError: If an argument is out of range, or the log belongs to another problem.
         LogError: If another collection holds the log, or it cannot be opened for writing.
 
@@ -138,7 +135,9 @@ class Collection(Measurements, Display):
         log: str | os.PathLike[str] | None = None,
         seed: int = 0,
     ) -> None:
-        for name, function in (("model_factory", model_factory), ("acquisition", acquisition)):
+        functions = {"model_factory": model_factory, "acquisition": acquisition}
+        functions |= {n: f for n, f in {"fit": fit, "keep": keep}.items() if f is not None}
+        for name, function in functions.items():
             if not callable(function):
                 raise TypeError(f"Expected {name} to be callable, got {function!r}.")
         if isinstance(acquisition, AcquisitionFunction):
@@ -147,13 +146,8 @@ class Collection(Measurements, Display):
                 "Expected acquisition to be a function that makes an acquisition function of each "
                 f"new model, got one of a model; pass `lambda model: {kind}(model, ...)`."
             )
-        for name, option in (("fit", fit), ("keep", keep)):
-            if option is not None and not callable(option):
-                raise TypeError(f"Expected {name} to be callable, got {option!r}.")
         checked_number("probability", probability, above=0, below=1)
-        self.keep: Keep | None = None
-        if keep is not None:
-            self.keep = Keep(keep, probability)
+        self.keep = None if keep is None else Keep(keep, probability)
         self.model_factory, self.acquisition = model_factory, acquisition
         self.bounds = checked_bounds("bounds", bounds)
         self.batch_size = checked_whole("batch_size", batch_size, 1)
@@ -219,9 +213,7 @@ class Collection(Measurements, Display):
 
     def _repr_html_(self) -> str:
         """Return the lowest and the highest measurement of each output, and the last one."""
-        rows: dict[str, int] = {}
-        if len(self.X):
-            rows["last"] = len(self.X) - 1
+        rows = {"last": len(self.X) - 1} if len(self.X) else {}
         for j, values in enumerate(self.Y.mT):
             if not values.isnan().all():
                 rows[f"lowest y{j + 1}"] = int(values.nan_to_num(nan=torch.inf).argmin())
@@ -240,15 +232,12 @@ class Collection(Measurements, Display):
     def model(self) -> Any:
         """The model of all data so far, fitted at the first access.
 
-        Raises:
-            RuntimeError: If there are fewer than two measurements of an output.
-            TypeError: If ``model_factory`` does not make a model.
+        Raise a RuntimeError if there are fewer than two measurements of an output.
         """
         if self._model is None:  # new data have removed it
             if self.num_observed < 2:
                 raise RuntimeError(
-                    f"A model needs at least 2 measurements of each output, found "
-                    f"{self.num_observed}."
+                    f"Expected at least 2 measurements of each output, found {self.num_observed}."
                 )
             model = make_model(self.model_factory, self.X, self.Y)
             self._fit(model)
@@ -271,9 +260,7 @@ class Collection(Measurements, Display):
             ValueError: If it takes single points, and ``q`` is larger.
             LogError: If the points cannot be logged; then they are not pending.
         """
-        if q is None:
-            q = self.batch_size
-        checked_whole("q", q, 1)
+        q = checked_whole("q", self.batch_size if q is None else q, 1)
         record: Record = {}
         points = self._design(q)
         if points is None:
@@ -303,39 +290,22 @@ class Collection(Measurements, Display):
         Raises:
             TypeError: If the arguments are not numbers.
             ValueError: If shapes disagree.
-            LogError: If they cannot be logged. They are then neither in the log nor in the
-                collection; call this again.
-
-        Warns:
-            MeasurementWarning: If a measurement failed.
+            LogError: If they cannot be logged, and are then not in the collection.
         """
         X = checked_points("X", X, self.bounds.shape[-1])
         Y = checked_outcomes(Y, len(X), self.num_outputs)
         self._enter([measurement(x, y) for x, y in zip(X.tolist(), Y.tolist(), strict=True)])
 
     def fail(self, X: Tensor, reason: str | Exception) -> None:
-        """Record failed measurements. :meth:`ask` does not return their points again.
-
-        Args:
-            X: The points, ``n x d``.
-            reason: The cause.
-
-        Warns:
-            MeasurementWarning: In any case.
-        """
+        """Record failed measurements at points ``n x d``, which are not asked for again."""
         X = checked_points("X", X, self.bounds.shape[-1])
         if not isinstance(reason, str):
             reason = f"{type(reason).__name__}: {reason}"
         self._enter([{"x": x, "failed": reason} for x in X.tolist()])
 
     def withdraw(self, X: Tensor | None = None) -> None:
-        """Withdraw pending points without a measurement; :meth:`ask` may return them again.
-
-        Args:
-            X: The points, ``n x d``. Default: all pending points.
-        """
-        if X is None:
-            X = self.pending
+        """Withdraw some or all pending points, ``n x d``; :meth:`ask` may return them again."""
+        X = self.pending if X is None else X
         self._enter([{"withdrawn": checked_points("X", X, self.bounds.shape[-1]).tolist()}])
 
     def run(
@@ -370,9 +340,6 @@ class Collection(Measurements, Display):
             CollectionError: If the oracle fails too often, or its result cannot be measured values
                 or cannot be logged: the error has it as ``result``, and the points are still
                 pending.
-
-        Warns:
-            MeasurementWarning: If a measurement fails.
         """
         if not callable(oracle):
             raise TypeError(f"Expected the oracle to be callable, got {oracle!r}.")
@@ -390,17 +357,14 @@ class Collection(Measurements, Display):
                 # Single failures are skipped; many in a row are a broken oracle.
                 bar.update(len(X))
                 bar.set_postfix(failed=len(self.failed_X))
-                failures += 1
-                if len(self.X) > num_before:
-                    failures = 0
+                failures = 0 if len(self.X) > num_before else failures + 1
                 if failures >= max_failures:
-                    raise CollectionError(
+                    message = (
                         f"The oracle failed {failures} times in a row, the last time at "
                         f"{X.tolist()}: {error or 'NaN or infinity'}. {len(self.X)} measurements "
-                        f"are in the error's `.collection`; {self._log_path()}.",
-                        self,
-                        X,
-                    ) from error
+                        f"are in the error's `.collection`; {self._log_path()}."
+                    )
+                    raise CollectionError(message, self, X) from error
         return self
 
     def close(self) -> None:
@@ -417,14 +381,10 @@ class Collection(Measurements, Display):
         if self.keep is not None:  # Sobol points may not be safe
             if len(first):
                 return first[:q]
-            if len(self.pending):
-                raise RuntimeError(
-                    f"All first points are asked for, and {len(self.pending)} of them are pending: "
-                    "tell() their results first, as later points need a model of them."
-                )
             raise RuntimeError(
-                f"The first points gave {self.num_observed} measurements, but a model that keeps "
-                "limits needs two of each output; tell() measurements at other safe points."
+                "Expected two measurements of each output, as later points need a model that keeps "
+                f"the limits; found {self.num_observed}. Of the first points, {len(self.pending)} "
+                "are pending: tell() their results first, or measurements at other safe points."
             )
         return torch.cat([first, sobol_points(self.bounds, q, earlier, self.seed)])[:q]
 
@@ -454,13 +414,12 @@ class Collection(Measurements, Display):
             self._model = None
         failed = [record for record in records if "failed" in record]
         if failed:
-            warnings.warn(
+            message = (
                 f"{len(failed)} of {len(records)} measurements failed, the first at x = "
                 f"{failed[0]['x']}: {failed[0]['failed']}. They count against a budget, and "
-                "ask() does not return them again.",
-                MeasurementWarning,
-                stacklevel=3,
+                "ask() does not return them again."
             )
+            warnings.warn(message, MeasurementWarning, stacklevel=3)
 
     def _resume(self, log: MeasurementLog) -> None:
         """Apply the records of the log."""
@@ -489,15 +448,13 @@ class Collection(Measurements, Display):
             if self.log is not None:
                 with suppress(LogError):
                     self.log.append([refusal(X, result, error)])
-            raise CollectionError(
+            message = (
                 f"The oracle returned no measured values for the points {X.tolist()}: {error} The "
                 f"result is in this error's `.result`; {self._log_path()}. The points are still "
                 "pending: tell() `.collection` their values, correct the oracle, and run it again. "
-                "An oracle reports a failure by an exception or by NaN.",
-                self,
-                X,
-                result,
-            ) from error
+                "An oracle reports a failure by an exception or by NaN."
+            )
+            raise CollectionError(message, self, X, result) from error
         try:
             self.tell(X, Y)
         except LogError as error:
@@ -541,12 +498,10 @@ def collect(
         ...     oracle=lambda X: 2 * torch.sin(X) + X,
         ...     bounds=[[0.0], [3.0]],
         ...     acquisition=qAdjustmentInformationGain,
-        ...     budget=6,
-        ...     batch_size=2,
-        ...     optimizer_options={"num_restarts": 2, "raw_samples": 16},
+        ...     budget=5,
         ... )
         >>> result.Y.shape
-        torch.Size([6, 1])
+        torch.Size([5, 1])
     """
     with Collection(model_factory, bounds, acquisition, **options) as collection:
         return collection.run(oracle, budget, progress=progress, max_failures=max_failures)

@@ -21,13 +21,7 @@ _AT_ONCE = 256  # candidates
 
 @dataclass(frozen=True)
 class Keep:
-    """Limits of the outputs, and the probability with which a measurement keeps them.
-
-    Args:
-        limits: A function of outputs ``... x m`` to numbers ``... x c``, each at most 0 for
-            permitted outputs.
-        probability: Probability of a measurement within all limits.
-    """
+    """Limits of the outputs, at most 0 where permitted, and the probability to keep them."""
 
     limits: Callable[[Tensor], Tensor]
     probability: float
@@ -53,26 +47,13 @@ class Keep:
         pending: Tensor,
         failed: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """Return the best of random points that are safe by the model (Sui et al. 2015).
+        """Return the best of random points that are safe by the model (Sui et al. 2015), ``q x d``.
 
-        Args:
-            acquisition: The acquisition function.
-            model: The model.
-            bounds: Bounds of the inputs, ``2 x d``.
-            q: Number of points.
-            measured: Measured points, ``n x d``.
-            pending: As of :func:`~gpadjust.active.points.best_points`.
-            failed: As of :func:`~gpadjust.active.points.best_points`.
-
-        Returns:
-            The points, ``q x d``, and the unsafe points with higher values of the acquisition
-            function, ``l x d``, at most one for each.
-
-        Raises:
-            RuntimeError: If fewer points are safe, or these are too close to each other.
+        And the unsafe points with higher values of the acquisition function, ``l x d``, at most one
+        for each. Raise a RuntimeError if fewer points are safe and apart.
         """
         # Candidates away from failed and pending points, with their probability by the model.
-        points = self._candidates(bounds, torch.cat([measured, pending]))
+        points = _candidates(bounds, torch.cat([measured, pending]))
         points = points[(distances(points, torch.cat([failed, pending]), bounds) >= NEAR).all(-1)]
         is_safe = self.probabilities(model, points) >= self.probability
         num_points = len(points)
@@ -101,11 +82,12 @@ class Keep:
             points, is_safe = points[is_apart], is_safe[is_apart]
         return torch.cat(best_points), torch.cat([bounds[:0], *left_out])
 
-    def _candidates(self, bounds: Tensor, centers: Tensor) -> Tensor:
-        """Return random points ``n x d`` in the bounds, half of them near some centers."""
-        seed = int(torch.randint(2**31, (1,)))
-        everywhere = draw_sobol_samples(bounds, n=_CANDIDATES, q=1, seed=seed).squeeze(-2)
-        # Safe regions grow from measured points, and may be small.
-        near = centers[torch.randint(len(centers), (_CANDIDATES,))]
-        near = near + _REACH * (bounds[1] - bounds[0]) * torch.randn_like(near)
-        return torch.cat([everywhere, near.clamp(*bounds)])
+
+def _candidates(bounds: Tensor, centers: Tensor) -> Tensor:
+    """Return random points ``n x d`` in the bounds, half of them near some centers."""
+    seed = int(torch.randint(2**31, (1,)))
+    everywhere = draw_sobol_samples(bounds, n=_CANDIDATES, q=1, seed=seed).squeeze(-2)
+    # Safe regions grow from measured points, and may be small.
+    near = centers[torch.randint(len(centers), (_CANDIDATES,))]
+    near = near + _REACH * (bounds[1] - bounds[0]) * torch.randn_like(near)
+    return torch.cat([everywhere, near.clamp(*bounds)])

@@ -30,11 +30,6 @@ class Measurements:
     A measurement belongs to the nearest pending point within a hundredth of the bounds' widths: a
     laboratory seldom sets inputs to the last digit.
 
-    Args:
-        bounds: Bounds of the inputs, ``2 x d``.
-        num_outputs: Number ``m`` of outputs, or None for that of the first measurement.
-        data: Earlier measurements ``(X, Y)``, or None.
-
     Attributes:
         X: The measured points, ``n x d``, ``data`` first.
         Y: The measured values, ``n x m``; NaN for a missing output.
@@ -117,19 +112,11 @@ class Measurements:
 
     def _points(self, rows: list[list[float]]) -> Tensor:
         """Return the points of a record, ``n x d``."""
-        d = self.X.shape[-1]
-        if not rows:
-            return self.X.new_zeros(0, d)
-        return checked_points("X", rows, d)
+        return checked_points("X", rows, self.X.shape[-1]) if rows else self.X[:0]
 
 
 def refusal(X: Tensor, result: Any, error: Exception) -> Record:
-    """Return the record of an invalid result of an oracle for points ``q x d``.
-
-    Example:
-        >>> refusal(torch.zeros(1, 1), {"Y": torch.tensor([1.5, math.nan])}, ValueError("no"))
-        {'refused': {'Y': [1.5, 'NaN']}, 'of': [[0.0]], 'because': 'no'}
-    """
+    """Return the record of an invalid result of an oracle for points ``q x d``."""
 
     def plain(part: Any) -> Any:  # arrays and tensors as lists
         return part.tolist() if hasattr(part, "tolist") else repr(part)
@@ -143,14 +130,7 @@ def refusal(X: Tensor, result: Any, error: Exception) -> Record:
 
 
 def measurement(x: list[float], y: list[float]) -> Record:
-    """Return the record of a measurement; of a failed one if no value is finite.
-
-    Example:
-        >>> measurement([0.5], [1.25, float("nan")])
-        {'x': [0.5], 'y': [1.25, None]}
-        >>> measurement([0.5], [float("inf")])
-        {'x': [0.5], 'y': [None], 'failed': 'measured [inf]'}
-    """
+    """Return the record of a measurement; of a failed one if no value is finite."""
     # JSON has no NaN: null stands for it.
     record: Record = {"x": x, "y": [value if math.isfinite(value) else None for value in y]}
     if not any(map(math.isfinite, y)):
@@ -159,21 +139,9 @@ def measurement(x: list[float], y: list[float]) -> Record:
 
 
 def checked_outcomes(Y: Any, num_points: int, num_outputs: int | None) -> Tensor:
-    """Return measured values as ``n x m``, float64; they may be NaN or infinite.
-
-    Args:
-        Y: The values, ``n x m`` or ``n``, or one number for one point.
-        num_points: Number ``n`` of points.
-        num_outputs: Number ``m`` of outputs, or None.
-
-    Raises:
-        TypeError: If the values are not numbers.
-        ValueError: If they have another shape.
-    """
+    """Return values ``n x m`` or ``n``, or a number, as ``n x m``; they may be NaN or infinite."""
     Y = checked_tensor("measured values", Y)
-    columns = Y
-    if Y.dim() < 2:  # one output
-        columns = Y.reshape(-1, 1)
+    columns = Y.reshape(-1, 1) if Y.dim() < 2 else Y
     fits = columns.dim() == 2 and len(columns) == num_points and columns.shape[-1] > 0
     if not fits or num_outputs not in (None, columns.shape[-1]):
         raise ValueError(
@@ -184,14 +152,8 @@ def checked_outcomes(Y: Any, num_points: int, num_outputs: int | None) -> Tensor
 
 
 def as_options(options: Any) -> dict[str, Any]:
-    """Return options of ``optimize_acqf``; an empty dictionary for None.
-
-    Raises:
-        TypeError: If they are not a dictionary.
-        ValueError: If the collection sets one of them.
-    """
-    if options is None:
-        return {}
+    """Return options of ``optimize_acqf``; raise a ValueError if the collection sets one."""
+    options = {} if options is None else options
     if not isinstance(options, dict):
         raise TypeError(f"Expected optimizer_options to be a dictionary, got {options!r}.")
     twice = {"acq_function", "bounds", "q", "return_best_only", "return_full_tree"} & set(options)

@@ -38,9 +38,7 @@ def plot_collection(
     """
     X, Y, pending = collection.X, collection.Y, collection.pending
     n, d, m = len(X), X.shape[-1], Y.shape[-1]
-    best: list[float] = []
-    if optimum is not None:
-        best = checked_tensor("optimum", optimum).reshape(-1).tolist()
+    best = [] if optimum is None else checked_tensor("optimum", optimum).reshape(-1).tolist()
     if len(best) == 1:
         best = best * m
     if len(best) not in (0, m) or not all(map(math.isfinite, best)):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import torch
@@ -19,17 +19,7 @@ _OTHERS = 256  # random points, of which the best replaces one too close to othe
 
 
 def sobol_points(bounds: Tensor, q: int, earlier: Tensor, seed: int) -> Tensor:
-    """Return the next points of a scrambled Sobol sequence.
-
-    Args:
-        bounds: Bounds of the inputs, ``2 x d``.
-        q: Number of points.
-        earlier: Points to leave out, ``n x d``.
-        seed: Seed of the scrambling.
-
-    Returns:
-        The points, ``q x d``.
-    """
+    """Return the next points of a scrambled Sobol sequence without earlier ones, ``q x d``."""
     engine = SobolEngine(bounds.shape[-1], scramble=True, seed=seed)
     # The earlier points may be those of the sequence, or any others.
     unit = engine.draw(len(earlier) + q, dtype=torch.float64)
@@ -43,10 +33,7 @@ def among(points: Tensor, others: Tensor) -> Tensor:
 
 
 def distances(points: Tensor, others: Tensor, bounds: Tensor) -> Tensor:
-    """Return distances of points ``n x d`` from others, ``n x k``, in the bounds' widths.
-
-    A distance is the largest difference of an input.
-    """
+    """Return distances of points ``n x d`` from others, ``n x k``, in the bounds' widths."""
     # max_i |x_i - x'_i| / (b_i - a_i)
     gaps = (points.unsqueeze(-2) - others).abs() / (bounds[1] - bounds[0])
     return gaps.amax(-1)
@@ -60,19 +47,9 @@ def best_points(
     failed: Tensor,
     options: dict[str, Any],
 ) -> Tensor:
-    """Maximise an acquisition function.
+    """Return points of a maximum of an acquisition function, ``q x d``, by ``optimize_acqf``.
 
-    Args:
-        acquisition: The acquisition function.
-        bounds: Bounds of the inputs, ``2 x d``.
-        q: Number of points.
-        pending: Points that are being measured, ``k x d``.
-        failed: Points of failed measurements, ``l x d``. The function considers them as pending,
-            so that their neighbourhood has no value, and no point is near one of them.
-        options: Arguments of ``optimize_acqf`` other than those above.
-
-    Returns:
-        The points, ``q x d``.
+    Failed points count as pending, so that their neighbourhood has no value, and no point is near.
     """
     # A line search that rounding errors end has converged: a second try is not needed.
     defaults = {"num_restarts": 8, "raw_samples": 128, "retry_on_optimization_warning": False}
@@ -92,13 +69,12 @@ def best_points(
 def taken_as_pending(acquisition: AcquisitionFunction, points: Tensor) -> Iterator[bool]:
     """Add pending points to an acquisition function for a while; yield whether it takes any."""
     before = getattr(acquisition, "X_pending", None)
-    has_pending = bool(len(points))
-    if has_pending:
-        pending = points if before is None else torch.cat([before, points])
-        try:
+    pending = points if before is None else torch.cat([before, points])
+    has_pending = False
+    if len(points):
+        with suppress(UnsupportedError):
             acquisition.set_X_pending(pending)
-        except UnsupportedError:
-            has_pending = False
+            has_pending = True
     try:
         yield has_pending
     finally:

@@ -16,9 +16,10 @@ from ax.generation_strategy.generation_strategy import GenerationStrategy
 from ax.generators.torch.botorch_modular.surrogate import SurrogateSpec
 from ax.generators.torch.botorch_modular.utils import ModelConfig
 
-from gpadjust.ax.parameter_physics import ParameterPhysics, of_each
+from gpadjust.ax.parameter_physics import ParameterPhysics
 from gpadjust.ax.tell_physics import TellPhysics
 from gpadjust.core import CKA, GP, ZeroMeanGP
+from gpadjust.kinds.factory import map_parts
 
 TRANSFORMS: list[type[Transform]] = [*MBM_X_trans, Derelativize, StandardizeY, TellPhysics]
 """Ax's transforms of parameters; for metrics only shift and scale, as others (``Winsorize``,
@@ -50,17 +51,15 @@ def generator_kwargs(
             class.
     """
     if not isinstance(physics, Mapping) or not physics:
-        raise TypeError(
-            "Expected the physics of at least one metric by its name, {'cost': f_p}, found "
-            f"{physics!r}."
-        )
+        message = "Expected the physics of at least one metric by its name, {'cost': f_p}, found "
+        raise TypeError(f"{message}{physics!r}.")
     mll_options = dict(fit_options or {})
     model_class, options = _class_of(model)
     # One config for each metric with a physics, and one for all others.
     configs = {
         metric: ModelConfig(
             botorch_model_class=model_class,
-            model_options={**options, "physics": of_each(ParameterPhysics, part)},
+            model_options={**options, "physics": map_parts(ParameterPhysics, part)},
             name=f"{model_class.__name__} of {metric}",
             mll_options=mll_options,
         )
@@ -84,21 +83,16 @@ def generation_strategy(
 ) -> GenerationStrategy:
     """Return Ax's default strategy, with models that adjust a physics in place of Ax's models.
 
-    The first trials are those of Ax, the center of the search space and Sobol points.
+    The first trials are those of Ax, the center of the search space and Sobol points. Arguments and
+    errors are those of :func:`generator_kwargs`; at the first trial of a model, a physics that
+    reads an unknown parameter, or text, is a ValueError.
 
     Args:
-        physics: As in :func:`generator_kwargs`.
-        model: As in :func:`generator_kwargs`.
-        fit_options: As in :func:`generator_kwargs`.
+        physics: The physics of metrics.
+        model: The model of these metrics.
+        fit_options: Arguments of :func:`gpadjust.fit`.
         options: Options of ``Client.configure_generation_strategy`` except ``method``, such as
             ``initialization_budget`` and ``initialization_random_seed``.
-
-    Returns:
-        A strategy for ``client.set_generation_strategy``.
-
-    Raises:
-        TypeError: As :func:`generator_kwargs`.
-        ValueError: At the first trial of a model, if a physics reads an unknown parameter, or text.
 
     Example:
         >>> from ax.api.client import Client

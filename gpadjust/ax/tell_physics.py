@@ -15,8 +15,9 @@ from ax.generators.torch.botorch_modular.generator import BoTorchGenerator
 from ax.generators.torch.botorch_modular.surrogate import SurrogateSpec
 from ax.generators.torch.botorch_modular.utils import ModelConfig
 
-from gpadjust.ax.parameter_physics import ParameterPhysics, of_each
+from gpadjust.ax.parameter_physics import ParameterPhysics
 from gpadjust.ax.units import PhysicsInUnits, Units
+from gpadjust.kinds.factory import map_parts
 
 
 class TellPhysics(Transform):
@@ -62,19 +63,12 @@ class TellPhysics(Transform):
                 "make one of parameters that are always there."
             )
         # Plain values of the parameters before all transforms.
-        ranges = {
-            p.name: (float(p.lower), float(p.upper))
-            for p in original.parameters.values()
-            if isinstance(p, RangeParameter)
-        }
-        integers = [
-            name for name in ranges if original.parameters[name].parameter_type is ParameterType.INT
-        ]
-        choices = {
-            p.name: [float(value) for value in p.values]
-            for p in original.parameters.values()
-            if isinstance(p, ChoiceParameter) and p.is_numeric
-        }
+        parameters = original.parameters.values()
+        scales = [p for p in parameters if isinstance(p, RangeParameter)]
+        ranges = {p.name: (float(p.lower), float(p.upper)) for p in scales}
+        integers = [p.name for p in scales if p.parameter_type is ParameterType.INT]
+        lists = [p for p in parameters if isinstance(p, ChoiceParameter) and p.is_numeric]
+        choices = {p.name: [float(value) for value in p.values] for p in lists}
         units = Units(transforms, [*search_space.parameters], ranges, integers, choices)
         # Metrics may have no data yet, or data without being tracked.
         observed = set(experiment_data.metric_signatures)
@@ -127,7 +121,7 @@ class _UnitsSetter:
                 "metric: SurrogateSpec(metric_to_model_configs={'the metric': [ModelConfig(...)]"
                 "}), or gpadjust.ax.generation_strategy({'the metric': f_p})."
             )
-        in_units = of_each(partial(self.physics, metrics[0]), physics)
+        in_units = map_parts(partial(self.physics, metrics[0]), physics)
         return replace(config, model_options={**config.model_options, "physics": in_units})
 
     def physics(self, metric: str, physics: Any) -> PhysicsInUnits:
