@@ -71,6 +71,13 @@ class Sine(torch.nn.Module):
         return torch.cat([angle.sin() + self.offset, angle.cos()], -1)[..., : self.num_outputs]
 
 
+def drawn(model, number=2, seed=3):
+    """The model with some draws near the middle of its prior, of its first nested model."""
+    u = 0.4 * normal(number, *model.u.shape[1:], seed=seed)
+    model.set_draws(model.table.with_choice(u, 0))
+    return model.eval()
+
+
 def same(ours, theirs, **tolerance):
     """Asserts that tensors are close, one by one: moments of two predictions, say."""
     for one, other in zip(ours, theirs, strict=True):
