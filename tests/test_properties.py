@@ -118,6 +118,9 @@ MODELS = {
     ),
     "RelativeNoise": lambda p: CKA(**p.all, noise=RelativeNoise()),
     "both": lambda p: CKA(**p.all, noise=HeavyTails(base=RelativeNoise(), added=ADDED[:, p.rows])),
+    "both, without physics": lambda p: ZeroMeanGP(
+        **p.data, noise=HeavyTails(base=RelativeNoise(), added=ADDED[:, p.rows])
+    ),
     "NoisyInputs": Problem.noisy,
     "log": lambda p: LinkedCKA(**p.all, link="log"),
     "bounds": lambda p: LinkedRRA(**p.all, num_features=16, link=(0.0, 5.0 * p.b)),
