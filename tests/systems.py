@@ -43,6 +43,11 @@ def truth(X):
     return crude(X) * (1.2 + 0.2 * X[..., :1]) + bias
 
 
+def measured(X):
+    """One output of two inputs, of a laboratory."""
+    return 1.4 * (2 + (2 * X[..., :1]).sin()) + X[..., 1:].square()
+
+
 def ripple(X):
     """As many outputs as inputs, none of them near zero."""
     return 2 + (3 * X).sin()
