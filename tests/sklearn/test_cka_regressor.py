@@ -1,8 +1,6 @@
 """CKARegressor in scikit-learn's own checks, in its tools, and against the library's models."""
 
-import importlib
 import pickle
-import sys
 from functools import partial
 
 import cloudpickle
@@ -102,23 +100,39 @@ def test_scikit_learn_accepts_it(estimator, check):
     check(estimator)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["bayes", "map"])
-@pytest.mark.parametrize("noise", [False, True])
-def test_it_says_what_the_model_says(data, method, noise):
-    X, y = data
-    regressor = CKARegressor(wave, fit_method=method, random_state=3).fit(X, y)
-    model = CKA(X, y.reshape(-1, 1), physics=BlackBoxPhysics(wave))
-    result = fit(model, method, seed=3)
-    assert type(regressor.fit_result_) is type(result)
-    mean, variance = (values[:, 0] for values in model.predict(Z, noise))
-    found, std = regressor.predict(Z, return_std=True, observation_noise=noise)
-    np.testing.assert_array_equal(found, mean)
-    np.testing.assert_allclose(std**2, variance, rtol=1e-12)
-    np.testing.assert_array_equal(regressor.predict(Z), mean)
-    found, covariance = regressor.predict(Z, return_cov=True, observation_noise=noise)
-    np.testing.assert_array_equal(found, mean)
-    np.testing.assert_allclose(np.diag(covariance), variance, rtol=1e-6)
+OPTIONS = {"constants": False, "train_Yvar": 0.05**2}
+MODELS = {
+    "cka": (fast(), CKA, {"physics": BlackBoxPhysics(wave)}),
+    "class": (
+        fast(model=partial(PhysicsMeanGP, **OPTIONS)),
+        PhysicsMeanGP,
+        {"physics": BlackBoxPhysics(wave), **OPTIONS},
+    ),
+    "no physics": (fast(None), ZeroMeanGP, {}),
+    "zero mean": (fast(model="zero_mean"), ZeroMeanGP, {}),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [*((n, "map") for n in MODELS), pytest.param("cka", "bayes", marks=pytest.mark.slow)],
+)
+def test_it_says_what_the_model_says(data, name, method):
+    regressor, structure, options = MODELS[name]
+    regressor = clone(regressor).set_params(fit_method=method).fit(*data)
+    model = structure(data[0], data[1].reshape(-1, 1), **options)
+    assert type(regressor.model_) is structure
+    assert type(regressor.fit_result_) is type(fit(model, method, seed=0))
+    for noise in (False, True):
+        mean, variance = (values[:, 0] for values in model.predict(Z, noise))
+        ours, std = regressor.predict(Z, return_std=True, observation_noise=noise)
+        np.testing.assert_array_equal(ours, mean)
+        np.testing.assert_allclose(std**2, variance, rtol=1e-12)
+        np.testing.assert_array_equal(regressor.predict(Z), model.predict(Z).mean[:, 0])
+        ours, covariance = regressor.predict(Z, return_cov=True, observation_noise=noise)
+        np.testing.assert_array_equal(ours, mean)
+        np.testing.assert_allclose(np.diag(covariance), variance, rtol=1e-6)
+    assert OPTIONS == {"constants": False, "train_Yvar": 0.05**2}
 
 
 def test_numpy_and_torch_are_one(data):
@@ -129,24 +143,11 @@ def test_numpy_and_torch_are_one(data):
     assert regressor.score(*data) > 0.9
 
 
-def test_several_outputs(data):
-    X, y = data
-    Y = np.column_stack([y, y**2 + X[:, 0]])
-    regressor = fast(waves, fit_method="bayes").fit(X, Y)
-    mean, std = regressor.predict(Z, return_std=True)
-    _, covariance = regressor.predict(Z, return_cov=True)
-    assert mean.shape == std.shape == (7, 2)
-    assert covariance.shape == (7, 7, 2)
-    np.testing.assert_allclose(np.einsum("iij->ij", covariance), std**2, rtol=1e-4)
-    assert regressor.sample_y(Z, 3).shape == (7, 2, 3)
-    assert regressor.score(X, Y) > 0.9
-
-
 @pytest.mark.parametrize("columns", [1, 2])
 def test_shapes_are_those_of_a_gaussian_process_regressor(data, columns):
     X, y = data
     Y = y if columns == 1 else np.column_stack([y, y])
-    found, expected = (
+    ours, expected = (
         (
             regressor.predict(Z),
             *regressor.predict(Z, return_std=True),
@@ -156,17 +157,12 @@ def test_shapes_are_those_of_a_gaussian_process_regressor(data, columns):
         )
         for regressor in (fast(None).fit(X, Y), GaussianProcessRegressor(optimizer=None).fit(X, Y))
     )
-    assert [each.shape for each in found] == [each.shape for each in expected]
-
-
-def test_columns_backward_rows_and_copies_make_no_difference(data):
-    X, y = data
-    expected = fast().fit(X, y).predict(Z)
-    np.testing.assert_array_equal(fast().fit(X, y.reshape(-1, 1)).predict(Z), expected)
-    for copied in (pickle.loads(pickle.dumps(fast())), clone(fast())):
-        np.testing.assert_array_equal(copied.fit(X, y).predict(Z), expected)
-    regressor = fast().fit(X[::-1], y[::-1])
-    np.testing.assert_allclose(regressor.predict(Z[::-1]), regressor.predict(Z)[::-1], rtol=1e-9)
+    assert [each.shape for each in ours] == [each.shape for each in expected]
+    regressor = fast(waves, fit_method="bayes").fit(X, np.column_stack([y, y**2 + X[:, 0]]))
+    _, std = regressor.predict(Z, return_std=True)
+    _, covariance = regressor.predict(Z, return_cov=True)
+    np.testing.assert_allclose(np.einsum("iij->ij", covariance), std**2, rtol=1e-4)
+    assert regressor.score(X, np.column_stack([y, y**2 + X[:, 0]])) > 0.9
 
 
 @pytest.mark.parametrize(("method", "noise"), [("bayes", True), ("map", False)])
@@ -180,11 +176,7 @@ def test_moments_of_draws(data, method, noise):
     np.testing.assert_allclose(
         np.cov(draws) / np.outer(sd, sd), covariance / np.outer(sd, sd), atol=0.06
     )
-
-
-def test_the_seed_of_draws(data):
-    regressor = fast(fit_method="bayes").fit(*data)
-    first = regressor.sample_y(Z, 3)
+    first = regressor.sample_y(Z, 3)  # a seed makes them
     np.testing.assert_array_equal(first, regressor.sample_y(Z, 3, random_state=0))
     assert (first != regressor.sample_y(Z, 3, random_state=1)).all()
     state = np.random.RandomState(0)
@@ -206,33 +198,12 @@ def test_the_seed_of_the_fit(data):
     assert same(scales(np.random.RandomState(0)), scales(np.random.RandomState(0)))
 
 
-def test_physics_none_is_a_gaussian_process_without_physics(data):
-    X, y = data
-    for regressor in (fast(None), fast(wave, model="zero_mean")):
-        assert type(regressor.fit(X, y).model_) is ZeroMeanGP
-    model = ZeroMeanGP(X, y.reshape(-1, 1))
-    fit(model, "map", seed=0)
-    np.testing.assert_array_equal(regressor.predict(Z), model.predict(Z).mean[:, 0])
-
-
-def test_a_class_of_models_with_options(data):
-    X, y = data
-    options = {"constants": False, "train_Yvar": 0.05**2}
-    regressor = fast(model=partial(PhysicsMeanGP, **options)).fit(X, y)
-    model = PhysicsMeanGP(X, y.reshape(-1, 1), physics=BlackBoxPhysics(wave), **options)
-    fit(model, "map", seed=0)
-    np.testing.assert_array_equal(regressor.predict(Z), model.predict(Z).mean[:, 0])
-    assert options == {"constants": False, "train_Yvar": 0.05**2}
-
-
 def test_parameters_are_left_as_they_are(data):
     linear, model = torch.nn.Linear(1, 1).double(), partial(CKA, center=0.0)
     before = linear.weight.item()
-    regressor = fast(linear, model=model).fit(*data)
+    parameters = fast(linear, model=model).fit(*data).get_params()
     assert linear.weight.item() == before
-    parameters = regressor.get_params()
-    assert parameters["physics"] is linear
-    assert parameters["model"] is model
+    assert (parameters["physics"], parameters["model"]) == (linear, model)
 
 
 def test_unknown_parameters(data):
@@ -361,6 +332,10 @@ def test_known_variances_are_taken_apart_with_the_rows(data):
 def test_kinds_of_arrays(data):
     X, y = data
     expected = fast().fit(X, y).predict(Z)
+    for regressor in (fast(), pickle.loads(pickle.dumps(fast())), clone(fast())):
+        np.testing.assert_array_equal(regressor.fit(X, y.reshape(-1, 1)).predict(Z), expected)
+    backward = fast().fit(X[::-1], y[::-1])
+    np.testing.assert_allclose(backward.predict(Z[::-1]), backward.predict(Z)[::-1], rtol=1e-9)
     X.setflags(write=False)
     for made in (np.ndarray.tolist, np.float32, torch.tensor, np.asarray):
         found = fast().fit(made(X.copy() if made is torch.tensor else X), made(y)).predict(made(Z))
@@ -392,14 +367,6 @@ def test_a_pickle_of_what_was_fitted(data, physics, options, by):
     if by is cloudpickle:
         refused((pickle.PicklingError, AttributeError), "lambda", pickle.dumps, regressor)
         assert regressor.physics is physics
-
-
-def test_without_scikit_learn_it_says_what_is_missing(monkeypatch):
-    monkeypatch.delitem(sys.modules, "gpadjust.sklearn")
-    monkeypatch.setitem(sys.modules, "sklearn", None)
-    with pytest.raises(ImportError, match=r'pip install "gpadjust\[sklearn\]"') as error:
-        importlib.import_module("gpadjust.sklearn")
-    assert "\n" not in str(error.value)
 
 
 REFUSED = [
