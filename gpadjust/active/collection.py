@@ -67,12 +67,11 @@ class Collection(Measurements, Display):
     Sobol design; later ones maximise the acquisition function of a model of all data so far. Points
     without a result are pending: acquisition functions with ``X_pending`` consider them.
 
-    With a log, :meth:`tell` first writes each measurement to the disk, as a line of JSON, and
-    :meth:`ask` writes its points before it returns them. A new collection with the same log and the
-    same seed continues where the last one stopped, with the same next and pending points. One
-    collection at a time holds a log, until :meth:`close` (or the end of
-    ``with Collection(...) as collection:``), or until it is out of scope. Nothing in a log is
-    executed or unpickled.
+    A log has each measurement and each point that was asked for, as a line of JSON on the disk. A
+    new collection with the same log and the same seed continues where the last one stopped, with
+    the same next and pending points. One collection at a time holds a log, until :meth:`close` (or
+    the end of ``with Collection(...) as collection:``), or until it is out of scope. Nothing in a
+    log is executed or unpickled.
 
     Args:
         model_factory: A callable that makes a new model of ``X``, ``n x d``, and ``Y``, ``n x m``,
@@ -106,16 +105,13 @@ class Collection(Measurements, Display):
         >>> import torch
         >>> from gpadjust import CKA
         >>> from gpadjust.active import Collection, qAdjustmentInformationGain
-        >>> collection = Collection(
-        ...     partial(CKA, physics=torch.sin),
-        ...     bounds=[[0.0], [3.0]],
-        ...     acquisition=lambda model: qAdjustmentInformationGain(model, about="rho"),
-        ... )
+        >>> factory = partial(CKA, physics=torch.sin)
+        >>> collection = Collection(factory, [[0.0], [3.0]], qAdjustmentInformationGain)
         >>> for _ in range(5):
         ...     X = collection.ask()
         ...     collection.tell(X, 2 * torch.sin(X) + X)
-        >>> collection.X.shape, collection.model.num_outputs
-        (torch.Size([5, 1]), 1)
+        >>> collection.model.num_outputs
+        1
     """
 
     def __init__(
@@ -141,10 +137,9 @@ class Collection(Measurements, Display):
             if not callable(function):
                 raise TypeError(f"Expected {name} to be callable, got {function!r}.")
         if isinstance(acquisition, AcquisitionFunction):
-            kind = type(acquisition).__name__
             raise TypeError(
-                "Expected acquisition to be a function that makes an acquisition function of each "
-                f"new model, got one of a model; pass `lambda model: {kind}(model, ...)`."
+                "Expected acquisition to be a function of each new model, got one of a model; pass "
+                f"`lambda model: {type(acquisition).__name__}(model, ...)`."
             )
         checked_number("probability", probability, above=0, below=1)
         self.keep = None if keep is None else Keep(keep, probability)
@@ -172,7 +167,7 @@ class Collection(Measurements, Display):
         if keep is not None and self._options:
             raise ValueError(
                 f"Expected no optimizer_options with keep, got {sorted(self._options)}: keep takes "
-                "the best of random safe points, without optimize_acqf. Leave the options out."
+                "the best of random safe points. Leave the options out."
             )
         if num_outputs is not None:
             checked_whole("num_outputs", num_outputs, 1)
@@ -245,13 +240,7 @@ class Collection(Measurements, Display):
         return self._model
 
     def ask(self, q: int | None = None) -> Tensor:
-        """Choose the points to measure next.
-
-        Args:
-            q: Number of points. Default: ``batch_size``.
-
-        Returns:
-            The points, ``q x d``, which are pending from now on.
+        """Choose the points to measure next, ``q x d``, which are pending from now on.
 
         Raises:
             RuntimeError: If with ``keep`` fewer points are safe, or the first points have too few
@@ -288,8 +277,7 @@ class Collection(Measurements, Display):
                 these alone is a failed measurement.
 
         Raises:
-            TypeError: If the arguments are not numbers.
-            ValueError: If shapes disagree.
+            ValueError: If shapes disagree; a TypeError if there are no numbers.
             LogError: If they cannot be logged, and are then not in the collection.
         """
         X = checked_points("X", X, self.bounds.shape[-1])
@@ -320,22 +308,15 @@ class Collection(Measurements, Display):
 
         A measurement fails if the oracle raises an exception, which concerns the whole batch, or
         returns only NaN and infinity for a point. It is logged with its message, with a warning,
-        and counts against the budget; later points keep a hundredth of the bounds' widths away. If
-        some outputs are NaN, each output has its own measurements.
+        and counts against the budget; later points keep a hundredth of the bounds' widths away.
 
         Args:
             oracle: Maps points ``q x d`` to measured values ``q x m`` (or ``q``).
             budget: Number of all measurements, including failures and the log, but not ``data``.
             progress: If True, show a progress bar.
-            max_failures: Number of successive calls of the oracle without any result after which
-                to stop.
-
-        Returns:
-            This collection.
+            max_failures: Number of successive calls without any result after which to stop.
 
         Raises:
-            TypeError: If the oracle is not callable.
-            ValueError: If a number is out of range.
             LogError: If the log cannot be written.
             CollectionError: If the oracle fails too often, or its result cannot be measured values
                 or cannot be logged: the error has it as ``result``, and the points are still
@@ -480,27 +461,17 @@ def collect(
 ) -> Collection:
     """Measure at the most informative points, until the budget is spent.
 
-    This makes a :class:`Collection` with ``options``, calls :meth:`~Collection.run`, and closes
-    it, with their arguments, errors and warnings. With a log the same call continues after an
-    interruption, or with a larger budget.
-
-    Returns:
-        The collection, with all data in ``X`` and ``Y``, their ``model``, ``failed_X``, and
-        ``ask``, ``tell`` and ``run`` to continue.
+    This makes a :class:`Collection` with ``options``, calls :meth:`~Collection.run`, closes and
+    returns it, with their arguments, errors and warnings. With a log the same call continues after
+    an interruption, or with a larger budget.
 
     Example:
         >>> from functools import partial
         >>> import torch
         >>> from gpadjust import CKA
         >>> from gpadjust.active import collect, qAdjustmentInformationGain
-        >>> result = collect(
-        ...     partial(CKA, physics=torch.sin),
-        ...     oracle=lambda X: 2 * torch.sin(X) + X,
-        ...     bounds=[[0.0], [3.0]],
-        ...     acquisition=qAdjustmentInformationGain,
-        ...     budget=5,
-        ... )
-        >>> result.Y.shape
+        >>> problem = partial(CKA, physics=torch.sin), lambda X: 2 * X.sin() + X, [[0.0], [3.0]]
+        >>> collect(*problem, qAdjustmentInformationGain, budget=5).Y.shape
         torch.Size([5, 1])
     """
     with Collection(model_factory, bounds, acquisition, **options) as collection:

@@ -30,10 +30,9 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
         = \tfrac{1}{2} \log\det \mathrm{Cov}(y(X) \mid D)
         - \tfrac{1}{2} \log\det \mathrm{Cov}(y(X) \mid D, \rho).
 
-    Both have a closed form. The first is the covariance of the model. For the second, subtract the
-    known :math:`\rho f_p` from all observations. The remainder is :math:`\delta(x) + \varepsilon`,
-    and as rho and delta are independent a priori (Kennedy and O'Hagan 2000), this is a regression
-    on delta alone, at the same points with the same noise S,
+    Both have a closed form. The first is the covariance of the model. As rho and delta are
+    independent a priori (Kennedy and O'Hagan 2000), the second is that of a regression on delta
+    alone, at the same points with the same noise S,
 
     .. math::
         \mathrm{Cov}(y(X) \mid D, \rho) = k_\delta(X, X)
@@ -49,10 +48,8 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
     with known noise (``train_Yvar``), the average of the old ones.
 
     References:
-        Kennedy and O'Hagan, *Predicting the output from a complex computer code when fast
-        approximations are available*, Biometrika 87, 2000. Lindley, Annals of Mathematical
-        Statistics 27, 1956. MacKay, *Information-based objective functions for active data
-        selection*, Neural Computation 4, 1992. Houlsby et al., arXiv:1112.5745, 2011.
+        Kennedy and O'Hagan, Biometrika 87, 2000. Lindley, Annals of Mathematical Statistics 27,
+        1956. MacKay, Neural Computation 4, 1992. Houlsby et al., arXiv:1112.5745, 2011.
 
     Args:
         model: A :class:`~gpadjust.CKA`, or another model with a physics and with rho or delta.

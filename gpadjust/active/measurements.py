@@ -19,13 +19,11 @@ class Measurements:
 
     A record is one of
 
-    - ``{"asked": [x, ...], "left_out": [x, ...]}``: points to measure, and better ones that limits
-      exclude;
+    - ``{"asked": [x, ...], "left_out": [x, ...]}``: points to measure, and excluded better ones;
     - ``{"x": x, "y": y}``: a measurement, null for a missing output;
     - ``{"x": x, "failed": message}``: a failed measurement, with or without ``"y"``;
     - ``{"withdrawn": [x, ...]}``: pending points that will not be measured;
-    - ``{"refused": result, "of": [x, ...], "because": message}``: a result of an oracle that cannot
-      be measured values. It changes nothing; a human may recover it.
+    - ``{"refused": result, "of": [x, ...], "because": message}``: an invalid result of an oracle.
 
     A measurement belongs to the nearest pending point within a hundredth of the bounds' widths: a
     laboratory seldom sets inputs to the last digit.
@@ -35,8 +33,7 @@ class Measurements:
         Y: The measured values, ``n x m``; NaN for a missing output.
         failed_X: Points of failed measurements, ``k x d``.
         pending: Points without a result yet, ``l x d``.
-        left_out: Points with the best values of the acquisition function that limits excluded,
-            ``k x d``.
+        left_out: Better points that limits excluded, ``k x d``.
         num_measured: Number of measurements, including failures but not ``data``.
         num_outputs: Number ``m`` of outputs; None before the first measurement.
     """

@@ -27,14 +27,7 @@ def plot_collection(
         collection: The collection.
         optimum: The best value of each output, or of all. Further axes then have the regret, the
             distance of the closest measurement so far. Default: none.
-        axes: An axis for each input, output and regret. Default: a new figure.
-
-    Returns:
-        An array of the axes; ``axes[0].figure`` is the figure.
-
-    Raises:
-        ValueError: If the optimum is not finite or has another number of outputs, or the number of
-            ``axes`` is wrong.
+        axes: An axis for each input, output and regret, returned. Default: a new figure.
     """
     X, Y, pending = collection.X, collection.Y, collection.pending
     n, d, m = len(X), X.shape[-1], Y.shape[-1]

@@ -60,7 +60,7 @@ def best_points(
         points, _ = optimize_acqf(acquisition, bounds, q=q, **{**defaults, **options})
         points = points.detach()
         for i in range(q):
-            if _near(points[i : i + 1], avoided, bounds).any():
+            if (distances(points[i : i + 1], avoided, bounds) < NEAR).any():
                 points[i] = _elsewhere(acquisition, points, i, avoided, bounds)
     return points
 
@@ -82,18 +82,13 @@ def taken_as_pending(acquisition: AcquisitionFunction, points: Tensor) -> Iterat
             acquisition.set_X_pending(before)
 
 
-def _near(points: Tensor, others: Tensor, bounds: Tensor) -> Tensor:
-    """Return a mask of points ``n x d`` near one of the others, ``n``."""
-    return (distances(points, others, bounds) < NEAR).any(-1)
-
-
 def _elsewhere(
     acquisition: AcquisitionFunction, points: Tensor, i: int, avoided: Tensor, bounds: Tensor
 ) -> Tensor:
     """Return the best place for the i-th point among random ones away from others."""
     seed = int(torch.randint(2**31, (1,)))
     places = draw_sobol_samples(bounds, n=_OTHERS, q=1, seed=seed).squeeze(-2)
-    places = places[~_near(places, avoided, bounds)]
+    places = places[(distances(places, avoided, bounds) >= NEAR).all(-1)]
     if not len(places):
         return points[i]
     if isinstance(acquisition, OneShotAcquisitionFunction):

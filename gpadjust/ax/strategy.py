@@ -22,8 +22,7 @@ from gpadjust.core import CKA, GP, ZeroMeanGP
 from gpadjust.kinds.factory import map_parts
 
 TRANSFORMS: list[type[Transform]] = [*MBM_X_trans, Derelativize, StandardizeY, TellPhysics]
-"""Ax's transforms of parameters; for metrics only shift and scale, as others (``Winsorize``,
-``BilogY``) would distort the outputs of f_p; and ``TellPhysics``."""
+"""Ax's transforms of parameters; of metrics shift and scale alone; and ``TellPhysics``."""
 
 
 def generator_kwargs(
@@ -32,7 +31,7 @@ def generator_kwargs(
     model: type[GP] | partial[GP] = CKA,
     fit_options: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Return arguments of Ax's ``BOTORCH_MODULAR`` generator, for your own ``GeneratorSpec``.
+    """Return ``surrogate_spec`` and ``transforms`` of Ax's ``BOTORCH_MODULAR`` generator.
 
     Args:
         physics: The physics of metrics by the metrics' names, see :class:`ParameterPhysics`;
@@ -42,9 +41,6 @@ def generator_kwargs(
             :class:`~gpadjust.ZeroMeanGP`.
         fit_options: Arguments of :func:`gpadjust.fit`, such as ``{"method": "map"}``, for all
             metrics.
-
-    Returns:
-        ``surrogate_spec`` and ``transforms``.
 
     Raises:
         TypeError: If ``physics`` is not a mapping of metrics to physics, or ``model`` is not such a
@@ -119,15 +115,12 @@ def generation_strategy(
 
 def _class_of(model: Any) -> tuple[type[GP], dict[str, Any]]:
     """Return the class of a model factory and its further arguments."""
+    factory = partial(model) if callable(model) else partial(CKA, model)
+    structure: Any = factory.func
     # Ax makes a model by a class and keyword arguments.
-    options: dict[str, Any] = {}
-    factory = model
-    if isinstance(model, partial) and not model.args:
-        factory = model.func
-        options = dict(model.keywords)
-    if not isinstance(factory, type) or not issubclass(factory, GP):
+    if factory.args or not isinstance(structure, type) or not issubclass(structure, GP):
         raise TypeError(
             "Expected model as a class of models, such as CKA, or functools.partial of one with "
             f"keyword arguments, as Ax needs a class, got {model!r}."
         )
-    return factory, options
+    return structure, dict(factory.keywords)

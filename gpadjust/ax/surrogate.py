@@ -62,8 +62,7 @@ def model_inputs(
     if special:
         raise ValueError(
             f"{name} has no kernel for {' and '.join(special)} parameters. Leave categories to "
-            "OneHot (transforms=gpadjust.ax.TRANSFORMS), and give each task or fidelity a model of "
-            "its own."
+            "OneHot (transforms=gpadjust.ax.TRANSFORMS); give each task or fidelity its own model."
         )
 
     def check_units(part: Any) -> None:

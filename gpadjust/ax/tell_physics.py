@@ -28,9 +28,8 @@ class TellPhysics(Transform):
     of the search space, and its outputs, in the units of its metric, pass the same transforms as
     the data of the metric.
 
-    Raises:
-        ValueError: If this is not the last transform; if a transform is not supported; or if a
-            physics belongs to several metrics, or to none of the experiment.
+    A ValueError is raised if this is not the last transform, if a transform is not supported, or
+    if a physics belongs to several metrics, or to none of the experiment.
     """
 
     no_op_for_experiment_data = True
@@ -59,8 +58,8 @@ class TellPhysics(Transform):
         original = adapter.transforms["Cast"].search_space  # Cast is the first transform
         if original.is_hierarchical:
             raise ValueError(
-                "A physics needs a search space without a hierarchy, found a hierarchical one; "
-                "make one of parameters that are always there."
+                "A physics needs a search space of parameters that are always there, found a "
+                "hierarchical one."
             )
         # Plain values of the parameters before all transforms.
         parameters = original.parameters.values()

@@ -41,10 +41,9 @@ _NEAR = 1e-6  # distance from an integer that is rounding
 class Units:
     """Conversions from a model's inputs in Ax to the search space, and of metrics to the model.
 
-    They are differentiable except for coded choices, and contain plain values, not Ax's objects, so
-    that models can be copied and pickled. A physics gets values within the ranges, as BoTorch also
-    evaluates models around the data; whole numbers, as after scaling 8 may be 7.999999999999999;
-    and the nearest of the choices. A transform that is not supported is a ValueError.
+    They are differentiable except for coded choices, and contain plain values, so that models can
+    be pickled. A physics gets values within the ranges, as BoTorch also evaluates models around
+    the data; whole numbers, as 8 may be 7.999999999999999; and the nearest of the choices.
     """
 
     def __init__(

@@ -25,12 +25,9 @@ _MOST = 1 / 3  # largest share of outliers
 
 
 class RowNoise(Noise):
-    """A noise with corrections for single training rows, found by rough fits.
+    """A noise with corrections of variances and means of training rows, by rough fits.
 
-    Args:
-        base: The noise of new observations. Default: one unknown variance for each output.
-        added: Corrections of the variances of the training targets, ``m x n``, in units.
-        moved: Corrections of their means.
+    The base is the noise of new observations; corrections are ``m x n``, in units.
     """
 
     of_targets = ("added", "moved")
@@ -96,10 +93,6 @@ class RowNoise(Noise):
         """Return the variances of the base, corrected at training rows."""
         variance = self.base.variance(values, places, is_training)
         return variance + self.added if is_training else variance
-
-    def pull_back(self, values: Values, places: Places, by: Tensor) -> Values:
-        """Return the derivatives by the numbers of the base."""
-        return self.base.pull_back(values, places, by)
 
     def of_terms(self, terms: TermSum) -> Self:
         """Return the noise for a model of these terms."""

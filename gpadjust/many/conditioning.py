@@ -159,10 +159,11 @@ class LaterConditioning(Conditioning):
 
     def left_out(self) -> tuple[Tensor, Tensor]:
         """Raise an error: the formula does not cover the rows of the fit."""
-        raise NotImplementedError(
-            "Left-out predictions need a model without observations since its fit; found "
-            f"{self.targets.shape[-1]}. Build a model of all data and fit it."
+        number = self.targets.shape[-1]
+        message = (
+            f"Expected no observations since the fit for left-out predictions; found {number}."
         )
+        raise NotImplementedError(f"{message} Build a model of all data and fit it.")
 
 
 def joined(old: WeightedSum, late: WeightedSum) -> WeightedSum:

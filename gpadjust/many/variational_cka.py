@@ -81,8 +81,7 @@ class VariationalCKA(CKA):
         )  # fmt: skip
         if type(self.noise).learnt is not Noise.learnt:
             raise ValueError(
-                f"Expected a noise that needs no rough fits; found {self.noise}. CKA takes it, for "
-                "up to some thousand rows."
+                f"Expected a noise that needs no rough fits; found {self.noise}. CKA takes it."
             )
         # A saved model is built again by this class, which adds choices and the rest.
         del self.settings["nested"]
@@ -139,10 +138,8 @@ class VariationalCKA(CKA):
 
     def as_single_task_gp(self, draw: int | None = None) -> NoReturn:
         """Raise an error: a ``SingleTaskGP`` is exact."""
-        raise NotImplementedError(
-            "Expected an exact model; take a model of some rows, "
-            "model.subset_rows(torch.arange(500)).as_single_task_gp()."
-        )
+        way_out = "model.subset_rows(torch.arange(500)).as_single_task_gp()"
+        raise NotImplementedError(f"Expected an exact model; take one of some rows, {way_out}.")
 
     def fit_itself(self, method: str, num_draws: int | None, seed: int) -> FitResult | None:
         """Find the most likely numbers; after an error the model is as before."""
@@ -150,8 +147,8 @@ class VariationalCKA(CKA):
             return None
         if num_draws is not None:
             raise ValueError(
-                f"Expected num_draws=None, as so many rows determine the numbers of a "
-                f"VariationalCKA; found {num_draws}. CKA draws them, for up to some thousand rows."
+                "Expected num_draws=None, as so many rows determine the numbers of a "
+                f"VariationalCKA; found {num_draws}. CKA draws them."
             )
         order = self._order(seed)
         work = self.subset_draws(torch.zeros(1, dtype=torch.long))

@@ -90,8 +90,6 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         >>> mean, std = regressor.predict([[0.33]], return_std=True)
         >>> mean.round(2)
         array([2.16])
-        >>> std.shape
-        (1,)
     """
 
     model_: Any
@@ -220,7 +218,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         random_state: int | np.random.RandomState | None = 0,
         observation_noise: bool = False,
     ) -> Array:
-        """Draw functions from the posterior, jointly at all points.
+        """Draw functions from the posterior, jointly at all points; errors as of :meth:`predict`.
 
         Args:
             X: Inputs, ``q x d``.
@@ -230,10 +228,6 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         Returns:
             ``q x n_samples`` or, for several outputs, ``q x m x n_samples``.
-
-        Raises:
-            NotFittedError: If the regressor was not fitted.
-            ValueError: If ``n_samples`` is not positive; and as :meth:`predict`.
         """
         checked_whole("n_samples", n_samples, 1)
         inputs = self._inputs(X)
