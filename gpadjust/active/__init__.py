@@ -7,7 +7,6 @@ from gpadjust.active.measurement_log import LogError
 __all__ = [
     "Collection",
     "CollectionError",
-    "LogError",
     "MeasurementWarning",
     "collect",
     "qAdjustmentInformationGain",
