@@ -156,8 +156,9 @@ class Kalman(Updated):
         return new
 
     def _updated(self, more: GP, f: WeightedSum, noise: Tensor, targets: Tensor) -> GP:
+        model = self.model  # before the weights are others
         self.weights = self.weights.updated(f, noise, targets - f.mean, self.forget)
-        return self.model.with_conditioning(self.weights)
+        return model.with_conditioning(self.weights)
 
 
 class Weights:
