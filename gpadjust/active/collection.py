@@ -208,7 +208,9 @@ class Collection(Measurements, Display):
 
     def _repr_html_(self) -> str:
         """Return the lowest and the highest measurement of each output, and the last one."""
-        rows = {"last": len(self.X) - 1} if len(self.X) else {}
+        rows: dict[str, int] = {}
+        if len(self.X):
+            rows["last"] = len(self.X) - 1
         for j, values in enumerate(self.Y.mT):
             if not values.isnan().all():
                 rows[f"lowest y{j + 1}"] = int(values.nan_to_num(nan=torch.inf).argmin())
@@ -249,7 +251,9 @@ class Collection(Measurements, Display):
             ValueError: If it takes single points, and ``q`` is larger.
             LogError: If the points cannot be logged; then they are not pending.
         """
-        q = checked_whole("q", self.batch_size if q is None else q, 1)
+        if q is None:
+            q = self.batch_size
+        checked_whole("q", q, 1)
         record: Record = {}
         points = self._design(q)
         if points is None:
@@ -293,7 +297,8 @@ class Collection(Measurements, Display):
 
     def withdraw(self, X: Tensor | None = None) -> None:
         """Withdraw some or all pending points, ``n x d``; :meth:`ask` may return them again."""
-        X = self.pending if X is None else X
+        if X is None:
+            X = self.pending
         self._enter([{"withdrawn": checked_points("X", X, self.bounds.shape[-1]).tolist()}])
 
     def run(
@@ -338,7 +343,9 @@ class Collection(Measurements, Display):
                 # Single failures are skipped; many in a row are a broken oracle.
                 bar.update(len(X))
                 bar.set_postfix(failed=len(self.failed_X))
-                failures = 0 if len(self.X) > num_before else failures + 1
+                failures += 1
+                if len(self.X) > num_before:
+                    failures = 0
                 if failures >= max_failures:
                     message = (
                         f"The oracle failed {failures} times in a row, the last time at "

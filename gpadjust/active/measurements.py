@@ -109,7 +109,9 @@ class Measurements:
 
     def _points(self, rows: list[list[float]]) -> Tensor:
         """Return the points of a record, ``n x d``."""
-        return checked_points("X", rows, self.X.shape[-1]) if rows else self.X[:0]
+        if not rows:
+            return self.X[:0]
+        return checked_points("X", rows, self.X.shape[-1])
 
 
 def refusal(X: Tensor, result: Any, error: Exception) -> Record:
@@ -138,7 +140,9 @@ def measurement(x: list[float], y: list[float]) -> Record:
 def checked_outcomes(Y: Any, num_points: int, num_outputs: int | None) -> Tensor:
     """Return values ``n x m`` or ``n``, or a number, as ``n x m``; they may be NaN or infinite."""
     Y = checked_tensor("measured values", Y)
-    columns = Y.reshape(-1, 1) if Y.dim() < 2 else Y
+    columns = Y
+    if Y.dim() < 2:  # one output
+        columns = Y.reshape(-1, 1)
     fits = columns.dim() == 2 and len(columns) == num_points and columns.shape[-1] > 0
     if not fits or num_outputs not in (None, columns.shape[-1]):
         raise ValueError(
@@ -150,7 +154,8 @@ def checked_outcomes(Y: Any, num_points: int, num_outputs: int | None) -> Tensor
 
 def as_options(options: Any) -> dict[str, Any]:
     """Return options of ``optimize_acqf``; raise a ValueError if the collection sets one."""
-    options = {} if options is None else options
+    if options is None:
+        return {}
     if not isinstance(options, dict):
         raise TypeError(f"Expected optimizer_options to be a dictionary, got {options!r}.")
     twice = {"acq_function", "bounds", "q", "return_best_only", "return_full_tree"} & set(options)

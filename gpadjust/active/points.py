@@ -56,7 +56,9 @@ def best_points(
     others = torch.cat([pending, failed])
     with taken_as_pending(acquisition, others) as has_pending:
         # A function without X_pending would return pending points again.
-        avoided = failed if has_pending else others
+        avoided = others
+        if has_pending:
+            avoided = failed
         points, _ = optimize_acqf(acquisition, bounds, q=q, **{**defaults, **options})
         points = points.detach()
         for i in range(q):

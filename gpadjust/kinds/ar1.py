@@ -159,11 +159,15 @@ class AtLevels(Kernel):
 
     def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
         """Return the covariances of inputs with others, or with themselves."""
-        inner = None if other is None else other[..., :-1]
-        k = self.kernel.covariance(own, x[..., :-1], inner) + own["constant"].unsqueeze(-1)
+        right = self.basis(own, x)
+        left = right.unsqueeze(-1)
+        inner = None
+        if other is not None:
+            right = self.basis(own, other)
+            inner = other[..., :-1]
+        k = self.kernel.covariance(own, x[..., :-1], inner)
         # b(l) (k + kappa) b(l')
-        left = self.basis(own, x).unsqueeze(-1)
-        return left * k * self.basis(own, x if other is None else other).unsqueeze(-2)
+        return left * (k + own["constant"].unsqueeze(-1)) * right.unsqueeze(-2)
 
     def with_pull_back(self, own: Values, x: Tensor) -> tuple[Tensor, PullBack]:
         """Return the covariance, and the function of its derivatives by the parameters."""

@@ -144,7 +144,9 @@ class Categories(InputTransform):
 
     def _unknown(self, i: int, value: str | float) -> ValueError:
         """Return the error of an unknown level."""
-        levels = self.levels[i] if isinstance(value, str) else numbers_of(self.levels[i])
+        levels: Sequence[str | float] = self.levels[i]
+        if not isinstance(value, str):
+            levels = numbers_of(levels)
         return ValueError(
             f"Expected {self.names[i]} to be one of {', '.join(map(str, levels))}; found {value}. "
             "List a new level when the model is built, levels={column: levels}, or take the column "
@@ -238,7 +240,8 @@ class Offset(Kernel):
 
     def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
         """Return s where values are the same."""
-        other = x if other is None else other
+        if other is None:
+            other = x
         same = x[..., self.column].unsqueeze(-1) == other[..., self.column].unsqueeze(-2)
         return own["outputscale"].unsqueeze(-1) * same
 
@@ -261,9 +264,10 @@ class Offset(Kernel):
 def levels_of_texts(frame: Any, asked: Sequence[int]) -> Levels:
     """Return the sorted levels of the columns of a frame that are texts or categories."""
     levels: Levels = {}
-    arrays = frame.to_numpy().T if hasattr(frame, "columns") else ()
-    dtypes = [*getattr(frame, "dtypes", ())] or [None] * len(arrays)
-    for i, column in enumerate(arrays):
+    if not hasattr(frame, "columns"):
+        return levels
+    dtypes = [*getattr(frame, "dtypes", ())] or [None] * len(frame.columns)
+    for i, column in enumerate(frame.to_numpy().T):
         categories = getattr(dtypes[i], "categories", None)
         texts = {value for value in column if isinstance(value, str)}
         has_number = any(map(_NUMBER.fullmatch, texts))

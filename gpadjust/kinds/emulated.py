@@ -208,9 +208,11 @@ def _fitted(
 ) -> GP:
     """Return the fitted model of the runs, by default the better of two kernels."""
     kernels = [Stationary(profile) for profile in (RBF, MATERN52)]
-    default = [partial(ZeroMeanGP, covar_module=kernel) for kernel in kernels]
+    factories: list[Any] = [partial(ZeroMeanGP, covar_module=kernel) for kernel in kernels]
+    if model_factory:
+        factories = [model_factory]
     fitted = []
-    for factory in [model_factory] if model_factory else default:
+    for factory in factories:
         emulator = factory(runs_X, runs_Y)
         check_kind("model_factory's model", emulator, GP, "a GP")
         if type(emulator).on_gaussian_scale is not GP.on_gaussian_scale:

@@ -35,7 +35,8 @@ class RowNoise(Noise):
     def __init__(
         self, base: Noise | None = None, added: Tensor | float = 0.0, moved: Tensor | float = 0.0
     ) -> None:
-        base = Noise() if base is None else base
+        if base is None:
+            base = Noise()
         if not isinstance(base, Noise):
             raise TypeError(
                 f"Expected base as a noise, such as RelativeNoise(); found {base!r}. Known "

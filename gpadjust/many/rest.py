@@ -67,8 +67,8 @@ def rest_of(
             leaf = u.detach().requires_grad_()
             with torch.set_grad_enabled(with_gradient):
                 values = table.values(leaf)
-                own = {n.removeprefix(_START): v for n, v in values.items() if _START in n}
-                K = has_rest * kernel.covariance(own, groups)
+                numbers = {n.removeprefix(_START): v for n, v in values.items() if _START in n}
+                K = has_rest * kernel.covariance(numbers, groups)
                 variance = of_groups(noise(values)).expand(K.shape[:-1])
             residuals = residual.expand(K.shape[:-1])
             result = log_likelihood(residuals, K, variance, observed, with_gradient)

@@ -306,7 +306,8 @@ def _in_numbers(X: Any, transform: Any) -> Any:
 
 def _checked(options: Any) -> dict[str, Any]:
     """Return a copy of the options of a model; raise a TypeError for anything else."""
-    options = {} if options is None else options
+    if options is None:
+        return {}
     if not isinstance(options, dict) or options.keys() & {"train_X", "train_Y", "physics"}:
         raise TypeError(
             "Expected model_options as a dictionary of arguments that models share, such as "
