@@ -140,8 +140,10 @@ WRAPPERS = {
     "StackedGP": lambda p: StackedGP(
         {"a": drawn(MODELS["CKA"](p)), "b": drawn(MODELS["ZeroMeanGP"](p))}, [0.5, 0.5], 4
     ),
+    "StackedGP, log": lambda p: StackedGP({"a": drawn(MODELS["log"](p))}, [1.0], 4),
 }
 ALL = {**MODELS, **WRAPPERS}
+WITHOUT_SLOPE = {"Categories", "batches"}  # of x, where a level changes
 
 
 @cache
@@ -243,6 +245,14 @@ def test_the_gradient_is_that_of_the_likelihood(name):
         expected = expected.unsqueeze(1)
     rtol = 1e-3 if name == "batches" else 1e-4  # without noise differences are rounded
     torch.testing.assert_close(gradient, expected, rtol=rtol, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", sorted({*ALL} - WITHOUT_SLOPE))
+def test_slopes_of_predictions_are_those_of_differences(name, gradient_is_right):
+    model, _ = made(name)
+    gradient_is_right(lambda X: model.posterior(X).mean.sum(), Z[1:4])
+    if "log" not in name:  # quantiles are rounded: tests/kinds/test_links.py
+        gradient_is_right(lambda X: model.posterior(X).variance.log().sum(), Z[1:4])
 
 
 @each_model

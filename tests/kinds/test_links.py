@@ -263,18 +263,6 @@ def test_unknown_parameters_and_missing_observations():
     refused(PhysicsError, r"(?s)returned -.*row 1: \[-1.0", model.predict, outside)
 
 
-def test_outputs_have_locations_of_their_own():
-    both = torch.cat([Y, 1e-12 * Y.flip(0)], -1)
-    physics = FunctionPhysics(lambda X: torch.cat([decades(X), 1e-10 / decades(X)], -1))
-    model = drawn(LinkedCKA(X, both, physics=physics))
-    for j in (0, 1):
-        part = model.subset_output([j])
-        close(part.predict(NEW).mean, model.predict(NEW).mean[:, [j]])
-        close(model.posterior(NEW, [j]).mean, model.predict(NEW).mean[:, [j]])
-    total = ScalarizedPosteriorTransform(torch.ones(2).double())
-    refused(TypeError, "subset_output", model.posterior, NEW, posterior_transform=total)
-
-
 def test_botorch_takes_it(model):
     Z, best = X[::3].unsqueeze(1), Y.max()
     sampler = SobolQMCNormalSampler(torch.Size([32]), seed=0)
@@ -309,15 +297,11 @@ def test_mixtures_of_linked_models():
     probability = sum(w * m.marginals(NEW).probability(levels[1])
                       for w, m in zip([0.25, 0.75], models.values(), strict=True))  # fmt: skip
     close(probability, torch.full((3, 1), 0.5).double())
-    functions = stacked.sample_functions(200, seed=0, num_features=128)(NEW[:2])
-    torch.testing.assert_close(functions.median(0).values, levels[1][:2], rtol=0.1, atol=0.0)
     density = [m.left_out().log_density(Y).sum() for m in models.values()]
     chosen = StackedGP.by_left_out(models, 16).weights
     assert max(chosen, key=chosen.get) == ("mean" if density[0] > density[1] else "none")
     several = ModelListGP(stacked, SingleTaskGP(X, SHARES))
     close(several.posterior(NEW).mean[:, :1], levels[1])
-    later = stacked.condition_on_observations(NEW, decades(NEW))
-    assert (later.components(NEW)[1].mean(0) < stacked.components(NEW)[1].mean(0)).all()
     unlike = {"one": models["none"], "other": ZeroMeanGP(X, Y)}
     refused(ValueError, r"one scale of y; found log\(y\).*, y", StackedGP, unlike, [0.5, 0.5])
 
@@ -352,6 +336,7 @@ def physics_mean(train_Y=Y, physics=decades, **options):
 
 
 SHARE = r"above 0 and below 1 for the link log\(y / \(1 - y\)\)"
+TOTAL = ScalarizedPosteriorTransform(torch.ones(1).double())
 REFUSED = [
     (lambda: physics_mean(Y - 10), ValueError, "targets above 0.*found .* the first row 0"),
     (lambda: physics_mean(link="logit"), ValueError, SHARE),
@@ -379,6 +364,7 @@ REFUSED = [
         "not negative or NaN",
     ),
     (lambda: physics_mean().as_single_task_gp(), TypeError, r"Gaussian in log\(y\)"),
+    (lambda: physics_mean().posterior(NEW, posterior_transform=TOTAL), TypeError, "subset_output"),
     (lambda: linked(torch.nn.Linear), TypeError, "structure"),
 ]
 
