@@ -39,12 +39,10 @@ def generator_kwargs(
         model: The model of these metrics: a class, or ``functools.partial`` of one with further
             arguments, whose units are those after Ax's transforms. The other metrics have a
             :class:`~gpadjust.ZeroMeanGP`.
-        fit_options: Arguments of :func:`gpadjust.fit`, such as ``{"method": "map"}``, for all
-            metrics.
+        fit_options: Arguments of :func:`gpadjust.fit`, such as ``{"method": "map"}``.
 
     Raises:
-        TypeError: If ``physics`` is not a mapping of metrics to physics, or ``model`` is not such a
-            class.
+        TypeError: If ``physics`` is not a mapping, or ``model`` is not such a class.
     """
     if not isinstance(physics, Mapping) or not physics:
         message = "Expected the physics of at least one metric by its name, {'cost': f_p}, found "
@@ -62,7 +60,6 @@ def generator_kwargs(
         for metric, part in physics.items()
     }
     other = ModelConfig(botorch_model_class=ZeroMeanGP, name="ZeroMeanGP", mll_options=mll_options)
-    # Ax takes the model of a metric, or the general one.
     spec = SurrogateSpec(
         model_configs=[other],
         metric_to_model_configs={metric: [config] for metric, config in configs.items()},

@@ -89,8 +89,7 @@ def as_dict(physics: ParameterPhysics) -> dict[str, Any]:
     """Return a physics in Ax's format, or raise a JSONEncodeError if it has no import path."""
     if physics.path is None:
         raise JSONEncodeError(
-            f"Ax cannot save the physics {physics.name!r}: found a lambda, or a function or object "
-            "inside of another; expected a name in a module. Write `def f_p(...)`, or "
-            "`f_p = BlackBoxPhysics(...)`, in a file that can be imported."
+            f"Ax cannot save the physics {physics.name!r}: expected a name in a module, no lambda. "
+            "Write `def f_p(...)`, or `f_p = BlackBoxPhysics(...)`, in a file to import."
         )
     return {"__type": ParameterPhysics.__name__, "physics": physics.path}
