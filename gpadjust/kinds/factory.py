@@ -39,7 +39,8 @@ def with_options(factory: ModelFactory, options: Mapping[str, Any]) -> ModelFact
         return factory
     make: Any = base.func
     if "link" in further:
-        if not isinstance(make, type) or not issubclass(make, GP):
+        is_structure = isinstance(make, type) and issubclass(make, GP)
+        if not is_structure:
             raise TypeError(
                 "Expected a structure such as CKA, or functools.partial of one, for a link; found "
                 f"{factory!r}. Use the link in the function: LinkedCKA(X, Y, link=...)."
