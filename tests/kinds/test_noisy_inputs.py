@@ -85,7 +85,7 @@ def test_it_is_nearer_than_what_ignores_it():
 @pytest.mark.slow
 def test_an_unknown_parameter_is_nearer_to_the_truth():
     true = uniform(200, 1)
-    X, Y = true + 0.1 * normal(200, 1), 2 * (true - 0.5) + 0.02 * normal(200, 1, seed=1)
+    X, Y = true + 0.1 * normal(200, 1, seed=1), 2 * (true - 0.5) + 0.02 * normal(200, 1, seed=2)
     law = FunctionPhysics(lambda X, p: p.a * (X[:, 0] - 0.5), unknowns={"a": Unknown(1.0, sd=2.0)})
     models = (
         CalibratedPhysics(X, Y, physics=law),
