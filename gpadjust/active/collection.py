@@ -260,13 +260,10 @@ class Collection(Measurements, Display):
             # A seed by the number of calls: a resumed collection returns the same points.
             with seeded((1_000_003 * self.seed + self._num_asks) % 2**63):
                 function = self._acquisition_function(q)
-                others = self.pending, self.failed_X
                 if self.keep is None:
-                    points = best_points(function, self.bounds, q, *others, self._options)
+                    points = best_points(function, self, q, self._options)
                 else:
-                    points, left_out = self.keep.best_points(
-                        function, self.model, self.bounds, q, self.X, *others
-                    )
+                    points, left_out = self.keep.best_points(function, self, q)
                     record = {"left_out": left_out.tolist()}
         self._enter([{"asked": points.tolist(), **record}])
         return points

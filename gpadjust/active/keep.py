@@ -38,24 +38,19 @@ class Keep:
         return torch.cat(shares)
 
     def best_points(
-        self,
-        acquisition: AcquisitionFunction,
-        model: Any,
-        bounds: Tensor,
-        q: int,
-        measured: Tensor,
-        pending: Tensor,
-        failed: Tensor,
+        self, acquisition: AcquisitionFunction, collection: Any, q: int
     ) -> tuple[Tensor, Tensor]:
         """Return the best of random points that are safe by the model (Sui et al. 2015), ``q x d``.
 
         And the unsafe points with higher values of the acquisition function, ``l x d``, at most one
         for each. Raise a RuntimeError if fewer points are safe and apart.
         """
+        bounds = collection.bounds
+        avoided = torch.cat([collection.pending, collection.failed_X])
         # Candidates away from failed and pending points, with their probability by the model.
-        points = _candidates(bounds, torch.cat([measured, pending]))
-        points = points[(distances(points, torch.cat([failed, pending]), bounds) >= NEAR).all(-1)]
-        is_safe = self.probabilities(model, points) >= self.probability
+        points = _candidates(bounds, torch.cat([collection.X, collection.pending]))
+        points = points[(distances(points, avoided, bounds) >= NEAR).all(-1)]
+        is_safe = self.probabilities(collection.model, points) >= self.probability
         num_points = len(points)
         num_safe = int(is_safe.sum())
         best_points: list[Tensor] = []
@@ -68,7 +63,7 @@ class Keep:
                     f"of the bounds' widths; expected {q}. Add measurements at points that you "
                     "know as safe, closer to each other, or lower the probability."
                 )
-            others = torch.cat([pending, failed, *best_points])
+            others = torch.cat([avoided, *best_points])
             # A function without X_pending takes single points, which are apart from others here.
             with taken_as_pending(acquisition, others), torch.no_grad():
                 values = torch.cat([acquisition(z.unsqueeze(-2)) for z in points.split(_AT_ONCE)])

@@ -40,12 +40,7 @@ def distances(points: Tensor, others: Tensor, bounds: Tensor) -> Tensor:
 
 
 def best_points(
-    acquisition: AcquisitionFunction,
-    bounds: Tensor,
-    q: int,
-    pending: Tensor,
-    failed: Tensor,
-    options: dict[str, Any],
+    acquisition: AcquisitionFunction, collection: Any, q: int, options: dict[str, Any]
 ) -> Tensor:
     """Return points of a maximum of an acquisition function, ``q x d``, by ``optimize_acqf``.
 
@@ -53,7 +48,8 @@ def best_points(
     """
     # A line search that rounding errors end has converged: a second try is not needed.
     defaults = {"num_restarts": 8, "raw_samples": 128, "retry_on_optimization_warning": False}
-    others = torch.cat([pending, failed])
+    bounds, failed = collection.bounds, collection.failed_X
+    others = torch.cat([collection.pending, failed])
     with taken_as_pending(acquisition, others) as has_pending:
         # A function without X_pending would return pending points again.
         avoided = others
