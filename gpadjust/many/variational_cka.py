@@ -182,7 +182,7 @@ class VariationalCKA(CKA):
         """Return row numbers ``m x M``, the pivots of the Cholesky factor of the first rows."""
         first = slice(_CANDIDATES * M)
         values = self.table.values(u)
-        total = split_off(self.at(self.data.X, values), _REST, False).of_rows(first)
+        total = split_off(self.evaluate(self.data.X, values), _REST, False).of_rows(first)
         variance = total.variance()[0]
         is_observed = ~self.data.Y[first].isnan().mT
         m, n = is_observed.shape

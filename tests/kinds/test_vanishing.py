@@ -45,7 +45,7 @@ def test_the_covariance_is_that_of_a_process_that_was_seen_to_be_zero(where):
 
     inverse = torch.linalg.pinv(k(places, places)[0], rtol=1e-12)
     expected = k(X, Z)[0] - k(X, places)[0] @ inverse @ k(places, Z)[0]
-    x, z = model.at(X), model.at(Z)
+    x, z = model.evaluate(X), model.evaluate(Z)
     same(x.cross(z)[0, 0], expected, 1e-6)
     assert k(X, Z)[0].sub(expected).abs().max() > 1e-3
     same(x.variance(), x.cross(x).diagonal(dim1=-1, dim2=-2))
@@ -60,7 +60,7 @@ def test_gradients_and_features(kernel):
     u = model.u.detach()
     numeric = slopes(lambda u: model.log_likelihood(u, False)[0], u)
     torch.testing.assert_close(model.log_likelihood(u)[1], numeric, rtol=1e-5, atol=1e-5)
-    own = model.at(X).own(model.terms[1])
+    own = model.evaluate(X).own(model.terms[1])
     phi = model.terms[1].kernel.features(own, 20000, torch.Generator().manual_seed(0))
     phi = phi(X[None, None])
     expected = model.terms[1].kernel.covariance(own, X[None, None])

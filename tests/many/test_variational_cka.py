@@ -196,7 +196,7 @@ def test_inducing_points_are_pivots():
     assert points.shape == (2, 8)
     assert all(len(set(each.tolist())) == 8 for each in points)
     assert not Y[points[1], 1].isnan().any()
-    f = model.at(X)
+    f = model.evaluate(X)
     f.weights.pop("rest")
     K = f.cross(f)[0, 0].detach()
 
