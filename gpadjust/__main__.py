@@ -132,7 +132,7 @@ def parser() -> ArgumentParser:
         add_to = commands.add_parser(command, **texts, formatter_class=RawDescriptionHelpFormatter)
         is_log = command == "identify"
         ends = add_to if is_log else add_to.add_mutually_exclusive_group()
-        kinds |= {"--out": {"default": f"{command}.html"}, "data": {"nargs": "+"} if is_log else {}}
+        kinds |= {"--out": {"default": f"{command}.html"}, "data": {"nargs": "+" if is_log else 1}}
         options = (_OPTIONS_OF_LOGS if is_log else _OPTIONS) + _OPTIONS_OF_BOTH
         for paragraph in re.split(r"\n(?! )", options.strip()):
             option, _, text = paragraph.partition(": ")

@@ -20,8 +20,8 @@ from gpadjust.physics import PhysicsError, PhysicsParameters
 from gpadjust.words import listed, number
 
 P = ParamSpec("P")
-_VOID = ("img", "meta")
-_SHOWN = 3
+_VOID = ("img", "meta")  # elements without an end
+_SHOWN = 3  # inputs at which a physics fails
 _WIDTH = 3.6  # inches: as wide as a column of the page, so that text has its size
 _STYLE: dict[str, Any] = {
     **dict.fromkeys(("font.size", "axes.labelsize", "axes.titlesize"), 9.5),
@@ -36,8 +36,8 @@ _NEEDLESS = re.compile(
     flags=re.DOTALL,
 )
 _OF_FONTS = "Glyph .* missing|Matplotlib currently does not support"  # names in any script
-_PATH = re.compile(r"\b(?:d|x|y)='[^']*'")
-_SPACE = re.compile(r"\s*\n?([MLQCz])\s*")
+_PATH = re.compile(r"\b(?:d|x|y)='[^']*'")  # attributes with coordinates
+_SPACE = re.compile(r"\s*\n?([MLQCz])\s*")  # around a command of a path
 _BEHIND = re.compile(r"(\.\d\d)\d+")  # hundredths of a point are more than a screen shows
 
 
@@ -46,17 +46,14 @@ class Markup(str):
 
 
 class Card(NamedTuple):
-    """The answer for an output: its errors with their unit, a note on them, and the reasons.
-
-    The color is ``"yes"``, ``"no"`` or ``"open"``.
-    """
+    """The answer for an output."""
 
     name: str
-    errors: Mapping[str, str]
-    note: str
+    errors: Mapping[str, str]  # with their unit
+    note: str  # on the errors
     answer: str
     reasons: list[str]
-    color: str = "open"
+    color: str = "open"  # or "yes" or "no"
     picture: Markup = Markup()
 
 
@@ -89,7 +86,7 @@ def tag(name: str, /, *children: str, **attributes: str) -> Markup:
 
 
 def join(children: Iterable[str]) -> Markup:
-    """Return texts beside one another, without an element around them."""
+    """Return texts one after the other, escaped, without an element around them."""
     return Markup("".join(c if isinstance(c, Markup) else escape(c) for c in children))
 
 
@@ -100,7 +97,9 @@ def bullets(items: Iterable[str]) -> Markup:
 
 
 def code(text: str) -> Markup:
-    """Return a block of code."""
+    """Return a block of code; nothing if it is empty."""
+    if not text:
+        return Markup()
     return tag("div", tag("pre", tag("code", text)), class_="scroll", tabindex="0")
 
 
@@ -128,7 +127,7 @@ def table(
 
 
 def parameter_table(caption: str, parameters: PhysicsParameters) -> Markup:
-    """Return a table of unknown parameters: their posterior, and what was known before."""
+    """Return a table of unknown parameters: their posterior and prior."""
     low, high = parameters.interval()
     rows = []
     for i, (name, unknown) in enumerate(parameters.unknowns.items()):
@@ -138,22 +137,20 @@ def parameter_table(caption: str, parameters: PhysicsParameters) -> Markup:
             spread = [number(parameters.sd[i]), interval]
         value = number(parameters.center[i], 4)
         rows.append([name, value, *spread, unknown.prior_text, unknown.unit or "-"])
-    head = ["parameter", "value", "sd", "95 % interval", "known before", "unit"]
+    head = ["parameter", "value", "sd", "95 % interval", "prior", "unit"]
     return table(caption, head, rows)
 
 
-def beside(cards: Sequence[Card]) -> Markup:
+def side_by_side(cards: Sequence[Card]) -> Markup:
     """Return the answer on each output, its reasons, its errors in large numbers, its picture."""
     shown = []
-    for name, errors, note, answer, reasons, color, picture in cards:
-        parts = [tag("h3", name)] if len(cards) > 1 else []
-        parts.append(tag("p", answer, class_="answer"))
-        parts += [tag("p", reason.replace("+-", "±")) for reason in reasons]
-        if errors:
-            numbers = [tag("div", tag("dt", n), tag("dd", value)) for n, value in errors.items()]
-            parts += [tag("dl", *numbers, class_="errors"), tag("p", note, class_="note")]
-        parts += [picture] if picture else []
-        shown.append(tag("div", *parts, class_=f"card {color}"))
+    for card in cards:
+        parts = [tag("h3", card.name)] * (len(cards) > 1)
+        parts.append(tag("p", card.answer, class_="answer"))
+        parts += [tag("p", reason.replace("+-", "±")) for reason in card.reasons]
+        numbers = [tag("div", tag("dt", n), tag("dd", value)) for n, value in card.errors.items()]
+        parts += [tag("dl", *numbers, class_="errors"), tag("p", card.note, class_="note")]
+        shown.append(tag("div", *parts, card.picture, class_=f"card {card.color}"))
     return tag("div", *shown, class_="cards")
 
 
@@ -163,12 +160,12 @@ def document(page: Page) -> Markup:
     settings = [[name, value] for name, value in page.settings.items()]
     caption = "How this page came about"
     sections["Settings"] = table(caption, ["setting", "value"], settings, kind="words")
-    ids = {n: "".join(c if c.isalnum() else "-" for c in n.lower()).strip("-") for n in sections}
+    ids = {name: re.sub(r"\W", "-", name.lower()).strip("-") for name in sections}
     main = tag(
         "main",
         tag("header", tag("h1", page.title), tag("p", page.lead, class_="lead")),
         tag("h2", page.question, class_="first"),
-        beside(page.cards),
+        side_by_side(page.cards),
         tag("nav", bullets(tag("a", n, href=f"#{ids[n]}") for n in ids), aria_label="Sections"),
         *(tag("section", tag("h2", n), text, id=ids[n]) for n, text in sections.items()),
     )
@@ -184,17 +181,18 @@ def document(page: Page) -> Markup:
 
 
 def failure(error: PhysicsError) -> str:
-    """Return the failure of a physics in a line, with the first inputs at which it fails."""
+    """Return the failure of a physics in a line, with the first of its inputs."""
     message = str(error.args[0]).rstrip(": ")
     if error.inputs is None or not len(error.inputs):
         return message
     rows = [f"({', '.join(map(number, row))})" for row in error.inputs[:_SHOWN].tolist()]
     more = len(error.inputs) - len(rows)
-    return f"{message.rstrip('.')}: at inputs {listed([*rows, f'{more} more'] if more else rows)}."
+    rows += [f"{more} more"] * (more > 0)
+    return f"{message.rstrip('.')}: at inputs {listed(rows)}."
 
 
 def drawn(draw: Callable[P, list[Markup]]) -> Callable[P, Markup]:
-    """Return a function of figures side by side, or of why a physics fails where there are none."""
+    """Return a function of figures side by side, or of the failure of a physics instead."""
 
     @wraps(draw)
     def figures(*args: P.args, **options: P.kwargs) -> Markup:

@@ -62,14 +62,19 @@ class Page(HTMLParser):
 
     def needs_nothing_else(self):
         """Whether it refers to nothing but its own sections, and runs no script."""
-        refers = [(t, value) for t, name, value in self.attributes if name in ("src", "href")]
+        links = [(tag, value) for tag, name, value in self.attributes if name in ("src", "href")]
         own = all(
-            value.startswith("data:image/") if t == "img" else value[1:] in self.ids
-            for t, value in refers
+            value.startswith("data:image/") if tag == "img" else value[1:] in self.ids
+            for tag, value in links
         )
-        names = {name for _, name, _ in self.attributes}
-        quiet = not any(name.startswith("on") for name in names) and "script" not in self.text
-        return own and quiet and not re.search(r"url\(|@import", "".join(self.styles))
+        has_events = any(name.startswith("on") for _, name, _ in self.attributes)
+        is_quiet = not has_events and "script" not in self.text
+        return own and is_quiet and not re.search(r"url\(|@import", "".join(self.styles))
+
+    def loading_code(self):
+        """The only code that loads a model."""
+        (code,) = [text for text in self.codes if "load(" in text]
+        return code
 
 
 @pytest.fixture

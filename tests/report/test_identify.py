@@ -59,7 +59,9 @@ def test_a_page_of_true_parameters_noise_and_a_free_run(folder, read, capsys):
     assert "1201 rows every 0.01" in err
     page = read(folder / "identify.html")
     assert page.needs_nothing_else()
-    for name, _, _, interval, _, unit in page.tables["Parameters by what was learnt from"][1:]:
+    for name, _, _, interval, _, unit in page.tables["Parameters by the fitted part of the log"][
+        1:
+    ]:
         low, high = map(float, interval.split(" to "))
         assert low < TRUE[name] < high < 3 * low
         assert unit == {"l": "m", "c": "1/s", "J": "kg m2", "F": "N m"}[name]
@@ -72,7 +74,7 @@ def test_a_page_of_true_parameters_noise_and_a_free_run(folder, read, capsys):
     assert errors["identified"][1] == "rad"
     assert int(errors["identified"][2].removesuffix(" %")) >= 90
     # The only advice is that a product is told better than its factors.
-    advice = page.text.rpartition("Advice")[2].partition("Go on in Python")[0]
+    advice = page.text.rpartition("Advice")[2].partition("Continue in Python")[0]
     told = (
         r"The log tells c\*F, [^;:]*, and hardly c and F each\. "
         "Measure one of them, and the other follows\\."
@@ -87,7 +89,7 @@ def test_a_page_of_true_parameters_noise_and_a_free_run(folder, read, capsys):
     (program,) = page.codes
     names = {}
     exec(program, names)
-    assert f"{float(names['found'].errors['identified'][0]):.3g}" == errors["identified"][0]
+    assert f"{float(names['machine'].errors['identified'][0]):.3g}" == errors["identified"][0]
     assert names["run"].mean.shape == (1, 100, 2)
     assert {each.name for each in folder.iterdir()} == {*("log.csv", "swing.py", "identify.html")}
 
@@ -158,14 +160,17 @@ def test_python_makes_the_same_page_of_an_identification(folder, read, undrawn):
 
 BAD = {
     ("--states", "angel,rate"): "expected a column 'angel', found .* Is it 'angle.*--hidden",
-    ("--hidden", "speed=0+-1"): "--hidden names 'speed', which is none of --states",
+    ("--hidden", "speed=0+-1"): "--hidden names 'speed'; expected one of --states",
     ("--hidden", "rate"): r"such as 'rate \[rad/s\]=0 \+- 2', found 'rate'",
     ("--hidden", "rate=0..1"): "mean and standard deviation",
     ("--angles", "torque"): "--angles names 'torque'",
-    ("--unknown", "z=1+-1"): "--unknown names 'z', which is none of the names in equations",
+    ("--unknown", "z=1+-1"): "--unknown names 'z'; expected one of the names in equations",
     ("--physics", "rate' = rate"): "one equation for each state",
     ("--physics", "swing:physics"): "Expected swing:physics alone",
-    ("--physics", "x' = rate"): "equation for each of angle, rate.* found those of angle, rate, x",
+    (
+        "--physics",
+        "x' = rate",
+    ): "equation for each of angle, rate.* found equations for angle, rate, x",
     ("--held-out", "0.8"): "at most 0.5",
     ("--step", "0.013"): "whole multiple of the sampling step",
 }
@@ -235,13 +240,13 @@ def test_a_log_with_dates_other_names_and_units_in_round_brackets(folder, read, 
     assert main([*command, "--unknown", "lambda [1/h] = 1 */ 3"]) == 0
     page = read(folder / "identify.html")
     assert "the times are in its only column of dates, 'Datum'." in capsys.readouterr().err
-    (row,) = page.tables["Parameters by what was learnt from"][1:]
+    (row,) = page.tables["Parameters by the fitted part of the log"][1:]
     assert float(row[1]) == pytest.approx(1.5803, rel=1e-3)  # ln(10 / 9) in four minutes
     assert dict(page.tables["How this page came about"])["step"] == "0.0666667 h"
     assert page.tables["Noise"][1][-1] == "RPM"
     names = {}
     exec(page.codes[0], names)
-    assert names["found"].parameters["lambda_"].mean() == pytest.approx(float(row[1]), rel=1e-3)
+    assert names["machine"].parameters["lambda_"].mean() == pytest.approx(float(row[1]), rel=1e-3)
 
 
 def test_times_in_milliseconds_are_converted(folder, undrawn):

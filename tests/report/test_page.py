@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from gpadjust.core import CKA, ZeroMeanGP, fit, load
 from gpadjust.physics import FunctionPhysics, PhysicsError
 from gpadjust.report import figures, report
-from gpadjust.report.markup import Markup, beside, failure, table, tag
+from gpadjust.report.markup import Markup, failure, side_by_side, table, tag
 from gpadjust.report.page import cards, headline
 from gpadjust.report.subject import subject_of
 from gpadjust.validation import Verdict
@@ -28,7 +28,7 @@ def test_a_comparison(comparison, tmp_path, read):
     page = read(path)
     assert page.needs_nothing_else()
     assert path.stat().st_size < 500_000
-    assert len(page.images) == 6
+    assert len(page.images) == 5
     assert all(len(image["alt"]) > 10 for image in page.images)
     _the_table_is_that_of(comparison, page)
     (verdict,) = comparison.verdict.values()
@@ -76,7 +76,7 @@ def test_the_code_in_the_page_predicts_as_the_model(
 ):
     page = read(report(comparison, tmp_path / "a b.html"))
     monkeypatch.chdir(tmp_path)
-    (code,) = [text for text in page.codes if "load(" in text]
+    code = page.loading_code()
     assert "load('a b.pt', trusted=True)" in code
     assert "by its name" in page.text
     names = {}
@@ -92,13 +92,13 @@ def test_one_model_whose_physics_has_no_name(tmp_path, read, monkeypatch, undraw
     model.data = model.data._replace(output_names=("p [Pa]",))
     fit(model, "map")
     page = read(report(model, tmp_path / "report.html"))
-    assert "Not asked" in page.text
+    assert "Not compared" in page.text
     assert "report(compare(train_X, train_Y, physics))" in page.text
     rmse = number(float(subject_of(model).loo.score().rmse[0]))
     alone = number(float((X.sum(-1).sin() - X[:, 0]).square().mean().sqrt()))
     assert f"your formula {alone} Pa adjusted {rmse} Pa root mean square" in page.text
     monkeypatch.chdir(tmp_path)
-    (code,) = [text for text in page.codes if "load(" in text]
+    code = page.loading_code()
     names = {"f_p": lambda X: X[:, :1]}
     exec(code, names)
     torch.testing.assert_close(names["mean"], model.predict(names["X"]).mean)
@@ -109,10 +109,10 @@ def test_a_model_without_physics(tmp_path, read, undrawn):
     model = ZeroMeanGP(X, X.sin())
     fit(model, "map")
     page = read(report(model, tmp_path / "report.html"))
-    assert "has no physics to be judged" in page.text
+    assert "has no physics to judge" in page.text
     assert "data alone " in page.text
     assert "your formula" not in page.text
-    assert "There is no physics that could be adjusted, trusted or overridden" in page.text
+    assert "This model has no formula to adjust or to trust" in page.text
     assert dict(page.tables["How this page came about"])["physics"] == "none"
     assert load(tmp_path / "report.pt").data.output_names == ("y",)
 
@@ -126,7 +126,7 @@ def test_the_verdict_and_its_color(comparison):
     ):
         verdict = Verdict(answer, ["One reason.", "Another."])
         shown = cards(subject_of(dataclasses.replace(comparison, verdict={"y": verdict})))
-        page = beside(shown)
+        page = side_by_side(shown)
         assert Page(page).text == f"{answer} One reason. Another. {_three(comparison)}"
         assert f'class="card {color}"' in page
         assert headline(shown, "Errors").endswith(f"\n{answer}. One reason.")

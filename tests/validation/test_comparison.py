@@ -16,14 +16,8 @@ from gpadjust.kinds.heavy_tails import HeavyTails
 from gpadjust.kinds.links import Linked
 from gpadjust.physics import FunctionPhysics, Unknown
 from gpadjust.validation import STRUCTURES, Structure, compare, leave_one_out
-from gpadjust.validation.comparison import (
-    _by_name,
-    _candidates,
-    _densities,
-    _known,
-    _physics_alone,
-    _with_noise,
-)
+from gpadjust.validation.comparison import candidates_of, checked_structures, physics_by_name
+from gpadjust.validation.leave_one_out import _with_noise, left_out_by_physics
 from gpadjust.validation.verdict import Evidence, straight_line, unsampled, verdict_on
 
 
@@ -155,27 +149,27 @@ class TestPhysicsAlone:
         f = (4 * X).exp()
         Y = torch.cat([f + 0.2 * noise, f * (1 + 0.2 * noise)], -1)
         data = Data.of(X, Y, None, None)
-        (loo,) = _physics_alone(_by_name(lambda X: (4 * X).exp().expand(-1, 2)), data).values()
+        (loo,) = _physics_alone(physics_by_name(lambda X: (4 * X).exp().expand(-1, 2)), data).values()
         spread = loo.variance.amax(0) / loo.variance.amin(0)
         assert spread[0] < 10 < 1000 < spread[1]
 
     def test_an_exact_physics_of_any_number_of_points(self, X):
         for n in (2, 3, 8):
             data = Data.of(X[:n], crude(X[:n]), None, None)
-            (loo,) = _physics_alone(_by_name(crude), data).values()
+            (loo,) = _physics_alone(physics_by_name(crude), data).values()
             assert loo.log_density.isfinite().all()
             assert loo.score().coverage.item() == 1
             assert not loo.variance.isnan().any()
 
     def test_known_variances_are_its_noise(self, X, noise):
         data = Data.of(X, crude(X) + noise, 0.04, None)
-        (loo,) = _physics_alone(_by_name(crude), data).values()
+        (loo,) = _physics_alone(physics_by_name(crude), data).values()
         expected = torch.distributions.Normal(crude(X), 0.2).log_prob(crude(X) + noise)
         torch.testing.assert_close(loo.log_density, expected)
 
     def test_each_of_several_and_none_of_unknown_parameters(self, X):
         unknown = FunctionPhysics(lambda X, p: p.a * X[:, 0], unknowns={"a": Unknown(1.0, sd=1.0)})
-        physics = _by_name({"wave": crude, "line": lambda X: X, "slope": unknown})
+        physics = physics_by_name({"wave": crude, "line": lambda X: X, "slope": unknown})
         found = _physics_alone(physics, Data.of(X, crude(X), None, None))
         assert [*found] == ["physics alone of wave", "physics alone of line"]
         torch.testing.assert_close(found["physics alone of line"].mean, X)
@@ -232,17 +226,17 @@ def test_units_make_no_difference(X, scaled, variance):
     assert large.rmse == pytest.approx(small.rmse, rel=1e-3)
 
 
-def test_candidates_of_several_physics_and_classes_are_known():
+def test_candidates_of_several_physics_and_classes_arechecked_structures():
     plain = [structure for structure in STRUCTURES if structure.kind != "calibrated physics"]
-    several = _by_name([crude, torch.sin, lambda X: X])
+    several = physics_by_name([crude, torch.sin, lambda X: X])
     assert [*several] == ["crude", "sin", "f_3"]
-    found = _candidates(plain, several)
+    found = candidates_of(plain, several)
     names = ["crude", "sin", "f_3", "all"]
     expected = [f"{kind} of {name}" for kind in ("physics mean", "CKA") for name in names]
     assert [structure.name for structure, _ in found] == ["zero mean", *expected]
-    assert [s.name for s, _ in _candidates(STRUCTURES, _by_name(crude))] == [s.name for s in plain]
+    assert [s.name for s, _ in candidates_of(STRUCTURES, physics_by_name(crude))] == [s.name for s in plain]
     named, classes = (
-        [each._replace(name="", model=None) for each in _known(given)]
+        [each._replace(name="", model=None) for each in checked_structures(given)]
         for given in (["CKA", "zero mean"], [partial(CKA, rho_mean=2.0), ZeroMeanGP])
     )
     assert named == classes

@@ -31,7 +31,7 @@ def prediction(uniform):
 def test_crps_of_a_sharp_prediction_is_the_absolute_error(prediction):
     mean, _, y = prediction
     sharp = torch.full_like(mean, 1e-16)
-    torch.testing.assert_close(Scores.of(mean, sharp, y).crps, (mean - y).abs().mean(-2))
+    torch.testing.assert_close(Scores.compute(mean, sharp, y).crps, (mean - y).abs().mean(-2))
 
 
 @pytest.mark.parametrize("level", [0.5, 0.9, 0.95])
@@ -40,14 +40,14 @@ def test_coverage_of_calibrated_predictions(uniform, level):
     mean, variance = uniform(n, 2, seed=1), uniform(n, 2, low=0.1, high=2, seed=2)
     y = mean + variance.sqrt() * torch.randn(n, 2, dtype=torch.float64)
     sd = (level * (1 - level) / n) ** 0.5
-    assert ((Scores.of(mean, variance, y, level=level).coverage - level).abs() < 5 * sd).all()
+    assert ((Scores.compute(mean, variance, y, level=level).coverage - level).abs() < 5 * sd).all()
 
 
 def test_coverage_of_overconfident_predictions_is_too_low(uniform):
     y = torch.randn(10_000, 1, dtype=torch.float64)
     variance = torch.full_like(y, 0.25)
     expected = 2 * scipy.stats.norm.cdf(1.959964 / 2) - 1
-    share = Scores.of(torch.zeros_like(y), variance, y).coverage.item()
+    share = Scores.compute(torch.zeros_like(y), variance, y).coverage.item()
     assert share == pytest.approx(expected, abs=0.025)
 
 
@@ -100,7 +100,7 @@ def test_a_mixture_of_equal_components_is_the_component(prediction):
     mean, variance, y = prediction
     many = [t.unsqueeze(-3).expand(2, 5, 7, 3) for t in (mean, variance)]
     scores = score(posterior_of(*many), y)
-    expected = Scores.of(*prediction)
+    expected = Scores.compute(*prediction)
     for name in NAMES:
         torch.testing.assert_close(getattr(scores, name), getattr(expected, name))
 
@@ -108,7 +108,7 @@ def test_a_mixture_of_equal_components_is_the_component(prediction):
 def test_pit_of_calibrated_predictions_is_uniform(uniform):
     mean, variance = uniform(5000, 1, seed=1), uniform(5000, 1, low=0.1, high=2, seed=2)
     y = mean + variance.sqrt() * torch.randn(5000, 1, dtype=torch.float64)
-    values = Scores.of(mean, variance, y).pit
+    values = Scores.compute(mean, variance, y).pit
     assert scipy.stats.kstest(values.flatten().numpy(), "uniform").pvalue > 1e-3
 
 
@@ -131,7 +131,7 @@ def test_score_of_a_posterior(uniform, num_outputs, mixed):
     if mixed:
         expected = score(posterior_of(mean, variance), y, level=0.5)
     else:
-        expected = Scores.of(mean, variance, y, level=0.5)
+        expected = Scores.compute(mean, variance, y, level=0.5)
     for name in NAMES:
         found, other = getattr(scores, name), getattr(expected, name)
         torch.testing.assert_close(found, other, equal_nan=True)
@@ -151,7 +151,7 @@ def test_score_of_a_model_with_a_link_is_that_of_the_model_within(data):
 def test_predictions_without_variance_have_their_limits():
     mean, y = torch.tensor([[1.0], [2.0]]).double(), torch.tensor([[1.5], [2.0]]).double()
     variance = torch.zeros_like(mean)
-    scores = Scores.of(mean, variance, y)
+    scores = Scores.compute(mean, variance, y)
     torch.testing.assert_close(scores.crps, torch.tensor([0.25]).double())
     assert scores.nlpd > 1e10
     assert scores.coverage == 0.5
@@ -171,9 +171,9 @@ def test_bad_input(prediction, data):
         ((mean, variance, y[..., :1]), ValueError, r"mean of y's shape \(2, 7, 1\), got"),
     ):
         with pytest.raises(error, match=words):
-            Scores.of(*values)
+            Scores.compute(*values)
     with pytest.raises(ValueError, match="level must be between 0 and 1; found"):
-        Scores.of(*prediction, level=95)
+        Scores.compute(*prediction, level=95)
     X, Y = data()
     with pytest.raises(TypeError, match=r"got CKA; that of a model is `model.posterior\(X, "):
         score(CKA(X, Y, physics=lambda X: X[:, :1]), Y)
@@ -185,8 +185,8 @@ def test_points_that_were_not_observed_are_left_out(prediction):
     partial[:, [0, 3], 0] = torch.nan
     partial[:, :, 2] = torch.nan
     rest = [1, 2, 4, 5, 6]
-    found, whole = Scores.of(mean, variance, partial), Scores.of(*prediction)
-    part = Scores.of(*(each[:, rest] for each in prediction))
+    found, whole = Scores.compute(mean, variance, partial), Scores.compute(*prediction)
+    part = Scores.compute(*(each[:, rest] for each in prediction))
     for name in ("rmse", "nlpd", "crps", "coverage"):
         of_found, of_whole, of_part = (getattr(each, name) for each in (found, whole, part))
         torch.testing.assert_close(of_found[:, 0], of_part[:, 0])
@@ -200,7 +200,7 @@ def test_gradients_of_scores_skip_what_was_not_observed(prediction):
     mean, variance, y = (t.clone() for t in prediction)
     y[0, 1, 2] = torch.nan
     mean.requires_grad_()
-    scores = Scores.of(mean, variance, y)
+    scores = Scores.compute(mean, variance, y)
     for value in (scores.rmse, scores.nlpd, scores.crps):
         (gradient,) = torch.autograd.grad(value.sum(), mean, retain_graph=True)
         assert gradient.isfinite().all()
@@ -211,9 +211,9 @@ def test_scores_of_a_batch_are_those_of_its_parts(prediction):
     mean, variance, y = prediction
     lower, upper = mean - 1, mean + variance
     energy = torch.tensor([1.0, 2.0])
-    whole = Scores.of(*prediction, interval=(lower, upper), energy=energy, output_names="abc")
+    whole = Scores.compute(*prediction, interval=(lower, upper), energy=energy, output_names="abc")
     part = whole[1]
-    expected = Scores.of(mean[1], variance[1], y[1])
+    expected = Scores.compute(mean[1], variance[1], y[1])
     torch.testing.assert_close(part.rmse, expected.rmse)
     torch.testing.assert_close(part.pit, expected.pit)
     torch.testing.assert_close(part.median, (mean[1] - y[1]).abs().median(0).values)
@@ -231,13 +231,13 @@ def test_where_no_variance_is_said_only_errors_count(prediction):
     mean, variance, y = (t.clone() for t in prediction)
     variance[:, 2], variance[..., 0] = torch.nan, torch.nan
     rest = [0, 1, 3, 4, 5, 6]
-    scores = Scores.of(mean, variance, y)
-    torch.testing.assert_close(scores.rmse, Scores.of(*prediction).rmse)
-    some = Scores.of(mean[:, rest, 1:], variance[:, rest, 1:], y[:, rest, 1:])
+    scores = Scores.compute(mean, variance, y)
+    torch.testing.assert_close(scores.rmse, Scores.compute(*prediction).rmse)
+    some = Scores.compute(mean[:, rest, 1:], variance[:, rest, 1:], y[:, rest, 1:])
     for name in ("nlpd", "crps", "coverage"):
         torch.testing.assert_close(getattr(scores, name)[:, 1:], getattr(some, name))
         assert getattr(scores, name)[:, 0].isnan().all()
-    none = Scores.of(mean[:, :0], variance[:, :0], y[:, :0])
+    none = Scores.compute(mean[:, :0], variance[:, :0], y[:, :0])
     assert none.median.isnan().all()
     assert none.rmse.shape == (2, 3)
 
