@@ -157,28 +157,6 @@ def test_predictions_without_variance_have_their_limits():
     assert scores.coverage == 0.5
 
 
-def test_bad_input(prediction, data):
-    mean, variance, y = (t.clone() for t in prediction)
-    negative, nan = variance.clone(), mean.clone()
-    negative[0, 1, 2], nan[0, 1, 2] = -0.5, torch.nan
-    for values, error, words in (
-        ((mean.numpy(), variance, y), TypeError, r"got ndarray; convert .*as_tensor\(mean, "),
-        ((mean, variance, y.tolist()), TypeError, r"got list; convert .*as_tensor\(y, "),
-        ((mean, negative, y), ValueError, r"at least 0, got -0.5; .*`variance.clamp_min\(0\)`"),
-        ((nan, variance, y), ValueError, "Expected mean without NaN, found 1 of 42"),
-        ((mean[0, :, 0],) * 3, ValueError, r"y of shape ... x n x m.*unsqueeze\(-1\)"),
-        ((mean, variance[..., :2], y), ValueError, r"variance of y's shape \(2, 7, 3\), got"),
-        ((mean, variance, y[..., :1]), ValueError, r"mean of y's shape \(2, 7, 1\), got"),
-    ):
-        with pytest.raises(error, match=words):
-            Scores.compute(*values)
-    with pytest.raises(ValueError, match="level must be between 0 and 1; found"):
-        Scores.compute(*prediction, level=95)
-    X, Y = data()
-    with pytest.raises(TypeError, match=r"got CKA; that of a model is `model.posterior\(X, "):
-        score(CKA(X, Y, physics=lambda X: X[:, :1]), Y)
-
-
 def test_points_that_were_not_observed_are_left_out(prediction):
     mean, variance, y = prediction
     partial = y.clone()
