@@ -52,8 +52,9 @@ def report(
     DataFrame.
 
     Args:
-        model: A fitted model, a :class:`~gpadjust.StackedGP`, or a :class:`~gpadjust.Comparison`,
-            whose recommended model is saved; or an :class:`~gpadjust.records.Identification`.
+        model: A fitted model, a :class:`~gpadjust.StackedGP`, or a
+            :class:`~gpadjust.validation.Comparison`, whose recommended model is saved; or an
+            :class:`~gpadjust.records.Identification`.
         file: The page to write, ``*.html``. An earlier page and its model are replaced; if the
             model cannot be saved, the page has the reason.
         title: The title. Default: the names of the outputs.
