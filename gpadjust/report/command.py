@@ -28,11 +28,11 @@ from gpadjust.validation.faults import faults
 from gpadjust.validation.verdict import difference
 from gpadjust.words import bare, listed, plural
 
-_DEGREES = ("deg", "degree", "degrees", "°")
-_HOW = "the same command, without --fit."
+_DEGREES = ("deg", "degree", "degrees", "°")  # units that a jumping angle cannot have
+_HOW = "the same command, without --fit."  # compares a model with others
 _SPAN = 10**0.5  # of positive outputs, from which kinds of noise are compared
 _DIGITS = 6  # of a sampling step, which is a mean of differences
-_NO_NOTES = (DeprecationWarning, PendingDeprecationWarning)
+_NO_NOTES = (DeprecationWarning, PendingDeprecationWarning)  # of libraries, not of the fit
 
 
 class Job(NamedTuple):
@@ -59,7 +59,7 @@ def run(arguments: Namespace, command: Sequence[str]) -> None:
             warnings.simplefilter("default")
             subject = work()
         texts = [str(w.message) for w in caught if not issubclass(w.category, _NO_NOTES)]
-        notes = tuple(dict.fromkeys(texts))
+        notes = tuple(dict.fromkeys(texts))  # each once
         _print(*(f"Warning: {note}" for note in notes))
         command_line = f"gpadjust {shlex.join(command)}"
         settings = {"command": command_line, **origin.settings, "seed": str(arguments.seed)}
@@ -82,7 +82,7 @@ def _print(*lines: str) -> None:
 def _of_table(arguments: Namespace) -> Job:
     """Read the table and the physics of ``gpadjust report``."""
     outputs = read.pairs(arguments.outputs, "--outputs", short=True)
-    variances = None
+    variances = None  # a fitted noise
     if arguments.noise not in (None, "constant", "relative"):
         sds = dict.fromkeys(outputs, arguments.noise)
         if "=" in arguments.noise:
@@ -121,7 +121,7 @@ def _of_table(arguments: Namespace) -> Job:
             options.update(_noise_of(data, physics, options, seed))
         X = data.X
         noise = options.get("noise")
-        if isinstance(noise, NoisyInputs):
+        if isinstance(noise, NoisyInputs):  # it has copies of the inputs, which it corrects
             X = read.Columns(X.columns, noise.points)
         if arguments.fit == "compare":
             model: Any = compare(X, data.Y, physics, variances, seed=seed, progress=True, **options)
@@ -166,6 +166,7 @@ def _noise_of(
             model = with_options(CKA, {**options, **noise})(data.X, data.Y, physics=physics)
             fit(model, seed=seed)
             densities[kind] = leave_one_out(model).log_density.nansum(-1)
+    # The simplest kind stays unless another one is better by more than a standard error.
     first, *_ = kinds
     best = max(kinds, key=lambda kind: float(densities[kind].sum()))
     gain, se = difference(densities[best], densities[first])
@@ -200,7 +201,7 @@ def _options(
                 f"Expected --bounds as two numbers, the lower first: 0,1; found {text!r}."
             )
         options["link"] = (ends[0], ends[1])
-    if data.levels:
+    if data.levels:  # columns have their units in the levels, but not in the option
         with_unit = {bare(name): name for name in data.levels}
         named = [with_unit.get(name, name) for name in batches]
         columns = [name for name in data.levels if name not in named]
@@ -225,6 +226,7 @@ def _of_log(arguments: Namespace) -> Job:
             f"Expected the angle {wrong[0]!r} in rad, found {units[wrong[0]]!r}; convert it, or do "
             "without --angles, which is for angles that go round."
         )
+    # The step of the specification depends on that of the records.
     records = Records.read_csv(tables, StateSpec(*names, angles=angles), **columns).records
 
     # Read the equations, whose step is the sampling step by default.
@@ -238,7 +240,7 @@ def _of_log(arguments: Namespace) -> Job:
         step = float(f"{records[0].sampling_step:.{_DIGITS}g}")
     motion = read.motion(arguments.physics, *names, unknowns, step)
     physics = motion.physics
-    if physics.step is not None:
+    if physics.step is not None:  # a physics of a module may have its own
         step = physics.step
     if arguments.step not in (None, step):
         raise ValueError(

@@ -25,7 +25,7 @@ from gpadjust.validation.plots import (
 from gpadjust.validation.trust import physics_at
 from gpadjust.words import bare, labelled, name_and_unit, number, percent, with_unit
 
-_MOST = 12  # inputs along which slices are drawn, in all outputs together
+_MOST = 24  # inputs along which slices are drawn, in all outputs together
 _BANDS = "Solid lines are means; bands cover 95 % of the function, without measurement noise."
 _NONE = "This model has no formula to adjust or to trust."
 _TRUST = (
@@ -38,23 +38,24 @@ _TRUST = (
 
 def where_wrong(subject: Subject) -> Markup:
     """Return the correction of the physics along each input, for each output."""
-    inputs = inputs_drawn(subject)
+    most = max(2, _MOST // len(subject.outputs))
+    inputs = [*range(len(subject.inputs))][:most]
     parts: list[Markup] = []
     if len(subject.inputs) > 1:
         values = zip(subject.inputs, point(subject, subject.base, 3), strict=True)
         pairs = [f"{bare(name)} = {with_unit(value, name)}" for name, value in values]
-        few = f" (drawn: {len(inputs)} of {len(pairs)} inputs, those that move predictions most)"
+        few = f" (drawn: the first {len(inputs)} of {len(pairs)} inputs)"
         others = f"Along each input the others stay at the median of the data: {', '.join(pairs)}"
         parts.append(tag("p", f"{others}{few * (len(inputs) < len(pairs))}.", class_="note"))
     for j, name in enumerate(subject.outputs):
-        parts += [tag("h3", name)] * (len(subject.outputs) > 1)
+        parts += [tag("h3", name)] * (len(subject.outputs) > 1)  # the title has a single one
         parts += [tag("p", " ".join(_words(subject, j))), corrections(subject, j, inputs)]
     return html.join(parts)
 
 
 def trusted(subject: Subject) -> Markup:
     """Return the shares of predictions that rest on the physics, on data, or on neither."""
-    rows, failed, points = [], [], 0
+    rows, failed, points = [], [], 0  # without a physics, or if it fails, there are no rows
     for j, (name, shown) in enumerate(zip(subject.outputs, subject.adjusted, strict=True)):
         if shown is None:
             continue
@@ -73,24 +74,6 @@ def trusted(subject: Subject) -> Markup:
     return html.join([*failed, tag("p", _TRUST.format(f"{points:,}")), table])
 
 
-@torch.no_grad()
-def inputs_drawn(subject: Subject) -> list[int]:
-    """Return the inputs along which slices are drawn: those that move the predictions most."""
-    d = len(subject.inputs)
-    most = max(2, _MOST // len(subject.outputs))
-    if d <= most:
-        return [*range(d)]
-    spread = subject.Y.sub(subject.Y.nanmean(0)).square().nanmean(0).sqrt()
-    effect = torch.zeros(d, dtype=torch.float64)
-    for i, (_, X) in enumerate(lines_along(subject.model, base=subject.base)):
-        try:
-            mean = subject.model.predict(X).mean
-        except PhysicsError:
-            continue  # its figure reports this, if it is among them
-        effect[i] = ((mean.amax(0) - mean.amin(0)) / spread.clamp_min(1e-300)).max()
-    return sorted(effect.argsort(descending=True)[:most].tolist())
-
-
 def point(subject: Subject, X: Tensor, digits: int = 4) -> list[str]:
     """Return the inputs of a point, ``d``, in words: numbers, and the names of categories."""
     levels = subject.levels
@@ -102,7 +85,7 @@ def point(subject: Subject, X: Tensor, digits: int = 4) -> list[str]:
 def agreement(subject: Subject, output: int) -> list[Markup]:
     """Return observations over left-out predictions, by the formula and corrected."""
     formulas = subject.physics_at(subject.X, output)
-    first = dict(zip(["your formula"], formulas.values(), strict=False))
+    first = dict(zip(["your formula"], formulas.values(), strict=False))  # one or none
     figure = html.new_figure(3.2)
     y = subject.loo.judged[:, output]
     legend(plots.draw_left_out(figure.subplots(), subject.loo, y, output, first))
@@ -146,6 +129,7 @@ def corrections(subject: Subject, output: int, inputs: list[int]) -> list[Markup
             (values,) = physics_at(shown.model, X).values()
             f, f_at_data = column(values, output), at_data[0]
             ax.axhline(0, color=GREY, ls="--", lw=1.2)
+        # The prediction less the formula along the line, and the data less the formula at them.
         ends = mean_and_ends(subject.model.marginals(X), output, 0.95)
         curve, *band_ends = (relative(values, f) for values in ends)
         band(ax, x, [curve, *band_ends], 0.95)
@@ -162,7 +146,7 @@ def corrections(subject: Subject, output: int, inputs: list[int]) -> list[Markup
 
 def _limits(values: Tensor) -> tuple[float, float]:
     """Return limits of an axis that show all of some values but few that are far off."""
-    low, high = values.quantile(0.01), values.quantile(0.99)
+    low, high = values.quantile(0.01), values.quantile(0.99)  # not the worst outliers
     room = 0.15 * (high - low).clamp_min(1e-12 * values.abs().max() + 1e-300)
     return float(low - room), float(high + room)
 

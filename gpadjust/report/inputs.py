@@ -45,11 +45,12 @@ _HINT = (
 _PRIOR = re.compile(
     r"\s*([^=\[]+?)\s*(?:\[(.*)\])?\s*=\s*(.+?)\s*(\+/?-|±|\*/|\.\.)\s*(.+?)\s*(%?)\s*"
 )  # name, unit, guess, operator, spread, percent sign
+# name, prime of a derivative, right side
 _EQUATION = re.compile(r"\s*([^\W\d]\w*)\s*('?)\s*=(?!=)(.*)", flags=re.DOTALL)
 _HOW = "A Python function is given as module:function, such as pump:head."
 _CELL = re.compile(r"[A-Z]{1,2}\d+")  # of a spreadsheet
 _SHOWN = 5  # rows at which a physics fails
-_MADE = ("BlackBoxPhysics", "FormulaPhysics", "ODEPhysics", "Unknown")
+_MADE = ("BlackBoxPhysics", "FormulaPhysics", "ODEPhysics", "Unknown")  # names in code of a physics
 _SAME = 1e-6  # relative difference that a model's file accepts when it is loaded
 
 
@@ -100,7 +101,7 @@ def table_options(arguments: Namespace) -> dict[str, Any]:
     return {
         "delimiter": mark,
         "decimal": arguments.decimal,
-        "names": names_of(arguments.names, "--names") or None,
+        "names": names_of(arguments.names, "--names") or None,  # an empty list has no meaning
         "sheet": arguments.sheet,
     }
 
@@ -133,6 +134,7 @@ def read_table(
         is_input = len(values) < d
         is_date = is_input and table.has_dates(column)
         in_file = table.unit(column)
+        # A unit of the option replaces that of the new name, and this that of the file.
         unit = next((units[key] for key in (name, column, label) if key in units), unit or in_file)
         if is_date:
             unit = unit or "s"
@@ -150,6 +152,7 @@ def read_table(
             values.append(numbers)
         else:
             values.append(table.numbers(column, may_miss=not is_input))
+    # Leave out rows without any output, and all but some of very many.
     matrix = torch.stack(values, -1)
     lines = torch.tensor(table.lines)
     has_output = ~matrix[:, d:].isnan().all(-1)
@@ -159,6 +162,7 @@ def read_table(
         lines_s = "line" + "s" * (len(dropped) > 1)
         remarks.append(f"Left out, as they have no output: {lines_s} {listed(shown)}.")
     if (n := len(rows)) > arguments.rows:
+        # Drawn at random, as the first rows may be of one place or time; in the order of the file.
         order = torch.randperm(n, generator=torch.Generator().manual_seed(arguments.seed))
         rows = rows[order[: arguments.rows].sort().values]
         remarks.append(
@@ -178,7 +182,7 @@ def read_table(
             "to its own rows."
         )
     for name, of_column in levels.items():
-        if isinstance(of_column[0], str):
+        if isinstance(of_column[0], str):  # numbers stay as they are
             numbered = listed(f"{k} is {level}" for k, level in enumerate(of_column))
             remarks.append(f"The physics reads {bare(name)} as a number: {numbered}.")
     X_and_Y = Columns(tuple(names[:d]), X), Columns(tuple(names[d:]), Y)
@@ -204,7 +208,7 @@ def log_columns(
     time = _time_column(table, arguments.time)
     if not arguments.actions and not has_times:
         raise ValueError("Expected --actions, as there is no column of times to stand for them.")
-    actions = {"time": time}
+    actions = {"time": time}  # of a machine on which nothing acts
     if arguments.actions:
         actions = pairs(arguments.actions, "--actions", short=True)
     columns = {
@@ -264,7 +268,7 @@ def unknown_of(text: str) -> tuple[str, Unknown]:
         options: dict[str, Any] = {"sd": second}
         if is_share and operator in ("*/", ".."):
             raise ValueError("a percentage goes with +-")
-        if is_share:
+        if is_share:  # of the guess, and a number that is known to a share has a sign
             bounds = (0.0, math.inf) if first > 0 else (-math.inf, 0.0)
             options = {"sd": 0.01 * second * abs(first), "bounds": bounds}
         elif operator == "*/":
@@ -292,7 +296,7 @@ def hidden_of(texts: Sequence[str]) -> dict[str, Unknown]:
     hidden: dict[str, Unknown] = {}
     for text in texts:
         prior: Unknown | None = None
-        with suppress(ValueError):
+        with suppress(ValueError):  # the error below has an example of a state
             name, prior = unknown_of(text)
         if prior is None or prior.sd is None:
             raise ValueError(
@@ -351,7 +355,7 @@ def given_physics(
             short = "formula" + f" {formulas.index(text) + 1}" * (len(formulas) > 1)
         name = text if short in parts else short
         make = _formula if text in formulas else _function
-        try:
+        try:  # before the fit, which may take minutes
             parts[name], code[name] = make(text, data, unknowns)
             _check(parts[name], data)
         except ValueError as error:
@@ -415,7 +419,7 @@ def motion(
         except (ValueError, TypeError) as error:
             raise ValueError(f"--physics {path}: {error}") from error
         return GivenPhysics(physics, path.replace(":", "."), (path.partition(":")[0],))
-    sides, primes = dict[str, str](), set[str]()
+    sides, primes = dict[str, str](), set[str]()  # right sides by state; "'" and ""
     for text in texts:
         match = _EQUATION.fullmatch(text)
         trees = [] if match is None else parse(match[3])
@@ -432,14 +436,14 @@ def motion(
             f"Expected an equation for each of {', '.join(states)}, all of time derivatives or all "
             f"of next values, found equations for {', '.join(sides)}."
         )
-    formula = ", ".join(sides[name] for name in states)
+    formula = ", ".join(sides[name] for name in states)  # outputs have commas between them
     columns = [*states, *actions]
     check_names(unknowns, "--unknown", names_in(formula), "the names in equations")
     physics = FormulaPhysics(formula, columns, unknowns=unknowns)
     priors = "".join(f"        {name!r}: {prior!r},\n" for name, prior in unknowns.items())
     rest = f"{formula!r},\n    {columns},\n    unknowns={{\n{priors}    }},\n"
     code = f"FormulaPhysics(\n    {rest})"
-    if primes == {"'"}:
+    if primes == {"'"}:  # x' = f(x, u), integrated over a step
         physics = ODEPhysics(physics, step, len(states))
         code = f"ODEPhysics({code}, step={step!r}, state_dim={len(states)})"
     return GivenPhysics(physics, code)
@@ -449,7 +453,7 @@ def imported(path: str) -> Any:
     """Return the object that a path ``module:name`` names."""
     module, _, name = path.partition(":")
     files = [file.stem for file in Path().glob("*.py")]
-    if os.getcwd() not in sys.path:
+    if os.getcwd() not in sys.path:  # as of a script there
         sys.path.insert(0, os.getcwd())
     try:
         return attrgetter(name)(import_module(module))
@@ -472,7 +476,7 @@ def _check(physics: Physics, data: TableData) -> None:
     """Raise a ValueError that names the lines of the file at which a physics fails."""
     m = len(data.Y.columns)
     Y = _values(physics, data)
-    again = _values(physics, data)
+    again = _values(physics, data)  # a random physics cannot be judged
     if Y.shape[-1] != m:
         hint = " Commas part the outputs of a formula: is one a decimal comma?"
         raise ValueError(
@@ -498,7 +502,7 @@ def _refuse(is_wrong: Tensor, expected: str, way_out: str, data: TableData) -> N
 def _values(physics: Physics, data: TableData) -> Tensor:
     """Return a physics at the data; its error, if any, names the lines of the file."""
     X = data.X.values
-    physics.forget()
+    physics.forget()  # it would repeat remembered values
     try:
         return physics(X)
     except PhysicsError as error:
@@ -553,6 +557,7 @@ def pairs(text: str | None, option: str, *, short: bool = False) -> dict[str, st
     """Return ``"a=m,b=s"`` as a dictionary; ``"a"`` is ``"a=a"`` if it may be ``short``."""
     values = dict[str, str]()
     for field in names_of(text, option):
+        # The last sign: a name may have others.
         name, equals, value = (part.strip() for part in field.rpartition("="))
         if short and not equals:
             name = value
@@ -592,7 +597,7 @@ def variances_of(
     if lacking := [name for name in names if all_of and name not in sds]:
         raise ValueError(f"{option} lacks {lacking[0]!r}: give it for each of them, or for none.")
     for name, text in sds.items():
-        if not 0 <= number_of(text) <= LARGEST:
+        if not 0 <= number_of(text) <= LARGEST:  # NaN is not
             raise ValueError(
                 f"Expected {option} as a standard deviation in the unit of {name!r}, such as 0.1, "
                 f"found {text!r}."

@@ -58,6 +58,7 @@ def page(machine: Identification, title: str | None, origin: Origin) -> Page:
     times = (number(n * machine.step) for n in (1, measured.shape[1]))
     step, held_out = (f"{time} {units.get('time', '')}".strip() for time in times)
     steps = sum(len(record.times) - 1 for record in machine.smoothed.records)
+    # Steps that are fitted, and held out.
     hidden = f", {listed(machine.hidden)} hidden" * bool(machine.hidden)
     lead = (
         f"{listed(spec.states)}{hidden}, under {listed(spec.actions)}: fitted to "
@@ -100,7 +101,7 @@ def _judged(
     note = f"root mean square errors of a free run of {held_out} that was held out"
     is_measured = (~machine.windows.measured.isnan()).flatten(0, 1).any(0).tolist()
     for i, name in enumerate(machine.spec.states):
-        if not is_measured[i]:
+        if not is_measured[i]:  # a hidden state has no errors
             continue
         unit = units.get(name, "")
         rmse = {by: float(machine.errors[by][i]) for by in _NAMES if by in machine.errors}
@@ -136,6 +137,7 @@ def _combinations(machine: Identification) -> Markup:
     rows = []
     for combination in machine.combinations:
         draws = combination.draws
+        # the median and the ends of the central 95 %
         low, middle, high = draws.quantile(draws.new_tensor([0.025, 0.5, 0.975]))
         interval = f"{number(low, 4)} to {number(high, 4)}"
         rows.append([combination.name, number(middle, 4), interval, combination.unit or "-"])
@@ -197,8 +199,8 @@ def _states(machine: Identification, units: Mapping[str, str]) -> list[Markup]:
     for i, state in enumerate(spec.states):
         figure = html.new_figure(_HEIGHT)
         ax = figure.subplots()
-        path = going_on(record.states[:, i], i in spec.angle_columns)
-        half = quantile(0.95) * sd[:, i]
+        path = going_on(record.states[:, i], i in spec.angle_columns)  # angles without jumps
+        half = quantile(0.95) * sd[:, i]  # 1.96 sigma
         band(ax, record.times, (path, path - half, path + half), 0.95)
         ax.set(xlabel=axis_labels["time"], ylabel=axis_labels[state])
         tidy(ax)

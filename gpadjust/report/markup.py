@@ -11,7 +11,6 @@ from html import escape
 from importlib.resources import files
 from io import BytesIO
 from typing import Any, NamedTuple, ParamSpec
-from urllib.parse import quote
 
 from matplotlib import rc_context
 from matplotlib.figure import Figure
@@ -23,22 +22,13 @@ P = ParamSpec("P")
 _VOID = ("img", "meta")  # elements without an end
 _SHOWN = 3  # inputs at which a physics fails
 _WIDTH = 3.6  # inches: as wide as a column of the page, so that text has its size
+_DPI = 200  # sharp on paper, too
 _STYLE: dict[str, Any] = {
     **dict.fromkeys(("font.size", "axes.labelsize", "axes.titlesize"), 9.5),
     **dict.fromkeys(("figure.facecolor", "savefig.facecolor"), "white"),
     **{"axes.linewidth": 0.7, "legend.fontsize": 8.5},
-    **{"svg.fonttype": "path", "svg.hashsalt": "gpadjust"},
 }
-_LARGE = 70_000  # characters, above which a figure of many points is smaller as pixels
-_PLAIN = " <>='/:;,.()!*+@$-_{}\n"  # what a URL between double quotes may have as it is
-_NEEDLESS = re.compile(
-    r"^.*?(?=<svg )|<!--.*?-->|<metadata>.*?</metadata>|(?<=>)\s+(?=<)|(?<=<g) id=\"[^\"]*\"",
-    flags=re.DOTALL,
-)
 _OF_FONTS = "Glyph .* missing|Matplotlib currently does not support"  # names in any script
-_PATH = re.compile(r"\b(?:d|x|y)='[^']*'")  # attributes with coordinates
-_SPACE = re.compile(r"\s*\n?([MLQCz])\s*")  # around a command of a path
-_BEHIND = re.compile(r"(\.\d\d)\d+")  # hundredths of a point are more than a screen shows
 
 
 class Markup(str):
@@ -78,6 +68,7 @@ def tag(name: str, /, *children: str, **attributes: str) -> Markup:
         >>> tag("p", "a < b, ", tag("em", "c"), class_="note")
         '<p class="note">a &lt; b, <em>c</em></p>'
     """
+    # Python's keywords have an underscore behind them, and names none of HTML's hyphens.
     named = {key.rstrip("_").replace("_", "-"): value for key, value in attributes.items()}
     start = "".join(f' {key}="{join([value])}"' for key, value in named.items())
     if name in _VOID:
@@ -131,7 +122,7 @@ def parameter_table(caption: str, parameters: PhysicsParameters) -> Markup:
     low, high = parameters.interval()
     rows = []
     for i, (name, unknown) in enumerate(parameters.unknowns.items()):
-        spread = ["-", "-"]
+        spread = ["-", "-"]  # sd and interval
         if parameters.sd[i] > 0:  # not of a point fit
             interval = f"{number(low[i], 4)} to {number(high[i], 4)}"
             spread = [number(parameters.sd[i]), interval]
@@ -160,6 +151,7 @@ def document(page: Page) -> Markup:
     settings = [[name, value] for name, value in page.settings.items()]
     caption = "How this page came about"
     sections["Settings"] = table(caption, ["setting", "value"], settings, kind="words")
+    # Links within the page have an id for each section.
     ids = {name: re.sub(r"\W", "-", name.lower()).strip("-") for name in sections}
     main = tag(
         "main",
@@ -183,7 +175,7 @@ def document(page: Page) -> Markup:
 def failure(error: PhysicsError) -> str:
     """Return the failure of a physics in a line, with the first of its inputs."""
     message = str(error.args[0]).rstrip(": ")
-    if error.inputs is None or not len(error.inputs):
+    if error.inputs is None or not len(error.inputs):  # the call failed as a whole
         return message
     rows = [f"({', '.join(map(number, row))})" for row in error.inputs[:_SHOWN].tolist()]
     more = len(error.inputs) - len(rows)
@@ -197,7 +189,7 @@ def drawn(draw: Callable[P, list[Markup]]) -> Callable[P, Markup]:
     @wraps(draw)
     def figures(*args: P.args, **options: P.kwargs) -> Markup:
         try:
-            with rc_context(_STYLE), warnings.catch_warnings():
+            with rc_context(_STYLE), warnings.catch_warnings():  # the user's settings stay
                 warnings.filterwarnings("ignore", message=_OF_FONTS)
                 images = [tag("figure", image) for image in draw(*args, **options)]
         except PhysicsError as error:
@@ -213,16 +205,9 @@ def new_figure(height: float) -> Figure:
 
 
 def image(figure: Figure, alt: str) -> Markup:
-    """Return a figure as an image in the page: as curves, or many points as pixels."""
+    """Return a figure as an image in the page."""
     buffer = BytesIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None})
-    text = _NEEDLESS.sub("", buffer.getvalue().decode()).replace('"', "'")
-    text = _PATH.sub(lambda path: _SPACE.sub(r"\1", _BEHIND.sub(r"\1", path[0])), text)
-    source = f"data:image/svg+xml,{quote(text, safe=_PLAIN)}"
-    if len(source) > _LARGE:
-        buffer = BytesIO()
-        figure.savefig(buffer, format="png", dpi=180)
-        raster = f"data:image/png;base64,{b64encode(buffer.getvalue()).decode()}"
-        source = min(source, raster, key=len)
-    width, height = (str(round(96 * size)) for size in figure.get_size_inches())
-    return tag("img", src=Markup(source), alt=alt, width=width, height=height)
+    figure.savefig(buffer, format="png", dpi=_DPI)
+    source = f"data:image/png;base64,{b64encode(buffer.getvalue()).decode()}"
+    width, height = (str(round(96 * size)) for size in figure.get_size_inches())  # CSS's pixels
+    return tag("img", src=source, alt=alt, width=width, height=height)

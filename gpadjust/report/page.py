@@ -25,8 +25,8 @@ from gpadjust.validation.verdict import ALONE, AS_IS, CALIBRATED, CORRECTED, NOT
 from gpadjust.words import listed, number, plural, with_unit
 
 _ERRORS = {ALONE: "your formula", CALIBRATED: "your formula, calibrated"}
-_COLORS = {AS_IS: "yes", CORRECTED: "yes", NOT: "no"}
-_LIBRARIES = ("torch", "gpytorch", "botorch", "numpy")
+_COLORS = {AS_IS: "yes", CORRECTED: "yes", NOT: "no"}  # other answers are open
+_LIBRARIES = ("torch", "gpytorch", "botorch", "numpy")  # whose versions decide the numbers
 
 
 def report(
@@ -42,14 +42,13 @@ def report(
 
     The page begins with the verdict, should you use your formula, and the left-out errors of the
     formula, of the adjustment and of the data alone. Then it has where the formula is wrong,
-    parameters, left-out observations, structures, advice, data and settings, and how to load the
-    model, which is saved beside it (``report.pt`` beside ``report.html``). The page of a log
-    (:func:`~gpadjust.records.identify`) has a free run along its held-out part, parameters, noise
-    and hidden states, and no model beside it. It is one file, without scripts and links.
+    parameters, left-out observations, structures, data and settings, and how to load the model,
+    which is saved beside it (``report.pt`` beside ``report.html``). The page of a log has a free
+    run along its held-out part, parameters, noise and hidden states, and no model beside it. It is
+    one file, without scripts and links. Units are read from names such as ``"head [m]"``.
 
     Whether the physics helps takes a comparison with a model that has none, so report on the result
-    of :func:`~gpadjust.compare`. Units are read from names such as ``"head [m]"``, the columns of a
-    DataFrame.
+    of :func:`~gpadjust.compare`.
 
     Args:
         model: A fitted model, a :class:`~gpadjust.StackedGP`, or a
@@ -101,7 +100,7 @@ def checked_path(file: str | Path, *data: str | Path, model: bool = True) -> Pat
         raise ValueError(f"Expected a page such as 'report.html' to write to, got {str(file)!r}.")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"There is no folder {str(path.parent)!r} to write {path.name} to.")
-    for target in (path, path.with_suffix(".pt"))[: 1 + model]:
+    for target in (path, path.with_suffix(".pt"))[: 1 + model]:  # the page of a log has no model
         if target.is_dir():
             raise IsADirectoryError(
                 f"{str(target)!r} is a folder, expected a file; give the page another name."
@@ -169,6 +168,7 @@ def _page(
         "Data": lambda: tables.data(subject, origin.remarks),
         "Load the model, predict": lambda: tables.loading(subject, saved, origin),
     }
+    # Sections are made one by one, as figures take time.
     bar = progress_bar(progress, makers.items(), unit="section", leave=False)
     sections = {name: make() for name, make in bar}
     names = ", ".join(f"{name} ({type(f).__name__})" for name, f in subject.physics.items())
@@ -231,13 +231,16 @@ def errors(subject: Subject, output: int) -> dict[str, str]:
         rmse_by = {}
         for physics, f_p in values.items():
             alone = ALONE + f" of {physics}" * (len(values) > 1)
+            # the root mean square of y - f_p
             rmse_by[alone] = float((subject.loo.judged[:, output] - f_p).square().nanmean().sqrt())
         adjusted = "adjusted" if subject.has_physics else "data alone"
         rmse_by[adjusted] = float(subject.loo.score().rmse[output])
     shown = {}
     for kind, rmse in rmse_by.items():
         short, of, physics = kind.partition(" of ")
-        label = _ERRORS.get(short, short)
+        label = _ERRORS.get(
+            short, short
+        )  # "physics alone of coarse" has the name of one of several
         if short == ALONE and any(part.unknowns for part in subject.physics.values()):
             label += ", with fitted parameters"
         which = f" ({physics.removeprefix('physics ')})" * bool(of)
@@ -276,12 +279,6 @@ def recommendation(subject: Subject) -> Markup:
     if name != STACKED:
         why = f", {tables.described(name)}. It has nearly all the weight."
         return tag("p", "Recommended: ", tag("strong", name), why)
-    weights = []
-    for output, ranked in comparison.table.items():
-        rows = [row for row in ranked if row.weight >= 0.005]
-        shares = listed(f"{row.structure} {row.weight:.2f}" for row in rows)
-        weights.append(f"{output}: " * (len(comparison.table) > 1) + shares)
     mixture = tag("strong", "the mixture of all structures")
-    why = ". Its intervals contain the doubt between them."
-    first = tag("p", "Recommended: ", mixture, why)
-    return html.join([first, tag("p", f"Its weights are {'; '.join(weights)}.")])
+    why = ", with the weights of the table. Its intervals contain the doubt between them."
+    return tag("p", "Recommended: ", mixture, why)

@@ -91,7 +91,7 @@ def subject_of(thing: object, rows: Sequence[object] | None = None) -> Subject:
             "whether the physics helps, report on `gpadjust.compare(train_X, train_Y, physics)`."
         )
     data = model.data
-    models = getattr(model, "models", [model])
+    models = getattr(model, "models", [model])  # those of a mixture
     if comparison is not None:
         models = [*comparison.models.values()]
     if rows is None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import torch
 from scipy.stats import binom
 
 from gpadjust.core import GP, CalibratedPhysics, KnownNoise, Noise, StackedGP
@@ -91,7 +90,7 @@ def structures(subject: Subject) -> Markup:
             texts = [*cells.values()]
             texts.insert(head.index("weight"), number(row.error))  # before RMSE / sd
             rows.append([row.structure, *texts])
-            names[row.structure] = None
+            names[row.structure] = None  # in their order, each once
         parts.append(table(f"Left-out predictions of {output}, best first", head, rows, marked=0))
     terms = [join([tag("dt", name), tag("dd", described(name))]) for name in names]
     return join([*parts, tag("p", _ELPD), tag("dl", *terms)])
@@ -111,7 +110,7 @@ def predictions(subject: Subject) -> Markup:
     else:
         how += ", nor have its hyper-parameters: their samples are weighted again for each."
     parts = [tag("p", how)]
-    counts = (~subject.loo.judged.isnan()).sum(0).tolist()
+    counts = (~subject.loo.judged.isnan()).sum(0).tolist()  # without missing ones and outliers
     for j, name in enumerate(subject.outputs):
         rmse = float(subject.loo.score().rmse[j])
         share = percent(rmse / spread_of(subject.Y[:, j]))
@@ -134,7 +133,7 @@ def _worst(subject: Subject, j: int) -> Markup:
     outliers = subject.outliers(j)
     distance = loo.residuals[:, j].abs().nan_to_num(nan=-1.0)  # a missing one is the last
     if loo.is_outlier is not None:
-        distance = distance.masked_fill(loo.is_outlier[:, j], torch.inf)
+        distance = distance.masked_fill(loo.is_outlier[:, j], math.inf)
     order = [i for i in distance.argsort(descending=True).tolist() if distance[i] >= 0][:_WORST]
     has_room = len(subject.inputs) <= 4
     head = ["", with_unit("observed", name, "{} [{}]"), with_unit("predicted", name, "{} [{}]")]
@@ -174,6 +173,7 @@ def parameters(subject: Subject) -> Markup:
     """Return prior and posterior of the physics' unknown parameters; nothing if it has none."""
     caption = "Parameters of the physics, by {}"
     tables: dict[str, tuple[str, PhysicsParameters]] = {}
+    # Of the model that adjusts the physics, and of the physics calibrated by itself.
     for shown in subject.adjusted:
         if shown is not None:
             by = caption.format(shown.structure)
@@ -200,7 +200,7 @@ def summary(subject: Subject) -> Markup:
 
 
 def data(subject: Subject, remarks: tuple[str, ...]) -> Markup:
-    """Return an overview of the columns, and the missing, repeated or assumed data."""
+    """Return an overview of the columns, remarks on the rows, and assumptions."""
     rows: list[list[str]] = []
     kinds = (("input", subject.inputs, subject.X), ("output", subject.outputs, subject.Y))
     for kind, names, values in kinds:
@@ -212,28 +212,10 @@ def data(subject: Subject, remarks: tuple[str, ...]) -> Markup:
                 ends = ["-"] * 3
             rows.append([short, kind, unit or "-", *ends, str(len(column) - len(numbers))])
     head = ["column", "is", "unit", "least", "median", "most", "missing"]
-    first = [f"{plural(len(subject.X), 'row')} of data.", _repeats(subject)]
-    items = html.bullets([*first, *remarks, _assumed(subject.model)])
+    distinct = len(subject.X.unique(dim=0))
+    first = f"{plural(len(subject.X), 'row')} of data, {distinct:,} with different inputs."
+    items = html.bullets([first, *remarks, _assumed(subject.model)])
     return join([table("Columns", head, rows), items])
-
-
-def _repeats(subject: Subject) -> str:
-    """Return the number of rows with the inputs of another, and the spread of their outputs."""
-    _, index = subject.X.unique(dim=0, return_inverse=True)
-    counts = index.bincount()
-    repeated = int(counts[counts > 1].sum())
-    if not repeated:
-        return "No two rows have the same inputs."
-    spreads = []
-    for name, y in zip(subject.outputs, subject.Y.unbind(-1), strict=True):
-        groups = [y[(index == group) & ~y.isnan()] for group in range(len(counts))]
-        groups = [group - group.mean() for group in groups if len(group) > 1]
-        if groups:
-            # pooled: the squares of all groups over their degrees of freedom
-            sd = (torch.cat(groups).square().sum() / sum(len(g) - 1 for g in groups)).sqrt()
-            spreads.append(f"{with_unit(number(sd), name)} ({bare(name)})")
-    by = f", and their outputs differ by a standard deviation of {', '.join(spreads)}"
-    return f"{plural(repeated, 'row')} share their inputs with another{by * bool(spreads)}."
 
 
 def _assumed(model: GP | StackedGP) -> str:
@@ -245,7 +227,7 @@ def _assumed(model: GP | StackedGP) -> str:
     while isinstance(noises[-1], RowNoise):
         noises.append(noises[-1].base)
     words = [_NOISES[kind] for kind in _NOISES if any(isinstance(noise, kind) for noise in noises)]
-    for noise in noises:
+    for noise in noises:  # one within the other
         if isinstance(noise, NoisyInputs):
             pairs = zip(inputs, noise.settings["variances"].mean(0).sqrt(), strict=True)
             sds = [f"{bare(n)} by {with_unit(number(s), n)}" for n, s in pairs if s > 0]
@@ -272,6 +254,7 @@ def loading(subject: Subject, saved: Saved | str, origin: Origin) -> Markup:
     missing = [*saved.missing]
     words = [f"The model is in {file}, beside this page; run this in its folder."]
     arguments = [repr(file)]
+    # The file may hold the physics, or its name, or neither.
     if origin.physics:
         where = f"module{'s' * (len(origin.modules) > 1)} {listed(origin.modules)}"
         words.append(f"Python has to find the {where}: there, or in a folder on PYTHONPATH.")
@@ -298,7 +281,7 @@ def loading(subject: Subject, saved: Saved | str, origin: Origin) -> Markup:
         levels = [f"{k} is {name}" for k, name in enumerate(names)]
         levels += ["any other number is a new one"] * (i in subject.batches)
         lines.append(f"# {subject.inputs[i]}: {', '.join(levels)}")
-    point = ", ".join(f"{x:.6g}" for x in subject.base.tolist())
+    point = ", ".join(f"{x:.6g}" for x in subject.base.tolist())  # in the middle of the data
     lines += [
         f"X = torch.tensor([[{point}]], dtype=torch.float64)",
         "",

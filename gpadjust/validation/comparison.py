@@ -29,7 +29,6 @@ from gpadjust.physics import Physics, PhysicsWarning, as_physics
 from gpadjust.progress import progress_bar
 from gpadjust.validation.faults import fault_of
 from gpadjust.validation.leave_one_out import LeaveOneOut, leave_one_out, left_out_by_physics
-from gpadjust.validation.trust import physics_at
 from gpadjust.validation.verdict import (
     ADJUSTED,
     ALONE,
@@ -37,15 +36,11 @@ from gpadjust.validation.verdict import (
     COUNTS,
     DATA,
     Candidate,
-    Evidence,
     Verdict,
-    correction_of,
     difference,
-    is_shown,
-    next_point,
-    straight_line,
+    formulas_of,
     unsampled,
-    verdict_on,
+    verdict_of,
 )
 from gpadjust.words import number, percent
 
@@ -322,83 +317,18 @@ def compare(
         messages |= {(str(warning.message), warning.category): None for warning in warned[name]}
     verdicts: dict[str, Verdict] = {}
     for j, output in enumerate(data.output_names):
-        formulas = _formulas(comparison, [*parts], j)
+        formulas = formulas_of(comparison, [*parts], j)
         faults = {name: fault_of(data, j, f) for name, f in formulas.items()}
         for name, fault in faults.items():
             if fault:
                 names = [name] * bool(name) + [output] * (len(data.output_names) > 1)
                 messages[": ".join([*names, fault]), PhysicsWarning] = None
-        verdict = _verdict(comparison, j, formulas.get(""), faults.get("", ""))
+        verdict = verdict_of(comparison, j, formulas.get(""), faults.get("", ""))
         if verdict is not None:
             verdicts[output] = verdict
     for text, category in messages:
         warnings.warn(text, category, stacklevel=2)
     return replace(comparison, verdict=verdicts)
-
-
-def _formulas(comparison: Comparison, names: Sequence[str], j: int) -> dict[str, Tensor]:
-    """Return output j of each physics at the data, with unknown parameters as they were fitted."""
-    rows = [*comparison.table.values()][j]
-    values = {}
-    for name in names:
-        suffix = f" of {name}" * bool(name)
-        alone = [f"{kind}{suffix}" for kind in (ALONE, CALIBRATED)]
-        predicted = [comparison.left_out[key] for key in alone if key in comparison.left_out]
-        adjusted = [comparison.models[row.structure] for row in rows if row.kind == ADJUSTED]
-        models = [model for model in adjusted if len(model.physics) == 1]
-        if predicted:
-            values[name] = predicted[0].mean[:, j]
-        elif models and not name:  # its parameters are those of the best structure
-            (f,) = physics_at(models[0], models[0].data.X).values()
-            values[name] = f[:, j]
-    return values
-
-
-def _verdict(c: Comparison, j: int, f: Tensor | None, fault: str) -> Verdict | None:
-    """Return the verdict on output j, of a physics with values f; None if nothing is compared."""
-    output, rows = [*c.table.items()][j]
-    rows = [row for row in rows if row.structure in c.models]
-    best = next((row for row in rows if row.kind != DATA), None)
-    without = next((row for row in rows if row.kind == DATA), None)
-    if best is None or without is None:
-        return None
-    adjusted = next((row for row in rows if row.kind == ADJUSTED), best)
-    model = c.models[adjusted.structure]
-    densities = {name: loo.densities_of(j) for name, loo in c.left_out.items()}
-    errors = c.errors()[output]
-    gain, se = difference(densities[best.structure], densities[without.structure])
-    of_use = best.of_use
-    if math.isnan(of_use):
-        of_use = max((row.of_use for row in rows if not math.isnan(row.of_use)), default=math.nan)
-    evidence = Evidence(
-        output,
-        number=len(densities[without.structure]),
-        of_use=of_use,
-        gain=gain,
-        se=se,
-        adjusted=errors.get(ADJUSTED, best.error),
-        data=errors[DATA],
-        fault=fault,
-        correction_needed=_correction_needed(model, c.results[adjusted.structure], j),
-    )
-    correction = ""
-    if f is not None:  # of several physics there is no error of the formula
-        loo = c.left_out[best.structure]
-        y = loo.judged[:, j]
-        is_judged = ~y.isnan()
-        factor, offset, line = straight_line(y[is_judged], f[is_judged])
-        evidence = evidence._replace(
-            alone=float((y - f)[is_judged].square().mean().sqrt()),
-            line=line,
-            factor=factor,
-            offset=offset,
-        )
-        formula = [densities[name] for name in (ALONE, CALIBRATED) if name in densities]
-        if formula:
-            shown = is_shown(densities[adjusted.structure], formula[0])
-            evidence = evidence._replace(is_surpassed=shown)
-        correction = correction_of(model, j, f)
-    return verdict_on(evidence, correction, next_point(model, c.models[without.structure], j))
 
 
 def checked_structures(requested: Any) -> list[Structure]:
@@ -537,14 +467,6 @@ def relevance_of(model: GP, result: FitResult) -> list[float]:
     without = [c.text for c in model.table.choices if any(z.endswith(".mean") for z in c.zeros)]
     shares = [result.probabilities[text] for text in without if text in result.probabilities]
     return [1 - sum(of_output) for of_output in zip(*shares, strict=True)]
-
-
-def _correction_needed(model: GP, result: FitResult, j: int) -> float:
-    """Return the probability that f_p of output j needs a correction; NaN if unknown."""
-    for choice in model.table.choices:
-        if not choice.zeros and choice.text in result.probabilities:
-            return result.probabilities[choice.text][j]
-    return math.nan
 
 
 def spread_of(y: Tensor) -> float:

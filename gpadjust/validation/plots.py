@@ -8,21 +8,12 @@ not drawn. A TypeError is of an argument of another kind, a ValueError of a wron
 Example:
     >>> import torch
     >>> from gpadjust import CKA
-    >>> from gpadjust.validation import leave_one_out, trust
     >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
     >>> model = CKA(X, 2 * torch.sin(6 * X) + X, physics=lambda X: torch.sin(6 * X))
     >>> plot_model(model).shape  # predictions, rho and delta
     (3, 1)
-    >>> plot_adjustment(model).shape  # rho and delta
-    (2, 1)
     >>> plot_prediction(model, X).get_xlabel()
     'x'
-    >>> plot_leave_one_out(leave_one_out(model)).shape
-    (2,)
-    >>> plot_coverage(leave_one_out(model)).get_ylabel()
-    'observed coverage'
-    >>> plot_trust(trust(model)).shape
-    (1,)
 """
 
 from __future__ import annotations

@@ -75,8 +75,7 @@ class Scores:
                 ``median`` only.
             y: True values, ``... x n x m``, NaN where not observed.
             level: Nominal coverage, between 0 and 1.
-            interval: Lower and upper ends of the interval of that level, ``... x n x m`` each.
-                Default: that of the Gaussian.
+            interval: Ends of the interval of that level, ``... x n x m`` each, if not Gaussian.
             energy: The energy score of draws, ``...``.
             output_names: The names of the ``m`` outputs.
 
@@ -103,11 +102,7 @@ class Scores:
         return replace(scores, energy=energy, output_names=tuple(output_names))
 
     def __getitem__(self, part: Any) -> Scores:
-        """Return the scores of a part of the batch, by an index of its leading dimensions.
-
-        Raises:
-            TypeError: If there is no batch.
-        """
+        """Return the scores of a part of the batch; raise a TypeError if there is no batch."""
         if self.rmse.dim() < 2:
             raise TypeError(
                 "These scores have no batch to take a part of; an output is `scores.rmse[j]`."
@@ -173,14 +168,6 @@ def energy_score(draws: Tensor, y: Tensor) -> Tensor:
     Args:
         draws: ``K x ... x n x m``, at least two.
         y: True values, ``... x n x m``; points with NaN are left out.
-
-    Returns:
-        ``...``, in the units of ``y``; NaN where there is no point.
-
-    Example:
-        >>> import torch
-        >>> energy_score(torch.tensor([[[0.0]], [[2.0]]]), torch.tensor([[1.0]]))
-        tensor(0.)
     """
     is_observed = ~y.isnan().any(-1)
     error = (draws - _filled(y)).norm(dim=-1).mean(0)

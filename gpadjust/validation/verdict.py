@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,6 +13,7 @@ from gpadjust.core import GP, FitResult
 from gpadjust.kinds.categories import levels_of, on_levels
 from gpadjust.physics import PhysicsError
 from gpadjust.validation.faults import rms
+from gpadjust.validation.trust import physics_at
 from gpadjust.words import bare, listed, number, with_unit
 
 ALONE, CALIBRATED, ADJUSTED = "physics alone", "calibrated physics", "adjusted"
@@ -106,6 +107,79 @@ def difference(first: Tensor, second: Tensor) -> tuple[float, float]:
     gains = first - second
     # sqrt(n) times the standard deviation of the n differences
     return gains.sum().item(), math.sqrt(len(gains)) * gains.std(correction=0).item()
+
+
+def formulas_of(comparison: Any, names: Sequence[str], j: int) -> dict[str, Tensor]:
+    """Return output j of each physics at the data, with unknown parameters as they were fitted."""
+    rows = [*comparison.table.values()][j]
+    values = {}
+    for name in names:
+        suffix = f" of {name}" * bool(name)
+        alone = [f"{kind}{suffix}" for kind in (ALONE, CALIBRATED)]
+        predicted = [comparison.left_out[key] for key in alone if key in comparison.left_out]
+        adjusted = [comparison.models[row.structure] for row in rows if row.kind == ADJUSTED]
+        models = [model for model in adjusted if len(model.physics) == 1]
+        if predicted:
+            values[name] = predicted[0].mean[:, j]
+        elif models and not name:  # its parameters are those of the best structure
+            (f,) = physics_at(models[0], models[0].data.X).values()
+            values[name] = f[:, j]
+    return values
+
+
+def verdict_of(c: Any, j: int, f: Tensor | None, fault: str) -> Verdict | None:
+    """Return the verdict on output j, of a physics with values f; None if nothing is compared."""
+    output, rows = [*c.table.items()][j]
+    rows = [row for row in rows if row.structure in c.models]
+    best = next((row for row in rows if row.kind != DATA), None)
+    without = next((row for row in rows if row.kind == DATA), None)
+    if best is None or without is None:
+        return None
+    adjusted = next((row for row in rows if row.kind == ADJUSTED), best)
+    model = c.models[adjusted.structure]
+    densities = {name: loo.densities_of(j) for name, loo in c.left_out.items()}
+    errors = c.errors()[output]
+    gain, se = difference(densities[best.structure], densities[without.structure])
+    of_use = best.of_use
+    if math.isnan(of_use):
+        of_use = max((row.of_use for row in rows if not math.isnan(row.of_use)), default=math.nan)
+    evidence = Evidence(
+        output,
+        number=len(densities[without.structure]),
+        of_use=of_use,
+        gain=gain,
+        se=se,
+        adjusted=errors.get(ADJUSTED, best.error),
+        data=errors[DATA],
+        fault=fault,
+        correction_needed=_correction_needed(model, c.results[adjusted.structure], j),
+    )
+    correction = ""
+    if f is not None:  # of several physics there is no error of the formula
+        loo = c.left_out[best.structure]
+        y = loo.judged[:, j]
+        is_judged = ~y.isnan()
+        factor, offset, line = straight_line(y[is_judged], f[is_judged])
+        evidence = evidence._replace(
+            alone=float((y - f)[is_judged].square().mean().sqrt()),
+            line=line,
+            factor=factor,
+            offset=offset,
+        )
+        formula = [densities[name] for name in (ALONE, CALIBRATED) if name in densities]
+        if formula:
+            shown = is_shown(densities[adjusted.structure], formula[0])
+            evidence = evidence._replace(is_surpassed=shown)
+        correction = correction_of(model, j, f)
+    return verdict_on(evidence, correction, next_point(model, c.models[without.structure], j))
+
+
+def _correction_needed(model: GP, result: FitResult, j: int) -> float:
+    """Return the probability that f_p of output j needs a correction; NaN if unknown."""
+    for choice in model.table.choices:
+        if not choice.zeros and choice.text in result.probabilities:
+            return result.probabilities[choice.text][j]
+    return math.nan
 
 
 def verdict_on(e: Evidence, correction: str, next_point: str) -> Verdict:
