@@ -19,6 +19,7 @@ class Page(HTMLParser):
         super().__init__()
         self.open, self.pieces, self.tables, self.images = [], [], {}, []
         self.codes, self.attributes, self.styles, self.ids = [], [], [], []
+        self.tags = set()
         self.feed(html)
         self.close()
         assert self.open == []
@@ -26,6 +27,7 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag, attributes):
         named = dict(attributes)
+        self.tags.add(tag)
         self.attributes += [(tag, *pair) for pair in attributes]
         self.ids += [named["id"]] if "id" in named else []
         if tag == "img":
@@ -68,7 +70,7 @@ class Page(HTMLParser):
             for tag, value in links
         )
         has_events = any(name.startswith("on") for _, name, _ in self.attributes)
-        is_quiet = not has_events and "script" not in self.text
+        is_quiet = not has_events and not {"script", "iframe"} & self.tags
         return own and is_quiet and not re.search(r"url\(|@import", "".join(self.styles))
 
     def loading_code(self):

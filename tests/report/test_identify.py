@@ -95,18 +95,14 @@ def test_a_page_of_true_parameters_noise_and_a_free_run(folder, read, capsys):
 
 
 @pytest.mark.slow
-def test_what_the_equations_lack_is_said(folder, read, undrawn):
+def test_missing_friction_and_a_physics_of_a_module(folder, read, undrawn):
     """Without dry friction the viscous one is wrong, and so are the intervals."""
     assert main(["identify", "log.csv", *STATES, *VISCOUS, *QUICKLY, "--title", "A swing"]) == 0
     page = read(folder / "identify.html")
     assert page.text.startswith("A swing")
     assert "the physics lacks something whose errors last longer" in page.text
-
-
-@pytest.mark.slow
-def test_a_physics_of_a_module_has_a_step_of_its_own(folder, read, undrawn):
-    given = ["--physics", "swing:physics", "--starts", "1", "--out", "module.html"]
-    assert main(["identify", "log.csv", *STATES, *given]) == 0
+    options = ["--physics", "swing:physics", "--starts", "1", "--out", "module.html"]
+    assert main(["identify", "log.csv", *STATES, *options]) == 0
     page = read(folder / "module.html")
     assert dict(page.tables["How this page came about"])["step"] == "0.1 s"
     assert "physics = swing.physics" in page.codes[0]
@@ -158,47 +154,41 @@ def test_python_makes_the_same_page_of_an_identification(folder, read, undrawn):
     assert not (folder / "own.pt").exists()
 
 
-BAD = {
-    ("--states", "angel,rate"): "expected a column 'angel', found .* Is it 'angle.*--hidden",
-    ("--hidden", "speed=0+-1"): "--hidden names 'speed'; expected one of --states",
-    ("--hidden", "rate"): r"such as 'rate \[rad/s\]=0 \+- 2', found 'rate'",
-    ("--hidden", "rate=0..1"): "mean and standard deviation",
-    ("--angles", "torque"): "--angles names 'torque'",
-    ("--unknown", "z=1+-1"): "--unknown names 'z'; expected one of the names in equations",
-    ("--physics", "rate' = rate"): "one equation for each state",
-    ("--physics", "swing:physics"): "Expected swing:physics alone",
-    (
-        "--physics",
-        "x' = rate",
-    ): "equation for each of angle, rate.* found equations for angle, rate, x",
-    ("--held-out", "0.8"): "at most 0.5",
-    ("--step", "0.013"): "whole multiple of the sampling step",
-}
+def option(name, value, words):
+    return ["log.csv", *STATES, *VISCOUS, name, value], words
 
 
-def test_bad_options(folder, capsys):
-    for option, words in BAD.items():
-        _fails(folder, capsys, ["log.csv", *STATES, *VISCOUS, *option], words)
-    given = ["log.csv", *STATES, "--physics", "swing:fails", "--step", "0.05"]
-    _fails(folder, capsys, given, "no such angle")
-
-
-def test_a_log_that_is_none(folder, capsys):
-    for text, words in BAD_LOGS.items():
-        (folder / "log.csv").write_text(text)
-        _fails(folder, capsys, ["log.csv", *STATES, *VISCOUS], words)
-    (folder / "log.csv").write_text(LOG.read_text().replace("[rad]", "[deg]", 1))
-    given = ["log.csv", *STATES, *VISCOUS, "--angles", "angle"]
-    _fails(folder, capsys, given, "Expected the angle 'angle' in rad, found 'deg'")
-
-
-BAD_LOGS = {
+REFUSED = [
+    option("--states", "angel,rate", "a column 'angel', found .* Is it 'angle.*--hidden"),
+    option("--hidden", "speed=0+-1", "--hidden names 'speed'; expected one of --states"),
+    option("--hidden", "rate", r"such as 'rate \[rad/s\]=0 \+- 2', found 'rate'"),
+    option("--hidden", "rate=0..1", "mean and standard deviation"),
+    option("--angles", "torque", "--angles names 'torque'"),
+    option("--unknown", "z=1+-1", "names 'z'; expected one of the names in equations"),
+    option("--physics", "rate' = rate", "one equation for each state"),
+    option("--physics", "swing:physics", "Expected swing:physics alone"),
+    option("--physics", "x' = rate", "each of angle, rate.* equations for angle, rate, x"),
+    option("--held-out", "0.8", "at most 0.5"),
+    option("--step", "0.013", "whole multiple of the sampling step"),
+    (["log.csv", *STATES, "--physics", "swing:fails", "--step", "0.05"], "no such angle"),
+]
+LOGS = {
     "time,angle,torque\n0,1,0\n0,1,0\n": "expected times that rise, found 0 after 0",
     "time,angle,torque\n0,1,0\n1,1,\n": r"column 3 \('torque'\): expected a number",
     "time,angle,torque\n0,1,0\n1,x,0\n": r"column 2 \('angle'\): expected a number, or nothing",
     "Zeit,angle,torque\n0,1,0\n1,1,0\n2,1,0\n": "column 'time', .*Other times: --time Zeit",
     "time,angle,torque\n0,1,0\n1,1,0\n2,1,0\n": "8 control steps or more",
+    LOG.read_text().replace("[rad]", "[deg]", 1): "the angle 'angle' in rad, found 'deg'",
 }
+
+
+def test_refused(folder, capsys):
+    for command, words in REFUSED:
+        _fails(folder, capsys, command, words)
+    for text, words in LOGS.items():
+        (folder / "log.csv").write_text(text)
+        angles = ["--angles", "angle"] * ("[deg]" in text)
+        _fails(folder, capsys, ["log.csv", *STATES, *VISCOUS, *angles], words)
 
 
 def test_the_log_is_never_overwritten(folder, capsys):
@@ -247,13 +237,3 @@ def test_a_log_with_dates_other_names_and_units_in_round_brackets(folder, read, 
     names = {}
     exec(page.codes[0], names)
     assert names["machine"].parameters["lambda_"].mean() == pytest.approx(float(row[1]), rel=1e-3)
-
-
-def test_times_in_milliseconds_are_converted(folder, undrawn):
-    rows = "".join(f"{20 * k},{5 * 0.9**k}\n" for k in range(24))
-    (folder / "log.csv").write_text(f"t [ms],excess (K)\n{rows}")
-    given = ["--time", "t", "--states", "x=excess", "--physics", "x' = -x/tau + 0*time"]
-    assert main(["identify", "log.csv", *given, "--unknown", "tau [s] = 0.1 */ 3"]) == 0
-    text = (folder / "identify.html").read_text()
-    assert "0.1898" in text  # 0.02 / ln(10 / 9)
-    assert "0.02 s" in text

@@ -18,7 +18,16 @@ from gpadjust.physics import FunctionPhysics, Unknown, as_physics
 from gpadjust.validation import STRUCTURES, Structure, compare, leave_one_out
 from gpadjust.validation.comparison import candidates_of, checked_structures, physics_by_name
 from gpadjust.validation.leave_one_out import _with_noise, left_out_by_physics
-from gpadjust.validation.verdict import Evidence, straight_line, unsampled, verdict_on
+from gpadjust.validation.verdict import (
+    AS_IS,
+    CORRECTED,
+    NOT,
+    OPEN,
+    Evidence,
+    straight_line,
+    unsampled,
+    verdict_on,
+)
 from tests.systems import line, normal
 
 
@@ -234,35 +243,31 @@ GOOD = Evidence(
 @pytest.mark.parametrize(
     ("changes", "answer", "words"),
     [
-        ({}, "Use it corrected", "Errors fall from 0.5 N to 0.1 N; largest"),
-        ({"data": 0.1}, "Use it corrected", "the data alone do as well (0.1 N)"),
-        ({"alone": math.nan, "line": math.nan}, "Use it corrected", "The error is 0.1 N, of the"),
-        ({"alone": 0.1, "line": 0.1}, "Use your formula as it is", "Its error is 0.1 N, corrected"),
+        ({}, CORRECTED, "Errors fall from 0.5 N to 0.1 N; largest"),
+        ({"data": 0.1}, CORRECTED, "the data alone do as well (0.1 N)"),
+        ({"alone": math.nan, "line": math.nan}, CORRECTED, "The error is 0.1 N, of the"),
+        ({"alone": 0.1, "line": 0.1}, AS_IS, "Its error is 0.1 N, corrected"),
         (
             {"alone": 0.1, "line": 0.1, "is_surpassed": True},
-            "Use it corrected",
+            CORRECTED,
             "0.1 N, as it is 0.1 N, but most observations are predicted better",
         ),
-        (
-            {"alone": 4.0, "line": 0.4},
-            "These data do not tell",
-            "By itself your formula is off by 4",
-        ),
-        ({"correction_needed": 0.4}, "Use your formula as it is", "Its error is 0.5 N"),
-        ({"correction_needed": 0.4, "is_surpassed": True}, "Use it corrected", "from 0.5 N to 0.1"),
-        ({"line": 0.1, "factor": 2.0}, "Use your formula as it is", "Take 2 times your formula: "),
-        ({"line": 0.1, "factor": 2.0, "offset": -3.0}, "Use your formula as it is", "less 3 N: "),
-        ({"of_use": 0.01, "gain": 0.5}, "Do not use it", "Without it the error is 0.3 N, with it"),
-        ({"of_use": 0.01}, "These data do not tell", "Without it"),  # they contradict one another
-        ({"of_use": 0.9, "gain": 0.5}, "These data do not tell", "would tell, the first one here"),
-        ({"gain": -9.0}, "These data do not tell", "Without it"),
-        ({"adjusted": 0.4}, "These data do not tell", "Without it the error is 0.3 N, with it 0.4"),
-        ({"number": 7}, "These data do not tell", "at least 8 observations"),
-        ({"factor": 0.0}, "These data do not tell", "the same value at all observations"),
-        ({"fault": "it is off"}, "These data do not tell", "seems to be wrong: it is off"),
-        ({"of_use": math.nan}, "Use it corrected", "Errors fall"),  # by left-out observations alone
-        ({"of_use": math.nan, "gain": 0.9, "se": 0.1}, "These data do not tell", "Without it"),
-        ({"of_use": math.nan, "gain": -9.0}, "Do not use it", "Without it the error is 0.3 N"),
+        ({"alone": 4.0, "line": 0.4}, OPEN, "By itself your formula is off by 4"),
+        ({"correction_needed": 0.4}, AS_IS, "Its error is 0.5 N"),
+        ({"correction_needed": 0.4, "is_surpassed": True}, CORRECTED, "from 0.5 N to 0.1"),
+        ({"line": 0.1, "factor": 2.0}, AS_IS, "Take 2 times your formula: "),
+        ({"line": 0.1, "factor": 2.0, "offset": -3.0}, AS_IS, "less 3 N: "),
+        ({"of_use": 0.01, "gain": 0.5}, NOT, "Without it the error is 0.3 N, with it"),
+        ({"of_use": 0.01}, OPEN, "Without it"),  # they contradict one another
+        ({"of_use": 0.9, "gain": 0.5}, OPEN, "would tell, the first one here"),
+        ({"gain": -9.0}, OPEN, "Without it"),
+        ({"adjusted": 0.4}, OPEN, "Without it the error is 0.3 N, with it 0.4"),
+        ({"number": 7}, OPEN, "at least 8 observations"),
+        ({"factor": 0.0}, OPEN, "the same value at all observations"),
+        ({"fault": "it is off"}, OPEN, "seems to be wrong: it is off"),
+        ({"of_use": math.nan}, CORRECTED, "Errors fall"),  # by left-out observations alone
+        ({"of_use": math.nan, "gain": 0.9, "se": 0.1}, OPEN, "Without it"),
+        ({"of_use": math.nan, "gain": -9.0}, NOT, "Without it the error is 0.3 N"),
     ],
 )
 def test_a_verdict_by_its_evidence(changes, answer, words):
@@ -271,10 +276,8 @@ def test_a_verdict_by_its_evidence(changes, answer, words):
     text = " ".join(verdict.reasons)
     assert words in text
     assert "nats" not in text
-    assert (verdict.factor, verdict.offset) == (
-        changes.get("factor") or 1,
-        changes.get("offset", 0),
-    )
+    line = changes.get("factor") or 1, changes.get("offset", 0)
+    assert (verdict.factor, verdict.offset) == line
 
 
 def test_the_straight_line_and_its_error_of_left_out_points(X, noise):
@@ -319,7 +322,7 @@ def test_a_formula_that_is_off_by_a_factor_is_never_used():
     with pytest.warns(PhysicsWarning, match="times too small; are its units those") as caught:
         comparison = compare(X, 1000 * (2 + (6 * X).sin() + noise), law)
     assert len(caught) == 1
-    assert comparison.verdict["y"].answer == "These data do not tell"
+    assert comparison.verdict["y"].answer == OPEN
     assert "times too small" in comparison.verdict["y"].reasons[0]
 
 
@@ -347,7 +350,7 @@ def test_two_points():
     X = torch.tensor([[0.0], [1.0]], dtype=torch.float64)
     comparison = compare(X, X.exp(), crude)
     assert comparison.recommended.predict(X).mean.isfinite().all()
-    assert comparison.verdict["y"].answer == "These data do not tell"
+    assert comparison.verdict["y"].answer == OPEN
 
 
 @pytest.mark.slow
