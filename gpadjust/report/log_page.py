@@ -175,13 +175,13 @@ def _runs(machine: Identification, units: Mapping[str, str]) -> list[Markup]:
     """Return the free runs of each state along a few windows."""
     others = {**machine.runs}
     run = others.pop(IDENTIFIED)
-    options: dict[str, Any] = {"others": others, "step": machine.step, "units": units}
     images = []
     for state in machine.spec.states:
         for row in range(min(_WINDOWS, len(run.mean))):
             figure = html.new_figure(_HEIGHT)
-            where = {"rows": [row], "states": [state], "axes": [[figure.subplots()]]}
-            plot_free_run(run, machine.windows, **where, **options)
+            options: dict[str, Any] = {"others": others, "step": machine.step, "units": units}
+            options |= {"rows": [row], "states": [state], "axes": [[figure.subplots()]]}
+            plot_free_run(run, machine.windows, **options)
             alt = f"free run of {state} with intervals, and measurements"
             images.append(html.image(figure, alt))
     return images

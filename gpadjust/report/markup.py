@@ -22,7 +22,7 @@ P = ParamSpec("P")
 _VOID = ("img", "meta")  # elements without an end
 _SHOWN = 3  # inputs at which a physics fails
 _WIDTH = 3.6  # inches: as wide as a column of the page, so that text has its size
-_DPI = 200  # sharp on paper, too
+_DPI = 160  # sharp on paper, too
 _STYLE: dict[str, Any] = {
     **dict.fromkeys(("font.size", "axes.labelsize", "axes.titlesize"), 9.5),
     **dict.fromkeys(("figure.facecolor", "savefig.facecolor"), "white"),

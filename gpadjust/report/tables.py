@@ -39,9 +39,9 @@ _ELPD = (
     "best: of structures that predict alike one may have all of it, also one that is not the first."
 )
 _COVERAGE = (
-    "Right 95 % intervals cover 95 % of left-out observations, but for chance: the fourth column "
-    "has the range of 95 of 100 right models. Below the diagonal of the figure intervals are too "
-    "narrow, above it too wide."
+    "The 95 % intervals of a right model cover 95 % of left-out observations, but for chance: the "
+    "fourth column has the range of 95 of 100 such models. Below the diagonal of the figure "
+    "intervals are too narrow, above it too wide."
 )
 _PARAMETERS = (
     "Values are means on the scale of the prior (of a factor, geometric means). With a bias that "
@@ -100,7 +100,7 @@ def predictions(subject: Subject) -> Markup:
     """Return the errors of left-out predictions, and the observations predicted worst."""
     how = "Each observation is predicted by a model that has not seen it"
     if subject.comparison is not None:
-        how += ", as in the table above. Of a mixture its weights, which have seen all, stay."
+        how += ", as in the table of structures. The weights of a mixture have seen all of them."
     elif isinstance(subject.model, GP) and len(subject.model.u) == 1:
         how = (
             "Each observation is predicted from all others; hyper-parameters (and fitted "
@@ -108,7 +108,7 @@ def predictions(subject: Subject) -> Markup:
             "errors are too small."
         )
     else:
-        how += ", nor have its hyper-parameters: their samples are weighted again for each."
+        how += ", nor have its hyper-parameters: their draws are weighted again for each."
     parts = [tag("p", how)]
     counts = (~subject.loo.judged.isnan()).sum(0).tolist()  # without missing ones and outliers
     for j, name in enumerate(subject.outputs):

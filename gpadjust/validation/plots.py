@@ -184,46 +184,33 @@ def plot_prediction(
     observation_noise: bool = False,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw predictions at inputs ``n x d``, and true values ``n x m`` there if ``Y`` is given.
+    """Draw predictions of a model of one input at ``n x 1``, and true values ``n x m`` there.
 
-    With one input: the mean, the central interval (of observations if ``observation_noise``), the
-    training data, the physics and the truth. With more, which need ``Y``: the predictions against
-    ``Y``, with their intervals.
+    There are the mean, the central interval (of observations if ``observation_noise``), the
+    training data, the physics, and the truth if ``Y`` is given.
     """
-    inputs = labels(model.data.input_names)
-    outputs = labels(model.data.output_names)
-    X = checked_points("X", X, len(inputs))
-    if Y is not None and (Y := checked_tensor("Y", Y)).shape != (len(X), len(outputs)):
+    inputs, outputs = labels(model.data.input_names), labels(model.data.output_names)
+    if len(inputs) > 1:
         raise ValueError(
-            f"Expected Y of shape {len(X)} x {len(outputs)}, a row for each of X and a column for "
-            f"each output, got {tuple(Y.shape)}."
+            f"Expected a model of one input, got {len(inputs)}; `plot_model` draws slices, and "
+            "`plot_leave_one_out(leave_one_out(model))` predictions against observations."
         )
-    if Y is None and len(inputs) > 1:
-        raise ValueError(
-            f"X has {len(inputs)} inputs, so predictions are drawn against the truth: pass `Y`; "
-            "for slices through a model use `plot_model`."
-        )
-    with torch.no_grad():
-        drawn = mean_and_ends(model.marginals(X, observation_noise), output, level)
-    ax = axes_of(ax, 1, 1)[0, 0]
-    y = None if Y is None else Y[:, output]
-    if y is not None and len(inputs) > 1:
-        is_observed = ~y.isnan()
-        y, mean, low, high = (values[is_observed] for values in (y, *drawn))
-        ends = [min(y.min(), mean.min()), max(y.max(), mean.max())]
-        ax.plot(ends, ends, color=GREY, lw=1, ls="--")
-        bars = torch.stack([mean - low, high - mean]).clamp_min(0.0)
-        style = {"color": BLUE, "elinewidth": 1, "alpha": 0.85, **DOTS}
-        ax.errorbar(y, mean, bars, label=f"mean, {100 * level:g} %", **style)
-        ax.set(xlabel=f"true {outputs[output]}", ylabel=f"predicted {outputs[output]}")
-        legend(ax, loc="upper left")
-        return ax
+    X = checked_points("X", X, 1)
     order = X[:, 0].argsort()
     x = X[order, 0]
-    band(ax, x, [values[order] for values in drawn], level)
+    with torch.no_grad():
+        drawn = mean_and_ends(model.marginals(X[order], observation_noise), output, level)
+    ax = axes_of(ax, 1, 1)[0, 0]
+    band(ax, x, drawn, level)
     _draw_physics(ax, x, physics_at(model, X[order]), output)
-    if y is not None:
-        y = y[order]
+    if Y is not None:
+        Y = checked_tensor("Y", Y)
+        if Y.shape != (len(X), len(outputs)):
+            raise ValueError(
+                f"Expected Y of shape {len(X)} x {len(outputs)}, a row for each of X and a column "
+                f"for each output, got {tuple(Y.shape)}."
+            )
+        y = Y[order, output]
         ax.plot(x[~y.isnan()], y[~y.isnan()], color="black", lw=1, ls=":", label="truth")
     _draw_data(ax, model, output)
     ax.set(xlabel=inputs[0], ylabel=outputs[output])

@@ -77,14 +77,6 @@ def test_a_prediction_of_one_input(line, forrester):
         assert high == pytest.approx((mean + Z95 * sd)[i].item())
 
 
-def test_a_prediction_of_more_inputs(plane, data):
-    X, Y = data(n=12, num_outputs=2, seed=3)
-    ax = plot_prediction(plane, X, Y, output=1)
-    mean = plane.posterior(X).mean.detach()[:, 1]
-    (container,) = ax.containers
-    np.testing.assert_allclose(container[0].get_xydata(), torch.stack([Y[:, 1], mean], dim=-1))
-
-
 def test_several_physics_behind_a_prediction(forrester):
     both = {"coarse": forrester.crude, "fine": forrester.truth}
     ax = plot_prediction(CKA(*forrester.data(0), physics=both), forrester.test_X)
@@ -181,8 +173,6 @@ def test_points_that_were_not_observed_are_not_drawn(data):
     assert np.isfinite(axes[1].get_ylim()).all()
     steps = curve(plot_coverage(loo, output=1), "observed").get_ydata()
     np.testing.assert_allclose(np.unique(steps), np.arange(len(rest) + 1) / len(rest))
-    (container,) = plot_prediction(model, X, Y, output=1).containers
-    np.testing.assert_allclose(container[0].get_xydata()[:, 0], Y[rest, 1])
     ticks = plot_adjustment(model, output=1)[0, 0].lines[-1]
     np.testing.assert_allclose(ticks.get_xdata(), X[rest, 0])
 
