@@ -121,8 +121,8 @@ def leave_one_out(model: Any) -> LeaveOneOut:
     .. math:: \mu_{-i} = y_i - \alpha_i / [K^{-1}]_{ii}, \quad
         \sigma^2_{-i} = 1 / [K^{-1}]_{ii}
 
-    (Rasmussen and Williams 2006, eqs. 5.10-5.12; Sundararajan and Keerthi 2001). The draws have
-    seen the observation; for its prediction they have the weights
+    (Rasmussen and Williams 2006, eqs. 5.10-5.12). The draws have seen the observation; for its
+    prediction they have the weights
     :math:`1 / p(y_i | y_{-i}, \theta)`, at most :math:`\sqrt S` times the average (Gelfand et al.
     1992; Ionides 2008). After a point fit there is one draw, and scores of few points are
     optimistic. For a :class:`~gpadjust.StackedGP` return the mixture of its models' predictions;

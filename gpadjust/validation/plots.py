@@ -327,7 +327,7 @@ def plot_priors(priors: Priors, *, axes: Any = None) -> Any:
     """Draw the prior of each unknown number of a model, and its posterior after a fit.
 
     Curves are shares of draws, on a logarithmic axis where the number spans a decade; a point fit
-    is a line. Return an array of as many axes as ``model.priors()`` has rows.
+    is a line. Return an array of axes, one for each row of ``model.priors()``.
     """
     n = len(priors.prior)
     shape = (-(-n // _COLUMNS), min(n, _COLUMNS))  # rows are rounded up

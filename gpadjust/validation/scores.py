@@ -80,16 +80,9 @@ class Scores:
             output_names: The names of the ``m`` outputs.
 
         Raises:
-            TypeError: If one is not a tensor of numbers, or ``level`` is not a number.
+            TypeError: If one is not a tensor of numbers.
             ValueError: If the shapes disagree, means have NaN, variances are negative, or ``level``
                 is not between 0 and 1.
-
-        Example:
-            >>> import torch
-            >>> mean, y = torch.zeros(5, 20, 2), torch.randn(5, 20, 2)
-            >>> scores = Scores.compute(mean, torch.ones(5, 20, 2), y)  # 5 steps of 20 windows
-            >>> scores.rmse.shape, scores[4].rmse.shape
-            (torch.Size([5, 2]), torch.Size([2]))
         """
         gaussians = _gaussians(mean, variance.nan_to_num(nan=1.0, posinf=math.inf), y)
         judged = y.masked_fill(variance.isnan(), math.nan)
@@ -117,16 +110,14 @@ def score(posterior: Posterior, Y: Tensor, level: float = 0.95) -> Scores:
     If ``Y`` is noisy, pass the posterior of *observations*, ``observation_noise=True``.
 
     Args:
-        posterior: The posterior of a model of this library (with a link ``crps`` is by the
-            prediction and its variance), or one of BoTorch that is Gaussian at each point or a
-            mixture.
+        posterior: The posterior of a model of this library, or one of BoTorch that is Gaussian at
+            each point or a mixture. With a link ``crps`` is by the mean and the variance.
         Y: Observations, ``... x n x m``, NaN where missing.
         level: Nominal coverage, between 0 and 1.
 
     Raises:
-        TypeError: If ``posterior`` has no mean and variance, ``Y`` is not a tensor, or ``level``
-            is not a number.
-        ValueError: If ``Y`` does not have the posterior's shape, or ``level`` is not between 0
+        TypeError: If ``posterior`` has no mean and variance, or ``Y`` is not a tensor.
+        ValueError: If ``Y`` has another shape than the posterior, or ``level`` is not between 0
             and 1.
 
     Example:

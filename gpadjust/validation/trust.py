@@ -73,13 +73,10 @@ def trust(model: Any, X: ArrayLike = None, *, level: float = 0.95) -> Trust:
     .. math:: \text{data if } |\mu - f_p| > w, \quad
         \text{else physics if } w \le D, \quad \text{else neither:}
 
-    - *data*: the model is sure that the physics is wrong there, and overrides it;
-    - *physics*: the physics may be right, and the interval is narrower than the discrepancies
-      elsewhere, so that data have confirmed it there;
-    - *neither*: the model predicts the physics for want of data; it may be as wrong as elsewhere.
-
-    w and D are at least a thousandth of the standard deviation of the observations. :math:`f_p` is
-    the prior mean of the model, of several physics their weighted sum.
+    that is, where the model is sure that the physics is wrong; where data have confirmed it; and
+    where the model predicts the physics for want of data. w and D are at least a thousandth of the
+    standard deviation of the observations. :math:`f_p` is the prior mean of the model, of several
+    physics their weighted sum.
 
     Args:
         model: A model with a physics, such as :class:`~gpadjust.CKA`; the ``model`` of
