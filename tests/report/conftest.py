@@ -1,11 +1,13 @@
 """A page as a reader sees it, and small things to report on."""
 
 import re
+import sys
 from html.parser import HTMLParser
 
 import pytest
 import torch
 
+from gpadjust.__main__ import main
 from gpadjust.report.markup import Markup
 from gpadjust.validation import compare
 
@@ -83,6 +85,38 @@ class Page(HTMLParser):
 def read():
     """Reads the page at a path."""
     return lambda path: Page(path.read_text(encoding="utf-8"))
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The working directory, and modules of its own."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    for name in ("hill", "broken", "lacks", "swing"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    yield tmp_path
+    for name in ("hill", "broken", "lacks", "swing"):
+        sys.modules.pop(name, None)
+
+
+@pytest.fixture
+def fails(folder, capsys):
+    """Asserts that a command ends with an error of these words, and that no file changes."""
+
+    def contents():
+        return {path: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+    def fails(command, words):
+        capsys.readouterr()
+        before = contents()
+        assert main(command) == 1
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert "Traceback" not in err
+        assert re.search(words, err, flags=re.DOTALL | re.MULTILINE), err
+        assert contents() == before
+
+    return fails
 
 
 @pytest.fixture

@@ -39,21 +39,15 @@ COMMAND = ["report", "data.csv", "--inputs", "time", *OUTPUT, "--fit", "map"]
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """The working directory: a table, a module of physics, and an earlier report."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", [*sys.path])
-    for name in ("hill", "broken", "lacks"):
-        monkeypatch.delitem(sys.modules, name, raising=False)
-    (tmp_path / "data.csv").write_text(TABLE)
-    (tmp_path / "hill.py").write_text(MODULE)
-    (tmp_path / "broken.py").write_text("x = 1\ny = 1 / 0\n")
-    (tmp_path / "lacks.py").write_text("import no_such_module_here\n")
-    (tmp_path / "report.html").write_text("earlier")
-    (tmp_path / "report.pt").write_text("earlier")
-    yield tmp_path
-    for name in ("hill", "broken", "lacks"):
-        sys.modules.pop(name, None)
+def folder(folder):
+    """The working directory: a table, modules of physics, and an earlier report."""
+    (folder / "data.csv").write_text(TABLE)
+    (folder / "hill.py").write_text(MODULE)
+    (folder / "broken.py").write_text("x = 1\ny = 1 / 0\n")
+    (folder / "lacks.py").write_text("import no_such_module_here\n")
+    (folder / "report.html").write_text("earlier")
+    (folder / "report.pt").write_text("earlier")
+    return folder
 
 
 @pytest.fixture
@@ -106,14 +100,6 @@ def test_a_page_and_a_model_that_its_code_loads(folder, read, capsys, undrawn, f
     assert how in page.text
     assert re.search(r"your formula [\d.e-]+ m adjusted [\d.e-]+ m root mean", page.text)
     assert "report(compare(" not in page.text
-
-
-def _fails(capsys, command, words):
-    assert main(command) == 1
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert "Traceback" not in err
-    assert re.search(words, err, flags=re.DOTALL | re.MULTILINE), err
 
 
 def physics(path, words):
@@ -176,31 +162,28 @@ TABLES = {
 }
 
 
-def test_faults_are_reported_and_nothing_is_written(folder, capsys):
+def test_faults_are_reported_and_nothing_is_written(folder, fails):
     (folder / "taken.pt").mkdir()
     for command, words in REFUSED:
-        _fails(capsys, command, words)
+        fails(command, words)
     for text, words in TABLES.items():
         (folder / "data.csv").write_text(text)
-        _fails(capsys, [*COMMAND, *WAVE], words)
-    assert {(folder / name).read_text() for name in ("report.html", "report.pt")} == {"earlier"}
-    assert not [file for file in folder.iterdir() if file.name.startswith(".report")]
+        fails([*COMMAND, *WAVE], words)
 
 
-def test_a_file_that_is_not_there_or_is_the_page(folder, capsys):
+def test_a_file_that_is_not_there_or_is_the_page(folder, fails):
     (folder / "data.csv").rename(folder / "date.csv")
     (folder / "data.csv2").mkdir()
-    _fails(capsys, [*COMMAND, *WAVE], r"There is no file 'data.csv'. Is it 'date.csv'\?")
+    fails([*COMMAND, *WAVE], r"There is no file 'data.csv'. Is it 'date.csv'\?")
     (folder / "data.csv").symlink_to("/dev/null")
-    _fails(capsys, [*COMMAND, *WAVE], "'data.csv' is a device or a pipe, expected a CSV file")
+    fails([*COMMAND, *WAVE], "'data.csv' is a device or a pipe, expected a CSV file")
     (folder / "data.csv").unlink()
     (folder / "data.csv").mkdir()
-    _fails(capsys, [*COMMAND, *WAVE], "'data.csv' is a folder, expected a CSV file")
+    fails([*COMMAND, *WAVE], "'data.csv' is a folder, expected a CSV file")
     for data in ("report.pt", "report.html"):
         (folder / data).write_text(TABLE)
         words = f"{data} is the data; give the page another name by --out"
-        _fails(capsys, ["report", data, *FORMULA], words)
-        assert (folder / data).read_text() == TABLE
+        fails(["report", data, *FORMULA], words)
 
 
 def test_an_interrupted_fit_leaves_nothing(folder, capsys, monkeypatch):
@@ -309,11 +292,11 @@ def test_inputs_are_those_of_the_option_of_formulas_and_groups(fitted, capsys):
     assert model.data.input_names == ("q", "rig", "in [s]")
 
 
-def test_texts_that_do_not_repeat_are_not_categories(folder, capsys):
+def test_texts_that_do_not_repeat_are_not_categories(folder, fails):
     rows = [f"{x},id{i},{y}" for i, (x, y) in enumerate(ROWS)]
     (folder / "data.csv").write_text("\n".join(["time [s],rig,head [m]", *rows, ""]))
     command = [*COMMAND, *WAVE, "--inputs", "time,rig"]
-    _fails(capsys, command, r"column 2 \('rig'\): expected a number")
+    fails(command, r"column 2 \('rig'\): expected a number")
 
 
 def test_formulas_of_several_forms(fitted, folder, read):
@@ -363,13 +346,12 @@ def test_a_german_spreadsheet_with_a_formula_of_a_spreadsheet(fitted, capsys):
     assert data.Y.flatten().tolist() == pytest.approx([1000 * (y + 3) for _, y in ROWS])
 
 
-def test_a_column_pi_is_never_the_constant(fitted, folder, capsys):
+def test_a_column_pi_is_never_the_constant(fitted, fails):
     rows = [f"{x + 1},{x},{y}" for x, y in ROWS]
     model = fitted("pi,po,q", rows, "--outputs", "q", "--physics", "2*(pi_-po)*PI()")
     assert model.data.input_names == ("pi", "po")
     options = ["--outputs", "q", "--inputs", "p=pi", "--physics", "pi*p - po"]
     assert fitted(None, None, *options).data.input_names == ("p", "po")
-    capsys.readouterr()
     for inputs in ([], ["--inputs", "po"], ["--inputs", "pi,po"]):
         command = ["report", "data.csv", "--outputs", "q", "--physics", "2*(pi-po)", *inputs]
-        _fails(capsys, command, "formulas take it as 3.14159, and here is a 'pi' of your own")
+        fails(command, "formulas take it as 3.14159, and here is a 'pi' of your own")
