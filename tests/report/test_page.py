@@ -17,6 +17,7 @@ from gpadjust.report.subject import subject_of
 from gpadjust.validation import Verdict
 from gpadjust.validation.plots import lines_along
 from gpadjust.words import name_and_unit, number
+from tests.systems import line
 
 from .conftest import Page, f_p
 
@@ -152,55 +153,46 @@ def test_nothing_is_written_of_what_cannot_be_reported(comparison, tmp_path):
     assert {each.name for each in tmp_path.iterdir()} == {"report.html", "folder.html"}
 
 
-def test_an_error_on_the_way_leaves_what_was_there(comparison, tmp_path, monkeypatch, undrawn):
-    old = tmp_path / "report.html"
-    old.write_text("old")
-
-    def interrupted(*args):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("gpadjust.report.tables.data", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        report(comparison, old)
-    assert old.read_text() == "old"
-    assert [each.name for each in tmp_path.iterdir()] == ["report.html"]
-
-
-def test_a_model_that_cannot_be_saved_leaves_none_of_an_earlier_page(
+def test_an_interrupted_page_and_a_model_that_cannot_be_saved(
     comparison, tmp_path, read, monkeypatch, undrawn
 ):
-    def refuses(*args):
-        raise ValueError("no way")
+    def raising(error):
+        def raise_it(*args):
+            raise error
 
-    (tmp_path / "report.pt").write_text("old")
-    monkeypatch.setattr("gpadjust.report.page.save", refuses)
-    page = read(report(comparison, tmp_path / "report.html"))
-    assert "The model could not be saved: no way" in page.text
-    assert [each.name for each in tmp_path.iterdir()] == ["report.html"]
+        return raise_it
+
+    page, model = tmp_path / "report.html", tmp_path / "report.pt"
+    page.write_text("old")
+    with monkeypatch.context() as patched:
+        patched.setattr("gpadjust.report.tables.data", raising(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            report(comparison, page)
+    assert page.read_text() == "old"
+    assert [file.name for file in tmp_path.iterdir()] == ["report.html"]
+    model.write_text("old")
+    monkeypatch.setattr("gpadjust.report.page.save", raising(ValueError("no way")))
+    assert "The model could not be saved: no way" in read(report(comparison, page)).text
+    assert not model.exists()  # of the earlier page
 
 
 def test_inputs_are_drawn_in_double_precision():
     offset = 1e60
-    X = offset * (1 + torch.linspace(0, 1e-8, 7, dtype=torch.float64).unsqueeze(-1))
+    X = offset * (1 + line(7, 0, 1e-8))
     model = CKA(X, X / offset, physics=lambda X: torch.zeros_like(X))
     fit(model, "map")
     ((_, drawn),) = lines_along(model)
     assert len(drawn.unique()) == len(drawn) > 9
 
 
-def test_dots_at_the_ends_of_a_figure_are_whole(monkeypatch):
-    X = torch.linspace(0, 1, 7, dtype=torch.float64).unsqueeze(-1)
+def test_dots_at_the_ends_of_a_figure_are_complete(monkeypatch):
+    X = line(7)
     model = CKA(X, X.sin(), physics=lambda X: X)
     fit(model, "map")
-    figures_drawn = []
-
-    def image(figure, text):
-        figures_drawn.append(figure)
-        return Markup(text)
-
-    monkeypatch.setattr(figures, "image", image)
+    drawn = []
+    monkeypatch.setattr(figures, "image", lambda figure, alt: drawn.append(figure) or Markup(alt))
     figures.corrections(subject_of(model), 0, [0])
-    low, high = figures_drawn[0].axes[0].get_xlim()
+    low, high = drawn[0].axes[0].get_xlim()
     assert low < -0.02
     assert high > 1.02
 
