@@ -15,7 +15,6 @@ from torch import Tensor
 from gpadjust.files import fields as read
 from gpadjust.files.rows import is_value, numeric_columns, rows_of_sheet, rows_of_text
 from gpadjust.physics.formula import symbol
-from gpadjust.words import labelled, plural
 
 LARGEST = 1e100
 """The largest number that is accepted; squares of larger ones may overflow."""
@@ -90,7 +89,9 @@ class Table:
         fields = [row for _, row in rows]
         header, units, first = _heads(fields, names is not None)
         if first >= len(rows):
-            content = "only a line of names" if rows else "an empty file"
+            content = "only a line of names"
+            if not rows:
+                content = "an empty file"
             raise ValueError(f"{file}: expected a line of names and then rows, found {content}.")
         if header is None and names is None:
             shown = ", ".join(map(repr, fields[0][:5]))
@@ -222,7 +223,8 @@ class Table:
 
     @property
     def _labels(self) -> list[str]:
-        return [*map(labelled, self.names, self.units)]
+        pairs = zip(self.names, self.units, strict=True)
+        return [f"{name} [{unit}]" if unit else name for name, unit in pairs]
 
     def _column(self, name: str) -> int:
         """Return the place of a column: by its header, its name without the unit, or its symbol."""
@@ -272,9 +274,10 @@ class Table:
             if not any(fields[width:]):  # a delimiter at the end of a line
                 row = fields[:width]
             if len(row) != width:
+                fields_s = "field" + "s" * (width != 1)
                 raise ValueError(
-                    f"{self.file}, line {line}: expected {plural(width, 'field')}, one for each "
-                    f"name, found {len(row)}; correct the line, or leave it out."
+                    f"{self.file}, line {line}: expected {width} {fields_s}, one for each name, "
+                    f"found {len(row)}; correct the line, or leave it out."
                     f"{self._miscounted(headers, row)}"
                 )
             self._rows[i] = line, row

@@ -365,14 +365,10 @@ def given_physics(
         way = " A function has its own: FunctionPhysics(f, unknowns=...)." * (not formulas)
         raise ValueError(f"--unknown names {absent[0]!r}, which is in no formula.{way}")
     modules = tuple(dict.fromkeys(text.partition(":")[0] for text in texts if ":" in text))
-    expression = code[name]
-    if len(parts) > 1:
-        several = ", ".join(f"{name!r}: {text}" for name, text in code.items())
-        expression = f"{{{several}}}"
-    physics: Any = parts
     if len(parts) == 1:
-        physics = parts[name]
-    return GivenPhysics(physics, expression * bool(modules), modules)
+        return GivenPhysics(parts[name], code[name] * bool(modules), modules)
+    several = ", ".join(f"{name!r}: {text}" for name, text in code.items())
+    return GivenPhysics(parts, f"{{{several}}}" * bool(modules), modules)
 
 
 def _formula(text: str, data: TableData, unknowns: Mapping[str, Unknown]) -> tuple[Physics, str]:
@@ -485,18 +481,16 @@ def _check(physics: Physics, data: TableData) -> None:
             f"{hint * isinstance(physics, FormulaPhysics)}"
         )
     is_same = torch.isclose(again, Y, rtol=_SAME, atol=_SAME * float(Y.abs().max()))
-    range_text = f"values between {-LARGEST:.0e} and {LARGEST:.0e}"
     exclude = "Correct the physics there, or exclude such inputs:"
-    _refuse(Y.abs() > LARGEST, range_text, exclude, data)
     settle = "Take random numbers out of it, or let it set their seed itself:"
-    _refuse(~is_same, "the same values whenever it is called", settle, data)
-
-
-def _refuse(is_wrong: Tensor, expected: str, way_out: str, data: TableData) -> None:
-    """Raise a ValueError if some values ``n x m`` of a physics are wrong."""
-    if rows := is_wrong.any(-1).nonzero().flatten().tolist():
-        counts = f"found others in {len(rows)} of {plural(len(data.lines), 'row')}"
-        raise ValueError(f"expected {expected}, {counts}. {way_out}{_lines(rows, data)}")
+    checks = {
+        f"values between {-LARGEST:.0e} and {LARGEST:.0e}": (Y.abs() > LARGEST, exclude),
+        "the same values whenever it is called": (~is_same, settle),
+    }
+    for expected, (is_wrong, way_out) in checks.items():
+        if rows := is_wrong.any(-1).nonzero().flatten().tolist():
+            counts = f"found others in {len(rows)} of {plural(len(data.lines), 'row')}"
+            raise ValueError(f"expected {expected}, {counts}. {way_out}{_lines(rows, data)}")
 
 
 def _values(physics: Physics, data: TableData) -> Tensor:
