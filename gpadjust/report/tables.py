@@ -85,11 +85,9 @@ def structures(subject: Subject) -> Markup:
         head += [with_unit("RMSE", output, "{} [{}]"), "RMSE / sd", "in 95 %", "of use"]
         rows = []
         for row in candidates:
-            cells = cells_of(row)
-            cells["coverage"] = percent(row.coverage)
-            texts = [*cells.values()]
-            texts.insert(head.index("weight"), number(row.error))  # before RMSE / sd
-            rows.append([row.structure, *texts])
+            *first, weight, relative, _, of_use = cells_of(row).values()
+            errors = [number(row.error), relative, percent(row.coverage)]
+            rows.append([row.structure, *first, weight, *errors, of_use])
             names[row.structure] = None  # in their order, each once
         parts.append(table(f"Left-out predictions of {output}, best first", head, rows, marked=0))
     terms = [join([tag("dt", name), tag("dd", described(name))]) for name in names]
