@@ -9,7 +9,7 @@ from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -34,13 +34,8 @@ _SPAN = 10**0.5  # of positive outputs, from which kinds of noise are compared
 _DIGITS = 6  # of a sampling step, which is a mean of differences
 _NO_NOTES = (DeprecationWarning, PendingDeprecationWarning)  # of libraries, not of the fit
 
-
-class Job(NamedTuple):
-    """A command whose options, files and physics are read."""
-
-    lines: Sequence[str]  # on the data, for the terminal
-    origin: Origin
-    work: Callable[[], Subject | Identification]
+Job = tuple[Sequence[str], Origin, Callable[[], Subject | Identification]]
+"""Lines on the data for the terminal, the origin of the page, and the work itself."""
 
 
 def run(arguments: Namespace, command: Sequence[str]) -> None:
@@ -137,7 +132,7 @@ def _of_table(arguments: Namespace) -> Job:
     first = f"{rows}, {listed(data.Y.columns)} from {listed(data.X.columns)}."
     settings = {"data file": read.digest_of(file)}
     origin = Origin(settings, data.remarks, physics=code, modules=modules)
-    return Job([first, *data.remarks], origin, work)
+    return [first, *data.remarks], origin, work
 
 
 def _noise_of(
@@ -269,7 +264,7 @@ def _of_log(arguments: Namespace) -> Job:
     program = _program(arguments.data, spec, reading, motion, options)
     line = f"{listed(arguments.data)}: {listed(map(repr, records))}."
     remarks = [remark for table in tables for remark in table.remarks]
-    return Job([line, *remarks], Origin(settings, units=units, program=program), work)
+    return [line, *remarks], Origin(settings, units=units, program=program), work
 
 
 def _program(

@@ -22,7 +22,7 @@ from gpadjust.validation.plots import (
     mean_and_ends,
     tidy,
 )
-from gpadjust.validation.trust import physics_at
+from gpadjust.validation.trust import SIDES, physics_at
 from gpadjust.words import bare, labelled, name_and_unit, number, percent, with_unit
 
 _MOST = 24  # inputs along which slices are drawn, in all outputs together
@@ -55,23 +55,21 @@ def where_wrong(subject: Subject) -> Markup:
 
 def trusted(subject: Subject) -> Markup:
     """Return the shares of predictions that rest on the physics, on data, or on neither."""
-    rows, failed, points = [], [], 0  # without a physics, or if it fails, there are no rows
-    for j, (name, shown) in enumerate(zip(subject.outputs, subject.adjusted, strict=True)):
-        if shown is None:
-            continue
-        try:
-            basis = trust(shown.model)
-        except PhysicsError as error:
-            failed.append(tag("p", f"{name}: {html.failure(error)}", class_="caution"))
-            continue
-        shares = (basis.physics, basis.data, basis.neither)
-        rows.append([name, shown.structure, *(percent(share[j]) for share in shares)])
-        points = len(basis.X)
+    rows, points = [], 0
+    try:
+        for j, (name, shown) in enumerate(zip(subject.outputs, subject.adjusted, strict=True)):
+            if shown is not None:
+                basis = trust(shown.model)
+                points = len(basis.X)  # of Sobol's sequence, for each output the same
+                shares = [percent(getattr(basis, side)[j]) for side in SIDES]
+                rows.append([name, shown.structure, *shares])
+    except PhysicsError as error:  # at some of these points
+        return tag("p", html.failure(error), class_="caution")
     if not rows:
-        return html.join(failed or [tag("p", _NONE)])
+        return tag("p", _NONE)
     head = ["output", "by the model", "formula", "data", "neither"]
     table = html.table("Basis of the predictions", head, rows)
-    return html.join([*failed, tag("p", _TRUST.format(f"{points:,}")), table])
+    return html.join([tag("p", _TRUST.format(f"{points:,}")), table])
 
 
 def point(subject: Subject, X: Tensor, digits: int = 4) -> list[str]:
@@ -147,6 +145,7 @@ def corrections(subject: Subject, output: int, inputs: list[int]) -> list[Markup
 def _limits(values: Tensor) -> tuple[float, float]:
     """Return limits of an axis that show all of some values but few that are far off."""
     low, high = values.quantile(0.01), values.quantile(0.99)  # not the worst outliers
+    # A constant has no range: take a width that its rounding does not exceed.
     room = 0.15 * (high - low).clamp_min(1e-12 * values.abs().max() + 1e-300)
     return float(low - room), float(high + room)
 

@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import gpadjust
 from gpadjust.core import GP, StackedGP, save
@@ -84,11 +85,12 @@ def report(
         ['report.html', 'report.pt']
     """
     origin = Origin({name: str(value) for name, value in (settings or {}).items()})
-    is_log = isinstance(model, Identification)
-    path = checked_path(file, model=not is_log)
-    if is_log and rows is not None:
+    path = checked_path(file, model=not isinstance(model, Identification))
+    subject: Any = model
+    if not isinstance(model, Identification):
+        subject = subject_of(model, rows)
+    elif rows is not None:
         raise TypeError("The page of a log has no names of rows; leave `rows` out.")
-    subject = model if isinstance(model, Identification) else subject_of(model, rows)
     write(subject, path, title, origin, progress)
     return path
 
@@ -121,7 +123,7 @@ def write(
     """Write the page, and a model beside it, or nothing; return the headline for the terminal."""
     model_path = path.with_suffix(".pt")
     # Files are complete before they replace earlier ones.
-    with TemporaryDirectory(prefix=".report-", dir=path.parent) as folder:
+    with TemporaryDirectory(prefix=".report-", dir=path.parent) as folder:  # of the same disk
         new_page, new_model = Path(folder, path.name), Path(folder, model_path.name)
         if isinstance(subject, Identification):
             page = log_page.page(subject, title, origin)

@@ -47,7 +47,7 @@ _PARAMETERS = (
     "Values are means on the scale of the prior (of a factor, geometric means). With a bias that "
     "is free to vary the true values remain open: these describe the system best together with it."
 )
-_UNKNOWN = "By {}, the data barely constrain {}, which {} as in the prior."
+_UNKNOWN = "By {}, the data barely constrain {}: the posterior is about the prior."
 _SUMMARY = (
     "In the units of the data; the median of draws, and the range of 95 % of them. A lengthscale "
     "is the distance over which a function changes, sd its size. Means are those of the prior; the "
@@ -118,8 +118,7 @@ def predictions(subject: Subject) -> Markup:
             "observations."
         )
         if rows := subject.outliers(j):
-            are = "is taken for an outlier" if len(rows) == 1 else "are taken for outliers"
-            words += f" {listed(rows)} {are}: errors and coverage on this page leave them out."
+            words += f" Taken for outliers, and not in errors and coverage here: {listed(rows)}."
         parts += [tag("p", words), figures.left_out(subject, j), _worst(subject, j)]
     return join(parts)
 
@@ -185,8 +184,7 @@ def parameters(subject: Subject) -> Markup:
         if posterior:
             parts += [html.parameter_table(by, posterior), figures.densities(posterior)]
             if names := posterior.untold:
-                stay = "stays" if len(names) == 1 else "stay"
-                parts.append(tag("p", _UNKNOWN.format(structure, listed(names), stay)))
+                parts.append(tag("p", _UNKNOWN.format(structure, listed(names))))
     return join([*parts, *[tag("p", _PARAMETERS)] * bool(parts)])
 
 

@@ -93,7 +93,9 @@ def test_parameters_that_stay_as_known_before_are_named(tmp_path, read, undrawn)
     model = CalibratedPhysics(X, Y, physics=FunctionPhysics(rows, unknowns=unknowns))
     fit(model)
     page = read(report(model, tmp_path / "report.html"))
-    words = "By CalibratedPhysics, the data barely constrain beyond, which stays as in the prior."
+    words = (
+        "By CalibratedPhysics, the data barely constrain beyond: the posterior is about the prior."
+    )
     assert words in page.text
 
 
@@ -165,7 +167,7 @@ def test_errors_and_coverage_are_without_outliers(tmp_path, read):
     page = read(
         report(comparison, tmp_path / "report.html", rows=[f"line {i + 2}" for i in range(20)])
     )
-    assert "line 7 is taken for an outlier" in page.text
+    assert "Taken for outliers, and not in errors and coverage here: line 7." in page.text
     assert f"is off by {float(alone):.3g} " in page.text
     caption = "The 5 observations of y that are farthest from their predictions"
     assert page.tables[caption][1][0] == "line 7 (outlier)"
