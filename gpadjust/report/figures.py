@@ -29,10 +29,10 @@ _MOST = 24  # inputs along which slices are drawn, in all outputs together
 _BANDS = "Solid lines are means; bands cover 95 % of the function, without measurement noise."
 _NONE = "This model has no formula to adjust or to trust."
 _TRUST = (
-    "Shares of {} points spread over the range of the data at which the prediction rests on the "
-    "formula (its interval covers the formula, and is narrower than the errors of the formula at "
-    "the data), on the data (its interval excludes the formula: the model is sure that it is wrong "
-    "there), or on neither (there are too few data to decide)."
+    "Shares of {} points in the range of the data at which the prediction rests on the formula "
+    "(its interval covers the formula, and is narrower than errors of the formula at the data), "
+    "on the data (its interval excludes the formula), or on neither (there are too few data to "
+    "decide)."
 )
 
 

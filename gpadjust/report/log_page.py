@@ -27,10 +27,10 @@ _PARAMETERS = (
     "intervals of the free run cover far less than 95 %, it is not, and they are too narrow."
 )
 _FREE_RUN = (
-    "The last {} were held out. From the last state before them, the runs follow the actions of "
-    "the log without any measurement. Intervals contain the uncertainty of state and parameters, "
-    "process noise and the noise of sensors. Dots are measurements, dashed is the physics with its "
-    "guesses."
+    "The last {} were held out. The runs begin with the last state before them, and follow the "
+    "logged actions without any measurement. Intervals contain the uncertainty of state and "
+    "parameters, process noise and sensor noise. Dots are measurements, dashed is the physics with "
+    "its guesses."
 )
 _NOISE = (
     "Standard deviations. Process noise is what a step adds to the physics; a physics that is "

@@ -31,12 +31,11 @@ _STRUCTURES = {
     STACKED: "the mixture of all structures with the weights of the table",
 }
 _ELPD = (
-    "elpd is the log density of left-out observations, summed, in nats: higher is better. A "
-    "difference of less than two of its errors shows nothing. RMSE is of the left-out predictions, "
-    "sd is that of the observations, 'in 95 %' the share of left-out observations within their "
-    "95 % intervals, and 'of use' the probability that the formula is of use, by nested models "
-    "with and without it. Weights are those of the mixture that predicts left-out observations "
-    "best: of structures that predict alike one may have all of it, also one that is not the first."
+    "elpd: log density of left-out observations, summed, in nats; higher is better, and a "
+    "difference of less than two of its errors shows nothing. RMSE: of left-out predictions; sd: "
+    "of the observations. In 95 %: share of left-out observations within their 95 % intervals. Of "
+    "use: probability that the formula is of use, by nested models. Weights: of the mixture that "
+    "predicts left-out observations best; of structures that predict alike one may have all of it."
 )
 _COVERAGE = (
     "The 95 % intervals of a right model cover 95 % of left-out observations, but for chance: the "
