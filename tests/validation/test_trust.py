@@ -46,30 +46,27 @@ def test_the_definition_by_hand(half):
     torch.testing.assert_close(found.doubt, w / discrepancy)
 
 
-def test_a_perfect_physics_is_trusted_everywhere():
-    X = line(9)
-    model = CKA(X, wave(X), physics=wave)
+LIMITS = {
+    "a perfect physics": (wave, line(9), line(50, -1, 2), "physics"),
+    "wrong throughout": (lambda X: 2 * wave(X) + 3, line(12), None, "data"),
+    "a large discrepancy elsewhere": (
+        lambda X: wave(X) + (40 * X).sin(),
+        line(12, 0, 0.2),
+        line(20, 3, 4),
+        "neither",
+    ),
+}
+
+
+@pytest.mark.parametrize(("truth", "X", "points", "side"), LIMITS.values(), ids=LIMITS)
+def test_limiting_cases(truth, X, points, side):
+    model = CKA(X, truth(X), physics=wave)
     fit(model)
-    assert trust(model, line(50, -1, 2)).physics.item() == 1
-
-
-def test_a_physics_that_is_wrong_throughout_is_overridden():
-    X = line(12)
-    model = CKA(X, 2 * wave(X) + 3, physics=wave)
-    fit(model)
-    found = trust(model)
-    assert found.X.shape == (512, 1)
-    assert (found.X >= 0).all()
-    assert (found.X <= 1).all()
-    assert found.data.item() == 1
-
-
-def test_without_data_there_is_neither():
-    """A model that has learnt of a large discrepancy elsewhere."""
-    X = line(12, 0, 0.2)
-    model = CKA(X, wave(X) + (40 * X).sin(), physics=wave)
-    fit(model)
-    assert trust(model, line(20, 3, 4)).neither.item() == 1
+    shares = trust(model, points)
+    assert getattr(shares, side).item() == 1
+    if points is None:
+        assert shares.X.shape == (512, 1)
+        assert ((shares.X >= 0) & (shares.X <= 1)).all()
 
 
 @pytest.mark.slow
