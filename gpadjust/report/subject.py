@@ -37,7 +37,6 @@ class Adjusted(NamedTuple):
 
     structure: str
     model: GP
-    weight: float  # in a mixture; 1 if there is none
 
 
 @dataclass(frozen=True)
@@ -128,15 +127,14 @@ def subject_of(thing: object, rows: Sequence[object] | None = None) -> Subject:
 
 def _adjusted(model: GP | StackedGP, comparison: Comparison | None, output: int) -> Adjusted | None:
     """Return the structure of most weight that adjusts a physics, of the models of an output."""
+    weights = {(type(model).__name__, model): 1.0}
     if comparison is not None:
         rows = [row for row in [*comparison.table.values()][output] if row.kind != ALONE]
-        candidates = [(r.structure, comparison.models[r.structure], r.weight) for r in rows]
+        weights = {(r.structure, comparison.models[r.structure]): r.weight for r in rows}
     elif isinstance(model, StackedGP):
-        weights = zip(model.weights.items(), model.models, strict=True)
-        candidates = [(name, part, shares[output]) for (name, shares), part in weights]
-    else:
-        candidates = [(type(model).__name__, model, 1.0)]
-    for name, part, weight in sorted(candidates, key=lambda candidate: -candidate[2]):
+        pairs = zip(model.weights.items(), model.models, strict=True)
+        weights = {(name, part): shares[output] for (name, shares), part in pairs}
+    for name, part in sorted(weights, key=lambda pair: -weights[pair]):
         if part.physics:
-            return Adjusted(name, part, weight)
+            return Adjusted(name, part)
     return None
