@@ -129,7 +129,7 @@ def test_the_tables_are_of_the_left_out_predictions(comparison, scaled):
 
 
 def of_physics(physics, X, Y, Yvar=None):
-    return left_out_by_physics(as_physics(physics), Data.of(X, Y, Yvar, None))
+    return left_out_by_physics(as_physics(physics), Data.read(X, Y, Yvar, None))
 
 
 class TestPhysicsAlone:
@@ -176,7 +176,9 @@ def test_warnings_come_once_and_those_of_the_seed_as_advice(scaled):
         warnings.simplefilter("always")
         compare(X, Y, crude, 1e-3, structures=["zero mean", "physics mean"])
     assert [str(each.message)[:14] for each in caught] == ["1 of 9 rows eq"]
-    rows = compare(*scaled, crude, structures=["zero mean"]).table
+    zero = compare(*scaled, crude, structures=["zero mean"])
+    assert [*zero.errors()["y"]] == ["physics alone", "data alone"]  # none that adjusts
+    rows = zero.table
     (text,) = unsampled(rows, {"zero mean": FitResult("bayes", error=0.9)})
     assert text.startswith("Results of zero mean depend on the seed")
     assert unsampled(rows, {"zero mean": FitResult("bayes", error=0.1)}) == []
