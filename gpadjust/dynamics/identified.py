@@ -98,7 +98,9 @@ class IdentifiedDynamics(Dynamics):
         # Draws of N(z, P'), with P' = L^-T L^-1 of the Cholesky factor L of its inverse.
         L = torch.linalg.cholesky(precision)
         spread = even_normal(len(draws), len(z), seed=0) @ L.inverse()
-        self.physics_parameters = PhysicsParameters(unknowns, unknowns.at(z + spread).unbind(-1))
+        self.physics_parameters = PhysicsParameters(
+            unknowns, unknowns.to_values(z + spread).unbind(-1)
+        )
 
     def predict(self, states: Tensor, actions: Tensor) -> Prediction:
         """Return the next states by the parameters' center, and their variance.

@@ -469,7 +469,7 @@ def varying_parameters(
             f"{', '.join(unknowns)}, got {sd.tolist()}."
         )
     sd = sd.expand(p)
-    center = unknowns.coordinates(learnt.draws).clamp(-_END, _END).mean(0)
+    center = unknowns.to_coordinates(learnt.draws).clamp(-_END, _END).mean(0)
     low, high = actions.amin(0), actions.amax(0)
     # Half of the range; for an action that never varied, its size.
     size = high.abs().where(high != 0, torch.ones_like(high))
@@ -490,7 +490,9 @@ def varying_parameters(
             # f_p(x; z + deviation) - f_p(x; z)
             ends = []
             for coordinates in (center, center + deviation):
-                values = unknowns.at(coordinates.expand_as(deviation).flatten(0, -2))  # per row
+                values = unknowns.to_values(
+                    coordinates.expand_as(deviation).flatten(0, -2)
+                )  # per row
                 end = states.clone()
                 end[..., spec.moving] = physics.or_nan(rows, values).view(*states.shape[:-1], -1)
                 ends.append(end)

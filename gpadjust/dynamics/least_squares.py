@@ -40,7 +40,7 @@ def most_likely(
     """
     unknowns = physics.unknowns
     errors = StepErrors(physics, spec, data)
-    guess = unknowns.coordinates(unknowns.guess)
+    guess = unknowns.to_coordinates(unknowns.guess)
     if not errors.evaluate(guess).isfinite().all():
         physics(errors.inputs)  # raises an error that says where it fails
     # Search: from the best draws of the prior, by some of the transitions.
@@ -78,7 +78,7 @@ class StepErrors:
 
     def evaluate(self, z: Tensor) -> Tensor:
         """Return next states less those of the physics, ``... x m x n``; infinite if it fails."""
-        following = self.physics.or_nan(self.inputs, self.physics.unknowns.at(z))
+        following = self.physics.or_nan(self.inputs, self.physics.unknowns.to_values(z))
         predicted = self.data.states.expand(*following.shape[:-1], -1).clone()
         predicted[..., self.spec.moving] = following
         # r_ij = s'_ij - f_p(s_j, a_j)_i, with angles the shortest way round

@@ -101,7 +101,7 @@ class PhysicsDynamics(Dynamics):
         chol = torch.linalg.cholesky(precision + torch.eye(len(point)).to(precision))
         normal = even_normal(_DRAWS, len(point), seed=0)
         deviation = torch.linalg.solve_triangular(chol.mT, normal.mT, upper=True).mT
-        return PhysicsParameters(unknowns, unknowns.at(point + deviation).unbind(-1))
+        return PhysicsParameters(unknowns, unknowns.to_values(point + deviation).unbind(-1))
 
     def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
         """Fit unknown parameters to these and all earlier transitions, one row or more.
@@ -188,7 +188,7 @@ class PhysicsDynamics(Dynamics):
                 data = Trajectories.checked(self.spec, **fitted.pop("transitions"))
                 fitted = _Fitted(data, **fitted)
                 # One number for each parameter, NaN if any entry is.
-                values = self.physics.unknowns.at(fitted.precision @ fitted.point)
+                values = self.physics.unknowns.to_values(fitted.precision @ fitted.point)
                 check_numbers({"fitted": values, "noise": fitted.noise.view(self.spec.state_dim)})
             if probes is not None:
                 probes = PhysicsProbes(*probes)
@@ -198,7 +198,7 @@ class PhysicsDynamics(Dynamics):
     @property
     def _values(self) -> Tensor | None:
         """The fitted parameters; None for the guesses."""
-        return None if self._fitted is None else self.physics.unknowns.at(self._fitted.point)
+        return None if self._fitted is None else self.physics.unknowns.to_values(self._fitted.point)
 
     def _step(self, states: Tensor, actions: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Return the next states by the physics."""

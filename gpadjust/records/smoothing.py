@@ -243,7 +243,7 @@ def drawn_parameters(physics: Physics, mean: Array, covariance: Array) -> Physic
         return PhysicsParameters({}, [])
     values, vectors = torch.linalg.eigh(torch.from_numpy(covariance.copy()))
     spread = even_normal(_DRAWS, len(unknowns), seed=0) * values.clamp_min(0).sqrt()
-    at = unknowns.at(torch.from_numpy(mean.copy()) + spread @ vectors.mT)
+    at = unknowns.to_values(torch.from_numpy(mean.copy()) + spread @ vectors.mT)
     return PhysicsParameters(unknowns, at.unbind(-1))
 
 
@@ -649,7 +649,7 @@ class Chain:
         inputs = self.recorded[rows].expand(*states.shape[:-1], -1).clone()
         following = torch.from_numpy(np.ascontiguousarray(states))
         unknowns = self.physics.unknowns
-        values = unknowns.at(torch.from_numpy(parameters)) if unknowns else None
+        values = unknowns.to_values(torch.from_numpy(parameters)) if unknowns else None
         for actions in self.within[rows].unbind(1):
             inputs[..., self.spec.moving] = following
             inputs[..., self.spec.state_dim :] = actions

@@ -104,8 +104,8 @@ def test_the_likelihood_is_the_dense_formula():
         v = {name: value.item() for name, value in model.values.items() if "noise" in name}
         noise = torch.full((20,), v.get("noise.variance", v.get("noise.constant")) + 1e-11)
         if base is not None:
-            f = law(X, law.unknowns.at(model.values["physics.rate"])).flatten()
-            at_prior = law(X, law.unknowns.at(torch.zeros(1, 1).double())).square().mean()
+            f = law(X, law.unknowns.to_values(model.values["physics.rate"])).flatten()
+            at_prior = law(X, law.unknowns.to_values(torch.zeros(1, 1).double())).square().mean()
             noise = noise + (v["noise.relative"] + 1e-11) * f.square() / at_prior
         noise = (noise + added[0]) * model.unit.square()[0]
         law_of_Y = MultivariateNormal(prior.mean, prior.covariance_matrix + noise.diag())
