@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from gpadjust import CKA, StackedGP, ZeroMeanGP, compare, fit
 from gpadjust.active import Collection
 from gpadjust.control import MPCAgent, Planner, Task
-from gpadjust.control.episodes import rewards_of
+from gpadjust.control.summary import episode_rewards
 from gpadjust.display import html_table
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.physics import FormulaPhysics, ODEPhysics, PhysicsParameters, Unknown
@@ -84,7 +84,7 @@ def learner():
 
 
 def numbers_of_agent(found):
-    return [number(rewards_of(found)[-1].reward), "10 steps"]
+    return [number(episode_rewards(found)[-1].reward), "10 steps"]
 
 
 def numbers_of_model(found):

@@ -11,8 +11,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from gpadjust.checks import checked_number, checked_whole
-from gpadjust.control.episodes import Row, nothing, recorded
-from gpadjust.control.faults import fault
+from gpadjust.control.episodes import Row, fault, nothing, recorded
 
 
 class MixedReplayBuffer(ReplayBuffer):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from contextlib import ExitStack
 from copy import deepcopy
 from typing import Any, ClassVar, Self
 
@@ -26,8 +27,9 @@ from stable_baselines3.common.vec_env import (
 from gpadjust.checks import check_kind
 from gpadjust.control import EpisodeCheckpoint, StepGuard, Task
 from gpadjust.control import episodes as real
-from gpadjust.control.checkpoint import locked, pickled_environment
-from gpadjust.control.faults import check_observation
+from gpadjust.control.checkpoint import pickled_environment
+from gpadjust.control.learning import check_functions, learn_dynamics
+from gpadjust.control.summary import agent_table, agent_text
 from gpadjust.display import Display
 from gpadjust.dynamics import Trajectories
 from gpadjust.rl.buffer import MixedReplayBuffer
@@ -176,7 +178,7 @@ class Dyna(OffPolicyAlgorithm, Display):
         data = new if dynamics.has_learnt else recorded
         is_enough = len(new) and len(data) >= 2 - dynamics.is_fitted  # two rows have a scale
         if is_enough and uses_model and options.reward_tolerance is not None:
-            real.check_functions(self.task, data, options.reward_tolerance)
+            check_functions(self.task, data, options.reward_tolerance)
         # Update on real transitions, and on transitions of earlier models.
         buffer.mix = uses_model
         with real.timed(self.wall_time, "update"):
@@ -188,7 +190,7 @@ class Dyna(OffPolicyAlgorithm, Display):
         if uses_model:
             with real.timed(self.wall_time, "fit"):
                 horizons = options.score_horizons
-                metrics = real.learn_dynamics(self.model_task(), data, recorded, horizons)
+                metrics = learn_dynamics(self.model_task(), data, recorded, horizons)
         buffer.num_learnt = len(recorded)
         num_ended = int((new.steps == 1).sum())
         self.num_episodes += num_ended
@@ -315,10 +317,10 @@ class Dyna(OffPolicyAlgorithm, Display):
 
     def __repr__(self) -> str:
         """Return a text on the agent, its environment, dynamics, progress and last reward."""
-        return real.described(self)
+        return agent_text(self)
 
     def _repr_html_(self) -> str:
-        return real.html_of(self)
+        return agent_table(self)
 
     # The loop of Stable-Baselines3
 
@@ -333,7 +335,10 @@ class Dyna(OffPolicyAlgorithm, Display):
         adapted: Any = [AgentCallback.around(part) for part in callbacks]
         if len(adapted) == 1:
             adapted = adapted[0]
-        with locked(callbacks):
+        with ExitStack() as stack:
+            for part in callbacks:
+                if isinstance(part, EpisodeCheckpoint):
+                    stack.enter_context(part.locked())
             return super().learn(total_timesteps, adapted, *args, **kwargs)
 
     def _setup_learn(
@@ -375,7 +380,7 @@ class Dyna(OffPolicyAlgorithm, Display):
         self, observation: Any, *args: Any, **kwargs: Any
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """Return the actions of the learner; raise a ValueError for an invalid observation."""
-        check_observation(observation)
+        real.check_observation(observation)
         return super().predict(observation, *args, **kwargs)
 
     @staticmethod

@@ -109,7 +109,7 @@ def test_terminations_that_come_late_are_refused(point_agent, point_env):
     env = point_env()
     agent = point_agent(env).learn(5)
     env.unwrapped.end = -9
-    with pytest.raises(ValueError, match="terminated=True, but none was given"):
+    with pytest.raises(ValueError, match="terminated=True, but the task has False"):
         agent.learn(5, reset_num_timesteps=False)
 
 
