@@ -15,10 +15,10 @@ FACTORIES = {
 ALLOWED = {
     "numbers of rows or draws, which index tensors of any device": {
         "core/fitting.py _parts",
-        "core/fitting.py _joined",
-        "core/fitting.py _pooled",
+        "core/fitting.py _evenly",
         "core/fitting.py modes",
         "core/functions.py __init__",
+        "core/model.py as_single_task_gp",
         "core/model.py log_likelihood",
         "core/nuts.py proposed",
         "physics/formula.py _parsed",
@@ -37,7 +37,7 @@ ALLOWED = {
         "physics/base.py forward",
     },
     "drawn on the CPU, so that a seed says the same everywhere, and moved": {
-        "core/kernels.py _normal",
+        "core/kernels.py __init__",
         "core/model.py sample_functions",
         "core/stacked.py sample_functions",
     },

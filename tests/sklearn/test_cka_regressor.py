@@ -245,7 +245,7 @@ def test_a_physics_that_is_off_is_said_to_be(data):
     assert "is scaled" not in str(caught[0].message)
     large = fast(lambda X: 1000 * wave(X), fit_method="bayes")
     scaled = TransformedTargetRegressor(large, transformer=StandardScaler())
-    with pytest.warns(PhysicsWarning, match="The targets were standardised"):
+    with pytest.warns(PhysicsWarning, match="The observations were standardised"):
         scaled.fit(X, y)
 
 
