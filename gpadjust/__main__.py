@@ -84,14 +84,15 @@ data: the log: CSV files or *.xlsx, a record each
 --physics equation: an equation for each state: "a'=...", its time derivative, or 'a=...', its next
     value; or module:name
 --step 0.05: the step of the free run, a multiple of the sampling step, which it is by default; a
-    longer one is quicker, and averages the actions over it
+    longer one takes the measurements at its ends alone; equations follow the actions in between
 --segment run: a column of labels: where they change, a new run begins
 --held-out 0.25: the share of the log that is held out at its end (%(default)s)
 --starts 4: searches to take the best of
 """
 _OPTIONS_OF_BOTH = """\
 --unknown E=2+-0.4: an unknown number of the physics, its guess and standard deviation, which may be
-    a percentage; or a factor, E=2*/1.5; or bounds, E=1..3. Several: give it again
+    a percentage; or a factor, E=2*/1.5; or bounds, E=1..3. Several: give it again. "F(v: 0..9)=2*/1.5"
+    is a function of v, from 0 to 9
 --out page.html: the page to write (%(default)s), with a model the model beside it, page.pt; both
     replace what has these names
 --seed 0: of the fits and free runs (%(default)s)

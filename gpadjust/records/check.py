@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpadjust.dynamics.targets import one_physics
 from gpadjust.physics import Physics, PhysicsError
 from gpadjust.records import kalman
 from gpadjust.records.kalman import Array
-from gpadjust.records.records import Records, control_steps
-from gpadjust.records.smoothing import Chain, first_moments, substeps_of, with_known_inputs
+from gpadjust.records.records import Records
+from gpadjust.records.smoothing import Chain, chain_of
+from gpadjust.states import Sensors
 from gpadjust.states.state_spec import side_by_side
 
 _WEAK = 1.0  # a singular value: the log halves the variance of the prior
@@ -55,6 +55,7 @@ def check_log(
     step: float | None = None,
     *,
     start: Mapping[str, tuple[float, float]] | None = None,
+    sensors: Sensors | None = None,
 ) -> list[Direction]:
     r"""Check which directions of the unknown parameters a log can tell, before a fit.
 
@@ -69,6 +70,7 @@ def check_log(
         physics: The next states, with unknown parameters.
         step: The control step, as of :func:`smooth`.
         start: Of hidden states by name, mean and standard deviation at the beginning.
+        sensors: As of :func:`smooth`.
 
     Returns:
         The directions, the clearest first. Of those that the log does not tell, each names the
@@ -91,26 +93,18 @@ def check_log(
         >>> print(check_log(log, ODEPhysics(rate, 0.1, 1))[-1])  # doctest: +ELLIPSIS
         The log cannot tell 1.00 b (singular value 0). A square wave of u between ...
     """
-    steps = with_known_inputs(control_steps(records, step))
-    f_p = one_physics(physics, steps.spec, "check one of them")
-    if not f_p.unknowns:
+    chain = chain_of(records, physics, step, start, sensors=sensors)
+    if not chain.unknowns:
         raise ValueError("Expected a physics with unknown parameters; found none, to check.")
-    chain = _chain(f_p, steps, first_moments(start, steps.spec))
     noise = np.maximum(_roughness(chain), chain.least)
     values, vectors = np.linalg.eigh(_information(chain, noise))
     directions = []
     for value, vector in zip(np.sqrt(values.clip(0))[::-1], vectors.T[::-1], strict=True):
         vector = vector * np.sign(vector[np.abs(vector).argmax()])
-        weights = dict(zip(f_p.unknowns, vector.tolist(), strict=True))
-        text = _best_input(chain, steps, noise, vector) if value < _WEAK else ""
+        weights = dict(zip(chain.unknowns, vector.tolist(), strict=True))
+        text = _best_input(chain, noise, vector) if value < _WEAK else ""
         directions.append(Direction(weights, float(value), text))
     return directions
-
-
-def _chain(f_p: Physics, steps: Records, start: Array) -> Chain:
-    length = steps.records[0].sampling_step
-    unknown = np.full((2, len(steps.spec.moving)), math.nan)
-    return Chain(f_p, steps, unknown, start, substeps_of(f_p, steps, length))
 
 
 def _roughness(chain: Chain) -> Array:
@@ -139,9 +133,9 @@ def _information(chain: Chain, noise: Array, seen: Array | None = None) -> Array
     return even
 
 
-def _best_input(chain: Chain, steps: Records, noise: Array, vector: Array) -> str:
+def _best_input(chain: Chain, noise: Array, vector: Array) -> str:
     """Return a sentence on the square wave, of one action, that tells a direction best."""
-    spec, best = steps.spec, (0.0, "")
+    steps, spec, best = chain.steps, chain.spec, (0.0, "")
     if len(spec.moving) < spec.state_dim:
         return "Other inputs are tried for states that all move only."
     length = min(max(len(record.times) for record in steps), _LONGEST)

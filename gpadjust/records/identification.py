@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from importlib import import_module
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -19,16 +21,22 @@ from gpadjust.checks import checked_number, checked_whole
 from gpadjust.display import Display, html_table
 from gpadjust.dynamics import FreeRun, IdentifiedDynamics, PhysicsDynamics, Windows
 from gpadjust.dynamics.targets import one_physics
-from gpadjust.physics import Physics
+from gpadjust.physics import Physics, PhysicsError
 from gpadjust.physics.parameters import PhysicsParameters
 from gpadjust.records.lack import Lack, clearest_lack, robust_moments
 from gpadjust.records.records import Records, control_steps
-from gpadjust.records.smoothing import SmoothedRecords, drawn_parameters, smooth
+from gpadjust.records.smoothing import (
+    SmoothedRecords,
+    SmoothingWarning,
+    drawn_parameters,
+    smooth,
+)
 from gpadjust.states import Sensors, StateSpec
 from gpadjust.words import listed, number, percent
 
 GUESSES, IDENTIFIED, PERSISTENCE = "guesses", "identified", "persistence"
 FEW = 0.9  # of measurements in intervals of 95 %
+_NO_NOISE = 1e-100  # standard deviation: the smoother takes the least that it computes with
 _LEAST = 8  # steps of a stretch, of which the last part is held out
 _FAR = 3.0  # standard deviations of a prior
 _VARIES = 1e-3  # share of the variance of an action that is within steps
@@ -96,6 +104,7 @@ class Identification(Display):
     runs: Mapping[str, FreeRun]
     step: float
     remarks: tuple[str, ...] = ()
+    _again: Callable[[], Identification] | None = None  # by free runs
 
     def task(self, reward: Callable[[Tensor, Tensor, Tensor], Tensor], **options: Any) -> Any:
         """Return a task in these dynamics, for :class:`~gpadjust.control.MPC` or an agent.
@@ -132,7 +141,8 @@ class Identification(Display):
     @property
     def parameters(self) -> PhysicsParameters | None:
         """The posterior of the physics' unknown parameters; None if it has none."""
-        return self.smoothed.physics_parameters if GUESSES in self.runs else None
+        parameters = self.smoothed.parameters
+        return parameters if parameters.unknowns else None
 
     @cached_property
     def robust_parameters(self) -> PhysicsParameters | None:
@@ -145,8 +155,10 @@ class Identification(Display):
         """
         if self.parameters is None:
             return None
-        chain, estimate = self.smoothed._chain, self.smoothed._estimate
-        return drawn_parameters(chain.physics, *robust_moments(chain, estimate, self._control_step))
+        chain, estimate = self.smoothed.chain, self.smoothed.estimate
+        return drawn_parameters(
+            chain.unknowns, *robust_moments(chain, estimate, self._control_step)
+        )
 
     @property
     def hidden(self) -> list[str]:
@@ -160,11 +172,9 @@ class Identification(Display):
 
         They are of the runs, and of ``"persistence"``: the state stays where it was.
         """
-        still = self.windows.initial_states.unsqueeze(1).expand_as(self.windows.measured)
-        paths = {name: run.mean for name, run in self.runs.items()} | {PERSISTENCE: still}
         return {
             name: self.spec.change(path, self.windows.measured).square().nanmean((0, 1)).sqrt()
-            for name, path in paths.items()
+            for name, path in self._paths.items()
         }
 
     @property
@@ -182,7 +192,18 @@ class Identification(Display):
 
         Takes some seconds for thousands of steps, once.
         """
-        return clearest_lack(self.smoothed._chain, self.smoothed._estimate, self._control_step)
+        return clearest_lack(self.smoothed.chain, self.smoothed.estimate, self._control_step)
+
+    @cached_property
+    def by_free_runs(self) -> Identification | None:
+        """The identification with ``by_free_runs=True``; None if this is one, or none settled."""
+        if self._again is None:
+            return None
+        with warnings.catch_warnings(), suppress(PhysicsError, RuntimeError):
+            warnings.simplefilter("ignore", SmoothingWarning)
+            other = self._again()
+            return other if other.smoothed.is_settled else None
+        return None
 
     @property
     def _control_step(self) -> float:
@@ -217,23 +238,29 @@ class Identification(Display):
                 answer = "In part"
                 reasons.append(str(self.lack))
             for other, words in _OTHERS.items():
-                if other not in errors or (own < errors[other][i] and self._beats(other, i)):
+                if other not in errors:
+                    continue
+                path = self._paths[other]
+                if own < errors[other][i] and self._beats(path, i):
                     continue
                 worse = own >= errors[other][i]
                 reasons.append(f"It errs {'no less' if worse else 'less by chance'} than {words}.")
-                is_no = worse and (other == PERSISTENCE or self._beats(other, i, -1))
+                is_no = worse and (other == PERSISTENCE or self._beats(path, i, -1))
                 answer = "No" if is_no or answer == "No" else "In part"
             verdicts[name] = answer, reasons
         return verdicts
 
-    def _beats(self, other: str, i: int, sign: int = 1) -> bool:
-        """Return whether errors of state i are below another's, block by block, beyond chance."""
-        measured, own = self.windows.measured, self.runs[IDENTIFIED].mean
-        still = self.windows.initial_states.unsqueeze(1).expand_as(measured)
-        path = still if other == PERSISTENCE else self.runs[other].mean
-        logs = []
-        for each in (own, path):
-            squares = self.spec.change(each, measured)[..., i].square()
+    @property
+    def _paths(self) -> dict[str, Tensor]:
+        """Paths along the windows, ``w x T x state_dim``: those of the runs, and of persistence."""
+        still = self.windows.initial_states.unsqueeze(1).expand_as(self.windows.measured)
+        return {name: run.mean for name, run in self.runs.items()} | {PERSISTENCE: still}
+
+    def _beats(self, other: Tensor, i: int, sign: int = 1) -> bool:
+        """Return whether errors of state i are below another path's by blocks, beyond chance."""
+        measured, logs = self.windows.measured, []
+        for path in (self.runs[IDENTIFIED].mean, other):
+            squares = self.spec.change(path, measured)[..., i].square()
             blocks = squares.tensor_split(min(_BLOCKS, squares.shape[1]), 1)
             logs.append(
                 torch.cat([block.nanmean(1) for block in blocks]).clamp(1e-300, 1e300).log()
@@ -299,7 +326,7 @@ class Identification(Display):
         moves = torch.cat([record.states.diff(dim=0) for record in records])
         sizes = moves.square().mean(0).sqrt()
         noises = (self.smoothed.noise, self.smoothed.process_noise, sizes)
-        for name, noise, added, size in zip(self.spec.states, *noises, strict=True):
+        for i, (noise, added, size) in enumerate(zip(*noises, strict=True)):
             if not added > noise or added < _MOVES * size:  # of hidden states it is NaN
                 continue
             if self.lack is not None:
@@ -309,11 +336,27 @@ class Identification(Display):
                     "no state, action or lag explains it. Look for an input that was not logged; "
                     "vibration or weather it may be, too, which the intervals then allow for"
                 )
+            name = self.spec.states[i]
             sentences.append(
                 f"Process noise of {name} is {added:.2g} a step, {added / noise:.2g} times the "
                 f"noise of its sensor: {cause}."
             )
+            if self.by_free_runs is not None:
+                sentences += self._of_free_runs(self.by_free_runs, i)
         return sentences
+
+    def _of_free_runs(self, other: Identification, i: int) -> list[str]:
+        """Return a sentence if the fit by free runs predicts state i better."""
+        covers_more = self.coverage[i] < FEW <= other.coverage[i]
+        if not covers_more and not other._beats(self.runs[IDENTIFIED].mean, i):
+            return []
+        errors = [number(fit.errors[IDENTIFIED][i]) for fit in (self, other)]
+        shares = [percent(fit.coverage[i]) for fit in (self, other)]
+        return [
+            f"Fitted to free runs (`by_free_runs=True`) the physics has an error of {errors[1]} in "
+            f"{self.spec.states[i]} in place of {errors[0]}, and its intervals of 95 % cover "
+            f"{shares[1]} in place of {shares[0]}: what it lacks is slow."
+        ]
 
     def __repr__(self) -> str:
         """Parameters, noises and errors."""
@@ -346,6 +389,8 @@ def identify(
     *,
     start: Mapping[str, tuple[float, float]] | None = None,
     held_out: float = 0.25,
+    sensors: Sensors | None = None,
+    by_free_runs: bool = False,
     num_starts: int | None = None,
     seed: int = 0,
 ) -> Identification:
@@ -363,6 +408,11 @@ def identify(
         start: Of hidden states by name, mean and standard deviation at the beginning.
         held_out: The share of the longest stretch without gaps that is held out at its end; as many
             steps are at the end of each other stretch that has twice as many.
+        sensors: As of :func:`smooth`. What was held out is corrected by the center of their gains,
+            offsets and delays, so that all errors are of states.
+        by_free_runs: If True, fit by least squares of free runs, without process noise. It is
+            better where the physics lacks something slow, and no different where it is right.
+            Intervals of parameters take the errors for white: they are then too narrow.
         num_starts: As of :func:`smooth`.
         seed: Seed of the free runs.
 
@@ -414,16 +464,25 @@ def identify(
             ends.append(i)
         beginnings.append(stretch.part(slice(end)))
     learnt_from = Records(beginnings, spec)
-    smoothed = smooth(learnt_from, f_p, start=start, num_starts=num_starts)
+    smoothed = smooth(
+        learnt_from,
+        f_p,
+        start=start,
+        process_noise=torch.full((spec.state_dim,), _NO_NOISE, dtype=torch.float64)
+        if by_free_runs
+        else None,
+        sensors=sensors,
+        num_starts=num_starts,
+    )
     last = torch.stack([smoothed.records.records[i].states[-1] for i in ends])
-    within = smoothed._chain.within.shape[1]  # steps of the physics in a control step
+    within = smoothed.chain.within.shape[1]  # steps of the physics in a control step
     actions, measured = [], []
     for i in ends:
         stretch = steps.records[i]
         each = stretch.within if within > 1 else stretch.actions.unsqueeze(1)
         actions.append(each[-held - 1 : -1].flatten(0, 1))
         states = torch.full((held * within, spec.state_dim), torch.nan, dtype=torch.float64)
-        states[within - 1 :: within] = stretch.states[-held:]
+        states[within - 1 :: within] = smoothed.corrected(stretch.states)[-held:]
         measured.append(states)
     windows = Windows(last, torch.stack(actions), torch.stack(measured))
     length = steps.records[0].sampling_step / within
@@ -452,7 +511,12 @@ def identify(
     gaps = [f"Gaps part the log into {len(steps)} stretches, each smoothed by itself."]
     remarks = gaps if len(steps) > len(records) else []
     remarks += [*_of_actions(records, length), *_of_jumps(records), *_of_outliers(records)]
-    return Identification(smoothed, dynamics, windows, runs, length, tuple(remarks))
+    again = None
+    if not by_free_runs:
+        fit: dict[str, Any] = {"start": start, "held_out": held_out, "sensors": sensors}
+        fit |= {"by_free_runs": True, "num_starts": num_starts, "seed": seed}
+        again = partial(identify, records, physics, step, **fit)
+    return Identification(smoothed, dynamics, windows, runs, length, tuple(remarks), again)
 
 
 def _of_actions(records: Records, step: float) -> list[str]:

@@ -56,7 +56,7 @@ class Lack(Display):
     over: str  # a state or an action
     term: str  # such as "-0.12*sign(rate)"; empty if none of a few simple ones tells it
     shape: str  # of the term, such as "sign"
-    lag: float | None  # the time by which the action acts late
+    lag: float | None  # the time by which the action acts late, to a factor of 2
     at: Tensor  # N, of what it depends on; of a lag the delayed action less the action
     residual: Tensor  # N
     middles: Tensor  # K
@@ -66,9 +66,12 @@ class Lack(Display):
     def __repr__(self) -> str:
         """Return a sentence on the missing effect."""
         if self.lag is not None:
+            # Lags are tried in powers of two.
+            low, high = self.lag / 2, self.lag * 2
             return (
-                f"{self.state}' lacks a lag: {self.over} acts some {self.lag:.2g} late. Try one "
-                f"state more, hidden, q' = ({self.over} - q)/tau, and q in place of {self.over}."
+                f"{self.state}' lacks a lag: {self.over} acts some {low:.2g} to {high:.2g} late. "
+                f"Try one state more, hidden, q' = ({self.over} - q)/tau, and q in place of "
+                f"{self.over}."
             )
         if self.shape == "constant":
             return f"{self.state}' lacks about {self.term} throughout: try an offset."
@@ -364,7 +367,8 @@ def _bins(values: Array, most: int) -> Array:
 def _at(link: Link, d: int, theta: Array) -> Link:
     """Return a link of the states alone, with these parameters."""
     offsets = link.offsets[:, :d] + link.matrices[:, :d, d:] @ theta
-    return Link(link.matrices[:, :d, :d], offsets, link.outputs[:, :, :d], link.measured)
+    measured = link.measured - link.outputs[:, :, d:] @ theta
+    return Link(link.matrices[:, :d, :d], offsets, link.outputs[:, :, :d], measured)
 
 
 def _with(link: Link, added: Array) -> Link:

@@ -25,11 +25,13 @@ from gpadjust.dynamics.least_squares import even_normal
 from gpadjust.dynamics.targets import check_next_values, one_physics
 from gpadjust.physics import Physics, PhysicsError
 from gpadjust.physics.parameters import PhysicsParameters
+from gpadjust.physics.unknown import Unknowns
 from gpadjust.progress import long_work, tick
 from gpadjust.records import kalman
 from gpadjust.records.kalman import Array, Link, Smoothed
 from gpadjust.records.records import Record, Records, control_steps, remember
-from gpadjust.states import StateSpec
+from gpadjust.records.sensing import Sensing
+from gpadjust.states import Sensors, StateSpec
 from gpadjust.states.state_spec import side_by_side
 
 _DRAWS = 256  # of the parameters
@@ -65,7 +67,9 @@ class SmoothedRecords:
             0 of those that the physics does not move.
         process_noise: Standard deviations of what a step adds to the physics, ``state_dim``.
         log_density: Of the measurements, near these states.
-        is_settled: Whether the search ended; if not, a SmoothingWarning said so.
+        is_settled: Whether the search ended; if not, there was a SmoothingWarning.
+        chain: The records as a chain of states, which the physics leads through.
+        estimate: Moments of the chain's states, which have the parameters at their end.
     """
 
     records: Records
@@ -74,15 +78,38 @@ class SmoothedRecords:
     process_noise: Tensor
     log_density: float
     is_settled: bool
-    _chain: Chain
-    _estimate: Estimate
+    chain: Chain
+    estimate: Estimate
+
+    @property
+    def parameters(self) -> PhysicsParameters:
+        """The posterior of the unknown parameters of physics and sensors; empty if there are none.
+
+        Those of sensors are ``x_gain``, ``x_offset`` and ``x_delay``, for a state x.
+        """
+        d, moments = self.chain.d, self.estimate.stretches[0].states
+        mean, covariance = moments.means[0, d:], moments.covariances[0, d:, d:]
+        return drawn_parameters(self.chain.unknowns, mean, covariance)
 
     @property
     def physics_parameters(self) -> PhysicsParameters:
         """The posterior of the unknown parameters of the physics; empty if it has none."""
-        d, moments = self._chain.d, self._estimate.stretches[0].states
-        mean, covariance = moments.means[0, d:], moments.covariances[0, d:, d:]
-        return drawn_parameters(self._chain.physics, mean, covariance)
+        unknowns, draws = self.chain.physics.unknowns, self.parameters.draws
+        return PhysicsParameters(unknowns, [*draws[:, : len(unknowns)].unbind(-1)])
+
+    def corrected(self, states: Tensor) -> Tensor:
+        """Correct measured states of a stretch, ``N x state_dim``, by the center of the sensors.
+
+        Of a sensor with a delay they are interpolated, and NaN at the end.
+        """
+        chain, corrected = self.chain, states.clone()
+        if chain.sensing is not None:
+            moving = chain.spec.moving
+            shown = chain.sensing.corrected(
+                states[:, moving].numpy(), self.estimate.states[0, chain.d :]
+            )
+            corrected[:, moving] = torch.from_numpy(shown)
+        return corrected
 
     @cached_property
     def variation(self) -> Tensor:
@@ -97,9 +124,9 @@ class SmoothedRecords:
         Raises:
             ValueError: If the physics has no unknown parameters.
         """
-        if not self._chain.physics.unknowns:
+        if not self.chain.physics.unknowns:
             raise ValueError("Expected a physics with unknown parameters; found none, that vary.")
-        return variation(self._chain, self._estimate)
+        return variation(self.chain, self.estimate)
 
     def draw(self, seed: int = 0) -> Records:
         """Draw states from their posterior, along each record.
@@ -111,7 +138,7 @@ class SmoothedRecords:
             ValueError: If the seed is no whole number of 0 or more.
         """
         rng = np.random.default_rng(checked_whole("seed", seed, 0))
-        paths = kalman.draw_paths(self._estimate.stretches, self._chain.num_parameters, rng)
+        paths = kalman.draw_paths(self.estimate.stretches, self.chain.num_parameters, rng)
         return _with_states(self.records, np.concatenate(paths))
 
     def __repr__(self) -> str:
@@ -130,6 +157,7 @@ def smooth(
     start: Mapping[str, tuple[float, float]] | None = None,
     noise: Tensor | None = None,
     process_noise: Tensor | None = None,
+    sensors: Sensors | None = None,
     num_starts: int | None = None,
     max_rounds: int = 100,
 ) -> SmoothedRecords:
@@ -158,8 +186,11 @@ def smooth(
             learnt. Default: all.
         process_noise: The same of what a step adds to f_p. Learnt, it makes the best predictions of
             the next measurement; a small one fits f_p to long free runs.
+        sensors: Sensors of states, with unknown gains, offsets and delays. Measurements begin later
+            by the longest delay that is likely; the errors of the measurements above are in the
+            unit of the sensor, those found in that of the state.
         num_starts: How many starts to take the best end of. Default: 4 with hidden states and
-            unknown parameters, else 1.
+            unknown parameters, 8 with sensors, else 1.
         max_rounds: The most rounds of smoothing of each; most settle in 15 to 40.
 
     Raises:
@@ -193,33 +224,51 @@ def smooth(
         True
     """
     checked_whole("max_rounds", max_rounds, 1)
-    steps = with_known_inputs(control_steps(records, step))
-    spec, length = records.spec, steps.records[0].sampling_step
-    f_p = one_physics(physics, spec, "smooth by one of them")
-    substeps = substeps_of(f_p, steps, length)
-    known = {"noise": noise, "process_noise": process_noise}
-    variances = np.stack([_variances(sd, name, spec) for name, sd in known.items()])
-    chain = Chain(f_p, steps, variances, first_moments(start, spec), substeps)
+    chain = chain_of(records, physics, step, start, noise, process_noise, sensors)
     if num_starts is None:
-        num_starts = 4 if chain.hidden.any() and f_p.unknowns else 1
+        num_starts = 1
+        if sensors is not None:
+            num_starts = 8
+        elif chain.hidden.any() and chain.unknowns:
+            num_starts = 4
     checked_whole("num_starts", num_starts, 1)
     estimate, is_settled = _estimate(chain, max_rounds, num_starts)
     covariances = np.concatenate([part.states.covariances for part in estimate.stretches])
     sd = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)[:, : chain.d].clip(0))
     noises = np.sqrt(estimate.variances)
     noises[0, chain.hidden] = math.nan
-    sd_of_noise, sd_of_process = _of_all_states(noises, spec)
-    each_sd = _of_all_states(sd, spec).split([len(record.times) for record in steps])
+    if chain.sensing is not None:  # in the unit of the states
+        noises[0] /= np.abs(chain.sensing.values(estimate.states[0, chain.d :])[0])
     return SmoothedRecords(
-        _with_states(steps, estimate.states),
-        each_sd,
-        sd_of_noise,
-        sd_of_process,
+        _with_states(chain.steps, estimate.states),
+        _of_all_states(sd, chain.spec).split(chain.lengths.tolist()),
+        *_of_all_states(noises, chain.spec),
         estimate.log_density,
         is_settled,
         chain,
         estimate,
     )
+
+
+def chain_of(
+    records: Records,
+    physics: Physics | Callable[[Tensor], Tensor],
+    step: float | None,
+    start: Mapping[str, tuple[float, float]] | None,
+    noise: Tensor | None = None,
+    process_noise: Tensor | None = None,
+    sensors: Sensors | None = None,
+) -> Chain:
+    """Return the chain of all stretches of records; arguments are those of :func:`smooth`."""
+    check_kind("sensors", sensors, Sensors | None, 'such as Sensors(["x"], offset={...})')
+    steps = with_known_inputs(control_steps(records, step))
+    spec, length = records.spec, steps.records[0].sampling_step
+    f_p = one_physics(physics, spec, "take one of them")
+    substeps = substeps_of(f_p, steps, length)
+    noises = {"noise": noise, "process_noise": process_noise}
+    variances = np.stack([_variances(sd, name, spec) for name, sd in noises.items()])
+    sensing = None if sensors is None else Sensing(sensors, f_p, spec, length)
+    return Chain(f_p, steps, variances, first_moments(start, spec), substeps, sensing)
 
 
 def substeps_of(f_p: Physics, steps: Records, length: float) -> int:
@@ -236,9 +285,8 @@ def substeps_of(f_p: Physics, steps: Records, length: float) -> int:
     )
 
 
-def drawn_parameters(physics: Physics, mean: Array, covariance: Array) -> PhysicsParameters:
+def drawn_parameters(unknowns: Unknowns, mean: Array, covariance: Array) -> PhysicsParameters:
     """Draw parameters from a normal distribution of their coordinates; none if there are none."""
-    unknowns = physics.unknowns
     if not unknowns:
         return PhysicsParameters({}, [])
     values, vectors = torch.linalg.eigh(torch.from_numpy(covariance.copy()))
@@ -473,10 +521,12 @@ class Chain:
         variances: Array,
         start: Array,
         substeps: int = 1,
+        sensing: Sensing | None = None,
     ) -> None:
-        self.physics, self.spec = physics, steps.spec
+        self.physics, self.steps, self.spec, self.sensing = physics, steps, steps.spec, sensing
+        self.unknowns = physics.unknowns if sensing is None else sensing.unknowns
         moving = self.spec.moving
-        self.d, self.num_parameters = len(moving), len(physics.unknowns)
+        self.d, self.num_parameters = len(moving), len(self.unknowns)
         self.angles = [moving.index(i) for i in self.spec.angle_columns if i in moving]
         self.lengths = np.array([len(record.times) for record in steps])
         ends = self.lengths.cumsum()
@@ -494,6 +544,11 @@ class Chain:
             for i in self.angles:  # go on without jumps
                 known = rows.start + np.flatnonzero(~np.isnan(y[rows, i]))
                 y[known, i] = np.unwrap(y[known, i])
+        if sensing is not None:
+            for rows in self.stretches:
+                for i, longest in enumerate(sensing.longest):
+                    y[rows][:longest, i] = math.nan
+            y = self.in_states(y, np.zeros(self.num_parameters))
         self.hidden = np.isnan(y).all(0)
         (mean, sd), names = start, [self.spec.states[i] for i in moving]
         if self.hidden.all():
@@ -544,7 +599,8 @@ class Chain:
 
     def first_path(self, parameters: Array) -> Path:
         """Return measured states, and between them and in hidden ones those to which f_p leads."""
-        states, measured, x = self.measured.copy(), self.measured.copy(), self.first.copy()
+        measured = self.in_states(self.measured, parameters).copy()
+        states, x = measured.copy(), self.first.copy()
         for t in range(self.lengths.max() if np.isnan(measured).any() else 0):
             going = self.lengths > t
             rows = self.firsts[going] + t
@@ -556,18 +612,38 @@ class Chain:
             if going.any():
                 x[going] = self._defined(self.firsts[going] + t, x[going], parameters)
         following = self._defined(self.now, states[self.now], parameters)
+        if self.sensing is not None:
+            measured = self.near(self.measured, self.outputs(states, parameters))
         return Path(states, measured, parameters, following)
+
+    def in_states(self, measured: Array, parameters: Array) -> Array:
+        """Return the states ``M x d`` that measurements show by these parameters of the sensors."""
+        if self.sensing is None:
+            return measured
+        stretches = [self.sensing.corrected(measured[rows], parameters) for rows in self.stretches]
+        return np.concatenate(stretches)
+
+    def outputs(self, states: Array, parameters: Array) -> Array:
+        """Return what the sensors show of states ``M x d``."""
+        if self.sensing is None:
+            return states
+        stretches = [self.sensing.outputs(states[rows], parameters) for rows in self.stretches]
+        return np.concatenate(stretches)
 
     def path_of(self, estimate: Estimate) -> Path:
         """Return the path of an estimate."""
         states, parameters = estimate.states[:, : self.d], estimate.states[0, self.d :]
         following = self.follow(self.now, states[self.now], parameters)
-        return Path(states, self.near(self.measured, states), parameters, following)
+        measured = self.near(self.measured, self.outputs(states, parameters))
+        return Path(states, measured, parameters, following)
 
     def first_variances(self, path: Path) -> Array:
         """Return first variances of both noises, by f_p's errors in single steps."""
         change = ((path.following - path.states[self.now]) ** 2).mean(0)
-        errors = (path.measured[self.now + 1] - path.following) ** 2
+        shown = self.in_states(path.measured, path.parameters)
+        errors = (shown[self.now + 1] - path.following) ** 2
+        if self.sensing is not None:
+            errors *= self.sensing.values(path.parameters)[0] ** 2
         noise = _SHARE * _means(errors, otherwise=_HIDDEN**2 * change)
         return np.stack([noise, 2 * noise]).clip(self.least)
 
@@ -594,7 +670,10 @@ class Chain:
         parts = zip(self.stretches, np.split(F, cuts), np.split(b, cuts), strict=True)
         for rows, matrices, offsets in parts:
             y = path.measured[rows]
-            links.append(Link(matrices, offsets, np.tile(outputs, (len(y), 1, 1)), y))
+            H = np.tile(outputs, (len(y), 1, 1))
+            if self.sensing is not None:
+                H, y = self.sensing.linearised(path.states[rows], path.parameters, y)
+            links.append(Link(matrices, offsets, H, y))
         return links
 
     def towards(self, path: Path, estimate: Estimate) -> tuple[Path, float]:
@@ -621,7 +700,8 @@ class Chain:
     def cost(self, path: Path, variances: Array) -> float:
         """Return twice the negative log density of a path, up to a constant; NaN if f_p fails."""
         noise, process_noise = variances
-        errors = np.nansum((path.measured - path.states) ** 2 / noise)
+        outputs = self.outputs(path.states, path.parameters)
+        errors = np.nansum((path.measured - outputs) ** 2 / noise)
         added = (path.states[self.now + 1] - path.following) ** 2 / process_noise
         begins = (path.states[self.firsts] - self.first) ** 2 / self.first_variance
         return float(errors + added.sum() + begins.sum() + (path.parameters**2).sum())
@@ -649,7 +729,8 @@ class Chain:
         inputs = self.recorded[rows].expand(*states.shape[:-1], -1).clone()
         following = torch.from_numpy(np.ascontiguousarray(states))
         unknowns = self.physics.unknowns
-        values = unknowns.at(torch.from_numpy(parameters)) if unknowns else None
+        own = torch.from_numpy(parameters)[..., : len(unknowns)]
+        values = unknowns.at(own) if unknowns else None
         for actions in self.within[rows].unbind(1):
             inputs[..., self.spec.moving] = following
             inputs[..., self.spec.state_dim :] = actions

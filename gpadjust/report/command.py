@@ -227,19 +227,19 @@ def _of_log(arguments: Namespace) -> Job:
     sides = [text.partition("=")[2] for text in arguments.physics if ":" not in text]
     read.check_constants(sides, [*own, *others, *unknowns])
     reading = {**columns, **read.table_options(arguments)}
-    step = arguments.step
-    if step is None:
-        step = float(f"{whole.records[0].sampling_step:.{_DIGITS}g}")
-    given = read.motion(arguments.physics, *names, unknowns, step)
+    # Equations are integrated along the recorded actions, also within a control step.
+    sampling = float(f"{whole.records[0].sampling_step:.{_DIGITS}g}")
+    given = read.motion(arguments.physics, *names, unknowns, sampling)
     physics = given.physics
-    if physics.step is not None:
-        step = physics.step
-    if arguments.step not in (None, step):
+    step = arguments.step or (sampling if physics.step is None else physics.step)
+    if given.modules and physics.step not in (None, step):
         raise ValueError(
-            f"Expected no --step, as the physics has a step of {step:g}, found {arguments.step:g}."
+            f"Expected no --step, as the physics has a step of {physics.step:g}, found "
+            f"{arguments.step:g}."
         )
-    spec = StateSpec(*names, angles=angles, step=step)
+    spec = StateSpec(*names, angles=angles)
     options = {
+        "step": step,
         "start": {name: (own.guess, own.sd) for name, own in hidden.items()} or None,
         "held_out": arguments.held_out,
         "num_starts": arguments.starts,
@@ -278,7 +278,7 @@ def _program(
 from gpadjust.records import Records, identify
 from gpadjust.states import StateSpec
 
-spec = StateSpec({states!r}, {actions!r}, step={spec.step!r}{angles})
+spec = StateSpec({states!r}, {actions!r}{angles})
 records = Records.read_csv(
     {[*files]!r},
     spec,
@@ -290,8 +290,8 @@ print(found)
 # From the last state that was learnt from, under other actions: {", ".join(actions)}
 smoothed = found.smoothed
 state = smoothed.records.records[-1].states[-1:]
-plan = torch.zeros(1, 100, {len(actions)}, dtype=torch.float64)  # of 100 steps
-noises = {{"start_noise": smoothed.sd[-1][-1], "process_noise": smoothed.process_noise}}
+plan = torch.zeros(1, 100, {len(actions)}, dtype=torch.float64)  # of 100 steps, found.step each
+noises = {{"start_noise": smoothed.sd[-1][-1], "process_noise": found.dynamics.process_noise}}
 run = found.dynamics.free_run(state, plan, noise=False, **noises)
 print(run.mean, run.lower, run.upper)
 """
