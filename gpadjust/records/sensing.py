@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -15,22 +16,18 @@ from gpadjust.states import Sensors, StateSpec
 
 _STEP = 1e-4  # of differences, in standard deviations of a prior
 _LONGEST = 3.0  # standard deviations of the prior of a delay, up to which measurements begin later
-_KINDS = {"gain": 1.0, "offset": 0.0, "delay": 0.0}  # without an unknown
 
 
 class Sensing:
     r"""Measurements of ``d`` states that move, :math:`y_t = g \, x(t - \tau) + o`.
+
+    A ValueError or a TypeError refuses other sensors, and other parameters than unknown numbers.
 
     Args:
         sensors: The sensors, of states.
         physics: The physics, whose parameters come first.
         spec: The entries of states and actions.
         step: The time from one row to the next.
-
-    Raises:
-        ValueError: If the sensors have a function or noise, an output is not a state that moves, or
-            an angle has a gain.
-        TypeError: If one of their parameters is not an unknown number.
     """
 
     def __init__(self, sensors: Sensors, physics: Physics, spec: StateSpec, step: float) -> None:
@@ -42,7 +39,8 @@ class Sensing:
                 f"Expected sensors of {', '.join(names)}, states that move, without a function, "
                 f"noise (an argument of `smooth`) and gains of angles; found {sensors}."
             )
-        self.step, self.first = step, len(physics.unknowns)
+        self.step = step
+        self.first = len(physics.unknowns)
         self.places = list[tuple[int, int]]()  # kind and state of each parameter
         priors = dict[str, Unknown]()
         for row, (kind, unknowns) in enumerate(sensors.unknowns.items()):
@@ -52,10 +50,7 @@ class Sensing:
         Unknowns(priors).refuse_functions()
         self.unknowns = Unknowns.together([physics.unknowns, Unknowns(priors)])
         if len(self.unknowns) < self.first + len(priors):
-            raise ValueError(
-                f"Expected other names of the parameters of the physics than {', '.join(priors)}, "
-                "those of the sensors."
-            )
+            raise ValueError(f"The physics has a parameter of a name of {', '.join(priors)}.")
         self.longest = np.zeros(len(names), int)  # rows of a delay
         for name, unknown in sensors.delay.items():
             longest = float(unknown.value(torch.tensor(_LONGEST, dtype=torch.float64)))
@@ -63,19 +58,36 @@ class Sensing:
 
     def values(self, parameters: Array) -> Array:
         """Return gains, offsets and delays in steps, ``... x 3 x d``, by parameters ``... x p``."""
-        shape = *parameters.shape[:-1], len(_KINDS), len(self.longest)
-        values = np.ones(shape) * np.array([*_KINDS.values()])[:, None]
+        values = np.zeros((*parameters.shape[:-1], 3, len(self.longest)))
+        values[..., 0, :] = 1.0
         if self.places:
             rows, columns = zip(*self.places, strict=True)
-            known = self.unknowns.at(torch.from_numpy(parameters)).numpy()
-            values[..., rows, columns] = known[..., self.first :]
+            numbers = self.unknowns.at(torch.from_numpy(parameters)).numpy()
+            values[..., rows, columns] = numbers[..., self.first :]
         values[..., 2, :] /= self.step
         return values
 
-    def outputs(self, states: Array, parameters: Array) -> Array:
-        """Return outputs of a stretch of states, ``n x d``."""
+    def outputs(self, states: Array, parameters: Array, stretches: Sequence[slice]) -> Array:
+        """Return outputs of the states of all stretches, ``M x d``."""
+        if not self.places:
+            return states
         gain, offset, delay = self.values(parameters)
-        return gain * _late(states, delay) + offset
+        late = np.concatenate([_late(states[rows], delay) for rows in stretches])
+        outputs: Array = gain * late + offset
+        return outputs
+
+    def corrected(self, measured: Array, parameters: Array, stretches: Sequence[slice]) -> Array:
+        """Return the states ``M x d`` that measurements show; with a delay NaN at the end."""
+        if not self.places:
+            return measured
+        gain, offset, delay = self.values(parameters)
+        shown = measured.copy()
+        for i in np.flatnonzero(delay):
+            for rows in stretches:
+                at = np.arange(rows.stop - rows.start)
+                shown[rows, i] = np.interp(at + delay[i], at, measured[rows, i], right=math.nan)
+        corrected: Array = (shown - offset) / gain
+        return corrected
 
     def linearised(self, states: Array, parameters: Array, measured: Array) -> tuple[Array, Array]:
         r"""Linearise outputs of a stretch near its states, ``n x d``.
@@ -88,41 +100,33 @@ class Sensing:
             and parameters.
         """
         n, d = states.shape
+        H = np.tile(np.eye(d, d + len(parameters)), (n, 1, 1))
+        if not self.places:
+            return H, measured
         gain, offset, delay = self.values(parameters)
-        late, speed = _late(states, delay), _late(states, delay, derivative=1)
+        late = _late(states, delay)
+        speed = _late(states, delay, derivative=1)
         steps = _STEP * np.eye(len(parameters))
-        ahead, behind = self.values(parameters + steps), self.values(parameters - steps)
-        slopes = np.moveaxis((ahead - behind) / (2 * _STEP), 0, -1)
+        slopes = self.values(parameters + steps) - self.values(parameters - steps)
+        slopes = np.moveaxis(slopes / (2 * _STEP), 0, -1)
         # dy / dz = x(t - tau) dg/dz + do/dz - g x'(t - tau) dtau/dz
         of_parameters = late[..., None] * slopes[0] + slopes[1]
         of_parameters -= (gain * speed)[..., None] * slopes[2]
         errors = measured - (gain * late + offset) + of_parameters @ parameters
-        H = np.tile(np.eye(d, d + len(parameters)) * gain[:, None], (n, 1, 1))
+        H *= gain[:, None]
         y = np.full((n, d), math.nan)
         for i, rows in enumerate(np.rint(delay).astype(int).clip(0, n)):
             H[: n - rows, i, d:] = of_parameters[rows:, i]
             y[: n - rows, i] = errors[rows:, i]
         return H, y + gain * states
 
-    def corrected(self, measured: Array, parameters: Array) -> Array:
-        """Return the states that a stretch of measurements ``n x d`` shows, NaN at its end."""
-        gain, offset, delay = self.values(parameters)
-        at, shown = np.arange(len(measured)), measured.copy()
-        for i in np.flatnonzero(delay):
-            shown[:, i] = np.interp(at + delay[i], at, measured[:, i], right=math.nan)
-        corrected: Array = (shown - offset) / gain
-        return corrected
-
 
 def _late(states: Array, delay: Array, derivative: int = 0) -> Array:
     """Return states of a stretch, ``n x d``, or their derivatives, as many steps before."""
     rows = np.arange(len(states))
-    late = np.empty_like(states)
-    for i, (column, steps) in enumerate(zip(states.T, delay, strict=True)):
-        if steps == 0 and not derivative:
-            late[:, i] = column
-        else:
-            late[:, i] = CubicSpline(rows, column)(
-                (rows - steps).clip(0, len(rows) - 1), derivative
-            )
+    late = states.copy()
+    for i in range(len(delay)):
+        if delay[i] != 0 or derivative:
+            at = (rows - delay[i]).clip(0, len(rows) - 1)
+            late[:, i] = CubicSpline(rows, states[:, i])(at, derivative)
     return late
