@@ -178,7 +178,7 @@ class Dynamics(ABC):
                 without noise, such as draws of :func:`smooth`. Default: none.
             variation: Standard deviations of the physics' unknown parameters between runs, one for
                 each or one for all, in standard deviations of their priors:
-                ``smoothed.variation`` of :func:`smooth`; more for another machine. Each particle
+                0.1, say, and more for another machine. Each particle
                 has its own parameters. Beyond the actions of the updates the deviations grow,
                 threefold at half of their range, but to at most half of the prior's. Default: none.
             state_bounds: Lower and upper bounds, ``2 x state_dim``, as of a task: a particle that

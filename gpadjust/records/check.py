@@ -116,58 +116,62 @@ def _roughness(chain: Chain) -> Array:
     return variances
 
 
-def _information(chain: Chain, noise: Array, seen: Array | None = None) -> Array:
+def _information(chain: Chain, noise: Array, outputs: Array | None = None) -> Array:
     """Return the information of all stretches on the parameters, ``p x p``: J' J / R.
 
-    ``seen`` is in the place of the measurements, NaN where there is none; it has no other effect.
+    ``outputs`` are in the place of each row of measurements, of which only NaN has an effect.
     """
     d, p = chain.d, chain.num_parameters
-    path, whole = chain.first_path(np.zeros(p)), np.zeros((p, p))
-    for link, start in zip(chain.linearised(path), chain.starts, strict=True):
-        link = (
-            link if seen is None else link._replace(measured=np.tile(seen, (len(link.measured), 1)))
-        )
-        (alone,), _ = kalman.smooth_chain([link], [start], noise, chain.least)
-        whole += np.linalg.inv(alone.states.covariances[0, d:, d:]) - np.eye(p)
-    even: Array = (whole + whole.T) / 2
+    information = np.zeros((p, p))
+    links = chain.linearised(chain.first_path(np.zeros(p)))
+    for link, start in zip(links, chain.starts, strict=True):
+        if outputs is not None:
+            link = link._replace(measured=np.tile(outputs, (len(link.measured), 1)))
+        (smoothed,), _ = kalman.smooth_chain([link], [start], noise, chain.least)
+        information += np.linalg.inv(smoothed.states.covariances[0, d:, d:]) - np.eye(p)
+    even: Array = (information + information.T) / 2
     return even
 
 
 def _best_input(chain: Chain, noise: Array, vector: Array) -> str:
     """Return a sentence on the square wave, of one action, that tells a direction best."""
-    steps, spec, best = chain.steps, chain.spec, (0.0, "")
+    spec, steps = chain.spec, chain.steps
+    best, sentence = 0.0, "None of the inputs that were tried does."
     if len(spec.moving) < spec.state_dim:
         return "Other inputs are tried for states that all move only."
     length = min(max(len(record.times) for record in steps), _LONGEST)
     recorded = torch.cat([record.actions for record in steps])
     low, high = recorded.aminmax(dim=0)
-    low, high = torch.where(low == high, low - 1, low), torch.where(low == high, high + 1, high)
-    times = steps.records[0].sampling_step * torch.arange(length, dtype=torch.float64)
+    is_constant = low == high
+    low, high = low - is_constant.to(low), high + is_constant.to(high)
+    step = steps.records[0].sampling_step
+    outputs = np.where(chain.hidden, math.nan, 0.0)
     for j, name in enumerate(spec.actions):
         for parts in _PERIODS:
             half = max(1, length // parts)
             actions = recorded.mean(0).repeat(length, 1)
             is_high = torch.arange(length) // half % 2 == 0
             actions[:, j] = torch.where(is_high, high[j], low[j])
-            other = _under(chain, actions)
-            seen = np.where(chain.hidden, math.nan, 0.0)
             try:
-                told = vector @ _information(other, noise, seen) @ vector
+                information = _information(_under(chain, actions), noise, outputs)
             except (PhysicsError, np.linalg.LinAlgError):
                 continue
-            value = math.sqrt(max(float(told), 0.0))
-            if value > best[0]:
-                wave = f"between {low[j]:.3g} and {high[j]:.3g} with half a period of "
-                seconds = f"{half * float(times[1]):.3g}"
-                best = value, f"A square wave of {name} {wave}{seconds} would: {value:.3g}."
-    return best[1] or "None of the inputs that were tried does."
+            value = math.sqrt(max(float(vector @ information @ vector), 0.0))
+            if value > best:
+                best = value
+                sentence = (
+                    f"A square wave of {name} between {low[j]:.3g} and {high[j]:.3g} with half a "
+                    f"period of {half * step:.3g} would: {value:.3g}."
+                )
+    return sentence
 
 
 def _under(chain: Chain, actions: Tensor) -> Chain:
     """Return the chain of a single stretch under other actions, of which nothing is measured."""
     other, length = copy(chain), len(actions)
     other.lengths, other.firsts = np.array([length]), np.array([0])
-    other.stretches, other.now = [slice(0, length)], np.arange(length - 1)
+    other.stretches = [slice(0, length)]
+    other.now = np.arange(length - 1)
     states = torch.zeros(length, chain.spec.state_dim, dtype=torch.float64)
     other.recorded = side_by_side(states, actions)
     other.within = actions.unsqueeze(1).expand(-1, chain.within.shape[1], -1)

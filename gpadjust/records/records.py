@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpadjust.checks import check_finite, check_kind, checked_number
+from gpadjust.checks import check_choice, check_finite, check_kind, checked_number
 from gpadjust.core.data import ArrayLike, as_tensor
 from gpadjust.dynamics import Trajectories, Windows
 from gpadjust.dynamics.targets import check_spec
@@ -49,7 +49,7 @@ class Record:
         sampling_step: The mean time from one row to the next, without gaps.
 
     Raises:
-        TypeError: If values are no numbers, or a tensor is not in float64.
+        TypeError: If values are not numbers, or a tensor is not in float64.
         ValueError: If shapes disagree, times do not rise or are not finite, a state is infinite, an
             action is missing, or no row follows another.
 
@@ -74,8 +74,8 @@ class Record:
         self.states = self._numbers(states, "states", 2)
         self.actions = self._numbers(actions, "actions", 2)
         self.within = self.actions.unsqueeze(1)  # N x k x action_dim: of the samples of a step
-        labels: Any = segments.tolist() if hasattr(segments, "tolist") else segments
-        self.segments = tuple([0] * len(self.times) if labels is None else labels)
+        labels: Any = [0] * len(self.times) if segments is None else segments
+        self.segments = tuple(labels.tolist() if hasattr(labels, "tolist") else labels)
         rows = {name: len(getattr(self, name)) for name in ("times", "states", "actions")}
         rows["segments"] = len(self.segments)
         if len({*rows.values()}) > 1:
@@ -182,8 +182,8 @@ class Records:
         spec: The entries of their states and actions.
 
     Raises:
-        TypeError: If ``spec`` is no :class:`StateSpec`, or a record no :class:`Record`.
-        ValueError: If there are none, or one has not the columns of the spec.
+        TypeError: If ``spec`` is not a :class:`StateSpec`, or a record not a :class:`Record`.
+        ValueError: If there is no record, or one does not have the columns of the spec.
 
     Example:
         >>> import torch
@@ -215,7 +215,7 @@ class Records:
                 if columns != len(expected):
                     raise ValueError(
                         f"Record {record.name!r}: expected {len(expected)} columns of {name}, "
-                        f"{', '.join(expected)}, as the spec says, found {columns}."
+                        f"{', '.join(expected)}, as in the spec, found {columns}."
                     )
 
     def __len__(self) -> int:
@@ -252,8 +252,8 @@ class Records:
                 state, which :func:`smooth` estimates. Default: the columns of their names. Units
                 in brackets may be left out.
             actions: The same for the actions.
-            time: The column of times, or where there is none the time from one row to the next.
-                Dates and times of day become the time since the first.
+            time: The column of times, or without one the time from one row to the next. Dates
+                and times of day become the time since the first.
             time_unit: The unit of times, steps and rates: s, ms, us, min, h or d. Default: seconds;
                 a column in other units of time is converted.
             segment: The column of the labels of segments. Default: a file is one segment.
@@ -262,23 +262,21 @@ class Records:
 
         Raises:
             OSError: If a file cannot be read.
-            TypeError: If ``spec`` is no :class:`StateSpec`.
+            TypeError: If ``spec`` is not a :class:`StateSpec`.
             ValueError: If a name is not in the spec, a file has no rows or not these columns, a
-                field is no number or a time or action is missing, with file, line and column; the
-                time is in minutes, hours or days, and no ``time_unit`` given; and as
-                :class:`Record`.
+                field is not a number or a time or action is missing, with file, line and column;
+                the time is in minutes, hours or days without ``time_unit``; and as :class:`Record`.
         """
         check_spec(spec)
         columns: dict[str, Any] = {"states": states or {}, "actions": actions or {}}
-        for argument, given in columns.items():
-            check_kind(argument, given, Mapping, "a dictionary from names of the spec to columns")
-            if unknown := [name for name in given if name not in getattr(spec, argument)]:
-                raise ValueError(
-                    f"There is no {unknown[0]!r} among the {argument} of the spec, "
-                    f"{getattr(spec, argument)}."
-                )
+        for argument, names in columns.items():
+            check_kind(argument, names, Mapping, "a dictionary from names of the spec to columns")
+            for name in names:
+                check_choice(argument, name, getattr(spec, argument))
         records = []
-        for file in [files] if isinstance(files, str | Path | Table) else files:
+        if isinstance(files, str | Path | Table):
+            files = [files]
+        for file in files:
             log = file if isinstance(file, Table) else Table(file, **table)
             if isinstance(time, str):
                 times = log.times(time, time_unit)
@@ -287,8 +285,8 @@ class Records:
                 times = checked_number("time", time, above=0) * rows
             measured = []
             for name in spec.states:
-                filled_in = name in spec.previous and name not in log.names
-                column = columns["states"].get(name, None if filled_in else name)
+                is_filled_in = name in spec.previous and name not in log.names
+                column = columns["states"].get(name, None if is_filled_in else name)
                 if column is None:
                     measured.append(torch.full_like(times, math.nan))
                 else:
@@ -304,8 +302,7 @@ class Records:
     def of_windows(cls, windows: Windows, spec: StateSpec, step: float) -> Records:
         """Make a record of each window, such as of an agent's episodes, to :func:`smooth` them.
 
-        The control step is in the unit of the times. Errors are those of :class:`Records`, and of a
-        step that is no number above 0.
+        The control step is in the unit of the times.
         """
         rows = torch.arange(windows.states.shape[1], dtype=torch.float64)
         times = checked_number("step", step, above=0) * rows
@@ -324,7 +321,7 @@ class Records:
 
         Raises:
             ValueError: If there are no transitions, the sampling steps of records differ or are
-                uneven, the step is no multiple of them, or another one than the spec says.
+                uneven, the step is not a multiple of them, or not that of the spec.
 
         Warns:
             UserWarning: If steps are left out, because they start at a state that was not measured
@@ -333,20 +330,20 @@ class Records:
         """
         data = _transitions(control_steps(self, step))
         complete = ~data.states.isnan().any(-1)
-        kept = data.some(complete & ~data.next_states[:, self.spec.predicted].isnan().all(-1))
-        if not len(kept.states):
+        usable = data.some(complete & ~data.next_states[:, self.spec.predicted].isnan().all(-1))
+        if not len(usable.states):
             raise ValueError(
                 f"Expected steps from a state that was measured in full, found none of "
                 f"{len(data.states)}.{self._hidden(data)}"
             )
-        if len(kept.states) < len(data.states):
+        if len(usable.states) < len(data.states):
             warnings.warn(
-                f"Left out: {len(data.states) - len(kept.states)} of {len(data.states)} steps, "
+                f"Left out: {len(data.states) - len(usable.states)} of {len(data.states)} steps, "
                 f"{int((~complete).sum())} of which start at a state not measured in full.",
                 UserWarning,
                 stacklevel=2,
             )
-        return kept
+        return usable
 
     def windows(self, length: int, step: float | None = None, stride: int | None = None) -> Windows:
         """Cut windows, to compare with :meth:`~gpadjust.dynamics.Dynamics.free_run`.
@@ -374,13 +371,13 @@ class Records:
 def control_steps(records: Records, step: float | None) -> Records:
     """Return records whose rows are control steps, at even times: one for each stretch.
 
-    For ``step`` and errors see :meth:`Records.trajectories`; a warning says how many stretches are
-    left out.
+    For ``step``, errors and warnings see :meth:`Records.trajectories`.
     """
     if not isinstance(records, Records):
         raise TypeError(f"Expected records as Records([record, ...], spec), found {records!r}.")
     spec, step = records.spec, _checked_step(records, step)
-    steps, short = [], 0
+    steps = []
+    short = 0
     for record in records:
         every = record.rows_in(step)
         for rows in record.stretches():
@@ -421,17 +418,17 @@ def remember(states: Tensor, actions: Tensor, spec: StateSpec) -> None:
 
 
 def _checked_step(records: Records, step: float | None) -> float:
-    """Return the control step: the one given, that of the spec, or the first sampling step."""
-    wanted = None if step is None else checked_number("step", step, above=0)
-    known = records.spec.step
-    if wanted is None or known is None:
-        return wanted or known or records.records[0].sampling_step
-    if abs(wanted - known) > _SAME * known:
+    """Return the control step: the argument, that of the spec, or the first sampling step."""
+    of_spec = records.spec.step
+    if step is None:
+        return of_spec or records.records[0].sampling_step
+    step = checked_number("step", step, above=0)
+    if of_spec is not None and abs(step - of_spec) > _SAME * of_spec:
         raise ValueError(
-            f"Expected the step of the spec, {known:.4g}, got {wanted:.4g}; leave `step` out, "
-            "or make a spec with this step."
+            f"Expected the step of the spec, {of_spec:.4g}, got {step:.4g}; leave `step` out, or "
+            "make a spec with this step."
         )
-    return wanted
+    return step
 
 
 def _transitions(steps: Records) -> Trajectories:

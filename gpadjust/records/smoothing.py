@@ -430,8 +430,8 @@ def _search(
             raise np.linalg.LinAlgError
         gained = density - value
         value = density
-        means = np.concatenate([stretch.states.means for stretch in smoothed])
-        estimate = Estimate(smoothed, means, variances, density)
+        states = np.concatenate([stretch.states.means for stretch in smoothed])
+        estimate = Estimate(smoothed, states, variances, density)
         # x <- x + share (E[x | y] - x), share = 1, 1/2, ... until p(x, theta, y) is no less
         path, share = chain.towards(path, estimate)
         if 0 < share < 1:
@@ -620,8 +620,7 @@ class Chain:
 
     def checked(self, variances: Array) -> Array:
         """Return variances, in their place the known ones, and none too small to compute with."""
-        known = self.known_variances
-        return np.where(np.isnan(known), variances, known).clip(self.least)
+        return np.where(self.is_known, self.known_variances, variances).clip(self.least)
 
     def linearised(self, path: Path) -> list[Link]:
         """Linearise the chain near a path: z[t + 1] = F[t] z[t] + b[t] with z = (x, theta)."""

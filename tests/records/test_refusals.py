@@ -131,7 +131,7 @@ def test_what_is_no_file_of_a_record(tmp_path):
     ):
         refused([(read(text), ValueError, f"log.csv{words}")])
     for options, error, words in (
-        ({"states": {"y": "q"}}, ValueError, "no 'y' among the states of the spec"),
+        ({"states": {"y": "q"}}, ValueError, "Unknown states 'y'; use 'x' or 'v'"),
         ({"actions": ["u"]}, TypeError, r"actions must be a dictionary .*found \['u'\]"),
         ({"time": 0.0}, ValueError, "time must be finite and above 0"),
     ):
@@ -156,7 +156,7 @@ def test_what_cannot_be_smoothed():
         (slow, {}, ValueError, r"makes steps of 0.2, but the control step .* is 0.1"),
         (fragile, {}, PhysicsError, r"fails at .* where smoothing begins"),
         (wild, {}, RuntimeError, "diverged from each of 1 starts"),
-        (body, {"records": without(1)}, ValueError, "'v' was never measured; say where"),
+        (body, {"records": without(1)}, ValueError, "'v' was never measured; give mean"),
         (body, {"records": without(0, 1)}, ValueError, "found none of x, v"),
         (body, {"records": moved()}, TypeError, "records as Records"),
         (body, {"records": Records(moved(), lagged)}, ValueError, "an earlier value of the state"),
