@@ -96,9 +96,9 @@ if TYPE_CHECKING:
         SubprocessPhysics,
         Unknown,
     )
-    from gpadjust.validation import Comparison, compare
+    from gpadjust.validation import compare
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 __all__ = [
     "AR1",
@@ -106,7 +106,6 @@ __all__ = [
     "RRA",
     "BlackBoxPhysics",
     "CalibratedPhysics",
-    "Comparison",
     "EmulatedPhysics",
     "FMUPhysics",
     "FormulaPhysics",
@@ -153,7 +152,7 @@ def __getattr__(name: str) -> Any:
     if name in __all__:
         for room in _ROOMS:
             module = import_module(f"gpadjust.{room}")
-            if name in getattr(module, "__all__", ()):
+            if hasattr(module, name):
                 globals()[name] = getattr(module, name)
                 return globals()[name]
     raise AttributeError(f"module 'gpadjust' has no attribute {name!r}")

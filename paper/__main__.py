@@ -14,8 +14,8 @@ from pkgutil import resolve_name
 
 CHAPTERS = {
     "forrester": ("Forrester",),
-    "cartpole": ("CartPole", "Planning"),
-    "arm": ("Arm", "Reaching"),
+    "cartpole": ("CartPole",),
+    "arm": ("Arm",),
     "functions": ("Functions",),
     "published": ("Masses", "Steels", "Uci", "Emps", "Freeruns", "Nist"),
     "machines": ("Real", "Tanks"),

@@ -1,7 +1,7 @@
 """Tables in the pages, and numbers that documents quote of them.
 
 A quoted number is a link to its table, whose title is its place there:
-``[0.28](../results/planning/tables.md#planning:plain "CKA :: trial 2")``. A reader sees the place
+``[0.31](../results/first/tables.md#first:trials "CKA, trial 1 :: cost")``. A reader sees the place
 as a tooltip. The row is its first cell, or the first cells joined by commas where that is needed.
 """
 

@@ -18,7 +18,12 @@ from sphinx.util.logging import getLogger
 
 REFERENCE = Path(__file__).parents[1] / "reference"
 PAGES = {page.stem for page in REFERENCE.glob("*.rst")} - {"index"}
-ROOMS = [import_module(f"gpadjust.{name}") for name in (*sorted(PAGES), "validation.plots")]
+MODULES = [
+    "gpadjust",
+    *(f"gpadjust.{n}" for n in sorted(PAGES - {"gpadjust"})),
+    "gpadjust.gpytorch",
+]
+ROOMS = [import_module(name) for name in (*MODULES, "gpadjust.validation.plots")]
 ENTRIES = {id(getattr(room, n)): f"{room.__name__}.{n}" for room in ROOMS for n in room.__all__}
 SOURCES = [ModuleAnalyzer.for_module(n) for n in list(sys.modules) if n.startswith("gpadjust.")]
 CONSTANTS = {  # the docstrings that follow assignments
@@ -58,7 +63,8 @@ def order_entries(app: Sphinx, page: str, source: list[str]) -> None:
     for part in source[0].split(".. currentmodule:: ")[1:] if "/reference/" in page else ():
         room, listed = part.split()[0], re.findall(r"^   (\w+)$", part, re.MULTILINE)
         entries = [f".. {directive(locate(f'{room}.{name}'))}:: {name}" for name in listed]
-        text = "\n\n".join([f".. automodule:: {room}\n   :no-members:", *entries])
+        head = [f".. automodule:: {room}\n   :no-members:"] if room != "gpadjust" else []
+        text = "\n\n".join([*head, *entries])  # the cheat sheet has the docstring of gpadjust
         source[0] = re.sub(rf"^\.\. automodule:: {room}(?=\n\n|\n?\Z)", text, source[0], flags=re.M)
 
 

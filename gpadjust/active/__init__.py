@@ -12,7 +12,6 @@ from gpadjust.active.measurement_log import LogError
 __all__ = [
     "Collection",
     "CollectionError",
-    "LogError",
     "MeasurementWarning",
     "collect",
     "qAdjustmentInformationGain",

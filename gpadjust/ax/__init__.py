@@ -1,7 +1,7 @@
 """The models in Ax, with a physics of the parameters of a search space (the extra ``ax``)."""
 
 try:
-    import ax as _  # noqa: F401
+    import ax as _
 except ImportError as error:
     raise ImportError('gpadjust.ax needs Ax; run `pip install "gpadjust[ax]"`.') from error
 
@@ -12,7 +12,6 @@ from gpadjust.ax.tell_physics import TellPhysics
 
 __all__ = [
     "TRANSFORMS",
-    "ParameterPhysics",
     "TellPhysics",
     "generation_strategy",
     "generator_kwargs",

@@ -38,9 +38,6 @@ from gpadjust.core.terms import Term
 from gpadjust.core.unknowns import Choice, LogNormal, Row
 
 __all__ = [
-    "CKA", "GP", "MATERN12", "MATERN32", "MATERN52", "RBF", "RRA", "CalibratedPhysics", "Choice",
-    "Data", "FitResult", "Fourier", "Functions", "Kernel", "KnownNoise", "LogNormal", "Marginals",
-    "MixturePosterior", "Noise", "OfGPyTorch", "PhysicsMeanGP", "Prediction", "Predictive",
-    "Profile", "Row", "SamplingWarning", "ScaleGP", "StackedGP", "Stationary", "Term",
-    "ZeroMeanGP", "fit", "load", "save",
+    "GP", "MATERN52", "Choice", "Kernel", "LogNormal", "Noise", "OfGPyTorch", "Prediction",
+    "Profile", "Row", "SamplingWarning", "Stationary", "Term",
 ]  # fmt: skip

@@ -9,14 +9,9 @@ from gpadjust.dynamics.trajectories import Trajectories, Windows
 from gpadjust.states import StateSpec
 
 __all__ = [
-    "AngleInput",
     "Dynamics",
-    "FreeRun",
     "IdentifiedDynamics",
     "LearnedDynamics",
     "PhysicsDynamics",
-    "StateSpec",
     "Trajectories",
-    "TransitionFunctions",
-    "Windows",
 ]

@@ -23,9 +23,6 @@ from gpadjust.kinds.updates import Kalman, Window
 from gpadjust.kinds.vanishing import Vanishing
 
 __all__ = [
-    "AR1", "Categories", "EmulatedPhysics", "HeavyTails", "Kalman", "Linked", "LinkedCKA",
-    "LinkedCalibratedPhysics", "LinkedPhysicsMeanGP", "LinkedRRA", "LinkedScaleGP",
-    "LinkedZeroMeanGP", "LocalErrors", "ModelFactory", "NoisyInputs",
-    "RelativeNoise", "Vanishing", "Window", "levels_of", "linked", "make_model", "on_levels",
-    "pyro_model", "with_options",
+    "Categories", "HeavyTails", "Kalman", "LinkedCKA", "LocalErrors", "NoisyInputs",
+    "RelativeNoise", "Vanishing", "Window", "levels_of", "linked", "pyro_model", "with_options",
 ]  # fmt: skip

@@ -1,5 +1,3 @@
 """Many rows: the adjustment on inducing points."""
 
 from gpadjust.many.variational_cka import VariationalCKA
-
-__all__ = ["VariationalCKA"]

@@ -13,18 +13,6 @@ from gpadjust.physics.subprocess_physics import SubprocessPhysics
 from gpadjust.physics.unknown import Unknown
 
 __all__ = [
-    "BlackBoxPhysics",
-    "FMUPhysics",
-    "FormulaPhysics",
-    "FunctionPhysics",
     "MujocoPhysics",
-    "ODEPhysics",
-    "ParameterValues",
     "Physics",
-    "PhysicsError",
-    "PhysicsParameters",
-    "PhysicsWarning",
-    "SubprocessPhysics",
-    "Unknown",
-    "as_physics",
 ]

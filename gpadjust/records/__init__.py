@@ -7,14 +7,8 @@ from gpadjust.records.records import Record, Records
 from gpadjust.records.smoothing import SmoothedRecords, SmoothingWarning, smooth
 
 __all__ = [
-    "Combination",
-    "Direction",
-    "Identification",
-    "Lack",
     "Record",
     "Records",
-    "SmoothedRecords",
-    "SmoothingWarning",
     "check_log",
     "identify",
     "smooth",

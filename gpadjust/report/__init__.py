@@ -1,7 +1,7 @@
 """A page to show: what a model or a comparison says (the extra ``report``)."""
 
 try:
-    import matplotlib as _  # noqa: F401
+    import matplotlib as _
 except ImportError as error:
     raise ImportError(
         'gpadjust.report needs matplotlib; run `pip install "gpadjust[report]"`.'

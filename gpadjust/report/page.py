@@ -52,8 +52,9 @@ def report(
     of a DataFrame, say.
 
     Args:
-        model: A fitted model, a :class:`~gpadjust.StackedGP`, or a :class:`~gpadjust.Comparison`,
-            of which what it recommends is saved; or an :class:`~gpadjust.records.Identification`.
+        model: A fitted model, a :class:`~gpadjust.StackedGP`, or a
+            :class:`~gpadjust.validation.Comparison`, of which what it recommends is saved; or an
+            :class:`~gpadjust.records.Identification`.
         file: Where to write the page, ``*.html``. Files that are there, this and the model's, are
             replaced; where the model cannot be saved, the page says why.
         title: The title. Default: the names of the outputs.

@@ -1,7 +1,7 @@
 """Reinforcement learning inside adjusted physics, on Stable-Baselines3 (the extra ``rl``)."""
 
 try:
-    import stable_baselines3 as _  # noqa: F401
+    import stable_baselines3 as _
 except ImportError as error:
     raise ImportError(
         'gpadjust.rl needs Stable-Baselines3 and Gymnasium; run `pip install "gpadjust[rl]"`.'
@@ -19,6 +19,5 @@ __all__ = [
     "DynaOptions",
     "DynaSAC",
     "DynaTD3",
-    "MixedReplayBuffer",
     "ModelVecEnv",
 ]

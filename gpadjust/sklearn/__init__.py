@@ -1,7 +1,7 @@
 """The models as a regressor of scikit-learn (the extra ``sklearn``)."""
 
 try:
-    import sklearn as _  # noqa: F401
+    import sklearn as _
 except ImportError as error:
     raise ImportError(
         'gpadjust.sklearn needs scikit-learn; run `pip install "gpadjust[sklearn]"`.'

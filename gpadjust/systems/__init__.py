@@ -26,9 +26,6 @@ _gymnasium.register(
 )
 
 __all__ = [
-    "CartPoleEquation",
-    "CartPoleSwingUpEnv",
-    "NoisySensors",
     "RememberAction",
     "System",
     "cart_pole",

@@ -8,15 +8,6 @@ from gpadjust.validation.trust import Trust, trust
 from gpadjust.validation.verdict import Candidate, Verdict
 
 __all__ = [
-    "STRUCTURES",
-    "Candidate",
-    "Comparison",
-    "LeaveOneOut",
-    "Scores",
-    "Structure",
-    "Trust",
-    "Verdict",
-    "compare",
     "leave_one_out",
     "score",
     "to_arviz",

@@ -1,4 +1,4 @@
-"""Reaching with a muscle arm: learners with and without physics, and policies after few trials."""
+"""Reaching with a muscle arm: learners with and without physics (the paper's sec. 3.3)."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from paper.cartpole import Control, Scenario, scenario
-from paper.common.experiment import Axes, Experiment
-from paper.common.learners import labels
+from paper.common.experiment import Axes
 
 if TYPE_CHECKING:
     from paper.cartpole.control import Setup
@@ -74,68 +73,3 @@ class Arm(Control):
         from paper.arm.evaluation import setup
 
         return setup(self.known[name], self.settings_of(name))
-
-
-BOUNDS = {"angles": (-2.0, 4.0), "velocities": (-40.0, 40.0)}
-"""In rad and rad/s: an episode in a model ends beyond these."""
-
-SENSORS = {"angles": 0.0175, "velocities": 0.05}
-"""Standard deviations of the noise of sensors in rad and rad/s, of the arm that has some; it is not
-filtered."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Reaching(Experiment):
-    """An arm of six muscles reaches after a few trials, computed by OpenSim.
-
-    Settings were found with other seeds, of 20 and more.
-    """
-
-    runs: int = 3
-    trials: int = 4
-    """real trials of a run"""
-    episode_length: int = 15
-    """steps of 0.2 s"""
-    updates: int = 150
-    """gradient steps after each trial, and before the first one"""
-    starts: int = 96
-    """of each update, along the mean of the model"""
-    learning_rate: float = 1e-2
-    """at the start of the updates"""
-    first_action: float = 0.05
-    """of all muscles, before there are data; at rest they are not tense"""
-    noise: float = 0.15
-    """standard deviation of the noise on the actions of the first trials"""
-    noisy_trials: int = 2
-    """how many these are"""
-    substeps: int = 8
-    """of f_p's integration"""
-    strength: float = 0.5
-    """of the muscles; a healthy arm's is 1"""
-
-    axes: ClassVar[Axes] = {
-        "system": {
-            "plain": "as the paper's",
-            "memory": "the previous action is seen",
-            "sensors": "noisy sensors",
-            "strength": "f_p twice as strong",
-        },
-        "learner": labels("cka", "phymean", "phy", "fitted", "gp"),
-    }
-    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "stable_baselines3", "opensim")
-    calls: ClassVar[tuple[str, ...]] = (
-        "gpadjust.dynamics.LearnedDynamics",
-        "gpadjust.control.PolicySearch",
-    )
-    cheap: ClassVar[Mapping[str, Any]] = {"trials": 1}
-
-    def check(self) -> None:
-        """Refuse a machine without OpenSim."""
-        _check_opensim()
-
-    def describe(self, *kind: Any) -> dict[str, Any]:
-        """The settings, and what the arm has beside."""
-        system, learner = kind
-        more: dict[str, Any] = {"sensors": SENSORS} if system == "sensors" else {}
-        more |= {"fitted_by": "PhysicsDynamics"} if learner == "fitted" else {}
-        return {**self.settings, "bounds": BOUNDS, **more}

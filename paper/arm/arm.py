@@ -11,8 +11,7 @@ from matplotlib.axes import Axes
 from paper.arm import Arm
 from paper.arm.claims import LAST, claims
 from paper.cartpole import Control
-from paper.cartpole.control import foresight, load
-from paper.cartpole.planning import trials_table
+from paper.cartpole.control import foresight, load, trials_table
 from paper.common.experiment import Run, Table
 from paper.common.figures import curves as draw_curves
 from paper.common.tables import claims_table, markdown

@@ -1,4 +1,4 @@
-"""The cart-pole: learners with and without physics (the paper's sec. 3.2), and planning."""
+"""The cart-pole: learners with and without physics (the paper's sec. 3.2)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from paper.common.experiment import Axes, Experiment
-from paper.common.learners import LEARNERS, LITERAL, Learner, labels
+from paper.common.learners import LEARNERS, LITERAL, Learner
 
 if TYPE_CHECKING:
     from paper.cartpole.control import Setup
@@ -191,99 +191,3 @@ class CartPole(Control):
         from paper.cartpole.system import setup
 
         return setup(self.known[name], self.settings_of(name), seed)
-
-
-FRICTIONS = {"friction": (0.3, 0.005), "strong-friction": (0.6, 0.01)}
-"""Dry friction of the cart in N, and drag of the pole in N m s²/rad², of systems that have some.
-The friction is none that f_p has, whatever its parameters."""
-
-SENSORS = {"x": 0.01, "theta": 0.01, "x_dot": 0.05, "theta_dot": 0.05}
-"""Standard deviations of the noise of sensors, of the system that has some; not filtered."""
-
-MC_PILCO: Mapping[str, Any] = {
-    "trials": 6,
-    "random_trials": 1,
-    "episode_length": 60,
-    "time_step": 0.05,
-    "horizon": 16,
-    "rounds": 2,
-}
-"""The protocol of Amadio et al. 2022, a random trial and five of 3 s; and how it is planned."""
-
-SMALL_NOISE = 0.01
-"""In that protocol, the standard deviation of the noise of all sensors, and of the starts."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Planning(Experiment):
-    """Cart-poles that are swung up by planning, with several models of them.
-
-    Settings were found with the true system and other seeds (100 to 111).
-    """
-
-    trials: int = 5
-    """real trials of a run, the first of which goes by f_p"""
-    random_trials: int = 0
-    """the first of these, if they have random forces"""
-    episode_length: int = 25
-    """steps of a trial"""
-    time_step: float = 0.1
-    """in s"""
-    horizon: int = 8
-    """steps that are planned ahead at each step"""
-    sequences: int = 128
-    """of these, in each round of the cross-entropy method"""
-    spread: float = 0.15
-    """of these about the earlier plan, in shares of the range of forces"""
-    rounds: int = 1
-    """of these after the first"""
-    elites: int = 12
-    """of these"""
-    first_sequences: int = 128
-    """of the plan when a trial begins, of all its steps"""
-    first_rounds: int = 12
-    """of these"""
-    correlation: float = 0.5
-    """of deviations of a step and the next"""
-
-    axes: ClassVar[Axes] = {
-        "system": {
-            "plain": "as the paper's",
-            "friction": "dry friction and drag",
-            "strong-friction": "strong dry friction and drag",
-            "sensors": "noisy sensors",
-            "mc-pilco": "in MC-PILCO's protocol",
-        },
-        "learner": labels("cka", "phymean", "phy")
-        | {
-            "fitted": "f_p and viscous friction, fitted",
-            "structured": "f_p with dry friction and drag, fitted",
-        }
-        | labels("gp", "oracle"),
-    }
-    calls: ClassVar[tuple[str, ...]] = (
-        "gpadjust.dynamics.LearnedDynamics",
-        "gpadjust.control.Planner",
-    )
-    cheap: ClassVar[Mapping[str, Any]] = {"trials": 1}
-
-    def settings_of(self, system: str) -> Planning:
-        """The experiment with the settings for a system."""
-        return self.changed({**MC_PILCO, **self._fewer()}) if system == "mc-pilco" else self
-
-    def _fewer(self) -> dict[str, int]:
-        """The trials of MC-PILCO's protocol, if fewer are asked for."""
-        return {"trials": self.trials} if self.trials < Planning.trials else {}
-
-    def describe(self, *kind: Any) -> dict[str, Any]:
-        """The settings, and what the system has that f_p lacks."""
-        system, learner = kind
-        more: dict[str, Any] = {"friction": FRICTIONS[system]} if system in FRICTIONS else {}
-        more |= {"sensors": SENSORS} if system == "sensors" else {}
-        more |= {"small_noise": SMALL_NOISE} if system == "mc-pilco" else {}
-        more |= {"fitted_by": "PhysicsDynamics"} if learner in ("fitted", "structured") else {}
-        return {**self.settings_of(system).settings, **more}
-
-    def seeds_of(self, *kind: Any) -> Sequence[int]:
-        """Ten of the paper's system and of friction; three of the others."""
-        return self.seeds if kind[0] in ("plain", "friction") else self.seeds[:3]

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from paper.cartpole import CartPole, Control
 from paper.cartpole.claims import CLAIMS, LAST
-from paper.cartpole.control import foresight, load
-from paper.cartpole.planning import trials_table
+from paper.cartpole.control import foresight, load, trials_table
 from paper.common.experiment import Run, Table
 from paper.common.figures import curves
 from paper.common.tables import claims_table

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -19,7 +19,8 @@ from gpadjust.rl import DynaCallback, DynaOptions, DynaSAC
 from gpadjust.states import StateSpec
 from paper.cartpole import Control, Scenario
 from paper.common.experiment import Run
-from paper.common.tables import numbers
+from paper.common.tables import groups, number, numbers, table
+from paper.common.verdicts import Curves
 
 
 class Setup(NamedTuple):
@@ -207,3 +208,26 @@ def foresight(episodes: pd.DataFrame, experiment: Control) -> str:
     table = table[table[errors[0]].notna()].rename(index=experiment.labels)
     headings = [f"RMSE of {what}" for what in experiment.rmses.values()]
     return numbers(table, ["", "NLPD", "coverage of 95 %", *headings], ".2g")
+
+
+def trials_table(
+    own: pd.DataFrame, measure: str, labels: Mapping[Any, str], shown: Sequence[int],
+    late: tuple[int, int], compared: tuple[int, int], form: str,
+) -> str:  # fmt: skip
+    """Means of some trials, the worst of later ones, differences from CKA by the same seeds."""
+    curves = Curves(own, measure)
+
+    def gap(part: pd.DataFrame) -> str:
+        if "cka" not in curves.names:
+            return ""
+        return curves.paired_difference(part["learner"].iloc[0], *compared).text(form)
+
+    def mean_at(trial: int, part: pd.DataFrame) -> str:
+        return number(curves.mean_at(part["learner"].iloc[0], trial), form)
+
+    columns: dict[str, Any] = {"runs": lambda part: part["seed"].nunique()}
+    columns |= {f"trial {i}": partial(mean_at, i) for i in shown}
+    columns["worst of {}-{}".format(*late)] = lambda part: number(
+        part.loc[part["episode"].between(*late), measure].max(), form
+    )
+    return table(groups(own, "learner", labels), {**columns, "less CKA's": gap})

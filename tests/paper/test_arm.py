@@ -7,15 +7,13 @@ import pytest
 import torch
 
 from gpadjust.control.episodes import generators
-from paper.arm import Arm, Reaching, evaluation
+from paper.arm import Arm, evaluation
 from paper.arm.arm import load_maps
 from paper.arm.claims import claims as arm_claims
 from paper.arm.claims import distance_from_start
 from paper.arm.evaluation import hundred, reach, score
-from paper.arm.reaching import dynamics
 from paper.cartpole.control import load
 from paper.common.runner import main, runs_file
-from paper.common.runs import rounded
 from paper.common.verdicts import Curves, judge
 
 TINY_ARM = Arm(
@@ -29,7 +27,6 @@ TINY_ARM = Arm(
     evaluate_every=1,
     map_after=1,
 )
-FEW = {"trials": 1, "updates": 2, "starts": 3}
 
 
 @pytest.fixture
@@ -131,25 +128,3 @@ def arm_verdicts(**curves):
     claims = arm_claims(load(records, "episodes", experiment), load_maps(records, experiment))
     every = Curves(load(records, "evaluations", experiment), "all_steps")
     return {claim.id: claim for claim in judge(claims, every, 30)}
-
-
-@pytest.mark.slow
-def test_reaching_runs_and_their_tables(tmp_path):
-    experiment = Reaching(out=tmp_path, runs=1, **FEW)
-    experiment.check()
-    records = []
-    for system, learner in (("sensors", "gp"), ("plain", "cka")):
-        found = rounded(experiment.run(system, learner, 0))
-        assert 1 < found["trials"]["all_steps"][0] < 130
-        assert len(found["maps"]["1"]) == 121
-        records.append({"system": system, "learner": learner, "seed": 0, **found})
-    tables = experiment.tables(records)
-    assert {*tables} == {
-        f"{system}_{m}" for system in ("sensors", "plain") for m in ("all_steps", "last_five")
-    }
-
-
-@pytest.mark.parametrize("learner", Reaching.axes["learner"])
-@pytest.mark.parametrize("system", Reaching.axes["system"])
-def test_all_models_are_known(system, learner):
-    assert dynamics(Reaching(), system, learner).spec.states[0] == "theta_s"

@@ -1,4 +1,4 @@
-"""The cart-pole's chapter: learners and planning."""
+"""The cart-pole's chapter."""
 
 import numpy as np
 import pandas as pd
@@ -7,10 +7,8 @@ import torch
 
 from gpadjust.control.episodes import generators
 from gpadjust.rl import DynaSAC
-from gpadjust.systems.swing_up import REAL_CART_POLE, START_MEAN, equation_physics
-from paper.cartpole import FRICTIONS, SMALL_NOISE, CartPole, Planning
+from paper.cartpole import CartPole
 from paper.cartpole.claims import CLAIMS
-from paper.cartpole.planning import dynamics, environment, mc_pilco_reward
 from paper.cartpole.system import evaluate, fixed_starts
 from paper.common.runner import main, runs_file
 from paper.common.verdicts import Curves, judge
@@ -101,64 +99,3 @@ def judged(claims, curves, num_runs=4, num_episodes=50):
     ]  # fmt: skip
     curves = Curves(pd.DataFrame(rows), "cost")
     return {claim.id: claim for claim in judge(claims, curves, num_episodes)}
-
-
-@pytest.mark.parametrize("learner", Planning.axes["learner"])
-def test_all_models_are_known(learner):
-    assert dynamics(Planning(), "friction", learner, 0).spec.states[0] == "x"
-
-
-def test_mc_pilcos_protocol_has_small_steps_still_starts_and_noise():
-    """Half a step twice, from the true state that is watched, is what noisy sensors see."""
-    settings = Planning().settings_of("mc-pilco")
-    assert settings.trials - settings.random_trials == 5
-    assert settings.episode_length * settings.time_step == 3
-    env = environment("mc-pilco", settings)
-    starts, seen = [], []
-    for seed in range(30):
-        observation, _ = env.reset(seed=seed)
-        starts.append(env.unwrapped.state)
-        seen.append(np.array([observation[0], *observation[3:]]) - starts[-1][[0, 2, 3]])
-    for found in (starts - np.array(START_MEAN), seen):
-        assert np.std(found) == pytest.approx(SMALL_NOISE, rel=0.25)
-    env.step(np.array([3.0], dtype=np.float32))
-    row = torch.tensor([[*starts[-1], 3.0]])
-    torch.testing.assert_close(
-        torch.from_numpy(np.stack(env.episodes[-1])),
-        equation_physics(REAL_CART_POLE, 0.05)(row.double()),
-        rtol=0,
-        atol=1e-9,
-    )
-
-
-def test_mc_pilcos_cost_is_that_of_angle_and_place():
-    states = torch.tensor([[0.0, 2 * np.pi, 9.0, 9.0], [1.0, 0.0, 0.0, 0.0], [0.0, 3.0, 0.0, 0.0]])
-    found = mc_pilco_reward(states, states, states.double())
-    expected = torch.tensor([0.0, np.exp(-1) - 1, np.exp(-1) - 1], dtype=torch.float64)
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("system", "learner"), [("plain", "fitted"), ("friction", "structured")])
-def test_the_fitted_baselines_find_the_parameters(system, learner):
-    env = environment(system, Planning())
-    env.action_space.seed(0)
-    env.reset(seed=0)
-    rows, actions = [env.unwrapped.state], []
-    for _ in range(25):
-        action = env.action_space.sample()
-        env.step(action)
-        actions.append(torch.from_numpy(action).double())
-        rows.append(env.unwrapped.state)
-    states = torch.stack([torch.from_numpy(row) for row in rows])
-    fitted = dynamics(Planning(), system, learner, 3)
-    before = fitted.score(states[:-1], torch.stack(actions), states[1:]).rmse
-    fitted.update(states[:-1], torch.stack(actions), states[1:])
-    after = fitted.score(states[:-1], torch.stack(actions), states[1:]).rmse
-    assert (after < before / 50).all()
-    found = fitted.physics_parameters
-    values = dict(zip(found, found.mean, strict=True))
-    dry, drag = FRICTIONS.get(system, (0.0, 0.0))
-    real = {**vars(REAL_CART_POLE), "dry": dry, "drag": drag}
-    for name, value in values.items():
-        assert float(value) == pytest.approx(real[name], rel=0.05), name
