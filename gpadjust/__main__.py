@@ -91,8 +91,8 @@ data: the log: CSV files or *.xlsx, a record each
 """
 _OPTIONS_OF_BOTH = """\
 --unknown E=2+-0.4: an unknown number of the physics, its guess and standard deviation, which may be
-    a percentage; or a factor, E=2*/1.5; or bounds, E=1..3. Several: give it again. "F(v: 0..9)=2*/1.5"
-    is a function of v, from 0 to 9
+    a percentage; or a factor, E=2*/1.5; or bounds, E=1..3; or of a function of v, from 0 to 9,
+    "F(v: 0..9)=2*/1.5". Several: give it again
 --out page.html: the page to write (%(default)s), with a model the model beside it, page.pt; both
     replace what has these names
 --seed 0: of the fits and free runs (%(default)s)

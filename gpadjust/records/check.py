@@ -136,7 +136,8 @@ def _information(chain: Chain, noise: Array, outputs: Array | None = None) -> Ar
 def _best_input(chain: Chain, noise: Array, vector: Array) -> str:
     """Return a sentence on the square wave, of one action, that tells a direction best."""
     spec, steps = chain.spec, chain.steps
-    best, sentence = 0.0, "None of the inputs that were tried does."
+    best = 0.0
+    sentence = "None of the inputs that were tried does."
     if len(spec.moving) < spec.state_dim:
         return "Other inputs are tried for states that all move only."
     length = min(max(len(record.times) for record in steps), _LONGEST)
@@ -168,8 +169,10 @@ def _best_input(chain: Chain, noise: Array, vector: Array) -> str:
 
 def _under(chain: Chain, actions: Tensor) -> Chain:
     """Return the chain of a single stretch under other actions, of which nothing is measured."""
-    other, length = copy(chain), len(actions)
-    other.lengths, other.firsts = np.array([length]), np.array([0])
+    other = copy(chain)
+    length = len(actions)
+    other.lengths = np.array([length])
+    other.firsts = np.array([0])
     other.stretches = [slice(0, length)]
     other.now = np.arange(length - 1)
     states = torch.zeros(length, chain.spec.state_dim, dtype=torch.float64)

@@ -46,6 +46,7 @@ _NEAR_A_TURN = 0.12
 _TOGETHER = 0.95  # a correlation of two parameters, in logarithms
 _CLEARER = 0.15  # of the least standard deviation of the two: that of their combination
 _POWERS = ((1, -1), (1, 1), (1, -2), (1, 2), (2, -1), (2, 1))
+_MORE = 0.1  # of the measurements in intervals: clearly more
 _BLOCKS = 5  # of a window, whose errors are compared
 _LARGE = 2.0  # times the noise of the sensor: an error that something missing may have made
 _WIDER = 1.5  # an interval that allows for missing forces, in place of the one that does not
@@ -59,6 +60,7 @@ _UNSETTLED = (
     "The search for states and parameters did not settle, so that all of this may change: raise "
     "num_starts, give narrower priors, or a start of hidden states."
 )
+_BY = {False: "no less", True: "less by chance"}
 _OTHERS = {GUESSES: "the guesses", PERSISTENCE: "a state that stays"}
 _ENDS = torch.tensor([0.025, 0.5, 0.975])
 
@@ -198,10 +200,9 @@ class Identification(Display):
         """The identification with ``by_free_runs=True``; None if this is one, or none settled."""
         if self._again is None:
             return None
-        with warnings.catch_warnings(), suppress(PhysicsError, RuntimeError):
-            warnings.simplefilter("ignore", SmoothingWarning)
-            other = self._again()
-            return other if other.smoothed.is_settled else None
+        with warnings.catch_warnings(), suppress(PhysicsError, RuntimeError, SmoothingWarning):
+            warnings.simplefilter("error", SmoothingWarning)
+            return self._again()
         return None
 
     @property
@@ -224,29 +225,28 @@ class Identification(Display):
         ``"In part"``.
         """
         verdicts = {}
-        errors, shares = self.errors, self.coverage.tolist()
+        errors = self.errors
+        shares = self.coverage.tolist()
         for i, name in enumerate(self.spec.states):
             if math.isnan(shares[i]):
                 continue
             error = errors[IDENTIFIED][i]
             reasons = [f"Intervals of 95 % cover {percent(shares[i])} of {name} there."]
-            answer = "In part" if shares[i] < FEW else "Yes"
             if not self.smoothed.is_settled:
-                answer = "In part"
                 reasons.append(_UNSETTLED)
             if self.lack is not None and error > _LARGE * self.smoothed.noise[i]:
-                answer = "In part"
                 reasons.append(str(self.lack))
+            answer = "In part" if shares[i] < FEW or len(reasons) > 1 else "Yes"
             for other, words in _OTHERS.items():
                 if other not in errors:
                     continue
-                path, is_less = self._paths[other], bool(error < errors[other][i])
+                path = self._paths[other]
+                is_less = bool(error < errors[other][i])
                 if is_less and self._beats(path, i):
                     continue
                 is_no = not is_less and (other == PERSISTENCE or self._beats(path, i, -1))
                 answer = "No" if is_no or answer == "No" else "In part"
-                by = "less by chance" if is_less else "no less"
-                reasons.append(f"Its error is {by} than that of {words}.")
+                reasons.append(f"Its error is {_BY[is_less]} than that of {words}.")
             verdicts[name] = answer, reasons
         return verdicts
 
@@ -258,7 +258,8 @@ class Identification(Display):
 
     def _beats(self, other: Tensor, i: int, sign: int = 1) -> bool:
         """Return whether errors of state i are below another path's by blocks, beyond chance."""
-        measured, logs = self.windows.measured, list[Tensor]()
+        measured = self.windows.measured
+        logs = list[Tensor]()
         for path in (self.runs[IDENTIFIED].mean, other):
             squares = self.spec.change(path, measured)[..., i].square()
             blocks = squares.tensor_split(min(_BLOCKS, squares.shape[1]), 1)
@@ -282,7 +283,8 @@ class Identification(Display):
         if self.lack is not None:
             sentences.append(str(self.lack))
         sentences += self._of_noise()
-        errors, shares = self.errors, self.coverage.tolist()
+        errors = self.errors
+        shares = self.coverage.tolist()
         cause = (
             "the physics lacks something whose errors last longer than process noise (dry "
             "friction, an input), or has a sign or unit wrong"
@@ -296,6 +298,7 @@ class Identification(Display):
                     f"Of {name} the intervals of 95 % cover {100 * shares[i]:.0f} % of what was "
                     f"held out: {cause}. Rely neither on them nor on those of the parameters."
                 )
+                sentences += self._of_free_runs(i)
             for other, words in _OTHERS.items():
                 if other in errors and errors[other][i] <= errors[IDENTIFIED][i]:
                     sentences.append(
@@ -341,13 +344,14 @@ class Identification(Display):
                 f"Process noise of {name} is {added:.2g} a step, {added / noise:.2g} times the "
                 f"noise of its sensor: {cause}."
             )
-            if self.by_free_runs is not None:
-                sentences += self._of_free_runs(self.by_free_runs, i)
         return sentences
 
-    def _of_free_runs(self, other: Identification, i: int) -> list[str]:
+    def _of_free_runs(self, i: int) -> list[str]:
         """Return a sentence if the fit by free runs predicts state i better."""
-        covers_more = self.coverage[i] < FEW <= other.coverage[i]
+        other = self.by_free_runs
+        if other is None:
+            return []
+        covers_more = other.coverage[i] - self.coverage[i] > _MORE
         if not covers_more and not other._beats(self.runs[IDENTIFIED].mean, i):
             return []
         errors = [number(fit.errors[IDENTIFIED][i]) for fit in (self, other)]
@@ -355,7 +359,7 @@ class Identification(Display):
         return [
             f"Fitted to free runs (`by_free_runs=True`) the physics has an error of {errors[1]} in "
             f"{self.spec.states[i]} in place of {errors[0]}, and its intervals of 95 % cover "
-            f"{shares[1]} in place of {shares[0]}: what it lacks is slow."
+            f"{shares[1]} in place of {shares[0]}: what it lacks lasts longer than a step."
         ]
 
     def __repr__(self) -> str:
@@ -413,9 +417,9 @@ def identify(
             steps are at the end of each other stretch that has twice as many.
         sensors: As of :func:`smooth`. What was held out is corrected by the center of their gains,
             offsets and delays, so that all errors are of states.
-        by_free_runs: If True, fit by least squares of free runs, without process noise. It is
-            better where the physics lacks something slow, and no different where it is right.
-            Intervals of parameters take the errors for white: they are then too narrow.
+        by_free_runs: If True, fit by least squares of free runs, without process noise. Where the
+            physics is right nothing changes; where it lacks something that lasts, intervals of free
+            runs cover more, and those of parameters, which take errors for white, are too narrow.
         num_starts: As of :func:`smooth`.
         seed: Seed of the free runs.
 
@@ -443,7 +447,8 @@ def identify(
         >>> bool((errors["identified"] < 0.1 * errors["guesses"]).all())
         True
     """
-    steps, spec = control_steps(records, step), records.spec
+    steps = control_steps(records, step)
+    spec = records.spec
     if len(spec.moving) < spec.state_dim:
         raise ValueError(
             "Expected states that all move, found exogenous ones or previous values; `smooth` "
@@ -521,8 +526,10 @@ def identify(
 def _of_actions(records: Records, step: float) -> list[str]:
     """Return a sentence if actions vary within control steps, over which they are averaged."""
     size = round(step / records.records[0].sampling_step)
-    shares = [torch.zeros(1)]
-    for record in records if size > 1 else ():
+    if size <= 1:
+        return []
+    shares = []
+    for record in records:
         steps = record.actions[: len(record.actions) // size * size].unflatten(0, (-1, size))
         shares.append(steps.var(1, correction=0).nanmean(0) / record.actions.var(0, correction=0))
     if torch.cat(shares).nan_to_num().max() <= _VARIES:
@@ -619,8 +626,8 @@ def _told_together(parameters: PhysicsParameters) -> list[Combination]:
     for _, first, second, (p, q) in sorted(clear):
         if group[first] == group[second]:  # it follows from others
             continue
-        old, new = group[second], group[first]
-        group = {name: new if other == old else other for name, other in group.items()}
+        joined = [name for name in names if group[name] == group[second]]
+        group |= dict.fromkeys(joined, group[first])
         powers = parameters[first] ** p * parameters[second] ** q
         units = [_bracketed(parameters.unknowns[name].unit) for name in (first, second)]
         unit = _product(*units, p, q) if all(units) else ""
@@ -635,4 +642,4 @@ def _product(first: str, second: str, p: int, q: int) -> str:
 
 
 def _bracketed(unit: str) -> str:
-    return f"({unit})" if " " in unit or "/" in unit else unit
+    return f"({unit})" if {" ", "/"} & {*unit} else unit

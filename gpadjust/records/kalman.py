@@ -29,6 +29,11 @@ class Moments(NamedTuple):
     means: Array  # T + 1 x D
     covariances: Array  # T + 1 x D x D
 
+    def put(self, row: int, mean: Array, covariance: Array) -> None:
+        """Write the moments of a row."""
+        self.means[row] = mean
+        self.covariances[row] = covariance
+
 
 class Smoothed(NamedTuple):
     """Distribution of the states of a stretch by all that was measured."""
@@ -226,11 +231,11 @@ def _filter(rows: _Rows) -> _Filtered:
     block = _filter_blocks(rows, starts)
     mean, covariance = np.zeros(D), np.zeros((D, D))
     for k in range(B):
-        starts.means[k], starts.covariances[k] = mean, covariance
+        starts.put(k, mean, covariance)
         # x | y ~ N(m + S (eta - J m), S), S = (P^-1 + J)^-1, for x ~ N(m, P)
-        A, J = block.A[k], block.J[k]
-        S = np.linalg.solve(np.eye(D) + covariance @ J, covariance)
-        mean = A @ (mean + S @ (block.eta[k] - J @ mean)) + block.after.means[-1, k]
+        A = block.A[k]
+        S = np.linalg.solve(np.eye(D) + covariance @ block.J[k], covariance)
+        mean = A @ (mean + S @ (block.eta[k] - block.J[k] @ mean)) + block.after.means[-1, k]
         covariance = _even(A @ S @ A.T) + block.after.covariances[-1, k]
     return _filter_blocks(rows, starts)
 
@@ -244,11 +249,11 @@ def _filter_blocks(rows: _Rows, starts: Moments) -> _Filtered:
     J = np.zeros_like(covariances)
     log_density = 0.0
     for t, F in enumerate(rows.F):
-        before.means[t], before.covariances[t] = means, covariances
+        before.put(t, means, covariances)
         means = _times(F, means) + rows.o[t]
         covariances = _even(F @ covariances @ np.swapaxes(F, -1, -2)) + rows.Q[t]
         A = F @ A
-        ahead.means[t], ahead.covariances[t] = means, covariances
+        ahead.put(t, means, covariances)
         # One output by one, as their errors are independent: y = h' x + N(0, R)
         for i in np.flatnonzero(np.isfinite(rows.noise[t]).any(0)):
             h = rows.outputs[t, :, i]
@@ -271,7 +276,7 @@ def _filter_blocks(rows: _Rows, starts: Moments) -> _Filtered:
             means = means + spread * by_error
             scaled = spread / np.sqrt(variance)[:, None]
             covariances = covariances - scaled[:, :, None] * scaled[:, None]
-        after.means[t], after.covariances[t] = means, covariances
+        after.put(t, means, covariances)
     return _Filtered(before, ahead, after, A, eta, J, float(log_density))
 
 
@@ -289,7 +294,7 @@ def _smooth(rows: _Rows, filtered: _Filtered) -> tuple[Moments, Array]:
     block, A = _smooth_blocks(G, c, L, ends)
     mean, covariance = last = [part[-1, -1] for part in filtered.after]
     for k in range(len(A) - 1, -1, -1):
-        ends.means[k], ends.covariances[k] = mean, covariance
+        ends.put(k, mean, covariance)
         mean = A[k] @ mean + block.means[0, k]
         covariance = _even(A[k] @ covariance @ A[k].T) + block.covariances[0, k]
     smoothed, _ = _smooth_blocks(G, c, L, ends)
@@ -308,7 +313,7 @@ def _smooth_blocks(G: Array, c: Array, L: Array, ends: Moments) -> tuple[Moments
         means = _times(G[t], means) + c[t]
         covariances = _even(G[t] @ covariances @ np.swapaxes(G[t], -1, -2)) + L[t]
         A = G[t] @ A
-        smoothed.means[t], smoothed.covariances[t] = means, covariances
+        smoothed.put(t, means, covariances)
     return smoothed, A
 
 

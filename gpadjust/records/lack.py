@@ -71,11 +71,10 @@ class Lack(Display):
         """Return a sentence on the missing effect."""
         if self.lag is not None:
             # Lags are tried in powers of two.
-            low, high = self.lag / 2, self.lag * 2
             return (
-                f"{self.state}' lacks a lag: {self.over} acts some {low:.2g} to {high:.2g} late. "
-                f"Try one state more, hidden, q' = ({self.over} - q)/tau, and q in place of "
-                f"{self.over}."
+                f"{self.state}' lacks a lag: {self.over} acts some {self.lag / 2:.2g} to "
+                f"{self.lag * 2:.2g} late. Try one state more, hidden, "
+                f"q' = ({self.over} - q)/tau, and q in place of {self.over}."
             )
         if self.shape == "constant":
             return f"{self.state}' lacks about {self.term} throughout: try an offset."
@@ -308,7 +307,8 @@ class _Search:
         mean, covariance, _, _, left = self._smoothed(links, added, alone, i)
         residual = columns @ mean + left / self.pushes[:, i, i]
         middles = np.array([np.median(at[column > 0]) for column in columns.T])
-        lag, term = None, ""
+        lag = None
+        term = ""
         if of.is_lag:
             lag = _LAGS[int(shape)] * self.step
         elif shape:

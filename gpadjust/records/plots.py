@@ -51,7 +51,8 @@ def plot_record(
             name, or the number of ``axes`` is another one.
     """
     Records([record], spec)  # checks types and columns
-    names, stretches = [*spec.states, *spec.actions], record.stretches()
+    names = [*spec.states, *spec.actions]
+    stretches = record.stretches()
     called = labels(spec, units)
     if axes is None:
         figure = plt.figure(figsize=(7, 1.4 * len(names)), layout="constrained")
@@ -115,10 +116,10 @@ def plot_lack(lack: Lack, *, units: Mapping[str, str] | None = None, ax: Any = N
     ax.axhline(0.0, color=GREY, lw=1, ls="--")
     bars: dict[str, Any] = {"color": BLUE, "fmt": "o-", "ms": 4, "lw": 1.3, "capsize": 2}
     ax.errorbar(lack.middles, lack.means, half, **bars, label="mean, 95 %")
-    low, high = float((lack.means - half).min()), float((lack.means + half).max())
-    ends = lack.residual.quantile(lack.residual.new_tensor([0.02, 0.98])).tolist()
-    room = 0.1 * (max(high, ends[1]) - min(low, ends[0]))
-    ax.set_ylim(min(low, ends[0], 0.0) - room, max(high, ends[1], 0.0) + room)
+    ends = lack.residual.quantile(lack.residual.new_tensor([0.02, 0.98]))
+    low, high = torch.cat([ends, lack.means - half, lack.means + half]).aminmax()
+    room = 0.1 * float(high - low)
+    ax.set_ylim(min(float(low), 0.0) - room, max(float(high), 0.0) + room)
     over = called[lack.over]
     if lack.lag is not None:
         over = f"{lack.over}, {lack.lag:.2g} late, less {lack.over}"

@@ -114,8 +114,8 @@ class Record:
 
     def part(self, rows: slice) -> Record:
         """Return some rows, as a record of the same name."""
-        times, states, actions = self.times[rows], self.states[rows], self.actions[rows]
-        part = Record(times, states, actions, self.segments[rows], self.name)
+        columns = (column[rows] for column in (self.times, self.states, self.actions))
+        part = Record(*columns, self.segments[rows], self.name)
         part.within = self.within[rows]
         return part
 
@@ -150,10 +150,10 @@ class Record:
     def _numbers(self, values: ArrayLike, name: str, dims: int) -> Tensor:
         tensor = as_tensor(values, name).detach().clone()
         if tensor.dim() != dims or 0 in tensor.shape[1:]:
-            expected = "N" if dims == 1 else f"N x {name.removesuffix('s')}_dim"
+            expected = f"N x {name.removesuffix('s')}_dim" if dims > 1 else "N"
+            way_out = "; of a single column, use `.reshape(-1, 1)`" * (dims > tensor.dim())
             raise self._error(
-                f": expected {name} of shape {expected}, got {tuple(tensor.shape)}"
-                + ("; of a single column, use `.reshape(-1, 1)`." if dims > tensor.dim() else ".")
+                f": expected {name} of shape {expected}, got {tuple(tensor.shape)}{way_out}."
             )
         return tensor
 
@@ -201,7 +201,9 @@ class Records:
 
     def __init__(self, records: Record | Iterable[Record], spec: StateSpec) -> None:
         check_spec(spec)
-        self.records = (records,) if isinstance(records, Record) else tuple(records)
+        if isinstance(records, Record):
+            records = [records]
+        self.records = tuple(records)
         self.spec = spec
         if not self.records:
             raise ValueError("Expected one record or more, found none.")
@@ -211,7 +213,8 @@ class Records:
                     f"Expected each record as a Record(times, states, actions), found {record!r}."
                 )
             for name in ("states", "actions"):
-                expected, columns = getattr(spec, name), getattr(record, name).shape[1]
+                expected = getattr(spec, name)
+                columns = getattr(record, name).shape[1]
                 if columns != len(expected):
                     raise ValueError(
                         f"Record {record.name!r}: expected {len(expected)} columns of {name}, "
@@ -375,7 +378,8 @@ def control_steps(records: Records, step: float | None) -> Records:
     """
     if not isinstance(records, Records):
         raise TypeError(f"Expected records as Records([record, ...], spec), found {records!r}.")
-    spec, step = records.spec, _checked_step(records, step)
+    spec = records.spec
+    step = _checked_step(records, step)
     steps = []
     short = 0
     for record in records:

@@ -102,8 +102,10 @@ class SmoothedRecords:
 
         Of a sensor with a delay they are interpolated, and NaN at the end.
         """
-        chain, corrected = self.chain, states.clone()
-        measured, theta = states[:, chain.spec.moving].numpy(), self.estimate.states[0, chain.d :]
+        chain = self.chain
+        corrected = states.clone()
+        measured = states[:, chain.spec.moving].numpy()
+        theta = self.estimate.states[0, chain.d :]
         shown = chain.sensing.corrected(measured, theta, [slice(0, len(states))])
         corrected[:, chain.spec.moving] = torch.from_numpy(shown)
         return corrected
@@ -239,7 +241,8 @@ def chain_of(
     """Return the chain of all stretches of records; arguments are those of :func:`smooth`."""
     check_kind("sensors", sensors, Sensors | None, 'such as Sensors(["x"], offset={...})')
     steps = with_known_inputs(control_steps(records, step))
-    spec, length = records.spec, steps.records[0].sampling_step
+    spec = records.spec
+    length = steps.records[0].sampling_step
     f_p = one_physics(physics, spec, "take one of them")
     substeps = substeps_of(f_p, steps, length)
     noises = {"noise": noise, "process_noise": process_noise}
@@ -251,7 +254,8 @@ def substeps_of(f_p: Physics, steps: Records, length: float) -> int:
     """Return how many steps of the physics make a control step: 1, or as many as it has samples."""
     if f_p.step is None or abs(f_p.step - length) <= _SAME * length:
         return 1
-    samples, spec = steps.records[0].within.shape[1], steps.spec
+    spec = steps.spec
+    samples = steps.records[0].within.shape[1]
     if len(spec.moving) == spec.state_dim and abs(f_p.step * samples - length) <= _SAME * length:
         return samples
     raise ValueError(
@@ -438,7 +442,9 @@ def _search(
             continue
         if max(hoped, abs(gained)) < _ARRIVED:
             off = np.abs(estimate.states[:, : chain.d] - path.states) / chain.spread
-            return estimate, 0.0 if off.max() < _RIGHT else math.inf
+            if off.max() >= _RIGHT:
+                gained = math.inf
+            return estimate, gained
         # log R and log Q climb; known ones go to their values
         ratio = chain.likely_variances(links, smoothed) / variances
         gradient = np.where(chain.is_known, 0.0, chain.counts / 2 * (ratio - 1))
@@ -510,11 +516,13 @@ class Chain:
         self.steps = steps
         self.spec = steps.spec
         moving = self.spec.moving
-        (mean, sd), names = start, [self.spec.states[i] for i in moving]
-        sensors = Sensors(names) if sensors is None else sensors
+        mean, sd = start
+        names = [self.spec.states[i] for i in moving]
+        sensors = sensors or Sensors(names)
         self.sensing = Sensing(sensors, physics, self.spec, steps.records[0].sampling_step)
         self.unknowns = self.sensing.unknowns
-        self.d, self.num_parameters = len(moving), len(self.unknowns)
+        self.d = len(moving)
+        self.num_parameters = len(self.unknowns)
         self.angles = [moving.index(i) for i in self.spec.angle_columns if i in moving]
         self.lengths = np.array([len(record.times) for record in steps])
         ends = self.lengths.cumsum()
@@ -574,7 +582,8 @@ class Chain:
         leave the physics is often found by way of those that may; of every other start they are so
         from the beginning.
         """
-        p, something_known = self.num_parameters, self.something_is_known
+        p = self.num_parameters
+        something_known = self.something_is_known
         starts = [np.zeros(p)] * (1 + something_known)
         if p and number > len(starts):
             starts += [*even_normal(number - len(starts), p, seed=0).numpy()]
@@ -696,7 +705,8 @@ class Chain:
         """
         inputs = self.recorded[rows].expand(*states.shape[:-1], -1).clone()
         following = torch.from_numpy(np.ascontiguousarray(states))
-        values, unknowns = None, self.physics.unknowns
+        values = None
+        unknowns = self.physics.unknowns
         if unknowns:
             values = unknowns.at(torch.from_numpy(parameters)[..., : len(unknowns)])
         for actions in self.within[rows].unbind(1):
