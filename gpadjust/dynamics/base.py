@@ -177,10 +177,10 @@ class Dynamics(ABC):
                 each step. ``"learnt"``: the estimated noise, which is right for updates by states
                 without noise, such as draws of :func:`smooth`. Default: none.
             variation: Standard deviations of the physics' unknown parameters between runs, one for
-                each or one for all, in standard deviations of their priors:
-                0.1, say, and more for another machine. Each particle
-                has its own parameters. Beyond the actions of the updates the deviations grow,
-                threefold at half of their range, but to at most half of the prior's. Default: none.
+                each or one for all, in standard deviations of their priors: 0.1 of one machine
+                from day to day, more of another one. Each particle has its own parameters. Beyond
+                the actions of the updates the deviations grow, threefold at half of their range,
+                but to at most half of the prior's. Default: none.
             state_bounds: Lower and upper bounds, ``2 x state_dim``, as of a task: a particle that
                 would leave them stops. Default: none.
             seed: Seed of functions and noise; PyTorch's generator is not changed.

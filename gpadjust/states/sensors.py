@@ -94,6 +94,7 @@ class Sensors:
 
     def measure(self, spec: StateSpec, states: Tensor) -> Tensor:
         """Return outputs ``N x len(outputs)`` of states ``N x state_dim``, without noise."""
+        # An estimate of these is in the fit of a log, not in the sensors.
         if any(self.unknowns.values()):
             raise ValueError(
                 "Sensors: an unknown gain, offset or delay is for `smooth` and `identify`; give "

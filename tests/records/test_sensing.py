@@ -142,24 +142,6 @@ def test_free_runs_are_advised_where_something_slow_is_lacking_and_equal_where_n
     assert lacking.coverage[0] < 0.6 < 0.75 < lacking.by_free_runs.coverage[0]
 
 
-REFUSED = [
-    ({"sensors": "x"}, TypeError, "sensors must be .*Sensors"),
-    ({"sensors": Sensors(["w"])}, ValueError, "Expected sensors of x, v, states that move"),
-    ({"sensors": Sensors(["x"], noise={"x": 0.1})}, ValueError, "an argument of `smooth`"),
-    ({"sensors": Sensors(["x"], gain={"x": 2.0})}, TypeError, "unknowns must map names to Unknown"),
-    ({"sensors": Sensors(["x"], lambda states: states)}, ValueError, "without a function"),
-]
-
-
-@pytest.mark.parametrize(("options", "error", "words"), REFUSED)
-def test_what_is_no_sensor_of_a_log(options, error, words):
-    records, _ = late_log(0)
-    with pytest.raises(error, match=words):
-        identify(records, spring(), start={"v": (0.0, 1.0)}, **options)
-
-
 def test_unknown_sensors_are_for_logs_alone():
-    with pytest.raises(ValueError, match="output of gain"):
-        Sensors(["x"], gain={"y": PRIORS["gain"]})
     with pytest.raises(ValueError, match="unknown gain, offset or delay is for `smooth`"):
         SENSORS.measure(SPEC, torch.zeros(1, 2))

@@ -1,5 +1,6 @@
 """The command for a log: from a CSV file and equations to a page, or an error that says why not."""
 
+import math
 import re
 import sys
 from dataclasses import replace
@@ -252,3 +253,19 @@ def test_times_in_milliseconds_are_converted(folder, undrawn):
     text = (folder / "identify.html").read_text()
     assert "0.1898" in text  # 0.02 / ln(10 / 9)
     assert "0.02 s" in text
+
+
+def test_actions_within_a_step_are_followed_and_a_parameter_may_be_a_function(folder, undrawn):
+    rows, x = [], 0.0
+    for k in range(161):  # of x' = u - c(x), c = 2 x
+        u = 3.0 * (k % 4 == 0) + 0.02 * k
+        rows.append(f"{0.1 * k:.1f},{x},{u}\n")
+        x = x * math.exp(-0.2) + u / 2 * (1 - math.exp(-0.2))
+    (folder / "log.csv").write_text("time,x,u\n" + "".join(rows))
+    given = ["identify", "log.csv", "--states", "x", "--actions", "u", "--step", "0.4"]
+    given += ["--physics", "x' = u - c*x", "--unknown"]
+    assert main([*given, "c [1/s] = 1 */ 3"]) == 0
+    (row,) = re.findall(r"c</td>\s*<td[^>]*>([^<]*)<", (folder / "identify.html").read_text())[:1]
+    assert float(row) == pytest.approx(2.0, rel=1e-3)
+    assert main([*given, "c(x: 0 .. 2) [1/s] = 1 */ 3"]) == 0
+    assert "c(2)" in (folder / "identify.html").read_text()
