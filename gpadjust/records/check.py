@@ -82,7 +82,7 @@ def check_log(
 
     Example:
         >>> import torch
-        >>> from gpadjust.physics import FormulaPhysics, ODEPhysics, Unknown
+        >>> from gpadjust import FormulaPhysics, ODEPhysics, Unknown
         >>> from gpadjust.records import Record, Records, check_log
         >>> from gpadjust.states import StateSpec
         >>> t = 0.1 * torch.arange(60, dtype=torch.float64)

@@ -112,9 +112,6 @@ class Identification(Display):
     def task(self, reward: Callable[[Tensor, Tensor, Tensor], Tensor], **options: Any) -> Any:
         """Return a task in these dynamics, for :class:`~gpadjust.control.MPC` or an agent.
 
-        Plans follow the parameters' center, or draws of them (``Planner(num_functions=20)``).
-        Margins of constraints allow for the parameters and for process noise.
-
         Args:
             reward: As of :class:`~gpadjust.control.Task`.
             options: The other arguments of a task. ``state_bounds`` are by default the range of the
@@ -151,8 +148,7 @@ class Identification(Display):
 
         White process noise averages out, what equations lack does not: with dry friction missing,
         the damping stands for it, and its interval is too narrow. Here each equation also has a
-        function of each state, twice as large as its process noise. Of right equations this is 0,
-        and the posterior that of :attr:`parameters`. A prior of the missing force, not a fact.
+        function of each state, twice as large as its process noise, which right equations lack.
         """
         if self.parameters is None:
             return None
@@ -189,10 +185,7 @@ class Identification(Display):
 
     @cached_property
     def lack(self) -> Lack | None:
-        """What the equations lack most clearly, by the part that was learnt from; None if nothing.
-
-        Takes some seconds for thousands of steps, once.
-        """
+        """What the equations lack most clearly, by what was learnt from; None if nothing."""
         return clearest_lack(self.smoothed.chain, self.smoothed.estimate, self._control_step)
 
     @cached_property
@@ -283,8 +276,6 @@ class Identification(Display):
         if self.lack is not None:
             sentences.append(str(self.lack))
         sentences += self._of_noise()
-        errors = self.errors
-        shares = self.coverage.tolist()
         cause = (
             "the physics lacks something whose errors last longer than process noise (dry "
             "friction, an input), or has a sign or unit wrong"
@@ -292,19 +283,14 @@ class Identification(Display):
         if self.lack is None and self.smoothed.parameters.untold:
             untold = listed(self.smoothed.parameters.untold)
             cause = f"the log shows no lack of the physics, and does not tell {untold}"
-        for i, name in enumerate(self.spec.states):
-            if shares[i] < FEW:
+        for i, share in enumerate(self.coverage.tolist()):
+            if share < FEW:
                 sentences.append(
-                    f"Of {name} the intervals of 95 % cover {100 * shares[i]:.0f} % of what was "
-                    f"held out: {cause}. Rely neither on them nor on those of the parameters."
+                    f"Of {self.spec.states[i]} the intervals of 95 % cover {100 * share:.0f} % of "
+                    f"what was held out: {cause}. Rely neither on them nor on those of the "
+                    "parameters."
                 )
                 sentences += self._of_free_runs(i)
-            for other, words in _OTHERS.items():
-                if other in errors and errors[other][i] <= errors[IDENTIFIED][i]:
-                    sentences.append(
-                        "Along what was held out the error of the identified physics in "
-                        f"{name} is no less than that of {words}."
-                    )
         return sentences
 
     def _of_forces(self) -> list[str]:
@@ -406,7 +392,6 @@ def identify(
     All but the last part of the records is smoothed (:func:`smooth`). A free run follows the
     actions from there to the end, and is compared with the measurements. Its particles start where
     the state may be, have parameters drawn from their posterior, and are moved by process noise.
-    That is white: where the physics lacks something, whose errors last, intervals are too narrow.
 
     Args:
         records: The records, of states that all move. One that is NaN throughout is hidden.
@@ -433,18 +418,15 @@ def identify(
 
     Example:
         >>> import torch
+        >>> from gpadjust import FormulaPhysics, ODEPhysics, Unknown
         >>> from gpadjust.records import Record, Records, identify
-        >>> from gpadjust.physics import FormulaPhysics, ODEPhysics, Unknown
-        >>> from gpadjust.states import Sensors, StateSpec
+        >>> from gpadjust.states import StateSpec
         >>> t = 0.1 * torch.arange(60, dtype=torch.float64)
-        >>> states = torch.stack([(1.5 * t).cos(), -1.5 * (1.5 * t).sin()], dim=-1)
-        >>> states += 0.01 * torch.randn(60, 2, dtype=torch.float64)
-        >>> record = Record(t, states, torch.zeros(60, 1, dtype=torch.float64))
-        >>> unknowns = {"k": Unknown(1.0, factor=2.0)}
-        >>> rates = FormulaPhysics("v, u - k * x", ["x", "v", "u"], unknowns=unknowns)
-        >>> log, physics = Records(record, StateSpec(["x", "v"], ["u"])), ODEPhysics(rates, 0.1, 2)
-        >>> errors = identify(log, physics).errors
-        >>> bool((errors["identified"] < 0.1 * errors["guesses"]).all())
+        >>> x = (1 - (-t).exp() + 0.01 * torch.randn(60).double()).unsqueeze(-1)
+        >>> law = FormulaPhysics("u - k * x", ["x", "u"], unknowns={"k": Unknown(2.0, factor=2.0)})
+        >>> log = Records(Record(t, x, torch.ones_like(x)), StateSpec(["x"], ["u"]))
+        >>> errors = identify(log, ODEPhysics(law, step=0.1, state_dim=1)).errors
+        >>> bool(errors["identified"] < 0.1 * errors["guesses"])
         True
     """
     steps = control_steps(records, step)

@@ -259,21 +259,17 @@ class _Search:
         prior = np.eye(K) / self.wide[of.i] ** 2
         precision = np.zeros((2, K, K))
         pull = np.zeros((2, K))
-        rows = zip(self.links, self._added(of.i, of.columns), self.chain.firsts, strict=True)
+        triples = zip(self.links, self._added(of.i, of.columns), self.chain.firsts, strict=True)
         anywhere = np.diag(np.append(self.chain.first_variance, [_WIDE**2] * len(self.theta)))
-        for link, added, first in rows:
+        for link, added, first in triples:
             cut = len(added) // 2
             for k, part in enumerate((slice(0, cut), slice(cut, len(added)))):
                 if part.stop == part.start:
                     continue
                 end = part.stop + 1
-                measured = slice(part.start, end)
-                shorter = Link(
-                    link.matrices[part],
-                    link.offsets[part],
-                    link.outputs[measured],
-                    link.measured[measured],
-                )
+                rows = slice(part.start, end)
+                outputs, measured = link.outputs[rows], link.measured[rows]
+                shorter = Link(link.matrices[part], link.offsets[part], outputs, measured)
                 start = [(self.estimate.states[first + part.start], anywhere)]
                 mean, covariance, *_ = self._smoothed([shorter], [added[part]], start, of.i)
                 inverse = np.linalg.inv(covariance)

@@ -186,19 +186,17 @@ def smooth(
         A mass on a spring of unknown stiffness, of which only the position is measured:
 
         >>> import torch
+        >>> from gpadjust import FormulaPhysics, ODEPhysics, Unknown
         >>> from gpadjust.records import Record, Records, smooth
-        >>> from gpadjust.physics import ODEPhysics, Unknown
         >>> from gpadjust.states import StateSpec
-        >>> def spring(x, u, p):
-        ...     return torch.stack([x[:, 1], u[:, 0] - p.stiffness * x[:, 0]], dim=-1)
-        >>> unknowns = {"stiffness": Unknown(1.0, factor=2.0)}
-        >>> physics = ODEPhysics(spring, step=0.1, state_dim=2, unknowns=unknowns)
+        >>> unknowns = {"k": Unknown(1.0, factor=2.0)}
+        >>> spring = FormulaPhysics("v, u - k * x", ["x", "v", "u"], unknowns=unknowns)
         >>> t = 0.1 * torch.arange(50, dtype=torch.float64)
         >>> position = (1.5 * t).cos() + 0.01 * torch.randn(50, dtype=torch.float64)
         >>> states = torch.stack([position, torch.full_like(t, torch.nan)], dim=-1)
-        >>> spec = StateSpec(["x", "v"], ["u"])
-        >>> records = Records(Record(t, states, torch.zeros_like(states[:, :1])), spec)
-        >>> smoothed = smooth(records, physics, start={"v": (0.0, 1.0)})
+        >>> record = Record(t, states, torch.zeros_like(states[:, :1]))
+        >>> records = Records(record, StateSpec(["x", "v"], ["u"]))
+        >>> smoothed = smooth(records, ODEPhysics(spring, 0.1, 2), start={"v": (0.0, 1.0)})
         >>> bool((smoothed.physics_parameters.mean - 2.25).abs() < 0.05)
         True
     """
@@ -577,10 +575,9 @@ class Chain:
     def starts_of_search(self, number: int) -> Iterator[tuple[Array, bool]]:
         """Yield coordinates of the parameters, and if known variances are so from the beginning.
 
-        They are at the guesses, and then at draws from the priors. Variances that are known come
-        down to this from the sizes of f_p's errors in single steps, as a trajectory that may hardly
-        leave the physics is often found by way of those that may; of every other start they are so
-        from the beginning.
+        They are the guesses, then draws from the priors. Known variances begin with the squares of
+        f_p's errors, as a path that must follow the physics is often found by way of others, but
+        in every other start.
         """
         p = self.num_parameters
         something_known = self.something_is_known
