@@ -612,7 +612,7 @@ def _told_together(parameters: PhysicsParameters) -> list[Combination]:
         group |= dict.fromkeys(joined, group[first])
         powers = parameters[first] ** p * parameters[second] ** q
         units = [_bracketed(parameters.unknowns[name].unit) for name in (first, second)]
-        unit = _product(*units, p, q) if all(units) else ""
+        unit = _product(units[0], units[1], p, q) if all(units) else ""
         combined.append(Combination(_product(first, second, p, q), first, second, unit, powers))
     return combined
 

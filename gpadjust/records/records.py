@@ -114,7 +114,7 @@ class Record:
 
     def part(self, rows: slice) -> Record:
         """Return some rows, as a record of the same name."""
-        columns = (column[rows] for column in (self.times, self.states, self.actions))
+        columns = self.times[rows], self.states[rows], self.actions[rows]
         part = Record(*columns, self.segments[rows], self.name)
         part.within = self.within[rows]
         return part

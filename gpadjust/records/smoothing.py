@@ -216,10 +216,12 @@ def smooth(
     noises[0, chain.hidden] = math.nan
     gain = chain.sensing.values(estimate.states[0, chain.d :])[0]
     noises[0] /= np.abs(gain)  # in the unit of the states
+    noise, process_noise = _of_all_states(noises, chain.spec)
     return SmoothedRecords(
         _with_states(chain.steps, estimate.states),
         _of_all_states(sd, chain.spec).split(chain.lengths.tolist()),
-        *_of_all_states(noises, chain.spec),
+        noise,
+        process_noise,
         estimate.log_density,
         is_settled,
         chain,
