@@ -25,7 +25,7 @@ if __name__ == "__main__":  # `python -m gpadjust report` needs the formula alon
     left_out = leave_one_out(model)
     alone = np.sqrt(np.mean((deflection(X) - measured[:, 0]) ** 2))
     adjusted = left_out.score().rmse.item()
-    print(f"The formula errs by {alone:.2f} mm, adjusted by {adjusted:.2f} mm.")
+    print(f"Error of the formula {alone:.2f} mm, adjusted {adjusted:.2f} mm.")
 
     figure, axes = plt.subplots(figsize=(5, 3), layout="constrained")
     axes.axline((1, 1), slope=1, color="0.7")

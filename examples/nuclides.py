@@ -1,6 +1,6 @@
 """Binding energies of nuclides: a liquid drop, and the shells that it lacks.
 
-Measured (AME2020, as in OpenMC, MIT): see ../paper/published/data/README.md.
+Measured (AME2020, as in OpenMC, MIT): paper/published/data/README.md of the repository.
 """
 
 from pathlib import Path
@@ -11,11 +11,10 @@ import torch
 
 from gpadjust import CKA, CalibratedPhysics, FunctionPhysics, Unknown, fit
 
-DATA = Path(__file__).parents[1] / "paper/published/data/masses/ame2020.csv"
-Z, N, energy, _, measured = np.loadtxt(DATA, delimiter=",", skiprows=1).T
-even = (measured == 1) & (Z >= 20) & (Z % 2 == 0) & (N % 2 == 0)
-X = torch.tensor(np.stack([Z, N], axis=1)[even])
-Y = torch.tensor(energy[even] * (Z + N)[even] / 1000).unsqueeze(-1)  # MeV
+DATA = Path(__file__).with_name("nuclides.csv")  # with even Z and N
+Z, N, energy = np.loadtxt(DATA, delimiter=",", skiprows=1)[:, :3].T
+X = torch.tensor(np.stack([Z, N], axis=1))
+Y = torch.tensor(energy * (Z + N) / 1000).unsqueeze(-1)  # MeV
 
 
 def drop(X, p):
@@ -41,10 +40,10 @@ for kind in (CalibratedPhysics, CKA):  # the drop alone, and adjusted
     model = kind(X[train], Y[train], physics=liquid)
     fit(model, "map")
     errors.append(model.predict(X[test]).mean - Y[test])
-drop_alone, adjusted = (each.square().mean().sqrt() for each in errors)
+drop_alone, adjusted = (error.square().mean().sqrt() for error in errors)
 print(
-    f"On {len(test)} nuclides that were left out the liquid drop, fitted to 150, "
-    f"errs by {drop_alone:.2f} MeV, adjusted by {adjusted:.2f} MeV."
+    f"Error on {len(test)} nuclides that were left out: liquid drop, fitted to 150, "
+    f"{drop_alone:.2f} MeV, adjusted {adjusted:.2f} MeV."
 )
 
 figure, axes = plt.subplots(figsize=(5, 3), layout="constrained")

@@ -1,6 +1,6 @@
 """A pendulum's log file: mass and inertia from it, and what the equation lacks.
 
-Measured at DFKI (BSD 3-Clause): see ../paper/machines/data/README.md.
+Measured at DFKI (BSD 3-Clause): paper/machines/data/README.md of the repository.
 """
 
 from importlib.resources import files

@@ -1,7 +1,7 @@
 """The resistance of yachts by the shape of their hulls, in scikit-learn.
 
-Measured in Delft (UCI Machine Learning Repository, CC BY 4.0): see
-../paper/published/data/README.md.
+Measured in Delft (UCI Machine Learning Repository, CC BY 4.0): the repository has
+paper/published/data/README.md on them.
 """
 
 from pathlib import Path
@@ -14,7 +14,7 @@ from sklearn.model_selection import train_test_split
 from gpadjust import FunctionPhysics, Unknown
 from gpadjust.sklearn import CKARegressor
 
-DATA = Path(__file__).parents[1] / "paper/published/data/uci/yacht.csv"
+DATA = Path(__file__).with_name("yacht.csv")
 table = np.loadtxt(DATA, delimiter=",", skiprows=1)
 X, y = table[:, :6], table[:, 6]  # resistance over weight, times 1000
 

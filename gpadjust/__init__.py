@@ -55,7 +55,7 @@ Each object draws itself, and is a table in a notebook::
 
 Beyond the models::
 
-    from gpadjust.validation import leave_one_out, trust   # do the intervals hold what they say?
+    from gpadjust.validation import leave_one_out, trust   # errors, coverage; what decides
     from gpadjust.validation.plots import plot_adjustment  # rho and delta; others beside it
     from gpadjust.report import report                     # a page to show
     from gpadjust.active import collect                    # the next point to measure

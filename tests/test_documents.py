@@ -1,6 +1,7 @@
 """What the documents speak of exists: files, extras, commands, versions, pages of the reference."""
 
 import doctest
+import json
 import re
 import shlex
 import tomllib
@@ -16,45 +17,49 @@ from gpadjust.__main__ import parser
 from paper.__main__ import main
 
 ROOT = Path(__file__).parents[1]
-CI = (ROOT / ".ci" / "run").read_text()
+DOCS = ROOT / "docs"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-COPIED = {"changelog", "contributing"}  # into docs/ by a build
-FOLDERS = ("docs", "guide", "control", "laboratory", "coming_from")
-PAGES = [p for p in sorted((ROOT / "docs").rglob("*.md")) if p.parent.name in FOLDERS]
-DOCUMENTS = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "paper/README.md"]
-DOCUMENTS += ["CODE_OF_CONDUCT.md", "SECURITY.md"]
-DOCUMENTS += [str(page.relative_to(ROOT)) for page in PAGES if page.stem not in COPIED]
+PAGES = [path for path in sorted(DOCS.rglob("*.md")) if "_build" not in path.parts]
+DOCUMENTS = ["README", "CONTRIBUTING", "CHANGELOG", "CODE_OF_CONDUCT", "SECURITY", "paper/README"]
+DOCUMENTS = [*(f"{name}.md" for name in DOCUMENTS), *(str(p.relative_to(ROOT)) for p in PAGES)]
+TEXTS = {name: (ROOT / name).read_text() for name in DOCUMENTS}
+REFERENCE = sorted((DOCS / "reference").glob("*.rst"))
+ROOM_PAGES = [page for page in REFERENCE if page.stem not in ("index", "gpadjust")]
 TOOLS = {"coverage", "mypy", "ruff", "sphinx-build", "tox", "twine"}
 BUILT = {"docs/_build", "docs/_build/index.html"}
 PICTURES = "tutorials/pictures/"  # taken from the notebooks as the site is built
-REFERENCE = sorted((ROOT / "docs" / "reference").glob("*.rst"))
-ROOM_PAGES = [page for page in REFERENCE if page.stem not in ("index", "gpadjust")]
-GUIDE = sorted((ROOT / "docs" / "guide").rglob("*.md"))
-DOCTESTS = [p for p in sorted((ROOT / "docs").rglob("*.rst")) if "_build" not in p.parts]
-
-WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
-
 YOURS = {"NAME.py"}
 MODULES = {
     p.name for room in ("docs", "gpadjust", "paper", "tests") for p in (ROOT / room).rglob("*.py")
 }
-
+WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
 COLUMN = 88  # characters of code that fit the site's column
+WORDS, CHANGES, NAMES = 35_000, 60, 110  # of the site, lines of the newest version, public names
+AVOIDED = re.compile(
+    r"\b(by the default fit|next to nothing|of one's own|is none|errs?|pays|nobody (says|told)|"
+    r"(intervals?|those) (of 95 % )?(that )?hold|go(es)? on|told|said)\b"
+)
+
+
+def shell_blocks(text):
+    return re.findall(r"```bash\n(.*?)```", text, flags=re.DOTALL)
 
 
 def commands(text):
-    """Those of the shell blocks of a document, and what it quotes of `python -m`."""
-    blocks = re.findall(r"```bash\n(.*?)```", text, flags=re.DOTALL)
-    lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    """Commands of the shell blocks of a document, and quoted ones of `python -m`."""
+    lines = [
+        line for block in shell_blocks(text) for line in block.replace("\\\n", " ").split("\n")
+    ]
     quoted = re.findall(r"`(python -m [^`]*)`", text)
     parts = [part.strip() for line in lines + quoted for part in line.split("&&")]
     return [shlex.split(part, comments=True) for part in parts if part]
 
 
 def lacking(name):
-    """Linked and quoted files and extras of a document that are not there, and long lines."""
-    text = (ROOT / name).read_text()
+    """Yield linked and quoted files and extras that are not there, and long lines of code."""
+    text = TEXTS[name]
     links = {link for link in re.findall(r"\]\(([^)#\s]+)", text) if "://" not in link}
+    links |= set(re.findall(r"\{download\}`[^`]*<([^>]*)>`", text))
     quoted = set(re.findall(r"`((?:gpadjust|paper|tests|docs|\.ci)/[\w./-]*)`", text))
     quoted |= set(re.findall(r"`(\w+\.(?:md|cff|toml))`", text))
     quoted = {path for path in quoted - BUILT if not re.search(r"-v\d$", path)}  # environments' ids
@@ -62,23 +67,33 @@ def lacking(name):
     yield from (link for link in links if not (ROOT / name).parent.joinpath(link).exists())
     yield from (path for path in quoted if not (ROOT / path).exists())
     yield from set(re.findall(r"`(?:\w+/)*(\w+\.py)`", text)) - MODULES - YOURS
-    named = set(re.findall(r"extra\s+`(\w+)`", text))
-    named |= {e for found in re.findall(r'\.\[([\w,]+)\]"', text) for e in found.split(",")}
-    yield from named - set(PROJECT["optional-dependencies"])
+    extras = set(re.findall(r"extra\s+`(\w+)`", text))
+    lists = re.findall(r'(?:\.|gpadjust)\[([\w,]+)\]["\s]', text)
+    extras |= {extra for names in lists for extra in names.split(",")}
+    yield from extras - set(PROJECT["optional-dependencies"])
     blocks = re.findall(r"```(?:python|none)\n(.*?)```", text, flags=re.DOTALL)
     yield from (line for line in "".join(blocks).splitlines() if len(line) > COLUMN)
 
 
 def test_documents_name_what_there_is_and_their_code_fits_its_column():
-    missing = {name: found for name in DOCUMENTS if (found := [*lacking(name)])}
+    missing = {name: problems for name in DOCUMENTS if (problems := [*lacking(name)])}
     for path in (ROOT / "examples").glob("*.py"):
-        if found := [line for line in path.read_text().splitlines() if len(line) > COLUMN]:
-            missing[path.name] = found
+        if long := [line for line in path.read_text().splitlines() if len(line) > COLUMN]:
+            missing[path.name] = long
     assert not missing
 
 
+def test_the_documents_are_short_and_plain():
+    pages = [*PAGES, *REFERENCE, ROOT / "tutorials" / "README.md"]
+    assert sum(len(page.read_text().split()) for page in pages) <= WORDS
+    newest = TEXTS["CHANGELOG.md"].split("\n## [")[1]
+    assert newest.count("\n") <= CHANGES
+    vague = {page.name: AVOIDED.findall(page.read_text()) for page in pages}
+    assert not {name: words for name, words in vague.items() if words}
+
+
 def is_known(command):
-    """Whether what a command needs is there."""
+    """Whether the needs of a command are there."""
     match command:
         case ["python", "-m", "paper", *_]:
             return True  # below
@@ -87,16 +102,18 @@ def is_known(command):
             return (find_spec(module) or module == "build") and all(p.exists() for p in places)
         case ["gpadjust", *arguments]:
             return parser().parse_args(arguments)
-        case ["cd", folder]:
-            return (ROOT / folder).is_dir()
         case ["python", file, *_] | ["pip", "install", "--constraint", file, *_]:
             return (ROOT / file).is_file()
+        case ["pip", "install", package]:
+            return re.fullmatch(
+                r"gpadjust\[\w+\] @ git\+https://github.com/OWNER/gpadjust", package
+            )
         case [tool, *_]:
             return tool in TOOLS
 
 
 def test_commands_exist(monkeypatch):
-    found = [each for name in DOCUMENTS for each in commands((ROOT / name).read_text())]
+    found = [command for text in TEXTS.values() for command in commands(text)]
     assert not [command for command in found if not is_known(command)]
     for command in {tuple(each) for each in found if each[:3] == ["python", "-m", "paper"]}:
         monkeypatch.setattr("sys.argv", ["paper", *command[3:], "--help"])
@@ -106,24 +123,22 @@ def test_commands_exist(monkeypatch):
 
 
 def test_a_guide_begins_with_a_picture_and_says_what_it_shows():
-    pages = {page.stem: page.read_text().split("\n\n")[:2] for page in GUIDE}
     picture = re.compile(r"!\[.{20,}\]\(\S+\)")
-    assert not [
-        n
-        for n, (title, next_) in pages.items()
-        if not title.startswith("# ") or not picture.fullmatch(next_)
-    ]
+    for page in (DOCS / "guide").rglob("*.md"):
+        title, next_ = page.read_text().split("\n\n")[:2]
+        assert title.startswith("# "), page
+        assert picture.fullmatch(next_), page
 
 
-def test_ci_runs_the_checks_that_documents_tell():
-    told = []
-    for name in ("README.md", "CONTRIBUTING.md"):
-        block = re.findall(r"```bash\n(.*?)```", (ROOT / name).read_text(), flags=re.DOTALL)[1]
-        told += block.replace(" && ", "\n").splitlines()
-    assert len(told) > 7
-    for check in told:
-        check = check.replace("pip install", "pip install --quiet").removesuffix(" docs/_build")
-        assert check in CI
+def test_ci_runs_the_checks_of_the_documents():
+    blocks = (shell_blocks(TEXTS[name])[1] for name in ("README.md", "CONTRIBUTING.md"))
+    checks = "".join(blocks).replace(" && ", "\n").splitlines()
+    assert len(checks) > 7
+    ci = (ROOT / ".ci" / "run").read_text()
+    for check in checks:
+        assert (
+            check.replace("pip install", "pip install --quiet").removesuffix(" docs/_build") in ci
+        )
 
 
 def test_the_tools_come_with_the_extra_dev_and_are_pinned():
@@ -133,29 +148,30 @@ def test_the_tools_come_with_the_extra_dev_and_are_pinned():
     for requirements in PROJECT["optional-dependencies"].values():
         for requirement in requirements:
             package = re.match(r"[\w.-]+", requirement)[0].lower()
-            assert package == "gpadjust" or re.search(
-                rf"^{re.sub('[-_.]', '[-_.]', package)}==", pins, flags=re.MULTILINE
-            ), package
+            pin = rf"^{re.sub('[-_.]', '[-_.]', package)}=="
+            assert package == "gpadjust" or re.search(pin, pins, flags=re.MULTILINE), package
 
 
 def test_tox_asks_for_the_lowest_versions_and_tests_that_there_are():
-    tox = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["tox"]["env_run_base"]
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["tox"]
+    tests = yaml.safe_load((ROOT / ".github" / "workflows" / "tests.yml").read_text())["jobs"]
+    assert tests["core"]["strategy"]["matrix"]["env"] == settings["env_list"]
+    tox = settings["env_run_base"]
     lists = (PROJECT["dependencies"], *PROJECT["optional-dependencies"].values())
     assert {*tox["deps"]} <= {requirement for each in lists for requirement in each}
     folders = [part for part in tox["commands"][0] if part.startswith("tests/")]
     assert folders
-    assert [folder for folder in folders if not (ROOT / folder).is_dir()] == []
+    assert all((ROOT / folder).is_dir() for folder in folders)
 
 
 def test_one_version():
     cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert cited["version"] == gpadjust.__version__
-    told = f"\n## [{cited['version']}] - {cited['date-released']}\n"
-    assert told in (ROOT / "CHANGELOG.md").read_text()
+    assert f"\n## [{cited['version']}] - {cited['date-released']}\n" in TEXTS["CHANGELOG.md"]
 
 
 def test_the_rooms_have_the_files_to_read_first():
-    text = (ROOT / "docs" / "architecture.md").read_text().split("## The rooms")[1]
+    text = TEXTS["docs/architecture.md"].split("## The rooms")[1]
     rows = re.findall(r"^\| `(\w+)` \| .* \| ([^|]*) \|$", text, flags=re.MULTILINE)
     read = [(room, file) for room, files in rows for file in re.findall(r"`([\w./]+\.py)`", files)]
     assert len({room for room, _ in read}) > 10
@@ -170,15 +186,15 @@ def public_names():
 
 
 def test_the_public_names_are_few_and_each_has_one_home():
-    rooms = (path.parent for path in (ROOT / "gpadjust").glob("*/__init__.py"))
-    public = {room.name for room in rooms if "__all__" in (room / "__init__.py").read_text()}
-    assert {page.stem for page in ROOM_PAGES} == public
+    files = (ROOT / "gpadjust").glob("*/__init__.py")
+    rooms = {file.parent.name for file in files if "__all__" in file.read_text()}
+    assert {page.stem for page in ROOM_PAGES} == rooms
     names = [name for names in public_names().values() for name in names]
-    assert len(names) == len({*names}) <= 110
+    assert len(names) == len({*names}) <= NAMES
 
 
 def test_the_reference_lists_the_public_names():
-    index = (ROOT / "docs" / "reference" / "index.rst").read_text()
+    index = (DOCS / "reference" / "index.rst").read_text()
     pages = index.partition(".. toctree::")[2].split()[2:]
     assert {*pages} == {page.stem for page in REFERENCE} - {"index"}
     listed = re.findall(r"^   ~(gpadjust[\w.]*)\.(\w+)$", index, flags=re.MULTILINE)
@@ -190,7 +206,7 @@ def test_the_reference_lists_the_public_names():
     "page",
     [
         pytest.param(page, marks=pytest.mark.slow if page.stem in ("control", "rl") else ())
-        for page in DOCTESTS
+        for page in REFERENCE
     ],
     ids=lambda page: page.stem,
 )
@@ -199,31 +215,47 @@ def test_the_examples_of_the_reference_run(page):
 
 
 def test_the_learner_of_the_recipes_runs():
-    text = (ROOT / "docs" / "extending.md").read_text()
-    blocks = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+    blocks = re.findall(r"```python\n(.*?)```", TEXTS["docs/extending.md"], flags=re.DOTALL)
     # core/test_recipes.py runs the others.
     (learner,) = [block for block in blocks if "class DynaDDPG" in block]
     exec(learner, {})
 
 
+def test_notebooks_and_examples_run_outside_the_clone():
+    """The sixth notebook is of an experiment, and says so; all data lie beside or are installed."""
+    for path in (ROOT / "tutorials").glob("*.ipynb"):
+        cells = json.loads(path.read_text())["cells"]
+        code = "".join(
+            line for cell in cells if cell["cell_type"] == "code" for line in cell["source"]
+        )
+        assert "../" not in code, path.name
+        assert path.stem[0] == "6" or not re.search(r"^(from|import) (paper|tests)\b", code, re.M)
+    gallery = TEXTS["docs/gallery.md"]
+    for path in (ROOT / "examples").glob("*.py"):
+        code = path.read_text()
+        assert "parents" not in code, path.name
+        files = [path.name, *re.findall(r'with_name\("([\w.]+)"\)', code)]
+        assert all(f"{{download}}`{name} <../examples/{name}>`" in gallery for name in files)
+    data = ROOT / "paper" / "published" / "data"
+    for name, source in {"yacht": "uci/yacht", "nuclides": "masses/ame2020"}.items():
+        rows = (ROOT / "examples" / f"{name}.csv").read_text().splitlines()
+        assert {*rows} <= {*(data / f"{source}.csv").read_text().splitlines()}
+
+
 @pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.stem)
-def test_the_workflows_run_what_documents_tell(path):
-    """Beside them, what only a runner has to do: check a tag, push a site, take main branches."""
-    documents = [(ROOT / name).read_text() for name in ("README.md", "CONTRIBUTING.md")]
-    told = {
-        line.strip()
-        for text in documents
-        for block in re.findall(r"```bash\n(.*?)```", text, flags=re.DOTALL)
-        for line in block.splitlines()
-    }
-    told |= {part.strip() for line in told for part in line.split("&&")}
-    told |= {"tox -e ${{ matrix.env }}", ".ci/run"}
-    told |= {"pip install --constraint constraints.txt build setuptools twine"}
+def test_the_workflows_run_the_commands_of_the_documents(path):
+    """In addition, what only a runner has to do: check a tag, push a site, take main branches."""
+    blocks = (shell_blocks(TEXTS[name]) for name in ("README.md", "CONTRIBUTING.md"))
+    lines = {line.strip() for texts in blocks for text in texts for line in text.splitlines()}
+    lines |= {part.strip() for line in lines for part in line.split("&&")}
+    lines |= {"tox -e ${{ matrix.env }}", ".ci/run"}
+    lines |= {"pip install --constraint constraints.txt build setuptools twine"}
     runs, jobs = [], yaml.safe_load(path.read_text())["jobs"]
     for job in jobs.values():
         steps = job.get("steps", [{"uses": "actions/checkout"}])  # or those of another workflow
-        assert steps[0].get("uses", "actions/checkout").startswith("actions/checkout")
+        first = steps[0].get("uses", "actions/checkout")
+        assert first.startswith(("actions/checkout", "actions/download-artifact"))
         runs += [step["run"] for step in steps if "run" in step]
     own = [run for run in runs if run.startswith(("git fetch", "grep ", "pip install --no-deps"))]
     assert len(own) < 2
-    assert {*runs} - {*own} <= told
+    assert {*runs} - {*own} <= lines
