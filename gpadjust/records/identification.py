@@ -116,8 +116,9 @@ class Identification(Display):
             reward: As of :class:`~gpadjust.control.Task`.
             options: The other arguments of a task. ``state_bounds`` are by default the range of the
                 states in the log, and as much again on either side; angles have none. If states
-                are hidden, ``sensors`` are by default those of the log, with its noise, and
-                ``initial_states`` any states of the log.
+                are hidden, ``sensors`` are by default those of the log, with its noise, for
+                measurements corrected by their gain and offset, and ``initial_states`` any states
+                of the log.
         """
         states = torch.cat([record.states for record in self.smoothed.records])
         low, high = states.amin(0), states.amax(0)

@@ -60,17 +60,14 @@ class Sensing:
         """Return gains, offsets and delays in steps, ``... x 3 x d``, by parameters ``... x p``."""
         values = np.zeros((*parameters.shape[:-1], 3, len(self.longest)))
         values[..., 0, :] = 1.0
-        if self.places:
-            rows, columns = zip(*self.places, strict=True)
-            numbers = self.unknowns.at(torch.from_numpy(parameters)).numpy()
-            values[..., rows, columns] = numbers[..., self.first :]
+        rows, columns = zip(*self.places, strict=True)
+        numbers = self.unknowns.at(torch.from_numpy(parameters)).numpy()
+        values[..., rows, columns] = numbers[..., self.first :]
         values[..., 2, :] /= self.step
         return values
 
     def outputs(self, states: Array, parameters: Array, stretches: Sequence[slice]) -> Array:
         """Return outputs of the states of all stretches, ``M x d``."""
-        if not self.places:
-            return states
         gain, offset, delay = self.values(parameters)
         late = np.concatenate([_late(states[rows], delay) for rows in stretches])
         outputs: Array = gain * late + offset
@@ -78,8 +75,6 @@ class Sensing:
 
     def corrected(self, measured: Array, parameters: Array, stretches: Sequence[slice]) -> Array:
         """Return the states ``M x d`` that measurements show; with a delay NaN at the end."""
-        if not self.places:
-            return measured
         gain, offset, delay = self.values(parameters)
         shown = measured.copy()
         for i in np.flatnonzero(delay):
@@ -101,8 +96,6 @@ class Sensing:
         """
         n, d = states.shape
         H = np.tile(np.eye(d, d + len(parameters)), (n, 1, 1))
-        if not self.places:
-            return H, measured
         gain, offset, delay = self.values(parameters)
         late = _late(states, delay)
         speed = _late(states, delay, derivative=1)

@@ -106,8 +106,9 @@ class SmoothedRecords:
         corrected = states.clone()
         measured = states[:, chain.spec.moving].numpy()
         theta = self.estimate.states[0, chain.d :]
-        shown = chain.sensing.corrected(measured, theta, [slice(0, len(states))])
-        corrected[:, chain.spec.moving] = torch.from_numpy(shown)
+        if chain.sensing is not None:
+            shown = chain.sensing.corrected(measured, theta, [slice(0, len(states))])
+            corrected[:, chain.spec.moving] = torch.from_numpy(shown)
         return corrected
 
     def draw(self, seed: int = 0) -> Records:
@@ -214,8 +215,7 @@ def smooth(
     sd = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)[:, : chain.d].clip(0))
     noises = np.sqrt(estimate.variances)
     noises[0, chain.hidden] = math.nan
-    gain = chain.sensing.values(estimate.states[0, chain.d :])[0]
-    noises[0] /= np.abs(gain)  # in the unit of the states
+    noises[0] /= chain.gain(estimate.states[0, chain.d :])  # in the unit of the states
     noise, process_noise = _of_all_states(noises, chain.spec)
     return SmoothedRecords(
         _with_states(chain.steps, estimate.states),
@@ -518,9 +518,12 @@ class Chain:
         moving = self.spec.moving
         mean, sd = start
         names = [self.spec.states[i] for i in moving]
-        sensors = sensors or Sensors(names)
-        self.sensing = Sensing(sensors, physics, self.spec, steps.records[0].sampling_step)
-        self.unknowns = self.sensing.unknowns
+        self.sensing: Sensing | None = None
+        self.unknowns = physics.unknowns
+        if sensors is not None:
+            sensing = Sensing(sensors, physics, self.spec, steps.records[0].sampling_step)
+            self.sensing = sensing if sensing.places else None
+            self.unknowns = sensing.unknowns
         self.d = len(moving)
         self.num_parameters = len(self.unknowns)
         self.angles = [moving.index(i) for i in self.spec.angle_columns if i in moving]
@@ -540,9 +543,9 @@ class Chain:
             for i in self.angles:  # without jumps
                 places = rows.start + np.flatnonzero(~np.isnan(y[rows, i]))
                 y[places, i] = np.unwrap(y[places, i])
-            for i, longest in enumerate(self.sensing.longest):
+            for i, longest in enumerate([] if self.sensing is None else self.sensing.longest):
                 y[rows][:longest, i] = math.nan
-        y = self.sensing.corrected(y, np.zeros(self.num_parameters), self.stretches)
+        y = self.corrected(y, np.zeros(self.num_parameters))
         self.hidden = np.isnan(y).all(0)
         if self.hidden.all():
             raise ValueError(f"Expected measured states, found none of {', '.join(names)}.")
@@ -591,7 +594,7 @@ class Chain:
 
     def first_path(self, parameters: Array) -> Path:
         """Return measured states, and between them and in hidden ones those to which f_p leads."""
-        measured = self.sensing.corrected(self.measured, parameters, self.stretches).copy()
+        measured = self.corrected(self.measured, parameters).copy()
         states = measured.copy()
         x = self.first.copy()
         for t in range(self.lengths.max() if np.isnan(measured).any() else 0):
@@ -605,24 +608,40 @@ class Chain:
             if going.any():
                 x[going] = self._defined(self.firsts[going] + t, x[going], parameters)
         following = self._defined(self.now, states[self.now], parameters)
-        if self.sensing.places:
-            outputs = self.sensing.outputs(states, parameters, self.stretches)
-            measured = self.near(self.measured, outputs)
+        if self.sensing is not None:
+            measured = self.near(self.measured, self.outputs(states, parameters))
         return Path(states, measured, parameters, following)
+
+    def corrected(self, measured: Array, parameters: Array) -> Array:
+        """Return the states ``M x d`` that measurements show."""
+        if self.sensing is None:
+            return measured
+        return self.sensing.corrected(measured, parameters, self.stretches)
+
+    def outputs(self, states: Array, parameters: Array) -> Array:
+        """Return what the sensors show of states ``M x d``."""
+        if self.sensing is None:
+            return states
+        return self.sensing.outputs(states, parameters, self.stretches)
+
+    def gain(self, parameters: Array) -> Array:
+        """Return sizes of the gains of the sensors, ``d``."""
+        if self.sensing is None:
+            return np.ones(self.d)
+        return np.abs(self.sensing.values(parameters)[0])
 
     def path_of(self, estimate: Estimate) -> Path:
         """Return the path of an estimate."""
         states, parameters = estimate.states[:, : self.d], estimate.states[0, self.d :]
         following = self.follow(self.now, states[self.now], parameters)
-        outputs = self.sensing.outputs(states, parameters, self.stretches)
-        return Path(states, self.near(self.measured, outputs), parameters, following)
+        measured = self.near(self.measured, self.outputs(states, parameters))
+        return Path(states, measured, parameters, following)
 
     def first_variances(self, path: Path) -> Array:
         """Return first variances of both noises, by f_p's errors in single steps."""
         change = ((path.following - path.states[self.now]) ** 2).mean(0)
-        shown = self.sensing.corrected(path.measured, path.parameters, self.stretches)
-        gain = self.sensing.values(path.parameters)[0]
-        errors = (shown[self.now + 1] - path.following) ** 2 * gain**2
+        shown = self.corrected(path.measured, path.parameters)
+        errors = ((shown[self.now + 1] - path.following) * self.gain(path.parameters)) ** 2
         noise = _SHARE * _means(errors, otherwise=_HIDDEN**2 * change)
         return np.stack([noise, 2 * noise]).clip(self.least)
 
@@ -648,8 +667,11 @@ class Chain:
         links = []
         parts = zip(self.stretches, np.split(F, cuts), np.split(b, cuts), strict=True)
         for rows, matrices, offsets in parts:
-            near = path.states[rows], path.parameters, path.measured[rows]
-            links.append(Link(matrices, offsets, *self.sensing.linearised(*near)))
+            y = path.measured[rows]
+            H = np.tile(np.eye(d, d + p), (len(y), 1, 1))
+            if self.sensing is not None:
+                H, y = self.sensing.linearised(path.states[rows], path.parameters, y)
+            links.append(Link(matrices, offsets, H, y))
         return links
 
     def towards(self, path: Path, estimate: Estimate) -> tuple[Path, float]:
@@ -677,7 +699,7 @@ class Chain:
     def cost(self, path: Path, variances: Array) -> float:
         """Return twice the negative log density of a path, up to a constant; NaN if f_p fails."""
         noise, process_noise = variances
-        outputs = self.sensing.outputs(path.states, path.parameters, self.stretches)
+        outputs = self.outputs(path.states, path.parameters)
         errors = np.nansum((path.measured - outputs) ** 2 / noise)
         added = (path.states[self.now + 1] - path.following) ** 2 / process_noise
         begins = (path.states[self.firsts] - self.first) ** 2 / self.first_variance

@@ -18,6 +18,7 @@ PRIORS = {
     "offset": Unknown(0.0, sd=0.3),
     "delay": Unknown(0.25, bounds=(0.0, 0.5), unit="s"),
 }
+ALL = [slice(0, 40)]
 SENSORS = Sensors(["x"], **{kind: {"x": prior} for kind, prior in PRIORS.items()})
 
 
@@ -53,7 +54,7 @@ def test_the_outputs_near_a_path_are_those_of_the_linear_chain():
     states = np.stack([np.sin(t), np.cos(t)], -1)
     z = np.array([0.3, -0.2, 0.5, 0.7, 0.1])  # a delay of some 2.7 steps
     gain, offset, delay = sensing.values(z)[:, 0]
-    outputs = sensing.outputs(states, z)
+    outputs = sensing.outputs(states, z, ALL)
     np.testing.assert_allclose(
         outputs[9:, 0], (gain * np.sin(t - STEP * delay) + offset)[9:], atol=1e-5
     )
@@ -64,9 +65,11 @@ def test_the_outputs_near_a_path_are_those_of_the_linear_chain():
     )
     assert np.isnan(y[-3:, 0]).all()
     for j, step in enumerate(1e-5 * np.eye(5)):
-        slope = (sensing.outputs(states, z + step) - sensing.outputs(states, z - step)) / 2e-5
+        slope = (
+            sensing.outputs(states, z + step, ALL) - sensing.outputs(states, z - step, ALL)
+        ) / 2e-5
         np.testing.assert_allclose(H[:-3, 0, 2 + j], slope[3:, 0], atol=1e-6)
-    corrected = sensing.corrected(outputs, z)
+    corrected = sensing.corrected(outputs, z, ALL)
     np.testing.assert_allclose(corrected[9:-3, 0], np.sin(t)[9:-3], atol=2e-3)  # linear in between
 
 
