@@ -6,7 +6,7 @@ The physics f_p takes rows of X and returns rows of Y. ``from gpadjust import CK
 The usual way::
 
     model = CKA(X, Y, physics=f_p)               # rho(x) f_p(x) + delta(x)
-    print(fit(model))                            # is f_p of use? A point fit: fit(model, "map")
+    print(fit(model))                            # does f_p help? A point fit: fit(model, "map")
     print(model.summary())                       # hyper-parameters and noise, in your units
     mean, variance = model.predict(X)            # of a measurement: observation_noise=True
     lower, upper = model.interval(X, level=0.95)
@@ -23,7 +23,7 @@ Other models, with the same calls::
     ZeroMeanGP(X, Y)                             # no physics
     RRA(X, Y, physics=f_p)                       # functions to call anywhere
     VariationalCKA(X, Y, physics=f_p)            # up to 100,000 rows
-    AR1(X, Y, physics=f_p, bounds=[[0], [1]])    # a constant rho; f_p known through samples
+    AR1(X, Y, physics=f_p, bounds=[[0], [1]])    # a constant rho; f_p by samples
 
 Other data, for each of these; names of gpadjust.kinds::
 
@@ -46,7 +46,7 @@ Each object draws itself, and is a table in a notebook::
 
     model.plot()                                 # predictions, rho and delta; also of a mixture
     comparison.plot()                            # of compare: left-out predictions, and scores
-    model.priors().plot()                        # of all numbers; beside them the posterior
+    model.priors().plot()                        # of all numbers, and the posterior
     parameters.plot()                            # model.physics_parameters: posterior and prior
     leave_one_out(model).plot()                  # left-out predictions, and their residuals
     collection.plot()                            # of collect: path and best so far; or regret
@@ -56,7 +56,7 @@ Each object draws itself, and is a table in a notebook::
 Beyond the models::
 
     from gpadjust.validation import leave_one_out, trust   # errors, coverage; what decides
-    from gpadjust.validation.plots import plot_adjustment  # rho and delta; others beside it
+    from gpadjust.validation.plots import plot_adjustment  # rho and delta
     from gpadjust.report import report                     # a page to show
     from gpadjust.active import collect                    # the next point to measure
     from gpadjust.physics import MujocoPhysics             # a MuJoCo model, its unknown numbers

@@ -1,8 +1,8 @@
-"""Checks of the numbers, shapes and options that a user gives, and seeds, for all.
+"""Checks of the numbers, shapes and options that a user gives, and seeds, for all rooms.
 
-A function ``check_...`` raises an error or returns nothing; one called ``checked_...`` also returns
-the value in the form that is worked with. The name of the argument comes first. A wrong kind is a
-TypeError, a wrong value or shape a ValueError; both say what was found and what was expected.
+``check_...`` returns nothing, ``checked_...`` the value in its final form. The name of the argument
+comes first. A wrong kind is a TypeError, a wrong value or shape a ValueError; both
+name the value and the expected one.
 """
 
 from __future__ import annotations
@@ -21,12 +21,7 @@ from torch import Tensor
 
 
 def checked_whole(name: str, value: Any, least: int | None = None) -> int:
-    """Return a whole number as an int; not True or False.
-
-    Raises:
-        TypeError: If it is none.
-        ValueError: If it is below ``least``.
-    """
+    """Return a whole number, of at least ``least``, as an int; not True or False."""
     try:
         number = None if isinstance(value, bool) else index(value)
     except TypeError:
@@ -39,27 +34,18 @@ def checked_whole(name: str, value: Any, least: int | None = None) -> int:
 
 
 def checked_number(
-    name: str,
-    value: Any,
-    *,
-    least: float | None = None,
-    above: float | None = None,
-    most: float | None = None,
-    below: float | None = None,
-) -> float:
+    name: str, value: Any, *, least: float | None = None, above: float | None = None,
+    most: float | None = None, below: float | None = None,
+) -> float:  # fmt: skip
     """Return a finite real number as a float.
 
     Args:
         name: The argument's name.
-        value: What was given for it.
+        value: Its value.
         least: The least value that is allowed.
         above: A value that it must exceed.
         most: The largest value that is allowed.
         below: A value that it must not reach.
-
-    Raises:
-        TypeError: If it is no number.
-        ValueError: If it is not finite, or out of range.
 
     Example:
         >>> checked_number("discount", 1.5, above=0, most=1)
@@ -70,18 +56,19 @@ def checked_number(
     if isinstance(value, bool) or not isinstance(value, Real):
         raise TypeError(f"{name} must be a number; found {value!r}.")
     number = float(value)
-    right = (
+    is_right = (
         math.isfinite(number)
         and (least is None or number >= least)
         and (above is None or number > above)
         and (most is None or number <= most)
         and (below is None or number < below)
     )
-    if not right:
+    if not is_right:
         limits = {"at least": least, "above": above, "at most": most, "below": below}
-        told = [f"{word} {limit:g}" for word, limit in limits.items() if limit is not None]
-        told = told if most is not None or below is not None else ["finite", *told]
-        raise ValueError(f"{name} must be {' and '.join(told)}; found {value}.")
+        words = [f"{word} {limit:g}" for word, limit in limits.items() if limit is not None]
+        if most is None and below is None:
+            words.insert(0, "finite")
+        raise ValueError(f"{name} must be {' and '.join(words)}; found {value}.")
     return number
 
 
@@ -100,7 +87,7 @@ def check_switch(name: str, value: Any) -> None:
 
 
 def check_kind(name: str, value: Any, kind: Any, expected: str) -> None:
-    """Raise a TypeError unless an option is an object of a class, which is told as expected."""
+    """Raise a TypeError unless an option is an object of a class, ``expected`` in words."""
     if not isinstance(value, kind):
         raise TypeError(f"{name} must be {expected}; found {value!r}.")
 
@@ -112,12 +99,7 @@ def check_choice(name: str, value: Any, known: Sequence[Any]) -> None:
 
 
 def checked_options(name: str, options: Any, known: Sequence[str]) -> dict[str, Any]:
-    """Options by name; none for None.
-
-    Raises:
-        TypeError: If they are no dictionary.
-        ValueError: If there is an unknown one.
-    """
+    """Return options by name, a dictionary of known ones, empty for None."""
     options = {} if options is None else options
     names = ", ".join(map(repr, known))
     if not isinstance(options, dict):
@@ -131,20 +113,16 @@ def checked_options(name: str, options: Any, known: Sequence[str]) -> dict[str, 
 
 
 def real_array(values: ArrayLike) -> NDArray[np.float64]:
-    """Return a copy of real numbers as a float64 array; raise a TypeError for anything else.
-
-    NumPy would drop the imaginary part of complex numbers, and take None for NaN and text for
-    numbers.
-    """
+    """Return a copy of real numbers as a float64 array; raise a TypeError for anything else."""
+    # NumPy would drop imaginary parts, and convert None to NaN and text to numbers.
     if np.ma.is_masked(values):
         raise TypeError("expected real numbers, found masked values")
     array = np.array(values)
-    # Objects may be numbers, such as fractions.
-    if array.dtype.kind not in "biufO" or (
-        array.dtype.kind == "O" and None in array.ravel().tolist()
-    ):
-        found = "None" if array.dtype.kind == "O" else array.dtype
-        raise TypeError(f"expected real numbers, found {found}")
+    kind = array.dtype.kind
+    if kind == "O" and None in array.ravel().tolist():  # others may be numbers, such as fractions
+        raise TypeError("expected real numbers, found None")
+    if kind not in "biufO":
+        raise TypeError(f"expected real numbers, found {array.dtype}")
     return array.astype(np.float64, copy=False)
 
 
@@ -158,11 +136,7 @@ def finite_array(values: Any, shape: tuple[int, ...]) -> NDArray[np.float64] | N
 
 
 def checked_tensor(name: str, values: Any) -> Tensor:
-    """Return a copy of real numbers as a float64 tensor.
-
-    Raises:
-        TypeError: If they are anything else.
-    """
+    """Return a copy of real numbers as a float64 tensor."""
     try:
         if not isinstance(values, Tensor):
             return torch.from_numpy(real_array(values))
@@ -176,17 +150,13 @@ def checked_tensor(name: str, values: Any) -> Tensor:
 def checked_bounds(
     name: str, bounds: Any, columns: int | None = None, *, finite: bool = True
 ) -> Tensor:
-    """Bounds ``2 x d``, lower ones and then upper ones, in float64.
+    """Return bounds ``2 x d``, lower ones and then upper ones, in float64.
 
-    Raises:
-        TypeError: If they are no numbers.
-        ValueError: If they have another shape (``d`` is ``columns``, or at least 1), are not
-            finite (or NaN, unless they must be ``finite``), or a lower one is not below its upper
-            one.
+    ``d`` is ``columns``, or at least 1; each lower one is below its upper one.
     """
     bounds = checked_tensor(name, bounds)
-    right = bounds.dim() == 2 and len(bounds) == 2 and bounds.shape[1] > 0
-    if not right or columns not in (None, bounds.shape[1]):
+    is_right = bounds.dim() == 2 and len(bounds) == 2 and bounds.shape[1] > 0
+    if not is_right or columns not in (None, bounds.shape[1]):
         raise ValueError(
             f"Expected {name} of shape 2 x {'d' if columns is None else columns}, the lower ones "
             f"and then the upper ones, got {tuple(bounds.shape)}."
@@ -200,12 +170,7 @@ def checked_bounds(
 
 
 def checked_points(name: str, X: Any, columns: int, bounds: Tensor | None = None) -> Tensor:
-    """Finite points ``n x columns`` in float64, within bounds ``2 x columns`` if there are any.
-
-    Raises:
-        TypeError: If they are no numbers.
-        ValueError: If they have another number of columns, are not finite, or out of bounds.
-    """
+    """Return finite points ``n x columns`` in float64, within bounds ``2 x columns`` if any."""
     X = checked_tensor(name, X)
     if X.dim() != 2 or X.shape[-1] != columns:
         raise ValueError(
@@ -213,9 +178,10 @@ def checked_points(name: str, X: Any, columns: int, bounds: Tensor | None = None
         )
     if not X.isfinite().all():
         raise ValueError(f"Expected {name} to be finite, got {X.tolist()}.")
-    if bounds is not None and (outside := (X.clamp(bounds[0], bounds[1]) != X).any(-1)).any():
+    outside = X[:0] if bounds is None else X[(X.clamp(bounds[0], bounds[1]) != X).any(-1)]
+    if bounds is not None and len(outside):
         raise ValueError(
-            f"Expected {name} within the bounds {bounds.tolist()}, got {X[outside][0].tolist()}."
+            f"Expected {name} within the bounds {bounds.tolist()}, got {outside[0].tolist()}."
         )
     return X
 
@@ -223,9 +189,9 @@ def checked_points(name: str, X: Any, columns: int, bounds: Tensor | None = None
 def check_columns(name: str, tensor: Tensor, columns: int, more: bool = False) -> None:
     """Raise an error unless a tensor is floating-point and ``... x columns`` (or ``more``)."""
     if not torch.is_tensor(tensor) or not tensor.is_floating_point():
-        found = tensor.dtype if torch.is_tensor(tensor) else type(tensor).__name__
+        kind = tensor.dtype if torch.is_tensor(tensor) else type(tensor).__name__
         raise TypeError(
-            f"Expected {name} as a floating-point tensor, got {found}; convert with "
+            f"Expected {name} as a floating-point tensor, got {kind}; convert with "
             f"`torch.as_tensor({name}, dtype=torch.float64)`."
         )
     width = tensor.shape[-1] if tensor.dim() else 0
@@ -248,19 +214,17 @@ def check_observed(name: str, Y: Tensor) -> None:
     _check_rows(name, Y.isnan().all(-1), expected)
 
 
-def _check_rows(name: str, bad: Tensor, expected: str) -> None:
-    if bad.any():
-        rows = marked_rows(bad)
-        shown = ", ".join(map(str, rows[:5])) + (", ..." if len(rows) > 5 else "")
-        raise ValueError(
-            f"Expected {name} {expected} in {len(rows)} of {bad.shape[-1]} rows (row {shown}); "
-            "remove these points."
-        )
+def _check_rows(name: str, is_wrong: Tensor, expected: str) -> None:
+    if is_wrong.any():
+        rows = marked_rows(is_wrong)
+        first = ", ".join([*map(str, rows[:5]), *["..."] * (len(rows) > 5)])
+        rows_of = f"{len(rows)} of {is_wrong.shape[-1]} rows (row {first})"
+        raise ValueError(f"Expected {name} {expected} in {rows_of}; remove these points.")
 
 
 def marked_rows(marked: Tensor) -> list[int]:
-    """Return the positions in the last dimension at which something is marked."""
-    return sorted({int(where[-1]) for where in marked.nonzero()})
+    """Return the positions in the last dimension at which any entry is marked."""
+    return marked.nonzero()[:, -1].unique().tolist()
 
 
 @contextmanager
@@ -268,5 +232,5 @@ def seeded(seed: int | None) -> Iterator[None]:
     """Draw from PyTorch's generator of the CPU, from a copy of it if there is a seed."""
     with nullcontext() if seed is None else torch.random.fork_rng(devices=[]):
         if seed is not None:
-            torch.default_generator.manual_seed(seed)  # those of GPUs are no copies
+            torch.default_generator.manual_seed(seed)  # the generators of GPUs are not copied
         yield

@@ -1,7 +1,7 @@
-"""How objects show themselves: a figure by ``plot()``, and a table of HTML in a notebook.
+"""Figures of objects by ``plot()``, and their tables of HTML in a notebook.
 
-The functions that draw are in rooms above those of the objects, so that they are found by name at
-the first figure; matplotlib is imported then.
+The functions that draw are in rooms above those of the objects; the first figure imports them by
+name, and matplotlib.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ FIGURES = {
     "Agent": "control.plots.plot_agent",
     "Dyna": "control.plots.plot_agent",
 }
-"""The function that draws objects of a class, and of those derived from it."""
+"""The function that draws objects of a class and of its subclasses."""
 
 
 class Display:
@@ -47,7 +47,7 @@ class Display:
 
 
 def html_table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table of HTML with every text escaped; spaces at the start of a text stay.
+    """Return a table of HTML with every text escaped; leading spaces of a text stay.
 
     Example:
         >>> html_table("a < b", ["", "mean"], [["g", "9.81"]])[:42]

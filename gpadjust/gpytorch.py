@@ -1,6 +1,6 @@
-"""The paper's model as ordinary GPyTorch modules, for your own ``ExactGP``.
+"""The paper's model as GPyTorch modules, for your own ``ExactGP``.
 
-The mean and a kernel evaluate a physics; the rest is GPyTorch's::
+A mean and a kernel evaluate a physics; the rest is GPyTorch's::
 
     class MyCKA(gpytorch.models.ExactGP):
         def __init__(self, X, y, likelihood, f_p):
@@ -55,16 +55,13 @@ class PhysicsScaledKernel(Kernel):
         base_kernel: The kernel k of rho.
         physics: As of :class:`PhysicsMean`.
         output: The number of the output.
-        center: A number c; the kernel then has :math:`f_p(x) - c` in place of :math:`f_p(x)`.
+        center: A number c: the kernel has :math:`f_p(x) - c` in place of :math:`f_p(x)`.
     """
 
     def __init__(
-        self,
-        base_kernel: Kernel,
-        physics: Physics | Callable[[Tensor], Tensor],
-        output: int = 0,
-        center: float = 0.0,
-    ) -> None:
+        self, base_kernel: Kernel, physics: Physics | Callable[[Tensor], Tensor],
+        output: int = 0, center: float = 0.0,
+    ) -> None:  # fmt: skip
         super().__init__()
         self.base_kernel = base_kernel
         self.mean = PhysicsMean(physics, output)

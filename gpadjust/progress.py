@@ -1,4 +1,4 @@
-"""Progress bars: those that a user asks for, and those that long work shows by itself."""
+"""Progress bars, on request or of long work by itself."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ class _Hidden:
 
 
 def progress_bar(shown: bool, iterable: Iterable[Any] = (), **options: Any) -> Any:
-    """Return a bar of tqdm with these options, or an object that goes the same way unseen.
+    """Return a bar of tqdm with these options, or an object with its methods that is not shown.
 
     Raises:
-        ImportError: If it is to be shown, and tqdm is not installed.
+        ImportError: If a bar is shown, and tqdm is not installed.
 
     Example:
         >>> with progress_bar(False, total=3) as bar:
@@ -63,10 +63,9 @@ def progress_bar(shown: bool, iterable: Iterable[Any] = (), **options: Any) -> A
 
 @contextmanager
 def long_work(text: str, unit: str, *, total: int | None = None) -> Iterator[None]:
-    """Show a bar of what :func:`tick` counts in a block, if that takes more than five seconds.
+    """Show a bar of the units that :func:`tick` counts in a block of more than five seconds.
 
-    It is shown in a terminal or a notebook, if tqdm is installed. With a total of units it also
-    shows the time that is left.
+    It is shown in a terminal or a notebook, if tqdm is installed, with a total also the time left.
     """
     is_seen = hasattr(sys, "ps1") or (sys.stderr is not None and sys.stderr.isatty())
     if not (is_seen and find_spec("tqdm")):
@@ -83,7 +82,7 @@ def long_work(text: str, unit: str, *, total: int | None = None) -> Iterator[Non
 
 
 def tick(unit: str, to: int | None = None) -> None:
-    """Count a unit, or go to this number, if the innermost long work counts such units."""
-    counted, bar = _BAR.get()
-    if counted == unit:
+    """Count a unit, or set their number, if the innermost long work counts such units."""
+    unit_of_bar, bar = _BAR.get()
+    if unit_of_bar == unit:
         bar.update(1 if to is None else to - bar.n)

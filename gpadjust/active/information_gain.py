@@ -108,7 +108,7 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
         conditioning = model.conditioning()
         values = conditioning.train.values
         places = model.places(X, values)
-        f = model.term_sum.at(values, places)
+        f = model.term_sum.evaluate(values, places)
         noise = model.noise.variance(values, places)
         # log det Cov(y(X) | D) / 2
         gain = _log_sds(conditioning.joint(f)[1], noise)

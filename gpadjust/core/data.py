@@ -1,4 +1,4 @@
-"""The data of a model: what is taken and checked, names of columns, and units of the targets."""
+"""The data of a model: checks, names of columns, and units of the targets."""
 
 from __future__ import annotations
 
@@ -20,21 +20,9 @@ ArrayLike = Any
 
 _FAINT = 1e-6  # of the size of the targets: their unit where the prior mean meets them
 
-# What NumPy would turn into numbers: kinds of arrays, types of objects, and the way out.
-_NO_NUMBERS: dict[str, tuple[str, tuple[type, ...], str]] = {
-    "text": (
-        "SU",
-        (str, bytes),
-        "convert numbers in text with `.astype(float)`; columns of a frame of inputs may be "
-        "categories, input_transform=Categories() of gpadjust.kinds; drop other text",
-    ),
-    "complex numbers": ("c", (complex, np.complexfloating), "give both parts, or take `.real`"),
-    "dates or times": (
-        "mM",
-        (date, time, timedelta, np.datetime64, np.timedelta64),
-        "convert them to seconds since the first with `(t - t.min()) / np.timedelta64(1, 's')`",
-    ),
-}
+# Types that NumPy would turn into numbers.
+_DATES = (date, time, timedelta, np.datetime64, np.timedelta64)
+_NO_NUMBERS: tuple[type, ...] = (str, bytes, complex, np.complexfloating, *_DATES)
 
 
 class Data(NamedTuple):
@@ -48,14 +36,14 @@ class Data(NamedTuple):
     transform: InputTransform | None = None  # of what kernels see of X; the physics sees X
 
     @classmethod
-    def of(
+    def read(
         cls, train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike, input_transform: Any
     ) -> Data:
         """Return checked data, detached from any graph."""
         if input_transform is not None:
             input_transform = deepcopy(input_transform).double().train()
-        inputs, outputs = names_of(train_X, "x"), names_of(train_Y, "y")
-        X, Y = as_tensor(_coded(train_X, input_transform), "train_X"), as_tensor(train_Y, "train_Y")
+        X = as_tensor(_coded(train_X, input_transform), "train_X")
+        Y = as_tensor(train_Y, "train_Y")
         for name, tensor in (("train_X", X), ("train_Y", Y)):
             if tensor.dim() != 2:
                 raise ValueError(
@@ -64,44 +52,44 @@ class Data(NamedTuple):
                 )
         if len(X) != len(Y) or X.shape[-1] < 1 or Y.shape[-1] < 1:
             raise ValueError(
-                "Expected a row of targets for each row of inputs, and a column of both; found "
-                f"train_X of shape {tuple(X.shape)} and train_Y of {tuple(Y.shape)}."
+                "Expected as many rows of train_Y as of train_X, and columns of both; found shapes "
+                f"{tuple(X.shape)} and {tuple(Y.shape)}."
             )
         if len(X) < 2:
-            raise ValueError(
-                f"Expected at least 2 points in train_X; found {len(X)}, which no scale can be "
-                "learnt from. Use the physics alone until there are two."
-            )
+            raise ValueError(f"Expected at least 2 points in train_X; found {len(X)}.")
         if not X.isfinite().all():
             check_finite("train_X", X)
         if not Y.isfinite().all():
             check_observed("train_Y", Y)
-        seldom = (~Y.isnan()).sum(-2) < 2
-        if seldom.any():
-            raise ValueError(
-                "Expected at least 2 observations of each output, but train_Y has fewer in "
-                f"column(s) {marked_rows(seldom)}; leave these out."
-            )
-        X, Y = X.detach().clone(), Y.detach().clone()
+        is_seldom = (~Y.isnan()).sum(-2) < 2
+        if is_seldom.any():
+            columns = marked_rows(is_seldom)
+            raise ValueError(f"Expected at least 2 targets of each output; leave out {columns}.")
+        X = X.detach().clone()
+        Y = Y.detach().clone()
         Yvar = None if train_Yvar is None else variances_of(train_Yvar, Y)
         if input_transform is not None:
             input_transform(X)
             input_transform.eval()
         _warn_of_copies(X, Y)
-        return cls(X, Y, Yvar, inputs, outputs, input_transform)
+        names = (names_of(train_X, "x"), names_of(train_Y, "y"))
+        return cls(X, Y, Yvar, *names, input_transform)
 
     def new_inputs(self, X: ArrayLike) -> Tensor:
         """Return checked inputs ``... x q x d`` of a call."""
-        names = None if isinstance(X, Tensor) else column_names(X)
+        names = None
+        if not isinstance(X, Tensor):
+            names = column_names(X)
         if names is not None and names != self.input_names and {*names} & {*self.input_names}:
             raise ValueError(f"Expected columns {self.input_names}, in this order; found {names}.")
-        X, d = as_tensor(_coded(X, self.transform), "X"), len(self.input_names)
+        X = as_tensor(_coded(X, self.transform), "X")
+        d = len(self.input_names)
         if X.dim() < 2 or X.shape[-1] != d:
             raise ValueError(
                 f"Expected X of shape ... x q x {d}, the columns {', '.join(self.input_names)}; "
                 f"found {tuple(X.shape)}. One column is `X.reshape(-1, 1)`."
             )
-        if not torch.isfinite(X.detach().sum()):
+        if not torch.isfinite(X.detach().sum()):  # one number is checked faster than all
             check_finite("X", X)
         return X
 
@@ -112,8 +100,8 @@ class Data(NamedTuple):
     def appended(self, X: Tensor, Y: Tensor) -> Data:
         """Return the data with further rows; Y may have more dimensions in front than X."""
         inputs = appended(self.X, X)
-        Y = Y.expand(*torch.broadcast_shapes(inputs.shape[:-2], Y.shape[:-2]), *Y.shape[-2:])
-        return self._replace(X=inputs, Y=appended(self.Y, Y))
+        lead = torch.broadcast_shapes(inputs.shape[:-2], Y.shape[:-2])
+        return self._replace(X=inputs, Y=appended(self.Y, Y.expand(*lead, *Y.shape[-2:])))
 
     def of_outputs(self, outputs: Sequence[int]) -> Data:
         """Return the data of some outputs."""
@@ -131,14 +119,13 @@ def appended(old: Tensor, new: Tensor, dim: int = -2) -> Tensor:
 def unit_of(Y: Tensor, mean: Tensor) -> Tensor:
     """Return the unit of targets ``n x m`` with a prior mean: ``m x 1``.
 
-    It is the root mean square of their difference or the standard deviation of the targets,
-    whichever is less: a good physics then leaves a small unit, and a bad one does no harm. Where
-    the prior mean meets the targets but for rounding it is a millionth of their size (or 1 if they
-    are zero).
+    A good physics leaves a small unit, and a bad one does no harm. Where the prior mean meets the
+    targets but for rounding the unit is a millionth of their size (or 1 if they are zero).
     """
     values = torch.stack([Y, Y - mean, Y - Y.nanmean(-2, keepdim=True)])
     largest = values.abs().nan_to_num().amax(-2, keepdim=True)
     largest = largest.where(largest > 0, torch.ones_like(largest))
+    # Root mean squares of y, of y - mean, and the standard deviation of y.
     size, away, spread = largest * (values / largest).square().nanmean(-2, keepdim=True).sqrt()
     unit = torch.where(spread > 1e-12 * size, away.minimum(spread), away)
     tiny = _FAINT * size.where(size > 0, torch.full_like(size, 1 / _FAINT))
@@ -149,56 +136,57 @@ def as_tensor(values: ArrayLike, name: str) -> Tensor:
     """Return a float64 tensor as it is, or one of an array, frame or Series, which is a column."""
     if isinstance(values, Tensor):
         if values.is_complex():
-            raise TypeError(_not_numbers(name, "complex numbers"))
+            raise _no_numbers(name, [str(values.dtype)])
         if values.dtype != torch.float64:  # Cholesky factors of these kernels fail in float32
             raise TypeError(
                 f"Expected {name} in float64; found {values.dtype}; take `{name}.double()`."
             )
         return values
-    values = values.to_frame() if hasattr(values, "to_frame") else values  # a Series is a column
-    array = values.to_numpy() if hasattr(values, "to_numpy") else values
+    if hasattr(values, "to_frame"):  # a Series is a column
+        values = values.to_frame()
+    array = getattr(values, "to_numpy", lambda: values)()
     if not isinstance(array, np.ndarray):
-        raise TypeError(
-            f"Expected {name} as a torch tensor, a NumPy array or a DataFrame; found "
-            f"{type(values).__name__}. Convert it with `torch.tensor({name}, dtype=torch.float64)`."
-        )
+        kind = type(values).__name__
+        raise TypeError(f"Expected {name} as a tensor, an array or a frame; found {kind}.")
     if np.ma.is_masked(array):
         raise ValueError(
-            f"Expected {name} without masked values; found {np.ma.count_masked(array)}. Leave out "
-            f"their rows; if they are targets, make them NaN, `{name}.filled(np.nan)`."
+            f"Expected {name} unmasked; take `{name}.filled(np.nan)`, or leave out rows."
         )
-    objects = {type(value) for value in array.flat} if array.dtype.kind == "O" else set()
-    for what, (kinds, types, _) in _NO_NUMBERS.items():
-        if array.dtype.kind in kinds or any(issubclass(each, types) for each in objects):
-            raise TypeError(_not_numbers(name, what))
+    types = {array.dtype.type}
+    if array.dtype.kind == "O":
+        types = {type(value) for value in array.flat}
+    wrong = [kind.__name__ for kind in types if issubclass(kind, _NO_NUMBERS)]
+    if wrong:
+        raise _no_numbers(name, wrong)
     try:
         return torch.as_tensor(np.array(array, dtype=np.float64))
     except (TypeError, ValueError) as error:
-        raise TypeError(
-            f"Expected {name} to contain numbers only, but {error}. Select the numeric columns, "
-            "and encode or drop the others."
-        ) from error
+        raise _no_numbers(name, [str(error)]) from error
 
 
-def _not_numbers(name: str, what: str) -> str:
-    return f"Expected {name} to contain numbers only; found {what}: {_NO_NUMBERS[what][2]}."
+def _no_numbers(name: str, types: Sequence[str]) -> TypeError:
+    return TypeError(
+        f"Expected {name} to contain numbers only; found {', '.join(types)}. Convert numbers in "
+        "text with `.astype(float)`, dates to seconds with `(t - t.min()) / np.timedelta64(1, "
+        "'s')`; take the real part of complex numbers. Columns of text in a frame of inputs may be "
+        "categories, input_transform=Categories() of gpadjust.kinds; drop other text."
+    )
 
 
 def variances_of(values: ArrayLike, Y: Tensor, name: str = "train_Yvar") -> Tensor:
     """Return known variances of the shape of ``Y``; their mean where there is no observation."""
     if isinstance(values, int | float | list | tuple):
         values = torch.tensor(values, dtype=torch.float64, device=Y.device)
-    variances, m = as_tensor(values, name), Y.shape[-1]
-    variances = variances.flatten() if variances.shape == (m, 1) != Y.shape else variances
+    variances = as_tensor(values, name)
+    m = Y.shape[-1]
+    if variances.shape == (m, 1) != Y.shape:
+        variances = variances.flatten()
     if variances.shape != Y.shape and variances.shape not in ((), (1,), (m,)):
-        raise ValueError(
-            f"Expected {name} (known variances) as one number, {m} (one for each column), or of "
-            f"the data's shape {tuple(Y.shape)}; found {tuple(variances.shape)}."
-        )
+        shapes = f"one number, {m}, or of the shape {tuple(Y.shape)} of the data"
+        raise ValueError(f"Expected {name} as {shapes}; found {tuple(variances.shape)}.")
     variances = variances.expand(Y.shape).masked_fill(Y.isnan(), torch.nan)
     variances = variances.where(~Y.isnan(), variances.nanmean(-2, keepdim=True))
-    if not variances.isfinite().all():
-        check_finite(name, variances)
+    check_finite(name, variances)
     if (variances < 0).any():
         raise ValueError(f"Expected variances in {name}; found {variances.min():.3g}.")
     return variances
@@ -206,17 +194,19 @@ def variances_of(values: ArrayLike, Y: Tensor, name: str = "train_Yvar") -> Tens
 
 def _coded(X: ArrayLike, transform: Any) -> ArrayLike:
     """Return inputs with numbers in place of what a transform makes numbers of."""
-    return transform.coded(X) if hasattr(transform, "coded") else X
+    if hasattr(transform, "coded"):
+        return transform.coded(X)
+    return X
 
 
 def names_of(values: ArrayLike, letter: str) -> tuple[str, ...]:
     """Return the names of columns, ``x`` or ``x1`` and so on if they have none."""
-    names = None if isinstance(values, Tensor) else column_names(values)
-    if names is not None:
+    if not isinstance(values, Tensor) and (names := column_names(values)) is not None:
         return names
     shape = [*getattr(values, "shape", ())]
-    number = int(shape[-1]) if len(shape) > 1 else 1
-    return (letter,) if number == 1 else tuple(f"{letter}{i + 1}" for i in range(number))
+    if len(shape) < 2 or shape[-1] == 1:
+        return (letter,)
+    return tuple(f"{letter}{i + 1}" for i in range(int(shape[-1])))
 
 
 def columns_of(names: Sequence[str], asked: Any, what: str) -> list[int]:
@@ -224,31 +214,35 @@ def columns_of(names: Sequence[str], asked: Any, what: str) -> list[int]:
     numbers: dict[Any, int] = {name: i for i, name in enumerate(names)}
     numbers |= {i: i % len(names) for i in range(-len(names), len(names))}
     several = [asked] if isinstance(asked, str | int) else [*asked]
-    if unknown := [each for each in several if each not in numbers]:
-        raise ValueError(
-            f"Expected {what} by names or numbers of the inputs {', '.join(names)}; found "
-            f"{unknown[0]!r}."
-        )
-    return [numbers[each] for each in several]
+    unknown = [column for column in several if column not in numbers]
+    if unknown:
+        expected = f"{what} by names or numbers of the inputs {', '.join(names)}"
+        raise ValueError(f"Expected {expected}; found {unknown[0]!r}.")
+    return [numbers[column] for column in several]
 
 
 def column_names(values: ArrayLike) -> tuple[str, ...] | None:
     """Return the names of a frame's columns or of a Series, or None."""
     if hasattr(values, "columns"):
         return tuple(map(str, values.columns))
-    name = getattr(values, "name", None)
-    return None if name is None or isinstance(values, Tensor) else (str(name),)
+    if isinstance(values, Tensor) or getattr(values, "name", None) is None:
+        return None
+    return (str(values.name),)
 
 
 def as_given(values: Tensor, X: ArrayLike, names: Sequence[str]) -> Any:
     """Return values ``... x q x m`` as X came: a tensor, an array, or a frame with these names."""
     if isinstance(X, Tensor):
         return values
-    X = X.to_frame() if hasattr(X, "to_frame") else X  # a Series
-    array, library = values.detach().cpu().numpy(), type(X).__module__.partition(".")[0]
+    if hasattr(X, "to_frame"):  # a Series
+        X = X.to_frame()
+    array = values.detach().cpu().numpy()
+    library = type(X).__module__.partition(".")[0]
     if library == "pandas":
         return type(X)(array, index=X.index, columns=list(names))
-    return type(X)(array, schema=list(names)) if library == "polars" else array
+    if library == "polars":
+        return type(X)(array, schema=list(names))
+    return array
 
 
 def _warn_of_copies(X: Tensor, Y: Tensor) -> None:
@@ -257,8 +251,8 @@ def _warn_of_copies(X: Tensor, Y: Tensor) -> None:
     copies = len(rows) - len(rows.unique(dim=0))
     if copies:
         warnings.warn(
-            f"{copies} of {len(rows)} rows equal an earlier row in all inputs and outputs. If the "
-            "same measurements are in the data twice, the noise comes out too small: drop them, "
-            "`frame.drop_duplicates()`. Repeats that are equal by rounding may stay.",
+            f"{copies} of {len(rows)} rows equal an earlier row in all inputs and outputs. If they "
+            "are the same measurements, drop them, `frame.drop_duplicates()`: the noise would be "
+            "too small. Repeats that are equal by rounding may stay.",
             stacklevel=4,
         )

@@ -17,14 +17,13 @@ from gpadjust.core.unknowns import standard_normal
 class Functions(torch.nn.Module):
     r"""Deterministic functions from a posterior, by Matheron's rule (Wilson et al. 2020).
 
-    Each is a function from the prior, on random features :math:`\varphi` of the terms, plus the
-    update that makes it meet the data:
+    Each is a function from the prior, on random features :math:`\varphi` of the terms, plus an
+    update by the data:
 
     .. math:: f(x) = m(x) + \varphi(x)^T w + k(x, X) v, \quad
         v = K^{-1} (y - f_{prior}(X) - \varepsilon).
 
-    The number ``k`` of functions is spread over the draws of the model; later changes of it have no
-    effect. Each kernel has an even number of features.
+    The ``k`` functions are spread over the draws of the model; later changes of it have no effect.
     """
 
     @torch.no_grad()
@@ -40,34 +39,34 @@ class Functions(torch.nn.Module):
         self.model = model.subset_draws(rows).requires_grad_(False)
         self.number = number
         self.data = self.model.conditioning()
-        f, shape = self.data.train, (number, model.num_outputs)
+        f = self.data.train
         self.features: dict[str, Features] = {}
         for term in f.terms:
             if term.kernel is not None:
-                own = {n: v.expand(number, *v.shape[1:]) for n, v in f.own(term).items()}
-                self.features[term.name] = term.kernel.features(own, num_features, generator)
+                values = {n: v.expand(number, *v.shape[1:]) for n, v in f.own(term).items()}
+                self.features[term.name] = term.kernel.features(values, num_features, generator)
         size = f.features(self.features).shape[-1]
-        self.weights = standard_normal((*shape, size), generator, f.x)
+        # w ~ N(0, I), and v
+        self.weights = standard_normal((number, model.num_outputs, size), generator, f.x)
         self.update = self.data.update(self._prior(f), generator)
 
     def forward(self, X: Tensor) -> Tensor:
         """Return the values ``k x ... x q x m`` of all functions at ``... x q x d``."""
         X = self.model.data.new_inputs(X)
-        return self._values(self.model.at(X, self.data.train.values)).movedim(-3, 0)
+        return self._values(self.model.evaluate(X, self.data.train.values)).movedim(-3, 0)
 
-    def each(self, X: Tensor) -> Tensor:
-        """Return the values ``k x q x m`` of each function at points of its own, ``k x q x d``."""
+    def evaluate_each(self, X: Tensor) -> Tensor:
+        """Return the values ``k x q x m`` of each function at other points, ``k x q x d``."""
         X = self.model.data.new_inputs(X)
         if X.dim() != 3 or len(X) != self.number:
-            raise ValueError(
-                f"Expected points for each of {self.number} functions, {self.number} x q x d; "
-                f"found {tuple(X.shape)}."
-            )
-        return self._values(self.model.at_each(X, self.data.train.values))
+            expected = f"points for each of {self.number} functions, {self.number} x q x d"
+            raise ValueError(f"Expected {expected}; found {tuple(X.shape)}.")
+        return self._values(self.model.evaluate_each(X, self.data.train.values))
 
     def _values(self, f: WeightedSum) -> Tensor:
         """Return the functions at the places of a sum, ``... x k x q x m``."""
         cross = f.cross(self.data.train) * self.data.observed.unsqueeze(-2)
+        # m(x) + phi(x)^T w + k(x, X) v
         values = self._prior(f) + (cross @ self.update.unsqueeze(-1)).squeeze(-1)
         Y: Tensor = self.model.off_gaussian_scale((values * self.model.unit).mT)
         return Y
@@ -92,18 +91,19 @@ class Paths(SamplePath):
 
         Dimensions of samples in X, in front or next to the points, are points of each function.
         """
-        k, m = self.functions.number, self.functions.model.num_outputs
-        if m > 1 and X.dim() > 2 and X.shape[-3] == 1:  # the place of outputs
-            X = X.squeeze(-3)
+        if self.functions.model.num_outputs > 1 and X.dim() > 2 and X.shape[-3] == 1:
+            X = X.squeeze(-3)  # the dimension of outputs
         lead, batch = len(self.sample_shape), X.dim() - 2
-        own = [*range(batch - lead, batch)]
+        first, last = [*range(lead)], [*range(batch - lead, batch)]
         is_inner = batch > lead and X.shape[batch - lead : batch] == self.sample_shape
-        X = X.movedim(own, [*range(lead)]) if is_inner else X
+        if is_inner:
+            X = X.movedim(last, first)
         if X.shape[:lead] == self.sample_shape and batch >= lead:
-            values = self.functions.each(X.reshape(k, -1, X.shape[-1]))
-            values = values.unflatten(1, X.shape[lead:-1])
+            points = X.reshape(self.functions.number, -1, X.shape[-1])
+            values = self.functions.evaluate_each(points).unflatten(1, X.shape[lead:-1])
         else:
             values = self.functions(X)
         values = values.reshape(*self.sample_shape, *values.shape[1:])
-        values = values.movedim([*range(lead)], own) if is_inner else values
+        if is_inner:
+            values = values.movedim(first, last)
         return values.squeeze(-1) if values.shape[-1] == 1 else values.mT

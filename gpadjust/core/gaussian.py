@@ -12,7 +12,7 @@ from gpadjust.core.terms import WeightedSum
 from gpadjust.core.unknowns import Values, standard_normal
 
 _EPS = torch.finfo(torch.float64).eps
-_NOISY = 1e-8  # of the largest variance given earlier rows: above, the inverse factor is exact
+_NOISY = 1e-8  # share of the largest variance given earlier rows above which L^-1 is exact
 
 
 def add_noise(K: Tensor, noise: Tensor) -> Tensor:
@@ -28,9 +28,9 @@ def add_noise(K: Tensor, noise: Tensor) -> Tensor:
 def factor(K: Tensor, noise: Tensor, observed: Tensor) -> Tensor:
     """Return Cholesky factors of covariances ``... x n x n`` with noise ``... x n`` (or 1).
 
-    Targets that are not ``observed`` (``... x n``) are independent of everything. A nugget of some
-    rounding errors of each variance is added, and more where a matrix is not positive definite; NaN
-    where it never is.
+    Targets that are not ``observed`` (``... x n``) are independent of everything. The nugget is
+    some rounding errors of each variance, more where a matrix is not positive definite; the factor
+    is NaN where it never is.
     """
     if not observed.all():
         K = K * (observed.unsqueeze(-1) & observed.unsqueeze(-2))
@@ -57,7 +57,7 @@ class Likelihood(NamedTuple):
 def log_likelihood(
     residual: Tensor, K: Tensor, noise: Tensor, observed: Tensor, with_gradient: bool = True
 ) -> Likelihood:
-    r"""Return log N(residual | 0, K + noise) and its derivatives (that by K is K if not asked for).
+    r"""Return log N(r | 0, K + noise) and its derivatives (that by K is K if not asked for).
 
     With :math:`\alpha = K^{-1} r` (Rasmussen and Williams 2006, algorithm 2.1 and eq. 5.9)
 
@@ -69,9 +69,11 @@ def log_likelihood(
     alpha = torch.cholesky_solve(residual.unsqueeze(-1), chol)
     log_det = chol.diagonal(dim1=-1, dim2=-2).log().sum(-1)  # log |K| / 2
     quadratic = (residual.unsqueeze(-1) * alpha).sum((-1, -2))
+    # -r^T alpha / 2 - log |K| / 2 - n log(2 pi) / 2
     value = -0.5 * quadratic - log_det - 0.5 * observed.sum(-1) * math.log(2 * math.pi)
     if not with_gradient:
         return Likelihood(value, alpha.squeeze(-1), K)
+    # (alpha alpha^T - K^-1) / 2
     D = torch.cholesky_inverse(chol).mul_(-0.5)
     D = torch.baddbmm(*(v.flatten(0, -3) for v in (D, alpha, alpha.mT)), alpha=0.5).reshape(D.shape)
     if not observed.all():
@@ -94,23 +96,23 @@ def sum_likelihood(
     """Return the likelihood of residuals ``S x m x n`` of a sum; 0 where not observed."""
     if not with_gradient:
         K = train.cross(train).expand(*residual.shape, residual.shape[-1])
-        found = log_likelihood(residual, K, noise, observed, False)
-        return SumLikelihood(found.value, {}, residual, residual)
+        value = log_likelihood(residual, K, noise, observed, False).value
+        return SumLikelihood(value, {}, residual, residual)
     K, pull_back = train.with_pull_back()
     K = K.expand(*residual.shape, residual.shape[-1])
-    found = log_likelihood(residual, K, noise, observed)
-    by_variance = found.by_covariance.diagonal(dim1=-1, dim2=-2)
-    return SumLikelihood(found.value, pull_back(found.by_covariance), found.by_mean, by_variance)
+    value, by_mean, D = log_likelihood(residual, K, noise, observed)
+    by_variance = D.diagonal(dim1=-1, dim2=-2)
+    return SumLikelihood(value, pull_back(D), by_mean, by_variance)
 
 
 class Conditioning:
     r"""The posterior of weighted sums, given noisy observations of one.
 
     Args:
-        train: The sum that was observed, at the training inputs.
+        train: The observed sum at the training inputs.
         noise: The variances of the observations, ``... x S x m x n`` (or 1).
-        targets: The observations, ``... x 1 x m x n``; NaN where one is missing. Their leading
-            dimensions may be more than those of the covariance, whose factor all of them share.
+        targets: The observations, ``... x 1 x m x n``; NaN where one is missing. All of their
+            further leading dimensions share the factor of the covariance.
         old: The conditioning on the first rows, of which the factor is used again.
 
     Attributes:
@@ -124,10 +126,13 @@ class Conditioning:
     def __init__(
         self, train: WeightedSum, noise: Tensor, targets: Tensor, old: Conditioning | None = None
     ) -> None:
-        self.train, self.targets = train, targets
-        late = train if old is None else train.of_rows(slice(old.chol.shape[-1], None))
+        self.train = train
+        self.targets = targets
+        late, batch = train, torch.Size()
+        if old is not None:
+            late = train.of_rows(slice(old.chol.shape[-1], None))
+            batch = old.chol.shape[:-2]
         K = late.cross(late)
-        batch = () if old is None else old.chol.shape[:-2]
         lead = torch.broadcast_shapes(K.shape[:-2], noise.shape[:-1], batch)
         self.noise = noise.expand(*lead, train.x.shape[-2])
         observed = ~targets.isnan()
@@ -156,20 +161,20 @@ class Conditioning:
         """
         n = old.chol.shape[-1]
         lead = torch.broadcast_shapes(self.noise.shape[:-1], self.observed.shape[:-1])
-        seen = self.observed[..., n:]
-        K21 = (K21 * seen.unsqueeze(-1) * old.observed.unsqueeze(-2)).expand(*lead, -1, n)
+        observed = self.observed[..., n:]
+        K21 = (K21 * observed.unsqueeze(-1) * old.observed.unsqueeze(-2)).expand(*lead, -1, n)
         B = old.white(K21)
         late_noise = self.noise[..., n:]
         # The nugget of the new rows is that of their own variances.
         variance = K22.diagonal(dim1=-1, dim2=-2) + late_noise
         late_noise = late_noise + max(100, self.noise.shape[-1]) * _EPS * variance
-        L2 = factor(K22 - B @ B.mT, late_noise, seen)
+        L2 = factor(K22 - B @ B.mT, late_noise, observed)
         L2 = L2.expand(*lead, *L2.shape[-2:])
         chol = _lower(old.chol.expand(*lead, n, n), B, L2)
         if not old.is_noisy:
             return chol, None
-        inverse1, inverse2 = old.inverse_factor(), _inverse(L2)
-        inverse1 = inverse1.expand(*lead, n, n)
+        inverse1 = old.inverse_factor().expand(*lead, n, n)
+        inverse2 = _inverse(L2)
         return chol, _lower(inverse1, -inverse2 @ B @ inverse1, inverse2)
 
     def solve(self, residual: Tensor) -> Tensor:
@@ -188,7 +193,7 @@ class Conditioning:
         return self._inverse
 
     def white(self, cross: Tensor) -> Tensor:
-        """Return :math:`k L^{-T}`: a product, or without noise a solve, which is exacter."""
+        """Return :math:`k L^{-T}`: a product, or without noise a solve, which is more exact."""
         if self.is_noisy:
             return cross @ self.inverse_factor().mT
         return torch.linalg.solve_triangular(self.chol, cross.mT, upper=False).mT
@@ -198,6 +203,7 @@ class Conditioning:
         cross = sought.cross(self.train)
         if not self.observed.all():
             cross = cross * self.observed.unsqueeze(-2)
+        # f + k alpha
         return sought.mean + (cross @ self.alpha.unsqueeze(-1)).squeeze(-1), cross
 
     def mean_alone(self, sought: WeightedSum) -> Tensor:
@@ -209,8 +215,8 @@ class Conditioning:
         mean, cross = self.mean(sought)
         white = self.white(cross)
         prior = sought.variance()
+        # k(x, x) - |k L^-T|^2, not below the rounding errors of the difference
         variance = prior - white.square().sum(-1)
-        # Not below the rounding errors of the difference.
         return mean, variance.maximum(4 * self.chol.shape[-1] * _EPS * prior)
 
     def joint(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
@@ -218,17 +224,15 @@ class Conditioning:
         mean, cross = self.mean(sought)
         white = self.white(cross)
         prior = sought.cross(sought)
+        # k(x, x') - k(x, X) K^-1 k(X, x')
         K = prior - white @ white.mT
         least = 4 * self.chol.shape[-1] * _EPS * prior.diagonal(dim1=-1, dim2=-2)
         raised = (least - K.diagonal(dim1=-1, dim2=-2)).clamp_min(0.0)
         return mean, add_noise(K, raised)
 
     def update(self, prior: Tensor, generator: torch.Generator) -> Tensor:
-        """Return what makes functions from the prior, with these values, meet the observations.
-
-        It weighs the covariances with the training inputs.
-        """
-        # The nugget of the factor is noise, too.
+        """Return the weights v of k by which functions from the prior, at X, meet the data."""
+        # v = K^-1 (y - f(X) - epsilon); the nugget of the factor is noise, too.
         total = self.chol.square().sum(-1) - self.train.variance()
         sd = total.maximum(self.noise).sqrt()
         noise = sd * standard_normal(prior.shape, generator, prior)
@@ -241,7 +245,7 @@ class Conditioning:
 
         (Rasmussen and Williams 2006, eqs. 5.10 to 5.12).
         """
-        precision = self.inverse_factor().square().sum(-2)
+        precision = self.inverse_factor().square().sum(-2)  # [K^-1]_ii
         variance = precision.reciprocal().masked_fill(~self.observed, math.nan)
         return self.targets - self.alpha * variance, variance
 
@@ -262,14 +266,14 @@ DRAWS = -3  # the dimension of draws in ... x S x q x m
 
 
 class Prediction(NamedTuple):
-    """Predictions at points by themselves, in the units of the targets."""
+    """Predictions of single points, in the units of the targets."""
 
     mean: Tensor  # ... x q x m
     variance: Tensor
 
 
 class Marginals(NamedTuple):
-    """Mixtures of equally likely Gaussians at points by themselves."""
+    """Mixtures of equally likely Gaussians at single points."""
 
     means: Tensor  # of the components, ... x S x q x m
     variances: Tensor
@@ -277,12 +281,12 @@ class Marginals(NamedTuple):
     @property
     def prediction(self) -> Prediction:
         """The mean and variance of the mixtures, ``... x q x m``."""
-        means, variances = self.means, self.variances
-        if means.shape[DRAWS] == 1:
-            return Prediction(means.squeeze(DRAWS), variances.squeeze(DRAWS))
-        center = means.mean(DRAWS)
-        between = (means - center.unsqueeze(DRAWS)).square().mean(DRAWS)
-        return Prediction(center, variances.mean(DRAWS) + between)
+        if self.means.shape[DRAWS] == 1:
+            return Prediction(self.means.squeeze(DRAWS), self.variances.squeeze(DRAWS))
+        center = self.means.mean(DRAWS)
+        # The variance of the means, and the mean of the variances.
+        between = (self.means - center.unsqueeze(DRAWS)).square().mean(DRAWS)
+        return Prediction(center, self.variances.mean(DRAWS) + between)
 
     def quantile(self, level: float) -> Tensor:
         r"""Return the quantiles ``... x q x m`` of a level, by bisection.
@@ -296,23 +300,28 @@ class Marginals(NamedTuple):
             low, high = ends.amin(DRAWS), ends.amax(DRAWS)
             for _ in range(50):
                 middle = (low + high) / 2
-                below = self.probability(middle) < level
-                low, high = torch.where(below, middle, low), torch.where(below, high, middle)
+                is_below = self.probability(middle) < level
+                low = torch.where(is_below, middle, low)
+                high = torch.where(is_below, high, middle)
             middle = (low + high) / 2
         if not ends.requires_grad:
             return middle
-        below, slope = self.probability(middle), self.log_density(middle).exp().detach()
+        # q - (F(q) - p) / F'(q), of which the value is q
+        below = self.probability(middle)
+        slope = self.log_density(middle).exp().detach()
         return middle - (below - below.detach()) / slope.clamp_min(1e-300)
 
     def probability(self, Y: Tensor) -> Tensor:
         """Return the probability of values below ``Y``, ``... x q x m``."""
+        # mean_s Phi((y - mu_s) / sd_s)
         return torch.special.ndtr((Y.unsqueeze(DRAWS) - self.means) / self._sd).mean(DRAWS)
 
     def log_density(self, Y: Tensor) -> Tensor:
         """Return the log density at values ``Y``, ``... x q x m``; NaN where they are."""
+        # log mean_s N(y | mu_s, sd_s^2)
         z = (Y.unsqueeze(DRAWS) - self.means) / self._sd
-        each = -0.5 * z.square() - self._sd.log() - 0.5 * math.log(2 * math.pi)
-        return each.logsumexp(DRAWS) - math.log(self.means.shape[DRAWS])
+        log_densities = -0.5 * z.square() - self._sd.log() - 0.5 * math.log(2 * math.pi)
+        return log_densities.logsumexp(DRAWS) - math.log(self.means.shape[DRAWS])
 
     @property
     def _sd(self) -> Tensor:

@@ -15,7 +15,7 @@ from gpytorch.kernels import Kernel as AnyGPyTorchKernel
 from torch import Tensor
 from torch.func import functional_call
 
-from gpadjust.core.unknowns import LogNormal, Row, Values
+from gpadjust.core.unknowns import LogNormal, Row, Values, standard_normal
 
 PullBack = Callable[[Tensor], Values]
 Features = Callable[[Tensor], Tensor]
@@ -28,9 +28,8 @@ _LENGTH_FACTOR = 7.4
 class Kernel(ABC):
     """The covariance function of a Gaussian process, and the priors of its parameters.
 
-    A kernel of one's own needs ``rows`` and ``covariance``; derivatives are then autograd's.
-    Inputs x are ``... x 1 x 1 x n x d``, parameters ``S x m x k``, covariances
-    ``... x S x m x n x n'``: draws and outputs are the last two dimensions before the points.
+    A subclass has ``rows`` and ``covariance``; derivatives are then autograd's. Inputs x are
+    ``... x 1 x 1 x n x d``, parameters ``S x m x k``, covariances ``... x S x m x n x n'``.
     """
 
     has_constant = True
@@ -53,7 +52,7 @@ class Kernel(ABC):
         return self
 
     def of_term(self, outputscale: LogNormal) -> Kernel:
-        """Return the kernel for a term, with its prior variance if it has none; or itself."""
+        """Return the kernel with the prior variance of a term if it has none; or itself."""
         return self
 
     def variance(self, own: Values, x: Tensor) -> Tensor:
@@ -76,10 +75,7 @@ class Kernel(ABC):
         return K.detach(), pull_back
 
     def features(self, own: Values, number: int, generator: torch.Generator) -> Features:
-        """Return random features whose inner products are about the kernel.
-
-        They map inputs ``... x n x d`` to ``... x S x m x n x D``.
-        """
+        """Return random features, ``... x n x d`` to ``... x S x m x n x D``, with k as product."""
         raise NotImplementedError(
             f"{self} has no random features, which functions are drawn with. Give its class a "
             "method features, or draw joint samples: model.posterior(X).rsample()."
@@ -90,28 +86,24 @@ class Kernel(ABC):
 
 
 class Profile(NamedTuple):
-    """A stationary kernel as a function of e = -r^2 / 2.
-
-    Random features are of a spectrum that is a Student t: normal, with infinitely many degrees.
-    """
+    """A stationary kernel as a function of e = -r^2 / 2."""
 
     name: str
     value: Callable[[Tensor], Tensor]  # k(e)
     slope: Callable[[Tensor], Tensor]  # dk / de, which is -2 dk / d(r^2)
-    degrees: float | None = None  # of freedom of the spectrum; None if it is another one
+    degrees: float | None = None  # of freedom of the spectrum if that is a Student t
 
 
 def _matern(p: int) -> Profile:
     """Return the Matern kernel with nu = p + 1/2 (Rasmussen and Williams 2006, eq. 4.16)."""
     nu2 = 2 * p + 1
-    return Profile(
-        f"matern{nu2}/2", partial(_matern_value, p), partial(_matern_slope, p), float(nu2)
-    )
+    value, slope = (partial(function, p) for function in (_matern_value, _matern_slope))
+    return Profile(f"matern{nu2}/2", value, slope, float(nu2))
 
 
 def _matern_value(p: int, e: Tensor) -> Tensor:
     t = (-2 * (2 * p + 1) * e).clamp_min(1e-30).sqrt()  # sqrt(2 nu) r
-    return (1.0, 1 + t, 1 + t + t.square() / 3)[p] * (-t).exp()
+    return (1.0, 1 + t, 1 + t + t.square() / 3)[p] * (-t).exp()  # exp(-t), (1 + t) exp(-t), ...
 
 
 def _matern_slope(p: int, e: Tensor) -> Tensor:
@@ -139,8 +131,9 @@ def exponents(z: Tensor, other: Tensor | None = None) -> Tensor:
         left = torch.cat([z, torch.ones_like(half), half], -1)
         right = torch.cat([other, other_half, torch.ones_like(other_half)], -1)
         return (left @ right.mT).clamp_max_(0.0)
+    # e_ij = z_i z_j - |z_i|^2 / 2 - |z_j|^2 / 2, with a diagonal of 0 exactly
     e = z @ z.mT
-    half = e.diagonal(dim1=-1, dim2=-2) / 2  # so that the diagonal is 0 exactly
+    half = e.diagonal(dim1=-1, dim2=-2) / 2
     return (e - half.unsqueeze(-1)).sub_(half.unsqueeze(-2)).clamp_max_(0.0)
 
 
@@ -160,14 +153,15 @@ class Stationary(Kernel):
         self, profile: Profile = RBF, outputscale: LogNormal | None = None,
         lengthscale: LogNormal = lengthscale,
     ) -> None:  # fmt: skip
-        self.profile, self.outputscale = profile, outputscale or DELTA
+        self.profile = profile
+        self.outputscale = outputscale or DELTA
         self.lengthscale = lengthscale
-        self.is_given = outputscale is not None
+        self.has_outputscale = outputscale is not None
 
     def of_term(self, outputscale: LogNormal) -> Stationary:
-        """Return the kernel with the prior variance of a term, if it was given none."""
-        new = self if self.is_given else copy(self)
-        if not self.is_given:
+        """Return the kernel with the prior variance of a term, if it has none."""
+        new = copy(self)
+        if not self.has_outputscale:
             new.outputscale = outputscale
         return new
 
@@ -186,29 +180,32 @@ class Stationary(Kernel):
         """Return ``s k(|(x - x') / l|)``."""
         length = own["lengthscale"].unsqueeze(-2)
         # Without a shift distances of large inputs, as of years, would lose digits.
-        shift = (x if other is None else other).detach().mean(-2, keepdim=True)
-        z = (x - shift) / length
-        e = exponents(z, None if other is None else (other - shift) / length)
-        return self._scaled(e, own["outputscale"].unsqueeze(-1))
+        if other is None:
+            z = (x - x.detach().mean(-2, keepdim=True)) / length
+            return self._scaled(exponents(z), own["outputscale"])
+        shift = other.detach().mean(-2, keepdim=True)
+        e = exponents((x - shift) / length, (other - shift) / length)
+        return self._scaled(e, own["outputscale"])
 
-    def _scaled(self, e: Tensor, scale: Tensor) -> Tensor:
+    def _scaled(self, e: Tensor, outputscale: Tensor) -> Tensor:
         """Return ``s k(e)``; without a graph in place, which takes half the time."""
+        scale = outputscale.unsqueeze(-1)
         if e.requires_grad or scale.requires_grad:
             return scale * self.profile.value(e)
         return (e.exp_() if self.profile is RBF else self.profile.value(e)).mul_(scale)
 
     def toward(self, own: Values, other: Tensor) -> Callable[[Tensor], Tensor]:
-        r"""Return covariances by one product of all draws, :math:`e = (x, x^2, 1) \cdot A`.
-
-        Of the kernel :math:`s e^e` the logarithm of s is part of A.
-        """
-        own_points = other.shape[-4:-2] != (1, 1)  # of each draw or output
-        if own_points or type(self).covariance is not Stationary.covariance:
+        r"""Return covariances by one product of all draws, :math:`e = (x, x^2, 1) \cdot A`."""
+        is_of_draws = other.shape[-4:-2] != (1, 1)
+        if is_of_draws or type(self).covariance is not Stationary.covariance:
             return super().toward(own, other)
-        shift, scale = other.mean(-2, keepdim=True), own["outputscale"].unsqueeze(-1)
-        w, o = own["lengthscale"].square().reciprocal().unsqueeze(-2), other - shift
+        shift = other.mean(-2, keepdim=True)
+        w = own["lengthscale"].square().reciprocal().unsqueeze(-2)
+        o = other - shift
+        # e = sum_k w_k (x_k o_k - x_k^2 / 2 - o_k^2 / 2); of s e^e log s is part of A.
         last = -(o.square() * w).sum(-1, keepdim=True) / 2
-        last = last + scale.log() if self.profile is RBF else last
+        if self.profile is RBF:
+            last = last + own["outputscale"].unsqueeze(-1).log()
         A = torch.cat([o * w, (-w / 2).expand_as(o * w), last], -1)  # S x m x n' x (2 d + 1)
         return partial(self._toward, own, other, shift, A)
 
@@ -220,16 +217,14 @@ class Stationary(Kernel):
         e = e.unflatten(-1, A.shape[:-1]).movedim(-4, -2)
         if self.profile is RBF:
             return e.exp_()
-        return self._scaled(e.clamp_max_(0.0), own["outputscale"].unsqueeze(-1))
+        return self._scaled(e.clamp_max_(0.0), own["outputscale"])
 
     def variance(self, own: Values, x: Tensor) -> Tensor:
         """Return ``s``."""
         return own["outputscale"]
 
     def with_pull_back(self, own: Values, x: Tensor) -> tuple[Tensor, PullBack]:
-        r"""Return K and its derivatives in closed form.
-
-        With D = df/dK and :math:`M = s D \circ dk/de`,
+        r"""Return K and its derivatives in closed form, with :math:`M = s D \circ dk/de`.
 
         .. math::
             \frac{\partial f}{\partial s} = \frac{1}{s} \sum D \circ K, \quad
@@ -237,14 +232,17 @@ class Stationary(Kernel):
             (z_{ik} - z_{jk})^2.
         """
         length = own["lengthscale"].unsqueeze(-2)
-        z, scale = (x - x.mean(-2, keepdim=True)) / length, own["outputscale"].unsqueeze(-1)
+        z = (x - x.mean(-2, keepdim=True)) / length
         e = exponents(z)
-        K = (e.exp_() if self.profile is RBF else self.profile.value(e)).mul_(scale)
-        slope = K if self.profile is RBF else self.profile.slope(e).mul_(scale)
+        K = self._scaled(e, own["outputscale"])
+        slope = K  # of RBF k is dk / de
+        if self.profile is not RBF:
+            slope = self.profile.slope(e).mul_(own["outputscale"].unsqueeze(-1))
 
         def pull_back(D: Tensor) -> Values:
             M = D * slope
             sums = M.sum(-1, keepdim=True)
+            # sum_ij M_ij (z_i - z_j)^2 = 2 sum_i z_i (z_i sum_j M_ij - sum_j M_ij z_j)
             by_log = 2 * (z * (z * sums - M @ z)).sum(-2)
             total = sums.sum(-2) if slope is K else (D * K).sum((-1, -2)).unsqueeze(-1)
             by_scale = total / own["outputscale"].clamp_min(1e-300)
@@ -254,13 +252,16 @@ class Stationary(Kernel):
 
     def features(self, own: Values, number: int, generator: torch.Generator) -> Features:
         """Return sines and cosines of frequencies of the kernel's spectrum."""
-        degrees, half = self.profile.degrees, number // 2
+        degrees = self.profile.degrees
         if degrees is None:
             return super().features(own, number, generator)
-        S, d = own["lengthscale"].shape[0], own["lengthscale"].shape[-1]
-        w = _normal((S, 1, d, half), generator)  # each function has frequencies of its own
-        if math.isfinite(degrees):  # chi^2 with an odd number of degrees, as squares
-            chi2 = _normal((S, 1, int(degrees), half), generator).square().sum(-2, keepdim=True)
+        length = own["lengthscale"]
+        shape = (len(length), 1, length.shape[-1], number // 2)  # each function has others
+        w = standard_normal(shape, generator, length)
+        # A Student t is normal / sqrt(chi^2 / degrees); chi^2 is a sum of squares.
+        if math.isfinite(degrees):
+            shape = (len(length), 1, int(degrees), number // 2)
+            chi2 = standard_normal(shape, generator, length).square().sum(-2, keepdim=True)
             w = w * (degrees / chi2).sqrt()
         return lambda x: _fourier(own, x, w)
 
@@ -268,12 +269,9 @@ class Stationary(Kernel):
         return f"{type(self).__name__}({self.profile.name})"
 
 
-def _normal(shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
-    return torch.randn(shape, generator=generator, dtype=torch.float64)
-
-
 def _fourier(own: Values, x: Tensor, w: Tensor) -> Tensor:
     """Return sines and cosines of frequencies ``d x D/2``."""
+    # sqrt(s / n) (sin a, cos a), a = w x / l, of n frequencies
     a = (x / own["lengthscale"].unsqueeze(-2)) @ w.to(x)
     size = (own["outputscale"] / w.shape[-1]).sqrt().unsqueeze(-1)
     return size * torch.cat([a.sin(), a.cos()], -1)
@@ -282,8 +280,7 @@ def _fourier(own: Values, x: Tensor, w: Tensor) -> Tensor:
 class Fourier(Stationary):
     r"""The kernel :math:`\varphi(x)^T \varphi(x')` of finitely many random Fourier features.
 
-    With it the process is a Bayesian linear model, ridge regression (Rahimi and Recht 2007). The
-    number of features is even; the seed is that of their frequencies.
+    With it the process is a Bayesian linear model, ridge regression (Rahimi and Recht 2007).
     """
 
     def __init__(
@@ -292,30 +289,38 @@ class Fourier(Stationary):
         super().__init__(RBF, outputscale)
         self.seed = seed
         generator = torch.Generator().manual_seed(seed)
-        self.frequencies = _normal((num_inputs, num_features // 2), generator)
+        shape = (num_inputs, num_features // 2)
+        self.frequencies = torch.randn(shape, generator=generator, dtype=torch.float64)
 
     def of_data(self, data: Any) -> Fourier:
         """Return the kernel of as many inputs as an input transform makes."""
-        d, half = data.kernel_inputs(data.X[:1]).shape[-1], self.frequencies.shape[-1]
-        is_right = d == len(self.frequencies)
-        return self if is_right else type(self)(d, 2 * half, self.seed, self.outputscale)
+        d = data.kernel_inputs(data.X[:1]).shape[-1]
+        if d == len(self.frequencies):
+            return self
+        return type(self)(d, 2 * self.frequencies.shape[-1], self.seed, self.outputscale)
 
     def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
         """Return the inner products of the features."""
-        phi = _fourier(own, x, self.frequencies)
-        return phi @ (phi if other is None else _fourier(own, other, self.frequencies)).mT
+        phi = phi_other = _fourier(own, x, self.frequencies)
+        if other is not None:
+            phi_other = _fourier(own, other, self.frequencies)
+        return phi @ phi_other.mT
 
     def with_pull_back(self, own: Values, x: Tensor) -> tuple[Tensor, PullBack]:
         """Return K and its derivatives in closed form."""
         w = self.frequencies.to(x)
+        half = w.shape[-1]
         z = x / own["lengthscale"].unsqueeze(-2)
-        a, half = z @ w, w.shape[-1]
+        a = z @ w
         phi = torch.cat([a.sin(), a.cos()], -1) / math.sqrt(half)
-        k, scale = phi @ phi.mT, own["outputscale"].unsqueeze(-1)
+        k = phi @ phi.mT
+        scale = own["outputscale"].unsqueeze(-1)
 
         def pull_back(D: Tensor) -> Values:
+            # df / da = cos(a) df / dsin - sin(a) df / dcos, and a = w x / l
             by_phi = 2 * scale * D @ phi
             by_angle = by_phi[..., :half] * phi[..., half:] - by_phi[..., half:] * phi[..., :half]
+            # da / dl = -w x / l^2
             by_length = -((by_angle @ w.mT) * z).sum(-2) / own["lengthscale"]
             return {"lengthscale": by_length, "outputscale": (D * k).sum((-1, -2)).unsqueeze(-1)}
 
@@ -327,15 +332,11 @@ class Fourier(Stationary):
 
 
 class OfGPyTorch(Kernel):
-    """Any GPyTorch kernel, with its constraints and priors.
+    """A GPyTorch kernel without batch shape, with its constraints and priors.
 
     A parameter without a prior is known to a factor (or, if it may be negative, with a standard
-    deviation of 1) around the value that the kernel has when it is given; an ``outputscale`` so has
-    the prior of the term that it is the kernel of. Values are in units of the targets.
-
-    Args:
-        kernel: The kernel, without batch shape.
-        outputscale: The prior of ``outputscale`` of a ``ScaleKernel`` without prior of its own.
+    deviation of 1) around its value in the kernel, in units of the targets; an ``outputscale``
+    without one has the prior of the term.
     """
 
     def __init__(self, kernel: AnyGPyTorchKernel, outputscale: LogNormal = DELTA) -> None:
@@ -346,10 +347,10 @@ class OfGPyTorch(Kernel):
             )
         if kernel.batch_shape:
             raise ValueError(
-                "Expected a kernel without batch shape, which draws and outputs add; found "
-                f"{tuple(kernel.batch_shape)}."
+                f"Expected a kernel without batch shape; found {tuple(kernel.batch_shape)}."
             )
-        self.kernel, self.outputscale = deepcopy(kernel).double(), outputscale
+        self.outputscale = outputscale
+        self.kernel = deepcopy(kernel).double()
         self.kernel.requires_grad_(False).eval()
         self._as_batch: bool | None = None
 
@@ -358,42 +359,45 @@ class OfGPyTorch(Kernel):
         priors = {}
         for _, module, prior, closure, _ in self.kernel.named_priors():
             for name, parameter in self.kernel.named_parameters():
-                if _reads(closure, module, parameter):
-                    priors[name] = prior
+                with torch.enable_grad():  # a prior is of the parameter that its value depends on
+                    parameter.requires_grad_(True)
+                    if closure(module).requires_grad:
+                        priors[name] = prior
+                    parameter.requires_grad_(False)
         rows = []
-        for name, (raw, constraint) in self._raw_parameters.items():
-            value = (raw if constraint is None else constraint.transform(raw)).reshape(-1)
-            positive = constraint is not None and bool((constraint.lower_bound >= 0).all())
-            prior, scale = priors.get(name), _LENGTH_FACTOR if positive else math.e
-            density = None if prior is None else _density(prior, raw.shape)
+        for name, raw, constraint in self.kernel.named_parameters_and_constraints():
+            value, factor, is_positive = raw, math.e, False
+            if constraint is not None:
+                value = constraint.transform(raw)
+                is_positive = bool((constraint.lower_bound >= 0).all())
+            if is_positive:
+                factor = _LENGTH_FACTOR
+            prior = priors.get(name)
+            density = prior and partial(_log_density, prior, raw.shape)
             if prior is None and name.endswith("raw_outputscale"):
-                value, scale = (
-                    torch.full_like(value, self.outputscale.median),
-                    self.outputscale.factor,
-                )
-            location = (value.clamp_min(1e-12).log() if positive else value).expand(num_outputs, -1)
-            rows.append(Row(name, location, math.log(scale), positive, log_density=density))
+                value = torch.full_like(value, self.outputscale.median)
+                factor = self.outputscale.factor
+            if is_positive:
+                value = value.clamp_min(1e-12).log()
+            location = value.reshape(-1).expand(num_outputs, -1)
+            rows.append(Row(name, location, math.log(factor), is_positive, log_density=density))
         return rows
 
     def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
         """Return the kernel's covariances, a batch at once where the kernel can."""
-        lead = next(iter(own.values())).shape[:-1] if own else torch.Size([1, 1])
+        lead = next((value.shape[:-1] for value in own.values()), torch.Size([1, 1]))
         if self._as_batch is None:
             self._as_batch = self._is_the_same_as_a_batch(own, x, lead)
+        if other is None:
+            other = x
         evaluate = self._of_batch if self._as_batch else self._one_by_one
-        return evaluate(own, x, x if other is None else other, lead)
-
-    @property
-    def _raw_parameters(self) -> dict[str, tuple[Tensor, Any]]:
-        """Raw parameters and their constraints by name."""
-        named = self.kernel.named_parameters_and_constraints()
-        return {name: (raw, constraint) for name, raw, constraint in named}
+        return evaluate(own, x, other, lead)
 
     def _dense(self, kernel: AnyGPyTorchKernel, values: Values, x: Tensor, other: Tensor) -> Tensor:
         """Return covariances of a kernel at values of its parameters."""
         raw = {}
-        for name, (old, constraint) in self._raw_parameters.items():
-            value = values[name].unflatten(-1, old.shape) if old.dim() else values[name].squeeze(-1)
+        for name, old, constraint in self.kernel.named_parameters_and_constraints():
+            value = values[name].reshape((*values[name].shape[:-1], *old.shape))
             if constraint is not None:
                 low, high = constraint.lower_bound.to(value), constraint.upper_bound.to(value)
                 value = value.maximum(low + 1e-12 * low.abs().nan_to_num(posinf=0.0))
@@ -404,9 +408,9 @@ class OfGPyTorch(Kernel):
 
     def _of_batch(self, own: Values, x: Tensor, other: Tensor, lead: torch.Size) -> Tensor:
         kernel = deepcopy(self.kernel)
-        for each in kernel.modules():
-            if isinstance(each, AnyGPyTorchKernel):
-                each.batch_shape = lead
+        for module in kernel.modules():
+            if isinstance(module, AnyGPyTorchKernel):
+                module.batch_shape = lead
         shape = torch.broadcast_shapes(lead, x.shape[:-2], other.shape[:-2])
         x, other = (v.expand(*shape, *v.shape[-2:]) for v in (x, other))
         return self._dense(kernel, own, x, other)
@@ -416,9 +420,8 @@ class OfGPyTorch(Kernel):
         parts = []
         for i, j in product(*map(range, lead)):
             one = {name: value[i, j] for name, value in own.items()}
-            points = (x[..., i, j, :, :], other[..., i, j, :, :])
-            kernel = deepcopy(self.kernel)  # some keep what they have computed
-            parts.append(self._dense(kernel, one, *points))
+            kernel = deepcopy(self.kernel)  # some cache what they have computed
+            parts.append(self._dense(kernel, one, x[..., i, j, :, :], other[..., i, j, :, :]))
         return torch.stack(parts, -3).unflatten(-3, lead)
 
     def _is_the_same_as_a_batch(self, own: Values, x: Tensor, lead: torch.Size) -> bool:
@@ -438,7 +441,7 @@ class OfGPyTorch(Kernel):
 
 
 class _Dense(torch.nn.Module):
-    """A kernel whose matrix is computed at the call, and so with the parameters of the call."""
+    """A kernel whose matrix is computed at the call, with the parameters of the call."""
 
     def __init__(self, kernel: AnyGPyTorchKernel) -> None:
         super().__init__()
@@ -448,31 +451,17 @@ class _Dense(torch.nn.Module):
         return self.kernel(x, other).to_dense()
 
 
-def _reads(closure: Callable[..., Tensor], module: Any, parameter: Tensor) -> bool:
-    """Return whether a prior's value depends on a parameter, of which no graph is recorded."""
-    with torch.enable_grad():
-        parameter.requires_grad_(True)
-        reads = bool(closure(module).requires_grad)
-        parameter.requires_grad_(False)
-    return reads
-
-
-def _density(prior: Any, shape: torch.Size) -> Callable[[Tensor], Tensor]:
+def _log_density(prior: Any, shape: torch.Size, theta: Tensor) -> Tensor:
     """Return the log density of numbers ``... x k`` by a prior of GPyTorch."""
-
-    def log_density(theta: Tensor) -> Tensor:
-        lead = theta.shape[:-1]
-        value = theta.reshape(*lead, *shape)
-        is_possible = prior.support.check(value)
-        log_prob = prior.log_prob(value.where(is_possible, torch.as_tensor(prior.mean).to(value)))
-        log_prob = log_prob.masked_fill(~is_possible, -math.inf)
-        return log_prob.reshape(*lead, -1).sum(-1)
-
-    return log_density
+    value = theta.reshape(*theta.shape[:-1], *shape)
+    is_possible = prior.support.check(value)
+    log_prob = prior.log_prob(value.where(is_possible, torch.as_tensor(prior.mean).to(value)))
+    log_prob = log_prob.masked_fill(~is_possible, -math.inf)
+    return log_prob.reshape(*theta.shape[:-1], -1).sum(-1)
 
 
 def as_kernel(kernel: Any, outputscale: LogNormal = DELTA) -> Kernel:
-    """Return a kernel of this library: itself, a wrapped one of GPyTorch, or the default RBF."""
+    """Return a kernel of this library, one of GPyTorch in a wrapper, or the default RBF."""
     if kernel is None:
         return Stationary(RBF, outputscale)
     if isinstance(kernel, Kernel):

@@ -38,13 +38,7 @@ from gpadjust.core.posterior import MixturePosterior
 from gpadjust.core.summary import counted, summary, summary_html
 from gpadjust.core.terms import Places, Term, TermSum, WeightedSum
 from gpadjust.core.unknowns import Choice, Row, Table, Values
-from gpadjust.core.views import (
-    MeanView,
-    OtherPriors,
-    kernel_view,
-    likelihood_view,
-    squeezed,
-)
+from gpadjust.core.views import MeanView, NoiseView, OtherPriors, TermView, squeezed
 from gpadjust.display import Display
 from gpadjust.physics import Physics, PhysicsError, as_physics
 from gpadjust.physics.parameters import PhysicsParameters
@@ -54,57 +48,48 @@ from gpadjust.progress import tick
 Slopes = dict[str, list[Tensor]]
 """Derivatives of each physics by the coordinate of each unknown parameter, ``S x m x n``."""
 
-_KINDS = {
-    "batch": "input_transform=Categories(batches=[column])",
-    "categorical": "input_transform=Categories([column])",
-    "likelihood": "noise=HeavyTails() or noise=RelativeNoise()",
-    "link": "a structure with a link, such as LinkedCKA(..., link='log')",
-    "train_Xvar": "noise=NoisyInputs(X, variances)",
-}  # instead of options of earlier versions or of other functions
-_ENTRIES = 150_000  # of covariances that are computed at once, which caches hold
+_ENTRIES = 150_000  # of covariances that are computed at once and fit into caches
 _STEP = 1e-4  # of differences by parameters of a physics, in coordinates
 
 
 class Predictive(Model, FantasizeMixin, Display):
-    """A model whose predictions are mixtures of equally likely Gaussians.
-
-    A subclass has ``components`` of X and observation_noise, the means and variances of each,
-    ``... x S x q x m``, and ``mixture`` of X, outputs and observation_noise, the joint posterior.
-    """
+    """A model whose predictions are mixtures of equally likely Gaussians."""
 
     components: Callable[..., tuple[Tensor, Tensor]]
+    """Of X and observation_noise: the means and variances of each Gaussian, ``... x S x q x m``."""
     mixture: Callable[..., MixturePosterior]
+    """Of X, outputs and observation_noise: the joint posterior."""
 
     def predict(self, X: ArrayLike, observation_noise: bool | Tensor = False) -> Prediction:
-        """Predict each point by itself, without the covariances between them.
+        """Predict single points, without the covariances between them.
 
         Args:
             X: Inputs, ``... x q x d``.
-            observation_noise: If True, of observations instead of the function; or the variances
-                of their noise, ``... x q x m``.
+            observation_noise: If True, include observation noise; or its variances,
+                ``... x q x m``.
 
         Returns:
-            Mean and variance, ``... x q x m``, as ``X`` came: tensors, arrays or frames.
+            Mean and variance, ``... x q x m``: tensors, arrays or frames, as ``X``.
         """
         prediction = self.marginals_of(*self.components(X, observation_noise)).prediction
         if isinstance(X, Tensor):
             return prediction
-        return Prediction(*(as_given(each, X, self.data.output_names) for each in prediction))
+        return Prediction(*(as_given(part, X, self.data.output_names) for part in prediction))
 
     @torch.no_grad()
     def interval(
         self, X: ArrayLike, level: float = 0.95, observation_noise: bool | Tensor = False
     ) -> tuple[Any, Any]:
-        """Return the lower and upper ends of the central interval at each point, as ``X`` came."""
+        """Return the lower and upper ends of the central interval at each point, as ``predict``."""
         if not 0 < level < 1:
             raise ValueError(f"Expected level between 0 and 1; found {level}; 95 % is 0.95.")
-        marginals, names = self.marginals(X, observation_noise), self.data.output_names
-        ends = ((1 - level) / 2, (1 + level) / 2)
-        lower, upper = (as_given(marginals.quantile(end), X, names) for end in ends)
-        return lower, upper
+        marginals = self.marginals(X, observation_noise)
+        names = self.data.output_names
+        lower, upper = (marginals.quantile(end) for end in ((1 - level) / 2, (1 + level) / 2))
+        return as_given(lower, X, names), as_given(upper, X, names)
 
     def marginals(self, X: ArrayLike, observation_noise: bool | Tensor = False) -> Marginals:
-        """Return the distributions at each point by itself; arguments as of :meth:`predict`."""
+        """Return the distributions at single points; arguments as of :meth:`predict`."""
         return self.marginals_of(*self.components(X, observation_noise))
 
     def marginals_of(self, means: Tensor, variances: Tensor) -> Marginals:
@@ -116,19 +101,15 @@ class Predictive(Model, FantasizeMixin, Display):
         return mixture
 
     def posterior(
-        self,
-        X: ArrayLike,
-        output_indices: list[int] | None = None,
+        self, X: ArrayLike, output_indices: list[int] | None = None,
         observation_noise: bool | Tensor = False,
         posterior_transform: PosteriorTransform | None = None,
-    ) -> Any:
-        """Return the joint posterior at ``X`` as BoTorch asks for it.
-
-        Its mean is ``... x q x m``, for ``X`` of ``... x q x d``.
-        """
+    ) -> Any:  # fmt: skip
+        """Return BoTorch's joint posterior at ``X``, of a mean ``... x q x m``."""
         self.eval()
-        is_part = output_indices is not None
-        outputs = self.checked_outputs(output_indices) if is_part else slice(None)
+        outputs: list[int] | slice = slice(None)
+        if output_indices is not None:
+            outputs = self.checked_outputs(output_indices)
         posterior = self.posterior_of(self.mixture(X, outputs, observation_noise), outputs)
         if posterior_transform is None:
             return posterior
@@ -148,24 +129,24 @@ class GP(gpytorch.models.GP, Predictive):
     r"""A sum of terms :math:`f(x) = \sum_t b_t(x) g_t(x)`, conditioned exactly on noisy targets.
 
     Each :math:`g_t` is a Gaussian process and each basis :math:`b_t` a physics or 1. All unknown
-    numbers, of kernels, noise and physics, are rows of one ``table``, and ``u`` holds draws of
-    their standard normal coordinates: one, all 0, until the model is fitted. Predictions are
-    averages over the draws. Outputs are independent given the numbers.
+    numbers, of kernels, noise and physics, are rows of one ``table``. Predictions are averages over
+    ``u``, draws of their standard normal coordinates: one, all 0, until the model is fitted.
+    Outputs are independent given the numbers.
 
-    The model is a BoTorch ``Model``, of which posteriors are ordinary ones without a dimension for
-    draws, and a ``gpytorch.models.GP`` with a mean, a kernel, a likelihood and the parameter ``u``.
+    The model is a BoTorch ``Model``, of which posteriors have no dimension for draws, and a
+    ``gpytorch.models.GP`` with a mean, a kernel, a likelihood and the parameter ``u``.
 
     Args:
         train_X: Inputs in the user's units, ``n x d``: a float64 tensor, an array or a frame.
         train_Y: Targets in the user's units, ``n x m``; NaN where one is missing.
         train_Yvar: Known variances of the targets: one number, ``m``, or of their shape.
         terms: The terms.
-        physics: What the bases of the terms are: functions or Physics with ``m`` outputs.
+        physics: The bases of the terms: functions or Physics with ``m`` outputs.
         noise: A :class:`Noise`. Default: one learnt variance of each output.
-        choices: Nested models, which are averaged over by their posterior probabilities.
-        input_transform: A one-to-one BoTorch transform of what kernels see; the physics sees X. It
-            may have the methods ``coded(X)``, which makes numbers of a frame, and ``terms(terms)``,
-            which returns the terms of a model of such inputs.
+        choices: Nested models, averaged by their posterior probabilities.
+        input_transform: A one-to-one BoTorch transform of the inputs of kernels; the physics sees
+            X. It may have the methods ``coded(X)``, from a frame to numbers, and ``terms(terms)``,
+            to the terms of a model of such inputs.
         outcome_transform: None or BoTorch's ``Standardize``, which has no effect: units are learnt.
         settings: The arguments by which :func:`~gpadjust.core.save` builds a subclass again.
 
@@ -175,8 +156,8 @@ class GP(gpytorch.models.GP, Predictive):
         unit: The unit of each output's targets, ``m x 1``.
 
     Raises:
-        TypeError: If data are no float64 tensors, arrays or frames of numbers, or an option is
-            unknown or a class instead of an instance.
+        TypeError: If data are not float64 tensors, arrays or frames of numbers, or an option is
+            unknown or not an instance.
         ValueError: If shapes disagree, data are not finite, or there are fewer than two points.
         PhysicsError: If a physics fails at the training inputs.
 
@@ -200,36 +181,39 @@ class GP(gpytorch.models.GP, Predictive):
             raise _unknown_option(type(self), next(iter(others)))
         for name, option in {"noise": noise, "input_transform": input_transform}.items():
             if isinstance(option, type):
-                own = option.__name__
-                raise TypeError(f"Expected {name} as an instance, {own}(); found the class {own}.")
+                kind = option.__name__
+                raise TypeError(f"Expected {name} as an instance, {kind}(); found the class.")
         if outcome_transform is not None and not isinstance(outcome_transform, Standardize):
             raise ValueError(
                 "Expected outcome_transform=None or Standardize, which has no effect; found "
-                f"{outcome_transform!r}. Of outputs with bounds take a structure with a link, such "
-                "as LinkedCKA(..., link='log') of gpadjust.kinds; otherwise transform the targets "
-                "and the physics before."
+                f"{outcome_transform!r}. Transform the targets and the physics, or take a link, "
+                "such as LinkedCKA(..., link='log') of gpadjust.kinds."
             )
-        self.data = Data.of(train_X, train_Y, train_Yvar, input_transform)
+        # Data, physics and terms.
+        self.data = Data.read(train_X, train_Y, train_Yvar, input_transform)
         X, Y = self.data.X, self.data.Y
         self.read_scale(Y)
         m = Y.shape[-1]
         self.rows_of_fit = len(Y)  # later ones are conditioned on, in the unit of these
-        self.physics = [as_physics(each) for each in physics]
-        for each in self.physics:
-            each.check_names(self.data.input_names)
+        self.physics = [as_physics(function) for function in physics]
+        for f_p in self.physics:
+            f_p.check_names(self.data.input_names)
         terms = [_with_kernel(term) for term in terms]
         if type(self) is GP:
             settings = {"terms": terms, "noise": noise, "choices": choices}
             settings["input_transform"] = input_transform
+        self.settings = dict(settings or {})
         transform: Any = self.data.transform
         if hasattr(transform, "terms"):
             terms = transform.terms(terms)
-        terms = [_of_data(term, self.data) for term in terms]
-        self.settings = dict(settings or {})
+        terms = [t._replace(kernel=t.kernel and t.kernel.of_data(self.data)) for t in terms]
         self._outputs: list[int] | None = None
         self._cached: tuple[Tensor, Conditioning] | None = None
-        unknowns = [each.unknowns for each in self.physics] or [NO_UNKNOWNS]
-        self._unknowns = unknowns[0] if len(unknowns) == 1 else Unknowns.together(unknowns)
+        unknowns = [f_p.unknowns for f_p in self.physics] or [NO_UNKNOWNS]
+        self._unknowns = unknowns[0]
+        if len(unknowns) > 1:
+            self._unknowns = Unknowns.together(unknowns)
+        # f_p at the training inputs, and the unit of the targets by it.
         self._f_train: list[Tensor] = []
         self.unit = Y.new_ones(1, 1)  # the user's, until the prior mean is known
         with torch.no_grad():  # a physics may have parameters, as a network does
@@ -239,21 +223,21 @@ class GP(gpytorch.models.GP, Predictive):
         self._f_train = [f / self.unit for f in places.f]
         self.term_sum = TermSum(terms, self._f_train, self.unit)
         if noise is not None and not isinstance(noise, Noise):
-            raise TypeError(
-                f"Expected noise as a Noise; found {noise!r}. A variance is train_Yvar."
-            )
+            raise TypeError(f"Expected noise as a Noise, not {noise!r}; variances are train_Yvar.")
         if self.data.Yvar is not None:
-            known = KnownNoise(self.noise_in_units(Y, self.data.Yvar))
-            noise = known if noise is None else noise.with_known(known)
-        self.noise = (Noise() if noise is None else noise).of_terms(self.term_sum)
+            known_noise = KnownNoise(self.noise_in_units(Y, self.data.Yvar))
+            noise = known_noise if noise is None else noise.with_known(known_noise)
+        self.noise = (noise or Noise()).of_terms(self.term_sum)
+        # The table of all unknown numbers, and u.
         rows = self.term_sum.rows(self.data.kernel_inputs(X), m) + self.noise.rows(Y)
         rows += [Row(f"physics.{n}", Y.new_zeros(1), is_shared=True) for n in self._unknowns]
         self.table = Table(rows, m, choices)
         names = {row.name for row in rows}
         names |= {f"{t.name}.{part}" for t in terms for part in ("mean", "process")}
-        if unknown := {name for choice in choices for name in choice.zeros} - names:
+        unknown = {name for choice in choices for name in choice.zeros} - names
+        if unknown:
             raise ValueError(
-                f"Unknown numbers {sorted(unknown)} in choices; expected some of {sorted(names)}."
+                f"Unknown numbers {sorted(unknown)}; expected some of {sorted(names)}."
             )
         self.u = torch.nn.Parameter(Y.new_zeros(1, self.table.problems, self.table.size))
         self._draws = self.u.detach()
@@ -278,7 +262,7 @@ class GP(gpytorch.models.GP, Predictive):
 
     @property
     def draws(self) -> Tensor:
-        """All coordinates that the last fit has drawn, ``N x B x P``; without a fit ``u``."""
+        """All coordinates drawn by the last fit, ``N x B x P``; without a fit ``u``."""
         return self._draws if len(self._draws) > len(self.u) else self.u.detach()
 
     @property
@@ -295,20 +279,18 @@ class GP(gpytorch.models.GP, Predictive):
 
     @property
     def is_fitted(self) -> bool:
-        """Whether the unknown numbers are others than the middle of their priors."""
+        """Whether the unknown numbers differ from the middle of their priors."""
         return bool(self.draws.any())
 
     def set_draws(self, draws: Tensor, number: int | None = None) -> None:
-        """Hold coordinates ``N x B x P``; predictions average over a number of them, or all.
+        """Set coordinates ``N x B x P``; predictions average over a number of them, or all.
 
-        Minus infinity stands for a positive number that is 0; others are finite, or a ValueError.
+        Minus infinity stands for a positive number that is 0; a ValueError if others are infinite.
         """
         shape = torch.Size([self.table.problems, self.table.size])
         if draws.shape[1:] != shape or not len(draws) or not (draws < torch.inf).all():
-            raise ValueError(
-                f"Expected finite coordinates of shape N x {shape[0]} x {shape[1]}; found "
-                f"{tuple(draws.shape)}."
-            )
+            shapes = f"N x {shape[0]} x {shape[1]}; found {tuple(draws.shape)}"
+            raise ValueError(f"Expected finite coordinates of shape {shapes}.")
         step = max(1, len(draws) // (number or len(draws)))
         self._draws = draws.detach()
         self.u = torch.nn.Parameter(self._draws[step // 2 :: step].clone())
@@ -323,68 +305,72 @@ class GP(gpytorch.models.GP, Predictive):
         It is in units of the targets, minus infinity where it or f_p is not finite; a choice is the
         number of a nested model. The gradient is zero if it is not asked for.
         """
-        u = u if choice is None else self.table.with_choice(u, choice)
-        f: list[Tensor] = []
+        if choice is not None:
+            u = self.table.with_choice(u, choice)
+        f: list[Tensor] | None = None
         slopes: Slopes = {}
-        if self._unknowns:  # f_p is asked once, at all draws
+        if self._unknowns:  # f_p is called once, at all draws
             f, slopes = self._physics_with_slopes(self.table.values(u), with_gradient)
         m, n = self.targets().shape[-2:]
-        parts = []
+        values, gradients = [], []
         for rows in torch.arange(len(u)).split(max(1, _ENTRIES // (n * n * m))):
-            own = {name: [each[rows] for each in by_f] for name, by_f in slopes.items()}
             tick("evaluations")
-            part = self._log_likelihood(u[rows], [each[rows] for each in f], own, with_gradient)
-            parts.append(part)
-        value, gradient = (torch.cat(each) for each in zip(*parts, strict=True))
-        return value, gradient
+            f_rows = f and [Y[rows] for Y in f]
+            slope_rows = {name: [Y[rows] for Y in by_f] for name, by_f in slopes.items()}
+            value, gradient = self._log_likelihood(u[rows], f_rows, slope_rows, with_gradient)
+            values.append(value)
+            gradients.append(gradient)
+        return torch.cat(values), torch.cat(gradients)
 
     def _log_likelihood(
-        self, u: Tensor, f: list[Tensor], f_slopes: Slopes, with_gradient: bool
+        self, u: Tensor, f: list[Tensor] | None, f_slopes: Slopes, with_gradient: bool
     ) -> tuple[Tensor, Tensor]:
         """Return the same of few draws, with f_p and its derivatives if it has parameters."""
         values, y = self.table.values(u), self.targets()
-        places = self.places(self.data.X, values, with_physics=not self._unknowns)
-        if self._unknowns:
+        places = self.places(self.data.X, values, with_physics=f is None)
+        if f is not None:
             places = places._replace(f=f)
-        total = self.term_sum.at(values, places)
+        total = self.term_sum.evaluate(values, places)
         noise = self.noise.variance(values, places, True)
         observed = ~y.isnan()
         residual = (y - total.mean).expand(len(u), *y.shape).masked_fill(~observed, 0.0)
-        found = self.sum_likelihood(total, residual, noise, observed, with_gradient)
-        value, gradient = found.value, torch.zeros_like(u)
+        result = self.sum_likelihood(total, residual, noise, observed, with_gradient)
+        value, gradient = result.value, torch.zeros_like(u)
         if with_gradient:
-            by = found.by | self.noise.pull_back(values, places, found.by_variance)
-            by |= self._by_physics(values, places, by, found, f_slopes)
+            by = result.by | self.noise.pull_back(values, places, result.by_variance)
+            by |= self._by_physics(values, places, by, result, f_slopes)
             gradient = self.table.gradient(by, values)
         if self.table.problems < value.shape[-1]:
             value = value.sum(-1, keepdim=True)
         if self.table.has_other_priors:
             ratio, by_ratio = self._other_priors(u)
             value, gradient = value + ratio, gradient + by_ratio
-        bad = ~(value.isfinite() & gradient.isfinite().all(-1))
-        return value.masked_fill(bad, -torch.inf), gradient.masked_fill(bad.unsqueeze(-1), 0.0)
+        fails = ~(value.isfinite() & gradient.isfinite().all(-1))
+        return value.masked_fill(fails, -torch.inf), gradient.masked_fill(fails.unsqueeze(-1), 0.0)
 
     def prior_mean(self, u: Tensor) -> Tensor:
         """Return the mean of the targets at coordinates ``S x B x P``, ``S x (m n)``, in units.
 
         It is NaN where f_p fails, and 0 of missing targets.
         """
-        total, _ = self._training_sum(u)
+        total, _ = self._prior(u)
         missing = self.targets().isnan()
         return total.mean.expand(len(u), *missing.shape).masked_fill(missing, 0.0).flatten(1)
 
     def precision_times(self, u: Tensor, v: Tensor) -> Tensor:
         """Return the inverse covariance of the targets at ``S x B x P`` times ``S x (m n)``."""
-        (total, noise), missing = self._training_sum(u), self.targets().isnan()
+        total, noise = self._prior(u)
+        missing = self.targets().isnan()
         v = v.reshape(len(u), *missing.shape)
         return self.sum_likelihood(total, v, noise, ~missing, True).by_mean.flatten(1)
 
-    def _training_sum(self, u: Tensor) -> tuple[WeightedSum, Tensor]:
-        """Return the sum at the training inputs, and the noise's variances."""
+    def _prior(self, u: Tensor) -> tuple[WeightedSum, Tensor]:
+        """Return the sum at the training inputs, NaN where f_p fails, and the noise's variances."""
         values = self.table.values(u)
         places = self.places(self.data.X, values, with_physics=False)
         places = places._replace(f=self._physics_with_slopes(values, False)[0])
-        return self.term_sum.at(values, places), self.noise.variance(values, places, True)
+        noise = self.noise.variance(values, places, True)
+        return self.term_sum.evaluate(values, places), noise
 
     def sum_likelihood(
         self, train: WeightedSum, residual: Tensor, noise: Tensor, observed: Tensor,
@@ -396,18 +382,18 @@ class GP(gpytorch.models.GP, Predictive):
     def conditioned(
         self, train: WeightedSum, noise: Tensor, targets: Tensor, old: Any = None
     ) -> Conditioning:
-        """Return the posterior given observations of a sum, of which the first ones made an old."""
+        """Return the posterior given observations of a sum, the first ones those of an old one."""
         return Conditioning(train, noise, targets, old)
 
     def fit_itself(self, method: str, num_draws: int | None, seed: int) -> Any:
-        """Return None; a subclass that is not fitted by draws fits itself, and its FitResult."""
+        """Return None; a subclass with a fit without draws returns its FitResult."""
         return None
 
     def _by_physics(
-        self, values: Values, places: Places, by: Values, found: SumLikelihood, f_slopes: Slopes
+        self, values: Values, places: Places, by: Values, result: SumLikelihood, f_slopes: Slopes
     ) -> Values:
         """Return derivatives by centers and by the coordinates of a physics' parameters."""
-        by_mean = found.by_mean
+        by_mean = result.by_mean
         slopes: Values = {}
         by_f = [torch.zeros_like(by_mean) for _ in self.physics]
         for term in self.terms:
@@ -417,13 +403,12 @@ class GP(gpytorch.models.GP, Predictive):
             # f_p is in the mean, times g's, and in the weight f_p - c.
             by_f[term.physics] += self.term_sum.mean_of(term, values) * by_mean + by_weight
             if term.has_center is True:
-                without = 1 - values.get(
-                    f"{term.name}.mean", by_mean.new_ones(())
-                )  # c in f_p's place
+                # c is in the weight, and in the place of f_p without a mean of g.
+                without = 1 - values.get(f"{term.name}.mean", by_mean.new_ones(()))
                 by_c = (term.mean * without * by_mean - by_weight).sum(-1, keepdim=True)
                 slopes[f"{term.name}.center"] = by_c * self.term_sum.spread[term.physics]
         if f_slopes and self.noise.has_shares:
-            by_shares = self._noise_by_f(values, places, found.by_variance)
+            by_shares = self._noise_by_f(values, places, result.by_variance)
             by_f = [a + b for a, b in zip(by_f, by_shares, strict=True)]
         for name, parts in f_slopes.items():
             products = [(a * b).sum((-1, -2)) for a, b in zip(by_f, parts, strict=True)]
@@ -451,9 +436,9 @@ class GP(gpytorch.models.GP, Predictive):
     def _physics_at(self, X: Tensor, values: Values) -> list[Tensor]:
         """Return each physics at ``... x S x n x d`` (1 for S): ``... x S x m x n``, in units."""
         f = []
-        for each in self.physics:
-            Y = each(X, *self._arguments(each, values))
-            self._check_physics(each, X, Y)
+        for physics in self.physics:
+            Y = physics(X, *self._arguments(physics, values))
+            self._check_physics(physics, X, Y)
             f.append(self._in_units(Y))
         return f
 
@@ -464,12 +449,13 @@ class GP(gpytorch.models.GP, Predictive):
                 f"Expected {self.num_outputs} outputs of physics {physics.name!r}, as many as of "
                 f"train_Y; found {Y.shape[-1]}."
             )
-        bad = ~self.holds(Y)
-        if bad.any():
-            rows = bad.any(-1).to(X).sum_to_size(X.shape[:-1]).flatten().nonzero().flatten()
+        wrong = ~self.holds(Y)
+        if wrong.any():
+            rows = wrong.any(-1).to(X).sum_to_size(X.shape[:-1]).flatten().nonzero().flatten()
             error = PhysicsError(
-                f"Physics {physics.name!r} returned {float(Y[bad][0].detach()):.6g}, which targets "
-                f"cannot be, as {self.scale_formula} is modelled; clamp its outputs.", rows.tolist()
+                f"Physics {physics.name!r} returned {float(Y[wrong][0].detach()):.6g}, which "
+                f"targets cannot be, as {self.scale_formula} is modelled; clamp its outputs.",
+                rows.tolist(),
             )  # fmt: skip
             error.inputs = X.detach().reshape(-1, X.shape[-1])[rows]
             raise error
@@ -480,10 +466,10 @@ class GP(gpytorch.models.GP, Predictive):
     """The scale on which the model is Gaussian, as a formula; empty for that of the targets."""
 
     def read_scale(self, Y: Tensor) -> None:
-        """Do nothing; a subclass may keep what its scale depends on of the training targets."""
+        """Do nothing; a subclass may store what its scale reads of the training targets."""
 
     def holds(self, Y: Tensor) -> Tensor:
-        """Return which values targets may have."""
+        """Return whether targets may have these values."""
         return torch.ones_like(Y, dtype=torch.bool)
 
     def on_gaussian_scale(self, Y: Tensor) -> Tensor:
@@ -504,6 +490,7 @@ class GP(gpytorch.models.GP, Predictive):
 
     def log_jacobian(self) -> Tensor:
         """Return the log density of the targets, ``m``, in the user's units less the model's."""
+        # log p(y) = log p(y / unit) - n log unit
         return -(~self.data.Y.isnan()).sum(-2) * self.unit.squeeze(-1).log()
 
     def targets(self) -> Tensor:
@@ -512,7 +499,8 @@ class GP(gpytorch.models.GP, Predictive):
 
     def _in_units(self, Y: Tensor) -> Tensor:
         """Return ``... x m x n`` of a physics' outputs, in units of the targets."""
-        Y = Y if self._outputs is None else Y[..., self._outputs]
+        if self._outputs is not None:
+            Y = Y[..., self._outputs]
         return self.on_gaussian_scale(Y).mT / self.unit
 
     def _arguments(self, physics: Physics, values: Values) -> list[Tensor]:
@@ -525,15 +513,14 @@ class GP(gpytorch.models.GP, Predictive):
     def _physics_with_slopes(
         self, values: Values, with_slopes: bool
     ) -> tuple[list[Tensor], Slopes]:
-        """Return each physics at the training inputs, NaN where it fails, and its derivatives.
-
-        These are central differences, of one call for all.
-        """
-        X, names = self.data.X, [*self._unknowns]
+        """Return each physics at the training inputs, NaN where it fails, and its derivatives."""
+        X = self.data.X
+        names = [*self._unknowns]
         z = torch.cat([values[f"physics.{name}"] for name in names], -1)  # S x p
-        p = len(names) if with_slopes else 0
+        p = len(names) * with_slopes
         steps = _STEP * torch.eye(p, len(names)).to(z).unsqueeze(1)
-        shifted = torch.cat([z.unsqueeze(0), z + steps, z - steps])  # (1 + 2 p) x S x p
+        # Central differences, by one call: (1 + 2 p) x S x p.
+        shifted = torch.cat([z.unsqueeze(0), z + steps, z - steps])
         moved = {f"physics.{n}": shifted[..., [i]].flatten(0, 1) for i, n in enumerate(names)}
         f, slopes = [], []
         for physics in self.physics:
@@ -541,17 +528,17 @@ class GP(gpytorch.models.GP, Predictive):
             Y = self._in_units(Y.masked_fill(~self.holds(Y), torch.nan))
             Y = Y.expand(len(shifted) * len(z), -1, -1).unflatten(0, shifted.shape[:2])
             f.append(Y[0])
-            slopes.append((Y[1 : p + 1] - Y[p + 1 :]) / (2 * _STEP))
-        return f, {name: [each[i] for each in slopes] for i, name in enumerate(names[:p])}
+            slopes.append((Y[1 : p + 1] - Y[p + 1 :]) / (2 * _STEP))  # df / dz
+        return f, {name: [slope[i] for slope in slopes] for i, name in enumerate(names[:p])}
 
     # Predictions.
 
     def kernel_inputs(self, X: Tensor) -> Tensor:
-        """Return what kernels see at inputs ``... x n x d``; a kind of data may add to it."""
+        """Return the inputs of kernels at ``... x n x d``; a kind of data may add to them."""
         return self.data.kernel_inputs(X)
 
     def places(self, X: Tensor, values: Values, with_physics: bool = True) -> Places:
-        """Return what terms and noise read at inputs ``... x n x d``."""
+        """Return the inputs of kernels, physics and noise at ``... x n x d``."""
         x = self.kernel_inputs(X).unsqueeze(-3).unsqueeze(-3)
         f: Sequence[Tensor] = []
         if self._f_train and not self._unknowns and X is self.data.X:
@@ -560,19 +547,20 @@ class GP(gpytorch.models.GP, Predictive):
             f = self._physics_at(X.unsqueeze(-3), values)
         return Places(x, f, X.unsqueeze(-3).unsqueeze(-3))
 
-    def at(self, X: Tensor, values: Values | None = None) -> WeightedSum:
+    def evaluate(self, X: Tensor, values: Values | None = None) -> WeightedSum:
         """Return the function at ``... x n x d``, at the draws ``u`` unless values are given."""
-        values = self.values if values is None else values
-        return self.term_sum.at(values, self.places(X, values))
+        if values is None:
+            values = self.values
+        return self.term_sum.evaluate(values, self.places(X, values))
 
-    def at_each(self, X: Tensor, values: Values) -> WeightedSum:
-        """Return the function of each draw at points of its own, ``S x n x d``."""
+    def evaluate_each(self, X: Tensor, values: Values) -> WeightedSum:
+        """Return the function of each draw at points ``S x n x d`` of this draw."""
         x = self.kernel_inputs(X).unsqueeze(-3)
         places = Places(x, self._physics_at(X, values), X.unsqueeze(-3))
-        return self.term_sum.at(values, places)
+        return self.term_sum.evaluate(values, places)
 
     def conditioning(self) -> Conditioning:
-        """Return the posterior given the data, without a graph of the draws; kept for these."""
+        """Return the posterior given the data, without a graph of the draws; cached for these."""
         if self._cached is None or not torch.equal(self._cached[0], self.u):
             with torch.no_grad():
                 conditioning = self.conditioned(*self._observed(self.table.values(self.u)))
@@ -583,12 +571,12 @@ class GP(gpytorch.models.GP, Predictive):
         """Return the function at the training inputs, the variances of the noise, and targets."""
         places = self.places(self.data.X, values)
         noise = self.noise.variance(values, places, True)
-        return self.term_sum.at(values, places), noise, self.targets().unsqueeze(-3)
+        return self.term_sum.evaluate(values, places), noise, self.targets().unsqueeze(-3)
 
     def left_out(self) -> Marginals:
         """Return the distribution of each target given all others, with noise; NaN if missing."""
         mean, variance = self.conditioning().left_out()
-        mean = mean + self.noise.shift
+        mean = mean + self.noise.shift  # targets are y / unit - shift
         return self.marginals_of((mean * self.unit).mT, (variance * self.unit.square()).mT)
 
     @torch.no_grad()
@@ -605,7 +593,7 @@ class GP(gpytorch.models.GP, Predictive):
         X, conditioning = self.data.new_inputs(X), self.conditioning()
         with self._graph_for(X):
             values = conditioning.train.values
-            f = self.term_sum.at(values, self.places(X, values))
+            f = self.term_sum.evaluate(values, self.places(X, values))
             mean, variance = conditioning.marginals(f)
             if observation_noise is not False:
                 variance = variance + self._noise_at(X, observation_noise)
@@ -619,16 +607,16 @@ class GP(gpytorch.models.GP, Predictive):
         """Return the joint posterior of some outputs: a Gaussian of each draw."""
         X, conditioning = self.data.new_inputs(X), self.conditioning()
         with self._graph_for(X):
-            mean, K = conditioning.joint(self.at(X, conditioning.train.values))
+            mean, K = conditioning.joint(self.evaluate(X, conditioning.train.values))
             if observation_noise is not False:
                 K = add_noise(K, self._noise_at(X, observation_noise))
             mean, K = mean * self.unit, K * self.unit.square().unsqueeze(-1)
             return MixturePosterior(mean[..., outputs, :], K[..., outputs, :, :])
 
     def term(self, name: str, X: ArrayLike) -> MixturePosterior:
-        """Return the joint posterior of a term's process at ``X``, without asking the physics.
+        """Return the joint posterior of a term's process at ``X``, without calling the physics.
 
-        The process of a basis has no unit, that of another term the targets'.
+        The process of a basis has no unit, that of another term the unit of the targets.
         """
         names = [term.name for term in self.terms]
         if name not in names:
@@ -647,15 +635,13 @@ class GP(gpytorch.models.GP, Predictive):
         return self.term("rho", X)
 
     def delta(self, X: ArrayLike) -> MixturePosterior:
-        """Return the posterior of what is added to the physics; see :meth:`term`."""
+        """Return the posterior of the correction that is added; see :meth:`term`."""
         return self.term("delta", X)
 
     def sample_functions(
         self, num_functions: int, seed: int | None = None, num_features: int = 1024
     ) -> Functions:
-        """Draw functions from the posterior.
-
-        They take ``... x q x d`` to ``k x ... x q x m``.
+        """Draw functions ``... x q x d`` to ``k x ... x q x m`` from the posterior.
 
         Args:
             num_functions: Number ``k`` of functions, spread over the draws.
@@ -672,18 +658,17 @@ class GP(gpytorch.models.GP, Predictive):
     def priors(self) -> Any:
         """Return a frame of the unknown numbers by their priors, in the user's units.
 
-        Its columns are name, output (empty of numbers that all outputs share), median, both ends
-        of the central 95 % interval, and meaning. Nested models have some of these numbers alone.
-        Its ``plot()`` draws the priors, and beside them the posterior of a fitted model.
+        Its columns are name, output (empty of shared numbers), median, both ends of the central
+        95 % interval, and meaning. Its ``plot()`` draws the priors, and the posterior after a fit.
         """
         from gpadjust.core.priors import priors  # with pandas, which models do not need
 
         return priors(self)
 
     def _graph_for(self, X: Tensor) -> torch.set_grad_enabled:
-        """Record a graph if inputs or fantasies ask for one, not for the draws."""
-        asked = X.requires_grad or self.conditioning().alpha.requires_grad
-        return torch.set_grad_enabled(asked and torch.is_grad_enabled())
+        """Record a graph if inputs or fantasies have one, not for the draws."""
+        has_graph = X.requires_grad or self.conditioning().alpha.requires_grad
+        return torch.set_grad_enabled(has_graph and torch.is_grad_enabled())
 
     def _noise_at(self, X: Tensor, asked: bool | Tensor) -> Tensor:
         """Return variances ``... x S x m x q`` in units of the targets."""
@@ -694,15 +679,16 @@ class GP(gpytorch.models.GP, Predictive):
 
     def checked_noise(self, noise: Any, X: Tensor) -> Tensor:
         """Return given variances of observations at ``X``, ``... x q x m``."""
-        q, m, found = X.shape[-2], self.num_outputs, noise
-        if isinstance(noise, Tensor):
-            found = tuple(noise.shape)
-            fits = found[-2:-1] in ((1,), (q,)) and found[-1] in (1, m)
-            if fits and (noise >= 0).all():
-                return noise.expand(*found[:-2], q, m)
+        q, m = X.shape[-2], self.num_outputs
+        shape = tuple(getattr(noise, "shape", ()))
+        is_right = shape[-2:-1] in ((1,), (q,)) and shape[-1] in (1, m)
+        if isinstance(noise, Tensor) and is_right and (noise >= 0).all():
+            return noise.expand(*shape[:-2], q, m)
+        if not isinstance(noise, Tensor):
+            shape = noise
         raise ValueError(
             f"Expected noise as True, False or variances ... x {q} x {m}, not negative or NaN; "
-            f"found {found!r}. Known noise belongs to the model, in train_Yvar."
+            f"found {shape!r}. Known noise belongs to the model, in train_Yvar."
         )
 
     # Other data, outputs and draws.
@@ -716,23 +702,21 @@ class GP(gpytorch.models.GP, Predictive):
             X: Inputs, ``... x k x d``.
             Y: Observations, ``... x k x m``; NaN where one is missing. Further dimensions in front,
                 as of fantasies, share the factor of X.
-            noise: Variances of the shape of ``Y``, of a model with known noise. Default: their
-                mean.
+            noise: Variances of the shape of ``Y``. Default: the mean of known noise.
         """
         X, Y = self.data.new_inputs(X), as_tensor(Y, "Y")
         if Y.shape[-2:] != (X.shape[-2], self.num_outputs) or Y.isinf().any():
-            raise ValueError(
-                f"Expected finite Y of shape ... x {X.shape[-2]} x {self.num_outputs}, or NaN "
-                f"where an output is missing; found {tuple(Y.shape)}."
-            )
+            shape = f"... x {X.shape[-2]} x {self.num_outputs}"
+            raise ValueError(f"Expected finite Y of shape {shape}, or NaN; found {tuple(Y.shape)}.")
         self.on_gaussian_scale(Y)  # an error if targets cannot have such values
         old, new = self.conditioning(), self._copy()
         new.data = self.data.appended(X, Y)
         is_usual = noise is None
-        noise = self.usual_noise(Y) if noise is None else as_tensor(noise, "noise")
+        noise = self.usual_noise(Y) if is_usual else as_tensor(noise, "noise")
         if noise is not None and self.noise.known is not None:
-            unused = noise.isnan() & Y.isnan()
-            noise = noise.masked_fill(unused, 1.0) if unused.any() else noise
+            is_unused = noise.isnan() & Y.isnan()
+            if is_unused.any():
+                noise = noise.masked_fill(is_unused, 1.0)
             noise = self.checked_noise(noise, X)
             if self.data.Yvar is not None:
                 new.data = new.data._replace(Yvar=appended(self.data.Yvar, noise))
@@ -741,22 +725,21 @@ class GP(gpytorch.models.GP, Predictive):
         values = old.train.values
         has_graph = X.requires_grad or Y.requires_grad or old.alpha.requires_grad
         with torch.set_grad_enabled(has_graph and torch.is_grad_enabled()):
-            if not self._unknowns:  # f_p is asked at the new points only
-                late = self._physics_at(X.unsqueeze(-3), values)
-                pairs = zip(self._f_train, late, strict=True)
-                new._f_train = [appended(f, f_late, -1) for f, f_late in pairs]
+            if not self._unknowns:  # f_p is called at the new points only
+                pairs = zip(self._f_train, self._physics_at(X.unsqueeze(-3), values), strict=True)
+                new._f_train = [appended(f, f_new, -1) for f, f_new in pairs]
             conditioning = new.conditioned(*new._observed(values), old)
         new._cached = (self.u.detach().clone(), conditioning)
         return new.eval()
 
     def get_fantasy_model(self, inputs: Any, targets: Tensor, **options: Any) -> Self:
-        """Condition on observations of targets ``... x (m) x k``, as GPyTorch has them."""
+        """Condition on targets ``... x (m) x k``, as GPyTorch's lists of models do."""
         X = inputs if isinstance(inputs, Tensor) else inputs[0]
-        Y = targets.unsqueeze(-1) if self.num_outputs == 1 else targets.mT
         noise = options.get("noise")
-        if noise is not None and self.num_outputs == 1:
-            noise = noise.unsqueeze(-1)
-        return self.condition_on_observations(X, Y, noise)
+        if self.num_outputs > 1:
+            return self.condition_on_observations(X, targets.mT, noise)
+        noise = None if noise is None else noise.unsqueeze(-1)
+        return self.condition_on_observations(X, targets.unsqueeze(-1), noise)
 
     def subset_output(self, idcs: list[int]) -> Self:
         """Return the model of some outputs; a ValueError if there are none of these numbers."""
@@ -777,24 +760,18 @@ class GP(gpytorch.models.GP, Predictive):
         noise = self.noise.of_rows(rows)
         if noise is None:
             return None
-        new = self._copy()
-        new.noise = noise
         Yvar = None if self.data.Yvar is None else self.data.Yvar[rows]
-        new.data = self.data._replace(X=self.data.X[rows], Y=self.data.Y[rows], Yvar=Yvar)
-        new._f_train, new._cached = [f[..., rows] for f in self._f_train], None
-        return new
+        data = self.data._replace(X=self.data.X[rows], Y=self.data.Y[rows], Yvar=Yvar)
+        f_train = [f[..., rows] for f in self._f_train]
+        return self._copy(noise=noise, data=data, _f_train=f_train, _cached=None)
 
     def with_noise(self, noise: Noise) -> Self:
         """Return the model with another noise of the same unknown numbers."""
-        new = self._copy()
-        new.noise, new._cached = noise, None
-        return new
+        return self._copy(noise=noise, _cached=None)
 
     def with_conditioning(self, conditioning: Any) -> Self:
         """Return the model with another posterior than its data's, of the same draws."""
-        new = self._copy()
-        new._cached = (self.u.detach().clone(), conditioning)
-        return new
+        return self._copy(_cached=(self.u.detach().clone(), conditioning))
 
     def subset_draws(self, numbers: Tensor) -> Self:
         """Return the model of some of its draws, with repetitions, by their numbers."""
@@ -802,20 +779,23 @@ class GP(gpytorch.models.GP, Predictive):
         new.set_draws(self.u.detach()[numbers])
         return new
 
-    def _copy(self) -> Self:
-        """Return a copy that shares what is never changed in place."""
+    def _copy(self, **attributes: Any) -> Self:
+        """Return a copy with other attributes, that shares what is never changed in place."""
         shared = [self.data, self.physics, self.table, self.term_sum, self.noise, self.unit]
         shared += [self._f_train, self._cached, self._draws, self.settings]
-        return deepcopy(self, {id(each): each for each in shared})
+        new = deepcopy(self, {id(part): part for part in shared})
+        for name, value in attributes.items():
+            setattr(new, name, value)
+        return new
 
     def to(self, *args: Any, **options: Any) -> Self:
         """Move the model to a device, with its data."""
         super().to(*args, **options)
-        Yvar = None if self.data.Yvar is None else self.data.Yvar.to(self.u)
-        X, Y = self.data.X.to(self.u), self.data.Y.to(self.u)
-        transform = None if self.data.transform is None else self.data.transform.to(self.u)
-        self.data = self.data._replace(X=X, Y=Y, Yvar=Yvar, transform=transform)
-        self.unit, self._draws = self.unit.to(self.u), self._draws.to(self.u)
+        parts = {name: getattr(self.data, name) for name in ("X", "Y", "Yvar", "transform")}
+        moved = {name: part.to(self.u) for name, part in parts.items() if part is not None}
+        self.data = self.data._replace(**moved)
+        self.unit = self.unit.to(self.u)
+        self._draws = self._draws.to(self.u)
         self._f_train = [f.to(self.u) for f in self._f_train]
         self.term_sum = TermSum(self.terms, [f.to(self.u) for f in self.term_sum.f], self.unit)
         self.table = self.table.to(self.u)
@@ -823,7 +803,7 @@ class GP(gpytorch.models.GP, Predictive):
         self._cached = None
         return self
 
-    # What BoTorch and GPyTorch ask for.
+    # The interfaces of BoTorch and GPyTorch.
 
     @property
     def num_outputs(self) -> int:
@@ -838,12 +818,15 @@ class GP(gpytorch.models.GP, Predictive):
     @property
     def covar_module(self) -> AdditiveKernel:
         """The prior covariance: the sum of the kernels of rho, scaled by f_p - c, and of delta."""
-        return kernel_view(self)
+        terms = [term for term in self.terms if term.varies] or self.terms[:1]  # of zeros
+        return AdditiveKernel(*(TermView(self, term.name) for term in terms))
 
     @property
     def likelihood(self) -> GaussianLikelihood:
         """The Gaussian likelihood with the model's noise."""
-        return likelihood_view(self)
+        likelihood = GaussianLikelihood()
+        likelihood.noise_covar = NoiseView(self)
+        return likelihood
 
     @property
     def batch_shape(self) -> Size:
@@ -867,24 +850,22 @@ class GP(gpytorch.models.GP, Predictive):
     def __call__(self, x: Tensor) -> MultivariateNormal:
         """Return the prior in training mode, at the training inputs only, else the posterior."""
         if not self.training:
-            mean, K = self.conditioning().joint(self.at(self.data.new_inputs(x)))
+            mean, K = self.conditioning().joint(self.evaluate(self.data.new_inputs(x)))
             K = (K * self.unit.square().unsqueeze(-1)).expand(*mean.shape, mean.shape[-1])
             lazy = to_linear_operator(squeezed(K, -3))
             return MultivariateNormal(squeezed(mean * self.unit, -2), lazy)
         if len(self.u) > 1:
-            raise RuntimeError(
-                f"The model holds {len(self.u)} draws of its unknown numbers, a loss needs one: "
-                "build a new model for a point fit, or call model.set_draws(model.u[:1])."
-            )
+            few = "call model.set_draws(model.u[:1])"
+            raise RuntimeError(f"The model holds {len(self.u)} draws, a loss needs one: {few}.")
         if x.shape != self.data.X.shape or not torch.equal(x, self.data.X):
             raise RuntimeError("In training mode call the model on its training inputs.")
         return self.forward(self.data.X)
 
     def as_single_task_gp(self, draw: int | None = None) -> SingleTaskGP:
-        """Return BoTorch's ``SingleTaskGP`` of one output at one draw, for code that asks for one.
+        """Return BoTorch's ``SingleTaskGP`` of one output at one draw, by default the likeliest.
 
-        Its mean, kernel and noise are the model's and are not learnt. The draw is, by default, the
-        most likely one. A ValueError if there are several outputs or missing targets.
+        Mean, kernel and noise are the model's and are not learnt. A ValueError if there are several
+        outputs or missing targets.
         """
         if self.num_outputs > 1 or self.data.Y.isnan().any():
             raise ValueError(
@@ -894,21 +875,16 @@ class GP(gpytorch.models.GP, Predictive):
         if draw is None:
             density = self.log_likelihood(self.u)[0].sum(-1) - 0.5 * self.u.square().sum((-1, -2))
             draw = int(density.argmax())
-        own = self._copy()
-        own.set_draws(self.u[[draw]])
-        own.requires_grad_(False)
-        noise = own.likelihood.noise.detach().reshape(self.data.Y.shape)
-        with validate_input_scaling(False):  # the model has units of its own
+        model = self.subset_draws(torch.tensor([draw])).requires_grad_(False)
+        noise = model.likelihood.noise.detach().reshape(self.data.Y.shape)
+        with validate_input_scaling(False):  # the model has units
             return SingleTaskGP(
-                self.data.X, self.data.Y, noise, covar_module=own.covar_module,
-                mean_module=own.mean_module, outcome_transform=None, input_transform=None,
+                self.data.X, self.data.Y, noise, covar_module=model.covar_module,
+                mean_module=model.mean_module, outcome_transform=None, input_transform=None,
             )  # fmt: skip
 
     def __repr__(self) -> str:
-        n, m = self.data.Y.shape[-2:]
-        d = self.data.X.shape[-1]
-        counts = {"point": n, "input": d, "output": m, "draw": len(self.draws)}
-        return f"{type(self).__name__}({counted(counts)})"
+        return f"{type(self).__name__}({counted(self)})"
 
     def _repr_html_(self) -> str:
         return summary_html(self)
@@ -922,16 +898,16 @@ def _draw_matheron_paths(model: Any, *, sample_shape: Size, **_: Any) -> Paths:
 
 
 def _unknown_option(structure: type[GP], name: str) -> TypeError:
-    """Return the error of an option that a structure does not have, with the way out."""
-    if name in _KINDS:
-        way = f"expected {_KINDS[name]} of gpadjust.kinds."
-    else:
-        own = [each for each in structure.__mro__ if issubclass(each, GP)]
-        parameters = [p for each in own[:-1] or own for p in signature(each).parameters.values()]
-        names = {p.name for p in parameters if p.kind is p.KEYWORD_ONLY} - {"settings"}
-        names |= {"noise", "input_transform"}
-        way = f"expected some of {', '.join(sorted(names))}. See CHANGELOG.md for earlier names."
-    return TypeError(f"Unknown option {name!r} of {structure.__name__}; {way}")
+    """Return the error of an option that a structure does not have."""
+    classes = [kind for kind in structure.__mro__ if issubclass(kind, GP)]
+    signatures = map(signature, classes[:-1] or classes)
+    parameters = [p for one in signatures for p in one.parameters.values()]
+    names = {p.name for p in parameters if p.kind is p.KEYWORD_ONLY} - {"settings"}
+    return TypeError(
+        f"Unknown option {name!r} of {structure.__name__}; expected some of "
+        f"{', '.join(sorted(names | {'noise', 'input_transform'}))}. Kinds of data are noises and "
+        "input transforms of gpadjust.kinds; see CHANGELOG.md for earlier names."
+    )
 
 
 def _with_kernel(term: Any) -> Term:
@@ -941,12 +917,9 @@ def _with_kernel(term: Any) -> Term:
     if term.kernel is None:
         return term
     kernel = as_kernel(term.kernel, DELTA if term.physics is None else RHO)
-    return term._replace(kernel=kernel, constant=term.constant if kernel.has_constant else None)
-
-
-def _of_data(term: Term, data: Data) -> Term:
-    """Return a term whose kernel knows the names of the inputs."""
-    return term if term.kernel is None else term._replace(kernel=term.kernel.of_data(data))
+    if not kernel.has_constant:
+        term = term._replace(constant=None)
+    return term._replace(kernel=kernel)
 
 
 def _coordinates(model: GP) -> Tensor:

@@ -20,26 +20,28 @@ _LEAST = 1e-11  # of the squared unit of the targets
 class Noise:
     r"""Independent noise of observations, with variances :math:`\sum_k h_k(x) \, v_k`.
 
-    The :math:`v_k` are learnt for each output. A noise of one's own overrides ``shares``, h: one
-    column for each name. ``1`` and the square of f_p, say, are noise of a constant standard
-    deviation and one that is a share of f_p. If h has numbers of each output, ``of_outputs`` has to
-    return the noise of some of them.
+    The :math:`v_k` are learnt for each output. A subclass overrides ``shares``, h: one column for
+    each name, such as 1 and the square of f_p for a constant standard deviation and a share of f_p.
+    If h has numbers of each output, ``of_outputs`` returns the noise of
+    some of them.
 
     Args:
         names: The names of the shares.
         priors: The priors of v, in squared units of the targets (times those of 1 / h).
+
+    Attributes:
+        known: Known variances of the training targets, ``... x m x n``, in their unit squared.
     """
 
     of_targets: tuple[str, ...] = ("known", "shift")
     """Attributes with a number of each training target, ``... x m x n``."""
-    known: Tensor | None = None
-    """Known variances of the training targets, ``... x m x n``, in their unit squared."""
     shift: Tensor | float = 0.0
-    """What the noise adds to the training targets in the mean, ``m x n``, in their unit."""
+    """Mean of the noise of the training targets, ``m x n``, in their unit."""
 
     def __init__(
         self, names: Sequence[str] = ("variance",), priors: Sequence[LogNormal] | None = None
     ) -> None:
+        self.known: Tensor | None = None
         self.names = tuple(names)
         self.priors = [_PRIOR] * len(self.names) if priors is None else [*priors]
 
@@ -50,7 +52,7 @@ class Noise:
 
     @property
     def is_outlier(self) -> Tensor | None:
-        """Mask ``n x m`` of the training targets that hardly count; None if none is searched."""
+        """Mask ``n x m`` of the training targets that are outliers; None without a search."""
         return None
 
     def of_terms(self, terms: TermSum) -> Self:
@@ -71,6 +73,7 @@ class Noise:
 
     def variance(self, values: Values, places: Places, is_training: bool = False) -> Tensor:
         """Return the variances, ``... x S x m x n`` (or 1 where all are equal)."""
+        # h_1 v_1 + h_2 v_2 + ...
         v = torch.cat([values[f"noise.{name}"] for name in self.names], -1) + _LEAST
         shares = self.shares(places)
         if shares is None:
@@ -83,7 +86,7 @@ class Noise:
         if variances.shape[-2] != v.shape[-2]:
             raise ValueError(
                 f"Expected shares of {v.shape[-2]} outputs or of 1; found {variances.shape[-2]}. A "
-                "noise with numbers of each output says in of_outputs what some of them have."
+                "noise with numbers of each output needs the method of_outputs."
             )
         return variances
 
@@ -92,20 +95,18 @@ class Noise:
         shares = self.shares(places)
         if shares is None:
             return {f"noise.{name}": by.sum(-1, keepdim=True) for name in self.names}
+        # df / dv_k = sum_i h_k(x_i) df / dvariance_i
         slopes = (by.unsqueeze(-1) * shares).sum(-2).split(1, -1)
         return {f"noise.{name}": slope for name, slope in zip(self.names, slopes, strict=True)}
 
     def appended(self, variances: Tensor | None, num_points: int) -> Noise:
-        """Return the noise of further rows, too; a ValueError if a learnt one is given any."""
+        """Return the noise of further rows, too; a ValueError of variances of a learnt one."""
         if variances is not None:
-            raise ValueError(
-                "Expected no noise, as the model learns its own; build it with train_Yvar to give "
-                "the variances of observations."
-            )
+            raise ValueError("Expected no noise, as the model learns it without train_Yvar.")
         return self
 
     def learnt(self, model: Any, fitted: Callable[[Noise], Any]) -> Noise:
-        """Return the noise with what rough fits tell of each row; :func:`fit` begins with it.
+        """Return the noise with what it learns of rows from rough fits; :func:`fit` begins so.
 
         Args:
             model: The model, before it is fitted.
@@ -146,10 +147,7 @@ class Noise:
 
 
 class KnownNoise(Noise):
-    """Noise of known variances of the targets.
-
-    They are ``... x m x n``, in squared units of the targets.
-    """
+    """Noise of known variances, ``... x m x n``, in squared units of the targets."""
 
     def __init__(self, variances: Tensor) -> None:
         super().__init__(())
@@ -157,8 +155,10 @@ class KnownNoise(Noise):
 
     def variance(self, values: Values, places: Places, is_training: bool = False) -> Tensor:
         """Return the known variances; at other places their mean in each output."""
-        known = self.known.unsqueeze(-3)  # ... x 1 x m x n
-        return known if is_training else known.mean(-1, keepdim=True)
+        variances = self.known.unsqueeze(-3)  # ... x 1 x m x n
+        if is_training:
+            return variances
+        return variances.mean(-1, keepdim=True)
 
     def appended(self, variances: Tensor | None, num_points: int) -> Self:
         """Return the noise of further rows, too: of given variances or the mean of those known."""

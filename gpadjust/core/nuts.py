@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 CHAINS = 4
 _DEPTH = 5  # of a trajectory, 32 steps at most
-_WARMING = 2  # draws of a chain that are kept for each step before, which adapts
+_WARMING = 2  # resulting draws of a chain for each step before, which adapts
 _JUMPS = 32  # proposals after each trajectory
 _WIDTH, _TAIL = 0.5, 3  # of proposals around a draw, Student's t: scale and degrees of freedom
 _FROM_PRIOR = 0.1  # share of proposals, so that densities are bounded by those of proposals
@@ -26,10 +26,9 @@ def nuts(model: GP, draws: Tensor, number: int, seed: int) -> tuple[Tensor, floa
     """Return ``number x B x P`` draws of four chains, one after the other, and the worst R-hat.
 
     Chains move in coordinates in which draws of the default fit, ``N x B x P``, are white. After
-    each trajectory of NUTS come jumps from mode to mode: Metropolis steps whose proposals are
-    points around these draws and, after warm-up, those of all chains, or from the prior (an
-    independence sampler, Tierney 1994). They decide how soon chains agree, not the density that
-    chains draw from. R-hat compares halves of the chains (Gelman et al. 2013).
+    each trajectory of NUTS come jumps: Metropolis steps whose proposals are points around these
+    draws and, after warm-up, those of all chains, or from the prior (an independence sampler,
+    Tierney 1994). R-hat compares halves of the chains (Gelman et al. 2013).
 
     Raises:
         ImportError: Without Pyro, ``pip install "gpadjust[pyro]"``.
@@ -81,7 +80,7 @@ class _Jumps:
         self.draws = self._white(draws)
 
     def add(self, v: Tensor) -> None:
-        """Propose points around other draws, too: as many of them, evenly."""
+        """Add as many other draws, evenly, to those of the proposals."""
         every = max(1, len(v) // len(self.draws))
         self.draws = torch.cat([self.draws, v[::every]])
 
@@ -98,7 +97,7 @@ class _Jumps:
         return torch.where(is_prior, self._white(z), near)
 
     def start(self) -> Tensor:
-        """Return the first possible proposal, ``B x P``, which are wider than the posterior."""
+        """Return the first possible proposal, ``B x P``."""
         v = self.proposed()
         first = self.log_ratio(v).isfinite().to(torch.int8).argmax(0)
         return v.take_along_dim(first[None, :, None], 0)[0]
@@ -122,6 +121,7 @@ class _Jumps:
         others = self.proposed()
         here, *ratios = self.log_ratio(torch.cat([v.unsqueeze(0), others]))
         for other, ratio in zip(others, ratios, strict=True):
+            # Accepted with the probability p(v') q(v) / (p(v) q(v')).
             taken = torch.rand(len(v)).to(v) < (ratio - here).exp()
             v = torch.where(taken.unsqueeze(-1), other, v)
             here = torch.where(taken, ratio, here)
@@ -141,6 +141,7 @@ class _Potential(torch.autograd.Function):
         """Return the sum of all problems."""
         value, slope = density(v.unsqueeze(0))
         ctx.save_for_backward(v - slope[0])
+        # -log L(v) - log N(v | 0, I)
         return (0.5 * v.square().sum() - value.sum()).nan_to_num(posinf=1e10)
 
     @staticmethod

@@ -13,6 +13,7 @@ from gpadjust.core.gaussian import Marginals
 
 def correlation_root(K: Tensor) -> Tensor:
     """Return a lower root of covariances, with a jitter relative to each variance."""
+    # K = D R D, and R = L L^T: D L is the root.
     sd = K.diagonal(dim1=-1, dim2=-2).clamp_min(1e-300).sqrt()
     R = K / (sd.unsqueeze(-1) * sd.unsqueeze(-2))
     eye = torch.eye(K.shape[-1]).to(K)
@@ -36,14 +37,6 @@ class _MultitaskNormal(MultitaskMultivariateNormal, _Normal):
     """The same of several outputs."""
 
 
-def _joint(mean: Tensor, K: Tensor) -> MultivariateNormal:
-    """Return the distribution of means ``... x m x q`` and a covariance ``... x m q x m q``."""
-    lazy = to_linear_operator(K)  # without a factor until one is asked for
-    if mean.shape[-2] == 1:
-        return _Normal(mean.squeeze(-2), lazy)
-    return _MultitaskNormal(mean.mT, lazy, interleaved=False)
-
-
 def _block_diagonal(K: Tensor) -> Tensor:
     """Return ``... x m q x m q`` of covariances ``... x m x q x q``."""
     if K.shape[-3] == 1:
@@ -56,19 +49,25 @@ class MixturePosterior(GPyTorchPosterior):
     """A mixture of ``S`` equally likely Gaussians, each of independent outputs.
 
     Their means are ``... x S x m x q``, their covariances ``... x S x m x q x q``. To BoTorch it is
-    one posterior over ``... x q x m``, without a dimension for the draws. Samples are exact: each
-    is of one component, which one further base sample picks. The ``distribution``, which BoTorch
-    takes where it asks for a Gaussian, has the joint mean and covariance.
+    one posterior over ``... x q x m``, without a dimension for the draws. A sample is exactly of
+    one component, which one further base sample picks. The Gaussian ``distribution`` has the joint
+    mean and covariance.
     """
 
     def __init__(self, mean: Tensor, covariance: Tensor) -> None:
         shape = torch.broadcast_shapes(mean.shape, covariance.shape[:-1])
         mean, covariance = mean.expand(shape), covariance.expand(*shape, shape[-1])
         self.gaussians = (mean, covariance)
+        # The mean of the covariances, and the covariance of the means.
         center = mean.mean(-3)
         away = (mean - center.unsqueeze(-3)).flatten(-2)  # ... x S x m q
         between = away.mT @ away / away.shape[-2]
-        super().__init__(_joint(center, _block_diagonal(covariance.mean(-4)) + between))
+        # Without a factor until one is read.
+        lazy = to_linear_operator(_block_diagonal(covariance.mean(-4)) + between)
+        if center.shape[-2] == 1:
+            super().__init__(_Normal(center.squeeze(-2), lazy))
+        else:
+            super().__init__(_MultitaskNormal(center.mT, lazy, interleaved=False))
 
     @property
     def base_sample_shape(self) -> Size:
@@ -85,7 +84,7 @@ class MixturePosterior(GPyTorchPosterior):
 
     @property
     def variance(self) -> Tensor:
-        """The variances, ``... x q x m``, however small."""
+        """The variances, ``... x q x m``, without a lower bound."""
         return self.marginals.prediction.variance
 
     @property
@@ -116,13 +115,14 @@ class MixturePosterior(GPyTorchPosterior):
         # Components in front, batches behind samples: pick without expanding the roots.
         flat_mean = mean.reshape(-1, S, m, q)
         flat_root = correlation_root(K).reshape(-1, S, m, q, q)
-        which, z = which.reshape(-1, len(flat_mean)), z.reshape(-1, len(flat_mean), m, q)
+        which = which.reshape(-1, len(flat_mean))
+        z = z.reshape(-1, len(flat_mean), m, q)
         rows = torch.arange(len(flat_mean), device=which.device).expand_as(which)
-        drawn = flat_mean[rows, which] + _products(flat_root, z, rows, which)
-        return drawn.reshape(*shape, m, q).mT
+        samples = flat_mean[rows, which] + _products(flat_root, z, rows, which)  # mu + L z
+        return samples.reshape(*shape, m, q).mT
 
     def quantile(self, value: Tensor) -> Tensor:
-        """Return quantiles ``... x q x m`` of the mixture; several levels are in front."""
+        """Return quantiles ``... x q x m`` of the mixture, with several levels in front."""
         levels = value.flatten().tolist()
         quantiles = [self.marginals.quantile(level) for level in levels]
         return torch.stack(quantiles) if value.numel() > 1 else quantiles[0]
@@ -138,6 +138,7 @@ class MixturePosterior(GPyTorchPosterior):
         if weights.shape != (m,):
             raise ValueError(f"Expected weights of {m} outputs; found {tuple(weights.shape)}.")
         w = weights.to(mean).unsqueeze(-1)
+        # sum_j w_j y_j has the variance sum_j w_j^2 K_j.
         total = (w * mean).sum(-2, keepdim=True) + offset
         return MixturePosterior(total, (w.square().unsqueeze(-1) * K).sum(-3, keepdim=True))
 
@@ -146,11 +147,11 @@ def _products(root: Tensor, z: Tensor, rows: Tensor, which: Tensor) -> Tensor:
     """Return the picked roots ``b x S x m x q x q`` times ``N x b x m x q``."""
     if root.shape[-1] == 1:
         return root[rows, which].squeeze(-1) * z
-    drawn = torch.zeros_like(z)
+    products = torch.zeros_like(z)
     for s in range(root.shape[1]):
-        mine = which == s
-        if mine.any():
-            at = mine.nonzero()
-            part = (root[at[:, 1], s] @ z[mine].unsqueeze(-1)).squeeze(-1)
-            drawn = drawn.index_put((at[:, 0], at[:, 1]), part)
-    return drawn
+        is_picked = which == s
+        if is_picked.any():
+            samples, batches = is_picked.nonzero().unbind(-1)
+            part = (root[batches, s] @ z[is_picked].unsqueeze(-1)).squeeze(-1)
+            products = products.index_put((samples, batches), part)
+    return products

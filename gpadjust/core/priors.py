@@ -39,11 +39,13 @@ def priors(model: Any) -> Priors:
     ends = torch.tensor([0.5, 0.025, 0.975]).to(model.u)
     numbers = numbers_of(model, table.with_choice(u, 0))
     rows = [
-        [each.name, output, *each.draws.quantile(ends).tolist(), each.meaning]
-        for (output, _), each in numbers.items()
+        [number.name, output, *number.draws.quantile(ends).tolist(), number.meaning]
+        for (output, _), number in numbers.items()
     ]
     frame = Priors(rows, columns=["name", "output", "median", "2.5 %", "97.5 %", "meaning"])
-    after = numbers_of(model, model.draws) if model.is_fitted else {}
-    frame.prior = [each.draws for each in numbers.values()]
-    frame.posterior = [after[key].draws for key in numbers] if after else None
+    frame.prior = [number.draws for number in numbers.values()]
+    frame.posterior = None
+    if model.is_fitted:
+        after = numbers_of(model, model.draws)
+        frame.posterior = [after[key].draws for key in numbers]
     return frame

@@ -20,8 +20,8 @@ class LogLikelihood(Protocol):
         """Return values ``N x B`` at ``N x B x P``, and gradients (zeros if not asked for)."""
 
 
-GROUPS = 2  # of draws that are resampled apart, so that their difference shows the error
-_SHARE = 0.5  # of the kept number of draws, so many count after each step of the power
+GROUPS = 2  # of draws that are resampled apart; their difference is the error
+_SHARE = 0.5  # of the resulting draws, that count after each step of the power
 _MOVES, _LAST_MOVES = 3, 4  # of each draw after a step of the power, and after the last step
 _LEAPS = 3  # steps of the Hamiltonian dynamics in a move
 _FIRST_LENGTH = 0.3  # of these steps, in standard deviations of the draws
@@ -32,8 +32,8 @@ _GAIN = 0.01  # log density, of all searches together, below which there is no f
 WIDER = 1.5  # standard deviations of a start, in those of Laplace's approximation
 _STEP = 0.1  # of differences for the Hessian, in standard deviations of the prior or posterior
 _PASSES = 3  # over the Hessian, each with steps by the last
-_REFINED = 10  # of a precise one, at most, until the evidence changes by less than
-_SETTLED = 0.05
+_REFINED = 10  # of a precise one, at most
+_SETTLED = 0.05  # change of the log evidence below which it is precise
 
 
 class Normal(NamedTuple):
@@ -44,6 +44,7 @@ class Normal(NamedTuple):
 
     def log_density(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Return log densities ``N x B`` at ``N x B x P``, and their gradients."""
+        # log N(u | m, L L^T) = -|w|^2 / 2 - log |L| - P log(2 pi) / 2, w = L^-1 (u - m)
         white = torch.linalg.solve_triangular(self.root, (u - self.mean).unsqueeze(-1), upper=False)
         log_det = self.root.diagonal(dim1=-1, dim2=-2).log().sum(-1)
         size = log_det + 0.5 * u.shape[-1] * math.log(2 * math.pi)
@@ -67,10 +68,10 @@ def sample(
 ) -> Draws:  # fmt: skip
     r"""Draw from :math:`N(u | 0, I) \, L(u)` by sequential Monte Carlo (Del Moral et al. 2006).
 
-    Draws of a start, ``first`` times as many as are kept, are weighted by a power of the ratio of
-    the posterior to the start, as large as half of them still count, resampled and moved by
-    Hamiltonian Monte Carlo; the power rises until it is 1. Where a start is so good that more draws
-    count than are kept, they are not moved.
+    Draws of a start, ``first`` times as many as result, are weighted by a power of the ratio of the
+    posterior to the start, as large as half of them still count, resampled and moved by Hamiltonian
+    Monte Carlo; the power rises until it is 1. They are not moved if more of them count than
+    result.
 
     Args:
         log_likelihood: L of ``B`` problems.
@@ -78,11 +79,12 @@ def sample(
         number: Number of draws, an even one.
         seed: Seed.
         start: The start. Default: the prior.
-        first: How many draws begin for each that is kept.
+        first: How many draws begin for each one that results.
         with_moves: Whether draws are moved; without, they are weighted and resampled once.
         points: Draws of the start from N(0, I), if not random ones, ``(first number) x B x P``.
     """
-    generator, shape = torch.Generator().manual_seed(seed), like.shape
+    shape = like.shape
+    generator = torch.Generator().manual_seed(seed)
     eye = torch.eye(shape[1]).to(like).expand(shape[0], -1, -1)
     prior = Normal(torch.zeros_like(like), eye)
     begin = prior if start is None else start
@@ -91,35 +93,42 @@ def sample(
         value, slope = log_likelihood(u, with_gradient)
         if start is None:
             return value, slope
-        (a, by_a), (b, by_b) = prior.log_density(u), start.log_density(u)
+        # log L(u) + log N(u | 0, I) - log q(u)
+        a, by_a = prior.log_density(u)
+        b, by_b = start.log_density(u)
         return value + a - b, slope + by_a - by_b
 
-    u = standard_normal((first * number, *shape), generator, like) if points is None else points
-    u = begin.mean + (begin.root @ u.unsqueeze(-1)).squeeze(-1)
+    if points is None:
+        points = standard_normal((first * number, *shape), generator, like)
+    u = begin.mean + (begin.root @ points.unsqueeze(-1)).squeeze(-1)
     value, slope = ratio(u, False)
-    power, evidence = like.new_zeros(shape[0]), like.new_zeros(GROUPS, shape[0])
+    power = like.new_zeros(shape[0])
+    evidence = like.new_zeros(GROUPS, shape[0])
     length = torch.full_like(power, _FIRST_LENGTH)
     problems = torch.arange(shape[0], device=like.device)
-    least, effective = _SHARE * number, None
+    effective = None
     while True:
         # The highest power at which enough draws count.
-        step = _step(value, power, least if with_moves else 0.0)
+        step = _step(value, power, _SHARE * number * with_moves)
         logs = (step * value).nan_to_num(nan=-math.inf)
         halves = logs.reshape(GROUPS, -1, shape[0])
+        # The evidence is the product of the mean weights.
         evidence = evidence + halves.logsumexp(1) - math.log(halves.shape[1])
-        power, weights = power + step, logs.softmax(0)
+        power = power + step
+        weights = logs.softmax(0)
         is_first = effective is None
         if effective is None:
             effective = weights.square().sum(0).reciprocal()
             with_moves = with_moves and (start is None or bool((effective < number).any()))
         is_done = bool((power >= 1).all()) or not with_moves
         # Resample, and move.
-        root = _root(u, weights, None if start is None else start.root / WIDER)
-        kept = _resampled(halves, number // GROUPS, generator)
-        u, value, slope = u[kept, problems], value[kept, problems], slope[kept, problems]
+        root = _root(u, weights, start)
+        chosen = _resampled(halves, number // GROUPS, generator)
+        u, value, slope = (part[chosen, problems] for part in (u, value, slope))
         if is_first and with_moves:
             value, slope = ratio(u)
-        for _ in range((_LAST_MOVES if is_done else _MOVES) * with_moves):
+        moves = _LAST_MOVES if is_done else _MOVES
+        for _ in range(moves * with_moves):
             here = (u, value, slope)
             u, value, slope, rate = _move(ratio, begin, here, power, root, length, generator)
             length = length * (rate - _ACCEPTED).exp()
@@ -131,9 +140,9 @@ def _move(
     ratio: LogLikelihood, begin: Normal, here: tuple[Tensor, Tensor, Tensor],
     power: Tensor, root: Tensor, length: Tensor, generator: torch.Generator,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Move draws, their values and slopes by Hamiltonian dynamics; return them and acceptance.
+    """Move draws of begin x ratio^power, their values and slopes; return them and acceptance.
 
-    The density is begin x ratio^power; momenta are N(0, I) where ``root`` makes draws white.
+    Hamiltonian dynamics have momenta N(0, I) in coordinates in which ``root`` makes draws white.
     """
     u, value, slope = here
     t = power.unsqueeze(-1)
@@ -145,39 +154,42 @@ def _move(
     jitter = torch.rand(u.shape[:-1], generator=generator, dtype=u.dtype).to(u)
     leap = (length * (0.6 + 0.8 * jitter)).unsqueeze(-1)
     prior, by_prior = begin.log_density(u)
+    # Minus the energy: log density - |p|^2 / 2.
     energy = power * value + prior - 0.5 * p.square().sum(-1)
     new, new_value, new_slope = here
+    # Leapfrog steps: half a step of p, steps of u and p by turns, and half a step of p.
     p = p + 0.5 * leap * force(slope, by_prior)
     for i in range(_LEAPS):
         new = (new + leap * (root @ p.unsqueeze(-1)).squeeze(-1)).clamp(-_FAR, _FAR)
         new_value, new_slope = ratio(new)
         prior, by_prior = begin.log_density(new)
-        half = 0.5 if i + 1 == _LEAPS else 1.0
-        p = p + half * leap * force(new_slope, by_prior)
+        share = 0.5 if i + 1 == _LEAPS else 1.0
+        p = p + share * leap * force(new_slope, by_prior)
     after = power * new_value + prior - 0.5 * p.square().sum(-1)
     chance = (after - energy).exp().nan_to_num(nan=0.0).clamp_max(1.0)
     taken = torch.rand(chance.shape, generator=generator, dtype=u.dtype).to(u) < chance
-    moved = taken.unsqueeze(-1)
-    u, slope = torch.where(moved, new, u), torch.where(moved, new_slope, slope)
+    u = torch.where(taken.unsqueeze(-1), new, u)
+    slope = torch.where(taken.unsqueeze(-1), new_slope, slope)
     return u, torch.where(taken, new_value, value), slope, chance.mean(0)
 
 
 def _step(value: Tensor, power: Tensor, least: float) -> Tensor:
-    """Return the largest steps of the power, ``B``, after which so many draws count."""
+    """Return the largest steps of the power, ``B``, after which enough draws count."""
 
     def counts(step: Tensor) -> Tensor:
+        # 1 / sum_i w_i^2, the effective number (Kong 1992)
         weights = (step * value).nan_to_num(nan=-math.inf).softmax(0)
         return weights.square().sum(0).reciprocal()
 
-    left = 1 - power
-    low, high = torch.zeros_like(left), left
+    left = high = 1 - power
     if bool((counts(left) >= least).all()):
         return left
-    low = torch.where(counts(left) >= least, left, low)
+    low = torch.where(counts(left) >= least, left, torch.zeros_like(left))
     middle = 0.1 * high
-    for _ in range(40):
-        enough = counts(middle) >= least
-        low, high = torch.where(enough, middle, low).maximum(low), torch.where(enough, high, middle)
+    for _ in range(40):  # bisection of the logarithm
+        is_enough = counts(middle) >= least
+        low = torch.where(is_enough, middle, low).maximum(low)
+        high = torch.where(is_enough, high, middle)
         middle = torch.where(low > 0, (low * high).sqrt(), 0.1 * high).minimum(left)
     return low.where(low > 0, high).minimum(left)
 
@@ -195,17 +207,17 @@ def _resampled(logs: Tensor, number: int, generator: torch.Generator) -> Tensor:
     return (drawn + shift).reshape(-1, problems)
 
 
-def _root(u: Tensor, weights: Tensor, expected: Tensor | None) -> Tensor:
-    """Return a root of the draws' covariances.
-
-    As far as draws are few it is that of an expected root ``B x P x P``, or of their diagonals.
-    """
+def _root(u: Tensor, weights: Tensor, start: Normal | None) -> Tensor:
+    """Return a root of covariances of few draws, shrunk to Laplace's or to their diagonals."""
     away = u - (weights.unsqueeze(-1) * u).sum(0)
     covariance = torch.einsum("nb,nbi,nbj->bij", weights, away, away)
     size = weights.square().sum(0).reciprocal()
     share = (size / (size + u.shape[-1]))[:, None, None]
     diagonal = covariance.diagonal(dim1=-1, dim2=-2).clamp_min(1e-12)
-    few = torch.diag_embed(diagonal) if expected is None else expected @ expected.mT
+    few = torch.diag_embed(diagonal)
+    if start is not None:
+        expected = start.root / WIDER
+        few = expected @ expected.mT
     total = share * covariance + (1 - share) * few
     root, info = torch.linalg.cholesky_ex(total)
     if info.any():  # by rounding errors, as some draws are far narrower than others are wide
@@ -221,22 +233,26 @@ def maximise(
 ) -> Tensor:
     """Return coordinates ``N x B x P`` of high density N(u | 0, I) L(u), by L-BFGS from each of N.
 
-    A precise search begins anew where it ended, as long as that pays: a line search may fail for
-    one problem where others still have a way to go. It takes so many iterations at most.
+    A precise search begins again where it ended, as long as that improves the density: a line
+    search may fail for one problem alone. A search takes ``most`` iterations at most.
     """
-    best, top = u.clone(), u.new_full(u.shape[:2], -math.inf)
+    best = u.clone()
+    top = u.new_full(u.shape[:2], -math.inf)
 
     def negative(flat: object) -> tuple[float, object]:
         point = torch.as_tensor(flat).to(u).reshape(u.shape)
         value, slope = log_likelihood(point)
         density = value - 0.5 * point.square().sum(-1)
-        better = density > top
-        top[better], best[better] = density[better], point[better]
+        is_better = density > top
+        top[is_better] = density[is_better]
+        best[is_better] = point[is_better]
         density = density.nan_to_num(neginf=-1e10)
         return -float(density.sum()), (point - slope).nan_to_num().flatten().cpu().numpy()
 
-    options = {"maxiter": most} | ({} if is_precise else {"ftol": 1e-5})
-    for _ in range(_SEARCHES if is_precise else 1):
+    options: dict[str, float] = {"maxiter": most}
+    if not is_precise:
+        options["ftol"] = 1e-5
+    for _ in range(max(1, _SEARCHES * is_precise)):
         before = float(top.nan_to_num(neginf=-1e10).sum())
         start = best.flatten().cpu().numpy()
         minimize(negative, start, jac=True, method="L-BFGS-B", options=options)
@@ -251,12 +267,13 @@ def around_mode(
 ) -> tuple[Normal, Tensor]:
     """Return Laplace's approximation at a mode ``B x P``, made wider, and the log evidence by it.
 
-    The Hessian is that of central differences of the gradient, along the coordinates that have any
-    influence. Their steps are a tenth of the prior's range, or of the posterior's if that is less.
-    A precise one is then refined along the axes of the posterior, as parameters may be known by a
-    combination a million times better than by another; the mode by Newton's steps.
+    The Hessian is by central differences of the gradient, along coordinates that have an influence,
+    with steps of a tenth of a standard deviation of the prior, or of the posterior if that is less.
+    A precise one is refined along the axes of the posterior, of which one may be a million times
+    longer than another; the mode by Newton's steps.
     """
-    p, here = mode.shape[-1], mode.unsqueeze(0)
+    p = mode.shape[-1]
+    here = mode.unsqueeze(0)
     _, at_random = log_likelihood(here + 0.1)
     moved = (at_random[0] != 0).any(0).nonzero().flatten()
     hessian = mode.new_zeros(len(mode), p, p)
@@ -268,12 +285,13 @@ def around_mode(
         rows = (down - up).movedim(0, -2) / (2 * step[:, moved].unsqueeze(-1))
         hessian[:, moved.unsqueeze(-1), moved] = rows.nan_to_num()[..., moved]
     root = _whitening(hessian, torch.eye(p).to(mode).expand_as(hessian), is_precise)
+    # log Z = log L(mode) - |mode|^2 / 2 + log |root|
     evidence = value[0] - 0.5 * mode.square().sum(-1) + torch.linalg.slogdet(root).logabsdet
-    for _ in range(_REFINED if is_precise else 0):
-        white, before = partial(white_density, log_likelihood, mode, root), evidence
-        mode = (
-            mode + (root @ maximise(white, torch.zeros_like(here), True)[0].unsqueeze(-1))[..., 0]
-        )
+    for _ in range(_REFINED * is_precise):
+        before = evidence
+        white = partial(white_density, log_likelihood, mode, root)
+        step = maximise(white, torch.zeros_like(here), True)[0]
+        mode = mode + (root @ step.unsqueeze(-1))[..., 0]
         moves = _STEP * torch.eye(p).to(mode).unsqueeze(1).expand(-1, len(mode), -1)
         white = partial(white_density, log_likelihood, mode, root)
         value, slope = white(torch.cat([torch.zeros_like(here), moves, -moves]))
@@ -303,14 +321,14 @@ def white_density(
 
 
 def _whitening(hessian: Tensor, root: Tensor, is_precise: bool) -> Tensor:
-    """Return a root of the posterior's covariance.
+    """Return a root of the posterior's covariance, by the Hessian of minus the log likelihood.
 
-    The Hessian of minus the log likelihood, ``B x P x P``, is that by coordinates along the columns
-    of another root. Negative curvature counts as none; in a precise search, where it is an error of
-    steps that were too long, as if it were positive.
+    This is by coordinates along the columns of another root. Negative curvature counts as zero; in
+    a precise search, where it is an error of too long steps, as positive.
     """
     values, vectors = torch.linalg.eigh(0.5 * (hessian + hessian.mT))
     values = values.abs() if is_precise else values.clamp_min(0.0)
+    # H + R^T R, the precision with that of the prior
     precision = (vectors * values.unsqueeze(-2)) @ vectors.mT + root.mT @ root
     values, vectors = torch.linalg.eigh(precision)
     return root @ (vectors * values.maximum(1e-14 * values[..., -1:]).rsqrt().unsqueeze(-2))

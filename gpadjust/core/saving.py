@@ -27,12 +27,12 @@ from gpadjust.physics import PhysicsError
 from gpadjust.physics.import_path import import_path, is_formula, physics_from_path
 
 _FORMAT = 5
-_COMPARED = 100  # rows whose covariances with all others tell kernels apart
-_PARTS = (Kernel, Noise, InputTransform)  # of a model, which a file may hold
+_COMPARED = 100  # rows whose covariances with all others distinguish kernels
+_PARTS = (Kernel, Noise, InputTransform)  # of a model, that a file may contain
 
 
 class Saved(NamedTuple):
-    """A file, the import paths of its physics, and which arguments it could not hold."""
+    """A file, the import paths of its physics, and arguments that it does not contain."""
 
     path: Path
     physics: tuple[str, ...]
@@ -43,13 +43,12 @@ def save(model: GP | StackedGP, path: str | Path) -> Saved:
     """Save a model: its class, settings, data and draws, and its physics by the import path.
 
     Arguments that are not plain values (kernels, noises and transforms without ``settings``,
-    lambdas, and the terms of a plain ``GP``) are to be given to :func:`load` again. The file is
-    written under a fresh name and renamed: it is complete or not there, and a symbolic link at
-    ``path`` is replaced.
+    lambdas, and the terms of a plain ``GP``) are to be passed to :func:`load`. The file is written
+    under a fresh name and renamed, so that it is complete.
 
     Args:
-        model: The model, or a mixture of several. A class of one's own takes train_X, train_Y and
-            train_Yvar first, and its ``settings`` are all its other arguments but ``physics``.
+        model: The model, or a mixture of several. A subclass of ``GP`` takes train_X, train_Y and
+            train_Yvar first, and its ``settings`` are all other arguments but ``physics``.
         path: The file.
 
     Warns:
@@ -85,15 +84,13 @@ def save(model: GP | StackedGP, path: str | Path) -> Saved:
     if isinstance(model, StackedGP):
         models = dict(zip(model.names, model.models, strict=True))
         is_whole = bool((model.picks == model.picks[:, :1]).all())
-        weights = {name: own[0] if is_whole else own for name, own in model.weights.items()}
+        weights = {name: w[0] if is_whole else w for name, w in model.weights.items()}
         mixture = {"class": _path_of(type(model)), "weights": weights}
         mixture["num_components"] = len(model.picks)
-    contents = {name: _content(each) for name, each in models.items()}
-    missing, physics = (
-        [*dict.fromkeys(name for each in contents.values() for name in each[key])]
-        for key in ("missing", "physics")
-    )
-    if any(each is None or each.startswith("__main__:") for each in physics):
+    contents = {name: _content(gp) for name, gp in models.items()}
+    missing = [*dict.fromkeys(name for content in contents.values() for name in content["missing"])]
+    physics = [*dict.fromkeys(name for content in contents.values() for name in content["physics"])]
+    if any(name is None or name.startswith("__main__:") for name in physics):
         warnings.warn(
             f"Other programs cannot import the physics of {path.name}, a lambda or a part of the "
             f"running script. Pass it again: load(path, {_call({'physics', *missing})}).",
@@ -113,21 +110,22 @@ def save(model: GP | StackedGP, path: str | Path) -> Saved:
 def load(path: str | Path, *, trusted: bool = False, **objects: Any) -> Any:
     """Load a model that :func:`save` wrote.
 
-    A stranger's file executes nothing: its class is one of an imported module, and its physics is
-    given, or a formula. Only a trusted file's physics is imported, which runs its module.
+    A file that is not trusted executes nothing: its class is one of an imported module, and its
+    physics is passed, or a formula. The physics of a trusted file is imported, which runs its
+    module.
 
     Args:
         path: The file.
-        trusted: Whether to import a physics that is not given.
-        objects: ``physics``, and what the file could not hold; an error names it. Of a mixture's
-            several physics, given by name, each model takes its own.
+        trusted: Whether to import a physics that is not passed.
+        objects: ``physics``, and other arguments that the file does not contain; an error names
+            them. Of several physics by name each model of a mixture takes its one.
 
     Raises:
         OSError: If the file cannot be read.
         PhysicsError: If a physics fails at the training inputs.
         TypeError: If ``trusted`` is not True or False.
-        ValueError: If the file is another kind or damaged, objects are missing or others than the
-            model was built with, or the class or physics is not imported, or not trusted.
+        ValueError: If the file is of another kind or damaged, objects are missing or differ from
+            those of the saved model, or the class or physics is not imported, or not trusted.
     """
     check_switch("trusted", trusted)
     try:
@@ -142,29 +140,28 @@ def load(path: str | Path, *, trusted: bool = False, **objects: Any) -> Any:
 
 
 def _content(model: GP) -> dict[str, Any]:
-    """Return what the file of a model holds."""
+    """Return the content of the file of a model."""
     data, n = model.data, model.rows_of_fit
     if model.batch_shape or model._outputs is not None or n > len(data.Y):
         raise ValueError(
-            "Expected a model of one data set and all its outputs; found fantasies, or a part of "
-            "the rows or outputs. Save the model that it was made from."
+            "Expected a model of one data set and all its outputs, not fantasies or a part of it."
         )
     parameters = signature(type(model)).parameters.values()
     takes_physics = any(p.name == "physics" or p.kind is p.VAR_KEYWORD for p in parameters)
-    paths = [import_path(each) for each in model.physics] if takes_physics else []
+    paths = [import_path(f_p) for f_p in model.physics if takes_physics]
     settings = {name: v for name, v in model.settings.items() if name != "outcome_transform"}
     learnt = {"noise": model.noise.of_rows(torch.arange(n)), "input_transform": data.transform}
     settings |= {name: v for name, v in learnt.items() if settings.get(name) is not None}
     settings = {name: _packed(value) for name, value in settings.items()}
     missing = [name for name, value in settings.items() if not _is_plain(value)]
     scalings = [term.name for term in model.terms if term.physics is not None]
-    is_mapping = type(model) is not GP and all(each.startswith("rho_") for each in scalings)
+    is_mapping = type(model) is not GP and all(name.startswith("rho_") for name in scalings)
     return {
         "class": _path_of(type(model)),
         "settings": {name: value for name, value in settings.items() if name not in missing},
         "missing": missing + ["physics"] * (None in paths),
         "physics": paths,
-        "physics_names": [each.removeprefix("rho_") for each in scalings if is_mapping],
+        "physics_names": [name.removeprefix("rho_") for name in scalings if is_mapping],
         "rows_of_fit": n,
         "names": [list(data.input_names), list(data.output_names)],
         "built_with": _built_with(model, n),
@@ -177,38 +174,38 @@ def _content(model: GP) -> dict[str, Any]:
     }
 
 
-def _path_of(own: type[Any]) -> str:
+def _path_of(kind: type[Any]) -> str:
     """Return the name of a class and its module; a ValueError if it is inside of a function."""
-    module, name = own.__module__, own.__qualname__
-    if getattr(sys.modules[module], name, None) is not own:
+    module, name = kind.__module__, kind.__qualname__
+    if getattr(sys.modules[module], name, None) is not kind:
         raise ValueError(f"Expected a class of a module; found {name}. Move it out of functions.")
     return f"{module}:{name}"
 
 
-def _class_of(path: str, kind: Any) -> Any:
+def _class_of(path: str, base: Any) -> Any:
     """Return a class by its name, of this library or of a module that is imported."""
     module, _, name = path.partition(":")
     if module.startswith("gpadjust."):
         import_module(module)
-    found = getattr(sys.modules.get(module), name, None)
-    if not isinstance(found, type) or not issubclass(found, kind):
+    kind = getattr(sys.modules.get(module), name, None)
+    if not isinstance(kind, type) or not issubclass(kind, base):
         raise ValueError(f"no class {path} was found; import its module first.")
-    return found
+    return kind
 
 
 def _packed(value: Any) -> Any:
     """Return a noise, kernel or transform as its class and settings, if it has any."""
     if not isinstance(value, _PARTS) or not hasattr(value, "settings"):
         return value
-    settings = {name: _packed(each) for name, each in value.settings.items()}
+    settings = {name: _packed(setting) for name, setting in value.settings.items()}
     return {"class": _path_of(type(value)), "settings": settings}
 
 
 def _unpacked(value: Any) -> Any:
-    """Return what was packed."""
+    """Return the reverse of :func:`_packed`."""
     if not isinstance(value, dict) or value.keys() != {"class", "settings"}:
         return value
-    settings = {name: _unpacked(each) for name, each in value["settings"].items()}
+    settings = {name: _unpacked(setting) for name, setting in value["settings"].items()}
     return _class_of(value["class"], _PARTS)(**settings)
 
 
@@ -223,15 +220,15 @@ def _is_plain(value: Any) -> bool:
 
 @torch.no_grad()
 def _built_with(model: GP, n: int) -> dict[str, Tensor]:
-    """Return numbers at the first n inputs and the prior's middle, which tell models apart."""
+    """Return numbers at the first n inputs and the prior's middle, which distinguish models."""
     values = model.table.values(torch.zeros_like(model.u[:1]))
     places = model.places(model.data.X[:n], values)
-    total = model.term_sum.at(values, places)
+    total = model.term_sum.evaluate(values, places)
     noise = model.noise.of_rows(torch.arange(n)) or model.noise
     numbers = {f"physics {i + 1}": f * model.unit for i, f in enumerate(places.f)}
     numbers["mean"] = total.mean * model.unit
     numbers["noise"] = noise.variance(values, places, True)[..., :n] * model.unit.square()
-    for row in (*model.table.own, *model.table.shared):
+    for row in model.table.rows:
         numbers[f"prior of {row.name}"] = torch.stack([row.location, row.location + row.scale])
     for choice in model.table.choices:
         numbers[f"choice {choice.text} {choice.zeros}"] = torch.tensor(choice.probability)
@@ -241,32 +238,33 @@ def _built_with(model: GP, n: int) -> dict[str, Tensor]:
 def _loaded(content: dict[str, Any], objects: dict[str, Any], trusted: bool) -> Any:
     """Return the model or mixture of a file, with the objects that are given."""
     if content["format"] != _FORMAT:
+        version = f"found {content['format']}, of another version of gpadjust"
+        raise ValueError(f"expected format {_FORMAT}; {version}: fit the model and save it again.")
+    contents = content["models"].values()
+    missing = {name for part in contents for name in part["missing"]}
+    possible = missing | {"physics" for part in contents if part["physics"]}
+    if not missing <= objects.keys() <= possible:
         raise ValueError(
-            f"expected format {_FORMAT}; found {content['format']}, of another version of gpadjust:"
-            " fit the model and save it with this version again."
+            f"expected the arguments that the file does not contain, load(path, {_call(missing)}), "
+            f"and otherwise only its physics; found load(path, {_call(objects)})."
         )
-    contents = content["models"]
-    missing = {name for each in contents.values() for name in each["missing"]}
-    known = missing | {"physics" for each in contents.values() if each["physics"]}
-    if not missing <= objects.keys() <= known:
-        raise ValueError(
-            f"expected what the file could not hold, load(path, {_call(missing)}), and nothing "
-            f"else but its physics; found load(path, {_call(objects)})."
-        )
-    own = content["mixture"]
-    if own is None:
-        return _model(contents[""], objects, trusted)
-    models = {name: _of_mixture(each, objects, trusted) for name, each in contents.items()}
-    return _class_of(own["class"], StackedGP)(models, own["weights"], own["num_components"])
+    mixture = content["mixture"]
+    if mixture is None:
+        return _model(content["models"][""], objects, trusted)
+    models = {n: _of_mixture(part, objects, trusted) for n, part in content["models"].items()}
+    return _class_of(mixture["class"], StackedGP)(
+        models, mixture["weights"], mixture["num_components"]
+    )
 
 
 def _of_mixture(content: dict[str, Any], objects: dict[str, Any], trusted: bool) -> GP:
-    """Return a model of a mixture, of several physics with the one that it was built with."""
+    """Return a model of a mixture, with the one of several physics that it was built with."""
     physics = objects.get("physics")
     takes_one = len(content["physics"]) == 1 and not content["physics_names"]
-    for each in physics.values() if takes_one and isinstance(physics, Mapping) else ():
-        with suppress(ValueError):
-            return _model(content, objects | {"physics": each}, trusted)
+    if takes_one and isinstance(physics, Mapping):
+        for f_p in physics.values():
+            with suppress(ValueError):
+                return _model(content, objects | {"physics": f_p}, trusted)
     return _model(content, objects, trusted)
 
 
@@ -275,8 +273,9 @@ def _model(content: dict[str, Any], objects: dict[str, Any], trusted: bool) -> G
     settings = {name: _unpacked(value) for name, value in content["settings"].items()}
     settings |= {name: objects[name] for name in content["missing"]}
     if content["physics"]:
-        given = objects.get("physics")
-        settings["physics"] = _physics(content, trusted) if given is None else given
+        settings["physics"] = objects.get("physics")
+        if settings["physics"] is None:
+            settings["physics"] = _physics(content, trusted)
     n, X, Y, Yvar = (content[name] for name in ("rows_of_fit", "X", "Y", "Yvar"))
     inputs, outputs = (tuple(map(str, names)) for names in content["names"])
     if (*X.shape, *Y.shape) != (len(X), len(inputs), len(X), len(outputs)):
@@ -284,18 +283,18 @@ def _model(content: dict[str, Any], objects: dict[str, Any], trusted: bool) -> G
     named: Any = X[:n]
     if inputs != names_of(X, "x"):  # kernels and transforms may ask for these
         named = SimpleNamespace(columns=inputs, shape=named.shape, to_numpy=named.numpy)
+    data = [Z[:n] for Z in (Y, Yvar) if Z is not None]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # they came when the model was built
-        data = [named, Y[:n]] if Yvar is None else [named, Y[:n], Yvar[:n]]
-        model: GP = _class_of(content["class"], GP)(*data, **settings)
-    found, saved = _built_with(model, n), content["built_with"]
-    for name in [*found, *saved]:
-        ours, theirs = (numbers.get(name, X.new_zeros(0)) for numbers in (found, saved))
-        same = ours.shape == theirs.shape
-        if not same or not torch.allclose(theirs, ours, 1e-6, 1e-9 * float(ours.abs().max())):
+        model: GP = _class_of(content["class"], GP)(named, *data, **settings)
+    built_with, saved = _built_with(model, n), content["built_with"]
+    for name in [*built_with, *saved]:
+        ours, theirs = (numbers.get(name, X.new_zeros(0)) for numbers in (built_with, saved))
+        is_same = ours.shape == theirs.shape
+        if not is_same or not torch.allclose(theirs, ours, 1e-6, 1e-9 * float(ours.abs().max())):
             raise ValueError(
-                f"it was saved with another {name}: numbers at the training inputs differ. Give "
-                "what the model was built with (several physics in the same order)."
+                f"it was saved with another {name}; pass what the model was built with, several "
+                "physics in the same order."
             )
     model.set_draws(content["u"])
     u = model.u
@@ -305,7 +304,8 @@ def _model(content: dict[str, Any], objects: dict[str, Any], trusted: bool) -> G
         setattr(model, name, content["buffers"][name])
     model.data = model.data._replace(input_names=inputs, output_names=outputs)
     if n < len(Y):
-        model = model.condition_on_observations(X[n:], Y[n:], None if Yvar is None else Yvar[n:])
+        data = [Z[n:] for Z in (Y, Yvar) if Z is not None]
+        model = model.condition_on_observations(X[n:], *data)
     return model.eval()
 
 
@@ -314,8 +314,8 @@ def _physics(content: dict[str, Any], trusted: bool) -> Any:
     for path in content["physics"]:
         if not trusted and not is_formula(path):
             raise ValueError(
-                f"its physics is the code {path}. Give the physics, load(path, physics=...), or "
-                "have it imported if you trust the file, load(path, trusted=True)."
+                f"its physics is the code {path}. Pass the physics, load(path, physics=...), or "
+                "import it if you trust the file, load(path, trusted=True)."
             )
     parts = [physics_from_path(path) for path in content["physics"]]
     if content["physics_names"]:

@@ -22,10 +22,7 @@ _ROUNDS = 1000  # of the search for weights
 
 
 class Wrapper(Predictive):
-    """A model made of fitted models of the same data, the first of which has data and scale.
-
-    A subclass has ``components`` and ``mixture``.
-    """
+    """A model made of fitted models, with data and scale of the first."""
 
     likelihood = None  # FantasizeMixin reads it
 
@@ -70,7 +67,7 @@ class Wrapper(Predictive):
 
     def subset_output(self, idcs: list[int]) -> Self:
         """Return the same of some outputs; a ValueError if there are none of these numbers."""
-        return self.of_models([each.subset_output(idcs) for each in self.models])
+        return self.of_models([model.subset_output(idcs) for model in self.models])
 
     def of_models(self, models: Iterable[GP]) -> Self:
         """Return the same of other models with as many draws."""
@@ -87,8 +84,8 @@ class Wrapper(Predictive):
 class StackedGP(Wrapper):
     r"""The mixture of several models, :math:`p(f(x)) = \sum_k w_k \, p_k(f(x))` (Yao et al. 2018).
 
-    Its components are draws of each model in proportion to the weight. By a weight of each model
-    these are mixed as wholes, by weights of each output the outputs are independent.
+    Its components are draws of each model in proportion to the weight. With weights of each output
+    the outputs are independent.
 
     Args:
         models: Fitted models of the same data, by name.
@@ -106,16 +103,20 @@ class StackedGP(Wrapper):
 
     def __init__(self, models: Mapping[str, GP], weights: Any, num_components: int = 64) -> None:
         _check_models(models)
-        shares, S = _shares(models, weights), checked_whole("num_components", num_components, 1)
+        shares = _shares(models, weights)
+        S = checked_whole("num_components", num_components, 1)
+        # The model of a component is that whose interval of cumulated weights contains it.
         heights = ((torch.arange(S) + 0.5) / S).to(shares).repeat(shares.shape[-1], 1)
         owners = torch.searchsorted(shares.cumsum(0).mT.contiguous(), heights).mT
         used, owners = owners.clamp_max(len(shares) - 1).unique(return_inverse=True)
         names = [[*models][i] for i in used]
         super().__init__(models[name] for name in names)
         self.names = names
-        picks, start = torch.zeros_like(owners), 0
-        for i, name in enumerate(self.names):
-            mine, draws = owners == i, len(models[name].u)
+        picks = torch.zeros_like(owners)
+        start = 0
+        for i, name in enumerate(names):
+            mine = owners == i
+            draws = len(models[name].u)
             numbers = (mine.cumsum(0) - 0.5) * draws / mine.sum(0)  # evenly from all draws
             picks[mine] = start + numbers.long()[mine]
             start += draws
@@ -129,23 +130,20 @@ class StackedGP(Wrapper):
 
     @classmethod
     def by_left_out(cls, models: Mapping[str, GP], num_components: int = 64) -> Self:
-        """Return the mixture of each output with the highest density of left-out targets.
-
-        Expectation maximisation of weights increases the mean of its logarithms.
-        """
+        """Return the mixture of each output with the highest density of left-out targets."""
         _check_models(models)
-        scores = []
-        for model in models.values():
-            density = model.left_out().log_density(model.data.Y)
-            scores.append(density.nan_to_num())  # 0 where one is missing
-        weights = torch.full_like(torch.stack(scores)[:, 0], 1 / len(models))  # K x m
-        for _ in range(_ROUNDS):
-            weights = (torch.stack(scores) + weights.log().unsqueeze(1)).softmax(0).mean(1)
+        densities = [model.left_out().log_density(model.data.Y) for model in models.values()]
+        scores = torch.stack(densities).nan_to_num()  # K x n x m; 0 where one is missing
+        weights = torch.full_like(scores[:, 0], 1 / len(models))
+        for _ in range(
+            _ROUNDS
+        ):  # expectation maximisation: w_k <- mean_i w_k p_ki / sum_l w_l p_li
+            weights = (scores + weights.log().unsqueeze(1)).softmax(0).mean(1)
         return cls(models, weights, num_components)
 
     @property
     def weights(self) -> dict[str, list[float]]:
-        """The weights of each model that has any after rounding, one for each output."""
+        """The weights of each model after rounding, one for each output, if any is positive."""
         return {n: (self.owners == i).double().mean(0).tolist() for i, n in enumerate(self.names)}
 
     def components(
@@ -153,18 +151,16 @@ class StackedGP(Wrapper):
     ) -> tuple[Tensor, Tensor]:
         """Return means and variances of all components, ``... x S x q x m``."""
         parts = [model.components(X, observation_noise) for model in self.models]
-        mean, variance = (torch.cat(each, DRAWS).mT for each in zip(*parts, strict=True))
-        picks, outputs = self.picks, torch.arange(self.num_outputs)
-        return mean[..., picks, outputs, :].mT, variance[..., picks, outputs, :].mT
+        mean, variance = (torch.cat(moments, DRAWS).mT for moments in zip(*parts, strict=True))
+        outputs = torch.arange(self.num_outputs)
+        return mean[..., self.picks, outputs, :].mT, variance[..., self.picks, outputs, :].mT
 
     def mixture(
         self, X: ArrayLike, outputs: list[int] | slice, observation_noise: bool | Tensor
     ) -> MixturePosterior:
         """Return the joint posterior of some outputs, each of its own components."""
-        parts = [
-            model.mixture(X, slice(None), observation_noise).gaussians for model in self.models
-        ]
-        means, covariances = zip(*parts, strict=True)
+        mixtures = [model.mixture(X, slice(None), observation_noise) for model in self.models]
+        means, covariances = zip(*(mixture.gaussians for mixture in mixtures), strict=True)
         mean, K = torch.cat(means, -3), torch.cat(covariances, -4)
         picks, columns = self.picks[:, outputs], torch.arange(self.num_outputs)[outputs]
         return MixturePosterior(mean[..., picks, columns, :], K[..., picks, columns, :, :])
@@ -183,7 +179,7 @@ class StackedGP(Wrapper):
         return StackedFunctions(self, num_functions, num_features, seed)
 
     def summary(self) -> str:
-        """Return the weights, and what each of the models has learnt."""
+        """Return the weights, and the summary of each model."""
         lines = [repr(self)]
         for model, (name, weights) in zip(self.models, self.weights.items(), strict=True):
             shares = ", ".join(f"{weight:.0%}" for weight in weights)
@@ -194,7 +190,7 @@ class StackedGP(Wrapper):
         return f"{type(self).__name__}({len(self.picks)} components of {', '.join(self.names)})"
 
     def _repr_html_(self) -> str:
-        rows = [[name, *(f"{w:.0%}" for w in own)] for name, own in self.weights.items()]
+        rows = [[name, *(f"{w:.0%}" for w in weights)] for name, weights in self.weights.items()]
         return html_table(repr(self), ["weights", *self.data.output_names], rows)
 
 
@@ -208,26 +204,27 @@ class StackedFunctions(Module):
         order = order[torch.arange(number) % len(order)]
         self.owners, picks = model.owners[order], model.picks[order]  # k x m
         outputs = [[j] for j in range(model.num_outputs)]
-        if (picks == picks[:, :1]).all():  # models as wholes
+        if (picks == picks[:, :1]).all():  # all outputs of a component are of the same draw
             outputs = [[*range(model.num_outputs)]]
         self.parts: list[list[Any]] = [[] for _ in outputs]
         for columns, parts in zip(outputs, self.parts, strict=True):
-            start = 0
-            for i, each in enumerate(model.models):
-                rows = (self.owners[:, columns[0]] == i).nonzero().squeeze(-1)
+            start, j = 0, columns[0]
+            for i, gp in enumerate(model.models):
+                rows = (self.owners[:, j] == i).nonzero().squeeze(-1)
                 if len(rows):
-                    own = each.subset_draws(picks[rows, columns[0]] - start).subset_output(columns)
-                    own_seed = seed + columns[0] * len(model.models) + i
-                    parts.append((rows, own.sample_functions(len(rows), own_seed, num_features)))
-                start += len(each.u)
+                    part = gp.subset_draws(picks[rows, j] - start).subset_output(columns)
+                    part_seed = seed + j * len(model.models) + i
+                    functions = part.sample_functions(len(rows), part_seed, num_features)
+                    parts.append((rows, functions))
+                start += len(gp.u)
 
     def forward(self, X: Tensor) -> Tensor:
         """Return the values ``k x ... x q x m`` of all functions at ``... x q x d``."""
         return self._side_by_side(lambda functions, rows: functions(X))
 
-    def each(self, X: Tensor) -> Tensor:
-        """Return the values ``k x q x m`` of each function at points of its own, ``k x q x d``."""
-        return self._side_by_side(lambda functions, rows: functions.each(X[rows]))
+    def evaluate_each(self, X: Tensor) -> Tensor:
+        """Return the values ``k x q x m`` of each function at other points, ``k x q x d``."""
+        return self._side_by_side(lambda functions, rows: functions.evaluate_each(X[rows]))
 
     def _side_by_side(self, evaluate: Callable[[Any, Tensor], Tensor]) -> Tensor:
         values = []
@@ -254,10 +251,11 @@ def _shares(models: Mapping[str, GP], weights: Any) -> Tensor:
     if isinstance(weights, Mapping) and weights.keys() == models.keys():
         weights = [weights[name] for name in models]
     try:
-        shares = torch.stack([torch.as_tensor(w).double().cpu() for w in weights])
+        shares = torch.stack([torch.as_tensor(w).detach().double().cpu() for w in weights])
     except (TypeError, ValueError, RuntimeError):
         shares = torch.zeros(0)
-    shares = shares.detach().unsqueeze(-1) if shares.dim() == 1 else shares.detach()
+    if shares.dim() == 1:
+        shares = shares.unsqueeze(-1)
     shapes = [(len(models), 1), (len(models), next(iter(models.values())).num_outputs)]
     is_right = shares.shape in shapes and bool((shares >= 0).all())
     if not is_right or not torch.allclose(shares.sum(0), shares.new_ones(())):

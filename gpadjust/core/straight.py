@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 _STEP = 0.02  # of differences, in standard deviations of the posterior
 _CHORD = 10  # steps to a solution with the derivatives at the mode, which cost nothing
 _NEWTON = 20  # further steps, with those at the point
-_SOLVED, _FOUND = 1e-5, 1e-3  # standard deviations that it may be away, and another one is away
+_SOLVED = 1e-5  # standard deviations that a solution may be away
+_MISSED = 1e-3  # standard deviations beyond which a solution is another one
 
 
 class Straight:
@@ -32,20 +33,18 @@ class Straight:
     surface f(u), which is mostly small, however curved ridges are by u (Bates and Watts 1980; the
     map of randomize-then-optimize, Bardsley et al. 2014). A call returns the log density by s over
     N(s | 0, I), for :func:`sample`, and its gradient but for that of the determinant.
-
-    Args:
-        model: A model whose physics has unknown parameters.
-        start: Laplace's approximation at the mode.
-        choice: The number of the nested model.
     """
 
     def __init__(self, model: GP, start: Normal, choice: int) -> None:
-        self.model, self.choice, self.mode = model, choice, start.mean
+        self.model = model
+        self.choice = choice
+        self.mode = start.mean  # u_0, of Laplace's approximation
         p = len(model.table.shared)
         # White coordinates w of the parameters: u = u_0 + R w.
         self.root = lower_root(start.root[0, -p:])
         mode = self.mode.new_zeros(1, p)
         self.mean = self._mean(mode)
+        # By w: R^T J^T K^-1 and R^T R.
         J = self._mean_slopes(mode)[0].nan_to_num().mT  # p x m n
         self.by = model.precision_times(self.mode.expand(p, 1, -1), J)
         self.within = self.root.mT @ self.root
@@ -61,6 +60,7 @@ class Straight:
         w, is_solved = self._solution(s)
         u = self._at(w, s)
         slopes = self._slopes(w).nan_to_num()
+        # log p(u) + log |du / ds| - log N(s | 0, I)
         log_det = torch.linalg.slogdet(slopes).logabsdet.masked_fill(~is_solved, math.inf)
         value, slope = self.model.log_likelihood(u, with_gradient, choice=self.choice)
         value = value + 0.5 * (s.square() - u.square()).sum(-1) - log_det.unsqueeze(-1)
@@ -68,18 +68,18 @@ class Straight:
         # du / ds = R (dt / dw)^-1 R^-1, of parameters.
         by_t, _ = torch.linalg.solve_ex(slopes.mT, ((slope - u)[:, 0, -p:] @ self.root)[..., None])
         by_s = torch.linalg.solve_triangular(self.root.mT, by_t[..., 0].mT, upper=True).mT
-        own = slope[..., :-p]
-        return value, torch.cat([own, by_s.unsqueeze(1).nan_to_num() + s[..., -p:]], -1)
+        by_s = by_s.unsqueeze(1).nan_to_num() + s[..., -p:]
+        return value, torch.cat([slope[..., :-p], by_s], -1)
 
     def coordinates(self, s: Tensor) -> Tensor:
         """Return u at s, ``N x B x P``."""
         return self._at(self._solution(s)[0], s)
 
     def points(self, number: int, seed: int) -> Tensor:
-        """Return ``number x B x P`` draws from N(0, I) that are spread evenly, by Sobol in groups.
+        """Return ``number x B x P`` even draws from N(0, I), by Sobol in groups.
 
-        Each group is in the order of the least known combination of parameters, so that draws which
-        are resampled systematically are spread evenly by it, too.
+        Each is in the order of the widest combination of parameters, by which systematically
+        resampled draws are then even, too.
         """
         p, dimension = self.root.shape[-1], self.mode.shape[-1]
         axis = torch.linalg.svd(self.start.root[0, -p:, -p:]).Vh[0]
@@ -92,11 +92,11 @@ class Straight:
         return torch.cat(groups).unsqueeze(1)
 
     def misses(self, u: Tensor) -> Tensor:
-        """Return which of u, ``N x B x P``, are not the coordinates of any s: ``N``."""
+        """Return whether u, ``N x B x P``, are not the coordinates of any s: ``N``."""
         w = self._white(u)
         s = self._at(self._straight(w), u)
         away = self._white(self.coordinates(s)) - w
-        return ~(away.norm(dim=-1) < _FOUND)
+        return ~(away.norm(dim=-1) < _MISSED)
 
     def _white(self, u: Tensor) -> Tensor:
         """Return white coordinates of the parameters, ``N x p``."""
@@ -105,7 +105,7 @@ class Straight:
         return torch.linalg.solve_triangular(self.root, away, upper=False).mT
 
     def _solution(self, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return w at s, ``N x p``, and of which the equation t(w) = R^-1 (s - u_0) is solved."""
+        """Return w at s, ``N x p``, and whether the equation t(w) = R^-1 (s - u_0) is solved."""
         goal = self._white(s)
         w, trial, step = goal.clone(), goal.clone(), torch.zeros_like(goal)
         error, share = s.new_full((len(s),), math.inf), s.new_ones(len(s))
@@ -117,12 +117,13 @@ class Straight:
             away = goal[left] - self._straight(trial[left])
             closer = away.norm(dim=-1) < error[left]
             at, back = left[closer], left[~closer]
-            w[at], error[at] = trial[at], away[closer].norm(dim=-1)
+            w[at] = trial[at]
+            error[at] = away[closer].norm(dim=-1)
             # w <- w + share (dt / dw)^-1 (goal - t), where dt / dw = I at the mode.
             step[at] = away[closer]
             if i >= _CHORD:
-                whole, _ = torch.linalg.solve_ex(self._slopes(w[at]), step[at].unsqueeze(-1))
-                step[at] = whole[..., 0].nan_to_num()
+                newton, _ = torch.linalg.solve_ex(self._slopes(w[at]), step[at].unsqueeze(-1))
+                step[at] = newton[..., 0].nan_to_num()
             share[at] = (4 * share[at]).clamp_max(1.0)
             share[back] /= 4
             left = left[error[left] > _SOLVED]
@@ -133,6 +134,7 @@ class Straight:
 
     def _straight(self, w: Tensor) -> Tensor:
         """Return t, of which s = u_0 + R t, at ``N x p``."""
+        # (R^T (J^T K^-1 J + I) R)^-1 [R^T J^T K^-1 (f - f_0) + R^T R w]
         return ((self._mean(w) - self.mean) @ self.by.mT + w @ self.within) @ self.inverse
 
     def _slopes(self, w: Tensor) -> Tensor:
@@ -153,5 +155,5 @@ class Straight:
     def _at(self, w: Tensor, other: Tensor) -> Tensor:
         """Return u at ``N x p``, with other coordinates than parameters of ``N x B x P``."""
         p = w.shape[-1]
-        parameters = self.mode[..., -p:] + (w @ self.root.mT).unsqueeze(1)
+        parameters = self.mode[..., -p:] + (w @ self.root.mT).unsqueeze(1)  # u_0 + R w
         return torch.cat([other[..., :-p], parameters], -1)

@@ -1,4 +1,4 @@
-"""The structures: each a list of terms. Their arguments and errors are as of GP, and their own."""
+"""The structures: each a list of terms. Other arguments, and errors, are as of :class:`GP`."""
 
 from __future__ import annotations
 
@@ -23,12 +23,10 @@ class CKA(GP):
         \rho \sim GP(1, k_\rho), \quad \delta \sim GP(0, k_\delta),
 
     so that :math:`f_a \sim GP(f_p, F_p k_\rho F_p^T + k_\delta)`: where there are no data, the
-    model falls back to the physics. Both processes contain an unknown constant with a variance of
-    its own, and with ``nested`` the model is averaged with its constants alone,
-    :math:`a f_p + b`, and with :math:`\delta` alone, which ignores the physics; a physics with
-    unknown parameters also with :math:`f_p` as it is.
-
-    Args as of :class:`GP`, and:
+    model falls back to the physics. Both processes contain an unknown constant with its own
+    variance, and with ``nested`` the model is averaged with its constants alone, :math:`a f_p + b`,
+    and with :math:`\delta` alone; a physics with unknown parameters also with :math:`f_p` as it is.
+    Other arguments as of :class:`GP`.
 
     Args:
         physics: The physics f_p, a function of ``n x d`` to ``n x m`` (or ``n``) or a
@@ -36,8 +34,7 @@ class CKA(GP):
             then :math:`f_a = \sum_i \rho_i f_i + \delta`.
         rho_covar_module: :math:`k_\rho`, a kernel of this library or of GPyTorch. Default: RBF.
         delta_covar_module: :math:`k_\delta`. Default: RBF.
-        rho_mean: The prior mean of rho; of several physics one for each. Default: 1, of k physics
-            1 / k.
+        rho_mean: The prior mean of rho, one of each physics. Default: 1, of k physics 1 / k.
         delta_mean: The prior mean of delta, in the user's units.
         center: Whether the kernel of rho is scaled by f_p - c with an unknown c, or the number c;
             the paper's model has 0, as has one whose delta cannot contain a constant.
@@ -46,7 +43,7 @@ class CKA(GP):
             targets.
         nested: Whether nested models are averaged over, with constants and one physics; or the
             nested models.
-        extra_terms: Further terms, which the formula as it is does not have.
+        extra_terms: Further terms.
 
     Example:
         >>> import torch
@@ -65,14 +62,9 @@ class CKA(GP):
         center: bool | float = True, constants: bool | Mapping[str, LogNormal] = True,
         nested: bool | Sequence[Choice] = True, extra_terms: Sequence[Term] = (), **options: Any,
     ) -> None:  # fmt: skip
-        for name, value in {"rho_mean": rho_mean, "delta_mean": delta_mean}.items():
-            if isinstance(value, str):
-                raise TypeError(
-                    f"Expected {name} as a number; found {value!r}. Constants of rho and delta are "
-                    "unknown by default."
-                )
-        if not isinstance(center, bool | int | float):
-            raise TypeError(f"Expected center True (unknown), False or a number; found {center!r}.")
+        for name, value in {"center": center, "delta_mean": delta_mean}.items():
+            if isinstance(value, str | None):
+                raise TypeError(f"Expected {name} as a number, or center=True; found {value!r}.")
         settings = options | {
             "rho_covar_module": rho_covar_module, "delta_covar_module": delta_covar_module,
             "rho_mean": rho_mean, "delta_mean": delta_mean, "center": center,
@@ -100,9 +92,7 @@ class RRA(CKA):
     r"""Ridge regression adjustment: CKA on finitely many random Fourier features.
 
     rho and delta are Bayesian linear models (Wannawas and Faisal 2023, section 2.2), which tend to
-    those of :class:`CKA` as features grow.
-
-    Args as of :class:`CKA` but for its kernels, and:
+    those of :class:`CKA` with more features. Other arguments as of :class:`CKA` but for kernels.
 
     Args:
         num_features: Number of features of each of the two, an even one.
@@ -122,6 +112,7 @@ class RRA(CKA):
             delta_covar_module=Fourier(d, num_features, 2 * seed + 1, DELTA),
             **options,
         )  # fmt: skip
+        # The kernels are made of these.
         del self.settings["rho_covar_module"], self.settings["delta_covar_module"]
         self.settings |= {"num_features": num_features, "seed": seed}
 
@@ -129,8 +120,8 @@ class RRA(CKA):
 class PhysicsMeanGP(GP):
     r"""A Gaussian process with the physics as its mean, :math:`f_a = f_p + \delta`.
 
-    Args as of :class:`GP`; physics and constants as of :class:`CKA`. ``covar_module`` is the kernel
-    of delta, by default RBF.
+    Physics and constants as of :class:`CKA`, others as of :class:`GP`; ``covar_module`` is the
+    kernel of delta, by default RBF.
     """
 
     def __init__(
@@ -149,8 +140,8 @@ class PhysicsMeanGP(GP):
 class ScaleGP(GP):
     r"""An adjustment by a scaling alone, :math:`f_a = \rho f_p`, :math:`\rho \sim GP(1, k)`.
 
-    It cannot adjust where f_p is zero. Args as of :class:`GP`; one physics, and constants, as of
-    :class:`CKA`. ``covar_module`` is the kernel of rho, by default RBF.
+    It cannot adjust where f_p is zero. One physics, and constants, as of :class:`CKA`, others as of
+    :class:`GP`; ``covar_module`` is the kernel of rho, by default RBF.
     """
 
     def __init__(
@@ -168,10 +159,9 @@ class ScaleGP(GP):
 
 
 class ZeroMeanGP(GP):
-    r"""A Gaussian process without physics, around an unknown constant.
+    """A Gaussian process without physics, of a kernel ``covar_module``, by default RBF.
 
-    Args as of :class:`GP`; constants as of :class:`CKA`. ``covar_module`` is the kernel, by default
-    RBF.
+    It varies around an unknown constant, as of :class:`CKA`. Other arguments as of :class:`GP`.
     """
 
     def __init__(
@@ -186,8 +176,8 @@ class ZeroMeanGP(GP):
 class CalibratedPhysics(GP):
     r"""The physics and noise alone, :math:`y = f_p(x; \theta) + \epsilon`: nonlinear regression.
 
-    Where the physics is wrong, intervals of its parameters are too narrow: compare it with
-    :class:`CKA` of the same physics. Args as of :class:`GP`; one physics, with unknown parameters.
+    Where the physics, one with unknown parameters, is wrong, intervals of these are too narrow:
+    compare it with :class:`CKA` of the same physics. Other arguments as of :class:`GP`.
     """
 
     def __init__(
@@ -200,24 +190,28 @@ class CalibratedPhysics(GP):
         )  # fmt: skip
         if not self.physics[0].unknowns:
             raise ValueError(
-                "Expected a physics with unknown parameters; found none in "
-                f"{self.physics[0].name!r}. Name them: unknowns={{'mass': Unknown(1.0, sd=0.5)}}."
+                "Expected a physics with unknown parameters, such as "
+                "unknowns={'mass': Unknown(1.0, sd=0.5)}."
             )
 
 
 def _scalings(physics: Any, means: Any = None) -> tuple[list[Term], list[Any]]:
     """Return a scaling of each physics by its prior mean, and the physics."""
     functions = [*physics] if isinstance(physics, list | tuple) else [physics]
-    names = [f"rho{i + 1}" for i in range(len(functions))] if len(functions) > 1 else ["rho"]
+    names = [f"rho{i + 1}" for i in range(len(functions))]
+    if len(functions) == 1:
+        names = ["rho"]
     if isinstance(physics, Mapping):
-        names, functions = [f"rho_{name}" for name in physics], [*physics.values()]
+        functions = [*physics.values()]
+        names = [f"rho_{name}" for name in physics]
     number = len(functions)
     if not number:
         raise ValueError("Expected at least one physics; found none. Without, take ZeroMeanGP.")
-    means = 1.0 / number if means is None else means
-    means = [means] * number if isinstance(means, int | float) else [*means]
-    if len(means) != number:
-        raise ValueError(f"Expected rho_mean for each of {number} physics; found {means}.")
+    if means is None:
+        means = 1.0 / number
+    means = [*means] if isinstance(means, list | tuple) else [means] * number
+    if len(means) != number or any(isinstance(mean, str) for mean in means):
+        raise ValueError(f"Expected rho_mean as numbers, of {number} physics; found {means}.")
     return [Term(names[i], mean=float(means[i]), physics=i) for i in range(number)], functions
 
 
@@ -231,8 +225,10 @@ def _constant(
 
 
 def _plain(constants: bool | Mapping[str, LogNormal]) -> Any:
-    """Return constants as a file can hold them."""
-    return {k: (*v,) for k, v in constants.items()} if isinstance(constants, Mapping) else constants
+    """Return constants as values of a file."""
+    if isinstance(constants, Mapping):
+        return {name: tuple(prior) for name, prior in constants.items()}
+    return constants
 
 
 def _delta(kernel: Any, constants: bool | Mapping[str, LogNormal], name: str = "delta") -> Term:
@@ -241,11 +237,7 @@ def _delta(kernel: Any, constants: bool | Mapping[str, LogNormal], name: str = "
 
 
 def _nested(rho: str, extra_terms: Sequence[Term], physics: Any) -> list[Choice]:
-    """Return the nested models and their prior probabilities.
-
-    A physics with unknown parameters may also be right as it is, which tells these much more of
-    them than a physics up to a factor and an offset does.
-    """
+    """Return the nested models and their prior probabilities."""
     constants = [f"{rho}.constant", "delta.constant"]
     processes = [f"{name}.process" for name in (rho, "delta", *(t.name for t in extra_terms))]
     processes += [f"{t.name}.constant" for t in extra_terms if t.constant is not None]
@@ -255,6 +247,6 @@ def _nested(rho: str, extra_terms: Sequence[Term], physics: Any) -> list[Choice]
         Choice("as it is up to a factor and an offset", 0.175, tuple(processes)),
         Choice("of no use", 0.2, (f"{rho}.mean", f"{rho}.constant", f"{rho}.process")),
     ]
-    if not getattr(physics, "unknowns", None):
+    if not getattr(physics, "unknowns", None):  # which "as it is" determines much better
         choices[1:3] = [choices[2]._replace(probability=0.35)]
     return choices

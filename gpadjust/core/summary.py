@@ -32,23 +32,23 @@ def summary_html(model: Any) -> str:
     """Return the same as tables of HTML."""
     first, *lines = _lines(model)
     table = html_table(first, (), [line.partition(": ")[::2] for line in lines])
-    parameters = model.physics_parameters
-    return table + parameters._repr_html_() if parameters else table
+    if model.physics_parameters:
+        table += model.physics_parameters._repr_html_()
+    return table
 
 
 @torch.no_grad()
 def _lines(model: Any) -> list[str]:
-    """Return what the model is, and the numbers of each output."""
+    """Return the kind and size of the model, and the numbers of each output."""
     values, X = model.table.values(model.draws), model.data.X
     variance = model.noise.variance(values, model.places(X, values, model.noise.has_shares), True)
-    n, d = X.shape[-2:]
-    counts = {"point": n, "input": d, "output": model.num_outputs, "draw": len(model.draws)}
-    parts = [counted(counts)]
-    parts += [] if model.is_fitted else ["not fitted"]
-    parts += [f"of {model.scale_formula}"] if model.scale_formula else []
+    parts = [counted(model)]
+    if not model.is_fitted:
+        parts.append("not fitted")
+    if model.scale_formula:
+        parts.append(f"of {model.scale_formula}")
     lines = [f"{type(model).__name__}: {', '.join(parts)}"]
     for j, name in enumerate(model.data.output_names):
-        own = {key: v[:, j] if v.dim() == 3 else v for key, v in values.items()}
         lines.append(f"{name}:")
         if model.table.choices and len(model.draws) > 1:
             shares = model.table.chosen(values)[:, j].bincount(minlength=len(model.table.choices))
@@ -56,31 +56,35 @@ def _lines(model: Any) -> list[str]:
             pairs = zip(model.table.choices, shares.tolist(), strict=True)
             lines.append(f"  probabilities: {', '.join(f'{c.text} {p:.0%}' for c, p in pairs)}")
         for term in model.terms:
-            lines += _of_term(model, term, own, j)
+            lines += _of_term(model, term, values, j)
         lines += _of_noise(model, variance[..., j, :].sqrt() * model.unit[j], j)
     return lines
 
 
-def counted(counts: dict[str, int]) -> str:
-    """Return numbers of things by their nouns, such as "8 points, 1 input"."""
+def counted(model: Any) -> str:
+    """Return the sizes of a model, such as "8 points, 1 input, 1 output, 16 draws"."""
+    n, d = model.data.X.shape[-2:]
+    counts = {"point": n, "input": d, "output": model.num_outputs, "draw": len(model.draws)}
     return ", ".join(f"{n} {noun}" + "s" * (n != 1) for noun, n in counts.items())
 
 
 def _of_term(model: Any, term: Term, values: Values, j: int) -> list[str]:
-    """Return the numbers of a term of an output, ``N x k``, at the draws that contain them."""
-    everywhere = torch.ones(len(model.draws), 1)
-    kept = values.get(f"{term.name}.process", everywhere).squeeze(-1) != 0
+    """Return the numbers of a term of an output, at the draws that contain them."""
+    numbers = numbers_of_term(model, term, values, j)
+    process = values.get(f"{term.name}.process", torch.ones(len(model.draws), j + 1, 1))
+    varies = process[:, j, 0] != 0
     head = f"  {term.name}: prior mean {term.mean:.4g}"
-    if term.kernel is not None and not kept.all():
-        head += f", varies in {int(kept.sum())} of {len(kept)} draws"
+    if term.kernel is not None and not varies.all():
+        head += f", varies in {int(varies.sum())} of {len(varies)} draws"
     lines = [head]
-    for each in numbers_of_term(model, term, values, j):
-        draws = each.draws
-        if each.is_of_kernel:
-            draws = draws[kept]
-        elif each.name.endswith("constant"):
+    for number in numbers:
+        draws = number.draws
+        if number.is_of_kernel:
+            draws = draws[varies]
+        elif number.name.endswith("constant"):
             draws = draws[draws > 0]
-        lines += [f"    {each.name}: {_text(draws)}"] if len(draws) else []
+        if len(draws):
+            lines.append(f"    {number.name}: {_text(draws)}")
     return lines
 
 
@@ -94,28 +98,25 @@ class Number(NamedTuple):
 
 
 def numbers_of_term(model: Any, term: Term, values: Values, j: int) -> list[Number]:
-    """Return the numbers of a term of an output, at values of it, ``N x k``."""
-    unit = float(model.unit[j]) if term.physics is None else 1.0  # a scaling has none
-    numbers, start = [], f"{term.name}.kernel."
-    for key in values:
-        if key.startswith(start):
-            draws, name = values[key], key.removeprefix(start).replace("raw_", "")
-            if name.endswith("outputscale"):
-                draws, name = draws.sqrt() * unit, name.replace("outputscale", _SD)
-            labels = _labels(model, term, name, draws.shape[-1])
-            meaning = _MEANINGS.get(name, f"a number of the kernel of {term.name}")
-            pairs = zip(labels, draws.unbind(-1), strict=True)
-            numbers += [
-                Number(name + label, each, meaning.format(term.name), True) for label, each in pairs
-            ]
-    if (constant := values.get(f"{term.name}.constant")) is not None:
-        size = constant.squeeze(-1).sqrt() * unit
+    """Return the numbers of a term of an output, at values ``N x m x k``."""
+    unit = float(model.unit[j]) if term.physics is None else 1.0  # a scaling has no unit
+    numbers = []
+    start = f"{term.name}.kernel."
+    for key in (key for key in values if key.startswith(start)):
+        draws, name = values[key][:, j], key.removeprefix(start).replace("raw_", "")
+        if name.endswith("outputscale"):
+            draws, name = draws.sqrt() * unit, name.replace("outputscale", _SD)
+        meaning = _MEANINGS.get(name, f"a number of the kernel of {term.name}").format(term.name)
+        labels = _labels(model, term, name, draws.shape[-1])
+        for label, column in zip(labels, draws.unbind(-1), strict=True):
+            numbers.append(Number(name + label, column, meaning, True))
+    constant, z = (values.get(f"{term.name}.{part}") for part in ("constant", "center"))
+    if constant is not None:
+        size = constant[:, j, 0].sqrt() * unit
         meaning = f"size of the constant in {term.name}"
         numbers.append(Number(f"{_SD} of the constant", size, meaning))
-    if (z := values.get(f"{term.name}.center")) is not None:
-        sums = model.term_sum
-        middle, spread = sums.middle[term.physics or 0], sums.spread[term.physics or 0]
-        center = ((middle + spread * z.unsqueeze(-1)) * model.unit)[..., j, 0]
+    if z is not None:
+        center = (model.term_sum.center(term, values) * model.unit)[:, j, 0]
         numbers.append(Number("center", center, "value of f_p where its scaling changes nothing"))
     return numbers
 
@@ -126,43 +127,45 @@ def numbers_of(model: Any, u: Tensor) -> dict[tuple[str, str], Number]:
     Those of a term that a nested model lacks are its prior's.
     """
     values = model.table.values(u)
-    found = {}
-    for i, (name, unknown) in enumerate(model.physics_parameters.unknowns.items()):
-        draws = model.physics_parameters_at(u).draws[:, i]
+    numbers = {}
+    parameters = model.physics_parameters_at(u)
+    for i, (name, unknown) in enumerate(parameters.unknowns.items()):
         meaning = "a parameter of the physics" + (unknown.unit and f", in {unknown.unit}")
-        found["", name] = Number(name, draws, meaning)
+        numbers["", name] = Number(name, parameters.draws[:, i], meaning)
     noise = model.noise.variance(values, model.places(model.data.X, values), True)
     for j, output in enumerate(model.data.output_names):
-        own = {key: v[:, j] if v.dim() == 3 else v for key, v in values.items()}
         for term in model.terms:
-            for each in numbers_of_term(model, term, own, j):
-                name = f"{term.name} {each.name}"
-                found[output, name] = each._replace(name=name)
+            for number in numbers_of_term(model, term, values, j):
+                name = f"{term.name} {number.name}"
+                numbers[output, name] = number._replace(name=name)
         if model.noise.names:
             sd = noise[..., j, :].mean(-1).sqrt() * float(model.unit[j])
             meaning = "noise of an observation, in the mean"
-            found[output, f"noise {_SD}"] = Number(f"noise {_SD}", sd, meaning)
-    return found
+            numbers[output, f"noise {_SD}"] = Number(f"noise {_SD}", sd, meaning)
+    return numbers
 
 
 def _labels(model: Any, term: Term, name: str, number: int) -> list[str]:
     """Return labels of a kernel's numbers: the inputs, if it has a lengthscale of each."""
-    labels = [""] if number == 1 else [f" {i + 1}" for i in range(number)]
-    if not name.endswith("lengthscale"):
-        return labels
-    names, transform = getattr(term.kernel, "input_names", None), model.data.transform
-    after = "" if transform is None or names is not None else " after the transform"
+    names, transform, after = getattr(term.kernel, "input_names", None), model.data.transform, ""
     if names is None:
         names = model.data.input_names
         if hasattr(transform, "column_names"):
-            names, after = transform.column_names(names), ""
-    labels = [f" of {each}" for each in names] if number == len(names) else labels
-    return [label + after for label in labels]
+            names = transform.column_names(names)
+        elif transform is not None:
+            after = " after the transform"
+    is_length = name.endswith("lengthscale")
+    if is_length and number == len(names):
+        return [f" of {name}{after}" for name in names]
+    if number == 1:
+        return [after * is_length]
+    return [f" {i + 1}{after * is_length}" for i in range(number)]
 
 
 def _of_noise(model: Any, sd: Tensor, j: int) -> list[str]:
     """Return standard deviations ``S x n`` of an output, how far they differ, and outliers."""
-    lines, mask = [], model.noise.is_outlier
+    lines = []
+    mask = model.noise.is_outlier
     if mask is not None and mask[:, j].any():
         rows = mask[:, j].nonzero().flatten().tolist()
         lines = [f"  outliers: rows {', '.join(map(str, rows))}"]
@@ -170,7 +173,8 @@ def _of_noise(model: Any, sd: Tensor, j: int) -> list[str]:
     ends = sd.reshape(-1, sd.shape[-1]).median(0).values
     low, high = (f"{float(end):.3g}" for end in (ends.min(), ends.max()))
     text = f"  noise: {_SD} {_text(sd.square().mean(-1).sqrt())}"
-    text = text if low == high else f"{text}, from {low} to {high} at the training inputs"
+    if low != high:
+        text += f", from {low} to {high} at the training inputs"
     return [text, *lines]
 
 

@@ -20,14 +20,12 @@ class Term(NamedTuple):
 
     Args:
         name: The name.
-        kernel: k; None for none.
+        kernel: k, if any.
         mean: The prior mean of g; in the user's units, where b is 1.
-        constant: The prior of :math:`\kappa`, the variance of an unknown constant in g; None for
-            none.
+        constant: The prior of :math:`\kappa`, the variance of an unknown constant in g, if any.
         physics: The number of the physics that is the basis; None for 1.
         has_center: Whether g's deviation from its mean is multiplied by b - c instead of b, with an
-            unknown c: then a constant in both f_p and the targets makes no difference. The prior
-            mean of the sum does not depend on c. Or the number c.
+            unknown c or the number c; the prior mean of the sum does not depend on it.
     """
 
     name: str
@@ -39,16 +37,16 @@ class Term(NamedTuple):
 
     @property
     def varies(self) -> bool:
-        """Whether g is not just its mean."""
+        """Whether g differs from its mean."""
         return self.kernel is not None or self.constant is not None
 
 
 class Places(NamedTuple):
-    """Where a sum is sought."""
+    """Points at which a sum is evaluated."""
 
     x: Tensor  # inputs of kernels, ... x 1 x 1 x n x d
     f: Sequence[Tensor]  # the outputs of each physics, ... x S x m x n (1 for S)
-    X: Tensor  # the inputs as the user gave them, ... x 1 x 1 x n x d
+    X: Tensor  # the inputs in the user's units, ... x 1 x 1 x n x d
 
 
 @dataclass
@@ -56,7 +54,7 @@ class WeightedSum:
     r"""A sum :math:`\bar f(x) + \sum_t w_t(x) \tilde g_t(x)` at some places, and its covariances.
 
     :math:`\tilde g_t` are the deviations of the terms from their means. The function itself is such
-    a sum, and so are rho, delta and every other part of it.
+    a sum, and so are rho and delta.
     """
 
     terms: Sequence[Term]
@@ -69,8 +67,8 @@ class WeightedSum:
     def of_rows(self, rows: slice | Tensor) -> WeightedSum:
         """Return the sum at some of its places."""
         weights = {name: w[..., rows] for name, w in self.weights.items()}
-        x, mean = self.x[..., rows, :], self.mean[..., rows]
-        return WeightedSum(self.terms, self.values, x, mean, weights)
+        mean = self.mean[..., rows]
+        return WeightedSum(self.terms, self.values, self.x[..., rows, :], mean, weights)
 
     def own(self, term: Term) -> Values:
         """Return the parameters of a term's kernel."""
@@ -80,7 +78,7 @@ class WeightedSum:
     def toward(self, term: Term, x: Tensor) -> Tensor:
         """Return the covariances of a term's kernel at inputs with the places of the sum."""
         if term.name not in self.ready:
-            assert term.kernel is not None, "asked before"
+            assert term.kernel is not None, "checked by the caller"
             self.ready[term.name] = term.kernel.toward(self.own(term), self.x)
         return self.ready[term.name](x)
 
@@ -92,7 +90,7 @@ class WeightedSum:
             if term.kernel is not None:
                 variance = term.kernel.variance(self.own(term), self.x)
                 k = k + self._process(term, variance.unsqueeze(-1)).squeeze(-1)
-            total = total + k * weight.square()
+            total = total + k * weight.square()  # w^2 (k + kappa)
         return total
 
     def cross(self, other: WeightedSum) -> Tensor:
@@ -106,8 +104,9 @@ class WeightedSum:
                 continue
             k = self._constant(term).unsqueeze(-1)
             if term.kernel is not None:
-                point = None if other is self else other.x
-                k = k + self._process(term, term.kernel.covariance(self.own(term), self.x, point))
+                points = (self.x,) if other is self else (self.x, other.x)
+                k = k + self._process(term, term.kernel.covariance(self.own(term), *points))
+            # w (k + kappa) w'
             total = total + k * weight.unsqueeze(-1) * other.weights[term.name].unsqueeze(-2)
         return total
 
@@ -128,17 +127,19 @@ class WeightedSum:
         return total
 
     def with_pull_back(self) -> tuple[Tensor, PullBack]:
-        """Return the covariance, and what gives derivatives by all parameters.
+        """Return the covariance, and a function of D = df/dK that gives df by all parameters.
 
         Derivatives by the weights of physics have the names ``"<term>.weight"``.
         """
-        total, steps = self.x.new_zeros(self.x.shape[-2], self.x.shape[-2]), []
+        total = self.x.new_zeros(self.x.shape[-2], self.x.shape[-2])
+        steps = []
         for term, w in self._parts():
-            column, row, K, back = w.unsqueeze(-1), w.unsqueeze(-2), None, None
+            column, row = w.unsqueeze(-1), w.unsqueeze(-2)
+            K = back = None
             if term.kernel is not None:
                 K, back = term.kernel.with_pull_back(self.own(term), self.x)
                 K = self._process(term, K)
-                total = total + (K * column).mul_(row)
+                total = total + (K * column).mul_(row)  # w_i K_ij w_j
             if term.constant is not None:  # kappa w_i w_j
                 total = torch.addcmul(total, self._constant(term).unsqueeze(-1) * column, row)
             steps.append((term, column, row, K, back))
@@ -148,14 +149,15 @@ class WeightedSum:
             for term, column, row, K, back in steps:
                 by_k = (D * column).mul_(row)
                 if back is not None:
-                    by_own = back(self._process(term, by_k))
-                    by |= {f"{term.name}.kernel.{n}": slope for n, slope in by_own.items()}
+                    by_kernel = back(self._process(term, by_k))
+                    by |= {f"{term.name}.kernel.{n}": slope for n, slope in by_kernel.items()}
                 if term.constant is not None:
                     by[f"{term.name}.constant"] = by_k.sum((-1, -2)).unsqueeze(-1)
                 if term.physics is not None:
                     # Of w_i (K_ij + kappa) w_j it is 2 sum_j D_ij (K_ij + kappa) w_j.
                     by_w = self._constant(term) * (D @ column).squeeze(-1)
-                    by_w = by_w if K is None else by_w + ((D * K) @ column).squeeze(-1)
+                    if K is not None:
+                        by_w = by_w + ((D * K) @ column).squeeze(-1)
                     by[f"{term.name}.weight"] = 2 * by_w
             return by
 
@@ -169,15 +171,15 @@ class WeightedSum:
         Args:
             of_kernels: :math:`\varphi_t` by the names of the terms.
         """
-        parts = [self.mean.unsqueeze(-1)[..., :0]]  # none where no term varies
+        parts = [self.mean.unsqueeze(-1)[..., :0]]  # p = 0 where no term varies
         for term in self.terms:
             w = self.weights.get(term.name, torch.zeros_like(self.mean)).unsqueeze(-1)
             if term.kernel is not None:
                 parts.append(self._process(term, of_kernels[term.name](self.x)) * w)
             if term.constant is not None:
                 parts.append(self._constant(term).sqrt().unsqueeze(-1) * w)
-        lead = torch.broadcast_shapes(*(each.shape[:-1] for each in parts))
-        return torch.cat([each.expand(*lead, each.shape[-1]) for each in parts], -1)
+        lead = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
+        return torch.cat([part.expand(*lead, part.shape[-1]) for part in parts], -1)
 
     def _parts(self) -> list[tuple[Term, Tensor]]:
         """Return the terms that vary and have a weight, without processes that no draw contains."""
@@ -193,7 +195,9 @@ class WeightedSum:
     def _process(self, term: Term, K: Tensor) -> Tensor:
         """Return covariances of a term's process, 0 for draws of nested models without it."""
         process = self.values.get(f"{term.name}.process")
-        return K if process is None else K * process.unsqueeze(-1)
+        if process is None:
+            return K
+        return K * process.unsqueeze(-1)
 
     def _constant(self, term: Term) -> Tensor:
         """Return kappa, ``S x m x 1``."""
@@ -205,7 +209,7 @@ class WeightedSum:
 class TermSum:
     """The terms of a model: their unknown numbers, and the weighted sums that they make.
 
-    It holds the outputs of each physics at the training inputs, ``m x n``, in a unit ``m x 1``.
+    The outputs f of each physics at the training inputs are ``m x n``, in a unit ``m x 1``.
     """
 
     def __init__(self, terms: Sequence[Term], f: Sequence[Tensor], unit: Tensor) -> None:
@@ -215,11 +219,10 @@ class TermSum:
         for term in terms:
             if term.physics is not None and not 0 <= term.physics < len(f):
                 raise ValueError(
-                    f"Term {term.name!r} has physics number {term.physics} of {len(f)}; pass it "
-                    "in physics=[...]."
+                    f"Term {term.name!r} has physics number {term.physics} of {len(f)} in physics=."
                 )
         self.terms = tuple(
-            term if term.physics is not None else term._replace(has_center=False) for term in terms
+            term._replace(has_center=term.physics is not None and term.has_center) for term in terms
         )
         plain = [term.name for term in terms if term.physics is None]
         self.plain = "delta" if "delta" in plain else next(iter(plain), None)
@@ -249,16 +252,17 @@ class TermSum:
         if term.has_center is not True:
             return term.has_center / self.unit
         i = term.physics or 0
+        # c = mean of f_p + 3 sd u
         return self.middle[i] + self.spread[i] * values[f"{term.name}.center"]
 
     def mean_of(self, term: Term, values: Values) -> Tensor | float:
         """Return the prior mean of a term's process, which is zero in some nested models.
 
-        There delta gets c in the place of f_p: a model without physics has its constant for free.
+        There delta has c in the place of f_p: a model without physics keeps its constant.
         """
-        mean = term.mean / (self.unit if term.physics is None else 1.0)
         if term.physics is not None:
-            return mean * values.get(f"{term.name}.mean", 1.0)
+            return term.mean * values.get(f"{term.name}.mean", 1.0)
+        mean = term.mean / self.unit
         if term.name == self.plain:
             for other in self.terms:
                 if (factor := values.get(f"{other.name}.mean")) is not None:
@@ -269,30 +273,31 @@ class TermSum:
         """Return the prior mean of the sum, ``... x S x m x n``."""
         total = torch.zeros_like(places.x[..., 0])
         for term in self.terms:
-            own = self.mean_of(term, values)
-            total = total + (own if term.physics is None else own * places.f[term.physics])
+            mean = self.mean_of(term, values)
+            if term.physics is not None:
+                mean = mean * places.f[term.physics]
+            total = total + mean  # b times the mean of g
         return total
 
-    def at(self, values: Values, places: Places) -> WeightedSum:
+    def evaluate(self, values: Values, places: Places) -> WeightedSum:
         r"""Return the function itself, :math:`\sum_t b_t g_t`."""
         weights = {}
         for term in self.terms:
             b = torch.ones_like(places.x[..., 0])
             if term.physics is not None:
-                b = places.f[term.physics] - self.center(term, values)
+                b = places.f[term.physics] - self.center(term, values)  # f_p - c
             weights[term.name] = b
         return WeightedSum(self.terms, values, places.x, self.mean(values, places), weights)
 
     def term(self, name: str, values: Values, places: Places) -> WeightedSum:
         r"""Return the process of a term in the user's meaning, :math:`f = \sum_t b_t g_t`.
 
-        delta (without one of this name, the first term without a basis) is then its own process
-        less c times each one that has a center:
-        :math:`\rho (f_p - c) + \delta' = \rho f_p + (\delta' - c \tilde\rho)`.
+        delta is the term of this name, or the first without a basis.
         """
         term = next(t for t in self.terms if t.name == name)
         one = torch.ones_like(places.x[..., 0])
         weights = {name: one}
+        # rho (f_p - c) + delta' = rho f_p + (delta' - c (rho - 1)), but for the means
         if name == self.plain:
             centered = [t for t in self.terms if t.has_center]
             weights |= {t.name: -self.center(t, values) * one for t in centered}

@@ -19,11 +19,10 @@ _SMALL = 600  # points of a covariance, up to which two threads took longer than
 
 @contextmanager
 def threads_for(num_points: int) -> Iterator[None]:
-    """Compute a small problem with one thread; the user's settings hold again after.
+    """Compute a small problem with one thread, then with the user's settings again.
 
-    Threads that wait for each other at every small product make a fit take longer, most of all on a
-    busy machine. PyTorch is limited in the calling thread alone, NumPy's and SciPy's libraries in
-    the process, by the first thread that asks.
+    Threads that wait for each other at every small product are slower than one. PyTorch is limited
+    in the calling thread alone, NumPy's and SciPy's libraries in the process, by the first thread.
 
     Example:
         >>> with threads_for(12):
@@ -43,7 +42,8 @@ def _set_own_threads(number: int) -> int:
     """Set the number of threads that PyTorch uses in the calling thread alone; return the last."""
     # PyTorch's own call also sets what new threads begin with; another thread sets that back.
     with _setting, ThreadPoolExecutor(1) as another:
-        before, common = torch.get_num_threads(), another.submit(torch.get_num_threads).result()
+        before = torch.get_num_threads()
+        common = another.submit(torch.get_num_threads).result()
         torch.set_num_threads(number)
         another.submit(torch.set_num_threads, common)
     return before

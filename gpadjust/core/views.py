@@ -1,8 +1,8 @@
 """The model as GPyTorch sees it: its mean, kernel and noise as modules that read the one table.
 
-They have no parameters of their own: all of them are functions of the model's coordinates ``u``,
-and differentiable in it. Values are in the user's units. Draws and outputs are batch dimensions,
-``... x (S) x (m) x n``, which are left out where there is one.
+They have no parameters: all of them are differentiable functions of the model's coordinates ``u``,
+in the user's units. Draws and outputs are batch dimensions, ``... x (S) x (m) x n``, which are left
+out where there is one.
 """
 
 from __future__ import annotations
@@ -10,22 +10,19 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from gpytorch.kernels import AdditiveKernel, Kernel
-from gpytorch.likelihoods import GaussianLikelihood
+from gpytorch.kernels import Kernel
 from gpytorch.likelihoods.noise_models import Noise as NoiseModule
 from gpytorch.means import Mean
 from gpytorch.mlls import AddedLossTerm
 from linear_operator.operators import DiagLinearOperator
 from torch import Tensor
 
-_MISSING = 1e12  # times the unit squared: the noise of a target that was not observed
+_MISSING = 1e12  # variance of the noise of a missing target, in squared units
 
 
 def squeezed(values: Tensor, dim: int) -> Tensor:
     """Return values ``... x S x m x n (x n)`` without S and m (at ``dim``) where these are 1."""
-    for each in (dim - 1, dim):
-        values = values.squeeze(each) if values.shape[each] == 1 else values
-    return values
+    return values.squeeze(tuple(i for i in (dim - 1, dim) if values.shape[i] == 1))
 
 
 def _of_all(values: Tensor, model: Any, dim: int) -> Tensor:
@@ -35,7 +32,7 @@ def _of_all(values: Tensor, model: Any, dim: int) -> Tensor:
 
 
 class _View:
-    """What reads a model, which is no part of it."""
+    """A reader of a model, which does not contain it."""
 
     model: Any
 
@@ -49,7 +46,7 @@ class MeanView(_View, Mean):
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the mean at ``... x n x d``."""
-        return _of_all(self.model.at(x).mean * self.model.unit, self.model, -2)
+        return _of_all(self.model.evaluate(x).mean * self.model.unit, self.model, -2)
 
 
 class TermView(_View, Kernel):
@@ -65,18 +62,12 @@ class TermView(_View, Kernel):
     ) -> Tensor:
         """Return covariances ``... x n x n'``, or variances ``... x n``."""
         model = self.model
-        one = model.at(x1)
-        one.weights = {self.name: one.weights[self.name]}
+        one = model.evaluate(x1)
+        one.weights = {self.name: one.weights[self.name]}  # b (k + kappa) b' of one term alone
         if diag:
             return _of_all(one.variance() * model.unit.square(), model, -2)
-        other = one if x2 is x1 else model.at(x2)
+        other = one if x2 is x1 else model.evaluate(x2)
         return _of_all(one.cross(other) * model.unit.square().unsqueeze(-1), model, -3)
-
-
-def kernel_view(model: Any) -> AdditiveKernel:
-    """Return the prior covariance of a model: the sum of its terms' scaled kernels."""
-    terms = [term for term in model.terms if term.varies] or model.terms[:1]  # of zeros
-    return AdditiveKernel(*(TermView(model, term.name) for term in terms))
 
 
 class NoiseView(_View, NoiseModule):
@@ -90,10 +81,7 @@ class NoiseView(_View, NoiseModule):
     def forward(
         self, *params: Any, shape: Any = None, noise: Tensor | None = None, **_: Any
     ) -> DiagLinearOperator:
-        """Return the diagonal covariance of observations ``shape``.
-
-        Shapes of the training targets are taken for these, so that missing ones have no weight.
-        """
+        """Return the diagonal covariance of observations ``shape``, in training of the targets."""
         if noise is not None:
             return DiagLinearOperator(noise)
         X = self.model.data.X
@@ -113,15 +101,8 @@ class NoiseView(_View, NoiseModule):
         return v.expand(*v.shape[:-1], X.shape[-2]) * model.unit.square()
 
 
-def likelihood_view(model: Any) -> GaussianLikelihood:
-    """Return a Gaussian likelihood whose noise is the model's."""
-    likelihood = GaussianLikelihood()
-    likelihood.noise_covar = NoiseView(model)
-    return likelihood
-
-
 class OtherPriors(_View, AddedLossTerm):
-    """What priors of GPyTorch's kernels add to the density of coordinates."""
+    """The log density of priors of GPyTorch's kernels over that of the coordinates."""
 
     def loss(self, *params: Any) -> Tensor:
         """Return the log density, of each output."""

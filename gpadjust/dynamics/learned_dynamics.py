@@ -235,7 +235,7 @@ class LearnedDynamics(Dynamics):
     def sample_functions(self, num_functions: int, seed: int | None = None) -> TransitionFunctions:
         """Draw transition functions from the posterior, without noise; see :class:`Dynamics`."""
         functions: Any = self.model.sample_functions(num_functions, seed, self.num_features)
-        return self._step(functions.each, num_functions)
+        return self._step(functions.evaluate_each, num_functions)
 
     def mean_function(self) -> TransitionFunctions:
         """Return the mean of the predictions, as a function of any ``k`` blocks, with gradients.
@@ -252,7 +252,7 @@ class LearnedDynamics(Dynamics):
             if has_scale:
                 values = model.predict(X).mean
             else:  # no variances, which cost most
-                means = posterior.mean_alone(model.at(X, posterior.train.values))
+                means = posterior.mean_alone(model.evaluate(X, posterior.train.values))
                 values = (means.mean(-3) * model.unit).mT
             return values.unflatten(0, inputs.shape[:-1])
 

@@ -73,7 +73,7 @@ class AR1(GP):
                 )
             with torch.no_grad():
                 low_Y = f_p(as_tensor(low_X, "low_X"))
-        low = Data.of(low_X, low_Y, None, None)
+        low = Data.read(low_X, low_Y, None, None)
         sizes = [len(names_of(train_X, "x")), len(names_of(train_Y, "y"))]
         if sizes != [low.X.shape[-1], low.Y.shape[-1]]:
             raise ValueError(

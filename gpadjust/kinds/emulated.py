@@ -159,7 +159,7 @@ class _Components:
         unit = sobol.draw(2 * _PLACES, dtype=X.dtype).to(X)
         places, others = (self.low + self.range * unit).chunk(2)
         self.data = emulator.conditioning()
-        self.places = emulator.at(places)
+        self.places = emulator.evaluate(places)
         mean, K = self.data.joint(self.places)  # S x m x Q (x Q)
         C = MixturePosterior(mean, K).distribution.covariance_matrix
         # C = E Lambda E^T; weights are e_k / sqrt(lambda_k) of the largest eigenvalues.
@@ -174,14 +174,14 @@ class _Components:
         of_means = torch.einsum("smq,mqk->sk", mean - mean.mean(0), weights)
         self.weights = [weights, solved @ weights, of_means]  # m x Q x K, S x m x n x K, S x K
         # Omitted components, and errors between places, increase the size of all components.
-        function = emulator.at(others)
+        function = emulator.evaluate(others)
         explained = self._moments(function)[1].square().sum().clamp_min(1e-300)
         factor = (self._variance(function).sum() / explained).sqrt()
         self.weights = [factor * part for part in self.weights]
 
     def evaluate(self, rows: Tensor) -> Tensor:
         """Return the mean and the components at rows ``N x D``, ``N x m x (1 + K)``."""
-        function = self.emulator.at(rows, self.data.train.values)
+        function = self.emulator.evaluate(rows, self.data.train.values)
         mean, components = self._moments(function)
         # Outside the box of the runs there is no place: scale to the emulator's variance.
         is_outside = ((rows < self.low) | (rows > self.low + self.range)).any(-1)

@@ -105,11 +105,11 @@ class NoisyInputs(RowNoise):
             )
 
         def posterior_mean(X: Tensor) -> Tensor:
-            return rough.conditioning().mean(rough.at(X))[0][0]
+            return rough.conditioning().mean(rough.evaluate(X))[0][0]
 
         spread = pad(self.spread.to(X), (0, 0, 0, len(X) - n))
         rough = fitted(self)
-        mean, variance = _moments(lambda X: rough.at(X).mean[0], X, spread)
+        mean, variance = _moments(lambda X: rough.evaluate(X).mean[0], X, spread)
         if not variance.any():  # a prior mean without slope
             mean, variance = _moments(posterior_mean, X, spread)
         if not variance.any():

@@ -58,7 +58,7 @@ def pyro_model(
             X = model.data.new_inputs(X)
         if Y is not None:
             targets = model.on_gaussian_scale(as_tensor(Y, "Y")).mT
-        f = one.at(X, values)
+        f = one.evaluate(X, values)
         phi = design(f)[0] * one.unit.unsqueeze(-1)  # m x n x p
         noise = one.noise.variance(values, one.places(X, values), is_training)[0]
         sd = (noise.sqrt() * one.unit).expand(phi.shape[:-1])

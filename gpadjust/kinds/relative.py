@@ -97,7 +97,7 @@ class RelativeNoise(Noise):
         ranges = (x.amax(-2) - x.amin(-2)).expand(model.num_outputs, -1)
         for _ in range(_ROUNDS):
             rough = fitted(noise)
-            mean, _ = rough.conditioning().mean(rough.at(model.data.X))
+            mean, _ = rough.conditioning().mean(rough.evaluate(model.data.X))
             # g is the absolute posterior mean, with a floor near its zeros.
             sizes = mean[0].abs().maximum(_FLOOR * mean[0].abs().amax(-1, keepdim=True))
             size = sizes.square().mean(-1, keepdim=True).sqrt()

@@ -249,7 +249,7 @@ class Weights:
     def moved_to(self, model: GP, outputs: Any = slice(None)) -> Self:
         """Return the weights for a model on another device, or of some outputs."""
         precision, pull = self.precision[:, outputs].to(model.u), self.pull[:, outputs].to(model.u)
-        return type(self)(model.at(model.data.X), precision, pull)
+        return type(self)(model.evaluate(model.data.X), precision, pull)
 
 
 def design(f: WeightedSum) -> Tensor:

@@ -205,7 +205,7 @@ class VariationalCKA(CKA):
         """
         first = slice(_CANDIDATES * M)
         values = self.table.values(u)
-        total = part_of(self.at(self.data.X, values), _REST, False).of_rows(first)
+        total = part_of(self.evaluate(self.data.X, values), _REST, False).of_rows(first)
         variance = total.variance()[0]
         is_observed = ~self.data.Y[first].isnan().mT
         m, n = is_observed.shape

@@ -137,7 +137,7 @@ def trust(model: Any, X: ArrayLike = None, *, level: float = 0.95) -> Trust:
 def prior_mean(model: Any, X: Tensor) -> Tensor:
     """Return what the model says without data, ``n x m``: its physics, whether of use or not."""
     values = model.table.values(model.table.with_choice(model.u.detach(), 0))
-    mean = (model.at(X, values).mean * model.unit).mT  # S x n x m
+    mean = (model.evaluate(X, values).mean * model.unit).mT  # S x n x m
     prior: Tensor = model.marginals_of(mean, torch.zeros_like(mean)).prediction.mean
     return prior
 

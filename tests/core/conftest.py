@@ -48,7 +48,7 @@ class Dense:
             return default if name not in values else values[name][s, j]
 
         self.names, self.bases, self.means, self.centers, self.kernels = [], [], [], [], []
-        instead = 0.0
+        instead = 0.0  # the mean of delta in the place of f_p
         for term in model.terms:
             size, basis = unit**2, lambda X: torch.ones_like(X[:, 0])
             if term.physics is not None:
@@ -62,7 +62,7 @@ class Dense:
             self.centers.append(c)
             share = number(f"{term.name}.mean", 1.0)
             self.means.append(term.mean * share)
-            instead += (1 - share) * term.mean * c  # of f_p in models without it
+            instead += (1 - share) * term.mean * c
             kappa = number(f"{term.name}.constant", 0.0) * size
             start = f"{term.name}.kernel."
             scale = number(f"{start}outputscale", 0.0) * size * number(f"{term.name}.process", 1.0)
@@ -77,11 +77,8 @@ class Dense:
         if "delta" in self.names:
             self.means[self.names.index("delta")] += instead
         if Yvar is None:
-            self.noise = (
-                (number("noise.variance") + LEAST) * unit**2 * torch.ones(len(self.y)).double()
-            )
-        else:
-            self.noise = Yvar[seen, j]
+            Yvar = (number("noise.variance") + LEAST) * unit**2 * torch.ones_like(Y)
+        self.noise = Yvar[seen, j]
 
     def mean(self, X):
         return sum(mean * b(X) for mean, b in zip(self.means, self.bases, strict=True))
@@ -244,20 +241,27 @@ def drawn():
 
 
 @pytest.fixture
-def same(close):
-    """Asserts that two models say the same at `Z`: joint, one by one, and of each term."""
+def alike(close):
+    """Asserts that the means and the variances of two predictions or posteriors are equal."""
+
+    def alike(p, q, tolerance=1e-8, outputs=slice(None)):
+        close(p.mean, q.mean[..., outputs], tolerance)
+        close(p.variance, q.variance[..., outputs], tolerance)
+
+    return alike
+
+
+@pytest.fixture
+def same(close, alike):
+    """Asserts that two models predict the same at `Z`: joint, one by one, and of each term."""
 
     def same(a, b, Z, tolerance=1e-8, outputs=slice(None), noise=True):
         assert [t.name for t in a.terms] == [t.name for t in b.terms]
-        for ask in (
-            lambda model: model.predict(Z),
-            lambda model: model.predict(Z, observation_noise=noise),
-            lambda model: model.posterior(Z),
-            *(lambda model, name=term.name: model.term(name, Z) for term in a.terms if term.varies),
-        ):
-            p, q = ask(a), ask(b)
-            close(p.mean, q.mean[..., outputs], tolerance)
-            close(p.variance, q.variance[..., outputs], tolerance)
+        alike(a.predict(Z), b.predict(Z), tolerance, outputs)
+        alike(a.predict(Z, noise), b.predict(Z, noise), tolerance, outputs)
+        alike(a.posterior(Z), b.posterior(Z), tolerance, outputs)
+        for name in [term.name for term in a.terms if term.varies]:
+            alike(a.term(name, Z), b.term(name, Z), tolerance, outputs)
         if outputs == slice(None):
             p, q = (m.posterior(Z).distribution.covariance_matrix for m in (a, b))
             close(p, q, tolerance)

@@ -1,16 +1,18 @@
-"""Conditioning on further observations, and fantasies of them."""
+"""Conditioning on further observations, fantasies of them, and targets that are missing."""
 
 import copy
+import pickle
 
 import pytest
 import torch
 from botorch.models.transforms import Normalize
 from botorch.sampling import SobolQMCNormalSampler
+from gpytorch.kernels import MaternKernel
 
-from gpadjust.core import CKA, RRA, CalibratedPhysics, ZeroMeanGP
+from gpadjust.core import CKA, MATERN52, RRA, CalibratedPhysics, Stationary, ZeroMeanGP
 from gpadjust.physics import FunctionPhysics, Unknown
 from tests.core.noises import Relative
-from tests.systems import crude, refused
+from tests.systems import crude
 
 
 def calibrated(X, Y, Yvar=None, cls=CalibratedPhysics):
@@ -79,15 +81,11 @@ def test_batches_of_observations(known, data, drawn, same, uniform, close):
         one = model.condition_on_observations(new_X[i], new_Y[2, i])
         two = one.condition_on_observations(new_X[i, :1] + 0.1, new_Y[2, i, :1])
         for found, single in ((batch, one), (twice, two)):
-            for ask in (
-                lambda model: model.predict(Z),
-                lambda model: model.posterior(Z),
-                lambda model: model.rho(Z),
-                lambda model: model.delta(Z),
-            ):
-                assert ask(found).mean.shape == (4, 3, 5, 2)
-                close(ask(found).mean[2, i], ask(single).mean)
-                close(ask(found).variance.expand(4, 3, 5, 2)[2, i], ask(single).variance)
+            for ask in ("predict", "posterior", "rho", "delta"):
+                many, expected = getattr(found, ask)(Z), getattr(single, ask)(Z)
+                assert many.mean.shape == (4, 3, 5, 2)
+                close(many.mean[2, i], expected.mean)
+                close(many.variance.expand(4, 3, 5, 2)[2, i], expected.variance)
             close(found.interval(Z)[0][2, i], single.interval(Z)[0])
             own = found.predict(Z + torch.arange(3).reshape(3, 1, 1)).mean[2, i]
             close(own, single.predict(Z + i).mean)
@@ -152,15 +150,93 @@ def test_copies(data, drawn, same, uniform):
             assert noise is None or each.data.Yvar.shape == each.data.Y.shape
 
 
-def test_bad_observations(data):
-    X, Y = data()
-    physics = {"physics": lambda X: crude(X)[..., :1]}
-    condition = CKA(X, Y, **physics).condition_on_observations
-    wrong = torch.tensor([[0.0], [torch.inf]], dtype=torch.float64)
-    refused(ValueError, "Expected finite Y", condition, X[:2], wrong)
-    refused(ValueError, r"X to be finite.*row 1", condition, wrong.expand(2, 2), Y[:2])
-    refused(ValueError, r"Y of shape \.\.\. x 2 x 1", condition, X[:2], Y[:3])
-    refused(ValueError, r"Y of shape \.\.\. x 2 x 1", condition, X[:2], Y[:2].expand(2, 2))
-    refused(ValueError, "learns its own", condition, X[:1], Y[:1], 0.1 * Y[:1])
-    known = CKA(X, Y, 0.1, **physics).condition_on_observations
-    refused(ValueError, "not negative", known, X[:1], Y[:1], -Y[:1].abs())
+@pytest.fixture
+def gaps(data):
+    X, Y = data(n=14, num_outputs=2)
+    Y[2:5, 0] = Y[7, 1] = Y[12, 0] = torch.nan
+    return X, Y
+
+
+APART = {"CKA": CKA, "RRA": RRA, "ZeroMeanGP": ZeroMeanGP}
+
+
+@pytest.mark.parametrize("known", [False, True], ids=["learnt", "known"])
+@pytest.mark.parametrize("name", APART)
+def test_each_output_is_the_model_of_its_own_rows(
+    name, known, gaps, drawn, numbers, give, same, alike, close, uniform
+):
+    cls, (X, Y) = APART[name], gaps
+    Yvar = uniform(*Y.shape, low=0.01, high=0.1, seed=2) if known else None
+    physics = {} if cls is ZeroMeanGP else {"physics": crude}
+    model, Z = drawn(cls(X, Y, Yvar, **physics)), uniform(5, 2, high=2.0, seed=4)
+    new_X, new_Y = uniform(3, 2, high=2.0, seed=5), 5 + uniform(3, 2, seed=6)
+    new_Y[0, 0] = new_Y[2, 1] = torch.nan
+    noise = uniform(3, 2, low=0.01, high=0.1, seed=7) if known else None
+    more = model.condition_on_observations(new_X, new_Y, noise)
+    value, _ = model.log_likelihood(model.u)
+    for j in range(2):
+        rows, new = ~Y[:, j].isnan(), ~new_Y[:, j].isnan()
+        variances = Yvar[rows][:, [j]] if known else None
+        if physics:
+            physics = {"physics": lambda X, j=j: crude(X)[..., [j]]}
+        single = cls(X[rows], Y[rows][:, [j]], variances, **physics)
+        give(single, {n: v[:, [j]] for n, v in numbers(model).items()})
+        last = model.terms[-1].name
+        for part in (model, model.subset_output([j])):
+            outputs = [j] if part is model else slice(None)
+            alike(single.predict(Z), part.predict(Z), outputs=outputs)
+            alike(single.posterior(Z), part.posterior(Z), outputs=outputs)
+            alike(single.term(last, Z), part.term(last, Z), outputs=outputs)
+            # Known noise elsewhere is the mean of the observed variances.
+            alike(single.predict(Z, True), part.predict(Z, True), outputs=outputs)
+        for own, whole in zip(single.left_out(), model.left_out(), strict=True):
+            close(own, whole[:, rows][..., [j]])
+        units = rows.sum() * (single.unit / model.unit[[j]]).log().squeeze(-1)
+        close(single.log_likelihood(single.u)[0], value[:, [j]] + units)
+        one = None if noise is None else noise[new][:, [j]]
+        later = single.condition_on_observations(new_X[new], new_Y[new][:, [j]], one)
+        same(later, more, Z, 1e-7, [j], noise=not known)
+
+
+@pytest.mark.parametrize("name", [*APART, "matern", "gpytorch"])
+def test_means_alone_are_those_with_covariances(name, gaps, drawn, close, uniform):
+    """Also with a graph, of batches of inputs, and of a model that was pickled."""
+    kernels = {"matern": Stationary(MATERN52), "gpytorch": MaternKernel()}
+    options = {} if name == "ZeroMeanGP" else {"physics": crude}
+    if name in kernels:
+        options["delta_covar_module"] = kernels[name]
+    model, Z = drawn(APART.get(name, CKA)(*gaps, **options)), uniform(3, 5, 2, high=2.0, seed=4)
+    for each in (model, pickle.loads(pickle.dumps(model))):
+        given = each.conditioning()
+        for X in (Z[0], Z, Z.clone().requires_grad_()):
+            close(given.mean_alone(each.evaluate(X)), given.mean(each.evaluate(X))[0])
+
+
+def test_nothing_new_is_learnt_of_what_is_missing(gaps, drawn, same, close, uniform):
+    X, Y = gaps
+    model, Z = drawn(CKA(X, Y, physics=crude)), uniform(5, 2, seed=4)
+    nothing = torch.full((2, 2), torch.nan, dtype=torch.float64)
+    same(model.condition_on_observations(X[:2] + 0.1, nothing), model, Z)
+    functions = model.sample_functions(3, seed=0)
+    assert functions(Z).isfinite().all()
+    known = CKA(X, Y, 0.1, physics=crude)
+    new_Y, noise = crude(X[:2]), torch.full((2, 2), 0.1, dtype=torch.float64)
+    new_Y[0, 1] = torch.nan
+    predicted = []
+    for value in (0.1, 7.0, torch.nan):
+        noise[0, 1] = value
+        predicted.append(known.condition_on_observations(X[:2] + 0.1, new_Y, noise).predict(Z))
+    close(predicted[1].variance, predicted[0].variance)
+    close(predicted[2].mean, predicted[0].mean)
+
+
+def test_each_of_a_batch_misses_its_own(gaps, drawn, close, uniform):
+    X, Y = gaps
+    model, Z = drawn(CKA(X, Y, physics=crude)), uniform(5, 2, seed=4)
+    new_X, new_Y = uniform(3, 2, seed=5), 5 + uniform(2, 3, 2, seed=6)
+    new_Y[0, 1, 0] = new_Y[1, 2, 1] = torch.nan
+    found = model.condition_on_observations(new_X, new_Y).predict(Z)
+    for i in range(2):
+        expected = model.condition_on_observations(new_X, new_Y[i]).predict(Z)
+        close(found.mean[i], expected.mean)
+        close(found.variance.expand(2, 5, 2)[i], expected.variance)

@@ -4,17 +4,8 @@ import pytest
 import torch
 from botorch.models.transforms import Normalize
 
-from gpadjust.core import (
-    CKA,
-    MATERN12,
-    MATERN32,
-    MATERN52,
-    RRA,
-    PhysicsMeanGP,
-    ScaleGP,
-    Stationary,
-    ZeroMeanGP,
-)
+from gpadjust import core
+from gpadjust.core import CKA, MATERN12, MATERN32, MATERN52, RRA, PhysicsMeanGP, Stationary
 from tests.systems import crude
 
 
@@ -22,18 +13,16 @@ def second(X):
     return 1 + (2 * crude(X)).sin()
 
 
+KERNELS = ("rho_covar_module", "delta_covar_module")
 MODELS = {
     "CKA": (CKA, {}),
     "CKA without a center": (CKA, {"center": False, "nested": False}),
     "CKA without constants": (CKA, {"constants": False, "center": 0.0}),
-    "Matern": (
-        CKA,
-        {"rho_covar_module": Stationary(MATERN12), "delta_covar_module": Stationary(MATERN32)},
-    ),
+    "Matern": (CKA, dict(zip(KERNELS, map(Stationary, (MATERN12, MATERN32)), strict=True))),
     "RRA": (RRA, {"num_features": 20}),
     "PhysicsMeanGP": (PhysicsMeanGP, {"covar_module": Stationary(MATERN52)}),
-    "ScaleGP": (ScaleGP, {}),
-    "ZeroMeanGP": (ZeroMeanGP, {}),
+    "ScaleGP": (core.ScaleGP, {}),
+    "ZeroMeanGP": (core.ZeroMeanGP, {}),
     "two physics": (CKA, {"rho_mean": [0.7, 0.2]}),
 }
 
@@ -70,9 +59,7 @@ def agree(model, formula, Z, close, tolerance=1e-8):
             close(model.term(term.name, Z).mean, mean, tolerance)
             close(model.term(term.name, Z).distribution.covariance_matrix, K, tolerance)
     left_out = formula.each(lambda part: part.left_out())
-    for found, expected in zip(
-        model.left_out(), (left_out[:, :, 0], left_out[:, :, 1]), strict=True
-    ):
+    for found, expected in zip(model.left_out(), left_out.unbind(2), strict=True):
         is_there = ~expected.isnan()
         assert torch.equal(found.mT.isnan(), ~is_there)
         close(found.mT[is_there], expected[is_there], tolerance)
@@ -146,9 +133,10 @@ def test_batches_of_inputs_are_predicted_apart(batch, data, drawn, uniform, clos
     Y[3, 1] = torch.nan
     model, Z = drawn(CKA(X, Y, physics=crude)), uniform(*batch, 4, 2)
     for ask in (model.predict, model.posterior, model.rho, model.delta):
-        assert ask(Z).mean.shape == ask(Z).variance.shape == (*batch, 4, 2)
-        close(ask(Z).mean.reshape(-1, 4, 2)[-1], ask(Z.reshape(-1, 4, 2)[-1]).mean)
-        close(ask(Z).variance.reshape(-1, 4, 2)[-1], ask(Z.reshape(-1, 4, 2)[-1]).variance)
+        found, last = ask(Z), ask(Z.reshape(-1, 4, 2)[-1])
+        assert found.mean.shape == found.variance.shape == (*batch, 4, 2)
+        close(found.mean.reshape(-1, 4, 2)[-1], last.mean)
+        close(found.variance.reshape(-1, 4, 2)[-1], last.variance)
     assert model.posterior(Z).rsample(torch.Size([5])).shape == (5, *batch, 4, 2)
     assert model.interval(Z)[0].shape == (*batch, 4, 2)
 

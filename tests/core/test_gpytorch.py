@@ -3,13 +3,7 @@
 import gpytorch
 import pytest
 import torch
-from botorch.acquisition import (
-    LogExpectedImprovement,
-    UpperConfidenceBound,
-    qKnowledgeGradient,
-    qLogExpectedImprovement,
-    qLogNoisyExpectedImprovement,
-)
+from botorch import acquisition
 from botorch.acquisition.multi_objective.logei import qLogNoisyExpectedHypervolumeImprovement
 from botorch.fit import fit_gpytorch_mll
 from botorch.generation import MaxPosteriorSampling
@@ -21,16 +15,13 @@ from botorch.sampling.pathwise import draw_matheron_paths, get_matheron_path_mod
 from gpytorch.kernels import RBFKernel, ScaleKernel
 from gpytorch.mlls import ExactMarginalLogLikelihood, SumMarginalLogLikelihood
 
-from gpadjust.core import CKA, CalibratedPhysics, fit
+from gpadjust.core import CKA, CalibratedPhysics, PhysicsMeanGP, fit
 from gpadjust.gpytorch import PhysicsMean, PhysicsScaledKernel
 from gpadjust.physics import FunctionPhysics, Unknown
+from tests.systems import normal, uniform, wave
 
 BOUNDS = torch.tensor([[0.0, 0.0], [1.0, 1.0]], dtype=torch.float64)
 SEARCH = {"num_restarts": 2, "raw_samples": 8, "options": {"maxiter": 5}}
-
-
-def wave(X):
-    return torch.sin(6 * X[..., :1])
 
 
 def both(X):
@@ -38,10 +29,9 @@ def both(X):
 
 
 def noisy():
-    generator = torch.Generator().manual_seed(0)
-    X = torch.rand(12, 2, generator=generator, dtype=torch.float64)
+    X = uniform(12, 2)
     Y = torch.cat([2 * wave(X) + X[:, :1], 2 * X[:, 1:].square() + 0.1], -1)
-    return X, Y + 0.05 * torch.randn(12, 2, generator=generator, dtype=torch.float64)
+    return X, Y + 0.05 * normal(12, 2, seed=1)
 
 
 @pytest.fixture
@@ -65,7 +55,7 @@ def loss(model):
     return -mll(model(*model.train_inputs), model.train_targets)
 
 
-def test_three_ways_to_the_most_likely_numbers(data, uniform):
+def test_three_ways_to_the_most_likely_numbers(data):
     X, Y = data
     by_adam, by_mll, by_fit = (CKA(X, Y[:, :1], physics=wave, nested=False) for _ in range(3))
     optimizer = torch.optim.Adam([p for p in by_adam.parameters() if p.requires_grad], lr=0.1)
@@ -98,7 +88,7 @@ def test_the_loss_is_the_density_and_differentiable(data):
         torch.testing.assert_close(slope, expected - model.u.detach(), rtol=1e-6, atol=1e-6)
 
 
-def test_lists_of_models(data, uniform):
+def test_lists_of_models(data):
     X, Y = data
     ours, theirs = CKA(X, Y[:, :1], physics=wave), SingleTaskGP(X, Y[:, 1:])
     both_models = ModelListGP(ours, theirs)
@@ -114,7 +104,7 @@ def test_lists_of_models(data, uniform):
     assert later.posterior(Z).mean.shape == (5, 2)
 
 
-def test_state(data, models, uniform):
+def test_state(data, models):
     X, Y = data
     Z = uniform(5, 2, seed=3)
     for model, (columns, physics) in zip(models, (([0], wave), ([0, 1], both)), strict=True):
@@ -126,7 +116,7 @@ def test_state(data, models, uniform):
         torch.testing.assert_close(part.mean, models[1].predict(Z).mean[:, [j]])
 
 
-def test_transforms(data, uniform):
+def test_transforms(data):
     X, Y = data
     Z = uniform(5, 2, seed=3)
     plain = CKA(X, Y, physics=both)
@@ -141,13 +131,13 @@ def test_transforms(data, uniform):
 def test_acquisition(models, data, name):
     X, Y = data
     one, two = models
-    sampler = SobolQMCNormalSampler(torch.Size([16]))
+    sampler, best = SobolQMCNormalSampler(torch.Size([16])), Y[:, 0].max()
     function = {
-        "LogEI": lambda: LogExpectedImprovement(one, Y[:, 0].max()),
-        "UCB": lambda: UpperConfidenceBound(one, 2.0),
-        "qLogEI": lambda: qLogExpectedImprovement(one, Y[:, 0].max(), sampler=sampler),
-        "qLogNEI": lambda: qLogNoisyExpectedImprovement(one, X, sampler=sampler),
-        "qKG": lambda: qKnowledgeGradient(one, num_fantasies=4),
+        "LogEI": lambda: acquisition.LogExpectedImprovement(one, best),
+        "UCB": lambda: acquisition.UpperConfidenceBound(one, 2.0),
+        "qLogEI": lambda: acquisition.qLogExpectedImprovement(one, best, sampler=sampler),
+        "qLogNEI": lambda: acquisition.qLogNoisyExpectedImprovement(one, X, sampler=sampler),
+        "qKG": lambda: acquisition.qKnowledgeGradient(one, num_fantasies=4),
         "qLogNEHVI": lambda: qLogNoisyExpectedHypervolumeImprovement(
             two, ref_point=[0.0, 0.0], X_baseline=X, sampler=sampler
         ),
@@ -169,7 +159,7 @@ def test_a_physics_without_kernels_is_fitted_by_its_marginal_likelihood(data):
     torch.testing.assert_close(by_mll.u.detach(), by_map.u.detach(), rtol=1e-3, atol=1e-3)
 
 
-def test_thompson_samples_and_paths(models, uniform):
+def test_thompson_samples_and_paths(models):
     one, two = models
     X = uniform(6, 2, seed=5)
     assert MaxPosteriorSampling(one)(X, num_samples=5).shape == (5, 2)
@@ -180,7 +170,7 @@ def test_thompson_samples_and_paths(models, uniform):
     assert get_matheron_path_model(two, torch.Size([3]))(X.expand(3, 6, 2)).shape == (3, 6, 2)
 
 
-def test_it_reads_as_a_gpytorch_model(models, uniform):
+def test_it_reads_as_a_gpytorch_model(models):
     Z = uniform(5, 2, seed=3)
     for model, physics in zip(models, (wave, both), strict=True):
         S, m = len(model.u), model.num_outputs
@@ -198,10 +188,8 @@ def test_it_reads_as_a_gpytorch_model(models, uniform):
         # rho's part of equation 2 is the kernel of rho, scaled by f_p - c on both sides.
         values = model.values
         f = physics(Z).mT - model.term_sum.center(model.terms[0], values) * model.unit
-        own = model.at(Z).own(model.terms[0])
-        k = model.terms[0].kernel.covariance(own, Z) * values.get(
-            "rho.process", torch.ones(1)
-        ).unsqueeze(-1)
+        k = model.terms[0].kernel.covariance(model.evaluate(Z).own(model.terms[0]), Z)
+        k = k * values.get("rho.process", torch.ones(1)).unsqueeze(-1)
         k = (k + values["rho.constant"].unsqueeze(-1)) * f.unsqueeze(-1) * f.unsqueeze(-2)
         rho = model.covar_module.kernels[0](Z).to_dense()
         torch.testing.assert_close(rho, k.reshape(rho.shape))
@@ -225,18 +213,15 @@ class OwnCKA(gpytorch.models.ExactGP):
         return gpytorch.distributions.MultivariateNormal(self.mean_module(x), covar)
 
 
-def test_an_exact_gp_of_ones_own_is_cka(data, uniform):
+def test_an_exact_gp_of_ones_own_is_cka(data):
     X, Y = data
     Z = uniform(5, 2, seed=3)
     model = CKA(X, Y[:, :1], physics=wave, center=0.0, constants=False)
     model.set_draws(model.u + 0.2 * torch.randn(model.u.shape, dtype=torch.float64))
     own = OwnCKA(X, Y[:, 0], gpytorch.likelihoods.GaussianLikelihood(), wave).double()
     values, unit = model.values, model.unit.item()
-    kernels = (
-        (own.rho_covar_module.base_kernel, "rho", 1.0),
-        (own.delta_covar_module, "delta", unit),
-    )
-    for kernel, name, size in kernels:
+    rho, delta = own.rho_covar_module.base_kernel, own.delta_covar_module
+    for kernel, name, size in ((rho, "rho", 1.0), (delta, "delta", unit)):
         kernel.base_kernel.lengthscale = values[f"{name}.kernel.lengthscale"].detach()[0]
         kernel.outputscale = values[f"{name}.kernel.outputscale"].detach()[0, 0, 0] * size**2
     own.likelihood.noise = model.likelihood.noise.detach()[0]
@@ -249,7 +234,7 @@ def test_an_exact_gp_of_ones_own_is_cka(data, uniform):
     torch.testing.assert_close(variance, expected.variance[:, 0], rtol=1e-8, atol=1e-10)
 
 
-def test_as_single_task_gp(models, uniform):
+def test_as_single_task_gp(models):
     Z = uniform(5, 2, seed=3)
     model = models[0]
     for draw in (None, len(model.u) - 1):
@@ -257,19 +242,14 @@ def test_as_single_task_gp(models, uniform):
         assert isinstance(single, SingleTaskGP)
         if draw is not None:
             expected = model.subset_draws(torch.tensor([draw])).predict(Z)
-            torch.testing.assert_close(single.posterior(Z).mean, expected.mean)
-            torch.testing.assert_close(
-                single.posterior(Z).variance, expected.variance, rtol=1e-4, atol=1e-7
-            )
-    with pytest.raises(ValueError, match="Expected one output"):
-        models[1].as_single_task_gp()
+            found = single.posterior(Z)
+            torch.testing.assert_close(found.mean, expected.mean)
+            torch.testing.assert_close(found.variance, expected.variance, rtol=1e-4, atol=1e-7)
 
 
-def test_what_training_mode_refuses(data):
-    X, Y = data
-    model = CKA(X, Y, physics=both)
-    with pytest.raises(RuntimeError, match="call the model on its training inputs"):
-        model(X[:3])
-    model.set_draws(model.u.detach().expand(4, -1, -1))
-    with pytest.raises(RuntimeError, match="The model holds 4 draws"):
-        model(X)
+def test_a_fitted_model_is_a_physics_by_its_predictions():
+    X = uniform(12, 1)
+    Y = 1.3 * wave(X) + X + 0.05 * normal(12, 1, seed=1)
+    old = PhysicsMeanGP(X, Y, physics=wave)
+    new = CKA(X, 2 * Y, physics=lambda X: old.predict(X).mean)
+    assert (new.predict(X).mean - 2 * Y).abs().max() < 0.2

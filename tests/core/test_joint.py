@@ -26,10 +26,9 @@ def agree(posterior, samples):
 
 @pytest.fixture
 def model_of(data, drawn):
-    def model_of(kind, size=1.0, m=2, noise_free=False, number=3):
-        X, Y = data(n=12, num_outputs=m)
-        physics = lambda X: size * crude(X)[..., :m]  # noqa: E731
-        options = {} if kind == "ZeroMeanGP" else {"physics": physics}
+    def model_of(kind, size=1.0, noise_free=False, number=3):
+        X, Y = data(n=12, num_outputs=2)
+        options = {} if kind == "ZeroMeanGP" else {"physics": lambda X: size * crude(X)}
         options |= {"train_Yvar": 0.0} if noise_free else {}
         return drawn(KINDS[kind](X, size * Y, **options), number), X
 
@@ -85,8 +84,6 @@ def test_weighted_sums_of_outputs(model_of, uniform, close):
     total = posterior.scalarized(w, 7.0)
     close(total.mean, (posterior.mean @ w).unsqueeze(-1) + 7)
     close(total.distribution.covariance_matrix, torch.einsum("i,iajb,j->ab", w, K, w))
-    with pytest.raises((ValueError, RuntimeError)):
-        posterior.scalarized(w[:1])
 
 
 @pytest.mark.parametrize("number", [1, 6])
@@ -98,18 +95,14 @@ def test_quantiles_densities_and_intervals(number, model_of, uniform):
         posterior = model.posterior(Z)
         first, low, high, last = posterior.quantile(levels)
         samples = posterior.rsample(torch.Size([40_000]))
-    density = posterior.density((low + high) / 2)
-    torch.testing.assert_close(
-        density * (high - low) / 1e-4, torch.ones_like(low), rtol=1e-3, atol=0
-    )
+    share = posterior.density((low + high) / 2) * (high - low)
+    torch.testing.assert_close(share, torch.full_like(low, 1e-4), rtol=1e-3, atol=0)
     at_zero = posterior.density(low[0, 0])  # one value for all points, as BoTorch has it
     torch.testing.assert_close(at_zero[0, 0], posterior.density(low)[0, 0])
     torch.testing.assert_close(model.interval(Z), (first, last), rtol=1e-10, atol=0)
     sd = posterior.variance.sqrt()
     for level, found in zip(levels, (first, low, high, last), strict=True):
         assert ((samples.quantile(float(level), dim=0) - found).abs() < 0.05 * sd).all()
-    with pytest.raises(ValueError, match="between 0 and 1"):
-        model.interval(Z, 95)
 
 
 def test_the_density_of_rho_where_some_draws_know_it(model_of, uniform, close):
@@ -120,24 +113,19 @@ def test_the_density_of_rho_where_some_draws_know_it(model_of, uniform, close):
     close(model.rho(Z).density(value), other.density(value) * 2 / 3)
 
 
-def test_outputs_by_number(model_of, uniform, close):
+def test_outputs_by_number(model_of, uniform, alike, close):
     model, _ = model_of("CKA")
     Z, whole = uniform(5, 2), model.posterior(uniform(5, 2))
     for outputs in ([1], [1, 0], [-1]):
         part, subset = model.posterior(Z, outputs), model.subset_output(outputs)
         for found in (part, subset.posterior(Z), subset.predict(Z)):
-            close(found.mean, whole.mean[:, outputs])
-            close(found.variance, whole.variance[:, outputs])
-        left_out = zip(subset.left_out(), model.left_out(), strict=True)
-        for own, expected in left_out:
-            close(own, expected[..., outputs])
+            alike(found, whole, outputs=outputs)
+        for found, expected in zip(subset.left_out(), model.left_out(), strict=True):
+            close(found, expected[..., outputs])
         first = subset.subset_output([0])  # of a part
         close(first.predict(Z).mean, whole.mean[:, outputs[:1]])
         u = subset.u.detach()
         close(subset.log_likelihood(u)[0], model.log_likelihood(model.u)[0][:, outputs])
-    for wrong in ([], [2], [0.5]):
-        with pytest.raises(ValueError, match="numbers of outputs from 0 to 1"):
-            model.subset_output(wrong)
 
 
 def test_the_posterior_of_gpytorch(model_of, uniform, close):

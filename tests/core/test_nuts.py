@@ -8,15 +8,14 @@ import torch
 from gpadjust import CKA, CalibratedPhysics, FunctionPhysics, Unknown, fit
 from gpadjust.core import SamplingWarning
 from gpadjust.core.nuts import nuts
-from gpadjust.many import VariationalCKA
-from tests.systems import line, refused, wave
+from tests.systems import line, normal, refused, wave
 
 pytestmark = pytest.mark.filterwarnings("ignore:Chains do not agree")
 
 
 def linear(sd=0.1):
     X = line(12)
-    noise = torch.randn(X.shape, generator=torch.Generator().manual_seed(0), dtype=X.dtype)
+    noise = normal(*X.shape)
     f_p = FunctionPhysics(lambda X, p: p.k * X[:, 0], unknowns={"k": Unknown(1.0, sd=1.0)})
     return CalibratedPhysics(X, 2 * X + sd * noise, torch.full_like(X, sd**2), physics=f_p)
 
@@ -60,8 +59,7 @@ def test_chains_jump_between_modes_as_often_as_these_are_likely():
     f_p = FunctionPhysics(lambda X, p: p.k**2 * X[:, 0], unknowns={"k": Unknown(0.5, sd=1.0)})
     model = CalibratedPhysics(X, 2 * X, torch.full_like(X, 0.25), physics=f_p)
     root = 2**0.5
-    k = torch.where(torch.arange(64) % 2 == 0, root, -root).to(X)
-    k = k + 0.1 * torch.randn(64, dtype=X.dtype, generator=torch.Generator().manual_seed(0))
+    k = torch.where(torch.arange(64) % 2 == 0, root, -root).to(X) + 0.1 * normal(64)
     row = model.table.shared[0]
     draws = model.u.detach().expand(64, -1, -1).clone()
     draws[..., -1] = row.coordinate(k).unsqueeze(-1)  # half of them in each mode
@@ -97,11 +95,6 @@ def test_chains_that_do_not_agree_warn():
     assert not result.converged
 
 
-def test_refused(monkeypatch):
-    X = line(9)
-    refused(ValueError, "nested=False", fit, CKA(X, wave(X), physics=wave), "nuts")
-    few = VariationalCKA(X, wave(X), physics=wave, num_inducing=4)
-    refused(ValueError, "from 16 on; found 8", fit, linear(), "nuts", num_draws=8)
-    refused(ValueError, "no density", fit, few, "nuts")
+def test_pyro_is_needed(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyro.infer", None)
     refused(ImportError, r"gpadjust\[pyro\]", fit, linear(), "nuts")

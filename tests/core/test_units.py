@@ -1,4 +1,4 @@
-"""Units of targets and inputs, constants, and forms of inputs."""
+"""Units of targets and inputs, constants, and forms of inputs: tensors, arrays, frames, Series."""
 
 import numpy as np
 import pandas as pd
@@ -7,8 +7,12 @@ import torch
 from botorch.acquisition.objective import ScalarizedPosteriorTransform
 from botorch.models.transforms import Normalize
 
-from gpadjust.core import CKA, GP, RRA, PhysicsMeanGP, ScaleGP, Term, ZeroMeanGP
-from tests.systems import crude
+from gpadjust import compare
+from gpadjust.core import CKA, GP, RRA, PhysicsMeanGP, ScaleGP, Term, ZeroMeanGP, fit
+from gpadjust.physics import FormulaPhysics
+from gpadjust.records import Record
+from gpadjust.sklearn import CKARegressor
+from tests.systems import crude, line
 
 SIZES = [1e-12, 1e-6, 1e6, 1e12]
 LEVELS = torch.tensor([0.025, 0.5, 0.975], dtype=torch.float64)
@@ -69,18 +73,6 @@ def test_no_variance_is_rounded_up(size, data, drawn, uniform, close):
     close(posterior.distribution.variance, posterior.variance, 1e-10)
 
 
-@pytest.mark.parametrize("offset", [1.0, 1e4, 1e8])
-def test_a_constant_of_both_makes_no_difference(offset, data, drawn, uniform, close):
-    X, Y = data(n=12, num_outputs=2)
-    one = drawn(CKA(X, Y, physics=crude), choice=0)
-    other = CKA(X, Y + offset, physics=lambda X: crude(X) + offset)
-    other.set_draws(one.u)
-    Z, tolerance = uniform(5, 2, high=2.0, seed=1), max(1e-8, 1e-13 * offset)
-    close(other.predict(Z).mean - offset, one.predict(Z).mean, tolerance)
-    close(other.predict(Z).variance, one.predict(Z).variance, tolerance)
-    close(other.rho(Z).mean, one.rho(Z).mean, tolerance)
-
-
 @pytest.mark.parametrize("cls", [CKA, RRA])
 def test_units_of_inputs(cls, data, drawn, uniform, close):
     X, Y = data(n=12, num_outputs=2)
@@ -128,7 +120,7 @@ def test_inputs_come_back_as_they_came(data, drawn, uniform):
         assert model.posterior(Z.numpy()).mean.shape == (4, 2)
         functions = model.sample_functions(2, seed=0)
         assert torch.equal(functions(Z.numpy()), functions(Z))
-        assert functions.each(Z.expand(2, 4, 2).numpy()).shape == (2, 4, 2)
+        assert functions.evaluate_each(Z.expand(2, 4, 2).numpy()).shape == (2, 4, 2)
         later = model.condition_on_observations(*(values[:2] + 0.1 for values in train))
         assert later.predict(Z).mean.shape == (4, 2)
     frame = pd.DataFrame(Z.numpy(), columns=["a", "b"], index=[3, 5, 7, 9])
@@ -136,9 +128,6 @@ def test_inputs_come_back_as_they_came(data, drawn, uniform):
         assert list(values.columns) == ["p", "q"]
         assert list(values.index) == [3, 5, 7, 9]
     np.testing.assert_allclose(model.predict(frame).mean, expected.mean)
-    for wrong in (frame[["b", "a"]], frame.rename(columns={"b": "c"})):
-        with pytest.raises(ValueError, match="columns"):
-            model.predict(wrong)
     series = ZeroMeanGP(frames[0], frames[1]["p"])
     assert list(series.predict(frame).mean.columns) == ["p"]
 
@@ -160,3 +149,57 @@ def test_the_unit_of_targets(data):
     torch.testing.assert_close(met, 1e-9 * size.unsqueeze(0))
     constant = torch.full_like(Y, 3.0)
     torch.testing.assert_close(unit(constant, lambda X: 0 * crude(X)), constant[:1])
+
+
+RANDOM = np.random.default_rng(0)
+FRAME = pd.DataFrame({"a": RANDOM.uniform(size=9), "b": RANDOM.uniform(size=9)}, range(5, 14))
+FRAME["y"], FRAME["v"] = np.sin(3 * FRAME.a) + 0.1 * FRAME.b, 0.01
+inputs, y, v = FRAME[["a", "b"]], FRAME["y"], FRAME["v"]
+WAVE = FormulaPhysics("sin(3*a)", ["a", "b"])
+
+
+@pytest.mark.parametrize("cls", [CKA, PhysicsMeanGP, ZeroMeanGP])
+def test_targets_and_variances_are_series(cls):
+    physics = {} if cls is ZeroMeanGP else {"physics": WAVE}
+    model, frames = (cls(inputs, Y, Yvar, **physics) for Y, Yvar in ((y, v), (FRAME[["y"]],) * 2))
+    assert torch.equal(model.data.Y, frames.data.Y)
+    assert model.data.output_names == ("y",)
+    assert model.data.Yvar.shape == (9, 1)
+    more = model.condition_on_observations(inputs[:2], y[:2], noise=v[:2])
+    assert len(more.data.X) == 11
+
+
+def test_a_series_of_inputs_is_one_column():
+    model = CKA(FRAME["a"], y, physics=FormulaPhysics("sin(3*a)", ["a"]))
+    fit(model, "map")
+    found = model.predict(FRAME["a"]).mean
+    assert isinstance(found, pd.DataFrame)
+    pd.testing.assert_frame_equal(found, model.predict(FRAME[["a"]]).mean)
+
+
+def test_a_variance_for_each_output_may_be_a_series():
+    outputs = FRAME[["y", "b"]]
+    model = ZeroMeanGP(inputs, outputs, outputs.var())
+    assert model.data.Yvar[3].tolist() == outputs.var().tolist()
+
+
+@pytest.mark.slow
+def test_comparisons_regressors_and_records_take_series():
+    assert "y" in repr(compare(inputs, y, WAVE, v))
+    assert CKARegressor(physics=WAVE).fit(inputs, y, train_Yvar=v).score(inputs, y) > 0
+    record = Record(0.1 * np.arange(9), FRAME["y"], FRAME["b"])
+    assert record.states.shape == record.actions.shape == (9, 1)
+
+
+def test_times_of_a_record_are_dates_in_texts():
+    texts = pd.Series([f"2015-02-13 23:59:{50 + k}" for k in range(9)])
+    record = Record(texts, FRAME[["y"]], FRAME[["b"]])
+    assert record.times.tolist() == [*range(9)]
+    with pytest.raises(TypeError, match=r"Convert numbers in text with `.astype\(float\)`"):
+        Record(pd.Series(["1", "2"]), FRAME[["y"]][:2], FRAME[["b"]][:2])
+
+
+def test_a_column_with_the_name_of_a_word_of_python():
+    x = line(5)
+    for formula in ("2 * lambda", "2 * lambda_"):
+        assert torch.equal(FormulaPhysics(formula, ["lambda"])(x), 2 * x)

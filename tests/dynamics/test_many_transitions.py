@@ -41,7 +41,7 @@ def test_means_by_inducing_points_of_each_output_are_those_of_predictions():
     model = VariationalCKA(X, X[:, :2].sin(), physics=step, num_inducing=12)
     model.inducing = torch.stack([torch.arange(12), torch.arange(20, 32)])
     model.set_draws(model.u.detach())
-    given, at = model.conditioning(), model.at(X[:7] + 0.1)
+    given, at = model.conditioning(), model.evaluate(X[:7] + 0.1)
     torch.testing.assert_close(given.mean_alone(at), given.mean(at)[0])
 
 

@@ -76,7 +76,7 @@ def test_the_covariance_is_exchangeable(profile):
         own[n].squeeze(1) for n in ("f.kernel.outputscale", "f.constant", "x3.kernel.outputscale")
     )
     expected = scale * k + kappa + rigs * (1 - unlike[1])
-    f = model.at(X)
+    f = model.evaluate(X)
     same(f.cross(f)[:, 0], expected)
     same(f.variance().expand(2, 1, N)[:, 0], expected.diagonal(dim1=-1, dim2=-2))
     u = model.u.detach()

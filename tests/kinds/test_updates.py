@@ -99,7 +99,7 @@ def test_what_is_long_ago_fades_to_the_prior():
     for _ in range(10):
         kalman.update(x, wave(x))
     rho = model.term_sum.term("rho", values, model.places(AT, values, with_physics=False))
-    one, phi = design(model.at(x[:1], values)), design(rho)
+    one, phi = design(model.evaluate(x[:1], values)), design(rho)
     weight = 1 / (1 - math.exp(-1 / tau)) / model.conditioning().noise[..., :1]
     lost = (phi @ one.mT).squeeze(-1).square() / (1 / weight + one.square().sum(-1))
     expected = phi.square().sum(-1) - lost
@@ -189,7 +189,7 @@ def test_links_and_categories_are_looked_at_and_nothing_changes_by_bad_numbers()
     (lambda: Window(rra(), 5).update(NEW_X.expand(2, 9, 1), NEW_Y), ValueError, "k x d"),
     (lambda: Window(rra(), 5).update(NEW_X, NEW_Y.expand(2, 9, 1)), ValueError, "k x m"),
     (lambda: Window(rra(), 5).update(NEW_X, math.inf * NEW_Y), ValueError, "finite"),
-    (lambda: Kalman(rra()).update(NEW_X, NEW_Y, NEW_Y.abs()), ValueError, "learns its own"),
+    (lambda: Kalman(rra()).update(NEW_X, NEW_Y, NEW_Y.abs()), ValueError, "model learns it"),
     (lambda: Kalman(rra()).sample_functions(3), NotImplementedError, "rsample"),
 ])  # fmt: skip
 def test_bad_input(call, error, words):

@@ -51,7 +51,7 @@ def test_the_covariance_is_that_of_a_process_that_was_seen_to_be_zero(where):
 
     inverse = torch.linalg.pinv(k(places, places)[0], rtol=1e-12)
     expected = k(X, Z)[0] - k(X, places)[0] @ inverse @ k(places, Z)[0]
-    x, z = model.at(X), model.at(Z)
+    x, z = model.evaluate(X), model.evaluate(Z)
     same(x.cross(z)[0, 0], expected, 1e-6)
     assert k(X, Z)[0].sub(expected).abs().max() > 1e-3
     same(x.variance(), x.cross(x).diagonal(dim1=-1, dim2=-2))
@@ -70,7 +70,7 @@ def test_gradients_and_features(kernel):
         step[..., i] = 1e-5
         high, low = (model.log_likelihood(u + sign * step)[0] for sign in (1, -1))
         torch.testing.assert_close(gradient[..., i], (high - low) / 2e-5, rtol=1e-5, atol=1e-5)
-    own = model.at(X).own(model.terms[1])
+    own = model.evaluate(X).own(model.terms[1])
     phi = model.terms[1].kernel.features(own, 20000, torch.Generator().manual_seed(0))
     phi = phi(X[None, None])
     expected = model.terms[1].kernel.covariance(own, X[None, None])

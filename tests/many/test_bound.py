@@ -44,7 +44,7 @@ def with_all_rows(model):
 
 def titsias(model, j):
     """Titsias (2009), by inverses, of one output."""
-    f, y = model.at(model.data.X), model.data.Y.mT[j] / model.unit[j]
+    f, y = model.evaluate(model.data.X), model.data.Y.mT[j] / model.unit[j]
     f.weights.pop("rest")
     seen, points = ~y.isnan(), model.inducing[j]
     K = f.cross(f).expand(1, 2, -1, -1)[0, j].detach()

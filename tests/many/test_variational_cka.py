@@ -208,7 +208,7 @@ def test_inducing_points_are_pivots():
     assert points.shape == (2, 8)
     assert all(len(set(each.tolist())) == 8 for each in points)
     assert not Y[points[1], 1].isnan().any()
-    f = model.at(X)
+    f = model.evaluate(X)
     f.weights.pop("rest")
     K = f.cross(f)[0, 0].detach()
 
@@ -364,7 +364,7 @@ def test_links_and_categories():
 X, Y = problem(10)
 BAD = {
     "float32": (TypeError, "float64", partial(make, X.float(), Y.float())),
-    "shapes": (ValueError, "row of targets", partial(make, X, Y[:4])),
+    "shapes": (ValueError, "rows of train_Y", partial(make, X, Y[:4])),
     "a batch": (ValueError, "two dimensions", partial(make, X.expand(2, -1, -1), Y)),
     "no points": (ValueError, "num_inducing", partial(make, X, Y, num_inducing=0)),
     "half points": (TypeError, "num_inducing", partial(make, X, Y, num_inducing=2.5)),

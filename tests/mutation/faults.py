@@ -63,8 +63,8 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/core/gaussian.py",
-        "return Prediction(center, variances.mean(DRAWS) + between)",
-        "return Prediction(center, variances.mean(DRAWS))",
+        "return Prediction(center, self.variances.mean(DRAWS) + between)",
+        "return Prediction(center, self.variances.mean(DRAWS))",
         "The variance forgets that the means of the draws differ.",
     ),
     Fault(
@@ -129,8 +129,8 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/core/sample.py",
-        "generator, shape = torch.Generator().manual_seed(seed), like.shape",
-        "generator, shape = torch.Generator().manual_seed(0), like.shape",
+        "    shape = like.shape\n    generator = torch.Generator().manual_seed(seed)",
+        "    shape = like.shape\n    generator = torch.Generator().manual_seed(0)",
         "The seed of a fit is ignored.",
     ),
     Fault(
@@ -141,14 +141,14 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/core/fitting.py",
-        "return total + (units if len(total) > 1 else units.sum())",
-        "return total + units",
+        "        units = units.sum()\n",
+        "        units = units\n",
         "The evidence of outputs that share parameters counts units once, not for each output.",
     ),
     Fault(
         "gpadjust/core/fitting.py",
-        "difference = (predicted[0][0].mean(0) - predicted[1][0].mean(0)) / 2",
-        "difference = (predicted[0][0].mean(0) - predicted[1][0].mean(0)) / 20",
+        "difference = (means[0].mean(0) - means[1].mean(0)) / 2",
+        "difference = (means[0].mean(0) - means[1].mean(0)) / 20",
         "The error of a fit by few draws is never large enough for its warning.",
     ),
     Fault(
@@ -174,6 +174,66 @@ FAULTS = (
         "unit = torch.where(spread > 1e-12 * size, away.minimum(spread), away)",
         "unit = away",
         "A bad physics makes the unit, and the priors with it, as large as its error.",
+    ),
+    Fault(
+        "gpadjust/core/unknowns.py",
+        "size = size + math.log(row.scale) + 0.5 * z.square() + 0.5 * math.log(2 * math.pi)",
+        "size = size + math.log(row.scale) + 0.5 * math.log(2 * math.pi)",
+        "Priors of GPyTorch's kernels multiply N(0, I) in place of replacing it.",
+    ),
+    Fault(
+        "gpadjust/core/kernels.py",
+        "A = torch.cat([o * w, (-w / 2).expand_as(o * w), last], -1)",
+        "A = torch.cat([o * w, -w.expand_as(o * w), last], -1)",
+        "Means without covariances, as planning reads them, have another lengthscale.",
+    ),
+    Fault(
+        "gpadjust/core/gaussian.py",
+        "noise = sd * standard_normal(prior.shape, generator, prior)",
+        "noise = 0 * sd * standard_normal(prior.shape, generator, prior)",
+        "Sampled functions forget the noise of the data: too narrow.",
+    ),
+    Fault(
+        "gpadjust/core/posterior.py",
+        "which = (torch.special.ndtr(base[..., -1].detach()) * S)",
+        "which = (torch.special.ndtr(base[..., 0].detach()) * S)",
+        "The component of a sample depends on its first value.",
+    ),
+    Fault(
+        "gpadjust/core/straight.py",
+        " - log_det.unsqueeze(-1)",
+        "",
+        "The density by straight coordinates forgets the determinant.",
+    ),
+    Fault(
+        "gpadjust/core/straight.py",
+        "return ~(away.norm(dim=-1) < _MISSED)",
+        "return away.norm(dim=-1) < 0",
+        "Draws beyond a fold of the physics are lost: one of two signs.",
+    ),
+    Fault(
+        "gpadjust/core/nuts.py",
+        "(value - torch.logaddexp(near.logsumexp(-1) + size, prior))",
+        "(value - prior)",
+        "Jumps are accepted as if all proposals came from the prior.",
+    ),
+    Fault(
+        "gpadjust/core/fitting.py",
+        "logs[k] = prior[k] + value",
+        "logs[k] = value",
+        "Nested models are weighted without their prior probabilities.",
+    ),
+    Fault(
+        "gpadjust/core/saving.py",
+        "if not is_same or not torch.allclose(theirs, ours, 1e-6, 1e-9 * float(ours.abs().max())):",
+        "if not is_same:",
+        "A file is loaded with another physics than it was saved with.",
+    ),
+    Fault(
+        "gpadjust/core/views.py",
+        "v = v + _MISSING * model.data.Y.isnan().mT",
+        "v = v + 0 * model.data.Y.isnan().mT",
+        "Missing targets count as zeros in GPyTorch's marginal likelihood.",
     ),
     Fault(
         "gpadjust/kinds/links.py",

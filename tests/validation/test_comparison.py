@@ -154,21 +154,21 @@ class TestPhysicsAlone:
     def test_its_noise_is_relative_where_that_predicts_better(self, X, noise):
         f = (4 * X).exp()
         Y = torch.cat([f + 0.2 * noise, f * (1 + 0.2 * noise)], -1)
-        data = Data.of(X, Y, None, None)
+        data = Data.read(X, Y, None, None)
         (loo,) = _physics_alone(_by_name(lambda X: (4 * X).exp().expand(-1, 2)), data).values()
         spread = loo.variance.amax(0) / loo.variance.amin(0)
         assert spread[0] < 10 < 1000 < spread[1]
 
     def test_an_exact_physics_of_any_number_of_points(self, X):
         for n in (2, 3, 8):
-            data = Data.of(X[:n], crude(X[:n]), None, None)
+            data = Data.read(X[:n], crude(X[:n]), None, None)
             (loo,) = _physics_alone(_by_name(crude), data).values()
             assert loo.log_density.isfinite().all()
             assert loo.score().coverage.item() == 1
             assert not loo.variance.isnan().any()
 
     def test_known_variances_are_its_noise(self, X, noise):
-        data = Data.of(X, crude(X) + noise, 0.04, None)
+        data = Data.read(X, crude(X) + noise, 0.04, None)
         (loo,) = _physics_alone(_by_name(crude), data).values()
         expected = torch.distributions.Normal(crude(X), 0.2).log_prob(crude(X) + noise)
         torch.testing.assert_close(loo.log_density, expected)
@@ -176,7 +176,7 @@ class TestPhysicsAlone:
     def test_each_of_several_and_none_of_unknown_parameters(self, X):
         unknown = FunctionPhysics(lambda X, p: p.a * X[:, 0], unknowns={"a": Unknown(1.0, sd=1.0)})
         physics = _by_name({"wave": crude, "line": lambda X: X, "slope": unknown})
-        found = _physics_alone(physics, Data.of(X, crude(X), None, None))
+        found = _physics_alone(physics, Data.read(X, crude(X), None, None))
         assert [*found] == ["physics alone of wave", "physics alone of line"]
         torch.testing.assert_close(found["physics alone of line"].mean, X)
 

@@ -28,7 +28,7 @@ def Y(X):
 
 
 def said(X, Y, physics):
-    data, values = Data.of(X, Y, None, None), as_physics(physics)(X)
+    data, values = Data.read(X, Y, None, None), as_physics(physics)(X)
     found = [fault_of(data, j, f) for j, f in enumerate(values.mT)]
     names = [f"{name}: " for name in data.output_names] if len(found) > 1 else [""]
     return "; ".join(name + text for name, text in zip(names, found, strict=True) if text)
