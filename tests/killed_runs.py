@@ -70,7 +70,7 @@ def searched(folder):
         agent = resume(path, env, task)
     else:
         search = PolicySearch(updates=12, num_starts=6, num_functions=2, learning_rate=0.05)
-        agent = PolicySearchAgent(env, task, linear, search, random_steps=7, seed=0)
+        agent = PolicySearchAgent(env, task, linear, search, seed=0)
     agent.learn(TOTAL - agent.num_timesteps, EpisodeCheckpoint(path))
     write(agent, folder, agent.policy.state_dict())
 

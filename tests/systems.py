@@ -43,6 +43,11 @@ def truth(X):
     return crude(X) * (1.2 + 0.2 * X[..., :1]) + bias
 
 
+def measured(X):
+    """One output of two inputs, of a laboratory."""
+    return 1.4 * (2 + (2 * X[..., :1]).sin()) + X[..., 1:].square()
+
+
 def ripple(X):
     """As many outputs as inputs, none of them near zero."""
     return 2 + (3 * X).sin()
@@ -69,6 +74,13 @@ class Sine(torch.nn.Module):
     def forward(self, X):
         angle = self.rate * X
         return torch.cat([angle.sin() + self.offset, angle.cos()], -1)[..., : self.num_outputs]
+
+
+def drawn(model, number=2, seed=3):
+    """The model with some draws near the middle of its prior, of its first nested model."""
+    u = 0.4 * normal(number, *model.u.shape[1:], seed=seed)
+    model.set_draws(model.table.with_choice(u, 0))
+    return model.eval()
 
 
 def same(ours, theirs, **tolerance):

@@ -45,7 +45,7 @@ ROOMS = sorted(path.parent for path in ROOT.glob("*/__init__.py"))
 BELOW = ("botorch", "gpytorch", "linear_operator")  # libraries that ours builds on
 
 
-NOT_YET = {"control", "export", "physics", "report", "validation"}
+NOT_YET = {"report", "validation"}
 EDITED = [room for room in ROOMS if room.name not in NOT_YET]  # the words of these are held
 CONDITIONALS, TUPLES = 15, 20  # of 1,000 lines of code, at most
 COMMENTS = 7  # of 100 lines of code, at least
@@ -57,13 +57,13 @@ AVOIDED = re.compile(
 LAYOUT = {getattr(tokenize, name) for name in ("NL", "NEWLINE", "INDENT", "DEDENT", "ENDMARKER")}
 DIRECTIVE = re.compile(r"#\s*(fmt|noqa|type)\b")
 
-CSV_TO_FREE_RUN = 33  # files that a log passes on the way to a judged free run
-TRIAL, ITERATION = 38, 39  # that a planned trial and an iteration of Dyna pass, fits included
-OF_CONTROL, OF_CONTROL_AND_RL = 10, 11  # of these
+CSV_TO_FREE_RUN = 31  # files that a log passes on the way to a judged free run
+TRIAL, ITERATION = 36, 36  # that a planned trial and an iteration of Dyna pass, fits included
+OF_CONTROL, OF_CONTROL_AND_RL = 10, 10  # of these
 FILES, CLASSES, FUNCTIONS = 14, 16, 132  # that the ten lines of the README pass; fewer are better
 CORE_LINES = 5316
 REPORT, WITH_A_REPORT = 14, 29  # of report and validation, and of what is below, by default
-IDENTIFIED = 32  # that a log passes on the way to its page
+IDENTIFIED = 31  # that a log passes on the way to its page
 
 
 def passed(call):

@@ -44,7 +44,7 @@ ALLOWED = {
     "numbers that become Python's, a file's, or are moved where they are used": {
         "core/stacked.py _shares",
         "core/unknowns.py __init__",
-        "kinds/links.py of",
+        "kinds/links.py parse",
         "kinds/vanishing.py __init__",
         "physics/parameters.py __init__",
         "physics/unknown.py _tails",

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from gpadjust import CKA, StackedGP, ZeroMeanGP, compare, fit
 from gpadjust.active import Collection
 from gpadjust.control import MPCAgent, Planner, Task
-from gpadjust.control.episodes import rewards_of
+from gpadjust.control.summary import episode_rewards
 from gpadjust.display import html_table
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.physics import FormulaPhysics, ODEPhysics, PhysicsParameters, Unknown
@@ -84,7 +84,7 @@ def learner():
 
 
 def numbers_of_agent(found):
-    return [number(rewards_of(found)[-1].reward), "10 steps"]
+    return [number(episode_rewards(found)[-1].reward), "10 steps"]
 
 
 def numbers_of_model(found):
@@ -169,7 +169,7 @@ def test_texts_of_a_table_are_escaped():
 
 def test_an_agent_without_episodes_has_nothing_to_draw():
     found = agent()
-    found._observed = found._observed.some(slice(0))
+    found._observed = found._observed.subset(slice(0))
     assert "best" not in found._repr_html_()
     with pytest.raises(ValueError, match="real episodes to draw, found none"):
         found.plot()

@@ -80,7 +80,7 @@ def test_the_core_brings_no_more_than_botorch():
     """And the README's ten lines, and a comparison, need no more."""
     core = {canonicalize_name(Requirement(each).name) for each in PROJECT["dependencies"]}
     assert core <= {"botorch", *brought_by("botorch")}
-    absent = ["gymnasium", "matplotlib", "pandas", "pyro", "torchdiffeq", "tqdm"]
+    absent = ["gymnasium", "matplotlib", "pandas", "pyro", "tqdm"]
     lines = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)[0]
     python(
         f"import sys\nsys.modules.update(dict.fromkeys({absent}))\n{lines}\n"
@@ -91,7 +91,6 @@ def test_the_core_brings_no_more_than_botorch():
 
 NEEDED = {
     "matplotlib": ("plot", lambda: RRA(line(5), line(5), physics=torch.sin).plot()),
-    "torchdiffeq": ("ode", lambda: gpadjust.ODEPhysics(lambda s, a: -s, 0.1, 1, method="dopri5")),
     "mujoco": ("mujoco", lambda: MujocoPhysics("<mujoco/>")),
     "pyro": ("pyro", lambda: pyro_model(RRA(line(5), line(5), physics=torch.sin))),
 }

@@ -45,8 +45,7 @@ class MeasurementWarning(UserWarning):
 class CollectionError(RuntimeError):
     """A run stopped before its budget was spent.
 
-    Args:
-        message: The cause.
+    Attributes:
         collection: The collection so far.
         X: The points of the last call of the oracle, ``q x d``.
         result: The values of the oracle, if the collection could not take them.
@@ -68,12 +67,11 @@ class Collection(Measurements, Display):
     Sobol design; later ones maximise the acquisition function of a model of all data so far. Points
     without a result are pending: acquisition functions with ``X_pending`` consider them.
 
-    With a log, :meth:`tell` first writes each measurement to the disk, as a line of JSON, and
-    :meth:`ask` writes its points before it returns them. A new collection with the same log and the
-    same seed continues where the last one stopped, with the same next and pending points. One
-    collection at a time holds a log, until :meth:`close` (or the end of
-    ``with Collection(...) as collection:``), until it is out of scope, or until its process ends.
-    Nothing in a log is executed or unpickled: a log from a stranger may be wrong, but is harmless.
+    A log has each measurement and each point that was asked for, as a line of JSON on the disk. A
+    new collection with the same log and the same seed continues where the last one stopped, with
+    the same next and pending points. One collection at a time holds a log, until :meth:`close` (or
+    the end of ``with Collection(...) as collection:``), or until it is out of scope. Nothing in a
+    log is executed or unpickled.
 
     Args:
         model_factory: A callable that makes a new model of ``X``, ``n x d``, and ``Y``, ``n x m``,
@@ -86,10 +84,9 @@ class Collection(Measurements, Display):
             points, ``k x d``, all different, in place of Sobol's. Default: ``2 (d + 1)``.
         data: Earlier measurements ``(X, Y)``. They are not logged: pass them each time.
         keep: Limits of the outputs: a function of outputs ``... x m`` to numbers ``... x c``, each
-            at most 0 if permitted, such as ``lambda Y: Y - 3`` for outputs below 3. Points are then
-            limited to those that keep all limits with ``probability`` by the model. The first
-            points, in ``initial`` or ``data``, must be safe by other knowledge, such as f_p; they
-            are not checked. Default: no limits.
+            at most 0 if permitted, such as ``lambda Y: Y - 3`` for outputs below 3. Points then
+            keep all limits with ``probability`` by the model. The first points, in ``initial`` or
+            ``data``, must be safe by other knowledge, such as f_p. Default: no limits.
         probability: Probability of a measurement within the limits of ``keep``, noise included.
         num_outputs: Number ``m`` of outputs. Default: by the first measurement.
         fit: Fits a new model, in place. Default: :func:`gpadjust.fit`, for models of this library.
@@ -99,8 +96,7 @@ class Collection(Measurements, Display):
             random state does not change.
 
     Raises:
-        TypeError: If ``model_factory``, ``acquisition`` or ``fit`` is not callable, or another
-            argument has a wrong type.
+        TypeError: If an argument has a wrong type.
         ValueError: If an argument is out of range, or the log belongs to another problem.
         LogError: If another collection holds the log, or it cannot be opened for writing.
 
@@ -109,16 +105,13 @@ class Collection(Measurements, Display):
         >>> import torch
         >>> from gpadjust import CKA
         >>> from gpadjust.active import Collection, qAdjustmentInformationGain
-        >>> collection = Collection(
-        ...     partial(CKA, physics=torch.sin),
-        ...     bounds=[[0.0], [3.0]],
-        ...     acquisition=lambda model: qAdjustmentInformationGain(model, about="rho"),
-        ... )
+        >>> factory = partial(CKA, physics=torch.sin)
+        >>> collection = Collection(factory, [[0.0], [3.0]], qAdjustmentInformationGain)
         >>> for _ in range(5):
         ...     X = collection.ask()
         ...     collection.tell(X, 2 * torch.sin(X) + X)
-        >>> collection.X.shape, collection.model.num_outputs
-        (torch.Size([5, 1]), 1)
+        >>> collection.model.num_outputs
+        1
     """
 
     def __init__(
@@ -138,22 +131,18 @@ class Collection(Measurements, Display):
         log: str | os.PathLike[str] | None = None,
         seed: int = 0,
     ) -> None:
-        for name, function in (("model_factory", model_factory), ("acquisition", acquisition)):
+        functions = {"model_factory": model_factory, "acquisition": acquisition}
+        functions |= {n: f for n, f in {"fit": fit, "keep": keep}.items() if f is not None}
+        for name, function in functions.items():
             if not callable(function):
                 raise TypeError(f"Expected {name} to be callable, got {function!r}.")
         if isinstance(acquisition, AcquisitionFunction):
-            kind = type(acquisition).__name__
             raise TypeError(
-                "Expected acquisition to be a function that makes an acquisition function of each "
-                f"new model, got one of a model; pass `lambda model: {kind}(model, ...)`."
+                "Expected acquisition to be a function of each new model, got one of a model; pass "
+                f"`lambda model: {type(acquisition).__name__}(model, ...)`."
             )
-        for name, option in (("fit", fit), ("keep", keep)):
-            if option is not None and not callable(option):
-                raise TypeError(f"Expected {name} to be callable, got {option!r}.")
         checked_number("probability", probability, above=0, below=1)
-        self.keep: Keep | None = None
-        if keep is not None:
-            self.keep = Keep(keep, probability)
+        self.keep = None if keep is None else Keep(keep, probability)
         self.model_factory, self.acquisition = model_factory, acquisition
         self.bounds = checked_bounds("bounds", bounds)
         self.batch_size = checked_whole("batch_size", batch_size, 1)
@@ -178,7 +167,7 @@ class Collection(Measurements, Display):
         if keep is not None and self._options:
             raise ValueError(
                 f"Expected no optimizer_options with keep, got {sorted(self._options)}: keep takes "
-                "the best of random safe points, without optimize_acqf. Leave the options out."
+                "the best of random safe points. Leave the options out."
             )
         if num_outputs is not None:
             checked_whole("num_outputs", num_outputs, 1)
@@ -240,15 +229,12 @@ class Collection(Measurements, Display):
     def model(self) -> Any:
         """The model of all data so far, fitted at the first access.
 
-        Raises:
-            RuntimeError: If there are fewer than two measurements of an output.
-            TypeError: If ``model_factory`` does not make a model.
+        Raise a RuntimeError if there are fewer than two measurements of an output.
         """
         if self._model is None:  # new data have removed it
             if self.num_observed < 2:
                 raise RuntimeError(
-                    f"A model needs at least 2 measurements of each output, found "
-                    f"{self.num_observed}."
+                    f"Expected at least 2 measurements of each output, found {self.num_observed}."
                 )
             model = make_model(self.model_factory, self.X, self.Y)
             self._fit(model)
@@ -256,13 +242,7 @@ class Collection(Measurements, Display):
         return self._model
 
     def ask(self, q: int | None = None) -> Tensor:
-        """Choose the points to measure next.
-
-        Args:
-            q: Number of points. Default: ``batch_size``.
-
-        Returns:
-            The points, ``q x d``, which are pending from now on.
+        """Choose the points to measure next, ``q x d``, which are pending from now on.
 
         Raises:
             RuntimeError: If with ``keep`` fewer points are safe, or the first points have too few
@@ -280,13 +260,10 @@ class Collection(Measurements, Display):
             # A seed by the number of calls: a resumed collection returns the same points.
             with seeded((1_000_003 * self.seed + self._num_asks) % 2**63):
                 function = self._acquisition_function(q)
-                others = self.pending, self.failed_X
                 if self.keep is None:
-                    points = best_points(function, self.bounds, q, *others, self._options)
+                    points = best_points(function, self, q, self._options)
                 else:
-                    points, left_out = self.keep.best_points(
-                        function, self.model, self.bounds, q, self.X, *others
-                    )
+                    points, left_out = self.keep.best_points(function, self, q)
                     record = {"left_out": left_out.tolist()}
         self._enter([{"asked": points.tolist(), **record}])
         return points
@@ -301,39 +278,22 @@ class Collection(Measurements, Display):
                 these alone is a failed measurement.
 
         Raises:
-            TypeError: If the arguments are not numbers.
-            ValueError: If shapes disagree.
-            LogError: If they cannot be logged. They are then neither in the log nor in the
-                collection; call this again.
-
-        Warns:
-            MeasurementWarning: If a measurement failed.
+            ValueError: If shapes disagree; a TypeError if there are no numbers.
+            LogError: If they cannot be logged, and are then not in the collection.
         """
         X = checked_points("X", X, self.bounds.shape[-1])
         Y = checked_outcomes(Y, len(X), self.num_outputs)
         self._enter([measurement(x, y) for x, y in zip(X.tolist(), Y.tolist(), strict=True)])
 
     def fail(self, X: Tensor, reason: str | Exception) -> None:
-        """Record failed measurements. :meth:`ask` does not return their points again.
-
-        Args:
-            X: The points, ``n x d``.
-            reason: The cause.
-
-        Warns:
-            MeasurementWarning: In any case.
-        """
+        """Record failed measurements at points ``n x d``, which are not asked for again."""
         X = checked_points("X", X, self.bounds.shape[-1])
         if not isinstance(reason, str):
             reason = f"{type(reason).__name__}: {reason}"
         self._enter([{"x": x, "failed": reason} for x in X.tolist()])
 
     def withdraw(self, X: Tensor | None = None) -> None:
-        """Withdraw pending points without a measurement; :meth:`ask` may return them again.
-
-        Args:
-            X: The points, ``n x d``. Default: all pending points.
-        """
+        """Withdraw some or all pending points, ``n x d``; :meth:`ask` may return them again."""
         if X is None:
             X = self.pending
         self._enter([{"withdrawn": checked_points("X", X, self.bounds.shape[-1]).tolist()}])
@@ -350,29 +310,19 @@ class Collection(Measurements, Display):
 
         A measurement fails if the oracle raises an exception, which concerns the whole batch, or
         returns only NaN and infinity for a point. It is logged with its message, with a warning,
-        and counts against the budget; later points keep a hundredth of the bounds' widths away. If
-        some outputs are NaN, each output has its own measurements.
+        and counts against the budget; later points keep a hundredth of the bounds' widths away.
 
         Args:
             oracle: Maps points ``q x d`` to measured values ``q x m`` (or ``q``).
             budget: Number of all measurements, including failures and the log, but not ``data``.
             progress: If True, show a progress bar.
-            max_failures: Number of successive calls of the oracle without any result after which
-                to stop.
-
-        Returns:
-            This collection.
+            max_failures: Number of successive calls without any result after which to stop.
 
         Raises:
-            TypeError: If the oracle is not callable.
-            ValueError: If a number is out of range.
             LogError: If the log cannot be written.
             CollectionError: If the oracle fails too often, or its result cannot be measured values
                 or cannot be logged: the error has it as ``result``, and the points are still
                 pending.
-
-        Warns:
-            MeasurementWarning: If a measurement fails.
         """
         if not callable(oracle):
             raise TypeError(f"Expected the oracle to be callable, got {oracle!r}.")
@@ -394,13 +344,12 @@ class Collection(Measurements, Display):
                 if len(self.X) > num_before:
                     failures = 0
                 if failures >= max_failures:
-                    raise CollectionError(
+                    message = (
                         f"The oracle failed {failures} times in a row, the last time at "
                         f"{X.tolist()}: {error or 'NaN or infinity'}. {len(self.X)} measurements "
-                        f"are in the error's `.collection`; {self._log_path()}.",
-                        self,
-                        X,
-                    ) from error
+                        f"are in the error's `.collection`; {self._log_path()}."
+                    )
+                    raise CollectionError(message, self, X) from error
         return self
 
     def close(self) -> None:
@@ -417,14 +366,10 @@ class Collection(Measurements, Display):
         if self.keep is not None:  # Sobol points may not be safe
             if len(first):
                 return first[:q]
-            if len(self.pending):
-                raise RuntimeError(
-                    f"All first points are asked for, and {len(self.pending)} of them are pending: "
-                    "tell() their results first, as later points need a model of them."
-                )
             raise RuntimeError(
-                f"The first points gave {self.num_observed} measurements, but a model that keeps "
-                "limits needs two of each output; tell() measurements at other safe points."
+                "Expected two measurements of each output, as later points need a model that keeps "
+                f"the limits; found {self.num_observed}. Of the first points, {len(self.pending)} "
+                "are pending: tell() their results first, or measurements at other safe points."
             )
         return torch.cat([first, sobol_points(self.bounds, q, earlier, self.seed)])[:q]
 
@@ -454,13 +399,12 @@ class Collection(Measurements, Display):
             self._model = None
         failed = [record for record in records if "failed" in record]
         if failed:
-            warnings.warn(
+            message = (
                 f"{len(failed)} of {len(records)} measurements failed, the first at x = "
                 f"{failed[0]['x']}: {failed[0]['failed']}. They count against a budget, and "
-                "ask() does not return them again.",
-                MeasurementWarning,
-                stacklevel=3,
+                "ask() does not return them again."
             )
+            warnings.warn(message, MeasurementWarning, stacklevel=3)
 
     def _resume(self, log: MeasurementLog) -> None:
         """Apply the records of the log."""
@@ -489,15 +433,13 @@ class Collection(Measurements, Display):
             if self.log is not None:
                 with suppress(LogError):
                     self.log.append([refusal(X, result, error)])
-            raise CollectionError(
+            message = (
                 f"The oracle returned no measured values for the points {X.tolist()}: {error} The "
                 f"result is in this error's `.result`; {self._log_path()}. The points are still "
                 "pending: tell() `.collection` their values, correct the oracle, and run it again. "
-                "An oracle reports a failure by an exception or by NaN.",
-                self,
-                X,
-                result,
-            ) from error
+                "An oracle reports a failure by an exception or by NaN."
+            )
+            raise CollectionError(message, self, X, result) from error
         try:
             self.tell(X, Y)
         except LogError as error:
@@ -523,30 +465,18 @@ def collect(
 ) -> Collection:
     """Measure at the most informative points, until the budget is spent.
 
-    This makes a :class:`Collection` with ``options``, calls :meth:`~Collection.run`, and closes
-    it, with their arguments, errors and warnings. With a log the same call continues after an
-    interruption, or with a larger budget.
-
-    Returns:
-        The collection, with all data in ``X`` and ``Y``, their ``model``, ``failed_X``, and
-        ``ask``, ``tell`` and ``run`` to continue.
+    This makes a :class:`Collection` with ``options``, calls :meth:`~Collection.run`, closes and
+    returns it, with their arguments, errors and warnings. With a log the same call continues after
+    an interruption, or with a larger budget.
 
     Example:
         >>> from functools import partial
         >>> import torch
         >>> from gpadjust import CKA
         >>> from gpadjust.active import collect, qAdjustmentInformationGain
-        >>> result = collect(
-        ...     partial(CKA, physics=torch.sin),
-        ...     oracle=lambda X: 2 * torch.sin(X) + X,
-        ...     bounds=[[0.0], [3.0]],
-        ...     acquisition=qAdjustmentInformationGain,
-        ...     budget=6,
-        ...     batch_size=2,
-        ...     optimizer_options={"num_restarts": 2, "raw_samples": 16},
-        ... )
-        >>> result.Y.shape
-        torch.Size([6, 1])
+        >>> problem = partial(CKA, physics=torch.sin), lambda X: 2 * X.sin() + X, [[0.0], [3.0]]
+        >>> collect(*problem, qAdjustmentInformationGain, budget=5).Y.shape
+        torch.Size([5, 1])
     """
     with Collection(model_factory, bounds, acquisition, **options) as collection:
         return collection.run(oracle, budget, progress=progress, max_failures=max_failures)

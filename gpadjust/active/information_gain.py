@@ -30,10 +30,9 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
         = \tfrac{1}{2} \log\det \mathrm{Cov}(y(X) \mid D)
         - \tfrac{1}{2} \log\det \mathrm{Cov}(y(X) \mid D, \rho).
 
-    Both have a closed form. The first is the covariance of the model. For the second, subtract the
-    known :math:`\rho f_p` from all observations. The remainder is :math:`\delta(x) + \varepsilon`,
-    and as rho and delta are independent a priori (Kennedy and O'Hagan 2000), this is a regression
-    on delta alone, at the same points with the same noise S,
+    Both have a closed form. The first is the covariance of the model. As rho and delta are
+    independent a priori (Kennedy and O'Hagan 2000), the second is that of a regression on delta
+    alone, at the same points with the same noise S,
 
     .. math::
         \mathrm{Cov}(y(X) \mid D, \rho) = k_\delta(X, X)
@@ -41,13 +40,7 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
 
     About :math:`\delta` it is the same with :math:`F_p k_\rho F_p^T` in place of
     :math:`k_\delta`; about both, only the noise :math:`S_X` remains. Determinants are in units of
-    the noise, :math:`\det(I + S_X^{-1/2} C S_X^{-1/2})` for the covariance C of the function, and
-    never singular. Thus
-
-    .. math:: I(y; \rho, \delta) = I(y; \rho) + I(y; \delta \mid \rho) \geq I(y; \rho) \geq 0.
-
-    Where :math:`f_p(x) = 0` an observation depends on delta alone. It still has information about
-    rho, through delta at measured points nearby.
+    the noise, and never singular.
 
     The acquisition needs no samples, is differentiable if f_p is, sums the information of
     independent outputs, and averages over the draws of the model's unknown numbers. Unknown
@@ -55,12 +48,8 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
     with known noise (``train_Yvar``), the average of the old ones.
 
     References:
-        M. C. Kennedy and A. O'Hagan, *Predicting the output from a complex computer code when fast
-        approximations are available*, Biometrika 87, 2000. D. V. Lindley, *On a measure of the
-        information provided by an experiment*, Annals of Mathematical Statistics 27, 1956. D. J. C.
-        MacKay, *Information-based objective functions for active data selection*, Neural
-        Computation 4, 1992. N. Houlsby, F. Huszar, Z. Ghahramani and M. Lengyel, *Bayesian active
-        learning for classification and preference learning*, arXiv:1112.5745, 2011.
+        Kennedy and O'Hagan, Biometrika 87, 2000. Lindley, Annals of Mathematical Statistics 27,
+        1956. MacKay, Neural Computation 4, 1992. Houlsby et al., arXiv:1112.5745, 2011.
 
     Args:
         model: A :class:`~gpadjust.CKA`, or another model with a physics and with rho or delta.
@@ -82,8 +71,6 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
         >>> acquisition = qAdjustmentInformationGain(model, about="rho")
         >>> bounds = torch.tensor([[0.0], [1.0]], dtype=torch.float64)
         >>> X, value = optimize_acqf(acquisition, bounds, q=2, num_restarts=2, raw_samples=8)
-        >>> X.shape
-        torch.Size([2, 1])
     """
 
     def __init__(self, model: GP, about: About = "both", X_pending: Tensor | None = None) -> None:
@@ -96,14 +83,7 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
     @concatenate_pending_points  # type: ignore[untyped-decorator]
     @t_batch_mode_transform()  # type: ignore[untyped-decorator]
     def forward(self, X: Tensor) -> Tensor:
-        """Return the information in nats.
-
-        Args:
-            X: Raw inputs, ``batch_shape x q x d``.
-
-        Returns:
-            The information of each batch of ``q`` points, ``batch_shape``.
-        """
+        """Return the information in nats, ``batch_shape``, of inputs ``batch_shape x q x d``."""
         model: Any = self.model
         conditioning = model.conditioning()
         values = conditioning.train.values
@@ -165,18 +145,15 @@ def _remaining(model: Any, about: str) -> tuple[str, ...]:
         raise TypeError(f"{name} has no unknown {about}; use about={other!r}, or take CKA.")
     if about == "delta" and any(term.has_center for term in terms):
         raise ValueError(
-            f"The {name} has a center of f_p (by default an unknown one), so that delta is not "
-            "independent of rho a priori and its information has no closed form: use about='rho' "
-            "or 'both', or build and fit the model with center=0.0."
+            f"The {name} has a center of f_p, so that delta is not independent of rho a priori and "
+            "its information has no closed form: use about='rho' or 'both', or build the model "
+            "with center=0.0."
         )
     return parts[other]
 
 
 def _log_sds(covariance: Tensor, noise: Tensor) -> Tensor:
-    """Return half the log determinant of noisy observations, in units of their noise.
-
-    The covariance without noise is ``... x q x q``, the noise variances ``... x q`` (or 1).
-    """
+    """Return half the log determinant of observations, in units of their noise ``... x q``."""
     # log det(I + S^-1/2 C S^-1/2) / 2 = sum_i log L_ii
     sd = noise.sqrt()
     scaled = covariance / (sd.unsqueeze(-1) * sd.unsqueeze(-2))

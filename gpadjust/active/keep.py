@@ -21,13 +21,7 @@ _AT_ONCE = 256  # candidates
 
 @dataclass(frozen=True)
 class Keep:
-    """Limits of the outputs, and the probability with which a measurement keeps them.
-
-    Args:
-        limits: A function of outputs ``... x m`` to numbers ``... x c``, each at most 0 for
-            permitted outputs.
-        probability: Probability of a measurement within all limits.
-    """
+    """Limits of the outputs, at most 0 where permitted, and the probability to keep them."""
 
     limits: Callable[[Tensor], Tensor]
     probability: float
@@ -44,37 +38,19 @@ class Keep:
         return torch.cat(shares)
 
     def best_points(
-        self,
-        acquisition: AcquisitionFunction,
-        model: Any,
-        bounds: Tensor,
-        q: int,
-        measured: Tensor,
-        pending: Tensor,
-        failed: Tensor,
+        self, acquisition: AcquisitionFunction, collection: Any, q: int
     ) -> tuple[Tensor, Tensor]:
-        """Return the best of random points that are safe by the model (Sui et al. 2015).
+        """Return the best of random points that are safe by the model (Sui et al. 2015), ``q x d``.
 
-        Args:
-            acquisition: The acquisition function.
-            model: The model.
-            bounds: Bounds of the inputs, ``2 x d``.
-            q: Number of points.
-            measured: Measured points, ``n x d``.
-            pending: As of :func:`~gpadjust.active.points.best_points`.
-            failed: As of :func:`~gpadjust.active.points.best_points`.
-
-        Returns:
-            The points, ``q x d``, and the unsafe points with higher values of the acquisition
-            function, ``l x d``, at most one for each.
-
-        Raises:
-            RuntimeError: If fewer points are safe, or these are too close to each other.
+        And the unsafe points with higher values of the acquisition function, ``l x d``, at most one
+        for each. Raise a RuntimeError if fewer points are safe and apart.
         """
+        bounds = collection.bounds
+        avoided = torch.cat([collection.pending, collection.failed_X])
         # Candidates away from failed and pending points, with their probability by the model.
-        points = self._candidates(bounds, torch.cat([measured, pending]))
-        points = points[(distances(points, torch.cat([failed, pending]), bounds) >= NEAR).all(-1)]
-        is_safe = self.probabilities(model, points) >= self.probability
+        points = _candidates(bounds, torch.cat([collection.X, collection.pending]))
+        points = points[(distances(points, avoided, bounds) >= NEAR).all(-1)]
+        is_safe = self.probabilities(collection.model, points) >= self.probability
         num_points = len(points)
         num_safe = int(is_safe.sum())
         best_points: list[Tensor] = []
@@ -87,7 +63,7 @@ class Keep:
                     f"of the bounds' widths; expected {q}. Add measurements at points that you "
                     "know as safe, closer to each other, or lower the probability."
                 )
-            others = torch.cat([pending, failed, *best_points])
+            others = torch.cat([avoided, *best_points])
             # A function without X_pending takes single points, which are apart from others here.
             with taken_as_pending(acquisition, others), torch.no_grad():
                 values = torch.cat([acquisition(z.unsqueeze(-2)) for z in points.split(_AT_ONCE)])
@@ -101,11 +77,12 @@ class Keep:
             points, is_safe = points[is_apart], is_safe[is_apart]
         return torch.cat(best_points), torch.cat([bounds[:0], *left_out])
 
-    def _candidates(self, bounds: Tensor, centers: Tensor) -> Tensor:
-        """Return random points ``n x d`` in the bounds, half of them near some centers."""
-        seed = int(torch.randint(2**31, (1,)))
-        everywhere = draw_sobol_samples(bounds, n=_CANDIDATES, q=1, seed=seed).squeeze(-2)
-        # Safe regions grow from measured points, and may be small.
-        near = centers[torch.randint(len(centers), (_CANDIDATES,))]
-        near = near + _REACH * (bounds[1] - bounds[0]) * torch.randn_like(near)
-        return torch.cat([everywhere, near.clamp(*bounds)])
+
+def _candidates(bounds: Tensor, centers: Tensor) -> Tensor:
+    """Return random points ``n x d`` in the bounds, half of them near some centers."""
+    seed = int(torch.randint(2**31, (1,)))
+    everywhere = draw_sobol_samples(bounds, n=_CANDIDATES, q=1, seed=seed).squeeze(-2)
+    # Safe regions grow from measured points, and may be small.
+    near = centers[torch.randint(len(centers), (_CANDIDATES,))]
+    near = near + _REACH * (bounds[1] - bounds[0]) * torch.randn_like(near)
+    return torch.cat([everywhere, near.clamp(*bounds)])

@@ -31,23 +31,9 @@ class MeasurementLog:
     example to a full disk, the file does not change.
 
     One log at a time holds a file, from :meth:`open` until it is closed or deleted, or its process
-    ends or is killed. The lock is another file in the folder, ``<name>.lock``, which stays there
-    and has no meaning by itself. Copies and pickles of a log do not hold its file; their first
-    :meth:`append` locks it, unless the file has changed.
-
-    Args:
-        path: The file.
-
-    Example:
-        >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "measurements.jsonl"
-        >>> log = MeasurementLog(path)
-        >>> log.open([[0.0], [1.0]])
-        []
-        >>> log.append([{"x": [0.5], "y": [1.25]}])
-        >>> log.close()
-        >>> MeasurementLog(path).open([[0.0], [1.0]])
-        [{'x': [0.5], 'y': [1.25]}]
+    ends. The lock is another file in the folder, ``<name>.lock``, which stays there. Copies and
+    pickles of a log do not hold its file; their first :meth:`append` locks it, unless the file has
+    changed.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -60,12 +46,8 @@ class MeasurementLog:
     def open(self, bounds: list[list[float]]) -> list[Record]:
         """Lock the file and return its records; make a new file and its folder if needed.
 
-        Args:
-            bounds: Bounds of the inputs, ``2 x d``, in the first line of the file.
-
-        Raises:
-            LogError: If another log holds the file, or it cannot be opened for writing.
-            ValueError: If the file has other bounds, or a line is not a record.
+        The first line has the bounds of the inputs, ``2 x d``. Raise a LogError if another log
+        holds the file or it cannot be written, a ValueError if its content is of another kind.
         """
         header = {"format": _FORMAT, "bounds": bounds}
         with self._explained("opened", "Name a file in a folder where you may write."):
@@ -104,18 +86,10 @@ class MeasurementLog:
         return records[1:]
 
     def append(self, records: Iterable[Record]) -> None:
-        """Write records at the end, and wait until they are on the disk.
-
-        Raises:
-            LogError: If the records cannot be written, and are then not in the file; or if another
-                log holds the file, or has written to it.
-        """
+        """Write records at the end, and wait until they are on the disk, or raise a LogError."""
         data = self._missing_end + b"".join(map(_line, records))
-        way_out = (
-            "Earlier records are safe; the new ones are neither on the disk nor in the collection. "
-            "Make room, and tell it again."
-        )
-        with self._explained("written", way_out):
+        way_out = "The new records are neither on the disk nor in the collection: make room, and "
+        with self._explained("written", way_out + "tell it again."):
             self._hold()
             with self.path.open("r+b", buffering=0) as file:
                 # Bytes after the records are our own torn record, or another program's.

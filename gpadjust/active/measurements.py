@@ -19,29 +19,21 @@ class Measurements:
 
     A record is one of
 
-    - ``{"asked": [x, ...], "left_out": [x, ...]}``: points to measure, and better ones that limits
-      exclude;
+    - ``{"asked": [x, ...], "left_out": [x, ...]}``: points to measure, and excluded better ones;
     - ``{"x": x, "y": y}``: a measurement, null for a missing output;
     - ``{"x": x, "failed": message}``: a failed measurement, with or without ``"y"``;
     - ``{"withdrawn": [x, ...]}``: pending points that will not be measured;
-    - ``{"refused": result, "of": [x, ...], "because": message}``: a result of an oracle that cannot
-      be measured values. It changes nothing; a human may recover it.
+    - ``{"refused": result, "of": [x, ...], "because": message}``: an invalid result of an oracle.
 
     A measurement belongs to the nearest pending point within a hundredth of the bounds' widths: a
     laboratory seldom sets inputs to the last digit.
-
-    Args:
-        bounds: Bounds of the inputs, ``2 x d``.
-        num_outputs: Number ``m`` of outputs, or None for that of the first measurement.
-        data: Earlier measurements ``(X, Y)``, or None.
 
     Attributes:
         X: The measured points, ``n x d``, ``data`` first.
         Y: The measured values, ``n x m``; NaN for a missing output.
         failed_X: Points of failed measurements, ``k x d``.
         pending: Points without a result yet, ``l x d``.
-        left_out: Points with the best values of the acquisition function that limits excluded,
-            ``k x d``.
+        left_out: Better points that limits excluded, ``k x d``.
         num_measured: Number of measurements, including failures but not ``data``.
         num_outputs: Number ``m`` of outputs; None before the first measurement.
     """
@@ -117,19 +109,13 @@ class Measurements:
 
     def _points(self, rows: list[list[float]]) -> Tensor:
         """Return the points of a record, ``n x d``."""
-        d = self.X.shape[-1]
         if not rows:
-            return self.X.new_zeros(0, d)
-        return checked_points("X", rows, d)
+            return self.X[:0]
+        return checked_points("X", rows, self.X.shape[-1])
 
 
 def refusal(X: Tensor, result: Any, error: Exception) -> Record:
-    """Return the record of an invalid result of an oracle for points ``q x d``.
-
-    Example:
-        >>> refusal(torch.zeros(1, 1), {"Y": torch.tensor([1.5, math.nan])}, ValueError("no"))
-        {'refused': {'Y': [1.5, 'NaN']}, 'of': [[0.0]], 'because': 'no'}
-    """
+    """Return the record of an invalid result of an oracle for points ``q x d``."""
 
     def plain(part: Any) -> Any:  # arrays and tensors as lists
         return part.tolist() if hasattr(part, "tolist") else repr(part)
@@ -143,14 +129,7 @@ def refusal(X: Tensor, result: Any, error: Exception) -> Record:
 
 
 def measurement(x: list[float], y: list[float]) -> Record:
-    """Return the record of a measurement; of a failed one if no value is finite.
-
-    Example:
-        >>> measurement([0.5], [1.25, float("nan")])
-        {'x': [0.5], 'y': [1.25, None]}
-        >>> measurement([0.5], [float("inf")])
-        {'x': [0.5], 'y': [None], 'failed': 'measured [inf]'}
-    """
+    """Return the record of a measurement; of a failed one if no value is finite."""
     # JSON has no NaN: null stands for it.
     record: Record = {"x": x, "y": [value if math.isfinite(value) else None for value in y]}
     if not any(map(math.isfinite, y)):
@@ -159,17 +138,7 @@ def measurement(x: list[float], y: list[float]) -> Record:
 
 
 def checked_outcomes(Y: Any, num_points: int, num_outputs: int | None) -> Tensor:
-    """Return measured values as ``n x m``, float64; they may be NaN or infinite.
-
-    Args:
-        Y: The values, ``n x m`` or ``n``, or one number for one point.
-        num_points: Number ``n`` of points.
-        num_outputs: Number ``m`` of outputs, or None.
-
-    Raises:
-        TypeError: If the values are not numbers.
-        ValueError: If they have another shape.
-    """
+    """Return values ``n x m`` or ``n``, or a number, as ``n x m``; they may be NaN or infinite."""
     Y = checked_tensor("measured values", Y)
     columns = Y
     if Y.dim() < 2:  # one output
@@ -184,12 +153,7 @@ def checked_outcomes(Y: Any, num_points: int, num_outputs: int | None) -> Tensor
 
 
 def as_options(options: Any) -> dict[str, Any]:
-    """Return options of ``optimize_acqf``; an empty dictionary for None.
-
-    Raises:
-        TypeError: If they are not a dictionary.
-        ValueError: If the collection sets one of them.
-    """
+    """Return options of ``optimize_acqf``; raise a ValueError if the collection sets one."""
     if options is None:
         return {}
     if not isinstance(options, dict):

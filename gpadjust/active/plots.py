@@ -27,20 +27,11 @@ def plot_collection(
         collection: The collection.
         optimum: The best value of each output, or of all. Further axes then have the regret, the
             distance of the closest measurement so far. Default: none.
-        axes: An axis for each input, output and regret. Default: a new figure.
-
-    Returns:
-        An array of the axes; ``axes[0].figure`` is the figure.
-
-    Raises:
-        ValueError: If the optimum is not finite or has another number of outputs, or the number of
-            ``axes`` is wrong.
+        axes: An axis for each input, output and regret, returned. Default: a new figure.
     """
     X, Y, pending = collection.X, collection.Y, collection.pending
     n, d, m = len(X), X.shape[-1], Y.shape[-1]
-    best: list[float] = []
-    if optimum is not None:
-        best = checked_tensor("optimum", optimum).reshape(-1).tolist()
+    best = [] if optimum is None else checked_tensor("optimum", optimum).reshape(-1).tolist()
     if len(best) == 1:
         best = best * m
     if len(best) not in (0, m) or not all(map(math.isfinite, best)):

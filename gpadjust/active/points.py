@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import torch
@@ -19,17 +19,7 @@ _OTHERS = 256  # random points, of which the best replaces one too close to othe
 
 
 def sobol_points(bounds: Tensor, q: int, earlier: Tensor, seed: int) -> Tensor:
-    """Return the next points of a scrambled Sobol sequence.
-
-    Args:
-        bounds: Bounds of the inputs, ``2 x d``.
-        q: Number of points.
-        earlier: Points to leave out, ``n x d``.
-        seed: Seed of the scrambling.
-
-    Returns:
-        The points, ``q x d``.
-    """
+    """Return the next points of a scrambled Sobol sequence without earlier ones, ``q x d``."""
     engine = SobolEngine(bounds.shape[-1], scramble=True, seed=seed)
     # The earlier points may be those of the sequence, or any others.
     unit = engine.draw(len(earlier) + q, dtype=torch.float64)
@@ -43,47 +33,32 @@ def among(points: Tensor, others: Tensor) -> Tensor:
 
 
 def distances(points: Tensor, others: Tensor, bounds: Tensor) -> Tensor:
-    """Return distances of points ``n x d`` from others, ``n x k``, in the bounds' widths.
-
-    A distance is the largest difference of an input.
-    """
+    """Return distances of points ``n x d`` from others, ``n x k``, in the bounds' widths."""
     # max_i |x_i - x'_i| / (b_i - a_i)
     gaps = (points.unsqueeze(-2) - others).abs() / (bounds[1] - bounds[0])
     return gaps.amax(-1)
 
 
 def best_points(
-    acquisition: AcquisitionFunction,
-    bounds: Tensor,
-    q: int,
-    pending: Tensor,
-    failed: Tensor,
-    options: dict[str, Any],
+    acquisition: AcquisitionFunction, collection: Any, q: int, options: dict[str, Any]
 ) -> Tensor:
-    """Maximise an acquisition function.
+    """Return points of a maximum of an acquisition function, ``q x d``, by ``optimize_acqf``.
 
-    Args:
-        acquisition: The acquisition function.
-        bounds: Bounds of the inputs, ``2 x d``.
-        q: Number of points.
-        pending: Points that are being measured, ``k x d``.
-        failed: Points of failed measurements, ``l x d``. The function considers them as pending,
-            so that their neighbourhood has no value, and no point is near one of them.
-        options: Arguments of ``optimize_acqf`` other than those above.
-
-    Returns:
-        The points, ``q x d``.
+    Failed points count as pending, so that their neighbourhood has no value, and no point is near.
     """
     # A line search that rounding errors end has converged: a second try is not needed.
     defaults = {"num_restarts": 8, "raw_samples": 128, "retry_on_optimization_warning": False}
-    others = torch.cat([pending, failed])
+    bounds, failed = collection.bounds, collection.failed_X
+    others = torch.cat([collection.pending, failed])
     with taken_as_pending(acquisition, others) as has_pending:
         # A function without X_pending would return pending points again.
-        avoided = failed if has_pending else others
+        avoided = others
+        if has_pending:
+            avoided = failed
         points, _ = optimize_acqf(acquisition, bounds, q=q, **{**defaults, **options})
         points = points.detach()
         for i in range(q):
-            if _near(points[i : i + 1], avoided, bounds).any():
+            if (distances(points[i : i + 1], avoided, bounds) < NEAR).any():
                 points[i] = _elsewhere(acquisition, points, i, avoided, bounds)
     return points
 
@@ -92,23 +67,17 @@ def best_points(
 def taken_as_pending(acquisition: AcquisitionFunction, points: Tensor) -> Iterator[bool]:
     """Add pending points to an acquisition function for a while; yield whether it takes any."""
     before = getattr(acquisition, "X_pending", None)
-    has_pending = bool(len(points))
-    if has_pending:
-        pending = points if before is None else torch.cat([before, points])
-        try:
+    pending = points if before is None else torch.cat([before, points])
+    has_pending = False
+    if len(points):
+        with suppress(UnsupportedError):
             acquisition.set_X_pending(pending)
-        except UnsupportedError:
-            has_pending = False
+            has_pending = True
     try:
         yield has_pending
     finally:
         if has_pending:
             acquisition.set_X_pending(before)
-
-
-def _near(points: Tensor, others: Tensor, bounds: Tensor) -> Tensor:
-    """Return a mask of points ``n x d`` near one of the others, ``n``."""
-    return (distances(points, others, bounds) < NEAR).any(-1)
 
 
 def _elsewhere(
@@ -117,7 +86,7 @@ def _elsewhere(
     """Return the best place for the i-th point among random ones away from others."""
     seed = int(torch.randint(2**31, (1,)))
     places = draw_sobol_samples(bounds, n=_OTHERS, q=1, seed=seed).squeeze(-2)
-    places = places[~_near(places, avoided, bounds)]
+    places = places[(distances(places, avoided, bounds) >= NEAR).all(-1)]
     if not len(places):
         return points[i]
     if isinstance(acquisition, OneShotAcquisitionFunction):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from inspect import Parameter, signature
 from typing import Any, Self
@@ -19,7 +19,6 @@ class ParameterPhysics:
 
     Its inputs have the units of the search space and its outputs those of its metric, whatever Ax
     transforms before a model (:class:`~gpadjust.ax.TellPhysics`). Ax saves it by its import path.
-    Every function of this room with a physics as its argument makes one of it.
 
     Args:
         physics: The physics f_p. A function with parameters as its arguments,
@@ -36,7 +35,7 @@ class ParameterPhysics:
         >>> from gpadjust.ax import ParameterPhysics
         >>> ParameterPhysics("torch:sin").path
         'torch:sin'
-        >>> ParameterPhysics(lambda x1, x2: x1 * x2).names_of(["x2", "x1", "x3"])
+        >>> ParameterPhysics(lambda x1, x2: x1 * x2).read_names(["x2", "x1", "x3"])
         ('x1', 'x2')
     """
 
@@ -65,14 +64,10 @@ class ParameterPhysics:
         """The import path for saving; None without one, for example of a lambda."""
         return self._path or import_path(self.physics)
 
-    def names_of(self, parameters: Sequence[str]) -> tuple[str, ...]:
-        """Return the parameters that the physics reads, in its order.
+    def read_names(self, parameters: Sequence[str]) -> tuple[str, ...]:
+        """Return the parameters that the physics reads, in its order, of those of a search space.
 
-        Args:
-            parameters: All parameters of the search space, in its order.
-
-        Raises:
-            ValueError: If the physics has several arguments that are not all parameters.
+        Raise a ValueError if it has several arguments that are not all parameters.
         """
         # Arguments without a default must be parameters; others may be.
         arguments = self._arguments()
@@ -85,17 +80,13 @@ class ParameterPhysics:
             raise ValueError(
                 f"The physics {self.name!r} takes {', '.join(arguments)}, but "
                 f"{', '.join(name for name in needed if name not in parameters)} is not a "
-                f"parameter of the search space, which has {', '.join(parameters)}. Give its "
-                "arguments the names of parameters, or let it take one tensor with a column for "
-                "each."
+                f"parameter of the search space, which has {', '.join(parameters)}. Name its "
+                "arguments as parameters, or let it take one tensor with a column for each."
             )
         return tuple(parameters)
 
-    def of(self, names: tuple[str, ...]) -> Physics:
-        """Return the physics as one of rows with the columns ``names``, see :meth:`names_of`.
-
-        Repeated calls return the same object, so that the memory of f_p outlives a model.
-        """
+    def take_rows(self, names: tuple[str, ...]) -> Physics:
+        """Return the physics of rows with the columns ``names``: each time the same object."""
         if names not in self._by_names:
             physics = self.physics
             # A function of named arguments gets columns, any other one rows.
@@ -106,7 +97,6 @@ class ParameterPhysics:
         return self._by_names[names]
 
     def __repr__(self) -> str:
-        """Return the class with the path, or with the name of a physics without one."""
         return f"{type(self).__name__}({self.path or self.name!r})"
 
     def __eq__(self, other: object) -> bool:
@@ -116,7 +106,6 @@ class ParameterPhysics:
         )
 
     def __hash__(self) -> int:
-        """Return the hash of the name."""
         return hash(self.name)
 
     def __deepcopy__(self, memo: Any) -> Self:
@@ -133,24 +122,6 @@ class ParameterPhysics:
             return {}
         kinds = (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)
         return {name: p.default for name, p in parameters.items() if p.kind in kinds}
-
-
-def parts_of(physics: Any) -> list[Any]:
-    """Return a list of the physics of a metric: one, several, or none."""
-    if isinstance(physics, Mapping):
-        return [*physics.values()]
-    if isinstance(physics, list | tuple):
-        return [*physics]
-    return [] if physics is None else [physics]
-
-
-def of_each(change: Callable[[Any], Any], physics: Any) -> Any:
-    """Return the result of a function for each physics of a metric, in the form of the physics."""
-    if isinstance(physics, Mapping):
-        return {name: change(part) for name, part in physics.items()}
-    if isinstance(physics, list | tuple):
-        return [change(part) for part in physics]
-    return change(physics)
 
 
 def _of_columns(function: Callable[..., Tensor], names: tuple[str, ...], X: Tensor) -> Tensor:

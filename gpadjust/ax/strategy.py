@@ -16,13 +16,13 @@ from ax.generation_strategy.generation_strategy import GenerationStrategy
 from ax.generators.torch.botorch_modular.surrogate import SurrogateSpec
 from ax.generators.torch.botorch_modular.utils import ModelConfig
 
-from gpadjust.ax.parameter_physics import ParameterPhysics, of_each
+from gpadjust.ax.parameter_physics import ParameterPhysics
 from gpadjust.ax.tell_physics import TellPhysics
 from gpadjust.core import CKA, GP, ZeroMeanGP
+from gpadjust.kinds.factory import map_parts
 
 TRANSFORMS: list[type[Transform]] = [*MBM_X_trans, Derelativize, StandardizeY, TellPhysics]
-"""Ax's transforms of parameters; for metrics only shift and scale, as others (``Winsorize``,
-``BilogY``) would distort the outputs of f_p; and ``TellPhysics``."""
+"""Ax's transforms of parameters; of metrics shift and scale alone; and ``TellPhysics``."""
 
 
 def generator_kwargs(
@@ -31,7 +31,7 @@ def generator_kwargs(
     model: type[GP] | partial[GP] = CKA,
     fit_options: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Return arguments of Ax's ``BOTORCH_MODULAR`` generator, for your own ``GeneratorSpec``.
+    """Return ``surrogate_spec`` and ``transforms`` of Ax's ``BOTORCH_MODULAR`` generator.
 
     Args:
         physics: The physics of metrics by the metrics' names, see :class:`ParameterPhysics`;
@@ -39,35 +39,27 @@ def generator_kwargs(
         model: The model of these metrics: a class, or ``functools.partial`` of one with further
             arguments, whose units are those after Ax's transforms. The other metrics have a
             :class:`~gpadjust.ZeroMeanGP`.
-        fit_options: Arguments of :func:`gpadjust.fit`, such as ``{"method": "map"}``, for all
-            metrics.
-
-    Returns:
-        ``surrogate_spec`` and ``transforms``.
+        fit_options: Arguments of :func:`gpadjust.fit`, such as ``{"method": "map"}``.
 
     Raises:
-        TypeError: If ``physics`` is not a mapping of metrics to physics, or ``model`` is not such a
-            class.
+        TypeError: If ``physics`` is not a mapping, or ``model`` is not such a class.
     """
     if not isinstance(physics, Mapping) or not physics:
-        raise TypeError(
-            "Expected the physics of at least one metric by its name, {'cost': f_p}, found "
-            f"{physics!r}."
-        )
+        message = "Expected the physics of at least one metric by its name, {'cost': f_p}, found "
+        raise TypeError(f"{message}{physics!r}.")
     mll_options = dict(fit_options or {})
     model_class, options = _class_of(model)
     # One config for each metric with a physics, and one for all others.
     configs = {
         metric: ModelConfig(
             botorch_model_class=model_class,
-            model_options={**options, "physics": of_each(ParameterPhysics, part)},
+            model_options={**options, "physics": map_parts(ParameterPhysics, part)},
             name=f"{model_class.__name__} of {metric}",
             mll_options=mll_options,
         )
         for metric, part in physics.items()
     }
     other = ModelConfig(botorch_model_class=ZeroMeanGP, name="ZeroMeanGP", mll_options=mll_options)
-    # Ax takes the model of a metric, or the general one.
     spec = SurrogateSpec(
         model_configs=[other],
         metric_to_model_configs={metric: [config] for metric, config in configs.items()},
@@ -84,21 +76,16 @@ def generation_strategy(
 ) -> GenerationStrategy:
     """Return Ax's default strategy, with models that adjust a physics in place of Ax's models.
 
-    The first trials are those of Ax, the center of the search space and Sobol points.
+    The first trials are those of Ax, the center of the search space and Sobol points. Arguments and
+    errors are those of :func:`generator_kwargs`; at the first trial of a model, a physics that
+    reads an unknown parameter, or text, is a ValueError.
 
     Args:
-        physics: As in :func:`generator_kwargs`.
-        model: As in :func:`generator_kwargs`.
-        fit_options: As in :func:`generator_kwargs`.
+        physics: The physics of metrics.
+        model: The model of these metrics.
+        fit_options: Arguments of :func:`gpadjust.fit`.
         options: Options of ``Client.configure_generation_strategy`` except ``method``, such as
             ``initialization_budget`` and ``initialization_random_seed``.
-
-    Returns:
-        A strategy for ``client.set_generation_strategy``.
-
-    Raises:
-        TypeError: As :func:`generator_kwargs`.
-        ValueError: At the first trial of a model, if a physics reads an unknown parameter, or text.
 
     Example:
         >>> from ax.api.client import Client
@@ -125,15 +112,12 @@ def generation_strategy(
 
 def _class_of(model: Any) -> tuple[type[GP], dict[str, Any]]:
     """Return the class of a model factory and its further arguments."""
+    factory = partial(model) if callable(model) else partial(CKA, model)
+    structure: Any = factory.func
     # Ax makes a model by a class and keyword arguments.
-    options: dict[str, Any] = {}
-    factory = model
-    if isinstance(model, partial) and not model.args:
-        factory = model.func
-        options = dict(model.keywords)
-    if not isinstance(factory, type) or not issubclass(factory, GP):
+    if factory.args or not isinstance(structure, type) or not issubclass(structure, GP):
         raise TypeError(
             "Expected model as a class of models, such as CKA, or functools.partial of one with "
             f"keyword arguments, as Ax needs a class, got {model!r}."
         )
-    return factory, options
+    return structure, dict(factory.keywords)

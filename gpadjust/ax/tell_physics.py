@@ -15,8 +15,9 @@ from ax.generators.torch.botorch_modular.generator import BoTorchGenerator
 from ax.generators.torch.botorch_modular.surrogate import SurrogateSpec
 from ax.generators.torch.botorch_modular.utils import ModelConfig
 
-from gpadjust.ax.parameter_physics import ParameterPhysics, of_each
+from gpadjust.ax.parameter_physics import ParameterPhysics
 from gpadjust.ax.units import PhysicsInUnits, Units
+from gpadjust.kinds.factory import map_parts
 
 
 class TellPhysics(Transform):
@@ -27,9 +28,8 @@ class TellPhysics(Transform):
     of the search space, and its outputs, in the units of its metric, pass the same transforms as
     the data of the metric.
 
-    Raises:
-        ValueError: If this is not the last transform; if a transform is not supported; or if a
-            physics belongs to several metrics, or to none of the experiment.
+    A ValueError is raised if this is not the last transform, if a transform is not supported, or
+    if a physics belongs to several metrics, or to none of the experiment.
     """
 
     no_op_for_experiment_data = True
@@ -58,23 +58,16 @@ class TellPhysics(Transform):
         original = adapter.transforms["Cast"].search_space  # Cast is the first transform
         if original.is_hierarchical:
             raise ValueError(
-                "A physics needs a search space without a hierarchy, found a hierarchical one; "
-                "make one of parameters that are always there."
+                "A physics needs a search space of parameters that are always there, found a "
+                "hierarchical one."
             )
         # Plain values of the parameters before all transforms.
-        ranges = {
-            p.name: (float(p.lower), float(p.upper))
-            for p in original.parameters.values()
-            if isinstance(p, RangeParameter)
-        }
-        integers = [
-            name for name in ranges if original.parameters[name].parameter_type is ParameterType.INT
-        ]
-        choices = {
-            p.name: [float(value) for value in p.values]
-            for p in original.parameters.values()
-            if isinstance(p, ChoiceParameter) and p.is_numeric
-        }
+        parameters = original.parameters.values()
+        scales = [p for p in parameters if isinstance(p, RangeParameter)]
+        ranges = {p.name: (float(p.lower), float(p.upper)) for p in scales}
+        integers = [p.name for p in scales if p.parameter_type is ParameterType.INT]
+        lists = [p for p in parameters if isinstance(p, ChoiceParameter) and p.is_numeric]
+        choices = {p.name: [float(value) for value in p.values] for p in lists}
         units = Units(transforms, [*search_space.parameters], ranges, integers, choices)
         # Metrics may have no data yet, or data without being tracked.
         observed = set(experiment_data.metric_signatures)
@@ -127,7 +120,7 @@ class _UnitsSetter:
                 "metric: SurrogateSpec(metric_to_model_configs={'the metric': [ModelConfig(...)]"
                 "}), or gpadjust.ax.generation_strategy({'the metric': f_p})."
             )
-        in_units = of_each(partial(self.physics, metrics[0]), physics)
+        in_units = map_parts(partial(self.physics, metrics[0]), physics)
         return replace(config, model_options={**config.model_options, "physics": in_units})
 
     def physics(self, metric: str, physics: Any) -> PhysicsInUnits:

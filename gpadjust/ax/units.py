@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
+from numbers import Real
 from typing import Any
 
 import torch
@@ -40,19 +41,9 @@ _NEAR = 1e-6  # distance from an integer that is rounding
 class Units:
     """Conversions from a model's inputs in Ax to the search space, and of metrics to the model.
 
-    They are differentiable except for coded choices, and contain plain values, not Ax's objects, so
-    that models can be copied and pickled.
-
-    Args:
-        transforms: Ax's transforms, initialised, in the order of their application.
-        names: The columns of the model.
-        ranges: Lower and upper bounds of parameters. A physics gets values within: BoTorch also
-            evaluates models around the data, outside of the bounds.
-        integers: Parameters with integers, to round: after scaling 8 may be 7.999999999999999.
-        choices: The numbers of choices, of which a physics gets the nearest.
-
-    Raises:
-        ValueError: If a transform is not supported.
+    They are differentiable except for coded choices, and contain plain values, so that models can
+    be pickled. A physics gets values within the ranges, as BoTorch also evaluates models around
+    the data; whole numbers, as 8 may be 7.999999999999999; and the nearest of the choices.
     """
 
     def __init__(
@@ -86,18 +77,7 @@ class Units:
         self._forth = [_FORTH[type(t)](t) for t in transforms if type(t) in _FORTH]
 
     def raw(self, X: Tensor, names: Sequence[str]) -> Tensor:
-        """Return parameters in the units of the search space.
-
-        Args:
-            X: Inputs of the model, ``N x d'``.
-            names: Some parameters.
-
-        Returns:
-            ``N x len(names)``.
-
-        Raises:
-            ValueError: If the values of a parameter are not numbers.
-        """
+        """Return some parameters in the units of the search space, ``N x len(names)``."""
         columns = dict(zip(self.names, X.unbind(-1), strict=True))
         for step in self._back:
             step(columns)  # in place
@@ -125,45 +105,28 @@ class Units:
 
     def metric(self, Y: Tensor, metric: str) -> Tensor:
         """Return values of a metric in the units of the model."""
-        # Each transform has a function for the metrics that it changed.
-        for steps in self._forth:
-            if metric in steps:
-                Y = steps[metric](Y)
+        for steps in self._forth:  # a function for each metric that a transform changed
+            Y = steps[metric](Y) if metric in steps else Y
         return Y
 
 
 class PhysicsInUnits(Physics):
-    """A physics behind Ax's transforms, with inputs and outputs in the units of a model.
-
-    Args:
-        origin: The user's physics.
-        metric: The metric of its outputs.
-        units: The effect of the transforms.
-        parameters: The parameters of the search space, in its order.
-    """
+    """A physics behind Ax's transforms, with inputs and outputs in the units of a model."""
 
     def __init__(
         self, origin: ParameterPhysics, metric: str, units: Units, parameters: list[str]
     ) -> None:
-        reads = origin.names_of(parameters)
-        inner = origin.of(reads)
+        reads = origin.read_names(parameters)
+        inner = origin.take_rows(reads)
         super().__init__(unknowns=dict(inner.unknowns.items()), name=inner.name)
         self.origin, self.metric, self.units = origin, metric, units
         self.reads = reads
         self.inner = inner
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """Return the physics in the search space's units, with the transforms of its metric.
+        """Return the physics at inputs of the model, with the transforms of its metric, ``N x 1``.
 
-        Args:
-            X: Inputs of the model, ``N x d'``.
-            parameters: The unknown parameters, if there are any.
-
-        Returns:
-            ``N x 1``.
-
-        Raises:
-            PhysicsError: If the physics fails, or has several outputs.
+        Raise a PhysicsError if the physics fails, or has several outputs.
         """
         # f_p at the user's parameters; its memory and batches work on these rows.
         raw = self.units.raw(X, self.reads)
@@ -181,15 +144,12 @@ class PhysicsInUnits(Physics):
 
 
 def _change(function: Change, name: str, columns: Columns) -> None:
-    """Apply a function to a column."""
     if name in columns:
         columns[name] = function(columns[name])
 
 
 def _constant(name: str, value: float, columns: Columns) -> None:
-    """Add the column of a fixed parameter."""
-    first = next(iter(columns.values()))
-    columns[name] = first.new_tensor(value)
+    columns[name] = torch.tensor(value).to(next(iter(columns.values())))
 
 
 def _value_of(name: str, values: Sequence[Any], one_hot: Sequence[str], columns: Columns) -> None:
@@ -199,13 +159,8 @@ def _value_of(name: str, values: Sequence[Any], one_hot: Sequence[str], columns:
     else:
         index = columns.pop(name).round().long().clamp(0, len(values) - 1)
     # Texts are left out: a physics that reads one gets an error.
-    if _are_numbers(values):
+    if all(isinstance(value, Real) for value in values):
         columns[name] = torch.tensor(values, dtype=torch.float64)[index]
-
-
-def _are_numbers(values: Sequence[Any]) -> bool:
-    """Return whether the values of a parameter are numbers, which a physics can take."""
-    return all(isinstance(value, bool | int | float) for value in values)
 
 
 def _bent(bound: float, Y: Tensor) -> Tensor:
@@ -217,16 +172,17 @@ def _scaled(mean: float, sd: float, Y: Tensor) -> Tensor:
     return (Y - mean) / sd
 
 
+_power = partial(torch.pow, 10)  # Ax's logarithms have the base 10
+
+
 def _unscaled(mean: float, sd: float, Y: Tensor) -> Tensor:
     return mean + sd * Y
 
 
 def _fixed(t: RemoveFixed) -> list[Step]:
     """Return the steps that add fixed parameters; derived ones have no value."""
-    values: dict[str, Any] = {
-        n: getattr(p, "value", None) for n, p in t.nontunable_parameters.items()
-    }
-    return [partial(_constant, n, float(v)) for n, v in values.items() if _are_numbers([v])]
+    values = {n: getattr(p, "value", None) for n, p in t.nontunable_parameters.items()}
+    return [partial(_constant, n, float(v)) for n, v in values.items() if isinstance(v, Real)]
 
 
 def _number(t: ChoiceToNumericChoice) -> list[Step]:
@@ -235,9 +191,7 @@ def _number(t: ChoiceToNumericChoice) -> list[Step]:
 
 
 _BACK: Mapping[type[Transform], Callable[[Any], list[Step]]] = {
-    Log: lambda t: [  # of base 10
-        partial(_change, partial(torch.pow, 10), name) for name in t.transform_parameters
-    ],
+    Log: lambda t: [partial(_change, _power, name) for name in t.transform_parameters],
     Logit: lambda t: [partial(_change, torch.sigmoid, name) for name in t.transform_parameters],
     UnitX: lambda t: [  # x = lower + (upper - lower) u
         partial(_change, partial(_unscaled, lower, upper - lower), name)

@@ -1,12 +1,13 @@
 """Tasks, planning, policy search, and agents that control by them.
 
-Agents and :class:`StepGuard` need Gymnasium (the extra ``control``); all else does without.
+Only agents and :class:`StepGuard` need Gymnasium (the extra ``control``).
 """
 
 from typing import Any
 
 from gpadjust.control.constraints import margins
-from gpadjust.control.mpc import MPC, Plan, Planner
+from gpadjust.control.mpc import MPC
+from gpadjust.control.planner import Plan, Planner
 from gpadjust.control.policy_search import BoundedPolicy, PolicySearch, SearchResult
 from gpadjust.control.rollouts import Objective, Return, Rollouts
 from gpadjust.control.state_filter import Estimate, StateFilter
@@ -42,7 +43,7 @@ except ImportError as error:
     _missing = error
 
     def __getattr__(name: str) -> Any:
-        """Raise an error that says what to install for the names that are missing."""
+        """Raise an error with the command that installs what a missing name needs."""
         if name not in __all__:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         raise ImportError(

@@ -1,4 +1,4 @@
-"""Checkpoints from which a run goes on exactly as if it had not been interrupted."""
+"""Checkpoints: a resumed run ends exactly as one that was not interrupted."""
 
 from __future__ import annotations
 
@@ -10,37 +10,35 @@ import sys
 import warnings
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import cloudpickle
 from filelock import FileLock, Timeout
 
-from gpadjust.checks import check_kind, checked_whole
-from gpadjust.control.episodes import generators, layer_names
+from gpadjust.checks import check_kind
+from gpadjust.control.episodes import generators
+from gpadjust.control.summary import layer_names
 from gpadjust.control.task import Task
 from gpadjust.dynamics import Dynamics
 from gpadjust.files.sync_folder import sync_folder
 
 
 class EpisodeCheckpoint:
-    """Writes the whole state of a run before and after each episode; :func:`resume` goes on.
+    """Writes the complete state of a run before and after each episode; :func:`resume` reads it.
 
-    It is a callback of :class:`Agent` and of ``gpadjust.rl.Dyna``. An interrupted run ends with the
-    same numbers, bit for bit, as one that was not, on the same machine and versions; but an
-    environment that cannot be pickled (a real robot) is reset, with a warning. The file is replaced
-    atomically: whenever the process dies, a whole checkpoint is on the disk. While it learns, a run
-    holds a lock beside the file (``.lock``): another run that would write there is refused. Other
-    callbacks keep their own state, unless they write it into ``agent.notes``.
+    It is a callback of :class:`Agent` and of ``gpadjust.rl.Dyna``. A resumed run ends with the same
+    numbers, bit for bit, on the same machine and versions; but an environment without a pickle (a
+    real robot) is reset, with a warning. The file is replaced atomically: whenever the process
+    dies, a complete checkpoint is on the disk. A run holds a lock beside the file (``.lock``).
+    Other callbacks may keep their state in ``agent.notes``.
 
     Args:
         path: The file.
-        every: Number of episodes between two checkpoints (of Dyna: of rollouts).
 
     Raises:
-        ValueError: If ``every`` is not positive.
         RuntimeError: When learning starts, if another run writes to this file.
 
     Example:
@@ -49,30 +47,21 @@ class EpisodeCheckpoint:
         >>> # agent.learn(1250 - agent.num_timesteps, checkpoint)
     """
 
-    def __init__(self, path: str | Path, every: int = 1) -> None:
+    def __init__(self, path: str | Path) -> None:
         self.path = Path(path).absolute()
-        self.every = checked_whole("every", every, 1)
-        self._episodes = 0
 
     def __call__(self, agent: Any, event: str, values: Any = None) -> None:
-        """Write the file before and after an episode, and when the run is done."""
+        """Write the file before and after an episode, and at the end of the run."""
         if not hasattr(agent, "environment_state"):
             raise TypeError(
                 "EpisodeCheckpoint is for learners with a model, such as MPCAgent and DynaSAC."
             )
-        is_due = event in ("episode", "trial") and self._episodes % self.every == 0
-        if event == "done" or is_due:
+        if event in ("episode", "trial", "done"):
             self._write(agent)
-        self._episodes += event == "episode"
 
     def write(self, agent: Any) -> None:
-        """Write the state of a run between two episodes.
-
-        Raises:
-            TypeError: If an attribute of the agent cannot be pickled.
-            RuntimeError: If another run writes to this file.
-        """
-        with locked([self]):
+        """Write the state of a run; an error if another run writes, or a pickle is impossible."""
+        with self.locked():
             self._write(agent)
 
     def _write(self, agent: Any) -> None:
@@ -90,40 +79,53 @@ class EpisodeCheckpoint:
             os.replace(part, self.path)
             sync_folder(self.path.parent)
         except OSError as error:  # a full disk
-            error.add_note(f"{self.path} is what it was, and the agent has lost nothing.")
+            error.add_note(f"{self.path} stays as it was, and the agent has lost nothing.")
             raise
         finally:
             part.unlink(missing_ok=True)
 
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the lock of the file; a RuntimeError if another run does."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(self.path.with_name(f"{self.path.name}.lock"))
+        try:
+            acquired = lock.acquire(blocking=False)
+        except Timeout as error:
+            raise RuntimeError(
+                f"Another run writes checkpoints to {self.path}, and holds the lock "
+                f"{lock.lock_file}. Wait for it, or give this run its own file."
+            ) from error
+        with acquired:
+            yield
+
 
 def resume(path: str | Path, env: Any, task: Task, algorithm: Any = None) -> Any:
-    """Read the agent of a run that :class:`EpisodeCheckpoint` wrote, ready to go on.
+    """Read the agent of a run that :class:`EpisodeCheckpoint` wrote.
 
-    Go on with ``agent.learn(total - agent.num_timesteps)`` (of Dyna with
-    ``reset_num_timesteps=False``). Class of the agent, wrappers and spaces of the environment, and
-    the task are compared before anything is unpickled; all else is a pickle, so open only files
-    that you trust.
+    Continue with ``agent.learn(total - agent.num_timesteps)`` (of Dyna with
+    ``reset_num_timesteps=False``), which restores the random generators. Class of the agent,
+    environment and task are compared before anything is unpickled; the rest is a pickle, so open
+    only files that you trust.
 
     Args:
         path: The checkpoint.
-        env: The environment, made and wrapped as for the first part of the run. It is replaced by
-            the environment of the checkpoint, in its state, if that could be saved.
+        env: The environment, made and wrapped as for the first part of the run. The environment of
+            the checkpoint, in its state, replaces it if it could be saved.
         task: The task of the run, its dynamics fitted or not.
-        algorithm: The class of the agent. Default: the one that the checkpoint names, if its module
-            is imported.
-
-    Returns:
-        The agent. ``learn`` restores the random generators; until then you may use them.
+        algorithm: The class of the agent. Default: the name in the checkpoint, if its module is
+            imported.
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If the file is no checkpoint, or is of another agent, environment or task.
+        ValueError: If the file is not a checkpoint, or of another agent, environment or task.
         RuntimeError: If the run had other dynamics, or another physics.
     """
     check_kind("task", task, Task, "a Task(dynamics, reward, ...)")
     try:
         with zipfile.ZipFile(path) as archive:
-            about, content = json.loads(archive.read("about.json")), archive.read("run.pkl")
+            about = json.loads(archive.read("about.json"))
+            content = archive.read("run.pkl")
     except (zipfile.BadZipFile, zlib.error, KeyError, ValueError) as error:
         raise ValueError(f"{path} is not a checkpoint of EpisodeCheckpoint ({error}).") from error
     if algorithm is None:
@@ -148,8 +150,8 @@ def resume(path: str | Path, env: Any, task: Task, algorithm: Any = None) -> Any
             f"{path} is of another run: {'; '.join(different)}. Pass agent, environment and task "
             "as in the first part of the run."
         )
-    run, learnt, random_state, environment = pickle.loads(content)
-    task.dynamics.load_state_dict(learnt)
+    run, state, random_state, environment = pickle.loads(content)
+    task.dynamics.load_state_dict(state)
     agent = algorithm.__new__(algorithm)
     vars(agent).update(run)
     agent.go_on(env, task, environment)
@@ -173,16 +175,16 @@ def _about(algorithm: type, env: Any, task: Task) -> dict[str, Any]:
 
 class _Pickler(cloudpickle.Pickler):
     def persistent_id(self, value: Any) -> None:
-        """Refuse what is code of the user's."""
+        """Refuse code of the user."""
         if isinstance(value, Task | Dynamics):
             raise TypeError("a checkpoint holds neither tasks nor dynamics; make them again")
 
 
 def _pickled(agent: Any) -> bytes:
-    """Return all of a run but its task: attributes, dynamics, generators and environment."""
+    """Return attributes, dynamics, generators and environment of a run, without its task."""
     left_out = {name for kind in type(agent).__mro__ for name in vars(kind).get("not_saved", ())}
     run = {name: value for name, value in vars(agent).items() if name not in left_out}
-    random_state = generators() if agent._random_state is None else agent._random_state
+    random_state = agent._random_state or generators()
     others = agent.task.dynamics.state_dict(), random_state, agent.environment_state()
     file = io.BytesIO()
     try:
@@ -202,7 +204,7 @@ def _pickled(agent: Any) -> bytes:
 
 
 def pickled_environment(env: Any) -> bytes | None:
-    """Return an environment in bytes; None, and a warning, if it cannot be pickled."""
+    """Return an environment in bytes; None, with a warning, if it cannot be pickled."""
     try:
         return bytes(cloudpickle.dumps(env))
     except Exception as error:  # pickling runs the user's code
@@ -214,20 +216,3 @@ def pickled_environment(env: Any) -> bytes | None:
             stacklevel=6,
         )
         return None
-
-
-@contextmanager
-def locked(callbacks: Iterable[Any]) -> Iterator[None]:
-    """Hold the locks of those callbacks that are checkpoints."""
-    with ExitStack() as stack:
-        for path in (each.path for each in callbacks if isinstance(each, EpisodeCheckpoint)):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            lock = FileLock(path.with_name(f"{path.name}.lock"))
-            try:
-                stack.enter_context(lock.acquire(blocking=False))
-            except Timeout as error:
-                raise RuntimeError(
-                    f"Another run writes checkpoints to {path}, and holds the lock "
-                    f"{lock.lock_file}. Wait for it, or give this run a file of its own."
-                ) from error
-        yield

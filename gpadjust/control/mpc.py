@@ -1,323 +1,55 @@
-"""Model predictive control: plans of actions, and a controller that plans at every step."""
+"""Model predictive control: a controller that plans at every step."""
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Sequence
-from dataclasses import KW_ONLY, dataclass, field, replace
-from typing import Any, NamedTuple, Self, TypeVar, cast
+from dataclasses import replace
+from typing import Any, Self, TypeVar, cast
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from gpadjust.checks import check_kind, checked_bounds, checked_number, checked_whole, seeded
-from gpadjust.control.constraints import margins
-from gpadjust.control.episodes import decoded, teach, warn_of_delay
-from gpadjust.control.faults import check_observation
-from gpadjust.control.rollouts import (
-    Objective,
-    Return,
-    Rollouts,
-    check_objective,
-    random_sequences,
-)
+from gpadjust.checks import check_kind, checked_bounds, checked_number, seeded
+from gpadjust.control.episodes import check_observation, decoded
+from gpadjust.control.learning import teach, warn_of_delay
+from gpadjust.control.planner import Plan, Planner
 from gpadjust.control.state_filter import Estimate, StateFilter, smooth_episodes
-from gpadjust.control.task import Moment, Steps, Task
+from gpadjust.control.task import Moment, Task
 from gpadjust.dynamics import Trajectories
-from gpadjust.progress import long_work, tick
-from gpadjust.states import StateSpec
+from gpadjust.progress import long_work
 
 _PART = 1.5  # horizons of a step that a part of an episode's first plan looks ahead
 _FIRST_ROUNDS = 5  # of the plan of an episode that begins
 _SHORTEST, _LONGEST = 8, 30  # steps ahead
 
 
-class Plan(NamedTuple):
-    """Actions for an episode, or for the rest of it.
-
-    Args:
-        actions: The actions of the steps ahead, ``T x action_dim``.
-        next_states: The states to which they lead, ``T x state_dim``, averaged over the functions.
-        value: The score of the objective.
-        rewards: Rewards of the steps by the model, ``T``, averaged over its functions; 0 after the
-            end of the episode.
-        reward: Their mean over the steps that are made, when it was last planned to the end.
-        left_bounds: The share of the functions in which it leaves the bounds of the states, or
-            meets a failure of the physics.
-        violation: Violation of the constraints with their margins in the worst step; 0 if none.
-        moment: The point of the episode at which the first of the steps is made.
-        promised: Rewards of all steps of the episode, as it was last planned to the end.
-        estimate: The state as sensors have shown it, with the action taken there; else None.
-    """
-
-    actions: Tensor
-    next_states: Tensor
-    value: float
-    rewards: Tensor
-    reward: float
-    left_bounds: float
-    violation: float
-    moment: Moment
-    promised: Tensor = torch.zeros(0)
-    estimate: Estimate | None = None
-
-    @classmethod
-    def of(cls, rollout: Steps, n: int, value: float, moment: Moment) -> Plan:
-        """Return the plan of the actions that were taken in the n-th episodes of a rollout."""
-        made = rollout.made[:, n]
-        rewards = rollout.rewards[:, n].masked_fill(~made, 0.0).mean(0)
-        return cls(
-            actions=rollout.actions[0, n],
-            next_states=rollout.next_states[:, n].mean(0),
-            value=value,
-            rewards=rewards,
-            reward=float(rewards.sum() / made.double().mean(0).sum().clamp_min(1e-12)),
-            left_bounds=float(rollout.left_bounds[:, n].any(-1).double().mean()),
-            violation=float(rollout.violation[:, n].mean(0).max()),
-            moment=moment,
-        )
-
-    def taken(self, estimate: Estimate | None) -> Plan:
-        """Return the plan after its first action was made."""
-        action = self.actions[0]
-        return self._replace(
-            actions=self.actions[1:],
-            next_states=self.next_states[1:],
-            moment=self.moment.after(action),
-            estimate=estimate and estimate._replace(action=action),
-        )
-
-
-@dataclass(frozen=True)
-class Planner:
-    """Plans actions by an objective, such as the return, in a model of the system.
-
-    Sequences of actions are proposed, random piecewise constant ones, or ones about an earlier
-    plan. Each is followed through the model, along its mean or through functions drawn from its
-    posterior. The cross-entropy method improves them (Rubinstein 1999): each round draws as many
-    from a normal distribution with mean and standard deviation of the best so far, step by step.
-
-    Args:
-        objective: What to look for: :class:`Return`, or your own.
-        rounds: Rounds after the first sequences; 0 takes the best of these.
-        num_elites: Number of best sequences that stay in a round.
-        correlation: Of the deviations from the mean of a step and the next one, in [0, 1): higher
-            for smoother actions (Pinneri et al. 2020).
-        horizon: The most time to look ahead, in the time unit of ``spec.step``; in steps where the
-            spec has none. Default: to the end of the episode (of a step's plan in :class:`MPC`: a
-            third of the episode, of 8 to 30 steps).
-        num_functions: Number of functions of the posterior that each sequence is followed through;
-            None for the mean of the model, which takes least time
-            (:meth:`~gpadjust.dynamics.LearnedDynamics.mean_function`).
-        num_random: Number of random sequences, or of those drawn about an earlier plan.
-        max_hold: The most steps that a random sequence holds an action.
-        spread: Standard deviation about an earlier plan, as a share of the range of the actions.
-        seconds: The most time that a plan takes. A round of the search that would take longer does
-            not begin; if even the first one would, its sequences are followed, and compared, as far
-            as there is time, one step of the model at least. Default: as long as it takes.
-
-    Raises:
-        TypeError: If the objective or a number is of another kind.
-        ValueError: If a number is out of range.
-
-    Example:
-        >>> import torch
-        >>> from gpadjust.control import Planner, Task
-        >>> from gpadjust.dynamics import PhysicsDynamics, StateSpec
-        >>> point = PhysicsDynamics(StateSpec(["x"], ["v"]), lambda X: X[:, :1] + X[:, 1:])
-        >>> task = Task(point, lambda states, actions, next_states: -next_states[:, 0].abs())
-        >>> plan = Planner().plan(task, torch.ones(1).double(), [[-1.0], [1.0]], num_steps=3)
-        >>> plan.actions.shape, plan.value > -1
-        (torch.Size([3, 1]), True)
-    """
-
-    objective: Objective = field(default_factory=Return)
-    _: KW_ONLY
-    rounds: int = 1
-    num_elites: int = 12
-    correlation: float = 0.5
-    horizon: float | None = None
-    num_functions: int | None = None
-    num_random: int = 128
-    max_hold: int = 5
-    spread: float = 0.15
-    seconds: float | None = None
-
-    def __post_init__(self) -> None:
-        """Check objective and numbers."""
-        check_objective(self.objective, self.num_functions)
-        for name, least in {"rounds": 0, "num_elites": 1, "num_random": 1, "max_hold": 1}.items():
-            checked_whole(name, getattr(self, name), least)
-        for name in ("horizon", "seconds"):
-            if getattr(self, name) is not None:
-                checked_number(name, getattr(self, name), above=0)
-        checked_number("correlation", self.correlation, least=0, below=1)
-        checked_number("spread", self.spread, above=0, below=1)
-
-    def steps_ahead(self, spec: StateSpec, left: int | None) -> int:
-        """Return the number of steps to plan, of the steps ``left``; a ValueError if there is none.
-
-        None is left where an episode has no length.
-        """
-        limits = [] if left is None else [left]
-        if self.horizon is not None:
-            step = spec.step or 1.0
-            limits.append(round(self.horizon / step))
-            if self.horizon < step * (1 - 1e-9):
-                raise ValueError(
-                    f"horizon must be one step at least, which takes {step:g} in the time unit of "
-                    f"StateSpec(step=...); found {self.horizon:g}."
-                )
-        if not limits or min(limits) < 1:
-            raise ValueError(
-                f"Expected a number of steps >= 1 to plan, found {left}; give the task an "
-                "episode_length, or the planner a horizon."
-            )
-        return min(limits)
-
-    @torch.no_grad()
-    def plan(
-        self,
-        task: Task,
-        state: Tensor,
-        action_bounds: ArrayLike,
-        num_steps: int | None = None,
-        *,
-        earlier: Plan | None = None,
-        moment: Moment | None = None,
-        covariance: Tensor | None = None,
-        deadline: float | None = None,
-    ) -> Plan:
-        """Choose the actions of the next steps; the randomness is PyTorch's global generator.
-
-        Args:
-            task: The task, whose dynamics have learnt from transitions. Its constraints have
-                margins along the earlier plan, or along one that was made without them first.
-            state: Where the episode is, ``state_dim``.
-            action_bounds: Lower and upper bounds of the actions, ``2 x action_dim``.
-            num_steps: Number of steps before the end. Default: the episode length of the task.
-            earlier: A plan to begin with; its last action is held where it is shorter.
-            moment: The point of the episode. Default: its beginning.
-            covariance: That of the state, ``state_dim x state_dim``, if it is estimated.
-            deadline: Until when, by ``time.perf_counter``. Default: for ``seconds``.
-
-        Raises:
-            ValueError: If ``state`` or ``action_bounds`` have another shape, bounds are not finite,
-                or there is no number of steps.
-            RuntimeError: If the dynamics have learnt nothing yet.
-            PhysicsError: If the physics fails at ``state``, whatever the action.
-        """
-        if deadline is None:
-            deadline = math.inf if self.seconds is None else time.perf_counter() + self.seconds
-        moment, spec = Moment() if moment is None else moment, task.dynamics.spec
-        bounds = checked_bounds("action_bounds", action_bounds, spec.action_dim)
-        if state.shape != (spec.state_dim,):
-            raise ValueError(
-                f"Expected state of shape {spec.state_dim}, found {tuple(state.shape)}."
-            )
-        num_steps = self.steps_ahead(spec, task.episode_length if num_steps is None else num_steps)
-        if task.constraints is not None:
-            if earlier is None:
-                rollouts = Rollouts(task, self.num_functions, moment, deadline=deadline)
-                earlier = self._searched(rollouts, state, bounds, num_steps, None)
-            actions = earlier.actions[:num_steps]
-            path = torch.cat([state.unsqueeze(0), earlier.next_states])[: len(actions)]
-            moment = moment._replace(margins=margins(task, path, actions, bounds, covariance))
-        rollouts = Rollouts(task, self.num_functions, moment, deadline=deadline)
-        return self._searched(rollouts, state, bounds, num_steps, earlier)
-
-    def _searched(
-        self,
-        rollouts: Rollouts,
-        state: Tensor,
-        bounds: Tensor,
-        num_steps: int,
-        earlier: Plan | None,
-    ) -> Plan:
-        """Return the best plan that the cross-entropy method finds."""
-        score = self.objective.of(rollouts.task)
-        new = self._proposed(num_steps, bounds, earlier)
-        sequences, scores, plan = new[:0], torch.zeros(0), cast(Plan, None)
-        for number in range(self.rounds + 1):
-            if number > 0:
-                # The best so far, and as many new ones from their mean and standard deviation.
-                elites = scores.topk(min(self.num_elites, len(scores))).indices
-                sequences, scores = sequences[elites], scores[elites]
-                mean, sd = sequences.mean(0), sequences.std(0, correction=0)
-                drawn = mean + sd * _correlated_noise(new.shape, self.correlation)
-                new = torch.clamp(drawn, bounds[0], bounds[1])
-            rollout = rollouts.follow(state, new)
-            tick("rounds")
-            if number > 0 and rollout.made.shape[-1] < num_steps:  # no time left
-                break
-            found = score(rollout)
-            if found.shape != (len(new),) or found.isnan().any():
-                raise ValueError(
-                    f"{type(self.objective).__name__} must return one score per sequence, shape "
-                    f"({len(new)},), none of them nan; found shape {tuple(found.shape)}."
-                )
-            best = int(found.argmax())
-            if number == 0 or found[best] > plan.value:
-                plan = Plan.of(rollout, best, float(found[best]), rollouts.moment)
-            sequences, scores = torch.cat([sequences, new]), torch.cat([scores, found])
-            if not rollouts.has_time(num_steps):
-                break
-        return plan
-
-    def _proposed(self, num_steps: int, bounds: Tensor, earlier: Plan | None) -> Tensor:
-        """Return the sequences that a search begins with, ``n x num_steps x action_dim``."""
-        if earlier is None:
-            return random_sequences(self.num_random, num_steps, bounds, self.max_hold)
-        held = torch.arange(num_steps).clamp_max(len(earlier.actions) - 1)
-        known = earlier.actions[held]
-        noise = _correlated_noise((self.num_random, *known.shape), 0.5)
-        drawn = known + self.spread * (bounds[1] - bounds[0]) * noise
-        return torch.cat([known.unsqueeze(0), torch.clamp(drawn, bounds[0], bounds[1])])
-
-
-def _correlated_noise(shape: Sequence[int], correlation: float) -> Tensor:
-    """Draw standard normal noise ``n x T x a`` whose steps are correlated."""
-    noise = torch.randn(*shape, dtype=torch.float64)
-    if correlation:
-        fresh = math.sqrt(1 - correlation**2)
-        for t in range(1, shape[1]):
-            noise[:, t] = correlation * noise[:, t - 1] + fresh * noise[:, t]
-    return noise
-
-
 class MPC:
-    """Model predictive control: at each step the steps ahead are planned, and the first is made.
+    """Model predictive control: at each step plan the steps ahead, and make the first.
 
-    :meth:`step` maps a measurement to an action, in a loop of your own; :meth:`learn` lets the
-    dynamics learn what was measured. Before that it plans in the physics.
+    :meth:`step` maps a measurement to an action, in a loop of your own; :meth:`learn` updates the
+    dynamics by the measurements. Before that it plans in the physics.
 
     Args:
-        task: The task. Its dynamics are what :meth:`learn` updates.
+        task: The task; :meth:`learn` updates its dynamics.
         action_bounds: Lower and upper bounds of the actions, ``2 x action_dim``.
-        each_step: Plans at each step but the first. A horizon must be as long as the manoeuvre
-            needs, as energy must be put into a pole before it can stand: try it in f_p alone
-            (:class:`~gpadjust.dynamics.PhysicsDynamics`) first.
-        first: Plans when an episode begins, which has not to be in time. Default: five rounds of
-            the whole episode, or as far as ``each_step`` if it has no length; objective and
-            functions are those of ``each_step``.
-        tolerance: Where the plan of a step is worth less than was promised of its steps by more
-            than this share of the range of the promised rewards (a step, on average), the rest is
-            planned as when the episode began; where ``each_step`` has ``seconds``, about that plan,
-            if half of these are left. None for never.
-        state_filter: Of a task with sensors, by which observations are states. Default: the one
-            before there are data.
+        each_step: Plans at each step but the first. A horizon must be as long as the manoeuvre:
+            try it in f_p alone (:class:`~gpadjust.dynamics.PhysicsDynamics`) first.
+        first: Plans when an episode begins, without a time limit. Default: five rounds of the whole
+            episode, or as far as ``each_step`` if it has no length.
+        tolerance: Largest loss of a plan compared with the promised rewards, per step, as a share
+            of their range; beyond it all the rest is planned again. None for no limit.
+        state_filter: Filter of a task with sensors. Default: the one before there are data.
 
     Raises:
-        TypeError: If the task or a planner is of another kind.
-        ValueError: If a horizon is shorter than a step, or ``action_bounds`` are no bounds.
+        TypeError: If the task or a planner has another type.
+        ValueError: If a horizon is shorter than a step, or ``action_bounds`` are not bounds.
 
     Example:
-        >>> import numpy as np
-        >>> from gpadjust.control import MPC, Task
-        >>> from gpadjust.dynamics import LearnedDynamics, StateSpec
+        >>> from gpadjust.dynamics import LearnedDynamics
+        >>> from gpadjust.states import StateSpec
         >>> spec = StateSpec(["level"], ["pump"])
         >>> dynamics = LearnedDynamics(spec, lambda X: X[:, :1] + X[:, 1:])
         >>> task = Task(dynamics, lambda states, actions, following: -following[:, 0].abs())
@@ -340,19 +72,22 @@ class MPC:
         state_filter: StateFilter | None = None,
     ) -> None:
         check_kind("task", task, Task, "a Task(dynamics, reward, ...)")
-        for name, planner in (("each_step", each_step), ("first", first)):
-            check_kind(name, planner, Planner | None, "a Planner(...)")
+        check_kind("each_step", each_step, Planner | None, "a Planner(...)")
+        check_kind("first", first, Planner | None, "a Planner(...)")
         if tolerance is not None:
             checked_number("tolerance", tolerance, above=0)
         length, spec = task.episode_length, task.dynamics.spec
-        each_step = Planner() if each_step is None else each_step
+        each_step = each_step or Planner()
         if each_step.horizon is None:
             steps = min(max((length or 0) // 3, _SHORTEST), _LONGEST)
             each_step = replace(each_step, horizon=steps * (spec.step or 1.0))
         if first is None:
-            like = {name: getattr(each_step, name) for name in ("objective", "num_functions")}
-            whole = each_step.horizon if length is None else None
-            first = Planner(rounds=_FIRST_ROUNDS, **like, horizon=whole)
+            first = Planner(
+                each_step.objective,
+                rounds=_FIRST_ROUNDS,
+                num_functions=each_step.num_functions,
+                horizon=each_step.horizon if length is None else None,
+            )
         for planner in (each_step, first):
             planner.steps_ahead(spec, length)  # or an error
         self.task = task
@@ -370,7 +105,7 @@ class MPC:
 
     @property
     def model(self) -> Task:
-        """The task in what its dynamics have learnt, or in the physics before that."""
+        """The task in the updated dynamics, or in the physics before that."""
         dynamics = self.task.dynamics
         newest = dynamics.before_data() or dynamics
         return self.task if newest is dynamics else replace(self.task, dynamics=newest)
@@ -378,36 +113,33 @@ class MPC:
     # The loop of the user
 
     def reset(self) -> None:
-        """Begin an episode: forget the plan, and go on with nothing but what was learnt."""
+        """Begin an episode: discard plan and estimate; keep the transitions."""
         self._plan: tuple[Plan, ...] | None = None
         self._last: tuple[Tensor, Tensor] | None = None  # measurement and action
 
     def step(self, measurement: ArrayLike) -> NDArray[np.float64]:
-        """Choose the action after a measurement; both are recorded for :meth:`learn`.
+        """Choose the action, ``action_dim``, after a measurement, ``observation_dim``.
 
-        Args:
-            measurement: ``observation_dim`` numbers of the task's spec, or of its sensors.
-
-        Returns:
-            The action, ``action_dim`` numbers within the bounds.
+        Both are recorded for :meth:`learn`.
 
         Raises:
             ValueError: If the measurement has another shape, or numbers that are not finite. No
-                transition goes across it; the plan stays.
-            RuntimeError: If there is neither a physics nor anything learnt.
+                transition crosses it; the plan stays.
+            RuntimeError: If there is neither a physics nor an update.
         """
-        row = self._recorded(measurement)
+        row = self._record(measurement)
         actions, self._plan = self._advance(row.unsqueeze(0), self._plan or [None], 0)
         self._last = row, actions[0]
         return actions[0].numpy().copy()
 
     def observe(self, measurement: ArrayLike) -> None:
-        """Record the measurement with which an episode ends; a ValueError as of :meth:`step`."""
-        self._recorded(measurement)
+        """Record the last measurement of an episode; a ValueError as of :meth:`step`."""
+        self._record(measurement)
 
-    def _recorded(self, measurement: ArrayLike) -> Tensor:
-        """Return a measurement, checked; record the transition to it, if there is one."""
-        last, self._last = self._last, None  # no transition goes across what fails from here on
+    def _record(self, measurement: ArrayLike) -> Tensor:
+        """Return a measurement, checked, and record the transition to it."""
+        last = self._last
+        self._last = None  # no transition crosses an error from here on
         values = np.atleast_1d(np.asarray(measurement, dtype=np.float64))
         spec = self.task.observed
         check_observation(values, names=spec.observations)
@@ -425,54 +157,53 @@ class MPC:
         return row
 
     def learn(self, data: Trajectories | None = None) -> Self:
-        """Let the dynamics learn, and go on in the newest model.
+        """Update the dynamics by trajectories of states, and continue in the newest model.
 
-        Args:
-            data: Trajectories of states. Default: the transitions between measurements of
-                :meth:`step` and :meth:`observe` that were not learnt yet. With sensors, the
-                states behind all of them are estimated first.
+        Default: by the new transitions between measurements; with sensors, the states behind all
+        of them are estimated first.
 
         Raises:
             ValueError: If there is no new transition; or trajectories of a task with sensors.
             PhysicsError: If the physics fails at a transition.
         """
-        hidden, number = self.filter is not None, self._num_learnt
-        if data is not None:
-            told = "Trajectories(states, actions, next_states, episode) of tensors"
-            check_kind("data", data, Trajectories, told)
-        if data is not None and hidden:
-            raise ValueError(
-                "The states behind trajectories of sensors are estimated from what `step` has "
-                "recorded; call learn() without data."
-            )
+        number = self._num_learnt
         if data is None:
             number = len(self._steps)
-            if number == self._num_learnt:
+            data = self._new_transitions()
+        else:
+            expected = "Trajectories(states, actions, next_states, episode) of tensors"
+            check_kind("data", data, Trajectories, expected)
+            if self.filter is not None:
                 raise ValueError(
-                    "There is no new transition to learn, which takes a measurement, an action and "
-                    "the measurement after it: call `step` first, or pass trajectories."
+                    "The states behind sensors are estimated from the measurements of `step`; "
+                    "call learn() without data."
                 )
-            # The states behind all measurements of sensors are known better by now.
-            known = self._states_of(self._steps)
-            data = known if hidden else known.some(slice(self._num_learnt, None))
-            warn_of_delay(self.task.dynamics, known, number - self._num_learnt)
         teach(self.task, data)
         self._num_learnt = number
         return self
 
-    def _states_of(self, steps: Sequence[tuple[Tensor, Tensor, Tensor, int]]) -> Trajectories:
-        """Return transitions of the states, which of sensors are estimated in the newest model."""
-        *columns, run = zip(*steps, strict=True)
+    def _new_transitions(self) -> Trajectories:
+        """Return the transitions to learn; with sensors all, as their states are estimated."""
+        if len(self._steps) == self._num_learnt:
+            raise ValueError(
+                "There is no new transition to learn: call `step` and measure again, or pass "
+                "trajectories."
+            )
+        *columns, run = zip(*self._steps, strict=True)
         before, actions, after = (torch.stack(column) for column in columns)
-        seen = Trajectories(before, actions, after, torch.tensor(run))
+        observed = Trajectories(before, actions, after, torch.tensor(run))
+        new = slice(self._num_learnt, None)
         if self.filter is None:
-            return decoded(self.task.dynamics.spec, seen)
-        number = len(seen.episodes())  # a seed
-        self.filter, states = smooth_episodes(self.model, self.filter, seen, number)
-        return states
+            states = decoded(self.task.dynamics.spec, observed)
+        else:
+            new = slice(0, None)
+            seed = len(observed.episodes())
+            self.filter, states = smooth_episodes(self.model, self.filter, observed, seed)
+        warn_of_delay(self.task.dynamics, states, len(self._steps) - self._num_learnt)
+        return states.subset(new)
 
     def __repr__(self) -> str:
-        """Name the dynamics, and how much they have learnt."""
+        """Name the dynamics, and the number of their transitions."""
         learnt = getattr(self.task.dynamics, "num_transitions", self._num_learnt)
         return f"MPC({type(self.task.dynamics).__name__}, {learnt} transitions learnt)"
 
@@ -485,17 +216,16 @@ class MPC:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], tuple[Plan, ...]]:
-        """Plan actions, as policies of Stable-Baselines3 do, whose ``evaluate_policy`` takes it.
+        """Plan actions, as :meth:`~gpadjust.control.Agent.predict`; record nothing.
 
-        Arguments and result are those of :meth:`~gpadjust.control.Agent.predict`. The state is the
-        plan of each episode. Without one all episodes begin. If ``deterministic``, the search is
-        always the same. Nothing is recorded.
+        The state is the plan of each episode. If ``deterministic``, the search always uses the same
+        random numbers.
         """
         check_observation(observation)
         rows = torch.as_tensor(np.atleast_2d(observation), dtype=torch.float64)
-        episodes = going_on(state, episode_start, len(rows))
-        found, plans = self._advance(rows, episodes, 0 if deterministic else None)
-        actions = found.numpy().astype(np.float32)
+        episodes = continued(state, episode_start, len(rows))
+        chosen, plans = self._advance(rows, episodes, 0 if deterministic else None)
+        actions = chosen.numpy().astype(np.float32)
         return (actions if np.ndim(observation) > 1 else actions[0]), plans
 
     def _advance(
@@ -503,108 +233,117 @@ class MPC:
     ) -> tuple[Tensor, tuple[Plan, ...]]:
         """Return the actions of episodes at observations, and their plans from there on."""
         task = self.model
-        estimates: Sequence[Estimate | None] = [None] * len(rows)
+        estimates: list[Estimate | None] = [None] * len(rows)
         if self.filter is None:
             states = [*task.dynamics.spec.decode(rows)]
         else:
-            before = [each and each.estimate for each in episodes]
-            found = estimates = self.filter.follow(task, rows, before)
-            states = [each.mean for each in found]
+            before = [plan and plan.estimate for plan in episodes]
+            filtered = self.filter.follow(task, rows, before)
+            states = [estimate.mean for estimate in filtered]
+            estimates = [*filtered]
         plans = []
         for state, earlier, estimate in zip(states, episodes, estimates, strict=True):
             # The seed makes a plan the same whatever the other rows are.
             with seeded(seed), long_work("plan", "rounds"):
-                plan = self._planned(state, earlier, estimate and estimate.covariance)
-            plans.append(plan.taken(estimate))
+                plan = self._plan_step(state, earlier, estimate and estimate.covariance)
+            plans.append(plan.after(1, estimate))
         actions = [cast(Tensor, plan.moment.action) for plan in plans]
         return torch.stack(actions), tuple(plans)
 
-    def _planned(self, state: Tensor, earlier: Plan | None, covariance: Tensor | None) -> Plan:
-        """Return the steps ahead of an episode at a state, which has the covariance."""
-        begun, task, seconds = time.perf_counter(), self.model, self.each_step.seconds
+    def _plan_step(self, state: Tensor, earlier: Plan | None, covariance: Tensor | None) -> Plan:
+        """Return the steps ahead of an episode at a state with this covariance."""
+        begun = time.perf_counter()
+        seconds = self.each_step.seconds
         moment = Moment() if earlier is None else earlier.moment
+        length = self.task.episode_length
         left = None  # beyond the episode's length it looks as far ahead as ever
-        if task.episode_length is not None and moment.steps_done < task.episode_length:
-            left = task.episode_length - moment.steps_done
-        at: Any = task, state, self.action_bounds, left
-        how: dict[str, Any] = {"moment": moment, "covariance": covariance}
+        if length is not None and moment.steps_done < length:
+            left = length - moment.steps_done
+        at: Any = self.model, state, self.action_bounds, left
+        options: dict[str, Any] = {"moment": moment, "covariance": covariance}
         if earlier is None or not len(earlier.actions):
-            return self._promising(self._anew(*at, **how), earlier)
+            return _with_promise(self._plan_anew(*at, **options), earlier)
         if seconds is not None:
-            how["deadline"] = begun + seconds
-        plan = self.each_step.plan(*at, earlier=earlier, **how)
-        k = len(plan.actions)
+            options["deadline"] = begun + seconds
+        plan = self.each_step.plan(*at, earlier=earlier, **options)
+        # Beyond its horizon the earlier plan stays.
+        rest = earlier.after(len(plan.actions))
         merged = earlier._replace(
-            actions=torch.cat([plan.actions, earlier.actions[k:]]),
-            next_states=torch.cat([plan.next_states, earlier.next_states[k:]]),
+            actions=torch.cat([plan.actions, rest.actions]),
+            next_states=torch.cat([plan.next_states, rest.next_states]),
             left_bounds=plan.left_bounds,
             violation=plan.violation,
         )
         if not self._disappoints(plan, earlier):
             return merged
         if seconds is None:
-            return self._promising(self._anew(*at, **how), earlier)
+            return _with_promise(self._plan_anew(*at, **options), earlier)
         if begun + seconds - time.perf_counter() < seconds / 2:
             return merged
-        plan = self.first.plan(*at, earlier=merged, **how)
-        is_whole = len(plan.actions) >= len(merged.actions)
-        return self._promising(plan, earlier) if is_whole else merged
+        plan = self.first.plan(*at, earlier=merged, **options)
+        is_complete = len(plan.actions) >= len(merged.actions)
+        return _with_promise(plan, earlier) if is_complete else merged
 
-    def _anew(self, task: Task, state: Tensor, bounds: Tensor, left: int | None, **at: Any) -> Plan:
-        """Return a plan of the steps ahead without an earlier one: the better of two searches.
-
-        One begins with random sequences. Of an unstable system those of a whole episode tell
-        nothing; the other search begins with a plan that is made in the model part by part.
-        """
-        plan = self.first.plan(task, state, bounds, left, **at)
-        horizon, is_limited = self.each_step.horizon, self.first.horizon or self.first.seconds
+    def _plan_anew(
+        self, task: Task, state: Tensor, bounds: Tensor, left: int | None, **options: Any
+    ) -> Plan:
+        """Return the better of two plans: from random sequences, or from one made in parts."""
+        plan = self.first.plan(task, state, bounds, left, **options)
+        horizon = self.each_step.horizon
+        is_limited = self.first.horizon or self.first.seconds
         if horizon is None or left is None or is_limited:
             return plan
         ahead = replace(self.first, horizon=_PART * horizon)
-        moment, here, done = at["moment"], state, 0
-        part: Plan | None = None
         if ahead.steps_ahead(task.dynamics.spec, left) >= left:
             return plan
-        actions, states = bounds[:0], state.unsqueeze(0)[:0]
+        # Random sequences tell nothing of a whole episode of an unstable system; parts do.
+        here = state
+        moment = options["moment"]
+        part: Plan | None = None
+        parts: list[tuple[Tensor, Tensor]] = []
+        done = 0
         while done < left:
             part = ahead.plan(task, here, bounds, left - done, earlier=part, moment=moment)
-            k = len(part.actions)
-            k = k if done + k == left else -(-k // 2)  # half of it is made
-            made, here = part.actions[:k], part.next_states[k - 1]
-            actions, states = torch.cat([actions, made]), torch.cat([states, part.next_states[:k]])
-            part = part._replace(actions=part.actions[k:], next_states=part.next_states[k:])
-            for action in made:
-                moment = moment.after(action)
-            done += k
+            num_made = len(part.actions)
+            if done + num_made < left:
+                num_made = -(-num_made // 2)  # half of the part is made, rounded up
+            parts.append((part.actions[:num_made], part.next_states[:num_made]))
+            here = part.next_states[num_made - 1]
+            part = part.after(num_made)
+            moment = part.moment
+            done += num_made
+        actions, states = (torch.cat(column) for column in zip(*parts, strict=True))
         rough = plan._replace(actions=actions, next_states=states)
-        other = self.first.plan(task, state, bounds, left, earlier=rough, **at)
-        return max(plan, other, key=lambda each: each.value)
-
-    @staticmethod
-    def _promising(plan: Plan, earlier: Plan | None) -> Plan:
-        """Return a plan of all steps ahead, with the rewards that it promises of the episode."""
-        made = plan.rewards[:0] if earlier is None else earlier.promised[: plan.moment.steps_done]
-        return plan._replace(promised=torch.cat([made, plan.rewards]))
+        other = self.first.plan(task, state, bounds, left, earlier=rough, **options)
+        return max(plan, other, key=lambda candidate: candidate.value)
 
     def _disappoints(self, plan: Plan, earlier: Plan) -> bool:
-        """Return whether a plan is worth much less than its steps had promised."""
+        """Return whether a plan is worth much less than the promise of its steps."""
         if self.tolerance is None:
             return False
         if plan.left_bounds > earlier.left_bounds:
             return True  # its missing rewards would look like good ones
         promised = earlier.promised[earlier.moment.steps_done :][: len(plan.rewards)]
-        if not len(promised):  # an episode may be longer than what was planned
+        if not len(promised):  # an episode may be longer than its plan
             return False
         loss = (promised - plan.rewards[: len(promised)]).mean()
         return bool(loss > self.tolerance * (earlier.promised.max() - earlier.promised.min()))
 
 
-Kept = TypeVar("Kept")
+def _with_promise(plan: Plan, earlier: Plan | None) -> Plan:
+    """Return a plan of all steps ahead, with the rewards that it promises of the episode."""
+    made = plan.rewards[:0]
+    if earlier is not None:
+        made = earlier.promised[: plan.moment.steps_done]
+    return plan._replace(promised=torch.cat([made, plan.rewards]))
 
 
-def going_on(state: Sequence[Kept] | None, episode_start: Any, n: int) -> list[Kept | None]:
-    """Return what a policy kept of each of ``n`` episodes, its state; None of those that begin."""
+State = TypeVar("State")
+
+
+def continued(state: Sequence[State] | None, episode_start: Any, n: int) -> list[State | None]:
+    """Return the states of a policy in ``n`` episodes; None in an episode that begins."""
     if state is None:
         return [None] * n
     begins = np.zeros(n, dtype=bool) if episode_start is None else np.atleast_1d(episode_start)
-    return [None if new else kept for kept, new in zip(state, begins, strict=True)]
+    return [None if new else before for before, new in zip(state, begins, strict=True)]

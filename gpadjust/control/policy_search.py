@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import KW_ONLY, dataclass, field
 from itertools import pairwise
@@ -20,8 +20,8 @@ from gpadjust.control.task import Task
 from gpadjust.progress import tick
 from gpadjust.states import StateSpec
 
-_NEAR = 0.95  # of the way to a bound: beyond, the tanh has hardly any slope
-_REDRAW_EVERY = 5  # updates after which the policy is judged, and other functions are drawn
+_GENTLE = 0.1  # factor of the last weights at the start
+_REDRAW_EVERY = 5  # updates between two tests of the policy, and between draws of functions
 _MAX_GRAD_NORM = 1.0
 
 
@@ -31,22 +31,14 @@ class BoundedPolicy(nn.Module):
     .. math:: a = \frac{h + l}{2} + \frac{h - l}{2} \tanh(\pi(z)), \quad z = (o - m) / s,
 
     where o is the observation (:meth:`~gpadjust.states.StateSpec.observe`) and :math:`\pi` the
-    ``body``, layers of float64 in whose place another module may be set.
+    ``body``, layers of float64, which you may replace by another module.
 
     Args:
-        spec: What the entries of states and actions are.
+        spec: The names of states and actions.
         action_bounds: Lower and upper bounds l and h of the actions, ``2 x action_dim``.
         net_arch: The widths of the hidden layers; () for a linear function.
-        first_actions: About what it does before it has learnt, ``action_dim`` numbers within the
-            bounds. Default: their middle, which for muscles, say, is to tense them all.
-
-    Raises:
-        ValueError: If ``first_actions`` are beyond the bounds, or another number of them.
 
     Example:
-        >>> import torch
-        >>> from gpadjust.control import BoundedPolicy
-        >>> from gpadjust.states import StateSpec
         >>> policy = BoundedPolicy(StateSpec(["x"], ["force"]), [[-2.0], [2.0]])
         >>> policy(torch.zeros(3, 1, dtype=torch.float64)).shape
         torch.Size([3, 1])
@@ -57,21 +49,10 @@ class BoundedPolicy(nn.Module):
     unit: Tensor
 
     def __init__(
-        self,
-        spec: StateSpec,
-        action_bounds: ArrayLike,
-        net_arch: Sequence[int] = (64, 64),
-        first_actions: Sequence[float] | None = None,
+        self, spec: StateSpec, action_bounds: ArrayLike, net_arch: Sequence[int] = (64, 64)
     ) -> None:
         super().__init__()
         bounds = checked_bounds("action_bounds", action_bounds, spec.action_dim)
-        low, high = bounds
-        first = (low + high) / 2 if first_actions is None else torch.tensor(first_actions).double()
-        if first.shape != low.shape or not ((first >= low) & (first <= high)).all():
-            raise ValueError(
-                f"first_actions must be {len(low)} numbers within {low.tolist()} and "
-                f"{high.tolist()}; found {first.tolist()}."
-            )
         self.spec = spec
         self.register_buffer("action_bounds", bounds)
         self.register_buffer("origin", torch.zeros(spec.observation_dim, dtype=torch.float64))
@@ -82,8 +63,8 @@ class BoundedPolicy(nn.Module):
         self.body = nn.Sequential(*layers[:-1])
         last: Any = self.body[-1]
         with torch.no_grad():
-            last.weight.mul_(0.1)  # gentle actions at first
-            last.bias.copy_(((2 * first - low - high) / (high - low)).clamp(-_NEAR, _NEAR).atanh())
+            last.weight.mul_(_GENTLE)
+            last.bias.zero_()  # the middle of the bounds
 
     def forward(self, states: Tensor) -> Tensor:
         """Return actions ``N x action_dim`` at states ``N x state_dim``."""
@@ -97,49 +78,41 @@ class BoundedPolicy(nn.Module):
 
     def look_at(self, states: Tensor) -> None:
         """Take the scale of observations from states ``N x state_dim``; once, before training."""
-        seen = self.spec.observe(states)
-        self.origin.copy_(seen.mean(0))
-        spread = seen.std(0, correction=0)
-        self.unit.copy_(torch.where(spread > 1e-6 * seen.abs().amax(0), spread, 1.0))
+        observations = self.spec.observe(states)
+        self.origin.copy_(observations.mean(0))
+        spread = observations.std(0, correction=0)
+        self.unit.copy_(torch.where(spread > 1e-6 * observations.abs().amax(0), spread, 1.0))
 
 
 class SearchResult(NamedTuple):
-    """Result of a search.
+    """Result of a search."""
 
-    Args:
-        values: Value of the objective in each update, ``updates``; of drawn functions and starts.
-        reward: The mean reward of a step of the best policy, in the draws that were held out.
-        left_bounds: The share of episodes that left the bounds there.
-        seconds: Duration.
-    """
-
-    values: Tensor
-    reward: float
-    left_bounds: float
+    values: Tensor  #: of the objective in each update, for drawn functions and starts
+    reward: float  #: mean reward of a step of the best policy, in held-out functions and starts
+    left_bounds: float  #: share of the held-out episodes that left the bounds
     seconds: float
 
 
 @dataclass(frozen=True)
 class PolicySearch:
-    """Improves a policy along whole episodes in the mean of the dynamics, or in functions.
+    """Improves a policy along episodes in the mean of the dynamics, or in functions drawn from it.
 
-    Each update lets the policy act from ``num_starts`` states, and follows the gradient of the
-    objective back through all steps, through policy, f_p and what was learnt (Deisenroth and
-    Rasmussen 2011; Parmas et al. 2018; Amadio et al. 2022). A black box as physics has the
-    gradients of its finite differences. Every few updates other functions are drawn, so that the
-    policy cannot lean on the errors of a few, and it is judged from starts, and in functions, that
-    no update sees, the same each time. The best one is kept, be it the one at the beginning.
+    Each update follows the gradient of the objective back through all steps, through policy, f_p
+    and its correction (Deisenroth and Rasmussen 2011; Parmas et al. 2018; Amadio et al. 2022); a
+    black box as physics has finite differences. Every few updates the functions are drawn again,
+    and the policy is tested with held-out functions and starts. The result is the best policy of
+    these tests, possibly the first.
 
     Args:
-        objective: What to look for. Default: the mean return; ``Return(quantile=0.2)`` is careful.
-        updates: Gradient steps (Adam).
+        objective: The goal. Default: the mean return; ``Return(quantile=0.2)`` is careful.
+        updates: Number of gradient steps (Adam).
         num_starts: Number of starts of each update.
-        num_functions: Number of functions in which it acts from each, such as 6; after one or two
-            real episodes they may differ too much for one policy. None for the mean.
-        learning_rate: At the start; it decays to a tenth along a cosine.
+        num_functions: Number of functions for each start, such as 6; after one or two real episodes
+            they may differ too much for one policy. None for the mean.
+        learning_rate: Learning rate at the start; it decays to a tenth along a cosine.
 
     Raises:
-        TypeError: If something is of another kind.
+        TypeError: If an argument has another type.
         ValueError: If a number is out of range.
 
     Example:
@@ -153,11 +126,9 @@ class PolicySearch:
         ...     initial_states=lambda n: torch.randn(n, 1, dtype=torch.float64),
         ...     episode_length=5,
         ... )
-        >>> _ = torch.manual_seed(0)
         >>> policy = BoundedPolicy(spec, [[-1.0], [1.0]], net_arch=())
-        >>> result = PolicySearch(updates=30, learning_rate=0.1).improve(policy, task)
-        >>> bool(result.values[-5:].mean() > result.values[:5].mean())
-        True
+        >>> PolicySearch(updates=30, learning_rate=0.1).improve(policy, task).values.shape
+        torch.Size([30])
     """
 
     objective: Objective = field(default_factory=Return)
@@ -175,30 +146,19 @@ class PolicySearch:
         checked_number("learning_rate", self.learning_rate, above=0)
 
     def check_task(self, task: Task) -> None:
-        """Raise a ValueError if a task has what a policy cannot keep."""
+        """Raise a ValueError if a task has limits that a policy cannot keep."""
         for part in ("constraints", "action_rate"):
             task.refuse(type(self).__name__, part, "MPCAgent can")
 
-    def improve(
-        self,
-        policy: nn.Module,
-        task: Task,
-        *,
-        progress: Callable[[int, float], None] | None = None,
-    ) -> SearchResult:
-        """Improve a policy; the randomness is PyTorch's global generator.
+    def improve(self, policy: nn.Module, task: Task) -> SearchResult:
+        """Improve a policy, from states ``N x state_dim`` to actions ``N x action_dim``.
 
-        Args:
-            policy: A module from states ``N x state_dim`` to actions ``N x action_dim``, whose
-                parameters are changed; after an error they are as before.
-            task: The task, whose dynamics are fitted, with episode length and starts.
-            progress: Called after each update with its number and the value of the objective.
+        The randomness is PyTorch's global generator. An error leaves the policy as it was.
 
         Raises:
-            TypeError: If the policy is no module with parameters.
-            ValueError: If the task leaves something open.
-            RuntimeError: If the dynamics have learnt nothing yet, or no gradient flows from the
-                rewards to the policy.
+            TypeError: If the policy is not a module with parameters.
+            ValueError: If the task lacks a part.
+            RuntimeError: If the dynamics are not fitted, or no gradient flows to the policy.
             PhysicsError: If the physics fails at all starts.
         """
         if not isinstance(policy, nn.Module) or not [*policy.parameters()]:
@@ -209,38 +169,43 @@ class PolicySearch:
         self.check_task(task)
         if task.episode_length is None:
             raise ValueError("A policy search needs a task with episode_length; found None.")
-        begun, values, length = time.perf_counter(), list[Tensor](), task.episode_length
+        begun = time.perf_counter()
+        values: list[Tensor] = []
+        length = task.episode_length
         home = next(policy.parameters()).device
-        policy.to("cpu")  # where the dynamics are
-        result = before = deepcopy(policy.state_dict())
+        policy.to("cpu")  # the device of the dynamics
+        result = best = deepcopy(policy.state_dict())
+        best_worth = -math.inf
         parameters = [p for p in policy.parameters() if p.requires_grad]
         optimizer = torch.optim.Adam(parameters, lr=self.learning_rate)
         rate = torch.optim.lr_scheduler.CosineAnnealingLR(
             optimizer, self.updates, eta_min=self.learning_rate / 10
         )
         try:
-            score, held_out = self.objective.of(task), Rollouts(task, self.num_functions)
+            compute_score = self.objective.make_score(task)
+            held_out = Rollouts(task, self.num_functions)
             starts = task.draw_initial_states(self.num_starts)
-            best, best_worth = before, -math.inf
             for i in range(self.updates + 1):
+                # Test the policy.
                 if i % _REDRAW_EVERY == 0 or i == self.updates:
                     with torch.no_grad():
-                        judged = held_out.act(starts, policy, length)
-                        worth = float(score(judged).mean())
+                        test = held_out.act(starts, policy, length)
+                        worth = float(compute_score(test).mean())
                     if i == 0 or worth > best_worth:
-                        best, best_worth = deepcopy(policy.state_dict()), worth
-                        reward = float(judged.rewards[judged.made].mean())
-                        left = float(judged.left_bounds.any(-1).double().mean())
+                        best = deepcopy(policy.state_dict())
+                        best_worth = worth
+                        reward = float(test.rewards[test.made].mean())
+                        left = float(test.left_bounds.any(-1).double().mean())
                 if i == self.updates:
                     break
                 if i % _REDRAW_EVERY == 0:
                     rollouts = Rollouts(task, self.num_functions)
+                # Follow the gradient of the objective, per step.
                 drawn = task.draw_initial_states(self.num_starts)
-                value = score(rollouts.act(drawn, policy, length)).mean() / length
+                value = compute_score(rollouts.act(drawn, policy, length)).mean() / length
                 if not value.requires_grad:
                     raise RuntimeError(
-                        "No gradient flows from the rewards to the policy: the task's reward or "
-                        "the dynamics are computed without PyTorch's autograd. Write the reward in "
+                        "No gradient flows from the rewards to the policy. Write the reward in "
                         "torch, without .detach() and .numpy()."
                     )
                 optimizer.zero_grad()
@@ -250,8 +215,6 @@ class PolicySearch:
                 rate.step()
                 values.append(value.detach())
                 tick("updates")
-                if progress is not None:
-                    progress(i + 1, float(values[-1]))
             result = best
         finally:
             policy.load_state_dict(result)

@@ -1,4 +1,4 @@
-"""Real steps that cannot be data, and what becomes of them."""
+"""A guard around an environment, for real steps that cannot be data."""
 
 from __future__ import annotations
 
@@ -9,38 +9,35 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from gpadjust.control.faults import check_observation, fault
+from gpadjust.control.episodes import check_observation, fault
 
-_IN_VAIN = 3  # episodes on end without a step, after which there is no sense in another
+_IN_VAIN = 3  # successive episodes without a step, after which another makes no sense
 
 
 class FailedStepWarning(UserWarning):
-    """A real step could not be made, or gave what cannot be data; it is not kept."""
+    """A real step could not be made, or returned what cannot be data; it is not stored."""
 
 
 class StepGuard(gym.Wrapper[Any, Any, Any, Any]):
-    """Ends an episode where its step fails, as a step that did not happen.
+    """Ends an episode at a step that fails, as if the step had not happened.
 
     A step fails that raises an error, or whose observation or reward is not finite or larger than
     1e25. The episode is truncated at the last good observation, with a
-    :class:`FailedStepWarning`, a reward of zero and a true ``info["step_failed"]``, by which an
-    environment itself may tell that a step did not happen: no learner of the library takes it as
-    data. Agents put a guard around their environment, and Dyna around each of a ``DummyVecEnv``;
-    put one yourself around each environment that another process runs, as in
-    ``SubprocVecEnv([lambda: StepGuard(make()), ...])``. Interruptions and errors of ``reset`` come
-    through.
+    :class:`FailedStepWarning`, a reward of zero and a true ``info["step_failed"]``, which an
+    environment may also set itself: no learner of the library takes the step as data. Agents put a
+    guard around their environment, and Dyna around each of a ``DummyVecEnv``; around environments
+    of other processes put one yourself, as in
+    ``SubprocVecEnv([lambda: StepGuard(make()), ...])``. Interruptions and errors of ``reset`` pass.
 
     Raises:
-        RuntimeError: By ``step``, if the first step of three episodes on end fails.
+        RuntimeError: By ``step``, if the first step of three successive episodes fails.
         ValueError: By ``reset``, if the first observation of an episode cannot be data.
 
     Example:
-        >>> from gpadjust.control import StepGuard
         >>> from gpadjust.systems import cart_pole
         >>> env = StepGuard(cart_pole().make())
         >>> _ = env.reset(seed=0)
-        >>> *_, info = env.step(env.action_space.sample())
-        >>> "step_failed" in info
+        >>> "step_failed" in env.step(env.action_space.sample())[4]
         False
     """
 
@@ -52,7 +49,7 @@ class StepGuard(gym.Wrapper[Any, Any, Any, Any]):
 
     @staticmethod
     def around(env: gym.Env[Any, Any]) -> StepGuard:
-        """Return the environment with a guard around it, or as it is if it has one."""
+        """Return the environment with one guard around it."""
         return env if isinstance(env, StepGuard) else StepGuard(env)
 
     def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
@@ -68,22 +65,25 @@ class StepGuard(gym.Wrapper[Any, Any, Any, Any]):
         try:
             result = self.env.step(action)
             problem = fault(result[0], result[1])
-        except Exception as error:  # whatever a machine, or its driver, does
-            cause, problem = error, f"the environment raised {type(error).__name__}: {error}"
+        except Exception as error:  # any error of a machine, or its driver
+            cause = error
+            problem = f"the environment raised {type(error).__name__}: {error}"
         if not problem:
-            self._last, self._steps, self._in_vain = np.array(result[0]), self._steps + 1, 0
+            self._last = np.array(result[0])  # a copy: the environment may write over it
+            self._steps += 1
+            self._in_vain = 0
             return result
         message = f"Step {self._steps + 1} of an episode failed, and ends it: {problem}."
         self._in_vain += self._steps == 0
         if self._in_vain >= _IN_VAIN:
             self._in_vain = 0
             raise RuntimeError(
-                f"{message} Nor was there a good step in the {_IN_VAIN - 1} episodes before. Mend "
-                "the environment and call `learn` again; all earlier steps are kept."
+                f"{message} The {_IN_VAIN - 1} previous episodes had no valid step either. Fix the "
+                "environment and call `learn` again; all earlier steps are stored."
             ) from cause
         warnings.warn(
-            f"{message} It is not kept, all earlier steps are, and learning goes on with the next "
-            "episode. If it happens often, look at the sensor or the simulator.",
+            f"{message} Earlier steps are stored, and learning continues with the next episode. If "
+            "it happens often, check the sensor or the simulator.",
             FailedStepWarning,
             stacklevel=2,
         )

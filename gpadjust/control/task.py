@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ from gpadjust.dynamics import Dynamics
 from gpadjust.dynamics.base import step_or_nan
 from gpadjust.states import Sensors, StateSpec
 
+_ROUNDING = 1e-5  # of the width of the bounds: observations have single precision
 _FUNCTIONS = {
     "reward": ("states", "actions", "next states"),
     "terminated": ("states",),
@@ -28,21 +29,17 @@ _FUNCTIONS = {
 
 @dataclass(frozen=True)
 class ActionRate:
-    """Limit and price of the change of an action from a step to the next one.
-
-    The first action of an episode is free.
+    """Limit and price of the change of an action between two steps; the first action is free.
 
     Args:
-        most: The most that an action changes in a step, one number for all actions or one for
-            each. Default: no limit.
-        price: Cost of a step for each unit of the sum of its squared changes, beside the rewards.
+        most: Largest change in a step, one number for all actions or one for each. Default: none.
+        price: Cost of a unit of the sum of squared changes, in addition to the rewards.
 
     Raises:
-        TypeError: If a number is of another kind.
+        TypeError: If a number has another type.
         ValueError: If ``most`` is not positive, or ``price`` negative.
 
     Example:
-        >>> import torch
         >>> ActionRate(most=0.25).limited(torch.tensor([1.0, -0.1]), torch.zeros(2))
         tensor([ 0.2500, -0.1000])
     """
@@ -59,10 +56,11 @@ class ActionRate:
 
     @property
     def limits(self) -> list[Any]:
-        """The limits as a list; empty without any."""
-        if isinstance(self.most, Sequence) and not isinstance(self.most, str):
-            return [*self.most]
-        return [] if self.most is None else [self.most]
+        """The limits as a list; empty without a limit."""
+        if self.most is None:
+            return []
+        is_list = isinstance(self.most, Sequence) and not isinstance(self.most, str)
+        return [*self.most] if is_list else [self.most]  # type: ignore[misc]
 
     def limited(self, actions: Tensor, before: Tensor | None) -> Tensor:
         """Return the nearest actions ``... x action_dim`` that may follow the ones before."""
@@ -73,17 +71,14 @@ class ActionRate:
 
 
 class Moment(NamedTuple):
-    """The point of an episode at which a step is made.
+    """The point of an episode at which a step is made, of ``N`` rows or one for all of them.
 
-    Args:
-        steps_done: Number of steps before, ``N`` or one for all rows.
-        action: The last action, ``N x action_dim`` or one for all rows; None at the start.
-        margins: Margins of the constraints in the steps ahead, ``T x c``, the last one for all
-            beyond; see :func:`~gpadjust.control.constraints.margins`. Default: none.
+    ``margins`` are those of the constraints in the steps ahead, ``T x c``, the last one for all
+    further steps; see :func:`~gpadjust.control.constraints.margins`.
     """
 
-    steps_done: Any = 0
-    action: Tensor | None = None
+    steps_done: Any = 0  #: number of earlier steps, N
+    action: Tensor | None = None  #: the last one, N x action_dim; None at the start
     margins: Tensor | None = None
 
     def after(self, actions: Tensor) -> Moment:
@@ -97,79 +92,65 @@ class Moment(NamedTuple):
 class Steps(NamedTuple):
     """Steps in a model: ``N`` of them, or ``k x n x T``, of ``n`` episodes in ``k`` functions.
 
-    Args:
-        states: The states at which actions were taken, ``... x state_dim``.
-        actions: As near to the chosen ones as the action rate allows, ``... x action_dim``.
-        next_states: ``... x state_dim``; the old state where the step left the bounds.
-        rewards: ``...``, as all that follow; where it left the bounds, the reward of staying.
-        made: Whether the step was made: not where it left the bounds, nor after the end of an
-            episode, where all other entries mean nothing.
-        terminated: Whether the next state ends the episode.
-        left_bounds: Whether it would have left the bounds or the finite numbers, or the physics
-            failed.
-        overshoot: How far it would have left the bounds, in halves of their width, summed over the
-            states; with its gradient, which leads back. 0 where that is not finite.
-        violation: Violation of the constraints with their margins, in sum; 0 if they hold.
-        price: What the change of the action costs.
+    Where a step left the bounds or the finite numbers, or the physics failed, the next state is the
+    old one, and the reward that of staying. A step is not made there, nor after the end of an
+    episode, where its other entries mean nothing. The overshoot, the distance beyond the bounds in
+    halves of their width summed over the states, has a gradient that leads back.
     """
 
-    states: Tensor
-    actions: Tensor
-    next_states: Tensor
-    rewards: Tensor
-    made: Tensor
-    terminated: Tensor
-    left_bounds: Tensor
-    overshoot: Tensor
-    violation: Tensor
-    price: Tensor
+    states: Tensor  #: at which actions were taken, ... x state_dim
+    actions: Tensor  #: within the limits of the action rate, ... x action_dim
+    next_states: Tensor  #: ... x state_dim
+    rewards: Tensor  #: ..., as all that follow
+    made: Tensor  #: True if the step was made
+    terminated: Tensor  #: True if the next state ends the episode
+    left_bounds: Tensor  #: True if it would have left the bounds
+    overshoot: Tensor  #: 0 where it is not finite
+    violation: Tensor  #: sum over the constraints with their margins; 0 if they hold
+    price: Tensor  #: of the change of the action
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
     """The dynamics of a system with its reward, bounds and starts.
 
-    All tensors are float64, in the units of ``dynamics.spec``. What is left out a learner takes
-    from its environment and the real episodes that it has seen. To change a part, make another one
-    by ``dataclasses.replace``. Dynamics learn: make others for another run.
+    All tensors are float64, in the units of ``dynamics.spec``. A learner completes missing parts
+    from its environment and real episodes. Dynamics learn: make new ones for another run.
 
     Args:
         dynamics: The model of the real system.
-        reward: Known rewards ``N`` of states ``N x state_dim``, actions ``N x action_dim`` and next
+        reward: Rewards ``N`` of states ``N x state_dim``, actions ``N x action_dim`` and next
             states ``N x state_dim``.
-        terminated: Whether states ``N x state_dim`` end an episode, ``N`` booleans. Default: none.
+        terminated: ``N`` booleans, True where states ``N x state_dim`` end an episode. Default:
+            nowhere.
         initial_states: Draws ``n`` states, ``n x state_dim``, at which episodes start. Default:
             the starts of real episodes.
-        episode_length: Steps after which an episode is truncated, in the model and by an
+        episode_length: Number of steps after which an episode is truncated, in the model and by an
             :class:`Agent`. Default: the time limit of the environment.
         state_bounds: Lower and upper bounds of the states, ``2 x state_dim``, beyond which the
-            model is not followed; infinite where there is none. Default: far beyond the recorded
-            states of an agent that has some; else none.
-        sensors: What is measured of the states, which observations then are; it takes
-            ``initial_states``. Default: all of the states.
+            model is not followed; infinite without a bound. Default: far beyond the recorded
+            states of an agent with real episodes; else none.
+        sensors: The measured outputs, which then are the observations; needs ``initial_states``.
+            Default: all states are measured.
         reference: Set-points that move during an episode, such as
             ``lambda states, steps: torch.sin(0.1 * steps).unsqueeze(-1)``: the values of the
             exogenous states, ``N x len(spec.exogenous)``, after ``steps`` steps of an episode,
-            ``N``, of which the last was made at ``states``, ``N x state_dim``. The environment
-            observes them; plans know them beforehand. Default: they stay as they are.
+            ``N``, the last of them at ``states``, ``N x state_dim``. The environment observes them;
+            plans use them in advance. Default: constant set-points.
         constraints: Numbers ``N x c``, in PyTorch's functions, of states ``N x state_dim`` and the
             actions ``N x action_dim`` that led to them: each constraint holds where its number is
-            at most 0, such as ``states[:, :1] - 0.5`` before a wall at 0.5. A planner looks for
-            plans that hold them, or violate them least. Default: none.
-        probability: Of all constraints holding through a whole episode: plans keep a margin for
-            what is not known of the next states (:func:`~gpadjust.control.constraints.margins`).
-            None: they hold in the mean of the model, without margin.
-        action_rate: The most that an action changes in a step, one number for all actions or one
-            for each; or an :class:`ActionRate`, which may have a price, too. Default: no limit.
+            at most 0, such as ``states[:, :1] - 0.5`` before a wall at 0.5. Default: none.
+        probability: Probability that all constraints hold through an episode, for which plans keep
+            :func:`~gpadjust.control.constraints.margins`. None: they hold in the mean of the model.
+        action_rate: Largest change of an action in a step, one number for all actions or one for
+            each; or an :class:`ActionRate`. Default: no limit.
 
     Raises:
-        TypeError: If something is of another kind, or a function takes other arguments.
+        TypeError: If a part has another type, or a function takes other arguments.
         ValueError: If a number or the bounds are out of range, or parts contradict each other.
 
     Example:
-        >>> import torch
-        >>> from gpadjust.control import Task
-        >>> from gpadjust.dynamics import LearnedDynamics, StateSpec
+        >>> from gpadjust.dynamics import LearnedDynamics
         >>> dynamics = LearnedDynamics(StateSpec(["x"], ["v"]), lambda X: X[:, :1] + 0.1 * X[:, 1:])
         >>> task = Task(dynamics, lambda states, actions, next_states: -next_states[:, 0].square())
     """
@@ -188,9 +169,9 @@ class Task:
     action_rate: ActionRate | float | Sequence[float] | None = None
 
     def __post_init__(self) -> None:
-        """Check what can be checked without a state."""
+        """Check what needs no state."""
         check_kind("dynamics", self.dynamics, Dynamics, "an object of a Dynamics")
-        check_kind("sensors", self.sensors, Sensors | None, 'Sensors(["x", "theta"]), say')
+        check_kind("sensors", self.sensors, Sensors | None, 'Sensors(["x", "theta"])')
         for name, arguments in _FUNCTIONS.items():
             function = getattr(self, name)
             if (function is not None or name == "reward") and not _takes(function, len(arguments)):
@@ -201,37 +182,34 @@ class Task:
             checked_whole("episode_length", self.episode_length, 1)
         if self.probability is not None:
             checked_number("probability", self.probability, above=0, below=1)
-        spec = self.dynamics.spec
         if self.state_bounds is not None:
-            bounds = checked_bounds("state_bounds", self.state_bounds, spec.state_dim, finite=False)
+            size = self.dynamics.spec.state_dim
+            bounds = checked_bounds("state_bounds", self.state_bounds, size, finite=False)
             object.__setattr__(self, "state_bounds", bounds)
-        self.observed  # noqa: B018 - or an error on the names of the sensors
-        limits = [] if self.rate is None else self.rate.limits
-        moves, hidden = self.reference is not None, self.sensors is not None
-        for is_wrong, message in (
-            (
-                moves and not spec.exogenous,
-                "reference says the values of exogenous states, but the spec has none; name the "
-                "set-points among `exogenous`, and let the environment observe them.",
-            ),
-            (
-                hidden and self.initial_states is None,
-                "Of hidden states it must be known where episodes start; pass initial_states, or "
-                "start of a System, as well as sensors.",
-            ),
-            (
-                hidden and moves,
-                "The estimate of hidden states takes set-points for constant; leave reference out, "
-                "or the sensors.",
-            ),
-            (
-                len(limits) not in (0, 1, spec.action_dim),
+        self.observed  # noqa: B018 - raises an error for unknown names of the sensors
+        for message in self._mistakes():
+            raise ValueError(message)
+
+    def _mistakes(self) -> Iterator[str]:
+        """Return messages on parts that contradict each other."""
+        spec = self.dynamics.spec
+        if self.reference is not None and not spec.exogenous:
+            yield (
+                "reference returns the values of exogenous states, but the spec has none; name the "
+                "set-points among `exogenous`, and let the environment observe them."
+            )
+        if self.sensors is not None and self.initial_states is None:
+            yield (
+                "Hidden states need known starts of episodes: give initial_states (of a System, "
+                "start) in addition to sensors."
+            )
+        if self.sensors is not None and self.reference is not None:
+            yield "Hidden states need constant set-points: give reference or sensors, not both."
+        if self.rate is not None and len(self.rate.limits) not in (0, 1, spec.action_dim):
+            yield (
                 f"action_rate must have one limit, or one for each of {spec.action_dim} actions; "
-                f"found {len(limits)}.",
-            ),
-        ):
-            if is_wrong:
-                raise ValueError(message)
+                f"found {len(self.rate.limits)}."
+            )
 
     @property
     def observed(self) -> StateSpec:
@@ -241,7 +219,7 @@ class Task:
 
     @property
     def rate(self) -> ActionRate | None:
-        """``action_rate`` as an object, None if there is none."""
+        """``action_rate`` as an object, or None."""
         rate = self.action_rate
         return rate if isinstance(rate, ActionRate | None) else ActionRate(rate)
 
@@ -254,39 +232,40 @@ class Task:
         move: Callable[[Tensor, Tensor], Tensor] | None = None,
         some_must_succeed: bool = False,
     ) -> Steps:
-        """Take actions ``N x action_dim`` at states ``N x state_dim`` of the model.
+        """Take actions ``N x action_dim`` at states ``N x state_dim``, at a moment of an episode.
 
-        This is the one place where action rate, set-points, bounds and constraints act.
-
-        Args:
-            states: The states.
-            actions: The actions that are chosen there.
-            moment: The point of the episode. Default: its beginning.
-            move: Next states of these. Default: drawn from the dynamics, row by row.
-            some_must_succeed: Whether it is an error that the physics fails for all rows.
+        This is the one place where action rate, set-points, bounds and constraints act. ``move``
+        returns the next states, by default a draw of the dynamics.
 
         Raises:
-            PhysicsError: If the physics fails everywhere, or does not say where.
+            PhysicsError: If the physics does not report where it fails, or fails for all rows and
+                ``some_must_succeed``.
         """
-        moment = Moment() if moment is None else moment
-        none = torch.zeros(len(states), dtype=torch.float64)
-        price = violation = none
+        moment = moment or Moment()
+        zeros = torch.zeros(len(states), dtype=torch.float64)
+        # The action rate: the nearest action within the limit, at the price of its change.
+        price = zeros
         if self.rate is not None and moment.action is not None:
             actions = self.rate.limited(actions, moment.action)
             price = self.rate.price * (actions - moment.action).square().sum(-1)
-        move = self.dynamics.sample if move is None else move
-        following = step_or_nan(move, states, actions, some_must_succeed=some_must_succeed)
+        following = step_or_nan(
+            move or self.dynamics.sample, states, actions, some_must_succeed=some_must_succeed
+        )
+        # Set-points are known in advance.
         set_points = self.set_points(states, moment.steps_done + 1)
         if set_points is not None:
             following = following.clone()
             following[:, self.dynamics.spec.exogenous_columns] = set_points
+        # Beyond the bounds a state stays as it was.
         left, overshoot = self._left_bounds(following)
         if left.any():
             following = torch.where(left.unsqueeze(-1), states, following)
         rewards = self.rewards(states, actions, following)
-        terminated = none.bool()
+        terminated = zeros.bool()
         if self.terminated is not None:
             terminated = self.terminations(following) & ~left
+        # A constraint holds with its margin: g + margin <= 0
+        violation = zeros
         if self.constraints is not None:
             values = self.constraint_values(following, actions)
             if moment.margins is not None:
@@ -296,8 +275,9 @@ class Task:
         return Steps(states, actions, following, rewards, *ends, violation, price)
 
     def _left_bounds(self, states: Tensor) -> tuple[Tensor, Tensor]:
-        """Return which of ``N`` states are beyond the bounds or not finite, and how far beyond."""
-        left, overshoot = ~states.isfinite().all(-1), states.new_zeros(len(states))
+        """Return which states are beyond the bounds or not finite, and how far beyond."""
+        left = ~states.isfinite().all(-1)
+        overshoot = states.new_zeros(len(states))
         if self.state_bounds is None:
             return left, overshoot
         low, high = self.state_bounds
@@ -310,12 +290,12 @@ class Task:
         return left | outside, overshoot
 
     def widened(self, states: Tensor) -> Task:
-        """Return this task, or one whose bounds give way to ``N x state_dim`` beyond them."""
+        """Return this task, or one with wider bounds if states ``N x state_dim`` are beyond."""
         if self.state_bounds is None:
             return self
         low, high = self.state_bounds
         span = torch.where((high - low).isfinite(), high - low, 0.0)
-        slack = 1e-5 * span  # observations have single precision
+        slack = _ROUNDING * span
         wider = ((states < low - slack) | (states > high + slack)).any(0)
         if not wider.any():
             return self
@@ -326,9 +306,9 @@ class Task:
     # The user's functions, checked
 
     def draw_initial_states(self, n: int) -> Tensor:
-        """Draw ``n x state_dim`` states at which episodes start; a ValueError if nothing does."""
+        """Draw ``n x state_dim`` states at which episodes start; a ValueError if unknown."""
         if self.initial_states is None:
-            raise ValueError("The task does not say where episodes start; pass initial_states.")
+            raise ValueError("The task has no starts of episodes; give initial_states.")
         drawn = torch.as_tensor(self.initial_states(n), dtype=torch.float64)
         return checked_values(f"initial_states({n})", drawn, n, self.dynamics.spec.state_dim)
 
@@ -344,10 +324,7 @@ class Task:
         return checked_values("terminated", self.terminated(states.detach()), len(states)).bool()
 
     def set_points(self, states: Tensor, steps: Tensor | int) -> Tensor | None:
-        """Return the exogenous states after steps of these numbers, from 1, at ``N`` states.
-
-        They are ``N x len(spec.exogenous)``; None without a ``reference``, as they stay.
-        """
+        """Return exogenous states ``N x len(spec.exogenous)`` after these steps, or None."""
         if self.reference is None:
             return None
         values = self.reference(states.detach(), torch.as_tensor(steps).expand(len(states)))
@@ -370,16 +347,7 @@ class Task:
     # Before and between real steps
 
     def try_functions(self, states: Tensor, actions: Tensor) -> None:
-        """Call physics and functions once, to find what is wrong with them before it costs data.
-
-        Args:
-            states: Where episodes start, ``N x state_dim``.
-            actions: Some that may be taken there, ``N x action_dim``.
-
-        Raises:
-            ValueError: If they return another shape, or numbers that are not finite.
-            PhysicsError: If the physics fails.
-        """
+        """Call physics and functions once at ``N`` rows, for their errors before real steps."""
         if self.initial_states is not None:
             self.draw_initial_states(len(states))
         if self.sensors is not None:
@@ -388,49 +356,46 @@ class Task:
         self.dynamics.try_physics(states, actions)
 
     def check_spaces(self, observation_space: Any, action_space: Any) -> None:
-        """Raise a ValueError unless the spaces are boxes of what is observed and of actions."""
-        spec, whose = self.observed, "dynamics" if self.sensors is None else "sensors"
-        for name, space, size in (
-            ("observation", observation_space, spec.observation_dim),
-            ("action", action_space, spec.action_dim),
-        ):
+        """Raise a ValueError unless the spaces are boxes of observations and actions."""
+        spec = self.observed
+        owner = "dynamics" if self.sensors is None else "sensors"
+        spaces = {"observation": observation_space, "action": action_space}
+        sizes = (spec.observation_dim, spec.action_dim)
+        for (name, space), size in zip(spaces.items(), sizes, strict=True):
             if not hasattr(space, "high") or space.shape != (size,):
                 raise ValueError(
-                    f"The spec of the {whose} says that the {name} has {size} entries (an angle is "
-                    f"seen as sine and cosine), so a Box of shape ({size},) is expected; found "
-                    f"{space}. {spec}."
+                    f"By the spec of the {owner} the {name} has {size} entries (sine and cosine of "
+                    f"an angle), so a Box of shape ({size},) is expected; found {space}. {spec}."
                 )
         if not np.isfinite([action_space.low, action_space.high]).all():
             raise ValueError(
-                "Actions must have bounds, between which plans and policies choose; found "
-                f"{action_space}. Set env.action_space = gymnasium.spaces.Box(low, high) with "
-                "the bounds of the machine."
+                f"Actions must have finite bounds, for plans and policies; found {action_space}. "
+                "Set env.action_space = gymnasium.spaces.Box(low, high)."
             )
 
     def refuse(self, learner: str, name: str, way_out: str) -> None:
-        """Raise a ValueError if the task has the part ``name``, with which a learner cannot do."""
+        """Raise a ValueError if the task has the part ``name``, which a learner cannot use."""
         if getattr(self, name) is not None:
             raise ValueError(f"{learner} cannot learn a task with {name}; {way_out}.")
 
     def describe(self) -> dict[str, Any]:
-        """Return the task in plain values: of functions, whether there is one."""
+        """Return the task in plain values, with True for a function."""
         bounds, sensors, rate = self.state_bounds, self.sensors, self.action_rate
         return {
             **{f"dynamics.{name}": text for name, text in self.dynamics.describe().items()},
             **{name: getattr(self, name) is not None for name in _FUNCTIONS if name != "reward"},
             "episode_length": self.episode_length,
             "state_bounds": None if bounds is None else bounds.tolist(),
-            "sensors": None if sensors is None else sensors.describe(),
+            "sensors": sensors and sensors.describe(),
             "probability": self.probability,
             "action_rate": None if rate is None else repr(rate),
         }
 
 
 def checked_values(function: str, values: Any, *shape: int | str) -> Tensor:
-    """Return values of a user's function as a tensor; a letter is any number of columns.
+    """Return a user's values as a tensor; raise a ValueError for another shape or NaN.
 
-    Raises:
-        ValueError: If they have another shape, or are not finite.
+    A letter in the shape is any number of columns.
     """
     values = torch.as_tensor(values)
     columns = values.shape[-1:] if shape[-1] == "c" else shape[-1:]
@@ -447,7 +412,7 @@ def checked_values(function: str, values: Any, *shape: int | str) -> Tensor:
 
 
 def _takes(function: Any, num_arguments: int) -> bool:
-    """Return whether something is a function that takes so many arguments."""
+    """Return True for a function of so many arguments."""
     try:
         inspect.signature(function).bind(*range(num_arguments))
     except TypeError:

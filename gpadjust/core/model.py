@@ -274,7 +274,7 @@ class GP(gpytorch.models.GP, Predictive):
         """Return the unknown parameters of the physics at coordinates ``N x B x P``."""
         values = self.table.values(u)
         z = [values[f"physics.{name}"] for name in self._unknowns]
-        draws = self._unknowns.at(torch.cat(z, -1)).unbind(-1) if z else []
+        draws = self._unknowns.to_values(torch.cat(z, -1)).unbind(-1) if z else []
         return PhysicsParameters(self._unknowns, draws)
 
     @property
@@ -508,7 +508,7 @@ class GP(gpytorch.models.GP, Predictive):
         if not physics.unknowns:
             return []
         z = torch.cat([values[f"physics.{name}"] for name in physics.unknowns], -1)
-        return [physics.unknowns.at(z)]
+        return [physics.unknowns.to_values(z)]
 
     def _physics_with_slopes(
         self, values: Values, with_slopes: bool

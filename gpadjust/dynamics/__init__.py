@@ -2,9 +2,8 @@
 
 from gpadjust.dynamics.base import Dynamics, FreeRun, TransitionFunctions
 from gpadjust.dynamics.identified import IdentifiedDynamics
-from gpadjust.dynamics.learned_dynamics import LearnedDynamics
+from gpadjust.dynamics.learned_dynamics import AngleInput, LearnedDynamics
 from gpadjust.dynamics.physics_dynamics import PhysicsDynamics
-from gpadjust.dynamics.targets import AngleInput
 from gpadjust.dynamics.trajectories import Trajectories, Windows
 from gpadjust.states import StateSpec
 

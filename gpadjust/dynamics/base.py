@@ -13,6 +13,7 @@ from torch import Tensor
 from gpadjust.checks import (
     check_columns,
     check_finite,
+    check_kind,
     check_level,
     checked_tensor,
     checked_whole,
@@ -20,7 +21,6 @@ from gpadjust.checks import (
 )
 from gpadjust.core import Prediction
 from gpadjust.dynamics.state import fingerprint
-from gpadjust.dynamics.targets import check_spec
 from gpadjust.dynamics.trajectories import Trajectories, check_doubles
 from gpadjust.physics import PhysicsError
 from gpadjust.states import StateSpec
@@ -30,12 +30,10 @@ from gpadjust.validation.scores import energy_score
 TransitionFunctions = Callable[[Tensor, Tensor], Tensor]
 """Functions from states and actions, ``k x N x ...``, to next states: a sample of the dynamics."""
 
+Sampler = Callable[[int, int | None], TransitionFunctions]  # of a number of functions, and a seed
+
 _ROWS = 1024  # per call of noise_variance
 _AT_ONCE = 8  # windows whose particles move together: more leave the cache, at half the speed
-_NOT_SAVED = (
-    "{} cannot be saved or loaded. Give it state_dict() and load_state_dict(state), or use no "
-    "checkpoints and no sensors."
-)
 _CERTAIN = 1e-9  # of the range of the means: a spread of rounding errors
 
 
@@ -47,7 +45,8 @@ class Dynamics(ABC):
     """
 
     def __init__(self, spec: StateSpec) -> None:
-        check_spec(spec)
+        expected = "a StateSpec, such as StateSpec(['x', 'v'], ['force'])"
+        check_kind("spec", spec, StateSpec, expected)
         self.spec = spec
 
     @property
@@ -70,16 +69,11 @@ class Dynamics(ABC):
 
     @abstractmethod
     def sample_functions(self, num_functions: int, seed: int | None = None) -> TransitionFunctions:
-        """Draw transition *functions*, so that particles stay consistent along a trajectory.
+        """Draw ``k`` transition *functions*, so that particles stay consistent along a trajectory.
 
-        Args:
-            num_functions: Number ``k`` of functions.
-            seed: Seed of the draw. Default: go on with PyTorch's generator.
-
-        Returns:
-            A deterministic function of states ``k x N x state_dim`` and actions
-            ``k x N x action_dim`` to next states, with one draw for each of the ``k`` blocks. Later
-            updates do not change it.
+        They are one deterministic function of states ``k x N x state_dim`` and actions
+        ``k x N x action_dim`` to next states, a draw for each block, which later updates do not
+        change. Without a seed they are of PyTorch's generator.
         """
 
     def sample(self, states: Tensor, actions: Tensor) -> Tensor:
@@ -117,19 +111,13 @@ class Dynamics(ABC):
         r"""Compare predictions with transitions that no update had.
 
         The outputs are the states that move, in the spec's order. The variance of an integrated
-        state is :math:`(h / 2)^2` times the variance of its velocity: the more certain the
-        velocity, the more the error of the trapezoid rule counts in ``nlpd`` and ``coverage``. A
-        state with zero variance has only ``rmse`` and ``median``.
+        state is :math:`(h / 2)^2` times the variance of its velocity, without the error of the
+        trapezoid rule. A state with zero variance has only ``rmse`` and ``median``.
 
         Args:
             states: ``N x state_dim``.
             actions: ``N x action_dim``.
             next_states: ``N x state_dim``; NaN where an entry was not measured.
-
-        Raises:
-            RuntimeError: Before the first update.
-            TypeError: If the arguments are not float64 tensors.
-            ValueError: If shapes disagree or values are not finite.
         """
         data = Trajectories.checked(self.spec, states, actions, next_states)
         moving = self.spec.moving
@@ -159,7 +147,7 @@ class Dynamics(ABC):
 
         Functions drawn from the dynamics follow the actions; see :class:`FreeRun`.
         :meth:`Trajectories.windows` returns initial states, actions, and measured states for
-        :meth:`FreeRun.score`.
+        :meth:`FreeRun.score`. All noises are standard deviations, ``state_dim``.
 
         Args:
             initial_states: ``w x state_dim``.
@@ -167,28 +155,26 @@ class Dynamics(ABC):
             num_functions: Number of functions, one for each particle: at least 39 for intervals of
                 95 %.
             level: The probability of the intervals.
-            noise: Standard deviations ``state_dim`` of the errors of measured states, included in
-                intervals and particles. True: the noise estimated by the dynamics (joint, for
-                clearly correlated entries). False: none, for the states themselves.
-            start_noise: Standard deviations ``state_dim`` of the errors of the initial states.
-                ``"learnt"``: half of the variance of the estimated noise, which is right if the
-                noise comes from measuring both ends of a transition. Default: none.
-            process_noise: Standard deviations ``state_dim`` of disturbances of the state itself in
-                each step. ``"learnt"``: the estimated noise, which is right for updates by states
-                without noise, such as draws of :func:`smooth`. Default: none.
-            variation: Standard deviations of the physics' unknown parameters between runs, one for
-                each or one for all, in standard deviations of their priors: 0.1 of one machine
-                from day to day, more of another one. Each particle has its own parameters. Beyond
-                the actions of the updates the deviations grow, threefold at half of their range,
-                but to at most half of the prior's. Default: none.
+            noise: Errors of measured states, included in intervals and particles. True: the noise
+                estimated by the dynamics (joint, for clearly correlated entries). False: none.
+            start_noise: Errors of the initial states. ``"learnt"``: half of the variance of the
+                estimated noise, right if it comes from measuring both ends of a transition.
+            process_noise: Disturbances of the state itself in each step. ``"learnt"``: the
+                estimated noise, right for updates by states without noise, such as draws of
+                :func:`smooth`.
+            variation: Deviations of the physics' unknown parameters between runs, one for each or
+                one for all, in standard deviations of their priors: 0.1 of one machine from day to
+                day, more of another one. Each particle has its own parameters.
+                Beyond the actions of the updates the deviations grow, threefold at half of their
+                range, but to at most half of the prior's.
             state_bounds: Lower and upper bounds, ``2 x state_dim``, as of a task: a particle that
-                would leave them stops. Default: none.
+                would leave them stops.
             seed: Seed of functions and noise; PyTorch's generator is not changed.
 
         Raises:
             RuntimeError: Before the first update.
-            TypeError: If states or actions are not float64 tensors.
-            ValueError: If shapes disagree, values are not finite, or an option is out of range.
+            TypeError, ValueError: If shapes disagree, values are not finite float64 tensors, or an
+                option is out of range.
             PhysicsError: If the physics fails, and its error does not have the rows.
         """
         spec = self.spec
@@ -258,9 +244,7 @@ class Dynamics(ABC):
         shares = torch.stack(lost, 1)
         return FreeRun(mean, lower, upper, center + cloud, shares, spec, level, initial_states)
 
-    def _varied(
-        self, variation: Tensor | float
-    ) -> Callable[[int, int | None], TransitionFunctions]:
+    def _varied(self, variation: Tensor | float) -> Sampler:
         """Return `sample_functions` with varying parameters of the physics."""
         raise ValueError(
             f"variation={variation!r} needs LearnedDynamics with one physics and unknown "
@@ -276,11 +260,14 @@ class Dynamics(ABC):
 
         A class of your own without this method raises a NotImplementedError.
         """
-        raise NotImplementedError(_NOT_SAVED.format(type(self).__name__))
+        raise NotImplementedError(
+            f"{type(self).__name__} cannot be saved or loaded. Give it state_dict() and "
+            "load_state_dict(state), or use no checkpoints and no sensors."
+        )
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Load a result of :meth:`state_dict`; predictions and later fits are then the same."""
-        raise NotImplementedError(_NOT_SAVED.format(type(self).__name__))
+        Dynamics.state_dict(self)  # raises the error of dynamics that cannot be saved
 
     def _checked(self, states: Tensor, actions: Tensor, next_states: Tensor) -> Trajectories:
         """Return transitions that agree with the spec."""
@@ -328,7 +315,7 @@ class FreeRun(NamedTuple):
         lost: Share of lost particles up to each step, ``w x T``.
         spec: Names and kinds of the entries of states.
         level: The probability of the intervals.
-        initial_states: Where the runs start, ``w x state_dim``.
+        initial_states: ``w x state_dim``.
 
     Example:
         >>> import torch
@@ -359,12 +346,11 @@ class FreeRun(NamedTuple):
         """Compare the runs with measured states that no update had.
 
         Scores are over all windows, ``T x state_dim``; ``scores[t]`` is after t + 1 steps. Angles
-        are compared the shortest way round. As measurements have noise, so should the runs, which
-        is the default. The predicted distribution is the Gaussian with the particles' mean and
-        variance (with 39 particles its ``nlpd`` is some 0.03 nats too high), and coverage is that
-        of the interval. States without a spread of the particles in a window have only ``rmse`` and
-        ``median``. In an unstable system a few runs to the wrong side dominate a mean square: use
-        the median. ``energy`` is joint over all states that move.
+        are compared the shortest way round. The predicted distribution is the Gaussian with the
+        particles' mean and variance (with 39 particles its ``nlpd`` is some 0.03 nats too high),
+        and coverage is that of the interval. States without a spread of the particles in a window
+        have only ``rmse`` and ``median``. In an unstable system a few runs to the wrong side
+        dominate a mean square: use the median. ``energy`` is joint over all states that move.
 
         Args:
             measured: ``w x T x state_dim``, as ``measured`` of :meth:`Trajectories.windows`; NaN
@@ -374,21 +360,19 @@ class FreeRun(NamedTuple):
                 square of their changes in a step, in these windows.
 
         Raises:
-            TypeError: If ``measured`` is not a float64 tensor.
-            ValueError: If shapes differ, an entry is infinite, a unit is not positive, or a horizon
-                is not a step of the runs.
+            TypeError, ValueError: If ``measured`` is not a float64 tensor of the runs' shape, an
+                entry is infinite, a unit is not positive, or a horizon is not a step of the runs.
         """
         spec = self.spec
         length = self.mean.shape[1]
         check_doubles("measured", measured, spec.state_dim)
-        if measured.shape != self.mean.shape:
+        if measured.shape != self.mean.shape or measured.isinf().any():
             raise ValueError(
                 f"Expected measured of shape w x T x state_dim {tuple(self.mean.shape)}, as the "
-                f"runs' means, got {tuple(measured.shape)}; take `windows.measured` of the windows "
-                "that the runs start from."
+                "runs' means, finite or NaN where it was not measured, got shape "
+                f"{tuple(measured.shape)}; take `windows.measured` of the windows that the runs "
+                "start from."
             )
-        if measured.isinf().any():
-            raise ValueError("Expected measured to be finite, or NaN where it was not measured.")
         steps = checked_horizons(range(1, length + 1) if horizons is None else horizons)
         if steps[-1] > length:
             raise ValueError(
@@ -434,7 +418,7 @@ def step_or_nan(
 ) -> Tensor:
     """Return the next states ``N x state_dim``; NaN where the physics fails.
 
-    Raise a PhysicsError if it does not have the rows, or if all fail and ``some_must_succeed``.
+    A PhysicsError without rows is raised, and one of all rows if ``some_must_succeed``.
     """
     states, actions = states.clone(), actions.clone()
     failed = torch.zeros(len(states), dtype=torch.bool)

@@ -13,8 +13,8 @@ from gpadjust.checks import checked_whole
 from gpadjust.core import Prediction
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.least_squares import StepErrors, even_normal
+from gpadjust.dynamics.physics_dynamics import next_values
 from gpadjust.dynamics.state import check_numbers, fingerprint, loading
-from gpadjust.dynamics.targets import next_values
 from gpadjust.physics import Physics
 from gpadjust.physics.parameters import PhysicsParameters
 from gpadjust.states import StateSpec
@@ -26,8 +26,7 @@ _ROUNDS = 5  # of the Gauss-Newton method
 class IdentifiedDynamics(Dynamics):
     """A physics of which each sampled function has parameters drawn from their posterior.
 
-    :func:`~gpadjust.records.identify` returns them, as ``found.dynamics``. They are exported by
-    :mod:`gpadjust.export`, and plan in a :class:`~gpadjust.control.Task`.
+    :func:`~gpadjust.records.identify` returns them, as ``found.dynamics``.
 
     Args:
         spec: The names and kinds of states and actions.
@@ -98,13 +97,12 @@ class IdentifiedDynamics(Dynamics):
         # Draws of N(z, P'), with P' = L^-T L^-1 of the Cholesky factor L of its inverse.
         L = torch.linalg.cholesky(precision)
         spread = even_normal(len(draws), len(z), seed=0) @ L.inverse()
-        self.physics_parameters = PhysicsParameters(unknowns, unknowns.at(z + spread).unbind(-1))
+        self.physics_parameters = PhysicsParameters(
+            unknowns, unknowns.to_values(z + spread).unbind(-1)
+        )
 
     def predict(self, states: Tensor, actions: Tensor) -> Prediction:
-        """Return the next states by the parameters' center, and their variance.
-
-        The variance is that of process noise, and of the next states by 32 draws.
-        """
+        """Return the next states by the parameters' center; variances by 32 draws and noise."""
         draws = self.physics_parameters.draws[:_DRAWS]
         rows = states.expand(len(draws), *[1] * (2 - states.dim()), *states.shape)
         values = draws.view(len(draws), *[1] * (rows.dim() - 3), -1)
@@ -150,7 +148,7 @@ class IdentifiedDynamics(Dynamics):
         return deepcopy({"fingerprint": self.describe(), "draws": draws, **noises})
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take back what :meth:`state_dict` gave; errors as of :class:`LearnedDynamics`."""
+        """Load a result of :meth:`state_dict`; errors as of :class:`LearnedDynamics`."""
         with loading(state, self.describe()) as copy:
             del copy["fingerprint"]
             check_numbers(copy)

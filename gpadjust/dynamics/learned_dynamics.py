@@ -3,43 +3,42 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property
 from inspect import signature
-from typing import Any
+from typing import Any, Literal, get_args
 
 import torch
+from botorch.models.transforms.input import InputTransform
 from torch import Tensor
 
-from gpadjust.checks import check_choice, checked_options, checked_tensor, checked_whole
+from gpadjust.checks import check_choice, check_kind, checked_options, checked_whole
 from gpadjust.core import CKA, GP, FitResult, Prediction, ZeroMeanGP, fit
 from gpadjust.core.model import Predictive
-from gpadjust.dynamics.base import Dynamics, TransitionFunctions
-from gpadjust.dynamics.least_squares import even_normal
-from gpadjust.dynamics.physics_dynamics import PhysicsDynamics
-from gpadjust.dynamics.state import PhysicsProbes, check_numbers, columns_of, fingerprint, loading
-from gpadjust.dynamics.targets import (
-    AngleInput,
-    Target,
-    TargetPhysics,
-    Targets,
+from gpadjust.dynamics.base import Dynamics, Sampler, TransitionFunctions
+from gpadjust.dynamics.physics_dynamics import (
+    PhysicsDynamics,
+    PhysicsProbes,
+    check_next_values,
     checked_physics_error,
     named_physics,
+    varying_parameters,
 )
+from gpadjust.dynamics.state import check_numbers, columns_of, fingerprint, loading
 from gpadjust.dynamics.trajectories import Trajectories
 from gpadjust.kinds.factory import ModelFactory, make_model
-from gpadjust.physics import Physics
-from gpadjust.physics.parameters import PhysicsParameters
+from gpadjust.physics import ParameterValues, Physics, PhysicsError
 from gpadjust.states import StateSpec
-from gpadjust.validation.leave_one_out import error_correlation
+from gpadjust.states.state_spec import side_by_side, some_columns, with_sine_and_cosine
 
 _NUM_FEATURES = 1024  # by default
 _MEAN_ROWS = 200  # kernel rows of a mean: transitions times draws
-_BEYOND = 2.0  # growth of a variation, per half range of the actions outside of the range
-_MOST = 0.5  # standard deviations of a parameter's prior
-_END = 8.0  # largest coordinate; a prior has no mass beyond
+_CLEAR = 3.5  # standard errors, below which a correlation of errors counts as none
+_LEAST = 1e-6  # eigenvalue of a correlation matrix
+
+Target = Literal["difference", "absolute"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +59,7 @@ class Learnt:
 
     @cached_property
     def noise_root(self) -> Tensor | None:
-        """See :meth:`LearnedDynamics.noise_root`."""
+        """Lower triangular root of the noise correlation, or None."""
         correlation = error_correlation(self.model)
         return None if correlation is None else torch.linalg.cholesky(correlation)
 
@@ -71,15 +70,14 @@ class LearnedDynamics(Dynamics):
     One model has the change (or next value) of each state as an independent output, and the moving
     states and the action as inputs, such as :math:`f_a = \rho f_p + \delta` of
     :class:`~gpadjust.CKA`. Integrated states follow from their velocities, exogenous states do not
-    change, and previous ones repeat the states and actions that they name. With earlier outputs and
-    actions among the states this is an autoregressive model (NARX), and :meth:`free_run` feeds its
-    predictions back.
+    change, and previous ones repeat the states and actions that they name. After an error, the
+    dynamics are as before.
 
     Args:
         spec: Names and kinds of the entries of states and actions.
         physics: The next values of the states that are neither exogenous nor previous values, from
-            the columns ``physics_reads`` of the spec, by default these states and the actions, with
-            angles in rad. Several: a list, or a dictionary with their names. Default: none.
+            these states and the actions or the ``physics_reads`` of the spec. Several: a list, or
+            a dictionary with their names. Default: none.
         model: Makes the model from ``(X, Y, physics=...)``: a class of models such as
             :class:`~gpadjust.CKA` (without physics :class:`~gpadjust.ZeroMeanGP`), a
             ``functools.partial`` of it with further arguments, or a function, which also gets
@@ -87,19 +85,17 @@ class LearnedDynamics(Dynamics):
         target: Outputs of the model: the ``"difference"`` of next state and state, for an angle the
             shortest way round, or the next state (``"absolute"``). A scaling of an absolute
             position or angle depends on its origin; a scaling of a change does not.
-        fit_options: Options of :func:`gpadjust.fit`: ``method``, ``num_draws`` and ``seed``. By
-            default, predictions include the uncertainty of hyper-parameters; ``"map"`` takes the
-            most likely ones.
-        num_features: Number of random features of each kernel in sampled functions, even. Fewer
-            are faster: 256 for a policy search, which needs many functions.
+        fit_options: Options of :func:`gpadjust.fit`: ``method``, ``num_draws`` and ``seed``.
+        num_features: Number of random features of each kernel in sampled functions, even; 256 for
+            a policy search, which needs many functions.
         physics_error: Standard deviations of the error of a step of the physics, by the name of the
             state, for margins of plans before the first transitions.
 
     Raises:
-        TypeError: If an argument has another type, or ``model`` does not take the arguments, or
-            needs a physics that is missing.
-        ValueError: If ``target`` or an option is unknown, a number is out of range, or a physics
-            returns the change of the state.
+        TypeError, ValueError: If an argument has another type or is out of range, ``model`` does
+            not take the arguments, or a physics returns the change of the state.
+        RuntimeError: By methods that predict, before the first update.
+        PhysicsError: By methods, if the physics fails.
 
     Example:
         >>> import torch
@@ -168,8 +164,6 @@ class LearnedDynamics(Dynamics):
     def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
         """Fit all unknown numbers again, to these and all earlier transitions.
 
-        After an error, the dynamics are as before; this is so for all methods below.
-
         Args:
             states: ``N x state_dim``.
             actions: ``N x action_dim``.
@@ -177,10 +171,9 @@ class LearnedDynamics(Dynamics):
                 state uses the rows where it was measured.
 
         Raises:
-            TypeError: If the arguments are not float64 tensors.
-            ValueError: If shapes disagree, values are not finite, a row of next states is NaN in
-                all states that the model predicts, there are fewer than 2 rows of a state in all,
-                or transitions contradict the spec (:meth:`StateSpec.check_transitions`).
+            TypeError, ValueError: As :meth:`Trajectories.checked`; if there are fewer than 2 rows
+                of a state in all, or transitions contradict the spec
+                (:meth:`StateSpec.check_transitions`).
             PhysicsError: If the physics fails.
         """
         data = self._checked(states, actions, next_states)
@@ -198,19 +191,18 @@ class LearnedDynamics(Dynamics):
         self.fit_result = fit(model, **self.fit_options)
         self._learnt = Learnt(data, model, probes)
 
+    @torch.no_grad()
     def predict(
         self, states: Tensor, actions: Tensor, *, observation_noise: bool = True
     ) -> Prediction:
         """Return mean and variance of each entry of the next states, ``... x state_dim`` each.
 
+        They have no gradients; :meth:`mean_function` does.
+
         Args:
             states: ``... x state_dim``; angles of states and means are not wrapped.
             actions: ``... x action_dim``.
             observation_noise: If True, the variance includes the estimated noise of next states.
-
-        Raises:
-            RuntimeError: Before the first update.
-            PhysicsError: If the physics fails.
         """
         following, variance = self._predict(states, actions, observation_noise)
         return Prediction(
@@ -223,6 +215,7 @@ class LearnedDynamics(Dynamics):
             return None
         return PhysicsDynamics(self.spec, self.physics, physics_error=self.physics_error)
 
+    @torch.no_grad()
     def sample(self, states: Tensor, actions: Tensor) -> Tensor:
         """Draw next states of each row, noise included, from PyTorch's generator."""
         mean, variance = self._predict(states, actions, True)
@@ -233,15 +226,14 @@ class LearnedDynamics(Dynamics):
         return self.spec.complete(states, actions, mean + variance.sqrt() * z)
 
     def sample_functions(self, num_functions: int, seed: int | None = None) -> TransitionFunctions:
-        """Draw transition functions from the posterior, without noise; see :class:`Dynamics`."""
+        """Draw transition functions from the posterior, without noise."""
         functions: Any = self.model.sample_functions(num_functions, seed, self.num_features)
         return self._step(functions.evaluate_each, num_functions)
 
     def mean_function(self) -> TransitionFunctions:
         """Return the mean of the predictions, as a function of any ``k`` blocks, with gradients.
 
-        With many transitions it is the mean of fewer draws, two or more, for speed; draws differ
-        less the more transitions there are.
+        With many transitions it is the mean of fewer draws, two or more, for speed.
         """
         model = self._last_learnt().with_few_draws
         posterior = model.conditioning()
@@ -258,16 +250,14 @@ class LearnedDynamics(Dynamics):
 
         return self._step(mean)
 
+    @torch.no_grad()
     def noise_variance(self, states: Tensor, actions: Tensor) -> Tensor:
         """Return the variance of the estimated noise, ``N x state_dim``."""
         with_noise, without = (self._predict(states, actions, noise)[1] for noise in (True, False))
         return self.spec.complete_variance((with_noise - without).clamp_min(0.0))
 
     def noise_root(self) -> Tensor | None:
-        """Return a lower triangular root of the noise correlation of predicted states, or None.
-
-        It is the correlation of left-out errors, shrunk, for states with a clear correlation.
-        """
+        """Return a root of the shrunk correlation of left-out errors, where it is clear."""
         return self._last_learnt().noise_root
 
     def describe(self) -> dict[str, str]:
@@ -296,29 +286,27 @@ class LearnedDynamics(Dynamics):
             return {}
         model = self._learnt.model
         settings = getattr(model.noise, "settings", {})
-        return deepcopy(
-            {
-                "fingerprint": self.describe(),
-                "transitions": columns_of(self._learnt.data),
-                "probes": [[*probe] for probe in self._learnt.probes],
-                "model": dict(model.state_dict()),
-                "draws": model.draws,
-                # corrections of single observations, set by a fit
-                "noise": {name: v for name, v in settings.items() if isinstance(v, Tensor)},
-            }
-        )
+        state = {
+            "fingerprint": self.describe(),
+            "transitions": columns_of(self._learnt.data),
+            "probes": [[*probe] for probe in self._learnt.probes],
+            "model": dict(model.state_dict()),
+            "draws": model.draws,
+            # corrections of single observations, set by a fit
+            "noise": {name: v for name, v in settings.items() if isinstance(v, Tensor)},
+        }
+        return deepcopy(state)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Load a result of :meth:`state_dict`; predictions and later fits are then the same.
 
         An empty state, that of dynamics before the first update, removes all transitions. The
-        physics is compared at three of the transitions, and evaluated at all of them.
+        physics is compared at three of the transitions.
 
         Raises:
             TypeError: If the state is not a dictionary.
             RuntimeError: If the state belongs to dynamics with other settings or another physics,
                 or is damaged.
-            PhysicsError: If the physics fails.
         """
         if state == {}:
             self._learnt = self.fit_result = None
@@ -369,9 +357,7 @@ class LearnedDynamics(Dynamics):
         )
         return model
 
-    def _varied(
-        self, variation: Tensor | float
-    ) -> Callable[[int, int | None], TransitionFunctions]:
+    def _varied(self, variation: Tensor | float) -> Sampler:
         """Return `sample_functions` with varying parameters of the physics."""
         learnt = self._last_learnt()
         if self.physics is None or not self.physics.unknowns:
@@ -412,12 +398,41 @@ class LearnedDynamics(Dynamics):
         """Return mean and variance of the predicted states, ``... x len(spec.predicted)``."""
         self._check_blocks(states, actions)
         X = self.targets.inputs(states, actions)
-        with torch.no_grad():
-            rows = X.reshape(-1, X.shape[-1])
-            moments = self.model.predict(rows, observation_noise=observation_noise)
+        rows = X.reshape(-1, X.shape[-1])
+        moments = self.model.predict(rows, observation_noise=observation_noise)
         # Back to the shape of the states.
         mean, variance = (part.reshape(*X.shape[:-1], part.shape[-1]) for part in moments)
         return self.targets.decode(states, mean), variance
+
+
+def error_correlation(model: Any) -> Tensor | None:
+    r"""Return the correlation of outputs by left-out errors, ``m x m``; None if none is clear.
+
+    A correlation r of n pairs has the standard error :math:`(1 - r^2) / \sqrt n`. It counts where
+    :math:`|r| \sqrt n` is more than 3.5, and is shrunk by the share of its square that is chance
+    (Schaefer and Strimmer 2005).
+    """
+    if model.num_outputs < 2 or not isinstance(model, GP):
+        return None
+    errors = model.data.Y - model.left_out().prediction.mean
+    is_observed = (~errors.isnan()).double()
+    errors = errors.nan_to_num(nan=0.0)
+    number = (is_observed.mT @ is_observed).clamp_min(1.0)
+    size = (errors.square().mT @ is_observed).clamp_min(torch.finfo(errors.dtype).tiny)
+    # r_ij = sum_k e_ki e_kj / sqrt(sum_k e_ki^2 sum_k e_kj^2), over the rows k with both
+    r = (errors.mT @ errors) / (size * size.mT).sqrt()
+    clear = r.abs() * number.sqrt() > _CLEAR
+    chance = (1 - r.square()).square() / (number * r.square().clamp_min(1e-12))
+    r = torch.where(clear, r * (1 - chance).clamp_min(0.0), 0.0)
+    r.fill_diagonal_(1.0)
+    if not (r - torch.eye(len(r))).any():
+        return None
+    values, vectors = torch.linalg.eigh(r)
+    if values[0] < _LEAST:  # pairs are observed together in different rows
+        r = vectors * values.clamp_min(_LEAST) @ vectors.mT
+        sd = r.diagonal().sqrt()
+        r = r / sd / sd.unsqueeze(-1)
+    return r
 
 
 def check_factory(make: Any, options: Mapping[str, Any]) -> None:
@@ -434,68 +449,141 @@ def check_factory(make: Any, options: Mapping[str, Any]) -> None:
         signature(make).bind(None, None, **options)
     except TypeError as error:
         arguments = ", ".join(["X", "Y", *(f"{option}=..." for option in options)])
+        name = getattr(function, "__name__", repr(function))
         raise TypeError(
             f"Expected model as a factory of ({arguments}): a class of gpadjust, such as CKA or, "
-            "without a physics, ZeroMeanGP, a functools.partial of it with further arguments, or "
-            f"a function; found {getattr(function, '__name__', repr(function))}: {error}."
+            "without a physics, ZeroMeanGP, a functools.partial of it, or a function; found "
+            f"{name}: {error}."
         ) from None
 
 
-def varying_parameters(
-    physics: Physics,
-    spec: StateSpec,
-    learnt: PhysicsParameters,
-    actions: Tensor,
-    variation: Tensor | float,
-) -> Callable[[int, int | None], TransitionFunctions]:
-    """Return a sampler of changes of the next states by varying parameters of the physics.
+class Targets:
+    r"""Targets of a model that stand for next states.
 
-    The sampler takes a number ``k`` of draws and a seed. It returns a function of states and
-    actions: the change of next states ``k x N x state_dim``, NaN where the physics fails.
+    They are the change of each predicted state, :math:`y = s' - s`, for an angle the shortest way
+    round; or with ``"absolute"`` its next value :math:`s + (s' - s)`, which is continuous along a
+    trajectory even if angles are wrapped.
+    """
+
+    def __init__(self, spec: StateSpec, target: Target) -> None:
+        check_choice("target", target, get_args(Target))
+        self.spec, self.target = spec, target
+        columns = spec.model_columns  # the moving states come first
+        self.predicted = [spec.moving.index(i) for i in spec.predicted]
+        self.angles = [place for place, i in enumerate(columns) if i in spec.angle_columns]
+        self.of_physics = [columns.index(i) for i in spec.physics_columns]
+        names = (*spec.states, *spec.actions)
+        self.input_names = tuple(names[i] for i in columns)
+        change = "change of " if target == "difference" else ""
+        self.output_names = tuple(change + names[i] for i in spec.predicted)
+
+    def inputs(self, states: Tensor, actions: Tensor) -> Tensor:
+        """Return raw inputs of a model, ``... x d``; see :attr:`StateSpec.model_columns`."""
+        return some_columns(side_by_side(states, actions), self.spec.model_columns)
+
+    def encode(self, states: Tensor, next_states: Tensor) -> Tensor:
+        """Return targets ``... x m`` of transitions."""
+        predicted = self.spec.predicted
+        change = self.spec.change(states, next_states)[..., predicted]
+        if self.target == "difference":
+            return change
+        return states[..., predicted] + change
+
+    def decode(self, states: Tensor, targets: Tensor) -> Tensor:
+        """Return next values of the predicted states, ``... x m``."""
+        if self.target == "absolute":
+            return targets
+        return some_columns(states, self.spec.predicted) + targets
+
+
+class TargetPhysics(Physics):
+    r"""The physics of the targets, by an f_p that returns next states.
+
+    Memory, batching and gradients are those of f_p.
+    """
+
+    def __init__(self, physics: Physics, targets: Targets) -> None:
+        super().__init__(unknowns=physics.unknowns, name=physics.name)
+        self.physics, self.targets = physics, targets
+        self.num_outputs = len(targets.predicted)
+
+    def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
+        """Return the targets by the physics, ``N x m``."""
+        targets = self.targets
+        num_states = len(targets.spec.moving)
+        inputs = some_columns(X, targets.of_physics)
+        try:
+            following = self.physics.of_rows(self.physics.read_rows(inputs, *parameters))
+        except PhysicsError as error:
+            error.partial = None  # it has next states, not targets
+            raise
+        check_next_values(self.physics, following, num_states)
+        change = following - X[:, :num_states]
+        columns = []
+        for i in targets.predicted:
+            column = change[:, i]
+            if i in targets.angles:  # the shortest way round
+                column = torch.atan2(column.sin(), column.cos())
+            if targets.target == "absolute":
+                column = X[:, i] + column
+            columns.append(column)
+        return torch.stack(columns, dim=-1)
+
+    def forget(self) -> None:
+        """Clear the memory of the physics."""
+        self.physics.forget()
+
+    def extra_repr(self) -> str:
+        """Return the settings in ``repr``."""
+        return f"target={self.targets.target!r}"
+
+
+class AngleInput(InputTransform):
+    r"""A transform of each angle :math:`\theta`, in its place, to :math:`\sin\theta, \cos\theta`.
+
+    A stationary kernel on the result is continuous where the angle wraps.
 
     Args:
-        physics: The physics.
-        spec: Names and kinds of the entries of states and actions.
-        learnt: Draws of the parameters.
-        actions: The actions of the updates, ``N x action_dim``, beyond which parameters vary more.
-        variation: Standard deviations of the coordinates, see :meth:`Dynamics.free_run`.
+        columns: The columns of X that are angles in rad: one or more different numbers, from 0.
+
+    Example:
+        >>> import torch
+        >>> AngleInput([0])(torch.tensor([[0.0, 7.0]]))
+        tensor([[0., 1., 7.]])
     """
-    unknowns = physics.unknowns
-    p = len(unknowns)
-    sd = checked_tensor("variation", variation)
-    if sd.shape not in ((), (p,)) or not (sd.isfinite() & (sd >= 0)).all():
-        raise ValueError(
-            f"Expected variation as one number of 0 or more, or one for each of "
-            f"{', '.join(unknowns)}, got {sd.tolist()}."
-        )
-    sd = sd.expand(p)
-    center = unknowns.coordinates(learnt.draws).clamp(-_END, _END).mean(0)
-    low, high = actions.amin(0), actions.amax(0)
-    # Half of the range; for an action that never varied, its size.
-    size = high.abs().where(high != 0, torch.ones_like(high))
-    half = ((high - low) / 2).where(high > low, size)
 
-    def changes(number: int, seed: int | None) -> TransitionFunctions:
-        if seed is None:
-            seed = int(torch.randint(2**31, ()))
-        normal = even_normal(number, p, seed).unsqueeze(1)  # number x 1 x p
+    is_one_to_many = False
+    transform_on_train = True
+    transform_on_eval = True
+    transform_on_fantasize = True
 
-        def change(states: Tensor, actions: Tensor) -> Tensor:
-            actions = actions.expand(*states.shape[:-1], -1)
-            # sd (1 + 2 |distance from the range| / half range), at most max(sd, 0.5)
-            beyond = (low - actions).clamp_min(0) + (actions - high).clamp_min(0)
-            growth = 1 + _BEYOND * (beyond / half).norm(dim=-1, keepdim=True)
-            deviation = torch.minimum(sd * growth, sd.clamp_min(_MOST)) * normal
-            rows = spec.physics_inputs(states, actions).flatten(0, -2).unsqueeze(1)
-            # f_p(x; z + deviation) - f_p(x; z)
-            ends = []
-            for coordinates in (center, center + deviation):
-                values = unknowns.at(coordinates.expand_as(deviation).flatten(0, -2))  # per row
-                end = states.clone()
-                end[..., spec.moving] = physics.or_nan(rows, values).view(*states.shape[:-1], -1)
-                ends.append(end)
-            return spec.change(*ends)
+    def __init__(self, columns: Sequence[int]) -> None:
+        super().__init__()
+        check_kind("columns", columns, Sequence, "a sequence of numbers, such as [0]")
+        self.columns = tuple(checked_whole("Each of columns", i, 0) for i in columns)
+        if not columns or len({*columns}) < len(columns):
+            raise ValueError(f"Expected columns as one or more different numbers, got {columns}.")
 
-        return change
+    def transform(self, X: Tensor) -> Tensor:
+        """Map ``... x n x d`` to ``... x n x (d + k)``, for ``k`` angles."""
+        if X.shape[-1] <= max(self.columns):
+            raise ValueError(
+                f"Expected X with an angle in column {max(self.columns)}, got {tuple(X.shape)}."
+            )
+        return with_sine_and_cosine(X, self.columns)
 
-    return changes
+    def column_names(self, names: Sequence[str]) -> list[str]:
+        """Return the names of the columns of :meth:`transform`, by the names of those of X."""
+        columns: list[str] = []
+        for i, name in enumerate(names):
+            columns += [f"sin({name})", f"cos({name})"] if i in self.columns else [name]
+        return columns
+
+    @property
+    def settings(self) -> dict[str, list[int]]:
+        """The arguments."""
+        return {"columns": [*self.columns]}
+
+    def equals(self, other: InputTransform) -> bool:
+        """Return whether ``other`` replaces the same columns."""
+        return isinstance(other, AngleInput) and self.columns == other.columns

@@ -40,13 +40,13 @@ def most_likely(
     """
     unknowns = physics.unknowns
     errors = StepErrors(physics, spec, data)
-    guess = unknowns.coordinates(unknowns.guess)
+    guess = unknowns.to_coordinates(unknowns.guess)
     if not errors.evaluate(guess).isfinite().all():
         physics(errors.inputs)  # raises an error that says where it fails
     # Search: from the best draws of the prior, by some of the transitions.
     number = min(len(data), _SEARCHED)
     rows = torch.linspace(0, len(data) - 1, number, dtype=torch.float64).round().long()
-    some = StepErrors(physics, spec, data.some(rows))
+    some = StepErrors(physics, spec, data.subset(rows))
     starts = torch.cat([guess.unsqueeze(0), even_normal(_GUESSES, len(guess), seed=0)])
     best = some.loss(starts).nan_to_num(nan=torch.inf).argsort()[:_STARTS]
     ends = [some.descend(z, _ROUGH) for z in starts[best] if some.loss(z).isfinite()]
@@ -78,7 +78,7 @@ class StepErrors:
 
     def evaluate(self, z: Tensor) -> Tensor:
         """Return next states less those of the physics, ``... x m x n``; infinite if it fails."""
-        following = self.physics.or_nan(self.inputs, self.physics.unknowns.at(z))
+        following = self.physics.or_nan(self.inputs, self.physics.unknowns.to_values(z))
         predicted = self.data.states.expand(*following.shape[:-1], -1).clone()
         predicted[..., self.spec.moving] = following
         # r_ij = s'_ij - f_p(s_j, a_j)_i, with angles the shortest way round

@@ -1,7 +1,9 @@
-"""Dynamics by a physics alone, with or without unknown parameters."""
+"""Dynamics by a physics alone, with or without unknown parameters, and the physics of a step."""
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Callable, Mapping
 from copy import deepcopy
 from functools import partial
@@ -10,24 +12,27 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gpadjust.checks import checked_whole
+from gpadjust.checks import checked_number, checked_tensor, checked_whole
 from gpadjust.core import Prediction
-from gpadjust.dynamics.base import Dynamics, TransitionFunctions
+from gpadjust.dynamics.base import Dynamics, Sampler, TransitionFunctions
 from gpadjust.dynamics.least_squares import even_normal, most_likely
-from gpadjust.dynamics.state import PhysicsProbes, check_numbers, columns_of, fingerprint, loading
-from gpadjust.dynamics.targets import checked_physics_error, next_values, one_physics
+from gpadjust.dynamics.state import check_numbers, columns_of, fingerprint, loading
 from gpadjust.dynamics.trajectories import Trajectories
-from gpadjust.physics import Physics
+from gpadjust.physics import ODEPhysics, Physics, PhysicsError, as_physics
 from gpadjust.physics.parameters import PhysicsParameters
 from gpadjust.states import StateSpec
 
 _DRAWS = 1024
+_PROBES = 3
+_OF_SPREAD = 1e-4  # tolerance between machines, as a share of the spread of changes
+_OF_SIZE = 1e-6  # the same, as a share of the size of states and changes
+_BEYOND = 2.0  # growth of a variation, per half range of the actions outside of the range
+_MOST = 0.5  # standard deviations of a parameter's prior
+_END = 8.0  # largest coordinate; a prior has no mass beyond
 
 
 class PhysicsDynamics(Dynamics):
     r"""The physics alone, with the most likely values of its unknown parameters.
-
-    With the true system as physics it is the oracle that bounds any model.
 
     Each `update` fits unknown parameters to all transitions so far, by least squares of one step:
     they minimise
@@ -45,10 +50,10 @@ class PhysicsDynamics(Dynamics):
         spec: Names and kinds of the entries of states and actions.
         physics: One physics, as of :class:`LearnedDynamics`.
         physics_error: Standard deviations of the error of a step of the physics, by the name of the
-            state, for predictions before the first fit. Default: none.
+            state, for predictions before the first fit.
 
     Raises:
-        TypeError: If ``spec`` is not a :class:`StateSpec`, or the physics is not callable.
+        TypeError: If ``spec`` or ``physics`` has another type.
         ValueError: If there are several physics, one returns the change of the state, or
             ``physics_error`` names a state that does not move, or is negative.
 
@@ -90,8 +95,7 @@ class PhysicsDynamics(Dynamics):
     def physics_parameters(self) -> PhysicsParameters:
         """Unknown parameters: 1024 draws around the fit, or the guesses before a fit.
 
-        The draws of the coordinates z are normal, with the precision of the prior and of the slopes
-        of the physics at the optimum; their ``sd`` are the standard errors.
+        Their ``sd`` are the standard errors.
         """
         unknowns = self.physics.unknowns
         if self._fitted is None:
@@ -101,7 +105,7 @@ class PhysicsDynamics(Dynamics):
         chol = torch.linalg.cholesky(precision + torch.eye(len(point)).to(precision))
         normal = even_normal(_DRAWS, len(point), seed=0)
         deviation = torch.linalg.solve_triangular(chol.mT, normal.mT, upper=True).mT
-        return PhysicsParameters(unknowns, unknowns.at(point + deviation).unbind(-1))
+        return PhysicsParameters(unknowns, unknowns.to_values(point + deviation).unbind(-1))
 
     def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
         """Fit unknown parameters to these and all earlier transitions, one row or more.
@@ -176,10 +180,7 @@ class PhysicsDynamics(Dynamics):
         return deepcopy({"fingerprint": self.describe(), "probes": probes, "fitted": fitted})
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Load a result of :meth:`state_dict`; errors as of :class:`LearnedDynamics`.
-
-        The physics is compared at no more than three transitions of the state.
-        """
+        """Load a result of :meth:`state_dict`; errors as of :class:`LearnedDynamics`."""
         if state == {}:  # before the first update
             state = {"fingerprint": self.describe(), "probes": None, "fitted": None}
         with loading(state, self.describe()) as copy:
@@ -188,7 +189,7 @@ class PhysicsDynamics(Dynamics):
                 data = Trajectories.checked(self.spec, **fitted.pop("transitions"))
                 fitted = _Fitted(data, **fitted)
                 # One number for each parameter, NaN if any entry is.
-                values = self.physics.unknowns.at(fitted.precision @ fitted.point)
+                values = self.physics.unknowns.to_values(fitted.precision @ fitted.point)
                 check_numbers({"fitted": values, "noise": fitted.noise.view(self.spec.state_dim)})
             if probes is not None:
                 probes = PhysicsProbes(*probes)
@@ -198,7 +199,7 @@ class PhysicsDynamics(Dynamics):
     @property
     def _values(self) -> Tensor | None:
         """The fitted parameters; None for the guesses."""
-        return None if self._fitted is None else self.physics.unknowns.at(self._fitted.point)
+        return None if self._fitted is None else self.physics.unknowns.to_values(self._fitted.point)
 
     def _step(self, states: Tensor, actions: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Return the next states by the physics."""
@@ -213,3 +214,198 @@ class _Fitted(NamedTuple):
     point: Tensor  # coordinates, p
     precision: Tensor  # of the coordinates by the transitions, p x p, without the prior
     noise: Tensor  # mean squares of the errors, state_dim, 0 for states that do not move
+
+
+class PhysicsProbes(NamedTuple):
+    """A few transitions, and changes by a physics there, at the guesses of its parameters."""
+
+    states: Tensor  # k x state_dim
+    actions: Tensor  # k x action_dim
+    changes: Tensor  # of the states that move, k x m
+    tolerance: Tensor  # largest difference of the same physics, m
+
+    @classmethod
+    def from_data(cls, physics: Physics, spec: StateSpec, data: Trajectories) -> PhysicsProbes:
+        """Return the row with the least usual output of the physics of each third of the rows.
+
+        Warn if the physics seems to return changes.
+        """
+        with torch.no_grad():
+            following = next_values(physics, spec, data.states, data.actions)
+        warn_of_differences(physics.name, spec, data, following)
+        changes = spec.change(data.states, following)[:, spec.moving]
+        deviation = (changes - changes.mean(0)).abs()
+        spread = deviation.square().mean(0).sqrt()
+        # The largest deviation of a row in standard deviations: the least usual row tells most.
+        unusual = (deviation / spread.clamp_min(torch.finfo(spread.dtype).tiny)).amax(-1)
+        parts = [rows for rows in torch.arange(len(data)).tensor_split(_PROBES) if len(rows)]
+        probes = torch.stack([rows[unusual[rows].argmax()] for rows in parts])
+        size = torch.cat([data.states[:, spec.moving], changes]).abs().amax(0)
+        tolerance = _OF_SPREAD * spread + _OF_SIZE * size
+        return cls(data.states[probes], data.actions[probes], changes[probes], tolerance)
+
+    def check(self, physics: Physics, spec: StateSpec) -> None:
+        """Raise a PhysicsError, which is a RuntimeError, if a physics returns something else."""
+        check_numbers(self._asdict())
+        physics.forget()  # a file or a program may have changed since
+        with torch.no_grad():
+            following = next_values(physics, spec, self.states, self.actions)
+        # Predicted changes within the tolerance; angles the shortest way round.
+        expected = self.states.clone()
+        expected[:, spec.moving] += self.changes
+        gap = spec.change(expected, following)[:, spec.moving].abs()
+        if (gap <= self.tolerance).all():
+            return
+        row, column = divmod(int((gap - self.tolerance).argmax()), gap.shape[-1])
+        i = spec.moving[column]
+        raise PhysicsError(
+            f"The saved dynamics have another physics than {physics.name!r} here. In the state "
+            f"{self.states[row].tolist()}, with the action {self.actions[row].tolist()}, that one "
+            f"returned {float(expected[row, i]):.6g} for {spec.states[i]!r}, this one returns "
+            f"{float(following[row, i]):.6g}. Load the state into dynamics with the same physics, "
+            "a deterministic one, or update new dynamics by its transitions."
+        )
+
+
+def named_physics(physics: Any, spec: StateSpec) -> dict[str, Physics]:
+    """Return checked physics of next states by name, from one, a list or a mapping."""
+    named: Any = physics
+    if not isinstance(named, Mapping):
+        several = physics if isinstance(physics, list | tuple) else [physics]
+        named = {str(i + 1): function for i, function in enumerate(several)}
+    parts: dict[str, Physics] = {}
+    for name, function in named.items():
+        part = parts[name] = as_physics(function)
+        if isinstance(physics, Mapping) and part is not function:  # not the user's object
+            part.name = name
+        if isinstance(part, ODEPhysics) and part.difference:
+            raise ValueError(
+                f"Physics {part.name!r} returns the change of the state (difference=True), but "
+                "dynamics need the next state; build it with difference=False."
+            )
+        steps = [step for step in (part.step, spec.step) if step is not None]
+        if len(steps) == 2 and not math.isclose(*steps, rel_tol=1e-6):
+            raise ValueError(
+                f"Physics {part.name!r} has steps of {part.step:g}, but the spec has "
+                f"{spec.step:g}; build it with step={spec.step:g}, or correct the spec."
+            )
+    return parts
+
+
+def one_physics(physics: Any, spec: StateSpec, otherwise: str) -> Physics:
+    """Return a physics of next states; raise a ValueError, with the way out, unless it is one."""
+    parts = [*named_physics(physics, spec).values()]
+    if len(parts) != 1:
+        names = ", ".join(repr(part.name) for part in parts)
+        raise ValueError(f"Expected one physics to follow, got {names}; {otherwise}.")
+    return parts[0]
+
+
+def next_values(
+    physics: Physics, spec: StateSpec, states: Tensor, actions: Tensor, parameters: Any = None
+) -> Tensor:
+    """Return the next states ``... x state_dim`` by a physics; exogenous states do not change."""
+    inputs = spec.physics_inputs(states, actions)
+    if inputs.dim() == 1:
+        inputs = inputs.unsqueeze(0)
+    Y = physics(inputs, parameters)
+    check_next_values(physics, Y, len(spec.moving))
+    following = states.clone()
+    following[..., spec.moving] = Y
+    return spec.remember(following, states, actions)
+
+
+def check_next_values(physics: Physics, Y: Tensor, num_states: int) -> None:
+    """Raise a ValueError unless the physics returned a column for each state that moves."""
+    if Y.shape[-1] != num_states:
+        raise ValueError(
+            f"Expected physics {physics.name!r} to return the next values of the {num_states} "
+            f"states that are neither exogenous nor previous values, got {Y.shape[-1]} columns."
+        )
+
+
+def warn_of_differences(name: str, spec: StateSpec, data: Trajectories, following: Tensor) -> None:
+    """Warn if outputs of a physics, read as changes, have at most a third of the error."""
+    # Errors in units of the changes, of the outputs as next states and as changes.
+    scale = spec.change(data.states, data.next_states).square().nanmean(0).sqrt()
+    columns = [i for i in spec.moving if scale[i] > 0]
+    errors = []
+    for predicted in (following, data.states + following):
+        error = spec.change(data.next_states, predicted) / scale
+        errors.append(float(error[:, columns].square().nansum().sqrt()))
+    if errors[1] < errors[0] / 3:
+        warnings.warn(
+            f"Physics {name!r} seems to return the change of the state, but dynamics need the next "
+            f"state. Read as a change, its error is {errors[1] / errors[0]:.2g} times the error "
+            "as the next state. Let it return `next state = state + change`.",
+            UserWarning,
+            stacklevel=4,
+        )
+
+
+def checked_physics_error(spec: StateSpec, errors: Mapping[str, float] | None) -> dict[str, float]:
+    """Return standard deviations of the error of a step of the physics, by state."""
+    errors = {} if errors is None else {**errors}
+    for name, sd in errors.items():
+        moving = [spec.states[i] for i in spec.moving]
+        if name not in moving:
+            raise ValueError(f"physics_error names states among {moving}; found {name!r}.")
+        checked_number(f"physics_error[{name!r}]", sd, least=0)
+    return errors
+
+
+def varying_parameters(
+    physics: Physics,
+    spec: StateSpec,
+    learnt: PhysicsParameters,
+    actions: Tensor,
+    variation: Tensor | float,
+) -> Sampler:
+    """Return a sampler of changes of the next states by varying parameters of the physics.
+
+    The sampler takes a number ``k`` of draws and a seed. It returns a function of states and
+    actions: the change of next states ``k x N x state_dim``, NaN where the physics fails. Beyond
+    the actions of the updates, ``N x action_dim``, the learnt parameters vary more; the variation
+    is as of :meth:`Dynamics.free_run`.
+    """
+    unknowns = physics.unknowns
+    p = len(unknowns)
+    sd = checked_tensor("variation", variation)
+    if sd.shape not in ((), (p,)) or not (sd.isfinite() & (sd >= 0)).all():
+        raise ValueError(
+            f"Expected variation as one number of 0 or more, or one for each of "
+            f"{', '.join(unknowns)}, got {sd.tolist()}."
+        )
+    sd = sd.expand(p)
+    center = unknowns.to_coordinates(learnt.draws).clamp(-_END, _END).mean(0)
+    low, high = actions.amin(0), actions.amax(0)
+    # Half of the range; for an action that never varied, its size.
+    size = high.abs().where(high != 0, torch.ones_like(high))
+    half = ((high - low) / 2).where(high > low, size)
+
+    def changes(number: int, seed: int | None) -> TransitionFunctions:
+        if seed is None:
+            seed = int(torch.randint(2**31, ()))
+        normal = even_normal(number, p, seed).unsqueeze(1)  # number x 1 x p
+
+        def change(states: Tensor, actions: Tensor) -> Tensor:
+            actions = actions.expand(*states.shape[:-1], -1)
+            # sd (1 + 2 |distance from the range| / half range), at most max(sd, 0.5)
+            beyond = (low - actions).clamp_min(0) + (actions - high).clamp_min(0)
+            growth = 1 + _BEYOND * (beyond / half).norm(dim=-1, keepdim=True)
+            deviation = torch.minimum(sd * growth, sd.clamp_min(_MOST)) * normal
+            rows = spec.physics_inputs(states, actions).flatten(0, -2).unsqueeze(1)
+            # f_p(x; z + deviation) - f_p(x; z)
+            ends = []
+            for coordinates in (center, center + deviation):
+                values = unknowns.to_values(  # of each row
+                    coordinates.expand_as(deviation).flatten(0, -2)
+                )
+                end = states.clone()
+                end[..., spec.moving] = physics.or_nan(rows, values).view(*states.shape[:-1], -1)
+                ends.append(end)
+            return spec.change(*ends)
+
+        return change
+
+    return changes

@@ -98,7 +98,10 @@ def plot_free_run(
             ax.plot(times, means[0], color=BLUE, lw=1.5, label="free run")
             for k, (label, mean) in enumerate(zip([*runs][1:], means[1:], strict=True)):
                 ax.plot(times, mean, "--", color=_OTHERS[k % len(_OTHERS)], lw=1.3, label=label)
-            ax.plot(times, measured, "o", color="black", ms=3, label="measured")
+            # Below the lines, and some fifty of them, so that the run is seen.
+            every = max(1, len(times) // 50)
+            dots = {"color": "black", "ms": 3, "zorder": 1.5, "markevery": every}
+            ax.plot(times, measured, "o", **dots, label="measured")
             shown = torch.cat([means[0], measured[~measured.isnan()]])
             margin = float(_MARGIN * (shown.max() - shown.min()))
             if margin > 0:
@@ -108,10 +111,7 @@ def plot_free_run(
         ax.set(xlabel=axis_labels["time"] if step else "steps")
     if axes is None:
         handles, texts = grid[0, 0].get_legend_handles_labels()
-        place: dict[str, Any] = {
-            "ncols": min(len(texts), 2 * len(rows)),
-            "loc": "outside upper center",
-        }
+        place: Any = {"ncols": min(len(texts), 2 * len(rows)), "loc": "outside upper center"}
         grid[0, 0].figure.legend(handles, texts, frameon=False, **place)
     else:
         legend(grid[0, 0])

@@ -32,13 +32,13 @@ class Windows(NamedTuple):
         """The initial states, then the measured ones: ``w x (T + 1) x state_dim``."""
         return torch.cat([self.initial_states.unsqueeze(1), self.measured], dim=1)
 
-    def some(self, rows: Tensor | list[int]) -> Windows:
+    def subset(self, rows: Tensor | list[int]) -> Windows:
         """Return the windows by their numbers, or by a mask of ``w`` booleans."""
         return Windows(*(part[rows] for part in self))
 
     def spread(self, number: int, seed: int = 0) -> Windows:
         """Draw some windows evenly, as :meth:`Trajectories.spread` does."""
-        return self.some(spread_rows(len(self.actions), number, seed))
+        return self.subset(_spread_rows(len(self.actions), number, seed))
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,17 +82,15 @@ class Trajectories:
         """Set the numbers of episodes, and check the numbers of rows."""
         episode: Any = self.episode
         if episode is None:
-            episode = torch.arange(len(self.states))
+            episode = range(len(self.states))
         episode = torch.as_tensor(episode)
         if episode.is_floating_point() and (episode != episode.round()).any():
             raise ValueError(f"Expected episode as whole numbers, found {episode.tolist()[:5]}.")
         object.__setattr__(self, "episode", episode.long())
         lengths = {name: len(tensor) for name, tensor in self._columns.items()}
         if len({*lengths.values()}) > 1 or self.episode.dim() != 1:
-            raise ValueError(
-                f"Expected {', '.join(lengths)} with equally many rows, found "
-                f"{', '.join(f'{number} of {name}' for name, number in lengths.items())}."
-            )
+            counts = ", ".join(f"{number} of {name}" for name, number in lengths.items())
+            raise ValueError(f"Expected columns with equally many rows, found {counts}.")
         if len(self.episode.unique_consecutive()) > len(self.episode.unique()):
             raise ValueError(
                 "Expected the rows of an episode one after the other, found rows of another "
@@ -111,25 +109,24 @@ class Trajectories:
         """Return trajectories from copies of the user's tensors.
 
         Raises:
-            TypeError: If the arguments are not float64 tensors.
-            ValueError: If shapes disagree, there are no rows, values are not finite, or a row has
-                no measured entry that a model predicts.
+            TypeError, ValueError: If the arguments are not finite float64 tensors of ``N`` rows, or
+                a row has no measured entry that a model predicts.
         """
-        named = {"states": states, "actions": actions, "next_states": next_states}
-        check_doubles("states", states, spec.state_dim)
-        check_doubles("actions", actions, spec.action_dim)
-        check_doubles("next_states", next_states, spec.state_dim)
-        if states.dim() != 2 or len({t.shape[:-1] for t in named.values()}) > 1 or not len(states):
+        columns = {"states": states, "actions": actions, "next_states": next_states}
+        for name, column in columns.items():
+            check_doubles(name, column, spec.action_dim if name == "actions" else spec.state_dim)
+        shapes = [tuple(column.shape) for column in columns.values()]
+        if states.dim() != 2 or len({shape[:-1] for shape in shapes}) > 1 or not len(states):
             raise ValueError(
                 "Expected states, actions and next_states with equally many rows, one or more; "
-                f"got shapes {', '.join(str(tuple(t.shape)) for t in named.values())}."
+                f"got shapes {', '.join(map(str, shapes))}."
             )
         check_finite("states", states)
         check_finite("actions", actions)
         check_observed("next_states", next_states)
         predicted = next_states[:, spec.predicted]
         check_observed("the predicted entries of next_states", predicted)
-        copies = {name: tensor.detach().clone() for name, tensor in named.items()}
+        copies = {name: column.detach().clone() for name, column in columns.items()}
         return cls(**copies, episode=episode)  # type: ignore[arg-type]
 
     def __iter__(self) -> Iterator[Tensor]:
@@ -152,9 +149,7 @@ class Trajectories:
 
     @property
     def _lengths(self) -> list[int]:
-        """The number of steps of each episode."""
-        lengths: list[int] = self.episode.unique_consecutive(return_counts=True)[1].tolist()
-        return lengths
+        return list(self.episode.unique_consecutive(return_counts=True)[1].tolist())
 
     @property
     def _columns(self) -> dict[str, Tensor]:
@@ -170,7 +165,7 @@ class Trajectories:
         names = ours.keys() & theirs.keys()
         return Trajectories(**{name: torch.cat([ours[name], theirs[name]]) for name in names})
 
-    def some(self, rows: Tensor | slice) -> Trajectories:
+    def subset(self, rows: Tensor | slice) -> Trajectories:
         """Return the rows by their numbers, a slice, or a mask of ``N`` booleans.
 
         Episodes get new numbers: one ends wherever the next row is left out.
@@ -185,11 +180,11 @@ class Trajectories:
 
     def episodes(self) -> list[Trajectories]:
         """Return a list of the episodes."""
-        return [self.some(rows) for rows in torch.arange(len(self)).split(self._lengths)]
+        return [self.subset(rows) for rows in torch.arange(len(self)).split(self._lengths)]
 
     def spread(self, number: int, seed: int = 0) -> Trajectories:
-        """Draw some rows evenly: one from each of ``number`` parts of the same length."""
-        return self.some(spread_rows(len(self), number, seed))
+        """Draw a row from each of ``number`` parts of the same length."""
+        return self.subset(_spread_rows(len(self), number, seed))
 
     def windows(self, length: int, stride: int | None = None) -> Windows:
         """Cut windows within episodes, to compare with :meth:`Dynamics.free_run`.
@@ -233,7 +228,7 @@ def check_doubles(name: str, tensor: Tensor, columns: int) -> None:
         raise TypeError(f"Expected {name} in float64, got {tensor.dtype}; use `{name}.double()`.")
 
 
-def spread_rows(total: int, number: int, seed: int) -> Tensor:
+def _spread_rows(total: int, number: int, seed: int) -> Tensor:
     """Draw numbers below ``total``, one from each of ``number`` parts of the same length."""
     if checked_whole("number", number, 1) > total:
         raise ValueError(f"Expected number <= {total}, the number of all rows, got {number}.")

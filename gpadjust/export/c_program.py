@@ -12,15 +12,16 @@ from torch import Tensor
 
 from gpadjust.core import GP
 from gpadjust.dynamics import LearnedDynamics
-from gpadjust.export.c_equations import equations_source, physics_lines
-from gpadjust.export.equations import (
-    Equations,
-    OfPhysics,
-    check_name,
-    equations_within,
-    own_dynamics,
-    refuse_parameters,
+from gpadjust.export.c_equations import (
+    Text,
+    braced,
+    comment,
+    entries,
+    equations_source,
+    parameters_text,
+    physics_lines,
 )
+from gpadjust.export.equations import Equations, OfPhysics, equations_within, exportable
 from gpadjust.export.finite_sum import Column, FiniteSum, finite_sum, model_of
 from gpadjust.export.transition import next_state, next_variance, target_columns
 
@@ -31,16 +32,20 @@ _KERNELS = {  # of r, the squared distance in lengthscales
     "matern5/2": "(1.0 + sqrt(5.0 * r) + 5.0 / 3.0 * r) * exp(-sqrt(5.0 * r))",
     "constant": "0.0",
 }
+# Of each Gaussian g: its features phi, and the sum of its mean.
 _BEGIN = Template("""\
     double each[DRAWS * OUTPUTS]$spread;
     for (int g = 0; g < DRAWS * OUTPUTS; g++) {
         double phi[FEATURES] = {0.0}, sum = 0.0$prior;
 """)
+# f m_g, and the basis b = f - center
 _TERM = Template("""\
         const double f$t = $basis, b$t = f$t - center$t[g]; /* $name */
         sum += f$t * mean$t[g];
 """)
+# b^2 (a + c), as k(x, x) = 1
 _PRIOR = Template("        prior += b$t * b$t * (amplitude$t[g] + constant$t[g]);\n")
+# phi_i = b(x) b(x_i) (a k(x, x_i) + c)
 _KERNEL = Template("""\
         for (int i = 0; i < FEATURES; i++) {
             double r = 0.0;
@@ -51,6 +56,7 @@ _KERNEL = Template("""\
             phi[i] += b$t * at_points$t[g][i] * (amplitude$t[g] * $kernel + constant$t[g]);
         }
 """)
+# phi = b sqrt(2 a / D) (cos w^T x, sin w^T x), D / 2 frequencies
 _WAVES = Template("""\
         for (int i = 0; i < $half; i++) {
             double angle = 0.0;
@@ -59,10 +65,12 @@ _WAVES = Template("""\
             phi[$first + $half + i] = b$t * sqrt(amplitude$t[g] / $half) * sin(angle);
         }
 """)
+# scale (prior mean + phi^T w)
 _MEAN = """\
         for (int i = 0; i < FEATURES; i++) sum += phi[i] * weights[g][i];
         each[g] = scale[g] * sum;
 """
+# |L^-1 phi|^2, by columns of L
 _SOLVED = """\
         if (!variance) continue;
         const double *column = lower[g];
@@ -73,6 +81,7 @@ _SOLVED = """\
             for (int i = 0; i < FEATURES - k; i++) phi[k + i] -= column[i] * u;
         }
 """
+# |R phi|^2, by columns of R
 _MULTIPLIED = """\
         if (!variance) continue;
         const double *column = lower[g];
@@ -82,6 +91,7 @@ _MULTIPLIED = """\
         for (int i = 0; i < FEATURES; i++) squares += u[i] * u[i];
 """
 _SPREAD = Template("        spread[g] = scale[g] * scale[g] * ($left + noise[g]);\n")
+# The mean of a mixture, and its variance: the mean variance, and the variance of the means.
 _MIXED = """\
     }
     for (int j = 0; j < OUTPUTS; j++) {
@@ -108,16 +118,15 @@ def c_source(
 ) -> str:
     r"""Return a fitted model or a physics as a file of C99.
 
-    It needs ``math.h`` alone and allocates nothing.
+    It needs ``math.h`` alone and allocates nothing. The same model makes the same file.
 
     Of a model it has ``void NAME_predict(const double *x, const double *f_p, double *mean, double
     *variance)``, which is :meth:`~gpadjust.CKA.predict` at one point. Of dynamics it has ``void
     NAME_step(const double *state, const double *action, const double *f_p, double *mean, double
     *variance)``, which is :meth:`LearnedDynamics.predict`; ``mean`` may be ``state`` itself.
-    ``f_p`` is what the physics returns there, of several physics side by side. It is no argument
-    without physics, and of a :class:`FormulaPhysics`, or an :class:`ODEPhysics` of one with a fixed
-    step: these are in the file. A ``variance`` that is ``NULL`` is not computed, which is faster.
-    The same model makes the same file.
+    ``f_p`` are the values of the physics there, of several physics side by side. There is no such
+    argument without physics, and of a :class:`FormulaPhysics`, or an :class:`ODEPhysics` of one:
+    these are in the file. A ``variance`` that is ``NULL`` is not computed, which is faster.
 
     Of such a physics itself it has ``void NAME_predict(const double *x, double *mean)``; of
     dynamics that are one, such as :func:`~gpadjust.records.identify` finds, ``void
@@ -125,18 +134,18 @@ def c_source(
 
     Args:
         fitted: The model, dynamics that have learnt, an identification, or a physics.
-        name: What the names of functions begin with. One unit of compilation takes several files.
-        variance: Whether there is a variance. Its tables are the most of the file: the square of
+        name: The beginning of the names of functions. One unit of compilation takes several files.
+        variance: If True, there is a variance. Its tables are the most of the file: the square of
             the number of points or features, for each output and draw.
-        observation_noise: If True, the variance includes that of the noise.
+        observation_noise: If True, the variance includes the noise.
         parameters: Of a physics, or dynamics that are one: if True, its unknown parameters are an
             argument, ``const double *parameters`` before ``mean``, in the order of the physics.
             Default: they are at their posterior means, of a physics itself at the guesses.
 
     Raises:
-        TypeError: If it is none of these, or a physics that is not written in formulas.
-        ValueError: If ``name`` is none in C, the model is no finite sum, or ``parameters`` are not
-            for it; with the way out.
+        TypeError: If it is another object, or a physics that is not written in formulas.
+        ValueError: If C cannot have the ``name``, the model is not a finite sum, or ``parameters``
+            are not for it; with the way out.
         RuntimeError: If the dynamics have learnt nothing yet.
 
     Example:
@@ -148,104 +157,98 @@ def c_source(
         >>> "void pump_predict(const double *x, const double *f_p, double *mean" in code
         True
     """
-    check_name(name)
-    fitted = own_dynamics(fitted)
+    fitted = exportable(fitted, name, parameters)
     if isinstance(fitted, OfPhysics):
         return "\n".join(equations_source(fitted, name, parameters)) + "\n"
-    refuse_parameters(parameters)
     model = model_of(fitted)
-    found, data = finite_sum(model, variance, observation_noise), model.data
-    is_step, body = isinstance(fitted, LearnedDynamics), "".join(_body(found, variance))
-    tables = {n: t for n, t in _tables(found).items() if re.search(rf"\b{n}\[", body)}
+    terms = finite_sum(model, variance, observation_noise)
     within = equations_within(model)
-    values = ["double *mean", *["double *variance"] * variance]
-    f_p, written = ["const double *f_p"], ["", *_written(within or [], name)]
-    given = f_p * (within is None or (is_step and bool(within))) + values
-    if within and not is_step:
+    is_argument = within is None  # f_p of the function
+    within = within or []
+    dynamics = fitted if isinstance(fitted, LearnedDynamics) else None
+    spec = getattr(dynamics, "spec", None)
+    about = [*_about(model, terms.num_physics, bool(within), spec, observation_noise)]
+    outputs = ["double *mean", *["double *variance"] * variance]
+    f_p = ["const double *f_p"] * (is_argument or (bool(within) and dynamics is not None))
+    body = "".join(_body(terms, variance))
+    if within and dynamics is None:
         body = "".join(f"    {line}\n" for line in _own_f_p(within, name, "x")) + body
-    about = [
-        f"{model!r}. Made by gpadjust; numbers are in the units of the data.",
-        f"x: {', '.join(data.input_names)}.",
-        f"f_p: {found.num_physics} values that the physics returns at x"
-        f"{', which is in this file' * bool(within)}.",
-        *_told(fitted, model),
-        f"mean: {', '.join(data.output_names)}.",
-        "variance: in their square, "
-        f"{'with' if observation_noise else 'without'} the noise; NULL if it is not wanted.",
-        f"Numbers in tables: {sum(table.numel() for table in tables.values())}.",
+    tables = {n: t for n, t in _tables(terms).items() if re.search(rf"\b{n}\[", body)}
+    about.append(f"Numbers in tables: {sum(table.numel() for table in tables.values())}.")
+    sizes = {
+        "INPUTS": len(terms.columns),
+        "OUTPUTS": model.num_outputs,
+        "DRAWS": len(terms.weights) // model.num_outputs,
+        "FEATURES": terms.weights.shape[-1],
+        "POINT_SETS": len(terms.points),
+    }
+    static = "static " * (dynamics is not None)
+    lines = [
+        f"enum {{ {', '.join(f'{n} = {size}' for n, size in sizes.items())} }};",
+        *(_declared(*table) for table in tables.items()),
+        "",
+        f"{static}void {name}_predict(const double *x, {', '.join(f_p + outputs)})",
+        f"{{\n{body}    }}\n}}",
     ]
-    head = ["/*", *(f" * {line.replace('*/', '* /')}" for line in about), " */", ""]
-    sizes = _sizes(found, model.num_outputs)
-    lines = [f"enum {{ {', '.join(f'{n} = {size}' for n, size in sizes.items())} }};"]
-    lines += [*(_declared(*table) for table in tables.items()), ""]
-    lines += [f"{'static ' * is_step}void {name}_predict(const double *x, {', '.join(given)})"]
-    lines += [f"{{\n{body}    }}\n}}"]
-    # Sizes and tables have names of their own, so that one unit may contain several models.
-    own = "|".join([*sizes, *tables])
-    code = re.sub(rf"(?<!_)\b({own})\b", rf"{name}_\1", "\n".join(lines))
-    more = []
-    if isinstance(fitted, LearnedDynamics):
-        given = f_p * (within is None) + values
-        more = ["", *_step(fitted, name, given, found.num_physics, within or [])]
-    return "\n".join([*head, "#include <math.h>", *written, code, *more]) + "\n"
-
-
-def _written(within: list[Equations], name: str) -> Iterator[str]:
-    """Yield functions of the physics that are written in formulas, ``NAME_f_p0`` and so on."""
-    for i, each in enumerate(within):
-        yield from physics_lines(each, f"{name}_f_p{i}")
+    # Sizes and tables get a prefix, so that one unit may contain several models.
+    local = "|".join([*sizes, *tables])
+    code = [re.sub(rf"(?<!_)\b({local})\b", rf"{name}_\1", "\n".join(lines))]
+    if dynamics is not None:
+        arguments = ["const double *f_p"] * is_argument + outputs
+        code += ["", *_step(dynamics, name, arguments, terms.num_physics, within)]
+    head = [*comment(about), "#include <math.h>", ""]
+    for i, equations in enumerate(within):
+        head += physics_lines(equations, f"{name}_f_p{i}")
+    return "\n".join(head + code) + "\n"
 
 
 def _own_f_p(within: list[Equations], name: str, x: str) -> Iterator[str]:
-    """Yield lines that call them."""
+    """Yield lines that call the physics of the file, ``NAME_f_p0`` and so on."""
     size = len(within[0].formula.outputs)
     yield f"double f_p[{size * len(within)}];"
     yield from (f"{name}_f_p{i}({x}, f_p + {i * size});" for i in range(len(within)))
 
 
-def _told(fitted: GP | LearnedDynamics, model: GP) -> Iterator[str]:
-    """Return lines on the parameters of f_p in this model, and on the step of dynamics."""
+def _about(model: GP, num_physics: int, is_within: bool, spec: Any, noise: bool) -> Iterator[str]:
+    """Yield lines on the content of the file."""
+    place = ", which is in this file" * is_within
+    yield f"{model!r}. Made by gpadjust; numbers are in the units of the data."
+    yield f"x: {', '.join(model.data.input_names)}."
+    yield f"f_p: {num_physics} values that the physics returns at x{place}."
     if model.physics_parameters:
         means = model.physics_parameters.mean.tolist()
-        pairs = zip(model.physics_parameters, means, strict=True)
-        yield f"Its parameters are {', '.join(f'{name} = {value!r}' for name, value in pairs)}."
-    if isinstance(fitted, LearnedDynamics) and fitted.spec.step is not None:
-        yield f"A step lasts {fitted.spec.step!r}."
-
-
-def _sizes(s: FiniteSum, num_outputs: int) -> dict[str, int]:
-    """Return the sizes of the tables."""
-    return {
-        "INPUTS": len(s.columns),
-        "OUTPUTS": num_outputs,
-        "DRAWS": len(s.weights) // num_outputs,
-        "FEATURES": s.weights.shape[-1],
-        "POINT_SETS": len(s.points),
-    }
+        yield parameters_text(model.physics_parameters, means)
+    if spec is not None and spec.step is not None:
+        yield f"A step lasts {spec.step!r}."
+    yield f"mean: {', '.join(model.data.output_names)}."
+    with_noise = "with" * noise or "without"
+    yield f"variance: in their square, {with_noise} the noise; NULL if it is not wanted."
 
 
 def _tables(s: FiniteSum) -> dict[str, Tensor]:
     """Return all numbers, by their names in C."""
-    found = s._asdict()
+    tables = s._asdict()
     for t, term in enumerate(s.terms):
-        found |= {f"{name}{t}": value for name, value in term._asdict().items()}
+        tables |= {f"{name}{t}": value for name, value in term._asdict().items()}
     if s.lower is not None:  # by columns: loops along them have no sum to wait for
         rows, columns = torch.triu_indices(*2 * s.weights.shape[-1:])
-        found["lower"] = s.lower[:, columns, rows]
-    return {name: value for name, value in found.items() if isinstance(value, Tensor)}
+        tables["lower"] = s.lower[:, columns, rows]
+    return {name: value for name, value in tables.items() if isinstance(value, Tensor)}
 
 
 def _body(s: FiniteSum, variance: bool) -> Iterator[str]:
-    """Return the sum at one point."""
-    yield f"    const double z[INPUTS] = {{{', '.join(map(_input, s.columns))}}};\n"
-    more = {"spread": ", spread[DRAWS * OUTPUTS]" * variance}
-    more["prior"] = ", prior = 0.0" * (variance and s.is_remainder)
-    yield _BEGIN.substitute(more)
-    first = 0
+    """Yield the parts of the sum at one point."""
+    yield f"    const double z[INPUTS] = {braced(map(_input, s.columns))};\n"
+    has_prior = variance and s.is_remainder
+    spread = ", spread[DRAWS * OUTPUTS]" * variance
+    yield _BEGIN.substitute(spread=spread, prior=", prior = 0.0" * has_prior)
+    first = 0  # feature of a term of waves
     for t, term in enumerate(s.terms):
-        basis = "1.0" if term.column is None else f"f_p[column{t}[g % OUTPUTS]] / unit{t}[g]"
+        basis = "1.0"
+        if term.column is not None:
+            basis = f"f_p[column{t}[g % OUTPUTS]] / unit{t}[g]"
         yield _TERM.substitute(t=t, basis=basis, name=term.name.replace("*/", "* /"))
-        if more["prior"]:
+        if has_prior:
             yield _PRIOR.substitute(t=t)
         if term.frequencies is not None:
             half = len(term.frequencies)
@@ -258,8 +261,10 @@ def _body(s: FiniteSum, variance: bool) -> Iterator[str]:
             yield _KERNEL.substitute(t=t, kernel=_KERNELS[term.kind])
     yield _MEAN
     if variance:
-        left = f"fmax(prior - squares, {s.least} * prior)" if s.is_remainder else "squares"
         yield _SOLVED if s.is_solved else _MULTIPLIED
+        left = "squares"
+        if s.is_remainder:
+            left = f"fmax(prior - squares, {s.least} * prior)"
         yield _SPREAD.substitute(left=left)
     yield _MIXED
     if variance:
@@ -269,9 +274,11 @@ def _body(s: FiniteSum, variance: bool) -> Iterator[str]:
 def _input(column: Column) -> str:
     """Return an input of the kernels in C."""
     value = f"x[{column.source}]"
-    value = f"{column.function}({value})" if column.function else value
-    plain = (column.offset, column.size) == (0.0, 1.0)
-    return value if plain else f"({value} - {column.offset!r}) / {column.size!r}"
+    if column.function:
+        value = f"{column.function}({value})"
+    if (column.offset, column.size) == (0.0, 1.0):
+        return value
+    return f"({value} - {column.offset!r}) / {column.size!r}"
 
 
 def _declared(name: str, table: Tensor) -> str:
@@ -285,6 +292,7 @@ def _braces(values: list[Any]) -> str:
     """Return nested numbers in C, a few in a line."""
     if isinstance(values[0], list):
         return "{" + ",\n".join(map(_braces, values)) + "}"
+    # repr has all digits of a float64
     parts = [", ".join(map(repr, values[i : i + 6])) for i in range(0, len(values), 6)]
     return "{" + ",\n ".join(parts) + "}"
 
@@ -292,59 +300,41 @@ def _braces(values: list[Any]) -> str:
 def _step(
     dynamics: LearnedDynamics,
     name: str,
-    given: list[str],
+    arguments: list[str],
     num_physics: int,
     within: list[Equations],
 ) -> Iterator[str]:
-    """Return the function of dynamics, which calls that of their model."""
+    """Yield the function of dynamics, which calls that of their model."""
     spec, m = dynamics.spec, dynamics.model.num_outputs
-    state, action = _entries("state", spec.state_dim), _entries("action", spec.action_dim)
+    state, action = entries("state", spec.state_dim), entries("action", spec.action_dim)
     yield f"/* state, mean: {', '.join(spec.states)}; action: {', '.join(spec.actions)}."
     yield f" * f_p: the next {', '.join(spec.states[i] for i in spec.moving)} by the physics. */"
-    yield f"void {name}_step(const double *state, const double *action, {', '.join(given)})"
+    yield f"void {name}_step(const double *state, const double *action, {', '.join(arguments)})"
     yield "{"
-    x, arguments = [(*state, *action)[i] for i in spec.model_columns], ["x"]
-    yield f"    const double x[{len(x)}] = {{{', '.join(x)}}};"
+    x = [(*state, *action)[i] for i in spec.model_columns]
+    yield f"    const double x[{len(x)}] = {braced(x)};"
+    values = ["x"]  # arguments of the model's function
     if within:
         read = [(*state, *action)[i] for i in spec.physics_columns]
-        yield f"    const double read[{len(read)}] = {{{', '.join(read)}}};"
+        yield f"    const double read[{len(read)}] = {braced(read)};"
         yield from (f"    {line}" for line in _own_f_p(within, name, "read"))
     if num_physics:
-        f_p = _entries("f_p", num_physics // m * len(spec.moving))
-        columns = target_columns(dynamics, state, f_p, _wrapped)
-        yield f"    const double columns[{num_physics}] = {{{', '.join(columns)}}};"
-        arguments.append("columns")
-    has_variance = "double *variance" in given
+        f_p = entries("f_p", num_physics // m * len(spec.moving))
+        columns = target_columns(
+            dynamics, state, f_p, lambda angle: Text(f"atan2(sin{angle}, cos{angle})")
+        )
+        yield f"    const double columns[{num_physics}] = {braced(columns)};"
+        values.append("columns")
+    has_variance = "double *variance" in arguments
     yield f"    double learnt[{m}]{f', spread[{m}]' * has_variance};"
-    arguments += ["learnt"] + ["variance ? spread : 0"] * has_variance
-    yield f"    {name}_predict({', '.join(arguments)});"
-    values = next_state(dynamics, state, action, _entries("learnt", m))
+    values += ["learnt"] + ["variance ? spread : 0"] * has_variance
+    yield f"    {name}_predict({', '.join(values)});"
+    following = next_state(dynamics, state, action, entries("learnt", m))
     # All of them are there before `mean` is written, which may be `state`.
-    yield f"    const double next[{len(values)}] = {{{', '.join(values)}}};"
-    yield f"    for (int i = 0; i < {len(values)}; i++) mean[i] = next[i];"
+    yield f"    const double next[{len(following)}] = {braced(following)};"
+    yield f"    for (int i = 0; i < {len(following)}; i++) mean[i] = next[i];"
     if has_variance:
         yield "    if (!variance) return;"
-        variances = next_variance(dynamics, _entries("spread", m), _Text("0.0"))
+        variances = next_variance(dynamics, entries("spread", m), Text("0.0"))
         yield from (f"    variance[{i}] = {value};" for i, value in enumerate(variances))
     yield "}"
-
-
-class _Text(str):
-    """An expression in C."""
-
-    def __add__(self, other: str) -> _Text:
-        return _Text(f"({self} + {other})")
-
-    def __sub__(self, other: str) -> _Text:
-        return _Text(f"({self} - {other})")
-
-    def __rmul__(self, number: Any) -> _Text:
-        return _Text(f"{number!r} * {self}")
-
-
-def _entries(name: str, size: int) -> list[_Text]:
-    return [_Text(f"{name}[{i}]") for i in range(size)]
-
-
-def _wrapped(angle: _Text) -> _Text:
-    return _Text(f"atan2(sin{angle}, cos{angle})")

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from gpadjust.dynamics import Dynamics
 from gpadjust.export.equations import Equations, OfPhysics, equations_of
-from gpadjust.export.transition import following
+from gpadjust.export.transition import following_state
 from gpadjust.physics.formula import ARITHMETIC, NAMES, Functions
-from gpadjust.physics.ode import FIXED_STEP
+from gpadjust.physics.ode import METHODS
 from gpadjust.physics.unknown import Unknown
 
 _OTHER_NAMES = {"abs": "fabs", "ln": "log", "min": "fmin", "max": "fmax", "pow": "power"}
@@ -22,50 +22,57 @@ def equations_function(fitted: OfPhysics, name: str, free: bool) -> Any:
     """Return a physics, or a step of dynamics that are one, as a ``casadi.Function``."""
     import casadi as ca
 
-    found = equations_of(fitted, free)
+    equations = equations_of(fitted, free)
     if not isinstance(fitted, Dynamics):
-        return physics_function(found, name, free)
+        return physics_function(equations, name, free)
     spec = fitted.spec
     sizes = {"state": spec.state_dim, "action": spec.action_dim}
-    sizes |= {"parameters": len(found.parameters)} if free else {}
-    given = {entry: ca.SX.sym(entry, size) for entry, size in sizes.items()}
-    state, action = (ca.vertsplit(given[entry]) for entry in ("state", "action"))
-    x = ca.vertcat(*[(*state, *action)[i] for i in spec.physics_columns])
-    own = (given["parameters"],) if free else ()
-    f_p = ca.vertsplit(physics_function(found, "f_p", free)(x, *own))
-    mean = ca.vertcat(*following(spec, state, action, f_p))
-    return ca.Function(name, [*given.values()], [mean], [*given], ["mean"])
+    if free:
+        sizes["parameters"] = len(equations.parameters)
+    arguments = {entry: ca.SX.sym(entry, size) for entry, size in sizes.items()}
+    state, action, *parameters = arguments.values()
+    entries = [*ca.vertsplit(state), *ca.vertsplit(action)]
+    x = ca.vertcat(*[entries[i] for i in spec.physics_columns])
+    f_p = physics_function(equations, "f_p", free)(x, *parameters)
+    mean = following_state(
+        spec, entries[: spec.state_dim], entries[spec.state_dim :], ca.vertsplit(f_p)
+    )
+    return ca.Function(name, [*arguments.values()], [ca.vertcat(*mean)], [*arguments], ["mean"])
 
 
-def physics_function(found: Equations, name: str, free: bool = False) -> Any:
+def physics_function(equations: Equations, name: str, free: bool = False) -> Any:
     """Return a physics as a function of x, and of its parameters if they are free."""
     import casadi as ca
 
-    formula, ode = found.formula, found.ode
-    size = len(formula.columns) if found.inputs is None else 1 + max(found.inputs)
-    x, parameters = ca.SX.sym("x", size), ca.SX(found.parameters.tolist())
-    given = {"x": x}
+    ode = equations.ode
+    x = ca.SX.sym("x", 1 + max(equations.inputs))
+    parameters = ca.SX(equations.parameters.tolist())  # numbers, unless they are free
+    arguments = {"x": x}
     if free:
-        given["parameters"] = parameters = ca.SX.sym("parameters", len(found.parameters))
+        arguments["parameters"] = parameters = ca.SX.sym("parameters", parameters.numel())
 
     def outputs(columns: list[Any]) -> Any:
-        own = ca.vertsplit(parameters) if found.parameters.numel() else []
-        return ca.vertcat(*found.values(columns, own, _functions(ca), ca.SX, _curve))
+        values = ca.vertsplit(parameters) if parameters.numel() else []
+        return ca.vertcat(*equations.values(columns, values, _functions(ca), ca.SX, _curve))
 
-    read = found.read(ca.vertsplit(x))
+    columns = [x[i] for i in equations.inputs]
     if ode is None:
-        mean = outputs(read)
+        mean = outputs(columns)
     else:
-        start = mean = ca.vertcat(*read[: ode.state_dim])
+        start = mean = ca.vertcat(*columns[: ode.state_dim])
+        action = columns[ode.state_dim :]
         for _ in range(ode.substeps):
-            begin, slopes = mean, list[Any]()
-            for weights in FIXED_STEP[ode.method]:
-                slopes.append(outputs([*ca.vertsplit(mean), *read[ode.state_dim :]]))
+            begin = mean
+            slopes = list[Any]()
+            for weights in METHODS[ode.method]:
+                # k_i = g(s + h sum_{j < i} a_ij k_j), as in ODEPhysics
+                slopes.append(outputs([*ca.vertsplit(mean), *action]))
                 mean = begin
                 for weight, slope in zip(weights, slopes, strict=True):
                     mean = mean + ode.step / ode.substeps * weight * slope
-        mean = mean - start if ode.difference else mean
-    return ca.Function(name, [*given.values()], [mean], [*given], ["mean"])
+        if ode.difference:
+            mean = mean - start
+    return ca.Function(name, [*arguments.values()], [mean], [*arguments], ["mean"])
 
 
 def _functions(ca: Any) -> Functions:
@@ -73,10 +80,7 @@ def _functions(ca: Any) -> Functions:
     return {
         **ARITHMETIC,
         **{n: getattr(ca, _OTHER_NAMES.get(n, n)) for n in NAMES if n != "where"},
-        "Lt": ca.lt,
-        "LtE": ca.le,
-        "Gt": ca.gt,
-        "GtE": ca.ge,
+        **{"Lt": ca.lt, "LtE": ca.le, "Gt": ca.gt, "GtE": ca.ge},
         "where": lambda c, a, b: ca.if_else(c != 0, a, b),
     }
 
@@ -90,13 +94,9 @@ def _curve(name: str, unknown: Unknown, weights: Tensor) -> Callable[[Any], Any]
     def value(x: Any) -> Any:
         x = ca.fmin(ca.fmax(x, low), high)
         knots = ca.DM(unknown.knots.tolist())
+        # z = sum_i w_i (1 + r_i + r_i^2 / 3) exp(-r_i), r_i = sqrt(5) |x - x_i| / lengthscale
         r = math.sqrt(5) * ca.fabs(x - knots) / unknown.lengthscale
         z = ca.dot(ca.DM(weights.tolist()), (1 + r + r**2 / 3) * ca.exp(-r))
-        if unknown.sd is not None:
-            return unknown.guess + unknown.sd * z
-        if unknown.factor is not None:
-            return unknown.guess * ca.exp(math.log(unknown.factor) * z)
-        least, most = unknown.bounds
-        return least + (most - least) * (1 + ca.erf(z / math.sqrt(2))) / 2
+        return unknown.quantile(z, ca.exp, lambda z: (1 + ca.erf(z / math.sqrt(2))) / 2)
 
     return value

@@ -12,34 +12,22 @@ from gpadjust.core import GP
 from gpadjust.dynamics import Dynamics, IdentifiedDynamics, PhysicsDynamics
 from gpadjust.physics import FormulaPhysics, ODEPhysics, Physics
 from gpadjust.physics.formula import Functions
-from gpadjust.physics.ode import FIXED_STEP
 from gpadjust.physics.unknown import Unknown
 
 MakeCurve = Callable[[str, Unknown, Tensor], Callable[[Any], Any]]
 """Makes an unknown function of its name, its prior and the weights of its knots, ``k``."""
 
 OfPhysics = Physics | IdentifiedDynamics | PhysicsDynamics
-"""What has equations alone."""
+"""Objects that have equations alone."""
 
 
 class Equations(NamedTuple):
-    """A formula, or the fixed steps of an equation of motion whose right-hand side is one.
-
-    Args:
-        formula: The formula.
-        parameters: Values of its ``p`` unknown parameters.
-        ode: The equation of motion; None of a formula alone.
-        inputs: The columns of x that it reads; None for all.
-    """
+    """A formula, or the steps of an equation of motion whose right-hand side is one."""
 
     formula: FormulaPhysics
-    parameters: Tensor
-    ode: ODEPhysics | None
-    inputs: Sequence[int] | None
-
-    def read(self, x: Sequence[Any]) -> list[Any]:
-        """Return the columns of x that the formula reads."""
-        return [*x] if self.inputs is None else [x[i] for i in self.inputs]
+    parameters: Tensor  # values of its p unknown parameters
+    ode: ODEPhysics | None  # None of a formula alone
+    inputs: Sequence[int]  # the columns of x that it reads
 
     def values(
         self,
@@ -53,18 +41,21 @@ class Equations(NamedTuple):
         unknowns = self.formula.unknowns
         curves = {}
         for name, (unknown, places) in unknowns.functions.items():
+            # k(Z, Z)^-1 z, so that the coordinate at x is k(x, Z) times the weights
             weights = unknown.precision @ unknown.coordinate(self.parameters[places])
             curves[name] = curve(name, unknown, weights)
         named = dict(zip(unknowns, parameters, strict=True))
         return self.formula.values_at(columns, named, curves, functions, number)
 
 
-def written(physics: Physics, parameters: Tensor | None = None) -> Equations | None:
+def _equations(physics: Physics, parameters: Tensor | None = None) -> Equations | None:
     """Return the equations of a physics with these parameters, ``p``; None if it has none."""
-    ode = physics if isinstance(physics, ODEPhysics) else None
-    formula = physics if ode is None else ode.rhs
-    is_fixed = ode is None or ode.method in FIXED_STEP
-    if not isinstance(formula, FormulaPhysics) or not is_fixed:
+    formula: Any = physics
+    ode = None
+    if isinstance(physics, ODEPhysics):
+        formula = physics.rhs
+        ode = physics
+    if not isinstance(formula, FormulaPhysics):
         return None
     for name, (unknown, _) in formula.unknowns.functions.items():
         if unknown.is_cut:
@@ -72,69 +63,64 @@ def written(physics: Physics, parameters: Tensor | None = None) -> Equations | N
                 f"Cannot export the function {name!r}, whose bounds cut off its prior: leave out "
                 "bounds, or sd and factor."
             )
-    values = formula.unknowns.guess if parameters is None else parameters.detach()
-    return Equations(formula, values, ode, physics.inputs)
+    inputs = physics.inputs or range(len(formula.columns))
+    if min(inputs) < 0:
+        raise ValueError(
+            f"Cannot export columns that are counted from the end, inputs={physics.inputs}: count "
+            "them from the first, 0."
+        )
+    if parameters is None:
+        parameters = formula.unknowns.guess
+    return Equations(formula, parameters.detach(), ode, inputs)
 
 
 def equations_of(fitted: OfPhysics, free: bool) -> Equations:
-    """Return the equations of a physics, or of dynamics that are one.
-
-    Raises:
-        TypeError: If it is not written in formulas, with the way out.
-        ValueError: If parameters are to be free, and there is none, or one is a function.
-    """
+    """Return the equations of a physics, or of dynamics that are one, or raise an error."""
     if isinstance(fitted, Physics):
-        physics, found = fitted, written(fitted)
+        physics = fitted
+        equations = _equations(physics)
     else:
         physics = fitted.physics
-        found = written(physics, fitted.physics_parameters.center)
-    if found is None:
-        method = f" by {physics.method!r}" if isinstance(physics, ODEPhysics) else ""
+        equations = _equations(physics, fitted.physics_parameters.center)
+    if equations is None:
         raise TypeError(
-            f"Cannot export the physics {physics.name!r}, a {type(physics).__name__}{method}: "
-            'expected equations that are a text, FormulaPhysics("v, u - k * x", ["x", "v", "u"]), '
-            'or an ODEPhysics of these with method="rk4", "midpoint" or "euler".'
+            f"Cannot export the physics {physics.name!r}, a {type(physics).__name__}: expected "
+            'equations that are a text, FormulaPhysics("v, u - k * x", ["x", "v", "u"]), or an '
+            "ODEPhysics of these."
         )
     if free and (physics.unknowns.functions or not physics.unknowns):
         raise ValueError(
             "parameters=True is for unknown parameters that are numbers; found "
             f"{', '.join(physics.unknowns.declared) or 'none'}. Leave it out."
         )
-    return found
+    return equations
 
 
 def equations_within(model: GP) -> list[Equations] | None:
     """Return the equations of the physics of a model; None unless all of them are written."""
-    found = []
-    for each in model.physics:
-        physics = getattr(each, "physics", each)  # without the targets of dynamics
+    within = []
+    for term_physics in model.physics:
+        physics = getattr(term_physics, "physics", term_physics)  # without targets of dynamics
         parameters = None
         if physics.unknowns:
             draws = model.physics_parameters_at(model.u)
             parameters = torch.stack([draws[name] for name in physics.unknowns], -1).mean(0)
-        equations = written(physics, parameters)
+        equations = _equations(physics, parameters)
         if equations is None:
             return None
-        found.append(equations)
-    return found
+        within.append(equations)
+    return within
 
 
-def check_name(name: Any) -> None:
-    """Raise a ValueError unless a program may have this name."""
+def exportable(fitted: Any, name: Any, free: bool = False) -> Any:
+    """Return a fitted object, of an identification its dynamics, or raise a ValueError."""
     if not (isinstance(name, str) and name.isidentifier() and name.isascii()):
         raise ValueError(f"Expected name as one of C, such as 'pump', got {name!r}.")
-
-
-def own_dynamics(fitted: Any) -> Any:
-    """Return a fitted object; of an identification its dynamics."""
-    is_known = isinstance(fitted, GP | Physics | Dynamics)
-    return fitted if is_known else getattr(fitted, "dynamics", fitted)
-
-
-def refuse_parameters(free: bool) -> None:
-    """Raise a ValueError if the parameters of a model are to be free."""
-    if free:
+    if not isinstance(fitted, GP | Physics | Dynamics):
+        fitted = getattr(fitted, "dynamics", fitted)
+    if free and not isinstance(fitted, OfPhysics):
         raise ValueError(
-            "parameters=True is for a physics, and for dynamics that are one. What a Gaussian "
-            "process has learnt is right for the parameters that it was learnt with: leave it out."
+            "parameters=True is for a physics, and for dynamics that are one. The Gaussian "
+            "process was fitted with these values of the parameters: leave it out."
         )
+    return fitted

@@ -1,4 +1,4 @@
-"""A fitted model as a finite sum: plain numbers, which programs of other languages are made of."""
+"""A fitted model as a finite sum: the numbers of programs in other languages."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torch import Tensor
 from gpadjust.core import GP, Fourier, Stationary, Term
 from gpadjust.core.gaussian import Conditioning
 from gpadjust.dynamics import LearnedDynamics
-from gpadjust.dynamics.targets import AngleInput
+from gpadjust.dynamics.learned_dynamics import AngleInput
 from gpadjust.many import VariationalCKA
 
 _PROFILES = ("rbf", "matern1/2", "matern3/2", "matern5/2")
@@ -37,68 +37,41 @@ class TermTables(NamedTuple):
     Its basis b is 1, or a column of f_p over a unit, less a center. Its features are :math:`b(x)
     \, b(x_i) (a\, k(x, x_i) + c)` at points :math:`x_i`; or, of waves, :math:`b(x) \sqrt{2 a / D}`
     times cosines and sines, and :math:`b(x) \sqrt c`.
-
-    Args:
-        name: As of :meth:`~gpadjust.CKA.term`.
-        column: Which column of f_p is the basis of each output, ``m``; None for 1.
-        unit: That of f_p, ``G``.
-        center: ``G``.
-        mean: The prior mean of g, ``G``.
-        kind: ``"rbf"``, ``"matern1/2"``, ``"matern3/2"``, ``"matern5/2"``, ``"waves"``, or
-            ``"constant"`` without a kernel; empty of a term without features.
-        amplitude: a, ``G``.
-        constant: c, the prior variance of an unknown constant, ``G``.
-        rate: One over the lengthscales, ``G x d``.
-        at_points: The basis at the points, ``G x P``; of waves ``G x 0``.
-        frequencies: Of waves, ``D/2 x d``; else None.
-        has_constant: Whether there is an unknown constant.
     """
 
     name: str
-    column: Tensor | None
-    unit: Tensor
-    center: Tensor
-    mean: Tensor
-    kind: str
-    amplitude: Tensor
-    constant: Tensor
-    rate: Tensor
-    at_points: Tensor
-    frequencies: Tensor | None
+    column: Tensor | None  # of f_p, the basis of each output, m; None for 1
+    unit: Tensor  # of the basis, G
+    center: Tensor  # of the basis, G
+    mean: Tensor  # of g by the prior, G
+    kind: str  # a name of _PROFILES, "waves", "constant", or nothing without features
+    amplitude: Tensor  # a, G
+    constant: Tensor  # c, the prior variance of an unknown constant, G
+    rate: Tensor  # one over the lengthscales, G x d
+    at_points: Tensor  # b(x_i), G x P; of waves G x 0
+    frequencies: Tensor | None  # of waves, D/2 x d
     has_constant: bool
 
 
 class FiniteSum(NamedTuple):
-    r"""A fitted model of ``m`` outputs: of each a mixture of ``S`` Gaussians, those of its draws.
+    r"""A fitted model of ``m`` outputs, each a mixture of ``S`` Gaussians, one of each draw.
 
     There are ``G = S m`` Gaussians, those of all outputs for each draw in turn. With the features
     :math:`\varphi(x)` of all terms, the mean of one is that of the prior, plus :math:`\varphi^T w`.
     With :math:`u = L^{-1} \varphi`, or :math:`u = R \varphi` of a model of inducing points, its
     variance is that of the prior, less :math:`|u|^2`; of waves it is :math:`|u|^2` itself.
-
-    Args:
-        columns: The ``d`` inputs of the kernels.
-        num_physics: Number of columns of f_p.
-        terms: The terms.
-        scale: The unit of the targets, ``G``.
-        noise: The variance of the noise in the model's units, ``G``.
-        points: Points of the kernels, ``1 x P x d``, or those of each output, ``m x P x d``.
-        weights: w, ``G x P``.
-        lower: L, or R, lower triangles ``G x P x P``, or None.
-        is_solved: Whether it is L.
-        is_remainder: Whether the variance is that of the prior, less :math:`|u|^2`.
     """
 
-    columns: list[Column]
-    num_physics: int
+    columns: list[Column]  # the d inputs of the kernels
+    num_physics: int  # columns of f_p
     terms: list[TermTables]
-    scale: Tensor
-    noise: Tensor
-    points: Tensor
-    weights: Tensor
-    lower: Tensor | None
-    is_solved: bool
-    is_remainder: bool
+    scale: Tensor  # the unit of the targets, G
+    noise: Tensor  # its variance in the model's units, G
+    points: Tensor  # of the kernels, 1 x P x d, or m x P x d of each output
+    weights: Tensor  # w, G x P
+    lower: Tensor | None  # L or R, lower triangles G x P x P; None without variance
+    is_solved: bool  # lower is L
+    is_remainder: bool  # the variance is that of the prior, less |u|^2
 
     @property
     def least(self) -> float:
@@ -119,16 +92,17 @@ def model_of(fitted: Any) -> GP:
 
 @torch.no_grad()
 def finite_sum(model: GP, variance: bool, observation_noise: bool) -> FiniteSum:
-    """Return a fitted model as a finite sum; a ValueError, with the way out, if it is none."""
+    """Return a fitted model as a finite sum, or raise a ValueError with the way out."""
     if model.batch_shape:
         raise ValueError("Cannot export fantasies, a batch of models: export each of them.")
-    conditioning, X = model.conditioning(), model.data.X[:2]
-    shape, values = conditioning.alpha.shape[:-1], conditioning.train.values
+    conditioning = model.conditioning()
+    X = model.data.X[:2]  # enough to see whether the noise depends on x
+    shape, values = conditioning.alpha.shape[:-1], conditioning.train.values  # S x m
     places = model.places(X, values)
     noise = model.noise.variance(values, places)
-    why = _why_not(model, places.f, noise, observation_noise)
-    if why:
-        raise ValueError(f"Cannot export a model of {why}.")
+    obstacle = _obstacle(model, places.f, noise, observation_noise)
+    if obstacle:
+        raise ValueError(f"Cannot export a model of {obstacle}.")
     varying = [term for term in model.terms if term.varies]
     is_remainder = any(type(term.kernel) is not Fourier for term in varying)
     terms = [_tables(term, model, conditioning, is_remainder) for term in model.terms]
@@ -153,17 +127,15 @@ def finite_sum(model: GP, variance: bool, observation_noise: bool) -> FiniteSum:
     )
 
 
-def _why_not(model: GP, f: Any, noise: Tensor, observation_noise: bool) -> str:
-    """Return why a model is no finite sum, with the way out; nothing if it is one."""
-    own = type(model)
-    if own.on_gaussian_scale is not GP.on_gaussian_scale:
+def _obstacle(model: GP, f: Any, noise: Tensor, observation_noise: bool) -> str:
+    """Return why a model is not a finite sum, with the way out; nothing if it is one."""
+    kind = type(model)
+    if kind.on_gaussian_scale is not GP.on_gaussian_scale:
         return "outputs with a link: build it of the link of the data, and invert that in your code"
-    if (
-        own.components not in (GP.components, VariationalCKA.components)
-        or own.marginals_of is not GP.marginals_of
-    ):
-        return f"predictions of its own, a {own.__name__}: take CKA"
-    if any(each.shape[-3] > 1 for each in f):
+    has_components = kind.components in (GP.components, VariationalCKA.components)
+    if not has_components or kind.marginals_of is not GP.marginals_of:
+        return f"predictions of its own, a {kind.__name__}: take CKA"
+    if any(values.shape[-3] > 1 for values in f):
         return "draws that have an f_p each: fit(model, 'map')"
     if not any(term.varies for term in model.terms):
         return "known terms alone, which is its physics: take model.physics_parameters to yours"
@@ -177,48 +149,62 @@ def _why_not(model: GP, f: Any, noise: Tensor, observation_noise: bool) -> str:
 
 def _tables(term: Term, model: GP, conditioning: Conditioning, is_remainder: bool) -> TermTables:
     """Return the numbers of a term."""
-    values, (S, m, n) = conditioning.train.values, conditioning.alpha.shape
+    train = conditioning.train
+    S, m, n = conditioning.alpha.shape
+    d = train.x.shape[-1]
     one = torch.ones(S, m, 1, dtype=torch.float64)
-    d = conditioning.train.x.shape[-1]
 
-    def each(number: Any) -> Tensor:
+    def repeat(number: Any) -> Tensor:
         """Return a number of each Gaussian, ``G``."""
         return (one * number).reshape(-1)
 
-    kind, amplitude, rate, frequencies = "", 0.0 * one, one.expand(-1, -1, d), None
+    kind = ""  # no features
+    amplitude: Tensor = 0.0 * one
+    rate, frequencies = one.expand(-1, -1, d), None
     if term.kernel is not None:
         kernel: Any = term.kernel
-        own = conditioning.train.own(term)
+        numbers = train.own(term)
         if type(kernel) is Stationary and kernel.profile.name in _PROFILES:
             kind = kernel.profile.name
         elif type(kernel) is Fourier and not is_remainder:
-            kind, frequencies = "waves", kernel.frequencies.mT
+            kind = "waves"
+            frequencies = kernel.frequencies.mT
         else:
             raise ValueError(
                 f"Cannot export the kernel of {term.name!r}, {kernel!r}: expected RBF or Matern, "
                 "as Stationary(MATERN52), or a model with Fourier kernels alone, as RRA."
             )
-        amplitude = own["outputscale"] * values.get(f"{term.name}.process", 1.0)
-        rate = 1 / own["lengthscale"] * one
+        amplitude = numbers["outputscale"] * train.values.get(f"{term.name}.process", 1.0)
+        rate = 1 / numbers["lengthscale"] * one
     elif term.constant is not None:
         kind = "constant"
-    if term.name not in conditioning.train.weights:
-        kind = ""  # what inducing points cannot show
-    is_basis = term.physics is not None
-    weight = conditioning.train.weights.get(term.name)
-    at_points = (one if weight is None else weight).expand(S, m, n) * conditioning.observed
+    weight = train.weights.get(term.name)
+    if weight is None:  # inducing points do not show the term
+        kind = ""
+        weight = one
+    at_points = weight.expand(S, m, n) * conditioning.observed  # 0 where an output is missing
     if not is_remainder:
         at_points = at_points[..., :0]
-    columns = torch.arange(m) + m * (term.physics or 0) if is_basis else None
+    column: Tensor | None = None
+    unit: Any = 1.0
+    center: Any = 0.0
+    constant: Any = 0.0
+    if term.physics is not None:
+        column = torch.arange(m) + m * term.physics  # of all physics side by side
+        unit = model.unit
+    if term.has_center:
+        center = model.term_sum.center(term, train.values)
+    if term.constant is not None:
+        constant = train.values[f"{term.name}.constant"]
     return TermTables(
         name=term.name,
-        column=columns,
-        unit=each(model.unit if is_basis else 1.0),
-        center=each(model.term_sum.center(term, values) if term.has_center else 0.0),
-        mean=each(model.term_sum.mean_of(term, values)),
+        column=column,
+        unit=repeat(unit),
+        center=repeat(center),
+        mean=repeat(model.term_sum.mean_of(term, train.values)),
         kind=kind,
-        amplitude=each(amplitude),
-        constant=each(0.0 if term.constant is None else values[f"{term.name}.constant"]),
+        amplitude=repeat(amplitude),
+        constant=repeat(constant),
         rate=rate.reshape(-1, d),
         at_points=at_points.reshape(S * m, -1),
         frequencies=frequencies,
@@ -233,23 +219,24 @@ def _of_waves(conditioning: Conditioning) -> tuple[Tensor, Tensor]:
 
     .. math:: L L^T = I + \Phi^T N^{-1} \Phi, \quad w = \Phi^T \alpha.
     """
-    f, columns = conditioning.train, list[Tensor]()
+    f = conditioning.train
+    columns = list[Tensor]()
     for term in f.terms:
         if term.kernel is None:
             continue
         kernel: Any = term.kernel
-        own, weight = f.own(term), f.weights[term.name]
-        angle = (f.x / own["lengthscale"].unsqueeze(-2)) @ kernel.frequencies
-        process = own["outputscale"] * f.values.get(f"{term.name}.process", 1.0)
+        numbers = f.own(term)
+        # sqrt(2 a / D) cos(w^T x / l), and sines
+        angle = (f.x / numbers["lengthscale"].unsqueeze(-2)) @ kernel.frequencies
+        process = numbers["outputscale"] * f.values.get(f"{term.name}.process", 1.0)
         size = (process / angle.shape[-1]).sqrt().unsqueeze(-1)
         waves = [size * angle.cos(), size * angle.sin()]
         if term.constant is not None:
             constant = f.values[f"{term.name}.constant"].sqrt().unsqueeze(-1)
             waves.append(constant.expand(*angle.shape[:-1], 1))
-        phi = torch.cat(waves, -1)
-        columns.append(phi * weight.unsqueeze(-1))
+        columns.append(torch.cat(waves, -1) * f.weights[term.name].unsqueeze(-1))
     phi = torch.cat(columns, -1)
-    # What the factor has beside the terms is noise, with its nugget.
+    # The rest of the factor is noise, with its nugget.
     noise = conditioning.chol.square().sum(-1) - f.variance()
     white = phi * (conditioning.observed / noise.maximum(conditioning.noise).sqrt()).unsqueeze(-1)
     eye = torch.eye(phi.shape[-1]).to(phi)
@@ -260,20 +247,24 @@ def _of_waves(conditioning: Conditioning) -> tuple[Tensor, Tensor]:
 def _columns(transform: Any, num_inputs: int) -> list[Column]:
     """Return the inputs of the kernels, by the transform of raw ones."""
     columns = [Column(i) for i in range(num_inputs)]
-    is_chain = isinstance(transform, ChainedInputTransform)
-    for part in transform.values() if is_chain else [transform] * (transform is not None):
+    parts = [transform] * (transform is not None)
+    if isinstance(transform, ChainedInputTransform):
+        parts = [*transform.values()]
+    for part in parts:
         is_plain = [column[1:] == Column(0)[1:] for column in columns]
         if isinstance(part, AngleInput) and all(is_plain[i] for i in part.columns):
-            columns = [
-                column._replace(function=function)
-                for i, column in enumerate(columns)
-                for function in (("sin", "cos") if i in part.columns else (column.function,))
-            ]
+            replaced = list[Column]()
+            for i, column in enumerate(columns):
+                functions = ("sin", "cos") if i in part.columns else (column.function,)
+                replaced += [column._replace(function=function) for function in functions]
+            columns = replaced
         elif type(part) in (AffineInputTransform, Normalize, InputStandardize):
-            offset, size = torch.zeros(len(columns)).double(), torch.ones(len(columns)).double()
+            offset = torch.zeros(len(columns), dtype=torch.float64)
+            size = torch.ones_like(offset)
             scaled = getattr(part, "indices", slice(None))
             offset[scaled], size[scaled] = part.offset.flatten(), part.coefficient.flatten()
             pairs = zip(columns, offset.tolist(), size.tolist(), strict=True)
+            # ((x - a) / b - o) / s = (x - (a + b o)) / (b s)
             columns = [
                 c._replace(offset=c.offset + c.size * o, size=c.size * s) for c, o, s in pairs
             ]

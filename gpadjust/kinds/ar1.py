@@ -25,24 +25,20 @@ class AR1(GP):
     r"""Auto-regressive co-kriging, :math:`f_2(x) = \rho f_1(x) + \delta(x)` with a constant rho.
 
     The classic of multi-fidelity modelling (Kennedy and O'Hagan 2000; Wannawas and Faisal 2023,
-    sec. 2.1.3), for comparison: a Gaussian process of the data and ``N_1`` samples of f_p, each
-    with its own noise variance. Far from the samples it does not use the physics. Data, predictions
-    and left-out targets belong to the high level. Args and errors as of
-    :class:`~gpadjust.core.GP`, and:
+    sec. 2.1.3), for comparison: a Gaussian process of the data and samples of f_p, each with its
+    own noise variance. Far from the samples it does not use the physics. Data, predictions and
+    left-out targets belong to the high level. Args and errors as of :class:`~gpadjust.core.GP`, and
+    either ``physics`` with ``bounds``, or ``low_X`` with its values:
 
     Args:
         physics: The low level f_p, sampled in ``bounds``.
         bounds: ``2 x d`` lower and upper bounds of the inputs.
-        num_low: Number ``N_1`` of samples of f_p.
+        num_low: Number of samples of f_p.
         low_X: Inputs of the low level, ``n_1 x d``, in place of samples in ``bounds``.
-        low_Y: Values of the low level, ``n_1 x m``, NaN where one is missing. Default: f_p at
-            ``low_X``.
+        low_Y: Values there, ``n_1 x m``, NaN where one is missing. Default: f_p.
         low_covar_module: The kernel of the low level. Default: RBF.
         delta_covar_module: The kernel of delta. Default: RBF.
         seed: Seed of the (scrambled Sobol) samples.
-
-    Raises:
-        ValueError: If neither ``physics`` with ``bounds`` nor ``low_X`` with its values is given.
     """
 
     low: Any = None  # the data of the low level; set after the units of the high level
@@ -59,11 +55,10 @@ class AR1(GP):
                 "Expected a low level: physics with bounds (2 x d) or low_X, or low_X with low_Y."
             )
         if low_X is None:
-            d = as_tensor(train_X, "train_X").shape[-1]
+            box = checked_bounds("bounds", bounds, as_tensor(train_X, "train_X").shape[-1])
             number = checked_whole("num_low", num_low, 2)
-            box = checked_bounds("bounds", bounds, d)
-            low_X = draw_sobol_samples(box, n=number, q=1, seed=checked_whole("seed", seed))
-            low_X = low_X.squeeze(-2)
+            samples = draw_sobol_samples(box, n=number, q=1, seed=checked_whole("seed", seed))
+            low_X = samples.squeeze(-2)
         if low_Y is None:
             f_p = as_physics(physics)
             if f_p.unknowns:
@@ -137,8 +132,7 @@ class AR1(GP):
 class AtLevels(Kernel):
     r"""The kernel :math:`b(l) \, (k(x, x') + \kappa) \, b(l')` of levels l, the last input.
 
-    b is :math:`\rho^l`, with a normal prior of rho in units of both levels, or l. The priors of
-    lengthscales consider the inputs of the low level, too.
+    b is :math:`\rho^l`, with a normal prior of rho in units of both levels, or l.
     """
 
     def __init__(self, kernel: Kernel, low_x: Tensor, has_rho: bool = False) -> None:
@@ -165,15 +159,15 @@ class AtLevels(Kernel):
 
     def covariance(self, own: Values, x: Tensor, other: Tensor | None = None) -> Tensor:
         """Return the covariances of inputs with others, or with themselves."""
-        left = self.basis(own, x)
-        if other is None:
-            k = self.kernel.covariance(own, x[..., :-1])
-            right = left
-        else:
-            k = self.kernel.covariance(own, x[..., :-1], other[..., :-1])
+        right = self.basis(own, x)
+        left = right.unsqueeze(-1)
+        inner = None
+        if other is not None:
             right = self.basis(own, other)
+            inner = other[..., :-1]
+        k = self.kernel.covariance(own, x[..., :-1], inner)
         # b(l) (k + kappa) b(l')
-        return left.unsqueeze(-1) * (k + own["constant"].unsqueeze(-1)) * right.unsqueeze(-2)
+        return left * (k + own["constant"].unsqueeze(-1)) * right.unsqueeze(-2)
 
     def with_pull_back(self, own: Values, x: Tensor) -> tuple[Tensor, PullBack]:
         """Return the covariance, and the function of its derivatives by the parameters."""

@@ -32,12 +32,11 @@ class Categories(InputTransform):
     whose levels are all at the same distance,
     :math:`r^2 = \sum_k (x_k - x'_k)^2 / \ell_k^2 + \sum_c 1\{c \neq c'\} / \ell_c^2`. It does not
     depend on batches, such as rigs or days. Each column of batches adds a term of its name:
-    independent offsets with one unknown variance, also for a new batch. Other kernels, of GPyTorch
-    or your own, use the numbers of the levels; ``active_dims`` excludes columns.
+    independent offsets with one unknown variance, also for a new batch. Other kernels use the
+    numbers of the levels; ``active_dims`` of GPyTorch excludes columns.
 
-    Texts of a frame become the numbers 0, 1, ... of their sorted levels; a new batch becomes a
-    negative number. Tensors and the physics have these numbers. BoTorch's optimisation needs
-    ``fixed_features`` for the columns.
+    Texts of a frame become the numbers 0, 1, ... of their sorted levels, as tensors and the physics
+    have them. BoTorch's optimisation needs ``fixed_features`` for the columns.
 
     Args:
         columns: Names or numbers of columns of categories. Default: all columns of texts or of
@@ -46,8 +45,7 @@ class Categories(InputTransform):
         levels: Levels by column, in the order of their numbers. Default: the levels in the data.
 
     Raises:
-        ValueError: When a model is built, if a column does not exist, or all columns are batches;
-            later, if a level is unknown.
+        ValueError: If a column does not exist, all are batches, or later a level is unknown.
 
     Example:
         >>> import torch
@@ -131,9 +129,9 @@ class Categories(InputTransform):
     def _read_levels(self, X: ArrayLike) -> None:
         """Set columns and levels of texts; `transform` reads levels that are numbers."""
         self.names = names_of(X, "x")
-        asked = {name: () if value is None else value for name, value in self.asked.items()}
         columns, self.batches, listed = (
-            columns_of(self.names, value, name) for name, value in asked.items()
+            columns_of(self.names, () if value is None else value, name)
+            for name, value in self.asked.items()
         )
         levels = levels_of_texts(X, [*columns, *self.batches])
         if self.asked["columns"] is None:
@@ -152,20 +150,14 @@ class Categories(InputTransform):
         return ValueError(
             f"Expected {self.names[i]} to be one of {', '.join(map(str, levels))}; found {value}. "
             "List a new level when the model is built, levels={column: levels}, or take the column "
-            "as batches=[...], whose new levels have new offsets. BoTorch's optimisation needs "
-            "fixed_features for the column."
+            "as batches=[...]; BoTorch's optimisation needs fixed_features for the column."
         )
 
 
 class Exchangeable(Kernel):
-    r"""A stationary kernel with the distance 1 between any two levels of a category.
+    r"""A stationary kernel of some columns, in which two levels of a category have the distance 1.
 
     The kernel reads :math:`1 / \sqrt 2` or 0 for each level; these columns share a lengthscale.
-
-    Args:
-        kernel: The stationary kernel.
-        columns: The names of the columns that the kernel reads, by their numbers.
-        levels: The numbers of the levels of each category, by its column.
     """
 
     def __init__(
@@ -217,8 +209,8 @@ class Exchangeable(Kernel):
         def pull_back(D: Tensor) -> Values:
             by = back(D)
             zeros = torch.zeros_like(own["lengthscale"])
-            groups = self.groups.to(D.device)
-            return by | {"lengthscale": zeros.index_add(-1, groups, by["lengthscale"])}
+            summed = zeros.index_add(-1, self.groups.to(D.device), by["lengthscale"])
+            return by | {"lengthscale": summed}
 
         return K, pull_back
 
@@ -229,10 +221,7 @@ class Exchangeable(Kernel):
 
 
 class Offset(Kernel):
-    r"""Independent offsets of equal variance s, one for each value: :math:`s \, 1\{x_c = x'_c\}`.
-
-    c is the number of a column; s has the prior of a process in squared units of the targets.
-    """
+    r"""Independent offsets of variance s, one for each value: :math:`s \, 1\{x_c = x'_c\}`."""
 
     def __init__(self, column: int) -> None:
         self.column = column

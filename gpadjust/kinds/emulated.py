@@ -29,18 +29,17 @@ class EmulatedPhysics(Physics):
     .. math:: f_p(x) = m(x) + \sum_{k=1}^K z_k v_k(x), \quad z_k \sim N(0, 1),
 
     with the mean m and the principal components v of the errors. The z are further unknown
-    parameters, ``emulator_1`` and so on, 0 before a fit. Each draw of a model then contains one
-    function, intervals are wide where there are no runs, and measurements correct the emulator,
-    too. With unknown parameters that are inputs of the runs, ``CKA`` and ``PhysicsMeanGP`` are the
-    calibration of Kennedy and O'Hagan (2001), with the emulator fitted to the runs alone.
+    parameters, ``emulator_1`` and so on, 0 before a fit. Intervals are wide where there are no
+    runs, and measurements correct the emulator, too. With unknown parameters that are inputs of the
+    runs, ``CKA`` and ``PhysicsMeanGP`` are the calibration of Kennedy and O'Hagan (2001), with the
+    emulator fitted to the runs alone.
 
     Args:
         runs_X: Inputs of the runs, ``N x (d + p)``: the inputs of the data, and then values of the
             unknown parameters. In a frame, columns with the names of the parameters, with or
             without a unit, such as ``"drag [1]"``.
         runs_Y: Outputs of the runs, ``N x m``; NaN where one is missing.
-        inputs: The columns of the data that are the first ``d`` inputs of the runs, in their order.
-            Default: all.
+        inputs: The columns of the data that are the first ``d`` inputs of the runs. Default: all.
         unknowns: The unknown parameters by name.
         model_factory: Makes the emulator of ``X`` and ``Y``. Default: ``ZeroMeanGP`` with an RBF or
             a Matern 5/2 kernel, whichever predicts left-out runs with the higher density.
@@ -48,9 +47,6 @@ class EmulatedPhysics(Physics):
         fit_options: Options of its :func:`~gpadjust.fit`, such as ``{"method": "map"}``.
         num_components: Number ``K`` of components; their size includes the omitted components.
         name: The name in messages. Default: the name of the class.
-
-    Attributes:
-        emulator: The fitted model of the runs, for inspection: ``emulator.left_out()``.
 
     Raises:
         TypeError: If the factory does not make an exact model of this library.
@@ -60,7 +56,7 @@ class EmulatedPhysics(Physics):
         >>> from gpadjust.core import PhysicsMeanGP
         >>> runs_X = torch.linspace(0, 3, 9, dtype=torch.float64).unsqueeze(-1)
         >>> simulator = EmulatedPhysics(runs_X, torch.sin(2 * runs_X), num_components=4)
-        >>> X = torch.linspace(0, 3, 5, dtype=torch.float64).unsqueeze(-1)
+        >>> X = runs_X[::2]
         >>> model = PhysicsMeanGP(X, torch.sin(2 * X) + X, physics=simulator)
         >>> result = fit(model)
         >>> round(model.predict(torch.tensor([[1.1]]).double()).mean.item(), 1)
@@ -77,8 +73,7 @@ class EmulatedPhysics(Physics):
         number = checked_whole("num_components", num_components, 1)
         parameters = dict(unknowns or {})
         components = {f"emulator_{k + 1}": Unknown(0.0, sd=1.0) for k in range(number)}
-        taken = sorted(parameters.keys() & components.keys())
-        if taken:
+        if taken := sorted(parameters.keys() & components.keys()):
             raise ValueError(
                 f"Expected other names than {taken}, which are components of the emulator's error."
             )
@@ -99,7 +94,7 @@ class EmulatedPhysics(Physics):
 
     @property
     def emulator(self) -> GP:
-        """The fitted model of the runs."""
+        """The fitted model of the runs, for inspection: ``emulator.left_out()``."""
         return self._emulator[0]
 
     def read(self, X: Tensor) -> Tensor:
@@ -238,8 +233,7 @@ def _with_unknowns_last(runs_X: Any, names: list[str], physics: str) -> Any:
         return runs_X
     by_name = {str(column).partition(" [")[0]: column for column in columns}  # "drag [1]" is drag
     by_name |= {column: column for column in columns}
-    absent = [name for name in names if name not in by_name]
-    if absent:
+    if absent := [name for name in names if name not in by_name]:
         raise ValueError(
             f"Expected columns of the names {', '.join(absent)} in the runs of {physics!r}, the "
             f"unknown parameters; found {columns}."

@@ -13,18 +13,23 @@ from gpadjust.core.model import GP
 from gpadjust.kinds.links import linked
 
 ModelFactory = Callable[..., Model]
-"""A callable ``(X, Y, **physics) -> model``: a structure, ``functools.partial`` of one with further
-arguments, or a function."""
+"""A callable ``(X, Y, **physics) -> model``: a structure, a partial of one, or a function."""
+
+
+def map_parts(change: Callable[[Any], Any], physics: Any) -> Any:
+    """Return a function of each physics of a list or dictionary, in their form, or of one."""
+    if isinstance(physics, Mapping):
+        return {name: change(part) for name, part in physics.items()}
+    if isinstance(physics, list | tuple):
+        return [change(part) for part in physics]
+    return change(physics)
 
 
 def with_options(factory: ModelFactory, options: Mapping[str, Any]) -> ModelFactory:
     """Return a factory with options as further arguments, if they are not None.
 
     Arguments of a ``functools.partial`` go before. A ``link`` makes the structure
-    :func:`~gpadjust.kinds.links.linked`.
-
-    Raises:
-        TypeError: If there is a link, and the factory is not a structure or a partial of one.
+    :func:`~gpadjust.kinds.links.linked`, or is a TypeError if the factory is a function.
     """
     if not callable(factory):
         return factory  # make_model raises the error
@@ -50,11 +55,8 @@ def make_model(
     """Return a new model of inputs ``n x d`` and targets ``n x m``, made by a factory.
 
     Further arguments, such as ``physics``, are omitted if they are None. Arguments of a
-    ``functools.partial`` other than a physics (kernels, a noise) are copied for each model.
-
-    Raises:
-        TypeError: If the factory is not callable, does not take the arguments, or does not return
-            a ``kind``.
+    ``functools.partial`` other than a physics (kernels, a noise) are copied for each model. A
+    factory that is not callable, or makes another ``kind``, is a TypeError.
     """
     if not callable(factory):
         raise TypeError(

@@ -25,13 +25,9 @@ _MOST = 1 / 3  # largest share of outliers
 
 
 class RowNoise(Noise):
-    """A noise with corrections for single training rows, found by rough fits.
+    """A noise with corrections of variances and means of training rows, by rough fits.
 
-    Args:
-        base: The noise of new observations. Default: one unknown variance for each output.
-        added: Corrections of the variances of the training targets, ``m x n``, in their squared
-            unit.
-        moved: Corrections of the means of the training targets, ``m x n``, in their unit.
+    The base is the noise of new observations; corrections are ``m x n``, in units.
     """
 
     of_targets = ("added", "moved")
@@ -99,10 +95,6 @@ class RowNoise(Noise):
         variance = self.base.variance(values, places, is_training)
         return variance + self.added if is_training else variance
 
-    def pull_back(self, values: Values, places: Places, by: Tensor) -> Values:
-        """Return the derivatives by the numbers of the base."""
-        return self.base.pull_back(values, places, by)
-
     def of_terms(self, terms: TermSum) -> Self:
         """Return the noise for a model of these terms."""
         return self.mapped(lambda v: v, "of_terms", terms)
@@ -128,25 +120,23 @@ class HeavyTails(RowNoise):
 
     An observation is an outlier with the probability :math:`\pi`. The logarithm of the standard
     deviation of its error is then uniform over three decades, so that a residual r from the
-    left-out prediction has the density :math:`1 / (2 |r| \log 10^3)`. A greedy search by rough
-    fits finds the outliers, as in relevance pursuit (Ament et al. 2024): it takes out the rows
-    with the largest left-out residuals, fits the other numbers again, and returns the likeliest of
-    all sets so far. In a fit, the variance of an outlier gives it :math:`\pi` times the density
-    above.
+    left-out prediction has the density :math:`1 / (2 |r| \log 10^3)`; in a fit, the variance of an
+    outlier gives it :math:`\pi` times this density. A greedy search by rough fits finds the
+    outliers, as in relevance pursuit (Ament et al. 2024).
 
     Args:
         share: :math:`\pi`.
-        base: The noise of other observations. Default: one unknown variance for each output, or a
-            model's ``train_Yvar``.
+        base: The noise of other observations, such as :class:`RelativeNoise`. Default: one unknown
+            variance for each output, or a model's ``train_Yvar``.
         added: Variances ``m x n`` of the outliers, set by a fit.
 
     Example:
         >>> import torch
         >>> from gpadjust.core import CKA, fit
-        >>> X = torch.linspace(0, 1, 12, dtype=torch.float64).unsqueeze(-1)
-        >>> Y = 2 * torch.sin(6 * X) + 0.01 * torch.cos(99 * X)
+        >>> X = torch.linspace(0, 6, 12, dtype=torch.float64).unsqueeze(-1)
+        >>> Y = 2 * X.sin() + 0.01 * torch.cos(16 * X)
         >>> Y[5] += 3
-        >>> model = CKA(X, Y, physics=lambda X: torch.sin(6 * X), noise=HeavyTails())
+        >>> model = CKA(X, Y, physics=torch.sin, noise=HeavyTails())
         >>> result = fit(model)
         >>> (model.noise.outliers(model) > 0.5).nonzero()[:, 0].tolist()
         [5]
@@ -170,10 +160,7 @@ class HeavyTails(RowNoise):
 
     @torch.no_grad()
     def outliers(self, model: Any) -> Tensor:
-        """Return the probability that each training target is an outlier, ``n x m``.
-
-        It compares left-out predictions over all draws of the model; a missing target has 0.
-        """
+        """Return the probability of each training target to be an outlier, ``n x m``."""
         left_out = self._left_out(model)
         odds = left_out.tails.logsumexp(0) - left_out.normal.logsumexp(0)
         return odds.sigmoid().mT.masked_fill(model.data.Y.isnan(), 0.0)
@@ -200,8 +187,8 @@ class HeavyTails(RowNoise):
             best = torch.stack(densities).argmax(0)
             sets = torch.stack(variances) > 0
             # The next set has the outliers that are still likely, and the rows with the largest
-            # residuals: one, or a quarter of the likely ones. Not all, as the neighbours of an
-            # outlier may have large residuals, too.
+            # residuals: one, or a quarter of the likely ones, as neighbours of an outlier may have
+            # large residuals, too.
             is_likely = (left_out.tails > left_out.normal)[0]
             z = left_out.z[0].masked_fill(outlying, 0.0)
             # sqrt(2 log n) is the expected maximum of n standard normal numbers.

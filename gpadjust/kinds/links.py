@@ -14,17 +14,10 @@ from botorch.posteriors.transformed import TransformedPosterior
 from torch import Tensor
 
 from gpadjust.checks import marked_rows
+from gpadjust.core import structures
 from gpadjust.core.gaussian import Marginals, Prediction
 from gpadjust.core.model import GP
 from gpadjust.core.posterior import MixturePosterior
-from gpadjust.core.structures import (
-    CKA,
-    RRA,
-    CalibratedPhysics,
-    PhysicsMeanGP,
-    ScaleGP,
-    ZeroMeanGP,
-)
 
 NAMED = {"log": (0.0, math.inf), "logit": (0.0, 1.0)}
 _LARGEST = 1e150  # without an upper bound: its square, and sums of such, are finite
@@ -43,7 +36,7 @@ class Link(NamedTuple):
     location: Tensor  # c, m
 
     @classmethod
-    def of(cls, link: Any) -> Link:
+    def parse(cls, link: Any) -> Link:
         """Return the link of a name or of two bounds, without a location."""
         bounds: Any = NAMED.get(link) if isinstance(link, str) else link
         is_pair = isinstance(bounds, tuple | list) and len(bounds) == 2
@@ -65,7 +58,7 @@ class Link(NamedTuple):
             return f"log({above.strip('()')})"
         return f"log({above} / ({self.upper:g} - y))"
 
-    def holds(self, y: Tensor) -> Tensor:
+    def covers(self, y: Tensor) -> Tensor:
         """Return which values are within the bounds, or NaN."""
         return ~((y <= self.lower) | (y >= self.upper))
 
@@ -77,7 +70,7 @@ class Link(NamedTuple):
         return above, (self.upper - y).clamp_min(0.0).log()
 
     def value(self, y: Tensor) -> Tensor:
-        """Return g of values ``... x m``: infinite at the bounds and beyond; NaN of NaN."""
+        """Return g of values ``... x m``; infinite at the bounds and beyond."""
         above, below = self.logs(y)
         return above - below - self.location.to(y)
 
@@ -110,19 +103,16 @@ class LinkedMarginals(Marginals):
     link: Link
 
     def __new__(cls, means: Tensor, variances: Tensor, link: Link) -> Self:
-        """Make mixtures from means and variances of components, ``... x S x q x m``, of g."""
+        """Make mixtures of components of g, ``... x S x q x m``."""
         new = super().__new__(cls, means, variances)
         new.link = link
         return new
 
     @property
     def prediction(self) -> Prediction:
-        """The median, and the square of half the width of the central 68.27 %, ``... x q x m``.
-
-        Rare values decide the moments: for a wide mixture these may be infinite, and the mean
-        outside of every interval.
-        """
-        # The quantiles at -1 and 1 standard deviations of a Gaussian.
+        """The median, and the square of half the width of the central 68.27 %, ``... x q x m``."""
+        # Rare values decide the moments: for a wide mixture these may be infinite, and the mean
+        # outside of every interval. So these are the quantiles at -1, 0 and 1 sd of a Gaussian.
         sd = (self.quantile(_HIGH) - self.quantile(_LOW)) / 2
         return Prediction(self.quantile(0.5), sd.square())
 
@@ -131,21 +121,18 @@ class LinkedMarginals(Marginals):
         return self.link.inverse(Marginals(*self).quantile(level))
 
     def probability(self, Y: Tensor) -> Tensor:
-        """Return the probability of values below ``Y``, ``... x q x m``."""
+        """Return the probability of values below ``Y``."""
         return Marginals(*self).probability(self.link.value(Y))
 
     def log_density(self, Y: Tensor) -> Tensor:
-        """Return the log density at values ``Y``, ``... x q x m``; NaN where ``Y`` is NaN."""
+        """Return the log density at values ``Y``; NaN where ``Y`` is NaN."""
         # p(y) = p(g(y)) dg/dy
         density = Marginals(*self).log_density(self.link.value(Y)) + self.link.log_slope(Y)
-        return density.masked_fill(~self.link.holds(Y), -math.inf)
+        return density.masked_fill(~self.link.covers(Y), -math.inf)
 
 
 class LinkedPosterior(TransformedPosterior):
-    """The joint posterior of outputs with a link, in the user's units.
-
-    Samples are exact; ``mean`` and ``variance`` are as of :class:`LinkedMarginals`.
-    """
+    """The joint posterior in the user's units; moments are those of :class:`LinkedMarginals`."""
 
     def __init__(self, mixture: MixturePosterior, link: Link) -> None:
         self.mixture, self.link = mixture, link
@@ -158,7 +145,7 @@ class LinkedPosterior(TransformedPosterior):
 
     @property
     def distribution(self) -> Any:
-        """Raises an AttributeError for code that needs a Gaussian, such as BoTorch's entropy."""
+        """An AttributeError for code that needs a Gaussian, such as BoTorch's entropy."""
         raise AttributeError(
             f"The model is Gaussian in {self.link.formula}, not in y. Take an acquisition function "
             "that needs the mean and variance alone, or samples: its name begins with qLog."
@@ -166,10 +153,7 @@ class LinkedPosterior(TransformedPosterior):
 
     @property
     def covariance_matrix(self) -> Tensor:
-        """Covariances of the points of one output, ``... x q x q``.
-
-        They have the variances of the predictions, and the correlations of g(y).
-        """
+        """Variances of the predictions with the correlations of g(y), of one output."""
         K = self.mixture.covariance_matrix
         # Cov_ij = sd_i corr_ij sd_j
         scale = (self.variance.squeeze(-1) / K.diagonal(dim1=-1, dim2=-2)).sqrt()
@@ -178,29 +162,18 @@ class LinkedPosterior(TransformedPosterior):
     def quantile(self, value: Tensor) -> Tensor:
         """Return quantiles ``... x q x m``; several levels are a further first dimension."""
         quantiles = [self.marginals.quantile(level) for level in value.flatten().tolist()]
-        return torch.stack(quantiles) if len(quantiles) > 1 else quantiles[0]
+        return torch.stack(quantiles).squeeze(0)
 
     def density(self, value: Tensor) -> Tensor:
-        """Return the density of each output at each point, at values ``... x q x m``."""
+        """Return the density at values ``... x q x m``."""
         return self.marginals.log_density(value).exp()
 
     def scalarized(self, weights: Tensor, offset: float = 0.0) -> TransformedPosterior:
-        """Return the posterior of one output times its weight, plus an offset."""
-        outputs = weights.nonzero().flatten().tolist()
-        mean, K = self.mixture.gaussians
-        if weights.shape != mean.shape[-2:-1] or len(outputs) != 1:
-            raise ValueError(
-                f"Expected the weight of one of {mean.shape[-2]} outputs with a link; found "
-                f"{weights.tolist()}. Sum samples: objective=LinearMCObjective(weights)."
-            )
-        w = weights.sum()
-        mixture = MixturePosterior(mean[..., outputs, :], K[..., outputs, :, :])
-        of_output = LinkedPosterior(mixture, self.link.of_outputs(outputs))
-        # w y + offset has the mean w E + offset and the variance w^2 Var
-        return TransformedPosterior(
-            of_output, lambda y: w * y + offset,
-            lambda mean, _: w * mean + offset, lambda _, variance: w.square() * variance,
-        )  # fmt: skip
+        """Raise a TypeError: a sum of outputs with a link has no closed form."""
+        raise TypeError(
+            "Expected no scalarisation of outputs with a link. Take samples, "
+            "objective=LinearMCObjective(weights), or one output, model.subset_output([0])."
+        )
 
 
 class NotGaussian(OutcomeTransform):
@@ -216,12 +189,9 @@ class Linked(GP):
 
     Data, predictions, intervals, samples and functions are in the user's units and within the
     bounds. A logarithm makes rho an exponent and errors relative. Predictions are medians, with the
-    square of half the width of the central 68.27 % as variance, see :class:`LinkedMarginals`. The
-    delta method gives the variances of g(y) from known variances of y. Acquisition functions by
-    samples average y, however rare large values are;
-    ``objective=GenericMCObjective(lambda Y, X=None: Y[..., 0].log())`` makes them search on the
-    scale of g. ``term``, ``rho``, ``delta`` and the summary are on the scale of g, as are kernels
-    and means among the arguments.
+    square of half the width of the central 68.27 % as variance. ``term``, ``rho``, ``delta`` and
+    the summary are on the scale of g, as are kernels and means among the arguments. To search on
+    this scale, pass ``objective=GenericMCObjective(lambda Y, X=None: Y[..., 0].log())``.
 
     Args as of the structure, and:
 
@@ -239,8 +209,7 @@ class Linked(GP):
         >>> from gpadjust.core import fit
         >>> from gpadjust.kinds.links import LinkedCKA
         >>> X = torch.linspace(0.1, 2, 8, dtype=torch.float64).unsqueeze(-1)
-        >>> share = 1 - (-X).exp()
-        >>> model = LinkedCKA(X, share, physics=lambda X: X / (1 + X), link="logit")
+        >>> model = LinkedCKA(X, 1 - (-X).exp(), physics=lambda X: X / (1 + X), link="logit")
         >>> result = fit(model)
         >>> lower, upper = model.interval(torch.tensor([[0.0001], [9.0]]).double())
         >>> bool((lower > 0).all() and (upper < 1).all())
@@ -253,7 +222,7 @@ class Linked(GP):
         self, train_X: Any, train_Y: Any, train_Yvar: Any = None, *, link: Any = "log",
         **options: Any,
     ) -> None:  # fmt: skip
-        self.link = Link.of(link)
+        self.link = Link.parse(link)
         super().__init__(train_X, train_Y, train_Yvar, **options)
         self.settings["link"] = link
 
@@ -268,21 +237,18 @@ class Linked(GP):
 
     def holds(self, Y: Tensor) -> Tensor:
         """Return which values are within the bounds, or NaN."""
-        return self.link.holds(Y)
+        return self.link.covers(Y)
 
     def on_gaussian_scale(self, Y: Tensor) -> Tensor:
         """Return g of targets or outputs; raise a ValueError outside of the bounds."""
         outside = ~self.holds(Y)
         if outside.any():
             rows = marked_rows(outside.any(-1))
-            limits = f"above {self.link.lower:g}"
-            if math.isfinite(self.link.upper):
-                limits += f" and below {self.link.upper:g}"
             raise ValueError(
-                f"Expected targets {limits} for the link {self.link.formula}; found "
-                f"{float(Y[outside][0]):.6g} in {len(rows)} row(s), the first row {rows[0]}. "
-                "Correct them, make them NaN if they are missing, or give other bounds: "
-                "link=(lower, upper)."
+                f"Expected targets above {self.link.lower:g} and below {self.link.upper:g} for the "
+                f"link {self.link.formula}; found {float(Y[outside][0]):.6g} in {len(rows)} "
+                f"row(s), the first row {rows[0]}. Correct them, make them NaN if they are "
+                "missing, or give other bounds: link=(lower, upper)."
             )
         return self.link.value(Y)
 
@@ -291,7 +257,7 @@ class Linked(GP):
         return self.link.inverse(Z)
 
     def noise_in_units(self, Y: Tensor, Yvar: Tensor) -> Tensor:
-        """Return known variances of targets by the delta method, ``... x m x n``, in units."""
+        """Return known variances by the delta method, ``... x m x n``, in units."""
         # Var g(y) = (dg/dy)^2 Var y
         variances = super().noise_in_units(Y, Yvar) * (2 * self.link.log_slope(Y)).exp().mT
         # A missing target has no slope: any variance will do.
@@ -299,14 +265,14 @@ class Linked(GP):
         return variances.where(~variances.isnan(), mean).nan_to_num(nan=1.0)
 
     def usual_noise(self, Y: Tensor) -> Tensor | None:
-        """Return the mean of the known variances of g, as variances of observations."""
+        """Return the mean of the known variances of g, as variances of y."""
         if self.noise.known is None:
             return None
         variances = (self.noise.known.mean(-1, keepdim=True) * self.unit.square()).mT
         return variances * (-2 * self.link.log_slope(Y)).exp()
 
     def log_jacobian(self) -> Tensor:
-        """Return the log density of the targets in the user's units less that of g, ``m``."""
+        """Return the log density of the targets less that of g, ``m``."""
         return super().log_jacobian() + self.link.log_slope(self.data.Y).nansum(-2)
 
     def _noise_at(self, X: Tensor, asked: bool | Tensor) -> Tensor:
@@ -317,7 +283,7 @@ class Linked(GP):
         return self.noise_in_units(self.marginals(X).quantile(0.5), variances).unsqueeze(-3)
 
     def marginals_of(self, means: Tensor, variances: Tensor) -> LinkedMarginals:
-        """Return the distributions of components on the scale of g, ``... x S x q x m``."""
+        """Return the distributions of components of g, ``... x S x q x m``."""
         return LinkedMarginals(means, variances, self.link)
 
     def posterior_of(self, mixture: MixturePosterior, outputs: Any) -> LinkedPosterior:
@@ -333,33 +299,28 @@ class Linked(GP):
     def as_single_task_gp(self, draw: int | None = None) -> Any:
         """Raise a TypeError: BoTorch's SingleTaskGP has no link."""
         raise TypeError(
-            f"{type(self).__name__} is Gaussian in {self.link.formula}, not in y: give its "
-            "posterior, samples or functions to code that takes a SingleTaskGP."
+            f"{type(self).__name__} is Gaussian in {self.link.formula}, not in y: use its "
+            "posterior, samples or functions in place of a SingleTaskGP."
         )
 
 
 @cache
 def linked(structure: Any) -> type[Linked]:
-    """Return the class of a structure with a link; :func:`save` needs a name in this module.
-
-    Example:
-        >>> linked(CKA).__name__
-        'LinkedCKA'
-    """
+    """Return the class of a structure, such as CKA, with a link."""
     if not isinstance(structure, type) or not issubclass(structure, GP):
         raise TypeError(f"Expected a structure, such as CKA; found {structure!r}.")
     if issubclass(structure, Linked):
         return structure
     name = structure.__name__
     text = f":class:`~gpadjust.core.{name}` of outputs with bounds, see :class:`Linked`."
-    members = {"__doc__": text, "__module__": __name__}
+    members = {"__doc__": text, "__module__": __name__}  # the module, as files name it
     linked_structure: Any = type(f"Linked{name}", (Linked, structure), members)
     return linked_structure
 
 
-LinkedCKA = linked(CKA)
-LinkedRRA = linked(RRA)
-LinkedPhysicsMeanGP = linked(PhysicsMeanGP)
-LinkedScaleGP = linked(ScaleGP)
-LinkedZeroMeanGP = linked(ZeroMeanGP)
-LinkedCalibratedPhysics = linked(CalibratedPhysics)
+LinkedCKA = linked(structures.CKA)
+LinkedRRA = linked(structures.RRA)
+LinkedPhysicsMeanGP = linked(structures.PhysicsMeanGP)
+LinkedScaleGP = linked(structures.ScaleGP)
+LinkedZeroMeanGP = linked(structures.ZeroMeanGP)
+LinkedCalibratedPhysics = linked(structures.CalibratedPhysics)

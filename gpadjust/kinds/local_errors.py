@@ -21,12 +21,9 @@ _ROUNDING = 1e-6  # of the targets' spread
 
 
 class Widened(Wrapper):
-    """A model whose variances, except known ones of noise, are multiplied by a factor.
+    """A model whose variances, except known ones of noise, are multiplied by ``factors``."""
 
-    A subclass defines ``factors``, and in ``numbers`` the names of buffers with a row per output.
-    """
-
-    numbers: tuple[str, ...]
+    numbers: tuple[str, ...]  # names of buffers with a row per output
 
     def __init__(self, model: GP) -> None:
         check_kind("model", model, GP, "a model of gpadjust.core, fitted")
@@ -99,17 +96,11 @@ class LocalErrors(Widened):
     .. math:: \max\Big(1, \frac{a + \sum_i k(x, x_i) z_i^2}{a + \sum_i k(x, x_i)}\Big),
 
     with an RBF kernel k of the shortest lengthscale of all terms for each input, and a = 1.
-    Locally weighted conformal prediction (Lei et al. 2018) has such a scale, too, from a model of
-    residuals. Here there is no guarantee: left-out observations took part in the fit of
-    hyper-parameters.
+    Locally weighted conformal prediction (Lei et al. 2018) has such a scale, too. Here there is no
+    guarantee: left-out observations took part in the fit of hyper-parameters.
 
     Args:
         model: The fitted model; each of its kernels has a lengthscale for each input.
-
-    Attributes:
-        squares: :math:`z_i^2`, ``m x n``; 1 where an observation is missing.
-        points: The inputs of kernels, ``n x d``.
-        lengthscale: The lengthscales of k, ``m x 1 x d``.
 
     Example:
         >>> from gpadjust.core import ZeroMeanGP
@@ -126,7 +117,7 @@ class LocalErrors(Widened):
         super().__init__(model)
         Y = model.on_gaussian_scale(self.data.Y)
         d = self.data.X.shape[-1]
-        self.points = Buffer(model.kernel_inputs(self.data.X))
+        self.points = Buffer(model.kernel_inputs(self.data.X))  # n x d
         scales = [v for name, v in model.values.items() if name.endswith(".kernel.lengthscale")]
         has_kernels = sum(term.kernel is not None for term in model.terms)
         if len(scales) < has_kernels or any(v.shape[-1] != d for v in scales):
@@ -140,7 +131,7 @@ class LocalErrors(Widened):
         # z_i^2 = (y_i - m_i)^2 / v_i, with a floor of v_i for data without noise
         spread = _ROUNDING * (Y - Y.nanmean(-2, keepdim=True)).square().nanmean(-2).sqrt()
         squares = (Y - mean).square() / variance.maximum(spread.square())
-        self.squares = Buffer(squares.nan_to_num(nan=1.0, posinf=1.0).mT)
+        self.squares = Buffer(squares.nan_to_num(nan=1.0, posinf=1.0).mT)  # m x n
 
     def factors(self, X: Tensor) -> Tensor:
         """Return the factors at inputs ``... x q x d``, ``... x q x m``."""

@@ -38,8 +38,7 @@ class NoisyInputs(RowNoise):
         \mathrm{Var} = \sum_j P_j (\partial_j f)^2 + \tfrac12 (P_j \partial_j^2 f)^2.
 
     The first part of the variance is that of McHutchon and Rasmussen (2011). f is f_p at first,
-    and then the posterior mean of rough fits. Differences over :math:`\pm \sqrt{3 P_j}` give both
-    sums exactly up to the fifth order of each input. Later observations have exact inputs.
+    and then the posterior mean of rough fits. Later observations have exact inputs.
 
     Args:
         train_X: The measured inputs, ``n x d``: a float64 tensor, an array or a frame.

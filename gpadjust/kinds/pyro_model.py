@@ -20,15 +20,14 @@ def pyro_model(
 
     .. math:: y = f_p(x) + \varphi(x)^T \beta + \epsilon, \quad \beta \sim N(0, I).
 
-    Its sample sites are ``"weights"``, ``m x p``, and ``"Y"``, ``m x n``. A draw of the model gives
-    lengthscales, variances and unknown parameters of the physics. The posterior of the weights is
-    normal, ``Weights.of_model(model)`` of ``gpadjust.kinds.updates``.
+    Its sample sites are ``"weights"``, ``m x p``, and ``"Y"``, ``m x n``. The posterior of the
+    weights is normal, ``Weights.condition(model)`` of ``gpadjust.kinds.updates``.
 
     Args:
         model: An :class:`~gpadjust.core.RRA`, or another model whose kernels are ``Fourier``.
         X: Inputs, ``n x d``. Default: the training inputs, with the training targets.
         Y: Observations, ``n x m``. Default: none; Pyro samples them.
-        draw: The number of the draw.
+        draw: The number of the draw of lengthscales, variances and unknown parameters.
 
     Returns:
         The weights, and the function ``n x m``, in the user's units (of a link on its scale).

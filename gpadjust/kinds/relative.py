@@ -25,8 +25,7 @@ class RelativeNoise(Noise):
 
     The size g is the physics (the sum of several, with the prior means of the rhos) over its root
     mean square at the training inputs. In a model without physics, g is the posterior mean of rough
-    fits at the training inputs; between them, an RBF kernel of half the shortest lengthscale
-    averages the logarithms of g. The numbers are named ``noise.constant`` and ``noise.relative``.
+    fits there, whose logarithms an RBF kernel of half the shortest lengthscale averages.
 
     Args:
         sizes: Results of a fit without physics: training inputs ``m x n x d``, log sizes
@@ -128,7 +127,6 @@ class RelativeNoise(Noise):
         return self._changed(lambda v: v.to(like))
 
     def _changed(self, change: Callable[[Tensor], Tensor]) -> RelativeNoise:
-        """Return the noise with changed tensors."""
         new = copy(self)
         if self.sizes is not None:
             new.sizes = tuple(map(change, self.sizes))

@@ -29,9 +29,6 @@ class Updated(Widened):
 
     .. math:: \max\Big(1, \frac{a + \sum_k \lambda^k z_k^2}{a + \sum_k \lambda^k}\Big), \quad
         a = 10.
-
-    Attributes:
-        recent: Both sums, ``m x 2``.
     """
 
     numbers = ("recent",)
@@ -39,7 +36,7 @@ class Updated(Widened):
 
     def __init__(self, model: GP) -> None:
         super().__init__(model)
-        self.recent: Tensor = Buffer(model.unit.new_zeros(model.num_outputs, 2))
+        self.recent: Tensor = Buffer(model.unit.new_zeros(model.num_outputs, 2))  # both sums
 
     def factors(self, X: Tensor) -> Tensor:
         """Return the factors of all inputs, ``1 x m``."""
@@ -49,15 +46,10 @@ class Updated(Widened):
 
     @torch.no_grad()
     def update(self, X: ArrayLike, Y: ArrayLike, noise: Tensor | None = None) -> Self:
-        """Update the model by observations, the newest last.
+        """Update the model by observations ``k x m`` at inputs ``k x d``, the newest last.
 
-        Args:
-            X: Inputs ``k x d``, of the type of the training inputs.
-            Y: Observations ``k x m``; NaN where one is missing.
-            noise: Variances of the observations, if the model has known ones.
-
-        Raises:
-            ValueError: If the data are invalid; the model is then as before.
+        The variances of their noise belong to models with known ones. If data are invalid, a
+        ValueError is raised, and the model is as before.
         """
         X = self.data.new_inputs(X)
         if X.dim() != 2 or not len(X):
@@ -86,10 +78,7 @@ class Updated(Widened):
 
 
 class Window(Updated):
-    """A model of the last observations.
-
-    The unknown numbers and units come from the fit. The attribute ``model`` is the model of the
-    last rows, with all its methods.
+    """A model of the last observations, the attribute ``model``, in the units of the fit.
 
     Args:
         model: Any fitted model with an exact posterior and a noise without corrections of rows.
@@ -116,24 +105,19 @@ class Kalman(Updated):
     r"""A ridge regression adjustment with recursive updates of its weights.
 
     The posterior of the weights of the features, in units of their prior N(0, I), has the
-    precision :math:`\Lambda` and the mean :math:`\Lambda^{-1} h`. An observation
-    :math:`y = \varphi^T \beta + \epsilon` adds to both. Before, with
-    :math:`\lambda = e^{-1 / \tau}`, old observations fade, but not the prior (stabilised
-    forgetting, Kulhavy and Zarrop 1993):
+    precision :math:`\Lambda` and the mean :math:`\Lambda^{-1} h`. For each observation
+    :math:`y = \varphi^T \beta + \epsilon`, with :math:`\lambda = e^{-1 / \tau}`, old ones fade, but
+    not the prior (stabilised forgetting, Kulhavy and Zarrop 1993):
 
     .. math:: \Lambda \leftarrow \lambda \Lambda + (1 - \lambda) I + \varphi \varphi^T / \sigma^2,
         \quad h \leftarrow \lambda h + \varphi y / \sigma^2.
 
     This is a Kalman filter in information form, for each draw of the model. An observation of
-    :math:`k` steps ago counts as one with the noise :math:`\sigma^2 e^{k / \tau}`; no variance
-    grows beyond the prior's. Observations are not stored.
+    :math:`k` steps ago counts as one with the noise :math:`\sigma^2 e^{k / \tau}`.
 
     Args:
         model: A fitted :class:`~gpadjust.RRA`, or another model whose kernels are ``Fourier``.
         forget: :math:`\tau`, in observations; infinity, the default, forgets nothing.
-
-    Attributes:
-        model: The model with the posterior of the weights, and the data of the fit.
     """
 
     def __init__(self, model: GP, forget: float = math.inf) -> None:
@@ -144,22 +128,16 @@ class Kalman(Updated):
         kernels = [term.kernel for term in model.terms if term.kernel is not None]
         if not all(isinstance(kernel, Fourier) for kernel in kernels):
             raise TypeError(f"Expected an RRA; found kernels {kernels}. Take Window(model, size).")
-        self._weights = Weights.of_model(model)
+        self.weights = Weights.condition(model)
         self.models.append(_of_rows(model, torch.arange(2)))  # checks and scales observations
 
     @property
     def model(self) -> GP:
         """The model with the posterior of the weights."""
         if not isinstance(self.models[0].conditioning(), Weights):  # lost by a move to a device
-            self._weights = self._weights.moved_to(self.models[0])
-            self.models[0] = self.models[0].with_conditioning(self._weights)
+            self.weights = self.weights.moved_to(self.models[0])
+            self.models[0] = self.models[0].with_conditioning(self.weights)
         return super().model
-
-    @property
-    def weights(self) -> Weights:
-        """The posterior of the weights."""
-        weights: Any = self.model.conditioning()
-        return weights
 
     def term(self, name: str, X: ArrayLike) -> MixturePosterior:
         """Return the joint posterior of a term's process at ``X``, as :meth:`GP.term` does."""
@@ -174,25 +152,22 @@ class Kalman(Updated):
     def subset_output(self, idcs: list[int]) -> Self:
         """Return the model of some outputs; raise a ValueError for an unknown number."""
         new = super().subset_output(idcs)
-        new._weights = self.weights.moved_to(new.models[0], idcs)
+        new.weights = self.weights.moved_to(new.models[0], idcs)
         return new
 
     def _updated(self, more: GP, f: WeightedSum, noise: Tensor, targets: Tensor) -> GP:
-        self._weights = self.weights.updated(f, noise, targets - f.mean, self.forget)
-        return self.model.with_conditioning(self._weights)
+        model = self.model  # before the weights are others
+        self.weights = self.weights.updated(f, noise, targets - f.mean, self.forget)
+        return model.with_conditioning(self.weights)
 
 
 class Weights:
-    r"""The posterior of the weights of Fourier features, as the conditioning of a model.
-
-    Args:
-        train: The function at the training inputs of the model.
-        precision: :math:`\Lambda`, ``S x m x p x p``.
-        pull: h, ``S x m x p``.
-    """
+    r"""The posterior of the weights of Fourier features, as the conditioning of a model."""
 
     def __init__(self, train: WeightedSum, precision: Tensor, pull: Tensor) -> None:
-        self.train, self.precision, self.pull = train, precision, pull
+        self.train = train  # the function at the training inputs of the model
+        self.precision = precision  # Lambda, S x m x p x p
+        self.pull = pull  # h, S x m x p
         self.alpha = pull  # a model reads whether it has a graph
         # Lambda^-1 = R R^T, with R = L^-T and Lambda = L L^T; the mean is R R^T h.
         chol = torch.linalg.cholesky(precision)
@@ -202,7 +177,7 @@ class Weights:
 
     @classmethod
     @torch.no_grad()
-    def of_model(cls, model: GP) -> Self:
+    def condition(cls, model: GP) -> Self:
         """Return the weights conditioned on the data of a model."""
         data = model.conditioning()
         residual = data.targets - data.train.mean
@@ -212,14 +187,7 @@ class Weights:
         return prior.updated(data.train, data.noise, residual, math.inf)
 
     def updated(self, f: WeightedSum, noise: Tensor, residual: Tensor, forget: float) -> Self:
-        r"""Return the weights conditioned on further observations of a sum, the newest last.
-
-        Args:
-            f: The sum at the inputs.
-            noise: Variances, ``S x m x k``.
-            residual: Targets less their prior mean, ``S x m x k``; NaN where one is missing.
-            forget: :math:`\tau`.
-        """
+        """Return the weights given further residuals ``S x m x k`` of a sum, the newest last."""
         k = residual.shape[-1]
         phi = design(f)
         # Of k observations the first has the weight lambda^(k - 1) / sigma^2, the last 1 / sigma^2.
@@ -254,12 +222,10 @@ class Weights:
 
 def design(f: WeightedSum) -> Tensor:
     """Return the features of a sum by its kernels, ``... x S x m x n x p``, for weights N(0, I)."""
-    generator = torch.Generator()  # not used: Fourier kernels have fixed frequencies
-    features = {
-        term.name: term.kernel.features(f.own(term), 0, generator)
-        for term in f.terms
-        if term.kernel is not None
-    }
+    features = {}
+    for term in f.terms:
+        if term.kernel is not None:  # of fixed frequencies, which need no generator
+            features[term.name] = term.kernel.features(f.own(term), 0, torch.Generator())
     return f.features(features)
 
 

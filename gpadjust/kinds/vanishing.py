@@ -28,8 +28,7 @@ class Vanishing(Kernel):
 
     .. math:: k_R(x_R, x'_R) \, [k_S(x_S, x'_S) - k_S(x_S, V) \, k_S(V, V)^{-1} k_S(V, x'_S)]
 
-    (conditioning, Rasmussen and Williams 2006, eq. 2.19). Values of one input are hyperplanes,
-    values of all inputs points. The observations there determine unknown parameters of the physics.
+    (conditioning, Rasmussen and Williams 2006, eq. 2.19).
 
     Args:
         where: Values of columns, by name or number, in the user's units: ``{"valve": 1.0}``,
@@ -39,9 +38,8 @@ class Vanishing(Kernel):
         kernel: k, of this library or GPyTorch. Default: RBF.
 
     Raises:
-        ValueError: If ``where`` is empty, not finite or of another shape. When a model is built, if
-            a column does not exist, a transform of the inputs mixes columns, or k is not a product
-            over S and R.
+        ValueError: If ``where`` is empty, not finite or of another shape, a column does not exist,
+            a transform of the inputs mixes columns, or k is not a product over S and R.
 
     Example:
         >>> import torch

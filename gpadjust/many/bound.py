@@ -29,7 +29,7 @@ def at_points(total: WeightedSum, points: Tensor) -> WeightedSum:
     return WeightedSum(total.terms, total.values, x, select(total.mean), weights)
 
 
-def part_of(total: WeightedSum, name: str, is_in: bool) -> WeightedSum:
+def split_off(total: WeightedSum, name: str, is_in: bool) -> WeightedSum:
     """Return the term of a name alone, or the sum without it."""
     weights = {n: w for n, w in total.weights.items() if (n == name) is is_in}
     return WeightedSum(total.terms, total.values, total.x, total.mean, weights)
@@ -60,11 +60,8 @@ class Sums(NamedTuple):
     def over_rows(
         cls, total: WeightedSum, points: Tensor, residual: Tensor, weight: Tensor
     ) -> Sums:
-        """Return the sums of residuals and weights ``S x m x n``, without a graph.
-
-        Sums of k k^T would be faster, but the nugget divides their rounding errors, which are then
-        larger than the information of the points where variances are far above the noise.
-        """
+        """Return the sums of residuals and weights ``S x m x n``, without a graph."""
+        # Sums of k k^T would be faster, but the nugget divides their rounding errors.
         with torch.no_grad():
             inducing = at_points(total, points)
             root = root_of(inducing)
@@ -85,23 +82,15 @@ def bound(
     r"""Return the evidence lower bound of Titsias (2009), and its derivatives.
 
     With :math:`\Lambda = I + \sum_i w_i v_i v_i^T`, :math:`c = \sum_i w_i r_i v_i` and weights
-    :math:`w_i = 1 / \sigma_i^2`, it is
+    :math:`w_i = 1 / \sigma_i^2`, it is, at the best distribution of the inducing values,
 
     .. math::
         -\tfrac12 \Big(\sum_i \log \frac{2 \pi}{w_i} + \log |\Lambda| + \sum_i w_i r_i^2
-        - c^T \Lambda^{-1} c + \sum_i w_i (k_{ii} - v_i^T v_i)\Big),
+        - c^T \Lambda^{-1} c + \sum_i w_i (k_{ii} - v_i^T v_i)\Big).
 
-    at the best distribution of the inducing values, :math:`v \sim N(\Lambda^{-1} c, \Lambda^{-1})`.
     Derivatives by the covariances of a block of rows at a time are pulled back by autograd.
-
-    Args:
-        total: The sum that the inducing points stand for, at the rows.
-        points: The numbers of the rows that are inducing points, ``m x M``.
-        rest: A further sum, which is noise to the inducing values.
-        residual: The targets less their means, ``S x m x n``; 0 for a missing target.
-        noise: The variances of the noise, ``S x m x n`` (or 1).
-        observed: False for missing targets, ``m x n``.
-        with_gradient: If True, compute the derivatives.
+    The inducing points are rows ``m x M`` of the total; the rest is noise to the inducing values.
+    Residuals are ``S x m x n``, 0 where a target is not observed, noise variances too (or 1).
     """
     values = {name: v.detach().clone().requires_grad_() for name, v in total.values.items()}
     weights = {n: w.detach().expand(residual.shape).clone() for n, w in total.weights.items()}

@@ -22,13 +22,8 @@ class SparseConditioning(Conditioning):
     :math:`\bar f + e^T (I + D)^{-1} E K_{uf} W r` and variances
     :math:`k(x, x) - e^T D (I + D)^{-1} e`.
 
-    Args:
-        total: The sum that the inducing points stand for, at all rows.
-        points: The numbers of the rows that are inducing points, ``m x M``.
-        prior: The variances of the observed sum at all rows, ``S x m x n``.
-        noise: The variances of the noise.
-        rest: The variances of the further sum that is noise to the inducing values.
-        targets: The observations, ``1 x m x n``; NaN where one is missing.
+    The points are rows ``m x M`` of the total. Prior, noise and rest are variances of the observed
+    sum, of the noise, and of the sum that is noise to the inducing values, at all rows.
     """
 
     def __init__(
@@ -67,7 +62,7 @@ class SparseConditioning(Conditioning):
         return -0.5 * (sizes + misfits + by_points.sum(-1))
 
     def inverse_factor(self) -> Tensor:
-        """Return F, with variances :math:`k(x, x) - |F k|^2` by covariances k with u."""
+        """Return F, with variances k(x, x) - |F k|^2 by covariances k with u."""
         return self.inverse
 
     def update(self, prior: Tensor, generator: torch.Generator) -> Tensor:
@@ -78,26 +73,22 @@ class SparseConditioning(Conditioning):
         move = self.white_mean + (1 + self.gain).rsqrt() * noise - white
         return (self.basis.mT @ move.unsqueeze(-1)).squeeze(-1)
 
-    def at_rows(self, rows: slice) -> tuple[Tensor, Tensor, Tensor]:
-        """Return mean, posterior and prior variance of the function of inducing values, at rows."""
-        e = self.basis @ self.train.cross(self.total.of_rows(rows))
-        mean = self.total.mean[..., rows] + (self.white_mean.unsqueeze(-2) @ e).squeeze(-2)
-        squares = e.square()
-        return mean, (squares / (1 + self.gain).unsqueeze(-1)).sum(-2), squares.sum(-2)
-
     def leverage(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return means, variances given the inducing values, and variances h by these, at rows."""
-        parts = [self.at_rows(rows) for rows in blocks(self.targets.shape[-1], self.chol)]
+        parts = []
+        for rows in blocks(self.targets.shape[-1], self.chol):
+            e = self.basis @ self.train.cross(self.total.of_rows(rows))
+            mean = self.total.mean[..., rows] + (self.white_mean.unsqueeze(-2) @ e).squeeze(-2)
+            squares = e.square()
+            h = (squares / (1 + self.gain).unsqueeze(-1)).sum(-2)
+            parts.append((mean, h, squares.sum(-2)))
         mean, h, explained = (torch.cat(part, -1) for part in zip(*parts, strict=True))
         return mean, (self.prior - explained).clamp_min(0.0), h
 
     def left_out(self) -> tuple[Tensor, Tensor]:
-        r"""Return means and variances of each observation given all others, noise included.
-
-        In the linear model of the inducing values a row has a variance h and a leverage
-        :math:`H = w h`. Without the row, the residual is :math:`(y - m) / (1 - H)` and the variance
-        :math:`h / (1 - H)`.
-        """
+        """Return means and variances of each observation given all others, noise included."""
+        # In the linear model of the inducing values a row has a variance h and a leverage H = w h.
+        # Without the row, the residual is (y - m) / (1 - H) and the variance h / (1 - H).
         mean, conditional, h = self.leverage()
         free = (1 - self.weight * h).clamp_min(1e-9)  # 1 - H
         variance = conditional + h / free + self.noise
@@ -106,15 +97,9 @@ class SparseConditioning(Conditioning):
 
 
 class LaterConditioning(Conditioning):
-    r"""A posterior by inducing values, given further observations exactly.
+    """An old posterior by inducing values, given further observations exactly.
 
     The late rows are observations of a Gaussian process with the old posterior as its prior.
-
-    Args:
-        old: The old posterior.
-        late: The observed sum at the late rows, with all its terms.
-        noise: The variances of their noise.
-        targets: Their observations.
     """
 
     def __init__(
@@ -174,14 +159,15 @@ class LaterConditioning(Conditioning):
 
     def left_out(self) -> tuple[Tensor, Tensor]:
         """Raise an error: the formula does not cover the rows of the fit."""
-        raise NotImplementedError(
-            "Left-out predictions need a model without observations since its fit; found "
-            f"{self.targets.shape[-1]}. Build a model of all data and fit it."
+        number = self.targets.shape[-1]
+        message = (
+            f"Expected no observations since the fit for left-out predictions; found {number}."
         )
+        raise NotImplementedError(f"{message} Build a model of all data and fit it.")
 
 
 def joined(old: WeightedSum, late: WeightedSum) -> WeightedSum:
-    """Return a sum at the places of two; terms of the late one alone have no weight at the old."""
+    """Return a sum at the places of two; further terms of the late one have no weight before."""
     zero = torch.zeros_like(old.mean)
     weights = {n: appended(old.weights.get(n, zero), w, -1) for n, w in late.weights.items()}
     mean = appended(old.mean, late.mean, -1)

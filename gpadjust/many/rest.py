@@ -19,6 +19,7 @@ _NEIGHBOURS = 128
 _LEAST = 8  # neighbours needed for a comparison
 _STARTS = (-1.0, -2.0)  # of searches, coordinates of lengthscales: shorter than the prior median
 _CHANCE = 1e-3  # probability of a rest in pure noise, at most
+_START = "rest.kernel."  # of the names of the numbers of its kernel
 
 
 @torch.no_grad()
@@ -32,15 +33,8 @@ def rest_of(
     Close rows share this function, but not the noise: the residuals of groups of neighbours are
     :math:`N(0, k + \sigma^2 I)`, with the kernel k. A likelihood ratio test (Wilks 1938) decides
     whether there is a rest, with a thousandth of false alarms: over distances with few neighbours
-    a rest looks like noise, and must not replace it.
-
-    Args:
-        posterior: The posterior without rest.
-        kernel: k, of the term ``rest``.
-        table: The table of the unknown numbers of k and of the noise.
-        begin: The numbers of the noise that contains the rest.
-        noise: Returns the variances of the noise, ``S x m x n`` (or 1), by its numbers.
-        seed: Seed of the places.
+    a rest looks like noise, and must not replace it. The posterior is that without rest, the table
+    that of k and of the noise, whose variances ``noise`` returns; they begin with the whole rest.
     """
     x = posterior.total.x[0, 0]
     n = posterior.num_rows
@@ -56,8 +50,7 @@ def rest_of(
     nearest = torch.cdist(x[centers] / spread, x / spread).topk(k, largest=False).indices
     groups = x[nearest].unsqueeze(-3).unsqueeze(-3)
 
-    def of_groups(v: Tensor) -> Tensor:
-        """Return ``G x S x m x k`` of values ``S x m x n`` (or 1)."""
+    def of_groups(v: Tensor) -> Tensor:  # G x S x m x k of S x m x n (or 1)
         return v.expand(*v.shape[:-1], n)[..., nearest].movedim(-2, 0)
 
     # A fit takes the share H of the noise out of a residual: divide by sqrt(1 - H).
@@ -70,13 +63,12 @@ def rest_of(
     residual = residual.nan_to_num()
 
     def likelihood(has_rest: bool) -> Callable[..., tuple[Tensor, Tensor]]:
-        """Return the log density of the residuals, with k or without, as a function of u."""
-
         def log_density(u: Tensor, with_gradient: bool = True) -> tuple[Tensor, Tensor]:
             leaf = u.detach().requires_grad_()
             with torch.set_grad_enabled(with_gradient):
                 values = table.values(leaf)
-                K = has_rest * kernel.covariance(_of_kernel(values), groups)
+                numbers = {n.removeprefix(_START): v for n, v in values.items() if _START in n}
+                K = has_rest * kernel.covariance(numbers, groups)
                 variance = of_groups(noise(values)).expand(K.shape[:-1])
             residuals = residual.expand(K.shape[:-1])
             result = log_likelihood(residuals, K, variance, observed, with_gradient)
@@ -94,7 +86,7 @@ def rest_of(
     starts = []
     for start in _STARTS:
         values = {name: 0.7 * value for name, value in begin.items()}
-        values["rest.kernel.outputscale"] = 0.3 * size
+        values[f"{_START}outputscale"] = 0.3 * size
         u = size.new_full((1, table.problems, table.size), start)
         starts.append(table.with_values(u, values))
     with_rest = likelihood(True)
@@ -109,12 +101,6 @@ def rest_of(
     # Groups determine the noise; the rest is what noise and predicted variances leave of all.
     values = table.values(best)
     other = (conditional + noise(values)).mean(-1, keepdim=True)
-    if "rest.kernel.outputscale" in values:
-        values["rest.kernel.outputscale"] = (size - other).maximum(1e-9 * size)
+    if f"{_START}outputscale" in values:
+        values[f"{_START}outputscale"] = (size - other).maximum(1e-9 * size)
     return values, statistic > chdtri(degrees, _CHANCE)
-
-
-def _of_kernel(values: Values) -> Values:
-    """Return the numbers of the kernel of the rest, by their names in the kernel."""
-    start = "rest.kernel."
-    return {n.removeprefix(start): v for n, v in values.items() if n.startswith(start)}

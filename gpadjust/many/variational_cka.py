@@ -17,7 +17,7 @@ from gpadjust.core.posterior import MixturePosterior
 from gpadjust.core.sample import maximise
 from gpadjust.core.terms import WeightedSum
 from gpadjust.core.unknowns import Table, Values
-from gpadjust.many.bound import at_points, bound, part_of
+from gpadjust.many.bound import at_points, bound, split_off
 from gpadjust.many.conditioning import LaterConditioning, SparseConditioning
 from gpadjust.many.rest import rest_of
 
@@ -35,36 +35,27 @@ class VariationalCKA(CKA):
 
     The model is :class:`~gpadjust.CKA`, with its values at ``num_inducing`` rows in place of all
     rows (Titsias 2009), so that a fit takes :math:`O(n M^2)` instead of :math:`O(n^3)` operations.
-    A term of its own, ``rest``, has the function that these points cannot resolve:
-
-    .. math:: f_a(x) = \rho(x) f_p(x) + \delta(x) + r(x)
-
-    r is noise to the inducing values, but a part of f and of :meth:`delta`: without it intervals
-    would be far too narrow. The residuals of close rows determine its size and lengthscales; its
-    kernel is of the same kind as that of delta.
+    A term of its own, ``rest``, has the function that these points cannot resolve. It is noise to
+    the inducing values, but a part of f and of :meth:`delta`: without it intervals would be far too
+    narrow. The residuals of close rows determine its size and lengthscales.
 
     :func:`~gpadjust.fit` finds the most likely numbers with any method, as so many rows determine
     them. ``log_likelihood`` returns a lower bound. Models of some rows, :meth:`subset_rows`, are
-    exact, as is the conditioning on further observations.
-
-    Args as of :class:`~gpadjust.CKA` except nested models, which large data sets do not need, and:
+    exact, as is the conditioning on further observations. Args as of :class:`~gpadjust.CKA` except
+    nested models, which large data sets do not need, and:
 
     Args:
-        num_inducing: Number ``M`` of inducing points, at most the number of rows. Time grows with
-            its square.
+        num_inducing: Number ``M`` of inducing points, at most the number of rows.
 
     Attributes:
-        inducing: The numbers of the rows that are inducing points, ``m x M``; None for an exact
-            model of some rows.
+        inducing: The rows that are inducing points, ``m x M``; None for an exact model.
 
     Example:
         >>> import torch
         >>> from gpadjust import VariationalCKA, fit
         >>> train_X = torch.rand(400, 1, dtype=torch.float64)
-        >>> train_Y = 2 * torch.sin(6 * train_X) + train_X
-        >>> train_Y = train_Y + 0.1 * torch.randn(400, 1, dtype=torch.float64)
-        >>> f_p = lambda X: torch.sin(6 * X)
-        >>> model = VariationalCKA(train_X, train_Y, physics=f_p, num_inducing=15)
+        >>> train_Y = 2 * train_X.sin() + train_X + 0.1 * torch.randn_like(train_X)
+        >>> model = VariationalCKA(train_X, train_Y, physics=torch.sin, num_inducing=15)
         >>> result = fit(model)
         >>> lower, upper = model.interval(train_X[:3])
     """
@@ -90,14 +81,11 @@ class VariationalCKA(CKA):
         )  # fmt: skip
         if type(self.noise).learnt is not Noise.learnt:
             raise ValueError(
-                f"Expected a noise that needs no rough fits; found {self.noise}. CKA takes it, for "
-                "up to some thousand rows."
+                f"Expected a noise that needs no rough fits; found {self.noise}. CKA takes it."
             )
-        # A saved model is built again by this class, which adds both.
-        del self.settings["nested"], self.settings["extra_terms"]
-        self.settings |= {"num_inducing": num_inducing}
-        if extra_terms:
-            self.settings["extra_terms"] = extra_terms
+        # A saved model is built again by this class, which adds choices and the rest.
+        del self.settings["nested"]
+        self.settings |= {"num_inducing": num_inducing, "extra_terms": [*extra_terms]}
         self.num_inducing = num_inducing
         rows = self._order(0)[:num_inducing]
         self.register_buffer("inducing", rows.expand(self.num_outputs, -1).clone())
@@ -109,8 +97,8 @@ class VariationalCKA(CKA):
         """Return the lower bound; for an exact model of some rows the log likelihood."""
         if self.inducing is None:
             return super().sum_likelihood(train, residual, noise, observed, with_gradient)
-        total = part_of(train, _REST, False)
-        rest = part_of(train, _REST, True)
+        total = split_off(train, _REST, False)
+        rest = split_off(train, _REST, True)
         return bound(total, self.inducing, rest, residual, noise, observed, with_gradient)
 
     def conditioned(
@@ -126,8 +114,8 @@ class VariationalCKA(CKA):
         if old is not None:
             late = slice(old.num_rows, None)
             return LaterConditioning(old, train.of_rows(late), noise[..., late], targets[..., late])
-        total = part_of(train, _REST, False)
-        rest = part_of(train, _REST, True).variance()
+        total = split_off(train, _REST, False)
+        rest = split_off(train, _REST, True).variance()
         return SparseConditioning(total, self.inducing, train.variance(), noise, rest, targets)
 
     def components(
@@ -135,9 +123,9 @@ class VariationalCKA(CKA):
     ) -> tuple[Tensor, Tensor]:
         """Return means and variances of each draw, ``... x S x q x m``; split many points."""
         X = self.data.new_inputs(X)
-        if X.dim() > 2 or len(X) <= _AT_ONCE or isinstance(observation_noise, Tensor):
-            return super().components(X, observation_noise)
         components = super().components
+        if X.dim() > 2 or isinstance(observation_noise, Tensor):
+            return components(X, observation_noise)
         parts = [components(part, observation_noise) for part in X.split(_AT_ONCE)]
         mean, variance = (torch.cat(part, -2) for part in zip(*parts, strict=True))
         return mean, variance
@@ -150,44 +138,36 @@ class VariationalCKA(CKA):
 
     def as_single_task_gp(self, draw: int | None = None) -> NoReturn:
         """Raise an error: a ``SingleTaskGP`` is exact."""
-        raise NotImplementedError(
-            "Expected an exact model; take a model of some rows, "
-            "model.subset_rows(torch.arange(500)).as_single_task_gp()."
-        )
+        way_out = "model.subset_rows(torch.arange(500)).as_single_task_gp()"
+        raise NotImplementedError(f"Expected an exact model; take one of some rows, {way_out}.")
 
     def fit_itself(self, method: str, num_draws: int | None, seed: int) -> FitResult | None:
-        """Find the most likely numbers; after an error the model is as before.
-
-        1. Find the most likely numbers of exact models of some rows.
-        2. By turns, place inducing points where the prior variance given the points before is
-           largest (Burt et al. 2020), and raise the bound of up to 20,000 rows by L-BFGS.
-        3. Condition the inducing values on all rows, in closed form.
-        4. Split the residuals into noise and rest.
-        """
+        """Find the most likely numbers; after an error the model is as before."""
         if self.inducing is None:
             return None
         if num_draws is not None:
             raise ValueError(
-                f"Expected num_draws=None, as so many rows determine the numbers of a "
-                f"VariationalCKA; found {num_draws}. CKA draws them, for up to some thousand rows."
+                "Expected num_draws=None, as so many rows determine the numbers of a "
+                f"VariationalCKA; found {num_draws}. CKA draws them."
             )
         order = self._order(seed)
         work = self.subset_draws(torch.zeros(1, dtype=torch.long))
-        # 1. Exact models of few rows find the mode cheaply.
+        # 1. Find the most likely numbers of exact models of some rows.
         few = work.subset_rows(order[:_FEW])
         some = work.subset_rows(order[:_SEARCHED])
         u = maximise(some.log_likelihood, modes(few, 0, seed)[:1])
-        # 2. Inducing points depend on the numbers, and the bound on the inducing points.
+        # 2. By turns, place inducing points where the prior variance given the points before is
+        # largest (Burt et al. 2020), and raise the bound of up to 20,000 rows by L-BFGS.
         for n, share, iterations in _ROUNDS:
             refined = work.subset_rows(order[:n])
             refined.inducing = refined.points(u, max(1, int(share * self.num_inducing)))
             u = maximise(refined.log_likelihood, u, most=iterations)
-        # 3. All rows.
+        # 3. Condition the inducing values on all rows, in closed form.
         work.inducing = order[refined.points(u, self.num_inducing)]
         work.set_draws(u)
         posterior = work.conditioning()
         assert isinstance(posterior, SparseConditioning)
-        # 4. The rest.
+        # 4. Split the residuals into noise and rest.
         u = work._with_rest(posterior, seed)
         self.inducing = work.inducing
         self.set_draws(u)
@@ -199,13 +179,10 @@ class VariationalCKA(CKA):
 
     @torch.no_grad()
     def points(self, u: Tensor, M: int) -> Tensor:
-        """Return row numbers ``m x M`` of most prior variance, at coordinates ``1 x B x P``.
-
-        These are pivots of the Cholesky factor of the covariance of the first rows.
-        """
+        """Return row numbers ``m x M``, the pivots of the Cholesky factor of the first rows."""
         first = slice(_CANDIDATES * M)
         values = self.table.values(u)
-        total = part_of(self.evaluate(self.data.X, values), _REST, False).of_rows(first)
+        total = split_off(self.evaluate(self.data.X, values), _REST, False).of_rows(first)
         variance = total.variance()[0]
         is_observed = ~self.data.Y[first].isnan().mT
         m, n = is_observed.shape

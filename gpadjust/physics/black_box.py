@@ -27,15 +27,14 @@ class BlackBoxPhysics(Physics):
 
     A call evaluates each distinct row once and remembers its result, even when other rows fail,
     until a parameter or buffer of the physics changes, or dtype and device of the inputs. Call
-    ``forget()`` after other changes. Copies and pickles begin without this memory. The likelihood
-    of unknown parameters, whose values seldom repeat, does without it. Threads may share a physics
-    if what it calls allows that.
+    ``forget()`` after other changes. Copies and pickles begin without this memory. Threads may
+    share a physics if its function allows that.
 
     Args:
         function: Maps a float64 array of rows ``N x d`` to ``N x m``, or ``N`` if ``m`` is 1; with
             ``batched=False``, one row ``(d,)``, and a number for each unknown parameter, to
             ``(m,)`` or a scalar.
-        batched: Whether the function takes all rows at once.
+        batched: If True, the function takes all rows at once.
         gradient: ``"finite-difference"``: central differences give the gradient in X, without
             second derivatives, by ``2 d`` evaluations per row in the backward pass, which are not
             remembered. None: the outputs are constants to autograd.
@@ -75,7 +74,7 @@ class BlackBoxPhysics(Physics):
         self.forget()
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """Return the function's outputs; an error of single rows contains those of the others."""
+        """Return the function's outputs; an error of single rows contains the other outputs."""
         rows = self._table(X, *parameters)
         if self.batched:
             return torch.from_numpy(real_array(self.function(*self._arguments(rows))))
@@ -92,12 +91,18 @@ class BlackBoxPhysics(Physics):
         return tensor.detach().cpu().double().numpy()
 
     def _gathered(self, results: list[NDArray[np.float64] | PhysicsError]) -> Tensor:
-        """Return the outputs of rows ``(m,)`` as ``N x m``; an error if some of them failed."""
+        """Return the outputs of rows ``(m,)`` as ``N x m``; raise an error if some rows failed."""
         m = next((len(y) for y in results if isinstance(y, np.ndarray)), 1)
-        odd = PhysicsError(f"ValueError: found other than {m} output(s), as in other rows")
-        found = [odd if isinstance(y, np.ndarray) and len(y) != m else y for y in results]
-        errors = {i: y for i, y in enumerate(found) if isinstance(y, PhysicsError)}
-        Y = np.stack([np.full(m, np.nan) if isinstance(y, PhysicsError) else y for y in found])
+        Y = np.full((len(results), m), np.nan)  # NaN where a row fails
+        errors = dict[int, PhysicsError]()
+        for i, y in enumerate(results):
+            if isinstance(y, PhysicsError):
+                errors[i] = y
+            elif len(y) != m:
+                message = f"ValueError: found other than {m} output(s), as in other rows"
+                errors[i] = PhysicsError(message)
+            else:
+                Y[i] = y
         if errors:
             first = next(iter(errors.values()))
             raise PhysicsError(
@@ -109,7 +114,7 @@ class BlackBoxPhysics(Physics):
         return torch.from_numpy(Y)
 
     def of_rows(self, rows: Tensor) -> Tensor:
-        """Return the outputs of rows from the memory, with the gradient that was chosen."""
+        """Return the outputs of rows from the memory, with the gradient of this physics."""
         tensors = [*self.parameters(), *self.buffers()]
         # Values are compared, not versions: `p.data.fill_(...)` leaves a tensor's version as it is.
         state = [rows.dtype, rows.device, *(tensor.tolist() for tensor in tensors)]
@@ -123,15 +128,14 @@ class BlackBoxPhysics(Physics):
 
     def forget(self) -> None:
         """Empty the memory; call it after a change that the physics cannot see."""
-        # A new memo: what other threads are evaluating right now ends in the old one.
+        # A new memo, so that rows which other threads are evaluating right now end in the old one.
         self._memo = RowMemo()
 
 
 class RowMemo:
     """A dictionary of at most ``capacity`` input rows to output rows, which threads may share.
 
-    When new rows do not fit, it forgets all and begins again with these. Two threads may evaluate
-    the same row at the same moment. Copies and pickles of it are empty.
+    When new rows do not fit, it forgets all and begins again with these. Copies are empty.
     """
 
     def __init__(self, capacity: int = 100_000) -> None:
@@ -145,44 +149,37 @@ class RowMemo:
     def __reduce__(self) -> tuple[type[RowMemo], tuple[int]]:
         return RowMemo, (self.capacity,)
 
-    def recall(
-        self, rows: Tensor, evaluate: Callable[[Tensor], Tensor], learn: bool = True
-    ) -> Tensor:
-        """Return the values of rows ``N x d``, by a function of distinct rows if not remembered.
-
-        If none is remembered, and none to be learnt, the function is of all rows as they are.
-
-        After its ``PhysicsError`` the finite rows of the ``partial`` result are remembered.
-        """
-        keys, known = row_keys(rows), self._rows  # to which other threads only add
-        if not keys or not (learn or any(key in known for key in keys)):
-            return evaluate(rows)
-        outputs = {key: known[key] for key in keys if key in known}
+    def recall(self, rows: Tensor, evaluate: Callable[[Tensor], Tensor]) -> Tensor:
+        """Return the values of rows ``N x d``, by a function of distinct rows if not remembered."""
+        keys = row_keys(rows)
+        if not keys:
+            return evaluate(rows)  # which sets the number of outputs
+        remembered = self._rows  # to which other threads only add
+        outputs = {key: remembered[key] for key in keys if key in remembered}
         places = {key: i for i, key in enumerate(keys) if key not in outputs}
         if places:
             new = [*places]
             try:
                 values = evaluate(rows[[*places.values()]])
             except PhysicsError as error:
-                if error.partial is not None and learn:
+                if error.partial is not None:  # rows that did not fail are remembered
                     good = error.partial.isfinite().all(-1)
-                    self.store([new[i] for i in good.nonzero()], error.partial[good])
-                error.partial = None
+                    self._store([new[i] for i in good.nonzero()], error.partial[good])
+                error.partial = None  # it has the distinct rows alone
                 if error.inputs is None:
                     failed = {new[i] for i in error.rows}
                     error.rows = tuple(i for i, key in enumerate(keys) if key in failed)
                 raise
-            if learn:
-                self.store(new, values)
+            self._store(new, values)
             outputs.update(zip(new, values, strict=True))
         return torch.stack([outputs[key] for key in keys]).to(rows)
 
-    def store(self, keys: list[bytes], values: Tensor) -> None:
+    def _store(self, keys: list[bytes], values: Tensor) -> None:
         """Remember values ``N x m``, without an autograd graph, by distinct keys."""
         values = values.detach().clone()
         with self._lock:
             if len(self._rows) + len(keys) > self.capacity:
-                self._rows = {}
+                self._rows = {}  # a new dictionary, as other threads may read the old one
             self._rows.update(zip(keys[: self.capacity], values[: self.capacity], strict=True))
 
 
@@ -201,8 +198,7 @@ class FiniteDifferences(torch.autograd.Function):
         \frac{f_k(x + h_j e_j) - f_k(x - h_j e_j)}{2 h_j}
 
     ``FiniteDifferences.apply(rows, Y, physics, step)`` returns ``N x m`` outputs Y of the rows
-    ``N x (d + p)``, columns of X and parameters; the gradient is 0 by the latter. An error names
-    the rows around which the physics fails.
+    ``N x (d + p)``, columns of X and parameters; the gradient is 0 by the latter.
     """
 
     @staticmethod
@@ -223,10 +219,13 @@ class FiniteDifferences(torch.autograd.Function):
                 "FunctionPhysics, for second ones."
             )
         (rows,) = ctx.saved_tensors
-        n, p = len(rows), len(ctx.physics.unknowns)
+        n = len(rows)
+        p = len(ctx.physics.unknowns)
         d = rows.shape[1] - p
+        # h = eps^(1/3) max(1, |x|) balances the errors of rounding and of truncation.
         h = torch.finfo(rows.dtype).eps ** (1 / 3) * rows.abs().clamp(min=1.0)
-        h = h if ctx.step is None else torch.full_like(rows, ctx.step)
+        if ctx.step is not None:
+            h = torch.full_like(rows, ctx.step)
         moves = torch.diag_embed(h)[:, :d]
         sides = rows.unsqueeze(1) + torch.stack([moves, -moves])  # 2 x n x d x (d + p)
         try:
@@ -241,8 +240,9 @@ class FiniteDifferences(torch.autograd.Function):
             )
             raise
         upper, lower = Y.unflatten(0, sides.shape[:3])
-        # The distance that rounding left, not 2 h.
+        # The distance after rounding, not 2 h.
         width = (sides[0] - sides[1]).diagonal(dim1=-2, dim2=-1)
+        # df/dx_j = (f(x + h_j e_j) - f(x - h_j e_j)) / width_j
         slopes = (upper - lower) / width.unsqueeze(-1)  # n x d x m
         gradient = torch.einsum("nm,ndm->nd", grad, slopes)
         return pad(gradient, (0, p)), None, None, None

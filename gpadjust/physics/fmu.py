@@ -26,24 +26,15 @@ _FATAL = 4  # the status after which no function of an instance may be called
 _IN_SOLVER = {"SetTime", "SetContinuousStates", "GetEventIndicators"}
 _IN_SOLVER |= {"GetDerivatives", "GetContinuousStateDerivatives"}
 # By model exchange FMPy permits 500 steps of CVode in each interval, none of which may be longer
-# than a 50th of the simulation: of the limited steps finite differences are rough.
+# than a 50th of the simulation: finite differences of the limited steps are rough.
 _INTERVALS, _LONGER = 5, 50
 _lock = Lock()  # one simulation at a time in a process
 _messages: deque[str] = deque(maxlen=5)
-_kept: list[Any] = []
+_callbacks: list[Any] = []
 
 
 class FMU:
-    """An FMU, unpacked into a temporary folder, with one instance, which is reset between uses.
-
-    Args:
-        path: The file.
-        kind: ``"CoSimulation"``, ``"ModelExchange"``, or None for the first that it has.
-
-    Raises:
-        ImportError: Without FMPy.
-        ValueError: If it is not an FMU of FMI 2 or 3, of this kind and this platform.
-    """
+    """An FMU, unpacked into a temporary folder, with one instance, which is reset between uses."""
 
     def __init__(self, path: Path, kind: str | None) -> None:
         try:
@@ -55,12 +46,12 @@ class FMU:
             platforms = fmpy.supported_platforms(path)
         except Exception as error:
             raise ValueError(f"Expected {path} as an FMU; it cannot be read: {error}") from error
-        kinds = dict(zip(KINDS, (description.coSimulation, description.modelExchange), strict=True))
-        has = [name for name, interface in kinds.items() if interface is not None]
-        if description.fmiVersion[0] not in "23" or not has or kind not in (None, *has):
+        interfaces = (description.coSimulation, description.modelExchange)
+        kinds = [k for k, interface in zip(KINDS, interfaces, strict=True) if interface is not None]
+        if description.fmiVersion[0] not in "23" or not kinds or kind not in (None, *kinds):
             raise ValueError(
                 f"Expected {path.name} of FMI 2 or 3 with {kind or ' or '.join(KINDS)}; found FMI "
-                f"{description.fmiVersion} with {' and '.join(has) or 'neither'}."
+                f"{description.fmiVersion} with {' and '.join(kinds) or 'neither'}."
             )
         if fmpy.platform not in platforms:
             raise ValueError(
@@ -69,8 +60,9 @@ class FMU:
                 "sources by `fmpy compile`."
             )
         self.name = path.name
-        self.kind: str = kind or has[0]
-        self.variables = {each.name: each for each in description.modelVariables}
+        self.kind: str = kind or kinds[0]
+        self.variables = {variable.name: variable for variable in description.modelVariables}
+        # The derivatives name the states that they are of.
         self.states: list[str] = [u.variable.derivative.name for u in description.derivatives]
         step = getattr(description.coSimulation, "fixedInternalStepSize", None)
         self.step = float(step or getattr(description.defaultExperiment, "stepSize", None) or 0.0)
@@ -88,25 +80,11 @@ class FMU:
             )
         variable = self.variables[name]
         if variable.shape or variable.type in ("String", "Binary", "Clock"):
-            found = f"an array of shape {variable.shape}" if variable.shape else variable.type
-            raise ValueError(f"Expected {name!r} of {self.name} as one number; found {found}.")
-        return variable
-
-    def check_settable(self, name: str) -> None:
-        """Raise a ValueError if a simulation cannot begin at a value of this variable."""
-        from fmpy.simulation import settable_in_initialization_mode, settable_in_instantiated
-
-        variable = self.variable(name)
-        is_settable = settable_in_instantiated(variable) or settable_in_initialization_mode(
-            variable
-        )
-        is_state = self.kind == "ModelExchange" and name in self.states
-        if not is_state and not is_settable:
             raise ValueError(
-                f"{self.name} permits no start value of {name!r}, which has initial="
-                f"{variable.initial!r}. Name the parameter of its start value, or export the FMU "
-                "with initial='exact' for it, or for model exchange, whose states can be set."
+                f"Expected {name!r} of {self.name} as one number; found type {variable.type} and "
+                f"shape {variable.shape}."
             )
+        return variable
 
     def simulate(
         self,
@@ -118,29 +96,21 @@ class FMU:
         step: float | None,
         tolerance: float,
     ) -> Array:
-        """Return outputs ``N x m`` at the times.
-
-        Args:
-            values: Start values and parameters by name.
-            start: The time at which the simulation begins.
-            times: ``N`` times from the start on, in any order.
-            outputs: The names of the outputs.
-            signals: Inputs by name with their ``"time"``; each holds until the next.
-            step: The communication step of co-simulation. None: the FMU's own, or none.
-            tolerance: The relative tolerance.
-        """
+        """Return outputs ``N x m`` at ``N`` times, given start values, parameters and signals."""
         from fmpy import simulate_fmu
 
-        changes, end = signals["time"], float(times.max())
+        changes = signals["time"]
+        end = stop = float(times.max())  # the latter limits the steps of a solver
         points = np.unique([start, *times, *changes[(start < changes) & (changes < end)]])
-        step, stop = step or self.step or end - start or 1.0, end
+        step = step or self.step or end - start or 1.0  # of one moment any step will do
         if self.kind == "ModelExchange":
-            step, stop = (end - start) / _INTERVALS or 1.0, start + _LONGER * (end - start)
+            step = (end - start) / _INTERVALS or 1.0
+            stop = start + _LONGER * (end - start)
         names = {*values, *outputs, *signals}
         description = copy(self.description)  # FMPy goes through all variables of one
         description.modelVariables = [v for v in self.variables.values() if v.name in names]
 
-        def go_on(time: float, recorder: Any) -> bool:
+        def is_before_end(time: float, recorder: Any) -> bool:
             if time < end - _SAME * (end - start):
                 return True
             recorder.sample(time)
@@ -149,7 +119,7 @@ class FMU:
         with _lock:
             _messages.clear()
             try:
-                found = simulate_fmu(
+                results = simulate_fmu(
                     self._folder.name,
                     model_description=description,
                     fmu_instance=self._begun(values),
@@ -158,7 +128,7 @@ class FMU:
                     start_time=start,
                     stop_time=stop,
                     set_stop_time=stop == end,
-                    step_finished=go_on,
+                    step_finished=is_before_end,
                     output_interval=step,
                     relative_tolerance=tolerance,
                     start_values=dict(values),
@@ -166,105 +136,109 @@ class FMU:
                     output=names,
                 )
             except BaseException as error:
-                failure = self._errors[0] if self._errors else error
+                failure = [*self._errors, error][0]
                 self._free()
                 failure.stderr = "; ".join(_messages)  # type: ignore[attr-defined]
                 raise failure from None
         for name, value in values.items():
-            first = float(found[name][0])
-            if not abs(first - value) <= 1e-6 * max(1.0, abs(value)):
+            first = float(results[name][0])
+            if not abs(first - value) <= 1e-6 * max(1.0, abs(value)):  # NaN is refused, too
                 raise ValueError(
                     f"{name!r} is {first:g} after its start value was set to {value:g}: the FMU "
-                    "computes it or rounds it. Name the parameter of its start value, or take "
-                    "model exchange, whose states can be set"
+                    "permits none, computes it or rounds it. Name the parameter of its start "
+                    "value, or take model exchange, whose states can be set"
                 )
-        missing = points[~np.isclose(found["time"][_places(found, points)], points, _SAME, 0)]
+        ends = results["time"]
+        missing = points[~np.isclose(ends[_places(ends, points)], points, _SAME, 0)]
         if len(missing):
             raise RuntimeError(
-                f"no step ends at t = {missing[0]:g}, the last one at {found['time'][-1]:g}. The "
+                f"no step ends at t = {missing[0]:g}, the last one at {ends[-1]:g}. The "
                 "FMU ended the simulation, or takes steps of one length alone: give a "
                 "communication_step of which the times, also of signals, are multiples"
             )
-        place = _places(found, times)
-        return np.stack([found[name][place].astype(float) for name in outputs], axis=-1)
+        rows = _places(ends, times)
+        return np.stack([results[name][rows].astype(float) for name in outputs], axis=-1)
 
     def _input(
-        self,
-        values: Mapping[str, float],
-        points: Array,
-        signals: Mapping[str, Array],
+        self, values: Mapping[str, float], points: Array, signals: Mapping[str, Array]
     ) -> NDArray[np.void] | None:
         """Return inputs as FMPy takes them: two rows at each point, which make it stop there."""
         if len(signals) == 1 and len(points) <= 2:
             return None  # nothing changes before the end
+        # The last change before a point, and the last one until it.
         last = [np.searchsorted(signals["time"], points, side) for side in ("left", "right")]
-        place = np.stack(last, axis=-1).clip(min=1) - 1
-        place[0] = place[0, 1]
+        rows = np.stack(last, axis=-1).clip(min=1) - 1
+        rows[0] = rows[0, 1]
         columns = {"time": np.repeat(points, 2)}
-        columns |= {name: of[place].ravel() for name, of in signals.items() if name != "time"}
+        columns |= {n: signal[rows].ravel() for n, signal in signals.items() if n != "time"}
         for name, value in values.items():
             if self.variables[name].causality == "input":  # or FMPy prints a warning
-                columns[name] = np.full(place.size, value)
-        rows = [*zip(*columns.values(), strict=True)]
-        return np.array(rows, [(name, float) for name in columns])
+                columns[name] = np.full(rows.size, value)
+        return np.array([*zip(*columns.values(), strict=True)], [(name, float) for name in columns])
 
     def _begun(self, values: Mapping[str, float]) -> Any:
         """Return the instance as if it were new; model exchange will set its states, too."""
         try:
             if self._instance is not None:
                 self._instance.reset()
-        except Exception:
+        except Exception:  # an FMU may not be able to
             self._free()
         if self._instance is None:
-            self._instance = self._made()
+            self._instance = self._instantiated()
         if self.kind == "ModelExchange" and values.keys() & {*self.states}:
             self._set_states_at_first_update(values)
         return self._instance
 
-    def _made(self) -> Any:
+    def _instantiated(self) -> Any:
         """Return an instance that keeps its first error, even one that CVode passes over."""
         from fmpy import instantiate_fmu
 
         fmu = instantiate_fmu(self._folder.name, self.description, self.kind, logger=_log)
         # For FMI 2 FMPy has one logger for all FMUs, that of the last instance, alive or not.
-        _kept.append(fmu.callbacks)
-        call, errors = fmu._call, self._errors
+        _callbacks.append(fmu.callbacks)
+        for name in dir(fmu):
+            if name.startswith(("fmi2", "fmi3")):
+                setattr(fmu, name, self._guarded(getattr(fmu, name), name[4:] in _IN_SOLVER))
+        return fmu
 
-        def guarded(name: str, *arguments: Any) -> Any:
+    def _guarded(self, function: Any, is_in_solver: bool) -> Any:
+        """Return a function of FMI that keeps its first error, and raises that from then on."""
+        errors = self._errors
+
+        def guarded(*arguments: Any) -> Any:
             try:
                 if errors:
                     raise errors[0]
-                return call(name, *arguments)
+                return function(*arguments)
             except Exception as error:
                 errors[:] = [error]
-                if name[4:] in _IN_SOLVER:
+                if is_in_solver:
                     return 0
                 raise
 
-        fmu._call = guarded
-        return fmu
+        return guarded
 
     def _set_states_at_first_update(self, values: Mapping[str, float]) -> None:
         """Let the first update of discrete states set continuous states by name, too."""
-        fmu, n = self._instance, len(self.states)
-        function = (
-            "newDiscreteStates" if hasattr(fmu, "newDiscreteStates") else "updateDiscreteStates"
-        )
-        update = getattr(fmu, function)
+        fmu = self._instance
+        name = "newDiscreteStates"  # of FMI 2
+        if not hasattr(fmu, name):
+            name = "updateDiscreteStates"
+        update = getattr(fmu, name)
 
         def first() -> Any:
-            delattr(fmu, function)
-            while update()[0]:
+            delattr(fmu, name)
+            while update()[0]:  # until discrete states stay as they are
                 pass
             fmu.enterContinuousTimeMode()
-            x = (c_double * n)()
-            fmu.getContinuousStates(x, n)
-            x[:] = [values.get(name, x[i]) for i, name in enumerate(self.states)]
-            fmu.setContinuousStates(x, n)
+            x = (c_double * len(self.states))()
+            fmu.getContinuousStates(x, len(x))
+            x[:] = [values.get(state, x[i]) for i, state in enumerate(self.states)]
+            fmu.setContinuousStates(x, len(x))
             fmu.enterEventMode()
             return update()
 
-        setattr(fmu, function, first)
+        setattr(fmu, name, first)
 
     def _free(self) -> None:
         """Free the instance, unless it is dead."""
@@ -291,7 +265,6 @@ def _log(*message: Any) -> None:
     _messages.append(message[-1].decode(errors="replace").strip())
 
 
-def _places(found: Any, times: Array) -> NDArray[np.int64]:
-    """Return the places of the first results at times, but for rounding errors."""
-    places = np.searchsorted(found["time"], times - _SAME * np.abs(times))
-    return places.clip(max=len(found) - 1)
+def _places(ends: Array, times: Array) -> NDArray[np.int64]:
+    """Return the places of times among the ends of steps, but for rounding errors."""
+    return np.searchsorted(ends, times - _SAME * np.abs(times)).clip(max=len(ends) - 1)

@@ -23,44 +23,43 @@ class FMUPhysics(BlackBoxPhysics):
     r"""Physics given as an FMU of FMI 2 or 3, the file in which simulation programs export a model.
 
     Each row is a simulation by `FMPy <https://github.com/CATIA-Systems/FMPy>`_ from ``start_time``
-    to the last of the ``times``, with the row's inputs as start values and the outputs at the end:
+    to the last of the ``times``, with the row's inputs as start values:
 
     - A simulator: inputs are parameters and constant inputs of the FMU.
     - Dynamics: inputs are states and actions, outputs the states, ``times`` the control step. A
       state can be set if its start value can, or by model exchange.
-    - Values over time: one of the inputs is ``"time"``, the FMU's independent variable. Rows that
-      differ in it alone share a simulation, and fail together; they agree with single ones within
-      the tolerance.
+    - Values over time: one of the inputs is ``"time"``. Rows that differ in it alone share a
+      simulation, and fail together; they agree with single ones within the tolerance.
 
-    Names are those of the FMU, such as ``"wall[1].T"``. A process has one instance, which is reset
-    for the next row. Rows run in parallel, in processes, and are remembered as of a
-    :class:`~gpadjust.BlackBoxPhysics`.
+    Names are those of the FMU, such as ``"wall[1].T"``. Rows run in parallel, in processes, and are
+    remembered as of a :class:`~gpadjust.BlackBoxPhysics`.
 
     Args:
         fmu: The file.
         inputs: The variable of each column of X, or ``"time"``.
         outputs: The variables that are the outputs.
         times: When outputs are read, in the FMU's time; of several times all outputs at the first,
-            then at the second. Not with ``"time"``.
+            then at the second.
         start_values: Values of further variables, at the beginning.
         signals: Inputs of the FMU over time: a frame or mapping with ``"time"``, ascending, and a
             column for each of them. A value holds until the next, and the first before.
         unknowns: Unknown parameters by their names in the FMU, whose units they take.
         start_time: The time at which simulations begin.
         communication_step: The steps of co-simulation, which end at ``times`` and ``signals``, too.
-            Default: the step that the FMU names, or none between these times.
+            Default: the step that the FMU proposes, or none between these times.
         tolerance: The relative tolerance of model exchange; a wish to the FMU in co-simulation.
         kind: ``"CoSimulation"`` or ``"ModelExchange"``. Default: the first that the FMU has.
         columns: The columns of X to read, one for each of the inputs. Default: all.
         gradient, fd_step: As of :class:`~gpadjust.BlackBoxPhysics`. A step should exceed the
             tolerance by far.
-        name: As of :class:`Physics`. Default: that of the file.
+        name: As of :class:`Physics`. Default: the name of the file.
 
     Raises:
         ImportError: Without FMPy (``pip install "gpadjust[fmu]"``).
         OSError: If there is no such file.
-        ValueError: If the FMU has no such variable, kind, or binary for this platform, a variable
-            cannot be set, or a state of the FMU is not in a step of dynamics.
+        ValueError: If the FMU has no such variable, kind, or binary for this platform, or a state
+            of the FMU is not in a step of dynamics.
+        PhysicsError: When called, if a simulation fails, or a variable has not its start value.
 
     Example:
         >>> tank = FMUPhysics(  # doctest: +SKIP
@@ -112,29 +111,24 @@ class FMUPhysics(BlackBoxPhysics):
             )
         if communication_step is not None:
             checked_number("communication_step", communication_step, above=0)
-        numbers = [] if times is None else np.atleast_1d(real_array(times)).tolist()
         self.path, self.kind = path, kind
         self.input_names, self.output_names = tuple(inputs), tuple(outputs)
         self.start_values = {k: checked_number(k, v) for k, v in (start_values or {}).items()}
         self.signals = _signals(signals)
         self.start_time = checked_number("start_time", start_time)
-        self.times = tuple(checked_number("times", t, least=self.start_time) for t in numbers)
+        self.times: tuple[float, ...] = ()
+        if times is not None:
+            numbers = np.atleast_1d(real_array(times)).tolist()
+            self.times = tuple(checked_number("times", t, least=self.start_time) for t in numbers)
         self.communication_step = communication_step
         self.tolerance = checked_number("tolerance", tolerance, above=0, below=1)
+        if self.inputs is None:
+            self.column_names = self.input_names
         self._check(opened(path, kind))
         self.num_outputs = len(self.output_names) * max(1, len(self.times))
 
-    def check_names(self, names: Sequence[str]) -> None:
-        """Raise a ValueError if data have columns of these names in another order."""
-        places = {name: i for i, name in enumerate(self.input_names)}
-        if self.inputs is None and any(places.get(n, i) != i for i, n in enumerate(names)):
-            raise ValueError(
-                f"{self.path.name} has the inputs {', '.join(self.input_names)}, and the data have "
-                f"{', '.join(names)}: name the inputs in the order of the data."
-            )
-
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """Return the outputs of simulations; an error of single rows contains those of others."""
+        """Return the outputs of simulations; an error of single rows contains the other outputs."""
         from joblib import Parallel, delayed  # slow to import
 
         if X.shape[-1] != len(self.input_names):
@@ -143,15 +137,16 @@ class FMUPhysics(BlackBoxPhysics):
                 f"columns=; found {X.shape[-1]}"
             )
         rows = self._table(X, *parameters)
-        place = np.arange(len(rows))
+        number = np.arange(len(rows))  # of the simulation of a row
         if "time" in self.input_names:
             others = np.delete(rows, self.input_names.index("time"), axis=1)
-            place = np.unique(others, axis=0, return_inverse=True)[1].ravel()
-        order = np.argsort(place, kind="stable")
-        groups = np.split(order, np.cumsum(np.bincount(place))[:-1])
-        found = Parallel()(delayed(call_row)(self.simulate, rows[group]) for group in groups)
+            number = np.unique(others, axis=0, return_inverse=True)[1].ravel()
+        # Rows of each simulation.
+        groups = [np.flatnonzero(number == i) for i in range(number.max() + 1)]
+        outputs = Parallel()(delayed(call_row)(self.simulate, rows[group]) for group in groups)
         results = dict[int, NDArray[np.float64] | PhysicsError]()
-        for group, y in zip(groups, found, strict=True):
+        for group, y in zip(groups, outputs, strict=True):
+            # N m outputs, the m of each row in turn
             parts = [y] * len(group) if isinstance(y, PhysicsError) else np.split(y, len(group))
             results |= dict(zip(group.tolist(), parts, strict=True))
         return self._gathered([results[i] for i in range(len(rows))])
@@ -163,12 +158,12 @@ class FMUPhysics(BlackBoxPhysics):
             if not np.isfinite(column).all():
                 raise ValueError(f"expected finite numbers for {name!r}, found {column.tolist()}")
         values = dict(zip(names, rows[0].tolist(), strict=True))
-        times = np.tile(self.times, (len(rows), 1))
+        times = np.tile(self.times, (len(rows), 1))  # N x times of a row
         if values.pop("time", None) is not None:
             times = rows[:, [self.input_names.index("time")]]
         if times.min() < self.start_time:
             raise ValueError(f"expected times from start_time={self.start_time:g} on")
-        found = opened(self.path, self.kind).simulate(
+        outputs = opened(self.path, self.kind).simulate(
             self.start_values | values,
             self.start_time,
             times.ravel(),
@@ -177,31 +172,30 @@ class FMUPhysics(BlackBoxPhysics):
             self.communication_step,
             self.tolerance,
         )
-        return found.ravel()
+        return outputs.ravel()
 
     def _check(self, fmu: FMU) -> None:
         """Raise a ValueError if variables are not in the FMU; take the units of parameters."""
         self.unknowns.refuse_functions()
+        inputs = [name for name in self.input_names if name != "time"]
         moving = [name for name in self.signals if name != "time"]
-        values = [name for name in self.input_names if name != "time"]
-        given = [*values, *self.unknowns, *self.start_values, *moving]
-        for name in (*given, *self.output_names):
+        names = [*inputs, *self.unknowns, *self.start_values, *moving]
+        for name in (*names, *self.output_names):
             variable = fmu.variable(name)
-            if given.count(name) > 1:
+            if names.count(name) > 1:
                 raise ValueError(
                     f"{name!r} is given twice: in inputs, unknowns, start_values or signals."
                 )
-            if name in given and name not in moving:
-                fmu.check_settable(name)
             if name in moving and variable.causality != "input":
                 raise ValueError(f"Expected signals of inputs of {fmu.name}; {name!r} is not one.")
             if name in self.unknowns and not self.unknowns[name].unit:
                 unit = variable.unit or getattr(variable.declaredType, "unit", None) or ""
                 self.unknowns[name] = replace(self.unknowns[name], unit=unit)
-        left = [name for name in fmu.states if name not in given]
-        if left and self.times and {*values} & {*self.output_names} & {*fmu.states}:
+        # A step that forgets a state is not a step of the system.
+        hidden = [name for name in fmu.states if name not in names]
+        if hidden and self.times and {*inputs} & {*self.output_names} & {*fmu.states}:
             raise ValueError(
-                f"The inputs and outputs are states of a step, and {', '.join(left)} of "
+                f"The inputs and outputs are states of a step, and {', '.join(hidden)} of "
                 f"{fmu.name} would begin each step at its start value: add it to inputs and "
                 "outputs, or, if it does not matter, to start_values."
             )
@@ -211,12 +205,12 @@ def _signals(signals: Any) -> dict[str, NDArray[np.float64]]:
     """Return signals by name, with their times."""
     if signals is None:
         return {"time": np.array([-np.inf])}  # nothing changes
-    found = {str(name): real_array(signals[name]) for name in signals}
-    shapes = {name: each.shape for name, each in found.items()}
-    is_table = "time" in found and len(found) > 1 and len({*shapes.values()}) == 1
-    if not is_table or found["time"].ndim != 1 or not (np.diff(found["time"]) > 0).all():
+    columns = {str(name): real_array(signals[name]) for name in signals}
+    shapes = {name: column.shape for name, column in columns.items()}
+    is_table = "time" in columns and len(columns) > 1 and len({*shapes.values()}) == 1
+    if not is_table or columns["time"].ndim != 1 or not (np.diff(columns["time"]) > 0).all():
         raise ValueError(
             "Expected signals as columns of one length, 'time', ascending, and one or more inputs; "
             f"found {shapes}."
         )
-    return found
+    return columns

@@ -21,7 +21,7 @@ from gpadjust.physics.parameters import ParameterValues
 from gpadjust.physics.unknown import Unknown
 
 Functions = Mapping[str, Callable[..., Any]]
-"""Functions of a formula, by their names, and those of operators by their names in a tree."""
+"""Functions of a formula by their names, and of operators by their names in a tree."""
 
 _LONGEST = 2000  # characters
 # Parts of a tree, and the functions of the module operator.
@@ -47,7 +47,7 @@ _OF_TORCH: Functions = {
     "where": lambda c, x, y: torch.where(c != 0, x, y),
 }
 _OF_SHEETS = {"wurzel": "sqrt", "power": "pow", "potenz": "pow", "if": "where", "wenn": "where"}
-_OTHERWISE = {  # in spreadsheets than here, and the way out
+_OTHERWISE = {  # the meaning in spreadsheets, and the way out
     "log": "LOG of a spreadsheet has the base 10: write log10(x), or ln(x)",
     "atan2": "ATAN2 of a spreadsheet takes x first: write atan2(y, x) in small letters, without =",
 }
@@ -65,7 +65,7 @@ _GRAMMAR = (
 class FormulaPhysics(Physics):
     """Physics given as a formula, a text in Python's notation, which a saved model contains.
 
-    It is read, never executed, so that a formula from a stranger does no harm.
+    It is read, never executed, so that a stranger's formula is harmless.
 
     Args:
         formula: The output, or outputs with commas between them, such as ``"U * I, U / I"``. It has
@@ -74,9 +74,9 @@ class FormulaPhysics(Physics):
             exp, log and ln (the same), log10, sqrt, abs, sign, pow, min and max of two, and
             ``where(a < b, x, y)``. It may be a spreadsheet's, with ``=`` in front, ``SQRT``,
             ``PI()`` and ``IF``, and in German, ``0,5*MAX(a;b)``.
-        columns: The names of the columns of X, ``d`` of them, without units and with ``_`` for
-            other marks: "air flow [m3/h]" is ``air_flow``. "lambda" is ``lambda`` or ``lambda_``,
-            as all words of Python; a column "pi" is ``pi_``.
+        columns: The ``d`` names of the columns of X, in the formula without units and with ``_``
+            for other marks: "air flow [m3/h]" is ``air_flow``. "lambda" is ``lambda`` or
+            ``lambda_``, as all words of Python; a column "pi" is ``pi_``.
         unknowns, name: As of :class:`Physics`. A function has in the formula its value in each row.
 
     Attributes:
@@ -99,56 +99,51 @@ class FormulaPhysics(Physics):
         check_kind("formula", formula, str, "a text")
         super().__init__(unknowns=unknowns, name=name or " ".join(formula.split()))
         self.formula = formula
-        self.columns = tuple(map(symbol, columns))
+        self.columns = self.column_names = tuple(map(symbol, columns))
         declared = self.unknowns.declared
-        known = [*self.columns, *declared]
-        if both := [name for name in declared if name in self.columns]:
-            raise ValueError(
-                f"{both[0]!r} is a column and an unknown parameter in {formula!r}: give the "
-                "unknown parameter another name."
-            )
-        if len({*known}) < len(known) or "pi" in known:
-            raise ValueError(f"Expected different names, and none 'pi'; found {known}.")
+        names = [*self.columns, *declared]
+        for name in declared:
+            if name in self.columns:
+                raise ValueError(
+                    f"{name!r} is a column and an unknown parameter in {formula!r}: give the "
+                    "unknown parameter another name."
+                )
+        if len({*names}) < len(names) or "pi" in names:
+            raise ValueError(f"Expected different names, and none 'pi'; found {names}.")
         self.outputs = parse(formula)
-        absent = sorted(_names(self.outputs) - {*known, "pi"})
-        if has_pi(formula) and "pi_" in known:
+        self.num_outputs = len(self.outputs)
+        if has_pi(formula) and "pi_" in names:
             raise ValueError(
                 f"The formula {formula!r} has pi, which is 3.14159, and there is a column 'pi', "
                 "which is pi_: write pi_, or the number."
             )
-        if absent:
+        for name in sorted(_names(self.outputs) - {*names, "pi"}):
             raise ValueError(
-                f"The formula {formula!r} has {absent[0]!r}; expected one of its names: "
-                f"{', '.join(known)}. Give its value as a number, or add it to unknowns."
+                f"The formula {formula!r} has {name!r}; expected one of its names: "
+                f"{', '.join(names)}. Give its value as a number, or add it to unknowns."
             )
-        self.num_outputs = len(self.outputs)
         self.variables = {}
-        numbers = [name for name in known if name in self.columns or name in self.unknowns]
-        for name in self.unknowns.functions:
-            (self.variables[name],) = variable = parse(declared[name].function_of)
-            if absent := sorted(_names(variable) - {*numbers, "pi"}):
+        numbers = [*self.columns, *(name for name in declared if name in self.unknowns)]
+        # The variable of a function is a formula, too, of numbers alone.
+        for function in self.unknowns.functions:
+            text = declared[function].function_of
+            (self.variables[function],) = variable = parse(text)
+            for name in sorted(_names(variable) - {*numbers, "pi"}):
                 raise ValueError(
-                    f"{name} is a function of {declared[name].function_of!r}, which has "
-                    f"{absent[0]!r}; expected one of {', '.join(numbers)}, or a formula of these."
+                    f"{function} is a function of {text!r}, which has {name!r}; expected one of "
+                    f"{', '.join(numbers)}, or a formula of these."
                 )
 
     def check_names(self, names: Sequence[str]) -> None:
         """Raise a ValueError if these are the names of the columns in another order."""
-        found = tuple(map(symbol, names))
-        places = {name: i for i, name in enumerate(self.columns)}
-        if any(places.get(name, i) != i for i, name in enumerate(found)):
-            raise ValueError(
-                f"The formula {self.formula!r} has the columns {', '.join(self.columns)}, and the "
-                f"data have {', '.join(found)}: give it the columns in the order of the data."
-            )
+        super().check_names([*map(symbol, names)])
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """Return the values of the formula, ``N x m``."""
         if X.shape[-1] != len(self.columns):
             raise ValueError(f"the formula has columns {self.columns}, and X has {X.shape[-1]}")
-        own = parameters[0] if parameters else {}
-        curves = parameters[0].functions if parameters else {}
-        outputs = self.values_at(X.unbind(-1), own, curves, _OF_TORCH, X.new_tensor)
+        values = parameters[0] if parameters else ParameterValues((), X)
+        outputs = self.values_at(X.unbind(-1), values, values.functions, _OF_TORCH, X.new_tensor)
         return torch.stack([Y.expand(len(X)) for Y in outputs], dim=-1)
 
     def values_at(
@@ -171,7 +166,8 @@ def symbol(name: str) -> str:
     """Return the name of a column in a formula: without its unit, and ``_`` for other marks."""
     name = normalize("NFKC", name.partition("[")[0].strip())  # as Python does with names
     bare = re.sub(r"\W+", "_", name).strip("_")
-    bare = f"{bare}_" if iskeyword(bare) or bare == "pi" else bare
+    if iskeyword(bare) or bare == "pi":
+        return f"{bare}_"
     return f"_{bare}" if bare[:1].isdigit() else bare
 
 
@@ -188,11 +184,11 @@ def has_pi(formula: str) -> bool:
 def parse(formula: str) -> list[ast.expr]:
     """Return the outputs of a formula, each as a tree of allowed parts, or raise a ValueError.
 
-    What is no formula with points and commas may be one with decimal commas and semicolons.
+    A text that cannot be read with points and commas may have decimal commas and semicolons.
     """
-    text = formula.strip()
-    of_sheet = text.startswith("=")
-    text = text.removeprefix("=").strip()
+    of_sheet = formula.strip().startswith("=")
+    text = formula.strip().removeprefix("=").strip()
+    # 0,5*MAX(a;b) is 0.5*MAX(a,b)
     continental = re.sub(r"(?<=\d),(?=\d)", ".", text).replace(";", ",")
     errors: list[Exception] = []
     for reading in dict.fromkeys((text, continental)):
@@ -223,6 +219,7 @@ def _parsed(text: str, of_sheet: bool) -> list[ast.expr]:
         raise ValueError("a formula with = in front has one output")
     one = torch.ones(())
     for output in outputs:
+        # A trial with ones finds parts that are not allowed, and wrong numbers of arguments.
         value_of(output, dict.fromkeys(_names(outputs), one), _OF_TORCH, one.new_tensor)
         for node in ast.walk(output):
             if isinstance(node, ast.Call):
@@ -264,11 +261,7 @@ def value_of(
 ) -> Any:
     """Return the value of a part of a formula, in tensors or in numbers of another kind.
 
-    Args:
-        node: The part.
-        values: Those of names but ``pi``.
-        functions: Functions of such numbers.
-        number: Makes such a number.
+    ``number`` makes such a number of a float, ``functions`` are of such numbers.
     """
     function: Callable[..., Any] | None = None
     match node:
@@ -289,8 +282,10 @@ def value_of(
             return number(math.pi)
         case ast.Call(func=ast.Name(id=name), args=parts, keywords=[]):
             short = name.lower().rstrip("_")
-            name = name if name in NAMES else _OF_SHEETS.get(short, short)
-            function = functions.get(name) if name in NAMES else None
+            if name not in NAMES:
+                name = _OF_SHEETS.get(short, short)
+            if name in NAMES:
+                function = functions.get(name)
     if function is None:
         raise ValueError(f"{ast.unparse(node)!r} is not a part of a formula")
     return function(*(value_of(part, values, functions, number) for part in parts))

@@ -70,16 +70,17 @@ def array_physics(physics: Any, X: NDArray[np.float64]) -> Physics:
     """
     if isinstance(physics, torch.nn.Module):
         return as_physics(deepcopy(physics))
-    made = as_physics(physics)  # which checks it
+    of_torch = as_physics(physics)  # which checks it
     try:
         value = physics(X[:1].copy())
-    except Exception as of_array:
+    except Exception as array_error:
         try:
             value = physics(torch.from_numpy(X[:1].copy()))
-        except Exception as of_tensor:
+        except Exception as tensor_error:
             raise PhysicsError(
-                f"Physics {made.name!r} failed at the first row of X, as a NumPy array "
-                f"({described(of_array)}) and as a torch tensor ({described(of_tensor)}). Expected "
-                "a function of rows N x d; of a single row, take BlackBoxPhysics(batched=False)."
-            ) from of_array
-    return made if torch.is_tensor(value) else BlackBoxPhysics(physics)
+                f"Physics {of_torch.name!r} failed at the first row of X, as a NumPy array "
+                f"({described(array_error)}) and as a torch tensor ({described(tensor_error)}). "
+                "Expected a function of rows N x d; of a single row, take "
+                "BlackBoxPhysics(batched=False)."
+            ) from array_error
+    return of_torch if torch.is_tensor(value) else BlackBoxPhysics(physics)

@@ -24,10 +24,10 @@ _FORMULA = "formula:"
 def import_path(physics: Physics | Callable[[Tensor], Tensor]) -> str | None:
     """Return ``"package.module:qualname"`` of a physics, for ``physics_from_path``.
 
-    Of a ``FormulaPhysics`` it is ``"formula:"`` and its arguments; of what has no name in a module,
-    as lambdas and functions inside of functions, None. Objects have a path if they are attributes
-    of the module of their class or callables; a ``FunctionPhysics`` also that of its function if it
-    was made of this alone. A path in ``__main__`` is valid for the same script only.
+    Of a ``FormulaPhysics`` it is ``"formula:"`` and its arguments. Lambdas and functions inside of
+    functions have no name in a module: None. Objects have a path if they are attributes of the
+    module of their class or callables; a ``FunctionPhysics`` also the path of its function if it
+    has no other settings. A path in ``__main__`` is valid for the same script only.
 
     Example:
         >>> import_path(physics_from_path), import_path(lambda X: X)
@@ -38,6 +38,7 @@ def import_path(physics: Physics | Callable[[Tensor], Tensor]) -> str | None:
         settings = {"formula": physics.formula, "columns": physics.columns, "name": physics.name}
         return f"{_FORMULA}{json.dumps({**settings, 'unknowns': unknowns})}"
     path = _path_of(physics)
+    # Settings of a FunctionPhysics would be lost with the path of its function.
     if path or type(physics) is not FunctionPhysics or physics.unknowns or physics.inputs:
         return path
     return _path_of(physics.function)
@@ -57,8 +58,8 @@ def physics_from_path(path: str) -> Physics:
     if is_formula(path):
         try:
             settings = json.loads(path.removeprefix(_FORMULA))
-            unknowns = {name: Unknown(**own) for name, own in settings["unknowns"].items()}
-            return FormulaPhysics(**{**settings, "unknowns": unknowns})
+            unknowns = {name: Unknown(**prior) for name, prior in settings["unknowns"].items()}
+            return FormulaPhysics(**{**settings, "unknowns": unknowns})  # which checks all of it
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"Found {path!r} as a formula, which is damaged: {error}") from error
     module, _, name = path.partition(":")
@@ -73,12 +74,15 @@ def physics_from_path(path: str) -> Physics:
 
 def _path_of(thing: Any) -> str | None:
     """Return the name of a thing in the module of its class, or of a callable that it contains."""
-    is_physics = isinstance(thing, Physics)
-    for owner in [*thing.modules(), *vars(thing).values()] if is_physics else [thing]:
+    owners = [thing]
+    if isinstance(thing, Physics):
+        owners = [*thing.modules(), *vars(thing).values()]
+    for owner in owners:
         module = sys.modules.get(getattr(owner, "__module__", None) or "")
-        # Only functions and classes know their names.
-        own = getattr(thing, "__qualname__", None)
-        for name in [own] if own else getattr(module, "__dict__", ()):
+        names = getattr(module, "__dict__", ())
+        if hasattr(thing, "__qualname__"):  # of a function or class
+            names = [thing.__qualname__]
+        for name in names:
             with suppress(AttributeError):
                 if attrgetter(name)(module) is thing:
                     return f"{owner.__module__}:{name}"

@@ -24,16 +24,17 @@ from gpadjust.states import Sensors, StateSpec
 Array = NDArray[np.float64]
 
 _AT_ONCE = 50_000  # simulation steps, after which Ctrl-C is heard
-_WORTH = 500  # simulation steps, for which another thread pays
+_WORTH = 500  # simulation steps that make up for the start of a thread
 
 
 class MujocoPhysics(BlackBoxPhysics):
     r"""One control step of a MuJoCo model, which is one or more of its simulation steps.
 
     A row is the state, ``qpos``, ``qvel`` and ``act``, and the action, which is held during the
-    step; the outputs are the next state. :attr:`spec` names their entries. Rows run in threads, and
-    do not depend on each other: the solver of constraints begins each of them at zero. Gradients
-    are central differences, as of :class:`BlackBoxPhysics`.
+    step; the outputs are the next state. :attr:`spec` names their entries: of a joint "hinge"
+    ``hinge`` and ``hinge_dot``, of the activation of an actuator "motor" ``motor_act``. Rows run in
+    threads, and do not depend on each other: the solver of constraints begins each at zero.
+    Gradients are central differences, as of :class:`BlackBoxPhysics`.
 
     Names of unknown parameters are ``"element.parameter"``, in the units of the MJCF:
 
@@ -49,7 +50,7 @@ class MujocoPhysics(BlackBoxPhysics):
       so that any numbers are of an inertia that a body can have (Rucker and Wensing 2022);
     - joint, tendon: ``damping, frictionloss, armature, stiffness``;
     - actuator: ``gear``; of a position or velocity servo ``kp, kv``; geom: ``friction`` (sliding);
-    - all else is what ``edit`` reads.
+    - all others are read by ``edit``.
 
     Args:
         model: The path of an MJCF or URDF file, an MJCF text, a ``mujoco.MjSpec`` or a
@@ -58,11 +59,9 @@ class MujocoPhysics(BlackBoxPhysics):
         unknowns: The unknown parameters, such as ``{"link1.mass": Unknown(1.0, factor=1.5)}``.
         edit: A function that changes an ``MjSpec``, its first argument, by the values of the
             parameters, ``p["pole.length"]``. The result is compiled for each value.
-        states: Names of the entries of the state. Default: for a joint "hinge" ``hinge`` and
-            ``hinge_dot``; for the activation of an actuator "motor" ``motor_act``.
         actions: The names of the actuators that the action drives, in its order; others get zero.
             Default: all.
-        threads: The most threads. Default: those of PyTorch.
+        threads: The most threads. Default: as many as PyTorch has.
         name: As of :class:`Physics`.
 
     Raises:
@@ -93,43 +92,41 @@ class MujocoPhysics(BlackBoxPhysics):
         step: float | None = None,
         unknowns: Mapping[str, Unknown] | None = None,
         edit: Edit | None = None,
-        states: Sequence[str] | None = None,
         actions: Sequence[str] | None = None,
         threads: int | None = None,
         name: str | None = None,
     ) -> None:
         mujoco = _mujoco()
         super().__init__(self._next_states, unknowns=unknowns, name=name or "MuJoCo model")
-        check_kind(
-            "model",
-            model,
-            str | Path | mujoco.MjSpec | mujoco.MjModel,
-            "the path of an MJCF, its text, an MjSpec or an MjModel",
-        )
-        is_path = isinstance(model, Path | str) and not str(model).lstrip().startswith("<")
-        is_compiled = isinstance(model, mujoco.MjModel)
+        kinds = str | Path | mujoco.MjSpec | mujoco.MjModel
+        check_kind("model", model, kinds, "the path of an MJCF, its text, an MjSpec or an MjModel")
         # Copies, as the caller may change an MjModel or an MjSpec later.
-        own_model = model.copy() if isinstance(model, mujoco.MjSpec) else copy(model)
-        self.source = Path(model).absolute() if is_path else own_model
-        self.model = own_model if is_compiled else _compiled(self.source)
-        spec = None if is_compiled else partial(_read, self.source)
-        own = _state_names(self.model)
+        self.source = model.copy() if isinstance(model, mujoco.MjSpec) else copy(model)
+        if isinstance(model, Path | str) and not str(model).lstrip().startswith("<"):
+            self.source = Path(model).absolute()
+        spec = None
+        self.model = self.source
+        if not isinstance(model, mujoco.MjModel):
+            spec = partial(_read, self.source)
+            self.model = _compiled(self.source)
+        self.states = tuple(_state_names(self.model))
+        self.num_outputs = len(self.states)
         self.unknowns.refuse_functions()
         self._models = ModelParameters(self.model, spec, self.unknowns, edit)
-        self.states = tuple(own if states is None else states)
-        self.num_outputs = len(own)
-        if len(self.states) != len(own):
-            raise ValueError(f"Expected other names for the states {own}; found {self.states}.")
-        each_drive = names_of(self.model, "actuator")
-        controls = getattr(self.model, "actuator_ctrlnum", np.ones(len(each_drive), int))
-        drives = _parts(each_drive, controls, "actuator")
-        self.actions = tuple(drives if actions is None else actions)
-        for each in self.actions:
-            if each not in drives:
-                raise ValueError(f"There is no actuator {each!r}; expected some of {drives}.")
-        self._driven = [drives.index(each) for each in self.actions]
+        actuators = names_of(self.model, "actuator")
+        controls = getattr(self.model, "actuator_ctrlnum", np.ones(len(actuators), int))
+        drives = _parts(actuators, controls, "actuator")
+        if actions is None:
+            actions = drives
+        self.actions = tuple(actions)
+        for action in self.actions:
+            if action not in drives:
+                raise ValueError(f"There is no actuator {action!r}; expected some of {drives}.")
+        self._driven = [drives.index(action) for action in self.actions]
         length = float(self.model.opt.timestep)
-        self.step = length if step is None else checked_number("step", step, above=0)
+        self.step = length
+        if step is not None:
+            self.step = checked_number("step", step, above=0)
         self.num_steps = round(self.step / length)
         if self.num_steps < 1 or abs(self.step / length - self.num_steps) > 1e-6:
             raise ValueError(f"step must be a multiple of the model's {length:g} s; found {step}.")
@@ -148,6 +145,7 @@ class MujocoPhysics(BlackBoxPhysics):
                 "The model has no actuator, and a StateSpec has an action: add a <motor> to the "
                 "MJCF, and let its action be zero."
             )
+        # A hinge that turns all around has the same state after a turn.
         is_hinge = self.model.jnt_type == int(_mujoco().mjtJoint.mjJNT_HINGE)
         is_angle = is_hinge & (self.model.jnt_limited == 0)
         angles = [name for name, turns in zip(self.states, is_angle, strict=False) if turns]
@@ -161,8 +159,9 @@ class MujocoPhysics(BlackBoxPhysics):
         Raises:
             ValueError: If it is another number of values.
         """
-        guess = self.unknowns.guess
-        values = guess if parameters is None else checked_tensor("parameters", parameters)
+        guess = values = self.unknowns.guess
+        if parameters is not None:
+            values = checked_tensor("parameters", parameters)
         if values.shape != guess.shape:
             raise ValueError(
                 f"parameters: expected a value of each of {', '.join(self.unknowns) or 'none'}, of "
@@ -173,7 +172,7 @@ class MujocoPhysics(BlackBoxPhysics):
     def sensors(self, names: Sequence[str] | None = None) -> Sensors:
         """Return sensors of the model as outputs of the state, with parameters at their guesses.
 
-        Guesses of the noise are those of the MJCF.
+        The noise of the MJCF is the guess of their noise.
 
         Args:
             names: The names of the sensors. Default: all that states determine.
@@ -182,21 +181,23 @@ class MujocoPhysics(BlackBoxPhysics):
             ValueError: If there is no sensor of a name, or it depends on the action, as those of
                 accelerations and forces do.
         """
-        known = dict(zip(names_of(self.model, "sensor"), range(self.model.nsensor), strict=True))
         with_forces = int(_mujoco().mjtStage.mjSTAGE_ACC)
+        all_names = names_of(self.model, "sensor")
         stages = self.model.sensor_needstage
-        of_states = [each for each, i in known.items() if stages[i] < with_forces]
-        names = of_states if names is None else names
-        for each in names:
-            if each not in of_states:
+        of_states = [name for name, s in zip(all_names, stages, strict=True) if s < with_forces]
+        if names is None:
+            names = of_states
+        for name in names:
+            if name not in of_states:
                 raise ValueError(
-                    f"Expected sensors of positions or velocities, {of_states}; found {each!r}."
+                    f"Expected sensors of positions or velocities, {of_states}; found {name!r}."
                 )
-        own = [self.model.sensor(each) for each in names]
-        columns = [k for each in own for k in range(each.adr[0], each.adr[0] + each.dim[0])]
-        outputs = _parts(names, [each.dim[0] for each in own], "sensor")
-        sd = [float(each.noise[0]) for each in own for _ in range(each.dim[0])]
-        noise = {output: each for output, each in zip(outputs, sd, strict=True) if each > 0}
+        sensors = [self.model.sensor(name) for name in names]
+        sizes = [sensor.dim[0] for sensor in sensors]
+        columns = [k for s in sensors for k in range(s.adr[0], s.adr[0] + s.dim[0])]
+        outputs = _parts(names, sizes, "sensor")
+        sd = np.repeat([float(sensor.noise[0]) for sensor in sensors], sizes).tolist()
+        noise = {output: value for output, value in zip(outputs, sd, strict=True) if value > 0}
         measure = BlackBoxPhysics(partial(self._measured, columns), name="sensors")
         return Sensors(outputs, measure, noise=noise)
 
@@ -210,16 +211,17 @@ class MujocoPhysics(BlackBoxPhysics):
 
     def _next_states(self, rows: Array, *parameters: ParameterValues) -> Array:
         """Return the states ``N x d`` after a control step, of rows and parameters."""
-        d = self.num_outputs or 0
+        d = len(self.states)
         if rows.shape[1] != d + len(self.actions):
             raise ValueError(
                 f"expected the states {self.states} and the actions {self.actions}, found "
                 f"{rows.shape[1]} column(s)"
             )
         values = parameters[0].rows if parameters else np.empty((len(rows), 0))
-        distinct, of_row = np.unique(values, axis=0, return_inverse=True)
-        built = [self._models.compiled(each) for each in distinct]
-        models = [built[i] for i in of_row.ravel()]
+        # Rows of the same parameters share a compiled model.
+        distinct, number = np.unique(values, axis=0, return_inverse=True)
+        compiled = [self._models.compiled(value) for value in distinct]
+        models = [compiled[i] for i in number.ravel()]
         following, _ = self._simulated(models, rows[:, :d], rows[:, d:], self.num_steps)
         unstable = np.flatnonzero(np.isnan(following).any(1)).tolist()
         if unstable:
@@ -233,7 +235,7 @@ class MujocoPhysics(BlackBoxPhysics):
         return following
 
     def _measured(self, columns: Sequence[int], states: Array) -> Array:
-        """Return what sensors show at states ``N x d``."""
+        """Return the readings of sensors at states ``N x d``."""
         models = [self.mj_model()] * len(states)
         actions = np.zeros((len(states), len(self.actions)))
         # Sensors of a simulation step are those of its beginning.
@@ -246,23 +248,29 @@ class MujocoPhysics(BlackBoxPhysics):
         from mujoco import MjData
         from mujoco.rollout import Rollout
 
-        length, n = self.model.opt.timestep, len(states)
+        n = len(states)
+        length = self.model.opt.timestep
         controls = np.zeros((n, 1, self.model.nu))
         controls[:, 0, self._driven] = actions
         # MuJoCo resets an unstable simulation to time 0, at any step.
         starts = np.column_stack([np.full(n, length), states])
-        ends, sensors = np.empty_like(starts), np.empty((n, self.model.nsensordata))
+        ends = np.empty_like(starts)
+        sensors = np.empty((n, self.model.nsensordata))
         threads = self.threads or torch.get_num_threads()
         threads = min(threads, 1 + n * num_steps // _WORTH)
         pool = Rollout(nthread=threads if threads > 1 else 0)
+        # Rows in a call of the pool, which Ctrl-C cannot end.
         at_once = max(1, _AT_ONCE // num_steps)
         with silenced(), pool:
             self._data += [MjData(self.model) for _ in range(threads - len(self._data))]
             for first in range(0, n, at_once):
                 part = slice(first, first + at_once)
-                given = models[part], self._data[:threads], starts[part], controls[part]
-                path, seen = pool.rollout(*given, nstep=num_steps)
-                ends[part], sensors[part] = path[:, -1], seen[:, -1]
+                path, readings = pool.rollout(
+                    *(models[part], self._data[:threads], starts[part], controls[part]),
+                    nstep=num_steps,
+                )
+                ends[part], sensors[part] = path[:, -1], readings[:, -1]
+        # Time began at one step, and would have counted all of them.
         ends[ends[:, 0] < (num_steps + 0.5) * length] = np.nan
         return ends[:, 1:], sensors
 
@@ -282,9 +290,9 @@ def _mujoco() -> Any:
 def _read(source: Any) -> Any:
     """Return a new MjSpec."""
     spec = _mujoco().MjSpec
-    if isinstance(source, spec):
-        return source.copy()
-    return spec.from_file(str(source)) if isinstance(source, Path) else spec.from_string(source)
+    if isinstance(source, Path):
+        return spec.from_file(str(source))
+    return spec.from_string(source) if isinstance(source, str) else source.copy()
 
 
 def _compiled(source: Any) -> Any:
@@ -298,12 +306,11 @@ def _compiled(source: Any) -> Any:
 
 def _parts(names: Sequence[str], sizes: Iterable[int], kind: str) -> list[str]:
     """Return names of all numbers of elements, by the number of the element if it has no name."""
-    whole = [name or f"{kind}{i}" for i, name in enumerate(names)]
-    return [
-        name if size == 1 else f"{name}_{k}"
-        for name, size in zip(whole, sizes, strict=True)
-        for k in range(size)
-    ]
+    parts = []
+    for i, (name, size) in enumerate(zip(names, sizes, strict=True)):
+        name = name or f"{kind}{i}"
+        parts += [name] if size == 1 else [f"{name}_{k}" for k in range(size)]
+    return parts
 
 
 def _state_names(model: Any) -> list[str]:
@@ -323,4 +330,4 @@ def _state_names(model: Any) -> list[str]:
             "of actions that act late see StateSpec(previous=...)."
         )
     activations = _parts(names_of(model, "actuator"), model.actuator_actnum, "actuator")
-    return [*joints, *(f"{name}_dot" for name in joints), *(f"{each}_act" for each in activations)]
+    return [*joints, *(f"{j}_dot" for j in joints), *(f"{a}_act" for a in activations)]

@@ -29,6 +29,8 @@ FIELDS = {
 }
 """Names of parameters, by the kind of element that has them."""
 _SIGNED = {*_CENTER, *_SHEAR, "gear"}
+_NAMES = ", ".join(sorted(set().union(*FIELDS.values())))
+_EXPECTED = f"expected 'element.parameter', the latter one of {_NAMES}, or an edit= that reads it"
 _MOST_MODELS, _MOST_BYTES = 1024, 2**28  # that are remembered
 
 _LOCK = RLock()  # of data, and of MuJoCo's handler of warnings: there is one for all threads
@@ -38,7 +40,7 @@ Edit = Callable[[Any, ParameterValues], object]
 
 @contextmanager
 def silenced() -> Iterator[None]:
-    """Keep MuJoCo from printing and logging what an error says, and other threads out."""
+    """Keep MuJoCo from printing and logging the message of an error, and other threads out."""
     import mujoco
 
     with _LOCK:
@@ -61,11 +63,7 @@ class Place(NamedTuple):
 class ModelParameters:
     """The unknown parameters of a model, and the compiled model of some values.
 
-    Args:
-        model: The compiled model of the MJCF as it is.
-        spec: Makes a new ``MjSpec`` of the MJCF; None if there is no MJCF.
-        unknowns: The unknown parameters.
-        edit: As of :class:`~gpadjust.physics.MujocoPhysics`.
+    ``spec`` makes a new ``MjSpec`` of the MJCF; it is None if there is no MJCF.
     """
 
     def __init__(
@@ -82,22 +80,21 @@ class ModelParameters:
         self._data: Any = None  # slower to make than a model
         self.places: dict[str, Place] = {}
         for name, unknown in unknowns.items():
-            place = self._place(name)
+            place = self._place(name)  # None of one that the edit reads
             if place is not None:
                 self._check(name, place, unknown)
                 self.places[name] = place
         if edit is not None:
-            read = _Read(unknowns, np.array([unknown.guess for unknown in unknowns.values()]))
+            guesses = np.array([unknown.guess for unknown in unknowns.values()])
+            values = _Read(unknowns, guesses)
             with silenced():
-                self._edited(read)
-            if unread := {*unknowns} - {*self.places} - read.names:
-                raise ValueError(
-                    f"edit does not read {min(unread)!r}, and {_expected()}; found neither."
-                )
+                self._edited(values)
+            if unread := {*unknowns} - {*self.places} - values.names:
+                raise ValueError(f"edit does not read {min(unread)!r}, and {_EXPECTED}.")
 
     def compiled(self, values: Array) -> Any:
         """Return the model with these values of the parameters, ``p``."""
-        key = values.tobytes()
+        key = values.tobytes()  # equal parameters alone are equal bytes
         with silenced():
             if key not in self._models:
                 if len(self._models) >= min(_MOST_MODELS, _MOST_BYTES // self.model.nbuffer):
@@ -125,16 +122,16 @@ class ModelParameters:
                 _write(model, place, named[name])
         if self._data is None or not is_as_compiled:
             self._data = mujoco.MjData(model)
-        mujoco.mj_setConst(model, self._data)  # what masses and gears determine
+        mujoco.mj_setConst(model, self._data)  # quantities of masses and gears
         return model
 
     def _edited(self, named: ParameterValues, shapes: Mapping[str, Any] | None = None) -> Any:
         """Return the compiled model of the MJCF, edited, with bodies of other shapes of mass."""
-        assert self.spec is not None, "asked before"
+        assert self.spec is not None, "checked before"
         spec = self.spec()
         if self.edit is not None:
             self.edit(spec, named)
-        model = spec.compile()
+        model = spec.compile()  # which computes the inertia of geoms
         if shapes:
             _deform(spec, model, shapes)
             model = spec.compile()
@@ -150,23 +147,24 @@ class ModelParameters:
     def _place(self, name: str) -> Place | None:
         """Return where a parameter is; None if the edit is to read it."""
         element, _, field = name.rpartition(".")
-        kinds = [kind for kind, fields in FIELDS.items() if field in fields]
-        found = [kind for kind in kinds if element in names_of(self.model, kind)]
-        if len(found) == 1:
-            return Place(found[0], element, field)
-        if self.edit is not None and not found:
+        elements = {
+            kind: names_of(self.model, kind) for kind, fields in FIELDS.items() if field in fields
+        }
+        kinds = [kind for kind, names in elements.items() if element in names]
+        if len(kinds) == 1:
+            return Place(kinds[0], element, field)
+        if self.edit is not None and not kinds:
             return None
-        if not kinds or not element:
-            raise ValueError(f"Unknown parameter {name!r}; {_expected()}.")
-        there = {each for kind in kinds for each in names_of(self.model, kind)}
+        if not elements or not element:
+            raise ValueError(f"Unknown parameter {name!r}; {_EXPECTED}.")
         raise ValueError(
-            f"Expected {name!r} to name one {' or '.join(kinds)}, of {', '.join(sorted(there))}; "
-            f"found {len(found)}."
+            f"Expected {name!r} to name one {' or '.join(elements)}, of "
+            f"{', '.join(sorted(set().union(*elements.values())))}; found {len(kinds)}."
         )
 
     def _check(self, name: str, place: Place, unknown: Unknown) -> None:
-        """Raise a ValueError if a parameter is not free to vary as its prior says."""
-        own = getattr(self.model, place.kind)(place.element)
+        """Raise a ValueError if a parameter cannot vary as by its prior."""
+        element = getattr(self.model, place.kind)(place.element)
         if place.field not in _SIGNED and unknown.factor is None and unknown.bounds[0] < 0:
             raise ValueError(
                 f"{name!r} cannot be negative, and by its prior, {unknown!r}, it can be: give it a "
@@ -174,15 +172,16 @@ class ModelParameters:
             )
         if place.field in _SHAPE and self.spec is None:
             raise ValueError(f"{name!r} needs the MJCF or an MjSpec; found an MjModel.")
-        if place.kind == "body" and own.mass[0] == 0:
+        if place.kind == "body" and element.mass[0] == 0:
             raise ValueError(f"{name!r}: the body has no mass in the MJCF; give it some.")
+        # A servo's force has its gains in the bias, - kp q - kv v.
         feedback = {"kp": slice(1, 2), "kv": slice(1, 3)}.get(place.field)
-        if feedback is not None and not own.biasprm[feedback].any():
-            raise ValueError(f"{name!r}: the actuator is no servo of that; its gain is its gear.")
+        if feedback is not None and not element.biasprm[feedback].any():
+            raise ValueError(f"{name!r}: the actuator is not a servo with it; a motor has a gear.")
 
 
 class _Read(ParameterValues):
-    """Values of parameters that know which of them were read."""
+    """Values of parameters that record which of them were read."""
 
     def __init__(self, names: Any, rows: Any) -> None:
         super().__init__(names, rows)
@@ -201,18 +200,9 @@ def names_of(model: Any, kind: str) -> list[str]:
 
 def _sizes(model: Any) -> dict[str, float]:
     """Return the numbers of all elements of a compiled model, and its time step."""
-    names = [name for name in dir(model) if name.startswith("n")]
-    sizes = {name: getattr(model, name) for name in names}
-    own = {name: size for name, size in sizes.items() if isinstance(size, int)}
-    return {**own, "the time step": model.opt.timestep}
-
-
-def _expected() -> str:
-    fields = sorted({field for each in FIELDS.values() for field in each})
-    return (
-        f"expected 'element.parameter', the latter one of {', '.join(fields)}, or an edit= that "
-        "reads it"
-    )
+    sizes = {name: getattr(model, name) for name in dir(model) if name.startswith("n")}
+    sizes = {name: size for name, size in sizes.items() if isinstance(size, int)}
+    return {**sizes, "the time step": model.opt.timestep}
 
 
 def _write(model: Any, place: Place, value: float) -> None:
@@ -222,11 +212,11 @@ def _write(model: Any, place: Place, value: float) -> None:
         case Place(field="mass"):
             element.inertia[:] *= value / element.mass[0]
             element.mass[0] = value
-        case Place(field="kp"):
+        case Place(field="kp"):  # force = kp (u - q)
             element.gainprm[0] = value
             element.biasprm[1] = -value
-        case Place(field="kv"):
-            if element.biasprm[1] == 0:  # a servo of velocities
+        case Place(field="kv"):  # - kv v, or kv (u - v) of a servo of velocities
+            if element.biasprm[1] == 0:
                 element.gainprm[0] = value
             element.biasprm[2] = -value
         case Place(kind="tendon"):
@@ -236,24 +226,23 @@ def _write(model: Any, place: Place, value: float) -> None:
 
 
 def _deform(spec: Any, model: Any, shapes: Mapping[str, Mapping[str, float]]) -> None:
-    r"""Write the inertia of bodies into an MJCF, of which ``model`` is compiled.
-
-    Second moments S of the mass about its center become :math:`A S A^\top`. No moment of inertia,
-    :math:`I = tr(S) 1 - S`, is then negative or exceeds the sum of the others.
-    """
+    """Write the inertia of bodies into an MJCF, of which ``model`` is compiled."""
     import mujoco
 
-    # Else the inertia of geoms would count, not what is written.
+    # Else the inertia of geoms would count, not the one written here.
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
     for body in spec.bodies[1:]:
-        i, shape = body.id, shapes.get(body.name, {})
+        i = body.id
+        shape = shapes.get(body.name, {})
         rotation = np.empty(9)
         mujoco.mju_quat2Mat(rotation, model.body_iquat[i])
         R = rotation.reshape(3, 3)
+        # Second moments about the center, of the principal moments: S = R (tr(I) / 2 - I) R^T
         S = R @ np.diag(model.body_inertia[i].sum() / 2 - model.body_inertia[i]) @ R.T
-        A = np.diag([shape.get(each, 1.0) for each in _STRETCH])
-        A[np.triu_indices(3, 1)] = [shape.get(each, 0.0) for each in _SHEAR]
+        A = np.diag([shape.get(name, 1.0) for name in _STRETCH])
+        A[np.triu_indices(3, 1)] = [shape.get(name, 0.0) for name in _SHEAR]
         S = A @ S @ A.T
+        # I = tr(S) 1 - S: no moment is negative or exceeds the sum of the others.
         inertia = np.trace(S) * np.eye(3) - S
         center = [shape.get(c, x) for c, x in zip(_CENTER, model.body_ipos[i], strict=True)]
         body.explicitinertial, body.mass, body.ipos = True, model.body_mass[i], center

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from importlib.util import find_spec
 from typing import Literal
 
 import torch
@@ -12,19 +11,18 @@ from torch import Tensor
 from gpadjust.checks import check_choice, checked_number, checked_whole
 from gpadjust.physics.base import Physics, name_of
 from gpadjust.physics.black_box import FiniteDifferences
-from gpadjust.physics.error import PhysicsError
+from gpadjust.physics.error import PhysicsError, outline
 from gpadjust.physics.formula import FormulaPhysics
 from gpadjust.physics.parameters import ParameterValues
 from gpadjust.physics.unknown import Unknown
 
-# Runge-Kutta methods of a fixed step: the weights of slopes in each further stage, and in the step.
-FIXED_STEP: dict[str, tuple[tuple[float, ...], ...]] = {
+# Runge-Kutta methods: the weights a of slopes in each further stage, and b in the step (Hairer,
+# Norsett and Wanner 1993, section II.1).
+METHODS: dict[str, tuple[tuple[float, ...], ...]] = {
     "euler": ((1.0,),),
     "midpoint": ((0.5,), (0.0, 1.0)),
     "rk4": ((1 / 3,), (-1 / 3, 1.0), (1.0, -1.0, 1.0), (0.125, 0.375, 0.375, 0.125)),
 }
-ADAPTIVE_STEP = ("dopri5", "dopri8", "bosh3", "fehlberg2", "adaptive_heun")
-_MOST_STEPS = 10_000  # of an adaptive method
 
 
 class ODEPhysics(Physics):
@@ -42,13 +40,10 @@ class ODEPhysics(Physics):
             Or a :class:`FormulaPhysics` of state and action, with its unknown parameters.
         step: The duration of the step, in the time unit of ``rhs``.
         state_dim: The number of leading columns that contain the state; the action follows.
-        substeps: Integration steps within the step, for the fixed-step methods.
-        method: ``"euler"``, ``"midpoint"`` or ``"rk4"`` (Kutta's 3/8 rule), of fixed steps, or an
-            adaptive one of ``torchdiffeq.odeint`` (``pip install "gpadjust[ode]"``), such as
-            ``"dopri5"``. These control one step size for all rows of a batch, on which a row's
-            result then depends within their tolerances. They fail if ``rhs`` is stiff, for all
-            rows: use ``"rk4"`` with many substeps.
-        difference: Whether the output is the change of the state instead of the new state.
+        substeps: Integration steps within the step.
+        method: ``"euler"``, ``"midpoint"`` or ``"rk4"`` (Kutta's 3/8 rule). An adaptive method is
+            ``torchdiffeq.odeint`` in a :class:`FunctionPhysics`.
+        difference: If True, the output is the change of the state instead of the new state.
         gradient: Source of the gradient in X: ``"autograd"``, or ``"finite-difference"``, without
             second derivatives, which is several times faster if there are many substeps.
         unknowns, inputs, name: As of :class:`Physics`.
@@ -76,14 +71,10 @@ class ODEPhysics(Physics):
         name: str | None = None,
     ) -> None:
         if isinstance(rhs, FormulaPhysics):
-            unknowns, name = rhs.unknowns, name or rhs.name
+            unknowns = rhs.unknowns
+            name = name or rhs.name
         super().__init__(unknowns=unknowns, inputs=inputs, name=name_of(rhs, name, "rhs"))
-        check_choice("method", method, (*FIXED_STEP, *ADAPTIVE_STEP))
-        if method in ADAPTIVE_STEP and find_spec("torchdiffeq") is None:
-            raise ImportError(
-                f'The method {method!r} needs torchdiffeq; run `pip install "gpadjust[ode]"`, or '
-                'take "rk4".'
-            )
+        check_choice("method", method, tuple(METHODS))
         check_choice("gradient", gradient, ("autograd", "finite-difference"))
         self.rhs, self.method, self.gradient = rhs, method, gradient
         self.step = checked_number("step", step, above=0)
@@ -92,7 +83,7 @@ class ODEPhysics(Physics):
         self.difference = difference
 
     def check_names(self, names: Sequence[str]) -> None:
-        """Raise a ValueError if the equations are a text, and data have other columns."""
+        """Raise a ValueError if the equations are a text, and data have another order."""
         if isinstance(self.rhs, FormulaPhysics):
             self.rhs.check_names(names)
 
@@ -107,52 +98,32 @@ class ODEPhysics(Physics):
                 rate = self.rhs(state, action, *parameters)
             shape = (len(X), self.state_dim)
             if not torch.is_tensor(rate) or rate.shape != shape or rate.is_complex():
-                found = tuple(rate.shape) if torch.is_tensor(rate) else type(rate).__name__
                 raise PhysicsError(
-                    f"The rhs of physics {self.name!r} returned {found}, expected a real tensor of "
-                    f"shape {shape}: a time derivative of each state. Correct it, or state_dim, or "
-                    f"inputs; state and action have {X.shape[1]} column(s)."
+                    f"The rhs of physics {self.name!r} returned {outline(rate)}, expected a real "
+                    f"tensor of shape {shape}: a time derivative of each state. Correct it, or "
+                    f"state_dim, or inputs; state and action have {X.shape[1]} column(s)."
                 )
             return rate
 
-        if self.method in FIXED_STEP:
-            end = _fixed(derivative, state, self.step / self.substeps, self.substeps, self.method)
-        else:
-            from torchdiffeq import odeint  # slow to import
-
-            times, options = (
-                torch.tensor([0.0, self.step]).to(state),
-                {"max_num_steps": _MOST_STEPS},
-            )
-            _, end = odeint(
-                lambda _, s: derivative(s), state, times, method=self.method, options=options
-            )
+        end = state
+        h = self.step / self.substeps
+        for _ in range(self.substeps):
+            # k_i = g(s + h sum_{j < i} a_ij k_j), and the new s = s + h sum_i b_i k_i
+            point = start = end
+            slopes = list[Tensor]()
+            for weights in METHODS[self.method]:
+                slopes.append(derivative(point))
+                point = start
+                for weight, slope in zip(weights, slopes, strict=True):
+                    if weight:
+                        point = point.add(slope, alpha=h * weight)
+            end = point
         return end - state if self.difference else end
 
     def of_rows(self, rows: Tensor) -> Tensor:
         """Return the outputs of rows, with the gradient in X by differences if that was chosen."""
+        # Differences in X would cut off the gradient of the parameters of a module.
         learns = any(p.requires_grad for p in self.parameters())
         if self.gradient == "autograd" or learns or not rows.requires_grad:
             return super().of_rows(rows)
         return FiniteDifferences.apply(rows, super().of_rows(rows.detach()), self)
-
-
-def _fixed(
-    derivative: Callable[[Tensor], Tensor], state: Tensor, h: float, number: int, method: str
-) -> Tensor:
-    r"""Return the state after a number of steps h of a Runge-Kutta method.
-
-    With its weights a (Hairer, Norsett and Wanner 1993, section II.1) a step is
-
-    .. math:: k_i = g\Bigl(s + h \sum_{j < i} a_{i j} k_j\Bigr), \quad s + h \sum_i a_i k_i.
-    """
-    for _ in range(number):
-        point, slopes = state, list[Tensor]()
-        for weights in FIXED_STEP[method]:
-            slopes.append(derivative(point))
-            point = state
-            for weight, slope in zip(weights, slopes, strict=True):
-                if weight:
-                    point = point.add(slope, alpha=h * weight)
-        state = point
-    return state

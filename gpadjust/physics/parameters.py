@@ -10,10 +10,9 @@ from torch import Tensor
 
 from gpadjust.checks import check_level
 from gpadjust.display import Display, html_table
-from gpadjust.physics.unknown import Curve, Unknown, Unknowns
+from gpadjust.physics.unknown import LARGEST, Curve, Unknown, Unknowns
 
 _AS_WIDE = 0.8  # of a prior's standard deviation, or more
-_FARTHEST = 8.0  # coordinate of a draw at a bound, in place of infinity
 _AS_FAR = 0.3  # standard deviations of a prior, or less from its middle
 
 
@@ -28,7 +27,7 @@ class ParameterValues(dict[str, Any]):
         super().__init__((name, rows[..., i]) for i, name in enumerate(names))
         self.rows = rows
         self.functions = dict[str, Curve]()
-        if names and isinstance(names, Unknowns):
+        if names and isinstance(names, Unknowns):  # a function has no row of its own
             for name, (unknown, columns) in names.functions.items():
                 self.functions[name] = Curve(unknown, self._of_function(columns))
 
@@ -78,20 +77,20 @@ class PhysicsParameters(ParameterValues, Display):
 
     @property
     def coordinates(self) -> Tensor:
-        """Coordinates of the draws, ``K x p``, standard normal by the prior."""
-        z = self.unknowns.coordinates(self.draws)
-        return z.nan_to_num(nan=torch.nan, posinf=_FARTHEST, neginf=-_FARTHEST)
+        """Coordinates of the draws, ``K x p``, standard normal by the prior; finite at bounds."""
+        z = self.unknowns.to_coordinates(self.draws)
+        return z.nan_to_num(nan=torch.nan, posinf=LARGEST, neginf=-LARGEST)
 
     @property
     def center(self) -> Tensor:
         """Values at the mean of the coordinates, ``p``: of factors the geometric mean.
 
-        Of parameters of which the data tell only a product or ratio, this keeps to it as the draws
+        If the data determine only a product or ratio of parameters, the center has it as the draws
         do; the mean does not.
         """
         if not self.unknowns:
             return self.mean
-        return self.unknowns.at(self.coordinates.mean(0))
+        return self.unknowns.to_values(self.coordinates.mean(0))
 
     @property
     def sd(self) -> Tensor:
@@ -112,6 +111,7 @@ class PhysicsParameters(ParameterValues, Display):
         return [
             name
             for name, z in coordinates.items()
+            # N(0, 1) by the prior
             if z.std(correction=0) > _AS_WIDE and z.mean().abs() < _AS_FAR
         ]
 
@@ -120,7 +120,9 @@ class PhysicsParameters(ParameterValues, Display):
         low, high = self.interval()
         rows = [("", "mean", "95 % interval", "prior", "unit")]
         for i, (name, unknown) in enumerate(self.unknowns.items()):
-            interval = f"{low[i]:.4g} to {high[i]:.4g}" if low[i] < high[i] else "-"  # a point fit
+            interval = f"{low[i]:.4g} to {high[i]:.4g}"
+            if not low[i] < high[i]:  # a point fit
+                interval = "-"
             rows.append((name, f"{self.mean[i]:.4g}", interval, unknown.prior_text, unknown.unit))
         return rows
 

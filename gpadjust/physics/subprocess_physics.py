@@ -25,8 +25,8 @@ class SubprocessPhysics(BlackBoxPhysics):
 
     Placeholders in its arguments, ``{T}``, are replaced by the values of a row: by the name of an
     input or unknown parameter, or by the number of an input, from 0. Formats are those of Python
-    (``{T:.3f}``; by default all digits), and ``{{`` is a brace. The outputs are what the program
-    prints. If its exit code is not 0, the row fails, with what it wrote to stderr in the error.
+    (``{T:.3f}``; by default all digits), and ``{{`` is a brace. The outputs are the printed
+    numbers. If the exit code is not 0, the row fails, with the program's stderr in the error.
 
     Rows run in parallel and are remembered as of a :class:`~gpadjust.BlackBoxPhysics`. There is no
     gradient in X, as programs seldom print the digits that differences need.
@@ -37,8 +37,8 @@ class SubprocessPhysics(BlackBoxPhysics):
         stdin: A text with placeholders for the program's standard input. Default: nothing.
         parse: Maps the printed text to the outputs. Default: numbers between blanks or commas.
         timeout: Seconds after which a run is ended, and has failed. Default: none.
-        cache: A folder in which outputs are kept, by command and ``stdin``, for all processes that
-            name it; a failure is not kept. Remove it when the program itself has changed.
+        cache: A folder that keeps outputs, by command and ``stdin``, for all processes that use it;
+            a failure is not kept. Remove it when the program itself has changed.
         unknowns, inputs, name: As of :class:`Physics`; each unknown parameter has a placeholder.
 
     Example:
@@ -68,6 +68,7 @@ class SubprocessPhysics(BlackBoxPhysics):
         super().__init__(
             self._run, unknowns=unknowns, batched=False, gradient=None, inputs=inputs, name=name
         )
+        # A part is a text, and the name and format of a placeholder or None.
         parts = [part for text in (*command, stdin) for part in Formatter().parse(text)]
         fields = {field for _, field, _, _ in parts if field is not None}
         unclear = {field for field in fields if not field.isdigit()} - {*names, *self.unknowns}
@@ -86,12 +87,12 @@ class SubprocessPhysics(BlackBoxPhysics):
 
     def _run(self, row: NDArray[np.float64], *parameters: Mapping[str, float]) -> ArrayLike:
         """Return the outputs at a row of inputs."""
-        values = row.tolist()
+        values = row.tolist()  # whose texts have all digits
         if self.names and len(self.names) != len(values):
             raise ValueError(f"expected names of all columns, or inputs=, found {self.names}")
         named = dict(zip(self.names, values, strict=False))
-        for each in parameters:
-            named |= each
+        for values_of_parameters in parameters:
+            named |= values_of_parameters
         command = [part.format(*values, **named) for part in self.command]
         return self.parse(self._output(command, self.stdin.format(*values, **named)))
 
@@ -99,15 +100,15 @@ class SubprocessPhysics(BlackBoxPhysics):
         """Return the printed text, from the cache if it is there."""
         if self.cache is None:
             return _printed(command, stdin, self.timeout)
-        asked = {"command": command, "stdin": stdin or None}
-        key = hashlib.sha256(json.dumps(asked).encode()).hexdigest()
+        run = {"command": command, "stdin": stdin or None}
+        key = hashlib.sha256(json.dumps(run).encode()).hexdigest()
         file = self.cache / f"{key}.json"
         with suppress(OSError, ValueError, KeyError):  # without a file, or with a damaged one
             return str(json.loads(file.read_text(encoding="utf-8"))["stdout"])
         text = _printed(command, stdin, self.timeout)
         self.cache.mkdir(parents=True, exist_ok=True)
         part = self.cache / f"{key}.{uuid4().hex}.part"
-        part.write_text(json.dumps({**asked, "stdout": text}), encoding="utf-8")
+        part.write_text(json.dumps({**run, "stdout": text}), encoding="utf-8")
         part.replace(file)  # at once, as other processes may read or write it now
         return text
 
@@ -126,11 +127,11 @@ def _printed(command: list[str], stdin: str, timeout: float | None) -> str:
         try:
             printed, written = process.communicate(stdin, timeout)
         except BaseException:
-            if os.name == "posix":  # with all that it has started
+            if os.name == "posix":  # with all that it has started, as one session
                 with suppress(ProcessLookupError):
                     os.killpg(process.pid, signal.SIGKILL)
             process.kill()
             raise
-    if process.returncode:
+    if process.returncode != 0:
         raise subprocess.CalledProcessError(process.returncode, command, printed, written)
     return printed

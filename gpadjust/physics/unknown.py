@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from keyword import iskeyword
 from typing import Any
@@ -15,13 +15,13 @@ from torch.special import ndtr, ndtri
 
 from gpadjust.checks import check_kind, checked_number, real_array
 
-_LARGEST = 8.0  # coordinate, beyond which float64 knows no mass of the normal distribution
+LARGEST = 8.0  # coordinate, beyond which float64 has no mass of the normal distribution
 _UNBOUNDED = (-math.inf, math.inf)
 _KNOTS = 3.0  # of a function, in a lengthscale
 _MOST_KNOTS = 60
 _OF_RANGE = 0.25  # a lengthscale, by default
 _NUGGET = 1e-10
-_FARTHEST = 40.0  # coordinate of a value; at a bound it is infinite
+_AT_BOUND = 40.0  # coordinate of a knot, in place of infinity
 
 
 def _pair(name: str, pair: Any) -> tuple[float, float]:
@@ -49,9 +49,9 @@ class Unknown:
     so on, three in a lengthscale. A function of torch calls it, ``p.friction(speed)``.
 
     Args:
-        guess: The value that the physics has where nothing was learnt; inside the bounds.
+        guess: The value before a fit; inside the bounds.
         sd: Standard deviation of a normal prior, in the parameter's unit.
-        factor: What a log-normal prior multiplies or divides the guess by, above 1.
+        factor: Factor of one standard deviation of a log-normal prior, above 1.
         bounds: The least and the largest possible value.
         unit: Its unit, for tables and figures.
         function_of: The variable of a function. A :class:`FormulaPhysics` reads it, as a formula of
@@ -90,6 +90,7 @@ class Unknown:
                 object.__setattr__(self, name, value)
         low, high = _pair("bounds", self.bounds)
         object.__setattr__(self, "bounds", (low, high))
+        # sd, factor or two finite bounds: one of them is the prior.
         spreads = (self.sd is not None) + (self.factor is not None)
         is_one_prior = spreads == 1 or (spreads == 0 and math.isfinite(high - low))
         is_positive = self.factor is None or self.guess > 0
@@ -98,21 +99,21 @@ class Unknown:
                 "Expected a guess inside of the bounds, above 0 with a factor, and one prior: sd, "
                 f"factor, or two finite bounds; found {self!r}."
             )
-        self._check_function()
+        check_kind("function_of", self.function_of, str, "the name of a variable")
+        if (self.function_of, self.between, self.lengthscale) != ("", None, None):
+            self._check_function()
 
     def _check_function(self) -> None:
-        """Raise an error unless all arguments of a function are there, or none."""
-        check_kind("function_of", self.function_of, str, "the name of a variable")
-        if not self.function_of and (self.between, self.lengthscale) == (None, None):
-            return
+        """Raise an error unless the arguments of a function suit each other."""
         low, high = (0.0, 0.0) if self.between is None else _pair("between", self.between)
         if not (self.function_of and low < high and math.isfinite(high - low)):
             raise ValueError(
                 'Expected of a function its variable and the range of that, function_of="speed", '
                 f"between=(0.0, 20.0); found {self!r}."
             )
-        scale = _OF_RANGE * (high - low) if self.lengthscale is None else self.lengthscale
-        scale = checked_number("lengthscale", scale, above=0)
+        scale = _OF_RANGE * (high - low)
+        if self.lengthscale is not None:
+            scale = checked_number("lengthscale", self.lengthscale, above=0)
         if (high - low) / scale > _MOST_KNOTS / _KNOTS:
             raise ValueError(
                 f"Expected a lengthscale of {_KNOTS / _MOST_KNOTS:g} of the range or more, found "
@@ -123,7 +124,7 @@ class Unknown:
 
     def __repr__(self) -> str:
         # The code that makes it, without defaults.
-        options = [(each.name, getattr(self, each.name), each.default) for each in fields(self)[1:]]
+        options = [(f.name, getattr(self, f.name), f.default) for f in fields(self)[1:]]
         texts = [f"{name}={value!r}" for name, value, default in options if value != default]
         return f"Unknown({', '.join([repr(self.guess), *texts])})"
 
@@ -132,27 +133,36 @@ class Unknown:
         """The prior, for tables."""
         low, high = self.bounds
         limits = f"{low:g} to {high:g}"
-        if math.inf in (high, -low):
-            limits = f"above {low:g}" if high == math.inf else f"below {high:g}"
-        if self.sd is None and self.factor is None:
+        if high == math.inf:
+            limits = f"above {low:g}"
+        elif low == -math.inf:
+            limits = f"below {high:g}"
+        if self.sd is not None:
+            text = f"{self.guess:g} ± {self.sd:g}"
+        elif self.factor is not None:
+            text = f"{self.guess:g}, factor {self.factor:g}"
+        else:
             return limits
-        spread = f" ± {self.sd:g}" if self.factor is None else f", factor {self.factor:g}"
-        text = f"{self.guess:g}{spread}"
-        return text if self.bounds == _UNBOUNDED else f"{text}, {limits}"
+        return text + f", {limits}" * (self.bounds != _UNBOUNDED)
 
     def value(self, z: Tensor) -> Tensor:
         """Return the value at a coordinate, which is standard normal by the prior."""
         low, high = self.bounds
         below, above = self._tails
         if self.is_cut:
-            z = ndtri(below + (above - below) * ndtr(z.clamp(-_LARGEST, _LARGEST)))
-        if self.sd is not None:
-            value = self.guess + self.sd * z
-        elif self.factor is not None:
-            value = self.guess * (math.log(self.factor) * z).exp()
-        else:
-            value = low + (high - low) * ndtr(z.clamp(-_LARGEST, _LARGEST))
+            # The prior between the bounds: its quantile at the probability of z.
+            z = ndtri(below + (above - below) * ndtr(z.clamp(-LARGEST, LARGEST)))
+        value: Tensor = self.quantile(z, torch.exp, lambda z: ndtr(z.clamp(-LARGEST, LARGEST)))
         return value.clamp(low, high)  # beyond there are rounding errors
+
+    def quantile(self, z: Any, exp: Callable[[Any], Any], cdf: Callable[[Any], Any]) -> Any:
+        """Return the value at a coordinate of any kind of number, by the prior without a cut."""
+        if self.sd is not None:
+            return self.guess + self.sd * z  # N(guess, sd^2)
+        if self.factor is not None:
+            return self.guess * exp(math.log(self.factor) * z)  # guess factor^z
+        low, high = self.bounds
+        return low + (high - low) * cdf(z)  # uniform between the bounds
 
     @property
     def is_cut(self) -> bool:
@@ -163,7 +173,9 @@ class Unknown:
         """Return the coordinate at which :meth:`value` is this one."""
         below, above = self._tails
         z = self._without_bounds(value)
-        return z if not self.is_cut else ndtri((ndtr(z) - below) / (above - below))
+        if self.is_cut:
+            z = ndtri((ndtr(z) - below) / (above - below))
+        return z
 
     def _without_bounds(self, value: Tensor) -> Tensor:
         """Return the coordinate by the prior that bounds do not cut off."""
@@ -189,6 +201,7 @@ class Unknown:
         if self.between is None or self.lengthscale is None:
             return torch.empty(0, dtype=torch.float64)
         low, high = self.between
+        # Rounding would add a knot to a range of whole lengthscales.
         number = 1 + math.ceil(_KNOTS * (high - low) / self.lengthscale - 1e-9)
         return torch.linspace(low, high, number, dtype=torch.float64)
 
@@ -204,39 +217,27 @@ class Unknown:
         return torch.cholesky_inverse(self.root)
 
     def weights(self, x: Tensor) -> Tensor:
-        """Return the weights of the coordinates at the knots in those at ``x``, ``... x k``.
-
-        :math:`k(x, Z) k(Z, Z)^{-1}`, the mean of a Gaussian process given its values at Z.
-        """
+        """Return :math:`k(x, Z) k(Z, Z)^{-1}`, weights of the coordinates at knots Z, at ``x``."""
         low, high = self.between or (0.0, 0.0)
         return self._correlation(x.clamp(low, high)) @ self.precision.to(x)
 
     def _correlation(self, x: Tensor) -> Tensor:
         """Return the correlation of coordinates at ``x`` and at the knots, ``... x k``."""
+        # k(x, x') = (1 + r + r^2 / 3) exp(-r), r = sqrt(5) |x - x'| / lengthscale
         r = math.sqrt(5) * (x.unsqueeze(-1) - self.knots.to(x)).abs() / (self.lengthscale or 1.0)
         return (1 + r + r.square() / 3) * (-r).exp()
 
 
 @dataclass(frozen=True, repr=False)
 class Knot(Unknown):
-    """The value of an unknown function at one of its knots: a number of a table of its own.
-
-    Args:
-        function: The name of the function.
-        at: The knot.
-    """
+    """The value of an unknown function, by its name, at one of its knots: a number of a table."""
 
     function: str = ""
     at: float = 0.0
 
 
 class Curve:
-    """An unknown function by its values at the knots.
-
-    Args:
-        unknown: Its prior.
-        values: ``... x k``, a tensor or an array.
-    """
+    """An unknown function by its prior and its values at the knots, ``... x k``."""
 
     def __init__(self, unknown: Unknown, values: Any) -> None:
         self.unknown, self.values = unknown, values
@@ -244,18 +245,15 @@ class Curve:
     def __call__(self, x: Any) -> Any:
         """Return the function at ``x``, whose shape broadcasts with that of the rows of values."""
         values = torch.as_tensor(self.values)
-        at = torch.as_tensor(x).to(values)
+        points = torch.as_tensor(x).to(values)
         # value(k(x, Z) k(Z, Z)^-1 z), z the coordinates of the values
-        z = self.unknown.coordinate(values).clamp(-_FARTHEST, _FARTHEST)
-        found = self.unknown.value((self.unknown.weights(at) * z).sum(-1))
-        return found if isinstance(self.values, Tensor) else found.numpy()
+        z = self.unknown.coordinate(values).clamp(-_AT_BOUND, _AT_BOUND)
+        curve = self.unknown.value((self.unknown.weights(points) * z).sum(-1))
+        return curve if isinstance(self.values, Tensor) else curve.numpy()
 
 
 class Unknowns(dict[str, Unknown]):
-    """The unknown parameters of a physics, by name, and their coordinates.
-
-    Of a function there is a :class:`Knot` for each value, ``p`` parameters in all.
-    """
+    """The ``p`` unknown parameters of a physics, by name; of a function a :class:`Knot` each."""
 
     def __init__(self, unknowns: Mapping[str, Unknown]) -> None:
         is_mapping = isinstance(unknowns, Mapping)
@@ -268,6 +266,7 @@ class Unknowns(dict[str, Unknown]):
             if isinstance(unknown, Knot):
                 self[name] = unknown
                 continue
+            # "link1.mass" of a simulator is an item, "mass" an attribute, too.
             is_path = isinstance(name, str) and ("." in name.strip(".") or "[" in name)
             is_word = isinstance(name, str) and name.isidentifier() and not iskeyword(name)
             is_attribute = is_word and not name.startswith("_") and name != "rows"
@@ -278,76 +277,74 @@ class Unknowns(dict[str, Unknown]):
                 )
             if not unknown.function_of:
                 self[name] = unknown
-            own = {f.name: getattr(unknown, f.name) for f in fields(unknown)}
-            for at, text in zip(unknown.knots.tolist(), _different(unknown.knots), strict=True):
-                self[f"{name}({text})"] = Knot(**own, function=name, at=at)
+            knots = unknown.knots.tolist()
+            for knot, text in zip(knots, _different(knots), strict=True):
+                self[f"{name}({text})"] = Knot(**asdict(unknown), function=name, at=knot)
 
     @classmethod
     def together(cls, several: Iterable[Unknowns]) -> Unknowns:
-        """Return those of several physics, of which those of one name are one.
-
-        Raises:
-            ValueError: If priors of one name differ.
-        """
-        found: dict[str, Unknown] = {}
+        """Return the parameters of several physics, one for each name, or raise a ValueError."""
+        union: dict[str, Unknown] = {}
         for unknowns in several:
             for name, unknown in unknowns.items():
-                if found.setdefault(name, unknown) != unknown:
+                if union.setdefault(name, unknown) != unknown:
                     raise ValueError(
                         f"Expected one prior of the parameter {name!r} in all physics; found "
-                        f"{found[name]!r} and {unknown!r}. Rename one of them."
+                        f"{union[name]!r} and {unknown!r}. Rename one of them."
                     )
-        return cls(found)
+        return cls(union)
 
     @cached_property
     def functions(self) -> dict[str, tuple[Unknown, list[int]]]:
         """The functions: their priors, and the columns of their values."""
-        found: dict[str, tuple[Unknown, list[int]]] = {}
+        functions: dict[str, tuple[Unknown, list[int]]] = {}
         for i, knot in enumerate(self.values()):
             if isinstance(knot, Knot):
-                found.setdefault(knot.function, (knot, []))[1].append(i)
-        return found
+                functions.setdefault(knot.function, (knot, []))[1].append(i)
+        return functions
 
     def refuse_functions(self) -> None:
         """Raise a ValueError if one of them is a function."""
         if self.functions:
             raise ValueError(
                 f"The unknown {min(self.functions)!r} is a function. A parameter here is a number; "
-                "functions are for FormulaPhysics, ODEPhysics and Python "
-                "functions. Leave out function_of and between."
+                "functions are for FormulaPhysics, ODEPhysics and Python functions. Leave out "
+                "function_of and between."
             )
 
     @property
     def declared(self) -> dict[str, Unknown]:
         """The parameters as the user named them, a function as one."""
-        found = {}
+        declared = {}
         for name, unknown in self.items():
             if isinstance(unknown, Knot):
-                name = unknown.function
-                own = {f.name: getattr(unknown, f.name) for f in fields(Unknown)}
-                unknown = Unknown(**own)
-            found[name] = unknown
-        return found
+                settings = {f.name: getattr(unknown, f.name) for f in fields(Unknown)}
+                declared[unknown.function] = Unknown(**settings)
+            else:
+                declared[name] = unknown
+        return declared
 
     @property
     def guess(self) -> Tensor:
         """The guesses, ``p``."""
         return torch.tensor([u.guess for u in self.values()], dtype=torch.float64)
 
-    def at(self, coordinates: Tensor) -> Tensor:
+    def to_values(self, coordinates: Tensor) -> Tensor:
         """Return values ``... x p`` at coordinates ``... x p``, standard normal by the prior."""
         for unknown, columns in self.functions.values():
             coordinates = coordinates.clone()
+            # L z, whose covariance is k(Z, Z)
             coordinates[..., columns] = coordinates[..., columns] @ unknown.root.mT.to(coordinates)
         pairs = zip(self.values(), coordinates.unbind(-1), strict=True)
         return torch.stack([u.value(z) for u, z in pairs], dim=-1)
 
-    def coordinates(self, values: Tensor) -> Tensor:
+    def to_coordinates(self, values: Tensor) -> Tensor:
         """Return the coordinates ``... x p`` of values ``... x p``."""
         pairs = zip(self.values(), values.unbind(-1), strict=True)
         z = torch.stack([u.coordinate(value) for u, value in pairs], dim=-1)
         for unknown, columns in self.functions.values():
             root = unknown.root.to(z)
+            # L^-1 z
             z[..., columns] = torch.linalg.solve_triangular(
                 root, z[..., columns].unsqueeze(-1), upper=False
             ).squeeze(-1)
@@ -357,10 +354,10 @@ class Unknowns(dict[str, Unknown]):
 NO_UNKNOWNS = Unknowns({})
 
 
-def _different(values: Tensor) -> list[str]:
+def _different(values: list[float]) -> list[str]:
     """Return texts of increasing values, of as few digits as make them different."""
     for digits in range(3, 18):
-        texts = [f"{value:.{digits}g}" for value in values.tolist()]
+        texts = [f"{value:.{digits}g}" for value in values]
         if len({*texts}) == len(texts):
             break
     return texts

@@ -20,7 +20,7 @@ import gpadjust
 from gpadjust.checks import checked_number, checked_whole
 from gpadjust.display import Display, html_table
 from gpadjust.dynamics import FreeRun, IdentifiedDynamics, PhysicsDynamics, Windows
-from gpadjust.dynamics.targets import one_physics
+from gpadjust.dynamics.physics_dynamics import one_physics
 from gpadjust.physics import Physics, PhysicsError
 from gpadjust.physics.parameters import PhysicsParameters
 from gpadjust.records.lack import Lack, clearest_lack, robust_moments

@@ -16,7 +16,6 @@ from torch import Tensor
 from gpadjust.checks import check_choice, check_finite, check_kind, checked_number
 from gpadjust.core.data import ArrayLike, as_tensor
 from gpadjust.dynamics import Trajectories, Windows
-from gpadjust.dynamics.targets import check_spec
 from gpadjust.files.fields import is_moment, seconds_of
 from gpadjust.files.table import Table
 from gpadjust.states import StateSpec
@@ -197,7 +196,7 @@ class Records:
     """
 
     def __init__(self, records: Record | Iterable[Record], spec: StateSpec) -> None:
-        check_spec(spec)
+        check_kind("spec", spec, StateSpec, "a StateSpec, such as StateSpec(['x', 'v'], ['force'])")
         if isinstance(records, Record):
             records = [records]
         self.records = tuple(records)
@@ -267,7 +266,7 @@ class Records:
                 field is not a number or a time or action is missing, with file, line and column;
                 the time is in minutes, hours or days without ``time_unit``; and as :class:`Record`.
         """
-        check_spec(spec)
+        check_kind("spec", spec, StateSpec, "a StateSpec, such as StateSpec(['x', 'v'], ['force'])")
         columns: dict[str, Any] = {"states": states or {}, "actions": actions or {}}
         for argument, names in columns.items():
             check_kind(argument, names, Mapping, "a dictionary from names of the spec to columns")
@@ -330,7 +329,7 @@ class Records:
         """
         data = _transitions(control_steps(self, step))
         complete = ~data.states.isnan().any(-1)
-        usable = data.some(complete & ~data.next_states[:, self.spec.predicted].isnan().all(-1))
+        usable = data.subset(complete & ~data.next_states[:, self.spec.predicted].isnan().all(-1))
         if not len(usable.states):
             raise ValueError(
                 f"Expected steps from a state that was measured in full, found none of "

@@ -61,7 +61,7 @@ class Sensing:
         values = np.zeros((*parameters.shape[:-1], 3, len(self.longest)))
         values[..., 0, :] = 1.0
         rows, columns = zip(*self.places, strict=True)
-        numbers = self.unknowns.at(torch.from_numpy(parameters)).numpy()
+        numbers = self.unknowns.to_values(torch.from_numpy(parameters)).numpy()
         values[..., rows, columns] = numbers[..., self.first :]
         values[..., 2, :] /= self.step
         return values

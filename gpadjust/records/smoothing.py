@@ -21,7 +21,7 @@ from torch import Tensor
 from gpadjust.checks import check_kind, checked_whole, finite_array
 from gpadjust.dynamics.base import of_states
 from gpadjust.dynamics.least_squares import even_normal
-from gpadjust.dynamics.targets import check_next_values, one_physics
+from gpadjust.dynamics.physics_dynamics import check_next_values, one_physics
 from gpadjust.physics import Physics, PhysicsError
 from gpadjust.physics.parameters import PhysicsParameters
 from gpadjust.physics.unknown import Unknowns
@@ -271,7 +271,7 @@ def drawn_parameters(unknowns: Unknowns, mean: Array, covariance: Array) -> Phys
         return PhysicsParameters({}, [])
     values, vectors = torch.linalg.eigh(torch.from_numpy(covariance.copy()))
     spread = even_normal(_DRAWS, len(unknowns), seed=0) * values.clamp_min(0).sqrt()
-    at = unknowns.at(torch.from_numpy(mean.copy()) + spread @ vectors.mT)
+    at = unknowns.to_values(torch.from_numpy(mean.copy()) + spread @ vectors.mT)
     return PhysicsParameters(unknowns, at.unbind(-1))
 
 
@@ -729,7 +729,7 @@ class Chain:
         values = None
         unknowns = self.physics.unknowns
         if unknowns:
-            values = unknowns.at(torch.from_numpy(parameters)[..., : len(unknowns)])
+            values = unknowns.to_values(torch.from_numpy(parameters)[..., : len(unknowns)])
         for actions in self.within[rows].unbind(1):
             inputs[..., self.spec.moving] = following
             inputs[..., self.spec.state_dim :] = actions

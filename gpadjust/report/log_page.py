@@ -54,14 +54,16 @@ _DIVERGING = 1e30  # an error in any unit, or more
 def page(found: Identification, title: str | None, origin: Origin) -> Page:
     """Return the page, with the units and the program of its origin."""
     spec, units, measured = found.spec, origin.units, found.windows.measured
-    times = (number(n * found.step) for n in (1, measured.shape[1]))
+    control_step = found.smoothed.records.records[0].sampling_step
+    seconds = measured.shape[1] * found.step
+    times = map(number, (control_step, seconds))
     step, held_out = (f"{time} {units.get('time', '')}".strip() for time in times)
     steps = sum(len(record.times) - 1 for record in found.smoothed.records)
     hidden = f", {listed(found.hidden)} hidden" if found.hidden else ""
     lead = (
         f"{listed(spec.states)}{hidden}, under {listed(spec.actions)}: "
         f"{plural(steps, 'step')} of {step} are learnt from, "
-        f"{plural(measured[..., 0].numel(), 'step')} held out."
+        f"{plural(len(measured) * round(seconds / control_step), 'step')} held out."
     )
     answers, rows = _judged(found, units, held_out)
     head = ["by", "state", "error (root mean square)", "unit", "95 % intervals hold"]

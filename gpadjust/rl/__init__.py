@@ -8,8 +8,7 @@ except ImportError as error:
     ) from error
 
 from gpadjust.rl.buffer import MixedReplayBuffer
-from gpadjust.rl.callbacks import DynaCallback
-from gpadjust.rl.dyna import Dyna, DynaSAC, DynaTD3
+from gpadjust.rl.dyna import Dyna, DynaCallback, DynaSAC, DynaTD3
 from gpadjust.rl.model_vec_env import ModelVecEnv
 from gpadjust.rl.options import DynaOptions
 

@@ -10,9 +10,8 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from gpadjust.checks import checked_number, checked_whole
-from gpadjust.control.episodes import Row, nothing, recorded
-from gpadjust.control.faults import fault
+from gpadjust.checks import checked_number
+from gpadjust.control.episodes import Row, fault, nothing, recorded
 
 
 class MixedReplayBuffer(ReplayBuffer):
@@ -26,10 +25,9 @@ class MixedReplayBuffer(ReplayBuffer):
     them takes its place.
 
     Args:
-        buffer_size: Capacity of the real buffer.
+        buffer_size: Capacity of the real buffer, and of the model's.
         args: As of Stable-Baselines3's ``ReplayBuffer``.
         real_fraction: Share of real samples in a batch, in [0, 1].
-        model_buffer_size: Capacity of the model's buffer. Default: as ``buffer_size``.
         options: As of ``ReplayBuffer``, with ``optimize_memory_usage=False``.
 
     Attributes:
@@ -39,7 +37,7 @@ class MixedReplayBuffer(ReplayBuffer):
         mix: If True, batches contain model transitions.
 
     Raises:
-        ValueError: If the fraction or a size is out of range.
+        ValueError: If the fraction is out of range.
     """
 
     def __init__(
@@ -47,16 +45,12 @@ class MixedReplayBuffer(ReplayBuffer):
         buffer_size: int,
         *args: Any,
         real_fraction: float = 1 / 11,
-        model_buffer_size: int | None = None,
         **options: Any,
     ) -> None:
         self.real_fraction = checked_number("real_fraction", real_fraction, least=0, most=1)
-        if model_buffer_size is None:
-            model_buffer_size = buffer_size
         super().__init__(buffer_size, *args, **options)
-        size = checked_whole("model_buffer_size", model_buffer_size, 1)
         spaces = self.observation_space, self.action_space
-        self.model_buffer = ReplayBuffer(size, *spaces, self.device)
+        self.model_buffer = ReplayBuffer(buffer_size, *spaces, self.device)
         self.mix = True
         self.reset()
 
@@ -110,10 +104,9 @@ class MixedReplayBuffer(ReplayBuffer):
     def add_model_rows(self, *columns: np.ndarray) -> None:
         """Add ``N`` transitions of the model at once.
 
-        Args:
-            columns: Observations ``N x d``; next observations, also at the end of an episode;
-                actions scaled to [-1, 1], as SB3 stores them, ``N x a``; rewards ``N``; ends of
-                episodes; and ends by a time limit alone.
+        The columns are observations ``N x d``; next observations, also at the end of an episode;
+        actions scaled to [-1, 1] ``N x a``; rewards, ends of episodes, and ends by a time limit
+        alone, ``N`` each.
         """
         buffer = self.model_buffer
         n = min(len(columns[0]), buffer.buffer_size)

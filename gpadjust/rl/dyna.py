@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
+import time
 import warnings
+from contextlib import ExitStack
 from copy import deepcopy
 from typing import Any, ClassVar, Self
 
@@ -26,14 +29,88 @@ from stable_baselines3.common.vec_env import (
 from gpadjust.checks import check_kind
 from gpadjust.control import EpisodeCheckpoint, StepGuard, Task
 from gpadjust.control import episodes as real
-from gpadjust.control.checkpoint import locked, pickled_environment
-from gpadjust.control.faults import check_observation
+from gpadjust.control.checkpoint import pickled_environment
+from gpadjust.control.learning import check_functions, learn_dynamics
+from gpadjust.control.summary import agent_table, agent_text
 from gpadjust.display import Display
 from gpadjust.dynamics import Trajectories
 from gpadjust.rl.buffer import MixedReplayBuffer
-from gpadjust.rl.callbacks import AgentCallback, DynaCallback
 from gpadjust.rl.model_vec_env import ModelVecEnv
 from gpadjust.rl.options import DynaOptions
+
+
+class DynaCallback(BaseCallback):
+    """A Stable-Baselines3 callback with two more hooks, for :class:`Dyna` agents.
+
+    A subclass with ``_init_callback`` must call that of this class.
+    """
+
+    model: Any
+
+    def _init_callback(self) -> None:
+        if not hasattr(self.model, "model_hooks"):
+            raise TypeError(
+                f"{type(self).__name__} is for Dyna agents, such as DynaSAC; found "
+                f"{type(self.model).__name__}."
+            )
+        self.model.model_hooks.append(self)
+
+    def _on_step(self) -> bool:
+        return True
+
+    def on_model_fit(self, metrics: dict[str, float]) -> None:
+        """React to a fit, with the numbers of the event ``"fit"`` of an ``Agent``."""
+
+    def on_model_episodes(self, returns: np.ndarray) -> None:
+        """React to parallel model episodes, with their returns."""
+
+
+class AgentCallback(DynaCallback):
+    """Calls a callback of :class:`gpadjust.control.Agent` at the corresponding events of Dyna.
+
+    A trial is a rollout of Stable-Baselines3 in which an episode ends.
+    """
+
+    def __init__(self, callback: Any) -> None:
+        super().__init__()
+        self.callback = callback
+        self._start_time = 0.0
+        self._steps_before = 0
+
+    @staticmethod
+    def around(callback: Any) -> Any:
+        """Return a callback of agents, a function of three values, as one of SB3."""
+        if isinstance(callback, BaseCallback) or not callable(callback):
+            return callback
+        try:
+            inspect.signature(callback).bind("agent", "event", "values")
+        except (TypeError, ValueError):  # a function of SB3, of locals and globals
+            return callback
+        return AgentCallback(callback)
+
+    def on_model_fit(self, metrics: dict[str, float]) -> None:
+        """Report a fit of the dynamics."""
+        self.callback(self.model, "fit", metrics)
+
+    def _on_rollout_start(self) -> None:
+        # The updates of the last episode are done, and the next has not begun.
+        self.callback(self.model, "episode", {})
+        self._start_time = time.perf_counter()
+        self._steps_before = len(self.model.replay_buffer.episodes)
+
+    def _on_rollout_end(self) -> None:
+        new = self.model.replay_buffer.episodes.subset(slice(self._steps_before, None))
+        # A checkpoint saves at the start of the next rollout, after the updates of the learner.
+        if len(new) and not isinstance(self.callback, EpisodeCheckpoint):
+            values: dict[str, float] = {"number": self.model.num_episodes + 1, "steps": len(new)}
+            values["reward"] = float(new.rewards.mean())
+            values["seconds"] = time.perf_counter() - self._start_time
+            self.callback(self.model, "trial", values)
+
+    def _on_training_end(self) -> None:
+        # Another callback may have stopped the run within an episode.
+        if self.model.num_timesteps >= self.model._total_timesteps:
+            self.callback(self.model, "done", {})
 
 
 class Dyna(OffPolicyAlgorithm, Display):
@@ -50,13 +127,12 @@ class Dyna(OffPolicyAlgorithm, Display):
     wrong data of an environment, call ``agent.replay_buffer.reset()``.
 
     Any off-policy learner of Stable-Baselines3 whose ``train`` samples from ``replay_buffer`` can
-    be a base, as in ``class DynaTD3(Dyna, TD3): ...``. Other bases raise a TypeError at the
-    definition of the class.
+    be a base, as in ``class DynaTD3(Dyna, TD3): ...``.
 
     Args:
         policy: As in the learner.
         env: The real environment; its observations follow the spec of the dynamics.
-        task: The task.
+        task: The task; to change a part of it, set another one.
         options: Options of the model.
         buffer_size: Number of real transitions in the buffer.
         learning_starts: As in the learner. Default: the untrained policy acts in the first episode.
@@ -67,15 +143,13 @@ class Dyna(OffPolicyAlgorithm, Display):
 
     Attributes:
         num_episodes: Number of real episodes that have ended and were used.
-        task: The task; to change a part of it, set another one.
         wall_time: Seconds spent on ``"fit"``, ``"rollout"`` and ``"update"``.
         notes: As of :class:`gpadjust.control.Agent`.
 
     Raises:
         ValueError: As :class:`gpadjust.control.Agent`, and if there is no task, or ``n_steps`` is
             not 1.
-        TypeError: If task or options have another type.
-        AssertionError: By Stable-Baselines3, if the action space is not a box.
+        TypeError: If task, options or the bases of a subclass have another type.
     """
 
     not_saved: ClassVar[tuple[str, ...]] = (
@@ -144,8 +218,7 @@ class Dyna(OffPolicyAlgorithm, Display):
     def _setup_model(self) -> None:
         if self.task is not None:
             self.task.check_spaces(self.observation_space, self.action_space)
-        names = ("real_fraction", "model_buffer_size")
-        self.replay_buffer_kwargs |= {name: getattr(self.options, name) for name in names}
+        self.replay_buffer_kwargs |= {"real_fraction": self.options.real_fraction}
         super()._setup_model()
 
     def _check_task(self) -> None:
@@ -172,11 +245,11 @@ class Dyna(OffPolicyAlgorithm, Display):
         uses_model = last is None or self.num_episodes < last
         # New real episodes; the first update of the dynamics has all of them.
         recorded = self.recorded_episodes()
-        new = recorded.some(slice(buffer.num_learnt, None))
+        new = recorded.subset(slice(buffer.num_learnt, None))
         data = new if dynamics.has_learnt else recorded
         is_enough = len(new) and len(data) >= 2 - dynamics.is_fitted  # two rows have a scale
         if is_enough and uses_model and options.reward_tolerance is not None:
-            real.check_functions(self.task, data, options.reward_tolerance)
+            check_functions(self.task, data, options.reward_tolerance)
         # Update on real transitions, and on transitions of earlier models.
         buffer.mix = uses_model
         with real.timed(self.wall_time, "update"):
@@ -188,7 +261,7 @@ class Dyna(OffPolicyAlgorithm, Display):
         if uses_model:
             with real.timed(self.wall_time, "fit"):
                 horizons = options.score_horizons
-                metrics = real.learn_dynamics(self.model_task(), data, recorded, horizons)
+                metrics = learn_dynamics(self.model_task(), data, recorded, horizons)
         buffer.num_learnt = len(recorded)
         num_ended = int((new.steps == 1).sum())
         self.num_episodes += num_ended
@@ -226,7 +299,7 @@ class Dyna(OffPolicyAlgorithm, Display):
             while running.any():
                 with real.timed(self.wall_time, "rollout"):
                     # One step of the particles whose episode has not ended, into the buffer.
-                    ahead = env.steps_ahead()
+                    ahead = env.steps_ahead
                     actions = self._act_in_model(obs, noise)
                     step = env.transition(actions)
                     done = step.terminated | step.truncated
@@ -315,15 +388,15 @@ class Dyna(OffPolicyAlgorithm, Display):
 
     def __repr__(self) -> str:
         """Return a text on the agent, its environment, dynamics, progress and last reward."""
-        return real.described(self)
+        return agent_text(self)
 
     def _repr_html_(self) -> str:
-        return real.html_of(self)
+        return agent_table(self)
 
     # The loop of Stable-Baselines3
 
     def learn(self, total_timesteps: int, callback: Any = None, *args: Any, **kwargs: Any) -> Self:
-        """Learn; callbacks may include an ``EpisodeCheckpoint`` and ``print_progress``."""
+        """Learn; callbacks may include those of an ``Agent``, functions of three values."""
         callbacks = callback if isinstance(callback, list) else [callback]
         if isinstance(callback, CallbackList):
             callbacks = callback.callbacks
@@ -333,7 +406,10 @@ class Dyna(OffPolicyAlgorithm, Display):
         adapted: Any = [AgentCallback.around(part) for part in callbacks]
         if len(adapted) == 1:
             adapted = adapted[0]
-        with locked(callbacks):
+        with ExitStack() as stack:
+            for part in callbacks:
+                if isinstance(part, EpisodeCheckpoint):
+                    stack.enter_context(part.locked())
             return super().learn(total_timesteps, adapted, *args, **kwargs)
 
     def _setup_learn(
@@ -375,7 +451,7 @@ class Dyna(OffPolicyAlgorithm, Display):
         self, observation: Any, *args: Any, **kwargs: Any
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """Return the actions of the learner; raise a ValueError for an invalid observation."""
-        check_observation(observation)
+        real.check_observation(observation)
         return super().predict(observation, *args, **kwargs)
 
     @staticmethod

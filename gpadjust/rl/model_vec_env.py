@@ -38,8 +38,8 @@ class ModelStep(NamedTuple):
 class ModelVecEnv(VecEnv):
     r"""Particles that move by a dynamics model, as a Stable-Baselines3 ``VecEnv``.
 
-    Any algorithm of Stable-Baselines3 can learn in it. A step of all particles is one call of the
-    model. Random numbers come from PyTorch's global generator.
+    A step of all particles is one call of the model. Random numbers come from PyTorch's global
+    generator.
 
     Leaving the bounds is never an advantage. A particle that would leave the bounds of the task or
     the finite numbers, or where the physics fails, stops, and its episode ends, with
@@ -54,8 +54,7 @@ class ModelVecEnv(VecEnv):
         action_space: The policy's action space.
         sampling: ``"step"``: a new draw from the predictive distribution in each step, as in the
             paper. ``"trajectory"``: between two calls of ``reset``, a transition function drawn
-            from the posterior for each particle. (In PETS, trajectory sampling 1 and infinity;
-            Chua et al. 2018.)
+            from the posterior for each particle. (Chua et al. 2018.)
         worst_reward: The worst reward elsewhere, such as in real episodes.
 
     Attributes:
@@ -142,8 +141,9 @@ class ModelVecEnv(VecEnv):
         ends = (part.numpy() for part in (step.terminated, truncated, step.left_bounds))
         return ModelStep(self._observe(self._states), rewards, *ends)
 
+    @property
     def steps_ahead(self) -> np.ndarray:
-        """Return the number of steps of each particle before the time limit, ``num_envs``."""
+        """The number of steps of each particle before the time limit, ``num_envs``."""
         return self.episode_length - self._steps.numpy()
 
     def refresh(self, buffer: ReplayBuffer) -> None:
@@ -241,9 +241,7 @@ class ModelVecEnv(VecEnv):
 
     def env_method(self, method_name: str, *args: Any, **kwargs: Any) -> list[Any]:
         """Raise an error: there are no environments inside."""
-        raise NotImplementedError(
-            f"Particles have no methods of their own, such as {method_name!r}."
-        )
+        raise NotImplementedError(f"Particles have no methods, such as {method_name!r}.")
 
     def env_is_wrapped(self, wrapper_class: Any, indices: VecEnvIndices = None) -> list[bool]:
         """Return False for each particle."""

@@ -21,22 +21,18 @@ class DynaOptions:
             and batches have real samples only; 0 never uses the model. Default: no limit.
         refresh_model_data: If True, the model predicts the transitions of earlier models again,
             from the same states and actions, after each fit: errors of the first models would
-            mislead the agent for long. This costs a prediction of the model buffer after each real
-            episode. (The paper does not have it.)
+            mislead the agent for long. (The paper does not have it.)
         real_fraction: Share of real transitions in a batch, see :class:`MixedReplayBuffer`. By
-            default one for ten of the model, twice as many as in a uniform draw from both buffers
-            with ``model_episodes=20``. (MBPO has 1/20; Janner et al. 2019.)
-        model_buffer_size: Capacity for model transitions. Default: as ``buffer_size``.
+            default twice as many as in a uniform draw with ``model_episodes=20``. (MBPO has 1/20;
+            Janner et al. 2019.)
         num_particles: Number of parallel model episodes. Default: all.
-        sampling: Sampling of model episodes, ``"step"`` or ``"trajectory"``, see
-            :class:`ModelVecEnv`.
+        sampling: As of :class:`ModelVecEnv`.
         reward_tolerance: As of :class:`gpadjust.control.Agent`.
         score_horizons: As of :class:`gpadjust.control.Agent`; the log has the scores
             (``model/coverage_15``).
 
     Raises:
-        TypeError: If an option has another type.
-        ValueError: If an option is out of range.
+        TypeError, ValueError: If an option has another type, or is out of range.
     """
 
     model_episodes: int = 20
@@ -44,7 +40,6 @@ class DynaOptions:
     last_model_episode: int | None = None
     refresh_model_data: bool = True
     real_fraction: float = 1 / 11
-    model_buffer_size: int | None = None
     num_particles: int | None = None
     sampling: Sampling = "step"
     reward_tolerance: float | None = 1e-3
@@ -53,12 +48,10 @@ class DynaOptions:
     def __post_init__(self) -> None:
         """Check the options."""
         checked_whole("model_episodes", self.model_episodes, 0)
-        least = {"last_model_episode": 0, "model_buffer_size": 1, "num_particles": 1}
-        for name, number in least.items():
+        for name, least in (("last_model_episode", 0), ("num_particles", 1)):
             if getattr(self, name) is not None:
-                checked_whole(name, getattr(self, name), number)
+                checked_whole(name, getattr(self, name), least)
         checked_number("updates_per_model_step", self.updates_per_model_step, least=0)
-        checked_number("real_fraction", self.real_fraction, least=0, most=1)
         check_switch("refresh_model_data", self.refresh_model_data)
         check_choice("sampling", self.sampling, get_args(Sampling))
         if self.reward_tolerance is not None:

@@ -15,21 +15,13 @@ from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted, validate_data
 from torch import Size, Tensor
 
+from gpadjust import core
 from gpadjust.checks import checked_whole, seeded
-from gpadjust.core import (
-    CKA,
-    RRA,
-    CalibratedPhysics,
-    FitResult,
-    PhysicsMeanGP,
-    ScaleGP,
-    ZeroMeanGP,
-    fit,
-)
+from gpadjust.core import CKA, FitResult, ZeroMeanGP, fit
 from gpadjust.core.data import as_tensor, column_names
 from gpadjust.core.model import Predictive
 from gpadjust.kinds.categories import Categories
-from gpadjust.kinds.factory import ModelFactory, make_model, with_options
+from gpadjust.kinds.factory import ModelFactory, make_model, map_parts, with_options
 from gpadjust.many import VariationalCKA
 from gpadjust.physics import PhysicsWarning
 from gpadjust.physics.function import array_physics
@@ -40,10 +32,10 @@ Array = NDArray[np.float64]
 
 MODELS: dict[str, type[Predictive]] = {
     "cka": CKA,
-    "rra": RRA,
-    "physics_mean": PhysicsMeanGP,
-    "scale": ScaleGP,
-    "calibrated_physics": CalibratedPhysics,
+    "rra": core.RRA,
+    "physics_mean": core.PhysicsMeanGP,
+    "scale": core.ScaleGP,
+    "calibrated_physics": core.CalibratedPhysics,
     "zero_mean": ZeroMeanGP,
     "variational": VariationalCKA,
 }
@@ -54,8 +46,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     This is :class:`~gpadjust.CKA`, or another model of this library, behind ``fit`` and ``predict``
     with NumPy arrays and frames, for pipelines, ``cross_val_score`` and ``GridSearchCV``. The
-    fitted ``model_`` has all methods of a model, such as ``model_.rho`` and ``model_.summary()``.
-    The model estimates the scales of inputs and targets; it needs no scaler.
+    model estimates the scales of inputs and targets; it needs no scaler.
 
     *The inputs of the physics* are the X of the regressor, as arrays with the columns in their
     order. After a ``StandardScaler`` in a pipeline, that is the scaled X: undo it in the physics,
@@ -63,12 +54,8 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     The physics must return values in the units of y: ``TransformedTargetRegressor`` transforms y,
     not the physics.
 
-    *NumPy or torch.* The physics may be any function of rows. A function that returns a tensor, or
-    takes only tensors, is a torch function; others get NumPy arrays. ``fit`` tries the first row
-    of X.
-
-    It passes scikit-learn's ``check_estimator``; with a physics all but
-    ``check_regressor_multioutput``, whose targets have more columns than the physics.
+    *NumPy or torch.* A function that returns a tensor, or takes only tensors, is a torch function;
+    others get NumPy arrays. ``fit`` tries the first row of X.
 
     Args:
         physics: The physics f_p: a function of rows ``N x d`` to ``N`` or ``N x m``, of NumPy
@@ -80,20 +67,17 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             ``"scale"``, ``"calibrated_physics"``, ``"zero_mean"`` (without the physics, for
             comparison), or a callable that makes a model of X and y, with the keyword
             ``physics`` if there is one: a class of models, or ``functools.partial`` of one with
-            further arguments, such as ``partial(CKA, center=0.0)``, or
-            ``partial(CKA, train_Yvar=0.01)`` for noise of known variance. Each fit takes a copy.
-        model_options: Options that all models share: ``noise``, ``link``, ``input_transform`` and
-            others, such as ``{"link": "log"}``. Each fit takes copies.
+            further arguments, such as ``partial(CKA, train_Yvar=0.01)``. Each fit takes a copy.
+        model_options: Options that all models share: ``noise``, ``input_transform`` and others,
+            such as ``{"link": "log"}``. Each fit takes copies.
         fit_method: ``"bayes"`` or ``"map"``, as in :func:`gpadjust.fit`.
         num_draws: As in :func:`gpadjust.fit`.
         random_state: The seed of the fit; a ``RandomState``, or None for NumPy's, draws it.
 
     Attributes:
-        model_: The fitted model; its methods return the type of their arguments, frames, arrays or
-            tensors.
+        model_: The fitted model, with its methods, such as ``rho`` and ``summary()``.
         fit_result_: The result of :func:`gpadjust.fit`.
-        physics_parameters_: The :class:`~gpadjust.physics.parameters.PhysicsParameters`, draws of
-            the unknown parameters of the physics by their names, if there are some.
+        physics_parameters_: Draws of the unknown parameters of the physics, if there are some.
         n_features_in_: The number ``d`` of columns of X.
         feature_names_in_: Their names, if X was a frame.
 
@@ -106,8 +90,6 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         >>> mean, std = regressor.predict([[0.33]], return_std=True)
         >>> mean.round(2)
         array([2.16])
-        >>> std.shape
-        (1,)
     """
 
     model_: Any
@@ -150,39 +132,34 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             PhysicsWarning: If the physics is obviously wrong at X, as after a scaler.
 
         Raises:
-            ValueError: If data are masked, not finite real numbers, or shapes disagree (by
-                scikit-learn); or if the model's name is unknown. For outputs that are missing in
-                some rows, use the models of this library.
+            ValueError: If data are masked, not finite real numbers (for missing outputs use the
+                models of this library), or shapes disagree; or if the model's name is unknown.
             TypeError: If physics, model or an option has a wrong type, or data are dates or times.
             PhysicsError: If the physics fails, or returns NaN or a wrong shape.
         """
-        _check_measured(y=y)
+        _check_measured("y", y)
         options = _checked(self.model_options)
         output_names = column_names(y)  # scikit-learn drops them
         if _has_texts(X):
             options.setdefault("input_transform", Categories())
         # scikit-learn checks numbers: texts as the numbers of their levels.
         numbers = _in_numbers(X, deepcopy(options.get("input_transform")))
-        _check_measured(X=numbers)
+        _check_measured("X", numbers)
         rows, y = validate_data(
             self, numbers, y, dtype=np.float64, multi_output=True, y_numeric=True,
             ensure_min_samples=2,
         )  # fmt: skip
         targets = np.asarray(y, dtype=np.float64).reshape(len(y), -1)
         if train_Yvar is not None:
-            train_Yvar = np.asanyarray(train_Yvar)
-            if train_Yvar.shape == (len(y),):
-                train_Yvar = train_Yvar.reshape(-1, 1)
-            options["train_Yvar"] = train_Yvar
+            variances = np.asanyarray(train_Yvar)
+            is_column = variances.shape == (len(y),)
+            options["train_Yvar"] = variances.reshape(-1, 1) if is_column else variances
         # A model reads the texts of a frame by itself; the physics gets rows of numbers.
         model = self._build(rows if numbers is X else X, rows, targets, options)
-        input_names = tuple(getattr(self, "feature_names_in_", model.data.input_names))
-        names = {
-            "input_names": input_names,
-            "output_names": output_names or model.data.output_names,
-        }
-        model.data = model.data._replace(**names)
-        # A new seed, drawn or the user's.
+        model.data = model.data._replace(
+            input_names=tuple(getattr(self, "feature_names_in_", model.data.input_names)),
+            output_names=output_names or model.data.output_names,
+        )
         seed = _seed(self.random_state)
         self.fit_result_ = fit(model, self.fit_method, num_draws=self.num_draws, seed=seed)
         # Such as inputs in other units.
@@ -211,9 +188,8 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             observation_noise: If True, include observation noise.
 
         Returns:
-            The means, ``q`` or, for several outputs, ``q x m``. With ``return_std`` also standard
-            deviations of the same shape; with ``return_cov`` also covariances, ``q x q`` or
-            ``q x q x m``. They are moments of the mixture over draws.
+            The means, ``q`` or, for several outputs, ``q x m``; with ``return_std`` also standard
+            deviations, with ``return_cov`` also covariances, ``q x q`` or ``q x q x m``.
 
         Raises:
             NotFittedError: If the regressor was not fitted.
@@ -242,7 +218,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         random_state: int | np.random.RandomState | None = 0,
         observation_noise: bool = False,
     ) -> Array:
-        """Draw functions from the posterior, jointly at all points.
+        """Draw functions from the posterior, jointly at all points; errors as of :meth:`predict`.
 
         Args:
             X: Inputs, ``q x d``.
@@ -252,10 +228,6 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         Returns:
             ``q x n_samples`` or, for several outputs, ``q x m x n_samples``.
-
-        Raises:
-            NotFittedError: If the regressor was not fitted.
-            ValueError: If ``n_samples`` is not positive; and as :meth:`predict`.
         """
         checked_whole("n_samples", n_samples, 1)
         inputs = self._inputs(X)
@@ -284,7 +256,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 )
         physics = None
         if self.physics is not None and factory is not ZeroMeanGP:
-            physics = _physics_of_arrays(self.physics, rows)
+            physics = map_parts(lambda part: array_physics(part, rows), self.physics)
         # Fits change kernels and noises, but scikit-learn forbids changes of parameters.
         factory = with_options(deepcopy(factory), options)
         return make_model(factory, X, Y, kind=Predictive, physics=physics)
@@ -293,37 +265,26 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Return checked inputs of a call."""
         check_is_fitted(self)
         numbers = _in_numbers(X, self.model_.data.transform)
-        _check_measured(X=numbers)
+        _check_measured("X", numbers)
         rows = validate_data(self, numbers, dtype=np.float64, reset=False)
         return torch.tensor(np.ascontiguousarray(rows))  # torch has no negative strides
 
     def _covariance(self, X: Tensor, observation_noise: bool) -> Tensor:
         """Return the covariances of the points, ``q x q x m``."""
         # One output at a time: the joint covariance would have m^2 as many entries.
-        covariances = []
-        for output in range(self.model_.num_outputs):
-            posterior = self.model_.posterior(X, [output], observation_noise)
-            covariances.append(posterior.covariance_matrix)
-        return torch.stack(covariances, dim=-1)
+        posteriors = (
+            self.model_.posterior(X, [output], observation_noise)
+            for output in range(self.model_.num_outputs)
+        )
+        return torch.stack([posterior.covariance_matrix for posterior in posteriors], dim=-1)
 
 
-def _check_measured(**data: Any) -> None:
+def _check_measured(name: str, values: Any) -> None:
     """Raise an error for masked values and times, which scikit-learn would turn into numbers."""
-    for name, values in data.items():
-        if not hasattr(values, "dtype") and not hasattr(values, "dtypes"):
-            continue  # neither an array nor a frame
+    if hasattr(values, "dtype") or hasattr(values, "dtypes"):  # an array or a frame
         array = np.asanyarray(values)
         if array.dtype.kind in "mM" or np.ma.is_masked(array):
             as_tensor(array, name)  # raises the error
-
-
-def _physics_of_arrays(physics: Any, X: Array) -> Any:
-    """Return physics of NumPy or torch functions, in the form of the argument."""
-    if isinstance(physics, dict):
-        return {name: array_physics(part, X) for name, part in physics.items()}
-    if isinstance(physics, list | tuple):
-        return [array_physics(part, X) for part in physics]
-    return array_physics(physics, X)
 
 
 def _has_texts(X: Any) -> bool:
@@ -345,18 +306,14 @@ def _in_numbers(X: Any, transform: Any) -> Any:
 
 def _checked(options: Any) -> dict[str, Any]:
     """Return a copy of the options of a model; raise a TypeError for anything else."""
-    if options is not None and not isinstance(options, dict):
+    if options is None:
+        return {}
+    if not isinstance(options, dict) or options.keys() & {"train_X", "train_Y", "physics"}:
         raise TypeError(
             "Expected model_options as a dictionary of arguments that models share, such as "
-            f"{{'link': 'log'}}, got {options!r}."
+            f"{{'link': 'log'}}, without data and physics; found {options!r}."
         )
-    for name in ("train_X", "train_Y", "physics"):
-        if name in (options or {}):
-            raise TypeError(
-                f"Expected model_options as options that models share, such as 'link', found "
-                f"{name!r}, which is an argument of the regressor."
-            )
-    return {**(options or {})}
+    return {**options}
 
 
 def _array(values: Tensor, dim: int = -1) -> Array:

@@ -31,10 +31,9 @@ class Sensors:
             unit of the times. Default: 1, 0 and 0.
 
     Raises:
-        TypeError: If names are not strings, or ``function`` is not a function.
-        ValueError: If there is no output, or a guess has an unknown name or is not positive; later,
-            if a function returns another shape, or an output is not a state and there is no
-            function.
+        TypeError, ValueError: If there is no output, names are not strings, ``function`` is not a
+            function, or a guess has an unknown name or is not positive; later, if a function
+            returns another shape, or an output is not a state and there is no function.
 
     Example:
         >>> import torch

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -30,8 +30,7 @@ class StateSpec:
     Args:
         states: The names of the state's entries.
         actions: The names of the action's entries.
-        angles: The states that are angles in rad. Policy and model get their sine and cosine, and
-            changes are the shortest way round the circle.
+        angles: The states that are angles in rad; changes are the shortest way round the circle.
         exogenous: The states that are constant during an episode, such as a target, or follow the
             ``reference`` of a task. Policies get them; models and physics only if
             ``physics_reads`` names them.
@@ -48,8 +47,7 @@ class StateSpec:
             the actions.
 
     Raises:
-        TypeError: If names are not strings, ``integrated`` or ``previous`` is not a mapping or
-            ``step`` not a number.
+        TypeError: If an argument has another type.
         ValueError: If a name is unknown, repeated or has two roles that exclude each other,
             ``previous`` is circular, no state is left to predict, or ``step`` is missing or not
             positive.
@@ -80,12 +78,9 @@ class StateSpec:
         for argument in ("states", "actions", "angles", "exogenous", "physics_reads"):
             names = checked_names(argument, getattr(self, argument))
             object.__setattr__(self, argument, names)
-        for argument, example in (
-            ("integrated", {"x": "x_dot"}),
-            ("previous", {"last_force": "force"}),
-        ):
+        for argument in ("integrated", "previous"):
             mapping = getattr(self, argument)
-            expected = f"a dictionary of names, such as {example}"
+            expected = "a dictionary of names, such as {'x': 'x_dot'}"
             check_kind(argument, mapping, Mapping, expected)
             for pair in mapping.items():
                 checked_names(argument, [*dict.fromkeys(pair)])
@@ -158,30 +153,26 @@ class StateSpec:
         """Number of entries of an observation."""
         return len(self.states) + len(self.angles)
 
-    def _columns(self, names: Iterable[str]) -> list[int]:
-        """Return the numbers of some states, in order."""
-        return [i for i, name in enumerate(self.states) if name in names]
-
     @cached_property
     def angle_columns(self) -> list[int]:
         """The states that are angles."""
-        return self._columns(self.angles)
+        return [i for i, name in enumerate(self.states) if name in self.angles]
 
     @cached_property
     def exogenous_columns(self) -> list[int]:
         """The states that are exogenous."""
-        return self._columns(self.exogenous)
+        return [i for i, name in enumerate(self.states) if name in self.exogenous]
 
     @cached_property
     def previous_columns(self) -> list[int]:
         """The states that hold previous values."""
-        return self._columns(self.previous)
+        return [i for i, name in enumerate(self.states) if name in self.previous]
 
     @cached_property
     def moving(self) -> list[int]:
         """The states that the physics changes, neither exogenous nor previous values."""
-        still = {*self.exogenous_columns, *self.previous_columns}
-        return [i for i in range(self.state_dim) if i not in still]
+        still = {*self.exogenous, *self.previous}
+        return [i for i, name in enumerate(self.states) if name not in still]
 
     @cached_property
     def predicted(self) -> list[int]:
@@ -209,13 +200,7 @@ class StateSpec:
     def observe(self, states: Tensor) -> Tensor:
         """Return observations ``... x observation_dim`` of states ``... x state_dim``."""
         check_columns("states", states, self.state_dim)
-        columns: list[Tensor] = []
-        for name, column in zip(self.states, states.unbind(-1), strict=True):
-            if name in self.angles:
-                columns += [column.sin(), column.cos()]
-            else:
-                columns.append(column)
-        return torch.stack(columns, dim=-1)
+        return with_sine_and_cosine(states, self.angle_columns)
 
     def decode(self, observations: Tensor) -> Tensor:
         r"""Return states ``... x state_dim`` of observations; angles in :math:`(-\pi, \pi]`."""
@@ -238,10 +223,7 @@ class StateSpec:
         return entries
 
     def check_observations(self, observations: Tensor) -> None:
-        """Raise a ValueError if the number of entries is wrong, or pairs are far from the circle.
-
-        Observations ``... x observation_dim`` may have the noise of sensors.
-        """
+        """Raise a ValueError if observations have other entries, or pairs far from the circle."""
         entries = self.observations
         try:
             check_columns("observations", observations, len(entries))
@@ -255,9 +237,8 @@ class StateSpec:
                 pair = ", ".join(f"{value:.3g}" for value in pairs[int(distance.argmax())])
                 raise ValueError(
                     f"Entries {first} and {first + 1} of an observation must be sine and cosine of "
-                    f"the angle {name!r}, found {pair}. Correct the order of the states of the "
-                    "StateSpec, or its angles; or wrap the environment so that its observations "
-                    "agree with the spec."
+                    f"the angle {name!r}, found {pair}. Correct states (their order) or angles of "
+                    "the StateSpec, or wrap the environment."
                 )
 
     def change(self, states: Tensor, next_states: Tensor) -> Tensor:
@@ -269,28 +250,16 @@ class StateSpec:
         return change
 
     def check_transitions(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
-        r"""Compare the roles of states with transitions of the system.
+        r"""Raise a ValueError if transitions contradict the roles of states.
 
         An exogenous state may change, and a previous state differ from its origin, by no more than
         the rounding of single precision; a previous action from its origin by a thousandth of the
         largest one. An integrated state follows its velocity as :math:`q' - q = b\, h (v + v') / 2`
         on a path of length :math:`w`, the larger of :math:`\sum h (|v| + |v'|) / 2` and
-        :math:`\sum |q' - q|`. An error is raised if the least squares estimate of :math:`b` differs
-        from 1 by more than three standard errors and :math:`0.1\, w`, as with a wrong ``step``. A
-        warning is issued if the sum of discrepancies exceeds :math:`0.5\, w`, as with another
-        state's velocity or noisy sensors at rest. The trapezoid rule has an error below a tenth
-        with six samples in a period of an oscillation.
-
-        Args:
-            states: ``N x state_dim``.
-            actions: ``N x action_dim``.
-            next_states: ``N x state_dim``; entries that were not measured (NaN) are not checked.
-
-        Raises:
-            ValueError: If a state contradicts its role.
-
-        Warns:
-            UserWarning: If an integrated state does not follow its velocity.
+        :math:`\sum |q' - q|`. It is an error if the least squares estimate of :math:`b` differs
+        from 1 by more than three standard errors and :math:`0.1\, w`, as with a wrong ``step``,
+        and a warning if the sum of discrepancies exceeds :math:`0.5\, w`, as with another state's
+        velocity or noisy sensors at rest. Entries that are NaN are not checked.
         """
         # Environments report states in single precision.
         size = torch.maximum(states.abs(), next_states.abs())
@@ -388,7 +357,7 @@ class StateSpec:
         return following
 
     def complete_variance(self, variance: Tensor) -> Tensor:
-        """Return the variance of all states by that of the predicted ones; see `complete`."""
+        """Return the variance of all states by the variance of the predicted ones."""
         full = variance.new_zeros(*variance.shape[:-1], self.state_dim)
         full[..., self.predicted] = variance
         # q' = q + h (v + v') / 2: Var q' = (h / 2)^2 Var v'
@@ -408,6 +377,17 @@ def checked_names(argument: str, names: Sequence[str]) -> tuple[str, ...]:
     if len({*names}) < len(names):
         raise ValueError(f"{argument} must be different names; found {tuple(names)}.")
     return tuple(names)
+
+
+def with_sine_and_cosine(rows: Tensor, angles: Sequence[int]) -> Tensor:
+    """Return rows ``... x d`` with each angle replaced by its sine and cosine."""
+    columns: list[Tensor] = []
+    for i, column in enumerate(rows.unbind(-1)):
+        if i in angles:
+            columns += [column.sin(), column.cos()]
+        else:
+            columns.append(column)
+    return torch.stack(columns, dim=-1)
 
 
 def side_by_side(states: Tensor, actions: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -25,17 +25,15 @@ from gpadjust.checks import (
 )
 from gpadjust.physics import ODEPhysics, Unknown
 from gpadjust.states import StateSpec
-from gpadjust.systems.cart_pole_view import SIZE, draw_cart_pole
-from gpadjust.systems.rendering import RENDER_MODES, ViewedEnv
+from gpadjust.systems.rendering import RENDER_MODES, SIZE, ViewedEnv, draw_cart_pole
 from gpadjust.systems.system import System
 
 TIME_STEP = 0.1
-SUBSTEP = 0.02  # s, the longest: one Euler step of 0.1 s has an error of 0.3 rad/s
+SUBSTEPS = 5  # one Euler step of 0.1 s has an error of 0.3 rad/s
 START_MEAN = (0.0, math.pi, 0.0, 0.0)  # hanging, at rest
 START_STD = 0.2
 MAX_FORCE = 10.0  # N
 MAX_START = 100.0  # far beyond reachable states; the equation can be integrated there
-_SOFT = 0.05  # m/s: the speed over which dry friction changes its sign
 
 CART_POLE_SPEC = StateSpec(
     ["x", "theta", "x_dot", "theta_dot"], actions=["force"], angles=["theta"], step=TIME_STEP
@@ -43,10 +41,9 @@ CART_POLE_SPEC = StateSpec(
 """The state of the cart-pole; policy and model see sine and cosine of the angle."""
 
 
-def cart_pole_spec(encode_angle: bool = True, time_step: float = TIME_STEP) -> StateSpec:
+def cart_pole_spec(encode_angle: bool = True) -> StateSpec:
     """Return the spec for options of the environment."""
-    step = checked_number("time_step", time_step, above=0)
-    return replace(CART_POLE_SPEC, angles=("theta",) if encode_angle else (), step=step)
+    return replace(CART_POLE_SPEC, angles=("theta",) if encode_angle else ())
 
 
 @dataclass(frozen=True)
@@ -63,10 +60,7 @@ class CartPoleEquation:
             + 6 (a - b \dot{x}) \cos\theta}{l (4 M - 3 m_p \cos^2\theta)}.
 
     This is the system of Deisenroth, "Efficient Reinforcement Learning using Gaussian Processes",
-    2010, Appendix C, with the angle from upright. The tip of the pole is at
-    :math:`(x - l \sin\theta, l \cos\theta)`. Dry friction reduces the force by
-    :math:`d \tanh(\dot{x} / 0.05)`; drag is a torque :math:`-k \dot\theta |\dot\theta|` on the
-    pole.
+    2010, Appendix C, with the angle from upright.
 
     Args:
         cart_mass: The mass :math:`m_c` of the cart, in kg.
@@ -74,12 +68,10 @@ class CartPoleEquation:
         pole_length: The length :math:`l` of the pole, in m.
         damping: The friction :math:`b` between cart and track, in N s/m.
         gravity: The acceleration :math:`g` of gravity, in m/s². Default: Deisenroth's 9.82.
-        dry: The dry friction d of the cart, in N.
-        drag: The drag k of the pole, in N m s²/rad².
 
     Raises:
-        TypeError: If a parameter is not a number.
-        ValueError: If a mass, the length or the gravity is not positive, or a friction negative.
+        TypeError, ValueError: If a mass, the length or the gravity is not a positive number, or the
+            friction is negative.
 
     Example:
         >>> equation = CartPoleEquation(0.5, 0.5, 0.6, 0.1)
@@ -92,24 +84,18 @@ class CartPoleEquation:
     pole_length: float
     damping: float
     gravity: float = 9.82
-    dry: float = 0.0
-    drag: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the parameters."""
-        for entry in fields(self):
-            is_friction = entry.name in ("damping", "dry", "drag")
-            limits = {"least": 0} if is_friction else {"above": 0}
-            checked_number(entry.name, getattr(self, entry.name), **limits)
+        for name in ("cart_mass", "pole_mass", "pole_length", "gravity"):
+            checked_number(name, getattr(self, name), above=0)
+        checked_number("damping", self.damping, least=0)
 
     def __call__(self, state: Tensor, action: Tensor, p: Mapping[str, Any] | None = None) -> Tensor:
         """Return the time derivative ``... x 4`` of states ``... x 4`` under forces ``... x 1``.
 
         States are position, angle, velocity and angular velocity, in m, rad and s, the force is in
         N; ``p`` has other values of some parameters by name, ``...`` each.
-
-        Raises:
-            ValueError: If the last dimensions are not 4 and 1.
         """
         if state.shape[-1] != 4 or action.shape[-1] != 1:
             raise ValueError(
@@ -119,21 +105,17 @@ class CartPoleEquation:
         coefficients = self._coefficients
         if p is not None:
             coefficients = _coefficients({**vars(self), **p})
-        mass, half_moment, swung_mass, gravity, arm, damping, dry, drag = coefficients
+        mass, half_moment, swung_mass, gravity, arm, damping = coefficients
         _, theta, x_dot, theta_dot = state.unbind(-1)
         sin, cos = theta.sin(), theta.cos()
-        # a - b x' - d tanh(x' / 0.05)
+        # a - b x'
         force = action[..., 0]
-        if dry is not None:
-            force = force - dry * (x_dot / _SOFT).tanh()
         if damping is not None:
             force = force - damping * x_dot
         # a - m l / 2 theta'^2 sin theta
         net = torch.addcmul(force, theta_dot * theta_dot, half_moment * sin, value=-1)
-        # g sin theta - 2 k / (m l) theta' |theta'|
+        # g sin theta
         tilt = gravity * sin
-        if drag is not None:
-            tilt = tilt - drag / half_moment * theta_dot * theta_dot.abs()
         # The fraction of x'' over 4: (net + 3/4 m cos theta tilt) / (M - 3/4 m cos^2 theta)
         swung = swung_mass * cos
         x_ddot = torch.addcmul(net, swung, tilt) / torch.addcmul(mass, swung, cos, value=-1)
@@ -152,35 +134,28 @@ REAL_CART_POLE = CartPoleEquation(cart_mass=0.5, pole_mass=0.5, pole_length=0.6,
 
 def _coefficients(values: Mapping[str, Any]) -> tuple[Any, ...]:
     """Return the coefficients of the equation as tensors; None for a friction of zero."""
-    m, length = values["pole_mass"], values["pole_length"]
-    # M, m l / 2, 3/4 m, g, 2/3 l
+    m, length, damping = (values[name] for name in ("pole_mass", "pole_length", "damping"))
+    # M, m l / 2, 3/4 m, g, 2/3 l, b
     numbers = [values["cart_mass"] + m, m * length / 2, 0.75 * m, values["gravity"], length / 1.5]
-    # Unknown parameters are tensors, which may be zero in some rows.
-    friction = [values[name] for name in ("damping", "dry", "drag")]
-    numbers += [v if torch.is_tensor(v) or v != 0 else None for v in friction]
+    # An unknown parameter is a tensor, which may be zero in some rows.
+    numbers.append(damping if torch.is_tensor(damping) or damping != 0 else None)
     return tuple(v if v is None else torch.as_tensor(v, dtype=torch.float64) for v in numbers)
 
 
 def equation_physics(
-    equation: Callable[..., Tensor],
-    time_step: float = TIME_STEP,
-    unknowns: Mapping[str, Unknown] | None = None,
+    equation: Callable[..., Tensor], unknowns: Mapping[str, Unknown] | None = None
 ) -> ODEPhysics:
-    """Return the physics of the next state of a cart-pole, after a time step (in s) at one force.
+    """Return the physics of the next state of a cart-pole, after 0.1 s at one force.
 
-    Unlike the environment, it does not limit the force. It integrates by Runge-Kutta of order four
-    with substeps of at most 0.02 s. Some parameters of the equation may be unknown.
+    It integrates by Runge-Kutta of order four with substeps of 0.02 s.
 
     Example:
         >>> physics = equation_physics(REAL_CART_POLE)  # of columns x, theta, their rates, force
         >>> physics(torch.tensor([[0.0, 0.0, 0.0, 0.0, 1.0]], dtype=torch.float64))
         tensor([[0.0081, 0.0206, 0.1627, 0.4233]], dtype=torch.float64)
     """
-    checked_number("time_step", time_step, above=0)
-    substeps = math.ceil(round(time_step / SUBSTEP, 6))  # 0.1 / 0.02 may be above 5
-    return ODEPhysics(
-        equation, time_step, state_dim=4, substeps=substeps, unknowns=unknowns, name="cart_pole"
-    )
+    options = {"state_dim": 4, "substeps": SUBSTEPS, "unknowns": unknowns, "name": "cart_pole"}
+    return ODEPhysics(equation, TIME_STEP, **options)  # type: ignore[arg-type]
 
 
 def believed_cart_pole(seed: int) -> CartPoleEquation:
@@ -213,7 +188,7 @@ def cart_pole_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Te
 
 
 def cart_pole_start(n: int) -> Tensor:
-    """Draw start states ``n x 4`` from N([0, pi, 0, 0], 0.2²), by PyTorch's generator."""
+    """Draw start states ``n x 4`` from N([0, pi, 0, 0], 0.2²)."""
     checked_whole("n", n, 0)
     mean = torch.tensor(START_MEAN, dtype=torch.float64)
     return mean + START_STD * torch.randn(n, 4, dtype=torch.float64)
@@ -227,20 +202,16 @@ class CartPoleSwingUpEnv(ViewedEnv):
     :math:`[x, \sin\theta, \cos\theta, \dot{x}, \dot\theta]`, with the angle from upright;
     ``state`` has the true state in float64. The reward is minus the cost of the next state, in
     [-1, 0], by the distance of the tip from its goal; the ``info`` of a step has the ``"cost"``.
-    An episode does not terminate; ``gym.make`` truncates it after 25 steps. Environments can be
-    pickled at any time.
+    ``gym.make`` truncates an episode after 25 steps.
 
     Args:
-        render_mode: ``"rgb_array"`` lets ``render`` return a frame, which needs ``pygame-ce``;
-            ``gymnasium.wrappers.HumanRendering`` shows them in a window.
+        render_mode: ``"rgb_array"`` lets ``render`` return a frame, which needs ``pygame-ce``.
         encode_angle: If False, the observation is the state
             :math:`[x, \theta, \dot{x}, \dot\theta]`, with the angle not wrapped.
         equation: The system. Default: ``REAL_CART_POLE``.
-        time_step: Duration of a step, in s.
 
     Raises:
-        TypeError: If an argument has another type.
-        ValueError: If the render mode is unknown, or ``time_step`` is not positive.
+        TypeError, ValueError: If an argument has another type, or is out of range.
 
     Example:
         >>> import gymnasium
@@ -262,15 +233,13 @@ class CartPoleSwingUpEnv(ViewedEnv):
         *,
         encode_angle: bool = True,
         equation: CartPoleEquation = REAL_CART_POLE,
-        time_step: float = TIME_STEP,
     ) -> None:
         super().__init__(render_mode)
         check_switch("encode_angle", encode_angle)
         check_kind("equation", equation, CartPoleEquation, "a CartPoleEquation")
         self.equation = equation
-        self.physics = equation_physics(equation, time_step)
-        self.metadata = {**self.metadata, "render_fps": max(round(1 / time_step), 1)}
-        self.state_spec = cart_pole_spec(encode_angle, time_step)
+        self.physics = equation_physics(equation)
+        self.state_spec = cart_pole_spec(encode_angle)
         high = [np.inf, 1.0, 1.0, np.inf, np.inf] if encode_angle else [np.inf] * 4
         # Sine and cosine have bounds, positions and velocities have none.
         bound = np.array(high, dtype=np.float32)
@@ -281,14 +250,10 @@ class CartPoleSwingUpEnv(ViewedEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Start an episode, by default from N([0, pi, 0, 0], 0.2²), around hanging at rest.
-
-        With ``options={"state": [x, theta, x_dot, theta_dot]}`` it starts at this state.
+        """Start an episode from N([0, pi, 0, 0], 0.2²), or at ``options={"state": ...}``.
 
         Raises:
-            TypeError: If ``options`` is not a dictionary.
-            ValueError: If ``options`` has another key, or the state is not four numbers of
-                magnitude at most 100.
+            ValueError: If the state is not four numbers of magnitude at most 100.
         """
         super().reset(seed=seed)
         options = checked_options("options", options, ("state",))
@@ -308,19 +273,12 @@ class CartPoleSwingUpEnv(ViewedEnv):
     def step(
         self, action: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Push the cart for a time step by a force in N, of shape ``(1,)``.
-
-        Raises:
-            ValueError: If the action is not one finite number.
-            gymnasium.error.ResetNeeded: Before the first episode.
-        """
+        """Push the cart for a time step by a force in N, of shape ``(1,)``."""
         if self.state is None:
             raise gym.error.ResetNeeded("Call reset before the first step.")
         force = finite_array(action, (1,))
         if force is None:
-            raise ValueError(
-                f"The action must be one finite force, of shape (1,); found {action!r}."
-            )
+            raise ValueError(f"Expected one finite force as action, (1,); found {action!r}.")
         force = force.clip(-MAX_FORCE, MAX_FORCE)
         # The physics of the real parameters is the simulator.
         with torch.no_grad():
@@ -344,12 +302,9 @@ class CartPoleSwingUpEnv(ViewedEnv):
 def cart_pole(
     seed: int = 0,
     *,
-    dry: float = 0.0,
-    drag: float = 0.0,
     noise: Mapping[str, float] | None = None,
     unknowns: bool = False,
     encode_angle: bool = True,
-    time_step: float = TIME_STEP,
     episode_length: int = 25,
 ) -> System:
     """Return the swing-up of a cart-pole, a :class:`CartPoleSwingUpEnv`.
@@ -359,12 +314,9 @@ def cart_pole(
     Args:
         seed: Seed of the physics, with masses from U(0.4, 0.6) kg for the cart and U(0.5, 0.7) kg
             for the pole, and a length from U(0.5, 0.7) m.
-        dry: Dry friction of the real cart, in N, which the physics does not have.
-        drag: Drag of the real pole, in N m s²/rad², which the physics does not have.
         noise: Standard deviations of the sensors' noise, by the name of the state.
         unknowns: If True, masses, length and damping of the physics are unknown parameters.
         encode_angle: As of the environment.
-        time_step: Duration of a step, in s.
         episode_length: Number of steps of an episode.
 
     Example:
@@ -387,13 +339,11 @@ def cart_pole(
         "gpadjust/CartPoleSwingUp-v0",
         max_episode_steps=episode_length,
         encode_angle=encode_angle,
-        time_step=time_step,
-        equation=replace(REAL_CART_POLE, dry=dry, drag=drag),
     )
     return System(
         make,
-        cart_pole_spec(encode_angle, time_step),
-        equation_physics(believed, time_step, parameters),
+        cart_pole_spec(encode_angle),
+        equation_physics(believed, parameters),
         cart_pole_reward,
         start=cart_pole_start,
         episode_length=episode_length,

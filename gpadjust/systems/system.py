@@ -19,6 +19,12 @@ if TYPE_CHECKING:
     from gpadjust.dynamics import Dynamics
 
 
+_OF_TASK = (
+    *("terminated", "episode_length", "state_bounds", "sensors", "reference", "constraints"),
+    *("probability", "action_rate"),
+)
+
+
 @dataclass(frozen=True, eq=False)
 class System:
     """A system to control: the real one as an environment, its physics, reward and task.
@@ -53,7 +59,7 @@ class System:
 
     Example:
         >>> from gpadjust import systems
-        >>> cart_pole = systems.cart_pole(dry=0.5)
+        >>> cart_pole = systems.cart_pole()
         >>> env, task = cart_pole.make(), cart_pole.task()
         >>> task.dynamics.spec.states
         ('x', 'theta', 'x_dot', 'theta_dot')
@@ -94,10 +100,7 @@ class System:
         return as_physics(self.physics).unknowns
 
     def make(self, **options: Any) -> gym.Env[Any, Any]:
-        """Make an environment, truncated after ``episode_length`` steps.
-
-        Args:
-            options: Keyword arguments of ``env``, such as ``render_mode="rgb_array"``.
+        """Make an environment by arguments of ``env``, truncated after ``episode_length`` steps.
 
         Raises:
             ValueError: If the time limit of the environment is less than ``episode_length``, or
@@ -108,8 +111,7 @@ class System:
         if self.episode_length is not None and limit and limit < self.episode_length:
             raise ValueError(
                 f"episode_length must be at most the environment's own time limit, {limit} steps; "
-                f"found {self.episode_length}. Raise the limit, as in `gymnasium.make(..., "
-                "max_episode_steps=...)`, or leave episode_length out."
+                f"found {self.episode_length}. Raise the limit, or leave episode_length out."
             )
         if self.episode_length not in (None, limit):
             env = gym.wrappers.TimeLimit(env, self.episode_length)
@@ -123,18 +125,15 @@ class System:
             if shape == (outputs,) and not self.noise:
                 return env
             raise ValueError(
-                f"The environment must observe the states ({states} entries), from which "
-                f"`system.make()` computes the outputs of the sensors, or without `noise` the "
-                f"outputs alone ({outputs} entries); found {env.observation_space}."
+                f"The environment must observe the states ({states} entries), or without `noise` "
+                f"the outputs alone ({outputs} entries); found {env.observation_space}."
             )
         return NoisySensors(env, self.spec, self.noise or {}, self.sensors)
 
     def task(self, dynamics: Dynamics | None = None) -> Task:
-        """Return the task for agents and planners.
+        """Return the task, by default with new :class:`~gpadjust.dynamics.LearnedDynamics`.
 
-        Updates change the dynamics: each run needs new ones. By default they are
-        :class:`~gpadjust.dynamics.LearnedDynamics` with the physics. Errors are those of a
-        :class:`~gpadjust.control.Task`.
+        Updates change the dynamics: each run needs new ones.
         """
         # Not at the top: an environment alone is quick to import.
         from gpadjust.control import Task
@@ -142,16 +141,5 @@ class System:
 
         if dynamics is None:
             dynamics = LearnedDynamics(self.spec, self.physics, physics_error=self.physics_error)
-        return Task(
-            dynamics,
-            self.reward,
-            terminated=self.terminated,
-            initial_states=self.start,
-            episode_length=self.episode_length,
-            state_bounds=self.state_bounds,
-            sensors=self.sensors,
-            reference=self.reference,
-            constraints=self.constraints,
-            probability=self.probability,
-            action_rate=self.action_rate,
-        )
+        options = {name: getattr(self, name) for name in _OF_TASK}
+        return Task(dynamics, self.reward, initial_states=self.start, **options)

@@ -19,11 +19,9 @@ Array = NDArray[np.float32]
 class RememberAction(gym.Wrapper[Array, Array, Array, Array], gym.utils.RecordConstructorArgs):
     """Appends the last actions to the observation, the newest first, beginning with zeros.
 
-    If a system follows its actions with a delay that is not in the observation, such as the
-    activation of muscles, the next observation depends on earlier actions. A
-    :class:`~gpadjust.states.StateSpec` declares them in ``previous``, such as
-    ``{"force_1": "force", "force_2": "force_1"}`` for two steps. Actions are clipped to their
-    space, as in the environments of this library.
+    For systems that follow their actions with a delay. A :class:`~gpadjust.states.StateSpec`
+    declares them in ``previous``, such as ``{"force_1": "force", "force_2": "force_1"}`` for two
+    steps. Actions are clipped to their space.
 
     Args:
         env: An environment whose observations and actions are boxes of one dimension, with zero as
@@ -31,8 +29,7 @@ class RememberAction(gym.Wrapper[Array, Array, Array, Array], gym.utils.RecordCo
         steps: The number of actions.
 
     Raises:
-        TypeError: If ``steps`` is not a whole number.
-        ValueError: If ``steps`` is not positive, or a space is not as above.
+        TypeError, ValueError: If ``steps`` is not a positive whole number, or a space is another.
 
     Example:
         >>> import gymnasium
@@ -74,7 +71,6 @@ class RememberAction(gym.Wrapper[Array, Array, Array, Array], gym.utils.RecordCo
     ) -> tuple[Array, dict[str, Any]]:
         """Start an episode; its first observation ends with zeros."""
         observation, info = self.env.reset(seed=seed, options=options)
-        # No action precedes an episode.
         self._last = np.zeros_like(self._last)
         return self._extended(observation), info
 
@@ -100,8 +96,8 @@ class NoisySensors(gym.ObservationWrapper[Array, Array, Array], gym.utils.Record
         sensors: The measured outputs. Default: all states.
 
     Raises:
-        TypeError: If a standard deviation is not a number.
-        ValueError: If one is negative, or a state or output does not exist.
+        TypeError, ValueError: If a standard deviation is not a number of 0 or more, or a state or
+            output does not exist.
 
     Example:
         >>> from gpadjust import systems

@@ -17,8 +17,6 @@ from gpadjust.words import number, percent
 
 ROUNDING = 1e-8  # of the observations' standard deviation; to predict better shows nothing
 _FAR = 6.0  # standard deviations, where a probability next to 1 is rounded
-_CLEAR = 3.5  # standard errors, below which a correlation of errors counts as none
-_LEAST = 1e-6  # eigenvalue of a correlation matrix
 _COMPONENTS = 64  # that draws are resampled to, for each observation
 
 
@@ -170,32 +168,3 @@ def _mixed(model: StackedGP, parts: list[Marginals]) -> Tensor:
             chosen.append(torch.stack([each[rows, :, j] for each in (part.means, part.variances)]))
         outputs.append(torch.cat(chosen, 1))
     return torch.stack(outputs, -1)
-
-
-def error_correlation(model: Any) -> Tensor | None:
-    r"""Return the correlation of outputs by left-out errors, ``m x m``; None if none is clear.
-
-    A correlation r of n pairs has the standard error :math:`(1 - r^2) / \sqrt n`. It counts where
-    :math:`|r| \sqrt n` is more than 3.5, and is shrunk by the share of its square that is chance
-    (Schaefer and Strimmer 2005).
-    """
-    if model.num_outputs < 2 or not isinstance(model, GP):
-        return None
-    errors = model.data.Y - model.left_out().prediction.mean
-    seen = ~errors.isnan()
-    errors, seen = errors.nan_to_num(nan=0.0), seen.double()
-    number = (seen.mT @ seen).clamp_min(1.0)
-    size = (errors.square().mT @ seen).clamp_min(torch.finfo(errors.dtype).tiny)
-    r = (errors.mT @ errors) / (size * size.mT).sqrt()
-    clear = r.abs() * number.sqrt() > _CLEAR
-    chance = (1 - r.square()).square() / (number * r.square().clamp_min(1e-12))
-    r = torch.where(clear, r * (1 - chance).clamp_min(0.0), 0.0)
-    r.fill_diagonal_(1.0)
-    if not (r - torch.eye(len(r))).any():
-        return None
-    values, vectors = torch.linalg.eigh(r)
-    if values[0] < _LEAST:  # pairs that are seen together in other rows than others
-        r = vectors * values.clamp_min(_LEAST) @ vectors.mT
-        sd = r.diagonal().sqrt()
-        r = r / sd / sd.unsqueeze(-1)
-    return r

@@ -23,7 +23,7 @@ def run(experiment: First, model: str, seed: int) -> Run:
     env, task = system.make(), system.task()
     if model == "truth":
         spec = cart_pole_spec()
-        physics = equation_physics(REAL_CART_POLE, spec.step or 1.0)
+        physics = equation_physics(REAL_CART_POLE)
         task = system.task(PhysicsDynamics(spec, physics))
     agent = MPCAgent(env, task, seed=seed)
     length, costs, promises = agent.episode_length(), list[float](), list[float]()

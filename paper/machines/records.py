@@ -78,14 +78,14 @@ class System:
     def steps(self, test: str) -> Trajectories:
         """The single steps of a test that start where the machine moves."""
         data = self._records(self.tests[test]).trajectories(STEP)
-        return data.some(self._fast(data.states).nonzero().flatten())
+        return data.subset(self._fast(data.states).nonzero().flatten())
 
     def windows(self, test: str, length: int, number: int) -> Windows:
         """So many windows of a test in which the machine moves, evenly spread."""
         found = self._records(self.tests[test]).windows(length, STEP, stride=1)
         rows = self._fast(found.states).any(1).nonzero().flatten()
         places = torch.linspace(0, len(rows) - 1, min(number, len(rows))).round().long()
-        return found.some(rows[places])
+        return found.subset(rows[places])
 
     def _fast(self, states: Tensor) -> Tensor:
         """Mask of states with a rate above the threshold; rates are the second half of a state."""

@@ -88,7 +88,7 @@ def case(name: str, seed: int, number: int | None = None, places: int | None = N
     X = low + engine.draw(number or problem.number, dtype=torch.float64) * (high - low)
     physics = FunctionPhysics(problem.law, unknowns=problem.unknowns, name=name)
     z = torch.randn(len(problem.unknowns), generator=generator, dtype=torch.float64)
-    true = physics.unknowns.at(z)
+    true = physics.unknowns.to_values(z)
     noise = torch.randn(len(X), 1, generator=generator, dtype=torch.float64)
     system = physics(X, true)
     named = dict(zip(problem.unknowns, true.tolist(), strict=True))

@@ -112,7 +112,7 @@ def log_of(machine: Machine, has_friction: bool, rows: int, seed: int) -> Log:
     real = machine.physics(**friction if has_friction else {})
     true = real.unknowns.guess
     known = len(machine.unknowns)
-    true[:known] = machine.physics().unknowns.at(normal(known))
+    true[:known] = machine.physics().unknowns.to_values(normal(known))
     torques = normal(rows // _HELD + 1, len(machine.torques)).repeat_interleave(_HELD, 0)[:rows]
     torques = torques * torch.tensor(machine.torques)
     angles = len(machine.start)

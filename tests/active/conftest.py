@@ -5,6 +5,7 @@ import torch
 from botorch.acquisition import qNegIntegratedPosteriorVariance
 
 from gpadjust import CKA
+from tests.systems import measured, uniform
 
 BOUNDS = torch.tensor([[0.0, -1.0], [2.0, 1.0]], dtype=torch.float64)
 
@@ -19,31 +20,22 @@ def bounds():
 
 
 @pytest.fixture
-def laboratory(request):
-    """Arguments of `collect` that take little time; `laboratory(**changes)`.
-
-    The oracle is the `truth` of the test's module.
-    """
-    points = BOUNDS[0] + 2 * torch.rand(
-        16, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(7)
-    )
+def laboratory():
+    """Arguments of `collect` that take little time; `laboratory(**changes)`."""
+    points = BOUNDS[0] + 2 * uniform(16, 2, seed=7)
 
     def arguments(**changes):
         arguments = {
             "model_factory": lambda X, Y: CKA(
                 X, Y, physics=lambda X: f_p(X).repeat(1, Y.shape[-1])
             ),
-            "oracle": request.module.truth,
+            "oracle": measured,
             "bounds": BOUNDS,
             "acquisition": lambda model: qNegIntegratedPosteriorVariance(model, mc_points=points),
             "budget": 7,
             "initial": 4,
             "fit": lambda model: None,  # of the loop, the priors' medians are enough
-            "optimizer_options": {
-                "num_restarts": 1,
-                "raw_samples": 4,
-                "options": {"maxiter": 3},
-            },
+            "optimizer_options": {"num_restarts": 1, "raw_samples": 4, "options": {"maxiter": 3}},
         }
         return {**arguments, **changes}
 

@@ -7,16 +7,9 @@ import shutil
 import pytest
 import torch
 
-from gpadjust.active import (
-    Collection,
-    LogError,
-    MeasurementWarning,
-    qAdjustmentInformationGain,
-)
-
-
-def truth(X):
-    return 1.4 * (2 + (2 * X[..., :1]).sin()) + X[..., 1:].square()
+from gpadjust.active import Collection, LogError, MeasurementWarning, qAdjustmentInformationGain
+from tests.systems import measured as truth
+from tests.systems import refused
 
 
 @pytest.fixture
@@ -46,13 +39,8 @@ def test_asked_points_are_pending_until_told(make):
     assert torch.equal(collection.pending, X[[0, 2]])
     more = collection.ask(2)
     assert torch.equal(collection.pending, torch.cat([X[[0, 2]], more]))
-
-
-def test_the_design_is_spread(make):
-    collection = make()
-    points = torch.cat([collection.ask(1) for _ in range(4)] + [collection.ask(4)])
-    quadrants = {tuple(x) for x in (points > torch.tensor([1.0, 0.0])).tolist()}
-    assert len(quadrants) == 4
+    points = torch.cat([make().ask(8)])  # a design is spread
+    assert len({tuple(x) for x in (points[:4] > torch.tensor([1.0, 0.0])).tolist()}) == 4
     assert len(points.unique(dim=0)) == 8
 
 
@@ -72,13 +60,7 @@ def test_points_that_nobody_asked_for(make, uniform):
     assert collection.num_measured == 5
     assert collection.ask().shape == (1, 2)  # by a model: five are enough
     assert len(collection.model.data.Y) == 5
-
-
-def test_told_again_is_a_repeated_measurement(make):
-    collection = make()
-    X = collection.ask()
-    collection.tell(X, truth(X))
-    collection.tell(X, truth(X) + 0.1)
+    collection.tell(X, truth(X) + 0.1)  # again
     assert torch.equal(collection.X, X.repeat(2, 1))
 
 
@@ -122,8 +104,7 @@ def test_some_of_the_outputs(make, tmp_path, missing):
         assert torch.equal(each.Y.isnan(), torch.tensor([[False, True]]))
         assert torch.equal(each.failed_X, X[1:])
         assert len(each.pending) == each.num_observed == 0
-        with pytest.raises(RuntimeError, match="2 measurements of each output, found 0"):
-            each.model  # noqa: B018
+        refused(RuntimeError, "2 measurements of each output, found 0", getattr, each, "model")
 
 
 def test_failing_and_withdrawing(make, tmp_path):
@@ -158,18 +139,6 @@ def test_all_of_it_comes_back_from_the_log(make, tmp_path, uniform):
     assert torch.equal(again.ask(), collection.ask())
 
 
-@pytest.mark.slow
-def test_a_log_of_another_structure_is_no_hindrance(make, tmp_path):
-    from gpadjust import PhysicsMeanGP
-
-    path = tmp_path / "log.jsonl"
-    filled(make(log=path), 6)
-    factory = lambda X, Y: PhysicsMeanGP(X, Y, physics=lambda X: X[..., :1])  # noqa: E731
-    collection = make(log=path, model_factory=factory)
-    assert collection.ask().shape == (1, 2)
-    assert isinstance(collection.model, PhysicsMeanGP)
-
-
 REFUSED = [
     (torch.ones(2), torch.ones(1), ValueError, r"Expected X of shape n x 2, .* got \(2,\)"),
     (torch.ones(2, 2), torch.ones(3, 1), ValueError, r"shape 2 x 1, .* got \(3, 1\)"),
@@ -185,37 +154,20 @@ def test_bad_tellings_change_nothing(make, tmp_path):
     collection = filled(make(log=path), 1)
     before = path.read_bytes()
     for X, Y, error, words in REFUSED:
-        with pytest.raises(error, match=words):
-            collection.tell(X, Y)
+        refused(error, words, collection.tell, X, Y)
     assert path.read_bytes() == before
     assert len(collection.X) == 1
 
 
-class TestOneCollectionOfALog:
-    def test_another_is_refused_until_it_is_closed(self, make, tmp_path):
-        path = tmp_path / "log.jsonl"
-        with make(log=path) as first:
-            X = first.ask()
-            with pytest.raises(LogError, match=r"log\.jsonl is held by process .*, this one: two"):
-                make(log=path)
-        second = make(log=path)
-        assert torch.equal(second.pending, X)
-        with pytest.raises(LogError, match="is held by process"):
-            first.tell(X, truth(X))
-        assert torch.equal(first.pending, X)
-        second.close()
-        first.tell(X, truth(X))
-        first.close()
-        with pytest.raises(LogError, match="something else has written to it"):
-            second.tell(X, truth(X))
-
-    def test_out_of_scope_it_holds_nothing(self, make, tmp_path, bounds):
-        path = tmp_path / "log.jsonl"
-        filled(make(log=path), 1)
-        with pytest.raises(ValueError, match="within the bounds") as kept:
-            make(log=path, bounds=2 * bounds)
-        assert kept.value.__traceback__
-        assert len(make(log=path).X) == 1
+def test_out_of_scope_a_collection_holds_no_log(make, tmp_path, bounds):
+    path = tmp_path / "log.jsonl"
+    filled(make(log=path), 1)
+    with pytest.raises(ValueError, match="within the bounds") as kept:
+        make(log=path, bounds=2 * bounds)
+    assert kept.value.__traceback__
+    with make(log=path) as second:
+        assert len(second.X) == 1
+        refused(LogError, r"log\.jsonl is held by process .*, this one: two", make, log=path)
 
 
 def test_what_cannot_be_logged_is_not_taken(make, tmp_path, monkeypatch):
@@ -257,8 +209,7 @@ def test_a_record_that_does_not_belong(make, tmp_path):
         ('{"asked": "abc"}', "Expected X to be real numbers"),
     ):
         path.write_text(before + line + "\n")
-        with pytest.raises(ValueError, match=rf"Line 4 of the .*jsonl, .* 2 inputs.*{words}"):
-            make(log=path)
+        refused(ValueError, rf"Line 4 of the .*jsonl, .* 2 inputs.*{words}", make, log=path)
 
 
 def test_pending_points_of_the_acquisition_functions_own_count_too(make):

@@ -9,6 +9,7 @@ from botorch.acquisition import AcquisitionFunction, PosteriorStandardDeviation
 from gpadjust import CKA, ZeroMeanGP, fit
 from gpadjust.active import Collection, collect, qAdjustmentInformationGain
 from gpadjust.active.keep import Keep
+from tests.systems import line, refused
 
 BOUNDS = [[0.0], [1.0]]
 MOST = 1.5
@@ -53,7 +54,7 @@ def test_a_forbidden_region_is_hardly_entered():
 
 
 def test_probabilities_are_those_of_the_normal_distribution():
-    X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+    X = line(8)
     model = ZeroMeanGP(X, torch.cat([X.sin(), X.cos()], -1), torch.full((8, 2), 1e-2).double())
     at = torch.tensor([[0.2], [0.9]], dtype=torch.float64)
     torch.manual_seed(0)
@@ -83,32 +84,6 @@ def test_an_interrupted_run_goes_on_with_what_was_left_out(tmp_path):
     with made() as again:
         assert torch.equal(again.left_out[: len(before)], before)
         assert torch.equal(again.pending, points)
-
-
-def test_bad_options_are_refused():
-    safe = {"initial": [[0.1], [0.2]]}
-    for options, error, words in (
-        ({}, ValueError, "first points must be known as safe"),
-        ({"initial": [[0.1]]}, ValueError, "first points must be known as safe.*found 1 and 0"),
-        ({**safe, "probability": 95}, ValueError, "probability must be"),
-        ({**safe, "keep": 1.5}, TypeError, "keep to be callable"),
-        ({**safe, "optimizer_options": {"a": 4}}, ValueError, r"no optimizer_options .* \['a'\]"),
-    ):
-        with pytest.raises(error, match=words):
-            Collection(ZeroMeanGP, BOUNDS, PosteriorStandardDeviation, **{"keep": below, **options})
-
-
-def test_where_nothing_is_safe_it_says_so():
-    collection = Collection(
-        ZeroMeanGP,
-        BOUNDS,
-        PosteriorStandardDeviation,
-        data=(torch.tensor([[0.0], [0.5], [1.0]]), torch.tensor([[5.0], [6.0], [5.0]])),
-        keep=below,
-        fit=lambda model: None,
-    )
-    with pytest.raises(RuntimeError, match=r"0 of \d+ points are safe with a probability of 0\.95"):
-        collection.ask()
 
 
 class Nearest(AcquisitionFunction):
@@ -153,14 +128,34 @@ def test_points_of_a_batch_are_apart_and_none_of_them_is_left_out(harmless):
     points = collection.ask(3)
     assert points.flatten().sort().values.diff().min() >= 0.01
     assert len(collection.left_out) == 0
-    with pytest.raises(RuntimeError, match=r"of which \d\d are apart by 0\.01 of the bounds"):
-        collection.ask(101)
+    words = r"of which \d\d are apart by 0\.01 of the bounds"
+    refused(RuntimeError, words, collection.ask, 101)
+
+
+SAFE = {"initial": [[0.1], [0.2]]}
+UNSAFE = {"data": (torch.tensor([[0.0], [0.5], [1.0]]), torch.tensor([[5.0], [6.0], [5.0]]))}
+REFUSED = [
+    ({}, ValueError, "first points must be known as safe"),
+    ({"initial": [[0.1]]}, ValueError, "first points must be known as safe.*found 1 and 0"),
+    ({**SAFE, "probability": 95}, ValueError, "probability must be"),
+    ({**SAFE, "keep": 1.5}, TypeError, "keep to be callable"),
+    ({**SAFE, "optimizer_options": {"a": 4}}, ValueError, r"no optimizer_options .* \['a'\]"),
+    (UNSAFE, RuntimeError, r"0 of \d+ points are safe with a probability of 0\.95"),
+]
+
+
+@pytest.mark.parametrize(("options", "error", "words"), REFUSED)
+def test_bad_options_and_unsafe_points_are_refused(options, error, words):
+    options = {"keep": below, "fit": lambda model: None, **options}
+
+    def call():
+        Collection(ZeroMeanGP, BOUNDS, PosteriorStandardDeviation, **options).ask()
+
+    refused(error, words, call)
 
 
 def test_first_points_are_to_be_told_first():
-    options = {"initial": [[0.1], [0.9]], "keep": below}
-    collection = Collection(ZeroMeanGP, BOUNDS, PosteriorStandardDeviation, **options)
+    collection = Collection(ZeroMeanGP, BOUNDS, PosteriorStandardDeviation, **SAFE, keep=below)
     X = collection.ask(2)
     collection.tell(X[:1], steep(X[:1]))
-    with pytest.raises(RuntimeError, match=r"1 of them are pending: tell\(\) their results first"):
-        collection.ask()
+    refused(RuntimeError, r"1 are pending: tell\(\) their results first", collection.ask)

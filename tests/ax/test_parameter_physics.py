@@ -2,11 +2,11 @@
 
 from copy import deepcopy
 
-import pytest
 import torch
 
 from gpadjust import BlackBoxPhysics
 from gpadjust.ax import ParameterPhysics
+from tests.systems import refused
 
 PARAMETERS = ["x1", "x2", "x3"]
 
@@ -27,18 +27,16 @@ def test_arguments_with_names_of_parameters_are_these():
         (BlackBoxPhysics(lambda x1: x1), ("x1", "x2", "x3")),
         ("torch:sin", ("x1", "x2", "x3")),
     ):
-        assert ParameterPhysics(physics).names_of(PARAMETERS) == names
+        assert ParameterPhysics(physics).read_names(PARAMETERS) == names
     for physics in (lambda x1, z: x1, lambda a, b: a, lambda x1, z, *, y=0: x1):
-        with pytest.raises(
-            ValueError, match=r"not a parameter of the search space, which has x1, x2"
-        ):
-            ParameterPhysics(physics).names_of(PARAMETERS)
+        words = r"not a parameter of the search space, which has x1, x2"
+        refused(ValueError, words, ParameterPhysics(physics).read_names, PARAMETERS)
 
 
 def test_it_is_given_values_by_name():
     physics = ParameterPhysics(lambda x3, x1: x3 - 10 * x1)
     rows = torch.tensor([[1.0, 2.0], [3.0, 4.0]], dtype=torch.float64)
-    assert physics.of(("x3", "x1"))(rows).flatten().tolist() == [-19.0, -37.0]
+    assert physics.take_rows(("x3", "x1"))(rows).flatten().tolist() == [-19.0, -37.0]
 
 
 def test_what_it_remembers_outlives_models():
@@ -51,14 +49,13 @@ def test_what_it_remembers_outlives_models():
     physics = ParameterPhysics(BlackBoxPhysics(f_p))
     rows = torch.rand(4, 1, dtype=torch.float64)
     for each in (physics, deepcopy(physics), physics):
-        each.of(("x1",))(rows)
+        each.take_rows(("x1",))(rows)
     assert calls == [4]
 
 
 def test_what_is_no_physics_is_an_error():
     for physics in (3.0, torch.nn.Linear, None):
-        with pytest.raises(TypeError, match="physics must be a Physics or a callable"):
-            ParameterPhysics(physics)
+        refused(TypeError, "physics must be a Physics or a callable", ParameterPhysics, physics)
 
 
 def test_it_is_told_by_its_path():

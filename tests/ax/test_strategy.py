@@ -21,6 +21,7 @@ from gpadjust.ax import (
     generator_kwargs,
 )
 from gpadjust.physics import FunctionPhysics
+from tests.systems import refused
 
 FAST = {"method": "map"}
 # Data without noise, on which Ax's acquisition functions are nearly singular.
@@ -77,11 +78,13 @@ def adapter(ours):
 
 
 @pytest.mark.slow
-def test_trials_constraints_and_predictions():
+@pytest.mark.parametrize(("fit_options", "draws"), [(FAST, 1), (None, 16)])
+def test_trials_constraints_and_predictions(fit_options, draws):
     torch.manual_seed(0)
-    ours = try_out(client(), 7)
+    ours = try_out(client(fit_options=fit_options), 9)
     model = adapter(ours).generator.surrogate.model
     assert [type(each) for each in model.models] == [CKA, ZeroMeanGP]
+    assert {len(each.u) for each in model.models} == {draws}
     tried = ours._experiment.trials[2].arm.parameters
     (predicted,) = ours.predict([tried])
     for metric, value in truth(**tried).items():
@@ -90,6 +93,7 @@ def test_trials_constraints_and_predictions():
     best, metrics, _, _ = ours.get_best_parameterization()
     assert truth(**best)["waste"] <= 9.2
     assert metrics["output"][0] > 50
+    assert fit_options is not None or truth(**best)["output"] > 78
 
 
 @pytest.mark.slow
@@ -142,8 +146,11 @@ def test_other_models_and_their_options():
     assert config.botorch_model_class is PhysicsMeanGP
     assert config.model_options["constants"] is False
     for model in (lambda X, Y, physics: CKA(X, Y, physics=physics), 3, partial(CKA, None)):
-        with pytest.raises(TypeError, match=r"class of models, such as CKA, or functools\.partial"):
-            generator_kwargs({"output": crude}, model=model)
+        words = r"class of models, such as CKA, or functools\.partial"
+        refused(TypeError, words, generator_kwargs, {"output": crude}, model=model)
+    for physics in ({}, None, crude, [crude]):
+        words = "the physics of at least one metric by its name"
+        refused(TypeError, words, generator_kwargs, physics)
 
 
 @pytest.mark.slow
@@ -155,22 +162,6 @@ def test_a_physics_with_unknown_parameters():
     ours = try_out(client(physics), 6)
     model = adapter(ours).generator.surrogate.model.models[0]
     assert model.physics_parameters["rate"].mean() > 0
-
-
-@pytest.mark.slow
-def test_full_bayes_is_the_default_and_finds_the_best():
-    torch.manual_seed(0)
-    ours = try_out(client(fit_options=None), 9)
-    models = adapter(ours).generator.surrogate.model.models
-    assert {len(each.u) for each in models} == {16}
-    best, *_ = ours.get_best_parameterization()
-    assert truth(**best)["output"] > 78
-
-
-def test_a_physics_is_of_a_metric():
-    for physics in ({}, None, crude, [crude]):
-        with pytest.raises(TypeError, match="the physics of at least one metric by its name"):
-            generator_kwargs(physics)
 
 
 @pytest.fixture
@@ -199,10 +190,26 @@ def of_one(physics, trials):
     return ours
 
 
-def specs(ours):
-    node = ours._generation_strategy.nodes_by_name["MBM"]
-    kwargs = node.generator_specs[0].generator_kwargs
-    return kwargs["surrogate_spec"], kwargs["transforms"]
+@pytest.mark.slow
+@pytest.mark.parametrize("trials", [0, 2])
+def test_it_goes_on_with_the_first_trials_from_a_file(named, tmp_path, trials):
+    first = of_one({"y": {"fine": named}}, trials)
+    first.save_to_json_file(str(tmp_path / "client.json"))
+    again = Client.load_from_json_file(str(tmp_path / "client.json"))
+    assert again._generation_strategy.name == "Center+Sobol+MBM:CKA"
+    for _ in range(3 - trials):
+        expected, loaded = (each.get_next_trials(max_trials=1) for each in (first, again))
+        assert loaded == expected
+
+
+def test_a_physics_without_a_path_is_an_error(named, tmp_path, monkeypatch):
+    path = str(tmp_path / "client.json")
+    save = of_one({"y": lambda x: x}, 0).save_to_json_file
+    refused(JSONEncodeError, r"the physics '<lambda>'.*Write `def f_p", save, path)
+    of_one({"y": named}, 0).save_to_json_file(path)
+    monkeypatch.delitem(sys.modules, "my_physics")
+    words = r"'my_physics:f_p' cannot be imported"
+    refused(ValueError, words, Client.load_from_json_file, path)
 
 
 @pytest.mark.slow
@@ -210,40 +217,16 @@ def test_it_goes_on_from_a_file(named, tmp_path):
     first = of_one({"y": named}, 3)
     first.save_to_json_file(str(tmp_path / "client.json"))
     again = Client.load_from_json_file(str(tmp_path / "client.json"))
-    spec, transforms = specs(again)
+    node = again._generation_strategy.nodes_by_name["MBM"]
+    kwargs = node.generator_specs[0].generator_kwargs
+    spec = kwargs["surrogate_spec"]
     (config,) = spec.metric_to_model_configs["y"]
     assert config.botorch_model_class is CKA
     assert config.model_options["physics"] == ParameterPhysics(named)
     assert spec.model_configs[0].botorch_model_class is ZeroMeanGP
-    assert transforms[-1] is TellPhysics
+    assert kwargs["transforms"][-1] is TellPhysics
     predicted = []
     for each in (first, again):
         each.get_next_trials(max_trials=1)
         predicted.append(each.predict([{"x": 0.35}])[0]["y"])
     assert predicted[0] == pytest.approx(predicted[1], rel=0.01)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("trials", [0, 1, 2])
-def test_it_goes_on_with_the_first_trials_from_a_file(named, tmp_path, trials):
-    first = of_one({"y": {"fine": named}}, trials)
-    first.save_to_json_file(str(tmp_path / "client.json"))
-    again = Client.load_from_json_file(str(tmp_path / "client.json"))
-    strategy = again._generation_strategy
-    assert strategy.name == "Center+Sobol+MBM:CKA"
-    for _ in range(3 - trials):
-        expected, found = (each.get_next_trials(max_trials=1) for each in (first, again))
-        assert found == expected
-
-
-def test_a_lambda_cannot_be_saved(tmp_path):
-    ours = of_one({"y": lambda x: x}, 0)
-    with pytest.raises(JSONEncodeError, match=r"the physics '<lambda>'.*Write `def f_p"):
-        ours.save_to_json_file(str(tmp_path / "client.json"))
-
-
-def test_a_physics_that_is_gone_is_an_error(named, tmp_path, monkeypatch):
-    of_one({"y": named}, 0).save_to_json_file(str(tmp_path / "client.json"))
-    monkeypatch.delitem(sys.modules, "my_physics")
-    with pytest.raises(ValueError, match=r"'my_physics:f_p' cannot be imported"):
-        Client.load_from_json_file(str(tmp_path / "client.json"))

@@ -14,6 +14,7 @@ from botorch.models.transforms.input import Normalize
 
 from gpadjust import CKA, BlackBoxPhysics
 from gpadjust.ax import TRANSFORMS, ParameterPhysics, TellPhysics, generator_kwargs
+from tests.systems import refused
 
 # Data without noise, on which Ax's acquisition functions are nearly singular.
 pytestmark = pytest.mark.filterwarnings(
@@ -126,6 +127,7 @@ def test_what_is_asked_for_a_candidate_is_in_the_search_space():
 def test_it_is_asked_within_the_search_space_alone():
     fitted = adapter(experiment(), Recorded(), metrics=["cost"])
     model = models(fitted)["cost"]
+    assert type(models(fitted)["load"]).__name__ == "SingleTaskGP"  # Ax's own
     inside = model.data.X[:1].clone()
     beyond = inside - 0.7 * torch.eye(inside.shape[-1], dtype=torch.float64)[:3]
     asked = model.physics[0].units.raw(beyond, ["rate", "width", "x"])
@@ -213,12 +215,6 @@ def test_a_tensor_has_the_columns_of_the_search_space_fixed_ones_too():
     torch.testing.assert_close(torch.from_numpy(asked[0]), expected, rtol=1e-9, atol=1e-12)
 
 
-def test_a_metric_without_physics_has_ax_s_own_model():
-    found = models(adapter(experiment(), Recorded(), metrics=["cost"]))
-    assert type(found["cost"]) is CKA
-    assert type(found["load"]).__name__ == "SingleTaskGP"
-
-
 def test_a_second_experiment_leaves_the_units_of_the_first():
     f_p = ParameterPhysics(Recorded())
     kwargs = generator_kwargs({"cost": f_p}, fit_options=FAST)
@@ -234,13 +230,9 @@ def test_a_second_experiment_leaves_the_units_of_the_first():
     }
 
 
-def test_a_plain_model_config_says_what_is_missing():
-    with pytest.raises(ValueError, match=r"would get inputs after Ax's transforms.*TellPhysics"):
-        adapter(experiment(), Recorded(), [*MBM_X_trans, *Y_trans])
-
-
 LATE, LOGGED = [*TRANSFORMS, UnitX], [*MBM_X_trans, LogY, TellPhysics]
 REFUSED = [
+    ({"transforms": [*MBM_X_trans, *Y_trans]}, "would get inputs after Ax's.*TellPhysics"),
     ({"transforms": LATE}, "TellPhysics as the last.*found UnitX after it"),
     ({"transforms": LOGGED}, r"transform\(s\) LogY of Ax are not supported"),
     ({"transforms": [*Mixed_transforms, TellPhysics]}, "no kernel for categorical"),
@@ -252,18 +244,17 @@ REFUSED = [
 ]
 
 
-def test_what_cannot_be_right_is_an_error():
-    for change, words in REFUSED:
-        with pytest.raises((ValueError, UserInputError, RuntimeError), match=words):
-            adapter(experiment(), **{"physics": Recorded(), **change})
+@pytest.mark.parametrize(("change", "words"), REFUSED)
+def test_what_cannot_be_right_is_an_error(change, words):
+    errors = (ValueError, UserInputError, RuntimeError)
+    refused(errors, words, adapter, experiment(), **{"physics": Recorded(), **change})
 
 
 def test_of_a_single_metric_it_is_of_that():
-    f_p = Recorded()
-    config = ModelConfig(botorch_model_class=CKA, model_options={"physics": f_p}, mll_options=FAST)
-    fitted = Generators.BOTORCH_MODULAR(
-        experiment=experiment(constrained=False),
-        surrogate_spec=SurrogateSpec(model_configs=[config]),
-        transforms=TRANSFORMS,
+    config = ModelConfig(
+        botorch_model_class=CKA, model_options={"physics": Recorded()}, mll_options=FAST
     )
+    spec = SurrogateSpec(model_configs=[config])
+    options = {"surrogate_spec": spec, "transforms": TRANSFORMS}
+    fitted = Generators.BOTORCH_MODULAR(experiment=experiment(constrained=False), **options)
     assert models(fitted)["cost"].physics[0].metric == "cost"

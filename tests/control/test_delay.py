@@ -5,7 +5,10 @@ import torch
 
 from gpadjust.control.delay import find_delay
 from gpadjust.dynamics import PhysicsDynamics, StateSpec, Trajectories
+from tests.control.conftest import full_step
+from tests.point import POINT_SPEC
 
+NOISES = 0.0, 0.3
 PLAIN = StateSpec(["x", "v"], ["u"])
 TOLD = StateSpec(["x", "v", "u_1"], ["u"], previous={"u_1": "u"}, physics_reads=["x", "v", "u_1"])
 
@@ -45,17 +48,16 @@ def test_one_step_more_than_told_is_found(spec, delay, seed):
     assert f"steps={delay}" in found
 
 
-@pytest.mark.parametrize(("spec", "delay"), [(PLAIN, 0), (TOLD, 1)])
-@pytest.mark.parametrize("seed", range(5))
-@pytest.mark.parametrize("noise", [0.0, 0.3])
-def test_there_is_no_false_alarm(spec, delay, seed, noise):
-    data = episodes(spec, delay, seed, friction=0.5, noise=noise)
-    assert find_delay(PhysicsDynamics(spec, motion), data) is None
-
-
-def test_few_steps_say_nothing():
-    data = episodes(PLAIN, 1, steps=6)
-    assert find_delay(PhysicsDynamics(PLAIN, motion), data) is None
+@pytest.mark.parametrize(
+    ("spec", "delay", "options"),
+    [
+        *((PLAIN, 0, {"seed": s, "friction": 0.5, "noise": n}) for s in range(5) for n in NOISES),
+        *((TOLD, 1, {"seed": s, "friction": 0.5, "noise": n}) for s in range(5) for n in NOISES),
+        (PLAIN, 1, {"steps": 6}),  # which tell nothing
+    ],
+)
+def test_there_is_no_false_alarm(spec, delay, options):
+    assert find_delay(PhysicsDynamics(spec, motion), episodes(spec, delay, **options)) is None
 
 
 @pytest.mark.parametrize("gain", [0.6, 1.5])
@@ -69,5 +71,4 @@ def test_a_wrong_gain_under_a_feedback_is_no_delay(gain):
         x = parts[-1][-1]
     columns = [torch.stack(column, 1).flatten(0, 1) for column in zip(*parts, strict=True)]
     data = Trajectories(*columns, torch.arange(4).repeat_interleave(10))
-    spec = StateSpec(["x"], ["v"])
-    assert find_delay(PhysicsDynamics(spec, lambda X: X.sum(-1, keepdim=True)), data) is None
+    assert find_delay(PhysicsDynamics(POINT_SPEC, full_step), data) is None

@@ -1,4 +1,4 @@
-"""What real episodes tell, and how dynamics learn them."""
+"""What real episodes add to a task, and how dynamics learn them."""
 
 import math
 from types import SimpleNamespace
@@ -7,18 +7,12 @@ import pytest
 import torch
 from gymnasium import spaces
 
-from gpadjust.control import Task
-from gpadjust.control.episodes import (
-    check_functions,
-    completed,
-    far_bounds,
-    learn_dynamics,
-    learnable,
-    warn_of_bounds,
-)
+from gpadjust.control.episodes import completed, far_bounds
+from gpadjust.control.learning import check_functions, learn_dynamics, learnable
 from gpadjust.core import Prediction
 from gpadjust.dynamics import Dynamics, PhysicsDynamics, StateSpec, Trajectories
 from gpadjust.physics import PhysicsError
+from tests.control.conftest import Task, point_of
 from tests.point import POINT_SPEC
 
 ENV = SimpleNamespace(
@@ -27,17 +21,12 @@ ENV = SimpleNamespace(
 SPEC = StateSpec(["x", "angle"], ["force"], angles=["angle"])
 
 
-@pytest.fixture
-def recorded():
-    """Records steps 0, 1, ... of episodes of three; `x` is the step."""
-
-    def record(num_steps, terminal=False):
-        x = torch.arange(float(num_steps)).double()
-        states, ends = torch.stack([x, x], -1), x % 3 == 2
-        force = torch.ones(num_steps, 1).double()
-        return Trajectories(states, force, states + 0.5, (x // 3).long(), -x, ends & terminal)
-
-    return record
+def recorded(num_steps, terminal=False):
+    """Steps 0, 1, ... of episodes of three; `x` is the step."""
+    x = torch.arange(float(num_steps)).double()
+    states, ends = torch.stack([x, x], -1), x % 3 == 2
+    force = torch.ones(num_steps, 1).double()
+    return Trajectories(states, force, states + 0.5, (x // 3).long(), -x, ends & terminal)
 
 
 @pytest.fixture
@@ -59,59 +48,41 @@ def task(episode_length=5, reward=reward, **parts):
     return Task(dynamics, reward, episode_length=episode_length, **parts)
 
 
-def test_starts_are_those_of_episodes(recorded):
-    starts = completed(task(3), recorded(8), ENV).initial_states(200)
-    assert sorted({*starts[:, 0].tolist()}) == [0, 3, 6]
-    assert starts.shape == (200, 2)
+def bounds_of(physics, data):
+    return completed(point_of(physics, reward, episode_length=5), data, ENV).state_bounds
 
 
-def test_bounds_are_far_beyond_what_was_seen(recorded):
+def fails(X):
+    raise PhysicsError("no", rows=[], partial=None)
+
+
+def test_a_task_is_completed_where_it_says_nothing():
     low, high = far_bounds(SPEC, recorded(3))
     assert low[0] == pytest.approx(1.25 - 12.5)
     assert high[0] == pytest.approx(1.25 + 12.5)
     assert (low[1], high[1]) == (-math.inf, math.inf)
-
-
-def test_a_task_is_completed_where_it_says_nothing(recorded):
-    whole = completed(task(3), recorded(6), ENV)
+    whole = completed(task(3), recorded(8), ENV)
     assert whole.episode_length == 3
-    assert torch.equal(
-        whole.state_bounds, far_bounds(SPEC, recorded(6))
-    )  # the physics stays where it is
+    assert torch.equal(whole.state_bounds, far_bounds(SPEC, recorded(8)))  # f_p stays where it is
+    starts = whole.initial_states(200)
+    assert sorted({*starts[:, 0].tolist()}) == [0, 3, 6]
+    assert starts.shape == (200, 2)
     assert completed(task(3), recorded(0), ENV).initial_states is None
 
 
 def test_bounds_leave_room_for_what_the_physics_reaches(moved):
-    fast = Task(
-        PhysicsDynamics(POINT_SPEC, lambda X: X[:, :1] + 4 * X[:, 1:]), reward, episode_length=5
-    )
-    low, high = completed(fast, moved, ENV).state_bounds
+    low, high = bounds_of(lambda X: X[:, :1] + 4 * X[:, 1:], moved)
     # Two starts, at 1.0 and 1.2, go 20 either way in five steps; half of that range beside it.
     middle, half = 1.1, 0.1 + 20.0
     assert low.item() == pytest.approx(middle - 2 * half, abs=0.5)
     assert high.item() == pytest.approx(middle + 2 * half, abs=0.5)
-    away = Task(PhysicsDynamics(POINT_SPEC, lambda X: 1e6 * X[:, :1]), reward, episode_length=5)
-    close, wide = far_bounds(POINT_SPEC, moved), completed(away, moved, ENV).state_bounds
+    close, wide = far_bounds(POINT_SPEC, moved), bounds_of(lambda X: 1e6 * X[:, :1], moved)
     assert (wide[1] - wide[0]).item() == pytest.approx(10 * (close[1] - close[0]).item())
-    still = Task(PhysicsDynamics(POINT_SPEC, lambda X: X[:, :1]), reward, episode_length=5)
-    assert torch.equal(completed(still, moved, ENV).state_bounds, far_bounds(POINT_SPEC, moved))
+    for still in (lambda X: X[:, :1], fails):
+        assert torch.equal(bounds_of(still, moved), close)
 
 
-def test_a_physics_that_fails_everywhere_reaches_nothing(moved):
-    def fails(X):
-        raise PhysicsError("no", rows=[], partial=None)
-
-    task = Task(PhysicsDynamics(POINT_SPEC, fails), reward, episode_length=5)
-    assert torch.equal(completed(task, moved, ENV).state_bounds, far_bounds(POINT_SPEC, moved))
-
-
-def test_an_episode_that_a_bound_may_have_held_is_told(moved):
-    with pytest.warns(UserWarning, match=r"came to x = 1\.3, .*beyond 1\.31: .*state_bounds"):
-        warn_of_bounds(POINT_SPEC, moved, torch.tensor([[-1.0], [1.31]]))
-    warn_of_bounds(POINT_SPEC, moved, torch.tensor([[-3.0], [3.0]]))
-
-
-def test_the_environments_functions_pass(recorded):
+def test_the_environments_functions_pass():
     check_functions(task(), recorded(6))
     check_functions(
         task(terminated=lambda states: states[:, 0] % 3 > 2), recorded(6, terminal=True)
@@ -122,14 +93,14 @@ def test_the_environments_functions_pass(recorded):
     ("terminal", "known", "message"),
     [
         (False, {"reward": lambda s, a, n: torch.where(s[:, 0] == 2, 5.0, -s[:, 0])},
-         r"transition 2 gave -2, but the function says 5.* actions\[2\] = \[1.0\]"),
+         r"transition 2 gave -2, but the function returns 5.* actions\[2\] = \[1.0\]"),
         (False, {"reward": lambda s, a, n: s}, r"one value per row, shape \(4,\)"),
-        (True, {}, r"transition 2 .*terminated=True, but none was given"),
+        (True, {}, r"transition 2 .*terminated=True, but the task has False"),
         (False, {"terminated": lambda s: s[:, 0] == 1.5},
-         r"transition 1 .*terminated=False, but the function says"),
+         r"transition 1 .*terminated=False, but the task has True"),
     ],
 )  # fmt: skip
-def test_other_functions_are_refused_by_their_worst_transition(recorded, terminal, known, message):
+def test_other_functions_are_refused_by_their_worst_transition(terminal, known, message):
     with pytest.raises(ValueError, match=message):
         check_functions(task(**known), recorded(4, terminal))
 
@@ -162,17 +133,10 @@ class Own(Dynamics):
         return Prediction(mean, torch.full_like(mean, 0.2**2))
 
     def sample_functions(self, num_functions, seed=None):
-        return lambda states, actions: self.predict(states, actions).mean
+        raise NotImplementedError("No features of this kernel.")
 
     def update(self, states, actions, next_states):
         self.learnt = states
-
-
-class Stiff(Own):
-    """Dynamics that have no functions."""
-
-    def sample_functions(self, num_functions, seed=None):
-        raise NotImplementedError("No features of this kernel.")
 
 
 def scores(dynamics, moved, horizons=()):
@@ -180,7 +144,7 @@ def scores(dynamics, moved, horizons=()):
     return learn_dynamics(known, moved, moved, horizons)
 
 
-def test_scores_are_of_what_was_predicted_before(moved):
+def test_scores_are_of_what_was_predicted_before_of_trajectories_if_there_are_functions(moved):
     dynamics = Own(POINT_SPEC)
     found = scores(dynamics, moved)
     assert found["rmse/x"] == pytest.approx(0.1)
@@ -188,8 +152,10 @@ def test_scores_are_of_what_was_predicted_before(moved):
     nlpd = 0.5 * math.log(2 * math.pi * 0.2**2) + 0.1**2 / (2 * 0.2**2)
     assert found["nlpd"] == pytest.approx(nlpd)
     assert torch.equal(dynamics.learnt, moved.states)
-    assert "overrides" not in found  # it has no physics
     assert found.keys() >= {"fit_seconds", "score_seconds"}
+    with pytest.warns(UserWarning, match=r"No features of this kernel\. Pass score_horizons"):
+        again = scores(Own(POINT_SPEC), moved, (1, 5))
+    assert again.keys() == found.keys()
 
 
 def test_trajectories_are_scored_as_far_as_episodes_go(moved, learnt_dynamics):
@@ -207,11 +173,3 @@ def test_what_has_no_doubt_has_energies_alone(moved, point_dynamics):
     found = scores(point_dynamics, moved, (1, 5))
     assert found.keys() >= {"energy_1", "energy_5"}
     assert not any("nlpd" in name or "coverage" in name for name in found)
-
-
-def test_dynamics_without_functions_are_learnt_without_scores_of_trajectories(moved):
-    with pytest.warns(UserWarning, match=r"No features of this kernel\. Pass score_horizons"):
-        found = scores(Stiff(POINT_SPEC), moved, (1, 5))
-    assert "coverage" in found
-    assert "energy_1" not in found
-    assert "coverage" in scores(Stiff(POINT_SPEC), moved)

@@ -1,4 +1,4 @@
-"""A policy that plans at every step."""
+"""A controller that plans at every step."""
 
 import subprocess
 import sys
@@ -10,41 +10,32 @@ import pytest
 import torch
 
 from gpadjust.control import MPC, MPCAgent, Planner, Return, Task
-from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec, Trajectories
+from gpadjust.dynamics import LearnedDynamics, StateSpec, Trajectories
+from tests.control.conftest import (
+    BOUNDS,
+    EVEN,
+    ZERO,
+    full_step,
+    half_step,
+    point_of,
+    quick,
+    to_one,
+)
+from tests.point import POINT_SPEC
 
-SPEC = StateSpec(["x"], ["v"])
-BOUNDS = torch.tensor([[-1.0], [2.0]], dtype=torch.float64)
-
-
-def to_one(states, actions, next_states):
-    return -(next_states[:, 0] - 1).abs()
+QUICK = {"fit_options": {"method": "map"}}
 
 
 @pytest.fixture
 def task():
-    dynamics = PhysicsDynamics(SPEC, lambda X: X[:, :1] + 0.5 * X[:, 1:])
-    return Task(dynamics, to_one, episode_length=6)
-
-
-def quick(rounds=3, **options):
-    return Planner(rounds=rounds, num_random=48, max_hold=1, **options)
-
-
-def test_it_reaches_a_goal_and_stays(task):
-    planner = Planner(rounds=3, horizon=3, num_random=64, max_hold=2)
-    mpc = MPC(task, BOUNDS, planner, first=planner)
-    x, plan = np.zeros(1), None
-    for _ in range(6):
-        action, plan = mpc.predict(x, plan)
-        x = x + 0.5 * action
-    assert abs(x - 1) < 0.1
+    return point_of(episode_length=6)
 
 
 def test_a_loop_of_the_users_learns_and_goes_on_in_the_newest_model():
     """The plant moves half as far as f_p says."""
-    dynamics = LearnedDynamics(SPEC, lambda X: X.sum(-1, True), fit_options={"method": "map"})
+    dynamics = LearnedDynamics(POINT_SPEC, full_step, **QUICK)
     task = Task(dynamics, to_one, episode_length=6)
-    controller, errors = MPC(task, BOUNDS, quick(horizon=3), first=quick()), []
+    controller, errors = MPC(task, BOUNDS, quick(rounds=3, horizon=3), first=quick(rounds=3)), []
     for _ in range(2):
         controller.reset()
         x = np.zeros(1)
@@ -67,7 +58,7 @@ def test_a_loop_of_the_users_learns_and_goes_on_in_the_newest_model():
 
 
 def test_steps_are_the_predictions_along_the_plan(task):
-    controller = MPC(task, BOUNDS, quick())
+    controller = MPC(task, BOUNDS, quick(rounds=3))
     x, plan = np.zeros(1), None
     for _ in range(3):
         action, plan = controller.predict(x, plan)
@@ -77,20 +68,23 @@ def test_steps_are_the_predictions_along_the_plan(task):
 
 
 def test_no_transition_goes_across_what_was_not_measured():
-    dynamics = LearnedDynamics(SPEC, lambda X: X.sum(-1, True), fit_options={"method": "map"})
-    controller = MPC(Task(dynamics, to_one, episode_length=9), BOUNDS, quick(0))
-    for x in (0.0, 0.1, np.nan, 7.0, [[1.0], [2.0]], 9.0, 9.1):
-        if np.ndim(x) == 2:
-            with pytest.raises(ValueError, match=r"of 1 numbers, found shape \(2, 1\)"):
-                controller.step(x)
-        elif np.isnan(x):
-            with pytest.raises(ValueError, match=r"entry 0 of the observation is nan.*Stop the ma"):
-                controller.step(x)
+    dynamics = LearnedDynamics(POINT_SPEC, full_step, **QUICK)
+    controller = MPC(Task(dynamics, to_one, episode_length=9), BOUNDS, quick(rounds=0))
+    messages = {
+        2: (np.nan, r"'x', entry 0 of the observation is nan.*Stop the ma"),
+        4: ([[1.0], [2.0]], r"of 1 numbers, found shape \(2, 1\)"),
+    }
+    for t, x in enumerate((0.0, 0.1, None, 7.0, None, 9.0, 9.1)):
+        if x is None:
+            with pytest.raises(ValueError, match=messages[t][1]):
+                controller.step(messages[t][0])
         else:
             controller.step(x)
     assert controller.learn().task.dynamics.num_transitions == 2
     with pytest.raises(ValueError, match="no new transition to learn"):
         controller.learn()
+    with pytest.raises(TypeError, match=r"data must be Trajectories\("):
+        controller.learn([1.0])
 
 
 def test_an_agent_makes_one_controller_for_each_model(make_agent, monkeypatch):
@@ -125,55 +119,52 @@ from gpadjust.control import MPCAgent
     assert "gpadjust.control.MPCAgent needs Gymnasium; run `pip install" in found.stderr
 
 
-def test_plans_go_on_from_earlier_ones_and_end_with_the_episode(task, monkeypatch):
-    asked = []
-    real = Planner.plan
+@pytest.fixture
+def calls(monkeypatch):
+    """Plans that were asked for: horizon, steps, earlier plan, actions."""
+    calls, real = [], Planner.plan
 
     def plan(self, task, state, bounds, num_steps=None, **others):
         found = real(self, task, state, bounds, num_steps, **others)
-        asked.append((self.horizon, num_steps, others.get("earlier"), found.actions))
+        calls.append((self.horizon, num_steps, others.get("earlier"), found.actions))
         return found
 
     monkeypatch.setattr(Planner, "plan", plan)
-    mpc = MPC(task, BOUNDS, quick(horizon=2), first=quick(horizon=5), tolerance=None)
+    return calls
+
+
+def test_plans_go_on_from_earlier_ones_and_end_with_the_episode(task, calls):
+    planners = quick(rounds=3, horizon=2), quick(rounds=3, horizon=5)
+    mpc = MPC(task, BOUNDS, planners[0], first=planners[1], tolerance=None)
     x, state = np.zeros((2, 1)), None
     for t in range(3):
         starts = np.array([t == 0, t in (0, 2)])
         _, state = mpc.predict(x, state, starts)
-    horizons = [each[0] for each in asked]
-    assert horizons == [5, 5, 2, 2, 2, 5]  # the second one begins anew
-    assert [each[1] for each in asked] == [6, 6, 5, 5, 4, 6]
-    assert asked[0][2] is None
-    assert torch.equal(asked[2][2].actions, asked[0][3][1:])
-    assert torch.equal(
-        asked[4][2].actions[1:], asked[0][3][3:]
-    )  # beyond the horizon, as planned before
+    assert [each[0] for each in calls] == [5, 5, 2, 2, 2, 5]  # the second one begins anew
+    assert [each[1] for each in calls] == [6, 6, 5, 5, 4, 6]
+    assert calls[0][2] is None
+    assert torch.equal(calls[2][2].actions, calls[0][3][1:])
+    # Beyond the horizon, as planned before
+    assert torch.equal(calls[4][2].actions[1:], calls[0][3][3:])
     assert [each.moment.steps_done for each in state] == [3, 1]
 
 
-def test_what_disappoints_is_planned_anew(monkeypatch):
+def test_what_disappoints_is_planned_anew(calls):
     """The model has no wind; where it has blown the point far away, the whole rest is planned.
 
     A plan of the rest is two, of which the second begins with parts of three steps.
     """
-    task = Task(PhysicsDynamics(SPEC, lambda X: X.sum(-1, True)), to_one, episode_length=8)
-    begun = []
-    real = Planner.plan
-
-    def plan(self, task, state, *others, **known):
-        begun.append(self.horizon)
-        return real(self, task, state, *others, **known)
-
-    monkeypatch.setattr(Planner, "plan", plan)
+    task = point_of(full_step, episode_length=8)
     whole = [None, None]
     for tolerance, asked in ((0.25, [*whole, 2, 2, *whole, 2]), (None, [*whole, 2, 2, 2])):
-        begun.clear()
-        mpc = MPC(task, BOUNDS, quick(horizon=2), first=quick(), tolerance=tolerance)
+        calls.clear()
+        planners = quick(rounds=3, horizon=2), quick(rounds=3)
+        mpc = MPC(task, BOUNDS, planners[0], first=planners[1], tolerance=tolerance)
         _, state = mpc.predict(np.zeros(1))
         for x in (1.0, -4.0, -3.0):
             _, state = mpc.predict(np.array([x]), state)
-        assert [each for each in begun if each != 3] == asked
-        assert 3 in begun
+        assert [each[0] for each in calls if each[0] != 3] == asked
+        assert 3 in [each[0] for each in calls]
         assert len(state[0].promised) == 8
         assert len(state[0].actions) == 4
 
@@ -187,9 +178,9 @@ def test_decisions_within_an_episode_are_in_time(monkeypatch):
         clock[0] += 1.0
         return to_one(states, actions, next_states)
 
-    task = Task(PhysicsDynamics(SPEC, lambda X: X.sum(-1, True)), slow, episode_length=8)
+    task = point_of(full_step, slow, episode_length=8)
     for seconds, again in ((5.5, False), (40.0, True)):
-        mpc = MPC(task, BOUNDS, quick(1, horizon=2, seconds=seconds))
+        mpc = MPC(task, BOUNDS, quick(rounds=1, horizon=2, seconds=seconds))
         assert mpc.first.seconds is None
         _, state = mpc.predict(np.zeros(1))
         assert clock[0] > 40  # the first plan takes its time
@@ -203,17 +194,14 @@ def test_decisions_within_an_episode_are_in_time(monkeypatch):
         assert len(state[0].promised) == 8
 
 
-def test_the_default_plans_look_a_third_of_the_episode_ahead_but_not_for_ever(task):
+def test_the_default_plans_look_a_third_of_the_episode_ahead_but_not_for_ever():
     for step, length, horizon in ((None, 6, 8), (0.1, 45, 1.5), (0.02, 1000, 0.6)):
-        dynamics = PhysicsDynamics(replace(SPEC, step=step), lambda X: X.sum(-1, True))
-        mpc = MPC(replace(task, dynamics=dynamics, episode_length=length), BOUNDS)
-        assert mpc.each_step.horizon == pytest.approx(horizon)
-    with pytest.raises(ValueError, match="horizon must be one step at least"):
-        MPC(replace(task, dynamics=dynamics), BOUNDS, quick(horizon=0.01))
+        task = point_of(full_step, spec=replace(POINT_SPEC, step=step), episode_length=length)
+        assert MPC(task, BOUNDS).each_step.horizon == pytest.approx(horizon)
 
 
 def test_deterministic_actions_are_always_the_same(task):
-    mpc = MPC(task, BOUNDS, quick(0))
+    mpc = MPC(task, BOUNDS, quick(rounds=0))
     before = torch.get_rng_state()
     first, again = (mpc.predict(np.zeros(1), deterministic=True)[0] for _ in range(2))
     assert first == again
@@ -223,7 +211,7 @@ def test_deterministic_actions_are_always_the_same(task):
 
 
 def test_the_action_of_a_row_is_that_of_the_row_alone(task):
-    mpc = MPC(task, [[-1.0], [1.0]], quick(), first=quick())
+    mpc = MPC(task, EVEN, quick(rounds=3), first=quick(rounds=3))
     rows = np.array([[0.5], [-0.25], [0.5]])
     together = mpc.predict(rows)[0]
     assert np.array_equal(together, np.stack([mpc.predict(row)[0] for row in rows]))
@@ -233,29 +221,24 @@ def test_a_careful_plan_keeps_away_from_what_is_not_known():
     """Beyond x = 0 nobody knows what v does: the mean gains there, a low quantile loses."""
     x = torch.linspace(-2, 0, 30, dtype=torch.float64).unsqueeze(-1)
     v = torch.zeros_like(x).uniform_(-1, 1, generator=torch.Generator().manual_seed(0))
-    fit = {"method": "map"}
-    dynamics = LearnedDynamics(SPEC, lambda X: X[:, :1] + 0.5 * X[:, 1:], fit_options=fit)
+    dynamics = LearnedDynamics(POINT_SPEC, half_step, **QUICK)
     noise = 0.3 * torch.randn(30, 1, generator=torch.Generator().manual_seed(1)).double()
     dynamics.update(x, v, x + 0.5 * v + noise * (x + 2))
     task = Task(dynamics, lambda s, a, n: n[:, 0], episode_length=2)
     values = {}
     for quantile in (None, 0.1):
         torch.manual_seed(0)
-        planner = quick(0, objective=Return(quantile=quantile), num_functions=20)
-        values[quantile] = planner.plan(task, torch.zeros(1).double(), BOUNDS).value
+        planner = quick(Return(quantile=quantile), rounds=0, num_functions=20)
+        values[quantile] = planner.plan(task, ZERO, BOUNDS).value
     assert values[0.1] < values[None]
 
 
 def test_a_loop_goes_on_beyond_the_length_and_warns_of_a_delay():
     """Of a tank whose pump acts a step late, which nobody has told."""
-
-    def physics(X):
-        return 0.9 * X[:, :1] + 0.5 * X[:, 1:]
-
-    options = {"fit_options": {"method": "map"}}
-    dynamics = LearnedDynamics(StateSpec(["level"], ["pump"]), physics, **options)
+    spec = StateSpec(["level"], ["pump"])
+    dynamics = LearnedDynamics(spec, lambda X: 0.9 * X[:, :1] + 0.5 * X[:, 1:], **QUICK)
     task = Task(dynamics, lambda s, a, n: -(n[:, 0] - 1).square(), episode_length=20)
-    controller = MPC(task, [[-1.0], [1.0]], quick(horizon=6))
+    controller = MPC(task, EVEN, quick(rounds=3, horizon=6))
     rng, level, last, actions = np.random.default_rng(0), np.zeros(1), 0.0, []
     for _ in range(30):
         actions.append(controller.step(level)[0])
@@ -264,7 +247,3 @@ def test_a_loop_goes_on_beyond_the_length_and_warns_of_a_delay():
     assert max(map(abs, actions[20:])) > 0.05
     with pytest.warns(UserWarning, match=r"follow 'pump' 1 step\(s\) late"):
         controller.learn()
-    with pytest.raises(ValueError, match="'level', entry 0 of the observation is nan"):
-        controller.step([np.nan])
-    with pytest.raises(TypeError, match=r"data must be Trajectories\("):
-        controller.learn([1.0])

@@ -23,10 +23,18 @@ SAID = {
 @pytest.mark.parametrize("fault", FAULTS)
 @pytest.mark.parametrize("place", [1, 3, 5])
 def test_a_step_that_fails_ends_its_episode_at_the_last_good_observation(point_env, fault, place):
-    env = StepGuard(Faulty(point_env(), {place: fault}))
-    last, _ = env.reset(seed=0)
+    """Though the environment writes over its observations."""
+
+    class Reuses(Faulty):
+        def step(self, action):
+            found = super().step(action)
+            self.unwrapped.x[:] = found[0]
+            return found
+
+    env = StepGuard(Reuses(point_env(), {place: fault}))
+    last = env.reset(seed=0)[0].copy()
     for _ in range(place - 1):
-        last, *_ = env.step(ACTION)
+        last = env.step(ACTION)[0].copy()
     with pytest.warns(FailedStepWarning, match=f"Step {place} of an episode failed.*{SAID[fault]}"):
         observation, reward, terminated, truncated, info = env.step(ACTION)
     assert np.array_equal(observation, last)
@@ -47,19 +55,6 @@ def test_good_steps_are_as_without_a_guard(point_env):
     assert StepGuard.around(guarded) is guarded
 
 
-def test_the_last_good_observation_is_kept_though_the_environment_writes_over_it(point_env):
-    class Reuses(Faulty):
-        def step(self, action):
-            found = super().step(action)
-            self.unwrapped.x[:] = found[0]
-            return found
-
-    env = StepGuard(Reuses(point_env(), {1: "nan"}))
-    first = env.reset(seed=0)[0].copy()
-    with pytest.warns(FailedStepWarning):
-        assert np.array_equal(env.step(ACTION)[0], first)
-
-
 def test_an_environment_that_can_make_no_step_is_an_error_in_the_third_episode(point_env):
     env = StepGuard(Faulty(point_env(), dict.fromkeys((2, 3, 4, 5, 6), "raises")))
     env.reset()
@@ -71,7 +66,7 @@ def test_an_environment_that_can_make_no_step_is_an_error_in_the_third_episode(p
         with pytest.warns(FailedStepWarning):
             env.step(ACTION)
     env.reset()
-    with pytest.raises(RuntimeError, match="Nor was there a good step in the 2 ep") as found:
+    with pytest.raises(RuntimeError, match="The 2 previous episodes had no valid step") as found:
         env.step(ACTION)
     assert isinstance(found.value.__cause__, OSError)
 
@@ -106,13 +101,7 @@ ALL = [{place: fault} for fault in FAULTS for place in (1, 6, 8, 10)]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "faults",
-    [
-        {1: "raises", 4: "nan"},
-        *(pytest.param(each, marks=pytest.mark.slow) for each in [EACH, *ALL]),
-    ],
-)
+@pytest.mark.parametrize("faults", [{1: "raises", 4: "nan"}, EACH, *ALL])
 def test_agents_lose_nothing(make_agent, kind, point_env, faults):
     """Of the first, a middle and the last step; before there are data, and after."""
     agent = make_agent(kind, Faulty(point_env(), faults))

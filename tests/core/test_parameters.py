@@ -78,7 +78,7 @@ def case(name, seed):
     X = low + torch.rand(n, len(low), **options) * (high - low)
     unknowns = {key: Unknown(guess, factor=factor) for key, (guess, factor) in priors.items()}
     physics = FunctionPhysics(law, unknowns=unknowns)
-    true = physics.unknowns.at(torch.randn(2, **options))
+    true = physics.unknowns.to_values(torch.randn(2, **options))
     return X, physics(X, true) + noise * torch.randn(n, 1, **options), physics, true
 
 
@@ -86,7 +86,7 @@ def by_grid(X, Y, physics, variance):
     """The ends of the central 95 % of each parameter, ``2 x p``."""
     z = torch.linspace(-4.5, 4.5, 361, dtype=torch.float64)
     points = torch.cartesian_prod(z, z)
-    grid = physics.unknowns.at(points)
+    grid = physics.unknowns.to_values(points)
     parts = [(Y - physics(X, part)).square().sum((-1, -2)) for part in grid.split(20_000)]
     weights = (-0.5 * (torch.cat(parts) / variance + points.square().sum(-1))).softmax(0)
     ends = []
@@ -131,7 +131,7 @@ def fold(law, unknowns, seed, noise=0.1):
     """A model of a law of one input, whose true parameters are drawn from the prior, and these."""
     X = line(12, 0.1, 2.0)
     physics = FunctionPhysics(law, unknowns=unknowns)
-    true = physics.unknowns.at(normal(len(unknowns), seed=seed))
+    true = physics.unknowns.to_values(normal(len(unknowns), seed=seed))
     Y = physics(X, true) + noise * normal(len(X), 1, seed=100 + seed)
     return CalibratedPhysics(X, Y, noise**2, physics=physics), true
 

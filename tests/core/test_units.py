@@ -73,6 +73,18 @@ def test_no_variance_is_rounded_up(size, data, drawn, uniform, close):
     close(posterior.distribution.variance, posterior.variance, 1e-10)
 
 
+@pytest.mark.parametrize("offset", [1.0, 1e4, 1e8])
+def test_a_constant_of_both_makes_no_difference(offset, data, drawn, uniform, close):
+    X, Y = data(n=12, num_outputs=2)
+    one = drawn(CKA(X, Y, physics=crude), choice=0)
+    other = CKA(X, Y + offset, physics=lambda X: crude(X) + offset)
+    other.set_draws(one.u)
+    Z, tolerance = uniform(5, 2, high=2.0, seed=1), max(1e-8, 1e-13 * offset)
+    close(other.predict(Z).mean - offset, one.predict(Z).mean, tolerance)
+    close(other.predict(Z).variance, one.predict(Z).variance, tolerance)
+    close(other.rho(Z).mean, one.rho(Z).mean, tolerance)
+
+
 @pytest.mark.parametrize("cls", [CKA, RRA])
 def test_units_of_inputs(cls, data, drawn, uniform, close):
     X, Y = data(n=12, num_outputs=2)

@@ -8,38 +8,21 @@ import torch
 
 from gpadjust import CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP
 from gpadjust.dynamics import LearnedDynamics, StateSpec
-from gpadjust.physics import ODEPhysics
+from gpadjust.systems.swing_up import CartPoleEquation, equation_physics
 from tests.systems import uniform
 
-TRUTH = (0.5, 0.5, 0.6, 0.1)
-
-
-def cart_pole(cart, pole, length, friction, step=0.1):
-    """Steps of a cart with a uniform rod, its angle from upright."""
-
-    def rhs(state, action):
-        _, theta, v, omega = state.unbind(-1)
-        force, total = action[:, 0] - friction * v, cart + pole
-        sin, cos = theta.sin(), theta.cos()
-        swing = pole * length * omega.square() * sin
-        divisor = 4 * total - 3 * pole * cos.square()
-        cart_rate = (-2 * swing + 3 * pole * 9.81 * sin * cos + 4 * force) / divisor
-        pole_rate = (-3 * swing * cos + 6 * total * 9.81 * sin + 6 * force * cos) / divisor
-        return torch.stack([v, omega, cart_rate, pole_rate / length], dim=-1)
-
-    return ODEPhysics(rhs, step, 4, substeps=5)
+TRUTH = equation_physics(CartPoleEquation(0.5, 0.5, 0.6, 0.1))
 
 
 @cache
 def trial_of(seed, num_steps):
     """The states and the actions of a trial, made once for all tests."""
-    truth = cart_pole(*TRUTH)
     generator = torch.Generator().manual_seed(seed)
     start = 0.2 * torch.randn(1, 4, generator=generator, dtype=torch.float64)
     states = [start + torch.tensor([0, math.pi, 0, 0])]
     actions = 20 * torch.rand(num_steps, 1, generator=generator, dtype=torch.float64) - 10
     for action in actions.split(1):
-        states.append(truth(torch.cat([states[-1], action], -1)))
+        states.append(TRUTH(torch.cat([states[-1], action], -1)))
     return torch.cat(states), actions
 
 
@@ -47,8 +30,8 @@ class CartPole:
     spec = StateSpec(["x", "theta", "v", "omega"], ["force"], angles=["theta"])
 
     def __init__(self):
-        self.truth = cart_pole(*TRUTH)
-        self.crude = cart_pole(0.45, 0.6, 0.65, 0.0)
+        self.truth = equation_physics(CartPoleEquation(0.5, 0.5, 0.6, 0.1))
+        self.crude = equation_physics(CartPoleEquation(0.45, 0.6, 0.65, 0.0))
 
     def trial(self, seed, num_steps=25):
         """A trial of random actions from hanging: states, actions, next states."""
@@ -77,29 +60,15 @@ def pushed(n=20, seed=0):
 
 
 FEW = {"num_draws": 8}
-_MODELS = {
-    "GP": ZeroMeanGP,
-    "PhysicsMean": PhysicsMeanGP,
-    "Scale": ScaleGP,
-    "CKA": CKA,
-    "RRA": RRA,
-}
-
-
-@pytest.fixture(params=_MODELS)
-def kind(request):
-    """The name of each model, for `make`."""
-    return request.param
-
-
-_QUICK = ["GP", "CKA"]
+_MODELS = {"PhysicsMean": PhysicsMeanGP, "Scale": ScaleGP, "RRA": RRA}
+_MODELS = {"GP": ZeroMeanGP, "CKA": CKA, **_MODELS}
 
 
 @pytest.fixture(
-    params=[pytest.param(k, marks=() if k in _QUICK else pytest.mark.slow) for k in _MODELS]
+    params=["GP", "CKA", *(pytest.param(k, marks=pytest.mark.slow) for k in [*_MODELS][2:])]
 )
 def costly_kind(request):
-    """As `kind`, for what takes long."""
+    """The name of each model, for `make`."""
     return request.param
 
 

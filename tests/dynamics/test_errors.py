@@ -8,11 +8,12 @@ import pytest
 import torch
 from botorch.models import SingleTaskGP
 
-from gpadjust import CKA, PhysicsMeanGP, ZeroMeanGP
+from gpadjust import CKA, ZeroMeanGP
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.physics import FunctionPhysics, ODEPhysics, PhysicsError
 from tests.dynamics.conftest import FEW, push, pushed
 from tests.dynamics.conftest import PUSHED as SPEC
+from tests.point import assert_equal
 
 
 def stronger(X):
@@ -24,43 +25,19 @@ def transitions(n=12, seed=0):
     return states, actions, following + 0.02 * states.sin()
 
 
-def learning(physics=push):
+def learnt(physics=push, *data):
     """Dynamics that have learnt from 12 transitions."""
     dynamics = LearnedDynamics(SPEC, physics, fit_options=FEW)
-    dynamics.update(*transitions())
+    dynamics.update(*(data or transitions()))
     return dynamics
-
-
-@pytest.fixture(scope="module")
-def learnt():
-    """Makes such dynamics; those of `push` learn once, and are loaded."""
-    state = learning().state_dict()
-
-    def learnt(physics=push):
-        if physics is not push:
-            return learning(physics)
-        dynamics = LearnedDynamics(SPEC, push, fit_options=FEW)
-        dynamics.load_state_dict(state)
-        return dynamics
-
-    return learnt
-
-
-def equal(one, other):
-    if isinstance(one, dict):
-        return one.keys() == other.keys() and all(equal(one[key], other[key]) for key in one)
-    if isinstance(one, list):
-        return len(one) == len(other) and all(map(equal, one, other))
-    return torch.equal(one, other) if torch.is_tensor(one) else one == other
 
 
 def unchanged(dynamics, before, twin):
     """Whether dynamics are those of a state, and learn as a twin does."""
-    assert equal(dynamics.state_dict(), before)
+    assert_equal(dynamics.state_dict(), before)
     states, actions, _ = transitions(seed=5)
     for _ in range(2):
-        pairs = zip(dynamics.predict(states, actions), twin.predict(states, actions), strict=True)
-        assert all(torch.equal(one, other) for one, other in pairs)
+        assert_equal([*dynamics.predict(states, actions)], [*twin.predict(states, actions)])
         for each in (dynamics, twin):
             each.update(*transitions(6, seed=2))
 
@@ -68,87 +45,53 @@ def unchanged(dynamics, before, twin):
 # States
 
 
-def damaged(change):
-    def damage(state):
-        change(state)
-        return state
-
-    return damage
-
-
 DAMAGES = [
-    (lambda state: None, TypeError, "dictionary from `state_dict`, found None"),
-    (lambda state: {"weights": 1}, RuntimeError, "from `state_dict`, with a 'fingerprint'"),
-    *(
-        (damaged(change), RuntimeError, words)
-        for change, words in (
-            (lambda s: s.pop("model"), "damaged: KeyError.*'model'"),
-            (lambda s: s["transitions"]["actions"][3].fill_(math.nan), r"damaged.*\(row 3\)"),
-            (lambda s: s["probes"][0][0].fill_(math.nan), "damaged.*'states' without NaN"),
-            (lambda s: s["model"].pop("u"), "for CKA"),
-            (lambda s: s["model"].update(u=torch.ones(2, 2, 3)), "size mismatch for u"),
-            (lambda s: s["model"]["u"].fill_(math.nan), "damaged.*'u' without NaN"),
-            (lambda s: s.update(draws=s["draws"][:1]), "or more draws"),
-            (lambda s: s.update(probes=[]), "damaged"),
-            (lambda s: s["probes"][0][2].mul_(1.1), "another physics than 'push' .* deterministic"),
-        )
-    ),
+    (lambda s: s.pop("fingerprint"), "from `state_dict`, with a 'fingerprint'"),
+    (lambda s: s.pop("model"), "damaged: KeyError.*'model'"),
+    (lambda s: s["transitions"]["actions"][3].fill_(math.nan), r"damaged.*\(row 3\)"),
+    (lambda s: s["probes"][0][0].fill_(math.nan), "damaged.*'states' without NaN"),
+    (lambda s: s["model"].pop("u"), "for CKA"),
+    (lambda s: s["model"].update(u=torch.ones(2, 2, 3)), "size mismatch for u"),
+    (lambda s: s["model"]["u"].fill_(math.nan), "damaged.*'u' without NaN"),
+    (lambda s: s.update(draws=s["draws"][:1]), "or more draws"),
+    (lambda s: s.update(probes=[]), "damaged"),
+    (lambda s: s["probes"][0][2].mul_(1.1), "another physics than 'push' .* deterministic"),
 ]
 
 
 @pytest.mark.slow
-def test_a_state_that_cannot_be_loaded_changes_nothing(learnt):
+def test_a_state_that_cannot_be_loaded_changes_nothing():
     dynamics = learnt()
     before = dynamics.state_dict()
-    other = LearnedDynamics(SPEC, push, fit_options=FEW)
-    other.update(*transitions(20, seed=3))
-    for change, error, message in DAMAGES:
-        with pytest.raises(error, match=message):
-            dynamics.load_state_dict(change(copy.deepcopy(other.state_dict())))
+    other = learnt(push, *transitions(20, seed=3)).state_dict()
+    with pytest.raises(TypeError, match="dictionary from `state_dict`, found None"):
+        dynamics.load_state_dict(None)
+    for damage, message in DAMAGES:
+        state = copy.deepcopy(other)
+        damage(state)
+        with pytest.raises(RuntimeError, match=message):
+            dynamics.load_state_dict(state)
     unchanged(dynamics, before, learnt())
 
 
-def test_dynamics_of_another_physics_are_refused(learnt):
-    seen = PhysicsDynamics(SPEC, push)
-    seen.update(*transitions())
-    for one in (learnt(), seen):
-        known = {"fit_options": FEW} if isinstance(one, LearnedDynamics) else {}
-        other = type(one)(SPEC, stronger, **known)
-        with pytest.raises(
-            RuntimeError, match=r"another physics than 'stronger'.* for 'v', this one"
-        ):
+def test_dynamics_of_another_physics_are_refused():
+    alone, rows = PhysicsDynamics(SPEC, push), []
+    alone.update(*transitions())
+    for one in (learnt(), alone):
+        options = {"fit_options": FEW} if isinstance(one, LearnedDynamics) else {}
+        other = type(one)(SPEC, stronger, **options)
+        with pytest.raises(RuntimeError, match=r"physics than 'stronger'.* for 'v', this one"):
             other.load_state_dict(one.state_dict())
-        type(one)(SPEC, push, **known).load_state_dict(one.state_dict())
-        one.load_state_dict(type(one)(SPEC, stronger, **known).state_dict())  # it has seen nothing
+        nearly = type(one)(SPEC, lambda X: push(X) * (1 + 1e-9), **options)  # by rounding
+        nearly.load_state_dict(one.state_dict())
+        counted = type(one)(SPEC, lambda X: rows.append(len(X)) or push(X), **options)
+        counted.load_state_dict(one.state_dict())
+        one.load_state_dict(other.state_dict())  # which has no transitions
         assert getattr(one, "num_transitions", 0) == 0
-
-
-def test_loading_asks_a_physics_alone_at_three_rows():
-    rows = []
-
-    def counted(X):
-        rows.append(len(X))
-        return push(X)
-
-    seen = PhysicsDynamics(SPEC, push)
-    seen.update(*transitions())
-    PhysicsDynamics(SPEC, counted).load_state_dict(seen.state_dict())
-    assert sum(rows) == 3
-
-
-def test_a_physics_may_differ_by_rounding(learnt):
-    state = learnt().state_dict()
-    nearly = LearnedDynamics(SPEC, lambda X: push(X) * (1 + 1e-9), fit_options=FEW)
-    nearly.load_state_dict(state)
-
-    def still(X):
-        return X[:, :2]
-
-    dynamics = LearnedDynamics(SPEC, still, model=PhysicsMeanGP, fit_options=FEW)
-    dynamics.update(*transitions())
-    again = LearnedDynamics(SPEC, still, model=PhysicsMeanGP, fit_options=FEW)
-    again.load_state_dict(dynamics.state_dict())
-    assert again.num_transitions == 12
+    assert rows[-1:] == [3]  # of a physics alone
+    still, again = (PhysicsDynamics(SPEC, lambda X: X[:, :2]) for _ in range(2))
+    still.update(*transitions())
+    again.load_state_dict(still.state_dict())
 
 
 def test_a_whole_turn_is_no_difference():
@@ -166,22 +109,22 @@ def test_a_whole_turn_is_no_difference():
         PhysicsDynamics(spec, physics(0.9)).load_state_dict(seen.state_dict())
 
 
-def test_a_loaded_state_is_a_copy(learnt):
+def test_a_loaded_state_is_a_copy():
     state = learnt().state_dict()
     dynamics = LearnedDynamics(SPEC, push, fit_options=FEW)
     dynamics.load_state_dict(state)
     before = copy.deepcopy(state)
     state["transitions"]["states"].zero_()
     state["probes"][0][0].zero_()
-    assert equal(dynamics.state_dict(), before)
+    assert_equal(dynamics.state_dict(), before)
 
 
 # Transitions
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("where", [pytest.param("physics", marks=pytest.mark.slow), "model", "fit"])
-def test_an_error_while_learning_changes_nothing(learnt, monkeypatch, where):
+@pytest.mark.parametrize("where", ["physics", "model", "fit"])
+def test_an_error_while_learning_changes_nothing(monkeypatch, where):
     broken = False
 
     def physics(X):
@@ -208,7 +151,7 @@ def test_an_error_while_learning_changes_nothing(learnt, monkeypatch, where):
     unchanged(dynamics, before, twin)
 
 
-def test_rows_of_a_failing_physics_are_those_that_were_asked_for(learnt):
+def test_rows_of_a_failing_physics_are_those_that_were_asked_for():
     broken = False
 
     def physics(X):
@@ -225,18 +168,6 @@ def test_rows_of_a_failing_physics_are_those_that_were_asked_for(learnt):
     assert caught.value.rows == (8, 17)
     expected = torch.cat([states, actions], -1)[[8, 17]]
     assert torch.equal(caught.value.inputs, expected)
-
-
-def test_an_integrated_state_hides_no_failure():
-    spec = StateSpec(["x", "v"], ["a"], integrated={"x": "v"}, step=0.1)
-    physics = FunctionPhysics(lambda X: push(X).where(X[:, 2:] < 2.1, torch.nan))
-    states, actions, _ = transitions()
-    velocity = states[:, 1:] + 0.1 * actions
-    following = torch.cat([states[:, :1] + 0.05 * (states[:, 1:] + velocity), velocity], -1)
-    actions[7] = 2.5
-    with pytest.raises(PhysicsError, match=r"NaN or inf in 1 of 12 row") as caught:
-        LearnedDynamics(spec, physics).update(states, actions, following)
-    assert caught.value.rows == (7,)
 
 
 # Arguments
@@ -259,7 +190,7 @@ REFUSED = [
 ]
 
 
-def test_bad_arguments_are_found_at_once():
-    for options, error, words in REFUSED:
-        with pytest.raises(error, match=words):
-            LearnedDynamics(**{"spec": SPEC, "physics": push, **options})
+@pytest.mark.parametrize(("options", "error", "words"), REFUSED)
+def test_bad_arguments_are_found_at_once(options, error, words):
+    with pytest.raises(error, match=words):
+        LearnedDynamics(**{"spec": SPEC, "physics": push, **options})

@@ -8,6 +8,8 @@ import torch
 
 from gpadjust.dynamics import PhysicsDynamics, StateSpec
 from gpadjust.physics import FunctionPhysics, ODEPhysics, PhysicsError, PhysicsWarning, Unknown
+from tests.point import assert_equal
+from tests.systems import normal
 
 LINE = StateSpec(["x"], ["a"])
 TRUTH = {"gravity": 9.0, "drag": 0.3}
@@ -30,14 +32,11 @@ PENDULUM = StateSpec(["theta", "rate"], ["torque"], angles=["theta"])
 
 
 def swings(n=60, noise=0.0, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    states = 3 * torch.randn(n, 2, generator=generator, dtype=torch.float64)
-    actions = torch.randn(n, 1, generator=generator, dtype=torch.float64)
+    z = normal(n, 5, seed=seed)
+    states, actions = 3 * z[:, :2], z[:, 2:3]
     values = torch.tensor([*TRUTH.values()], dtype=torch.float64)
     following = swing()(torch.cat([states, actions], -1), values)
-    sd = noise * torch.tensor([0.1, 1.0], dtype=torch.float64)
-    following = following + sd * torch.randn(n, 2, generator=generator, dtype=torch.float64)
-    return states, actions, following
+    return states, actions, following + noise * torch.tensor([0.1, 1.0]) * z[:, 3:]
 
 
 def fitted(*data):
@@ -87,10 +86,8 @@ def test_standard_errors_are_those_of_repeated_data():
 
 
 def test_linear_parameters_of_one_output_are_those_of_lstsq():
-    generator = torch.Generator().manual_seed(1)
-    X = torch.randn(30, 2, generator=generator, dtype=torch.float64)
-    y = X @ torch.tensor([[0.4], [-1.3]], dtype=torch.float64)
-    y = y + 0.2 * torch.randn(30, 1, generator=generator, dtype=torch.float64)
+    X = normal(30, 2, seed=1)
+    y = X @ torch.tensor([[0.4], [-1.3]]).double() + 0.2 * normal(30, 1, seed=2)
     unknowns = {"a": Unknown(0.0, sd=1e3), "b": Unknown(0.0, sd=1e3)}
     line = FunctionPhysics(lambda X, p: p.a * X[:, 0] + p.b * X[:, 1], unknowns=unknowns)
     dynamics = PhysicsDynamics(LINE, line)
@@ -106,13 +103,19 @@ def test_linear_parameters_of_one_output_are_those_of_lstsq():
     torch.testing.assert_close(dynamics.physics_parameters.sd, errors, rtol=0.02, atol=0)
 
 
-def test_each_state_counts_in_units_of_its_own_error():
-    states, actions, following = swings(60, noise=0.1)
-    following[:, 0] += 0.8 * torch.randn(60, generator=torch.Generator().manual_seed(3)).double()
+def test_each_state_counts_in_units_of_its_own_error_where_it_was_measured():
+    states, actions, following = swings(80, noise=0.1)
+    following[:, 0] += 0.8 * normal(80, seed=3)
     dynamics = fitted(states, actions, following)
     assert found(dynamics)["gravity"] == pytest.approx(9.0, rel=0.03)
     noise = dynamics.noise_variance(states[:1], actions[:1]).sqrt()[0]
     assert noise.tolist() == pytest.approx([0.8, 0.1], rel=0.2)
+    states, actions, gaps = swings(80, noise=0.05)
+    gaps[40:, 0] = torch.nan
+    gaps[:40, 1] = torch.nan
+    dynamics = fitted(states, actions, gaps)
+    assert found(dynamics)["gravity"] == pytest.approx(9.0, rel=0.03)
+    assert dynamics.noise_variance(states, actions).isfinite().all()
 
 
 def test_a_parameter_of_which_nothing_is_known_stays_where_it_was():
@@ -125,16 +128,6 @@ def test_a_parameter_of_which_nothing_is_known_stays_where_it_was():
         dynamics.update(states, actions, following)
     assert found(dynamics)["buoyancy"] == pytest.approx(2.0, abs=0.01)
     assert dynamics.physics_parameters.sd[2] == pytest.approx(0.5, rel=0.02)
-
-
-def test_entries_that_were_not_measured_are_left_out():
-    states, actions, following = swings(80, noise=0.05)
-    gaps = following.clone()
-    gaps[40:, 0] = torch.nan
-    gaps[:40, 1] = torch.nan
-    dynamics = fitted(states, actions, gaps)
-    assert found(dynamics)["gravity"] == pytest.approx(9.0, rel=0.03)
-    assert dynamics.noise_variance(states, actions).isfinite().all()
 
 
 def test_an_update_goes_by_all_transitions_so_far():
@@ -150,24 +143,17 @@ def test_an_update_goes_by_all_transitions_so_far():
 
 
 def test_a_dynamics_that_was_saved_goes_on_bit_for_bit():
-    states, actions, following = swings(60, noise=0.1)
-    one, other = (
-        fitted(states[:30], actions[:30], following[:30]),
-        PhysicsDynamics(PENDULUM, swing()),
-    )
+    data = swings(60, noise=0.1)
+    one, other = fitted(*(part[:30] for part in data)), PhysicsDynamics(PENDULUM, swing())
     other.load_state_dict(one.state_dict())
-    assert torch.equal(one.predict(states, actions).mean, other.predict(states, actions).mean)
+    assert torch.equal(one.predict(*data[:2]).mean, other.predict(*data[:2]).mean)
     for dynamics in (one, other):
-        dynamics.update(states[30:], actions[30:], following[30:])
-    assert torch.equal(one._values, other._values)
+        dynamics.update(*(part[30:] for part in data))
+    assert_equal(one.state_dict(), other.state_dict())
     assert torch.equal(one.physics_parameters.draws, other.physics_parameters.draws)
+    state = one.state_dict()
     other.load_state_dict(PhysicsDynamics(PENDULUM, swing()).state_dict())
     assert found(other) == {"gravity": 6.0, "drag": 0.1}
-
-
-def test_a_state_of_others_is_refused():
-    dynamics = fitted(*swings(20))
-    state = dynamics.state_dict()
     with pytest.raises(RuntimeError, match=r"unknowns is .* in the state"):
         PhysicsDynamics(PENDULUM, swing(gravity=7.0)).load_state_dict(state)
     for damage in ({"point": torch.zeros(3).double()}, {"noise": None}, {"transitions": {}}):
@@ -195,9 +181,8 @@ def test_values_at_which_the_physics_fails_are_not_tried_further():
 def test_several_optima_are_told_apart():
     """A sine of unknown frequency: from the guess alone, descent ends elsewhere."""
     x = torch.linspace(0, 3, 25, dtype=torch.float64).unsqueeze(-1)
-    physics = FunctionPhysics(
-        lambda X, p: (p.omega * X[:, 0]).sin(), unknowns={"omega": Unknown(2.0, bounds=(0.0, 20.0))}
-    )
+    unknowns = {"omega": Unknown(2.0, bounds=(0.0, 20.0))}
+    physics = FunctionPhysics(lambda X, p: (p.omega * X[:, 0]).sin(), unknowns=unknowns)
     dynamics = PhysicsDynamics(LINE, physics)
     dynamics.update(x, x, (13.0 * x).sin())
     assert dynamics._values.item() == pytest.approx(13.0, rel=1e-6)
@@ -221,7 +206,3 @@ def test_more_transitions_than_are_searched_by():
         warnings.simplefilter("error")
         dynamics = fitted(*swings(2000, noise=0.1))
     assert found(dynamics) == pytest.approx(TRUTH, rel=0.05)
-
-
-def test_a_physics_without_unknowns_has_no_parameters():
-    assert not PhysicsDynamics(LINE, lambda X: X[:, :1]).physics_parameters

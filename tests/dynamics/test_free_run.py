@@ -11,6 +11,7 @@ from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics, StateS
 from gpadjust.dynamics.base import step_or_nan
 from gpadjust.physics import PhysicsError
 from gpadjust.records import Record, Records
+from tests.systems import refused
 
 SPEC = StateSpec(["x"], ["v"])
 TURN = StateSpec(["theta"], ["omega"], angles=["theta"])
@@ -53,6 +54,8 @@ def start(num_windows=2, num_steps=6):
 
 
 STATES, ACTIONS = start()
+PATH = STATES.unsqueeze(1) + ACTIONS.cumsum(1)
+ORIGIN = torch.zeros(1, 1).double()
 
 
 def test_a_perfect_model_is_where_the_system_was(cart_pole_system):
@@ -74,16 +77,13 @@ def test_a_perfect_model_is_where_the_system_was(cart_pole_system):
 @pytest.mark.parametrize("noise", [0.0, 0.3])
 def test_each_particle_keeps_its_function_and_noise_comes_once(noise):
     """After k steps a rate of its own has moved a particle by k rates: sd^2 k^2, plus noise."""
-    states, actions = start()
     dynamics, k = Drift(0.2, noise), torch.arange(1, 7)
-    run = dynamics.free_run(states, actions, num_functions=3999)
-    torch.testing.assert_close(
-        run.mean[..., 0], states + actions[0, :, 0].cumsum(0), rtol=0, atol=0.03
-    )
+    run = dynamics.free_run(STATES, ACTIONS, num_functions=3999)
+    torch.testing.assert_close(run.mean, PATH, rtol=0, atol=0.03)
     width = 1.96 * ((0.2 * k) ** 2 + noise**2).sqrt().double().expand(2, -1)
-    torch.testing.assert_close((run.upper - run.mean)[..., 0], width, rtol=0.08, atol=0)
-    torch.testing.assert_close((run.mean - run.lower)[..., 0], width, rtol=0.08, atol=0)
-    quiet = dynamics.free_run(states, actions, num_functions=3999, noise=False)
+    for ends in (run.upper - run.mean, run.mean - run.lower):
+        torch.testing.assert_close(ends[..., 0], width, rtol=0.08, atol=0)
+    quiet = dynamics.free_run(STATES, ACTIONS, num_functions=3999, noise=False)
     assert torch.equal(quiet.mean, run.mean)
     steps = (quiet.particles - run.mean)[..., 0]
     torch.testing.assert_close(steps[..., 5], 6 * steps[..., 0])
@@ -95,7 +95,7 @@ def test_a_start_that_was_measured_with_noise_moves_all_that_follows(start_noise
     run = Drift(noise=noise).free_run(
         STATES, ACTIONS, num_functions=3999, noise=False, start_noise=start_noise
     )
-    torch.testing.assert_close(run.mean, STATES.unsqueeze(1) + ACTIONS.cumsum(1), rtol=0, atol=0.02)
+    torch.testing.assert_close(run.mean, PATH, rtol=0, atol=0.02)
     spread = run.particles.std(0)
     torch.testing.assert_close(spread, torch.full_like(spread, 0.3), rtol=0.05, atol=0)
     steps = run.particles.diff(dim=2)  # each goes on from where it started
@@ -103,14 +103,13 @@ def test_a_start_that_was_measured_with_noise_moves_all_that_follows(start_noise
 
 
 def test_the_ends_of_the_interval_are_draws_at_any_level():
-    states, actions = start()
     for level, number in ((0.95, 39), (0.8, 9), (0.5, 3)):
-        run = Drift(1.0).free_run(states, actions, level=level, num_functions=number)
+        run = Drift(1.0).free_run(STATES, ACTIONS, level=level, num_functions=number)
         torch.testing.assert_close(run.lower, run.particles.amin(0))
         torch.testing.assert_close(run.upper, run.particles.amax(0))
         with pytest.raises(ValueError, match=f"num_functions >= {number}, .* of {100 * level:g} %"):
-            Drift(1.0).free_run(states, actions, level=level, num_functions=number - 1)
-    inner = Drift(1.0).free_run(states, actions, level=0.5, num_functions=39)
+            Drift(1.0).free_run(STATES, ACTIONS, level=level, num_functions=number - 1)
+    inner = Drift(1.0).free_run(STATES, ACTIONS, level=0.5, num_functions=39)
     ordered = inner.particles.sort(0).values
     torch.testing.assert_close(inner.lower, ordered[9])
     torch.testing.assert_close(inner.upper, ordered[29])
@@ -159,8 +158,10 @@ def test_states_that_are_integrated_share_the_noise_of_their_velocities(uniform)
     torch.testing.assert_close(variance, noisy - quiet)
     torch.testing.assert_close(variance[:, 0], variance[:, 1] / 16)
     # In units of the noise the pair is a line, whose energy score is that of v, sqrt(1 + 1) longer.
-    run = dynamics.free_run(states, actions.unsqueeze(1), num_functions=199)
-    quiet = dynamics.free_run(states, actions.unsqueeze(1), num_functions=199, noise=False)
+    run, quiet = (
+        dynamics.free_run(states, actions.unsqueeze(1), num_functions=199, noise=noise)
+        for noise in (True, False)
+    )
     added = run.particles - quiet.particles
     assert added[..., 1].std() > 0.01
     torch.testing.assert_close(added[..., 0], 0.25 * added[..., 1])
@@ -220,8 +221,7 @@ def test_without_the_noise_there_is_no_interval():
                 raise PhysicsError("It fails.", rows=rows)
             return super().noise_variance(states, actions)
 
-    states, actions = start()
-    run = Fails(0.01, 0.1).free_run(states, actions)
+    run = Fails(0.01, 0.1).free_run(STATES, ACTIONS)
     assert run.mean.isfinite().all()
     assert run.lower.isfinite()[..., 0].tolist() == [
         [True] * 5 + [False],
@@ -263,67 +263,46 @@ REFUSED = [
 
 def test_arguments_out_of_range():
     for arguments, options, error, words in REFUSED:
-        with pytest.raises(error, match=words):
-            Drift(0.1).free_run(*arguments, **options)
+        refused(error, words, Drift(0.1).free_run, *arguments, **options)
     with pytest.raises(RuntimeError, match="call `update`"):
         LearnedDynamics(SPEC, lambda X: X[:, :1]).free_run(STATES, ACTIONS)
 
 
-def test_process_noise_is_carried_on_and_noise_of_sensors_is_not():
-    start, still = torch.zeros(1, 1).double(), torch.zeros(1, 30, 1).double()
-    steps = torch.arange(1, 31).double()
-    for given in ({"process_noise": torch.tensor([0.3])}, {"process_noise": "learnt"}):
-        drift = Drift(noise=0.3)
-        run = drift.free_run(start, still, num_functions=2000, noise=False, **given)
-        walk = run.particles[:, 0, :, 0]
-        torch.testing.assert_close(walk.var(0), 0.09 * steps, rtol=0.15, atol=0)
-        sizes = walk.diff(dim=1).std(0)
-        torch.testing.assert_close(sizes, torch.full_like(sizes, 0.3), rtol=0.1, atol=0)
-        sensors = torch.tensor([2.0])
-        seen = drift.free_run(start, still, num_functions=2000, noise=sensors, **given)
-        variance = seen.particles[:, 0, :, 0].var(0)
-        torch.testing.assert_close(variance, 4 + 0.09 * steps, rtol=0.15, atol=0)
+@pytest.mark.parametrize("noise", [torch.tensor([0.3]), "learnt"])
+def test_process_noise_is_carried_on_and_noise_of_sensors_is_not(noise):
+    still, variance = torch.zeros(1, 30, 1).double(), 0.09 * torch.arange(1, 31).double()
+    options = {"num_functions": 2000, "process_noise": noise}
+    walk = Drift(noise=0.3).free_run(ORIGIN, still, noise=False, **options).particles[:, 0, :, 0]
+    torch.testing.assert_close(walk.var(0), variance, rtol=0.15, atol=0)
+    sizes = walk.diff(dim=1).std(0)
+    torch.testing.assert_close(sizes, torch.full_like(sizes, 0.3), rtol=0.1, atol=0)
+    run = Drift(noise=0.3).free_run(ORIGIN, still, noise=torch.tensor([2.0]), **options)
+    measured = run.particles[:, 0, :, 0].var(0)
+    torch.testing.assert_close(measured, 4 + variance, rtol=0.15, atol=0)
 
 
-def test_a_lost_particle_stays_in_spite_of_process_noise():
-    start, on = torch.zeros(1, 1).double(), torch.ones(1, 5, 1).double()
+def test_process_noise_leads_out_of_bounds_where_particles_stay():
+    options = {"noise": False, "num_functions": 200, "process_noise": torch.tensor([0.01])}
     bounds = torch.tensor([[-9.0], [2.5]])
-    given = {"process_noise": torch.tensor([0.01]), "noise": False, "state_bounds": bounds}
-    run = Drift().free_run(start, on, **given)
+    run = Drift().free_run(ORIGIN, torch.ones(1, 5, 1).double(), state_bounds=bounds, **options)
     assert run.lost[0].tolist() == [0, 0, 1, 1, 1]
     assert torch.equal(run.particles[:, :, 1], run.particles[:, :, 4])
-
-
-def test_process_noise_leads_out_of_bounds_and_lags_have_none_of_their_own():
-    start, still = torch.zeros(1, 1).double(), torch.zeros(1, 20, 1).double()
+    still, options["process_noise"] = torch.zeros(1, 20, 1).double(), torch.tensor([0.5])
     bounds = torch.tensor([[-1.0], [1.0]])
-    given = {"process_noise": torch.tensor([0.5]), "noise": False, "num_functions": 200}
-    run = Drift().free_run(start, still, state_bounds=bounds, **given)
+    run = Drift().free_run(ORIGIN, still, state_bounds=bounds, **options)
     assert run.particles.abs().max() <= 1
     assert run.lost[0, -1] > 0.5
-    spec = StateSpec(["x", "x_1"], ["v"], previous={"x_1": "x"})
-    dynamics = PhysicsDynamics(spec, physics=lambda X: X[:, :1] + X[:, 1:])
-    given["process_noise"] = torch.tensor([0.5, 0.5])
-    walk = dynamics.free_run(torch.zeros(1, 2).double(), still, **given).particles
-    torch.testing.assert_close(walk[:, :, 1:, 1], walk[:, :, :-1, 0])
 
 
-def test_lags_are_measured_with_the_noise_of_what_they_hold():
+def test_lags_have_the_noise_of_their_origins():
     spec = StateSpec(["x", "x_1", "v_1"], ["v"], previous={"x_1": "x", "v_1": "v"})
-
-    class Noisy(Drift):
-        def sample_functions(self, num_functions, seed=None):
-            def step(x, v):
-                return torch.cat([x[..., :1] + v, x[..., :1], v], dim=-1)
-
-            return step
-
-        def noise_variance(self, states, actions):
-            return torch.tensor([0.09, 0.0, 0.0]).double().expand_as(states)
-
-    run = Noisy(spec=spec).free_run(
-        torch.zeros(1, 3).double(), torch.zeros(1, 3, 1).double(), num_functions=2000
-    )
+    start, still = torch.zeros(1, 3).double(), torch.zeros(1, 20, 1).double()
+    dynamics = PhysicsDynamics(spec, physics=lambda X: X[:, :1] + X[:, 1:])
+    noises = {"process_noise": torch.full((3,), 0.5), "noise": False}
+    walk = dynamics.free_run(start, still, **noises).particles
+    torch.testing.assert_close(walk[:, :, 1:, 1], walk[:, :, :-1, 0])
+    dynamics.noise_variance = lambda x, v: torch.tensor([0.09, 0.0, 0.0]).double().expand_as(x)
+    run = dynamics.free_run(start, still[:, :3], num_functions=2000)
     assert run.particles[:, 0, 2].std(0).tolist() == pytest.approx([0.3, 0.3, 0], rel=0.1)
 
 

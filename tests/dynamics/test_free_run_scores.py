@@ -10,6 +10,7 @@ from scipy.stats import norm
 from gpadjust.dynamics import FreeRun, PhysicsDynamics, StateSpec
 from gpadjust.dynamics.base import central_interval
 from gpadjust.records import Record, Records
+from tests.systems import refused
 
 SPEC = StateSpec(["x", "theta"], ["u"], angles=["theta"])
 
@@ -54,11 +55,8 @@ def test_each_step_is_scored_by_its_formula(run, measured):
             error = y.numpy() - mean
             error -= 2 * math.pi * np.round(error / (2 * math.pi)) if i == 1 else 0
             inside = (low <= mean + error) & (mean + error <= high)
-            expected = [
-                np.sqrt(np.mean(error**2)),
-                inside.mean(),
-                -norm.logpdf(error, 0, sd).mean(),
-            ]
+            nlpd = -norm.logpdf(error, 0, sd).mean()
+            expected = [np.sqrt(np.mean(error**2)), inside.mean(), nlpd]
             found = [scores.rmse[t, i], scores.coverage[t, i], scores.nlpd[t, i]]
             np.testing.assert_allclose(found, expected)
             # Of an even number torch takes the lower one of the two in the middle.
@@ -110,19 +108,22 @@ def test_horizons_are_rows_of_all_steps(run, measured):
         torch.testing.assert_close(getattr(whole[2], name), chosen[1], equal_nan=True)
 
 
+REFUSED = [
+    ({"horizons": ()}, ValueError, "different numbers of steps"),
+    ({"horizons": 5}, ValueError, r"different numbers of steps.*\(1, 5, 15\), got 5"),
+    ({"horizons": (3, 3)}, ValueError, "different numbers"),
+    ({"horizons": (0, 3)}, ValueError, "each horizon must be at least 1; found 0"),
+    ({"horizons": (1, 4)}, ValueError, "at most the 3 steps of the runs, got 4"),
+    ({"units": torch.zeros(2)}, ValueError, "finite and positive"),
+    ({"units": torch.ones(3)}, ValueError, "Expected units of shape 2, an entry for each"),
+    ({"units": "metres"}, TypeError, "Expected units to be real numbers"),
+]
+
+
 def test_options_out_of_range(run, measured):
-    for options, error, words in (
-        ({"horizons": ()}, ValueError, "different numbers of steps"),
-        ({"horizons": 5}, ValueError, r"different numbers of steps.*\(1, 5, 15\), got 5"),
-        ({"horizons": (3, 3)}, ValueError, "different numbers"),
-        ({"horizons": (0, 3)}, ValueError, "each horizon must be at least 1; found 0"),
-        ({"horizons": (1, 4)}, ValueError, "at most the 3 steps of the runs, got 4"),
-        ({"units": torch.zeros(2)}, ValueError, "finite and positive"),
-        ({"units": torch.ones(3)}, ValueError, "Expected units of shape 2, an entry for each"),
-        ({"units": "metres"}, TypeError, "Expected units to be real numbers"),
-    ):
-        with pytest.raises(error, match=words):
-            run.score(measured, **options)
+    for options, error, words in REFUSED:
+        refused(error, words, run.score, measured, **options)
+    refused(ValueError, r"shape .*\(4, 3, 2\).*got shape \(4, 2, 2\)", run.score, measured[:, 1:])
 
 
 def test_particles_without_spread_say_nothing_of_errors(run, measured):
@@ -130,10 +131,9 @@ def test_particles_without_spread_say_nothing_of_errors(run, measured):
     particles[:, 3, 1] = particles[:1, 3, 1] * (1 + 1e-13 * torch.rand(9, 1))  # rounding errors
     scores, before = run_of(particles).score(measured), run.score(measured)
     for name in ("coverage", "nlpd"):
-        assert getattr(scores, name)[1].isnan().all()
-        torch.testing.assert_close(
-            getattr(scores, name)[::2], getattr(before, name)[::2], equal_nan=True
-        )
+        some, others = getattr(scores, name), getattr(before, name)
+        assert some[1].isnan().all()
+        torch.testing.assert_close(some[::2], others[::2], equal_nan=True)
     assert scores.rmse[1].isfinite().all()
     exact = run_of(run.particles[:1, :1, :1].expand(9, -1, -1, -1)).score(measured[:1, :1])
     assert exact.coverage.isnan().all()
@@ -154,9 +154,9 @@ def test_windows_of_records_are_chosen_and_scored():
     spec, x = StateSpec(["x"], ["u"]), torch.arange(13, dtype=torch.float64).unsqueeze(-1)
     windows = Records(Record(x[:, 0], x, torch.ones_like(x)), spec).windows(3)
     assert windows.states[..., 0].tolist() == [[3.0 * w + t for t in range(4)] for w in range(4)]
-    late = windows.some(windows.states[:, 0, 0] > 4)
+    late = windows.subset(windows.states[:, 0, 0] > 4)
     assert late.initial_states.flatten().tolist() == [6, 9]
-    assert torch.equal(windows.some(torch.tensor([3, 2])).measured, late.measured.flip(0))
+    assert torch.equal(windows.subset(torch.tensor([3, 2])).measured, late.measured.flip(0))
     slow = PhysicsDynamics(spec, lambda X: X[:, :1] + 0.9 * X[:, 1:])
     scores = slow.free_run(late.initial_states, late.actions).score(late.measured)
     np.testing.assert_allclose(scores.rmse[:, 0], [0.1, 0.2, 0.3])

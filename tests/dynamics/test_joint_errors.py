@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gpadjust.dynamics import LearnedDynamics, StateSpec
-from gpadjust.validation.leave_one_out import error_correlation
+from gpadjust.dynamics.learned_dynamics import error_correlation
 
 SPEC = StateSpec(["angle", "rate"], ["torque"])
 SD = torch.tensor([0.02, 0.05], dtype=torch.float64)

@@ -1,6 +1,5 @@
 """What dynamics predict, in limiting cases, and how they go on learning and are stored."""
 
-import io
 import math
 import warnings
 from functools import partial
@@ -9,16 +8,16 @@ import pytest
 import torch
 
 from gpadjust import CKA
-from gpadjust.core import Stationary, Term
 from gpadjust.dynamics import LearnedDynamics, StateSpec
 from gpadjust.physics import BlackBoxPhysics
+from tests.point import assert_equal
+from tests.systems import refused, same
+
+POINT_FIT = {"method": "map"}
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:f_p is nearly zero", "ignore::gpadjust.core.SamplingWarning"
 )
-
-KINDS = ["CKA", "RRA"]
-KINDS += [pytest.param(k, marks=pytest.mark.slow) for k in ("GP", "PhysicsMean", "Scale")]
 
 
 @pytest.mark.slow
@@ -30,29 +29,6 @@ def test_physics_that_is_the_truth_is_left_alone(cart_pole_system, make):
         states, actions, next_states = system.trial(1)
         mean, _ = dynamics.predict(states, actions)
         torch.testing.assert_close(mean, next_states, rtol=0, atol=1e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_learning_lowers_the_error_of_the_physics(cart_pole_system, make, kind):
-    system = cart_pole_system
-    dynamics = make(kind, system.spec, system.crude)
-    assert not dynamics.is_fitted
-    for seed in range(2):
-        dynamics.update(*system.trial(seed))
-    assert dynamics.is_fitted
-    assert dynamics.num_transitions == 50
-    states, actions, next_states = system.trial(7)
-    scores = dynamics.score(states, actions, next_states)
-    for value in (scores.rmse, scores.median, scores.nlpd, scores.crps, scores.coverage):
-        assert value.shape == (4,)
-        assert value.isfinite().all()
-    assert ((scores.coverage >= 0) & (scores.coverage <= 1)).all()
-    physics_error = system.crude(torch.cat([states, actions], -1)) - next_states
-    if kind not in ("GP", "Scale"):
-        ratio = (scores.rmse / physics_error.square().mean(0).sqrt())[2:]
-        # Random features are seen through a few frequencies only.
-        assert (ratio.log().mean() if kind == "RRA" else ratio.log().max()) < 0
 
 
 def test_scores_are_those_of_the_predictions(cart_pole_system, learnt_cart_pole):
@@ -91,11 +67,11 @@ def test_absolute_targets_of_an_angle_go_on_across_the_seam(uniform):
     spec = StateSpec(["theta"], ["rate"], angles=["theta"])
     states, actions = uniform(20, 1, low=2.8, high=3.4), uniform(20, 1, high=0.3, seed=1)
     wrapped = torch.atan2((states + actions).sin(), (states + actions).cos())
-    dynamics = LearnedDynamics(
-        spec,
-        lambda X: torch.atan2((X[:, :1] + 0.9 * X[:, 1:]).sin(), (X[:, :1]).cos()),
-        target="absolute",
-    )
+
+    def physics(X):
+        return torch.atan2((X[:, :1] + 0.9 * X[:, 1:]).sin(), (X[:, :1]).cos())
+
+    dynamics = LearnedDynamics(spec, physics, target="absolute")
     dynamics.update(states, actions, wrapped)
     mean, _ = dynamics.predict(states, actions)
     torch.testing.assert_close(mean, states + actions, rtol=0, atol=1e-2)
@@ -110,80 +86,47 @@ def test_exogenous_and_integrated_states(uniform):
         faster = v + 0.1 * (actions - 0.5 * v)
         return torch.cat([goal, x + 0.05 * (v + faster), faster], -1)
 
-    seen = []
-
     def physics(X):
-        seen.append(X.shape[-1])
+        assert X.shape[-1] == 3
         return torch.cat([X[:, :1] + 0.1 * X[:, 1:2], X[:, 1:2] + 0.08 * X[:, 2:]], -1)
 
     dynamics = LearnedDynamics(spec, physics)
     dynamics.update(states, actions, follow(states, actions))
     assert dynamics.model.num_outputs == 1
-    assert set(seen) == {3}
     new, pushes = uniform(10, 3, low=-1, seed=2), uniform(10, 1, low=-1, seed=3)
     mean, variance = dynamics.predict(new, pushes)
     torch.testing.assert_close(mean, follow(new, pushes), rtol=0, atol=1e-3)
     assert (variance[:, 0] == 0).all()
     torch.testing.assert_close(variance[:, 1], 0.05**2 * variance[:, 2])
-    for drawn in (
-        dynamics.sample(new, pushes),
-        dynamics.sample_functions(1)(new[None], pushes[None])[0],
-    ):
+    functions = dynamics.sample_functions(1)
+    for drawn in (dynamics.sample(new, pushes), functions(new[None], pushes[None])[0]):
         torch.testing.assert_close(drawn[:, 1], new[:, 1] + 0.05 * (new[:, 2] + drawn[:, 2]))
         torch.testing.assert_close(drawn[:, 0], new[:, 0])
 
 
-class WavyCKA(CKA):
-    """A structure of a user's: CKA with a term more."""
-
-    def __init__(self, *data, waves=1, **options):
-        terms = [Term(f"wave_{i}", Stationary()) for i in range(waves)]
-        super().__init__(*data, extra_terms=terms, **options)
-
-
-@pytest.mark.slow
-def test_a_model_of_the_user(cart_pole_system):
-    system = cart_pole_system
-
-    two_waves = partial(WavyCKA, waves=2, center=0.0)
-
-    def dynamics(model=two_waves):
-        options = {"model": model, "fit_options": {"method": "map"}}
-        return LearnedDynamics(system.spec, system.crude, **options)
-
-    one, other = dynamics(), dynamics()
-    one.update(*system.trial(0, 10))
-    one.update(*system.trial(1, 10))
-    assert [t.name for t in one.model.terms] == ["rho", "delta", "wave_0", "wave_1"]
-    assert one.describe()["model"] == "WavyCKA"
-    other.load_state_dict(one.state_dict())
-    states, actions, _ = system.trial(2)
-    assert torch.equal(one.predict(states, actions).mean, other.predict(states, actions).mean)
-    with pytest.raises(RuntimeError, match=r"model_options is .*waves.* in the state"):
-        dynamics(WavyCKA).load_state_dict(one.state_dict())
-    with pytest.raises(TypeError, match=r"Unknown option 'wave' of WavyCKA; .*waves"):
-        dynamics(partial(WavyCKA, wave=2)).update(*system.trial(0, 10))
-
-
-def test_a_function_makes_the_model(cart_pole_system):
-    system, asked = cart_pole_system, []
+def test_a_function_or_a_partial_makes_the_model(cart_pole_system):
+    system, names = cart_pole_system, []
 
     def made(X, Y, **physics):
-        asked.append(sorted(physics))
+        names.append(sorted(physics))
         return CKA(X, Y, **physics, center=0.0)
 
-    options = {"fit_options": {"method": "map"}}
-    by_function = LearnedDynamics(system.spec, system.crude, model=made, **options)
-    by_class = LearnedDynamics(system.spec, system.crude, model=partial(CKA, center=0.0), **options)
-    for dynamics in (by_function, by_class):
-        dynamics.update(*system.trial(0, 10))
+    def dynamics(model):
+        return LearnedDynamics(system.spec, system.crude, model=model, fit_options=POINT_FIT)
+
+    both = [dynamics(model) for model in (made, partial(CKA, center=0.0))]
+    for one in both:
+        one.update(*system.trial(0, 10))
     states, actions, _ = system.trial(2)
-    pair = [d.predict(states, actions).mean for d in (by_function, by_class)]
-    assert torch.equal(*pair)
-    assert asked == [["input_transform", "physics"]]
-    assert by_function.describe()["model"] == "made"
+    assert torch.equal(*(one.predict(states, actions).mean for one in both))
+    assert names == [["input_transform", "physics"]]
+    assert [one.describe()["model"] for one in both] == ["made", "CKA"]
+    with pytest.raises(RuntimeError, match=r"model_options is .*center.* in the state"):
+        dynamics(CKA).load_state_dict(both[1].state_dict())
+    with pytest.raises(TypeError, match=r"Unknown option 'wave' of CKA"):
+        dynamics(partial(CKA, wave=2)).update(*system.trial(0, 10))
     with pytest.raises(TypeError, match="make a gpadjust GP; found NoneType"):
-        LearnedDynamics(system.spec, model=lambda X, Y, **given: None).update(*system.trial(0))
+        dynamics(lambda X, Y, **given: None).update(*system.trial(0))
 
 
 @pytest.mark.slow
@@ -221,7 +164,7 @@ def test_samples_scatter_as_predicted(cart_pole_system, make):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [pytest.param("GP", marks=pytest.mark.slow), "CKA", "RRA"])
+@pytest.mark.parametrize("kind", ["GP", "CKA", "RRA"])
 def test_sampled_functions_are_of_the_posterior(cart_pole_system, make, kind):
     system = cart_pole_system
     dynamics = make(kind, system.spec, system.crude)
@@ -254,17 +197,21 @@ def test_each_block_follows_a_function_of_its_own(cart_pole_system, make, costly
         torch.testing.assert_close(drawn[i], states[i] + change, rtol=0, atol=1e-8)
 
 
-def test_predictions_take_leading_dimensions_and_raw_angles(cart_pole_system, make):
-    system = cart_pole_system
-    dynamics = make("CKA", system.spec, system.crude)
-    dynamics.update(*system.trial(0))
+def test_predictions_take_leading_dimensions_and_have_no_gradients(
+    cart_pole_system, learnt_cart_pole
+):
+    states, actions, _ = cart_pole_system.trial(2)
+    states.requires_grad_()
+    dynamics = learnt_cart_pole
     assert isinstance(dynamics.model, CKA)
-    assert dynamics.physics is dynamics.model.physics[0].physics is system.crude
-    states, actions, _ = system.trial(1)
-    whole = dynamics.predict(states, actions)
+    assert dynamics.physics is dynamics.model.physics[0].physics
+    flat = dynamics.predict(states, actions)
     blocks = dynamics.predict(states.reshape(5, 5, 4), actions.reshape(5, 5, 1))
-    for block, flat in zip(blocks, whole, strict=True):
-        torch.testing.assert_close(block, flat.reshape(5, 5, 4))
+    same(blocks, (part.reshape(5, 5, 4) for part in flat))
+    assert not any(part.requires_grad for part in (*flat, dynamics.sample(states, actions)))
+    mean = dynamics.mean_function()(states[None], actions[None])
+    (slopes,) = torch.autograd.grad(mean.sum(), states)
+    assert slopes[:, 2:].abs().max() > 0
 
 
 def test_bad_data_are_refused_and_what_was_learnt_stands(cart_pole_system, make):
@@ -286,39 +233,26 @@ def test_bad_data_are_refused_and_what_was_learnt_stands(cart_pole_system, make)
         ((states, actions.float(), following), TypeError, r"actions in float64, got torch\.float3"),
         ((states, actions[:3], following), ValueError, "equally many rows"),
     ):
-        with pytest.raises(error, match=words):
-            dynamics.update(*rows)
-    with pytest.raises(ValueError, match="states of shape"):
-        dynamics.predict(states[:, :3], actions)
+        refused(error, words, dynamics.update, *rows)
+    refused(ValueError, "states of shape", dynamics.predict, states[:, :3], actions)
     assert dynamics.num_transitions == 6
     assert torch.equal(dynamics.predict(states, actions).mean, before)
 
 
-def stored(dynamics):
-    file = io.BytesIO()
-    torch.save(dynamics.state_dict(), file)
-    file.seek(0)
-    return torch.load(file, weights_only=True)
-
-
-def agree(first, second, states, actions):
-    pairs = zip(first.predict(states, actions), second.predict(states, actions), strict=True)
-    return all(torch.equal(a, b) for a, b in pairs)
-
-
 @pytest.mark.slow
-def test_loaded_dynamics_go_on_bit_by_bit(cart_pole_system, make, costly_kind):
+def test_loaded_dynamics_go_on_bit_by_bit(cart_pole_system, make, costly_kind, tmp_path):
     system, kind = cart_pole_system, costly_kind
     dynamics, other = (make(kind, system.spec, system.crude) for _ in range(2))
     for seed in (0, 1):
         dynamics.update(*system.trial(seed, 12))
-    other.load_state_dict(stored(dynamics))
-    test = system.trial(9)[:2]
-    assert agree(dynamics, other, *test)
-    for each in (dynamics, other):
-        each.update(*system.trial(3, 12))
-    assert agree(dynamics, other, *test)
-    assert other.num_transitions == 36
+    torch.save(dynamics.state_dict(), tmp_path / "state.pt")
+    other.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
+    for data in (system.trial(3, 12), system.trial(4, 12)):
+        assert_equal(*([*each.predict(*system.trial(9)[:2])] for each in (dynamics, other)))
+        for each in (dynamics, other):
+            each.update(*data)
+    assert_equal(dynamics.state_dict(), other.state_dict())
+    assert other.num_transitions == 48
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ import torch
 from gpadjust import ZeroMeanGP
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.dynamics.linearised import linearised
+from tests.systems import normal
 
 SPEC = StateSpec(["angle", "rate", "target"], ["torque"], angles=["angle"], exogenous=["target"])
 
@@ -14,13 +15,8 @@ def swing(X):
     return torch.stack([angle + 0.1 * rate, rate + 0.1 * (torque - angle.sin())], dim=-1)
 
 
-def rows(n, dim):
-    return torch.randn(n, dim, dtype=torch.float64)
-
-
 def test_physics_has_its_own_slopes_and_no_variance():
-    torch.manual_seed(0)
-    states, actions = rows(5, 3), rows(5, 1)
+    states, actions = normal(5, 3), normal(5, 1, seed=1)
     near = linearised(PhysicsDynamics(SPEC, swing), states, actions)
     expected = torch.eye(3).double().repeat(5, 1, 1)
     expected[:, 0, 1], expected[:, 1, 0] = 0.1, -0.1 * states[:, 0].cos()
@@ -31,11 +27,12 @@ def test_physics_has_its_own_slopes_and_no_variance():
 
 
 def test_learnt_slopes_are_those_of_differences():
-    torch.manual_seed(1)
-    states, actions = rows(30, 3), rows(30, 1)
+    states, actions = normal(30, 3), normal(30, 1, seed=1)
     moved = torch.cat([swing(torch.cat([states[:, :2], actions], -1)), states[:, 2:]], -1)
     dynamics = LearnedDynamics(SPEC, model=ZeroMeanGP, fit_options={"method": "map"})
-    dynamics.update(states, actions, moved + 0.01 * rows(30, 3) * torch.tensor([1.0, 1.0, 0.0]))
+    dynamics.update(
+        states, actions, moved + 0.01 * normal(30, 3, seed=2) * torch.tensor([1.0, 1.0, 0.0])
+    )
     near, move = linearised(dynamics, states, actions), dynamics.mean_function()
     for i in range(3):
         step = 1e-5 * torch.eye(3, dtype=torch.float64)[i]

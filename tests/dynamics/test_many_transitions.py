@@ -7,6 +7,7 @@ import torch
 
 from gpadjust import VariationalCKA
 from gpadjust.dynamics import LearnedDynamics, StateSpec
+from tests.systems import normal, same
 
 SPEC = StateSpec(["x", "v"], ["u"])
 
@@ -17,16 +18,12 @@ def step(X):
 
 
 def transitions(n, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    X = torch.randn(n, 3, generator=generator, dtype=torch.float64)
-    noise = 0.01 * torch.randn(n, 2, generator=generator, dtype=torch.float64)
-    return X[:, :2], X[:, 2:], step(X) + 0.1 * X[:, :2].sin() + noise
+    X = normal(n, 3, seed=seed)
+    return X[:, :2], X[:, 2:], step(X) + 0.1 * X[:, :2].sin() + 0.01 * normal(n, 2, seed=seed + 50)
 
 
-def make(**options):
-    return LearnedDynamics(
-        SPEC, physics=step, model=partial(VariationalCKA, num_inducing=12), **options
-    )
+def make():
+    return LearnedDynamics(SPEC, step, model=partial(VariationalCKA, num_inducing=12))
 
 
 @pytest.fixture(scope="module")
@@ -50,8 +47,7 @@ def test_they_come_back_and_go_on(dynamics):
     before, dynamics = dynamics, make()
     dynamics.load_state_dict(before.state_dict())
     X = transitions(5)[:2]
-    for ours, theirs in zip(dynamics.predict(*X), before.predict(*X), strict=True):
-        torch.testing.assert_close(ours, theirs, rtol=1e-10, atol=0)
+    same(dynamics.predict(*X), before.predict(*X), rtol=1e-10, atol=0)
     dynamics.update(*transitions(60, seed=1))
     assert dynamics.num_transitions == 160
     states, actions, next_states = transitions(50, seed=2)
@@ -69,8 +65,7 @@ def test_they_come_back_and_go_on(dynamics):
 
 
 def test_a_free_run(dynamics):
-    generator = torch.Generator().manual_seed(3)
-    actions = torch.randn(1, 10, 1, generator=generator, dtype=torch.float64)
+    actions = normal(1, 10, 1, seed=3)
     path = [torch.tensor([[0.5, -0.5]], dtype=torch.float64)]
     for action in actions.unbind(1):
         path.append(step(torch.cat([path[-1], action], dim=-1)) + 0.1 * path[-1].sin())

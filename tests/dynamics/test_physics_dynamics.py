@@ -9,6 +9,7 @@ from gpadjust.physics import ODEPhysics
 from tests.dynamics.conftest import PUSHED as SPEC
 from tests.dynamics.conftest import push
 from tests.dynamics.conftest import pushed as transitions
+from tests.systems import refused
 
 
 def test_it_predicts_the_physics_without_doubt():
@@ -72,28 +73,27 @@ def test_a_physics_of_differences_is_warned_of(learnt):
     with pytest.warns(UserWarning, match="seems to return the change of the state"):
         dynamics.update(*transitions())
     dynamics.update(*transitions(seed=1))  # no second warning, which would be an error here
-
-
-def test_a_crude_physics_of_next_states_is_not():
-    for scale in (0.5, 3.0):
-
-        def crude(X, scale=scale):
-            return X[:, :2] + scale * (push(X) - X[:, :2])
-
+    for scale in (0.5, 3.0):  # nor of a crude physics of next states
+        crude = lambda X, scale=scale: X[:, :2] + scale * (push(X) - X[:, :2])  # noqa: E731
         PhysicsDynamics(SPEC, crude).update(*transitions())
 
 
+TIMED = StateSpec(["x", "v"], ["push"], step=0.1)
+DIFFERENCE, FAST = (ODEPhysics(lambda x, a: x, h, 2, difference=h > 0.09) for h in (0.1, 0.05))
+REFUSED = [
+    (TypeError, "spec must be a StateSpec", PhysicsDynamics, ["x", "v"], push),
+    (ValueError, "difference=False", PhysicsDynamics, SPEC, DIFFERENCE),
+    (ValueError, r"steps of 0.05, but .* has 0.1; .*step=0\.1", PhysicsDynamics, TIMED, FAST),
+    (ValueError, "Expected one physics to follow", PhysicsDynamics, SPEC, [push, push]),
+]
+
+
 def test_bad_input_is_refused():
-    with pytest.raises(TypeError, match="spec must be a StateSpec"):
-        PhysicsDynamics(["x", "v"], push)
-    with pytest.raises(ValueError, match="difference=False"):
-        PhysicsDynamics(SPEC, ODEPhysics(lambda x, a: x, 0.1, 2, difference=True))
-    timed = StateSpec(["x", "v"], ["push"], step=0.1)
-    with pytest.raises(ValueError, match=r"steps of 0.05, but the spec has 0.1; .*step=0\.1"):
-        PhysicsDynamics(timed, ODEPhysics(lambda x, a: x, 0.05, 2))
+    for error, words, *call in REFUSED:
+        refused(error, words, *call)
     dynamics = PhysicsDynamics(SPEC, lambda X: X)
-    with pytest.raises(ValueError, match=r"next values of the 2 states .*got 3 columns"):
-        dynamics.predict(*transitions()[:2])
+    words = r"next values of the 2 states .*got 3 columns"
+    refused(ValueError, words, dynamics.predict, *transitions()[:2])
 
 
 @pytest.mark.slow

@@ -37,12 +37,12 @@ def test_windows_do_not_cross_the_ends_of_episodes():
 
 def test_a_row_that_is_left_out_ends_an_episode():
     data = count(6, 3)
-    some = data.some(torch.tensor([0, 1, 2, 4, 5, 6, 8]))
+    some = data.subset(torch.tensor([0, 1, 2, 4, 5, 6, 8]))
     assert some.episode.tolist() == [0, 0, 0, 1, 1, 2, 3]
-    assert data.some(data.states[:, 0] != 3).episode.tolist() == [0, 0, 0, 1, 1, 2, 2, 2]
-    assert data.some(slice(4, 7)).episode.tolist() == [0, 0, 1]
-    assert data.some(torch.tensor([2, 1, 0])).longest == 1
-    assert data.some(slice(0)).longest == 0
+    assert data.subset(data.states[:, 0] != 3).episode.tolist() == [0, 0, 0, 1, 1, 2, 2, 2]
+    assert data.subset(slice(4, 7)).episode.tolist() == [0, 0, 1]
+    assert data.subset(torch.tensor([2, 1, 0])).longest == 1
+    assert data.subset(slice(0)).longest == 0
 
 
 def test_no_episode_goes_on_in_what_is_appended():

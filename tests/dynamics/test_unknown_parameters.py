@@ -1,12 +1,16 @@
 """Dynamics that learn unknown parameters of their physics."""
 
+import numpy as np
 import pytest
 import torch
 
-from gpadjust import CKA, CalibratedPhysics, ODEPhysics, Unknown
+from gpadjust import CKA, CalibratedPhysics, ODEPhysics, PhysicsMeanGP, Unknown
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
-from gpadjust.dynamics.targets import TargetPhysics, Targets
+from gpadjust.dynamics.learned_dynamics import TargetPhysics, Targets
 from gpadjust.physics import FunctionPhysics
+from gpadjust.systems.swing_up import CART_POLE_SPEC, CartPoleEquation, equation_physics
+from tests.dynamics.conftest import trial_of
+from tests.systems import normal, same, uniform
 
 SPEC = StateSpec(["q", "dq"], ["u"], angles=["q"])
 UNKNOWNS = {"k": Unknown(1.0, factor=2.0), "c": Unknown(0.2, bounds=(0.0, 1.0))}
@@ -27,21 +31,16 @@ def make(model=CalibratedPhysics, **changes):
     return LearnedDynamics(SPEC, make_physics(**changes), model=model, fit_options=FEW)
 
 
-@pytest.fixture
-def transitions(uniform):
-    """Makes transitions of a pendulum with k = 1.7 and c = 0.5."""
-
-    def transitions(n, seed=0):
-        rows = uniform(n, 3, low=-2.0, high=2.0, seed=seed)
-        truth = make_physics()(rows, torch.tensor([1.7, 0.5], dtype=torch.float64))
-        return rows[:, :2], rows[:, 2:], truth + 1e-4 * uniform(n, 2, low=-1.0, seed=seed + 1)
-
-    return transitions
+def transitions(n, seed=0):
+    """Transitions of a pendulum with k = 1.7 and c = 0.5."""
+    rows = uniform(n, 3, low=-2.0, high=2.0, seed=seed)
+    truth = make_physics()(rows, torch.tensor([1.7, 0.5], dtype=torch.float64))
+    return rows[:, :2], rows[:, 2:], truth + 1e-4 * uniform(n, 2, low=-1.0, seed=seed + 1)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", [CalibratedPhysics, CKA])
-def test_are_learnt_kept_and_used(model, transitions, uniform):
+def test_are_learnt_kept_and_used(model):
     dynamics, (states, actions, after) = make(model), transitions(8, seed=5)
     first = transitions(12)
     dynamics.update(*first)
@@ -54,10 +53,7 @@ def test_are_learnt_kept_and_used(model, transitions, uniform):
 
     again = make(model)
     again.load_state_dict(dynamics.state_dict())
-    for found, expected in zip(
-        again.predict(states, actions), dynamics.predict(states, actions), strict=True
-    ):
-        torch.testing.assert_close(found, expected)
+    same(again.predict(states, actions), dynamics.predict(states, actions))
     assert torch.equal(again.model.physics_parameters.draws, parameters.draws)
 
     blocks = [t.expand(4, *t.shape) for t in (states, actions)]
@@ -71,7 +67,7 @@ def test_are_learnt_kept_and_used(model, transitions, uniform):
     assert dynamics.num_transitions == 16
 
 
-def test_a_state_of_other_priors_is_refused(transitions):
+def test_a_state_of_other_priors_is_refused():
     dynamics = make()
     dynamics.update(*transitions(6))
     other = make(k=Unknown(1.0, factor=1.9))  # the same guess
@@ -80,7 +76,7 @@ def test_a_state_of_other_priors_is_refused(transitions):
     assert "unknowns" not in LearnedDynamics(SPEC, lambda X: X[:, :2]).describe()
 
 
-def test_without_learning_they_are_the_guesses(transitions):
+def test_without_learning_they_are_the_guesses():
     states, actions, _ = transitions(5)
     mean, _ = PhysicsDynamics(SPEC, make_physics()).predict(states, actions)
     guess = torch.tensor([1.0, 0.2], dtype=torch.float64)
@@ -88,7 +84,7 @@ def test_without_learning_they_are_the_guesses(transitions):
     torch.testing.assert_close(mean, expected)
 
 
-def test_targets_of_a_physics_at_parameters(uniform):
+def test_targets_of_a_physics_at_parameters():
     def turn(X, p):
         """NaN where it turns too far."""
         moved = X[:, :2] + p.speed[:, None]
@@ -107,3 +103,63 @@ def test_targets_of_a_physics_at_parameters(uniform):
     found = targets.or_nan(X, torch.tensor([[0.5], [9.0]], dtype=torch.float64))
     assert found.isnan().all(-1).all(-1).tolist() == [False, True]
     torch.testing.assert_close(found[0], expected[0].expand(4, 2))
+
+
+# A cart-pole whose masses, length and friction are unknown, after one trial
+
+MASSES = {
+    "cart_mass": Unknown(0.6, factor=1.5, unit="kg"),
+    "pole_mass": Unknown(0.6, factor=1.5, unit="kg"),
+    "pole_length": Unknown(0.7, factor=1.5, unit="m"),
+    "damping": Unknown(0.05, bounds=(0.0, 1.0), unit="N s/m"),
+}
+NOISE = 0.01  # m, rad, m/s, rad/s
+
+
+def cart_pole():
+    return equation_physics(CartPoleEquation(0.6, 0.6, 0.7, 0.05), unknowns=MASSES)
+
+
+def trial(seed, noise=0.0):
+    """Transitions under random forces, with noise of the sensors."""
+    path, actions = trial_of(seed, 25)
+    path = path + noise * normal(26, 4, seed=seed)
+    return path[:-1], actions, path[1:]
+
+
+def error(dynamics):
+    """Of single steps that were not seen, relative to the change of each state."""
+    trials = [trial(100 + i) for i in range(4)]
+    states, actions, after = (torch.cat(part) for part in zip(*trials, strict=True))
+    missed = CART_POLE_SPEC.change(after, dynamics.predict(states, actions).mean)
+    return (missed.square().mean(0) / (after - states).square().mean(0)).sqrt().mean().item()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", [CalibratedPhysics, PhysicsMeanGP, CKA])
+def test_one_trial_without_noise_tells_the_parameters(model):
+    dynamics = LearnedDynamics(CART_POLE_SPEC, cart_pole(), model=model, fit_options=FEW)
+    dynamics.update(*trial(0))
+    assert error(dynamics) < 1e-4
+    truth = torch.tensor([0.5, 0.5, 0.6, 0.1], dtype=torch.float64)
+    found = dynamics.model.physics_parameters.mean
+    torch.testing.assert_close(found, truth, rtol=1e-3, atol=0)
+
+
+@pytest.mark.slow
+def test_with_noise_it_is_as_good_as_least_squares():
+    errors = {name: [] for name in ("least squares", "calibrated", "delta", "rho and delta")}
+    for seed in range(2):
+        data = trial(seed, NOISE)
+        fitted = PhysicsDynamics(CART_POLE_SPEC, cart_pole())
+        fitted.update(*data)
+        errors["least squares"].append(error(fitted))
+        models = (CalibratedPhysics, PhysicsMeanGP, CKA)
+        for name, model in zip([*errors][1:], models, strict=True):
+            dynamics = LearnedDynamics(CART_POLE_SPEC, cart_pole(), model=model, fit_options=FEW)
+            dynamics.update(*data)
+            errors[name].append(error(dynamics))
+    means = {name: np.mean(values) for name, values in errors.items()}
+    assert means["calibrated"] < 1.5 * means["least squares"]
+    assert means["delta"] < 1.5 * means["least squares"]
+    assert means["rho and delta"] < 2 * means["least squares"]

@@ -104,3 +104,10 @@ def called(function, sizes, *given):
     pointer = ctypes.POINTER(ctypes.c_double)
     function(*(array.ctypes.data_as(pointer) for array in arrays))
     return [torch.as_tensor(array) for array in arrays[len(given) :]]
+
+
+def in_casadi(function, *given):
+    """Outputs of a function of CasADi, the only one by itself."""
+    outputs = function(*(each.numpy() for each in given))
+    several = outputs if isinstance(outputs, tuple) else [outputs]
+    return [torch.tensor(each.full()[:, 0]) for each in several]

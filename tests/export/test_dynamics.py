@@ -13,8 +13,8 @@ from gpadjust.dynamics import LearnedDynamics
 from gpadjust.export import c_source, casadi_function
 from gpadjust.states import StateSpec
 from tests.export.apart import apart
-from tests.export.conftest import called, compiled
-from tests.systems import normal, uniform
+from tests.export.conftest import called, compiled, in_casadi
+from tests.systems import normal, same, uniform
 
 SPEC = StateSpec(
     ["goal", "angle", "x", "rate", "speed", "last"],
@@ -56,18 +56,21 @@ def transitions():
 
 @functools.cache
 def learnt(target="difference", model=CKA, physics=pushed, reads=()):
-    options = {"method": "map"}
-    physics = STILL if physics is None else physics
     dynamics = LearnedDynamics(
-        replace(SPEC, physics_reads=reads), physics, model=model, target=target, fit_options=options
+        replace(SPEC, physics_reads=reads),
+        STILL if physics is None else physics,
+        model=model,
+        target=target,
+        fit_options={"method": "map"},
     )
     dynamics.update(*transitions())
     return dynamics
 
 
+RRA20 = partial(RRA, num_features=20)
 CASES = {
     "difference": learnt,
-    "absolute": partial(learnt, "absolute", partial(RRA, num_features=20)),
+    "absolute": partial(learnt, "absolute", RRA20),
     "two physics": partial(learnt, physics=None),
     "late": partial(learnt, reads=("angle", "x", "rate", "speed", "last")),
 }
@@ -87,60 +90,49 @@ def test_programs_say_the_next_state_and_its_variance(case, tmp_path):
     function = casadi_function(dynamics)
     assert function.name_in() == ["state", "action", "f_p"]
     for *given, mean, variance in zip(states, actions, f_p, *expected, strict=True):
-        for found in (
-            called(program.cart_step, (6, 6), *given),
-            [torch.tensor(each.full()[:, 0]) for each in function(*(g.numpy() for g in given))],
-        ):
-            torch.testing.assert_close(found[0], mean, rtol=1e-9, atol=1e-12)
-            torch.testing.assert_close(found[1], variance, rtol=1e-8, atol=1e-14)
+        in_c = called(program.cart_step, (6, 6), *given)
+        for found in (in_c, in_casadi(function, *given)):
+            same(found[:1], [mean], rtol=1e-9, atol=1e-12)
+            same(found[1:], [variance], rtol=1e-8, atol=1e-14)
+
+
+STATE, ACTION = normal(6, seed=5), normal(1, seed=6)
+F_P = pushed(torch.cat([STATE[1:5], ACTION])[None])[0]
 
 
 @pytest.mark.parametrize("case", ["difference", "late"])
 @apart
 def test_a_physics_in_casadi_takes_the_place_of_its_values(case):
     dynamics = CASES[case]()
-    state, action = normal(6, seed=5), normal(1, seed=6)
     step = casadi_function(dynamics, "step", physics=pushed_in_casadi, observation_noise=True)
     assert (step.name_in(), step.name_out()) == (["state", "action"], ["mean", "variance"])
-    found = [torch.tensor(each.full()[:, 0]) for each in step(state.numpy(), action.numpy())]
-    for value, expected in zip(found, dynamics.predict(state, action), strict=True):
-        torch.testing.assert_close(value, expected, rtol=1e-9, atol=1e-14)
+    expected = dynamics.predict(STATE, ACTION)
+    same(in_casadi(step, STATE, ACTION), expected, rtol=1e-9, atol=1e-14)
 
 
 @apart
 def test_casadi_has_the_slopes_of_the_mean():
     dynamics = learnt()
-    state, action = normal(6, seed=5), normal(1, seed=6)
     step = casadi_function(dynamics, physics=pushed_in_casadi, variance=False)
-    found = step.jacobian()(state.numpy(), action.numpy(), 0)[0].full()
+    found = step.jacobian()(STATE.numpy(), ACTION.numpy(), 0)[0].full()
 
     def mean(state):
-        return dynamics.mean_function()(state[None, None], action[None, None])[0, 0]
+        return dynamics.mean_function()(state[None, None], ACTION[None, None])[0, 0]
 
-    expected = torch.autograd.functional.jacobian(mean, state)
+    expected = torch.autograd.functional.jacobian(mean, STATE)
     torch.testing.assert_close(torch.tensor(found), expected, rtol=1e-8, atol=1e-10)
 
 
-def test_a_file_without_variance_says_the_next_state_alone(tmp_path):
-    dynamics = learnt()
-    state, action = normal(6, seed=5), normal(1, seed=6)
-    f_p = pushed(torch.cat([state[1:5], action])[None])[0]
-    program = compiled(c_source(dynamics, "cart", variance=False), tmp_path)
-    (found,) = called(program.cart_step, (6,), state, action, f_p)
-    torch.testing.assert_close(found, dynamics.predict(state, action).mean, rtol=1e-9, atol=1e-12)
-
-
-def test_one_unit_may_contain_several_dynamics(tmp_path):
-    dynamics = [learnt(), learnt("absolute", partial(RRA, num_features=20))]
-    program = compiled(
-        "".join(c_source(each, f"d{i}") for i, each in enumerate(dynamics)), tmp_path
-    )
-    state, action = normal(6, seed=5), normal(1, seed=6)
-    f_p = pushed(torch.cat([state[1:5], action])[None])[0]
-    for i, each in enumerate(dynamics):
-        found = called(getattr(program, f"d{i}_step"), (6, 6), state, action, f_p)[0]
-        expected = each.predict(state, action).mean
-        torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-12)
+def test_one_unit_may_contain_several_dynamics_also_without_variance(tmp_path):
+    dynamics = [learnt(), learnt("absolute", RRA20)]
+    code = [c_source(each, f"d{i}") for i, each in enumerate(dynamics)]
+    code.append(c_source(dynamics[0], "d2", variance=False))
+    program = compiled("".join(code), tmp_path)
+    expected = [each.predict(STATE, ACTION).mean for each in dynamics]
+    for i, mean in enumerate([*expected, expected[0]]):
+        sizes = (6, 6)[: 1 + (i < 2)]
+        found = called(getattr(program, f"d{i}_step"), sizes, STATE, ACTION, F_P)[0]
+        torch.testing.assert_close(found, mean, rtol=1e-9, atol=1e-12)
 
 
 def test_a_step_in_place_is_that_into_another_array(tmp_path):

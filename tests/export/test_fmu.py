@@ -13,12 +13,12 @@ from gpadjust.dynamics import LearnedDynamics
 from gpadjust.export import export_fmu
 from gpadjust.export import fmu as module
 from gpadjust.states import StateSpec
-from tests.export.conftest import fitted
+from tests.export.conftest import MODELS, fitted
 from tests.export.test_dynamics import SPEC, learnt, pushed
 from tests.export.test_equations import SPRING
 from tests.export.test_equations import dynamics as identified
 from tests.export.test_models import POINTS, arguments
-from tests.systems import normal, uniform
+from tests.systems import normal, refused, same, uniform
 
 if shutil.which("cc") is None:
     pytest.skip("there is no C compiler", allow_module_level=True)
@@ -51,53 +51,48 @@ def with_equal_names():
     return CKA(data[["T [K]"]], data[["T [K]"]], physics=lambda X: X)
 
 
+def simulated(path, rows, step, outputs, **start):
+    """Outputs of a valid FMU at the steps, whose inputs are these rows."""
+    from fmpy.validation import validate_fmu
+
+    assert validate_fmu(str(path)) == []
+    kinds = [("time", float), *((each, float) for each in names(path, "input"))]
+    signal = np.array([(step * k, *row) for k, row in enumerate(rows.tolist())], dtype=kinds)
+    duration = {"stop_time": step * (len(rows) - 1), "output_interval": step}
+    options = {"output": outputs, "start_values": start, **duration}
+    found = fmpy.simulate_fmu(str(path), input=signal, **options)[outputs]
+    return torch.tensor(found.tolist(), dtype=torch.float64)
+
+
 @pytest.mark.parametrize("name", ["CKA", "CKA, nested", "CKA, two physics", "RRA", "ZeroMeanGP"])
 def test_a_model_is_simulated_beside_torch(name, tmp_path):
-    from fmpy.validation import validate_fmu
-
     model = fitted(name)
     path = export_fmu(model, tmp_path / "model.fmu", observation_noise=True)
-    assert validate_fmu(str(path)) == []
     given = torch.cat(arguments(model, POINTS), dim=-1)
     mean, variance = model.predict(POINTS, observation_noise=True)
-    columns = [*names(path, "input"), *names(path, "output")]
-    assert len(columns) == given.shape[1] + 2 * mean.shape[1]
-    signal = np.array(
-        [(t, *row) for t, row in enumerate(given.tolist())],
-        dtype=[("time", float), *((each, float) for each in names(path, "input"))],
-    )
-    found = fmpy.simulate_fmu(
-        str(path), input=signal, stop_time=len(given) - 1, output_interval=1.0, output=columns
-    )
-    found = np.stack([found[each] for each in names(path, "output")], axis=-1)
+    outputs = names(path, "output")
+    assert len(names(path, "input")) + len(outputs) == given.shape[1] + 2 * mean.shape[1]
     # At each point in time the outputs are those before the next inputs.
-    expected = torch.cat([mean, variance.sqrt()], dim=-1)[:-1].numpy()
-    np.testing.assert_allclose(found[1:], expected, rtol=1e-10, atol=1e-10)
+    expected = torch.cat([mean, variance.sqrt()], dim=-1)[:-1]
+    same([simulated(path, given, 1.0, outputs)[1:]], [expected], rtol=1e-10, atol=1e-10)
 
 
-def test_dynamics_are_simulated_beside_torch_with_the_physics_in_c(tmp_path):
-    from fmpy.validation import validate_fmu
-
-    dynamics = learnt()
-    path = export_fmu(dynamics, tmp_path / "cart.fmu", physics=PUSHED)
-    assert validate_fmu(str(path)) == []
-    state, forces = uniform(6, low=-1.0, high=1.0), normal(5, 1)
-    signal = np.array(
-        [(0.1 * k, u) for k, (u,) in enumerate(forces.tolist())],
-        dtype=[("time", float), ("force", float)],
-    )
-    outputs = [*SPEC.states, *(f"{each}_sd" for each in SPEC.states)]
-    found = fmpy.simulate_fmu(
-        str(path),
-        start_values=dict(zip(SPEC.states, state.tolist(), strict=True)),
-        input=signal,
-        stop_time=0.5,
-        output=outputs,
-    )
-    for k, force in enumerate(forces):
-        state, variance = dynamics.predict(state, force, observation_noise=False)
-        row = torch.tensor([*found[k + 1]])[1:]
-        torch.testing.assert_close(row, torch.cat([state, variance.sqrt()]), rtol=1e-10, atol=1e-10)
+@pytest.mark.parametrize("make", [learnt, lambda: identified("curves")])
+def test_dynamics_are_simulated_beside_torch(make, tmp_path):
+    """The physics is in C, given or of formulas."""
+    dynamics, forces = make(), normal(6, 1)
+    is_learnt = make is learnt
+    path = export_fmu(dynamics, tmp_path / "cart.fmu", physics=PUSHED if is_learnt else None)
+    states = dynamics.spec.states
+    state = uniform(len(states), low=-1.0, high=1.0)
+    start = dict(zip(states, state.tolist(), strict=True))
+    outputs = [*states, *(f"{each}_sd" for each in states if is_learnt)]
+    found = simulated(path, forces, 0.1, outputs, **start)
+    noise = {"observation_noise": False} if is_learnt else {}
+    for row, force in zip(found[1:], forces[:-1], strict=True):
+        state, variance = (part[0] for part in dynamics.predict(state[None], force[None], **noise))
+        expected = torch.cat([state, variance.sqrt()])[: len(outputs)]
+        torch.testing.assert_close(row, expected, rtol=1e-10, atol=1e-10)
 
 
 def test_dynamics_come_back_as_physics(tmp_path):
@@ -109,9 +104,8 @@ def test_dynamics_come_back_as_physics(tmp_path):
     states, actions = 2 * uniform(5, 6, low=-2.0, high=2.0, seed=3), uniform(5, 1, seed=4)
     values = pushed(SPEC.physics_inputs(states, actions))
     expected = dynamics.predict(states, actions).mean
-    torch.testing.assert_close(
-        physics(torch.cat([states, actions, values], -1)), expected, rtol=1e-9, atol=1e-11
-    )
+    given = torch.cat([states, actions, values], -1)
+    same([physics(given)], [expected], rtol=1e-9, atol=1e-11)
 
 
 def test_two_fmus_of_one_name_are_in_one_process(tmp_path):
@@ -166,24 +160,20 @@ def test_names_and_units_are_those_of_the_data(tmp_path):
 
 
 def test_the_same_model_makes_the_same_file(tmp_path):
-    made = [export_fmu(fitted("CKA"), tmp_path / "pump.fmu").read_bytes() for _ in range(2)]
-    assert made[0] == made[1]
+    paths = (export_fmu(MODELS["CKA"](), tmp_path / "pump.fmu") for _ in range(2))
+    once, again = (path.read_bytes() for path in paths)
+    assert once == again
     with zipfile.ZipFile(tmp_path / "pump.fmu") as file:
         assert {"modelDescription.xml", "sources/pump.c"} < {*file.namelist()}
 
 
+NO_CODE = {"physics": "f_p[0] = head(x);"}
 REFUSED = [
     (lambda: fitted("CKA"), {}, "a b.fmu", ValueError, "one of C"),
     (without_step, {}, "x.fmu", ValueError, r"StateSpec\(..., step=0.1\)"),
     (lambda: fitted("ZeroMeanGP"), {"physics": ""}, "x.fmu", ValueError, "leave physics= out"),
     (with_equal_names, {}, "x.fmu", ValueError, "two 'T'"),
-    (
-        lambda: fitted("CKA"),
-        {"physics": "f_p[0] = head(x);"},
-        "x.fmu",
-        ValueError,
-        "cannot compile the program: .*head",
-    ),
+    (lambda: fitted("CKA"), NO_CODE, "x.fmu", ValueError, "(?s)cannot compile the program: .*head"),
     (lambda: SPRING, {}, "x.fmu", TypeError, "no names of outputs.*PhysicsDynamics"),
     (lambda: None, {}, "x.fmu", TypeError, "or what identify returns; found"),
 ]
@@ -191,36 +181,10 @@ REFUSED = [
 
 @pytest.mark.parametrize(("make", "options", "file", "error", "words"), REFUSED)
 def test_what_is_refused(make, options, file, error, words, tmp_path):
-    with pytest.raises(error, match=f"(?s){words}"):
-        export_fmu(make(), tmp_path / file, **options)
+    refused(error, words, export_fmu, make(), tmp_path / file, **options)
 
 
 def test_without_a_compiler_there_is_a_way_out(tmp_path, monkeypatch):
     monkeypatch.setattr(module.shutil, "which", lambda name: None)
     with pytest.raises(OSError, match=r"no C compiler was found.*or take c_source"):
         export_fmu(fitted("CKA"), tmp_path / "pump.fmu")
-
-
-def test_identified_dynamics_are_simulated_beside_torch(tmp_path):
-    from fmpy.validation import validate_fmu
-
-    own = identified("curves")
-    path = export_fmu(own, tmp_path / "arm.fmu")
-    assert validate_fmu(str(path)) == []
-    state, pushes = uniform(4, low=-1.0, high=1.0), normal(5, 1)
-    signal = np.array(
-        [(0.1 * k, u) for k, (u,) in enumerate(pushes.tolist())],
-        dtype=[("time", float), ("u", float)],
-    )
-    found = fmpy.simulate_fmu(
-        str(path),
-        start_values=dict(zip(own.spec.states, state.tolist(), strict=True)),
-        input=signal,
-        stop_time=0.4,
-        output_interval=0.1,
-        output=[*own.spec.states],
-    )
-    for k in range(4):
-        state = own.predict(state[None], pushes[k][None]).mean[0]
-        row = [found[each][k + 1] for each in own.spec.states]
-        np.testing.assert_allclose(row, state.numpy(), rtol=1e-10, atol=1e-10)

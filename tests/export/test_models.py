@@ -7,7 +7,7 @@ import torch
 
 from gpadjust.export import c_source, casadi_function
 from tests.export.apart import apart
-from tests.export.conftest import MODELS, called, compiled, fitted
+from tests.export.conftest import MODELS, called, compiled, fitted, in_casadi
 from tests.systems import uniform
 
 POINTS = torch.cat([uniform(4, 2, low=-0.5, high=1.5, seed=1), uniform(1, 2), 50 * uniform(1, 2)])
@@ -16,7 +16,7 @@ POINTS = torch.cat([uniform(4, 2, low=-0.5, high=1.5, seed=1), uniform(1, 2), 50
 def arguments(model, X):
     """What a program is given: the inputs, and f_p where there is a physics."""
     values = [
-        each(X, *([each.unknowns.at(model.u[0, :, -1:])] if each.unknowns else []))
+        each(X, *([each.unknowns.to_values(model.u[0, :, -1:])] if each.unknowns else []))
         for each in model.physics
     ]
     values = [value.detach().reshape(len(X), -1) for value in values]
@@ -45,20 +45,6 @@ def test_c_says_what_the_model_predicts(name, tmp_path):
         agrees(model, called(program.f_predict, sizes, *given), (mean, variance))
 
 
-def test_one_unit_may_contain_several_models(tmp_path):
-    code = "".join(c_source(fitted(name), f"m{i}") for i, name in enumerate(("CKA", "RRA")))
-    program = compiled(code, tmp_path)
-    for i, name in enumerate(("CKA", "RRA")):
-        model = fitted(name)
-        given, expected = arguments(model, POINTS), model.predict(POINTS)
-        one = called(
-            getattr(program, f"m{i}_predict"),
-            2 * (model.num_outputs,),
-            *(each[0] for each in given),
-        )
-        agrees(model, one, [each[0] for each in expected])
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 @apart
@@ -68,9 +54,7 @@ def test_casadi_says_what_the_model_predicts(name):
     for *given, mean, variance in zip(
         *arguments(model, POINTS), *model.predict(POINTS), strict=True
     ):
-        found = function(*(each.numpy() for each in given))
-        found = [torch.tensor(each.full()[:, 0]) for each in found]
-        agrees(model, found, (mean, variance))
+        agrees(model, in_casadi(function, *given), (mean, variance))
 
 
 @pytest.mark.slow

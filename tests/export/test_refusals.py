@@ -7,16 +7,18 @@ import torch
 from botorch.models.transforms.input import Warp
 from gpytorch.kernels import MaternKernel
 
-from gpadjust import CKA, CalibratedPhysics
+from gpadjust import CKA, CalibratedPhysics, Unknown
 from gpadjust.core import Fourier
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.export import c_source, casadi_function
 from gpadjust.kinds.links import LinkedCKA
 from gpadjust.kinds.relative import RelativeNoise
+from gpadjust.physics import BlackBoxPhysics, FormulaPhysics, FunctionPhysics, ODEPhysics
 from gpadjust.states import StateSpec
 from tests.export.apart import apart
 from tests.export.conftest import LAW, MODELS, X, Y, fitted
-from tests.systems import crude, normal
+from tests.export.test_equations import PHYSICS, SPRING, learnt
+from tests.systems import crude, normal, refused
 
 
 def with_draws_of_parameters():
@@ -35,42 +37,54 @@ def warped():
     return CKA(X, Y, physics=crude, input_transform=warp)
 
 
+def unlearnt():
+    return LearnedDynamics(StateSpec(["x"], ["u"]), lambda X: X[:, :1])
+
+
+CUT = {"a": Unknown(1.0, sd=1.0, bounds=(0.0, 2.0), function_of="x", between=(0.0, 1.0))}
+FREE, NOISY = {"parameters": True}, {"observation_noise": True}
 REFUSED = [
-    (fantasies, "fantasies"),
-    (lambda: LinkedCKA(X, Y, physics=crude, link="log"), "outputs with a link"),
-    (lambda: CKA(X, Y, physics=crude, delta_covar_module=MaternKernel()), "kernel of 'delta'"),
-    (lambda: CKA(X, Y, physics=crude, delta_covar_module=Fourier(2, 4)), "Fourier kernels alone"),
-    (warped, "input transform Warp"),
-    (with_draws_of_parameters, r"fit\(model, 'map'\)"),
-    (lambda: CalibratedPhysics(X, Y, physics=LAW), "physics_parameters"),
-    (lambda: CKA(X, Y, physics=crude, noise=RelativeNoise()), "add the variance"),
+    (fantasies, {}, ValueError, "fantasies"),
+    (lambda: LinkedCKA(X, Y, physics=crude, link="log"), {}, ValueError, "outputs with a link"),
+    (
+        lambda: CKA(X, Y, physics=crude, delta_covar_module=MaternKernel()),
+        *({}, ValueError, "kernel of 'delta'"),
+    ),
+    (
+        lambda: CKA(X, Y, physics=crude, delta_covar_module=Fourier(2, 4)),
+        *({}, ValueError, "Fourier kernels alone"),
+    ),
+    (warped, {}, ValueError, "input transform Warp"),
+    (with_draws_of_parameters, {}, ValueError, r"fit\(model, 'map'\)"),
+    (lambda: CalibratedPhysics(X, Y, physics=LAW), {}, ValueError, "physics_parameters"),
+    (
+        lambda: CKA(X, Y, physics=crude, noise=RelativeNoise()),
+        *(NOISY, ValueError, "add the variance"),
+    ),
+    (lambda: learnt()[1], FREE, ValueError, "fitted with these values.*: leave it out"),
+    (unlearnt, {}, RuntimeError, "has not learnt"),
+    *((lambda wrong=w: wrong, {}, TypeError, "or what identify returns; f") for w in (None, 3, X)),
+    (lambda: FunctionPhysics(crude), {}, TypeError, "'crude', a FunctionPhysics: expected equa"),
+    (lambda: BlackBoxPhysics(crude), {}, TypeError, "BlackBoxPhysics: expected equations"),
+    (lambda: ODEPhysics(crude, 0.1, 1), {}, TypeError, "ODEPhysics: expected equations"),
+    (lambda: ODEPhysics(SPRING, 0.1, 2, inputs=[0, 1, -1]), {}, ValueError, "from the end"),
+    (
+        lambda: FormulaPhysics("a * x", ["x"], unknowns=CUT),
+        *({}, ValueError, "bounds cut off its prior"),
+    ),
+    (lambda: FormulaPhysics("x", ["x"]), FREE, ValueError, "found none. Leave it out"),
+    (lambda: PHYSICS["curves"], FREE, ValueError, "found dry, drag, share"),
 ]
 
 
-def test_what_is_no_finite_sum_is_refused_with_the_way_out():
-    for make, words in REFUSED:
-        with pytest.raises(ValueError, match=words):
-            c_source(make(), "f", observation_noise=True)
-
-
-def test_what_is_no_model_of_terms_is_refused():
-    for wrong in (None, lambda X: X):
-        with pytest.raises(TypeError, match="or what identify returns; found"):
-            c_source(wrong, "f")
-    with pytest.raises(RuntimeError, match="has not learnt"):
-        c_source(LearnedDynamics(StateSpec(["x"], ["u"]), lambda X: X[:, :1]), "f")
-
-
-def test_a_name_that_c_has_not_is_refused():
+def test_what_is_refused_with_the_way_out():
+    for make, options, error, words in REFUSED:
+        refused(error, words, c_source, make(), "f", **options)
+    words = "which have nothing else"
+    refused(ValueError, words, casadi_function, PHYSICS["rk4"], physics=crude)
     for name in ("", "a b", "2f", "pumpe_ä", None):
         for export in (c_source, casadi_function):
-            with pytest.raises(ValueError, match="one of C"):
-                export(fitted("CKA"), name)
-
-
-def test_the_same_model_makes_the_same_file():
-    once, again = (c_source(CKA(X, Y, physics=crude), "f") for _ in range(2))
-    assert once == again
+            refused(ValueError, "one of C", export, fitted("CKA"), name)
 
 
 def test_a_file_without_variance_is_small():
@@ -83,11 +97,10 @@ def test_a_file_without_variance_is_small():
 @pytest.mark.slow
 @apart
 def test_a_physics_that_returns_another_number_of_values_is_refused():
-    with pytest.raises(ValueError, match="column of 2 values"):
-        casadi_function(fitted("CKA"), physics=lambda x: x[0])
+    words = "column of 2 values"
+    refused(ValueError, words, casadi_function, fitted("CKA"), physics=lambda x: x[0])
 
 
 def test_without_casadi_there_is_a_way_out(monkeypatch):
     monkeypatch.setitem(sys.modules, "casadi", None)
-    with pytest.raises(ImportError, match=r"gpadjust\[export\]"):
-        casadi_function(fitted("CKA"))
+    refused(ImportError, r"gpadjust\[export\]", casadi_function, fitted("CKA"))

@@ -1,6 +1,5 @@
 """Categories among the inputs, and batches of which each has an offset."""
 
-import numpy as np
 import pandas as pd
 import pytest
 import torch
@@ -11,7 +10,7 @@ from gpytorch.kernels import MaternKernel, ScaleKernel
 
 from gpadjust.core import CKA, MATERN52, RRA, StackedGP, Stationary, ZeroMeanGP, fit, load, save
 from gpadjust.kinds.categories import Categories, levels_of, on_levels
-from tests.systems import normal, refused, slopes, uniform
+from tests.systems import drawn, line, normal, refused, slopes, uniform
 
 GENERATOR = torch.Generator().manual_seed(0)
 N = 30
@@ -36,12 +35,6 @@ RIGS = Categories(batches="rig")
 
 def head(X):
     return 0.9 * HEAD[X[:, 1].long()] * (3 - X[:, 0].square())
-
-
-def drawn(model, number=2):
-    """Hold random coordinates."""
-    model.set_draws(0.4 * normal(number, *model.u.shape[1:], seed=3))
-    return model.eval()
 
 
 def same(actual, expected, tolerance=1e-8):
@@ -108,19 +101,17 @@ def test_names_of_levels_do_not_matter():
     assert levels_of(c)[1] == (10.0, 11.0, 12.0)
 
 
-@pytest.mark.parametrize("structure", [ZeroMeanGP, RRA])
-def test_a_category_that_does_not_matter_is_as_if_left_out(structure):
-    physics = {} if structure is ZeroMeanGP else {"physics": lambda X: X[:, 0]}
-    if structure is RRA:
-        physics["num_features"] = 64
-    model = structure(X[:, :2], Y, **physics, input_transform=Categories([1]))
-    plain = structure(X[:, :1], Y, **physics)
-    for row in model.table.own:
+@pytest.mark.parametrize(
+    ("structure", "options"),
+    [(ZeroMeanGP, {}), (RRA, {"physics": lambda X: X[:, 0], "num_features": 64})],
+)
+def test_a_category_that_does_not_matter_is_as_if_left_out(structure, options):
+    model = structure(X[:, :2], Y, **options, input_transform=Categories([1]))
+    plain = structure(X[:, :1], Y, **options)
+    for row in (*model.table.own, *plain.table.own):
         if row.name.endswith("lengthscale"):
-            row.location[:] = torch.tensor([2.0, 1e9]).double().log()
-    for row in plain.table.own:
-        if row.name.endswith("lengthscale"):
-            row.location[:] = torch.tensor(2.0).double().log()
+            numbers = torch.tensor([2.0, 1e9]).double().log()
+            row.location[:] = numbers[: row.location.shape[-1]]
     same(model.predict(X[:, :2]).mean, plain.predict(X[:, :1]).mean, 1e-6)
     far = torch.tensor([[0.3, 0.0], [0.3, 1.0], [0.3, 2.0]]).double()
     values = model.sample_functions(2, seed=0)(far)
@@ -162,7 +153,6 @@ def test_files_and_mixtures(model, tmp_path):
     again = load(tmp_path / "model.pt", trusted=True)
     same(moments(again, NEW)[1], moments(later, NEW)[1])
     assert levels_of(again) == levels_of(model)
-    refused(ValueError, "found wood", again.predict, FRAME[:2].assign(material="wood"))
     stacked = StackedGP({"CKA": model}, [[1.0]], 4)
     assert moments(stacked.condition_on_observations(NEW, Y[:4]), NEW)[0].shape == (4, 1)
     assert levels_of(stacked) == levels_of(model)
@@ -177,7 +167,6 @@ def test_outputs_declared_levels_and_kernels_of_gpytorch():
     same(model.data.X[:, 1], 2 - MATERIAL.double())
     zinc = moments(model, FRAME[:4].assign(material="zinc"))[1]
     assert (zinc > moments(model, FRAME[:4])[1]).all()
-    same(moments(model.subset_output([1]), NEW)[1], moments(model, NEW)[1][:, 1:])
     matern = ScaleKernel(MaternKernel(active_dims=[0]))
     model = drawn(ZeroMeanGP(X, Y, covar_module=matern, input_transform=Categories([1], [2])))
     other = X - torch.tensor([0.0, 1.0, 0.0]) * (X[:, 1:2] > 0)
@@ -185,13 +174,8 @@ def test_outputs_declared_levels_and_kernels_of_gpytorch():
 
 
 def test_which_columns_are_categories():
-    frame = pd.DataFrame(
-        {
-            "size": np.linspace(0, 1, 12),
-            "text": ["low", "high"] * 6,
-            "year": pd.Categorical([2020, 2021, 2022] * 4),
-        }
-    )
+    years = pd.Categorical([2020, 2021, 2022] * 4)
+    frame = pd.DataFrame({"size": line(12)[:, 0], "text": ["low", "high"] * 6, "year": years})
     frame["text"] = frame["text"].astype(object)
     model = ZeroMeanGP(frame, uniform(12, 1), input_transform=Categories())
     assert levels_of(model) == {1: ("high", "low"), 2: (2020.0, 2021.0, 2022.0)}
@@ -219,19 +203,25 @@ def test_botorch_optimises_the_inputs_of_a_material(model):
     assert slope[0, 1:].tolist() == [0.0, 0.0]
 
 
-def test_bad_columns_and_levels(model):
-    for options, says in (
-        ({"columns": "colour"}, "inputs flow, material, rig; found 'colour'"),
-        ({"batches": 7}, "found 7"),
-        ({"levels": {"material": ["iron", "iron"]}}, "different levels of material"),
-        ({"levels": {"material": ["iron", 2.0]}}, "different levels of material"),
-        ({"levels": {"material": ["iron", "steel"]}}, "one of iron, steel; found brass"),
-    ):
-        transform = Categories(**options)
-        refused(ValueError, says, CKA, FRAME, Y, physics=head, input_transform=transform)
-    wood = FRAME[:2].assign(material="wood")
-    refused(ValueError, "brass, iron, steel; found wood", model.predict, wood)
-    between = torch.tensor([[1.0, 1.5, 0.0]]).double()
-    refused(ValueError, "one of 0.0, 1.0, 2.0; found 1.5.*fixed_features", model.predict, between)
-    only = {"input_transform": Categories(batches=0)}
-    refused(ValueError, "in addition to batches", ZeroMeanGP, X[:, 2:], Y, **only)
+WOOD = FRAME[:2].assign(material="wood")
+BETWEEN = torch.tensor([[1.0, 1.5, 0.0]]).double()
+REFUSED = [
+    ({"columns": "colour"}, "inputs flow, material, rig; found 'colour'"),
+    ({"batches": 7}, "found 7"),
+    ({"levels": {"material": ["iron", "iron"]}}, "different levels of material"),
+    ({"levels": {"material": ["iron", 2.0]}}, "different levels of material"),
+    ({"levels": {"material": ["iron", "steel"]}}, "one of iron, steel; found brass"),
+    (lambda model: model.predict(WOOD), "brass, iron, steel; found wood"),
+    (lambda model: model.predict(BETWEEN), "one of 0.0, 1.0, 2.0; found 1.5.*fixed_features"),
+    (
+        lambda _: ZeroMeanGP(X[:, 2:], Y, input_transform=Categories(batches=0)),
+        "in addition to batches",
+    ),
+]
+
+
+@pytest.mark.parametrize(("case", "words"), REFUSED)
+def test_bad_columns_and_levels(model, case, words):
+    options = {} if callable(case) else {"input_transform": Categories(**case)}
+    call = case if callable(case) else lambda _: CKA(FRAME, Y, physics=head, **options)
+    refused(ValueError, words, call, model)

@@ -5,11 +5,11 @@ import pandas as pd
 import pytest
 import torch
 
-from gpadjust.core import CKA, CalibratedPhysics, PhysicsMeanGP, fit, load, save
+from gpadjust.core import CKA, CalibratedPhysics, PhysicsMeanGP, fit
 from gpadjust.kinds.emulated import EmulatedPhysics
 from gpadjust.kinds.links import LinkedCKA
 from gpadjust.physics import FunctionPhysics, Unknown
-from tests.systems import line, refused, uniform
+from tests.systems import line, normal, refused, uniform
 
 MAP = {"method": "map"}
 W = {"w": Unknown(2.0, bounds=(1.0, 3.0))}
@@ -37,9 +37,7 @@ def crude():
 
 def functions(physics, X, number=4000, seed=0):
     """Outputs ``number x n x m`` of functions drawn by the prior."""
-    draw = torch.Generator().manual_seed(seed)
-    z = torch.randn(number, len(physics.unknowns), generator=draw, dtype=torch.float64)
-    return physics(X, z)
+    return physics(X, normal(number, len(physics.unknowns), seed=seed))
 
 
 def test_functions_have_the_mean_and_covariance_of_the_emulator():
@@ -66,7 +64,7 @@ def test_several_outputs_have_errors_of_their_own_size():
 
 
 def test_gradients_are_those_of_the_function():
-    z = torch.randn(3, 8, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    z = normal(3, 8, seed=1)
     plain = EmulatedPhysics(1.2 * line(9), wave(1.2 * line(9)), fit_options=MAP)
     X = (1.05 + line(4)).requires_grad_()
     assert torch.autograd.gradcheck(lambda X: plain(X, z), X)
@@ -100,7 +98,7 @@ def test_intervals_are_wide_where_there_are_no_runs_and_measurements_correct_the
 def test_with_dense_runs_results_are_those_of_the_simulator(n):
     """By draws from the prior, and from Laplace's approximation."""
     runs, X = 1.5 * line(40), 1.2 * line(n) + 0.1
-    noise = 0.02 * torch.randn(n, 1, generator=torch.Generator().manual_seed(0)).double()
+    noise = 0.02 * normal(n, 1)
     known = EmulatedPhysics(runs, wave(runs), num_components=2)
     Z = 1.4 * line(9)
     data = X, wave(X) + 0.1 * X + noise, torch.full_like(X, 0.02**2)
@@ -119,7 +117,7 @@ def test_unknown_parameters_are_inputs_of_the_runs():
     emulated = EmulatedPhysics(runs, simulated(*runs.split(1, -1)), unknowns=W, fit_options=MAP)
     exact = FunctionPhysics(lambda X, p: simulated(X[:, 0], p.w), unknowns=W)
     X = 0.1 + 2.8 * line(12)
-    noise = 0.02 * torch.randn(X.shape, generator=torch.Generator().manual_seed(0)).double()
+    noise = 0.02 * normal(*X.shape)
     draws = []
     for physics in (emulated, exact):
         model = CalibratedPhysics(X, simulated(X, 1.6) + noise, physics=physics)
@@ -150,16 +148,6 @@ def test_names_of_inputs_are_to_be_in_order():
     turned = EmulatedPhysics(X, X[["a"]], inputs=[1, 0], fit_options=MAP, num_components=1)
     model = CKA(X[["b", "a"]], X[["a"]], physics=turned)
     assert abs(turned(model.data.X) - model.data.Y).max() < 0.1
-
-
-def test_a_model_may_be_saved_and_its_physics_is_given_again(crude, tmp_path):
-    X = 2.4 * line(7)
-    model = PhysicsMeanGP(X, truth(X), physics=crude)
-    model.set_draws(0.3 * torch.randn(3, *model.u.shape[1:]).double())
-    with pytest.warns(UserWarning, match="Pass it again"):
-        save(model, tmp_path / "model.pt")
-    again = load(tmp_path / "model.pt", physics=crude)
-    torch.testing.assert_close(again.predict(FAR).mean, model.predict(FAR).mean)
 
 
 @pytest.mark.parametrize(("call", "error", "words"), [

@@ -8,8 +8,9 @@ import torch
 from gpadjust.core import CKA, GP, Noise, Stationary, ZeroMeanGP
 from gpadjust.kinds.factory import make_model, with_options
 from gpadjust.kinds.links import LinkedCKA, LinkedZeroMeanGP
+from tests.systems import line, refused
 
-X = torch.linspace(0, 1, 6, dtype=torch.float64).unsqueeze(-1)
+X = line(6)
 Y = X.exp()
 
 
@@ -25,8 +26,8 @@ def test_a_link_makes_the_structure_linked():
     model = make_model(factory, X, Y)
     assert type(model) is LinkedZeroMeanGP
     assert model.settings == ZeroMeanGP(X, Y, constants=False).settings | {"link": "log"}
-    with pytest.raises(TypeError, match=r"a structure such as CKA.*LinkedCKA"):
-        with_options(own, {"link": "log"})
+    words = r"a structure such as CKA.*LinkedCKA"
+    refused(TypeError, words, with_options, own, {"link": "log"})
 
 
 def test_a_factory_keeps_its_own_arguments():
@@ -47,14 +48,13 @@ def test_models_share_the_physics_only():
     assert model.settings["delta_covar_module"] is not kernel
 
 
-@pytest.mark.parametrize(
-    ("factory", "options", "message"),
-    [
-        ("cka", {}, "a callable.*'cka'"),
-        (lambda X, Y: None, {"physics": torch.sin}, "unexpected keyword argument"),
-        (lambda X, Y: None, {}, "gpadjust GP; found NoneType"),
-    ],
-)
-def test_bad_factories(factory, options, message):
-    with pytest.raises(TypeError, match=message):
-        make_model(factory, X, Y, kind=GP, **options)
+REFUSED = [
+    ("cka", {}, "a callable.*'cka'"),
+    (lambda X, Y: None, {"physics": torch.sin}, "unexpected keyword argument"),
+    (lambda X, Y: None, {}, "gpadjust GP; found NoneType"),
+]
+
+
+@pytest.mark.parametrize(("factory", "options", "words"), REFUSED)
+def test_bad_factories(factory, options, words):
+    refused(TypeError, words, make_model, factory, X, Y, kind=GP, **options)

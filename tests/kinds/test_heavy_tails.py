@@ -5,14 +5,14 @@ import math
 import pytest
 import torch
 from torch.distributions import MultivariateNormal
-from torch.nn.functional import silu
 
-from gpadjust.core import CKA, RRA, ZeroMeanGP, fit, load, save
+from gpadjust.core import CKA, fit
 from gpadjust.kinds.heavy_tails import HeavyTails
 from gpadjust.kinds.relative import RelativeNoise
 from gpadjust.physics import FunctionPhysics, Unknown
+from tests.systems import drawn, line, normal, refused, slopes
 
-X = torch.linspace(0, 1, 20, dtype=torch.float64).unsqueeze(-1)
+X = line(20)
 Z = torch.tensor([[0.22], [0.47], [0.81]], dtype=torch.float64)
 ROWS = [4, 13]
 
@@ -30,21 +30,13 @@ def truth(X):
 
 
 def clean():
-    draw = torch.Generator().manual_seed(1)
-    return truth(X) + 0.03 * torch.randn(20, 1, generator=draw, dtype=torch.float64)
+    return truth(X) + 0.03 * normal(20, 1, seed=1)
 
 
 def gross(rows=ROWS, sizes=(0.6, -3.0)):
     Y = clean()
     Y[rows] += torch.tensor(sizes, dtype=torch.float64).unsqueeze(-1)
     return Y
-
-
-def drawn(model, number=2):
-    draw = torch.Generator().manual_seed(0)
-    u = 0.4 * torch.randn(number, *model.u.shape[1:], generator=draw, dtype=torch.float64)
-    model.set_draws(model.table.with_choice(u, 0))
-    return model.eval()
 
 
 def rows_of(mask):
@@ -63,10 +55,11 @@ CASES = {
 
 
 QUICK = ("near and far", "known variances", "none, of known variances")
-SLOW = [name for name in CASES if name not in QUICK]
 
 
-@pytest.mark.parametrize("name", [*QUICK, *(pytest.param(s, marks=pytest.mark.slow) for s in SLOW)])
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n not in QUICK)) for n in CASES]
+)
 def test_outliers_are_found_and_hardly_count(name):
     Y, rows, options = CASES[name]
     model = CKA(X, Y, physics=wave, noise=HeavyTails(), **options)
@@ -104,17 +97,16 @@ def test_the_likelihood_is_the_dense_formula():
         v = {name: value.item() for name, value in model.values.items() if "noise" in name}
         noise = torch.full((20,), v.get("noise.variance", v.get("noise.constant")) + 1e-11)
         if base is not None:
-            f = law(X, law.unknowns.at(model.values["physics.rate"])).flatten()
-            at_prior = law(X, law.unknowns.at(torch.zeros(1, 1).double())).square().mean()
+            f = law(X, law.unknowns.to_values(model.values["physics.rate"])).flatten()
+            at_prior = law(X, law.unknowns.to_values(torch.zeros(1, 1).double())).square().mean()
             noise = noise + (v["noise.relative"] + 1e-11) * f.square() / at_prior
         noise = (noise + added[0]) * model.unit.square()[0]
         law_of_Y = MultivariateNormal(prior.mean, prior.covariance_matrix + noise.diag())
         expected = law_of_Y.log_prob(model.data.Y[:, 0]) + 20 * model.unit.log()
         value, slope = model.log_likelihood(u)
         torch.testing.assert_close(value, expected.detach(), rtol=1e-7, atol=1e-7)
-        step = 1e-5 * torch.eye(u.shape[-1]).double().unsqueeze(1)
-        up, down = (model.log_likelihood(u + s, False)[0] for s in (step, -step))
-        torch.testing.assert_close((up - down).mT / 2e-5, slope[:, 0], rtol=1e-3, atol=1e-4)
+        numeric = slopes(lambda u, m=model: m.log_likelihood(u, False)[0], u)
+        torch.testing.assert_close(numeric, slope, rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.slow
@@ -150,69 +142,35 @@ def test_outputs_may_share_unknown_numbers():
     assert [rows_of(mask) for mask in model.noise.is_outlier.mT] == [ROWS, [17]]
 
 
-MODELS = {
-    "learnt": lambda added: CKA(X, gross(), physics=silu, noise=HeavyTails(0.1, None, added)),
-    "relative": lambda added: CKA(
-        X, gross(), physics=silu, noise=HeavyTails(base=RelativeNoise(), added=added)
-    ),
-    "known": lambda added: CKA(X, gross(), 0.03**2, physics=silu, noise=HeavyTails(added=added)),
-}
-
-
-@pytest.mark.parametrize("name", list(MODELS))
-def test_conditioning_subsets_and_files_keep_the_numbers(name, tmp_path):
+def test_later_rows_have_no_corrections():
     added = torch.zeros(1, 20, dtype=torch.float64)
     added[0, ROWS] = 1e5
-    model = drawn(MODELS[name](added))
-    noise = None if model.data.Yvar is None else torch.full((3, 1), 0.01).double()
-    later = model.condition_on_observations(Z, truth(Z) + 1, noise)
+    model = drawn(CKA(X, gross(), 0.03**2, physics=wave, noise=HeavyTails(added=added)))
+    later = model.condition_on_observations(Z, truth(Z) + 1, torch.full((3, 1), 0.01).double())
     values = later.table.values(later.u)
-    variance = later.noise.variance(values, later.places(later.data.X, values), True)
-    variance = variance.expand(2, 1, 23)
-    plain = later.noise.base.variance(values, later.places(later.data.X, values), True)
-    torch.testing.assert_close((variance - plain)[..., :20], added.expand(2, 1, 20))
-    assert not (variance - plain)[..., 20:].any()
-    if noise is not None:
-        torch.testing.assert_close(later.noise.known[0, 20:] * model.unit.square(), noise.mT)
-    again = later.subset_rows(torch.arange(20))
-    torch.testing.assert_close(again.predict(Z).mean, model.predict(Z).mean)
-    for each in (model, later):
-        assert not save(each, tmp_path / "model.pt").missing
-        loaded = load(tmp_path / "model.pt", trusted=True)
-        torch.testing.assert_close(loaded.predict(Z, True), each.predict(Z, True))
-        assert torch.equal(loaded.noise.added, each.noise.added)
-        assert loaded.noise.share == each.noise.share
+    noise, base = (
+        n.variance(values, later.places(later.data.X, values), True)
+        for n in (later.noise, later.noise.base)
+    )
+    torch.testing.assert_close((noise - base)[0, 0, :20], added[0])
+    assert not (noise - base)[..., 20:].any()
+    torch.testing.assert_close(
+        later.noise.known[0, 20:] * model.unit.square(), noise.new_full((1, 3), 0.01)
+    )
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("base", [None, RelativeNoise()])
-@pytest.mark.parametrize("kind", [ZeroMeanGP, RRA])
-def test_a_second_fit_is_the_first(kind, base):
-    options = {} if kind is ZeroMeanGP else {"physics": wave}
-    model = kind(X, gross() + 2, noise=HeavyTails(base=base), **options)
-    fit(model, "map")
-    first = model.predict(Z, True).variance
-    added = model.noise.added
-    assert {*ROWS} <= {*rows_of(model.noise.is_outlier)}
-    fit(model, "map")
-    assert torch.equal(model.predict(Z, True).variance, first)
-    assert torch.equal(model.noise.added, added)
-
-
-BAD = {
-    "share": (lambda: HeavyTails(share=0.6), ValueError, "below 0.5"),
-    "no share": (lambda: HeavyTails(share=0.0), ValueError, "above 0"),
-    "base": (lambda: HeavyTails(base=0.1), TypeError, "train_Yvar"),
-    "both": (
+REFUSED = [
+    (lambda: HeavyTails(share=0.6), ValueError, "below 0.5"),
+    (lambda: HeavyTails(share=0.0), ValueError, "above 0"),
+    (lambda: HeavyTails(base=0.1), TypeError, "train_Yvar"),
+    (
         lambda: CKA(X, clean(), 0.1, physics=wave, noise=HeavyTails(base=RelativeNoise())),
         ValueError,
         "found both",
     ),
-}
+]
 
 
-@pytest.mark.parametrize("name", list(BAD))
-def test_bad_input(name):
-    call, error, match = BAD[name]
-    with pytest.raises(error, match=match):
-        call()
+@pytest.mark.parametrize(("call", "error", "words"), REFUSED)
+def test_bad_input(call, error, words):
+    refused(error, words, call)

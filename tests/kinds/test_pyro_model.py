@@ -7,7 +7,7 @@ from gpadjust.core import RRA, fit
 from gpadjust.kinds.noisy_inputs import NoisyInputs
 from gpadjust.kinds.pyro_model import pyro_model
 from gpadjust.kinds.updates import Weights
-from tests.systems import line, wave
+from tests.systems import line, refused, wave
 
 pyro = pytest.importorskip("pyro")
 
@@ -31,7 +31,7 @@ def test_the_joint_density_is_that_of_the_regression(model):
     trace = pyro.poutine.trace(pyro_model).get_trace(model)
     weights, function = trace.nodes["_RETURN"]["value"]
     # Mean and precision of the weights, by the gradient of the joint density.
-    posterior = Weights.of_model(model)
+    posterior = Weights.condition(model)
 
     def log_density(w):
         known = pyro.condition(pyro_model, {"weights": w})
@@ -52,15 +52,14 @@ def test_it_samples_at_new_inputs(model):
     X = line(4) + 0.03
     trace = pyro.poutine.trace(pyro_model).get_trace(model, X)
     assert trace.nodes["Y"]["value"].shape == (2, 4)
-    mean = Weights.of_model(model).mean[0]
+    mean = Weights.condition(model).mean[0]
     _, function = pyro.condition(pyro_model, {"weights": mean})(model, X)
     torch.testing.assert_close(function, model.predict(X).mean, rtol=1e-5, atol=1e-7)
 
 
 def test_bad_input(model):
-    for options, words in (({"Y": model.data.Y}, "Expected X"), ({"draw": 1}, "draw")):
-        with pytest.raises(ValueError, match=words):
-            pyro_model(model, **options)
+    refused(ValueError, "Expected X", pyro_model, model, Y=model.data.Y)
+    refused(ValueError, "draw", pyro_model, model, draw=1)
 
 
 def test_what_noise_adds_to_the_targets_in_the_mean_is_no_observation():

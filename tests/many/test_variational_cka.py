@@ -2,7 +2,7 @@
 
 import copy
 import pickle
-from functools import cache, partial
+from functools import cache
 
 import pytest
 import torch
@@ -21,7 +21,7 @@ from gpadjust.kinds.links import Linked
 from gpadjust.many import VariationalCKA
 from gpadjust.physics import FunctionPhysics, Unknown
 from tests.many.numbers import at_random, exact_of, physics_of, problem, truth
-from tests.systems import line, normal, refused, same, uniform, wave, waves
+from tests.systems import line, normal, refused, same, wave, waves
 
 
 def make(X, Y, *args, num_inducing=10, **options):
@@ -93,9 +93,6 @@ def test_all_that_predicts_agrees(model, close, has_rest):
         added = with_rest(model).predict(Z).variance - before
         assert (added > 0.3 * model.unit.mT.square()).all()
     mean, variance = model.predict(Z)
-    posterior = model.posterior(Z)
-    close(posterior.mean, mean)
-    close(posterior.variance, variance, 1e-6)
     f_p = physics_of(model.num_outputs)(Z)
     close(model.rho(Z).mean * f_p + model.delta(Z).mean, mean)
     assert (model.delta(Z).variance >= model.term("delta", Z).variance).all()
@@ -138,15 +135,13 @@ def test_later_rows_are_observed_exactly(model, close, has_rest):
     refused(NotImplementedError, "Build a model of all data", later.left_out)
 
 
-def test_shapes_and_gradients(model, close, gradient_is_right):
+def test_shapes(model, close):
     m, X = model.num_outputs, problem(24)[0].reshape(2, 3, 4, 1)
     posterior = model.posterior(X)
     assert posterior.rsample(torch.Size([5])).shape == (5, 2, 3, 4, m)
     close(posterior.mean[1, 2], model.posterior(X[1, 2]).mean)
     last = model.posterior(X, output_indices=[m - 1])
     close(last.mean, posterior.mean[..., -1:])
-    gradient_is_right(lambda X: model.predict(X).mean.sum(), X[0, 0])
-    gradient_is_right(lambda X: model.posterior(X).variance.sum(), X[0, 0])
 
 
 @pytest.mark.slow
@@ -170,7 +165,7 @@ def test_botorch():
     assert StackedGP.by_left_out(names, 8).predict(X[:3]).mean.isfinite().all()
 
 
-def test_copies_states_and_outputs(model, close):
+def test_copies_states_and_outputs(model):
     Z, before = line(5), with_rest(model).predict(line(5), True)
     fresh = make(*model.data[:2])
     fresh.inducing = 0 * fresh.inducing
@@ -180,24 +175,17 @@ def test_copies_states_and_outputs(model, close):
         same(each.predict(Z, True), before, rtol=1e-10, atol=0)
         assert each.summary() == model.summary()
     assert "varies in 0 of 1 draws" in make(*problem(10)).summary()
-    for kept in ([0], [-1], [model.num_outputs - 1, 0][: model.num_outputs]):
-        part = model.subset_output(kept)
-        same(part.predict(Z, True), [each[:, kept] for each in before], rtol=1e-6, atol=0)
 
 
-@pytest.mark.parametrize("later", [False, True], ids=["", "conditioned"])
-def test_files(tmp_path, later):
+def test_a_file_has_inducing_points_and_later_rows(tmp_path):
     X, Y = problem(60, 2)
     model = with_rest(at_random(make(5 * X, Y, 0.01, input_transform=Normalize(1), center=0.5)))
     model.inducing = model.inducing.flip(-1)[:, 1:]
-    options = {"input_transform": Normalize(1), "physics": waves}
-    if later:
-        model = model.condition_on_observations(X[:2] + 6, Y[:2])
+    model = model.condition_on_observations(X[:2] + 6, Y[:2])
     save(model, tmp_path / "model.pt")
-    again = load(tmp_path / "model.pt", **options)
+    again = load(tmp_path / "model.pt", input_transform=Normalize(1), physics=waves)
     same(again.predict(line(5), True), model.predict(line(5), True), rtol=1e-8, atol=1e-10)
     assert torch.equal(again.inducing, model.inducing)
-    assert again.summary() == model.summary()
 
 
 def test_inducing_points_are_pivots():
@@ -361,24 +349,18 @@ def test_links_and_categories():
         assert (model.predict(frame).mean.to_numpy() - Y.numpy()).std() < 0.15
 
 
-X, Y = problem(10)
-BAD = {
-    "float32": (TypeError, "float64", partial(make, X.float(), Y.float())),
-    "shapes": (ValueError, "rows of train_Y", partial(make, X, Y[:4])),
-    "a batch": (ValueError, "two dimensions", partial(make, X.expand(2, -1, -1), Y)),
-    "no points": (ValueError, "num_inducing", partial(make, X, Y, num_inducing=0)),
-    "half points": (TypeError, "num_inducing", partial(make, X, Y, num_inducing=2.5)),
-    "outliers": (ValueError, "CKA takes it", partial(make, X, Y, noise=HeavyTails())),
-    "nested": (TypeError, "nested", partial(make, X, Y, nested=True)),
-    "draws": (ValueError, "num_draws=None", lambda: fit(make(X, Y), num_draws=8)),
-    "a method": (ValueError, "Unknown method", lambda: fit(make(X, Y), "vi")),
-    "a bridge": (NotImplementedError, "subset_rows", lambda: make(X, Y).as_single_task_gp()),
-    "columns": (ValueError, "q x 1", lambda: make(X, Y).predict(uniform(2, 3))),
-    "a term": (ValueError, "Unknown term 'season'", lambda: make(X, Y).term("season", X)),
-}
+REFUSED = [
+    (lambda X, Y: make(X.float(), Y.float()), TypeError, "float64"),
+    (lambda X, Y: make(X, Y, num_inducing=0), ValueError, "num_inducing"),
+    (lambda X, Y: make(X, Y, num_inducing=2.5), TypeError, "num_inducing"),
+    (lambda X, Y: make(X, Y, noise=HeavyTails()), ValueError, "CKA takes it"),
+    (lambda X, Y: make(X, Y, nested=True), TypeError, "nested"),
+    (lambda X, Y: fit(make(X, Y), num_draws=8), ValueError, "num_draws=None"),
+    (lambda X, Y: make(X, Y).as_single_task_gp(), NotImplementedError, "subset_rows"),
+    (lambda X, Y: make(X, Y).term("season", X), ValueError, "Unknown term 'season'"),
+]
 
 
-@pytest.mark.parametrize("case", BAD)
-def test_what_is_refused(case):
-    error, words, call = BAD[case]
-    refused(error, words, call)
+@pytest.mark.parametrize(("call", "error", "words"), REFUSED)
+def test_what_is_refused(call, error, words):
+    refused(error, words, call, *problem(10))

@@ -356,15 +356,16 @@ FAULTS = (
         "Margins count on corrections that the actions leave no room for.",
     ),
     Fault(
-        "gpadjust/control/mpc.py",
-        "torch.cat([sequences, new]), torch.cat([scores, found])",
-        "new, found",
+        "gpadjust/control/planner.py",
+        "            sequences = torch.cat([sequences, new])\n"
+        "            scores = torch.cat([scores, new_scores])\n",
+        "            sequences, scores = new, new_scores\n",
         "The planner forgets its best sequences of earlier rounds.",
     ),
     Fault(
         "gpadjust/control/state_filter.py",
-        "off = seen.change(values.detach(), seen.decode(observations))",
-        "off = seen.decode(observations) - values.detach()",
+        "off = outputs.change(values.detach(), outputs.decode(observations))",
+        "off = outputs.decode(observations) - values.detach()",
         "A measured angle beyond half a turn throws the estimate a turn back.",
     ),
     Fault(

@@ -7,28 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from tests.systems import normal
-
 torch.set_num_threads(1)
 
 
-class RowCounter:
-    """A torch function `x -> [sum(x^2), sin(x_0)]` that records the rows it is asked for."""
-
-    def __init__(self):
-        self.rows = []
-
-    def __call__(self, X):
-        self.rows += [tuple(row) for row in X.detach().tolist()]
-        return self.formula(X)
-
-    @staticmethod
-    def formula(X):
-        return torch.stack([X.square().sum(-1), X[..., 0].sin()], dim=-1)
-
-
 class NumpyRowCounter:
-    """The same function for a batch of NumPy rows, or for one."""
+    """A function `x -> [sum(x^2), sin(x_0)]` of rows or one row, that records them."""
 
     def __init__(self):
         self.rows = []
@@ -39,23 +22,22 @@ class NumpyRowCounter:
 
 
 @pytest.fixture
-def counter():
-    return RowCounter()
-
-
-@pytest.fixture
 def numpy_counter():
     return NumpyRowCounter()
 
 
-@pytest.fixture
-def points():
-    """Draws standard normal float64 numbers of a shape, the same ones each time."""
+class Scale(torch.nn.Module):
+    """`x_0 -> gain * x_0 + offset`, with a parameter and a buffer."""
 
-    def draw(*shape, seed=0):
-        return normal(*shape, seed=seed)
+    def __init__(self):
+        super().__init__()
+        self.gain = torch.nn.Parameter(torch.tensor(2.0, dtype=torch.float64))
+        self.register_buffer("offset", torch.tensor(0.0, dtype=torch.float64))
+        self.calls = 0
 
-    return draw
+    def forward(self, X):
+        self.calls += 1
+        return self.gain * X[:, 0] + self.offset
 
 
 @pytest.fixture

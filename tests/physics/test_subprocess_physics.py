@@ -28,35 +28,49 @@ def law(tmp_path):
     return [sys.executable, str(tmp_path / "law.py")]
 
 
+K = {"k": Unknown(4.0, sd=1.0)}
+
+
 def test_placeholders_are_inputs_and_unknown_parameters(law):
-    unknowns = {"k": Unknown(4.0, sd=1.0)}
-    by_name = SubprocessPhysics([*law, "{t}", "{k}"], names=["t"], unknowns=unknowns)
+    by_name = SubprocessPhysics([*law, "{t}", "{k}"], names=["t"], unknowns=K)
     by_number = SubprocessPhysics([*law, "{0}", "{1:.1f}"])
     X = 0.1 + line(3)
     expected = torch.cat([5 * X**2, X], dim=-1)
     torch.testing.assert_close(by_name(X, torch.tensor([5.0]).double()), expected)
-    rows = torch.cat([X, 0 * X + 5.04], dim=-1)
-    torch.testing.assert_close(by_number(rows), expected)
-    assert by_name.name == "python" or by_name.name.startswith("python")
+    torch.testing.assert_close(by_number(torch.cat([X, 0 * X + 5.04], dim=-1)), expected)
+    assert by_name.name.startswith("python")
     X = torch.rand(4, 1, dtype=torch.float64)
-    assert torch.equal(SubprocessPhysics([*law, "{0}", "1"])(X)[:, 1:], X)
+    assert torch.equal(SubprocessPhysics([*law, "{0}", "1"])(X)[:, 1:], X)  # all digits
 
 
 def test_standard_input_and_parameters(law):
     program = "import sys; print('result:', 2 * float(sys.stdin.read().split('=')[1]))"
-    physics = SubprocessPhysics(
-        [sys.executable, "-c", program],
-        names=["T"],
-        stdin="T = {T}",
-        parse=lambda text: float(text.removeprefix("result:")),
-    )
+    parse = {"parse": lambda text: float(text.removeprefix("result:"))}
+    physics = SubprocessPhysics([*PYTHON, program], names=["T"], stdin="T = {T}", **parse)
     assert physics(torch.tensor([[1.5]]).double()).item() == 3.0
     one = {"names": ["t"], "parse": lambda text: float(text.split()[0])}
-    physics = SubprocessPhysics([*law, "{t}", "{k}"], unknowns={"k": Unknown(4.0, sd=1.0)}, **one)
-    t = 0.5 + line(3)
-    exact = FunctionPhysics(lambda X, p: p.k * X[:, 0] ** 2, unknowns={"k": Unknown(4.0, sd=1.0)})
-    parameters = torch.tensor([[4.905], [4.0]]).double()
+    physics = SubprocessPhysics([*law, "{t}", "{k}"], unknowns=K, **one)
+    exact = FunctionPhysics(lambda X, p: p.k * X[:, 0] ** 2, unknowns=K)
+    t, parameters = 0.5 + line(3), torch.tensor([[4.905], [4.0]]).double()
     torch.testing.assert_close(physics.or_nan(t, parameters), exact(t, parameters))
+
+
+PYTHON = [sys.executable, "-c"]
+REFUSED = [
+    (PhysicsError, "No such file or directory: 'no_such_program'", ["no_such_program", "{0}"], {}),
+    (PhysicsError, "could not convert string to float: 'do'", [*PYTHON, "print('do')"], {}),
+    (PhysicsError, r"expected a scalar or outputs.*found \(0,\)", [*PYTHON, ""], {}),
+    (PhysicsError, "names of all columns", ["prog", "{T}"], {"names": ["T", "p"]}),
+    (TypeError, r"shlex\.split", "prog {T}", {}),
+    (
+        ValueError,
+        r"are \['T'\]; expected inputs, which are names=\['t'\]",
+        ["prog", "{T}"],
+        {"names": ["t"]},
+    ),
+    (ValueError, "Single '{' encountered", ["prog", "{"], {}),
+    (ValueError, r"are \[\]; expected.* unknown parameter, \['k'\]", ["prog"], {"unknowns": K}),
+]
 
 
 def test_failures_and_bad_input(law):
@@ -65,20 +79,9 @@ def test_failures_and_bad_input(law):
         physics(torch.tensor([[1.0], [3.0]]).double())
     assert caught.value.rows == (1,)
     assert physics.or_nan(torch.tensor([[3.0], [1.0]]).double())[1].isfinite().all()
-    with pytest.raises(PhysicsError, match="No such file or directory: 'no_such_program'"):
-        SubprocessPhysics(["no_such_program", "{0}"])(line(1))
-    with pytest.raises(PhysicsError, match="could not convert string to float: 'done'"):
-        SubprocessPhysics([sys.executable, "-c", "print('done')"])(line(1))
-    refused(TypeError, r"shlex\.split", SubprocessPhysics, "prog {T}")
-    with pytest.raises(PhysicsError, match=r"expected a scalar or outputs.*found \(0,\)"):
-        SubprocessPhysics([sys.executable, "-c", ""])(line(1))
-    says = r"are \['T'\]; expected inputs, which are names=\['t'\]"
-    refused(ValueError, says, SubprocessPhysics, ["prog", "{T}"], names=["t"])
-    refused(ValueError, "Single '{' encountered", SubprocessPhysics, ["prog", "{"])
-    with pytest.raises(ValueError, match=r"are \[\]; expected.* unknown parameter, \['k'\]"):
-        SubprocessPhysics(["prog"], unknowns={"k": Unknown(4.0, sd=1.0)})
-    with pytest.raises(PhysicsError, match="names of all columns"):
-        SubprocessPhysics(["prog", "{T}"], names=["T"])(torch.zeros(1, 2).double())
+    for error, words, command, options in REFUSED:
+        with pytest.raises(error, match=words):
+            SubprocessPhysics(command, **options)(line(1))
 
 
 @pytest.mark.slow
@@ -109,6 +112,5 @@ def test_outputs_are_kept_on_disk(law, tmp_path):
     assert {file.suffix for file in files} == {".json"}
     files[0].write_text("{")  # as a machine that went down leaves it
     assert torch.equal(made()(X), expected)
-    with pytest.raises(PhysicsError):
-        made()(torch.tensor([[3.0]]).double())
+    refused(PhysicsError, "no solution", made(), torch.tensor([[3.0]]).double())
     assert len([*cache.iterdir()]) == 2  # a failure is not kept

@@ -20,7 +20,7 @@ from gpadjust.physics import (
     Unknown,
 )
 from gpadjust.physics.parameters import PhysicsParameters
-from tests.systems import refused
+from tests.systems import normal, refused
 
 A, B = Unknown(1.0, sd=0.5), Unknown(2.0, factor=1.5)
 
@@ -55,11 +55,12 @@ def numpy_wave(x, p):
     return np.stack([left, p.a * p.b + 0 * left], -1)
 
 
+AB = {"a": A, "b": B}
 MAKE = {
-    "function": lambda **o: FunctionPhysics(wave, unknowns={"a": A, "b": B}, **o),
-    "class": lambda **o: Wave(unknowns={"a": A, "b": B}, **o),
-    "black box": lambda **o: BlackBoxPhysics(numpy_wave, unknowns={"a": A, "b": B}, **o),
-    "rows": lambda **o: BlackBoxPhysics(numpy_wave, unknowns={"a": A, "b": B}, batched=False, **o),
+    "function": lambda **o: FunctionPhysics(wave, unknowns=AB, **o),
+    "class": lambda **o: Wave(unknowns=AB, **o),
+    "black box": lambda **o: BlackBoxPhysics(numpy_wave, unknowns=AB, **o),
+    "rows": lambda **o: BlackBoxPhysics(numpy_wave, unknowns=AB, batched=False, **o),
 }
 
 
@@ -179,63 +180,57 @@ def test_values_are_a_mapping_with_attributes():
     refused(AttributeError, "parameter 'drag'.*mass, length", getattr, values, "drag")
 
 
-class TestCalls:
-    def test_values_columns_and_precision(self, make, points):
-        X = points(3, 2)
-        torch.testing.assert_close(make()(X), wave_at(X, numbers(1.0, 2.0)))
-        X, values = points(4, 3), points(2, 2, seed=1)
-        found = make(inputs=[2, 0])(X, values)
-        torch.testing.assert_close(found, wave_at(X[:, [2, 0]], values))
-        X, values = points(4, 2).float(), points(2, 2, seed=1)
-        found = make()(X, values)
-        assert found.dtype == torch.float32
-        torch.testing.assert_close(found, wave_at(X, values.float()))
-
-    @pytest.mark.parametrize("lead", [(), (3,), (1,)], ids=str)
-    @pytest.mark.parametrize("batch", [(), (3,), (3, 1), (4, 3)], ids=str)
-    def test_shapes(self, make, points, lead, batch):
-        X, values = points(*batch, 5, 2), points(*lead, 2, seed=1)
-        expected = wave_at(X, values)
-        physics = make()
-        for _ in range(2):  # the second time it remembers them
-            found = physics(X, values)
-            assert found.shape == expected.shape
-            torch.testing.assert_close(found, expected)
-        torch.testing.assert_close(physics.or_nan(X, values), expected)
-
-    def test_equal_parameters_are_evaluated_once_and_other_shapes_refused(self, points):
-        asked = []
-
-        def record(X, p):
-            asked.append(len(X))
-            return wave(X, p)
-
-        physics = FunctionPhysics(record, unknowns={"a": A, "b": B})
-        X, values = points(5, 2), points(3, 2, seed=1)
-        found = physics(X.expand(4, 3, 5, 2), values)
-        torch.testing.assert_close(found, wave_at(X, values).expand(4, 3, 5, 2))
-        assert asked == [15]
-        says = r"has 2 unknown parameter\(s\) a, b; expected parameters of shape ... x 2, found"
-        for values in (torch.ones(3), torch.ones(()), 1.0):
-            refused(ValueError, says, MAKE["function"](), points(3, 2), values)
-        known = FunctionPhysics(torch.sin)
-        refused(ValueError, r"'sin' has 0 unknown", known, points(3, 2), torch.ones(2))
+def test_values_columns_and_precision(make):
+    X, values = normal(4, 3), normal(2, 2, seed=1)
+    torch.testing.assert_close(make()(X[:, :2]), wave_at(X[:, :2], numbers(1.0, 2.0)))
+    found = make(inputs=[2, 0])(X, values)
+    torch.testing.assert_close(found, wave_at(X[:, [2, 0]], values))
+    found = make()(X[:, :2].float(), values)
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found, wave_at(X[:, :2].float(), values.float()))
 
 
-class TestGradients:
-    def test_in_X(self, make, points):
-        X, values = points(3, 4, 2), points(3, 2, seed=1)
-        weights, leaf = points(3, 4, 2, seed=2), X.clone().requires_grad_()
-        physics = make()
-        torch.testing.assert_close(physics(leaf, values), wave_at(X, values))
-        (found,) = torch.autograd.grad((weights * physics(leaf, values)).sum(), leaf)
-        (expected,) = torch.autograd.grad((weights * wave_at(leaf, values)).sum(), leaf)
-        torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-7)
+@pytest.mark.parametrize("lead", [(), (3,), (1,)], ids=str)
+@pytest.mark.parametrize("batch", [(), (3,), (3, 1), (4, 3)], ids=str)
+def test_shapes(make, lead, batch):
+    X, values = normal(*batch, 5, 2), normal(*lead, 2, seed=1)
+    expected, physics = wave_at(X, values), make()
+    for _ in range(2):  # the second time it remembers them
+        found = physics(X, values)
+        assert found.shape == expected.shape
+        torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(physics.or_nan(X, values), expected)
 
-    @pytest.mark.parametrize("name", ["function", "class"])
-    def test_in_parameters(self, name, points):
-        X, values = points(4, 2), points(3, 2, seed=1).requires_grad_()
-        assert torch.autograd.gradcheck(lambda values: MAKE[name]()(X, values), values)
+
+def test_equal_parameters_are_evaluated_once_and_other_shapes_refused():
+    asked = []
+    physics = FunctionPhysics(lambda X, p: asked.append(len(X)) or wave(X, p), unknowns=AB)
+    X, values = normal(5, 2), normal(3, 2, seed=1)
+    found = physics(X.expand(4, 3, 5, 2), values)
+    torch.testing.assert_close(found, wave_at(X, values).expand(4, 3, 5, 2))
+    assert asked == [15]
+    says = r"has 2 unknown parameter\(s\) a, b; expected parameters of shape ... x 2, found"
+    for values in (torch.ones(3), torch.ones(()), 1.0):
+        refused(ValueError, says, physics, X, values)
+    refused(ValueError, r"'sin' has 0 unknown", FunctionPhysics(torch.sin), X, torch.ones(2))
+
+
+def test_gradients_in_X(make):
+    X, values = normal(3, 4, 2).requires_grad_(), normal(3, 2, seed=1)
+    weights = normal(3, 4, 2, seed=2)
+    outputs = make()(X, values), wave_at(X, values)
+    slopes = [torch.autograd.grad((weights * Y).sum(), X)[0] for Y in outputs]
+    torch.testing.assert_close(*slopes, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["function", "class"])
+def test_gradients_in_parameters_pickles_and_copies(name):
+    physics, X, values = MAKE[name](), normal(4, 2), normal(3, 2, seed=1).requires_grad_()
+    assert torch.autograd.gradcheck(lambda values: physics(X, values), values)
+    for again in (copy.deepcopy(physics), pickle.loads(pickle.dumps(physics)), copy.copy(physics)):
+        assert {**again.unknowns} == AB
+        torch.testing.assert_close(again(X, values), physics(X, values))
+    assert copy.deepcopy(physics) is physics
 
 
 def root(x, p):
@@ -260,75 +255,61 @@ ROOTS = {
 }
 
 
-class TestFailures:
-    @pytest.mark.parametrize("name", ["NaN", "rows"])
-    @pytest.mark.parametrize("grad", [False, True])
-    def test_name_rows_with_their_parameters(self, name, grad):
-        physics = ROOTS[name]()
-        X = numbers(1.0, 2.0).unsqueeze(-1).requires_grad_(grad)
-        with pytest.raises(PhysicsError) as caught:
-            physics(X, numbers(0.0, 1.5, 1.0).unsqueeze(-1))
-        assert caught.value.rows == (2,)
-        assert caught.value.inputs.tolist() == [[1.0, 1.5]]
-        with pytest.raises(PhysicsError) as caught:  # of X that is expanded, too
-            physics(X.expand(2, 2, 1), numbers(1.5))
-        assert caught.value.rows == (0, 2)
-
-    @pytest.mark.parametrize("name", ROOTS)
-    def test_or_nan(self, name):
-        physics, X = ROOTS[name](), numbers(1.0, 2.0, 3.0).unsqueeze(-1)
-        physics(X)
-        low = numbers(0.0, 1.5, 4.0, -1.0)
-        found = physics.or_nan(X, low.unsqueeze(-1)).squeeze(-1)
-        expected = (X.squeeze(-1) - low.unsqueeze(-1)).sqrt()
-        if name == "error":  # it does not say in which rows
-            expected[1] = torch.nan
-        torch.testing.assert_close(found, expected, equal_nan=True)
-        assert physics.or_nan(X, numbers(5.0)).isnan().all()
-        assert not physics.or_nan(X, numbers(0.5).expand(2, 1)).isnan().any()
-
-    def test_or_nan_of_nothing_else_runs_a_simulation_once(self):
-        X = numbers(1.0).unsqueeze(-1)
-        assert ROOTS["NaN"]().or_nan(X, numbers(2.0)).isnan().all()  # its shape is known
-        for name in ("error", "rows"):
-            both = numbers(2.0, 3.0).unsqueeze(-1)
-            refused(PhysicsError, "below zero", ROOTS[name]().or_nan, X, both)
-        no_tensor = FunctionPhysics(lambda X, p: [1.0], unknowns=LOW)
-        args = torch.ones(2, 1), torch.zeros(1)
-        refused(PhysicsError, "list, expected a real tensor", no_tensor.or_nan, *args)
-        asked = []
-
-        def simulate(x, p):
-            asked.append((x[0], float(p.low)))
-            return root(x, p)
-
-        physics = BlackBoxPhysics(simulate, unknowns=LOW, batched=False)
-        physics.or_nan(numbers(1.0, 2.0).unsqueeze(-1), numbers(0.0, 1.5).unsqueeze(-1))
-        assert asked == [(1.0, 0.0), (2.0, 0.0), (1.0, 1.5), (2.0, 1.5)]
+@pytest.mark.parametrize("name", ["NaN", "rows"])
+@pytest.mark.parametrize("grad", [False, True])
+def test_failures_name_rows_with_their_parameters(name, grad):
+    physics = ROOTS[name]()
+    X = numbers(1.0, 2.0).unsqueeze(-1).requires_grad_(grad)
+    with pytest.raises(PhysicsError) as caught:
+        physics(X, numbers(0.0, 1.5, 1.0).unsqueeze(-1))
+    assert caught.value.rows == (2,)
+    assert caught.value.inputs.tolist() == [[1.0, 1.5]]
+    with pytest.raises(PhysicsError) as caught:  # of X that is expanded, too
+        physics(X.expand(2, 2, 1), numbers(1.5))
+    assert caught.value.rows == (0, 2)
 
 
-@pytest.mark.parametrize("name", ["function", "class"])
-def test_pickles_and_copies(name, points):
-    physics, X, values = MAKE[name](), points(3, 2), points(2, 2, seed=1)
-    expected = physics(X, values)
-    for again in (copy.deepcopy(physics), pickle.loads(pickle.dumps(physics)), copy.copy(physics)):
-        assert {**again.unknowns} == {"a": A, "b": B}
-        torch.testing.assert_close(again(X, values), expected)
-    assert copy.deepcopy(physics) is physics
+@pytest.mark.parametrize("name", ROOTS)
+def test_or_nan(name):
+    physics, X = ROOTS[name](), numbers(1.0, 2.0, 3.0).unsqueeze(-1)
+    physics(X)
+    low = numbers(0.0, 1.5, 4.0, -1.0)
+    found = physics.or_nan(X, low.unsqueeze(-1)).squeeze(-1)
+    expected = (X.squeeze(-1) - low.unsqueeze(-1)).sqrt()
+    if name == "error":  # it does not say in which rows
+        expected[1] = torch.nan
+    torch.testing.assert_close(found, expected, equal_nan=True)
+    assert physics.or_nan(X, numbers(5.0)).isnan().all()
+    assert not physics.or_nan(X, numbers(0.5).expand(2, 1)).isnan().any()
+
+
+def test_or_nan_of_nothing_else_runs_a_simulation_once():
+    X = numbers(1.0).unsqueeze(-1)
+    assert ROOTS["NaN"]().or_nan(X, numbers(2.0)).isnan().all()  # its shape is known
+    for name in ("error", "rows"):
+        both = numbers(2.0, 3.0).unsqueeze(-1)
+        refused(PhysicsError, "below zero", ROOTS[name]().or_nan, X, both)
+    no_tensor = FunctionPhysics(lambda X, p: [1.0], unknowns=LOW)
+    args = torch.ones(2, 1), torch.zeros(1)
+    refused(PhysicsError, "list, expected a real tensor", no_tensor.or_nan, *args)
+    asked = []
+
+    def simulate(x, p):
+        asked.append((x[0], float(p.low)))
+        return root(x, p)
+
+    physics = BlackBoxPhysics(simulate, unknowns=LOW, batched=False)
+    physics.or_nan(numbers(1.0, 2.0).unsqueeze(-1), numbers(0.0, 1.5).unsqueeze(-1))
+    assert asked == [(1.0, 0.0), (2.0, 0.0), (1.0, 1.5), (2.0, 1.5)]
 
 
 def test_a_function_that_takes_other_arguments_is_told_what_it_is_called_with():
-    X = torch.ones(2, 1, dtype=torch.float64)
-    without = FunctionPhysics(lambda X: X[:, 0], unknowns={"a": Unknown(1.0, sd=1.0)})
-    refused(PhysicsError, r"takes 1 positional.*with unknowns=\['a'\]", without, X)
-    refused(
-        PhysicsError,
-        r"missing 1.*with unknowns=\[\]",
-        FunctionPhysics(lambda X, p: p.a * X[:, 0]),
-        X,
-    )
-    misspelt = FunctionPhysics(lambda X, p: p.b * X[:, 0], unknowns={"a": Unknown(1.0, sd=1.0)})
-    refused(PhysicsError, r"parameter 'b'; expected one of a\.", misspelt, X)
+    for function, unknowns, says in (
+        (lambda X: X[:, 0], {"a": A}, r"takes 1 positional.*with unknowns=\['a'\]"),
+        (lambda X, p: p.a * X[:, 0], {}, r"missing 1.*with unknowns=\[\]"),
+        (lambda X, p: p.b * X[:, 0], {"a": A}, r"parameter 'b'; expected one of a\."),
+    ):
+        refused(PhysicsError, says, FunctionPhysics(function, unknowns=unknowns), normal(2, 1))
 
 
 @pytest.mark.parametrize(

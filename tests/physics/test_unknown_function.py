@@ -17,7 +17,7 @@ from gpadjust.physics import (
     Unknown,
 )
 from gpadjust.states import StateSpec
-from tests.systems import normal, uniform
+from tests.systems import normal, refused, uniform
 
 OVER = {"function_of": "abs(v)", "between": (0.0, 6.0)}
 PRIORS = {
@@ -43,11 +43,13 @@ def test_at_each_point_it_has_its_prior(prior):
     """Also between the knots, and beyond their range."""
     unknowns = FunctionPhysics(by_torch, unknowns={"friction": PRIORS[prior]}).unknowns
     z = normal(4000, len(unknowns))
-    draws = PhysicsParameters(unknowns, unknowns.at(z).unbind(-1))
+    draws = PhysicsParameters(unknowns, unknowns.to_values(z).unbind(-1))
     coordinates = PRIORS[prior].coordinate(draws.friction(torch.tensor([0.0, 3.3, 4.0, 50.0])))
     torch.testing.assert_close(coordinates.mean(0), torch.zeros(4).double(), atol=0.06, rtol=0)
     torch.testing.assert_close(coordinates.std(0), torch.ones(4).double(), atol=0.06, rtol=0)
-    torch.testing.assert_close(unknowns.coordinates(unknowns.at(z)), z, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(
+        unknowns.to_coordinates(unknowns.to_values(z)), z, rtol=1e-6, atol=1e-6
+    )
 
 
 def test_between_the_knots_it_is_a_gaussian_process():
@@ -74,7 +76,7 @@ def test_between_the_knots_it_is_a_gaussian_process():
 
 def test_formulas_and_functions_of_torch_and_numpy_read_the_same():
     X = torch.tensor([[2.0, 1.0], [-2.5, 1.0], [20.0, 0.5]]).double()
-    values = FORMULA.unknowns.at(normal(4, len(FORMULA.unknowns)))
+    values = FORMULA.unknowns.to_values(normal(4, len(FORMULA.unknowns)))
     expected = FORMULA(X, values)
     for physics in (
         FunctionPhysics(by_torch, unknowns=UNKNOWNS),
@@ -89,13 +91,13 @@ def test_formulas_and_functions_of_torch_and_numpy_read_the_same():
 
 def test_its_slope_is_that_of_autograd():
     X = torch.tensor([[2.0, 1.0], [3.3, 1.0]]).double().requires_grad_()
-    values = FORMULA.unknowns.at(normal(len(FORMULA.unknowns)))
+    values = FORMULA.unknowns.to_values(normal(len(FORMULA.unknowns)))
     assert torch.autograd.gradcheck(lambda X: FORMULA(X, values), X)
 
 
 def test_values_are_of_the_knots_in_tables_and_curves_by_name():
     unknowns = FORMULA.unknowns
-    parameters = PhysicsParameters(unknowns, unknowns.at(normal(9, 14)).unbind(-1))
+    parameters = PhysicsParameters(unknowns, unknowns.to_values(normal(9, 14)).unbind(-1))
     again = pickle.loads(pickle.dumps(parameters))
     torch.testing.assert_close(again.friction(2.0)[:, 0], parameters["friction(2)"])
     near = Unknown(1.0, sd=0.1, function_of="v", between=(1e5, 1e5 + 1))
@@ -163,25 +165,24 @@ def test_least_squares_find_it():
     assert width < 0.05
 
 
-TABLE = [
-    ({"function_of": "v"}, "Expected of a function its variable and the range"),
+V = {"function_of": "v"}
+REFUSED = [
+    (V, "Expected of a function its variable and the range"),
     ({"between": (0.0, 1.0)}, "Expected of a function its variable and the range"),
-    ({"function_of": "v", "between": (1.0, 1.0)}, "the range of that"),
-    ({"function_of": "v", "between": (0.0, float("inf"))}, "the range of that"),
-    ({"function_of": "v", "between": (0, 1, 2)}, r"between as two numbers.*found \(0, 1, 2\)"),
-    ({"function_of": "v", "between": "01"}, "between as two numbers.*found '01'"),
+    ({**V, "between": (1.0, 1.0)}, "the range of that"),
+    ({**V, "between": (0.0, float("inf"))}, "the range of that"),
+    ({**V, "between": (0, 1, 2)}, r"between as two numbers.*found \(0, 1, 2\)"),
+    ({**V, "between": "01"}, "between as two numbers.*found '01'"),
     ({**OVER, "lengthscale": 0.1}, "0.05 of the range or more, found 0.1 of 6"),
     ({**OVER, "lengthscale": -1.0}, "lengthscale"),
 ]
 
 
 def test_bad_input_is_refused_with_the_way_out():
-    for options, words in TABLE:
-        with pytest.raises(ValueError, match=words):
-            Unknown(0.3, sd=0.1, **options)
-    with pytest.raises(TypeError, match="the name of a variable"):
-        Unknown(0.3, sd=0.1, function_of=3, between=(0.0, 1.0))
+    for options, words in REFUSED:
+        refused(ValueError, words, Unknown, 0.3, sd=0.1, **options)
+    refused(TypeError, "the name of a variable", Unknown, 0.3, sd=0.1, function_of=3)
     for variable in ("speed", "friction", "v +"):
         unknowns = {"friction": Unknown(0.3, sd=0.1, function_of=variable, between=(0.0, 1.0))}
-        with pytest.raises(ValueError, match=r"expected one of v, u|Expected a formula"):
-            FormulaPhysics("u - friction", ["v", "u"], unknowns=unknowns)
+        words = r"expected one of v, u|Expected a formula"
+        refused(ValueError, words, FormulaPhysics, "u - friction", ["v", "u"], unknowns=unknowns)

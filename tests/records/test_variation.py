@@ -7,7 +7,7 @@ import torch
 
 from gpadjust import CalibratedPhysics
 from gpadjust.dynamics import LearnedDynamics, StateSpec
-from gpadjust.dynamics.learned_dynamics import varying_parameters
+from gpadjust.dynamics.physics_dynamics import varying_parameters
 from gpadjust.physics import ODEPhysics, Unknown
 from gpadjust.physics.parameters import PhysicsParameters
 from gpadjust.records import Record, Records, smooth

@@ -18,6 +18,11 @@ from tests.point import assert_equal
 COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
+def taken(given, kind):
+    """Those of the given options that are fields of a class; they are removed."""
+    return {e.name: given.pop(e.name) for e in fields(kind) if e.name in given}
+
+
 @pytest.fixture
 def point_agent(point_env, point_task):
     """Makes an agent for the point; parts of the task, options and arguments can be given.
@@ -26,21 +31,11 @@ def point_agent(point_env, point_task):
     """
 
     def make(env=None, algorithm=DynaSAC, **given):
-        def taken(kind, **defaults):
-            names = {entry.name for entry in fields(kind)} & {*given}
-            return {**defaults, **{name: given.pop(name) for name in names}}
-
-        task = given.pop("task", None) or point_task(**taken(Task))
+        task = given.pop("task", None) or point_task(**taken(given, Task))
         few = {"model_episodes": 2, "updates_per_model_step": 0.2, "score_horizons": ()}
-        options = DynaOptions(**taken(DynaOptions, **few))
-        defaults = {
-            "policy": "MlpPolicy",
-            "batch_size": 8,
-            "buffer_size": 500,
-            "policy_kwargs": {"net_arch": [8]},
-            "device": "cpu",
-            "seed": 0,
-        }
+        options = DynaOptions(**{**few, **taken(given, DynaOptions)})
+        defaults = {"policy": "MlpPolicy", "policy_kwargs": {"net_arch": [8]}, "batch_size": 8}
+        defaults |= {"buffer_size": 500, "device": "cpu", "seed": 0}
         env = point_env() if env is None else env
         return algorithm(env=env, task=task, options=options, **{**defaults, **given})
 
@@ -97,9 +92,8 @@ def point_particles(point_env, point_task):
 
     def make(num_envs=3, start=1.0, **given):
         env = point_env()
-        parts = {entry.name for entry in fields(Task)} & {*given}
         starts = {"initial_states": lambda n: torch.full((n, 1), start)}
-        task = point_task(**{**starts, **{name: given.pop(name) for name in parts}})
+        task = point_task(**{**starts, **taken(given, Task)})
         names = ("observation_space", "action_space")
         spaces = (given.pop(name, getattr(env, name)) for name in names)
         return ModelVecEnv(task, num_envs, *spaces, **given)

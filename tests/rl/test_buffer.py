@@ -10,6 +10,8 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from gpadjust.rl import MixedReplayBuffer
+from tests.point import assert_equal
+from tests.rl.conftest import COLUMNS
 
 OBSERVATIONS = spaces.Box(-np.inf, np.inf, (2,))
 ACTIONS = spaces.Box(-1, 1, (1,))
@@ -46,7 +48,7 @@ def rows(values):
 )
 def test_batches_hold_the_promised_share(buffer, batch_size, fraction):
     np.random.seed(0)  # noqa: NPY002 - the generator that SB3 uses
-    made = buffer(20, 20, real_fraction=fraction)
+    made = buffer(20, 20, n_envs=2, real_fraction=fraction)
     counts = [int((made.sample(batch_size).rewards > 0).sum()) for _ in range(400)]
     expected = batch_size * fraction
     assert set(counts) == {int(np.floor(expected)), int(np.ceil(expected))}
@@ -64,14 +66,11 @@ def test_a_sample_is_a_whole_row(buffer):
         np.testing.assert_allclose(part, expected, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("num_real", "num_model", "mix", "sign"),
-    [(5, 0, True, 1), (0, 5, True, -1), (5, 5, False, 1), (5, 0, False, 1)],
-)
-def test_one_buffer_serves_where_the_other_does_not(buffer, num_real, num_model, mix, sign):
-    made = buffer(num_real, num_model, real_fraction=0.5)
-    made.mix = mix
-    assert (made.sample(16).rewards * sign > 0).all()
+def test_one_buffer_serves_where_the_other_does_not(buffer):
+    for num_real, num_model, mix, sign in ((5, 0, True, 1), (0, 5, True, -1), (5, 5, False, 1)):
+        made = buffer(num_real, num_model, real_fraction=0.5)
+        made.mix = mix
+        assert (made.sample(16).rewards * sign > 0).all()
 
 
 def test_terminations_by_the_time_limit_are_not_dones(buffer):
@@ -85,7 +84,7 @@ def test_terminations_by_the_time_limit_are_not_dones(buffer):
 
 @pytest.mark.parametrize("chunks", [[3, 4], [7, 2, 5], [10], [4, 10], [3, 23], [25, 1], [0, 2]])
 def test_add_rows_keeps_the_newest_rows_in_order(buffer, chunks):
-    mixed, one = buffer(model_buffer_size=10), buffer(buffer_size=10)
+    mixed, one = buffer(buffer_size=10), buffer(buffer_size=10)
     many = mixed.model_buffer
     start = 1
     for size in chunks:
@@ -97,44 +96,27 @@ def test_add_rows_keeps_the_newest_rows_in_order(buffer, chunks):
     def in_order(buffer):
         first = buffer.pos if buffer.full else 0
         places = (first + np.arange(buffer.size())) % buffer.buffer_size
-        return {
-            name: getattr(buffer, name)[places, 0].tolist()
-            for name in ("observations", "next_observations", "actions", "rewards", "dones")
-        }
+        return [getattr(buffer, name)[places, 0].tolist() for name in COLUMNS]
 
     assert many.size() == one.size()
     assert in_order(many) == in_order(one)
-
-
-def test_extend_is_that_of_stable_baselines(buffer):
-    made = buffer()
-    steps = [real_row(i) for i in range(1, 4)]
-    made.extend(*zip(*steps, strict=True))
-    assert made.size() == 3
-    np.testing.assert_array_equal(made.rewards[:3, 0], [1, 2, 3])
-
-
-def test_several_real_environments(buffer):
-    made = buffer(6, 6, n_envs=2, buffer_size=20, real_fraction=0.5)
-    assert made.model_buffer.n_envs == 1
-    assert int((made.sample(10).rewards > 0).sum()) == 5
+    one.add_model_rows(*rows(np.arange(3)))
+    one.reset()
+    assert one.size() == one.model_buffer.size() == len(one.episodes) == 0
 
 
 @pytest.mark.parametrize("num_rows", [0, 4, 50, 70])
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda made: pickle.loads(pickle.dumps(made))])
 def test_a_copy_goes_on_as_the_buffer_would(buffer, num_rows, copied):
     made = buffer(num_rows, num_rows, real_fraction=0.3)
-    again = copied(made)
-    for side in (made, again):
+    content = []
+    for side in (made, copied(made)):
         side.add(*real_row(99))
         side.add_model_rows(*rows(np.array([-98, -99])))
         np.random.seed(1)  # noqa: NPY002
-        side.batch = side.sample(40)
-    for one, other in zip(made.batch[:-1], again.batch[:-1], strict=True):
-        np.testing.assert_array_equal(one, other)
-    for one, other in [(made, again), (made.model_buffer, again.model_buffer)]:
-        assert (one.pos, one.full) == (other.pos, other.full)
-        np.testing.assert_array_equal(one.observations, other.observations)
+        parts = [(each.pos, each.full, each.observations) for each in (side, side.model_buffer)]
+        content.append([*side.sample(40)[:-1], parts])
+    assert_equal(*content)
 
 
 def test_samples_are_normalised(buffer, point_env):
@@ -147,18 +129,10 @@ def test_samples_are_normalised(buffer, point_env):
     plain = made.sample(20)
     np.random.seed(2)  # noqa: NPY002
     batch = made.sample(20, normalizer)
-    shift = np.array([1.0, 2.0])
-    np.testing.assert_allclose(batch.observations, (plain.observations - shift) / 2, rtol=1e-4)
-    np.testing.assert_allclose(
-        batch.next_observations, (plain.next_observations - shift) / 2, rtol=1e-4
-    )
+    for name in ("observations", "next_observations"):
+        expected = (getattr(plain, name) - np.array([1.0, 2.0])) / 2
+        np.testing.assert_allclose(getattr(batch, name), expected, rtol=1e-4)
     np.testing.assert_allclose(batch.rewards, plain.rewards / 10, rtol=1e-4)
-
-
-def test_reset_empties_both(buffer):
-    made = buffer(5, 5)
-    made.reset()
-    assert made.size() == made.model_buffer.size() == len(made.episodes) == 0
 
 
 # Real episodes

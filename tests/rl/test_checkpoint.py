@@ -9,14 +9,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 
 from gpadjust import systems
 from gpadjust.control import EpisodeCheckpoint, resume
-from gpadjust.rl import DynaOptions, DynaSAC, DynaTD3
-from tests.point import (
-    PowerCut,
-    Shouting,
-    forbid_unpickling,
-    robot,
-    scramble,
-)
+from gpadjust.rl import DynaSAC, DynaTD3
+from tests.point import PowerCut, Shouting, forbid_unpickling, robot, scramble
 
 TOTAL = 20  # four episodes of the point
 
@@ -49,39 +43,43 @@ def go_on(agent, *callbacks):
     return agent.learn(TOTAL - agent.num_timesteps, [*callbacks], reset_num_timesteps=False)
 
 
+@pytest.fixture
+def interrupted(assert_same, tmp_path):
+    """Asserts that a run that is cut at a step ends as one that is not; from where it goes on."""
+
+    def check(agent, resumed, step, total=TOTAL):
+        path, whole = tmp_path / "run.ckpt", agent().learn(total)
+        with pytest.raises(PowerCut):
+            agent().learn(total, [EpisodeCheckpoint(path), CutAt(step)])
+        scramble()
+        second = resumed(path)
+        start = second.num_timesteps
+        scramble()
+        second.learn(total - start, [EpisodeCheckpoint(path)], reset_num_timesteps=False)
+        assert_same(whole, second)
+        assert_same(whole, resumed(path))
+        return start
+
+    return check
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("dynamics", "step", "layers"),
-    [
-        ("point_dynamics", 6, ("normalised",)),
-        ("sampled_dynamics", 13, ("monitored", "normalised")),
-        pytest.param("sampled_dynamics", 13, (), marks=pytest.mark.slow),
-        pytest.param("point_dynamics", 6, (), marks=pytest.mark.slow),
-        pytest.param("point_dynamics", 6, ("monitored", "normalised"), marks=pytest.mark.slow),
-        pytest.param("sampled_dynamics", 13, ("normalised",), marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize("layers", [("normalised",), ("monitored", "normalised"), ()])
+@pytest.mark.parametrize("learns", [False, True])
 def test_a_run_that_was_interrupted_ends_as_one_that_was_not(
-    request, dynamics, layers, step, point_agent, point_task, wrapped, assert_same, tmp_path
+    point_dynamics, sampled_dynamics, layers, learns, point_agent, point_task, wrapped, interrupted
 ):
-    def known():
-        found = request.getfixturevalue(dynamics)
-        return found() if callable(found) else found
+    def parts():
+        return {"dynamics": sampled_dynamics() if learns else point_dynamics}
 
     def agent():
-        return point_agent(wrapped(layers), dynamics=known(), updates_per_model_step=0.7)
+        return point_agent(wrapped(layers), **parts(), updates_per_model_step=0.7)
 
-    path, whole = tmp_path / "run.ckpt", agent().learn(TOTAL)
-    with pytest.raises(PowerCut):
-        agent().learn(TOTAL, [EpisodeCheckpoint(path), CutAt(step)])
-    scramble()
-    second = resume(path, wrapped(layers), point_task(dynamics=known()))
-    assert second.num_timesteps == step // 5 * 5
-    scramble()
-    go_on(second, EpisodeCheckpoint(path))
-    assert_same(whole, second)
-    last = resume(path, wrapped(layers), point_task(dynamics=known()))
-    assert_same(whole, last)
+    def resumed(path):
+        return resume(path, wrapped(layers), point_task(**parts()))
+
+    step = 13 if learns else 6
+    assert interrupted(agent, resumed, step) == step // 5 * 5
 
 
 def test_many_interruptions(point_agent, point_task, point_env, assert_same, tmp_path):
@@ -96,19 +94,38 @@ def test_many_interruptions(point_agent, point_task, point_env, assert_same, tmp
     assert_same(whole, go_on(agent))
 
 
-def test_steps_in_the_middle_of_episodes(point_agent, point_task, point_env, assert_same, tmp_path):
-    def env():
-        return DummyVecEnv([point_env, point_env])
+def test_steps_in_the_middle_of_episodes(point_agent, point_task, point_env, interrupted):
+    def agent():
+        return point_agent(DummyVecEnv([point_env, point_env]), train_freq=(3, "step"))
 
-    path = tmp_path / "run.ckpt"
-    whole = point_agent(env(), train_freq=(3, "step")).learn(TOTAL + 4)
-    agent = point_agent(env(), train_freq=(3, "step"))
-    with pytest.raises(PowerCut):
-        agent.learn(TOTAL + 4, [EpisodeCheckpoint(path), CutAt(16)])
-    agent = resume(path, env(), point_task())
-    assert agent.num_timesteps == 12
-    agent.learn(TOTAL + 4 - 12, reset_num_timesteps=False)
-    assert_same(whole, agent)
+    def resumed(path):
+        return resume(path, DummyVecEnv([point_env, point_env]), point_task())
+
+    assert interrupted(agent, resumed, 16, TOTAL + 4) == 12
+
+
+def test_td3_goes_on(point_agent, point_env, point_task, interrupted):
+    def agent():
+        noise = OrnsteinUhlenbeckActionNoise(np.zeros(1), np.full(1, 0.3))
+        return point_agent(algorithm=DynaTD3, action_noise=noise, train_freq=(3, "step"))
+
+    def resumed(path):
+        return resume(path, point_env(), point_task(), DynaTD3)
+
+    assert interrupted(agent, resumed, 14, TOTAL + 1) % 5  # within an episode
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sampling", ["step", "trajectory"])
+def test_cart_pole_of_co_kriging(sampling, cart_pole, point_agent, interrupted):
+    def parts():
+        return VecNormalize(DummyVecEnv([cart_pole])), systems.cart_pole().task()
+
+    def agent():
+        env, task = parts()
+        return point_agent(env, task=task, sampling=sampling, updates_per_model_step=1)
+
+    assert interrupted(agent, lambda path: resume(path, *parts()), 88, 100) == 75
 
 
 def test_a_refused_call_does_not_spend_the_generators(
@@ -155,52 +172,8 @@ def test_what_does_not_fit_is_refused_before_anything_is_unpickled(
     for file, env, algorithm, message in [
         (path, Shouting(point_env()), DynaSAC, "DummyVecEnv of StepGuard of Monitor of Shout"),
         (path, wrapped(["normalised"]), DynaSAC, "environment is"),
-        (
-            path,
-            point_env(),
-            DynaTD3,
-            "of another run: agent is .*:DynaSAC in .*:DynaTD3 here",
-        ),
+        (path, point_env(), DynaTD3, "of another run: agent is .*:DynaSAC in .*:DynaTD3 here"),
         (tmp_path / "two", point_env(), DynaSAC, "num_envs is 2 in the checkpoint, 1 here"),
     ]:
         with pytest.raises(ValueError, match=message):
             resume(file, env, point_task(), algorithm)
-
-
-def test_td3_goes_on(point_agent, point_env, point_task, assert_same, tmp_path):
-    def agent():
-        noise = OrnsteinUhlenbeckActionNoise(np.zeros(1), np.full(1, 0.3))
-        return point_agent(algorithm=DynaTD3, action_noise=noise, train_freq=(3, "step"))
-
-    path, whole = tmp_path / "run.ckpt", agent().learn(TOTAL + 1)
-    with pytest.raises(PowerCut):
-        agent().learn(TOTAL + 1, [EpisodeCheckpoint(path), CutAt(14)])
-    scramble()
-    second = resume(path, point_env(), point_task(), DynaTD3)
-    assert second.num_timesteps % 5  # within an episode
-    second.learn(TOTAL + 1 - second.num_timesteps, reset_num_timesteps=False)
-    assert_same(whole, second)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sampling", ["step", "trajectory"])
-def test_cart_pole_of_co_kriging(sampling, cart_pole, assert_same, tmp_path):
-    path = tmp_path / "run.ckpt"
-
-    def task():
-        return systems.cart_pole().task()
-
-    def agent():
-        return DynaSAC(
-            "MlpPolicy", VecNormalize(DummyVecEnv([cart_pole])), task(),
-            DynaOptions(model_episodes=2, sampling=sampling), batch_size=8, seed=0,
-            policy_kwargs={"net_arch": [8]}, device="cpu",
-        )  # fmt: skip
-
-    whole = agent().learn(100)
-    with pytest.raises(PowerCut):
-        agent().learn(100, [EpisodeCheckpoint(path), CutAt(88)])
-    scramble()
-    rest = resume(path, VecNormalize(DummyVecEnv([cart_pole])), task())
-    assert rest.num_timesteps == 75
-    assert_same(whole, rest.learn(25, reset_num_timesteps=False))

@@ -16,29 +16,15 @@ from tests.rl.conftest import COLUMNS, model_rows
 def test_one_that_never_uses_its_model_is_the_learner(point_agent, point_env, normalised):
     for algorithm, learner, noisy in [(DynaSAC, SAC, False), (DynaTD3, TD3, True)]:
         noise = NormalActionNoise(np.zeros(1), np.full(1, 0.3)) if noisy else None
-        shared = {
-            "batch_size": 8,
-            "buffer_size": 500,
-            "learning_starts": 3,
-            "train_freq": (1, "episode"),
-            "gradient_steps": -1,
-            "policy_kwargs": {"net_arch": [8]},
-            "action_noise": noise,
-            "device": "cpu",
-            "seed": 0,
-        }
+        shared = {"learning_starts": 3, "train_freq": (1, "episode"), "gradient_steps": -1}
+        shared |= {"batch_size": 8, "buffer_size": 500, "action_noise": noise, "seed": 0}
+        shared |= {"policy_kwargs": {"net_arch": [8]}, "device": "cpu"}
         ours = point_agent(normalised(), algorithm, last_model_episode=0, **shared).learn(25)
         theirs = learner("MlpPolicy", normalised(), **shared).learn(25)
         assert ours._n_updates == theirs._n_updates == 25
-        pairs = zip(
-            ours.policy.state_dict().items(), theirs.policy.state_dict().items(), strict=True
-        )
-        for (name, weights), (other, expected) in pairs:
-            assert name == other
-            assert torch.equal(weights, expected), name
-        for name in COLUMNS:
-            one, other = (getattr(agent.replay_buffer, name) for agent in (ours, theirs))
-            np.testing.assert_array_equal(one, other)
+        assert_equal(ours.policy.state_dict(), theirs.policy.state_dict())
+        buffers = ours.replay_buffer, theirs.replay_buffer
+        assert_equal(*([getattr(each, name) for name in COLUMNS] for each in buffers))
         assert model_rows(ours) == 0
 
 

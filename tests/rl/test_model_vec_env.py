@@ -41,36 +41,6 @@ def test_perfect_physics_are_the_real_environment(cart_pole, cart_pole_dynamics)
         np.testing.assert_array_equal(seen[-1][i], seen[0][i])
 
 
-def test_one_call_of_the_model_moves_all_particles(point_particles, point_dynamics, rise):
-    calls = []
-    step = point_dynamics.sample
-    point_dynamics.sample = lambda *args: calls.append(len(args[0])) or step(*args)
-    particles = point_particles(num_envs=7)
-    particles.reset()
-    particles.step(rise(7))
-    assert calls == [7]
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_observations_have_the_type_of_the_space(point_particles, dtype, rise):
-    space = spaces.Box(-np.inf, np.inf, (1,), dtype)
-    particles = point_particles(observation_space=space)
-    assert particles.reset().dtype == dtype
-    obs, rewards, dones, _ = particles.step(rise(3))
-    assert (obs.dtype, rewards.dtype, dones.dtype) == (dtype, np.float32, bool)
-
-
-def test_soft_actor_critic_learns_in_it(point_particles):
-    env = VecMonitor(point_particles())
-    agent = SAC(
-        "MlpPolicy", env, learning_starts=6, batch_size=8, policy_kwargs={"net_arch": [8]}, seed=0
-    )
-    agent.learn(30)
-    assert agent._n_updates > 0
-    assert [info["l"] for info in agent.ep_info_buffer] == [5] * 6
-    assert np.isfinite([info["r"] for info in agent.ep_info_buffer]).all()
-
-
 LEARNERS = {
     "SAC": partial(SAC, learning_starts=64, train_freq=8, gradient_steps=8, learning_rate=3e-3),
     "PPO": partial(PPO, n_steps=64, batch_size=64, learning_rate=3e-3),
@@ -107,14 +77,25 @@ def test_leaving_the_bounds_is_not_learnt(point_particles, learner, task):
     assert total > (9 if survival else -14)
 
 
-def test_seed_repeats_what_particles_meet(point_particles, rise):
-    def rewards():
-        particles = point_particles(initial_states=lambda n: torch.rand(n, 1))
-        particles.seed(7)
-        particles.reset()
-        return particles.step(rise(3))[1]
+def moved(particles, *actions):
+    """Reset particles, and step them by an action each."""
+    particles.reset()
+    return particles.step(np.array(actions, dtype=np.float32)[:, None])
 
-    np.testing.assert_array_equal(rewards(), rewards())
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_one_call_of_the_model_moves_all_particles(point_particles, point_dynamics, dtype):
+    calls = []
+    step = point_dynamics.sample
+    point_dynamics.sample = lambda *args: calls.append(len(args[0])) or step(*args)
+    particles = point_particles(observation_space=spaces.Box(-np.inf, np.inf, (1,), dtype))
+    assert particles.reset().dtype == dtype
+    obs, rewards, dones, _ = moved(particles, 1, 1, 1)
+    assert calls == [3]
+    assert (obs.dtype, rewards.dtype, dones.dtype) == (dtype, np.float32, bool)
+
+
+# Sampling
 
 
 @pytest.fixture
@@ -126,60 +107,52 @@ def unsure_dynamics(point_dynamics):
     return dynamics
 
 
-def test_particles_of_functions_meet_the_same_twice(point_particles, unsure_dynamics, rise):
-    particles = point_particles(
-        num_envs=2, episode_length=1, dynamics=unsure_dynamics, sampling="trajectory"
-    )
-    particles.reset()
-    first, second = (particles.step(2 * rise(2))[1] for _ in range(2))
-    np.testing.assert_allclose(first, second, rtol=1e-6)
+@pytest.mark.parametrize("sampling", ["step", "trajectory"])
+def test_particles_follow_functions_or_draws(point_particles, unsure_dynamics, sampling):
+    given = {"dynamics": unsure_dynamics, "sampling": sampling, "episode_length": 1}
+    particles = point_particles(num_envs=2, **given)
+    first = moved(particles, 2, 2)[1]
+    second = particles.step(np.full((2, 1), 2, dtype=np.float32))[1]
+    np.testing.assert_equal(np.isclose(first, second, rtol=1e-6), sampling == "trajectory")
     assert first[0] != first[1]
-    particles.reset()
-    assert (particles.step(2 * rise(2))[1] != first).all()
+    assert (moved(particles, 2, 2)[1] != first).all()
+    rewards = []
+    for again in (point_particles(num_envs=2, **given) for _ in range(2)):
+        again.seed(7)
+        rewards.append(moved(again, 2, 2)[1])
+    np.testing.assert_array_equal(*rewards)
 
 
-def test_independent_particles_do_not(point_particles, unsure_dynamics, rise):
-    particles = point_particles(num_envs=2, episode_length=1, dynamics=unsure_dynamics)
-    particles.reset()
-    first, second = (particles.step(2 * rise(2))[1] for _ in range(2))
-    assert (first != second).all()
+# Ends of episodes
 
 
-def test_termination_ends_an_episode(point_particles, rise):
+def test_termination_ends_an_episode(point_particles):
     particles = point_particles(num_envs=2, terminated=lambda states: states[:, 0] > 1.7)
-    particles.reset()
-    _, _, dones, _ = particles.step(rise(2))
-    assert not dones.any()
+    assert not moved(particles, 1, 1)[2].any()
     obs, rewards, dones, infos = particles.step(np.array([[1.0], [0.0]], dtype=np.float32))
     assert dones.tolist() == [True, False]
     assert not infos[0]["TimeLimit.truncated"]
     assert infos[0]["terminal_observation"].tolist() == [2.0]
     assert obs[:, 0].tolist() == [1.0, 1.5]
     assert rewards.tolist() == [-4.0, -2.25]
-
-
-def test_a_termination_at_the_time_limit_is_no_truncation(point_particles, rise):
     particles = point_particles(episode_length=1, terminated=lambda states: states[:, 0] > 0)
-    particles.reset()
-    *_, dones, infos = particles.step(rise(3))
+    *_, dones, infos = moved(particles, 1, 1, 1)  # at the time limit, too
     assert dones.all()
     assert not any(info["TimeLimit.truncated"] for info in infos)
 
 
 def test_each_particle_has_its_own_clock(point_particles, rise):
-    particles = point_particles(
-        num_envs=2, episode_length=3, terminated=lambda states: states[:, 0] > 1.9
-    )
-    particles.reset()
-    particles.step(np.array([[2.0], [0.0]], dtype=np.float32))  # ends the first
+    end = {"terminated": lambda states: states[:, 0] > 1.9}
+    particles = point_particles(num_envs=2, episode_length=3, **end)
+    moved(particles, 2, 0)  # ends the first
     ended = [particles.step(0 * rise(2))[2].tolist() for _ in range(3)]
     assert ended == [[False, False], [False, True], [True, False]]
 
 
-def test_particles_that_leave_the_bounds_end_and_are_counted(point_particles, rise):
-    particles = point_particles(num_envs=2, state_bounds=torch.tensor([[-5.0], [1.3]]))
-    particles.reset()
-    obs, rewards, dones, infos = particles.step(np.array([[1.0], [0.1]], dtype=np.float32))
+def test_particles_that_leave_the_bounds_end_and_are_counted(point_particles):
+    bounds = torch.tensor([[-5.0], [1.3]])
+    particles = point_particles(num_envs=2, state_bounds=bounds)
+    obs, rewards, dones, infos = moved(particles, 1, 0.1)
     assert dones.tolist() == [True, False]
     assert infos[0]["left_bounds"]
     assert infos[0]["TimeLimit.truncated"]
@@ -187,10 +160,20 @@ def test_particles_that_leave_the_bounds_end_and_are_counted(point_particles, ri
     assert rewards.tolist() == pytest.approx([-(1.05**2)] * 2)
     assert obs[:, 0].tolist() == pytest.approx([1.0, 1.05])
     assert particles.num_left_bounds == 1
+    # Where all rewards are positive, leaving terminates.
+    particles = point_particles(reward=lambda s, a, n: 2 + n[:, 0], state_bounds=bounds)
+    _, rewards, dones, infos = moved(particles, 1, 0.1, -2)
+    assert dones.tolist() == [True, False, False]
+    assert not infos[0]["TimeLimit.truncated"]
+    assert rewards[0] == rewards[2] == 2.0
+    # Bounds give way to the starts.
+    particles = point_particles(start=4.0, state_bounds=torch.tensor([[0.0], [2.0]]))
+    assert not moved(particles, 1, 1, 1)[2].any()
+    assert particles.task.state_bounds.tolist() == [[0.0], [5.0]]
 
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])
-def test_particles_that_leave_the_numbers_end(point_particles, point_dynamics, value, rise):
+def test_particles_that_leave_the_numbers_end(point_particles, point_dynamics, value):
     def broken(states, actions):
         following = states + actions
         following[1] = value
@@ -198,13 +181,11 @@ def test_particles_that_leave_the_numbers_end(point_particles, point_dynamics, v
 
     point_dynamics.sample = broken
     particles = point_particles(terminated=lambda states: states[:, 0] > 10)
-    particles.reset()
-    obs, rewards, dones, infos = particles.step(rise(3))
+    obs, rewards, dones, infos = moved(particles, 1, 1, 1)
     assert dones.tolist() == [False, True, False]
     assert particles.num_left_bounds == 1
-    assert np.isfinite(obs).all()
-    assert np.isfinite(rewards).all()
-    assert np.isfinite(infos[1]["terminal_observation"]).all()
+    for values in (obs, rewards, infos[1]["terminal_observation"]):
+        assert np.isfinite(values).all()
 
 
 @pytest.fixture
@@ -221,51 +202,37 @@ def choosy_dynamics(point_dynamics):
 
 
 @pytest.mark.parametrize("sampling", ["step", "trajectory"])
-def test_particles_at_which_the_physics_fails_end(point_particles, choosy_dynamics, sampling, rise):
-    env = point_particles(dynamics=choosy_dynamics, sampling=sampling, num_envs=3)
-    env.reset()
-    obs, _, dones, infos = env.step(np.array([[1.0], [2.0], [0.0]], dtype=np.float32))
+def test_particles_at_which_the_physics_fails_end(point_particles, choosy_dynamics, sampling):
+    env = point_particles(dynamics=choosy_dynamics, sampling=sampling)
+    obs, _, dones, infos = moved(env, 1, 2, 0)
     assert dones.tolist() == [False, True, False]
     assert infos[1]["left_bounds"]
     assert obs[:, 0].tolist() == pytest.approx([1.4, 1.0, 1.0])
-    env.reset()
-    _, _, dones, infos = env.step(np.full((3, 1), 2.0, dtype=np.float32))
+    _, _, dones, infos = moved(env, 2, 2, 2)
     assert dones.all()
     assert all(info["left_bounds"] for info in infos)
 
 
-def test_where_all_rewards_are_positive_leaving_terminates(point_particles, rise):
-    particles = point_particles(
-        reward=lambda s, a, n: 2 + n[:, 0], state_bounds=torch.tensor([[-1.0], [1.3]])
-    )
-    particles.reset()
-    _, rewards, dones, infos = particles.step(rise(3) * np.array([[1], [0.1], [-2]]))
-    assert dones.tolist() == [True, False, False]
-    assert not infos[0]["TimeLimit.truncated"]
-    assert rewards[0] == rewards[2] == 2.0
+# Transitions of earlier models
+
+
+def refreshed(env, states, actions):
+    """A model buffer with transitions of an earlier model, refreshed by an environment."""
+    mixed = MixedReplayBuffer(20, env.observation_space, env.action_space, "cpu")
+    zeros = np.zeros(len(states), dtype=np.float32)
+    mixed.add_model_rows(states, states + 99, actions, zeros, zeros, zeros)
+    env.refresh(mixed.model_buffer)
+    return mixed.model_buffer
 
 
 @pytest.mark.parametrize("failing", [0, 3, 6])
 def test_functions_whose_physics_fails_at_any_row(point_particles, choosy_dynamics, failing):
     """Rows are filled up to blocks of one size, which the physics may blame."""
-    env = point_particles(dynamics=choosy_dynamics, sampling="trajectory", num_envs=3)
+    env = point_particles(dynamics=choosy_dynamics, sampling="trajectory")
     env.reset()
-    mixed = MixedReplayBuffer(20, env.observation_space, env.action_space, "cpu")
-    buffer = mixed.model_buffer
     scaled = np.where(np.arange(7) == failing, 1.0, 0.1)[:, None]
-    zeros = np.zeros(7, dtype=np.float32)
-    mixed.add_model_rows(np.ones((7, 1)), np.ones((7, 1)), scaled, zeros, zeros, zeros)
-    env.refresh(buffer)
-    left = buffer.dones[:7, 0].astype(bool)
+    left = refreshed(env, np.ones((7, 1)), scaled).dones[:7, 0].astype(bool)
     assert left.nonzero()[0].tolist() == [failing]
-
-
-def test_bounds_give_way_to_the_starts(point_particles, rise):
-    particles = point_particles(start=4.0, state_bounds=torch.tensor([[0.0], [2.0]]))
-    particles.reset()
-    _, _, dones, _ = particles.step(rise(3))
-    assert not dones.any()
-    assert particles.task.state_bounds.tolist() == [[0.0], [5.0]]
 
 
 @pytest.mark.slow
@@ -275,29 +242,41 @@ def test_refreshed_transitions_end_as_the_model_has_it(
     point_particles, unsure_dynamics, sampling, rows
 ):
     env = point_particles(dynamics=unsure_dynamics, sampling=sampling)
-    mixed = MixedReplayBuffer(20, env.observation_space, env.action_space, "cpu")
-    buffer = mixed.model_buffer
     states = np.linspace(0.1, 0.9, rows, dtype=np.float32)[:, None]
-    zeros = np.zeros(rows, dtype=np.float32)
-    mixed.add_model_rows(states, states + 99, 0.2 * states, zeros, zeros, zeros)
-    env.refresh(buffer)
+    buffer = refreshed(env, states, 0.2 * states)
     assert buffer.size() == rows
-    mean, variance = unsure_dynamics.predict(
-        torch.from_numpy(states).double(), torch.from_numpy(0.4 * states).double()
-    )
+    pair = (torch.from_numpy(values).double() for values in (states, 0.4 * states))
+    mean, variance = unsure_dynamics.predict(*pair)
     following = torch.from_numpy(buffer.next_observations[:rows, 0])
     assert ((following - mean).abs() <= 6 * variance.sqrt() + 1e-6).all()
     rewards = torch.from_numpy(buffer.rewards[:rows, 0])
     torch.testing.assert_close(rewards, -following[:, 0].square())
 
 
+def test_functions_are_drawn_once_for_what_is_refreshed_and_the_episodes_after(
+    point_particles, unsure_dynamics, monkeypatch
+):
+    drawn = []
+    draw = unsure_dynamics.sample_functions
+    monkeypatch.setattr(
+        unsure_dynamics, "sample_functions", lambda n, *seed: drawn.append(n) or draw(n, *seed)
+    )
+    env = point_particles(dynamics=unsure_dynamics, sampling="trajectory")
+    refreshed(env, np.ones((2, 1)), np.ones((2, 1)))
+    moved(env, 1, 1, 1)
+    assert drawn == [3]
+    env.reset()  # other functions for other episodes
+    assert drawn == [3, 3]
+
+
+# As a vectorised environment
+
+
 @pytest.mark.parametrize(
     "reward", [lambda s, a, n: (n[:, 0] > 0).long(), lambda s, a, n: WEIGHT * n[:, 0] / 1.5]
 )
-def test_rewards_may_be_whole_numbers_or_carry_gradients(point_particles, rise, reward):
-    particles = point_particles(reward=reward)
-    particles.reset()
-    assert particles.step(rise(3))[1].tolist() == [1, 1, 1]
+def test_rewards_may_be_whole_numbers_or_carry_gradients(point_particles, reward):
+    assert moved(point_particles(reward=reward), 1, 1, 1)[1].tolist() == [1, 1, 1]
 
 
 def test_attributes_are_those_of_all_particles(point_particles):
@@ -310,24 +289,3 @@ def test_attributes_are_those_of_all_particles(point_particles):
         particles.set_attr("worst_reward", 0.5, indices=0)
     with pytest.raises(NotImplementedError, match="fly"):
         particles.env_method("fly")
-
-
-def test_functions_are_drawn_once_for_what_is_refreshed_and_the_episodes_after(
-    point_particles, unsure_dynamics, monkeypatch, rise
-):
-    drawn = []
-    draw = unsure_dynamics.sample_functions
-    monkeypatch.setattr(
-        unsure_dynamics, "sample_functions", lambda n, *seed: drawn.append(n) or draw(n, *seed)
-    )
-    env = point_particles(dynamics=unsure_dynamics, sampling="trajectory")
-    mixed = MixedReplayBuffer(5, env.observation_space, env.action_space, "cpu")
-    buffer = mixed.model_buffer
-    zeros = np.zeros(2)
-    mixed.add_model_rows(np.ones((2, 1)), np.ones((2, 1)), np.ones((2, 1)), zeros, zeros, zeros)
-    env.refresh(buffer)
-    env.reset()
-    assert drawn == [3]
-    env.step(rise(3))
-    env.reset()  # other functions for other episodes
-    assert drawn == [3, 3]

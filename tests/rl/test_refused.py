@@ -14,14 +14,14 @@ from gpadjust.dynamics import LearnedDynamics
 from gpadjust.physics import PhysicsError
 from gpadjust.rl import Dyna, DynaCallback, DynaSAC
 from tests.point import POINT_SPEC
-from tests.rl.conftest import model_rows
 
 LINE, PLANE = spaces.Box(-1, 1, (1,)), spaces.Box(-1, 1, (2,))
 
 
-class Shaped(gymnasium.Env):
-    def __init__(self, observation_space, action_space):
-        self.observation_space, self.action_space = observation_space, action_space
+def shaped(observation_space, action_space=LINE):
+    env = gymnasium.Env()
+    env.observation_space, env.action_space = observation_space, action_space
+    return {"env": env}
 
 
 OPTIONS = [
@@ -29,7 +29,6 @@ OPTIONS = [
     ({"optimize_memory_usage": True}, "optimize_memory_usage"),
     ({"real_fraction": 2}, "real_fraction must be .*; found 2"),
     ({"updates_per_model_step": float("inf")}, "updates_per_model_step must be .*; found inf"),
-    ({"model_buffer_size": 0}, "model_buffer_size must be at least 1; found 0"),
     ({"model_episodes": 2.5}, "model_episodes must be a whole number; found 2.5"),
     ({"last_model_episode": -1}, "last_model_episode must be at least 0; found -1"),
     ({"num_particles": 0}, "num_particles must be at least 1; found 0"),
@@ -37,16 +36,14 @@ OPTIONS = [
     ({"refresh_model_data": 1}, "refresh_model_data must be True or False; found 1"),
     ({"reward_tolerance": "no"}, "reward_tolerance must be a number; found 'no'"),
     ({"gradient_steps": 0}, "gradient_steps"),
-    ({"policy": "MultiInputPolicy", "env": Shaped(spaces.Dict({"x": LINE}), LINE)}, "has 1 entri"),
-    ({"env": Shaped(PLANE, LINE)}, "observation has 1 entries"),
-    ({"env": Shaped(LINE, PLANE)}, "action has 1 entries"),
+    ({"policy": "MultiInputPolicy", **shaped(spaces.Dict({"x": LINE}))}, "has 1 entri"),
+    (shaped(PLANE), "observation has 1 entries"),
+    (shaped(LINE, PLANE), "action has 1 entries"),
+    (shaped(LINE, spaces.Discrete(2)), r"only supports.*Box.*Discrete"),
 ]
 CALLS = [
     (lambda at: DynaSAC("MlpPolicy", at.env(), at.task().dynamics), r"must be a Task\(dynamics,"),
-    (
-        lambda at: DynaSAC("MlpPolicy", at.env(), at.task(), model_episodes=2),
-        "unexpected keyword argument 'model_episodes'",
-    ),
+    (lambda at: DynaSAC("MlpPolicy", at.env(), at.task(), model_episodes=2), "'model_episodes'"),
     (lambda at: type("Other", (TD3, Dyna), {}), r"Dyna first .* class Other\(Dyna, .* found TD3"),
     (lambda at: type("Other", (Dyna, PPO), {}), "then an off-policy learner, .* found PPO"),
     (lambda at: at.agent(at.env().unwrapped, episode_length=None).learn(5), "no time limit"),
@@ -54,39 +51,34 @@ CALLS = [
     (lambda at: at.sac().learn(5, at.checkpoint), "is for learners with a model"),
     (lambda at: at.sac().learn(5, DynaCallback()), "DynaCallback is for Dyna agents.*found SAC"),
     (lambda at: at.agent().model_env(3), "initial_states"),
-    (
-        lambda at: at.agent().predict(np.array([np.nan], dtype=np.float32)),
-        "No action can be chosen: entry 0 of the observation is",
-    ),
+    (lambda at: at.agent().predict(np.array([np.nan], dtype=np.float32)), "No action can be chos"),
+    (lambda at: at.particles(observation_space=PLANE), "observation has 1 entries"),
+    (lambda at: at.particles(observation_space=spaces.Discrete(2)), "observation has 1 entries"),
+    (lambda at: at.particles(num_envs=0), "num_envs must be at least 1; found 0"),
+    (lambda at: at.particles(sampling="swarm"), "Unknown sampling 'swarm'"),
+    (lambda at: at.particles(initial_states=None), "needs a task with initial_states"),
 ]
 FUNCTIONS = [
     ({"initial_states": lambda n: torch.ones(n)}, r"initial_states\(2\) must return .* 2 x 1"),
-    (
-        {"initial_states": lambda n: torch.full((n, 1), torch.nan)},
-        r"initial_states\(2\) returned .*expected finite",
-    ),
     ({"reward": lambda s, a, n: n}, r"reward must return one value per row, shape \(2,\)"),
-    ({"terminated": lambda s: s}, r"terminated must return one value per row"),
     ({"dynamics": LearnedDynamics(POINT_SPEC, lambda X: X)}, "1 states .* got 2 columns"),
 ]
 
 
 @pytest.mark.parametrize(("options", "words"), OPTIONS)
 def test_an_option_is_refused(point_agent, options, words):
-    with pytest.raises((TypeError, ValueError), match=words):
+    with pytest.raises((TypeError, ValueError, AssertionError), match=words):
         point_agent(**options)
 
 
 @pytest.mark.parametrize(("call", "words"), CALLS)
-def test_a_call_is_refused(point_agent, point_env, point_task, tmp_path, call, words):
+def test_a_call_is_refused(
+    point_agent, point_env, point_task, point_particles, tmp_path, call, words
+):
     path = tmp_path / "run.ckpt"
-    at = SimpleNamespace(
-        agent=point_agent,
-        env=point_env,
-        task=point_task,
-        checkpoint=EpisodeCheckpoint(path),
-        sac=lambda: SAC("MlpPolicy", point_env(), policy_kwargs={"net_arch": [8]}),
-    )
+    at = SimpleNamespace(agent=point_agent, env=point_env, task=point_task)
+    at.particles, at.checkpoint = point_particles, EpisodeCheckpoint(path)
+    at.sac = lambda: SAC("MlpPolicy", point_env(), policy_kwargs={"net_arch": [8]})
     with pytest.raises((TypeError, ValueError), match=words):
         call(at)
     assert not path.exists()
@@ -100,16 +92,11 @@ def test_wrong_functions_are_found_before_the_first_real_step(point_agent, parts
     assert agent.num_timesteps == 0
 
 
-def test_discrete_actions_are_refused_by_stable_baselines(point_agent):
-    with pytest.raises(AssertionError, match=r"only supports.*Box.*Discrete"):
-        point_agent(Shaped(LINE, spaces.Discrete(2)))
-
-
 def test_terminations_that_come_late_are_refused(point_agent, point_env):
     env = point_env()
     agent = point_agent(env).learn(5)
     env.unwrapped.end = -9
-    with pytest.raises(ValueError, match="terminated=True, but none was given"):
+    with pytest.raises(ValueError, match="terminated=True, but the task has False"):
         agent.learn(5, reset_num_timesteps=False)
 
 
@@ -121,29 +108,3 @@ def test_noisy_rewards_may_be_tolerated(point_agent, point_reward):
         point_agent(reward=noisy).learn(5)
     for tolerance in (0.1, None):
         assert point_agent(reward=noisy, reward_tolerance=tolerance).learn(5).num_episodes == 1
-
-
-def test_a_time_limit_put_around_by_hand_is_read(point_agent):
-    assert model_rows(point_agent(episode_length=None).learn(5)) == 2 * 5
-
-
-PARTICLES = [
-    ({"observation_space": PLANE}, "observation has 1 entries"),
-    ({"observation_space": spaces.Discrete(2)}, "observation has 1 entries"),
-    ({"num_envs": 0}, "num_envs must be at least 1; found 0"),
-    ({"sampling": "swarm"}, "Unknown sampling 'swarm'"),
-    ({"initial_states": None}, "needs a task with initial_states"),
-    ({"initial_states": torch.zeros}, r"initial_states\(3\) must return .* 3 x 1; found \(3,\)"),
-    ({"reward": lambda s, a, n: n[:, 0] / 0}, "reward.*inf"),
-]
-
-
-@pytest.mark.parametrize(("options", "words"), PARTICLES)
-def test_particles_are_refused(point_particles, options, words, rise):
-    def step():
-        particles = point_particles(**options)
-        particles.reset()
-        particles.step(rise(3))
-
-    with pytest.raises(ValueError, match=words):
-        step()

@@ -11,46 +11,19 @@ from gpadjust.dynamics import PhysicsDynamics, StateSpec
 from gpadjust.rl import DynaCallback, DynaSAC
 
 
-@pytest.fixture(scope="module")
-def once():
-    """What is made once for several tests, none of which changes it."""
-    return {}
-
-
-@pytest.fixture
-def saved(once, point_agent, learnt_dynamics, tmp_path_factory):
-    """An agent after two episodes, and its file."""
-    if not once:
-        agent = point_agent(dynamics=learnt_dynamics()).learn(10)
-        path = tmp_path_factory.mktemp("saved") / "agent.zip"
-        agent.save(path)
-        once["saved"] = agent, path
-    return once["saved"]
-
-
-def test_a_loaded_agent_predicts_the_same(saved):
-    agent, path = saved
-    obs = np.linspace(-1, 1, 7, dtype=np.float32)[:, None]
-    loaded = DynaSAC.load(path)
-    np.testing.assert_array_equal(
-        loaded.predict(obs, deterministic=True)[0], agent.predict(obs, deterministic=True)[0]
-    )
-
-
-def test_a_loaded_agent_says_what_it_lacks(saved, point_env, point_task, learnt_dynamics):
-    _, path = saved
-    with pytest.raises(ValueError, match=r"needs a task to learn.*DynaSAC.load"):
-        DynaSAC.load(path, env=point_env()).learn(5)
-    with pytest.raises(ValueError, match=r"needs a task to learn"):
-        DynaSAC.load(path).learn(5)
-    with pytest.raises(AssertionError, match="must set the environment"):  # of Stable-Baselines3
-        DynaSAC.load(path, task=point_task(dynamics=learnt_dynamics())).learn(5)
-
-
-def test_with_its_buffer_a_loaded_agent_goes_on_and_its_dynamics_learn_all(
-    saved, point_env, learnt_dynamics, point_task, tmp_path
+def test_a_loaded_agent_predicts_the_same_and_its_dynamics_learn_all(
+    point_agent, point_env, learnt_dynamics, point_task, tmp_path
 ):
-    agent, path = saved
+    agent, path = point_agent(dynamics=learnt_dynamics()).learn(10), tmp_path / "agent.zip"
+    agent.save(path)
+    obs = np.linspace(-1, 1, 7, dtype=np.float32)[:, None]
+    both = (each.predict(obs, deterministic=True)[0] for each in (agent, DynaSAC.load(path)))
+    np.testing.assert_array_equal(*both)
+    for given in ({"env": point_env()}, {}):
+        with pytest.raises(ValueError, match=r"needs a task to learn.*DynaSAC.load"):
+            DynaSAC.load(path, **given).learn(5)
+    with pytest.raises(AssertionError, match="must set the environment"):  # of Stable-Baselines3
+        DynaSAC.load(path, task=point_task()).learn(5)
     agent.save_replay_buffer(tmp_path / "buffer.pkl")
     loaded = DynaSAC.load(path, env=point_env(), task=point_task(dynamics=learnt_dynamics()))
     loaded.load_replay_buffer(tmp_path / "buffer.pkl")
@@ -58,14 +31,6 @@ def test_with_its_buffer_a_loaded_agent_goes_on_and_its_dynamics_learn_all(
     loaded.learn(5, reset_num_timesteps=False)
     assert loaded.task.dynamics.num_transitions == loaded.num_timesteps == 15
     assert loaded.num_episodes == 3
-
-
-def test_a_wrong_reward_is_found_after_loading_too(saved, point_env, learnt_dynamics, point_task):
-    _, path = saved
-    task = point_task(dynamics=learnt_dynamics(), reward=lambda s, a, n: s[:, 0])
-    loaded = DynaSAC.load(path, env=point_env(), task=task)
-    with pytest.raises(ValueError, match="is not the environment's"):
-        loaded.learn(5)
 
 
 def test_the_file_holds_neither_physics_nor_functions_nor_environment(

@@ -1,7 +1,6 @@
 """The cart-pole's equation, physics and cost, against mechanics derived anew."""
 
 import math
-import pickle
 
 import numpy as np
 import pytest
@@ -9,25 +8,24 @@ import sympy
 import torch
 from scipy.integrate import solve_ivp
 
-from gpadjust.dynamics import PhysicsDynamics
 from gpadjust.physics import ODEPhysics
 from gpadjust.systems import CartPoleEquation, cart_pole
 from gpadjust.systems.swing_up import (
-    CART_POLE_SPEC,
     REAL_CART_POLE,
     cart_pole_cost,
     cart_pole_reward,
-    cart_pole_spec,
     cart_pole_start,
     equation_physics,
 )
+from tests.systems import refused
 
 PARAMETERS = [(0.5, 0.5, 0.6, 0.1), (1.3, 0.2, 0.9, 0.0)]
+X5, X1 = torch.zeros(2, 5), torch.zeros(2, 1)
 
 
 @pytest.fixture(scope="module")
 def mechanics():
-    """Accelerations and energy from the Lagrangian of a cart and a rod, by integrals along it."""
+    """Accelerations from the Lagrangian of a cart and a rod, by integrals along it."""
     cart, pole, length, damping, g, force, t, s = sympy.symbols("M m l b g a t s", positive=True)
     x, theta = sympy.Function("x")(t), sympy.Function("theta")(t)
     place = sympy.Matrix([x - s * sympy.sin(theta), s * sympy.cos(theta)])
@@ -48,49 +46,17 @@ def mechanics():
         *zip([x, theta], values[:2], strict=True),
     ]
     solved = sympy.solve([e.subs(names) for e in balance], accelerations)
-    formulas = [*(solved[a] for a in accelerations), (kinetic + potential).subs(names)]
+    formulas = [solved[a] for a in accelerations]
     return sympy.lambdify([values, force, (cart, pole, length, damping, g)], formulas)
 
 
-def energy(equation, states):
-    """The kinetic and the potential energy in J; the latter is zero when the pole is level."""
-    _, theta, x_dot, theta_dot = states.unbind(-1)
-    m, length, cos = equation.pole_mass, equation.pole_length, theta.cos()
-    kinetic = (equation.cart_mass + m) * x_dot.square() / 2
-    kinetic = kinetic + m * length * theta_dot * (length * theta_dot / 6 - x_dot * cos / 2)
-    return kinetic + m * equation.gravity * length * cos / 2
-
-
 @pytest.mark.parametrize("parameters", PARAMETERS)
-def test_equation_and_energy_are_those_of_the_lagrangian(mechanics, states_and_forces, parameters):
-    equation = CartPoleEquation(*parameters)
+def test_equation_is_that_of_the_lagrangian(mechanics, states_and_forces, parameters):
     states, forces = states_and_forces(50)
-    rates = equation(states, forces)
-    x_ddot, theta_ddot, expected = mechanics(states.T, forces[:, 0], (*parameters, 9.82))
+    rates = CartPoleEquation(*parameters)(states, forces)
+    expected = mechanics(states.T, forces[:, 0], (*parameters, 9.82))
     torch.testing.assert_close(rates[:, :2], states[:, 2:], rtol=0, atol=0)
-    torch.testing.assert_close(rates[:, 2], x_ddot)
-    torch.testing.assert_close(rates[:, 3], theta_ddot)
-    torch.testing.assert_close(energy(equation, states), expected)
-
-
-def test_power_of_force_and_friction_changes_the_energy(states_and_forces):
-    states, forces = states_and_forces(50)
-    states.requires_grad_()
-    (gradient,) = torch.autograd.grad(energy(REAL_CART_POLE, states).sum(), states)
-    power = (gradient * REAL_CART_POLE(states, forces)).sum(-1)
-    x_dot = states[:, 2]
-    torch.testing.assert_close(power, (forces[:, 0] - REAL_CART_POLE.damping * x_dot) * x_dot)
-
-
-@pytest.mark.slow
-def test_energy_is_conserved_without_damping():
-    equation = CartPoleEquation(0.5, 0.5, 0.6, 0.0)
-    physics = ODEPhysics(equation, step=0.1, state_dim=4, substeps=50)
-    state = torch.tensor([[0.0, 2.0, 0.3, 1.0], [0.0, 0.1, 0.0, 0.0]], dtype=torch.float64)
-    before = energy(equation, state)
-    for _ in range(100):
-        state = physics(torch.cat([state, torch.zeros(2, 1, dtype=torch.float64)], dim=-1))
-        torch.testing.assert_close(energy(equation, state), before, rtol=1e-8, atol=0)
+    torch.testing.assert_close(rates[:, 2:], torch.stack(expected, -1))
 
 
 def test_step_agrees_with_scipy(states_and_forces):
@@ -111,23 +77,6 @@ def test_step_agrees_with_scipy(states_and_forces):
     torch.testing.assert_close(fine(X), expected, rtol=0, atol=1e-8)
 
 
-@pytest.mark.parametrize("time_step", [0.01, 0.05, 0.13])
-def test_time_steps_can_be_others(time_step, states_and_forces):
-    X = torch.cat(states_and_forces(10), dim=-1)
-    fine = ODEPhysics(REAL_CART_POLE, step=time_step, state_dim=4, substeps=100)
-    physics = equation_physics(REAL_CART_POLE, time_step)
-    torch.testing.assert_close(physics(X), fine(X), rtol=0, atol=2e-3)
-    assert physics.step / physics.substeps <= 0.02 + 1e-12
-    believed = cart_pole(3, time_step=time_step).physics
-    assert (believed.step, believed.rhs) == (time_step, cart_pole(3).physics.rhs)
-
-
-def test_hanging_is_stable_and_upright_is_not():
-    nudge = torch.tensor([[0.0, 0.01, 0.0, 0.0], [0.0, math.pi + 0.01, 0.0, 0.0]])
-    rates = REAL_CART_POLE(nudge, torch.zeros(2, 1))[:, 3]
-    assert rates[0] > 0 > rates[1]
-
-
 def test_equation_takes_any_batch_and_is_differentiable(states_and_forces):
     states, forces = states_and_forces(6)
     blocks = REAL_CART_POLE(states.view(2, 3, 4), forces.view(2, 3, 1))
@@ -136,51 +85,31 @@ def test_equation_takes_any_batch_and_is_differentiable(states_and_forces):
     assert torch.autograd.gradcheck(REAL_CART_POLE, inputs)
 
 
+REFUSED = [
+    (ValueError, r"states \.\.\. x 4 .* actions \.\.\. x 1", REAL_CART_POLE, X5, X1),
+    (ValueError, r"states \.\.\. x 4 .* actions \.\.\. x 1", REAL_CART_POLE, X5[:, :4], X1[:, :0]),
+    (ValueError, "cart_mass", CartPoleEquation, 0.0, 0.5, 0.6, 0.1),
+    (ValueError, "pole_mass", CartPoleEquation, 0.5, -1.0, 0.6, 0.1),
+    (ValueError, "pole_length", CartPoleEquation, 0.5, 0.5, math.inf, 0.1),
+    (ValueError, "damping", CartPoleEquation, 0.5, 0.5, 0.6, -0.1),
+]
+
+
 def test_other_columns_and_impossible_parameters_are_refused():
-    for columns in ((5, 1), (4, 2), (4, 0)):
-        with pytest.raises(ValueError, match=r"states \.\.\. x 4 .* actions \.\.\. x 1"):
-            REAL_CART_POLE(*(torch.zeros(2, n) for n in columns))
-    good = {"cart_mass": 0.5, "pole_mass": 0.5, "pole_length": 0.6, "damping": 0.1}
-    bad = {"cart_mass": 0.0, "pole_mass": -1.0, "pole_length": math.inf, "damping": -0.1}
-    for name, value in bad.items():
-        with pytest.raises(ValueError, match=name):
-            CartPoleEquation(**{**good, name: value})
+    for error, words, *call in REFUSED:
+        refused(error, words, *call)
 
 
 def test_random_physics_is_in_its_ranges_and_follows_its_seed():
     equations = [cart_pole(seed).physics.rhs for seed in range(200)]
-    for name, low, high in [
-        ("cart_mass", 0.4, 0.6),
-        ("pole_mass", 0.5, 0.7),
-        ("pole_length", 0.5, 0.7),
-    ]:
+    ranges = [("cart_mass", 0.4, 0.6), ("pole_mass", 0.5, 0.7), ("pole_length", 0.5, 0.7)]
+    for name, low, high in ranges:
         values = [getattr(equation, name) for equation in equations]
         assert low <= min(values) < low + 0.01
         assert high - 0.01 < max(values) <= high
     assert {equation.damping for equation in equations} == {0.0}
     assert cart_pole(3).physics.rhs == equations[3]
     assert len(set(equations)) == 200
-
-
-def test_specs_fit_the_physics_which_can_be_pickled(states_and_forces):
-    states, forces = states_and_forces(5)
-    physics = equation_physics(REAL_CART_POLE)
-    expected = physics(torch.cat([states, forces], dim=-1))
-    for spec in (CART_POLE_SPEC, cart_pole_spec(encode_angle=False)):
-        dynamics = PhysicsDynamics(spec, pickle.loads(pickle.dumps(physics)))
-        assert torch.equal(dynamics.sample(states, forces), expected)
-        assert spec.observe(states).shape == (5, 5 if spec.angles else 4)
-
-
-def test_cost_of_known_states():
-    states = torch.tensor(
-        [[0.0, 0.0, 3.0, 3.0], [0.0, math.pi, 0.0, 0.0], [0.6, math.pi / 2, 0.0, 0.0]],
-        dtype=torch.float64,
-    )
-    squares = torch.tensor([0.0, 1.2**2, 0.6**2], dtype=torch.float64)
-    torch.testing.assert_close(cart_pole_cost(states), 1 - torch.exp(-2 * squares))
-    longer = 1 - math.exp(-2 * 2.0**2)
-    torch.testing.assert_close(cart_pole_cost(states[1], pole_length=1.0).item(), longer)
 
 
 def test_cost_is_of_the_tip_and_within_its_bounds(states_and_forces):
@@ -192,6 +121,9 @@ def test_cost_is_of_the_tip_and_within_its_bounds(states_and_forces):
     assert ((cost >= 0) & (cost <= 1)).all()
     assert torch.equal(cart_pole_cost(states.view(3, 20, 4)).flatten(), cost)
     assert torch.equal(cart_pole_reward(torch.zeros(60, 4), forces, states), -cost)
+    hanging = torch.tensor([0.0, math.pi, 0.0, 0.0]).double()
+    longer = cart_pole_cost(hanging, pole_length=1.0).item()
+    assert longer == pytest.approx(1 - math.exp(-2 * 2.0**2))
 
 
 def test_start_is_spread_around_hanging():

@@ -11,16 +11,16 @@ from gymnasium.utils.env_checker import check_env
 from gpadjust.systems import CartPoleSwingUpEnv, RememberAction
 
 
-def test_the_observation_ends_with_the_last_action():
-    env = RememberAction(CartPoleSwingUpEnv(encode_angle=False))
+def test_the_observation_ends_with_the_last_actions_the_newest_first():
+    env = RememberAction(CartPoleSwingUpEnv(encode_angle=False), steps=3)
     observation, _ = env.reset(seed=0)
-    assert observation.shape == (5,)
-    assert observation[-1] == 0
-    for force in (2.0, -1.0):
+    assert observation.shape == (7,)
+    for force in (1.0, 2.0, 3.0, 4.0):
         observation, *_ = env.step(np.array([force], dtype=np.float32))
-        assert observation[-1] == force
-    assert pickle.loads(pickle.dumps(env)).observation_space == env.observation_space
-    assert env.reset(seed=0)[0][-1] == 0
+    assert observation[-3:].tolist() == [4.0, 3.0, 2.0]
+    assert env.reset(seed=0)[0][-3:].tolist() == [0.0, 0.0, 0.0]
+    with pytest.raises(ValueError, match="steps must be"):
+        RememberAction(CartPoleSwingUpEnv(), steps=0)
 
 
 def test_the_action_is_remembered_as_the_environment_takes_it():
@@ -56,12 +56,7 @@ def test_observations_have_the_dtype_that_takes_both(dtype, expected):
 
 @pytest.mark.parametrize(
     "duplicate",
-    [
-        lambda env: gym.make(env.spec),
-        copy.deepcopy,
-        lambda env: pickle.loads(pickle.dumps(env)),
-        lambda env: gym.make(pickle.loads(pickle.dumps(copy.deepcopy(env))).spec),
-    ],
+    [lambda env: gym.make(env.spec), lambda env: pickle.loads(pickle.dumps(copy.deepcopy(env)))],
 )
 def test_a_registered_environment_can_be_made_again(duplicate):
     env = RememberAction(gym.make("gpadjust/CartPoleSwingUp-v0", encode_angle=False))
@@ -90,14 +85,3 @@ def test_other_actions_are_refused(space, message):
     env.action_space = space
     with pytest.raises(ValueError, match=message):
         RememberAction(env)
-
-
-def test_several_actions_are_remembered_the_newest_first():
-    env = RememberAction(CartPoleSwingUpEnv(encode_angle=False), steps=3)
-    env.reset(seed=0)
-    for force in (1.0, 2.0, 3.0, 4.0):
-        observation, *_ = env.step(np.array([force], dtype=np.float32))
-    assert observation[-3:].tolist() == [4.0, 3.0, 2.0]
-    assert env.reset(seed=0)[0][-3:].tolist() == [0.0, 0.0, 0.0]
-    with pytest.raises(ValueError, match="steps must be"):
-        RememberAction(CartPoleSwingUpEnv(), steps=0)

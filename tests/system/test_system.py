@@ -17,6 +17,7 @@ from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.states import Sensors
 from gpadjust.systems import System
 from gpadjust.systems.swing_up import REAL_CART_POLE, believed_cart_pole, equation_physics
+from tests.systems import normal, refused, uniform
 
 SPEC = StateSpec(["x", "v"], ["force"])
 
@@ -50,12 +51,6 @@ def reward(states, actions, next_states):
 
 def cart(**options):
     return System(Cart, SPEC, coast, reward, **options)
-
-
-def states_and_actions(n=20):
-    generator = torch.Generator().manual_seed(0)
-    states = torch.randn(n, 4, generator=generator, dtype=torch.float64)
-    return states, torch.rand(n, 1, generator=generator, dtype=torch.float64)
 
 
 def test_the_environment_ends_where_the_system_says():
@@ -96,19 +91,19 @@ def test_the_task_has_what_the_system_knows():
     assert first is not second
 
 
-def test_what_is_no_part_of_a_system_is_refused():
-    for parts, message in (
-        ((Cart(), SPEC, coast, reward), "env must be a function, its class or `lambda: env`"),
-        ((Cart, "x", coast, reward), "spec must be a StateSpec"),
-        ((Cart, SPEC, coast, None), "reward must be a function"),
-        ((Cart, SPEC, 3.0, reward), "callable"),
-    ):
-        with pytest.raises(TypeError, match=message):
-            System(*parts)
-    with pytest.raises(TypeError, match=r"sensors must be .*found .*'x'"):
-        cart(sensors=["x"])
-    with pytest.raises(TypeError, match=r"physics_error must be .*found 0.1"):
-        cart(physics_error=0.1)
+REFUSED = [
+    ({"env": Cart()}, "env must be a function, its class or `lambda: env`"),
+    ({"spec": "x"}, "spec must be a StateSpec"),
+    ({"reward": None}, "reward must be a function"),
+    ({"physics": 3.0}, "callable"),
+    ({"sensors": ["x"]}, r"sensors must be .*found .*'x'"),
+    ({"physics_error": 0.1}, r"physics_error must be .*found 0.1"),
+]
+
+
+@pytest.mark.parametrize(("parts", "words"), REFUSED)
+def test_what_is_no_part_of_a_system_is_refused(parts, words):
+    refused(TypeError, words, replace, cart(), **parts)
 
 
 def test_the_cart_pole_is_that_of_its_id():
@@ -123,22 +118,9 @@ def test_the_cart_pole_is_that_of_its_id():
         assert paid == cost
     assert steps[0][-1][3]
     assert ours.unwrapped.equation == REAL_CART_POLE
-    system = systems.cart_pole(3, dry=0.5, drag=0.01, time_step=0.05, encode_angle=False)
-    env = system.make()
-    assert (env.unwrapped.equation.dry, env.unwrapped.equation.drag) == (0.5, 0.01)
-    assert env.observation_space.shape == (4,)
-    assert (system.physics.rhs, system.physics.step) == (believed_cart_pole(3), 0.05)
-    assert (system.physics.rhs.dry, system.physics.rhs.drag) == (0, 0)
-
-
-def test_environment_and_task_agree():
-    system = systems.cart_pole()
-    env, task = system.make(), system.task()
-    env.reset(seed=0)
-    before = torch.from_numpy(env.unwrapped.state).unsqueeze(0)
-    _, paid, *_ = env.step(np.array([2.0], dtype=np.float32))
-    after = torch.from_numpy(env.unwrapped.state).unsqueeze(0)
-    assert task.rewards(before, torch.tensor([[2.0]]).double(), after).item() == pytest.approx(paid)
+    system = systems.cart_pole(3, encode_angle=False)
+    assert system.make().observation_space.shape == (4,)
+    assert (system.physics.rhs, system.physics.step) == (believed_cart_pole(3), 0.1)
 
 
 def test_sensors_of_any_system_can_be_noisy():
@@ -174,30 +156,24 @@ def test_no_system_hides_a_module():
         assert found is None or isinstance(found, ModuleType), path.stem
 
 
-def test_unknown_parameters_make_the_same_physics_of_their_guesses():
-    known, unknown = systems.cart_pole(), systems.cart_pole(unknowns=True)
-    assert not known.unknowns
-    X = torch.cat(states_and_actions(), -1)
-    values = {name: u.guess for name, u in unknown.unknowns.items()} | {"damping": 0.0}
-    found = unknown.physics(X, torch.tensor([*values.values()], dtype=torch.float64))
-    torch.testing.assert_close(found, known.physics(X), rtol=1e-12, atol=1e-12)
-
-
 def test_each_row_has_the_parameters_that_it_is_given():
-    X = torch.cat(states_and_actions(), -1)
-    physics = systems.cart_pole(unknowns=True).physics
-    several = torch.tensor([[0.5, 0.5, 0.6, 0.1], [0.4, 0.7, 0.5, 0.3]], dtype=torch.float64)
-    for values, found in zip(several, physics(X, several), strict=True):
+    system = pickle.loads(pickle.dumps(systems.cart_pole(noise={"x": 0.1}, unknowns=True)))
+    assert system.make().reset(seed=0)[0].shape == (5,)
+    X, guesses = normal(20, 5), [u.guess for u in system.unknowns.values()]
+    several = [[0.5, 0.5, 0.6, 0.1], [0.4, 0.7, 0.5, 0.3], [*guesses[:3], 0.0]]
+    several = torch.tensor(several, dtype=torch.float64)
+    for values, outputs in zip(several, system.physics(X, several), strict=True):
         equation = systems.CartPoleEquation(*values.tolist())
-        torch.testing.assert_close(found, equation_physics(equation)(X), rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(outputs, equation_physics(equation)(X), rtol=1e-12, atol=1e-12)
+    known = systems.cart_pole()
+    assert not known.unknowns
+    torch.testing.assert_close(outputs, known.physics(X), rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.slow
 def test_its_parameters_are_found_by_least_squares():
     system = systems.cart_pole(unknowns=True)
-    generator = torch.Generator().manual_seed(1)
-    states = torch.randn(40, 4, generator=generator, dtype=torch.float64)
-    actions = 10 * torch.rand(40, 1, generator=generator, dtype=torch.float64)
+    states, actions = normal(40, 4, seed=1), uniform(40, 1, high=10.0, seed=1)
     truth = {name: 1.2 * u.guess for name, u in system.unknowns.items()}
     values = torch.tensor([*truth.values()], dtype=torch.float64)
     following = system.physics(torch.cat([states, actions], -1), values)
@@ -224,9 +200,3 @@ def test_noise_of_sensors_has_its_size_and_leaves_rewards_alone():
             errors.append(spec.change(torch.from_numpy(true.unwrapped.state), state))
     sd = torch.stack(errors).std(0)
     torch.testing.assert_close(sd, torch.tensor([0, 0.1, 0.5, 0]).double(), rtol=0.1, atol=1e-5)
-
-
-def test_a_system_can_be_pickled():
-    system = pickle.loads(pickle.dumps(systems.cart_pole(2, noise={"x": 0.1}, unknowns=True)))
-    system.make().reset(seed=0)
-    assert system.unknowns["pole_length"].unit == "m"
