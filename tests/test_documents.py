@@ -106,6 +106,10 @@ def is_known(command):
             return (ROOT / folder).is_dir()
         case ["python", file, *_] | ["pip", "install", "--constraint", file, *_]:
             return (ROOT / file).is_file()
+        case ["pip", "install", package]:
+            return re.fullmatch(
+                r"gpadjust\[\w+\] @ git\+https://github.com/OWNER/gpadjust", package
+            )
         case [tool, *_]:
             return tool in TOOLS
 
