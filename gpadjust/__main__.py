@@ -10,10 +10,10 @@ from functools import partial
 from typing import Any
 
 _ABOUT = """\
-One page that shows whether a crude physics model helps to predict your measurements, where it is
-wrong, how well left-out measurements are predicted, and which model to take, which is saved beside
-it. You need a table, a line of which names its columns, and the physics: a formula of these
-columns, or a Python function.
+Write a page that shows whether a crude physics model helps to predict your measurements, where it
+is wrong, how well left-out measurements are predicted, and which model to take; the model is saved
+beside it. You need a table with names of its columns, and the physics: a formula of these columns,
+or a Python function.
 """
 _EXAMPLE = """\
 example: beam.csv has the columns "force [N]", "length [m]", "thickness [m]" and "deflection [m]"
@@ -33,9 +33,9 @@ of NumPy arrays or torch tensors, in its folder,
     gpadjust report pump.csv --inputs flow,speed --outputs head --physics pump:head
 """
 _ABOUT_LOGS = """\
-One page about a machine by its log: parameters of its equations with intervals, noise of the
+Write a page about a machine by its log: parameters of its equations with intervals, noise of the
 sensors, hidden states, and how well the equations follow the last part of the log, which is held
-out. You need a CSV file, a line of which names its columns, and equations, one for each state.
+out. You need a CSV file with names of its columns, and equations, one for each state.
 """
 _EXAMPLE_OF_LOGS = """\
 example: swing.csv has the columns "time [s]", "angle [rad]" and "torque [N m]", and no rate
@@ -53,22 +53,23 @@ _OPTIONS = """\
 data: the table: a CSV file, or *.xlsx (the extra excel)
 --inputs a,b: the columns that the physics reads, and others that matter; by default those that its
     formula names; "d=wire d" calls a column d
---outputs y: the columns that it predicts; "y=Force 1" calls a column y
+--outputs y: the columns to predict; "y=Force 1" calls a column y
 --physics formula: the physics: a formula of the columns' names, with + - * / ** or ^ and functions
     such as sqrt, or a spreadsheet's, of several outputs with commas between them; or
     module:function. Several: give it again
---units a=m,y=Pa: units, of columns that do not say them, as "a [m]"
---noise 0.1: known standard deviation of the outputs; or y=0.1,z=2; or learnt: constant, or
-    relative, which grows with the physics. By default the one that left-out observations prefer
+--units a=m,y=Pa: units of columns, as in "a [m]"; they replace those of the file, and convert
+    nothing
+--noise 0.1: known standard deviation of the outputs; or y=0.1,z=2; or fitted: constant, or
+    relative, which grows with the physics. By default the kind that left-out observations prefer
 --outliers: some measurements may be far off
---input-noise a=0.5: standard deviations of inputs that are noisy, too
+--input-noise a=0.5: standard deviations of noisy inputs
 --positive: the outputs cannot be negative
 --bounds 0,1: the outputs are between these numbers
 --categories a,b: inputs that are names, not sizes: numbers or text
 --batches rig: categories that each shift the outputs by an offset
---fit: compare structures, which tells whether the physics helps (the default); or one CKA alone, by
+--fit: compare structures, which shows whether the physics helps (the default); or one CKA alone, by
     full Bayes or at the likeliest hyper-parameters, which is quicker
---rows 500: the most rows that are taken; of more, so many are drawn at random (%(default)s)
+--rows 500: maximum number of rows; of more, this many are drawn at random (%(default)s)
 """
 _OPTIONS_OF_LOGS = """\
 data: the log: CSV files or *.xlsx, a record each
@@ -79,26 +80,26 @@ data: the log: CSV files or *.xlsx, a record each
 --states a,b: the states, columns of the log; or a=q, where a's column is q
 --hidden b=0+-2: a state that was not measured, with mean and standard deviation at the beginning.
     Several: give it again
---actions u: what acts on the machine; without it, the time
---angles a: states in rad that jump where they have gone round
+--actions u: inputs that act on the machine; by default the time
+--angles a: angles in rad that jump after a full turn
 --physics equation: an equation for each state: "a'=...", its time derivative, or 'a=...', its next
     value; or module:name
 --step 0.05: the step of the free run, a multiple of the sampling step, which it is by default; a
     longer one takes the measurements at its ends alone; equations follow the actions in between
 --segment run: a column of labels: where they change, a new run begins
 --held-out 0.25: the share of the log that is held out at its end (%(default)s)
---starts 4: searches to take the best of
+--starts 4: number of searches, of which the best is taken
 """
 _OPTIONS_OF_BOTH = """\
 --unknown E=2+-0.4: an unknown number of the physics, its guess and standard deviation, which may be
     a percentage; or a factor, E=2*/1.5; or bounds, E=1..3; or of a function of v, from 0 to 9,
     "F(v: 0..9)=2*/1.5". Several: give it again
---out page.html: the page to write (%(default)s), with a model the model beside it, page.pt; both
-    replace what has these names
---seed 0: of the fits and free runs (%(default)s)
---names a,b: names of all columns, of a file without, or in place of its own
---delimiter mark: between two fields, such as ";" or tab; found by default
---decimal mark: the decimal mark, "." or ","; found by default
+--out page.html: the page to write (%(default)s), and for a table its model, page.pt; earlier files
+    of these names are replaced
+--seed 0: seed of the fits and free runs (%(default)s)
+--names a,b: names of all columns, for a file without names or in place of them
+--delimiter mark: between two fields, such as ";" or tab; inferred by default
+--decimal mark: the decimal mark, "." or ","; inferred by default
 --sheet name: the sheet of a workbook that has several
 --title text: the title of the page
 """
@@ -133,7 +134,7 @@ def parser() -> ArgumentParser:
         add_to = commands.add_parser(command, **texts, formatter_class=RawDescriptionHelpFormatter)
         is_log = command == "identify"
         ends = add_to if is_log else add_to.add_mutually_exclusive_group()
-        kinds |= {"--out": {"default": f"{command}.html"}, "data": {"nargs": "+"} if is_log else {}}
+        kinds |= {"--out": {"default": f"{command}.html"}, "data": {"nargs": "+" if is_log else 1}}
         options = (_OPTIONS_OF_LOGS if is_log else _OPTIONS) + _OPTIONS_OF_BOTH
         for paragraph in re.split(r"\n(?! )", options.strip()):
             option, _, text = paragraph.partition(": ")

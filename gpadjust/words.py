@@ -46,6 +46,11 @@ def name_and_unit(name: str) -> tuple[str, str]:
     return match[1], match[2].strip()
 
 
+def labelled(name: str, unit: str) -> str:
+    """Return a name with its unit, such as ``head [m]``; the name alone if it has none."""
+    return f"{name} [{unit}]" if unit else name
+
+
 def bare(name: str) -> str:
     """Return a name without its unit."""
     return name_and_unit(name)[0]

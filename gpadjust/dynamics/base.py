@@ -127,7 +127,7 @@ class Dynamics(ABC):
         # A variance of zero has no density: NaN leaves such states out of nlpd and coverage.
         variance = variance.masked_fill((variance <= 0).any(0), torch.nan)
         names = [self.spec.states[i] for i in moving]
-        return Scores.of(mean, variance, measured, output_names=names)
+        return Scores.compute(mean, variance, measured, output_names=names)
 
     def free_run(
         self,
@@ -398,7 +398,7 @@ class FreeRun(NamedTuple):
         )
         draws, y = ((part / units)[..., spec.moving] for part in (draws, measured))
         y = y.masked_fill(draws.isnan().any(0), torch.nan)  # where the physics fails
-        return Scores.of(
+        return Scores.compute(
             mean,
             variance,
             measured,

@@ -39,8 +39,7 @@ _COMMON_UNITS = frozenset(
 def number(text: str, decimal: str = ".", *, grouped: bool = False) -> float:
     """Return the number in a field: NaN if it is missing, infinity if the field is not a number.
 
-    Blanks or apostrophes may separate thousands. A point or comma separates them where the field
-    has the other mark, too, or if ``grouped``.
+    A point or comma separates thousands where the field has the other mark, or if ``grouped``.
     """
     if text.lower() in MISSING or not text.strip("-"):
         return math.nan
@@ -100,11 +99,8 @@ def is_moment(text: str) -> bool:
 def seconds_of(texts: Sequence[str]) -> list[float]:
     """Return dates and times of day as seconds since the first.
 
-    Dates follow ISO 8601, ``2015-02-02 14:19:00``, or have points, ``2.2.2015 14:19``. Dates with
-    strokes need the same order of day and month in all rows.
-
-    Raises:
-        ValueError: If a text is not a date, or the order of day and month is ambiguous.
+    Dates follow ISO 8601, ``2015-02-02 14:19:00``, or have points, ``2.2.2015 14:19``. Raise a
+    ValueError if a text is not a date, or the order of day and month is ambiguous.
     """
     readings: list[list[float]] = []
     for day_first in (True, False):
@@ -164,12 +160,7 @@ def _moment(text: str, day_first: bool) -> tuple[str, timedelta] | None:
 
 
 def split_unit(name: str) -> tuple[str, str]:
-    """Return ``"head"`` and ``"m"`` of ``"head [m]"`` or ``"head (m)"``; ``""`` without a unit.
-
-    Example:
-        >>> split_unit("Servo 3 (us)"), split_unit("head")
-        (('Servo 3', 'us'), ('head', ''))
-    """
+    """Return ``"head"`` and ``"m"`` of ``"head [m]"`` or ``"head (m)"``; ``""`` without a unit."""
     match = _NAME.fullmatch(name.strip())
     if not match:
         return name, ""
@@ -193,6 +184,4 @@ def seconds_in(unit: str) -> float | None:
 def time_unit_of(name: str) -> str:
     """Return the unit of time at the end of a name, as in ``time_ms`` or ``millis``, or ""."""
     last = re.split(r"[\s_.-]+", name.strip())[-1]
-    if seconds_in(last) is None:
-        return ""
-    return last
+    return last * (seconds_in(last) is not None)

@@ -25,27 +25,22 @@ _CODES = {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 
 
 def rows_of_text(file: str | Path, delimiter: str | None) -> tuple[list[Row], str]:
-    """Return the rows of a CSV file and its delimiter.
-
-    The encoding is UTF-8, UTF-16 with a byte order mark, or Windows-1252, which old spreadsheets
-    write.
-    """
+    """Return the rows of a CSV file in UTF-8, UTF-16 or Windows-1252, and its delimiter."""
     content = Path(file).read_bytes()
     try:
         text = content.decode(_CODES.get(content[:2], "utf-8-sig"))
     except UnicodeDecodeError:  # the few bytes that Windows-1252 leaves open are replaced
         text = content.decode("cp1252", errors="replace")
     first, _, rest = text.partition("\n")
-    skipped = 0
-    if first.strip().lower().startswith("sep=") and len(first.strip()) == 5:  # a line for Excel
+    is_for_excel = first.strip().lower().startswith("sep=") and len(first.strip()) == 5
+    if is_for_excel:
         delimiter = delimiter or first.strip()[4]
         text = rest
-        skipped = 1
     mark = delimiter or _delimiter(text)
     try:
         if "\0" in text:  # newer versions of Python read it as text
             raise csv.Error("line contains NUL")
-        rows = [(line + skipped, fields) for line, fields in _parsed(text, mark)]
+        rows = [(line + is_for_excel, fields) for line, fields in _parsed(text, mark)]
     except csv.Error as error:
         raise ValueError(
             f"{file}: expected a CSV file in UTF-8, but {error}; save it as UTF-8, in a "
@@ -108,7 +103,7 @@ def rows_of_sheet(
 ) -> list[Row]:
     """Return the rows of a sheet of a workbook as texts, all of one width.
 
-    Sheets without a value need no choice. ``option`` writes the option ``sheet`` in errors.
+    ``option`` writes the option ``sheet`` in errors; sheets without a value need no choice.
     """
     try:
         from openpyxl import load_workbook
@@ -129,10 +124,10 @@ def rows_of_sheet(
             filled = filter(_has_values, formulas.worksheets)
             names = [worksheet.title for worksheet in filled] or names[:1]
         if sheet not in names and (sheet is not None or len(names) != 1):
-            listed = ", ".join(map(repr, names))
+            titles = ", ".join(map(repr, names))
             expected = "one sheet" if sheet is None else f"a sheet {sheet!r}"
             way = option("sheet", names[0])
-            raise ValueError(f"{file}: expected {expected}, found {listed}; choose one: {way}.")
+            raise ValueError(f"{file}: expected {expected}, found {titles}; choose one: {way}.")
         rows: list[Row] = []
         values = book[sheet or names[0]].iter_rows()
         sources = formulas[sheet or names[0]].iter_rows()

@@ -25,10 +25,10 @@ class Table:
     r"""The columns of a table by their names.
 
     Delimiter, decimal mark and encoding are inferred. Names are in the line before the first
-    numbers. Units are in brackets after the names, ``[m]`` or ``(m)``, or in a line below them.
-    Earlier lines are skipped, as are lines without a value. If each row has one field more than
-    there are names, the first column has the names of the rows, as R writes them. Lines and columns
-    are counted from 1, as in editors.
+    numbers, units in brackets after the names, ``[m]`` or ``(m)``, or in a line below them. Earlier
+    lines are skipped, as are lines without a value. If each row has one field more than there are
+    names, the first column has the names of the rows, as R writes them. Lines and columns are
+    counted from 1. Methods raise a ValueError if there is no such column, or several.
 
     Args:
         file: A CSV file, or a workbook, ``*.xlsx`` (the extra ``excel``).
@@ -88,14 +88,11 @@ class Table:
         rows = [row for row in rows if any(row[1])]
         fields = [row for _, row in rows]
         header, units, first = _heads(fields, names is not None)
-        if not rows:
-            raise ValueError(
-                f"{file}: expected a line of names and then rows, found an empty file."
-            )
         if first >= len(rows):
-            raise ValueError(
-                f"{file}: expected a line of names and then rows, found only a line of names."
-            )
+            content = "only a line of names"
+            if not rows:
+                content = "an empty file"
+            raise ValueError(f"{file}: expected a line of names and then rows, found {content}.")
         if header is None and names is None:
             shown = ", ".join(map(repr, fields[0][:5]))
             raise ValueError(
@@ -139,11 +136,7 @@ class Table:
         return self._labels[self._column(name)]
 
     def texts(self, name: str) -> list[str]:
-        """Return the fields of a column.
-
-        Raises:
-            ValueError: If there is no such column, or several, or a field is empty.
-        """
+        """Return the fields of a column; raise a ValueError if one is empty."""
         column = self._column(name)
         for line, fields in self._rows:
             if not fields[column]:
@@ -153,10 +146,7 @@ class Table:
     def categories(self, name: str) -> tuple[Tensor, tuple[float, ...] | tuple[str, ...]]:
         """Return the categories of a column: numbers, ``N``, and the sorted levels.
 
-        If a field is not a number, the levels are texts, numbered from 0.
-
-        Raises:
-            ValueError: If there is no such column, or several, or a field is empty.
+        If a field is not a number, the levels are texts, numbered from 0. None may be empty.
         """
         texts = self.texts(name)
         values = [self._number(text) for text in texts]
@@ -168,18 +158,13 @@ class Table:
     def numbers(self, name: str, *, may_miss: bool = False) -> Tensor:
         """Return the numbers of a column, ``N``, in float64.
 
-        Args:
-            name: The name of the column.
-            may_miss: If True, return NaN for an empty field or a word for a missing value.
+        If it ``may_miss``, a field that is empty or has a word for a missing value is NaN.
 
         Raises:
-            ValueError: If there is no such column, or several, or a field is not a finite number,
-                or one beyond 1e100.
+            ValueError: If a field is not a finite number, or one beyond 1e100.
         """
         column = self._column(name)
-        expected = "a number, or nothing if it was not measured"
-        if not may_miss:
-            expected = "a number"
+        expected = "a number" + ", or nothing if it was not measured" * may_miss
         values = []
         for line, fields in self._rows:
             value = self._number(fields[column])
@@ -202,9 +187,9 @@ class Table:
         column, in brackets or as in ``time_ms``, or in ``unit`` if the column has no unit.
 
         Raises:
-            ValueError: If there is no such column, a field is not a number, dates are ambiguous or
-                mixed with numbers, or the column is in minutes, hours, days or not in a unit of
-                time, unless ``unit`` is given.
+            ValueError: If a field is not a number, dates are ambiguous or mixed with numbers, or
+                the column is in minutes, hours, days or not in a unit of time, unless ``unit`` is
+                given.
         """
         column = self._column(name)
         where = f"{self.file}, column {column + 1} ({self.headers[column]!r})"
@@ -224,11 +209,9 @@ class Table:
             in_s = self._option("time_unit", "s")
             advice = f"if the column is in seconds, {in_s}."
             if seconds_in_column is not None:
-                in_column_unit = self._option("time_unit", column_unit)
-                advice = (
-                    f"if rates are per {column_unit}, {in_column_unit}; if per s, {in_s}, which "
-                    "converts it."
-                )
+                option = self._option("time_unit", column_unit)
+                advice = f"if rates are per {column_unit}, {option}; if per s, {in_s}, "
+                advice += "which converts it."
             raise ValueError(
                 f"{where}: expected a time in seconds, found {column_unit!r}; {advice}"
             )
@@ -258,16 +241,16 @@ class Table:
         if places:
             columns = " and ".join(str(place + 1) for place in places)
             raise ValueError(
-                f"{where}: expected one column {name!r}, found columns {columns}; "
-                "rename all but one."
+                f"{where}: expected one column {name!r}, found columns {columns}; rename all but "
+                "one."
             )
-        listed = ", ".join(map(repr, self.headers))
+        headers = ", ".join(map(repr, self.headers))
         # Names are compared without units and capitals.
         plain = dict(zip(map(str.casefold, self.names), self.headers, strict=True))
         similar = get_close_matches(read.split_unit(name)[0].casefold(), plain, n=1)
         question = "".join(f" Is it {plain[match]!r}?" for match in similar)
         raise ValueError(
-            f"{where}: expected a column {name!r}, found {listed}.{question} {self._hint}"
+            f"{where}: expected a column {name!r}, found {headers}.{question} {self._hint}"
         )
 
     def _header_of_each_field(

@@ -1,4 +1,4 @@
-"""A page to show: what a model or a comparison says (the extra ``report``)."""
+"""A page about a model or a comparison, for those who decide (the extra ``report``)."""
 
 try:
     import matplotlib as _

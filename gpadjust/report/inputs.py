@@ -1,4 +1,4 @@
-"""What a command line gives: tables, physics, and options that are texts."""
+"""Input of a command line: tables, physics, and options that are texts."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from gpadjust.physics import (
 )
 from gpadjust.physics.formula import has_pi, names_in, parse, symbol
 from gpadjust.physics.function import array_physics
-from gpadjust.words import bare, listed, plural
+from gpadjust.words import bare, labelled, listed, plural
 
 _HINT = (
     "Name columns as the file does; a unit in brackets may be left out, so that 'head' is 'head "
@@ -44,19 +44,21 @@ _HINT = (
 )
 _PRIOR = re.compile(
     r"\s*([^=\[]+?)\s*(?:\[(.*)\])?\s*=\s*(.+?)\s*(\+/?-|±|\*/|\.\.)\s*(.+?)\s*(%?)\s*"
-)
+)  # name, unit, guess, operator, spread, percent sign
+# name of a function, its variable, ends of its range
 _FUNCTION = re.compile(r"(\w+)\((.+?)\s*:\s*(.+?)\s*\.\.\s*(.+?)\)")
+# name, prime of a derivative, right side
 _EQUATION = re.compile(r"\s*([^\W\d]\w*)\s*('?)\s*=(?!=)(.*)", flags=re.DOTALL)
 _HOW = "A Python function is given as module:function, such as pump:head."
-_CELL = re.compile(r"[A-Z]{1,2}\d+")
+_CELL = re.compile(r"[A-Z]{1,2}\d+")  # of a spreadsheet
 _SHOWN = 5  # rows at which a physics fails
-_MADE = ("BlackBoxPhysics", "FormulaPhysics", "ODEPhysics", "Unknown")
-_SAME = 1e-6  # as a model's file asks it when it is loaded
+_MADE = ("BlackBoxPhysics", "FormulaPhysics", "ODEPhysics", "Unknown")  # names in code of a physics
+_SAME = 1e-6  # relative difference that a model's file accepts when it is loaded
 
 
 @dataclass(frozen=True)
 class Columns:
-    """Columns by their names, with units in brackets: like a DataFrame, as far as models ask."""
+    """Columns by their names, with units in brackets: as much of a DataFrame as models need."""
 
     columns: tuple[str, ...]
     values: Tensor
@@ -82,23 +84,26 @@ class TableData(NamedTuple):
 
 
 def open_table(file: str, arguments: Namespace, hint: str = "") -> Table:
-    """Open a CSV file or a workbook by the marks of a command line; errors have its options."""
+    """Open a CSV file or a workbook with the options of a command line, which errors name."""
     path = Path(file)
     if not path.exists():
-        near = (other.name for other in path.absolute().parent.glob("*") if other.is_file())
-        raise FileNotFoundError(f"There is no file {file!r}.{meant(path.name, near)}")
+        others = (other.name for other in path.absolute().parent.glob("*") if other.is_file())
+        raise FileNotFoundError(f"There is no file {file!r}.{meant(path.name, others)}")
     if not path.is_file():
-        what = "a folder" if path.is_dir() else "a device or a pipe"
-        raise OSError(f"{file!r} is {what}, expected a CSV file.")
+        kind = "a folder" if path.is_dir() else "a device or a pipe"
+        raise OSError(f"{file!r} is {kind}, expected a CSV file.")
     return Table(file, **table_options(arguments), hint=_HINT + hint, is_command=True)
 
 
 def table_options(arguments: Namespace) -> dict[str, Any]:
-    """Return the options of a :class:`Table` that a command line has, None where it has none."""
+    """Return the options of a :class:`Table` on a command line, None where it has none."""
+    mark = {"\\t": "\t", "tab": "\t"}.get(arguments.delimiter, arguments.delimiter)
+    if mark is not None and len(mark) != 1:
+        raise ValueError(f"Expected --delimiter as one character, or tab, found {mark!r}.")
     return {
-        "delimiter": None if arguments.delimiter is None else mark_of(arguments.delimiter),
+        "delimiter": mark,
         "decimal": arguments.decimal,
-        "names": names_of(arguments.names, "--names") or None,
+        "names": names_of(arguments.names, "--names") or None,  # an empty list has no meaning
         "sheet": arguments.sheet,
     }
 
@@ -112,65 +117,75 @@ def read_table(
 ) -> TableData:
     """Read columns of a table by new names, in the order in which the physics has them.
 
-    Inputs that are texts are categories, too; dates are times since the first. A command line has
-    units and the number of rows.
+    Inputs that are texts are categories, too; dates are times since the first. The command line
+    specifies units and the number of rows.
     """
-    d, asked = len(inputs), [*inputs.items(), *outputs.items()]
-    columns = [table.label(column) for _, column in asked]
-    check_different(columns, "columns as inputs and outputs")
-    known = f"--inputs {','.join(inputs)}; name it there"
-    check_names(categories, "--categories or --batches", inputs, known)
-    units = {} if arguments.units is None else pairs(arguments.units, "--units")
-    old = [column for _, column in asked]
-    known = ", ".join(repr(name) for name, _ in asked)
-    check_names(units, "--units", [*inputs, *outputs, *old, *columns], known)
+    d = len(inputs)
+    requested = [*inputs.items(), *outputs.items()]
+    labels = [table.label(column) for _, column in requested]
+    check_different(labels, "columns as inputs and outputs")
+    options = f"--inputs {','.join(inputs)}; name it there"
+    check_names(categories, "--categories or --batches", inputs, options)
+    units = pairs(arguments.units, "--units")
+    spellings = [*inputs, *outputs, *(column for _, column in requested), *labels]
+    check_names(units, "--units", spellings, ", ".join(repr(name) for name, _ in requested))
     names, values, remarks = list[str](), list[Tensor](), [*table.remarks]
     levels: dict[str, tuple[Any, ...]] = {}
-    for (name, column), label in zip(asked, columns, strict=True):
+    for (name, column), label in zip(requested, labels, strict=True):
         short, unit = split_unit(name if name != column else label)
-        named = [units[key] for key in (name, column, label) if key in units]
-        unit = (named or [unit or table.unit(column)])[0]
         is_input = len(values) < d
-        if is_dates := is_input and table.has_dates(column):
+        is_date = is_input and table.has_dates(column)
+        in_file = table.unit(column)
+        # A unit of the option replaces that of the new name, and this that of the file.
+        unit = next((units[key] for key in (name, column, label) if key in units), unit or in_file)
+        if is_date:
             unit = unit or "s"
             remarks.append(f"{short} is the time since the first row, in {unit}.")
-        names.append(f"{short} [{unit}]" if unit else short)
-        if is_dates:
+        elif in_file not in ("", unit):
+            remarks.append(
+                f"{short} is taken in {unit} instead of {in_file}, its unit in the file; its "
+                "numbers are not converted."
+            )
+        names.append(labelled(short, unit))
+        if is_date:
             values.append(table.times(column, unit))
         elif is_input and (name in categories or _are_names(table, column)):
             numbers, levels[names[-1]] = table.categories(column)
             values.append(numbers)
         else:
             values.append(table.numbers(column, may_miss=not is_input))
-    everything, lines = torch.stack(values, -1), torch.tensor(table.lines)
-    has_none = everything[:, d:].isnan().all(-1)
-    rows = (~has_none).nonzero().flatten()
-    if left := [str(line) for line in lines[has_none].tolist()]:
-        shown = [*left[:10], f"{len(left) - 10} more"] if len(left) > 10 else left
-        plural_s = "s" * (len(left) > 1)
-        remarks.append(f"Left out, as they have no output: line{plural_s} {listed(shown)}.")
+    # Leave out rows without any output, and all but some of very many.
+    matrix = torch.stack(values, -1)
+    lines = torch.tensor(table.lines)
+    has_output = ~matrix[:, d:].isnan().all(-1)
+    rows = has_output.nonzero().flatten()
+    if dropped := [str(line) for line in lines[~has_output].tolist()]:
+        shown = [*dropped[:10], *[f"{len(dropped) - 10} more"] * (len(dropped) > 10)]
+        lines_s = "line" + "s" * (len(dropped) > 1)
+        remarks.append(f"Left out, as they have no output: {lines_s} {listed(shown)}.")
     if (n := len(rows)) > arguments.rows:
+        # Drawn at random, as the first rows may be of one place or time; in the order of the file.
         order = torch.randperm(n, generator=torch.Generator().manual_seed(arguments.seed))
         rows = rows[order[: arguments.rows].sort().values]
         remarks.append(
             f"Of {plural(n, 'row')} {arguments.rows:,} were taken, drawn at random by --seed: a "
             "comparison takes time with the cube of their number. --rows takes more or fewer."
         )
-    X, Y = everything[rows].split([d, len(outputs)], -1)
+    X, Y = matrix[rows].split([d, len(outputs)], -1)
     for name, count in zip(names[d:], (~Y.isnan()).sum(0).tolist(), strict=True):
         if count < 2:
             raise ValueError(
                 f"{table.file}: expected two rows or more with a number in {name!r}, found "
-                f"{count}; a comparison wants eight or more to show anything."
+                f"{count}; a comparison needs eight or more to show anything."
             )
     if missing := int(Y.isnan().sum()):
         remarks.append(
-            f"{plural(missing, 'output')} missing in rows that have others: each output learns "
-            "from its own rows."
+            f"{plural(missing, 'output')} missing in rows that have others: each output is fitted "
+            "to its own rows."
         )
-    for name, own in levels.items():
-        if isinstance(own[0], str):
-            numbered = listed(f"{k} is {level}" for k, level in enumerate(own))
+    for name, of_column in levels.items():
+        if isinstance(of_column[0], str):  # numbers stay as they are
+            numbered = listed(f"{k} is {level}" for k, level in enumerate(of_column))
             remarks.append(f"The physics reads {bare(name)} as a number: {numbered}.")
     X_and_Y = Columns(tuple(names[:d]), X), Columns(tuple(names[d:]), Y)
     return TableData(*X_and_Y, lines[rows].tolist(), tuple(remarks), levels)
@@ -189,24 +204,24 @@ def log_columns(
     table: Table, hidden: Mapping[str, str], arguments: Namespace
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """Return columns of a log as options of ``Records.read_csv``, None if hidden, and units."""
-    named = pairs(arguments.states, "--states", short=True)
-    check_names(hidden, "--hidden", named, "--states")
-    has_times = math.isnan(number_of(arguments.time))
+    states = pairs(arguments.states, "--states", short=True)
+    check_names(hidden, "--hidden", states, "--states")
+    has_times = math.isnan(number_of(arguments.time))  # otherwise the number is the sampling step
     time = _time_column(table, arguments.time)
     if not arguments.actions and not has_times:
         raise ValueError("Expected --actions, as there is no column of times to stand for them.")
-    acting = {"time": time}
+    actions = {"time": time}  # of a machine on which nothing acts
     if arguments.actions:
-        acting = pairs(arguments.actions, "--actions", short=True)
+        actions = pairs(arguments.actions, "--actions", short=True)
     columns = {
-        "states": {name: None if name in hidden else column for name, column in named.items()},
-        "actions": acting,
+        "states": {name: None if name in hidden else column for name, column in states.items()},
+        "actions": actions,
         "time": time if has_times else float(time),
         "time_unit": arguments.time_unit,
         "segment": arguments.segment,
     }
-    own = {**named, **acting}
-    units = {name: hidden[name] if name in hidden else table.unit(own[name]) for name in own}
+    measured = {name: col for name, col in {**states, **actions}.items() if name not in hidden}
+    units = {**hidden, **{name: table.unit(column) for name, column in measured.items()}}
     units["time"] = arguments.time_unit or "s"
     return columns, {name: unit for name, unit in units.items() if unit}
 
@@ -217,7 +232,7 @@ def _time_column(table: Table, name: str) -> str:
     dates = [header for header in headers if table.has_dates(header)]
     if name != "time" or len(dates) != 1 or name in {*table.headers, *table.names}:
         return name
-    (column,) = map(table.bare, dates)
+    column = table.bare(dates[0])
     table.remarks.append(f"{table.file}: the times are in its only column of dates, {column!r}.")
     return column
 
@@ -232,10 +247,10 @@ class GivenPhysics(NamedTuple):
 
 def imports_of(code: str, modules: Sequence[str], *names: str) -> str:
     """Return lines that import what the code of a physics needs, and names of the library."""
-    made = [*(name for name in _MADE if f"{name}(" in code), *names]
-    lines = ["from math import inf\n"] if re.search(r"\binf\b", code) else []
+    names = (*(name for name in _MADE if f"{name}(" in code), *names)
+    lines = ["from math import inf\n"] * bool(re.search(r"\binf\b", code))
     lines += ["import torch", *(f"import {module}" for module in modules)]
-    lines += [f"from gpadjust import {', '.join(made)}"] if made else []
+    lines += [f"from gpadjust import {', '.join(names)}"] * bool(names)
     return "\n".join(lines)
 
 
@@ -250,19 +265,21 @@ def unknown_of(text: str) -> tuple[str, Unknown]:
     try:
         if match is None:
             raise ValueError("it has another form")
-        name, unit, guess, how, spread, is_share = match.groups()
+        name, unit, guess, operator, spread, is_share = match.groups()
         function = _FUNCTION.fullmatch(name)
-        first, second = float(guess), float(spread)
+        first = float(guess)
+        second = float(spread)
         options: dict[str, Any] = {"sd": second}
-        if is_share and how in ("*/", ".."):
+        if is_share and operator in ("*/", ".."):
             raise ValueError("a percentage goes with +-")
-        if is_share:
+        if is_share:  # of the guess, and a number that is known to a share has a sign
             bounds = (0.0, math.inf) if first > 0 else (-math.inf, 0.0)
             options = {"sd": 0.01 * second * abs(first), "bounds": bounds}
-        elif how == "*/":
+        elif operator == "*/":
             options = {"factor": second}
-        elif how == "..":
-            first, options = 0.5 * (first + second), {"bounds": (first, second)}
+        elif operator == "..":
+            options = {"bounds": (first, second)}
+            first = 0.5 * (first + second)
         if function is not None:
             name, variable, low, high = function.groups()
             options |= {"function_of": variable, "between": (float(low), float(high))}
@@ -276,9 +293,9 @@ def unknown_of(text: str) -> tuple[str, Unknown]:
 
 def unknowns_of(texts: Sequence[str]) -> dict[str, Unknown]:
     """Return the unknown parameters of a command line by their names."""
-    pairs = [(symbol(name), prior) for name, prior in map(unknown_of, texts)]
-    check_different([name for name, _ in pairs], "--unknown")
-    return dict(pairs)
+    priors = [(symbol(name), prior) for name, prior in map(unknown_of, texts)]
+    check_different([name for name, _ in priors], "--unknown")
+    return dict(priors)
 
 
 def hidden_of(texts: Sequence[str]) -> dict[str, Unknown]:
@@ -286,12 +303,12 @@ def hidden_of(texts: Sequence[str]) -> dict[str, Unknown]:
     hidden: dict[str, Unknown] = {}
     for text in texts:
         prior: Unknown | None = None
-        with suppress(ValueError):
+        with suppress(ValueError):  # the error below has an example of a state
             name, prior = unknown_of(text)
         if prior is None or prior.sd is None:
             raise ValueError(
-                "Expected --hidden with what is known of its beginning, mean and standard "
-                f"deviation, such as 'rate [rad/s]=0 +- 2', found {text!r}."
+                "Expected --hidden with mean and standard deviation at its beginning, such as "
+                f"'rate [rad/s]=0 +- 2', found {text!r}."
             )
         hidden[name] = prior
     return hidden
@@ -300,23 +317,23 @@ def hidden_of(texts: Sequence[str]) -> dict[str, Unknown]:
 def columns_of(
     formulas: Sequence[str], names: Sequence[str], inputs: Sequence[str], unknowns: Sequence[str]
 ) -> list[str]:
-    """Return the columns that formulas name beside inputs, in the order of the table."""
-    named = {name for formula in formulas for name in names_in(formula)}
-    known = [symbol(name) for name in (*inputs, *names)]
-    columns = [name for name in names if symbol(name) in named]
+    """Return the columns that formulas name in addition to inputs, in the order of the table."""
+    used = {name for formula in formulas for name in names_in(formula)}
+    symbols = [symbol(name) for name in (*inputs, *names)]
+    columns = [name for name in names if symbol(name) in used]
     check_different([*map(symbol, columns)], "columns in a formula, which has no units")
-    absent = sorted(named - {*known, *unknowns})
-    if absent or not (columns or inputs):
-        wrong = absent[0] if absent else "none of them"
-        hint = meant(wrong, [*known, *unknowns]) if absent else ""
-        if _CELL.fullmatch(wrong):
-            hint = f" {wrong} seems to be a cell: write the name of its column."
-        raise ValueError(
-            f"Expected a formula of columns of the table, {', '.join(known)}, and of --unknown; "
-            f"found {wrong!r} in --physics {formulas[0]!r}.{hint} Another name for a column: "
-            f'--inputs "d=wire d". {_HOW}'
-        )
-    return columns
+    absent = sorted(used - {*symbols, *unknowns})
+    if not absent and (columns or inputs):
+        return columns
+    wrong = (absent or ["none of them"])[0]
+    hint = meant(wrong, [*symbols, *unknowns])
+    if _CELL.fullmatch(wrong):
+        hint = f" {wrong} seems to be a cell: write the name of its column."
+    raise ValueError(
+        f"Expected a formula of columns of the table, {', '.join(symbols)}, and of --unknown; "
+        f"found {wrong!r} in --physics {formulas[0]!r}.{hint} Another name for a column: "
+        f'--inputs "d=wire d". {_HOW}'
+    )
 
 
 def check_constants(formulas: Iterable[str], names: Iterable[str]) -> None:
@@ -341,46 +358,47 @@ def given_physics(
     parts, code = dict[str, Physics](), dict[str, str]()
     for text in texts:
         short = text.rpartition(":")[2].rpartition(".")[2]
-        if text in formulas:  # a name that figures have room for
-            short = f"formula {formulas.index(text) + 1}" if len(formulas) > 1 else "formula"
+        if text in formulas:  # figures have room for a short name
+            short = "formula" + f" {formulas.index(text) + 1}" * (len(formulas) > 1)
         name = text if short in parts else short
         make = _formula if text in formulas else _function
-        try:
+        try:  # before the fit, which may take minutes
             parts[name], code[name] = make(text, data, unknowns)
             _check(parts[name], data)
         except ValueError as error:
             raise ValueError(f"--physics {text}: {error}") from error
     used = {name for physics in parts.values() for name in physics.unknowns}
     if absent := [name for name in unknowns if name not in used]:
-        way = "" if formulas else " A function has its own: FunctionPhysics(f, unknowns=...)."
+        way = " A function has its own: FunctionPhysics(f, unknowns=...)." * (not formulas)
         raise ValueError(f"--unknown names {absent[0]!r}, which is in no formula.{way}")
     modules = tuple(dict.fromkeys(text.partition(":")[0] for text in texts if ":" in text))
-    several = ", ".join(f"{name!r}: {own}" for name, own in code.items())
-    expression = f"{{{several}}}" if len(parts) > 1 else code[name]
-    physics = parts if len(parts) > 1 else parts[name]
-    return GivenPhysics(physics, expression if modules else "", modules)
+    if len(parts) == 1:
+        return GivenPhysics(parts[name], code[name] * bool(modules), modules)
+    several = ", ".join(f"{name!r}: {text}" for name, text in code.items())
+    return GivenPhysics(parts, f"{{{several}}}" * bool(modules), modules)
 
 
 def _formula(text: str, data: TableData, unknowns: Mapping[str, Unknown]) -> tuple[Physics, str]:
-    """Return the physics of a formula, with the unknown parameters that it has, and its code."""
+    """Return the physics of a formula, with its unknown parameters, and its code."""
     try:
-        own = {name: unknown for name, unknown in unknowns.items() if name in names_in(text)}
-        physics = FormulaPhysics(text, data.X.columns, unknowns=own)
+        used = {name: unknown for name, unknown in unknowns.items() if name in names_in(text)}
+        physics = FormulaPhysics(text, data.X.columns, unknowns=used)
     except ValueError as error:
         raise ValueError(f"{error} {_HOW}") from error
-    more = f", unknowns={own!r}" if own else ""
+    more = f", unknowns={used!r}" * bool(used)
     return physics, f"FormulaPhysics({text!r}, {[*physics.columns]!r}{more})"
 
 
 def _function(path: str, data: TableData, _: object = None) -> tuple[Physics, str]:
-    """Return the physics that a path names, and the code that makes it of what the path names."""
-    thing, code = imported(path), path.replace(":", ".")
+    """Return the physics that a path names, and its code."""
+    function = imported(path)
+    code = path.replace(":", ".")
     try:
-        physics = array_physics(thing, data.X.to_numpy())
+        physics = array_physics(function, data.X.to_numpy())
     except (TypeError, PhysicsError) as error:
         row = f" The first row is line {data.lines[0]} of the file."
         raise ValueError(f"{error}{row * isinstance(error, PhysicsError)}") from error
-    is_numpy = isinstance(physics, BlackBoxPhysics) and physics is not thing
+    is_numpy = isinstance(physics, BlackBoxPhysics) and physics is not function
     return physics, f"BlackBoxPhysics({code})" if is_numpy else code
 
 
@@ -393,17 +411,18 @@ def motion(
 ) -> GivenPhysics:
     """Return the physics ``"module:name"`` of a machine, or of equations, one for each state."""
     if paths := [text for text in texts if ":" in text]:
-        path, module = paths[0], paths[0].partition(":")[0]
+        path = paths[0]
         if len(texts) > 1 or unknowns:
             raise ValueError(
                 f"Expected {path} alone: it has the next values of all states, and its own "
                 "unknown parameters, as of ODEPhysics(f, ..., unknowns=...)."
             )
         try:
-            return GivenPhysics(as_physics(imported(path)), path.replace(":", "."), (module,))
+            physics = as_physics(imported(path))
         except (ValueError, TypeError) as error:
             raise ValueError(f"--physics {path}: {error}") from error
-    sides, primes = dict[str, str](), set[str]()
+        return GivenPhysics(physics, path.replace(":", "."), (path.partition(":")[0],))
+    sides, primes = dict[str, str](), set[str]()  # right sides by state; "'" and ""
     for text in texts:
         match = _EQUATION.fullmatch(text)
         trees = [] if match is None else parse(match[3])
@@ -418,15 +437,16 @@ def motion(
     if {*sides} != {*states} or len(primes) > 1:
         raise ValueError(
             f"Expected an equation for each of {', '.join(states)}, all of time derivatives or all "
-            f"of next values, found those of {', '.join(sides)}."
+            f"of next values, found equations for {', '.join(sides)}."
         )
-    formula, columns = ", ".join(sides[name] for name in states), [*states, *actions]
+    formula = ", ".join(sides[name] for name in states)  # outputs have commas between them
+    columns = [*states, *actions]
     check_names(unknowns, "--unknown", names_in(formula), "the names in equations")
-    physics: Physics = FormulaPhysics(formula, columns, unknowns=unknowns)
-    priors = "".join(f"        {name!r}: {own!r},\n" for name, own in unknowns.items())
+    physics = FormulaPhysics(formula, columns, unknowns=unknowns)
+    priors = "".join(f"        {name!r}: {prior!r},\n" for name, prior in unknowns.items())
     rest = f"{formula!r},\n    {columns},\n    unknowns={{\n{priors}    }},\n"
     code = f"FormulaPhysics(\n    {rest})"
-    if primes == {"'"}:
+    if primes == {"'"}:  # x' = f(x, u), integrated over a step
         physics = ODEPhysics(physics, step, len(states))
         code = f"ODEPhysics({code}, step={step!r}, state_dim={len(states)})"
     return GivenPhysics(physics, code)
@@ -436,16 +456,17 @@ def imported(path: str) -> Any:
     """Return the object that a path ``module:name`` names."""
     module, _, name = path.partition(":")
     files = [file.stem for file in Path().glob("*.py")]
-    if os.getcwd() not in sys.path:
+    if os.getcwd() not in sys.path:  # as of a script there
         sys.path.insert(0, os.getcwd())
     try:
         return attrgetter(name)(import_module(module))
     except (Exception, SystemExit) as error:  # importing runs the user's code
         last = traceback.extract_tb(error.__traceback__)[-1]
         is_ours = "importlib" in last.filename or last.filename == __file__
-        place = "" if is_ours else f" ({Path(last.filename).name}, line {last.lineno})"
-        names = [*vars(sys.modules[module])] if module in sys.modules else []
-        near = meant(name, names) if module in files else meant(module, files)
+        place = f" ({Path(last.filename).name}, line {last.lineno})" * (not is_ours)
+        near = meant(module, files)
+        if module in files:
+            near = meant(name, vars(sys.modules.get(module, object)))
         raise ValueError(
             f"it cannot be imported, {type(error).__name__}: {error}{place}. Expected "
             "module:function, such as pump:head for the function head of pump.py in this folder, "
@@ -456,8 +477,9 @@ def imported(path: str) -> Any:
 @torch.no_grad()
 def _check(physics: Physics, data: TableData) -> None:
     """Raise a ValueError that names the lines of the file at which a physics fails."""
-    n, m = len(data.lines), len(data.Y.columns)
-    Y, again = _values(physics, data), _values(physics, data)
+    m = len(data.Y.columns)
+    Y = _values(physics, data)
+    again = _values(physics, data)  # a random physics cannot be judged
     if Y.shape[-1] != m:
         hint = " Commas part the outputs of a formula: is one a decimal comma?"
         raise ValueError(
@@ -474,45 +496,42 @@ def _check(physics: Physics, data: TableData) -> None:
     }
     for expected, (is_wrong, way_out) in checks.items():
         if rows := is_wrong.any(-1).nonzero().flatten().tolist():
-            found = f"found others in {len(rows)} of {plural(n, 'row')}"
-            raise ValueError(f"expected {expected}, {found}. {way_out}{_lines(rows, data)}")
+            counts = f"found others in {len(rows)} of {plural(len(data.lines), 'row')}"
+            raise ValueError(f"expected {expected}, {counts}. {way_out}{_lines(rows, data)}")
 
 
 def _values(physics: Physics, data: TableData) -> Tensor:
     """Return a physics at the data; its error, if any, names the lines of the file."""
-    X, errors = data.X.values, dict[int, str]()
-    physics.forget()
+    X = data.X.values
+    physics.forget()  # it would repeat remembered values
     try:
         return physics(X)
     except PhysicsError as error:
-        rows, message = [*error.rows], str(error.args[0])
-        for i in range(len(X) if len(rows) == len(X) > 1 else 0):  # which one does not say
-            try:
-                physics(X[i : i + 1])
-            except PhysicsError as of_row:
-                errors[i] = str(of_row.args[0])
+        rows = [*error.rows]
+        message = str(error.args[0])
+        errors = dict[int, str]()
+        if len(rows) == len(X) > 1:  # the call failed as a whole: try its rows one by one
+            for i in rows:
+                try:
+                    physics(X[i : i + 1])
+                except PhysicsError as of_row:
+                    errors[i] = str(of_row.args[0])
         if 0 < len(errors) < len(X):
-            rows, message = [*errors], next(iter(errors.values()))
+            rows = [*errors]
+            message = errors[rows[0]]
         raise ValueError(message + _lines(rows, data)) from error
 
 
 def _lines(rows: Sequence[int], data: TableData) -> str:
     """Return the first of some rows by their lines in the file and their inputs."""
-    shown = []
+    texts = []
     for i in rows[:_SHOWN]:
         values = zip(data.X.columns, data.X.values[i].tolist(), strict=True)
         at = ", ".join(f"{name} = {value:.6g}" for name, value in values)
-        shown.append(f"\n  line {data.lines[i]}: {at}")
-    more = f"\n  and {len(rows) - _SHOWN} more" if len(rows) > _SHOWN else ""
-    return f"{''.join(shown)}{more}"
-
-
-def mark_of(text: str) -> str:
-    """Return the mark between two fields, one character; a tab may be written as in Python."""
-    mark = {"\\t": "\t", "tab": "\t"}.get(text, text)
-    if len(mark) != 1:
-        raise ValueError(f"Expected --delimiter as one character, or tab, found {text!r}.")
-    return mark
+        texts.append(f"\n  line {data.lines[i]}: {at}")
+    if len(rows) > _SHOWN:
+        texts.append(f"\n  and {len(rows) - _SHOWN} more")
+    return "".join(texts)
 
 
 def digest_of(file: str) -> str:
@@ -535,10 +554,11 @@ def names_of(text: str | None, option: str) -> list[str]:
     return names
 
 
-def pairs(text: str, option: str, *, short: bool = False) -> dict[str, str]:
+def pairs(text: str | None, option: str, *, short: bool = False) -> dict[str, str]:
     """Return ``"a=m,b=s"`` as a dictionary; ``"a"`` is ``"a=a"`` if it may be ``short``."""
     values = dict[str, str]()
     for field in names_of(text, option):
+        # The last sign: a name may have others.
         name, equals, value = (part.strip() for part in field.rpartition("="))
         if short and not equals:
             name = value
@@ -550,16 +570,16 @@ def pairs(text: str, option: str, *, short: bool = False) -> dict[str, str]:
     return values
 
 
-def check_names(names: Iterable[str], option: str, known: Iterable[str], option_of: str) -> None:
+def check_names(names: Iterable[str], option: str, others: Iterable[str], of_others: str) -> None:
     """Raise a ValueError if an option names what another one does not."""
-    if unknown := [name for name in names if name not in known]:
-        raise ValueError(f"{option} names {unknown[0]!r}, which is none of {option_of}.")
+    if unknown := [name for name in names if name not in others]:
+        raise ValueError(f"{option} names {unknown[0]!r}; expected one of {of_others}.")
 
 
-def check_different(names: Sequence[str], what: str) -> None:
+def check_different(names: Sequence[str], subject: str) -> None:
     """Raise a ValueError if a name is there twice."""
-    if again := sorted(name for name in names if names.count(name) > 1):
-        raise ValueError(f"Expected different {what}, found {again[0]!r} more than once.")
+    if repeated := sorted(name for name in names if names.count(name) > 1):
+        raise ValueError(f"Expected different {subject}, found {repeated[0]!r} more than once.")
 
 
 def number_of(text: str) -> float:
@@ -578,7 +598,7 @@ def variances_of(
     if lacking := [name for name in names if all_of and name not in sds]:
         raise ValueError(f"{option} lacks {lacking[0]!r}: give it for each of them, or for none.")
     for name, text in sds.items():
-        if not 0 <= number_of(text) <= LARGEST:
+        if not 0 <= number_of(text) <= LARGEST:  # NaN is not
             raise ValueError(
                 f"Expected {option} as a standard deviation in the unit of {name!r}, such as 0.1, "
                 f"found {text!r}."
@@ -586,7 +606,7 @@ def variances_of(
     return [number_of(sds.get(name, "0")) ** 2 for name in names]
 
 
-def meant(name: str, known: Iterable[str]) -> str:
+def meant(name: str, others: Iterable[str]) -> str:
     """Return a hint at the name that was meant, if some is near."""
-    near = get_close_matches(name, [*known], n=1)
-    return f" Is it {near[0]!r}?" if near else ""
+    near = get_close_matches(name, [*others], n=1)
+    return "".join(f" Is it {match!r}?" for match in near)

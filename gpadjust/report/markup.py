@@ -11,7 +11,6 @@ from html import escape
 from importlib.resources import files
 from io import BytesIO
 from typing import Any, NamedTuple, ParamSpec
-from urllib.parse import quote
 
 from matplotlib import rc_context
 from matplotlib.figure import Figure
@@ -20,25 +19,16 @@ from gpadjust.physics import PhysicsError, PhysicsParameters
 from gpadjust.words import listed, number
 
 P = ParamSpec("P")
-_VOID = ("img", "meta")
-_SHOWN = 3
+_VOID = ("img", "meta")  # elements without an end
+_SHOWN = 3  # inputs at which a physics fails
 _WIDTH = 3.6  # inches: as wide as a column of the page, so that text has its size
+_DPI = 160  # sharp on paper, too
 _STYLE: dict[str, Any] = {
     **dict.fromkeys(("font.size", "axes.labelsize", "axes.titlesize"), 9.5),
     **dict.fromkeys(("figure.facecolor", "savefig.facecolor"), "white"),
     **{"axes.linewidth": 0.7, "legend.fontsize": 8.5},
-    **{"svg.fonttype": "path", "svg.hashsalt": "gpadjust"},
 }
-_LARGE = 70_000  # characters, above which a figure of many points is smaller as pixels
-_PLAIN = " <>='/:;,.()!*+@$-_{}\n"  # what a URL between double quotes may have as it is
-_NEEDLESS = re.compile(
-    r"^.*?(?=<svg )|<!--.*?-->|<metadata>.*?</metadata>|(?<=>)\s+(?=<)|(?<=<g) id=\"[^\"]*\"",
-    flags=re.DOTALL,
-)
 _OF_FONTS = "Glyph .* missing|Matplotlib currently does not support"  # names in any script
-_PATH = re.compile(r"\b(?:d|x|y)='[^']*'")
-_SPACE = re.compile(r"\s*\n?([MLQCz])\s*")
-_BEHIND = re.compile(r"(\.\d\d)\d+")  # hundredths of a point are more than a screen shows
 
 
 class Markup(str):
@@ -46,17 +36,14 @@ class Markup(str):
 
 
 class Card(NamedTuple):
-    """The answer for an output: its errors with their unit, a note on them, and the reasons.
-
-    The color is ``"yes"``, ``"no"`` or ``"open"``.
-    """
+    """The answer for an output."""
 
     name: str
-    errors: Mapping[str, str]
-    note: str
+    errors: Mapping[str, str]  # with their unit
+    note: str  # on the errors
     answer: str
     reasons: list[str]
-    color: str = "open"
+    color: str = "open"  # or "yes" or "no"
     picture: Markup = Markup()
 
 
@@ -81,6 +68,7 @@ def tag(name: str, /, *children: str, **attributes: str) -> Markup:
         >>> tag("p", "a < b, ", tag("em", "c"), class_="note")
         '<p class="note">a &lt; b, <em>c</em></p>'
     """
+    # Python's keywords have an underscore behind them, and names none of HTML's hyphens.
     named = {key.rstrip("_").replace("_", "-"): value for key, value in attributes.items()}
     start = "".join(f' {key}="{join([value])}"' for key, value in named.items())
     if name in _VOID:
@@ -89,7 +77,7 @@ def tag(name: str, /, *children: str, **attributes: str) -> Markup:
 
 
 def join(children: Iterable[str]) -> Markup:
-    """Return texts beside one another, without an element around them."""
+    """Return texts one after the other, escaped, without an element around them."""
     return Markup("".join(c if isinstance(c, Markup) else escape(c) for c in children))
 
 
@@ -100,7 +88,9 @@ def bullets(items: Iterable[str]) -> Markup:
 
 
 def code(text: str) -> Markup:
-    """Return a block of code."""
+    """Return a block of code; nothing if it is empty."""
+    if not text:
+        return Markup()
     return tag("div", tag("pre", tag("code", text)), class_="scroll", tabindex="0")
 
 
@@ -128,32 +118,30 @@ def table(
 
 
 def parameter_table(caption: str, parameters: PhysicsParameters) -> Markup:
-    """Return a table of unknown parameters: their posterior, and what was known before."""
+    """Return a table of unknown parameters: their posterior and prior."""
     low, high = parameters.interval()
     rows = []
     for i, (name, unknown) in enumerate(parameters.unknowns.items()):
-        spread = ["-", "-"]
+        spread = ["-", "-"]  # sd and interval
         if parameters.sd[i] > 0:  # not of a point fit
             interval = f"{number(low[i], 4)} to {number(high[i], 4)}"
             spread = [number(parameters.sd[i]), interval]
         value = number(parameters.center[i], 4)
         rows.append([name, value, *spread, unknown.prior_text, unknown.unit or "-"])
-    head = ["parameter", "value", "sd", "95 % interval", "known before", "unit"]
+    head = ["parameter", "value", "sd", "95 % interval", "prior", "unit"]
     return table(caption, head, rows)
 
 
-def beside(cards: Sequence[Card]) -> Markup:
+def side_by_side(cards: Sequence[Card]) -> Markup:
     """Return the answer on each output, its reasons, its errors in large numbers, its picture."""
     shown = []
-    for name, errors, note, answer, reasons, color, picture in cards:
-        parts = [tag("h3", name)] if len(cards) > 1 else []
-        parts.append(tag("p", answer, class_="answer"))
-        parts += [tag("p", reason.replace("+-", "±")) for reason in reasons]
-        if errors:
-            numbers = [tag("div", tag("dt", n), tag("dd", value)) for n, value in errors.items()]
-            parts += [tag("dl", *numbers, class_="errors"), tag("p", note, class_="note")]
-        parts += [picture] if picture else []
-        shown.append(tag("div", *parts, class_=f"card {color}"))
+    for card in cards:
+        parts = [tag("h3", card.name)] * (len(cards) > 1)
+        parts.append(tag("p", card.answer, class_="answer"))
+        parts += [tag("p", reason.replace("+-", "±")) for reason in card.reasons]
+        numbers = [tag("div", tag("dt", n), tag("dd", value)) for n, value in card.errors.items()]
+        parts += [tag("dl", *numbers, class_="errors"), tag("p", card.note, class_="note")]
+        shown.append(tag("div", *parts, card.picture, class_=f"card {card.color}"))
     return tag("div", *shown, class_="cards")
 
 
@@ -163,12 +151,13 @@ def document(page: Page) -> Markup:
     settings = [[name, value] for name, value in page.settings.items()]
     caption = "How this page came about"
     sections["Settings"] = table(caption, ["setting", "value"], settings, kind="words")
-    ids = {n: "".join(c if c.isalnum() else "-" for c in n.lower()).strip("-") for n in sections}
+    # Links within the page have an id for each section.
+    ids = {name: re.sub(r"\W", "-", name.lower()).strip("-") for name in sections}
     main = tag(
         "main",
         tag("header", tag("h1", page.title), tag("p", page.lead, class_="lead")),
         tag("h2", page.question, class_="first"),
-        beside(page.cards),
+        side_by_side(page.cards),
         tag("nav", bullets(tag("a", n, href=f"#{ids[n]}") for n in ids), aria_label="Sections"),
         *(tag("section", tag("h2", n), text, id=ids[n]) for n, text in sections.items()),
     )
@@ -184,22 +173,23 @@ def document(page: Page) -> Markup:
 
 
 def failure(error: PhysicsError) -> str:
-    """Return the failure of a physics in a line, with the first inputs at which it fails."""
+    """Return the failure of a physics in a line, with the first of its inputs."""
     message = str(error.args[0]).rstrip(": ")
-    if error.inputs is None or not len(error.inputs):
+    if error.inputs is None or not len(error.inputs):  # the call failed as a whole
         return message
     rows = [f"({', '.join(map(number, row))})" for row in error.inputs[:_SHOWN].tolist()]
     more = len(error.inputs) - len(rows)
-    return f"{message.rstrip('.')}: at inputs {listed([*rows, f'{more} more'] if more else rows)}."
+    rows += [f"{more} more"] * (more > 0)
+    return f"{message.rstrip('.')}: at inputs {listed(rows)}."
 
 
 def drawn(draw: Callable[P, list[Markup]]) -> Callable[P, Markup]:
-    """Return a function of figures side by side, or of why a physics fails where there are none."""
+    """Return a function of figures side by side, or of the failure of a physics instead."""
 
     @wraps(draw)
     def figures(*args: P.args, **options: P.kwargs) -> Markup:
         try:
-            with rc_context(_STYLE), warnings.catch_warnings():
+            with rc_context(_STYLE), warnings.catch_warnings():  # the user's settings stay
                 warnings.filterwarnings("ignore", message=_OF_FONTS)
                 images = [tag("figure", image) for image in draw(*args, **options)]
         except PhysicsError as error:
@@ -215,16 +205,9 @@ def new_figure(height: float) -> Figure:
 
 
 def image(figure: Figure, alt: str) -> Markup:
-    """Return a figure as an image in the page: as curves, or many points as pixels."""
+    """Return a figure as an image in the page."""
     buffer = BytesIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None})
-    text = _NEEDLESS.sub("", buffer.getvalue().decode()).replace('"', "'")
-    text = _PATH.sub(lambda path: _SPACE.sub(r"\1", _BEHIND.sub(r"\1", path[0])), text)
-    source = f"data:image/svg+xml,{quote(text, safe=_PLAIN)}"
-    if len(source) > _LARGE:
-        buffer = BytesIO()
-        figure.savefig(buffer, format="png", dpi=180)
-        raster = f"data:image/png;base64,{b64encode(buffer.getvalue()).decode()}"
-        source = min(source, raster, key=len)
-    width, height = (str(round(96 * size)) for size in figure.get_size_inches())
-    return tag("img", src=Markup(source), alt=alt, width=width, height=height)
+    figure.savefig(buffer, format="png", dpi=_DPI)
+    source = f"data:image/png;base64,{b64encode(buffer.getvalue()).decode()}"
+    width, height = (str(round(96 * size)) for size in figure.get_size_inches())  # CSS's pixels
+    return tag("img", src=source, alt=alt, width=width, height=height)

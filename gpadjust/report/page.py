@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import gpadjust
 from gpadjust.core import GP, StackedGP, save
@@ -25,8 +26,8 @@ from gpadjust.validation.verdict import ALONE, AS_IS, CALIBRATED, CORRECTED, NOT
 from gpadjust.words import listed, number, plural, with_unit
 
 _ERRORS = {ALONE: "your formula", CALIBRATED: "your formula, calibrated"}
-_COLORS = {AS_IS: "yes", CORRECTED: "yes", NOT: "no"}
-_LIBRARIES = ("torch", "gpytorch", "botorch", "numpy")
+_COLORS = {AS_IS: "yes", CORRECTED: "yes", NOT: "no"}  # other answers are open
+_LIBRARIES = ("torch", "gpytorch", "botorch", "numpy")  # whose versions decide the numbers
 
 
 def report(
@@ -38,30 +39,29 @@ def report(
     settings: Mapping[str, object] | None = None,
     progress: bool = False,
 ) -> Path:
-    """Write a page that shows what a model or a comparison says, for those who decide.
+    """Write a page about a model or a comparison, for those who decide.
 
     The page begins with the verdict, should you use your formula, and the left-out errors of the
     formula, of the adjustment and of the data alone. Then it has where the formula is wrong,
-    parameters, left-out observations, structures, advice, data and settings, and how to load the
-    model, which is saved beside it (``report.pt`` beside ``report.html``). The page of a log
-    (:func:`~gpadjust.records.identify`) has a free run along what was held out, parameters, noise
-    and hidden states, and no model beside it. It is one file, without scripts and links.
+    parameters, left-out observations, structures, data and settings, and how to load the model,
+    which is saved beside it (``report.pt`` beside ``report.html``). The page of a log has a free
+    run along its held-out part, parameters, noise and hidden states, and no model beside it. It is
+    one file, without scripts and links. Units are read from names such as ``"head [m]"``.
 
-    Whether the physics helps takes a comparison with a model that has none, so report on what
-    :func:`~gpadjust.compare` returns. Units are read from names such as ``"head [m]"``, the columns
-    of a DataFrame, say.
+    Whether the physics helps takes a comparison with a model that has none, so report on the result
+    of :func:`~gpadjust.compare`.
 
     Args:
         model: A fitted model, a :class:`~gpadjust.StackedGP`, or a
-            :class:`~gpadjust.validation.Comparison`, of which what it recommends is saved; or an
+            :class:`~gpadjust.validation.Comparison`, whose recommended model is saved; or an
             :class:`~gpadjust.records.Identification`.
-        file: Where to write the page, ``*.html``. Files that are there, this and the model's, are
-            replaced; where the model cannot be saved, the page says why.
+        file: The page to write, ``*.html``. An earlier page and its model are replaced; if the
+            model cannot be saved, the page has the reason.
         title: The title. Default: the names of the outputs.
         rows: The name of each observation, ``n``, such as its line in your file. Default: by its
             number, from 0.
         settings: Further settings to show, such as ``{"seed": 3}``.
-        progress: Whether to show a progress bar.
+        progress: If True, show a progress bar.
 
     Returns:
         The path of the page.
@@ -81,15 +81,16 @@ def report(
         >>> result = fit(model)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     path = report(model, f"{folder}/report.html")
-        ...     sorted(each.name for each in path.parent.iterdir())
+        ...     sorted(file.name for file in path.parent.iterdir())
         ['report.html', 'report.pt']
     """
     origin = Origin({name: str(value) for name, value in (settings or {}).items()})
-    is_log = isinstance(model, Identification)
-    path = checked_path(file, model=not is_log)
-    if is_log and rows is not None:
+    path = checked_path(file, model=not isinstance(model, Identification))
+    subject: Any = model
+    if not isinstance(model, Identification):
+        subject = subject_of(model, rows)
+    elif rows is not None:
         raise TypeError("The page of a log has no names of rows; leave `rows` out.")
-    subject = model if isinstance(model, Identification) else subject_of(model, rows)
     write(subject, path, title, origin, progress)
     return path
 
@@ -101,13 +102,13 @@ def checked_path(file: str | Path, *data: str | Path, model: bool = True) -> Pat
         raise ValueError(f"Expected a page such as 'report.html' to write to, got {str(file)!r}.")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"There is no folder {str(path.parent)!r} to write {path.name} to.")
-    for own in (path, path.with_suffix(".pt"))[: 1 + model]:
-        if own.is_dir():
+    for target in (path, path.with_suffix(".pt"))[: 1 + model]:  # the page of a log has no model
+        if target.is_dir():
             raise IsADirectoryError(
-                f"{str(own)!r} is a folder, where a file would be; give the page another name."
+                f"{str(target)!r} is a folder, expected a file; give the page another name."
             )
-        if any(own.exists() and Path(one).exists() and own.samefile(one) for one in data):
-            raise ValueError(f"{own.name} is the data; give the page another name by --out.")
+        if any(target.exists() and Path(f).exists() and target.samefile(f) for f in data):
+            raise ValueError(f"{target.name} is the data; give the page another name by --out.")
     try:  # before the work rather than after it
         with TemporaryDirectory(prefix=".report-", dir=path.parent):
             return path.absolute()  # a physics may change the working folder
@@ -121,97 +122,104 @@ def write(
 ) -> str:
     """Write the page, and a model beside it, or nothing; return the headline for the terminal."""
     model_path = path.with_suffix(".pt")
-    with TemporaryDirectory(prefix=".report-", dir=path.parent) as folder:
-        part, model_part = Path(folder, path.name), Path(folder, model_path.name)
+    # Files are complete before they replace earlier ones.
+    with TemporaryDirectory(prefix=".report-", dir=path.parent) as folder:  # of the same disk
+        new_page, new_model = Path(folder, path.name), Path(folder, model_path.name)
         if isinstance(subject, Identification):
             page = log_page.page(subject, title, origin)
         else:
-            saved: Saved | str
-            try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", UserWarning)  # the page says it
-                    saved = save(subject.model, model_part)
-            except (TypeError, ValueError) as error:
-                saved = str(error)
-            page = _page(subject, title, saved, origin, progress)
+            page = _page(subject, title, _saved(subject, new_model), origin, progress)
         versions = [f"gpadjust {gpadjust.__version__}", f"Python {platform.python_version()}"]
         versions += [f"{name} {version(name)}" for name in _LIBRARIES]
         date = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
         page.settings.update(versions=", ".join(versions), date=date)
-        part.write_bytes(html.document(page).encode("utf-8", errors="xmlcharrefreplace"))
-        if model_part.exists():
-            model_part.replace(model_path)
+        new_page.write_bytes(html.document(page).encode("utf-8", errors="xmlcharrefreplace"))
+        if new_model.exists():
+            new_model.replace(model_path)
         elif isinstance(subject, Subject):
             model_path.unlink(missing_ok=True)  # of an earlier page
-        part.replace(path)
+        new_page.replace(path)
     return page.headline
 
 
+def _saved(subject: Subject, path: Path) -> Saved | str:
+    """Save the model; return its file, or the reason why it cannot be saved."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # the page has its content
+            return save(subject.model, path)
+    except (TypeError, ValueError) as error:
+        return str(error)
+
+
 def _page(
-    subject: Subject, title: str | None, saved: Saved | str, origin: Origin, progress: bool = False
+    subject: Subject, title: str | None, saved: Saved | str, origin: Origin, progress: bool
 ) -> Page:
-    """Return the page; ``saved`` is the model's file, or the reason why there is none."""
-    advice = [] if subject.comparison is None else subject.comparison.advice
+    """Return the page; ``saved`` is the file of the model, or the reason why it has no file."""
+    advice = getattr(subject.comparison, "advice", [])
     sentences = [text.replace("+-", "±") for text in (*advice, *origin.notes)]
-    made_by = {
+    makers = {
         "Where is the formula wrong?": lambda: figures.where_wrong(subject),
         "Parameters of the physics": lambda: tables.parameters(subject),
-        "Do the intervals hold?": lambda: tables.coverage(subject),
+        "Are the intervals right?": lambda: tables.coverage(subject),
         "Left-out predictions": lambda: tables.predictions(subject),
-        "Where trust lies": lambda: figures.trusted(subject),
+        "Where predictions rest on the formula": lambda: figures.trusted(subject),
         "Structures": lambda: html.join([recommendation(subject), tables.structures(subject)]),
-        "What was learnt": lambda: tables.summary(subject),
+        "Hyper-parameters": lambda: tables.summary(subject),
         "Advice": lambda: html.bullets(sentences),
         "Data": lambda: tables.data(subject, origin.remarks),
         "Load the model, predict": lambda: tables.loading(subject, saved, origin),
     }
-    bar = progress_bar(progress, made_by.items(), unit="section", leave=False)
+    # Sections are made one by one, as figures take time.
+    bar = progress_bar(progress, makers.items(), unit="section", leave=False)
     sections = {name: make() for name, make in bar}
-    formula = "f_a(x) = rho(x) f_p(x) + delta(x)" if subject.has_physics else "without physics"
-    variables = f"{listed(subject.outputs)} from {listed(subject.inputs)}"
-    lead = f"{variables}: {plural(len(subject.X), 'row')} of data, {formula}."
-    physics = ", ".join(f"{name} ({type(own).__name__})" for name, own in subject.physics.items())
-    settings = {
-        **origin.settings,
-        "model": repr(subject.model),
-        "physics": physics or ("known through samples" if subject.has_physics else "none"),
-    }
-    title = title or f"Report on {', '.join(subject.outputs)}"
-    answers = cards(subject, origin.how)
-    kind = "Errors" if subject.comparison is None else "Left-out errors"
+    names = ", ".join(f"{name} ({type(f).__name__})" for name, f in subject.physics.items())
+    physics = names or "known through samples"
+    form = "prediction = rho(x) formula(x) + delta(x)"
     question = "Should you use your formula?"
     if not subject.has_physics:
+        physics = "none"
+        form = "without physics"
         question = "How well are left-out observations predicted?"
-    line = headline(answers, kind)
-    return Page(title, lead, question, answers, line, sections, settings)
+    variables = f"{listed(subject.outputs)} from {listed(subject.inputs)}"
+    answers = cards(subject, origin.how)
+    kind = "Errors" if subject.comparison is None else "Left-out errors"
+    return Page(
+        title or f"Report on {', '.join(subject.outputs)}",
+        f"{variables}: {plural(len(subject.X), 'row')} of data, {form}.",
+        question,
+        answers,
+        headline(answers, kind),
+        sections,
+        {**origin.settings, "model": repr(subject.model), "physics": physics},
+    )
 
 
 def cards(subject: Subject, how: str = Origin.how) -> list[Card]:
     """Return the verdict on each output; ``how`` is code or a command that compares."""
+    note = "root mean square errors of left-out observations"
+    if subject.comparison is None and subject.physics:
+        note += "; the formula's at the data, with the model's parameters if it has unknown ones"
+    elif subject.batches:
+        note += "; each with an offset for each batch"
     shown = []
     for j, name in enumerate(subject.outputs):
-        numbers = errors(subject, j)
-        note = "root mean square errors of left-out observations"
-        if subject.comparison is None and len(numbers) > 1:
-            note += (
-                "; the formula's at the data, with the model's parameters if it has unknown ones"
-            )
-        elif subject.batches:
-            note += "; each with an offset for each batch"
         answer, reasons = _answer(subject, name, how)
-        color, picture = _COLORS.get(answer, "open"), figures.agreement(subject, j)
-        shown.append(Card(name, numbers, note, answer, reasons, color, picture))
+        color = _COLORS.get(answer, "open")
+        picture = figures.agreement(subject, j)
+        shown.append(Card(name, errors(subject, j), note, answer, reasons, color, picture))
     return shown
 
 
 def headline(cards: list[Card], kind: str) -> str:
     """Return the errors and the answer of each output, a line each, for the terminal."""
     lines = []
-    for name, numbers, _, answer, reasons, *_ in cards:
-        each = "; ".join(f"{what}: {value}" for what, value in numbers.items())
-        line = f"{kind} of {name}, {each}." if each else f"{name}:"
-        several = len(cards) > 1
-        lines.append(f"{line} {answer}." if several else f"{line}\n{answer}. {reasons[0]}")
+    for card in cards:
+        numbers = "; ".join(f"{label}: {value}" for label, value in card.errors.items())
+        answer = f" {card.answer}."
+        if len(cards) == 1:
+            answer = f"\n{card.answer}. {card.reasons[0]}"
+        lines.append(f"{kind} of {card.name}, {numbers}.{answer}")
     return "\n".join(lines)
 
 
@@ -221,16 +229,20 @@ def errors(subject: Subject, output: int) -> dict[str, str]:
     if subject.comparison is not None:
         rmse_by = subject.comparison.errors()[name]
     else:
-        values, rmse_by = subject.physics_at(subject.X, output), {}
+        values = subject.physics_at(subject.X, output)
+        rmse_by = {}
         for physics, f_p in values.items():
-            alone = ALONE if len(values) == 1 else f"{ALONE} of {physics}"
-            rmse_by[alone] = float((subject.judged[:, output] - f_p).square().nanmean().sqrt())
+            alone = ALONE + f" of {physics}" * (len(values) > 1)
+            # the root mean square of y - f_p
+            rmse_by[alone] = float((subject.loo.judged[:, output] - f_p).square().nanmean().sqrt())
         adjusted = "adjusted" if subject.has_physics else "data alone"
         rmse_by[adjusted] = float(subject.loo.score().rmse[output])
     shown = {}
-    for what, rmse in rmse_by.items():
-        short, of, physics = what.partition(" of ")
-        label = _ERRORS.get(short, short)
+    for kind, rmse in rmse_by.items():
+        short, of, physics = kind.partition(" of ")
+        label = _ERRORS.get(
+            short, short
+        )  # "physics alone of coarse" has the name of one of several
         if short == ALONE and any(part.unknowns for part in subject.physics.values()):
             label += ", with fitted parameters"
         which = f" ({physics.removeprefix('physics ')})" * bool(of)
@@ -239,17 +251,17 @@ def errors(subject: Subject, output: int) -> dict[str, str]:
 
 
 def _answer(subject: Subject, name: str, how: str) -> tuple[str, list[str]]:
-    """Return the answer for an output, and sentences: those of the comparison, if any."""
+    """Return the answer for an output, and its reasons: those of the comparison, if any."""
     comparison = subject.comparison
     if not subject.has_physics:
-        return "No physics", [f"The model of {name} has no physics to be judged."]
+        return "No physics", [f"The model of {name} has no physics to judge."]
     if comparison is None:
-        return "Not asked", [
+        return "Not compared", [
             "This is a report of one model; whether the physics helps takes a comparison with a "
             f"model that has none: {how}"
         ]
     if name not in comparison.verdict:
-        return "Not asked", [
+        return "Not compared", [
             "The comparison has no structure without the physics, or none with it; add 'zero mean' "
             "to its structures."
         ]
@@ -261,21 +273,14 @@ def recommendation(subject: Subject) -> Markup:
     """Return the recommended model, and the reason."""
     comparison = subject.comparison
     if comparison is None:
-        given = f"This page is of a given model, {subject.model!r}."
-        return tag("p", f"{given} It was not compared with others.")
-    name = comparison.chosen
+        return tag("p", f"This page is of a single model, {subject.model!r}, without a comparison.")
     if len(comparison.models) == 1:
         (name,) = comparison.models
         return tag("p", f"Only {name} was fitted: {tables.described(name)}.")
+    name = comparison.chosen
     if name != STACKED:
         why = f", {tables.described(name)}. It has nearly all the weight."
         return tag("p", "Recommended: ", tag("strong", name), why)
-    weights = []
-    for output, ranked in comparison.table.items():
-        rows = [row for row in ranked if row.weight >= 0.005]
-        shares = listed(f"{row.structure} {row.weight:.2f}" for row in rows)
-        weights.append(f"{output}: {shares}" if len(comparison.table) > 1 else shares)
     mixture = tag("strong", "the mixture of all structures")
-    why = ". It keeps the doubt between them in its intervals."
-    first = tag("p", "Recommended: ", mixture, why)
-    return html.join([first, tag("p", f"Its weights are {'; '.join(weights)}.")])
+    why = ", with the weights of the table. Its intervals contain the doubt between them."
+    return tag("p", "Recommended: ", mixture, why)

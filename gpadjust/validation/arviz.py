@@ -11,8 +11,6 @@ from torch import Tensor
 from gpadjust.core import GP
 from gpadjust.core.summary import numbers_of
 
-_Groups = dict[str, dict[str, Tensor]]
-
 
 @torch.no_grad()
 def to_arviz(*models: GP, chains: int = 1, seed: int = 0) -> Any:
@@ -26,8 +24,7 @@ def to_arviz(*models: GP, chains: int = 1, seed: int = 0) -> Any:
 
     Args:
         models: The model, fitted several times by different seeds: a chain each.
-        chains: How many chains the draws of each model are, one after the other: 4 after a fit by
-            ``"nuts"``.
+        chains: Number of chains of each model, one after the other: 4 after a fit by ``"nuts"``.
         seed: Seed of the draws from the prior and of observations.
 
     Raises:
@@ -48,43 +45,45 @@ def to_arviz(*models: GP, chains: int = 1, seed: int = 0) -> Any:
         from arviz_base import from_dict
     except ImportError as error:
         raise ImportError('to_arviz needs ArviZ; run `pip install "gpadjust[arviz]"`.') from error
-    for each in models:
-        if not isinstance(each, GP):
+    for model in models:
+        if not isinstance(model, GP):
             raise TypeError(
-                f"Expected models of gpadjust.core; found {type(each).__name__}. Of a model of "
+                f"Expected models of gpadjust.core; found {type(model).__name__}. Of a model of "
                 "several, as `gpadjust report` saves it, give one of its `models`."
             )
     if not models or any(
-        each.draws.shape != models[0].draws.shape
-        or len(each.draws) % chains
-        or not np.array_equal(each.data.Y, models[0].data.Y, equal_nan=True)
-        for each in models
+        model.draws.shape != models[0].draws.shape
+        or len(model.draws) % chains
+        or not np.array_equal(model.data.Y, models[0].data.Y, equal_nan=True)
+        for model in models
     ):
         raise ValueError(
             "Expected fits of one model to the same data, with equally many draws, a multiple of "
-            f"{chains} chains; found draws {[len(each.draws) for each in models]}."
+            f"{chains} chains; found draws {[len(model.draws) for model in models]}."
         )
     generator = torch.Generator().manual_seed(seed)
     parts = [_groups(model, generator) for model in models]
-    groups: dict[str, Any] = {}
+    # Each variable has dimensions chain x draw, and rows of observations.
+    groups: dict[str, dict[str, Any]] = {}
     for group in parts[0]:
-        groups[group] = {
-            name: np.concatenate([_chains(part[group][name], chains) for part in parts])
-            for name in parts[0][group]
-        }
+        groups[group] = {}
+        for name in parts[0][group]:
+            arrays = [part[group][name] for part in parts]
+            chained = [a.reshape(chains, -1, *a.shape[1:]).numpy() for a in arrays]
+            groups[group][name] = np.concatenate(chained)
     first = models[0]
     u = first.table.prior_draws(len(first.draws) * len(models), seed)
-    groups["prior"] = {name: each.numpy()[None] for name, each in _numbers(first, u).items()}
-    dims, coords, groups["observed_data"] = {}, {}, {}
+    groups["prior"] = {name: draws.numpy()[None] for name, draws in _numbers(first, u).items()}
+    groups["observed_data"] = {}
+    dims: dict[str, list[str]] = {}
+    coords: dict[str, Any] = {}
     for j, name in enumerate(first.data.output_names):
-        rows = ~first.data.Y[:, j].isnan()
-        row = _node(f"{name} row")
-        dims[_node(name)], coords[row] = [row], rows.nonzero().flatten().numpy()
-        groups["observed_data"][name] = first.data.Y[rows, j].numpy()
-    groups = {
-        group: {_node(name): values for name, values in variables.items()}
-        for group, variables in groups.items()
-    }
+        is_observed = ~first.data.Y[:, j].isnan()
+        groups["observed_data"][name] = first.data.Y[is_observed, j].numpy()
+        dims[_node(name)] = [_node(f"{name} row")]
+        coords[_node(f"{name} row")] = is_observed.nonzero().flatten().numpy()
+    for group, variables in groups.items():
+        groups[group] = {_node(name): values for name, values in variables.items()}
     return from_dict(groups, dims=dims, coords=coords)
 
 
@@ -93,34 +92,28 @@ def _node(name: str) -> str:
     return name.replace("/", "\u2215")
 
 
-def _groups(model: GP, generator: torch.Generator) -> _Groups:
+def _groups(model: GP, generator: torch.Generator) -> dict[str, dict[str, Tensor]]:
     """Return variables by group and name, whose first dimension is that of draws."""
-    every = model.subset_draws(torch.zeros(1, dtype=torch.long))
-    every.set_draws(model.draws)
-    Y, likelihood, predictive = model.data.Y, {}, {}
-    mean, variance = every.left_out_at(every.draws)
-    log_density = every.marginals_of(mean.unsqueeze(1), variance.unsqueeze(1)).log_density(Y)
-    mean, variance = every.components(model.data.X, observation_noise=True)
+    copy = model.subset_draws(torch.zeros(1, dtype=torch.long))
+    copy.set_draws(model.draws)
+    Y = model.data.Y
+    mean, variance = copy.left_out_at(copy.draws)
+    log_density = copy.marginals_of(mean.unsqueeze(1), variance.unsqueeze(1)).log_density(Y)
+    mean, variance = copy.components(model.data.X, observation_noise=True)
     white = torch.randn(mean.shape, generator=generator, dtype=mean.dtype)
-    replicated = every.off_gaussian_scale(mean + variance.sqrt() * white)
-    for j, name in enumerate(model.data.output_names):
-        rows = ~Y[:, j].isnan()
-        likelihood[name], predictive[name] = log_density[:, rows, j], replicated[:, rows, j]
+    replicated = copy.off_gaussian_scale(mean + variance.sqrt() * white)
+    columns = {name: (~Y[:, j].isnan(), j) for j, name in enumerate(model.data.output_names)}
     return {
         "posterior": _numbers(model, model.draws),
-        "log_likelihood": likelihood,
-        "posterior_predictive": predictive,
+        "log_likelihood": {n: log_density[:, rows, j] for n, (rows, j) in columns.items()},
+        "posterior_predictive": {n: replicated[:, rows, j] for n, (rows, j) in columns.items()},
     }
 
 
 def _numbers(model: GP, u: Tensor) -> dict[str, Tensor]:
     """Return the numbers by name; of several outputs names begin with the output."""
-    several = model.num_outputs > 1
-    return {
-        f"{output}: {name}" if several and output else name: each.draws.expand(len(u))
-        for (output, name), each in numbers_of(model, u).items()
-    }
-
-
-def _chains(draws: Tensor, chains: int) -> np.ndarray:
-    return draws.reshape(chains, -1, *draws.shape[1:]).numpy()
+    draws = {}
+    for (output, name), number in numbers_of(model, u).items():
+        prefix = f"{output}: " * bool(output and model.num_outputs > 1)
+        draws[prefix + name] = number.draws.expand(len(u))
+    return draws

@@ -8,9 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-import torch
 from torch import Tensor
-from torch.distributions import Normal, StudentT
 
 from gpadjust.checks import check_choice
 from gpadjust.core import (
@@ -24,14 +22,13 @@ from gpadjust.core import (
     ZeroMeanGP,
     fit,
 )
-from gpadjust.core.data import ArrayLike, Data
+from gpadjust.core.data import ArrayLike
 from gpadjust.display import Display, html_table
 from gpadjust.kinds.factory import ModelFactory, make_model, with_options
 from gpadjust.physics import Physics, PhysicsWarning, as_physics
 from gpadjust.progress import progress_bar
 from gpadjust.validation.faults import fault_of
-from gpadjust.validation.leave_one_out import ROUNDING, LeaveOneOut, leave_one_out
-from gpadjust.validation.trust import physics_at
+from gpadjust.validation.leave_one_out import LeaveOneOut, leave_one_out, left_out_by_physics
 from gpadjust.validation.verdict import (
     ADJUSTED,
     ALONE,
@@ -39,21 +36,17 @@ from gpadjust.validation.verdict import (
     COUNTS,
     DATA,
     Candidate,
-    Evidence,
     Verdict,
-    correction_of,
     difference,
-    is_shown,
-    next_point,
-    straight_line,
+    formulas_of,
     unsampled,
-    verdict_on,
+    verdict_of,
 )
 from gpadjust.words import number, percent
 
-STACKED = "stacked"  # what a comparison calls the mixture of all structures
+STACKED = "stacked"  # the name of the mixture of all structures in a comparison
 _ALL = 0.95  # weight of a structure that needs no others
-_WORST = -1e6  # nats; a density of zero would make others' differences infinite
+_KINDS = (ALONE, CALIBRATED, ADJUSTED, DATA)
 
 
 class Structure(NamedTuple):
@@ -85,21 +78,18 @@ STRUCTURES = (
 
 @dataclass(frozen=True)
 class Comparison(Display):
-    """Fitted models of several structures, and which of them the data prefer.
-
-    Print it for the tables and the advice.
+    """Fitted models of several structures, ranked by the data. Print it for the tables.
 
     Attributes:
         models: The fitted models by the names of their structures.
-        results: The results of the fits, such as the probabilities of nested models, by these
-            names.
+        results: The results of the fits by these names.
         stacked: All models, stacked with the weights of the tables.
         left_out: The predictions of left-out observations by each structure, and by the physics as
             it is, ``"physics alone"`` (of several ``"physics alone of coarse"`` and so on).
         table: The candidates of each output, best first, by the names of the outputs; beneath them
             each physics alone, which has no weight (NaN).
-        verdict: The verdict on the physics, by the names of the outputs; empty if no structure is
-            without it, or none with it.
+        verdict: The verdict on the physics, by the names of the outputs; empty unless structures
+            with and without it are compared.
         advice: Further findings, in sentences.
     """
 
@@ -122,7 +112,7 @@ class Comparison(Display):
         return self.models.get(self.chosen, self.stacked)
 
     def leave_one_out(self) -> LeaveOneOut:
-        """Return predictions of left-out observations by what is recommended.
+        """Return predictions of left-out observations by the recommended model.
 
         The weights of a mixture stay; they have seen all observations.
         """
@@ -133,25 +123,22 @@ class Comparison(Display):
     def errors(self) -> dict[str, dict[str, float]]:
         """Return root mean square errors of left-out observations of each output, in its units.
 
-        ``"physics alone"`` (of one with unknown parameters ``"calibrated physics"``), of several
-        each; ``"adjusted"``, what is recommended, or the best structure that adjusts the physics if
-        that does not; ``"data alone"``, the best structure without it. What was not fitted is not
-        there.
+        ``"physics alone"`` and ``"calibrated physics"``, of several physics each; ``"adjusted"``,
+        the recommended model, or the best structure that adjusts the physics if that does not;
+        ``"data alone"``, the best structure without it. What was not fitted is not there.
         """
         kinds = {row.structure: row.kind for rows in self.table.values() for row in rows}
         recommends_adjusting = kinds.get(self.chosen, ADJUSTED) == ADJUSTED
         recommended = self.leave_one_out().score().rmse.tolist()
         errors: dict[str, dict[str, float]] = {}
-        for (output, rows), of_recommended in zip(self.table.items(), recommended, strict=True):
+        for (output, rows), rmse in zip(self.table.items(), recommended, strict=True):
             errors[output] = {}
-            for kind in (ALONE, CALIBRATED, ADJUSTED, DATA):
-                of_kind = {row.structure: row.error for row in rows if row.kind == kind}
-                if kind in (ALONE, CALIBRATED):
-                    errors[output] |= of_kind
-                elif of_kind:  # the best is the first
-                    errors[output][kind] = next(iter(of_kind.values()))
+            for row in sorted(rows, key=lambda row: _KINDS.index(row.kind)):
+                is_physics = row.kind in (ALONE, CALIBRATED)
+                name = row.structure if is_physics else row.kind
+                errors[output].setdefault(name, row.error)  # the best of a kind is the first
             if ADJUSTED in errors[output] and recommends_adjusting:
-                errors[output][ADJUSTED] = of_recommended
+                errors[output][ADJUSTED] = rmse
         return errors
 
     def to_dataframe(self) -> Any:
@@ -170,46 +157,51 @@ class Comparison(Display):
 
     def __str__(self) -> str:
         lines: list[str] = []
+        outputs = {name: f"{name}: " * (len(self.table) > 1) for name in self.table}
         for output, errors in self.errors().items():
-            where = f"{output}: " if len(self.table) > 1 else ""
             # The error of the physics alone is the same, left out or not.
-            called = {n: n if n.startswith(ALONE) else f"{n}, left out" for n in errors}
-            each = "; ".join(f"{called[name]}: RMSE {rmse:.3g}" for name, rmse in errors.items())
-            lines += [where + each] if each else []
-        lines += [""] if lines else []
+            how = {name: ", left out" * (not name.startswith(ALONE)) for name in errors}
+            texts = [f"{name}{how[name]}: RMSE {rmse:.3g}" for name, rmse in errors.items()]
+            lines.append(outputs[output] + "; ".join(texts))
+        lines.append("")
         width = max(len(row.structure) for rows in self.table.values() for row in rows)
-        head = ("elpd", "elpd diff", "its error", "weight", "RMSE/sd", "coverage", "of use")
         for output, rows in self.table.items():
-            lines.append(f"{output:{width}}" + "".join(f"  {name:>9}" for name in head))
-            for row in rows:
-                weight, use = (
-                    "-" if math.isnan(x) else f"{x:.2f}" for x in (row.weight, row.of_use)
-                )
-                lines.append(
-                    f"{row.structure:{width}}  {row.elpd:>9.4g}  {row.elpd_diff:>9.3g}"
-                    f"  {row.se_diff:>9.2g}  {weight:>9}  {row.rmse:>9.3g}  {row.coverage:>9.2f}"
-                    f"  {use:>9}"
-                )
+            cells = [(output, [*cells_of(rows[0])])]  # the first line has the names of columns
+            cells += [(row.structure, [*cells_of(row).values()]) for row in rows]
+            for name, texts in cells:
+                lines.append(f"{name:{width}}" + "".join(f"  {text:>9}" for text in texts))
             lines.append("")
         for output, verdict in self.verdict.items():
-            where = f"{output}: " if len(self.table) > 1 else ""
-            lines.append(" ".join([f"{where}{verdict.answer}.", *verdict.reasons]))
+            lines.append(" ".join([f"{outputs[output]}{verdict.answer}.", *verdict.reasons]))
         return "\n".join([*lines, *self.advice])
 
     def _repr_html_(self) -> str:
         head = ["structure", "RMSE", "in 95 %", "elpd diff", "its error", "weight"]
         tables = []
+        answers = {name: f": {verdict.answer}" for name, verdict in self.verdict.items()}
         for output, candidates in self.table.items():
             rows = []
             for row in candidates:
-                numbers = map(number, (row.elpd_diff, row.se_diff))
-                weight = "-" if math.isnan(row.weight) else f"{row.weight:.2f}"
-                rows.append(
-                    [row.structure, number(row.error), percent(row.coverage), *numbers, weight]
-                )
-            verdict = f": {self.verdict[output].answer}" if output in self.verdict else ""
-            tables.append(html_table(output + verdict, head, rows))
+                errors = [number(row.error), percent(row.coverage)]
+                cells = cells_of(row)
+                rows.append([row.structure, *errors, *(cells[name] for name in head[3:])])
+            tables.append(html_table(output + answers.get(output, ""), head, rows))
         return "".join(tables)
+
+
+def cells_of(row: Candidate) -> dict[str, str]:
+    """Return the numbers of a candidate as texts, by the names of their columns."""
+    shares = {"weight": row.weight, "of use": row.of_use}
+    texts = {name: "-" if math.isnan(x) else f"{x:.2f}" for name, x in shares.items()}
+    return {
+        "elpd": f"{row.elpd:.4g}",
+        "elpd diff": f"{row.elpd_diff:.3g}",
+        "its error": f"{row.se_diff:.2g}",
+        "weight": texts["weight"],
+        "RMSE/sd": f"{row.rmse:.3g}",
+        "coverage": f"{row.coverage:.2f}",
+        "of use": texts["of use"],
+    }
 
 
 def compare(
@@ -228,39 +220,32 @@ def compare(
     ==================  ===========================================================================
     ``"zero mean"``     no physics, :class:`~gpadjust.ZeroMeanGP`
     ``"physics mean"``  :math:`f_p + \delta(x)`, :class:`~gpadjust.PhysicsMeanGP`
-    ``"CKA"``           :math:`\rho(x) (f_p - c) + \delta(x)` with learnt c, :class:`~gpadjust.CKA`
+    ``"CKA"``           :math:`\rho(x) (f_p - c) + \delta(x)` with fitted c, :class:`~gpadjust.CKA`
     ==================  ===========================================================================
 
     Each is fitted once, by full Bayes. Each output is judged by itself, by the *expected log
-    predictive density* (elpd) of left-out observations, see :func:`leave_one_out`: of few
-    observations it is rather high. A difference of less than two standard errors shows nothing.
-
-    What is recommended is the mixture of all, a :class:`~gpadjust.StackedGP` with the weights of
-    Yao et al. (2018), or the structure that has nearly all weight (:attr:`Comparison.chosen`).
+    predictive density* (elpd) of left-out observations, see :func:`leave_one_out`. A difference of
+    less than two standard errors shows nothing. The recommended model is the mixture of all, a
+    :class:`~gpadjust.StackedGP` with the weights of Yao et al. (2018), or the structure that has
+    nearly all weight (:attr:`Comparison.chosen`).
 
     Of several physics each structure is fitted to each of them alone, ``"CKA of coarse"`` and so
-    on, and to all at once, ``"CKA of all"``, whose rhos tell where the data prefer which.
-
-    A physics with unknown parameters is calibrated by each structure that uses it: then
-    ``"physics mean"`` is the calibrated physics and a delta (Kennedy and O'Hagan 2001), ``"CKA"``
-    that with rho and delta, and ``"calibrated physics"`` is one more structure without either,
-    :class:`~gpadjust.CalibratedPhysics`.
+    on, and to all at once, ``"CKA of all"``. A physics with unknown parameters is calibrated by
+    each structure that uses it (Kennedy and O'Hagan 2001); ``"calibrated physics"`` is one more
+    structure without rho and delta, :class:`~gpadjust.CalibratedPhysics`.
 
     Args:
         train_X: Inputs, ``n x d``, as in :class:`~gpadjust.CKA`.
         train_Y: Targets, ``n x m``.
         physics: The physics f_p, or several, as in :class:`~gpadjust.CKA`.
         train_Yvar: Known observation variances, as in :class:`~gpadjust.CKA`.
-        structures: Which to fit: names; callables that make a model of X, Y and ``physics``, such
-            as ``RRA`` or ``functools.partial(CKA, rho_mean=2.0)``; or a :class:`Structure`, which
-            specifies more of one. Default: those above.
+        structures: The structures to fit: names; callables that make a model of X, Y and
+            ``physics``, such as ``RRA`` or ``functools.partial(CKA, rho_mean=2.0)``; or a
+            :class:`Structure`. Default: those above.
         seed: Seed of the fits.
-        progress: Whether to show a progress bar.
-        options: What the data are: ``noise``, ``link``, ``input_transform`` and others that all
+        progress: If True, show a progress bar.
+        options: ``noise``, ``link``, ``input_transform`` and other options of models that all
             structures share. A structure keeps its own.
-
-    Returns:
-        The fitted models, their rankings, and in words whether the physics is shown to help.
 
     Warns:
         PhysicsWarning: If a physics is obviously off.
@@ -282,21 +267,24 @@ def compare(
         'CKA'
         >>> mean, variance = comparison.recommended.predict(X)
     """
-    parts = _by_name(physics)
-    fitted = _candidates(_known(STRUCTURES if structures is None else structures), parts)
+    parts = physics_by_name(physics)
+    if structures is None:
+        structures = STRUCTURES
+    candidates = candidates_of(checked_structures(structures), parts)
     models: dict[str, GP] = {}
     results: dict[str, FitResult] = {}
 
     # Fit each structure.
-    caught: dict[str, list[warnings.WarningMessage]] = {}
-    for structure, part in progress_bar(progress, fitted, unit="structure"):
-        name, factory = structure.name, with_options(structure.model, options)
-        given = {"train_Yvar": train_Yvar, "physics": None if structure.kind == DATA else part}
-        with warnings.catch_warnings(record=True) as caught[name]:
+    warned: dict[str, list[warnings.WarningMessage]] = {}
+    for structure, part in progress_bar(progress, candidates, unit="structure"):
+        name = structure.name
+        factory = with_options(structure.model, options)
+        arguments = {"train_Yvar": train_Yvar, "physics": part}
+        with warnings.catch_warnings(record=True) as warned[name]:
             warnings.simplefilter("always")
             warnings.simplefilter("ignore", SamplingWarning)  # the advice mentions it
             try:
-                models[name] = make_model(factory, train_X, train_Y, kind=GP, **given)
+                models[name] = make_model(factory, train_X, train_Y, kind=GP, **arguments)
                 results[name] = fit(models[name], seed=seed)
             except Exception as error:
                 error.add_note(f"This is of the structure {name!r}.")
@@ -307,33 +295,35 @@ def compare(
     left_out = {name: leave_one_out(model) for name, model in models.items()}
     stacked = StackedGP.by_left_out(models)
     # An error with outliers would not be comparable with the others, which leave them out.
-    chosen = left_out.get(_chosen(stacked))
-    is_outlier = None if chosen is None else chosen.is_outlier
-    left_out |= _physics_alone(parts, data, is_outlier)
+    is_outlier = getattr(left_out.get(_chosen(stacked)), "is_outlier", None)
+    for name, part in parts.items():
+        if not part.unknowns:  # with unknown parameters the physics alone is CalibratedPhysics
+            full_name = ALONE + f" of {name}" * bool(name)
+            left_out[full_name] = left_out_by_physics(part, data, is_outlier)
 
     # Rank the structures for each output.
-    kinds = {structure.name: structure.kind for structure, _ in fitted}
+    kinds = {structure.name: structure.kind for structure, _ in candidates}
     table = {
-        output: _ranked(j, _densities(left_out, j), left_out, kinds, models, results, stacked)
+        output: _ranked(j, left_out, kinds, models, results, stacked)
         for j, output in enumerate(data.output_names)
     }
     advice = unsampled(table, results)
     comparison = Comparison(models, results, stacked, left_out, table, {}, advice)
 
-    # Judge the physics, and repeat each warning once: of a physics, or of what is recommended.
+    # Judge the physics, and repeat each warning once: of a physics, or of a recommended structure.
+    recommended = {row.structure for rows in table.values() for row in rows if row.weight > COUNTS}
     messages: dict[tuple[str, type[Warning]], None] = {}
-    for name, each in caught.items():
-        if any(row.weight > COUNTS for rows in table.values() for row in rows if row[0] == name):
-            messages |= {(str(one.message), one.category): None for one in each}
+    for name in (name for name in warned if name in recommended):
+        messages |= {(str(warning.message), warning.category): None for warning in warned[name]}
     verdicts: dict[str, Verdict] = {}
     for j, output in enumerate(data.output_names):
-        formulas = _formulas(comparison, [*parts], j)
-        found = {name: fault_of(data, j, f) for name, f in formulas.items()}
-        for name, fault in found.items():
-            where = f"{name}: " if name else ""
-            where += f"{output}: " if len(data.output_names) > 1 else ""
-            messages |= {(where + fault, PhysicsWarning): None} if fault else {}
-        verdict = _verdict(comparison, j, formulas.get(""), found.get("", ""))
+        formulas = formulas_of(comparison, [*parts], j)
+        faults = {name: fault_of(data, j, f) for name, f in formulas.items()}
+        for name, fault in faults.items():
+            if fault:
+                names = [name] * bool(name) + [output] * (len(data.output_names) > 1)
+                messages[": ".join([*names, fault]), PhysicsWarning] = None
+        verdict = verdict_of(comparison, j, formulas.get(""), faults.get("", ""))
         if verdict is not None:
             verdicts[output] = verdict
     for text, category in messages:
@@ -341,84 +331,28 @@ def compare(
     return replace(comparison, verdict=verdicts)
 
 
-def _formulas(comparison: Comparison, names: Sequence[str], j: int) -> dict[str, Tensor]:
-    """Return output j of each physics at the data, unknown parameters as they were fitted."""
-    values = {}
-    for name in names:
-        of = f" of {name}" if name else ""
-        known = [f"{kind}{of}" for kind in (ALONE, CALIBRATED)]
-        loo = next((comparison.left_out[one] for one in known if one in comparison.left_out), None)
-        if loo is not None:
-            values[name] = loo.mean[:, j]
-            continue
-        rows = [*comparison.table.values()][j]
-        models = [comparison.models[row.structure] for row in rows if row.kind == ADJUSTED]
-        for model in (one for one in models if len(one.physics) == 1 and not name):
-            (f,) = physics_at(model, model.data.X).values()
-            values[name] = f[:, j]
-            break
-    return values
-
-
-def _verdict(c: Comparison, j: int, f: Tensor | None, fault: str) -> Verdict | None:
-    """Return the verdict on output j, of a single physics with its values f; None if not asked."""
-    output, rows = [*c.table.items()][j]
-    rows = [row for row in rows if row.structure in c.models]
-    best = next((row for row in rows if row.kind != DATA), None)
-    without = next((row for row in rows if row.kind == DATA), None)
-    if best is None or without is None:
-        return None
-    densities, errors = _densities(c.left_out, j), c.errors()[output]
-    gain, se = difference(densities[best.structure], densities[without.structure])
-    of_use = [row.of_use for row in rows if not math.isnan(row.of_use)]
-    adjusted = next((row for row in rows if row.kind == ADJUSTED), best)
-    alone = line = factor = offset = math.nan
-    loo = c.left_out[best.structure]
-    correction, is_surpassed = "", False
-    if f is not None:
-        formula = next((name for name in (ALONE, CALIBRATED) if name in densities), None)
-        if formula is not None:
-            is_surpassed = is_shown(densities[adjusted.structure], densities[formula])
-        y = loo.Y[:, j]
-        if loo.is_outlier is not None:
-            y = y.masked_fill(loo.is_outlier[:, j], torch.nan)
-        seen = ~y.isnan()
-        alone = float((y - f)[seen].square().mean().sqrt())
-        factor, offset, line = straight_line(y[seen], f[seen])
-        correction = correction_of(c.models[adjusted.structure], j, f)
-    evidence = Evidence(
-        output,
-        len(densities[without.structure]),
-        max(of_use, default=math.nan) if math.isnan(best.of_use) else best.of_use,
-        gain,
-        se,
-        alone,
-        line,
-        errors.get(ADJUSTED, best.error),
-        errors[DATA],
-        factor,
-        offset,
-        fault,
-        is_surpassed,
-        _correction_needed(c.models[adjusted.structure], c.results[adjusted.structure], j),
-    )
-    pair = c.models[adjusted.structure], c.models[without.structure]
-    return verdict_on(evidence, correction, next_point(*pair, j))
-
-
-def _known(asked: Any) -> list[Structure]:
-    """Return the structures that are asked for, each once."""
-    names = {structure.name: structure for structure in STRUCTURES}
-    is_one = isinstance(asked, str | Structure) or callable(asked)
-    asked = [asked] if is_one else [*asked]
-    asked = [_of_factory(each) if callable(each) else each for each in asked]
-    unknown = [s for s in asked if not isinstance(s, Structure) and s not in names]
-    if unknown or not asked:
+def checked_structures(requested: Any) -> list[Structure]:
+    """Return the requested structures, each once."""
+    defaults = {structure.name: structure for structure in STRUCTURES}
+    if isinstance(requested, str | Structure) or callable(requested):
+        requested = [requested]
+    structures = []
+    unknown = []
+    for item in requested:
+        if isinstance(item, Structure):
+            structures.append(item)
+        elif callable(item):
+            structures.append(_of_factory(item))
+        elif item in defaults:
+            structures.append(defaults[item])
+        else:
+            unknown.append(item)
+    if unknown or not structures:
         raise ValueError(
-            f"Unknown structures {unknown}; expected some of {', '.join(map(repr, names))}, or a "
-            "Structure of your own, or what makes a model: a class, or functools.partial of one."
+            f"Unknown structures {unknown}; expected some of {', '.join(map(repr, defaults))}, or "
+            "a Structure of your own, or a callable that makes a model: a class, or "
+            "functools.partial of one."
         )
-    structures = [s if isinstance(s, Structure) else names[s] for s in asked]
     for structure in structures:
         check_choice("kind", structure.kind, (ADJUSTED, DATA, CALIBRATED))
     named = {structure.name: structure for structure in structures}
@@ -432,23 +366,23 @@ def _known(asked: Any) -> list[Structure]:
 
 
 def _of_factory(factory: Any) -> Structure:
-    """Return the structure of what makes a model, named by its class and arguments."""
+    """Return the structure of a callable that makes a model, named by its class and arguments."""
     function = getattr(factory, "func", factory)
     arguments = [f"{name}={v!r}" for name, v in getattr(factory, "keywords", {}).items()]
     name = getattr(function, "__name__", type(function).__name__)
-    known = [structure for structure in STRUCTURES if structure.model is function]
-    like = known[0] if known else Structure(name, factory)
-    called = f"{name}({', '.join(arguments)})" if arguments else name
-    return like._replace(name=called, model=factory)
+    defaults = [structure for structure in STRUCTURES if structure.model is function]
+    (like,) = defaults or [Structure(name, factory)]
+    full_name = name + f"({', '.join(arguments)})" * bool(arguments)
+    return like._replace(name=full_name, model=factory)
 
 
-def _by_name(physics: Any) -> dict[str, Physics]:
+def physics_by_name(physics: Any) -> dict[str, Physics]:
     """Return several physics by their names; a single one by an empty name."""
     if isinstance(physics, Mapping):
-        return {str(name): as_physics(each) for name, each in physics.items()}
+        return {str(name): as_physics(part) for name, part in physics.items()}
     if not isinstance(physics, list | tuple):
         return {"": as_physics(physics)}
-    parts = [as_physics(each) for each in physics]
+    parts = [as_physics(part) for part in physics]
     names = [part.name for part in parts]
     named: dict[str, Physics] = {}
     for i, (name, part) in enumerate(zip(names, parts, strict=True)):
@@ -457,21 +391,20 @@ def _by_name(physics: Any) -> dict[str, Physics]:
     return named
 
 
-def _candidates(
+def candidates_of(
     structures: Sequence[Structure], parts: Mapping[str, Physics]
 ) -> list[tuple[Structure, Any]]:
-    """Return the structures to be fitted: of one physics, or of each of several and of all."""
+    """Return the structures to fit with their physics: of one, or of each of several and of all."""
     candidates: list[tuple[Structure, Any]] = []
     for structure in structures:
-        own = parts
-        if structure.kind == CALIBRATED:
-            own = {name: part for name, part in parts.items() if part.unknowns}
-        if structure.kind == DATA or [*parts] == [""]:
-            candidates += [(structure, part) for part in [*own.values()][:1]]
+        if structure.kind == DATA:
+            candidates.append((structure, None))
             continue
-        for name, part in own.items():
-            candidates.append((structure._replace(name=f"{structure.name} of {name}"), part))
-        if structure.kind == ADJUSTED:
+        for name, part in parts.items():
+            if part.unknowns or structure.kind == ADJUSTED:
+                full_name = structure.name + f" of {name}" * bool(name)
+                candidates.append((structure._replace(name=full_name), part))
+        if structure.kind == ADJUSTED and [*parts] != [""]:
             joined = structure._replace(name=f"{structure.name} of all")
             candidates.append((joined, {**parts}))
     if not candidates:
@@ -485,78 +418,11 @@ def _candidates(
 def _chosen(stacked: StackedGP) -> str:
     """Return the structure that has nearly all weight of all outputs, otherwise the mixture."""
     weights = stacked.weights.items()
-    return next((name for name, each in weights if min(each) >= _ALL), STACKED)
-
-
-@torch.no_grad()
-def _physics_alone(
-    parts: Mapping[str, Physics], data: Data, is_outlier: Tensor | None = None
-) -> dict[str, LeaveOneOut]:
-    r"""Return left-out predictions by each physics as it is, with noise of an unknown variance.
-
-    Nothing is fitted, :math:`y_i = f_p(x_i) + s_i \epsilon_i`, with :math:`s_i = 1` or
-    :math:`|f_p(x_i)|`, whichever predicts an output better. With a prior of the variance that does
-    not depend on units, an observation that is left out has Student's distribution about f_p with
-    the mean square error at the others and ``n - 1`` degrees of freedom (Gelman et al. 2013,
-    section 3.2); with known variances it is Gaussian. Physics with unknown parameters are left out:
-    alone, they are :class:`~gpadjust.CalibratedPhysics`.
-    """
-    X, Y = data.X, data.Y
-    least = ROUNDING**2 * (Y - Y.nanmean(0)).square().nanmean(0)
-    alone = {}
-    for name, physics in parts.items():
-        if physics.unknowns:
-            continue
-        mean = physics(X)
-        if data.Yvar is not None:
-            variance = data.Yvar.maximum(least)
-            density = Normal(mean, variance.sqrt(), False).log_prob(Y)
-        else:
-            variance, density = _with_noise(Y, mean, torch.ones_like(mean), least)
-            sizes = mean.abs()
-            relative = _with_noise(Y, mean, sizes, least / sizes.square())
-            is_relative = relative[1].nansum(0) > density.nansum(0)  # not if f_p is 0 somewhere
-            variance = torch.where(is_relative, relative[0], variance)
-            density = torch.where(is_relative, relative[1], density)
-        pit = torch.special.ndtr((Y - mean) / variance.sqrt())
-        alone[f"{ALONE} of {name}" if name else ALONE] = LeaveOneOut(
-            X, Y, mean, variance, density, pit, data.output_names, is_outlier
-        )
-    return alone
-
-
-def _with_noise(Y: Tensor, mean: Tensor, sizes: Tensor, least: Tensor) -> tuple[Tensor, Tensor]:
-    """Return variances and log densities, ``n x m``, of noise in proportion to sizes ``n x m``."""
-    # (y - f) / s has Student's distribution, and y the density of that over s.
-    squares = ((Y - mean) / sizes).square()
-    freedom = (~Y.isnan()).sum(0) - 1
-    others = squares.nansum(0) - squares.nan_to_num(nan=0.0)
-    scale = sizes * (others.clamp_min(0) / freedom).maximum(least).sqrt()
-    student = StudentT(freedom.to(mean), mean, scale, validate_args=False)
-    return student.variance.nan_to_num(nan=torch.inf), student.log_prob(Y)
-
-
-def _densities(left_out: Mapping[str, LeaveOneOut], output: int) -> dict[str, Tensor]:
-    """Return the log densities ``n`` of an output's observations by each structure.
-
-    Observations of the same inputs are taken together, ``n`` are different inputs: repeated ones
-    are no further evidence of where a structure is right, but would seem to be.
-    """
-    densities = {}
-    for name, loo in left_out.items():
-        is_observed = ~loo.Y[:, output].isnan()
-        density = loo.log_density[is_observed, output]
-        density = density.nan_to_num(nan=_WORST, neginf=_WORST).clamp_min(_WORST)
-        distinct, group = loo.X[is_observed].unique(dim=0, return_inverse=True)
-        if len(distinct) < len(density):
-            density = density.new_zeros(len(distinct)).index_add(0, group, density)
-        densities[name] = density
-    return densities
+    return next((name for name, shares in weights if min(shares) >= _ALL), STACKED)
 
 
 def _ranked(
     j: int,
-    densities: Mapping[str, Tensor],
     left_out: Mapping[str, LeaveOneOut],
     kinds: Mapping[str, str],
     models: Mapping[str, GP],
@@ -564,47 +430,43 @@ def _ranked(
     stacked: StackedGP,
 ) -> list[Candidate]:
     """Return the structures for output j, best first, and beneath them each physics alone."""
+    densities = {name: loo.densities_of(j) for name, loo in left_out.items()}
     best = max((densities[name] for name in models), key=lambda density: float(density.sum()))
     rows = []
     for name, loo in left_out.items():
-        density, scores = densities[name], loo.score()
+        scores = loo.score()
         error = float(scores.rmse[j])
-        weight = log_evidence = of_use = math.nan
-        if name in models:
-            model, result = models[name], results[name]
-            weight = stacked.weights[name][j] if name in stacked.weights else 0.0
-            if result.log_evidence is not None:
-                log_evidence = float(result.log_evidence.expand(model.num_outputs)[j])
-            if relevance := relevance_of(model, result):
-                of_use = relevance[j]
-        rows.append(
-            Candidate(
-                name,
-                float(density.sum()),
-                *difference(density, best),
-                weight,
-                error / spread_of(loo.Y[:, j]),
-                float(scores.coverage[j]),
-                error,
-                log_evidence,
-                of_use,
-                kinds.get(name, ALONE),
-            )
+        row = Candidate(
+            name,
+            float(densities[name].sum()),
+            *difference(densities[name], best),
+            weight=math.nan,
+            rmse=error / spread_of(loo.Y[:, j]),
+            coverage=float(scores.coverage[j]),
+            error=error,
+            log_evidence=math.nan,
+            of_use=math.nan,
+            kind=kinds.get(name, ALONE),
         )
+        if name in models:  # of a physics alone there are no weight and no evidence
+            model = models[name]
+            result = results[name]
+            weights = stacked.weights.get(name, [0.0] * model.num_outputs)
+            row = row._replace(weight=weights[j])
+            if result.log_evidence is not None:
+                evidence = result.log_evidence.expand(model.num_outputs)
+                row = row._replace(log_evidence=float(evidence[j]))
+            if relevance := relevance_of(model, result):
+                row = row._replace(of_use=relevance[j])
+        rows.append(row)
     return sorted(rows, key=lambda row: (row.structure not in models, -row.elpd))
 
 
 def relevance_of(model: GP, result: FitResult) -> list[float]:
-    """Return the probability that the physics is of use, of each output; empty if not asked."""
+    """Return the probability that the physics is of use, of each output; empty if unknown."""
     without = [c.text for c in model.table.choices if any(z.endswith(".mean") for z in c.zeros)]
     shares = [result.probabilities[text] for text in without if text in result.probabilities]
-    return [1 - sum(each) for each in zip(*shares, strict=True)]
-
-
-def _correction_needed(model: GP, result: FitResult, j: int) -> float:
-    """Return the probability that f_p of output j needs a correction; NaN if unknown."""
-    shares = [result.probabilities.get(c.text) for c in model.table.choices if not c.zeros]
-    return shares[0][j] if shares and shares[0] else math.nan
+    return [1 - sum(of_output) for of_output in zip(*shares, strict=True)]
 
 
 def spread_of(y: Tensor) -> float:

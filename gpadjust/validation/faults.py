@@ -12,19 +12,19 @@ from gpadjust.core.data import Data
 from gpadjust.validation.trust import physics_at
 from gpadjust.words import listed, name_and_unit, number, with_unit
 
-_SAID = 5  # observations, for anything to be said
+_FEWEST = 5  # observations, for any statement
 _MANY = 8  # observations, for the sign or a factor of a twentieth by correlation
-_FAR = 3.0  # standard deviations of the targets, beyond which a physics is off
-_NEAR = 0.5  # of the targets' root mean square; a physics that is nearer is crude, no more
+_FAR = 3.0  # standard deviations of the observations, beyond which a physics is off
+_NEAR = 0.5  # of the observations' root mean square; a physics that is nearer is crude, no more
 _WORSE = 1.5  # standard deviations, where the cause is plain
-_APART = 12.0  # standard deviations of the targets; a smaller offset is crudeness
+_APART = 12.0  # standard deviations of the observations; a smaller offset is crudeness
 _FACTOR = 10.0  # a smaller factor is crudeness
-_TINY = 20.0  # times too small: next to nothing, so that the error is that of no physics
-_HUGE = 100.0  # times as large as the targets, whatever its shape
+_TINY = 20.0  # times too small: so near to zero that the error is that of no physics
+_HUGE = 100.0  # times as large as the observations, whatever its shape
 _EXPLAINS = 1 / 3  # of the error is left, where its cause is found
-_FITS = 0.6  # standard deviations of the targets that a factor leaves
+_FITS = 0.6  # standard deviations of the observations that a factor leaves
 _LIKE = 0.8  # of the error is left by the opposite, at most
-_FOLLOWS = 0.5  # correlation of a physics that has anything to do with the targets
+_FOLLOWS = 0.5  # correlation of a physics that has anything to do with the observations
 _TIGHT = 0.9  # correlation that shows what the size of the error does not
 _SHOWN = 3.0  # standard errors of a correlation
 _OF_UNITS = (25.4, 57.3, 60.0, 100.0, 1e3, 1e4, 1e6, 1e9)  # factors of units and angles
@@ -34,56 +34,65 @@ _STANDARD = 1e-6  # of means and standard deviations that a scaler made
 
 
 def fault_of(data: Data, output: int, f: Tensor) -> str:
-    """Return what is obviously wrong with values ``n`` of f_p of an output; empty if nothing is."""
-    y, X = data.Y[:, output], data.X
-    seen = ~y.isnan() & f.isfinite()
-    y, f = y[seen], f[seen]
-    if len(y) < _SAID:
+    """Return the obvious fault of a physics with values ``n`` of an output; empty without one."""
+    y = data.Y[:, output]
+    is_known = ~y.isnan() & f.isfinite()
+    X, y, f = (values[is_known] for values in (data.X, y, f))
+    if len(y) < _FEWEST:
         return ""
     sd = float(y.std())
-    cause = _cause(data, output, X[seen], y, f) if sd > _ROUNDING * rms(y) else ""
-    if cause and _is_standardised(y.unsqueeze(-1)):
-        cause += " The targets were standardised; f_p has to return what they are in."
+    if sd <= _ROUNDING * rms(y):
+        return ""
+    cause = _cause(data, output, X, y, f)
+    if not cause:
+        return ""
     name = data.output_names[output]
-    errors = [with_unit(number(value), name) for value in (rms(y - f), sd)]
-    return cause and (
-        f"at the training inputs f_p has a root mean square error of {errors[0]}, where the "
-        f"targets have a standard deviation of {errors[1]}: {cause}"
+    error, spread = (with_unit(number(value), name) for value in (rms(y - f), sd))
+    hint = ""
+    if _is_standardised(y.unsqueeze(-1)):
+        hint = " The observations were standardised: give them in the unit of your formula."
+    return (
+        f"at the data your formula has a root mean square error of {error}, where the observations "
+        f"have a standard deviation of {spread}: {cause}{hint}"
     )
 
 
 def faults(model: GP) -> list[str]:
-    """Return what is obviously wrong with the physics of a fitted model, for each and output."""
-    found = []
+    """Return the obvious faults of each physics of a fitted model, and of each output."""
+    texts = []
     for name, values in physics_at(model, model.data.X).items():
         for j, output in enumerate(model.data.output_names):
+            names = [name] * (len(model.physics) > 1) + [output] * (model.num_outputs > 1)
             if fault := fault_of(model.data, j, values[:, j]):
-                where = f"{name}: " if len(model.physics) > 1 else ""
-                found.append(
-                    f"{where}{output}: {fault}" if model.num_outputs > 1 else where + fault
-                )
-    return found
+                texts.append(": ".join([*names, fault]))
+    return texts
 
 
 def _cause(data: Data, output: int, X: Tensor, y: Tensor, f: Tensor) -> str:
-    """Return what is wrong with f_p: scaled inputs, or a sign, an offset or a factor."""
-    n, sd, size, rmse = len(y), float(y.std()), rms(y), rms(f - y)
+    """Return what is wrong with a formula: scaled inputs, or a sign, an offset or a factor."""
+    n = len(y)
+    sd = float(y.std())
+    rmse = rms(f - y)
     r = _correlation(y, f)
-    if rmse > (_WORSE if r > _FOLLOWS else 1.0) * sd and _is_standardised(X):
+    bound = _WORSE if r > _FOLLOWS else 1.0
+    if rmse > bound * sd and _is_standardised(X):
         return (
             "are the inputs scaled? Each column of them has mean 0 and standard deviation 1, and "
-            f"the correlation of f_p with the targets is {r:.2f}. f_p reads raw units: give the "
-            "model raw inputs; its input_transform may scale them, and shows f_p raw ones."
+            f"the correlation of your formula with the observations is {r:.2f}. It reads raw "
+            "units: give the model raw inputs; its input_transform may scale them, and shows your "
+            "formula raw ones."
         )
-    if rmse <= _NEAR * size:
+    if rmse <= _NEAR * rms(y):
         return ""
     factor, by_factor = _factor(y, f, r)
     is_off = rmse > _FAR * sd
+    # t = r sqrt((n - 2) / (1 - r^2)) beyond three standard errors
     is_opposite = r < -_FOLLOWS and r**2 * (n - 2) > _SHOWN**2 * (1 - r**2)
     is_worse = n >= _MANY and rmse > _WORSE * sd and r < -_TIGHT
-    if is_opposite and (is_off or is_worse) and rms(f + y) < (1.0 if is_off else _LIKE) * rmse:
+    left_by_opposite = 1.0 if is_off else _LIKE
+    if is_opposite and (is_off or is_worse) and rms(f + y) < left_by_opposite * rmse:
         large = f", and {_times(factor)}" if abs(factor) > _FACTOR else ""
-        return f"f_p is of the opposite sign (correlation {r:.2f}){large}."
+        return f"it is of the opposite sign (correlation {r:.2f}){large}."
     is_tiny = n >= _MANY and r > _TIGHT and 0 < factor < 1 / _TINY
     if not is_off and not is_tiny:
         return ""
@@ -91,27 +100,31 @@ def _cause(data: Data, output: int, X: Tensor, y: Tensor, f: Tensor) -> str:
     by_offset = rms(f - y - offset)
     if rmse > _APART * sd and by_offset < _EXPLAINS * rmse and by_offset <= by_factor:
         where = "above" if offset > 0 else "below"
-        return f"f_p is about {number(abs(offset))} {where} the targets."
+        return f"it is about {number(abs(offset))} {where} the observations."
     if factor > 0 and not 1 / _FACTOR < factor < _FACTOR:
-        return f"f_p is {_times(factor)}; {_units(data, output)}"
+        return f"it is {_times(factor)}; {_units(data, output)}"
     return ""
 
 
 def _factor(y: Tensor, f: Tensor, r: float) -> tuple[float, float]:
-    """Return how many times too large f_p is, 0 if that says nothing, and the error without."""
-    sd, size = float(y.std()), rms(y)
+    """Return how many times too large f is, 0 if that is unclear, and the error without it."""
+    sd = float(y.std())
     slope = float(f @ y / (f @ f)) if f.any() else 0.0
-    by_factor, affine = rms(y - slope * f), sd * max(0.0, 1 - r**2) ** 0.5
+    by_factor = rms(y - slope * f)
+    affine = sd * max(0.0, 1 - r**2) ** 0.5  # the error of a straight line over f
     if affine < _FITS * sd and by_factor > 1.5 * affine:  # there is an offset, too
         slope = r * sd / float(f.std())
     elif by_factor > _FITS * sd:
-        slope = size / rms(f) if rms(f) > _HUGE * size else 0.0
-        slope = -slope if r < -_FOLLOWS else slope
+        slope = 0.0  # its shape is another one: its size alone may be wrong
+        if rms(f) > _HUGE * rms(y):
+            slope = rms(y) / rms(f)
+        if r < -_FOLLOWS:
+            slope = -slope
     return (1 / slope if slope else 0.0), by_factor
 
 
 def _correlation(y: Tensor, f: Tensor) -> float:
-    """Return the correlation; 0 of a constant f_p."""
+    """Return the correlation; 0 of a constant f."""
     if float(f.std()) <= _ROUNDING * rms(f):
         return 0.0
     return float(torch.corrcoef(torch.stack([y, f]))[0, 1])
@@ -119,7 +132,8 @@ def _correlation(y: Tensor, f: Tensor) -> float:
 
 def _is_standardised(values: Tensor) -> bool:
     """Return whether a scaler made the columns of ``n x d``; it makes 0 of a constant one."""
-    mean, sd = values.mean(0), values.std(0, correction=0)
+    mean = values.mean(0)
+    sd = values.std(0, correction=0)
     ones = torch.stack([(sd - 1).abs(), (values.std(0) - 1).abs()]).amin(0) < _STANDARD
     return bool((mean.abs() < _STANDARD).all() & (ones | (sd == 0)).all() & ones.any())
 
@@ -132,23 +146,20 @@ def rms(values: Tensor) -> float:
 def _times(factor: float) -> str:
     """Return a text for a factor, too large or too small, by the nearest one of units."""
     size = max(abs(factor), 1 / abs(factor))
-    nearest = min(_OF_UNITS, key=lambda known: abs(math.log(size / known)))
-    if abs(math.log(size / nearest)) < _NEARLY:
-        text = f"{nearest:,g}"
-    else:
-        text = f"{float(f'{size:.2g}'):,g}"
-    return f"about {text} times too {'large' if abs(factor) >= 1 else 'small'}"
+    nearest = min(_OF_UNITS, key=lambda unit: abs(math.log(size / unit)))
+    if abs(math.log(size / nearest)) >= _NEARLY:
+        nearest = float(f"{size:.2g}")
+    return f"about {nearest:,g} times too {'large' if abs(factor) >= 1 else 'small'}"
 
 
 def _units(data: Data, output: int) -> str:
-    """Return the question for the units of f_p, with those that names have."""
+    """Return the question for the units of a formula, with those that names have."""
     units = [" in ".join(name_and_unit(name)) for name in data.input_names if "[" in name]
     name, unit = name_and_unit(data.output_names[output])
     if not units or not unit:
-        return "are its units those of the targets?"
-    unnamed = [name for name in data.input_names if "[" not in name]
+        return "are its units those of the observations?"
     question = f"does it give {name} in {unit}, and read {listed(units)}?"
-    if unnamed:
+    if unnamed := [name for name in data.input_names if "[" not in name]:
         units_are = "units are" if len(unnamed) > 1 else "unit is"
         question += f" In which {units_are} {listed(unnamed)}?"
     return question

@@ -1,30 +1,19 @@
 r"""Figures of predictions, of their coverage, and of where the physics is wrong or trusted.
 
-Each function draws on the axes that it is given, or on those of a new figure, and returns them;
-show or save the figure with ``ax.figure``. They need matplotlib, ``pip install gpadjust[plot]``.
-``output`` is the number of the output to draw, ``level`` the nominal coverage of intervals. Where
-an output was not observed, nothing is drawn.
-
-A TypeError is of an argument of another kind, a ValueError of a wrong value, shape or output.
+Each function draws on given axes, or on those of a new figure, and returns them; show or save the
+figure with ``ax.figure``. They need matplotlib, ``pip install gpadjust[plot]``. ``output`` is the
+number of the output to draw, ``level`` the nominal coverage of intervals. Missing observations are
+not drawn. A TypeError is of an argument of another kind, a ValueError of a wrong value or shape.
 
 Example:
     >>> import torch
     >>> from gpadjust import CKA
-    >>> from gpadjust.validation import leave_one_out, trust
     >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
     >>> model = CKA(X, 2 * torch.sin(6 * X) + X, physics=lambda X: torch.sin(6 * X))
     >>> plot_model(model).shape  # predictions, rho and delta
     (3, 1)
-    >>> plot_adjustment(model).shape  # rho and delta
-    (2, 1)
     >>> plot_prediction(model, X).get_xlabel()
     'x'
-    >>> plot_leave_one_out(leave_one_out(model)).shape
-    (2,)
-    >>> plot_coverage(leave_one_out(model)).get_ylabel()
-    'observed coverage'
-    >>> plot_trust(trust(model)).shape
-    (1,)
 """
 
 from __future__ import annotations
@@ -61,6 +50,7 @@ from gpadjust.validation.leave_one_out import LeaveOneOut
 from gpadjust.validation.scores import Scores
 from gpadjust.validation.trust import SIDES, Trust, physics_at
 from gpadjust.validation.verdict import ALONE, CALIBRATED
+from gpadjust.words import labelled
 
 if TYPE_CHECKING:  # it needs pandas
     from gpadjust.core.priors import Priors
@@ -76,14 +66,13 @@ __all__ = [
     "plot_priors",
     "plot_trust",
 ]
-BLUE, RED, GREY = "#0072B2", "#D55E00", "0.45"  # told apart by the colour-blind, too
+BLUE, RED, GREY = "#0072B2", "#D55E00", "0.45"  # different for the colour-blind, too
 BAND: dict[str, Any] = {"color": BLUE, "alpha": 0.2, "lw": 0}
 DOTS: dict[str, Any] = {"ls": "", "marker": "o", "ms": 4.5, "mec": "white", "mew": 0.6}
 _POINTS = 120  # of a curve
 _STYLES = ("--", "-.", ":")  # of several physics
 _COLORS = (BLUE, RED, "0.85")  # of physics, data and neither
 _BINS = 10  # of each input
-_HONEST = "95 % if intervals hold"
 _DECADE = 10.0  # highest over lowest, from which axes are logarithmic
 _BARS = 30  # of a histogram of draws
 _COLUMNS = 4  # of panels
@@ -103,19 +92,23 @@ def plot_model(model: Any, *, output: int = 0, level: float = 0.95, axes: Any = 
     Returns:
         An array of axes, ``rows x d``.
     """
-    names = adjustments_of(model)
+    names = _adjustments_of(model)
     # Of a mixture the physics is that of one of its models.
     parts = [part for part in getattr(model, "models", ()) if getattr(part, "physics", None)]
     with_physics = next(iter(parts), model)
     lines = lines_along(model, output, level)
     axes = axes_of(axes, 1 + len(names), len(lines), 2.6)
     for i, (ax, (x, X)) in enumerate(zip(axes[0], lines, strict=True)):
-        draw_prediction(ax, model, x, X, output, physics_at(with_physics, X), level)
+        with torch.no_grad():
+            band(ax, x, mean_and_ends(model.marginals(X), output, level), level)
+        _draw_physics(ax, x, physics_at(with_physics, X), output)
+        ax.set_xlim(float(x[0]), float(x[-1]))
+        tidy(ax)
         if len(lines) == 1:
-            draw_data(ax, model, output)
+            _draw_data(ax, model, output)
         else:
             _draw_ticks(ax, model, output, i)
-    share_limits(axes[0])
+    _share_limits(axes[0])
     axes[0, 0].set_ylabel(labels(model.data.output_names)[output])
     legend(axes[0, 0])
     if names:
@@ -137,23 +130,22 @@ def plot_adjustment(
     r"""Draw :math:`\rho` and :math:`\delta` with their intervals: where is the physics wrong?
 
     One row for each that the model has (a rho for each of several physics), one column for each
-    input, along which the others stay at a base point. The dashed line is what the model falls
-    back to far from data, such as the physics as it is, :math:`\rho = 1` and
-    :math:`\delta = 0`; ticks at the bottom are the training inputs.
+    input, along which the others stay at a base point. The dashed line is the value far from data,
+    for the physics as it is :math:`\rho = 1` and :math:`\delta = 0`; ticks at the bottom are the
+    training inputs.
 
     Args:
         model: A model with ``rho`` or ``delta``.
-        bounds: Range of the inputs, ``2 x d``, a tensor or lists. Default: that of the training
-            inputs.
-        base: The base point, ``d``, a tensor or a list. Default: the median of the training inputs.
-        output: Which output to draw.
+        bounds: Range of the inputs, ``2 x d``. Default: the range of the training inputs.
+        base: The base point, ``d``. Default: the median of the training inputs.
+        output: The output to draw.
         level: Nominal coverage of the intervals.
         axes: Axes to draw on. Default: a new figure.
 
     Returns:
         An array of axes, ``rows x d``.
     """
-    names = adjustments_of(model)
+    names = _adjustments_of(model)
     if not names:
         raise TypeError(
             "Expected a model with rho or delta to draw, such as CKA, RRA, ScaleGP and "
@@ -161,20 +153,22 @@ def plot_adjustment(
         )
     lines = lines_along(model, output, level, bounds, base)
     axes = axes_of(axes, len(names), len(lines), 2.6)
-    for i, (x, X) in enumerate(lines):
-        for ax, name in zip(axes[:, i], names, strict=True):
+    outputs = labels(model.data.output_names)
+    inputs = labels(model.data.input_names)
+    suffix = f"\nfor {outputs[output]}" * (len(outputs) > 1)
+    for row, name in zip(axes, names, strict=True):
+        far_from_data = next(term.mean for term in model.terms if term.name == name)
+        for i, (ax, (x, X)) in enumerate(zip(row, lines, strict=True)):
             with torch.no_grad():
                 drawn = mean_and_ends(model.term(name, X).marginals, output, level)
-            ax.axhline(unadjusted(model, name), color=GREY, lw=1, ls="--")
+            ax.axhline(float(far_from_data), color=GREY, lw=1, ls="--")
             band(ax, x, drawn, level)
             _draw_ticks(ax, model, output, i)
             ax.set_xlim(float(x[0]), float(x[-1]))
             tidy(ax)
-        axes[-1, i].set_xlabel(labels(model.data.input_names)[i])
-    outputs = labels(model.data.output_names)
-    suffix = f"\nfor {outputs[output]}" if len(outputs) > 1 else ""
-    for row, name in zip(axes, names, strict=True):
-        share_limits(row)
+            if name == names[-1]:
+                ax.set_xlabel(inputs[i])
+        _share_limits(row)
         row[0].set_ylabel(_symbol(name) + suffix)
     axes[0, 0].legend(frameon=False)
     return axes
@@ -190,39 +184,35 @@ def plot_prediction(
     observation_noise: bool = False,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw predictions at inputs ``n x d``, and true values ``n x m`` there if ``Y`` is given.
+    """Draw predictions of a model of one input at ``n x 1``, and true values ``n x m`` there.
 
-    With one input: the mean, the central interval (of observations if ``observation_noise``), the
-    training data, the physics and the truth. With more, which need ``Y``: the predictions against
-    ``Y``, with their intervals.
+    There are the mean, the central interval (of observations if ``observation_noise``), the
+    training data, the physics, and the truth if ``Y`` is given.
     """
     inputs, outputs = labels(model.data.input_names), labels(model.data.output_names)
-    X = checked_points("X", X, len(inputs))
-    if Y is not None and (Y := checked_tensor("Y", Y)).shape != (len(X), len(outputs)):
+    if len(inputs) > 1:
         raise ValueError(
-            f"Expected Y of shape {len(X)} x {len(outputs)}, a row for each of X and a column for "
-            f"each output, got {tuple(Y.shape)}."
+            f"Expected a model of one input, got {len(inputs)}; `plot_model` draws slices, and "
+            "`plot_leave_one_out(leave_one_out(model))` predictions against observations."
         )
-    if Y is None and len(inputs) > 1:
-        raise ValueError(
-            f"X has {len(inputs)} inputs, so predictions are drawn against the truth: pass `Y`; "
-            "for slices through a model use `plot_model`."
-        )
-    with torch.no_grad():
-        drawn = mean_and_ends(model.marginals(X, observation_noise), output, level)
-    ax = axes_of(ax, 1, 1)[0, 0]
-    if Y is not None and len(inputs) > 1:
-        against_truth(ax, Y[:, output], drawn, level, f"true {outputs[output]}")
-        ax.set_ylabel(f"predicted {outputs[output]}")
-        return ax
+    X = checked_points("X", X, 1)
     order = X[:, 0].argsort()
     x = X[order, 0]
-    band(ax, x, [each[order] for each in drawn], level)
+    with torch.no_grad():
+        drawn = mean_and_ends(model.marginals(X[order], observation_noise), output, level)
+    ax = axes_of(ax, 1, 1)[0, 0]
+    band(ax, x, drawn, level)
     _draw_physics(ax, x, physics_at(model, X[order]), output)
     if Y is not None:
+        Y = checked_tensor("Y", Y)
+        if Y.shape != (len(X), len(outputs)):
+            raise ValueError(
+                f"Expected Y of shape {len(X)} x {len(outputs)}, a row for each of X and a column "
+                f"for each output, got {tuple(Y.shape)}."
+            )
         y = Y[order, output]
         ax.plot(x[~y.isnan()], y[~y.isnan()], color="black", lw=1, ls=":", label="truth")
-    draw_data(ax, model, output)
+    _draw_data(ax, model, output)
     ax.set(xlabel=inputs[0], ylabel=outputs[output])
     legend(ax)
     return ax
@@ -231,16 +221,14 @@ def plot_prediction(
 def plot_leave_one_out(
     loo: LeaveOneOut, *, output: int = 0, level: float = 0.95, axes: Any = None
 ) -> Any:
-    """Draw observations over left-out predictions, and standardized residuals.
-
-    ``axes`` are two; so many are returned.
-    """
+    """Draw observations over left-out predictions, and standardized residuals: on two axes."""
     if not isinstance(loo, LeaveOneOut):
         raise TypeError(
             f"Expected a LeaveOneOut, got {type(loo).__name__}; pass `leave_one_out(model)`."
         )
     z = quantile(level)
-    mean, residuals = column(loo.mean, output), column(loo.residuals, output)
+    mean = column(loo.mean, output)
+    residuals = column(loo.residuals, output)
     axes = axes_of(axes, 1, 2)[0]
     draw_left_out(axes[0], loo, column(loo.Y, output), output, {}, level=level)
     legend(axes[0], loc="upper left")
@@ -254,17 +242,17 @@ def plot_leave_one_out(
 
 
 def plot_comparison(comparison: Comparison, *, output: int = 0, axes: Any = None) -> Any:
-    """Draw left-out predictions by the formula and by what is recommended, and the scores.
+    """Draw left-out predictions by the formula and by the recommended model, and the scores.
 
-    The first axes have observations over predictions. The second have the expected log
+    The first of two axes has observations over predictions. The second has the expected log
     predictive density of each structure less that of the best, with two standard errors, and its
-    weight; ``axes`` are these two.
+    weight.
     """
     loo = comparison.leave_one_out()
     axes = axes_of(axes, 1, 2)[0]
     formulas = {
-        name: column(each.mean, output)
-        for name, each in comparison.left_out.items()
+        name: column(predictions.mean, output)
+        for name, predictions in comparison.left_out.items()
         if name.startswith((ALONE, CALIBRATED))
     }
     name = f"{comparison.chosen}, left out"
@@ -272,7 +260,8 @@ def plot_comparison(comparison: Comparison, *, output: int = 0, axes: Any = None
     legend(axes[0])
     rows = [row for row in comparison.table[loo.output_names[output]] if not math.isnan(row.weight)]
     places = range(len(rows))
-    differences, errors = [row.elpd_diff for row in rows], [2 * row.se_diff for row in rows]
+    differences = [row.elpd_diff for row in rows]
+    errors = [2 * row.se_diff for row in rows]
     axes[1].errorbar(differences, places, xerr=errors, color=BLUE, **DOTS, elinewidth=1)
     axes[1].axvline(0, color=GREY, lw=1, ls="--")
     axes[1].set_yticks(places, [f"{row.structure}\nweight {row.weight:.2f}" for row in rows])
@@ -284,23 +273,22 @@ def plot_comparison(comparison: Comparison, *, output: int = 0, axes: Any = None
 def plot_parameters(parameters: PhysicsParameters, *, axes: Any = None) -> Any:
     """Draw the draws of each unknown parameter of a physics, and its prior.
 
-    A point fit is a line. Of a function there are its mean and its band of 95 %, over what it
-    depends on, and dotted the band of its prior. Return an array of axes, one for each parameter.
+    A point fit is a line. An unknown function has its mean, its band of 95 %, and dotted the band
+    of its prior. Return an array of axes, one for each parameter.
     """
     if not parameters:
         raise ValueError("Expected parameters to draw; the physics has no unknown ones.")
     declared = parameters.unknowns.declared
     axes = axes_of(axes, 1, len(declared), 2.6)[0]
     for ax, (name, unknown) in zip(axes, declared.items(), strict=True):
-        unit = f" [{unknown.unit}]" if unknown.unit else ""
+        label = labelled(labels([name])[0], unknown.unit)
         if unknown.between is None:
             _plot_density(ax, parameters[name].detach().double(), unknown)
-            ax.set(xlabel=labels([name])[0] + unit, yticks=[])
+            ax.set(xlabel=label, ylabel="density" * (ax is axes[0]), yticks=[])
             ax.set_ylim(0, 1.4 * ax.dataLim.y1)  # room for the legend
-            ax.set_ylabel("density" if ax is axes[0] else "")
         else:
             _plot_curve(ax, parameters[name], unknown)
-            ax.set(xlabel=unknown.function_of, ylabel=labels([name])[0] + unit)
+            ax.set(xlabel=unknown.function_of, ylabel=label)
         tidy(ax)
     legend(axes[0])
     return axes
@@ -339,31 +327,33 @@ def plot_priors(priors: Priors, *, axes: Any = None) -> Any:
     """Draw the prior of each unknown number of a model, and its posterior after a fit.
 
     Curves are shares of draws, on a logarithmic axis where the number spans a decade; a point fit
-    is a line. Return an array of as many axes as ``model.priors()`` has rows.
+    is a line. Return an array of axes, one for each row of ``model.priors()``.
     """
     n = len(priors.prior)
-    shape = (1, n) if axes is not None else (-(-n // _COLUMNS), min(n, _COLUMNS))
+    shape = (-(-n // _COLUMNS), min(n, _COLUMNS))  # rows are rounded up
+    if axes is not None:
+        shape = (1, n)
     axes = axes_of(axes, *shape, 2.4).flatten()
-    posterior = priors.posterior or [each[:0] for each in priors.prior]
-    several = len({*priors["output"]} - {""}) > 1
+    posterior = priors.posterior or [draws[:0] for draws in priors.prior]
+    has_several = len({*priors["output"]} - {""}) > 1
     for i, (ax, drawn, after) in enumerate(zip(axes, priors.prior, posterior, strict=False)):
         inner = drawn.quantile(drawn.new_tensor([0.01, 0.99]))
         low, high = (float(end) for end in torch.cat([inner, after[after != 0]]).aminmax())
         is_log = low > 0 and high > _DECADE * low
+        edges = np.linspace(low, high, _BARS + 1)
         if is_log:
             edges = np.geomspace(low, high, _BARS + 1)
             ax.set_xscale("log")
-        else:
-            edges = np.linspace(low, high, _BARS + 1)
         if len(after) == 1:
             ax.axvline(float(after), color=BLUE, label="value")
         for draws, style in ((after, _POSTERIOR), (drawn, _PRIOR)):
             if len(draws) > 1:
                 counts, _ = np.histogram(draws, edges)
                 ax.stairs(counts / len(draws), edges, **style)
-        name, output = priors["name"][i], priors["output"][i]
-        name = fill(f"{name} for {output}" if several and output else name, _LINE)
-        ax.set(xlabel=name, yticks=[])
+        name = priors["name"][i]
+        if has_several and priors["output"][i]:
+            name = f"{name} for {priors['output'][i]}"
+        ax.set(xlabel=fill(name, _LINE), yticks=[])
         tidy(ax)
     for ax in axes[n:]:
         ax.remove()
@@ -378,42 +368,39 @@ def plot_coverage(
     """Draw the observed coverage of central intervals against the nominal one.
 
     Below the diagonal the intervals are too narrow, above it too wide. The band covers 95 % of the
-    observed coverages of predictions whose intervals hold, of as many points, at each level.
+    observed coverages of as many right predictions, at each level.
     """
-    pit, ax = _pit_and_axes(prediction, output, ax, 3.6)
-    n, levels = len(pit), np.linspace(0, 1, 201)
+    scores: Any = prediction
+    if isinstance(prediction, LeaveOneOut):
+        scores = prediction.score()
+    if not isinstance(scores, Scores):
+        raise TypeError(
+            f"Expected predictions with PIT values, got {type(prediction).__name__}; pass "
+            "`leave_one_out(model)` of a model, or `score(posterior, Y)` of a posterior."
+        )
+    values = column(scores.pit, output)
+    pit = values[~values.isnan()].numpy()
+    axes = axes_of(ax, 1, 1, 3.6)[0, 0]
+    if ax is None and len(scores.output_names) > 1:
+        axes.set_title(labels(scores.output_names)[output])
+    n = len(pit)
+    levels = np.linspace(0, 1, 201)
     low, high = (binom.ppf(p, n, levels) / n for p in (0.025, 0.975))
-    ax.fill_between(levels, low, high, color=GREY, alpha=0.2, lw=0, label=_HONEST)
-    ax.plot([0, 1], [0, 1], color=GREY, lw=1, ls="--")
+    label = "95 % of right intervals"
+    axes.fill_between(levels, low, high, color=GREY, alpha=0.2, lw=0, label=label)
+    axes.plot([0, 1], [0, 1], color=GREY, lw=1, ls="--")
+    # A central interval of level 2 |p - 1/2| is the smallest that covers a PIT value p.
     reached = [0, *np.sort(2 * abs(pit - 0.5)), 1]
     shares = [*np.arange(n + 1) / n, 1]
-    ax.step(reached, shares, where="post", color=BLUE, lw=1.8, label="observed")
-    ax.set(xlabel="nominal coverage", ylabel="observed coverage", aspect="equal")
-    ax.set(xlim=(0, 1), ylim=(0, 1.01))
-    legend(ax, loc="upper left")
-    return ax
-
-
-def plot_pit(prediction: LeaveOneOut | Scores, *, output: int = 0, ax: Axes | None = None) -> Axes:
-    """Draw the histogram of PIT values: flat if intervals hold, U-shaped if too sure.
-
-    The band covers 95 % of the counts of a bin if intervals hold.
-    """
-    pit, ax = _pit_and_axes(prediction, output, ax, 3.2)
-    n = len(pit)
-    bins = max(4, min(_BINS, n // 4))
-    low, high = binom.ppf([0.025, 0.975], n, 1 / bins)
-    ax.hist(pit, bins=bins, range=(0, 1), color=BLUE, alpha=0.75, ec="white")
-    ax.fill_between([0, 1], low, high, color=GREY, alpha=0.25, lw=0, zorder=3, label=_HONEST)
-    ax.axhline(n / bins, color=GREY, lw=1, ls="--", zorder=3)
-    ax.set(xlabel="probability integral transform", ylabel="count", xlim=(0, 1))
-    ax.set_ylim(top=1.25 * max(high, ax.get_ylim()[1]))  # room for the legend
-    legend(ax)
-    return ax
+    axes.step(reached, shares, where="post", color=BLUE, lw=1.8, label="observed")
+    axes.set(xlabel="nominal coverage", ylabel="observed coverage", aspect="equal")
+    axes.set(xlim=(0, 1), ylim=(0, 1.01))
+    legend(axes, loc="upper left")
+    return axes
 
 
 def plot_trust(trust: Trust, *, output: int = 0, axes: Any = None) -> Any:
-    """Draw along each input which share of the predictions rests on physics, data, or neither.
+    """Draw along each input the share of predictions that rest on physics, data, or neither.
 
     The shares of all points are in the legend. Return an array of ``d`` axes.
     """
@@ -434,46 +421,26 @@ def plot_trust(trust: Trust, *, output: int = 0, axes: Any = None) -> Any:
         tidy(ax)
     axes[0].set_ylabel("share of predictions")
     outputs = labels(trust.output_names)
-    title = f"{outputs[output]} rests on" if len(outputs) > 1 else "rests on"
-    beside = (1.0, 1.0)
-    legend(axes[-1], title=title, alignment="left", loc="upper left", bbox_to_anchor=beside)
+    title = f"{outputs[output]} " * (len(outputs) > 1) + "rests on"
+    corner = (1.0, 1.0)  # outside the last axes
+    legend(axes[-1], title=title, alignment="left", loc="upper left", bbox_to_anchor=corner)
     return axes
 
 
-def adjustments_of(model: Any) -> list[str]:
+def _adjustments_of(model: Any) -> list[str]:
     """Return the names of the rhos and deltas of a model that vary, if it has a physics."""
-    terms = model.terms if getattr(model, "physics", None) else ()
-    return [t.name for t in terms if t.varies and t.name not in model.data.input_names]
-
-
-def unadjusted(model: Any, name: str) -> float:
-    """Return the value of a rho or a delta away from data."""
-    return float(next(term.mean for term in model.terms if term.name == name))
-
-
-@torch.no_grad()
-def draw_prediction(
-    ax: Axes,
-    model: Any,
-    x: Tensor,
-    X: Tensor,
-    output: int,
-    physics: Mapping[str, Tensor],
-    level: float = 0.95,
-) -> None:
-    """Draw the prediction and each physics, ``n x m``, at points ``X`` over a line ``x``."""
-    band(ax, x, mean_and_ends(model.marginals(X), output, level), level)
-    _draw_physics(ax, x, physics, output)
-    ax.set_xlim(float(x[0]), float(x[-1]))
-    tidy(ax)
+    if not getattr(model, "physics", None):
+        return []
+    return [t.name for t in model.terms if t.varies and t.name not in model.data.input_names]
 
 
 def _draw_physics(ax: Axes, x: Tensor, physics: Mapping[str, Tensor], output: int) -> None:
+    """Draw the values ``n x m`` of each physics over a line."""
     for (name, f_p), style in zip(physics.items(), cycle(_STYLES), strict=False):
         ax.plot(x, column(f_p, output), color=GREY, ls=style, lw=1.2, label=name)
 
 
-def draw_data(ax: Axes, model: Any, output: int) -> None:
+def _draw_data(ax: Axes, model: Any, output: int) -> None:
     """Draw the observations of an output over the only input."""
     y = column(model.data.Y, output)
     x = model.data.X[~y.isnan(), 0]
@@ -493,10 +460,10 @@ def draw_left_out(
 
     Axes are logarithmic where the observations span a decade.
     """
-    ends = [column(each, output) for each in loo.interval(level)]
-    seen = ~y.isnan()
-    y, mean, low, high = (each[seen] for each in (y, column(loo.mean, output), *ends))
-    values = {formula: f[seen] for formula, f in formulas.items()}
+    predicted = [column(values, output) for values in (loo.mean, *loo.interval(level))]
+    is_observed = ~y.isnan()
+    y, mean, low, high = (values[is_observed] for values in (y, *predicted))
+    values = {formula: f[is_observed] for formula, f in formulas.items()}
     drawn = torch.cat([y, mean, *values.values()])
     is_log = bool((drawn > 0).all()) and float(y.max() / y.min()) > _DECADE
     if is_log:
@@ -507,8 +474,8 @@ def draw_left_out(
         ax.plot(f, y, **DOTS | {"mec": color, "mfc": "none", "mew": 1.0}, label=formula)
     name = name or ("corrected, left out" if formulas else "predicted, left out")
     bars = torch.stack([mean - low, high - mean]).clamp_min(0.0)
-    how: dict[str, Any] = {"color": BLUE, "elinewidth": 0.8, "alpha": 0.85, **DOTS}
-    ax.errorbar(mean, y, xerr=bars, label=f"{name}, {100 * level:g} %", **how)
+    style: dict[str, Any] = {"color": BLUE, "elinewidth": 0.8, "alpha": 0.85, **DOTS}
+    ax.errorbar(mean, y, xerr=bars, label=f"{name}, {100 * level:g} %", **style)
     if is_log:  # an interval that goes far below the dots would take decades
         shown = low.maximum(0.5 * drawn.min())
         ax.set(xlim=_log_limits(torch.cat([drawn, shown, high])), ylim=_log_limits(y))
@@ -534,10 +501,11 @@ def lines_along(
 ) -> list[tuple[Tensor, Tensor]]:
     """Return positions ``n`` and points ``n x d`` on a line along each input, through the base.
 
-    Arguments are those of :func:`plot_adjustment`; an error if one is wrong.
+    Arguments are those of :func:`plot_adjustment`, which are checked.
     """
-    X, _ = model.data.X, column(model.data.Y, output)
+    X = model.data.X
     d = X.shape[-1]
+    column(model.data.Y, output)
     check_level(level)
     if bounds is None:
         lower, upper = X.min(0).values, X.max(0).values
@@ -562,24 +530,7 @@ def _symbol(name: str) -> str:
     symbol, _, physics = name.partition("_")
     if symbol not in ("rho", "delta"):
         return name
-    return rf"$\{symbol}$" + (f" of {physics}" if physics else "")
-
-
-def _pit_and_axes(
-    prediction: LeaveOneOut | Scores, output: int, ax: Axes | None, size: float
-) -> tuple[np.ndarray, Axes]:
-    """Return the PIT values of what was observed, and the axes; new ones have a title."""
-    scores = prediction.score() if isinstance(prediction, LeaveOneOut) else prediction
-    if not isinstance(scores, Scores):
-        raise TypeError(
-            f"Expected what has PIT values, got {type(prediction).__name__}; pass "
-            "`leave_one_out(model)` of a model, or `score(posterior, Y)` of a posterior."
-        )
-    values = column(scores.pit, output)
-    drawn = axes_of(ax, 1, 1, size)[0, 0]
-    if ax is None and len(scores.output_names) > 1:
-        drawn.set_title(labels(scores.output_names)[output])
-    return values[~values.isnan()].numpy(), drawn
+    return rf"$\{symbol}$" + f" of {physics}" * bool(physics)
 
 
 def quantile(level: float) -> float:
@@ -591,7 +542,7 @@ def quantile(level: float) -> float:
 def mean_and_ends(marginals: Marginals, output: int, level: float) -> tuple[Tensor, ...]:
     """Return the mean and the ends of the interval of one output of predictions, ``n`` each."""
     ends = [marginals.quantile((1 + sign * level) / 2) for sign in (-1, 1)]
-    return tuple(column(each, output) for each in (marginals.prediction.mean, *ends))
+    return tuple(column(values, output) for values in (marginals.prediction.mean, *ends))
 
 
 def column(values: Tensor, output: int) -> Tensor:
@@ -621,17 +572,17 @@ def labels(names: Sequence[str]) -> list[str]:
     return shown
 
 
-def axes_of(given: Any, rows: int, columns: int, size: float = 3.2) -> Any:
-    """Return the axes that the user gave as an array, or those of a new figure of pyplot."""
-    if given is not None:
-        return given_axes(given, (rows, columns))
+def axes_of(axes: Any, rows: int, columns: int, size: float = 3.2) -> Any:
+    """Return the user's axes as an array, or those of a new figure of pyplot if they are None."""
+    if axes is not None:
+        return given_axes(axes, (rows, columns))
     width = 1.3 * size if columns == 1 else 1.15 * size
     figure = plt.figure(figsize=(width * columns, size * rows), layout="constrained")
     return figure.subplots(rows, columns, squeeze=False)
 
 
 def given_axes(axes: Any, shape: tuple[int, ...]) -> Any:
-    """Return the axes that the user gave, as an array of the shape needed."""
+    """Return the user's axes as an array of the needed shape."""
     axes = np.asarray(axes)
     number = sum(isinstance(ax, Axes) for ax in axes.flat)
     if not number == axes.size == math.prod(shape):
@@ -646,22 +597,7 @@ def band(ax: Axes, x: Tensor, drawn: Sequence[Tensor], level: float) -> None:
     ax.plot(x, mean, color=BLUE, lw=1.8, label="mean")
 
 
-def against_truth(
-    ax: Axes, truth: Tensor, drawn: Sequence[Tensor], level: float, xlabel: str
-) -> None:
-    """Draw predictions, a mean and the ends of its interval, against the true values, ``n``."""
-    is_observed = ~truth.isnan()
-    truth, mean, low, high = (values[is_observed] for values in (truth, *drawn))
-    diagonal = [min(truth.min(), mean.min()), max(truth.max(), mean.max())]
-    ax.plot(diagonal, diagonal, color=GREY, lw=1, ls="--")
-    errors = torch.stack([mean - low, high - mean]).clamp_min(0.0)
-    label = f"mean, {100 * level:g} %"
-    ax.errorbar(truth, mean, errors, color=BLUE, **DOTS, elinewidth=1, alpha=0.85, label=label)
-    ax.set_xlabel(xlabel)
-    legend(ax, loc="upper left")
-
-
-def share_limits(axes: Sequence[Axes]) -> None:
+def _share_limits(axes: Sequence[Axes]) -> None:
     """Give axes the same range of y: slices of one function are compared by eye."""
     low, high = zip(*(ax.get_ylim() for ax in axes), strict=True)
     for ax in axes:

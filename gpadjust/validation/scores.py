@@ -1,7 +1,6 @@
-"""Scores of Gaussian predictions, and of the mixtures of them that posteriors are.
+"""Scores of Gaussian predictions and of mixtures of Gaussians, over the observed points only.
 
-A true value may be NaN where it was not observed. Scores are over the observed points only, and NaN
-for an output that has none.
+A true value is NaN where it was not observed; scores are NaN for an output without any.
 """
 
 from __future__ import annotations
@@ -31,9 +30,7 @@ def central_share(pit: Tensor, level: float) -> Tensor:
 class Scores:
     """Quality of predictions at the observed points.
 
-    One type for all: of a posterior (:func:`score`), of left-out observations
-    (:meth:`~gpadjust.validation.LeaveOneOut.score`), of transitions and of free runs. Leading
-    dimensions, such as the steps of a free run, are a batch: ``scores[i]`` are those of a part.
+    Leading dimensions, such as the steps of a free run, are a batch, and ``scores[i]`` is a part.
 
     Attributes:
         rmse: Root mean square error, ``... x m``, in y's units.
@@ -44,8 +41,8 @@ class Scores:
         coverage: Share of the points in the central interval, ``... x m``.
         pit: Probability integral transform of each point, ``... x n x m``: the distribution
             function at the true value, NaN where not observed. Uniform between 0 and 1 if intervals
-            of all levels hold (Dawid 1984).
-        energy: Mean energy score of all outputs together, ``...``, where there are draws of them.
+            of all levels have their coverage (Dawid 1984).
+        energy: Mean energy score of all outputs together, ``...``, where there are draws.
         output_names: The names of the outputs; empty if they have none.
     """
 
@@ -59,7 +56,7 @@ class Scores:
     output_names: tuple[str, ...] = ()
 
     @classmethod
-    def of(
+    def compute(
         cls,
         mean: Tensor,
         variance: Tensor,
@@ -70,47 +67,35 @@ class Scores:
         energy: Tensor | None = None,
         output_names: Sequence[str] = (),
     ) -> Scores:
-        """Return the scores of Gaussian predictions, in closed form.
+        """Compute the scores of Gaussian predictions, in closed form.
 
         Args:
             mean: Predicted means, ``... x n x m``.
-            variance: Predicted variances, of the same shape. NaN where the prediction says none:
-                these points count in ``rmse`` and ``median`` only.
+            variance: Predicted variances, of the same shape. Points with NaN count in ``rmse`` and
+                ``median`` only.
             y: True values, ``... x n x m``, NaN where not observed.
             level: Nominal coverage, between 0 and 1.
-            interval: Lower and upper ends of the interval of that level, ``... x n x m`` each.
-                Default: those of the prediction's own distribution.
+            interval: Ends of the interval of that level, ``... x n x m`` each, if not Gaussian.
             energy: The energy score of draws, ``...``.
             output_names: The names of the ``m`` outputs.
 
         Raises:
-            TypeError: If these are no tensors of numbers, or ``level`` is no number.
+            TypeError: If one is not a tensor of numbers.
             ValueError: If the shapes disagree, means have NaN, variances are negative, or ``level``
                 is not between 0 and 1.
-
-        Example:
-            >>> import torch
-            >>> mean, y = torch.zeros(5, 20, 2), torch.randn(5, 20, 2)
-            >>> scores = Scores.of(mean, torch.ones(5, 20, 2), y)  # 5 steps of 20 windows
-            >>> scores.rmse.shape, scores[4].rmse.shape
-            (torch.Size([5, 2]), torch.Size([2]))
         """
         gaussians = _gaussians(mean, variance.nan_to_num(nan=1.0, posinf=math.inf), y)
         judged = y.masked_fill(variance.isnan(), math.nan)
         scores = _scores(gaussians, y, judged, level)
         if interval is not None:
-            known = judged + 0 * (interval[0] + interval[1])  # NaN where an end is
-            inside = (interval[0] <= known) & (known <= interval[1])
-            scores = replace(scores, coverage=_mean_over_observed(inside.to(mean.dtype), known))
+            values = judged + 0 * (interval[0] + interval[1])  # NaN where an end is
+            is_inside = (interval[0] <= values) & (values <= interval[1])
+            share = _mean_over_observed(is_inside.to(mean.dtype), values)
+            scores = replace(scores, coverage=share)
         return replace(scores, energy=energy, output_names=tuple(output_names))
 
     def __getitem__(self, part: Any) -> Scores:
-        """Return the scores of a part of the batch, by an index of its leading dimensions.
-
-        Raises:
-            TypeError: If there is no batch.
-            IndexError: If the batch has not this part.
-        """
+        """Return the scores of a part of the batch; raise a TypeError if there is no batch."""
         if self.rmse.dim() < 2:
             raise TypeError(
                 "These scores have no batch to take a part of; an output is `scores.rmse[j]`."
@@ -120,20 +105,19 @@ class Scores:
 
 
 def score(posterior: Posterior, Y: Tensor, level: float = 0.95) -> Scores:
-    """Judge a posterior by what was observed.
+    """Judge a posterior by observations.
 
-    Of noisy ``Y`` take the posterior of *observations*, ``observation_noise=True``.
+    If ``Y`` is noisy, pass the posterior of *observations*, ``observation_noise=True``.
 
     Args:
-        posterior: That of a model of this library (with a link ``crps`` is by the prediction and
-            its variance), or one of BoTorch that is Gaussian at each point or a mixture.
-        Y: Observations, ``... x n x m``, NaN where there is none.
+        posterior: The posterior of a model of this library, or one of BoTorch that is Gaussian at
+            each point or a mixture. With a link ``crps`` is by the mean and the variance.
+        Y: Observations, ``... x n x m``, NaN where missing.
         level: Nominal coverage, between 0 and 1.
 
     Raises:
-        TypeError: If ``posterior`` has no mean and variance, ``Y`` is no tensor, or ``level`` no
-            number.
-        ValueError: If ``Y`` does not have the posterior's shape, or ``level`` is not between 0
+        TypeError: If ``posterior`` has no mean and variance, or ``Y`` is not a tensor.
+        ValueError: If ``Y`` has another shape than the posterior, or ``level`` is not between 0
             and 1.
 
     Example:
@@ -149,11 +133,12 @@ def score(posterior: Posterior, Y: Tensor, level: float = 0.95) -> Scores:
     """
     marginals = getattr(posterior, "marginals", None)
     if not isinstance(marginals, Marginals):
-        mean, variance = getattr(posterior, "mean", None), getattr(posterior, "variance", None)
+        mean = getattr(posterior, "mean", None)
+        variance = getattr(posterior, "variance", None)
         if not (isinstance(mean, Tensor) and isinstance(variance, Tensor)):
             raise TypeError(
                 "Expected a posterior, with a mean and a variance, got "
-                f"{type(posterior).__name__}; that of a model is `model.posterior(X, "
+                f"{type(posterior).__name__}; a model has one, `model.posterior(X, "
                 "observation_noise=True)`."
             )
         if isinstance(posterior, GaussianMixturePosterior):
@@ -169,36 +154,30 @@ def energy_score(draws: Tensor, y: Tensor) -> Tensor:
 
     :math:`\frac1K \sum_i |x_i - y| - \frac{1}{2 K (K - 1)} \sum_{i \neq j} |x_i - x_j|` of ``K``
     draws (Gneiting and Raftery 2007, sec. 4.3; without bias of ``K``: Ferro 2014). Give all outputs
-    one scale first, as a distance is no more than the largest of them. Of draws that are all equal
-    it is the distance itself.
+    one scale first, as the largest one dominates a distance.
 
     Args:
         draws: ``K x ... x n x m``, at least two.
         y: True values, ``... x n x m``; points with NaN are left out.
-
-    Returns:
-        ``...``, in the units of ``y``; NaN where there is no point.
-
-    Example:
-        >>> import torch
-        >>> energy_score(torch.tensor([[[0.0]], [[2.0]]]), torch.tensor([[1.0]]))
-        tensor(0.)
     """
-    known = ~y.isnan().any(-1)
+    is_observed = ~y.isnan().any(-1)
     error = (draws - _filled(y)).norm(dim=-1).mean(0)
     # Point by point, as all pairs at once are n K^2; not by products, which cancel.
     mode = "donot_use_mm_for_euclid_dist"
     points = draws.movedim(0, -2).flatten(0, -3)
-    pairs = [torch.cdist(each, each, compute_mode=mode).sum() for each in points]
-    spread = torch.stack(pairs).reshape(known.shape) if pairs else torch.zeros_like(error)
-    values = error - spread / (2 * len(draws) * (len(draws) - 1))
-    return values.masked_fill(~known, 0).sum(-1) / known.sum(-1)
+    pairs = error.new_zeros(len(points))
+    for i, point in enumerate(points):
+        pairs[i] = torch.cdist(point, point, compute_mode=mode).sum()
+    # sum_i |x_i - y| / K - sum_ij |x_i - x_j| / (2 K (K - 1))
+    values = error - pairs.reshape(error.shape) / (2 * len(draws) * (len(draws) - 1))
+    return values.masked_fill(~is_observed, 0).sum(-1) / is_observed.sum(-1)
 
 
 def _scores(marginals: Marginals, y: Tensor, judged: Tensor, level: float) -> Scores:
-    """Return the scores of mixtures; errors at ``y``, all else at the values that are judged."""
-    mean, values = marginals.prediction.mean, marginals.probability(judged)
-    # A median of no points is an error of torch.
+    """Return the scores of mixtures; errors at ``y``, all else at the judged values."""
+    mean = marginals.prediction.mean
+    values = marginals.probability(judged)
+    # The median of no points is an error in torch.
     median = (mean - y).abs().nanmedian(-2).values if y.shape[-2] else y.sum(-2) / 0
     return Scores(
         rmse=_mean_over_observed((mean - _filled(y)).square(), y).sqrt(),
@@ -216,12 +195,12 @@ def _crps(marginals: Marginals, y: Tensor) -> Tensor:
     .. math:: \frac1S \sum_i A(y - \mu_i, \sigma_i^2)
         - \frac{1}{2 S^2} \sum_{i, j} A(\mu_i - \mu_j, \sigma_i^2 + \sigma_j^2)
 
-    Of a model with a link it is that of a Gaussian with the prediction's mean and variance.
+    With a link it is the score of a Gaussian with the prediction's mean and variance.
     """
     if type(marginals) is Marginals:
-        mean, variance = (each.movedim(DRAWS, 0) for each in marginals)
+        mean, variance = (moment.movedim(DRAWS, 0) for moment in marginals)
     else:
-        mean, variance = (each.unsqueeze(0) for each in marginals.prediction)
+        mean, variance = (moment.unsqueeze(0) for moment in marginals.prediction)
     score = _absolute_moment(_filled(y) - mean, variance).mean(0)
     for mean_i, variance_i in zip(mean, variance, strict=True):  # all pairs at once are S^2 n m
         spread = _absolute_moment(mean - mean_i, variance + variance_i).mean(0)
@@ -231,10 +210,11 @@ def _crps(marginals: Marginals, y: Tensor) -> Tensor:
 
 def _absolute_moment(mean: Tensor, variance: Tensor) -> Tensor:
     """Return the expectation of ``|Z|`` for a normal ``Z``."""
-    # Next to no variance instead of none, so that the score has its limit.
+    # A tiny variance instead of zero, so that the score has its limit.
     sd = variance.sqrt().clamp_min(torch.finfo(variance.dtype).tiny ** 0.5)
     z = mean / sd
     normal = Normal(torch.zeros_like(z), torch.ones_like(z))
+    # E|Z| = mu (2 Phi(z) - 1) + 2 sigma phi(z)
     return mean * (2 * normal.cdf(z) - 1) + 2 * sd * normal.log_prob(z).exp()
 
 
@@ -251,7 +231,7 @@ def _check(y: Tensor, **predicted: Tensor) -> None:
     if y.dim() < 2:
         raise ValueError(
             f"Expected y of shape ... x n x m, n points of m outputs, got {tuple(y.shape)}; give "
-            "one output its column with `.unsqueeze(-1)`, of all that is passed."
+            "a single output a column in all arguments, `.unsqueeze(-1)`."
         )
     for name, values in predicted.items():
         if values.shape != y.shape:
@@ -271,7 +251,7 @@ def _check(y: Tensor, **predicted: Tensor) -> None:
 
 
 def _filled(y: Tensor) -> Tensor:
-    """Return true values with a number where they are NaN, which is left out later."""
+    """Return true values with 0 where they are NaN, which are left out later."""
     return y.masked_fill(y.isnan(), 0)
 
 

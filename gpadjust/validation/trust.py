@@ -17,7 +17,7 @@ from gpadjust.kinds.categories import on_levels
 
 _POINTS = 512
 SIDES = ("physics", "data", "neither")
-_NOTHING = 1e-3  # of the targets' standard deviation: what makes no difference
+_NOTHING = 1e-3  # of the observations' standard deviation: what makes no difference
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Trust:
 
     @property
     def physics(self) -> Tensor:
-        """Share of the points at which the physics holds, ``m``."""
+        """Share of the points at which the prediction rests on the physics, ``m``."""
         return (self.side == 0).double().mean(0)
 
     @property
@@ -58,7 +58,7 @@ class Trust:
 
     @property
     def neither(self) -> Tensor:
-        """Share of the points at which the data say too little to tell, ``m``."""
+        """Share of the points at which there are too few data to decide, ``m``."""
         return (self.side == 2).double().mean(0)
 
 
@@ -73,26 +73,21 @@ def trust(model: Any, X: ArrayLike = None, *, level: float = 0.95) -> Trust:
     .. math:: \text{data if } |\mu - f_p| > w, \quad
         \text{else physics if } w \le D, \quad \text{else neither:}
 
-    - *data*: the model is sure that the physics is wrong there, and overrides it;
-    - *physics*: the physics may be right, and the model is surer of it than the discrepancies that
-      were seen would allow, so that data have confirmed it there;
-    - *neither*: the physics may be right, or as wrong as it was elsewhere. The model says what the
-      physics says, for want of data.
-
-    w and D are taken to be at least a thousandth of the standard deviation of the targets, as less
-    makes no difference to speak of. :math:`f_p` is the prior mean of the model, of several physics
-    their weighted sum.
+    that is, where the model is sure that the physics is wrong; where data have confirmed it; and
+    where the model predicts the physics for want of data. w and D are at least a thousandth of the
+    standard deviation of the observations. :math:`f_p` is the prior mean of the model, of several
+    physics their weighted sum.
 
     Args:
-        model: A model with a physics, such as :class:`~gpadjust.CKA`; that of
+        model: A model with a physics, such as :class:`~gpadjust.CKA`; the ``model`` of
             ``LearnedDynamics``, too.
-        X: Inputs, ``n x d``, such as states and actions that were visited. Default:
-            512 in the box of the training inputs, by Sobol's sequence.
+        X: Inputs, ``n x d``, such as visited states and actions. Default: 512 in the box of the
+            training inputs, by Sobol's sequence.
         level: Nominal coverage of the interval.
 
     Raises:
-        TypeError: If the model has no physics to be trusted, or is a :class:`~gpadjust.StackedGP`,
-            or ``level`` is no number.
+        TypeError: If the model has no physics to trust, or is a :class:`~gpadjust.StackedGP`, or
+            ``level`` is not a number.
         ValueError: If ``X`` has the wrong shape, or ``level`` is not between 0 and 1.
         PhysicsError: If the physics fails.
 
@@ -110,9 +105,9 @@ def trust(model: Any, X: ArrayLike = None, *, level: float = 0.95) -> Trust:
     check_level(level)
     if not isinstance(model, Predictive) or not getattr(model, "physics", None):
         raise TypeError(
-            "Expected a model with a physics that it could trust, such as CKA; found "
-            f"{type(model).__name__}. Of LearnedDynamics pass its `model`, of a StackedGP one of "
-            "its models, such as comparison.models['CKA']."
+            f"Expected a model with a physics to trust, such as CKA; found {type(model).__name__}. "
+            "For LearnedDynamics pass its `model`, for a StackedGP one of its models, such as "
+            "comparison.models['CKA']."
         )
     data = model.data
     if X is None:
@@ -125,17 +120,18 @@ def trust(model: Any, X: ArrayLike = None, *, level: float = 0.95) -> Trust:
             f"Expected X of shape n x d, one point or more; found {tuple(points.shape)}."
         )
     mean, variance = model.predict(points)
-    away = (mean - prior_mean(model, points)).abs()
+    distance = (mean - prior_mean(model, points)).abs()
     discrepancy = _rms(data.Y - prior_mean(model, data.X))
     least = _NOTHING * _rms(data.Y - data.Y.nanmean(0))
     least = least.clamp_min(torch.finfo(least.dtype).tiny)
+    # w = z sigma, z the quantile of the level
     half = torch.maximum(NormalDist().inv_cdf((1 + level) / 2) * variance.sqrt(), least)
     doubt = half / torch.maximum(discrepancy, least)
-    return Trust(points, away / half, doubt, data.input_names, data.output_names)
+    return Trust(points, distance / half, doubt, data.input_names, data.output_names)
 
 
 def prior_mean(model: Any, X: Tensor) -> Tensor:
-    """Return what the model says without data, ``n x m``: its physics, whether of use or not."""
+    """Return the predictions without data, ``n x m``: the physics, whether of use or not."""
     values = model.table.values(model.table.with_choice(model.u.detach(), 0))
     mean = (model.evaluate(X, values).mean * model.unit).mT  # S x n x m
     prior: Tensor = model.marginals_of(mean, torch.zeros_like(mean)).prediction.mean
@@ -145,14 +141,16 @@ def prior_mean(model: Any, X: Tensor) -> Tensor:
 @torch.no_grad()
 def physics_at(model: Any, X: Tensor) -> dict[str, Tensor]:
     """Return the outputs ``n x m`` of each physics by name, the means of their draws."""
-    names = {t.physics: t.name.removeprefix("rho_") for t in getattr(model, "terms", ())}
-    outputs = model.places(X, model.values).f if getattr(model, "physics", None) else []
-    found: dict[str, Tensor] = {}
+    if not getattr(model, "physics", None):
+        return {}
+    names = {term.physics: term.name.removeprefix("rho_") for term in model.terms}
+    outputs = model.places(X, model.values).f
+    means: dict[str, Tensor] = {}
     for i, f in enumerate(outputs):
-        name = f"physics {names.get(i, i + 1)}" if len(outputs) > 1 else "physics"
+        name = "physics" + f" {names.get(i, i + 1)}" * (len(outputs) > 1)
         values = (f * model.unit).mT
-        found[name] = model.marginals_of(values, torch.zeros_like(values)).prediction.mean
-    return found
+        means[name] = model.marginals_of(values, torch.zeros_like(values)).prediction.mean
+    return means
 
 
 def _rms(values: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,6 +13,7 @@ from gpadjust.core import GP, FitResult
 from gpadjust.kinds.categories import levels_of, on_levels
 from gpadjust.physics import PhysicsError
 from gpadjust.validation.faults import rms
+from gpadjust.validation.trust import physics_at
 from gpadjust.words import bare, listed, number, with_unit
 
 ALONE, CALIBRATED, ADJUSTED = "physics alone", "calibrated physics", "adjusted"
@@ -22,7 +23,7 @@ NOT, OPEN = "Do not use it", "These data do not tell"
 _ROUNDING = 1e-9  # relative; less is rounding
 _SURE = 2.0  # standard errors that a difference takes to be real
 _ENOUGH = 8  # observations of different inputs, for any answer
-_LEAST = 1.0  # nats; a smaller difference says nothing
+_LEAST = 1.0  # nats; a smaller difference shows nothing
 _SURELY = 0.95  # probability with which nested models decide
 _EVEN = 0.5  # probability below which a correction is not believed for a smaller error alone
 _LARGER = 1.1  # times as large; by less, errors are equal
@@ -41,15 +42,14 @@ class Candidate(NamedTuple):
     Attributes:
         structure: Its name.
         elpd: Expected log predictive density, the sum over the observations, in nats.
-        elpd_diff: That less the best structure's; 0 for the best.
+        elpd_diff: Difference from the elpd of the best structure; 0 for the best.
         se_diff: The standard error of this difference.
-        weight: Its weight in the stacked model; NaN of a physics alone, which is no part of it.
+        weight: Its weight in the stacked model; NaN of a physics alone, which has none.
         rmse: Root mean square error, relative to the standard deviation of the observations.
         coverage: Share of the observations within their 95 % intervals.
         error: Root mean square error, in the output's units.
-        log_evidence: The log evidence of the fit; NaN if there is none.
-        of_use: Probability that the physics is of use, by the evidence of nested models with and
-            without it; NaN if there are none.
+        log_evidence: The log evidence of the fit; NaN if unknown.
+        of_use: Probability that the physics is of use, by nested models; NaN if unknown.
         kind: ``"physics alone"``, ``"calibrated physics"``, ``"adjusted"`` or ``"data alone"``.
     """
 
@@ -72,9 +72,9 @@ class Verdict(NamedTuple):
     Attributes:
         answer: ``"Use your formula as it is"``, ``"Use it corrected"``, ``"Do not use it"`` or
             ``"These data do not tell"``.
-        reasons: Why, in sentences.
-        factor: By which the formula is to be multiplied where it is used as it is.
-        offset: What is to be added then, in the unit of the output.
+        reasons: The reasons, in sentences.
+        factor: Factor of the formula where it is used as it is.
+        offset: Its offset then, in the unit of the output.
     """
 
     answer: str
@@ -84,91 +84,144 @@ class Verdict(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """What a verdict on an output is reached by.
+    """The evidence for a verdict on an output; errors are root mean squares of left-out ones."""
 
-    Attributes:
-        name: The output, with its unit.
-        number: Observations, those of the same inputs taken together.
-        of_use: Probability that the physics is of use, by nested models with and without it; NaN if
-            none were fitted.
-        gain: The difference of expected log predictive densities with and without the physics, in
-            nats.
-        se: Its standard error.
-        alone: Root mean square error of left-out observations by the formula, with fitted
-            parameters if it has unknown ones; NaN of several.
-        line: The same by the formula up to the factor and offset.
-        adjusted: The same by the best structure that adjusts it.
-        data: The same by the best structure without it.
-        factor: Of the straight line through observations over the formula.
-        offset: Likewise.
-        fault: What is obviously wrong with the formula, in words.
-        is_surpassed: Whether densities of left-out observations show that the correction is needed.
-        correction_needed: Its probability by nested models; NaN if none were fitted.
-    """
-
-    name: str
-    number: int
-    of_use: float
-    gain: float
-    se: float
-    alone: float
-    line: float
-    adjusted: float
-    data: float
-    factor: float
-    offset: float
-    fault: str = ""
-    is_surpassed: bool = False
-    correction_needed: float = math.nan
+    name: str  # of the output, with its unit
+    number: int  # of observations, those of the same inputs taken together
+    of_use: float  # probability by nested models with and without the physics; NaN without these
+    gain: float  # of the expected log predictive density by the physics, in nats
+    se: float  # its standard error
+    adjusted: float  # error by the best structure that adjusts the formula
+    data: float  # error by the best structure without it
+    alone: float = math.nan  # error by the formula, its parameters fitted; NaN of several
+    line: float = math.nan  # error by the formula up to the factor and offset
+    factor: float = math.nan  # of the straight line through observations over the formula
+    offset: float = math.nan  # of this line
+    fault: str = ""  # the obvious fault of the formula, in words
+    is_surpassed: bool = False  # whether densities show that the correction is needed
+    correction_needed: float = math.nan  # probability by nested models; NaN without these
 
 
 def difference(first: Tensor, second: Tensor) -> tuple[float, float]:
     """Return the difference of two elpd, and its standard error (Vehtari et al. 2017, eq. 24)."""
-    each = first - second
-    return each.sum().item(), math.sqrt(len(each)) * each.std(correction=0).item()
+    gains = first - second
+    # sqrt(n) times the standard deviation of the n differences
+    return gains.sum().item(), math.sqrt(len(gains)) * gains.std(correction=0).item()
+
+
+def formulas_of(comparison: Any, names: Sequence[str], j: int) -> dict[str, Tensor]:
+    """Return output j of each physics at the data, with unknown parameters as they were fitted."""
+    rows = [*comparison.table.values()][j]
+    values = {}
+    for name in names:
+        suffix = f" of {name}" * bool(name)
+        alone = [f"{kind}{suffix}" for kind in (ALONE, CALIBRATED)]
+        predicted = [comparison.left_out[key] for key in alone if key in comparison.left_out]
+        adjusted = [comparison.models[row.structure] for row in rows if row.kind == ADJUSTED]
+        models = [model for model in adjusted if len(model.physics) == 1]
+        if predicted:
+            values[name] = predicted[0].mean[:, j]
+        elif models and not name:  # its parameters are those of the best structure
+            (f,) = physics_at(models[0], models[0].data.X).values()
+            values[name] = f[:, j]
+    return values
+
+
+def verdict_of(c: Any, j: int, f: Tensor | None, fault: str) -> Verdict | None:
+    """Return the verdict on output j, of a physics with values f; None if nothing is compared."""
+    output, rows = [*c.table.items()][j]
+    rows = [row for row in rows if row.structure in c.models]
+    best = next((row for row in rows if row.kind != DATA), None)
+    without = next((row for row in rows if row.kind == DATA), None)
+    if best is None or without is None:
+        return None
+    adjusted = next((row for row in rows if row.kind == ADJUSTED), best)
+    model = c.models[adjusted.structure]
+    densities = {name: loo.densities_of(j) for name, loo in c.left_out.items()}
+    errors = c.errors()[output]
+    gain, se = difference(densities[best.structure], densities[without.structure])
+    of_use = best.of_use
+    if math.isnan(of_use):
+        of_use = max((row.of_use for row in rows if not math.isnan(row.of_use)), default=math.nan)
+    evidence = Evidence(
+        output,
+        number=len(densities[without.structure]),
+        of_use=of_use,
+        gain=gain,
+        se=se,
+        adjusted=errors.get(ADJUSTED, best.error),
+        data=errors[DATA],
+        fault=fault,
+        correction_needed=_correction_needed(model, c.results[adjusted.structure], j),
+    )
+    correction = ""
+    if f is not None:  # of several physics there is no error of the formula
+        loo = c.left_out[best.structure]
+        y = loo.judged[:, j]
+        is_judged = ~y.isnan()
+        factor, offset, line = straight_line(y[is_judged], f[is_judged])
+        evidence = evidence._replace(
+            alone=float((y - f)[is_judged].square().mean().sqrt()),
+            line=line,
+            factor=factor,
+            offset=offset,
+        )
+        formula = [densities[name] for name in (ALONE, CALIBRATED) if name in densities]
+        if formula:
+            shown = is_shown(densities[adjusted.structure], formula[0])
+            evidence = evidence._replace(is_surpassed=shown)
+        correction = correction_of(model, j, f)
+    return verdict_on(evidence, correction, next_point(model, c.models[without.structure], j))
+
+
+def _correction_needed(model: GP, result: FitResult, j: int) -> float:
+    """Return the probability that f_p of output j needs a correction; NaN if unknown."""
+    for choice in model.table.choices:
+        if not choice.zeros and choice.text in result.probabilities:
+            return result.probabilities[choice.text][j]
+    return math.nan
 
 
 def verdict_on(e: Evidence, correction: str, next_point: str) -> Verdict:
     """Return the verdict that evidence allows.
 
     The probability of nested models decides whether the formula is of use, unless left-out
-    observations contradict it; their errors decide whether it needs a correction.
-
-    Args:
-        e: The evidence.
-        correction: The largest correction, in words; empty if there is none.
-        next_point: Where one more observation would tell most; empty if none among the data would.
+    observations contradict it; their errors decide whether it needs a correction. The largest
+    correction and the most useful next point are in words, or empty.
     """
 
     def error(value: float) -> str:
         return with_unit(number(value), e.name)
 
-    without = f"without it the error is {error(e.data)}, with it {error(e.adjusted)}"
+    # The data do not tell: a fault, too few observations, or a constant.
     where = " Observe where the formula has other values."
     if next_point:
         where = f" More observations would tell, the first one {next_point}."
     if e.fault:
         fault = f"Your formula seems to be wrong: {e.fault}"
-        return Verdict(OPEN, [fault, "Mend it and ask again: until then no answer is worth much."])
+        return Verdict(OPEN, [fault, "Correct it and run again; no other answer is worth much."])
     if e.number < _ENOUGH:
         few = f"It takes at least {_ENOUGH} observations of different inputs, and there are"
         return Verdict(OPEN, [f"{few} {e.number}.{where}"])
     if e.factor == 0:
-        same = "Your formula has the same value at all observations, which tells nothing of it."
+        same = "Your formula has the same value at all observations, so they cannot judge it."
         return Verdict(OPEN, [f"{same} Observe where it differs."])
+
+    # Is the formula of use?
+    compared = f"Without it the error is {error(e.data)}, with it {error(e.adjusted)}"
     is_better = e.gain > max(_SURE * e.se, _LEAST)
     is_worse = -e.gain > max(_SURE * e.se, _LEAST)
     of_use = e.of_use
-    if math.isnan(of_use):
-        of_use = 1.0 if is_better else 0.0 if is_worse else 0.5
+    if math.isnan(of_use):  # left-out observations alone decide
+        of_use = 0.5 + 0.5 * is_better - 0.5 * is_worse
     if of_use < 1 - _SURELY and not is_better:
-        return Verdict(NOT, [f"{without[0].upper()}{without[1:]}, and the formula alone "
-                             f"is off by {error(e.alone)}."])  # fmt: skip
-    if of_use <= _SURELY or is_worse or e.adjusted > _LARGER * e.data:
-        doubt = f"{without[0].upper()}{without[1:]}: too near one another to tell"
-        if e.adjusted > _LARGER * e.data:
-            doubt = f"{without[0].upper()}{without[1:]}"
-        return Verdict(OPEN, [f"{doubt}.{where}"])
+        return Verdict(NOT, [f"{compared}, and the formula alone is off by {error(e.alone)}."])
+    is_larger = e.adjusted > _LARGER * e.data
+    if of_use <= _SURELY or is_worse or is_larger:
+        doubt = ": too near one another to tell" * (not is_larger)
+        return Verdict(OPEN, [f"{compared}{doubt}.{where}"])
+
+    # Is it right as it is, or up to a factor and an offset?
     simple = e.line if e.alone > _LARGER * e.line else e.alone  # NaN of several
     is_as_good = simple <= _LARGER * min(e.adjusted, e.data) or e.correction_needed < _EVEN
     if is_as_good and not (e.is_surpassed and simple == e.alone):
@@ -181,18 +234,20 @@ def verdict_on(e: Evidence, correction: str, next_point: str) -> Verdict:
             line += f" {sign} {error(abs(e.offset))}"
         reason = f"Take {line}: its error is {error(e.line)}, as it is {error(e.alone)}, corrected"
         return Verdict(AS_IS, [f"{reason} {error(e.adjusted)}."], e.factor, e.offset)
+
+    # It needs a correction, unless it hardly describes the data.
     if e.alone > _HARDLY * e.data and e.line > _LARGER * e.data:
         alone = f"By itself your formula is off by {error(e.alone)}, the data alone {error(e.data)}"
         input_only = f"As an input of a model it lowers the error to {error(e.adjusted)}"
-        return Verdict(OPEN, [f"{alone}. {input_only}; look whether it is the right formula."])
+        return Verdict(OPEN, [f"{alone}. {input_only}; check whether it is the right formula."])
     falls = f"Errors fall from {error(e.alone)} to {error(e.adjusted)}"
-    if e.adjusted >= e.alone:
+    if math.isnan(e.alone):
+        falls = f"The error is {error(e.adjusted)}, of the data alone {error(e.data)}"
+    elif e.adjusted >= e.alone:
         falls = (
             f"The error is {error(e.adjusted)}, as it is {error(e.alone)}, but most observations "
             "are predicted better with the correction"
         )
-    if math.isnan(e.alone):
-        falls = f"The error is {error(e.adjusted)}, of the data alone {error(e.data)}"
     reasons = [f"{falls}{'; ' * bool(correction)}{correction}."]
     if e.data <= _LARGER * e.adjusted:
         reasons.append(
@@ -211,27 +266,30 @@ def is_shown(first: Tensor, second: Tensor) -> bool:
 def straight_line(y: Tensor, f: Tensor) -> tuple[float, float, float]:
     """Return factor and offset of y over f by least squares, and the error of left-out ``n``."""
     varies = float(f.std()) > _ROUNDING * rms(f)
-    basis = torch.stack([f, torch.ones_like(f)] if varies else [torch.ones_like(f)], -1)
+    columns = [f] * varies + [torch.ones_like(f)]
+    basis = torch.stack(columns, -1)
     q, r = torch.linalg.qr(basis)
     solution = torch.linalg.solve_triangular(r, q.mT @ y.unsqueeze(-1), upper=True).squeeze(-1)
-    left = (1 - q.square().sum(-1)).clamp_min(_ROUNDING)  # of the errors, if a point is left out
-    error = rms((y - basis @ solution) / left)
-    factor, offset = solution.tolist() if varies else (0.0, *solution.tolist())
-    return factor, offset, error
+    # The error at a point that is left out is the residual over 1 - h, h the diagonal of Q Q'.
+    remainder = (1 - q.square().sum(-1)).clamp_min(_ROUNDING)
+    error = rms((y - basis @ solution) / remainder)
+    *factors, offset = solution.tolist()
+    return sum(factors), offset, error
 
 
 @torch.no_grad()
 def correction_of(model: GP, j: int, f: Tensor) -> str:
     """Return the largest correction of a formula's values at the data, in words."""
     X = model.data.X
-    off = model.predict(X).mean[:, j] - f
+    corrections = model.predict(X).mean[:, j] - f
     is_share = bool((f > 0).all() or (f < 0).all())
     is_large = f.abs() > _TINY_SHARE * f.abs().median()  # where a share says something
-    sizes = torch.where(is_large, off / f.abs(), 0.0) if is_share else off
+    sizes = torch.where(is_large, corrections / f.abs(), 0.0) if is_share else corrections
     i = int(sizes.abs().argmax())
     size = f"{100 * sizes[i]:+.0f} %"
     if not is_share:
-        size = with_unit(f"{'+' * bool(off[i] > 0)}{number(off[i])}", model.data.output_names[j])
+        sign = "+" * bool(sizes[i] > 0)
+        size = with_unit(f"{sign}{number(sizes[i])}", model.data.output_names[j])
     return f"the largest correction at the data is {size}{_at(model, X[i])}"
 
 
@@ -245,15 +303,15 @@ def next_point(first: GP, second: GP, j: int) -> str:
         a, b = first.predict(X), second.predict(X)
     except PhysicsError:
         return ""
+    # squared distance of the means over the sum of the variances
     apart = (a.mean - b.mean)[:, j].square() / (a.variance + b.variance)[:, j]
     i = int(apart.argmax())
     if apart[i] < _APART_BY**2:
         return ""
     name = first.data.output_names[j]
-    values = [with_unit(number(each.mean[i, j]), name) for each in (a, b)]
+    values = [with_unit(number(mean[i, j]), name) for mean in (a.mean, b.mean)]
     where = f"where it is {values[0]} with the formula, {values[1]} without"
-    at = _at(first, X[i]).strip()
-    return f"{at}, {where}" if at else where
+    return f"{_at(first, X[i]).strip()}, {where}".removeprefix(", ")
 
 
 def _at(model: GP, x: Tensor) -> str:
@@ -268,12 +326,12 @@ def _at(model: GP, x: Tensor) -> str:
 def unsampled(
     table: Mapping[str, Sequence[Candidate]], results: Mapping[str, FitResult]
 ) -> list[str]:
-    """Return which structures with weight have other results by other seeds."""
+    """Return a warning of structures with weight that have other results by other seeds."""
     names = {row.structure for rows in table.values() for row in rows if row.weight > COUNTS}
-    low = [name for name, result in results.items() if name in names and not result.converged]
-    if not low:
+    names &= {name for name, result in results.items() if not result.converged}
+    if not names:
         return []
     return [
-        f"Results of {', '.join(low)} depend on the seed: doubt the intervals, and fit again "
-        "with more num_draws or narrower priors."
+        f"Results of {', '.join(sorted(names))} depend on the seed: doubt the intervals, and fit "
+        "again with more num_draws or narrower priors."
     ]

@@ -88,7 +88,7 @@ def run(experiment: Forrester, reading: str, protocol: str, seed: int) -> Run:
     for name, model, seconds in _models(reading, protocol, X, Y, settings):
         with torch.no_grad():
             posterior = model.posterior(POINTS, observation_noise=True)
-            scores = Scores.of(posterior.mean, posterior.variance, y)
+            scores = Scores.compute(posterior.mean, posterior.variance, y)
         shown = ("rmse", *_SCORES) if protocol in PROTOCOLS else ("rmse",)
         judged = dict.fromkeys(_SCORES) | {name: getattr(scores, name).item() for name in shown}
         rows.append({"model": name, **judged, "seconds": seconds})

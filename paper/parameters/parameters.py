@@ -43,7 +43,7 @@ def run(experiment: Parameters, problem: str, model: str, seed: int) -> Run:
         "intervals": {name: [low[i], high[i]] for i, name in enumerate(best)},
         "best": best,
         "true": dict(known.true),
-        "rmse": Scores.of(mean, variance, known.system).rmse.item(),
+        "rmse": Scores.compute(mean, variance, known.system).rmse.item(),
         "coverage": inside.double().mean().item(),
         "seconds": seconds,
     }

@@ -73,6 +73,14 @@ def test_sheets_without_a_value_need_no_choice(tmp_path):
         Table(tmp_path / "table.xlsx")
     with pytest.raises(ValueError, match="choose one: --sheet 'Sheet'"):
         Table(tmp_path / "table.xlsx", is_command=True)
+    assert Table(tmp_path / "table.xlsx", sheet="Sheet").numbers("a").tolist() == [1, 3]
+    book["Sheet"]["B3"] = "=1+1"
+    book.save(tmp_path / "table.xlsx")
+    with pytest.raises(ValueError, match="line 3: expected a value, found a formula without one"):
+        Table(tmp_path / "table.xlsx", sheet="Sheet")
+    (tmp_path / "table.xlsx").write_text("a,b\n1,2\n")
+    with pytest.raises(ValueError, match=r"expected a workbook, \*.xlsx, but"):
+        Table(tmp_path / "table.xlsx")
 
 
 def test_a_column_that_is_not_there_has_the_likest_name(columns):

@@ -1,11 +1,13 @@
 """A page as a reader sees it, and small things to report on."""
 
 import re
+import sys
 from html.parser import HTMLParser
 
 import pytest
 import torch
 
+from gpadjust.__main__ import main
 from gpadjust.report.markup import Markup
 from gpadjust.validation import compare
 
@@ -19,6 +21,7 @@ class Page(HTMLParser):
         super().__init__()
         self.open, self.pieces, self.tables, self.images = [], [], {}, []
         self.codes, self.attributes, self.styles, self.ids = [], [], [], []
+        self.tags = set()
         self.feed(html)
         self.close()
         assert self.open == []
@@ -26,6 +29,7 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag, attributes):
         named = dict(attributes)
+        self.tags.add(tag)
         self.attributes += [(tag, *pair) for pair in attributes]
         self.ids += [named["id"]] if "id" in named else []
         if tag == "img":
@@ -62,20 +66,57 @@ class Page(HTMLParser):
 
     def needs_nothing_else(self):
         """Whether it refers to nothing but its own sections, and runs no script."""
-        refers = [(t, value) for t, name, value in self.attributes if name in ("src", "href")]
+        links = [(tag, value) for tag, name, value in self.attributes if name in ("src", "href")]
         own = all(
-            value.startswith("data:image/") if t == "img" else value[1:] in self.ids
-            for t, value in refers
+            value.startswith("data:image/") if tag == "img" else value[1:] in self.ids
+            for tag, value in links
         )
-        names = {name for _, name, _ in self.attributes}
-        quiet = not any(name.startswith("on") for name in names) and "script" not in self.text
-        return own and quiet and not re.search(r"url\(|@import", "".join(self.styles))
+        has_events = any(name.startswith("on") for _, name, _ in self.attributes)
+        is_quiet = not has_events and not {"script", "iframe"} & self.tags
+        return own and is_quiet and not re.search(r"url\(|@import", "".join(self.styles))
+
+    def loading_code(self):
+        """The only code that loads a model."""
+        (code,) = [text for text in self.codes if "load(" in text]
+        return code
 
 
 @pytest.fixture
 def read():
     """Reads the page at a path."""
     return lambda path: Page(path.read_text(encoding="utf-8"))
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The working directory, and modules of its own."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    for name in ("hill", "broken", "lacks", "swing"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    yield tmp_path
+    for name in ("hill", "broken", "lacks", "swing"):
+        sys.modules.pop(name, None)
+
+
+@pytest.fixture
+def fails(folder, capsys):
+    """Asserts that a command ends with an error of these words, and that no file changes."""
+
+    def contents():
+        return {path: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+    def fails(command, words):
+        capsys.readouterr()
+        before = contents()
+        assert main(command) == 1
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert "Traceback" not in err
+        assert re.search(words, err, flags=re.DOTALL | re.MULTILINE), err
+        assert contents() == before
+
+    return fails
 
 
 @pytest.fixture

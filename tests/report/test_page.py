@@ -8,15 +8,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gpadjust.core import CKA, ZeroMeanGP, fit, load
-from gpadjust.physics import FunctionPhysics, PhysicsError
+from gpadjust.core import CKA, CalibratedPhysics, ZeroMeanGP, fit, load
+from gpadjust.physics import FunctionPhysics, PhysicsError, Unknown
 from gpadjust.report import figures, report
-from gpadjust.report.markup import Markup, beside, failure, table, tag
+from gpadjust.report.markup import Markup, failure, side_by_side, table, tag
 from gpadjust.report.page import cards, headline
 from gpadjust.report.subject import subject_of
 from gpadjust.validation import Verdict
 from gpadjust.validation.plots import lines_along
 from gpadjust.words import name_and_unit, number
+from tests.systems import line
 
 from .conftest import Page, f_p
 
@@ -28,7 +29,7 @@ def test_a_comparison(comparison, tmp_path, read):
     page = read(path)
     assert page.needs_nothing_else()
     assert path.stat().st_size < 500_000
-    assert len(page.images) == 6
+    assert len(page.images) == 5
     assert all(len(image["alt"]) > 10 for image in page.images)
     _the_table_is_that_of(comparison, page)
     (verdict,) = comparison.verdict.values()
@@ -76,7 +77,7 @@ def test_the_code_in_the_page_predicts_as_the_model(
 ):
     page = read(report(comparison, tmp_path / "a b.html"))
     monkeypatch.chdir(tmp_path)
-    (code,) = [text for text in page.codes if "load(" in text]
+    code = page.loading_code()
     assert "load('a b.pt', trusted=True)" in code
     assert "by its name" in page.text
     names = {}
@@ -92,13 +93,13 @@ def test_one_model_whose_physics_has_no_name(tmp_path, read, monkeypatch, undraw
     model.data = model.data._replace(output_names=("p [Pa]",))
     fit(model, "map")
     page = read(report(model, tmp_path / "report.html"))
-    assert "Not asked" in page.text
+    assert "Not compared" in page.text
     assert "report(compare(train_X, train_Y, physics))" in page.text
     rmse = number(float(subject_of(model).loo.score().rmse[0]))
     alone = number(float((X.sum(-1).sin() - X[:, 0]).square().mean().sqrt()))
     assert f"your formula {alone} Pa adjusted {rmse} Pa root mean square" in page.text
     monkeypatch.chdir(tmp_path)
-    (code,) = [text for text in page.codes if "load(" in text]
+    code = page.loading_code()
     names = {"f_p": lambda X: X[:, :1]}
     exec(code, names)
     torch.testing.assert_close(names["mean"], model.predict(names["X"]).mean)
@@ -109,10 +110,10 @@ def test_a_model_without_physics(tmp_path, read, undrawn):
     model = ZeroMeanGP(X, X.sin())
     fit(model, "map")
     page = read(report(model, tmp_path / "report.html"))
-    assert "has no physics to be judged" in page.text
+    assert "has no physics to judge" in page.text
     assert "data alone " in page.text
     assert "your formula" not in page.text
-    assert "There is no physics that could be adjusted, trusted or overridden" in page.text
+    assert "This model has no formula to adjust or to trust" in page.text
     assert dict(page.tables["How this page came about"])["physics"] == "none"
     assert load(tmp_path / "report.pt").data.output_names == ("y",)
 
@@ -126,7 +127,7 @@ def test_the_verdict_and_its_color(comparison):
     ):
         verdict = Verdict(answer, ["One reason.", "Another."])
         shown = cards(subject_of(dataclasses.replace(comparison, verdict={"y": verdict})))
-        page = beside(shown)
+        page = side_by_side(shown)
         assert Page(page).text == f"{answer} One reason. Another. {_three(comparison)}"
         assert f'class="card {color}"' in page
         assert headline(shown, "Errors").endswith(f"\n{answer}. One reason.")
@@ -152,55 +153,46 @@ def test_nothing_is_written_of_what_cannot_be_reported(comparison, tmp_path):
     assert {each.name for each in tmp_path.iterdir()} == {"report.html", "folder.html"}
 
 
-def test_an_error_on_the_way_leaves_what_was_there(comparison, tmp_path, monkeypatch, undrawn):
-    old = tmp_path / "report.html"
-    old.write_text("old")
-
-    def interrupted(*args):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("gpadjust.report.tables.data", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        report(comparison, old)
-    assert old.read_text() == "old"
-    assert [each.name for each in tmp_path.iterdir()] == ["report.html"]
-
-
-def test_a_model_that_cannot_be_saved_leaves_none_of_an_earlier_page(
+def test_an_interrupted_page_and_a_model_that_cannot_be_saved(
     comparison, tmp_path, read, monkeypatch, undrawn
 ):
-    def refuses(*args):
-        raise ValueError("no way")
+    def raising(error):
+        def raise_it(*args):
+            raise error
 
-    (tmp_path / "report.pt").write_text("old")
-    monkeypatch.setattr("gpadjust.report.page.save", refuses)
-    page = read(report(comparison, tmp_path / "report.html"))
-    assert "The model could not be saved: no way" in page.text
-    assert [each.name for each in tmp_path.iterdir()] == ["report.html"]
+        return raise_it
+
+    page, model = tmp_path / "report.html", tmp_path / "report.pt"
+    page.write_text("old")
+    with monkeypatch.context() as patched:
+        patched.setattr("gpadjust.report.tables.data", raising(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            report(comparison, page)
+    assert page.read_text() == "old"
+    assert [file.name for file in tmp_path.iterdir()] == ["report.html"]
+    model.write_text("old")
+    monkeypatch.setattr("gpadjust.report.page.save", raising(ValueError("no way")))
+    assert "The model could not be saved: no way" in read(report(comparison, page)).text
+    assert not model.exists()  # of the earlier page
 
 
 def test_inputs_are_drawn_in_double_precision():
     offset = 1e60
-    X = offset * (1 + torch.linspace(0, 1e-8, 7, dtype=torch.float64).unsqueeze(-1))
+    X = offset * (1 + line(7, 0, 1e-8))
     model = CKA(X, X / offset, physics=lambda X: torch.zeros_like(X))
     fit(model, "map")
     ((_, drawn),) = lines_along(model)
     assert len(drawn.unique()) == len(drawn) > 9
 
 
-def test_dots_at_the_ends_of_a_figure_are_whole(monkeypatch):
-    X = torch.linspace(0, 1, 7, dtype=torch.float64).unsqueeze(-1)
+def test_dots_at_the_ends_of_a_figure_are_complete(monkeypatch):
+    X = line(7)
     model = CKA(X, X.sin(), physics=lambda X: X)
     fit(model, "map")
-    figures_drawn = []
-
-    def image(figure, text):
-        figures_drawn.append(figure)
-        return Markup(text)
-
-    monkeypatch.setattr(figures, "image", image)
+    drawn = []
+    monkeypatch.setattr(figures, "image", lambda figure, alt: drawn.append(figure) or Markup(alt))
     figures.corrections(subject_of(model), 0, [0])
-    low, high = figures_drawn[0].axes[0].get_xlim()
+    low, high = drawn[0].axes[0].get_xlim()
     assert low < -0.02
     assert high > 1.02
 
@@ -230,3 +222,19 @@ def test_numbers_and_names_with_units():
     assert {value: number(value) for value in numbers} == numbers
     names = {"head [m]": ("head", "m"), "x[0]": ("x", "0"), "[m]": ("[m]", ""), "a": ("a", "")}
     assert {text: name_and_unit(text) for text in names} == names
+
+
+@pytest.mark.parametrize(("form", "pairs"), [("sum", 1), ("line", 0)])
+def test_correlated_parameters_are_drawn_as_a_pair(form, pairs):
+    """Data tell a + b alone; a and b of a + b x about x = 0 are independent."""
+    X = line(9) - 0.5
+    slope = 1.0 if form == "sum" else X
+    physics = FunctionPhysics(
+        lambda X, p: p.a + p.b * (X[:, 0] ** (form == "line")),
+        unknowns={name: Unknown(1.0, sd=0.3) for name in "ab"},
+    )
+    model = CalibratedPhysics(X, 1.0 + slope + 0.01 * (7 * X).cos(), physics=physics)
+    fit(model, seed=0)
+    drawn = figures.densities(model.physics_parameters)
+    assert drawn.count("<img") == 2 + pairs
+    assert drawn.count("draws of a and b, correlated") == pairs

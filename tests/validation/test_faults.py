@@ -36,17 +36,17 @@ def said(X, Y, physics):
 
 def test_the_cause_is_told(X, Y):
     for physics, words in (
-        (lambda X: 1000 * law(X), "f_p is about 1,000 times too large; are its units"),
-        (lambda X: law(X) / 1000, "f_p is about 1,000 times too small; are its units"),
-        (lambda X: -law(X), "f_p is of the opposite sign (correlation -1.00)."),
+        (lambda X: 1000 * law(X), "it is about 1,000 times too large; are its units"),
+        (lambda X: law(X) / 1000, "it is about 1,000 times too small; are its units"),
+        (lambda X: -law(X), "it is of the opposite sign (correlation -1.00)."),
         (lambda X: -1000 * law(X), ", and about 1,000 times too large."),
-        (lambda X: law(X) + 273, "f_p is about 273 above the targets."),
-        (lambda X: law(X) - 273, "f_p is about 273 below the targets."),
+        (lambda X: law(X) + 273, "it is about 273 above the observations."),
+        (lambda X: law(X) - 273, "it is about 273 below the observations."),
     ):
         assert words in said(X, Y, physics)
     text = said(X, 1e3 * Y, lambda X: 1e3 * law(X) + 3e4)
-    assert "root mean square error of 30000, where the targets" in text
-    assert "standard deviation of 526: f_p is about 30000 above the targets." in text
+    assert "root mean square error of 30000, where the observations" in text
+    assert "standard deviation of 526: it is about 30000 above the observations." in text
 
 
 def test_a_crude_physics_is_not_complained_of(X, Y):
@@ -67,10 +67,10 @@ def test_outputs_are_judged_one_by_one_by_five_observations(X, Y):
     few[4:] = torch.nan
     both = torch.cat([few, Y], -1)
     text = said(X, both, lambda X: 1000 * law(X).expand(-1, 2))
-    assert text.startswith("y2: at the training inputs")
+    assert text.startswith("y2: at the data")
     assert "y1" not in text
     both[4, 0] = Y[4, 0]
-    assert said(X, both, lambda X: 1000 * law(X).expand(-1, 2)).startswith("y1: at the training")
+    assert said(X, both, lambda X: 1000 * law(X).expand(-1, 2)).startswith("y1: at the data")
     assert said(X, torch.ones_like(Y), lambda X: 1000 * law(X)) == ""
 
 
@@ -84,4 +84,4 @@ def test_scaled_inputs_and_targets_are_asked_about(X, Y, correction):
     assert said(torch.cat([scaled, 0 * X], -1), Y, law)
     Y = warm(X)
     text = said(X, (Y - Y.mean()) / Y.std(correction=correction), warm)
-    assert "f_p is about 283 above the targets. The targets were standardised" in text
+    assert "it is about 283 above the observations. The observations were standardised" in text

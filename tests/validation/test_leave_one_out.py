@@ -4,7 +4,6 @@ import math
 
 import pytest
 import torch
-from botorch.models import ModelListGP
 
 from gpadjust.core import CKA, PhysicsMeanGP, StackedGP, ZeroMeanGP, fit
 from gpadjust.kinds.heavy_tails import HeavyTails
@@ -105,16 +104,6 @@ def test_outliers_are_left_out_of_scores():
     assert loo.is_outlier.nonzero()[:, 0].tolist() == [5]
     assert loo.score().rmse < 0.1
     assert loo.score().pit[5].isnan()
-
-
-def test_other_models_are_refused(data):
-    X, Y = data()
-    for model, words in (
-        (ModelListGP(ZeroMeanGP(X, Y)), "found ModelListGP. Of a list take each model by itself"),
-        (torch.nn.Linear(1, 1), "found Linear"),
-    ):
-        with pytest.raises(TypeError, match=words):
-            leave_one_out(model)
 
 
 @pytest.mark.slow
