@@ -221,8 +221,8 @@ def _of_log(arguments: Namespace) -> Job:
             f"Expected the angle {wrong[0]!r} in rad, found {units[wrong[0]]!r}; convert it, or do "
             "without --angles, which is for angles that go round."
         )
-    # The step of the specification depends on that of the records.
-    records = Records.read_csv(tables, StateSpec(*names, angles=angles), **columns).records
+    spec = StateSpec(*names, angles=angles)
+    records = Records.read_csv(tables, spec, **columns)
 
     # Read the equations, whose step is the sampling step by default.
     renamed = {**columns["states"], **columns["actions"]}
@@ -231,16 +231,17 @@ def _of_log(arguments: Namespace) -> Job:
     sides = [text.partition("=")[2] for text in arguments.physics if ":" not in text]
     read.check_constants(sides, [*renamed, *others, *unknowns])
     # Equations are integrated along the recorded actions, also within a control step.
-    sampling = float(f"{records[0].sampling_step:.{_DIGITS}g}")
+    sampling = float(f"{records.records[0].sampling_step:.{_DIGITS}g}")
     motion = read.motion(arguments.physics, *names, unknowns, sampling)
     physics = motion.physics
-    step = arguments.step or physics.step or sampling
+    step = arguments.step
+    if step is None:
+        step = physics.step or sampling
     if motion.modules and physics.step not in (None, step):
         raise ValueError(
             f"Expected no --step, as the physics has a step of {physics.step:g}, found "
             f"{arguments.step:g}."
         )
-    spec = StateSpec(*names, angles=angles)
     options = {
         "step": step,
         "start": {name: (prior.guess, prior.sd) for name, prior in hidden.items()} or None,
@@ -251,7 +252,7 @@ def _of_log(arguments: Namespace) -> Job:
 
     def work() -> Identification:
         try:
-            return identify(Records(records, spec), physics, **options)
+            return identify(records, physics, **options)
         except RuntimeError as error:  # the states diverged, or the physics failed
             raise ValueError(str(error)) from error
 
