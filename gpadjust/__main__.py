@@ -85,14 +85,15 @@ data: the log: CSV files or *.xlsx, a record each
 --physics equation: an equation for each state: "a'=...", its time derivative, or 'a=...', its next
     value; or module:name
 --step 0.05: the step of the free run, a multiple of the sampling step, which it is by default; a
-    longer one is quicker, and averages the actions over it
+    longer one takes the measurements at its ends alone; equations follow the actions in between
 --segment run: a column of labels: where they change, a new run begins
 --held-out 0.25: the share of the log that is held out at its end (%(default)s)
 --starts 4: number of searches, of which the best is taken
 """
 _OPTIONS_OF_BOTH = """\
 --unknown E=2+-0.4: an unknown number of the physics, its guess and standard deviation, which may be
-    a percentage; or a factor, E=2*/1.5; or bounds, E=1..3. Several: give it again
+    a percentage; or a factor, E=2*/1.5; or bounds, E=1..3; or of a function of v, from 0 to 9,
+    "F(v: 0..9)=2*/1.5". Several: give it again
 --out page.html: the page to write (%(default)s), and for a table its model, page.pt; earlier files
     of these names are replaced
 --seed 0: seed of the fits and free runs (%(default)s)

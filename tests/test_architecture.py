@@ -45,7 +45,7 @@ ROOMS = sorted(path.parent for path in ROOT.glob("*/__init__.py"))
 BELOW = ("botorch", "gpytorch", "linear_operator")  # libraries that ours builds on
 
 
-NOT_YET = {"records"}
+NOT_YET: set[str] = set()  # rooms whose words wait for an editor
 EDITED = [room for room in ROOMS if room.name not in NOT_YET]  # the words of these are held
 CONDITIONALS, TUPLES = 15, 20  # of 1,000 lines of code, at most
 COMMENTS = 7  # of 100 lines of code, at least

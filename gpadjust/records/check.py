@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpadjust.dynamics.physics_dynamics import one_physics
 from gpadjust.physics import Physics, PhysicsError
 from gpadjust.records import kalman
 from gpadjust.records.kalman import Array
-from gpadjust.records.records import Records, control_steps
-from gpadjust.records.smoothing import Chain, first_moments, substeps_of, with_known_inputs
+from gpadjust.records.records import Records
+from gpadjust.records.smoothing import Chain, chain_of
+from gpadjust.states import Sensors
 from gpadjust.states.state_spec import side_by_side
 
 _WEAK = 1.0  # a singular value: the log halves the variance of the prior
@@ -55,6 +55,7 @@ def check_log(
     step: float | None = None,
     *,
     start: Mapping[str, tuple[float, float]] | None = None,
+    sensors: Sensors | None = None,
 ) -> list[Direction]:
     r"""Check which directions of the unknown parameters a log can tell, before a fit.
 
@@ -69,6 +70,7 @@ def check_log(
         physics: The next states, with unknown parameters.
         step: The control step, as of :func:`smooth`.
         start: Of hidden states by name, mean and standard deviation at the beginning.
+        sensors: As of :func:`smooth`.
 
     Returns:
         The directions, the clearest first. Of those that the log does not tell, each names the
@@ -80,7 +82,7 @@ def check_log(
 
     Example:
         >>> import torch
-        >>> from gpadjust.physics import FormulaPhysics, ODEPhysics, Unknown
+        >>> from gpadjust import FormulaPhysics, ODEPhysics, Unknown
         >>> from gpadjust.records import Record, Records, check_log
         >>> from gpadjust.states import StateSpec
         >>> t = 0.1 * torch.arange(60, dtype=torch.float64)
@@ -91,26 +93,18 @@ def check_log(
         >>> print(check_log(log, ODEPhysics(rate, 0.1, 1))[-1])  # doctest: +ELLIPSIS
         The log cannot tell 1.00 b (singular value 0). A square wave of u between ...
     """
-    steps = with_known_inputs(control_steps(records, step))
-    f_p = one_physics(physics, steps.spec, "check one of them")
-    if not f_p.unknowns:
+    chain = chain_of(records, physics, step, start, sensors=sensors)
+    if not chain.unknowns:
         raise ValueError("Expected a physics with unknown parameters; found none, to check.")
-    chain = _chain(f_p, steps, first_moments(start, steps.spec))
     noise = np.maximum(_roughness(chain), chain.least)
     values, vectors = np.linalg.eigh(_information(chain, noise))
     directions = []
     for value, vector in zip(np.sqrt(values.clip(0))[::-1], vectors.T[::-1], strict=True):
         vector = vector * np.sign(vector[np.abs(vector).argmax()])
-        weights = dict(zip(f_p.unknowns, vector.tolist(), strict=True))
-        text = _best_input(chain, steps, noise, vector) if value < _WEAK else ""
+        weights = dict(zip(chain.unknowns, vector.tolist(), strict=True))
+        text = _best_input(chain, noise, vector) if value < _WEAK else ""
         directions.append(Direction(weights, float(value), text))
     return directions
-
-
-def _chain(f_p: Physics, steps: Records, start: Array) -> Chain:
-    length = steps.records[0].sampling_step
-    unknown = np.full((2, len(steps.spec.moving)), math.nan)
-    return Chain(f_p, steps, unknown, start, substeps_of(f_p, steps, length))
 
 
 def _roughness(chain: Chain) -> Array:
@@ -122,58 +116,65 @@ def _roughness(chain: Chain) -> Array:
     return variances
 
 
-def _information(chain: Chain, noise: Array, seen: Array | None = None) -> Array:
+def _information(chain: Chain, noise: Array, outputs: Array | None = None) -> Array:
     """Return the information of all stretches on the parameters, ``p x p``: J' J / R.
 
-    ``seen`` is in the place of the measurements, NaN where there is none; it has no other effect.
+    ``outputs`` are in the place of each row of measurements, of which only NaN has an effect.
     """
     d, p = chain.d, chain.num_parameters
-    path, whole = chain.first_path(np.zeros(p)), np.zeros((p, p))
-    for link, start in zip(chain.linearised(path), chain.starts, strict=True):
-        link = (
-            link if seen is None else link._replace(measured=np.tile(seen, (len(link.measured), 1)))
-        )
-        (alone,), _ = kalman.smooth_chain([link], [start], noise, chain.least)
-        whole += np.linalg.inv(alone.states.covariances[0, d:, d:]) - np.eye(p)
-    even: Array = (whole + whole.T) / 2
+    information = np.zeros((p, p))
+    links = chain.linearised(chain.first_path(np.zeros(p)))
+    for link, start in zip(links, chain.starts, strict=True):
+        if outputs is not None:
+            link = link._replace(measured=np.tile(outputs, (len(link.measured), 1)))
+        (smoothed,), _ = kalman.smooth_chain([link], [start], noise, chain.least)
+        information += np.linalg.inv(smoothed.states.covariances[0, d:, d:]) - np.eye(p)
+    even: Array = (information + information.T) / 2
     return even
 
 
-def _best_input(chain: Chain, steps: Records, noise: Array, vector: Array) -> str:
+def _best_input(chain: Chain, noise: Array, vector: Array) -> str:
     """Return a sentence on the square wave, of one action, that tells a direction best."""
-    spec, best = steps.spec, (0.0, "")
+    spec, steps = chain.spec, chain.steps
+    best = 0.0
+    sentence = "None of the inputs that were tried does."
     if len(spec.moving) < spec.state_dim:
         return "Other inputs are tried for states that all move only."
     length = min(max(len(record.times) for record in steps), _LONGEST)
     recorded = torch.cat([record.actions for record in steps])
     low, high = recorded.aminmax(dim=0)
-    low, high = torch.where(low == high, low - 1, low), torch.where(low == high, high + 1, high)
-    times = steps.records[0].sampling_step * torch.arange(length, dtype=torch.float64)
+    is_constant = low == high
+    low, high = low - is_constant.to(low), high + is_constant.to(high)
+    step = steps.records[0].sampling_step
+    outputs = np.where(chain.hidden, math.nan, 0.0)
     for j, name in enumerate(spec.actions):
         for parts in _PERIODS:
             half = max(1, length // parts)
             actions = recorded.mean(0).repeat(length, 1)
             is_high = torch.arange(length) // half % 2 == 0
             actions[:, j] = torch.where(is_high, high[j], low[j])
-            other = _under(chain, actions)
-            seen = np.where(chain.hidden, math.nan, 0.0)
             try:
-                told = vector @ _information(other, noise, seen) @ vector
+                information = _information(_under(chain, actions), noise, outputs)
             except (PhysicsError, np.linalg.LinAlgError):
                 continue
-            value = math.sqrt(max(float(told), 0.0))
-            if value > best[0]:
-                wave = f"between {low[j]:.3g} and {high[j]:.3g} with half a period of "
-                seconds = f"{half * float(times[1]):.3g}"
-                best = value, f"A square wave of {name} {wave}{seconds} would: {value:.3g}."
-    return best[1] or "None of the inputs that were tried does."
+            value = math.sqrt(max(float(vector @ information @ vector), 0.0))
+            if value > best:
+                best = value
+                sentence = (
+                    f"A square wave of {name} between {low[j]:.3g} and {high[j]:.3g} with half a "
+                    f"period of {half * step:.3g} would: {value:.3g}."
+                )
+    return sentence
 
 
 def _under(chain: Chain, actions: Tensor) -> Chain:
     """Return the chain of a single stretch under other actions, of which nothing is measured."""
-    other, length = copy(chain), len(actions)
-    other.lengths, other.firsts = np.array([length]), np.array([0])
-    other.stretches, other.now = [slice(0, length)], np.arange(length - 1)
+    other = copy(chain)
+    length = len(actions)
+    other.lengths = np.array([length])
+    other.firsts = np.array([0])
+    other.stretches = [slice(0, length)]
+    other.now = np.arange(length - 1)
     states = torch.zeros(length, chain.spec.state_dim, dtype=torch.float64)
     other.recorded = side_by_side(states, actions)
     other.within = actions.unsqueeze(1).expand(-1, chain.within.shape[1], -1)

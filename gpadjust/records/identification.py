@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
-from importlib import import_module
+from functools import cached_property, partial
 from itertools import combinations
 from typing import Any, NamedTuple
 
@@ -15,31 +16,42 @@ import torch
 from scipy.stats import t
 from torch import Tensor
 
+import gpadjust
 from gpadjust.checks import checked_number, checked_whole
 from gpadjust.display import Display, html_table
 from gpadjust.dynamics import FreeRun, IdentifiedDynamics, PhysicsDynamics, Windows
 from gpadjust.dynamics.physics_dynamics import one_physics
-from gpadjust.physics import Physics
+from gpadjust.physics import Physics, PhysicsError
 from gpadjust.physics.parameters import PhysicsParameters
 from gpadjust.records.lack import Lack, clearest_lack, robust_moments
 from gpadjust.records.records import Records, control_steps
-from gpadjust.records.smoothing import SmoothedRecords, drawn_parameters, smooth
+from gpadjust.records.smoothing import (
+    SmoothedRecords,
+    SmoothingWarning,
+    drawn_parameters,
+    smooth,
+)
 from gpadjust.states import Sensors, StateSpec
 from gpadjust.words import listed, number, percent
 
-GUESSES, IDENTIFIED, PERSISTENCE = "guesses", "identified", "persistence"
+GUESSES = "guesses"
+IDENTIFIED = "identified"
+PERSISTENCE = "persistence"
 FEW = 0.9  # of measurements in intervals of 95 %
+_NO_NOISE = 1e-100  # standard deviation: the smoother takes the least that it computes with
 _LEAST = 8  # steps of a stretch, of which the last part is held out
 _FAR = 3.0  # standard deviations of a prior
 _VARIES = 1e-3  # share of the variance of an action that is within steps
 _NEAR_A_TURN = 0.12
 _TOGETHER = 0.95  # a correlation of two parameters, in logarithms
-_TOLD = 0.15  # of the least standard deviation of the two: their combination's is smaller
+_CLEARER = 0.15  # of the least standard deviation of the two: that of their combination
 _POWERS = ((1, -1), (1, 1), (1, -2), (1, 2), (2, -1), (2, 1))
+_MORE = 0.1  # of the measurements in intervals: clearly more
 _BLOCKS = 5  # of a window, whose errors are compared
 _LARGE = 2.0  # times the noise of the sensor: an error that something missing may have made
 _WIDER = 1.5  # an interval that allows for missing forces, in place of the one that does not
 _OUTLYING = 20.0  # robust standard deviations of changes, by which a row is off both neighbours
+_TURNS = {2 * math.pi: "add it to `angles`", 360.0: "convert it to rad, and add it to `angles`"}
 _NAMED = 5  # rows in a sentence
 _UNSURE = 0.05  # of a prior's standard deviation: uncertainty that matters
 _MOVES = 0.01  # of a state's changes in a step: process noise that matters
@@ -48,7 +60,9 @@ _UNSETTLED = (
     "The search for states and parameters did not settle, so that all of this may change: raise "
     "num_starts, give narrower priors, or a start of hidden states."
 )
-_OTHERS = {GUESSES: "the guesses do", PERSISTENCE: "a state that stays"}
+_BY = {False: "no less", True: "less by chance"}
+_OTHERS = {GUESSES: "the guesses", PERSISTENCE: "a state that stays"}
+_ENDS = torch.tensor([0.025, 0.5, 0.975])
 
 
 class Combination(NamedTuple):
@@ -67,9 +81,6 @@ class Combination(NamedTuple):
             f"The log tells {self.name}, {mid:.4g} [{low:.4g}, {high:.4g}], and hardly "
             f"{self.first} and {self.second} each. Measure one of them, and the other follows."
         )
-
-
-_ENDS = torch.tensor([0.025, 0.5, 0.975])
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -96,19 +107,18 @@ class Identification(Display):
     runs: Mapping[str, FreeRun]
     step: float
     remarks: tuple[str, ...] = ()
+    _again: Callable[[], Identification] | None = None  # by free runs
 
     def task(self, reward: Callable[[Tensor, Tensor, Tensor], Tensor], **options: Any) -> Any:
         """Return a task in these dynamics, for :class:`~gpadjust.control.MPC` or an agent.
-
-        Plans follow the parameters' center, or draws of them (``Planner(num_functions=20)``).
-        Margins of constraints allow for the parameters and for process noise.
 
         Args:
             reward: As of :class:`~gpadjust.control.Task`.
             options: The other arguments of a task. ``state_bounds`` are by default the range of the
                 states in the log, and as much again on either side; angles have none. If states
-                are hidden, ``sensors`` are by default those of the log, with its noise, and
-                ``initial_states`` any states of the log.
+                are hidden, ``sensors`` are by default those of the log, with its noise, for
+                measurements corrected by their gain and offset, and ``initial_states`` any states
+                of the log.
         """
         states = torch.cat([record.states for record in self.smoothed.records])
         low, high = states.amin(0), states.amax(0)
@@ -120,9 +130,8 @@ class Identification(Display):
             noise = {name: sd for name, sd in pairs if name not in self.hidden}
             defaults["sensors"] = Sensors([*noise], noise=noise)
             defaults["initial_states"] = lambda n: states[torch.randint(len(states), (n,))]
-        tasks = import_module("gpadjust.control")  # a room above this one
         # An update sets attributes, so that a shallow copy leaves the identification as it is.
-        return tasks.Task(copy(self.dynamics), reward, **defaults | options)
+        return gpadjust.control.Task(copy(self.dynamics), reward, **defaults | options)
 
     @property
     def spec(self) -> StateSpec:
@@ -131,8 +140,8 @@ class Identification(Display):
 
     @property
     def parameters(self) -> PhysicsParameters | None:
-        """The posterior of the physics' unknown parameters; None if it has none."""
-        return self.smoothed.physics_parameters if GUESSES in self.runs else None
+        """The posterior of the unknown parameters of physics and sensors; None without any."""
+        return self.smoothed.parameters if self.smoothed.chain.unknowns else None
 
     @cached_property
     def robust_parameters(self) -> PhysicsParameters | None:
@@ -140,49 +149,55 @@ class Identification(Display):
 
         White process noise averages out, what equations lack does not: with dry friction missing,
         the damping stands for it, and its interval is too narrow. Here each equation also has a
-        function of each state, twice as large as its process noise. Of right equations this is 0,
-        and the posterior that of :attr:`parameters`. A prior of the missing force, not a fact.
+        function of each state, twice as large as its process noise, which right equations lack.
         """
         if self.parameters is None:
             return None
-        chain, estimate = self.smoothed._chain, self.smoothed._estimate
-        return drawn_parameters(chain.physics, *robust_moments(chain, estimate, self._control_step))
+        chain, estimate = self.smoothed.chain, self.smoothed.estimate
+        return drawn_parameters(
+            chain.unknowns, *robust_moments(chain, estimate, self._control_step)
+        )
 
     @property
     def hidden(self) -> list[str]:
         """The states that were not measured."""
         pairs = zip(self.spec.states, self.smoothed.noise.isnan().tolist(), strict=True)
-        return [name for name, was_not in pairs if was_not]
+        return [name for name, is_hidden in pairs if is_hidden]
 
     @property
     def errors(self) -> dict[str, Tensor]:
-        """Root mean square errors along the windows, ``state_dim``, NaN of hidden states.
+        """Root mean square errors of the runs, and of ``"persistence"``: the state stays.
 
-        They are of the runs, and of ``"persistence"``: the state stays where it was.
+        They are along the windows, ``state_dim``, NaN of hidden states.
         """
-        still = self.windows.initial_states.unsqueeze(1).expand_as(self.windows.measured)
-        paths = {name: run.mean for name, run in self.runs.items()} | {PERSISTENCE: still}
         return {
             name: self.spec.change(path, self.windows.measured).square().nanmean((0, 1)).sqrt()
-            for name, path in paths.items()
+            for name, path in self._paths.items()
         }
 
     @property
     def coverage(self) -> Tensor:
-        """Shares of the measurements that the identified run's intervals hold, ``state_dim``."""
+        """Shares of the measurements that the identified run's intervals cover, ``state_dim``."""
         run, measured = self.runs[IDENTIFIED], self.windows.measured
         # Of angles, the measured one within half a turn of the mean.
         measured = run.mean + self.spec.change(run.mean, measured)
-        holds = (run.lower <= measured) & (measured <= run.upper)
-        return holds.double().where(~measured.isnan(), torch.nan).nanmean((0, 1))
+        is_covered = (run.lower <= measured) & (measured <= run.upper)
+        return is_covered.double().where(~measured.isnan(), torch.nan).nanmean((0, 1))
 
     @cached_property
     def lack(self) -> Lack | None:
-        """What the equations lack most clearly, by the part that was learnt from; None if nothing.
+        """What the equations lack most clearly, by what was learnt from; None if nothing."""
+        return clearest_lack(self.smoothed.chain, self.smoothed.estimate, self._control_step)
 
-        Takes some seconds for thousands of steps, once.
-        """
-        return clearest_lack(self.smoothed._chain, self.smoothed._estimate, self._control_step)
+    @cached_property
+    def by_free_runs(self) -> Identification | None:
+        """The identification with ``by_free_runs=True``; None if this is one, or none settled."""
+        if self._again is None:
+            return None
+        with warnings.catch_warnings(), suppress(PhysicsError, RuntimeError, SmoothingWarning):
+            warnings.simplefilter("error", SmoothingWarning)
+            return self._again()
+        return None
 
     @property
     def _control_step(self) -> float:
@@ -190,54 +205,61 @@ class Identification(Display):
 
     @property
     def combinations(self) -> list[Combination]:
-        """Ratios and products of two parameters, each better told than the parameters."""
-        return [] if self.parameters is None else _told_together(self.parameters)
+        """Ratios and products of two parameters that the log tells better than these."""
+        return _told_together(self.smoothed.parameters)
 
     @property
     def verdicts(self) -> dict[str, tuple[str, list[str]]]:
         """Whether the physics follows the log, by each state that was measured, and why.
 
-        ``"Yes"`` if the free run errs less than the guesses' and than a state that stays, both by
-        more than chance, the intervals hold, the search settled, and no error that is more than
-        the sensor's has a cause that :attr:`lack` shows. ``"No"`` if it errs no less than a state
-        that stays, or more than the guesses' by more than chance; else ``"In part"``.
+        ``"Yes"`` if the free run has a smaller error than the guesses and than a state that stays,
+        both beyond chance, the intervals cover 90 %, the search settled, and no error that is more
+        than the sensor's has a cause that :attr:`lack` shows. ``"No"`` if its error is no smaller
+        than that of a state that stays, or larger than the guesses' beyond chance; else
+        ``"In part"``.
         """
-        verdicts, errors, shares = {}, self.errors, self.coverage.tolist()
+        verdicts = {}
+        errors = self.errors
+        shares = self.coverage.tolist()
         for i, name in enumerate(self.spec.states):
             if math.isnan(shares[i]):
                 continue
-            own, answer = errors[IDENTIFIED][i], "Yes"
-            reasons = [f"Intervals of 95 % hold {percent(shares[i])} of {name} there."]
-            if shares[i] < FEW:
-                answer = "In part"
+            error = errors[IDENTIFIED][i]
+            reasons = [f"Intervals of 95 % cover {percent(shares[i])} of {name} there."]
             if not self.smoothed.is_settled:
-                answer = "In part"
                 reasons.append(_UNSETTLED)
-            if self.lack is not None and own > _LARGE * self.smoothed.noise[i]:
-                answer = "In part"
+            if self.lack is not None and error > _LARGE * self.smoothed.noise[i]:
                 reasons.append(str(self.lack))
+            answer = "In part" if shares[i] < FEW or len(reasons) > 1 else "Yes"
             for other, words in _OTHERS.items():
-                if other not in errors or (own < errors[other][i] and self._beats(other, i)):
+                if other not in errors:
                     continue
-                worse = own >= errors[other][i]
-                reasons.append(f"It errs {'no less' if worse else 'less by chance'} than {words}.")
-                is_no = worse and (other == PERSISTENCE or self._beats(other, i, -1))
+                path = self._paths[other]
+                is_less = bool(error < errors[other][i])
+                if is_less and self._beats(path, i):
+                    continue
+                is_no = not is_less and (other == PERSISTENCE or self._beats(path, i, -1))
                 answer = "No" if is_no or answer == "No" else "In part"
+                reasons.append(f"Its error is {_BY[is_less]} than that of {words}.")
             verdicts[name] = answer, reasons
         return verdicts
 
-    def _beats(self, other: str, i: int, sign: int = 1) -> bool:
-        """Return whether errors of state i are below another's, block by block, beyond chance."""
-        measured, own = self.windows.measured, self.runs[IDENTIFIED].mean
-        still = self.windows.initial_states.unsqueeze(1).expand_as(measured)
-        path = still if other == PERSISTENCE else self.runs[other].mean
-        logs = []
-        for each in (own, path):
-            squares = self.spec.change(each, measured)[..., i].square()
+    @property
+    def _paths(self) -> dict[str, Tensor]:
+        """Paths along the windows, ``w x T x state_dim``: those of the runs, and of persistence."""
+        still = self.windows.initial_states.unsqueeze(1).expand_as(self.windows.measured)
+        return {name: run.mean for name, run in self.runs.items()} | {PERSISTENCE: still}
+
+    def _beats(self, other: Tensor, i: int, sign: int = 1) -> bool:
+        """Return whether errors of state i are below another path's by blocks, beyond chance."""
+        measured = self.windows.measured
+        logs = list[Tensor]()
+        for path in (self.runs[IDENTIFIED].mean, other):
+            squares = self.spec.change(path, measured)[..., i].square()
             blocks = squares.tensor_split(min(_BLOCKS, squares.shape[1]), 1)
-            logs.append(
-                torch.cat([block.nanmean(1) for block in blocks]).clamp(1e-300, 1e300).log()
-            )
+            errors = torch.cat([block.nanmean(1) for block in blocks])
+            logs.append(errors.clamp(1e-300, 1e300).log())
+        # One-sided t-test of the mean gain of a block
         gains = sign * (logs[1] - logs[0])
         gains = gains[~gains.isnan()]
         if len(gains) < 2:
@@ -248,77 +270,90 @@ class Identification(Display):
     @property
     def advice(self) -> list[str]:
         """Sentences on the log, on parameters, and on errors that are too large."""
-        unsettled = [] if self.smoothed.is_settled else [_UNSETTLED]
-        sentences = [*unsettled, *self.remarks, *_of_parameters(self.parameters)]
+        sentences = [] if self.smoothed.is_settled else [_UNSETTLED]
+        sentences += [*self.remarks, *_of_parameters(self.smoothed.parameters)]
         sentences += map(str, self.combinations)
         sentences += self._of_forces()
         if self.lack is not None:
             sentences.append(str(self.lack))
         sentences += self._of_noise()
-        errors, shares = self.errors, self.coverage.tolist()
-        untold = listed([] if self.parameters is None else self.parameters.untold)
-        for i, name in enumerate(self.spec.states):
-            if shares[i] < FEW:
-                cause = (
-                    "the physics lacks something whose errors last longer than process noise (dry "
-                    "friction, an input), or has a sign or unit wrong"
-                )
-                if self.lack is None and untold:
-                    cause = f"the log shows no lack of the physics, and does not tell {untold}"
+        cause = (
+            "the physics lacks something whose errors last longer than process noise (dry "
+            "friction, an input), or has a sign or unit wrong"
+        )
+        if self.lack is None and self.smoothed.parameters.untold:
+            untold = listed(self.smoothed.parameters.untold)
+            cause = f"the log shows no lack of the physics, and does not tell {untold}"
+        for i, share in enumerate(self.coverage.tolist()):
+            if share < FEW:
                 sentences.append(
-                    f"Of {name} the intervals of 95 % hold {100 * shares[i]:.0f} % of what was "
-                    f"held out: {cause}. Rely neither on them nor on those of the parameters."
+                    f"Of {self.spec.states[i]} the intervals of 95 % cover {100 * share:.0f} % of "
+                    f"what was held out: {cause}. Rely neither on them nor on those of the "
+                    "parameters."
                 )
-            for other, words in _OTHERS.items():
-                if other in errors and errors[other][i] <= errors[IDENTIFIED][i]:
-                    sentences.append(
-                        "Along what was held out the identified physics errs no less in "
-                        f"{name} than {words}."
-                    )
+                sentences += self._of_free_runs(i)
         return sentences
 
     def _of_forces(self) -> list[str]:
         """Return a sentence on parameters that a force which may be missing makes uncertain."""
         if self.parameters is None or self.robust_parameters is None:
             return []
-        (low, high), wider = self.robust_parameters.interval(), []
+        low, high = self.robust_parameters.interval()
+        wider = []
         times = self.robust_parameters.sd / self.parameters.sd
         for i, name in enumerate(self.parameters):
-            known = self.parameters.unknowns[name].coordinate(self.robust_parameters[name])
-            if times[i] > _WIDER and known.std() > _UNSURE:
+            z = self.parameters.unknowns[name].coordinate(self.robust_parameters[name])
+            if times[i] > _WIDER and z.std() > _UNSURE:
                 wider.append(f"{name} {low[i]:.3g} to {high[i]:.3g} ({times[i]:.2g} times as wide)")
         return wider and [
             "The intervals of parameters take errors of the equations for noise of each step. If "
             "they lack a force that depends on the states, as large as the process noise, the log "
-            f"tells {', '.join(wider)}. Dry friction, say, is hard to tell from damping."
+            f"tells {', '.join(wider)}. Dry friction, for one, is hard to tell from damping."
         ]
 
     def _of_noise(self) -> list[str]:
         """Return sentences on process noise that is larger than the noise of the sensor."""
-        records, sentences = self.smoothed.records, []
-        moves = torch.cat([record.states.diff(dim=0) for record in records])
+        sentences = []
+        moves = torch.cat([record.states.diff(dim=0) for record in self.smoothed.records])
         sizes = moves.square().mean(0).sqrt()
         noises = (self.smoothed.noise, self.smoothed.process_noise, sizes)
-        for name, noise, added, size in zip(self.spec.states, *noises, strict=True):
+        for i, (noise, added, size) in enumerate(zip(*noises, strict=True)):
             if not added > noise or added < _MOVES * size:  # of hidden states it is NaN
                 continue
-            if self.lack is not None:
-                cause = "it stands for what the equations lack, and falls with it"
-            else:
+            cause = "it stands for what the equations lack, and falls with it"
+            if self.lack is None:
                 cause = (
                     "no state, action or lag explains it. Look for an input that was not logged; "
                     "vibration or weather it may be, too, which the intervals then allow for"
                 )
+            name = self.spec.states[i]
             sentences.append(
                 f"Process noise of {name} is {added:.2g} a step, {added / noise:.2g} times the "
                 f"noise of its sensor: {cause}."
             )
         return sentences
 
+    def _of_free_runs(self, i: int) -> list[str]:
+        """Return a sentence if the fit by free runs predicts state i better."""
+        other = self.by_free_runs
+        if other is None:
+            return []
+        covers_more = other.coverage[i] - self.coverage[i] > _MORE
+        if not covers_more and not other._beats(self.runs[IDENTIFIED].mean, i):
+            return []
+        errors = [number(fit.errors[IDENTIFIED][i]) for fit in (self, other)]
+        shares = [percent(fit.coverage[i]) for fit in (self, other)]
+        return [
+            f"Fitted to free runs (`by_free_runs=True`) the physics has an error of {errors[1]} in "
+            f"{self.spec.states[i]} in place of {errors[0]}, and its intervals of 95 % cover "
+            f"{shares[1]} in place of {shares[0]}: what it lacks lasts longer than a step."
+        ]
+
     def __repr__(self) -> str:
         """Parameters, noises and errors."""
         lines = [f"Identification by {self.smoothed!r}"]
-        lines += [] if self.parameters is None else [repr(self.parameters)]
+        if self.parameters is not None:
+            lines.append(repr(self.parameters))
         places = [i for i, name in enumerate(self.spec.states) if name not in self.hidden]
         names = ", ".join(self.spec.states[i] for i in places)
         steps = self.windows.measured.shape[1]
@@ -329,7 +364,9 @@ class Identification(Display):
         return "\n".join([*lines, f"  in intervals of 95 %: {shares}"])
 
     def _repr_html_(self) -> str:
-        parameters = "" if self.parameters is None else self.parameters._repr_html_()
+        parameters = ""
+        if self.parameters is not None:
+            parameters = self.parameters._repr_html_()
         caption = f"Errors of free runs of {self.windows.measured.shape[1]} steps"
         columns = [*map(torch.Tensor.tolist, self.errors.values()), self.coverage.tolist()]
         rows = [
@@ -346,6 +383,8 @@ def identify(
     *,
     start: Mapping[str, tuple[float, float]] | None = None,
     held_out: float = 0.25,
+    sensors: Sensors | None = None,
+    by_free_runs: bool = False,
     num_starts: int | None = None,
     seed: int = 0,
 ) -> Identification:
@@ -354,7 +393,6 @@ def identify(
     All but the last part of the records is smoothed (:func:`smooth`). A free run follows the
     actions from there to the end, and is compared with the measurements. Its particles start where
     the state may be, have parameters drawn from their posterior, and are moved by process noise.
-    That is white: where the physics lacks something, whose errors last, intervals are too narrow.
 
     Args:
         records: The records, of states that all move. One that is NaN throughout is hidden.
@@ -363,6 +401,11 @@ def identify(
         start: Of hidden states by name, mean and standard deviation at the beginning.
         held_out: The share of the longest stretch without gaps that is held out at its end; as many
             steps are at the end of each other stretch that has twice as many.
+        sensors: As of :func:`smooth`. What was held out is corrected by the center of their gains,
+            offsets and delays, so that all errors are of states.
+        by_free_runs: If True, fit by least squares of free runs, without process noise. Where the
+            physics is right nothing changes; where it lacks something that lasts, intervals of free
+            runs cover more, and those of parameters, which take errors for white, are too narrow.
         num_starts: As of :func:`smooth`.
         seed: Seed of the free runs.
 
@@ -376,21 +419,19 @@ def identify(
 
     Example:
         >>> import torch
+        >>> from gpadjust import FormulaPhysics, ODEPhysics, Unknown
         >>> from gpadjust.records import Record, Records, identify
-        >>> from gpadjust.physics import FormulaPhysics, ODEPhysics, Unknown
-        >>> from gpadjust.states import Sensors, StateSpec
+        >>> from gpadjust.states import StateSpec
         >>> t = 0.1 * torch.arange(60, dtype=torch.float64)
-        >>> states = torch.stack([(1.5 * t).cos(), -1.5 * (1.5 * t).sin()], dim=-1)
-        >>> states += 0.01 * torch.randn(60, 2, dtype=torch.float64)
-        >>> record = Record(t, states, torch.zeros(60, 1, dtype=torch.float64))
-        >>> unknowns = {"k": Unknown(1.0, factor=2.0)}
-        >>> rates = FormulaPhysics("v, u - k * x", ["x", "v", "u"], unknowns=unknowns)
-        >>> log, physics = Records(record, StateSpec(["x", "v"], ["u"])), ODEPhysics(rates, 0.1, 2)
-        >>> errors = identify(log, physics).errors
-        >>> bool((errors["identified"] < 0.1 * errors["guesses"]).all())
+        >>> x = (1 - (-t).exp() + 0.01 * torch.randn(60).double()).unsqueeze(-1)
+        >>> law = FormulaPhysics("u - k * x", ["x", "u"], unknowns={"k": Unknown(2.0, factor=2.0)})
+        >>> log = Records(Record(t, x, torch.ones_like(x)), StateSpec(["x"], ["u"]))
+        >>> errors = identify(log, ODEPhysics(law, step=0.1, state_dim=1)).errors
+        >>> bool(errors["identified"] < 0.1 * errors["guesses"])
         True
     """
-    steps, spec = control_steps(records, step), records.spec
+    steps = control_steps(records, step)
+    spec = records.spec
     if len(spec.moving) < spec.state_dim:
         raise ValueError(
             "Expected states that all move, found exogenous ones or previous values; `smooth` "
@@ -406,7 +447,8 @@ def identify(
         )
     held = max(1, int(share * longest))
     f_p = one_physics(physics, spec, "identify one of them")
-    beginnings, ends = [], list[int]()
+    beginnings = []
+    ends = list[int]()
     for i, stretch in enumerate(steps):
         end = len(stretch.times)
         if end - 1 >= 2 * held:
@@ -414,16 +456,20 @@ def identify(
             ends.append(i)
         beginnings.append(stretch.part(slice(end)))
     learnt_from = Records(beginnings, spec)
-    smoothed = smooth(learnt_from, f_p, start=start, num_starts=num_starts)
+    process_noise = None
+    if by_free_runs:
+        process_noise = torch.full((spec.state_dim,), _NO_NOISE, dtype=torch.float64)
+    fit: dict[str, Any] = {"start": start, "sensors": sensors, "num_starts": num_starts}
+    smoothed = smooth(learnt_from, f_p, process_noise=process_noise, **fit)
     last = torch.stack([smoothed.records.records[i].states[-1] for i in ends])
-    within = smoothed._chain.within.shape[1]  # steps of the physics in a control step
-    actions, measured = [], []
+    within = smoothed.chain.within.shape[1]  # steps of the physics in a control step
+    actions, measured = list[Tensor](), list[Tensor]()
     for i in ends:
         stretch = steps.records[i]
-        each = stretch.within if within > 1 else stretch.actions.unsqueeze(1)
-        actions.append(each[-held - 1 : -1].flatten(0, 1))
+        acting = stretch.within if within > 1 else stretch.actions.unsqueeze(1)
+        actions.append(acting[-held - 1 : -1].flatten(0, 1))
         states = torch.full((held * within, spec.state_dim), torch.nan, dtype=torch.float64)
-        states[within - 1 :: within] = stretch.states[-held:]
+        states[within - 1 :: within] = smoothed.corrected(stretch.states)[-held:]
         measured.append(states)
     windows = Windows(last, torch.stack(actions), torch.stack(measured))
     length = steps.records[0].sampling_step / within
@@ -449,16 +495,24 @@ def identify(
     options |= {"process_noise": process_noise, "num_functions": 199}
     run = dynamics.free_run(last, windows.actions, **options)._replace(mean=path)
     runs = {IDENTIFIED: run, **runs}
-    gaps = [f"Gaps part the log into {len(steps)} stretches, each smoothed by itself."]
-    remarks = gaps if len(steps) > len(records) else []
+    remarks = []
+    if len(steps) > len(records):
+        remarks = [f"Gaps part the log into {len(steps)} stretches, each smoothed by itself."]
     remarks += [*_of_actions(records, length), *_of_jumps(records), *_of_outliers(records)]
-    return Identification(smoothed, dynamics, windows, runs, length, tuple(remarks))
+    again = None
+    if not by_free_runs:
+        fit |= {"held_out": held_out, "by_free_runs": True, "seed": seed}
+        again = partial(identify, records, physics, step, **fit)
+    return Identification(smoothed, dynamics, windows, runs, length, tuple(remarks), again)
 
 
 def _of_actions(records: Records, step: float) -> list[str]:
     """Return a sentence if actions vary within control steps, over which they are averaged."""
-    size, shares = round(step / records.records[0].sampling_step), [torch.zeros(1)]
-    for record in records if size > 1 else ():
+    size = round(step / records.records[0].sampling_step)
+    if size <= 1:
+        return []
+    shares = []
+    for record in records:
         steps = record.actions[: len(record.actions) // size * size].unflatten(0, (-1, size))
         shares.append(steps.var(1, correction=0).nanmean(0) / record.actions.var(0, correction=0))
     if torch.cat(shares).nan_to_num().max() <= _VARIES:
@@ -479,19 +533,20 @@ def _of_jumps(records: Records) -> list[str]:
         values = torch.cat([record.states[:, i] for record in records])
         values = values[~values.isnan()]
         moves = [record.states[:, i].diff() for record in records]
-        for turn, way in ((2 * math.pi, "say so"), (360.0, "convert it to rad, and say so")):
+        for turn, way in _TURNS.items():
             # An angle that is wrapped has values within a turn, and jumps back as it moves on.
             if len(values) == 0 or values.max() - values.min() > (1 + _NEAR_A_TURN) * turn:
                 continue
             is_slow = torch.cat(moves).abs().nanmedian() < 0.1 * turn
-            if is_slow and sum(_returns(each, turn) for each in moves) > 0:
-                sentences.append(f"{name} jumps by a turn: if it is an angle, {way} (`angles`).")
+            if is_slow and sum(_returns(move, turn) for move in moves) > 0:
+                sentences.append(f"{name} jumps by a turn: if it is an angle, {way}.")
     return sentences
 
 
 def _of_outliers(records: Records) -> list[str]:
     """Return sentences on rows that are far off both neighbours, on the same side."""
-    spec, sentences = records.spec, []
+    spec = records.spec
+    sentences = []
     moves = [spec.change(record.states[:-1], record.states[1:]) for record in records]
     together = torch.cat(moves)
     # Robust standard deviations of the changes: 1.4826 medians of their sizes
@@ -521,26 +576,24 @@ def _returns(moves: Tensor, turn: float) -> float:
     return -float((jumps[1:] * moves[:-1]).sum() + (jumps[:-1] * moves[1:]).sum())
 
 
-def _of_parameters(parameters: PhysicsParameters | None) -> list[str]:
+def _of_parameters(parameters: PhysicsParameters) -> list[str]:
     """Return sentences on parameters that the log does not tell, or that contradict their prior."""
-    if parameters is None:
-        return []
     sentences = []
     for name, unknown in parameters.unknowns.items():
-        z = unknown.coordinate(parameters[name])
-        if z.mean().abs() > _FAR:
+        off = float(unknown.coordinate(parameters[name]).mean().abs())
+        if off > _FAR:
             sentences.append(
-                f"{name} is {float(z.mean().abs()):.1f} standard deviations of its prior from its "
-                "guess: a sign, a unit, or a physics that lacks something?"
+                f"{name} is {off:.1f} standard deviations of its prior from its guess: a sign, a "
+                "unit, or a physics that lacks something?"
             )
-    told = "The log says next to nothing of {}: it stays as known before."
-    return [*sentences, *map(told.format, parameters.untold)]
+    untold = "The log hardly constrains {}: it stays as known before."
+    return [*sentences, *map(untold.format, parameters.untold)]
 
 
 def _told_together(parameters: PhysicsParameters) -> list[Combination]:
-    """Return the best-told combination of parameters that are only known together, tree by tree."""
-    found = []
-    numbers = [name for name, each in parameters.unknowns.items() if not each.function_of]
+    """Return the clearest combination of parameters that are only known together, tree by tree."""
+    clear = []
+    numbers = [name for name, unknown in parameters.unknowns.items() if not unknown.function_of]
     names = [name for name in numbers if (parameters[name] > 0).all()]
     for first, second in combinations(names, 2):
         logs = torch.stack([parameters[first], parameters[second]]).log()
@@ -549,19 +602,19 @@ def _told_together(parameters: PhysicsParameters) -> list[Combination]:
             continue
         sizes = [(p * logs[0] + q * logs[1]).std() / math.hypot(p, q) for p, q in _POWERS]
         least = min(range(len(sizes)), key=sizes.__getitem__)
-        if sizes[least] < _TOLD * sd.min():
-            found.append((float(sizes[least] / sd.min()), first, second, _POWERS[least]))
-    combined, group = [], {name: name for name in names}
-    for _, first, second, (p, q) in sorted(found):
+        if sizes[least] < _CLEARER * sd.min():
+            clear.append((float(sizes[least] / sd.min()), first, second, _POWERS[least]))
+    combined = []
+    group = {name: name for name in names}
+    for _, first, second, (p, q) in sorted(clear):
         if group[first] == group[second]:  # it follows from others
             continue
-        old, new = group[second], group[first]
-        group = {name: new if own == old else own for name, own in group.items()}
+        joined = [name for name in names if group[name] == group[second]]
+        group |= dict.fromkeys(joined, group[first])
         powers = parameters[first] ** p * parameters[second] ** q
-        units = [parameters.unknowns[each].unit for each in (first, second)]
-        unit = _product(_bracketed(units[0]), _bracketed(units[1]), p, q)
-        name = _product(first, second, p, q)
-        combined.append(Combination(name, first, second, unit if all(units) else "", powers))
+        units = [_bracketed(parameters.unknowns[name].unit) for name in (first, second)]
+        unit = _product(units[0], units[1], p, q) if all(units) else ""
+        combined.append(Combination(_product(first, second, p, q), first, second, unit, powers))
     return combined
 
 
@@ -572,4 +625,4 @@ def _product(first: str, second: str, p: int, q: int) -> str:
 
 
 def _bracketed(unit: str) -> str:
-    return f"({unit})" if " " in unit or "/" in unit else unit
+    return f"({unit})" if {" ", "/"} & {*unit} else unit

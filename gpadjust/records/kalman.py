@@ -29,6 +29,11 @@ class Moments(NamedTuple):
     means: Array  # T + 1 x D
     covariances: Array  # T + 1 x D x D
 
+    def put(self, row: int, mean: Array, covariance: Array) -> None:
+        """Write the moments of a row."""
+        self.means[row] = mean
+        self.covariances[row] = covariance
+
 
 class Smoothed(NamedTuple):
     """Distribution of the states of a stretch by all that was measured."""
@@ -58,7 +63,8 @@ def smooth_chain(
     rows = _Rows.joined(links, starts, noise, process_noise)
     filtered = _filter(rows)
     states, gains = _smooth(rows, filtered)
-    smoothed, t = [], 0
+    smoothed = []
+    t = 0
     for link in links:
         end = t + len(link.measured)
         moments = Moments(states.means[t:end], states.covariances[t:end])
@@ -69,19 +75,22 @@ def smooth_chain(
 
 
 def draw_paths(
-    found: Sequence[Smoothed], num_constants: int, rng: np.random.Generator
+    stretches: Sequence[Smoothed], num_constants: int, rng: np.random.Generator
 ) -> list[Array]:
     """Draw the states of all stretches, ``T + 1 x D`` each; their last entries are constants."""
-    paths, constants = [], None
-    for (means, covariances), crossed in found:
-        path, mean, covariance = np.empty_like(means), means[-1], covariances[-1]
+    paths = list[Array]()
+    constants = None
+    for (means, covariances), crossed in stretches:
+        path = np.empty_like(means)
+        mean, covariance = means[-1], covariances[-1]
         d = means.shape[1] - num_constants
         if constants is None:
             constants = _normal(mean[d:], covariance[d:, d:], rng)
         path[-1, d:] = constants
         gain = _gain(covariance[d:, d:], covariance[d:, :d])
-        own = covariance[:d, :d] - gain @ covariance[d:, :d]
-        path[-1, :d] = _normal(mean[:d] + gain @ (constants - mean[d:]), own, rng)
+        # x | theta ~ N(m + G (theta - m'), P - G C), G = C' P'^-1
+        left = covariance[:d, :d] - gain @ covariance[d:, :d]
+        path[-1, :d] = _normal(mean[:d] + gain @ (constants - mean[d:]), left, rng)
         for t in range(len(crossed) - 1, -1, -1):
             gain = _gain(covariances[t + 1], crossed[t])
             mean = means[t] + gain @ (path[t + 1] - means[t + 1])
@@ -102,12 +111,13 @@ def measure(
         Mean and covariance of the state, and the log density of what was measured.
 
     Raises:
-        LinAlgError: If a variance is no positive number.
+        LinAlgError: If a variance is not a positive number.
     """
     log_density = 0.0
     for i in np.flatnonzero(~np.isnan(measured)):  # one by one, as their errors are independent
         spread = covariance @ outputs[i]
-        variance, error = outputs[i] @ spread + noise[i], measured[i] - outputs[i] @ mean
+        variance = outputs[i] @ spread + noise[i]
+        error = measured[i] - outputs[i] @ mean
         if not 0 < variance < math.inf:
             raise np.linalg.LinAlgError(_NO_VARIANCE)
         mean = mean + spread / variance * error
@@ -117,17 +127,18 @@ def measure(
 
 
 def expected_squares(
-    links: Sequence[Link], found: Sequence[Smoothed], d: int
+    links: Sequence[Link], stretches: Sequence[Smoothed], d: int
 ) -> tuple[Array, Array]:
-    """Squares of errors as they are expected given what is known of the states.
+    """Return expected squares of errors, given the distribution of the states.
 
     Returns:
-        Those of the measurements, ``sum (T + 1) x m``, and of the first ``d`` entries of what the
-        steps added, ``sum T x d``.
+        Squares of errors of the measurements, ``sum (T + 1) x m``, and of the first ``d`` entries
+        of what the steps added, ``sum T x d``.
     """
-    errors, added = [], []
-    for link, (states, crossed) in zip(links, found, strict=True):
-        outputs, means, spread = link.outputs, states.means, states.covariances
+    errors, added = list[Array](), list[Array]()
+    for link, (states, crossed) in zip(links, stretches, strict=True):
+        means, spread = states
+        outputs = link.outputs
         off = link.measured - np.einsum("tij,tj->ti", outputs, means)
         errors.append(off**2 + np.einsum("tij,tjk,tik->ti", outputs, spread, outputs))
         lead = link.matrices[:, :d]
@@ -166,7 +177,9 @@ class _Rows(NamedTuple):
         outputs = np.concatenate([link.outputs for link in links])
         M, _, D = outputs.shape
         d = len(process_noise)
-        F, o, Q = np.zeros((M, D, D)), np.zeros((M, D)), np.zeros((M, D, D))
+        F = np.zeros((M, D, D))
+        o = np.zeros((M, D))
+        Q = np.zeros((M, D, D))
         Q[:, range(d), range(d)] = process_noise
         t = 0
         for link, (first, spread) in zip(links, starts, strict=True):
@@ -194,13 +207,13 @@ class _Rows(NamedTuple):
 class _Filtered(NamedTuple):
     """The filter of all blocks, each from its start x, the state before its first row.
 
-    From starts of 0 without variance the last state of a block is ``A x`` more than found, and the
+    From starts of 0 without variance the last state of a block is ``A x`` more than here, and the
     density of its measurements, by x, ``exp(eta' x - x' J x / 2)``.
     """
 
     before: Moments  # length x B x ...: of the state before, by measurements until then
     ahead: Moments  # of the state, by the measurements before it
-    known: Moments  # and by its own
+    after: Moments  # and by its measurements
     A: Array  # B x D x D
     eta: Array  # B x D
     J: Array  # B x D x D
@@ -218,30 +231,33 @@ def _filter(rows: _Rows) -> _Filtered:
     block = _filter_blocks(rows, starts)
     mean, covariance = np.zeros(D), np.zeros((D, D))
     for k in range(B):
-        starts.means[k], starts.covariances[k] = mean, covariance
+        starts.put(k, mean, covariance)
         # x | y ~ N(m + S (eta - J m), S), S = (P^-1 + J)^-1, for x ~ N(m, P)
-        A, J = block.A[k], block.J[k]
-        S = np.linalg.solve(np.eye(D) + covariance @ J, covariance)
-        mean = A @ (mean + S @ (block.eta[k] - J @ mean)) + block.known.means[-1, k]
-        covariance = _even(A @ S @ A.T) + block.known.covariances[-1, k]
+        A = block.A[k]
+        S = np.linalg.solve(np.eye(D) + covariance @ block.J[k], covariance)
+        mean = A @ (mean + S @ (block.eta[k] - block.J[k] @ mean)) + block.after.means[-1, k]
+        covariance = _even(A @ S @ A.T) + block.after.covariances[-1, k]
     return _filter_blocks(rows, starts)
 
 
 def _filter_blocks(rows: _Rows, starts: Moments) -> _Filtered:
     """Filter all blocks from their starts, ``B`` moments (Kalman 1960)."""
     means, covariances = starts
-    before, ahead, known = (Moments(np.empty_like(rows.o), np.empty_like(rows.Q)) for _ in range(3))
+    before, ahead, after = (Moments(np.empty_like(rows.o), np.empty_like(rows.Q)) for _ in range(3))
     A = np.zeros_like(covariances) + np.eye(means.shape[1])
-    eta, J, log_density = np.zeros_like(means), np.zeros_like(covariances), 0.0
+    eta = np.zeros_like(means)
+    J = np.zeros_like(covariances)
+    log_density = 0.0
     for t, F in enumerate(rows.F):
-        before.means[t], before.covariances[t] = means, covariances
+        before.put(t, means, covariances)
         means = _times(F, means) + rows.o[t]
         covariances = _even(F @ covariances @ np.swapaxes(F, -1, -2)) + rows.Q[t]
         A = F @ A
-        ahead.means[t], ahead.covariances[t] = means, covariances
+        ahead.put(t, means, covariances)
         # One output by one, as their errors are independent: y = h' x + N(0, R)
         for i in np.flatnonzero(np.isfinite(rows.noise[t]).any(0)):
-            h, R = rows.outputs[t, :, i], rows.noise[t, :, i]
+            h = rows.outputs[t, :, i]
+            R = rows.noise[t, :, i]
             is_seen = np.isfinite(R)
             spread = _times(covariances, h)
             variance = (h * spread).sum(-1) + R
@@ -260,8 +276,8 @@ def _filter_blocks(rows: _Rows, starts: Moments) -> _Filtered:
             means = means + spread * by_error
             scaled = spread / np.sqrt(variance)[:, None]
             covariances = covariances - scaled[:, :, None] * scaled[:, None]
-        known.means[t], known.covariances[t] = means, covariances
-    return _Filtered(before, ahead, known, A, eta, J, float(log_density))
+        after.put(t, means, covariances)
+    return _Filtered(before, ahead, after, A, eta, J, float(log_density))
 
 
 def _smooth(rows: _Rows, filtered: _Filtered) -> tuple[Moments, Array]:
@@ -276,9 +292,9 @@ def _smooth(rows: _Rows, filtered: _Filtered) -> tuple[Moments, Array]:
     L = before.covariances - _even(G @ ahead.covariances @ np.swapaxes(G, -1, -2))
     ends = Moments(np.zeros_like(c[0]), np.zeros_like(L[0]))
     block, A = _smooth_blocks(G, c, L, ends)
-    mean, covariance = last = [part[-1, -1] for part in filtered.known]
+    mean, covariance = last = [part[-1, -1] for part in filtered.after]
     for k in range(len(A) - 1, -1, -1):
-        ends.means[k], ends.covariances[k] = mean, covariance
+        ends.put(k, mean, covariance)
         mean = A[k] @ mean + block.means[0, k]
         covariance = _even(A[k] @ covariance @ A[k].T) + block.covariances[0, k]
     smoothed, _ = _smooth_blocks(G, c, L, ends)
@@ -291,12 +307,13 @@ def _smooth(rows: _Rows, filtered: _Filtered) -> tuple[Moments, Array]:
 def _smooth_blocks(G: Array, c: Array, L: Array, ends: Moments) -> tuple[Moments, Array]:
     """Return the states before each row by the ends of the blocks, and their products of gains."""
     means, covariances = ends
-    smoothed, A = Moments(np.empty_like(c), np.empty_like(L)), np.eye(c.shape[-1])
+    smoothed = Moments(np.empty_like(c), np.empty_like(L))
+    A = np.eye(c.shape[-1])
     for t in range(len(G) - 1, -1, -1):
         means = _times(G[t], means) + c[t]
         covariances = _even(G[t] @ covariances @ np.swapaxes(G[t], -1, -2)) + L[t]
         A = G[t] @ A
-        smoothed.means[t], smoothed.covariances[t] = means, covariances
+        smoothed.put(t, means, covariances)
     return smoothed, A
 
 
@@ -321,13 +338,13 @@ def _times(matrices: Array, vectors: Array) -> Array:
 
 
 def _even(matrices: Array) -> Array:
-    """Return symmetric matrices, of ones that are so but for rounding."""
+    """Return matrices made symmetric, which rounding leaves nearly so."""
     even: Array = (matrices + np.swapaxes(matrices, -1, -2)) / 2
     return even
 
 
 def _gain(covariance: Array, crossed: Array) -> Array:
-    """``crossed' covariance^-1``, also of constants that are known, which have no variance."""
+    """Return ``crossed' covariance^-1``, also of constants without variance."""
     scale = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1).clip(np.finfo(float).tiny))
     scaled = covariance / (scale[..., None] * scale[..., None, :])
     scaled = scaled + 1e-14 * np.eye(scale.shape[-1])
@@ -337,7 +354,7 @@ def _gain(covariance: Array, crossed: Array) -> Array:
 
 
 def _normal(mean: Array, covariance: Array, rng: np.random.Generator) -> Array:
-    """Draw from a normal distribution, with zero variance in some directions or not."""
+    """Draw from a normal distribution, whose variance may be zero in some directions."""
     values, vectors = np.linalg.eigh(covariance)
-    found: Array = mean + vectors @ (np.sqrt(values.clip(0)) * rng.standard_normal(len(mean)))
-    return found
+    draw: Array = mean + vectors @ (np.sqrt(values.clip(0)) * rng.standard_normal(len(mean)))
+    return draw

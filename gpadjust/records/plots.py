@@ -46,24 +46,28 @@ def plot_record(
         An array of these axes; ``axes[0].figure`` is the figure.
 
     Raises:
-        TypeError: If ``record`` is no :class:`Record`, or ``spec`` no :class:`StateSpec`.
-        ValueError: If the record has not the columns of the spec, a unit is of an unknown name,
-            or the number of ``axes`` is another one.
+        TypeError: If ``record`` is not a :class:`Record`, or ``spec`` not a :class:`StateSpec`.
+        ValueError: If the record does not have the columns of the spec, a unit is of an unknown
+            name, or the number of ``axes`` is another one.
     """
     Records([record], spec)  # checks types and columns
-    names, stretches = [*spec.states, *spec.actions], record.stretches()
+    names = [*spec.states, *spec.actions]
+    stretches = record.stretches()
     called = labels(spec, units)
     if axes is None:
         figure = plt.figure(figsize=(7, 1.4 * len(names)), layout="constrained")
         axes = figure.subplots(len(names), 1, sharex=True, squeeze=False)
-    axes, values = given_axes(axes, (len(names),)), torch.cat([record.states, record.actions], -1)
+    axes = given_axes(axes, (len(names),))
+    values = torch.cat([record.states, record.actions], -1)
     for i, (name, ax) in enumerate(zip(names, axes, strict=True)):
         style = "default" if i < spec.state_dim else "steps-post"
         for rows in stretches:
-            times, line = record.times[rows], going_on(values[rows, i], i in spec.angle_columns)
+            times = record.times[rows]
+            line = going_on(values[rows, i], i in spec.angle_columns)
             ax.plot(times, line, color=BLUE, lw=1.1, drawstyle=style)
-            known = torch.nn.functional.pad(~line.isnan(), (1, 1))
-            if (alone := known[1:-1] & ~known[:-2] & ~known[2:]).any():
+            is_number = torch.nn.functional.pad(~line.isnan(), (1, 1))
+            alone = is_number[1:-1] & ~is_number[:-2] & ~is_number[2:]
+            if alone.any():
                 ax.plot(times[alone], line[alone], ".", color=BLUE, ms=3)
         for before, after in pairwise(stretches):
             end, start = (float(record.times[k]) for k in (before.stop - 1, after.start))
@@ -84,8 +88,8 @@ def plot_identification(identification: Identification, **options: Any) -> Any:
     Options and axes are those of :func:`~gpadjust.dynamics.plots.plot_free_run`.
     """
     others = {**identification.runs}
-    run, step = others.pop(IDENTIFIED), identification.step
-    defaults: dict[str, Any] = {"others": others, "step": step}
+    run = others.pop(IDENTIFIED)
+    defaults: dict[str, Any] = {"others": others, "step": identification.step}
     return plot_free_run(run, identification.windows, **defaults | options)
 
 
@@ -101,19 +105,21 @@ def plot_lack(lack: Lack, *, units: Mapping[str, str] | None = None, ax: Any = N
         The axes.
     """
     spec = lack.spec
-    called, units = labels(spec, units), {**dict.fromkeys(spec.angles, "rad"), **(units or {})}
+    called = labels(spec, units)
+    units = {**dict.fromkeys(spec.angles, "rad"), **(units or {})}
     unit, time = units.get(lack.state, ""), units.get("time", "s")
     rate = f"{unit}²" if unit.endswith(f"/{time}") else f"{unit or 1}/{time}"
-    ax = plt.figure(figsize=(5, 3), layout="constrained").subplots() if ax is None else ax
+    if ax is None:
+        ax = plt.figure(figsize=(5, 3), layout="constrained").subplots()
     half = quantile(0.95) * lack.sd
     ax.plot(lack.at, lack.residual, **{**DOTS, "ms": 3, "color": "0.7"}, label="each step")
     ax.axhline(0.0, color=GREY, lw=1, ls="--")
     bars: dict[str, Any] = {"color": BLUE, "fmt": "o-", "ms": 4, "lw": 1.3, "capsize": 2}
     ax.errorbar(lack.middles, lack.means, half, **bars, label="mean, 95 %")
-    low, high = float((lack.means - half).min()), float((lack.means + half).max())
-    ends = lack.residual.quantile(lack.residual.new_tensor([0.02, 0.98])).tolist()
-    room = 0.1 * (max(high, ends[1]) - min(low, ends[0]))
-    ax.set_ylim(min(low, ends[0], 0.0) - room, max(high, ends[1], 0.0) + room)
+    ends = lack.residual.quantile(lack.residual.new_tensor([0.02, 0.98]))
+    low, high = torch.cat([ends, lack.means - half, lack.means + half]).aminmax()
+    room = 0.1 * float(high - low)
+    ax.set_ylim(min(float(low), 0.0) - room, max(float(high), 0.0) + room)
     over = called[lack.over]
     if lack.lag is not None:
         over = f"{lack.over}, {lack.lag:.2g} late, less {lack.over}"

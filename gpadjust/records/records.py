@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpadjust.checks import check_finite, check_kind, checked_number
+from gpadjust.checks import check_choice, check_finite, check_kind, checked_number
 from gpadjust.core.data import ArrayLike, as_tensor
 from gpadjust.dynamics import Trajectories, Windows
 from gpadjust.files.fields import is_moment, seconds_of
@@ -48,7 +48,7 @@ class Record:
         sampling_step: The mean time from one row to the next, without gaps.
 
     Raises:
-        TypeError: If values are no numbers, or a tensor is not in float64.
+        TypeError: If values are not numbers, or a tensor is not in float64.
         ValueError: If shapes disagree, times do not rise or are not finite, a state is infinite, an
             action is missing, or no row follows another.
 
@@ -73,8 +73,8 @@ class Record:
         self.states = self._numbers(states, "states", 2)
         self.actions = self._numbers(actions, "actions", 2)
         self.within = self.actions.unsqueeze(1)  # N x k x action_dim: of the samples of a step
-        labels: Any = segments.tolist() if hasattr(segments, "tolist") else segments
-        self.segments = tuple([0] * len(self.times) if labels is None else labels)
+        labels: Any = [0] * len(self.times) if segments is None else segments
+        self.segments = tuple(labels.tolist() if hasattr(labels, "tolist") else labels)
         rows = {name: len(getattr(self, name)) for name in ("times", "states", "actions")}
         rows["segments"] = len(self.segments)
         if len({*rows.values()}) > 1:
@@ -113,8 +113,8 @@ class Record:
 
     def part(self, rows: slice) -> Record:
         """Return some rows, as a record of the same name."""
-        times, states, actions = self.times[rows], self.states[rows], self.actions[rows]
-        part = Record(times, states, actions, self.segments[rows], self.name)
+        columns = self.times[rows], self.states[rows], self.actions[rows]
+        part = Record(*columns, self.segments[rows], self.name)
         part.within = self.within[rows]
         return part
 
@@ -149,10 +149,10 @@ class Record:
     def _numbers(self, values: ArrayLike, name: str, dims: int) -> Tensor:
         tensor = as_tensor(values, name).detach().clone()
         if tensor.dim() != dims or 0 in tensor.shape[1:]:
-            expected = "N" if dims == 1 else f"N x {name.removesuffix('s')}_dim"
+            expected = f"N x {name.removesuffix('s')}_dim" if dims > 1 else "N"
+            way_out = "; of a single column, use `.reshape(-1, 1)`" * (dims > tensor.dim())
             raise self._error(
-                f": expected {name} of shape {expected}, got {tuple(tensor.shape)}"
-                + ("; of a single column, use `.reshape(-1, 1)`." if dims > tensor.dim() else ".")
+                f": expected {name} of shape {expected}, got {tuple(tensor.shape)}{way_out}."
             )
         return tensor
 
@@ -181,8 +181,8 @@ class Records:
         spec: The entries of their states and actions.
 
     Raises:
-        TypeError: If ``spec`` is no :class:`StateSpec`, or a record no :class:`Record`.
-        ValueError: If there are none, or one has not the columns of the spec.
+        TypeError: If ``spec`` is not a :class:`StateSpec`, or a record not a :class:`Record`.
+        ValueError: If there is no record, or one does not have the columns of the spec.
 
     Example:
         >>> import torch
@@ -191,16 +191,15 @@ class Records:
         >>> times = 0.01 * torch.arange(101, dtype=torch.float64)
         >>> record = Record(times, times.sin().unsqueeze(-1), times.cos().unsqueeze(-1))
         >>> records = Records([record], StateSpec(["x"], ["v"]))
-        >>> states, actions, next_states = records.trajectories(0.05)
-        >>> len(states), bool((next_states - states - 0.05 * actions).abs().max() < 0.001)
-        (20, True)
-        >>> records.windows(10, 0.05).measured.shape
-        torch.Size([2, 10, 1])
+        >>> len(records.trajectories(0.05).states), records.windows(10, 0.05).measured.shape
+        (20, torch.Size([2, 10, 1]))
     """
 
     def __init__(self, records: Record | Iterable[Record], spec: StateSpec) -> None:
         check_kind("spec", spec, StateSpec, "a StateSpec, such as StateSpec(['x', 'v'], ['force'])")
-        self.records = (records,) if isinstance(records, Record) else tuple(records)
+        if isinstance(records, Record):
+            records = [records]
+        self.records = tuple(records)
         self.spec = spec
         if not self.records:
             raise ValueError("Expected one record or more, found none.")
@@ -210,11 +209,12 @@ class Records:
                     f"Expected each record as a Record(times, states, actions), found {record!r}."
                 )
             for name in ("states", "actions"):
-                expected, columns = getattr(spec, name), getattr(record, name).shape[1]
+                expected = getattr(spec, name)
+                columns = getattr(record, name).shape[1]
                 if columns != len(expected):
                     raise ValueError(
                         f"Record {record.name!r}: expected {len(expected)} columns of {name}, "
-                        f"{', '.join(expected)}, as the spec says, found {columns}."
+                        f"{', '.join(expected)}, as in the spec, found {columns}."
                     )
 
     def __len__(self) -> int:
@@ -251,8 +251,8 @@ class Records:
                 state, which :func:`smooth` estimates. Default: the columns of their names. Units
                 in brackets may be left out.
             actions: The same for the actions.
-            time: The column of times, or where there is none the time from one row to the next.
-                Dates and times of day become the time since the first.
+            time: The column of times, or without one the time from one row to the next. Dates
+                and times of day become the time since the first.
             time_unit: The unit of times, steps and rates: s, ms, us, min, h or d. Default: seconds;
                 a column in other units of time is converted.
             segment: The column of the labels of segments. Default: a file is one segment.
@@ -261,23 +261,21 @@ class Records:
 
         Raises:
             OSError: If a file cannot be read.
-            TypeError: If ``spec`` is no :class:`StateSpec`.
+            TypeError: If ``spec`` is not a :class:`StateSpec`.
             ValueError: If a name is not in the spec, a file has no rows or not these columns, a
-                field is no number or a time or action is missing, with file, line and column; the
-                time is in minutes, hours or days, and no ``time_unit`` given; and as
-                :class:`Record`.
+                field is not a number or a time or action is missing, with file, line and column;
+                the time is in minutes, hours or days without ``time_unit``; and as :class:`Record`.
         """
         check_kind("spec", spec, StateSpec, "a StateSpec, such as StateSpec(['x', 'v'], ['force'])")
         columns: dict[str, Any] = {"states": states or {}, "actions": actions or {}}
-        for argument, given in columns.items():
-            check_kind(argument, given, Mapping, "a dictionary from names of the spec to columns")
-            if unknown := [name for name in given if name not in getattr(spec, argument)]:
-                raise ValueError(
-                    f"There is no {unknown[0]!r} among the {argument} of the spec, "
-                    f"{getattr(spec, argument)}."
-                )
+        for argument, names in columns.items():
+            check_kind(argument, names, Mapping, "a dictionary from names of the spec to columns")
+            for name in names:
+                check_choice(argument, name, getattr(spec, argument))
         records = []
-        for file in [files] if isinstance(files, str | Path | Table) else files:
+        if isinstance(files, str | Path | Table):
+            files = [files]
+        for file in files:
             log = file if isinstance(file, Table) else Table(file, **table)
             if isinstance(time, str):
                 times = log.times(time, time_unit)
@@ -286,8 +284,8 @@ class Records:
                 times = checked_number("time", time, above=0) * rows
             measured = []
             for name in spec.states:
-                filled_in = name in spec.previous and name not in log.names
-                column = columns["states"].get(name, None if filled_in else name)
+                is_filled_in = name in spec.previous and name not in log.names
+                column = columns["states"].get(name, None if is_filled_in else name)
                 if column is None:
                     measured.append(torch.full_like(times, math.nan))
                 else:
@@ -303,8 +301,7 @@ class Records:
     def of_windows(cls, windows: Windows, spec: StateSpec, step: float) -> Records:
         """Make a record of each window, such as of an agent's episodes, to :func:`smooth` them.
 
-        The control step is in the unit of the times. Errors are those of :class:`Records`, and of a
-        step that is no number above 0.
+        The control step is in the unit of the times.
         """
         rows = torch.arange(windows.states.shape[1], dtype=torch.float64)
         times = checked_number("step", step, above=0) * rows
@@ -323,7 +320,7 @@ class Records:
 
         Raises:
             ValueError: If there are no transitions, the sampling steps of records differ or are
-                uneven, the step is no multiple of them, or another one than the spec says.
+                uneven, the step is not a multiple of them, or not that of the spec.
 
         Warns:
             UserWarning: If steps are left out, because they start at a state that was not measured
@@ -332,20 +329,20 @@ class Records:
         """
         data = _transitions(control_steps(self, step))
         complete = ~data.states.isnan().any(-1)
-        kept = data.subset(complete & ~data.next_states[:, self.spec.predicted].isnan().all(-1))
-        if not len(kept.states):
+        usable = data.subset(complete & ~data.next_states[:, self.spec.predicted].isnan().all(-1))
+        if not len(usable.states):
             raise ValueError(
                 f"Expected steps from a state that was measured in full, found none of "
                 f"{len(data.states)}.{self._hidden(data)}"
             )
-        if len(kept.states) < len(data.states):
+        if len(usable.states) < len(data.states):
             warnings.warn(
-                f"Left out: {len(data.states) - len(kept.states)} of {len(data.states)} steps, "
+                f"Left out: {len(data.states) - len(usable.states)} of {len(data.states)} steps, "
                 f"{int((~complete).sum())} of which start at a state not measured in full.",
                 UserWarning,
                 stacklevel=2,
             )
-        return kept
+        return usable
 
     def windows(self, length: int, step: float | None = None, stride: int | None = None) -> Windows:
         """Cut windows, to compare with :meth:`~gpadjust.dynamics.Dynamics.free_run`.
@@ -359,7 +356,7 @@ class Records:
         return data.windows(length, stride)
 
     def _hidden(self, data: Trajectories) -> str:
-        """Return the way out if states were never measured; empty if there are none."""
+        """Return the way out if states were never measured; empty if all were."""
         never = data.states.isnan().all(0).nonzero().flatten().tolist()
         if not never:
             return ""
@@ -373,13 +370,14 @@ class Records:
 def control_steps(records: Records, step: float | None) -> Records:
     """Return records whose rows are control steps, at even times: one for each stretch.
 
-    For ``step`` and errors see :meth:`Records.trajectories`; a warning says how many stretches are
-    left out.
+    For ``step``, errors and warnings see :meth:`Records.trajectories`.
     """
     if not isinstance(records, Records):
         raise TypeError(f"Expected records as Records([record, ...], spec), found {records!r}.")
-    spec, step = records.spec, _checked_step(records, step)
-    steps, short = [], 0
+    spec = records.spec
+    step = _checked_step(records, step)
+    steps = []
+    short = 0
     for record in records:
         every = record.rows_in(step)
         for rows in record.stretches():
@@ -420,17 +418,17 @@ def remember(states: Tensor, actions: Tensor, spec: StateSpec) -> None:
 
 
 def _checked_step(records: Records, step: float | None) -> float:
-    """Return the control step: the one given, that of the spec, or the first sampling step."""
-    wanted = None if step is None else checked_number("step", step, above=0)
-    known = records.spec.step
-    if wanted is None or known is None:
-        return wanted or known or records.records[0].sampling_step
-    if abs(wanted - known) > _SAME * known:
+    """Return the control step: the argument, that of the spec, or the first sampling step."""
+    of_spec = records.spec.step
+    if step is None:
+        return of_spec or records.records[0].sampling_step
+    step = checked_number("step", step, above=0)
+    if of_spec is not None and abs(step - of_spec) > _SAME * of_spec:
         raise ValueError(
-            f"Expected the step of the spec, {known:.4g}, got {wanted:.4g}; leave `step` out, "
-            "or make a spec with this step."
+            f"Expected the step of the spec, {of_spec:.4g}, got {step:.4g}; leave `step` out, or "
+            "make a spec with this step."
         )
-    return wanted
+    return step
 
 
 def _transitions(steps: Records) -> Trajectories:

@@ -1,8 +1,8 @@
 """The states of a machine, from noisy and incomplete records and a physics.
 
 From top to bottom: :func:`smooth`; the search for the most likely states, parameters and noises;
-the chain of Gaussian states that the physics makes near a path; the variation of parameters from
-one stretch to another. Moments of a chain are from :mod:`gpadjust.records.kalman`.
+the chain of Gaussian states that the physics makes near a path. Moments of a chain are from
+:mod:`gpadjust.records.kalman`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -25,11 +24,13 @@ from gpadjust.dynamics.least_squares import even_normal
 from gpadjust.dynamics.physics_dynamics import check_next_values, one_physics
 from gpadjust.physics import Physics, PhysicsError
 from gpadjust.physics.parameters import PhysicsParameters
+from gpadjust.physics.unknown import Unknowns
 from gpadjust.progress import long_work, tick
 from gpadjust.records import kalman
 from gpadjust.records.kalman import Array, Link, Smoothed
 from gpadjust.records.records import Record, Records, control_steps, remember
-from gpadjust.states import StateSpec
+from gpadjust.records.sensing import Sensing
+from gpadjust.states import Sensors, StateSpec
 from gpadjust.states.state_spec import side_by_side
 
 _DRAWS = 256  # of the parameters
@@ -43,10 +44,9 @@ _WIDE = 10.0  # standard deviations of a state, by which the first one may be el
 _SIZE = 1e-3  # of a state's size: it varies by no less
 _SHARE = 0.25  # of the variance of f_p's errors in single steps: that of the noise at first
 _HIDDEN = 0.1  # of the change in a step: what it adds to a state that is never measured, at first
-_LEAST = 1e-6  # of the standard deviation of a state: no noise is less, but by rounding
+_LEAST = 1e-6  # of the standard deviation of a state: the least noise
 _HALVINGS = 6
 _BETTER = 0.01  # what a worse path may cost more, by rounding
-_MEDIAN = 0.05  # of a variation beforehand, in standard deviations of a parameter's prior
 
 
 class SmoothingWarning(UserWarning):
@@ -65,7 +65,9 @@ class SmoothedRecords:
             0 of those that the physics does not move.
         process_noise: Standard deviations of what a step adds to the physics, ``state_dim``.
         log_density: Of the measurements, near these states.
-        is_settled: Whether the search ended; if not, a SmoothingWarning said so.
+        is_settled: Whether the search ended; if not, there was a SmoothingWarning.
+        chain: The records as a chain of states, which the physics leads through.
+        estimate: Moments of the chain's states, which have the parameters at their end.
     """
 
     records: Records
@@ -74,44 +76,49 @@ class SmoothedRecords:
     process_noise: Tensor
     log_density: float
     is_settled: bool
-    _chain: Chain
-    _estimate: Estimate
+    chain: Chain
+    estimate: Estimate
+
+    @property
+    def parameters(self) -> PhysicsParameters:
+        """The posterior of the unknown parameters of physics and sensors; empty if there are none.
+
+        Parameters of sensors are ``x_gain``, ``x_offset`` and ``x_delay``, for a state x.
+        """
+        moments = self.estimate.stretches[0].states
+        theta = slice(self.chain.d, None)
+        mean, covariance = moments.means[0, theta], moments.covariances[0, theta, theta]
+        return drawn_parameters(self.chain.unknowns, mean, covariance)
 
     @property
     def physics_parameters(self) -> PhysicsParameters:
         """The posterior of the unknown parameters of the physics; empty if it has none."""
-        d, moments = self._chain.d, self._estimate.stretches[0].states
-        mean, covariance = moments.means[0, d:], moments.covariances[0, d:, d:]
-        return drawn_parameters(self._chain.physics, mean, covariance)
+        unknowns = self.chain.physics.unknowns
+        draws = self.parameters.draws[:, : len(unknowns)]
+        return PhysicsParameters(unknowns, [*draws.unbind(-1)])
 
-    @cached_property
-    def variation(self) -> Tensor:
-        """Variation of the parameters from one stretch of the records to another, ``p``.
+    def corrected(self, states: Tensor) -> Tensor:
+        """Correct measured states of a stretch, ``N x state_dim``, by the center of the sensors.
 
-        Standard deviations, in those of each parameter's prior: with 0.1, and a prior of a factor
-        of 1.5, some 4 %. They explain best, given the noises, stretches of which each has its own
-        parameters; where the stretches tell nothing, they are 0.05. What an equation lacks shows as
-        parameters that vary, and moves a free run for as long as it lasts, where process noise
-        averages out: see ``variation`` of :meth:`Dynamics.free_run`.
-
-        Raises:
-            ValueError: If the physics has no unknown parameters.
+        Of a sensor with a delay they are interpolated, and NaN at the end.
         """
-        if not self._chain.physics.unknowns:
-            raise ValueError("Expected a physics with unknown parameters; found none, that vary.")
-        return variation(self._chain, self._estimate)
+        chain = self.chain
+        corrected = states.clone()
+        measured = states[:, chain.spec.moving].numpy()
+        theta = self.estimate.states[0, chain.d :]
+        if chain.sensing is not None:
+            shown = chain.sensing.corrected(measured, theta, [slice(0, len(states))])
+            corrected[:, chain.spec.moving] = torch.from_numpy(shown)
+        return corrected
 
     def draw(self, seed: int = 0) -> Records:
         """Draw states from their posterior, along each record.
 
         Unlike the most likely ones they scatter about the physics as the machine does, so that a
         model which learns from them finds the right noise.
-
-        Raises:
-            ValueError: If the seed is no whole number of 0 or more.
         """
         rng = np.random.default_rng(checked_whole("seed", seed, 0))
-        paths = kalman.draw_paths(self._estimate.stretches, self._chain.num_parameters, rng)
+        paths = kalman.draw_paths(self.estimate.stretches, self.chain.num_parameters, rng)
         return _with_states(self.records, np.concatenate(paths))
 
     def __repr__(self) -> str:
@@ -130,6 +137,7 @@ def smooth(
     start: Mapping[str, tuple[float, float]] | None = None,
     noise: Tensor | None = None,
     process_noise: Tensor | None = None,
+    sensors: Sensors | None = None,
     num_starts: int | None = None,
     max_rounds: int = 100,
 ) -> SmoothedRecords:
@@ -158,8 +166,11 @@ def smooth(
             learnt. Default: all.
         process_noise: The same of what a step adds to f_p. Learnt, it makes the best predictions of
             the next measurement; a small one fits f_p to long free runs.
+        sensors: Sensors of states, with unknown gains, offsets and delays. Measurements begin later
+            by the longest delay that is likely; the errors of the measurements above are in the
+            unit of the sensor, those found in that of the state.
         num_starts: How many starts to take the best end of. Default: 4 with hidden states and
-            unknown parameters, else 1.
+            unknown parameters, 8 with sensors, else 1.
         max_rounds: The most rounds of smoothing of each; most settle in 15 to 40.
 
     Raises:
@@ -176,45 +187,41 @@ def smooth(
         A mass on a spring of unknown stiffness, of which only the position is measured:
 
         >>> import torch
+        >>> from gpadjust import FormulaPhysics, ODEPhysics, Unknown
         >>> from gpadjust.records import Record, Records, smooth
-        >>> from gpadjust.physics import ODEPhysics, Unknown
         >>> from gpadjust.states import StateSpec
-        >>> def spring(x, u, p):
-        ...     return torch.stack([x[:, 1], u[:, 0] - p.stiffness * x[:, 0]], dim=-1)
-        >>> unknowns = {"stiffness": Unknown(1.0, factor=2.0)}
-        >>> physics = ODEPhysics(spring, step=0.1, state_dim=2, unknowns=unknowns)
+        >>> unknowns = {"k": Unknown(1.0, factor=2.0)}
+        >>> spring = FormulaPhysics("v, u - k * x", ["x", "v", "u"], unknowns=unknowns)
         >>> t = 0.1 * torch.arange(50, dtype=torch.float64)
         >>> position = (1.5 * t).cos() + 0.01 * torch.randn(50, dtype=torch.float64)
         >>> states = torch.stack([position, torch.full_like(t, torch.nan)], dim=-1)
-        >>> spec = StateSpec(["x", "v"], ["u"])
-        >>> records = Records(Record(t, states, torch.zeros_like(states[:, :1])), spec)
-        >>> smoothed = smooth(records, physics, start={"v": (0.0, 1.0)})
+        >>> record = Record(t, states, torch.zeros_like(states[:, :1]))
+        >>> records = Records(record, StateSpec(["x", "v"], ["u"]))
+        >>> smoothed = smooth(records, ODEPhysics(spring, 0.1, 2), start={"v": (0.0, 1.0)})
         >>> bool((smoothed.physics_parameters.mean - 2.25).abs() < 0.05)
         True
     """
     checked_whole("max_rounds", max_rounds, 1)
-    steps = with_known_inputs(control_steps(records, step))
-    spec, length = records.spec, steps.records[0].sampling_step
-    f_p = one_physics(physics, spec, "smooth by one of them")
-    substeps = substeps_of(f_p, steps, length)
-    known = {"noise": noise, "process_noise": process_noise}
-    variances = np.stack([_variances(sd, name, spec) for name, sd in known.items()])
-    chain = Chain(f_p, steps, variances, first_moments(start, spec), substeps)
+    chain = chain_of(records, physics, step, start, noise, process_noise, sensors)
     if num_starts is None:
-        num_starts = 4 if chain.hidden.any() and f_p.unknowns else 1
+        num_starts = 1
+        if sensors is not None:
+            num_starts = 8
+        elif chain.hidden.any() and chain.unknowns:
+            num_starts = 4
     checked_whole("num_starts", num_starts, 1)
     estimate, is_settled = _estimate(chain, max_rounds, num_starts)
     covariances = np.concatenate([part.states.covariances for part in estimate.stretches])
     sd = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)[:, : chain.d].clip(0))
     noises = np.sqrt(estimate.variances)
     noises[0, chain.hidden] = math.nan
-    sd_of_noise, sd_of_process = _of_all_states(noises, spec)
-    each_sd = _of_all_states(sd, spec).split([len(record.times) for record in steps])
+    noises[0] /= chain.gain(estimate.states[0, chain.d :])  # in the unit of the states
+    noise, process_noise = _of_all_states(noises, chain.spec)
     return SmoothedRecords(
-        _with_states(steps, estimate.states),
-        each_sd,
-        sd_of_noise,
-        sd_of_process,
+        _with_states(chain.steps, estimate.states),
+        _of_all_states(sd, chain.spec).split(chain.lengths.tolist()),
+        noise,
+        process_noise,
         estimate.log_density,
         is_settled,
         chain,
@@ -222,11 +229,33 @@ def smooth(
     )
 
 
+def chain_of(
+    records: Records,
+    physics: Physics | Callable[[Tensor], Tensor],
+    step: float | None,
+    start: Mapping[str, tuple[float, float]] | None,
+    noise: Tensor | None = None,
+    process_noise: Tensor | None = None,
+    sensors: Sensors | None = None,
+) -> Chain:
+    """Return the chain of all stretches of records; arguments are those of :func:`smooth`."""
+    check_kind("sensors", sensors, Sensors | None, 'such as Sensors(["x"], offset={...})')
+    steps = with_known_inputs(control_steps(records, step))
+    spec = records.spec
+    length = steps.records[0].sampling_step
+    f_p = one_physics(physics, spec, "take one of them")
+    substeps = substeps_of(f_p, steps, length)
+    noises = {"noise": noise, "process_noise": process_noise}
+    variances = np.stack([_variances(sd, name, spec) for name, sd in noises.items()])
+    return Chain(f_p, steps, variances, first_moments(start, spec), substeps, sensors)
+
+
 def substeps_of(f_p: Physics, steps: Records, length: float) -> int:
     """Return how many steps of the physics make a control step: 1, or as many as it has samples."""
     if f_p.step is None or abs(f_p.step - length) <= _SAME * length:
         return 1
-    samples, spec = steps.records[0].within.shape[1], steps.spec
+    spec = steps.spec
+    samples = steps.records[0].within.shape[1]
     if len(spec.moving) == spec.state_dim and abs(f_p.step * samples - length) <= _SAME * length:
         return samples
     raise ValueError(
@@ -236,9 +265,8 @@ def substeps_of(f_p: Physics, steps: Records, length: float) -> int:
     )
 
 
-def drawn_parameters(physics: Physics, mean: Array, covariance: Array) -> PhysicsParameters:
+def drawn_parameters(unknowns: Unknowns, mean: Array, covariance: Array) -> PhysicsParameters:
     """Draw parameters from a normal distribution of their coordinates; none if there are none."""
-    unknowns = physics.unknowns
     if not unknowns:
         return PhysicsParameters({}, [])
     values, vectors = torch.linalg.eigh(torch.from_numpy(covariance.copy()))
@@ -256,7 +284,8 @@ def _of_all_states(moving: Array, spec: StateSpec) -> Tensor:
 
 def _with_states(steps: Records, path: Array) -> Records:
     """Return records of other states that move, ``M x (d + p)`` one record after the other."""
-    records, moving = [], steps.spec.moving
+    records = []
+    moving = steps.spec.moving
     parts = torch.from_numpy(path[:, : len(moving)]).split([len(record.times) for record in steps])
     for record, part in zip(steps, parts, strict=True):
         states = record.states.clone()
@@ -268,17 +297,18 @@ def _with_states(steps: Records, path: Array) -> Records:
 
 def with_known_inputs(steps: Records) -> Records:
     """Return stretches from where all inputs of the physics that do not move are known."""
-    spec, records = steps.spec, []
+    spec = steps.spec
+    records = []
     beside = [i for i in spec.physics_columns if i < spec.state_dim and i not in spec.moving]
     names = [spec.states[i] for i in beside]
     for name in names:
-        held = name
-        while held in spec.previous:
-            held = spec.previous[held]
-        if held != name and held in spec.states:
+        origin = name
+        while origin in spec.previous:
+            origin = spec.previous[origin]
+        if origin != name and origin in spec.states:
             raise ValueError(
-                f"The physics reads {name!r}, an earlier value of the state {held!r}, which smooth "
-                "would have to find, too; it takes earlier actions only."
+                f"The physics reads {name!r}, an earlier value of the state {origin!r}, but "
+                "`smooth` takes earlier actions only."
             )
     for record in steps:
         unknown = record.states[:-1, beside].isnan().any(1).nonzero().flatten().tolist()
@@ -294,8 +324,9 @@ def with_known_inputs(steps: Records) -> Records:
 
 def _variances(sd: Tensor | None, name: str, spec: StateSpec) -> Array:
     """Return variances of the states that move, NaN where they are to be learnt."""
-    unknown = torch.full((spec.state_dim,), math.nan, dtype=torch.float64)
-    sd = of_states(unknown if sd is None else sd, name, (spec.state_dim,))
+    if sd is None:
+        sd = torch.full((spec.state_dim,), math.nan, dtype=torch.float64)
+    sd = of_states(sd, name, (spec.state_dim,))
     if (sd <= 0).any() or sd.isinf().any():
         raise ValueError(
             f"Expected {name} as standard deviations above 0, or NaN for those to be learnt, got "
@@ -363,10 +394,9 @@ def _estimate(chain: Chain, max_rounds: int, num_starts: int) -> tuple[Estimate,
     is_settled = bool(arrived) and abs(gained) <= _STILL
     if not is_settled:
         warnings.warn(
-            f"The states did not settle in {max_rounds} rounds. Raise num_starts, say more of what "
-            "is known (start, narrower priors), or look whether the physics is defined, and "
-            "without jumps, about these states. `smooth` also has max_rounds, noise and "
-            "process_noise.",
+            f"The states did not settle in {max_rounds} rounds. Raise num_starts, give narrower "
+            "priors or a start, or check that the physics is defined, and without jumps, near "
+            "these states. `smooth` also has max_rounds, noise and process_noise.",
             SmoothingWarning,
             stacklevel=3,
         )
@@ -393,7 +423,8 @@ def _search(
     if known_at_once:
         variances = chain.checked(variances)
     climb = _Climb(chain.counts / 2)
-    value, gained, hoped = -math.inf, math.inf, math.inf
+    value = -math.inf
+    gained = hoped = math.inf
     for _ in range(max_rounds):
         tick("rounds")
         # E: p(x, theta | y) of the chain x[t + 1] = F[t] x[t] + b[t] + q[t], F = df_p / dx
@@ -401,23 +432,28 @@ def _search(
         smoothed, density = kalman.smooth_chain(links, chain.starts, *variances)
         if not math.isfinite(density):
             raise np.linalg.LinAlgError
-        gained, value = density - value, density
-        means = np.concatenate([stretch.states.means for stretch in smoothed])
-        estimate = Estimate(smoothed, means, variances, density)
+        gained = density - value
+        value = density
+        states = np.concatenate([stretch.states.means for stretch in smoothed])
+        estimate = Estimate(smoothed, states, variances, density)
         # x <- x + share (E[x | y] - x), share = 1, 1/2, ... until p(x, theta, y) is no less
         path, share = chain.towards(path, estimate)
         if 0 < share < 1:
             continue
         if max(hoped, abs(gained)) < _ARRIVED:
             off = np.abs(estimate.states[:, : chain.d] - path.states) / chain.spread
-            return estimate, 0.0 if off.max() < _RIGHT else math.inf
+            if off.max() >= _RIGHT:
+                gained = math.inf
+            return estimate, gained
         # log R and log Q climb; known ones go to their values
         ratio = chain.likely_variances(links, smoothed) / variances
         gradient = np.where(chain.is_known, 0.0, chain.counts / 2 * (ratio - 1))
         aim = variances * np.exp(climb.step(np.log(variances), gradient, gained))
         moved = np.log(chain.checked(aim) / variances).clip(-_NEARER, _NEARER)
         variances = variances * np.exp(moved)
-        hoped = math.inf if moved[chain.is_known].any() else float((gradient * moved).sum())
+        hoped = float((gradient * moved).sum())
+        if moved[chain.is_known].any():
+            hoped = math.inf
     return estimate, gained
 
 
@@ -435,16 +471,17 @@ class _Climb:
 
     def step(self, x: Array, gradient: Array, gained: float) -> Array:
         """Return the step from ``x``, to which the last step led, and gained so much."""
-        at, g = x.ravel(), gradient.ravel()
+        point, g = x.ravel(), gradient.ravel()
         if gained < 0 or self.last is None:
             self.inverse = self.first
         else:
-            s, y = at - self.last[0], self.last[1] - g
+            s = point - self.last[0]
+            y = self.last[1] - g
             if s @ y > 0:
                 # H <- (I - s y' / s'y) H (I - y s' / s'y) + s s' / s'y
                 left = np.eye(len(s)) - np.outer(s, y) / (s @ y)
                 self.inverse = left @ self.inverse @ left.T + np.outer(s, s) / (s @ y)
-        self.last = at, g
+        self.last = point, g
         return (self.inverse @ g).clip(-_NEARER, _NEARER).reshape(x.shape)
 
 
@@ -462,8 +499,8 @@ class Chain:
 
     Rows of the stretches are one after the other: ``M`` states, of which ``N`` are followed by
     another one. Known are variances of noise and process noise, and mean and standard deviation of
-    first states, ``2 x d`` each; NaN where they are not. A ValueError says if nothing was measured,
-    or a hidden state has no start.
+    first states, ``2 x d`` each; NaN where they are not. A ValueError refuses records without
+    measurements, and hidden states without a start.
     """
 
     def __init__(
@@ -473,10 +510,22 @@ class Chain:
         variances: Array,
         start: Array,
         substeps: int = 1,
+        sensors: Sensors | None = None,
     ) -> None:
-        self.physics, self.spec = physics, steps.spec
+        self.physics = physics
+        self.steps = steps
+        self.spec = steps.spec
         moving = self.spec.moving
-        self.d, self.num_parameters = len(moving), len(physics.unknowns)
+        mean, sd = start
+        names = [self.spec.states[i] for i in moving]
+        self.sensing: Sensing | None = None
+        self.unknowns = physics.unknowns
+        if sensors is not None:
+            sensing = Sensing(sensors, physics, self.spec, steps.records[0].sampling_step)
+            self.sensing = sensing if sensing.places else None
+            self.unknowns = sensing.unknowns
+        self.d = len(moving)
+        self.num_parameters = len(self.unknowns)
         self.angles = [moving.index(i) for i in self.spec.angle_columns if i in moving]
         self.lengths = np.array([len(record.times) for record in steps])
         ends = self.lengths.cumsum()
@@ -491,18 +540,20 @@ class Chain:
             self.within = torch.cat([record.within for record in steps])
         y = self.measured = states[:, moving].numpy()
         for rows in self.stretches:
-            for i in self.angles:  # go on without jumps
-                known = rows.start + np.flatnonzero(~np.isnan(y[rows, i]))
-                y[known, i] = np.unwrap(y[known, i])
+            for i in self.angles:  # without jumps
+                places = rows.start + np.flatnonzero(~np.isnan(y[rows, i]))
+                y[places, i] = np.unwrap(y[places, i])
+            for i, longest in enumerate([] if self.sensing is None else self.sensing.longest):
+                y[rows][:longest, i] = math.nan
+        y = self.corrected(y, np.zeros(self.num_parameters))
         self.hidden = np.isnan(y).all(0)
-        (mean, sd), names = start, [self.spec.states[i] for i in moving]
         if self.hidden.all():
             raise ValueError(f"Expected measured states, found none of {', '.join(names)}.")
         for column in np.flatnonzero(self.hidden & np.isnan(mean)):
             name = repr(names[column])
             raise ValueError(
-                f"State {name} was never measured; say where it may be at the beginning of a "
-                f"stretch, such as start={{{name}: (0.0, 1.0)}}: mean and standard deviation."
+                f"State {name} was never measured; give mean and standard deviation of where it "
+                f"may be at the beginning of a stretch, such as start={{{name}: (0.0, 1.0)}}."
             )
         # By how much each state varies, as far as is known
         middle = _means(y, otherwise=0.0)
@@ -529,14 +580,13 @@ class Chain:
     def starts_of_search(self, number: int) -> Iterator[tuple[Array, bool]]:
         """Yield coordinates of the parameters, and if known variances are so from the beginning.
 
-        They are at the guesses, and then at draws from the priors. Variances that are known come
-        down to this from the sizes of f_p's errors in single steps, as a trajectory that may hardly
-        leave the physics is often found by way of those that may; of every other start they are so
-        from the beginning.
+        They are the guesses, then draws from the priors. Known variances begin with the squares of
+        f_p's errors, as a path that must follow the physics is often found by way of others, but
+        in every other start.
         """
         p = self.num_parameters
         something_known = self.something_is_known
-        starts = [np.zeros(p)] * (2 if something_known else 1)
+        starts = [np.zeros(p)] * (1 + something_known)
         if p and number > len(starts):
             starts += [*even_normal(number - len(starts), p, seed=0).numpy()]
         for i, coordinates in enumerate(starts[:number]):
@@ -544,7 +594,9 @@ class Chain:
 
     def first_path(self, parameters: Array) -> Path:
         """Return measured states, and between them and in hidden ones those to which f_p leads."""
-        states, measured, x = self.measured.copy(), self.measured.copy(), self.first.copy()
+        measured = self.corrected(self.measured, parameters).copy()
+        states = measured.copy()
+        x = self.first.copy()
         for t in range(self.lengths.max() if np.isnan(measured).any() else 0):
             going = self.lengths > t
             rows = self.firsts[going] + t
@@ -556,29 +608,51 @@ class Chain:
             if going.any():
                 x[going] = self._defined(self.firsts[going] + t, x[going], parameters)
         following = self._defined(self.now, states[self.now], parameters)
+        if self.sensing is not None:
+            measured = self.near(self.measured, self.outputs(states, parameters))
         return Path(states, measured, parameters, following)
+
+    def corrected(self, measured: Array, parameters: Array) -> Array:
+        """Return the states ``M x d`` that measurements show."""
+        if self.sensing is None:
+            return measured
+        return self.sensing.corrected(measured, parameters, self.stretches)
+
+    def outputs(self, states: Array, parameters: Array) -> Array:
+        """Return what the sensors show of states ``M x d``."""
+        if self.sensing is None:
+            return states
+        return self.sensing.outputs(states, parameters, self.stretches)
+
+    def gain(self, parameters: Array) -> Array:
+        """Return sizes of the gains of the sensors, ``d``."""
+        if self.sensing is None:
+            return np.ones(self.d)
+        return np.abs(self.sensing.values(parameters)[0])
 
     def path_of(self, estimate: Estimate) -> Path:
         """Return the path of an estimate."""
         states, parameters = estimate.states[:, : self.d], estimate.states[0, self.d :]
         following = self.follow(self.now, states[self.now], parameters)
-        return Path(states, self.near(self.measured, states), parameters, following)
+        measured = self.near(self.measured, self.outputs(states, parameters))
+        return Path(states, measured, parameters, following)
 
     def first_variances(self, path: Path) -> Array:
         """Return first variances of both noises, by f_p's errors in single steps."""
         change = ((path.following - path.states[self.now]) ** 2).mean(0)
-        errors = (path.measured[self.now + 1] - path.following) ** 2
+        shown = self.corrected(path.measured, path.parameters)
+        errors = ((shown[self.now + 1] - path.following) * self.gain(path.parameters)) ** 2
         noise = _SHARE * _means(errors, otherwise=_HIDDEN**2 * change)
         return np.stack([noise, 2 * noise]).clip(self.least)
 
     def checked(self, variances: Array) -> Array:
         """Return variances, in their place the known ones, and none too small to compute with."""
-        known = self.known_variances
-        return np.where(np.isnan(known), variances, known).clip(self.least)
+        return np.where(self.is_known, self.known_variances, variances).clip(self.least)
 
     def linearised(self, path: Path) -> list[Link]:
         """Linearise the chain near a path: z[t + 1] = F[t] z[t] + b[t] with z = (x, theta)."""
-        d, p, x = self.d, self.num_parameters, path.states[self.now]
+        d, p = self.d, self.num_parameters
+        x = path.states[self.now]
         sizes = _STEP * np.concatenate([self.spread, np.ones(p)])
         dx, dtheta = np.split(np.diag(sizes), [d], axis=1)
         ahead = self.follow(self.now, x + dx[:, None], path.parameters + dtheta)
@@ -590,17 +664,21 @@ class Chain:
         b = np.zeros_like(z)
         b[:, :d] = path.following - np.einsum("tij,tj->ti", F[:, :d], z)
         cuts = (self.lengths - 1).cumsum()[:-1]
-        outputs, links = np.eye(d, d + p), []
+        links = []
         parts = zip(self.stretches, np.split(F, cuts), np.split(b, cuts), strict=True)
         for rows, matrices, offsets in parts:
             y = path.measured[rows]
-            links.append(Link(matrices, offsets, np.tile(outputs, (len(y), 1, 1)), y))
+            H = np.tile(np.eye(d, d + p), (len(y), 1, 1))
+            if self.sensing is not None:
+                H, y = self.sensing.linearised(path.states[rows], path.parameters, y)
+            links.append(Link(matrices, offsets, H, y))
         return links
 
     def towards(self, path: Path, estimate: Estimate) -> tuple[Path, float]:
         """Go to the estimate, or as much of the way as explains more; return the share, maybe 0."""
         ahead, theta = estimate.states[:, : self.d], estimate.states[0, self.d :]
-        before, share = self.cost(path, estimate.variances), 1.0
+        before = self.cost(path, estimate.variances)
+        share = 1.0
         for _ in range(_HALVINGS):
             states = path.states + share * (ahead - path.states)
             parameters = path.parameters + share * (theta - path.parameters)
@@ -621,7 +699,8 @@ class Chain:
     def cost(self, path: Path, variances: Array) -> float:
         """Return twice the negative log density of a path, up to a constant; NaN if f_p fails."""
         noise, process_noise = variances
-        errors = np.nansum((path.measured - path.states) ** 2 / noise)
+        outputs = self.outputs(path.states, path.parameters)
+        errors = np.nansum((path.measured - outputs) ** 2 / noise)
         added = (path.states[self.now + 1] - path.following) ** 2 / process_noise
         begins = (path.states[self.firsts] - self.first) ** 2 / self.first_variance
         return float(errors + added.sum() + begins.sum() + (path.parameters**2).sum())
@@ -634,10 +713,9 @@ class Chain:
             action = self.recorded[rows[failed[0]], self.spec.state_dim :].tolist()
             raise PhysicsError(
                 f"Physics {self.physics.name!r} fails at {len(failed)} of {len(states)} states "
-                f"where smoothing begins, the first of which is {states[failed[0]].tolist()} under "
-                f"the action {action}. They are measured ones, which may be "
-                "some noise beyond what is possible, or where the physics leads from `start` with "
-                "its guesses: let it go on smoothly beyond its limits, or say another start."
+                f"where smoothing begins, first {states[failed[0]].tolist()} under the action "
+                f"{action}. They were measured with noise, or guesses lead there from `start`: "
+                "let the physics be smooth beyond its limits, or give another start."
             )
         return following
 
@@ -648,8 +726,10 @@ class Chain:
         """
         inputs = self.recorded[rows].expand(*states.shape[:-1], -1).clone()
         following = torch.from_numpy(np.ascontiguousarray(states))
+        values = None
         unknowns = self.physics.unknowns
-        values = unknowns.to_values(torch.from_numpy(parameters)) if unknowns else None
+        if unknowns:
+            values = unknowns.to_values(torch.from_numpy(parameters)[..., : len(unknowns)])
         for actions in self.within[rows].unbind(1):
             inputs[..., self.spec.moving] = following
             inputs[..., self.spec.state_dim :] = actions
@@ -659,8 +739,9 @@ class Chain:
 
     def near(self, states: Array, others: Array) -> Array:
         """Return states ``... x d``, their angles within half a turn of those of others."""
-        near, a = states.copy(), self.angles
-        near[..., a] -= 2 * np.pi * np.round((states[..., a] - others[..., a]) / (2 * np.pi))
+        near = states.copy()
+        turns = np.round((states - others)[..., self.angles] / (2 * np.pi))
+        near[..., self.angles] -= 2 * np.pi * turns
         return near
 
 
@@ -669,65 +750,3 @@ def _means(values: Array, otherwise: Array | float) -> Array:
     columns = np.ascontiguousarray(values.T)
     number = (~np.isnan(columns)).sum(1)
     return np.where(number > 0, np.nansum(columns, 1) / number.clip(1), otherwise)
-
-
-def variation(chain: Chain, estimate: Estimate) -> Tensor:
-    r"""Estimate standard deviations of stretches' parameters, ``p``, in those of the priors.
-
-    With :math:`\theta_s = \theta + \eta_s` in the coordinates in which priors are standard normal,
-    :math:`\eta_s \sim N(0, \operatorname{diag}(v^2))` for stretch s, and the noises as they were
-    found, v is where its posterior density is highest (empirical Bayes for random effects,
-    Laird and Ware 1982), with :math:`\log v \sim N(\log 0.05, 1)`: what the stretches say nothing
-    of stays there.
-    """
-    precision, pull = _of_each_stretch(chain, estimate)
-    start = math.log(_MEDIAN)
-    log_v = torch.full_like(pull[0], start).requires_grad_()
-    search = torch.optim.LBFGS([log_v], max_iter=60, line_search_fn="strong_wolfe")
-
-    def cost() -> Tensor:
-        search.zero_grad()
-        prior = 0.5 * (log_v - start).square().sum()
-        value = prior - log_evidence(precision, pull, log_v.exp())
-        value.backward()
-        return value
-
-    search.step(cost)
-    return log_v.detach().exp()
-
-
-def log_evidence(precision: Tensor, pull: Tensor, v: Tensor) -> Tensor:
-    r"""Return the log density of all stretches by v, up to a constant.
-
-    What stretch s says of its parameters is
-    :math:`\exp(h_s^\top \theta_s - \theta_s^\top \Lambda_s \theta_s / 2)`; :math:`\eta_s`, and then
-    :math:`\theta \sim N(0, I)`, are integrated out. Precisions :math:`\Lambda_s` are
-    ``S x p x p``, pulls :math:`h_s` ``S x p``, standard deviations v of the :math:`\eta_s` ``p``.
-    """
-    eye = torch.eye(len(v), dtype=v.dtype)
-    scaled, h = precision * v, pull * v  # Lambda_s V, V h_s
-    root = torch.linalg.cholesky(eye + v.unsqueeze(-1) * scaled)
-    shift = torch.cholesky_solve(h.unsqueeze(-1), root).squeeze(-1)
-    own = 0.5 * (h * shift).sum() - root.diagonal(dim1=-2, dim2=-1).log().sum()
-    shared = eye + (precision - scaled @ torch.cholesky_solve(scaled.mT, root)).sum(0)
-    left = (pull - (scaled @ shift.unsqueeze(-1)).squeeze(-1)).sum(0).unsqueeze(-1)
-    whole = torch.linalg.cholesky((shared + shared.mT) / 2)
-    common = 0.5 * (left * torch.cholesky_solve(left, whole)).sum()
-    return own + common - whole.diagonal().log().sum()
-
-
-def _of_each_stretch(chain: Chain, estimate: Estimate) -> tuple[Tensor, Tensor]:
-    """Return precision and pull of each stretch, smoothed alone about the estimate by all."""
-    d, p = chain.d, chain.num_parameters
-    path = chain.path_of(estimate)
-    parameters = path.parameters
-    precisions, pulls = [], []
-    for link, (mean, covariance) in zip(chain.linearised(path), chain.starts, strict=True):
-        start = np.concatenate([mean[:d], parameters]), covariance  # a standard normal prior there
-        (alone,), _ = kalman.smooth_chain([link], [start], *estimate.variances)
-        covariance = alone.states.covariances[0, d:, d:]
-        # No stretch knows less than its prior, but by rounding.
-        values, vectors = np.linalg.eigh(np.linalg.inv(covariance) - np.eye(p))
-        precisions.append((vectors * values.clip(0)) @ vectors.T)
-        pulls.append(np.linalg.solve(covariance, alone.states.means[0, d:] - parameters))
-    return torch.from_numpy(np.stack(precisions)), torch.from_numpy(np.stack(pulls))

@@ -221,8 +221,8 @@ def _of_log(arguments: Namespace) -> Job:
             f"Expected the angle {wrong[0]!r} in rad, found {units[wrong[0]]!r}; convert it, or do "
             "without --angles, which is for angles that go round."
         )
-    # The step of the specification depends on that of the records.
-    records = Records.read_csv(tables, StateSpec(*names, angles=angles), **columns).records
+    spec = StateSpec(*names, angles=angles)
+    records = Records.read_csv(tables, spec, **columns)
 
     # Read the equations, whose step is the sampling step by default.
     renamed = {**columns["states"], **columns["actions"]}
@@ -230,19 +230,20 @@ def _of_log(arguments: Namespace) -> Job:
     others = [name for name in tables[0].names if name not in bare_names]
     sides = [text.partition("=")[2] for text in arguments.physics if ":" not in text]
     read.check_constants(sides, [*renamed, *others, *unknowns])
+    # Equations are integrated along the recorded actions, also within a control step.
+    sampling = float(f"{records.records[0].sampling_step:.{_DIGITS}g}")
+    motion = read.motion(arguments.physics, *names, unknowns, sampling)
+    physics = motion.physics
     step = arguments.step
     if step is None:
-        step = float(f"{records[0].sampling_step:.{_DIGITS}g}")
-    motion = read.motion(arguments.physics, *names, unknowns, step)
-    physics = motion.physics
-    if physics.step is not None:  # a physics of a module may have its own
-        step = physics.step
-    if arguments.step not in (None, step):
+        step = physics.step or sampling
+    if motion.modules and physics.step not in (None, step):
         raise ValueError(
-            f"Expected no --step, as the physics has a step of {step:g}, found {arguments.step:g}."
+            f"Expected no --step, as the physics has a step of {physics.step:g}, found "
+            f"{arguments.step:g}."
         )
-    spec = StateSpec(*names, angles=angles, step=step)
     options = {
+        "step": step,
         "start": {name: (prior.guess, prior.sd) for name, prior in hidden.items()} or None,
         "held_out": arguments.held_out,
         "num_starts": arguments.starts,
@@ -251,7 +252,7 @@ def _of_log(arguments: Namespace) -> Job:
 
     def work() -> Identification:
         try:
-            return identify(Records(records, spec), physics, **options)
+            return identify(records, physics, **options)
         except RuntimeError as error:  # the states diverged, or the physics failed
             raise ValueError(str(error)) from error
 
@@ -285,7 +286,7 @@ def _program(
 from gpadjust.records import Records, identify
 from gpadjust.states import StateSpec
 
-spec = StateSpec({states!r}, {actions!r}, step={spec.step!r}{angles})
+spec = StateSpec({states!r}, {actions!r}{angles})
 records = Records.read_csv(
     {[*files]!r},
     spec,
@@ -297,8 +298,8 @@ print(machine)
 # From the last state of the fitted part, under other actions: {", ".join(actions)}
 smoothed = machine.smoothed
 state = smoothed.records.records[-1].states[-1:]
-plan = torch.zeros(1, 100, {len(actions)}, dtype=torch.float64)  # of 100 steps
-noises = {{"start_noise": smoothed.sd[-1][-1], "process_noise": smoothed.process_noise}}
+plan = torch.zeros(1, 100, {len(actions)}, dtype=torch.float64)  # of 100 steps, machine.step each
+noises = {{"start_noise": smoothed.sd[-1][-1], "process_noise": machine.dynamics.process_noise}}
 run = machine.dynamics.free_run(state, plan, noise=False, **noises)
 print(run.mean, run.lower, run.upper)
 """

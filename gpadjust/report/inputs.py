@@ -45,6 +45,8 @@ _HINT = (
 _PRIOR = re.compile(
     r"\s*([^=\[]+?)\s*(?:\[(.*)\])?\s*=\s*(.+?)\s*(\+/?-|±|\*/|\.\.)\s*(.+?)\s*(%?)\s*"
 )  # name, unit, guess, operator, spread, percent sign
+# name of a function, its variable, ends of its range
+_FUNCTION = re.compile(r"(\w+)\((.+?)\s*:\s*(.+?)\s*\.\.\s*(.+?)\)")
 # name, prime of a derivative, right side
 _EQUATION = re.compile(r"\s*([^\W\d]\w*)\s*('?)\s*=(?!=)(.*)", flags=re.DOTALL)
 _HOW = "A Python function is given as module:function, such as pump:head."
@@ -256,13 +258,15 @@ def unknown_of(text: str) -> tuple[str, Unknown]:
     """Return the name and the prior of an unknown parameter.
 
     It is ``"E [Pa]=210e9 +- 20 %"``, a standard deviation, of a percentage one that keeps the sign;
-    or ``"c=0.1 */ 2"``, a factor; or ``"e=0.1 .. 0.3"``, bounds.
+    or ``"c=0.1 */ 2"``, a factor; or ``"e=0.1 .. 0.3"``, bounds. ``"c(speed: 0 .. 9)=0.1 */ 2"`` is
+    a function.
     """
     match = _PRIOR.fullmatch(text)
     try:
         if match is None:
             raise ValueError("it has another form")
         name, unit, guess, operator, spread, is_share = match.groups()
+        function = _FUNCTION.fullmatch(name)
         first = float(guess)
         second = float(spread)
         options: dict[str, Any] = {"sd": second}
@@ -276,6 +280,9 @@ def unknown_of(text: str) -> tuple[str, Unknown]:
         elif operator == "..":
             options = {"bounds": (first, second)}
             first = 0.5 * (first + second)
+        if function is not None:
+            name, variable, low, high = function.groups()
+            options |= {"function_of": variable, "between": (float(low), float(high))}
         return name, Unknown(first, unit=unit or "", **options)
     except ValueError as error:
         raise ValueError(

@@ -55,14 +55,17 @@ def page(machine: Identification, title: str | None, origin: Origin) -> Page:
     spec = machine.spec
     units = origin.units
     measured = machine.windows.measured
-    times = (number(n * machine.step) for n in (1, measured.shape[1]))
+    control_step = machine.smoothed.records.records[0].sampling_step
+    seconds = measured.shape[1] * machine.step
+    times = map(number, (control_step, seconds))
     step, held_out = (f"{time} {units.get('time', '')}".strip() for time in times)
     steps = sum(len(record.times) - 1 for record in machine.smoothed.records)
     # Steps that are fitted, and held out.
     hidden = f", {listed(machine.hidden)} hidden" * bool(machine.hidden)
     lead = (
         f"{listed(spec.states)}{hidden}, under {listed(spec.actions)}: fitted to "
-        f"{plural(steps, 'step')} of {step}, {plural(measured[..., 0].numel(), 'step')} held out."
+        f"{plural(steps, 'step')} of {step}, "
+        f"{plural(len(measured) * round(seconds / control_step), 'step')} held out."
     )
     cards, rows = _judged(machine, units, held_out)
     head = ["by", "state", "error (root mean square)", "unit", "95 % intervals cover"]

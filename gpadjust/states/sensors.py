@@ -15,7 +15,7 @@ from gpadjust.states.state_spec import StateSpec, checked_names
 
 @dataclass(frozen=True, eq=False)
 class Sensors:
-    """The measured outputs of a state, with noise; the rest of the state is hidden.
+    r"""The measured outputs of a state, with noise; the rest of the state is hidden.
 
     Args:
         outputs: The names of the measured states, angles as their sine and cosine; or the names of
@@ -25,6 +25,10 @@ class Sensors:
         noise: Guesses of the standard deviations of the noise, by the name of the output, each with
             the weight of ten measurements. Default: at first a tenth of the change of an output in
             a step, then an estimate.
+        gain, offset, delay: Of a log, :func:`~gpadjust.records.smooth` estimates these: by the name
+            of the output an :class:`~gpadjust.physics.Unknown` each, with
+            :math:`y_t = \text{gain} \, x(t - \text{delay}) + \text{offset}`, the delay in the
+            unit of the times. Default: 1, 0 and 0.
 
     Raises:
         TypeError, ValueError: If there is no output, names are not strings, ``function`` is not a
@@ -48,6 +52,9 @@ class Sensors:
     function: Callable[[Tensor], Tensor] | None = None
     _: KW_ONLY
     noise: Mapping[str, float] = field(default_factory=dict)
+    gain: Mapping[str, Any] = field(default_factory=dict)
+    offset: Mapping[str, Any] = field(default_factory=dict)
+    delay: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check names and guesses."""
@@ -61,6 +68,14 @@ class Sensors:
         for name, guess in self.noise.items():
             checked_number(f"The noise of {name!r}", guess, above=0)
             check_choice("output", name, self.outputs)
+        for argument, unknowns in self.unknowns.items():
+            for name in unknowns:
+                check_choice(f"output of {argument}", name, self.outputs)
+
+    @property
+    def unknowns(self) -> dict[str, Mapping[str, Any]]:
+        """Unknown parameters by ``"gain"``, ``"offset"`` and ``"delay"``, and by output."""
+        return {"gain": self.gain, "offset": self.offset, "delay": self.delay}
 
     def spec(self, spec: StateSpec) -> StateSpec:
         """Return a spec with the outputs as its states."""
@@ -78,6 +93,12 @@ class Sensors:
 
     def measure(self, spec: StateSpec, states: Tensor) -> Tensor:
         """Return outputs ``N x len(outputs)`` of states ``N x state_dim``, without noise."""
+        # An estimate of these is in the fit of a log, not in the sensors.
+        if any(self.unknowns.values()):
+            raise ValueError(
+                "Sensors: an unknown gain, offset or delay is for `smooth` and `identify`; give "
+                "these sensors to one of them, and correct later measurements by its estimate."
+            )
         if self.function is None:
             return states[:, [spec.states.index(name) for name in self.outputs]]
         values: Any = self.function(states)  # of the user: anything

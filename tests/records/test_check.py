@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from gpadjust.physics import FormulaPhysics, FunctionPhysics, ODEPhysics, Unknown
+from gpadjust.physics import FunctionPhysics, Unknown
 from gpadjust.records import Record, Records, check_log
 from gpadjust.records.check import Direction
 from gpadjust.states import StateSpec
@@ -76,9 +76,3 @@ def test_what_no_action_moves_is_not_told_and_an_input_is_named():
     calls.clear()
     check_log(log(np.random.default_rng(1).uniform(-1, 1, ROWS)), physics)
     assert sum(calls) <= 10 * 2 * ROWS  # evaluations of f_p in all, for two parameters
-
-
-def test_a_physics_without_unknown_parameters_is_refused():
-    rate = FormulaPhysics("-x + u", ["x", "u"])
-    with pytest.raises(ValueError, match="physics with unknown parameters; found none, to check"):
-        check_log(log(np.zeros(ROWS)), ODEPhysics(rate, STEP, 1))

@@ -100,7 +100,9 @@ def test_intervals_that_allow_for_a_missing_force_hold_the_damping(dry, right):
     assert not low[1] < 0.3 < high[1]
     assert wide_low[0] < 4 < wide_high[0]
     assert wide_low[1] < 0.3 < wide_high[1]
-    assert any("c " in each and "Dry friction, say, is hard to tell" in each for each in dry.advice)
+    assert any(
+        "c " in each and "Dry friction, for one, is hard to tell" in each for each in dry.advice
+    )
     assert right.robust_parameters.sd[1] < 0.1 * dry.robust_parameters.sd[1]
 
 
@@ -153,7 +155,7 @@ def test_better_than_the_guesses_by_chance_is_no_yes(right):
     assert found.errors["identified"][0] < found.errors["guesses"][0]
     answer, reasons = found.verdicts["angle"]
     assert answer == "In part"
-    assert reasons[-1] == "It errs less by chance than the guesses do."
+    assert reasons[-1] == "Its error is less by chance than that of the guesses."
     worse = replace(
         right, runs={"identified": guessed._replace(mean=measured + 50.0), "guesses": run}
     )

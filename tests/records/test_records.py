@@ -262,23 +262,6 @@ def test_csv_files_are_read_as_pandas_reads_them(csv, uniform):
         assert record.segments == expected.segments
 
 
-def test_csv_files_as_they_come(csv):
-    plain = "time,q,dq,tau\n0,1,2,3\n1,4,5,6\n"
-    for text, encoding, options in (
-        (plain, "utf-8", {}),
-        (plain.replace("\n", "\r\n").removesuffix("\r\n"), "utf-8", {}),
-        (plain, "utf-8-sig", {}),
-        ('"time", q ,"dq","tau",\n 0,1, 2,3,\n\n1,4,5,6,\n,,,,\n', "utf-8", {}),
-        (plain.replace(",", ";"), "utf-8", {"delimiter": ";"}),
-        ("q,dq,tau\n1,2,3\n4,5,6\n", "utf-8", {"time": 1.0}),
-        ("x,q,x,dq,tau,time\na,1,a,2,3,0\na,4,a,5,6,1\n", "utf-8", {}),
-    ):
-        (record,) = Records.read_csv(csv(text, encoding=encoding), POINT, **NAMES, **options)
-        assert record.times.tolist() == [0, 1]
-        assert record.states.tolist() == [[1, 2], [4, 5]]
-        assert record.actions.tolist() == [[3], [6]]
-
-
 def test_columns_of_the_same_names_need_no_words_and_hidden_states_no_column(csv):
     (record,) = Records.read_csv(str(csv("time,v,u,x\n0,1,2,\n1,4,5,nan\n")), POINT)
     assert record.states.tolist() == [[pytest.approx(math.nan, nan_ok=True), v] for v in (1, 4)]

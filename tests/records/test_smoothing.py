@@ -1,14 +1,12 @@
 """States of records: by a dense Gaussian, and by what was simulated."""
 
 import math
-import sys
 
 import numpy as np
 import pytest
 import torch
 from scipy.linalg import block_diag
 
-from gpadjust import progress
 from gpadjust.dynamics import StateSpec
 from gpadjust.physics import FunctionPhysics, ODEPhysics, Unknown
 from gpadjust.records import Record, Records, smooth
@@ -247,23 +245,27 @@ def test_what_is_known_of_the_errors_is_kept():
 
 
 @pytest.mark.slow
-def test_angles_may_come_wrapped_and_the_physics_may_wrap_them():
+def test_angles_may_come_wrapped_and_go_on_over_a_gap():
+    """The physics wraps them, too; in the gap the angle goes round."""
+
     def turn(X):
         q = X[:, 0] + STEP * X[:, 1]
         return torch.stack([torch.atan2(q.sin(), q.cos()), X[:, 1] + STEP * X[:, 2]], dim=-1)
 
     spec = StateSpec(["q", "dq"], ["u"], angles=["q"])
-    times = STEP * torch.arange(60).double()
+    times = STEP * torch.arange(80).double()
     generator = torch.Generator().manual_seed(0)
-    turned = torch.stack([2 * times, torch.full_like(times, 2.0)], dim=-1)
+    turned = torch.stack([12 * times, torch.full_like(times, 12.0)], dim=-1)
     turned += 0.01 * torch.randn(turned.shape, generator=generator)
+    turned[30:37] = math.nan
     wrapped = turned.clone()
     wrapped[:, 0] = torch.atan2(turned[:, 0].sin(), turned[:, 0].cos())
-    still = torch.zeros(60, 1).double()
-    paths = [
-        smooth(Records(Record(times, states, still), spec), turn).records.records[0].states
-        for states in (turned, wrapped)
-    ]
+    still, paths = torch.zeros(80, 1).double(), []
+    for states in (turned, wrapped):
+        found = smooth(Records(Record(times, states, still), spec), turn)
+        assert found.process_noise[0] < 0.02
+        paths.append(found.records.records[0].states)
+    torch.testing.assert_close(paths[0][:, 0], 12 * times, atol=0.1, rtol=0)
     torch.testing.assert_close(*paths)
 
 
@@ -307,24 +309,6 @@ def test_a_state_that_one_record_lacks_starts_about_where_it_is_in_others():
     error = found.records.records[1].states[:, 1] - (other[0] + level)[:, 1]
     assert error.square().mean().sqrt() < 0.15
     assert found.process_noise[1] < 0.1
-
-
-@pytest.mark.slow
-def test_a_turning_angle_goes_on_over_a_gap():
-    spec = StateSpec(["q", "dq"], ["u"], angles=["q"])
-    times = STEP * torch.arange(80).double()
-    generator = torch.Generator().manual_seed(0)
-    states = torch.stack([12 * times, torch.full_like(times, 12.0)], dim=-1)
-    states += 0.01 * torch.randn(states.shape, generator=generator)
-    states[30:37] = math.nan
-    record = Record(times, states, torch.zeros(80, 1).double())
-
-    def turn(X):
-        return torch.stack([X[:, 0] + STEP * X[:, 1], X[:, 1]], dim=-1)
-
-    found = smooth(Records(record, spec), turn)
-    assert found.process_noise[0] < 0.02
-    torch.testing.assert_close(found.records.records[0].states[:, 0], 12 * times, atol=0.1, rtol=0)
 
 
 @pytest.mark.slow
@@ -397,16 +381,6 @@ def test_intervals_of_parameters_hold_as_often_as_they_say():
         low, high = found.physics_parameters.interval()
         held += int(((low <= truth) & (truth <= high)).sum())
     assert 0.88 <= held / 80 <= 1
-
-
-@pytest.mark.filterwarnings("ignore::gpadjust.records.SmoothingWarning")
-@pytest.mark.parametrize("is_seen", [True, False])
-def test_long_smoothing_shows_a_bar_where_somebody_sees_it(is_seen, monkeypatch, capsys):
-    monkeypatch.setattr(progress, "PATIENCE", 0.0)
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: is_seen, raising=False)
-    records = Records(measured(*simulated(0, length=50), 0), SPEC)
-    smooth(records, spring(), max_rounds=3, num_starts=1)
-    assert (" rounds" in capsys.readouterr().err) == is_seen
 
 
 def pendulum_log(seed, rows=499, step=0.01, noise=0.005):

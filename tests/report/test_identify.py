@@ -1,5 +1,6 @@
 """The command for a log: from a CSV file and equations to a page, or an error that says why not."""
 
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -8,8 +9,10 @@ import pytest
 import torch
 
 from gpadjust.__main__ import main
+from gpadjust.physics import Unknown
 from gpadjust.records import Records, identify
 from gpadjust.report import report
+from gpadjust.report.inputs import unknown_of
 
 LOG = Path(__file__).parents[2] / "examples" / "swing.csv"
 TRUE = {"l": 0.6, "c": 0.15, "J": 0.4, "F": 0.1}  # of the simulation
@@ -93,8 +96,10 @@ def test_a_page_of_true_parameters_noise_and_a_free_run(folder, read, capsys):
 @pytest.mark.slow
 def test_missing_friction_and_a_physics_of_a_module(folder, read, undrawn):
     """Without dry friction the viscous one is wrong, and so are the intervals."""
-    assert main(["identify", "log.csv", *STATES, *VISCOUS, *QUICKLY, "--title", "A swing"]) == 0
+    quickly = ["--step", "0.05", "--starts", "1", "--title", "A swing"]
+    assert main(["identify", "log.csv", *STATES, *VISCOUS, *quickly]) == 0
     page = read(folder / "identify.html")
+    assert "180 steps of 0.05 s, 60 steps held out" in page.text
     assert page.text.startswith("A swing")
     assert "the physics lacks something whose errors last longer" in page.text
     options = ["--physics", "swing:physics", "--starts", "1", "--out", "module.html"]
@@ -121,7 +126,7 @@ def test_without_actions_there_is_the_time_and_next_values_are_equations_too(
 
 
 def test_guesses_that_diverge_are_beaten_and_have_no_number(folder, read, undrawn):
-    from tests.records.test_identification import SPEC, Unknown, oscillation, quickly, spring
+    from tests.records.test_identification import SPEC, oscillation, quickly, spring
 
     found = quickly(Records(oscillation(80), SPEC), spring(Unknown(1.5, factor=1.5)))
     guesses = found.runs["guesses"]
@@ -224,3 +229,21 @@ def test_a_log_with_dates_other_names_and_units_in_round_brackets(folder, read, 
     names = {}
     exec(page.codes[0], names)
     assert names["machine"].parameters["lambda_"].mean() == pytest.approx(float(row[1]), rel=1e-3)
+
+
+def test_actions_within_a_step_are_followed(folder, undrawn, capsys):
+    rows, x = [], 0.0
+    for k in range(161):  # of x' = u - c(x), c = 2 x
+        u = 3.0 * (k % 4 == 0) + 0.02 * k
+        rows.append(f"{0.1 * k:.1f},{x},{u}\n")
+        x = x * math.exp(-0.2) + u / 2 * (1 - math.exp(-0.2))
+    (folder / "log.csv").write_text("time,x,u\n" + "".join(rows))
+    given = ["identify", "log.csv", "--states", "x", "--actions", "u", "--step", "0.4"]
+    given += ["--physics", "x' = u - c*x", "--unknown"]
+    assert main([*given, "c [1/s] = 1 */ 3"]) == 0
+    assert "c = 2 (2 to 2) 1/s" in capsys.readouterr().out
+
+
+def test_a_parameter_may_be_a_function():
+    function = Unknown(1.0, factor=3.0, unit="1/s", function_of="x", between=(0.0, 2.0))
+    assert unknown_of("c(x: 0 .. 2) [1/s] = 1 */ 3") == ("c", function)
