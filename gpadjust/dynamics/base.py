@@ -163,8 +163,8 @@ class Dynamics(ABC):
                 estimated noise, right for updates by states without noise, such as draws of
                 :func:`smooth`.
             variation: Deviations of the physics' unknown parameters between runs, one for each or
-                one for all, in standard deviations of their priors: 0.1 of one machine from day to
-                day, more of another one. Each particle has its own parameters.
+                one for all, in standard deviations of their priors: ``smoothed.variation`` of
+                :func:`smooth`; more for another machine. Each particle has its own parameters.
                 Beyond the actions of the updates the deviations grow, threefold at half of their
                 range, but to at most half of the prior's.
             state_bounds: Lower and upper bounds, ``2 x state_dim``, as of a task: a particle that

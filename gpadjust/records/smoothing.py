@@ -12,6 +12,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +31,7 @@ from gpadjust.records import kalman
 from gpadjust.records.kalman import Array, Link, Smoothed
 from gpadjust.records.records import Record, Records, control_steps, remember
 from gpadjust.records.sensing import Sensing
+from gpadjust.records.variation import variation_of
 from gpadjust.states import Sensors, StateSpec
 from gpadjust.states.state_spec import side_by_side
 
@@ -110,6 +112,26 @@ class SmoothedRecords:
             shown = chain.sensing.corrected(measured, theta, [slice(0, len(states))])
             corrected[:, chain.spec.moving] = torch.from_numpy(shown)
         return corrected
+
+    @cached_property
+    def variation(self) -> Tensor:
+        """Variation of the parameters from one stretch of the records to another, ``p``.
+
+        Standard deviations, in those of each parameter's prior: with 0.1, and a prior of a factor
+        of 1.5, some 4 %. They explain best, given the noises, stretches that each have other
+        parameters; where the stretches do not tell, they are 0.05. A fault of an equation shows as
+        parameters that vary, and moves a free run for as long as it lasts, where process noise
+        averages out: see ``variation`` of :meth:`Dynamics.free_run`.
+
+        Raises:
+            ValueError: If the physics has no unknown parameters, or sensors have some.
+        """
+        if not self.chain.physics.unknowns or self.chain.sensing is not None:
+            raise ValueError(
+                "Expected a physics with unknown parameters, and sensors without; found "
+                f"{', '.join(self.chain.unknowns) or 'no unknown parameters'}."
+            )
+        return variation_of(self.chain, self.estimate)
 
     def draw(self, seed: int = 0) -> Records:
         """Draw states from their posterior, along each record.
