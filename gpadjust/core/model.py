@@ -105,7 +105,10 @@ class Predictive(Model, FantasizeMixin, Display):
         observation_noise: bool | Tensor = False,
         posterior_transform: PosteriorTransform | None = None,
     ) -> Any:  # fmt: skip
-        """Return BoTorch's joint posterior at ``X``, of a mean ``... x q x m``."""
+        """Return the joint posterior at ``X`` in BoTorch's form.
+
+        Its mean is ``... x q x m``, for ``X`` of ``... x q x d``.
+        """
         self.eval()
         outputs: list[int] | slice = slice(None)
         if output_indices is not None:
@@ -641,7 +644,9 @@ class GP(gpytorch.models.GP, Predictive):
     def sample_functions(
         self, num_functions: int, seed: int | None = None, num_features: int = 1024
     ) -> Functions:
-        """Draw functions ``... x q x d`` to ``k x ... x q x m`` from the posterior.
+        """Draw functions from the posterior.
+
+        They map ``... x q x d`` to ``k x ... x q x m``.
 
         Args:
             num_functions: Number ``k`` of functions, spread over the draws.
