@@ -7,11 +7,14 @@ name the value and the expected one.
 
 from __future__ import annotations
 
+import inspect
 import math
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from numbers import Real
 from operator import index
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -234,3 +237,14 @@ def seeded(seed: int | None) -> Iterator[None]:
         if seed is not None:
             torch.default_generator.manual_seed(seed)  # the generators of GPUs are not copied
         yield
+
+
+def warn(message: str, category: type[Warning] = UserWarning) -> None:
+    """Warn at the line of the user: that of the first frame outside of the package."""
+    folder = str(Path(__file__).parent)
+    level = 1  # this function
+    frame = inspect.currentframe()
+    while frame is not None and frame.f_code.co_filename.startswith(folder):
+        frame = frame.f_back
+        level += 1
+    warnings.warn(message, category, stacklevel=level)

@@ -2,6 +2,7 @@
 
 import math
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -125,3 +126,14 @@ def test_refused(check):
 def test_arrays_of_another_kind_or_shape():
     for values in ([1], [1, NAN], [1, "2"], None, [[1, 2]]):
         assert checks.finite_array(values, (2,)) is None
+
+
+def test_a_warning_is_at_the_line_of_the_user():
+    """However many functions of the package are between."""
+    code = "from gpadjust.checks import warn\ndef inner(): warn('here')\ndef outer(): inner()\n"
+    names = {}
+    exec(compile(code, str(Path(checks.__file__).parent / "new.py"), "exec"), names)
+    for call in ("inner", "outer"):
+        with pytest.warns(UserWarning, match="here") as caught:
+            names[call]()
+        assert caught[0].filename == __file__

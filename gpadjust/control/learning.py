@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import time
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from gpadjust.checks import warn
 from gpadjust.control.delay import find_delay
 from gpadjust.control.task import Task
 from gpadjust.dynamics import Dynamics, Trajectories
@@ -78,7 +78,7 @@ def learnable(dynamics: Dynamics, data: Trajectories) -> Trajectories:
             if not len(rows) or len(rows) == works.sum():
                 raise
             message = f"The physics fails at {len(rows)} of {len(works)} new transitions, which"
-            warnings.warn(f"{message} are left out: {error}", UserWarning, stacklevel=4)
+            warn(f"{message} are left out: {error}")
             works[rows] = False
 
 
@@ -115,7 +115,7 @@ def warn_of_delay(dynamics: Dynamics, data: Trajectories, num_new: int) -> None:
         return
     message = find_delay(physics, data)
     if message and find_delay(physics, data.subset(slice(len(data) - num_new))) is None:
-        warnings.warn(message, UserWarning, stacklevel=4)
+        warn(message)
 
 
 def warn_of_promise(values: dict[str, float], rewards: Tensor) -> None:
@@ -130,7 +130,7 @@ def warn_of_promise(values: dict[str, float], rewards: Tensor) -> None:
         "(Return(quantile=0.2), with num_functions=16) or a better physics may help: "
         "gpadjust.validation.trust shows where data override it."
     )
-    warnings.warn(message, UserWarning, stacklevel=4)
+    warn(message)
 
 
 def learn_dynamics(
@@ -180,7 +180,7 @@ def _score(
         run = dynamics.free_run(windows.initial_states, windows.actions, state_bounds=bounds)
     except (NotImplementedError, PhysicsError) as error:  # scores are not worth an episode
         message = f"Trajectories have no scores: {error} Pass score_horizons=() to do without."
-        warnings.warn(message, UserWarning, stacklevel=4)
+        warn(message)
         return numbers
     units = typical_change(spec, data.states, data.next_states)
     scores = run.score(windows.measured, horizons=horizons, units=units)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpadjust.checks import check_kind, checked_whole, finite_array
+from gpadjust.checks import check_kind, checked_whole, finite_array, warn
 from gpadjust.dynamics.base import of_states
 from gpadjust.dynamics.least_squares import even_normal
 from gpadjust.dynamics.physics_dynamics import check_next_values, one_physics
@@ -415,12 +414,11 @@ def _estimate(chain: Chain, max_rounds: int, num_starts: int) -> tuple[Estimate,
     best, gained = max(arrived or ends, key=lambda end: end[0].log_density)
     is_settled = bool(arrived) and abs(gained) <= _STILL
     if not is_settled:
-        warnings.warn(
+        warn(
             f"The states did not settle in {max_rounds} rounds. Raise num_starts, give narrower "
             "priors or a start, or check that the physics is defined, and without jumps, near "
             "these states. `smooth` also has max_rounds, noise and process_noise.",
             SmoothingWarning,
-            stacklevel=3,
         )
     return best, is_settled
 

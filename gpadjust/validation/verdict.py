@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.core import GP, FitResult
-from gpadjust.kinds.categories import levels_of, on_levels
+from gpadjust.kinds.categories import levels_of, numbers_of, on_levels
 from gpadjust.physics import PhysicsError
 from gpadjust.validation.faults import rms
 from gpadjust.validation.trust import physics_at
@@ -170,7 +170,9 @@ def verdict_of(c: Any, j: int, f: Tensor | None, fault: str) -> Verdict | None:
         if formula:
             shown = is_shown(densities[adjusted.structure], formula[0])
             evidence = evidence._replace(is_surpassed=shown)
-        correction = correction_of(model, j, f)
+        # That of the recommended model, if it is one that adjusts the formula.
+        names = {row.structure for row in rows if row.kind == ADJUSTED}
+        correction = correction_of(c.models[c.chosen] if c.chosen in names else model, j, f)
     return verdict_on(evidence, correction, next_point(model, c.models[without.structure], j))
 
 
@@ -317,10 +319,16 @@ def next_point(first: GP, second: GP, j: int) -> str:
 def _at(model: GP, x: Tensor) -> str:
     """Return the inputs of a point, ``d``, in words; nothing of more than three."""
     names = model.data.input_names
-    if len(names) > _NAMED or levels_of(model):
+    if len(names) > _NAMED:
         return ""
-    pairs = zip(names, x.tolist(), strict=True)
-    return f" at {listed(f'{bare(n)} = {with_unit(number(v), n)}' for n, v in pairs)}"
+    levels = levels_of(model)
+    places = []
+    for i, (name, value) in enumerate(zip(names, x.tolist(), strict=True)):
+        text = with_unit(number(value), name)
+        if i in levels:
+            text = str(levels[i][numbers_of(levels[i]).index(value)])
+        places.append(f"{bare(name)} = {text}")
+    return f" at {listed(places)}"
 
 
 def unsampled(

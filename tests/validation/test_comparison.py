@@ -12,6 +12,7 @@ from botorch.models.transforms import Normalize
 from gpadjust import PhysicsWarning
 from gpadjust.core import CKA, FitResult, PhysicsMeanGP, StackedGP, ZeroMeanGP, load, save
 from gpadjust.core.data import Data
+from gpadjust.kinds import Categories
 from gpadjust.kinds.heavy_tails import HeavyTails
 from gpadjust.kinds.links import Linked
 from gpadjust.physics import FunctionPhysics, Unknown, as_physics
@@ -24,6 +25,7 @@ from gpadjust.validation.verdict import (
     NOT,
     OPEN,
     Evidence,
+    _at,
     straight_line,
     unsampled,
     verdict_on,
@@ -445,3 +447,11 @@ def test_repeated_inputs_are_no_evidence_of_the_physics():
     generator = torch.Generator().manual_seed(0)
     Y = torch.randn(24, 1, generator=generator, dtype=torch.float64)
     assert compare(X, Y, lambda X: 5 * X.sin()).verdict["y"].answer == "These data do not tell"
+
+
+def test_the_next_point_has_names_of_categories():
+    pd = pytest.importorskip("pandas")
+    frame = pd.DataFrame({"x": [0.0, 1.0] * 3, "metal": ["brass", "iron", "zinc"] * 2})
+    Y = torch.arange(6.0).double().unsqueeze(-1)
+    first = CKA(frame, Y, physics=lambda X: X[:, :1], input_transform=Categories(["metal"]))
+    assert _at(first, torch.tensor([0.5, 2.0])) == " at x = 0.5 and metal = zinc"
