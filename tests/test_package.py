@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tomllib
 from contextlib import suppress
+from importlib import import_module, reload
 from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 
@@ -92,6 +93,7 @@ def test_the_core_brings_no_more_than_botorch():
 NEEDED = {
     "matplotlib": ("plot", lambda: RRA(line(5), line(5), physics=torch.sin).plot()),
     "mujoco": ("mujoco", lambda: MujocoPhysics("<mujoco/>")),
+    "sklearn": ("sklearn", lambda: reload(import_module("gpadjust.sklearn"))),
     "pyro": ("pyro", lambda: pyro_model(RRA(line(5), line(5), physics=torch.sin))),
 }
 

@@ -204,8 +204,7 @@ def test_conditioning_is_a_refit_with_the_same_numbers(name):
 
 
 @every
-@settings(max_examples=1, deadline=None)
-@given(a=st.sampled_from([1e-6, 50.0, 1e5]), b=st.sampled_from([1e-7, 30.0, 1e6]))
+@pytest.mark.parametrize(("a", "b"), [(1e-6, 1e-7), (1e5, 1e6)])
 def test_units_do_not_matter(name, a, b):
     (model, problem), (other, scaled) = made(name), made(name, None, a, b)
     ours = answers(model, inputs(name, problem, Z))
@@ -272,11 +271,14 @@ def test_functions_have_the_moments_of_predictions(name):
 def test_a_file_has_the_model(name, tmp_path):
     model, problem = made(name)
     X = inputs(name, problem, Z)
-    saved = save(model, tmp_path / "model.pt")
     objects = {"physics": problem.physics, "covar_module": Stationary(MATERN52)}
-    again = load(tmp_path / "model.pt", trusted=True, **{n: objects[n] for n in saved.missing})
-    same(answers(again, X), answers(model, X), rtol=1e-9, atol=1e-12)
-    assert again.summary() == model.summary()
+    noise = None if model.data.Yvar is None else model.data.Yvar[:5]
+    later = model.condition_on_observations(X, problem.f(Z), noise)
+    for each in (model, later):
+        missing = save(each, tmp_path / "model.pt").missing
+        again = load(tmp_path / "model.pt", trusted=True, **{n: objects[n] for n in missing})
+        same(answers(again, X), answers(each, X), rtol=1e-9, atol=1e-12)
+        assert again.summary() == each.summary()
 
 
 QUICK = {"CKA", "log"}

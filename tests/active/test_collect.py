@@ -22,6 +22,7 @@ from gpadjust import CKA
 from gpadjust.active import (
     Collection,
     CollectionError,
+    LogError,
     MeasurementWarning,
     collect,
     qAdjustmentInformationGain,
@@ -299,6 +300,18 @@ class TestResuming:
             assert same(result, whole)
             measured = 0 if not oracle.asked else len(torch.cat(oracle.asked))
             assert measured in (lost, lost + 1)
+
+    def test_a_log_is_free_when_it_is_done(self, laboratory, tmp_path):
+        path = tmp_path / "log.jsonl"
+        first = collect(**laboratory(log=path, budget=2))
+        second = collect(**laboratory(log=path, budget=3))
+        assert first.num_measured == 2
+        with pytest.raises(KeyboardInterrupt) as kept:
+            collect(**laboratory(oracle=Oracle(n1=throw(KeyboardInterrupt())), log=path))
+        assert kept.value.__traceback__
+        refused(LogError, "something else has written to it", first.ask)
+        assert same(collect(**laboratory(log=path, budget=3)), second)
+        assert same(second, collect(**laboratory(budget=3)))
 
     @pytest.mark.slow
     def test_a_killed_process(self, tmp_path):

@@ -7,6 +7,7 @@ import shutil
 import pytest
 import torch
 
+from gpadjust import PhysicsMeanGP
 from gpadjust.active import Collection, LogError, MeasurementWarning, qAdjustmentInformationGain
 from tests.systems import measured as truth
 from tests.systems import refused
@@ -137,6 +138,16 @@ def test_all_of_it_comes_back_from_the_log(make, tmp_path, uniform):
     assert again.num_measured == collection.num_measured == 6
     assert torch.equal(again.ask(), collection.ask())
     assert torch.equal(again.ask(), collection.ask())
+
+
+@pytest.mark.slow
+def test_a_log_of_another_structure_is_no_hindrance(make, tmp_path):
+    path = tmp_path / "log.jsonl"
+    filled(make(log=path), 6)
+    factory = lambda X, Y: PhysicsMeanGP(X, Y, physics=lambda X: X[..., :1])  # noqa: E731
+    collection = make(log=path, model_factory=factory)
+    assert collection.ask().shape == (1, 2)
+    assert isinstance(collection.model, PhysicsMeanGP)
 
 
 REFUSED = [

@@ -1,6 +1,7 @@
 """Records that survive."""
 
 import copy
+import gc
 import multiprocessing
 import os
 import pickle
@@ -138,6 +139,13 @@ class TestHolding:
         log.close()
         assert other.open(BOUNDS) == RECORDS
         refused(LogError, "is held by process", log.append, RECORDS)
+
+    def test_until_it_is_deleted(self, tmp_path):
+        log = MeasurementLog(tmp_path / "log.jsonl")
+        log.open(BOUNDS)
+        del log
+        gc.collect()
+        MeasurementLog(tmp_path / "log.jsonl").open(BOUNDS)
 
     def test_again_if_nobody_else_has_written(self, log):
         log.close()

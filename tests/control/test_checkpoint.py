@@ -17,8 +17,10 @@ from filelock import FileLock
 
 from gpadjust.control import EpisodeCheckpoint, MPCAgent, PolicySearchAgent, resume
 from gpadjust.control.episodes import generators, set_generators
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
 from tests.control.conftest import PLAN, described
 from tests.point import (
+    POINT_SPEC,
     PowerCut,
     Shouting,
     assert_equal,
@@ -311,6 +313,16 @@ def test_what_does_not_fit_is_refused_before_anything_is_unpickled(
             resume(path, *given)
     with pytest.raises(TypeError, match="task must be a Task"):
         resume(path, env, task.dynamics)
+
+
+@pytest.mark.parametrize("kind", [LearnedDynamics, PhysicsDynamics])
+def test_another_physics_is_refused(make_agent, again, kind, path):
+    def known(slope):
+        return {"dynamics": kind(POINT_SPEC, lambda X: X[:, :1] + slope * X[:, 1:])}
+
+    make_agent(MPCAgent, **known(0.4)).learn(5).save(path)
+    with pytest.raises(RuntimeError, match="physics"):
+        resume(path, *again(**known(0.41)))
 
 
 OTHER = """

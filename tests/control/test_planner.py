@@ -158,6 +158,15 @@ def test_staying_is_better_than_leaving_however_few_the_sequences(seed):
 # Returns
 
 
+def test_a_plan_of_the_greatest_return():
+    """From x = 0 the way to x = 1 and to stay there, by steps of v / 2 with v at most 2."""
+    options = {"num_elites": 8, "correlation": 0.0, "num_random": 200, "max_hold": 1}
+    plan = Planner(Return(), rounds=12, **options).plan(point_of(), ZERO, BOUNDS, 4)
+    assert plan.value > -0.1
+    reached = (plan.actions[:, 0] / 2).cumsum(0)
+    torch.testing.assert_close(reached, torch.ones(4).double(), atol=0.05, rtol=0)
+
+
 def test_a_return_is_the_sum_of_the_rewards_that_are_made():
     beyond = (1.5 - 1.2) / 5.1  # in halves of the width
     worst = -0.5 - 1.5 * (2e6 + 40 * beyond)

@@ -17,8 +17,9 @@ from gpytorch.mlls import ExactMarginalLogLikelihood, SumMarginalLogLikelihood
 
 from gpadjust.core import CKA, CalibratedPhysics, PhysicsMeanGP, fit
 from gpadjust.gpytorch import PhysicsMean, PhysicsScaledKernel
+from gpadjust.kinds import LinkedCKA
 from gpadjust.physics import FunctionPhysics, Unknown
-from tests.systems import normal, uniform, wave
+from tests.systems import line, normal, same, uniform, wave
 
 BOUNDS = torch.tensor([[0.0, 0.0], [1.0, 1.0]], dtype=torch.float64)
 SEARCH = {"num_restarts": 2, "raw_samples": 8, "options": {"maxiter": 5}}
@@ -102,6 +103,20 @@ def test_lists_of_models(data):
     plain = ModelListGP(ours, CKA(X, Y[:, 1:], physics=lambda X: X[:, 1:]))
     later = plain.condition_on_observations([Z, Z], uniform(5, 2, seed=4))
     assert later.posterior(Z).mean.shape == (5, 2)
+
+
+def test_a_link_and_other_models_in_a_list():
+    """After the default fit, by which a linked posterior once had a dimension for draws."""
+    X, Z = line(12), uniform(5, 1, seed=3)
+    Y = 1.3 * wave(X) + X + 0.05 * normal(12, 1)
+    linked = LinkedCKA(X, Y.exp(), physics=lambda X: wave(X).exp())
+    plain = CKA(X, Y, physics=wave)
+    for each in (linked, plain):
+        fit(each, num_draws=16)
+    for models in ([linked, plain], [SingleTaskGP(X, Y), linked]):
+        posterior = ModelListGP(*models).posterior(Z)
+        assert posterior.rsample(torch.Size([4])).shape == (4, 5, 2)
+        same(posterior.mean.unbind(-1), [m.posterior(Z).mean[:, 0] for m in models])
 
 
 def test_state(data, models):

@@ -75,6 +75,8 @@ REFUSED = [
     (lambda: CKA(FRAME, Y, physics=wave), TypeError, r"found str\..*Categories\(\)"),
     (lambda: CKA(X, Y, physics=lambda X: X.expand(12, 2)), ValueError, "1 outputs of physics"),
     (lambda: CKA(X, Y.expand(12, 4), physics=wave), ValueError, "4 outputs of physics"),
+    (lambda: CKA(X.expand(2, -1, -1), Y, physics=wave), ValueError, "two dimensions"),
+    (lambda: CKA(X, Y[:4], physics=wave), ValueError, "as many rows"),
     (lambda: CKA(X, Y, physics=[]), ValueError, "at least one physics"),
     (lambda: CKA(X, Y, physics=[wave, wave], rho_mean=[1.0]), ValueError, "numbers, of 2 physics"),
     (lambda: RRA(X, Y, physics=wave, num_features=7), ValueError, "even number of features"),
@@ -121,6 +123,7 @@ REFUSED = [
     (lambda: cka().subset_draws(torch.zeros(4).long()).train()(X), RuntimeError, "holds 4 draws"),
     # Functions.
     (lambda: MODEL.sample_functions(0), ValueError, "num_functions must be at least 1"),
+    (lambda: MODEL.sample_functions(-1), ValueError, "num_functions must be at least 1"),
     (lambda: MODEL.sample_functions(2.5), TypeError, "num_functions must be a whole number"),
     (lambda: MODEL.sample_functions(1, num_features=7), ValueError, "even number of features"),
     (lambda: FUNCTIONS.evaluate_each(uniform(2, 4, 1)), ValueError, "3 functions, 3 x q x d"),

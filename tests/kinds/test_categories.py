@@ -153,6 +153,7 @@ def test_files_and_mixtures(model, tmp_path):
     again = load(tmp_path / "model.pt", trusted=True)
     same(moments(again, NEW)[1], moments(later, NEW)[1])
     assert levels_of(again) == levels_of(model)
+    refused(ValueError, "found wood", again.predict, FRAME[:2].assign(material="wood"))
     stacked = StackedGP({"CKA": model}, [[1.0]], 4)
     assert moments(stacked.condition_on_observations(NEW, Y[:4]), NEW)[0].shape == (4, 1)
     assert levels_of(stacked) == levels_of(model)

@@ -5,8 +5,9 @@ import math
 import pytest
 import torch
 from torch.distributions import MultivariateNormal
+from torch.nn.functional import silu
 
-from gpadjust.core import CKA, fit
+from gpadjust.core import CKA, RRA, ZeroMeanGP, fit, load, save
 from gpadjust.kinds.heavy_tails import HeavyTails
 from gpadjust.kinds.relative import RelativeNoise
 from gpadjust.physics import FunctionPhysics, Unknown
@@ -140,6 +141,28 @@ def test_outputs_may_share_unknown_numbers():
     model = CKA(X, two, physics=law, noise=HeavyTails())
     fit(model, "map")
     assert [rows_of(mask) for mask in model.noise.is_outlier.mT] == [ROWS, [17]]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("base", [None, RelativeNoise()])
+@pytest.mark.parametrize("kind", [ZeroMeanGP, RRA])
+def test_a_second_fit_is_the_first(kind, base):
+    options = {} if kind is ZeroMeanGP else {"physics": wave}
+    model = kind(X, gross() + 2, noise=HeavyTails(base=base), **options)
+    fit(model, "map")
+    first, added = model.predict(Z, True).variance, model.noise.added
+    assert {*ROWS} <= {*rows_of(model.noise.is_outlier)}
+    fit(model, "map")
+    assert torch.equal(model.predict(Z, True).variance, first)
+    assert torch.equal(model.noise.added, added)
+
+
+def test_a_file_has_the_share(tmp_path):
+    model = CKA(X, gross(), physics=silu, noise=HeavyTails(0.1))
+    for each in (model, model.condition_on_observations(Z, truth(Z))):
+        assert not save(each, tmp_path / "model.pt").missing
+        loaded = load(tmp_path / "model.pt", trusted=True)
+        assert loaded.noise.share == each.noise.share == 0.1
 
 
 def test_later_rows_have_no_corrections():

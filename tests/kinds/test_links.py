@@ -263,6 +263,17 @@ def test_unknown_parameters_and_missing_observations():
     refused(PhysicsError, r"(?s)returned -.*row 1: \[-1.0", model.predict, outside)
 
 
+def test_outputs_have_locations_of_their_own():
+    both = torch.cat([Y, 1e-12 * Y.flip(0)], -1)
+    physics = FunctionPhysics(lambda X: torch.cat([decades(X), 1e-10 / decades(X)], -1))
+    model = drawn(LinkedCKA(X, both, physics=physics))
+    for j in (0, 1):
+        part = model.subset_output([j])
+        close(part.predict(NEW).mean, model.predict(NEW).mean[:, [j]])
+        close(model.posterior(NEW, [j]).mean, model.predict(NEW).mean[:, [j]])
+        assert part.condition_on_observations(NEW, decades(NEW)).predict(NEW).mean.isfinite().all()
+
+
 def test_botorch_takes_it(model):
     Z, best = X[::3].unsqueeze(1), Y.max()
     sampler = SobolQMCNormalSampler(torch.Size([32]), seed=0)
@@ -329,6 +340,13 @@ def test_structures_and_their_linked_classes(tmp_path):
     assert type(again) is LinkedSine
     close(again.predict(NEW).mean, model.predict(NEW).mean)
     assert ", of log(" in again.summary().splitlines()[0]
+
+
+def test_rows_of_frames():
+    pd = pytest.importorskip("pandas")
+    frame = pd.DataFrame({"x": X[:, 0]})
+    model = LinkedPhysicsMeanGP(frame, pd.Series(Y[:, 0], name="rate"), physics=decades)
+    assert list(model.predict(frame[:2]).mean.columns) == ["rate"]
 
 
 def physics_mean(train_Y=Y, physics=decades, **options):

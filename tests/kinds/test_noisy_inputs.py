@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch.nn.functional import silu
 
-from gpadjust.core import CKA, GP, CalibratedPhysics, Term, fit, load, save
+from gpadjust.core import CKA, GP, CalibratedPhysics, Term, ZeroMeanGP, fit, load, save
 from gpadjust.kinds.heavy_tails import HeavyTails
 from gpadjust.kinds.noisy_inputs import NoisyInputs
 from gpadjust.kinds.relative import RelativeNoise
@@ -190,8 +190,12 @@ def test_bad_input(call, error, words):
     refused(error, words, call)
 
 
-def test_later_inputs_are_exact():
-    model = model_of(X, torch.cat([Y, 2 * Y.flip(0)], -1), SD**2, physics=lambda X: X.expand(-1, 2))
+@pytest.mark.parametrize(
+    ("structure", "options"),
+    [(CKA, {"physics": lambda X: X.sin().expand(-1, 2)}), (ZeroMeanGP, {})],
+)
+def test_later_inputs_are_exact(structure, options):
+    model = model_of(X, torch.cat([Y, 2 * Y.flip(0)], -1), SD**2, structure, **options)
     fit(model, "map")
     assert (model.noise.added.amax(-1) > 10 * model.noise.added.amin(-1)).all()
     later = model.condition_on_observations(TEST[:1], 3 + truth(TEST[:1]).expand(-1, 2))

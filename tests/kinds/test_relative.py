@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from gpadjust.core import CKA, GP, Term, ZeroMeanGP, fit
+from gpadjust.core import CKA, GP, Term, ZeroMeanGP, fit, load, save
 from gpadjust.kinds.relative import RelativeNoise
 from gpadjust.physics import FunctionPhysics, Unknown
 from tests.systems import drawn, line, normal, refused
@@ -57,7 +57,7 @@ def test_several_physics_count_by_their_prior_means():
 
 
 @pytest.mark.slow
-def test_without_physics_sizes_are_those_of_the_posterior_mean():
+def test_without_physics_sizes_are_those_of_the_posterior_mean(tmp_path):
     model = ZeroMeanGP(
         X, torch.cat([growing(), growing(seed=1).flip(0)], -1), noise=RelativeNoise()
     )
@@ -71,6 +71,11 @@ def test_without_physics_sizes_are_those_of_the_posterior_mean():
     assert away.abs().max() < 0.1 * model.predict(X).mean.max()
     second = model.subset_output([1])
     torch.testing.assert_close(noise_at(second, ENDS), noise_at(model, ENDS)[:, 1:])
+    first = noise_at(model, ENDS)
+    assert not save(model, tmp_path / "model.pt").missing
+    torch.testing.assert_close(noise_at(load(tmp_path / "model.pt"), ENDS), first)
+    fit(model, "map")
+    assert torch.equal(noise_at(model, ENDS), first)
 
 
 @pytest.mark.slow

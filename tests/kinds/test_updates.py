@@ -207,4 +207,5 @@ def test_a_drift_is_followed_by_both_at_a_constant_size():
         assert (each.predict(X).mean - 3 * wave(X) - X).abs().max() < 0.2
         low, high = each.interval(X, observation_noise=True)
         assert ((low < 3 * wave(X) + X) & (3 * wave(X) + X < high)).double().mean() > 0.8
+        torch.testing.assert_close(deepcopy(each).predict(AT).mean, each.predict(AT).mean)
     assert len(both[0].data.X) == 12

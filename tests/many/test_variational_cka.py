@@ -135,13 +135,15 @@ def test_later_rows_are_observed_exactly(model, close, has_rest):
     refused(NotImplementedError, "Build a model of all data", later.left_out)
 
 
-def test_shapes(model, close):
+def test_shapes_and_gradients(model, close, gradient_is_right):
     m, X = model.num_outputs, problem(24)[0].reshape(2, 3, 4, 1)
     posterior = model.posterior(X)
     assert posterior.rsample(torch.Size([5])).shape == (5, 2, 3, 4, m)
     close(posterior.mean[1, 2], model.posterior(X[1, 2]).mean)
     last = model.posterior(X, output_indices=[m - 1])
     close(last.mean, posterior.mean[..., -1:])
+    gradient_is_right(lambda X: model.predict(X).mean.sum(), X[0, 0])
+    gradient_is_right(lambda X: model.posterior(X).variance.sum(), X[0, 0])
 
 
 @pytest.mark.slow
@@ -175,6 +177,9 @@ def test_copies_states_and_outputs(model):
         same(each.predict(Z, True), before, rtol=1e-10, atol=0)
         assert each.summary() == model.summary()
     assert "varies in 0 of 1 draws" in make(*problem(10)).summary()
+    for kept in ([0], [-1], [model.num_outputs - 1, 0][: model.num_outputs]):
+        part = model.subset_output(kept)
+        same(part.predict(Z, True), [v[:, kept] for v in before], rtol=1e-6, atol=0)
 
 
 def test_a_file_has_inducing_points_and_later_rows(tmp_path):

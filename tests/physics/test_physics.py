@@ -122,6 +122,8 @@ def test_wrong_results(grad):
         call = function if callable(function) else lambda X, result=function: result
         physics = FunctionPhysics(call, name="wrong")
         refused(PhysicsError, "Physics 'wrong' .*" + says, physics, X)
+    overflow = FunctionPhysics(lambda X: X.double() * 1e300)  # in the conversion to float32
+    refused(PhysicsError, "NaN or inf in 1 of 1", overflow, torch.ones(1, 1))
     if grad:
         physics = FunctionPhysics(lambda X: torch.from_numpy(np.sin(X.numpy())))
         refused(PhysicsError, r"RuntimeError: Can't call numpy\(\)", physics, X)
