@@ -77,9 +77,10 @@ class Sine(torch.nn.Module):
 
 
 def drawn(model, number=2, seed=3):
-    """The model with some draws near the middle of its prior, of its first nested model."""
+    """The model with some draws near the middle of its prior, the second of a nested model."""
     u = 0.4 * normal(number, *model.u.shape[1:], seed=seed)
-    model.set_draws(model.table.with_choice(u, 0))
+    u, nested = (model.table.with_choice(u, k) for k in (0, 1))
+    model.set_draws(torch.cat([u[:1], nested[1:2], u[2:]]))
     return model.eval()
 
 

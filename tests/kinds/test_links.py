@@ -228,6 +228,7 @@ def test_known_variances_by_the_delta_method():
     variance = model.components(NEW)[1]
     median = model.predict(NEW).mean
     close(model.components(NEW, 0.01 * median.square())[1], variance + 0.01)
+    refused(ValueError, r"found -0\.05", model.condition_on_observations, NEW, -NEW)
     fantasies = model.fantasize(NEW, SobolQMCNormalSampler(torch.Size([2]), seed=0))
     assert fantasies.conditioning().chol.shape[:-2] == (2, 1)  # of all fantasies
     given = model.condition_on_observations(
