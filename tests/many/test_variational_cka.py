@@ -168,6 +168,7 @@ def test_botorch():
 
 
 def test_copies_states_and_outputs(model):
+    model.inducing = model.points(model.u.detach(), 10)  # of each output
     Z, before = line(5), with_rest(model).predict(line(5), True)
     fresh = make(*model.data[:2])
     fresh.inducing = 0 * fresh.inducing
