@@ -83,6 +83,7 @@ FRAGILE = FunctionPhysics(lambda X: torch.where(X[:, :2] > 0.9, NAN, X[:, :2]))
 IN_STEPS = partial(Records(moved(), StateSpec(["x", "v"], ["u"], step=0.2)).trajectories, 0.4)
 
 SLOWER = r".* multiple of the sampling step, 0\.2, got 0\.1; take 0\.2"
+UNEVEN_STEPS = r".* a tenth of its step 0\.1"
 
 REFUSED = [
     # Records
@@ -107,7 +108,7 @@ REFUSED = [
     (lambda: every_way([moved()], 0.25), r"multiple of .* 0\.1, got 0\.25; take 0\.2\."),
     (lambda: every_way([moved()], 0.04), r"got 0\.04; take 0\.1\."),
     (lambda: every_way([moved(), moved(step=0.2, name="slow")], None), f"'slow': {SLOWER}"),
-    (lambda: every_way([moved(times=SHAKEN, name="rough")], 0.1), r"'rough': .* a tenth of its step 0\.1"),
+    (lambda: every_way([moved(times=SHAKEN, name="rough")], 0.1), f"'rough': {UNEVEN_STEPS}"),
     (lambda: every_way([moved(6, times=UNEVEN)], 1), "few gaps, .* from 1 to 3.*numpy.interp"),
     (lambda: every_way([moved()], -0.1), "step must be finite and above 0; found -0.1"),
     (lambda: every_way([moved(3)], 0.4), "as long as a control step, 0.4, found none of 1"),

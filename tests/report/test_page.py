@@ -195,7 +195,7 @@ def test_inputs_that_move_predictions_are_drawn_and_repeated_rows_are_counted():
 def test_a_physics_that_fails_leaves_the_shares_of_the_other_output():
     X = torch.rand(9, 1, dtype=torch.float64)
     least = [0.0]
-    fragile = FunctionPhysics(lambda X: X.where(X >= least[0], torch.nan).repeat(1, 2))
+    fragile = FunctionPhysics(lambda X: X.where(X.ge(least[0]), torch.nan).repeat(1, 2))
     models = [CKA(X, X.repeat(1, 2).sin(), physics=f) for f in (fragile, lambda X: X.repeat(1, 2))]
     fit(models[1], "map")
     subject = subject_of(models[1])
