@@ -194,11 +194,11 @@ class Collection(Measurements, Display):
             checked_whole("num_outputs", num_outputs, 1)
         super().__init__(self.bounds, num_outputs, data)
         # A model that limits points needs measurements within the limits before.
-        if limits and len(self._first_points) + self.num_observed < 2:
+        if limits and len(self._first_points) + self.num_observed < self._initial:
             raise ValueError(
                 f"With {' and '.join(limits)}, the first points must be known as safe, by f_p for "
-                "example, or as within the constraints: pass two or more as initial=[[...], ...], "
-                "or measurements as data=(X, Y); found "
+                f"example, or as within the constraints: pass {self._initial} or more as "
+                "initial=[[...], ...], or measurements as data=(X, Y); found "
                 f"{len(self._first_points)} and {self.num_observed}."
             )
         self._model: Any = None
