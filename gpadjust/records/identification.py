@@ -150,6 +150,7 @@ class Identification(Display):
         White process noise averages out, what equations lack does not: with dry friction missing,
         the damping stands for it, and its interval is too narrow. Here each equation also has a
         function of each state, twice as large as its process noise, which right equations lack.
+        Of a fit to free runs, which has no process noise, it is the posterior as it is.
         """
         if self.parameters is None:
             return None

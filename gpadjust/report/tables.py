@@ -97,7 +97,9 @@ def predictions(subject: Subject) -> Markup:
     """Return the errors of left-out predictions, and the observations predicted worst."""
     how = "Each observation is predicted by a model that has not seen it"
     if subject.comparison is not None:
-        how += ", as in the table of structures. The weights of a mixture have seen all of them."
+        how += ", as in the table of structures."
+        if subject.comparison.chosen == STACKED:
+            how += " The weights of the mixture have seen all of them."
     elif isinstance(subject.model, GP) and len(subject.model.u) == 1:
         how = (
             "Each observation is predicted from all others; hyper-parameters (and fitted "
