@@ -378,10 +378,15 @@ REFUSED = [
     ({"model_factory": CKA(*PAIR, physics=torch.sin)}, "got a model; pass", TypeError),
     ({"model_factory": SingleTaskGP, "fit": None}, "default fit .* Pass fit=", TypeError),
     ({"fit": lambda: None}, r"`lambda model: fit\(.* too many", TypeError),
+    (
+        {"optimizer_options": FIXED, "data": PAIR, "initial": 5},
+        "5 or more .* found 0 and 4",
+        ValueError,
+    ),
     ({"optimizer_options": {"num_restart": 2}}, r"Unknown .* \['num_restart'\]", ValueError),
     (
         {"optimizer_options": FIXED, "initial": None},
-        "With fixed_features, the first .* found 0 and 0",
+        "With fixed_features, .* 2 or more .* found 0",
         ValueError,
     ),
 ]
