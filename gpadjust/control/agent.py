@@ -21,7 +21,12 @@ from torch import Tensor
 from gpadjust.checks import check_kind, checked_number, checked_whole
 from gpadjust.control import episodes
 from gpadjust.control.checkpoint import EpisodeCheckpoint, pickled_environment
-from gpadjust.control.learning import check_functions, learn_dynamics, warn_of_promise
+from gpadjust.control.learning import (
+    check_functions,
+    learn_dynamics,
+    warn_of_bounds,
+    warn_of_promise,
+)
 from gpadjust.control.rollouts import random_sequences
 from gpadjust.control.state_filter import StateFilter, smooth_episodes
 from gpadjust.control.step_guard import StepGuard
@@ -299,6 +304,7 @@ class Agent(ABC, Display):
     def _learn_dynamics(self) -> None:
         """Update the dynamics by the episodes that are not in them."""
         task, dynamics = self.task, self.task.dynamics
+        acted_in = self.model
         if self.filter is not None and len(self._promises) > self.num_episodes:
             with episodes.timed(self.wall_time, "fit"):
                 newest = replace(task, dynamics=self.newest_model.dynamics)
@@ -331,6 +337,8 @@ class Agent(ABC, Display):
         if self.promised_reward is not None:
             values["promised_reward"] = self.promised_reward
             warn_of_promise(values, data.rewards)
+        if task.state_bounds is None and acted_in is not None and acted_in.state_bounds is not None:
+            warn_of_bounds(dynamics.spec, new, acted_in.state_bounds)
         self.tell("fit", values)
 
     def _improve(self) -> None:

@@ -16,7 +16,9 @@ from gpadjust.control.task import Task
 from gpadjust.dynamics import Dynamics, Trajectories
 from gpadjust.dynamics.base import typical_change
 from gpadjust.physics import PhysicsError
+from gpadjust.states import StateSpec
 
+_NEAR = 0.05  # of half the width between bounds: they may have held a state that is so near
 _ROUNDING = 1e-5  # of set-points, in single precision
 _WINDOWS = 4  # windows of scored trajectories: some half second for a model of an episode
 
@@ -115,6 +117,20 @@ def warn_of_delay(dynamics: Dynamics, data: Trajectories, num_new: int) -> None:
         return
     message = find_delay(physics, data)
     if message and find_delay(physics, data.subset(slice(len(data) - num_new))) is None:
+        warn(message)
+
+
+def warn_of_bounds(spec: StateSpec, data: Trajectories, bounds: Tensor) -> None:
+    """Warn if states came near bounds ``2 x state_dim`` that the user did not give."""
+    near = _NEAR * (bounds[1] - bounds[0]) / 2
+    extremes = torch.stack([data.next_states.amin(0), data.next_states.amax(0)])
+    room = torch.stack([extremes[0] - bounds[0], bounds[1] - extremes[1]])
+    for side, i in ((room < near) & bounds.isfinite()).nonzero().tolist():
+        message = (
+            f"An episode came to {spec.states[i]} = {float(extremes[side, i]):.3g}, and the model "
+            f"was not followed beyond {float(bounds[side, i]):.3g}: a default bound, which may "
+            "have held it there. Give the task state_bounds with room for its goal."
+        )
         warn(message)
 
 

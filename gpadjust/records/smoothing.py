@@ -130,7 +130,10 @@ class SmoothedRecords:
                 "Expected a physics with unknown parameters, and sensors without; found "
                 f"{', '.join(self.chain.unknowns) or 'no unknown parameters'}."
             )
-        return variation_of(self.chain, self.estimate)
+        chain = self.chain
+        path = chain.path_of(self.estimate)
+        variances = self.estimate.variances
+        return variation_of(chain.linearised(path), chain.starts, path.parameters, variances)
 
     def draw(self, seed: int = 0) -> Records:
         """Draw states from their posterior, along each record.

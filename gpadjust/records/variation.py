@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gpadjust.records import kalman
-
-if TYPE_CHECKING:
-    from gpadjust.records.smoothing import Chain, Estimate
+from gpadjust.records.kalman import Array, Link
 
 _MEDIAN = 0.05  # of a variation a priori, in standard deviations of a parameter's prior
 
 
-def variation_of(chain: Chain, estimate: Estimate) -> Tensor:
+def variation_of(
+    links: Sequence[Link],
+    starts: Sequence[tuple[Array, Array]],
+    parameters: Array,
+    variances: Array,
+) -> Tensor:
     r"""Estimate standard deviations of stretches' parameters, ``p``, in those of the priors.
+
+    Links are of each stretch, near the path by all; starts are means and covariances of its first
+    state and the parameters, whose estimate by all is ``p``; variances are of noise and process
+    noise, ``2 x d``.
 
     With :math:`\theta_s = \theta + \eta_s` in the coordinates in which priors are standard normal,
     :math:`\eta_s \sim N(0, \operatorname{diag}(v^2))` for stretch s, and the noises of the
@@ -26,7 +33,7 @@ def variation_of(chain: Chain, estimate: Estimate) -> Tensor:
     Laird and Ware 1982), with :math:`\log v \sim N(\log 0.05, 1)`, which it is where the stretches
     do not tell.
     """
-    precision, pull = _of_each_stretch(chain, estimate)
+    precision, pull = _of_each_stretch(links, starts, parameters, variances)
     start = math.log(_MEDIAN)
     log_v = torch.full_like(pull[0], start).requires_grad_()
     search = torch.optim.LBFGS([log_v], max_iter=60, line_search_fn="strong_wolfe")
@@ -66,18 +73,22 @@ def log_evidence(precision: Tensor, pull: Tensor, v: Tensor) -> Tensor:
     return of_stretches + shared - root.diagonal().log().sum()
 
 
-def _of_each_stretch(chain: Chain, estimate: Estimate) -> tuple[Tensor, Tensor]:
+def _of_each_stretch(
+    links: Sequence[Link],
+    starts: Sequence[tuple[Array, Array]],
+    parameters: Array,
+    variances: Array,
+) -> tuple[Tensor, Tensor]:
     """Return precision and pull of each stretch, smoothed alone near the estimate by all."""
-    d = chain.d
-    path = chain.path_of(estimate)
     precisions, pulls = [], []
-    for link, (mean, covariance) in zip(chain.linearised(path), chain.starts, strict=True):
+    for link, (mean, covariance) in zip(links, starts, strict=True):
+        d = len(mean) - len(parameters)
         # The prior of the parameters of a stretch is standard normal about those of all.
-        start = np.concatenate([mean[:d], path.parameters]), covariance
-        (alone,), _ = kalman.smooth_chain([link], [start], *estimate.variances)
+        start = np.concatenate([mean[:d], parameters]), covariance
+        (alone,), _ = kalman.smooth_chain([link], [start], *variances)
         covariance = alone.states.covariances[0, d:, d:]
         # Lambda_s = C^-1 - I, positive but for rounding
         values, vectors = np.linalg.eigh(np.linalg.inv(covariance) - np.eye(len(covariance)))
         precisions.append((vectors * values.clip(0)) @ vectors.T)
-        pulls.append(np.linalg.solve(covariance, alone.states.means[0, d:] - path.parameters))
+        pulls.append(np.linalg.solve(covariance, alone.states.means[0, d:] - parameters))
     return torch.from_numpy(np.stack(precisions)), torch.from_numpy(np.stack(pulls))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from itertools import combinations
 
 import torch
@@ -29,7 +30,7 @@ from gpadjust.validation.trust import SIDES, physics_at
 from gpadjust.words import bare, labelled, name_and_unit, number, percent, with_unit
 
 _CORRELATED = 0.7  # absolute correlation of parameters whose pair is drawn
-_MOST = 24  # inputs along which slices are drawn, in all outputs together
+_MOST = 12  # inputs along which slices are drawn, in all outputs together
 _BANDS = "Solid lines are means; bands cover 95 % of the function, without measurement noise."
 _NONE = "This model has no formula to adjust or to trust."
 _TRUST = (
@@ -42,13 +43,12 @@ _TRUST = (
 
 def where_wrong(subject: Subject) -> Markup:
     """Return the correction of the physics along each input, for each output."""
-    most = max(2, _MOST // len(subject.outputs))
-    inputs = [*range(len(subject.inputs))][:most]
+    inputs = inputs_drawn(subject)
     parts: list[Markup] = []
     if len(subject.inputs) > 1:
         values = zip(subject.inputs, point(subject, subject.base, 3), strict=True)
         pairs = [f"{bare(name)} = {with_unit(value, name)}" for name, value in values]
-        few = f" (drawn: the first {len(inputs)} of {len(pairs)} inputs)"
+        few = f" (drawn: {len(inputs)} of {len(pairs)} inputs, those that move predictions most)"
         others = f"Along each input the others stay at the median of the data: {', '.join(pairs)}"
         parts.append(tag("p", f"{others}{few * (len(inputs) < len(pairs))}.", class_="note"))
     for j, name in enumerate(subject.outputs):
@@ -59,21 +59,39 @@ def where_wrong(subject: Subject) -> Markup:
 
 def trusted(subject: Subject) -> Markup:
     """Return the shares of predictions that rest on the physics, on data, or on neither."""
-    rows, points = [], 0
-    try:
-        for j, (name, shown) in enumerate(zip(subject.outputs, subject.adjusted, strict=True)):
-            if shown is not None:
-                basis = trust(shown.model)
-                points = len(basis.X)  # of Sobol's sequence, for each output the same
-                shares = [percent(getattr(basis, side)[j]) for side in SIDES]
-                rows.append([name, shown.structure, *shares])
-    except PhysicsError as error:  # at some of these points
-        return tag("p", html.failure(error), class_="caution")
+    rows, failures, points = [], [], 0
+    for j, (name, shown) in enumerate(zip(subject.outputs, subject.adjusted, strict=True)):
+        if shown is None:
+            continue
+        try:
+            basis = trust(shown.model)
+        except PhysicsError as error:  # at some of these points
+            failures.append(tag("p", f"{name}: {html.failure(error)}", class_="caution"))
+            continue
+        points = len(basis.X)  # of Sobol's sequence, for each output the same
+        shares = [percent(getattr(basis, side)[j]) for side in SIDES]
+        rows.append([name, shown.structure, *shares])
     if not rows:
-        return tag("p", _NONE)
+        return html.join(failures or [tag("p", _NONE)])
     head = ["output", "by the model", "formula", "data", "neither"]
     table = html.table("Basis of the predictions", head, rows)
-    return html.join([tag("p", _TRUST.format(f"{points:,}")), table])
+    return html.join([*failures, tag("p", _TRUST.format(f"{points:,}")), table])
+
+
+@torch.no_grad()
+def inputs_drawn(subject: Subject) -> list[int]:
+    """Return the inputs along which slices are drawn: those that move the predictions most."""
+    most = max(2, _MOST // len(subject.outputs))
+    if len(subject.inputs) <= most:
+        return [*range(len(subject.inputs))]
+    spread = subject.Y.sub(subject.Y.nanmean(0)).square().nanmean(0).sqrt().clamp_min(1e-300)
+    effects = []
+    for _, X in lines_along(subject.model, base=subject.base):
+        effects.append(0.0)
+        with suppress(PhysicsError):  # its figure reports it, if it is among them
+            mean = subject.model.predict(X).mean
+            effects[-1] = float(((mean.amax(0) - mean.amin(0)) / spread).max())
+    return sorted(sorted(range(len(effects)), key=lambda i: -effects[i])[:most])
 
 
 def point(subject: Subject, X: Tensor, digits: int = 4) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import torch
 from scipy.stats import binom
 
 from gpadjust.core import GP, CalibratedPhysics, KnownNoise, Noise, StackedGP
@@ -209,10 +210,29 @@ def data(subject: Subject, remarks: tuple[str, ...]) -> Markup:
                 ends = ["-"] * 3
             rows.append([short, kind, unit or "-", *ends, str(len(column) - len(numbers))])
     head = ["column", "is", "unit", "least", "median", "most", "missing"]
-    distinct = len(subject.X.unique(dim=0))
-    first = f"{plural(len(subject.X), 'row')} of data, {distinct:,} with different inputs."
+    first = f"{plural(len(subject.X), 'row')} of data. {_repeats(subject)}"
     items = html.bullets([first, *remarks, _assumed(subject.model)])
     return join([table("Columns", head, rows), items])
+
+
+def _repeats(subject: Subject) -> str:
+    """Return the number of rows with the inputs of another, and the spread of their outputs."""
+    _, index, counts = subject.X.unique(dim=0, return_inverse=True, return_counts=True)
+    repeated = counts > 1
+    if not repeated.any():
+        return "No two rows have the same inputs."
+    spreads = []
+    for name, y in zip(subject.outputs, subject.Y.unbind(-1), strict=True):
+        groups = [y[(index == group) & ~y.isnan()] for group in repeated.nonzero()]
+        errors = [group - group.mean() for group in groups if len(group) > 1]
+        if errors:
+            # s^2 = sum (y - mean of its group)^2 / (n - groups)
+            sd = (torch.cat(errors).square().sum() / sum(len(e) - 1 for e in errors)).sqrt()
+            spreads.append(f"{with_unit(number(sd), name)} ({bare(name)})")
+    same = f"{plural(int(counts[repeated].sum()), 'row')} share their inputs with another"
+    if not spreads:
+        return f"{same}."
+    return f"{same}, and their outputs differ by a standard deviation of {', '.join(spreads)}."
 
 
 def _assumed(model: GP | StackedGP) -> str:

@@ -204,6 +204,14 @@ def test_what_cannot_be_trusted_is_told(make_agent, kind, parts, message):
         assert plans[0]["left_bounds"] == 1
 
 
+def test_a_default_bound_that_may_have_held_an_episode_is_told(make_agent, monkeypatch):
+    bounds = torch.tensor([[-0.1], [9.0]], dtype=torch.float64)
+    monkeypatch.setattr("gpadjust.control.episodes.far_bounds", lambda *given: bounds)
+    with pytest.warns(UserWarning, match=r"came to x = .* beyond -0.1: a default bound"):
+        make_agent(MPCAgent).learn(10)
+    make_agent(MPCAgent, state_bounds=bounds).learn(10)
+
+
 # Errors lose nothing
 
 

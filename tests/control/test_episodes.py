@@ -8,7 +8,7 @@ import torch
 from gymnasium import spaces
 
 from gpadjust.control.episodes import completed, far_bounds
-from gpadjust.control.learning import check_functions, learn_dynamics, learnable
+from gpadjust.control.learning import check_functions, learn_dynamics, learnable, warn_of_bounds
 from gpadjust.core import Prediction
 from gpadjust.dynamics import Dynamics, PhysicsDynamics, StateSpec, Trajectories
 from gpadjust.physics import PhysicsError
@@ -80,6 +80,12 @@ def test_bounds_leave_room_for_what_the_physics_reaches(moved):
     assert (wide[1] - wide[0]).item() == pytest.approx(10 * (close[1] - close[0]).item())
     for still in (lambda X: X[:, :1], fails):
         assert torch.equal(bounds_of(still, moved), close)
+
+
+def test_an_episode_that_a_bound_may_have_held_is_told(moved):
+    with pytest.warns(UserWarning, match=r"came to x = 1\.3, .*beyond 1\.31: .*state_bounds"):
+        warn_of_bounds(POINT_SPEC, moved, torch.tensor([[-1.0], [1.31]]))
+    warn_of_bounds(POINT_SPEC, moved, torch.tensor([[-3.0], [3.0]]))
 
 
 def test_the_environments_functions_pass():

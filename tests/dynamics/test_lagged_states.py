@@ -78,6 +78,24 @@ def test_physics_knows_the_present_only_and_a_model_both():
         dynamics.update(states, actions[:, 0], following[:, 0].flip(0))
 
 
+def test_a_state_is_loaded_with_the_same_previous_values_in_any_order():
+    dynamics = learnt(NARX, model=ZeroMeanGP)
+    turned = dict([*LAGS.items()][::-1])
+    again, other = (
+        LearnedDynamics(
+            StateSpec(NARX.states, ["u"], previous=previous), model=ZeroMeanGP, fit_options=QUICK
+        )
+        for previous in (turned, {"y_1": "y", "u_1": "y_1"})
+    )
+    again.load_state_dict(dynamics.state_dict())
+    states, actions, _ = records_of(NARX, 45, 1).windows(1)
+    both = (each.predict(states, actions[:, 0]) for each in (again, dynamics))
+    for loaded, expected in zip(*both, strict=True):
+        assert torch.equal(loaded, expected)
+    with pytest.raises(RuntimeError, match=r"previous is {'u_1': 'u', .* in the state"):
+        other.load_state_dict(dynamics.state_dict())
+
+
 def test_a_model_reads_the_point_of_the_circle_of_an_earlier_angle(uniform):
     """A rotor turns on as in the step before, and by the action; its rate is not measured."""
     spec = StateSpec(["q_1", "q"], ["u"], angles=["q", "q_1"], previous={"q_1": "q"})

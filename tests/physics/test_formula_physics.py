@@ -64,6 +64,8 @@ WRONG = {
     "=atan2(a; b)": "ATAN2 of a spreadsheet takes x first",
     "=a, b": "a formula with = in front has one output",
     "=A1:A2": "Expected a formula such as",
+    "head = a": "leave out 'head ='",
+    "a\u00b2 + b": r"write 'a\^2'",
     "sinn(a)": r"'sinn\(a\)' is not a part of a formula.*functions sin, ",
     "max(a)": r"missing 1 required.*such as max\(a, b\)",
     "where(a, b)": "missing 1 required",

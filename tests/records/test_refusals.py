@@ -57,6 +57,8 @@ def every_way(records, step):
             call(step)
         except ValueError as error:
             messages.add(str(error))
+        else:
+            pytest.fail(f"{call} did not raise")
     (message,) = messages
     raise ValueError(message)
 
@@ -80,6 +82,9 @@ SLOW = ODEPhysics(lambda x, u: x, step=0.2, state_dim=2)
 FRAGILE = FunctionPhysics(lambda X: torch.where(X[:, :2] > 0.9, NAN, X[:, :2]))
 IN_STEPS = partial(Records(moved(), StateSpec(["x", "v"], ["u"], step=0.2)).trajectories, 0.4)
 
+SLOWER = r".* multiple of the sampling step, 0\.2, got 0\.1; take 0\.2"
+UNEVEN_STEPS = r".* a tenth of its step 0\.1"
+
 REFUSED = [
     # Records
     (lambda: three(times=torch.tensor([0, 2, 1.0]).double()), "'r', row 2: .*found 1 after 2"),
@@ -90,6 +95,7 @@ REFUSED = [
     (lambda: three(actions=column(0, 0, NAN)), r"actions of record 'r' .*\(row 2\)"),
     (lambda: three(actions=column(0, 0)), "3 of times, 3 of states, 2 of actions"),
     (lambda: three(segments=[]), "3 of actions, 0 of segments"),
+    (lambda: three(segments=[1, 1]), "3 of actions, 2 of segments"),
     (lambda: three(segments=[1, 2, 1]), "two rows or more of a segment, .* found 3 in all"),
     (lambda: moved(3, states=TEXT), TypeError, "contain numbers only"),
     (lambda: Records([], POINT), "one record or more"),
@@ -101,8 +107,8 @@ REFUSED = [
     # Control steps
     (lambda: every_way([moved()], 0.25), r"multiple of .* 0\.1, got 0\.25; take 0\.2\."),
     (lambda: every_way([moved()], 0.04), r"got 0\.04; take 0\.1\."),
-    (lambda: every_way([moved(), moved(step=0.2)], None), r"step, 0\.2, got 0\.1; take 0\.2"),
-    (lambda: every_way([moved(times=SHAKEN)], 0.1), r"a tenth of its step 0\.1"),
+    (lambda: every_way([moved(), moved(step=0.2, name="slow")], None), f"'slow': {SLOWER}"),
+    (lambda: every_way([moved(times=SHAKEN, name="rough")], 0.1), f"'rough': {UNEVEN_STEPS}"),
     (lambda: every_way([moved(6, times=UNEVEN)], 1), "few gaps, .* from 1 to 3.*numpy.interp"),
     (lambda: every_way([moved()], -0.1), "step must be finite and above 0; found -0.1"),
     (lambda: every_way([moved(3)], 0.4), "as long as a control step, 0.4, found none of 1"),

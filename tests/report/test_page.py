@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from gpadjust.core import CKA, CalibratedPhysics, ZeroMeanGP, fit, load
 from gpadjust.physics import FunctionPhysics, PhysicsError, Unknown
-from gpadjust.report import figures, report
+from gpadjust.report import figures, report, tables
 from gpadjust.report.markup import Markup, failure, side_by_side, table, tag
 from gpadjust.report.page import cards, headline
-from gpadjust.report.subject import subject_of
+from gpadjust.report.subject import Adjusted, subject_of
 from gpadjust.validation import Verdict
 from gpadjust.validation.plots import lines_along
 from gpadjust.words import name_and_unit, number
@@ -174,6 +174,36 @@ def test_an_interrupted_page_and_a_model_that_cannot_be_saved(
     monkeypatch.setattr("gpadjust.report.page.save", raising(ValueError("no way")))
     assert "The model could not be saved: no way" in read(report(comparison, page)).text
     assert not model.exists()  # of the earlier page
+
+
+def test_inputs_that_move_predictions_are_drawn_and_repeated_rows_are_counted():
+    X = torch.rand(20, 13, generator=torch.Generator().manual_seed(0)).double()
+    X[1:3] = X[0]
+    Y = 5 * X[:, -1:]
+    Y[:3, 0] += torch.tensor([-1.0, 0.0, 1.0])
+    model = CKA(X, Y, physics=lambda X: 5 * X[:, -1:])
+    model.data = model.data._replace(output_names=("p [Pa]",))
+    fit(model, "map")
+    subject = subject_of(model)
+    drawn = figures.inputs_drawn(subject)
+    assert len(drawn) == 12
+    assert drawn[-1] == 12
+    same = "3 rows share their inputs with another, and their outputs differ"
+    assert f"{same} by a standard deviation of 1 Pa (p)." in tables.data(subject, ())
+
+
+def test_a_physics_that_fails_leaves_the_shares_of_the_other_output():
+    X = torch.rand(9, 1, dtype=torch.float64)
+    least = [0.0]
+    fragile = FunctionPhysics(lambda X: X.where(X.ge(least[0]), torch.nan).repeat(1, 2))
+    models = [CKA(X, X.repeat(1, 2).sin(), physics=f) for f in (fragile, lambda X: X.repeat(1, 2))]
+    fit(models[1], "map")
+    subject = subject_of(models[1])
+    least[0] = 1.0
+    subject = dataclasses.replace(subject, adjusted=[Adjusted("CKA", model) for model in models])
+    page = Page(figures.trusted(subject))
+    assert "y1: Physics" in page.text
+    assert [row[0] for row in page.tables["Basis of the predictions"][1:]] == ["y2"]
 
 
 def test_inputs_are_drawn_in_double_precision():

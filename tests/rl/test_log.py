@@ -84,7 +84,7 @@ def test_hooks_of_the_model(point_agent, learnt_dynamics, monkeypatch):
     rewards = agent.replay_buffer.model_buffer.rewards[: 5 * 6, 0]
     assert np.concatenate(watch.returns).sum() == pytest.approx(rewards.sum(), rel=1e-5)
     monkeypatch.setattr(watch, "on_model_fit", {}.popitem)  # which raises an error
-    with pytest.raises(TypeError):
+    with pytest.raises(TypeError, match="popitem"):
         agent.learn(5, watch, reset_num_timesteps=False)
     agent.learn(5, reset_num_timesteps=False)
     assert len(watch.fits) == 2

@@ -24,6 +24,11 @@ def shaped(observation_space, action_space=LINE):
     return {"env": env}
 
 
+def stepped(particles):
+    particles.reset()
+    particles.step(np.ones((3, 1), dtype=np.float32))
+
+
 OPTIONS = [
     ({"n_steps": 3}, "no n-step returns; found n_steps=3"),
     ({"optimize_memory_usage": True}, "optimize_memory_usage"),
@@ -57,10 +62,20 @@ CALLS = [
     (lambda at: at.particles(num_envs=0), "num_envs must be at least 1; found 0"),
     (lambda at: at.particles(sampling="swarm"), "Unknown sampling 'swarm'"),
     (lambda at: at.particles(initial_states=None), "needs a task with initial_states"),
+    (
+        lambda at: stepped(at.particles(initial_states=torch.zeros)),
+        r"initial_states\(3\) must return .* 3 x 1; found \(3,\)",
+    ),
+    (lambda at: stepped(at.particles(reward=lambda s, a, n: n[:, 0] / 0)), "reward.*inf"),
 ]
 FUNCTIONS = [
     ({"initial_states": lambda n: torch.ones(n)}, r"initial_states\(2\) must return .* 2 x 1"),
+    (
+        {"initial_states": lambda n: torch.full((n, 1), torch.nan)},
+        r"initial_states\(2\) returned .*expected finite",
+    ),
     ({"reward": lambda s, a, n: n}, r"reward must return one value per row, shape \(2,\)"),
+    ({"terminated": lambda s: s}, r"terminated must return one value per row"),
     ({"dynamics": LearnedDynamics(POINT_SPEC, lambda X: X)}, "1 states .* got 2 columns"),
 ]
 

@@ -24,6 +24,9 @@ def test_a_loaded_agent_predicts_the_same_and_its_dynamics_learn_all(
             DynaSAC.load(path, **given).learn(5)
     with pytest.raises(AssertionError, match="must set the environment"):  # of Stable-Baselines3
         DynaSAC.load(path, task=point_task()).learn(5)
+    task = point_task(dynamics=learnt_dynamics(), reward=lambda s, a, n: s[:, 0])
+    with pytest.raises(ValueError, match="is not the environment's"):
+        DynaSAC.load(path, env=point_env(), task=task).learn(5)
     agent.save_replay_buffer(tmp_path / "buffer.pkl")
     loaded = DynaSAC.load(path, env=point_env(), task=point_task(dynamics=learnt_dynamics()))
     loaded.load_replay_buffer(tmp_path / "buffer.pkl")
